@@ -1,0 +1,1 @@
+//! Keeps every frame in a pcapng file.
