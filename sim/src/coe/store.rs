@@ -1,0 +1,331 @@
+//! The object dictionary as one flat byte arena. Every (index, subindex) is a [`Slot`]; PDO copies,
+//! SDO transfers and the drive all work on slots, so that nothing is looked up or allocated while
+//! cycling.
+
+use std::ops::Range;
+
+use ecaxis_esi::model::{Access, Dictionary, PdoMapping, Writable};
+
+/// A subindex that exists, as a handle that stays valid for the store's life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Slot(u32);
+
+/// What the dictionary says about one subindex.
+#[derive(Debug, Clone)]
+pub struct Item {
+    pub index: u16,
+    pub sub: u8,
+    pub name: String,
+    pub bit_len: u32,
+    /// Offset inside the object under complete access (subindex 0 takes 16 bits).
+    pub bit_offset: u32,
+    /// Two's complement: [`ObjectStore::get`] extends the sign.
+    pub signed: bool,
+    /// Text of variable length: an upload ends at the first zero byte, a shorter download is padded.
+    pub text: bool,
+    pub access: Access,
+    pub mapping: PdoMapping,
+    pub min: Option<i64>,
+    pub max: Option<i64>,
+    range: Range<usize>,
+}
+
+/// All objects of one device.
+#[derive(Debug, Clone, Default)]
+pub struct ObjectStore {
+    arena: Vec<u8>,
+    items: Vec<Item>,
+    /// Sorted by (index, subindex).
+    order: Vec<(u32, Slot)>,
+}
+
+fn key(index: u16, sub: u8) -> u32 {
+    u32::from(index) << 8 | u32::from(sub)
+}
+
+impl ObjectStore {
+    /// Objects of all dictionaries; a later dictionary's object replaces an earlier one of the same index.
+    #[must_use]
+    pub fn from_dictionary(dictionaries: &[&Dictionary]) -> Self {
+        let mut store = Self::default();
+        for (n, dictionary) in dictionaries.iter().enumerate() {
+            for object in &dictionary.objects {
+                if dictionaries
+                    .iter()
+                    .skip(n + 1)
+                    .any(|d| d.object(object.index).is_some())
+                {
+                    continue;
+                }
+                for item in &object.items {
+                    let base = item.type_name.trim();
+                    store.insert(
+                        Item {
+                            index: object.index,
+                            sub: item.sub,
+                            name: if item.name.is_empty() {
+                                object.name.clone()
+                            } else {
+                                item.name.clone()
+                            },
+                            bit_len: item.bit_len,
+                            bit_offset: item.bit_offset,
+                            signed: is_signed(base),
+                            text: base.starts_with("STRING"),
+                            access: item.access,
+                            mapping: item.pdo_mapping,
+                            min: item
+                                .min
+                                .as_deref()
+                                .map(|b| number(b, item.bit_len, is_signed(base))),
+                            max: item
+                                .max
+                                .as_deref()
+                                .map(|b| number(b, item.bit_len, is_signed(base))),
+                            range: 0..0,
+                        },
+                        &item.default,
+                    );
+                }
+            }
+        }
+        store
+    }
+
+    /// The slot of an existing subindex.
+    #[must_use]
+    pub fn slot(&self, index: u16, sub: u8) -> Option<Slot> {
+        let key = key(index, sub);
+        let at = self.order.binary_search_by_key(&key, |(k, _)| *k).ok()?;
+        self.order.get(at).map(|(_, slot)| *slot)
+    }
+
+    /// The slot of a subindex, created (readable over CoE like any other) where the ESI lacks it.
+    /// An existing one keeps its length, access and value. Created items read as unsigned through
+    /// [`Self::get`]; use [`Self::get_signed`] where the profile says otherwise.
+    pub fn ensure(
+        &mut self,
+        index: u16,
+        sub: u8,
+        name: &str,
+        bit_len: u32,
+        access: Access,
+        default: &[u8],
+    ) -> Slot {
+        if let Some(slot) = self.slot(index, sub) {
+            return slot;
+        }
+        let bit_offset = if sub == 0 {
+            0
+        } else {
+            self.object(index)
+                .filter_map(|slot| self.item(slot))
+                .filter(|item| item.sub > 0 && item.sub < sub)
+                .map(|item| item.bit_offset + item.bit_len)
+                .max()
+                .unwrap_or(16)
+        };
+        self.insert(
+            Item {
+                index,
+                sub,
+                name: name.to_owned(),
+                bit_len,
+                bit_offset,
+                signed: false,
+                text: false,
+                access,
+                mapping: PdoMapping { rx: true, tx: true },
+                min: None,
+                max: None,
+                range: 0..0,
+            },
+            default,
+        )
+    }
+
+    fn insert(&mut self, mut item: Item, default: &[u8]) -> Slot {
+        let key = key(item.index, item.sub);
+        let len = usize::try_from(item.bit_len.div_ceil(8)).unwrap_or(0);
+        let start = self.arena.len();
+        self.arena.extend(
+            default
+                .iter()
+                .copied()
+                .chain(std::iter::repeat(0))
+                .take(len),
+        );
+        item.range = start..start + len;
+        let slot = Slot(u32::try_from(self.items.len()).unwrap_or(u32::MAX));
+        self.items.push(item);
+        match self.order.binary_search_by_key(&key, |(k, _)| *k) {
+            // The same subindex twice in one file: the later one counts.
+            Ok(at) => self.order[at].1 = slot,
+            Err(at) => self.order.insert(at, (key, slot)),
+        }
+        slot
+    }
+
+    /// The object's slots in subindex order; empty where there is no such object.
+    pub fn object(&self, index: u16) -> impl Iterator<Item = Slot> + '_ {
+        let start = self.order.partition_point(|(k, _)| *k < key(index, 0));
+        self.order
+            .get(start..)
+            .unwrap_or_default()
+            .iter()
+            .take_while(move |(k, _)| k >> 8 == u32::from(index))
+            .map(|(_, slot)| *slot)
+    }
+
+    #[must_use]
+    pub fn has_object(&self, index: u16) -> bool {
+        self.object(index).next().is_some()
+    }
+
+    #[must_use]
+    pub fn item(&self, slot: Slot) -> Option<&Item> {
+        self.items.get(slot.0 as usize)
+    }
+
+    /// Lets CoE clients write (or no longer write) an item.
+    pub fn set_access(&mut self, slot: Slot, write: Writable) {
+        if let Some(item) = self.items.get_mut(slot.0 as usize) {
+            item.access.write = write;
+        }
+    }
+
+    /// The value, sign-extended if the dictionary's type is signed; of long items the low 64 bits.
+    #[must_use]
+    pub fn get(&self, slot: Slot) -> i64 {
+        self.item(slot).map_or(0, |item| {
+            number(self.slice(item), item.bit_len, item.signed)
+        })
+    }
+
+    /// The value as two's complement of its length, whatever the dictionary says.
+    #[must_use]
+    pub fn get_signed(&self, slot: Slot) -> i64 {
+        self.item(slot)
+            .map_or(0, |item| number(self.slice(item), item.bit_len, true))
+    }
+
+    /// Stores the low `bit_len` bits of the value, little-endian.
+    pub fn set(&mut self, slot: Slot, value: i64) {
+        let Some(item) = self.items.get(slot.0 as usize) else {
+            return;
+        };
+        let value = if item.bit_len < 64 {
+            value & ((1 << item.bit_len) - 1)
+        } else {
+            value
+        };
+        if let Some(bytes) = self.arena.get_mut(item.range.clone()) {
+            for (to, from) in bytes.iter_mut().zip(value.to_le_bytes()) {
+                *to = from;
+            }
+        }
+    }
+
+    /// Little-endian, `bit_len.div_ceil(8)` bytes.
+    #[must_use]
+    pub fn bytes(&self, slot: Slot) -> &[u8] {
+        self.item(slot).map_or(&[], |item| self.slice(item))
+    }
+
+    pub fn bytes_mut(&mut self, slot: Slot) -> &mut [u8] {
+        match self.items.get(slot.0 as usize) {
+            Some(item) => self.arena.get_mut(item.range.clone()).unwrap_or_default(),
+            None => &mut [],
+        }
+    }
+
+    fn slice(&self, item: &Item) -> &[u8] {
+        self.arena.get(item.range.clone()).unwrap_or_default()
+    }
+}
+
+fn is_signed(type_name: &str) -> bool {
+    matches!(
+        type_name,
+        "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
+    )
+}
+
+fn number(bytes: &[u8], bit_len: u32, signed: bool) -> i64 {
+    let mut raw = [0; 8];
+    for (to, from) in raw.iter_mut().zip(bytes) {
+        *to = *from;
+    }
+    let value = i64::from_le_bytes(raw);
+    let unused = 64u32.saturating_sub(bit_len.max(1));
+    if signed {
+        value << unused >> unused
+    } else {
+        (value << unused)
+            .cast_unsigned()
+            .wrapping_shr(unused)
+            .cast_signed()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ecaxis_esi::model::{Object, ObjectItem};
+
+    fn dictionary(default: u8) -> Dictionary {
+        let item = |sub, type_name: &str, bit_len, default: Vec<u8>| ObjectItem {
+            sub,
+            type_name: type_name.into(),
+            bit_len,
+            default,
+            ..ObjectItem::default()
+        };
+        Dictionary {
+            objects: vec![Object {
+                index: 0x6064,
+                items: vec![
+                    item(0, "DINT", 32, vec![default, 0xff, 0xff, 0xff]),
+                    item(3, "BOOL", 1, vec![1]),
+                ],
+                ..Object::default()
+            }],
+        }
+    }
+
+    #[test]
+    fn values_extend_by_type_and_later_dictionaries_win() {
+        let store = ObjectStore::from_dictionary(&[&dictionary(0xfd), &dictionary(0xfe)]);
+        let slot = store.slot(0x6064, 0).unwrap();
+        assert_eq!(store.get(slot), -2);
+        assert_eq!(store.object(0x6064).count(), 2);
+        assert_eq!(store.slot(0x6064, 1), None);
+        assert_eq!(store.slot(0x6065, 0), None);
+    }
+
+    #[test]
+    fn set_keeps_to_the_items_bits() {
+        let mut store = ObjectStore::from_dictionary(&[&dictionary(0)]);
+        let wide = store.slot(0x6064, 0).unwrap();
+        let bit = store.slot(0x6064, 3).unwrap();
+        store.set(bit, 0xff);
+        assert_eq!(store.bytes(bit), [1]);
+        store.set(wide, -5);
+        assert_eq!(store.get(wide), -5);
+        assert_eq!(store.get(bit), 1);
+    }
+
+    #[test]
+    fn ensure_creates_once_and_is_found() {
+        let mut store = ObjectStore::default();
+        let a = store.ensure(0x2000, 1, "new", 16, Access::default(), &[0xfe, 0xff]);
+        let b = store.ensure(0x2000, 2, "next", 32, Access::default(), &[]);
+        assert_eq!(
+            store.ensure(0x2000, 1, "other", 8, Access::default(), &[]),
+            a
+        );
+        assert_eq!(store.slot(0x2000, 1), Some(a));
+        assert_eq!((store.get(a), store.get_signed(a)), (0xfffe, -2));
+        assert_eq!(store.item(b).unwrap().bit_offset, 32);
+    }
+}
