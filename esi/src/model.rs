@@ -336,7 +336,10 @@ pub struct Access {
 
 impl Default for Access {
     fn default() -> Self {
-        Self { read: true, write: Writable::Never }
+        Self {
+            read: true,
+            write: Writable::Never,
+        }
     }
 }
 
@@ -345,7 +348,11 @@ pub enum Writable {
     Never,
     Always,
     /// `WriteRestrictions` name the states in which it may be written.
-    Only { pre_op: bool, safe_op: bool, op: bool },
+    Only {
+        pre_op: bool,
+        safe_op: bool,
+        op: bool,
+    },
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

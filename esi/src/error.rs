@@ -1,0 +1,66 @@
+//! What can be wrong with an ESI file.
+
+use crate::model::Position;
+
+/// The file cannot be used. Displays as `line:column path: what`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{position} {path}: {problem}")]
+pub struct EsiError {
+    position: Position,
+    path: String,
+    problem: EsiProblem,
+}
+
+impl EsiError {
+    pub(crate) fn new(position: Position, path: String, problem: EsiProblem) -> Self {
+        Self {
+            position,
+            path,
+            problem,
+        }
+    }
+
+    /// Line and column of the element at fault.
+    #[must_use]
+    pub fn position(&self) -> Position {
+        self.position
+    }
+
+    /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
+    #[must_use]
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    #[must_use]
+    pub fn problem(&self) -> &EsiProblem {
+        &self.problem
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum EsiProblem {
+    #[error("not well-formed XML: {0}")]
+    Syntax(String),
+    #[error("the file ends inside <{0}>")]
+    Truncated(String),
+    #[error("the root element is <{0}>, an ESI file starts with <EtherCATInfo>")]
+    NotEsi(String),
+    #[error("there is no XML element in the file")]
+    Empty,
+    #[error("{what} is missing")]
+    Missing { what: &'static str },
+    #[error("{what} {text:?} is not a number that fits ({min} to {max})")]
+    Number {
+        what: &'static str,
+        text: String,
+        min: i128,
+        max: i128,
+    },
+    #[error("{what} {text:?} is not a sequence of hexadecimal bytes")]
+    HexBytes { what: &'static str, text: String },
+    #[error("elements are nested deeper than {limit}")]
+    TooDeep { limit: usize },
+    #[error("{what} exceed {limit}, which no device needs")]
+    TooLarge { what: &'static str, limit: usize },
+}

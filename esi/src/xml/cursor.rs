@@ -1,0 +1,442 @@
+//! A pull cursor over quick-xml's events that knows line, column and element path, refuses to nest without
+//! bound and meters how much a file may make us allocate. General entities are never expanded.
+
+use quick_xml::escape::resolve_xml_entity;
+use quick_xml::events::{BytesRef, BytesStart, Event};
+use quick_xml::{Reader, XmlVersion};
+
+use super::number;
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{Position, Warning};
+
+const MAX_DEPTH: usize = 64;
+const MAX_WARNINGS: usize = 500;
+/// Bytes of data that one file may expand to; the largest known file needs about 2 MB.
+const MAX_EXPANSION: usize = 128 << 20;
+
+/// Elements that occur several times and therefore carry their number in a path.
+const NUMBERED: [&str; 16] = [
+    "Device",
+    "Module",
+    "Fmmu",
+    "Sm",
+    "RxPdo",
+    "TxPdo",
+    "Entry",
+    "Exclude",
+    "InitCmd",
+    "OpMode",
+    "Slot",
+    "ModuleIdent",
+    "DataType",
+    "SubItem",
+    "Object",
+    "EtherCATInfo",
+];
+
+pub(super) struct Cursor<'a> {
+    reader: Reader<&'a [u8]>,
+    text: &'a str,
+    stack: Vec<Level<'a>>,
+    /// Names of the root's level, for numbering.
+    top: Vec<(&'a str, u32)>,
+    at: Position,
+    at_offset: usize,
+    spent: usize,
+    pub warnings: Vec<Warning>,
+}
+
+struct Level<'a> {
+    name: &'a str,
+    number: u32,
+    position: Position,
+    seen: Vec<(&'a str, u32)>,
+}
+
+/// A start tag. Whoever receives it reads its children or its text; what is left unread is skipped.
+pub(super) struct Element<'a> {
+    pub name: &'a str,
+    pub position: Position,
+    start: BytesStart<'a>,
+    depth: usize,
+}
+
+enum Token<'a> {
+    Start(Element<'a>),
+    Text(String),
+    End,
+    Eof,
+}
+
+impl<'a> Cursor<'a> {
+    pub fn new(text: &'a str) -> Self {
+        let mut reader = Reader::from_str(text);
+        reader.config_mut().expand_empty_elements = true;
+        Self {
+            reader,
+            text,
+            stack: Vec::new(),
+            top: Vec::new(),
+            at: Position { line: 1, column: 1 },
+            at_offset: 0,
+            spent: 0,
+            warnings: Vec::new(),
+        }
+    }
+
+    /// The first element of the document.
+    pub fn root(&mut self) -> Result<Element<'a>, EsiError> {
+        loop {
+            match self.token()? {
+                Token::Start(element) => return Ok(element),
+                Token::Text(_) | Token::End => {}
+                Token::Eof => return Err(self.error(EsiProblem::Empty)),
+            }
+        }
+    }
+
+    /// Calls `visit` with every child element of `parent`.
+    pub fn children(
+        &mut self,
+        parent: &Element<'a>,
+        mut visit: impl FnMut(&mut Self, &Element<'a>) -> Result<(), EsiError>,
+    ) -> Result<(), EsiError> {
+        while self.stack.len() >= parent.depth {
+            match self.token()? {
+                Token::Start(child) => {
+                    visit(self, &child)?;
+                    self.finish(child.depth)?;
+                }
+                Token::Text(_) | Token::End => {}
+                Token::Eof => return Err(self.truncated()),
+            }
+        }
+        Ok(())
+    }
+
+    /// The element's own text, trimmed.
+    pub fn text(&mut self, element: &Element<'a>) -> Result<String, EsiError> {
+        let mut text = String::new();
+        while self.stack.len() >= element.depth {
+            match self.token()? {
+                Token::Start(child) => self.finish(child.depth)?,
+                Token::Text(part) => text.push_str(&part),
+                Token::End => {}
+                Token::Eof => return Err(self.truncated()),
+            }
+        }
+        Ok(text.trim().to_owned())
+    }
+
+    pub fn number<T>(&mut self, element: &Element<'a>, what: &'static str) -> Result<T, EsiError>
+    where
+        T: TryFrom<i128> + Bounds,
+    {
+        let text = self.text(element)?;
+        self.to_number(element, what, &text)
+    }
+
+    /// Like [`Self::number`]; an empty element counts as absent.
+    pub fn optional_number<T>(
+        &mut self,
+        element: &Element<'a>,
+        what: &'static str,
+    ) -> Result<Option<T>, EsiError>
+    where
+        T: TryFrom<i128> + Bounds,
+    {
+        let text = self.text(element)?;
+        if text.is_empty() {
+            Ok(None)
+        } else {
+            self.to_number(element, what, &text).map(Some)
+        }
+    }
+
+    pub fn hex_bytes(
+        &mut self,
+        element: &Element<'a>,
+        what: &'static str,
+    ) -> Result<Vec<u8>, EsiError> {
+        let text = self.text(element)?;
+        number::hex_bytes(&text).ok_or_else(|| {
+            self.error_at(
+                element,
+                EsiProblem::HexBytes {
+                    what,
+                    text: shorten(&text),
+                },
+            )
+        })
+    }
+
+    pub fn attribute(&self, element: &Element<'a>, name: &str) -> Result<Option<String>, EsiError> {
+        for attribute in element.start.attributes().with_checks(false) {
+            let attribute = attribute.map_err(|e| {
+                self.error_at(element, EsiProblem::Syntax(format!("attribute: {e}")))
+            })?;
+            if attribute.key.local_name().as_ref() == name {
+                let value = attribute
+                    .normalized_value(XmlVersion::Implicit1_0)
+                    .map_err(|e| {
+                        self.error_at(
+                            element,
+                            EsiProblem::Syntax(format!("attribute {name}: {e}")),
+                        )
+                    })?;
+                return Ok(Some(value.into_owned()));
+            }
+        }
+        Ok(None)
+    }
+
+    /// A numeric attribute; an empty one counts as absent.
+    pub fn attribute_number<T>(
+        &self,
+        element: &Element<'a>,
+        name: &'static str,
+    ) -> Result<Option<T>, EsiError>
+    where
+        T: TryFrom<i128> + Bounds,
+    {
+        match self.attribute(element, name)? {
+            Some(text) if !text.trim().is_empty() => self.to_number(element, name, &text).map(Some),
+            _ => Ok(None),
+        }
+    }
+
+    pub fn attribute_flag(&mut self, element: &Element<'a>, name: &str) -> Result<bool, EsiError> {
+        let Some(text) = self.attribute(element, name)? else {
+            return Ok(false);
+        };
+        if let Some(flag) = number::boolean(&text) {
+            return Ok(flag);
+        }
+        self.warn(
+            element,
+            format!("{name}={text:?} is neither true nor false; taken as false"),
+        );
+        Ok(false)
+    }
+
+    pub fn warn(&mut self, element: &Element<'a>, message: String) {
+        self.warn_at(element.position, element, message);
+    }
+
+    /// For oddities found after the element itself was left; `within` names the part of the file.
+    pub fn warn_at(&mut self, position: Position, within: &Element<'a>, message: String) {
+        if self.warnings.len() < MAX_WARNINGS {
+            let path = self.path(within.depth);
+            self.warnings.push(Warning {
+                position,
+                path,
+                message,
+            });
+        }
+    }
+
+    /// Accounts for `bytes` of data built from the file.
+    pub fn spend(&mut self, bytes: usize) -> Result<(), EsiError> {
+        self.spent = self.spent.saturating_add(bytes);
+        if self.spent > MAX_EXPANSION {
+            return Err(self.error(EsiProblem::TooLarge {
+                what: "the objects' bytes",
+                limit: MAX_EXPANSION,
+            }));
+        }
+        Ok(())
+    }
+
+    pub fn error_at(&self, element: &Element<'a>, problem: EsiProblem) -> EsiError {
+        EsiError::new(element.position, self.path(element.depth), problem)
+    }
+
+    fn error(&self, problem: EsiProblem) -> EsiError {
+        let position = self.stack.last().map_or(self.at, |level| level.position);
+        EsiError::new(position, self.path(self.stack.len()), problem)
+    }
+
+    fn truncated(&self) -> EsiError {
+        let name = self.stack.last().map_or("", |level| level.name);
+        self.error(EsiProblem::Truncated(name.to_owned()))
+    }
+
+    fn to_number<T>(
+        &self,
+        element: &Element<'a>,
+        what: &'static str,
+        text: &str,
+    ) -> Result<T, EsiError>
+    where
+        T: TryFrom<i128> + Bounds,
+    {
+        number::number(text)
+            .and_then(|n| T::try_from(n).ok())
+            .ok_or_else(|| {
+                let problem = EsiProblem::Number {
+                    what,
+                    text: shorten(text),
+                    min: T::MIN,
+                    max: T::MAX,
+                };
+                self.error_at(element, problem)
+            })
+    }
+
+    /// Reads on until the element at `depth` is closed.
+    fn finish(&mut self, depth: usize) -> Result<(), EsiError> {
+        while self.stack.len() >= depth {
+            if let Token::Eof = self.token()? {
+                return Err(self.truncated());
+            }
+        }
+        Ok(())
+    }
+
+    fn token(&mut self) -> Result<Token<'a>, EsiError> {
+        loop {
+            let offset = usize::try_from(self.reader.buffer_position()).unwrap_or(usize::MAX);
+            let event = match self.reader.read_event() {
+                Ok(event) => event,
+                Err(error) => {
+                    self.move_to(usize::try_from(self.reader.error_position()).unwrap_or(offset));
+                    let path = self.path(self.stack.len());
+                    return Err(EsiError::new(
+                        self.at,
+                        path,
+                        EsiProblem::Syntax(error.to_string()),
+                    ));
+                }
+            };
+            match event {
+                Event::Start(start) => return self.open(start, offset).map(Token::Start),
+                Event::End(_) => {
+                    self.stack.pop();
+                    return Ok(Token::End);
+                }
+                Event::Text(text) => return Ok(Token::Text(text.xml10_content().into_owned())),
+                Event::CData(text) => return Ok(Token::Text(text.xml10_content().into_owned())),
+                Event::GeneralRef(reference) => return Ok(Token::Text(self.reference(&reference))),
+                Event::Eof => return Ok(Token::Eof),
+                // expand_empty_elements leaves no Empty; the others carry nothing for us.
+                Event::Empty(_)
+                | Event::Decl(_)
+                | Event::PI(_)
+                | Event::DocType(_)
+                | Event::Comment(_) => {}
+            }
+        }
+    }
+
+    fn open(&mut self, start: BytesStart<'a>, offset: usize) -> Result<Element<'a>, EsiError> {
+        self.move_to(offset);
+        let length = start.name().as_ref().len();
+        let qualified = self
+            .text
+            .get(offset.saturating_add(1)..)
+            .and_then(|rest| rest.get(..length))
+            .unwrap_or("");
+        let name = qualified.rsplit(':').next().unwrap_or(qualified);
+        let seen = self
+            .stack
+            .last_mut()
+            .map_or(&mut self.top, |level| &mut level.seen);
+        let number = match seen.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, count)) => {
+                *count = count.saturating_add(1);
+                *count
+            }
+            None => {
+                seen.push((name, 1));
+                1
+            }
+        };
+        if self.stack.len() >= MAX_DEPTH {
+            return Err(self.error(EsiProblem::TooDeep { limit: MAX_DEPTH }));
+        }
+        self.stack.push(Level {
+            name,
+            number,
+            position: self.at,
+            seen: Vec::new(),
+        });
+        Ok(Element {
+            name,
+            position: self.at,
+            start,
+            depth: self.stack.len(),
+        })
+    }
+
+    /// Character references and XML's own five; everything else stays as written.
+    fn reference(&mut self, reference: &BytesRef<'_>) -> String {
+        if let Ok(Some(character)) = reference.resolve_char_ref() {
+            return character.to_string();
+        }
+        let name = reference.xml10_content();
+        if let Some(text) = resolve_xml_entity(&name) {
+            return text.to_owned();
+        }
+        if self.warnings.len() < MAX_WARNINGS {
+            let position = self.stack.last().map_or(self.at, |level| level.position);
+            let message = format!("entity &{}; is not expanded", shorten(&name));
+            self.warnings.push(Warning {
+                position,
+                path: self.path(self.stack.len()),
+                message,
+            });
+        }
+        format!("&{name};")
+    }
+
+    fn move_to(&mut self, offset: usize) {
+        let Some(passed) = self.text.get(self.at_offset..offset) else {
+            return;
+        };
+        for character in passed.chars() {
+            if character == '\n' {
+                self.at.line = self.at.line.saturating_add(1);
+                self.at.column = 1;
+            } else {
+                self.at.column = self.at.column.saturating_add(1);
+            }
+        }
+        self.at_offset = offset;
+    }
+
+    fn path(&self, depth: usize) -> String {
+        let mut path = String::new();
+        for level in self.stack.iter().take(depth) {
+            if !path.is_empty() {
+                path.push('/');
+            }
+            path.push_str(level.name);
+            if NUMBERED.contains(&level.name) && (level.number > 1 || level.name != "EtherCATInfo")
+            {
+                path.push_str(&format!("[{}]", level.number));
+            }
+        }
+        path
+    }
+}
+
+/// The range of a number type, for error texts.
+pub(super) trait Bounds {
+    const MIN: i128;
+    const MAX: i128;
+}
+
+macro_rules! bounds {
+    ($($type:ty),*) => {
+        $(impl Bounds for $type {
+            const MIN: i128 = <$type>::MIN as i128;
+            const MAX: i128 = <$type>::MAX as i128;
+        })*
+    };
+}
+bounds!(u8, u16, u32, i32, i64);
+
+/// Keeps what a damaged file may put into an error text short.
+fn shorten(text: &str) -> String {
+    text.chars().take(40).collect()
+}

@@ -1,0 +1,131 @@
+//! `Dictionary/DataTypes`, as written.
+
+use std::collections::HashMap;
+
+use super::cursor::{Cursor, Element};
+use super::object::{self, Flags};
+use super::text::Names;
+use crate::error::EsiError;
+
+#[derive(Default)]
+pub(super) struct DataTypes {
+    by_name: HashMap<String, DataType>,
+}
+
+#[derive(Default)]
+pub(super) struct DataType {
+    pub base: Option<String>,
+    pub bit_size: u32,
+    pub arrays: Vec<ArrayInfo>,
+    pub sub_items: Vec<SubItem>,
+}
+
+#[derive(Default, Clone, Copy)]
+pub(super) struct ArrayInfo {
+    pub lower_bound: u32,
+    pub elements: u32,
+}
+
+#[derive(Default)]
+pub(super) struct SubItem {
+    pub sub: Option<u8>,
+    pub name: String,
+    pub type_name: String,
+    pub bit_size: u32,
+    pub bit_offset: Option<u32>,
+    pub flags: Flags,
+}
+
+/// Alias chains longer than this are cycles.
+const MAX_ALIASES: usize = 8;
+
+impl DataTypes {
+    pub fn get(&self, name: &str) -> Option<&DataType> {
+        self.by_name.get(name)
+    }
+
+    /// Follows enumerations and aliases to the type they are made of; arrays and records stand for themselves.
+    pub fn base<'s>(&'s self, name: &'s str) -> &'s str {
+        let mut name = name;
+        for _ in 0..MAX_ALIASES {
+            match self.get(name) {
+                Some(DataType {
+                    base: Some(base),
+                    arrays,
+                    sub_items,
+                    ..
+                }) if arrays.is_empty() && sub_items.is_empty() => {
+                    name = base;
+                }
+                _ => break,
+            }
+        }
+        name
+    }
+}
+
+pub(super) fn read<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    types: &mut DataTypes,
+) -> Result<(), EsiError> {
+    c.children(element, |c, el| {
+        if el.name == "DataType" {
+            let (name, data_type) = data_type(c, el)?;
+            types.by_name.entry(name).or_insert(data_type);
+        }
+        Ok(())
+    })
+}
+
+fn data_type<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<(String, DataType), EsiError> {
+    let mut name = String::new();
+    let mut data_type = DataType::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "Name" => name = c.text(el)?,
+            "BaseType" => data_type.base = Some(c.text(el)?).filter(|base| !base.is_empty()),
+            "BitSize" => data_type.bit_size = c.number(el, "BitSize")?,
+            "ArrayInfo" => data_type.arrays.push(array_info(c, el)?),
+            "SubItem" => data_type.sub_items.push(sub_item(c, el)?),
+            _ => {}
+        }
+        Ok(())
+    })?;
+    Ok((name, data_type))
+}
+
+fn array_info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<ArrayInfo, EsiError> {
+    let mut info = ArrayInfo::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "LBound" => info.lower_bound = c.number(el, "LBound")?,
+            "Elements" => info.elements = c.number(el, "Elements")?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    Ok(info)
+}
+
+fn sub_item<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<SubItem, EsiError> {
+    let mut item = SubItem::default();
+    let mut names = Names::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "SubIdx" => item.sub = c.optional_number(el, "SubIdx")?,
+            "Name" => names.add(c, el)?,
+            "Type" => item.type_name = c.text(el)?,
+            "BitSize" => item.bit_size = c.number(el, "BitSize")?,
+            "BitOffs" => item.bit_offset = c.optional_number(el, "BitOffs")?,
+            "Flags" => item.flags = object::flags(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    item.name = names.take();
+    Ok(item)
+}

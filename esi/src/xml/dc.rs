@@ -1,0 +1,67 @@
+//! `Dc/OpMode`.
+
+use super::cursor::{Cursor, Element};
+use super::text::Names;
+use crate::error::EsiError;
+use crate::model::{DcMode, SyncTime};
+
+pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Vec<DcMode>, EsiError> {
+    let mut modes = Vec::new();
+    c.children(element, |c, el| {
+        if el.name == "OpMode" {
+            modes.push(op_mode(c, el)?);
+        }
+        Ok(())
+    })?;
+    Ok(modes)
+}
+
+fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiError> {
+    let mut mode = DcMode {
+        position: element.position,
+        ..DcMode::default()
+    };
+    let mut descriptions = Names::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "Name" => mode.name = c.text(el)?,
+            "Desc" => descriptions.add(c, el)?,
+            "AssignActivate" => mode.assign_activate = c.number(el, "AssignActivate")?,
+            "CycleTimeSync0" => cycle(c, el, &mut mode.sync0)?,
+            "ShiftTimeSync0" => shift(c, el, &mut mode.sync0)?,
+            "CycleTimeSync1" => cycle(c, el, &mut mode.sync1)?,
+            "ShiftTimeSync1" => shift(c, el, &mut mode.sync1)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    mode.description = descriptions.take();
+    Ok(mode)
+}
+
+fn cycle<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    sync: &mut SyncTime,
+) -> Result<(), EsiError> {
+    sync.factor = c.attribute_number(element, "Factor")?.unwrap_or_default();
+    sync.cycle_ns = time(c, element)?;
+    Ok(())
+}
+
+fn shift<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    sync: &mut SyncTime,
+) -> Result<(), EsiError> {
+    sync.shift_factor = c.attribute_number(element, "Factor")?.unwrap_or_default();
+    sync.shift_input = c.attribute_flag(element, "Input")?;
+    sync.shift_ns = time(c, element)?;
+    Ok(())
+}
+
+/// Nanoseconds; an empty element means 0.
+fn time<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<i64, EsiError> {
+    c.optional_number(element, "time in nanoseconds")
+        .map(Option::unwrap_or_default)
+}

@@ -1,0 +1,140 @@
+//! Bytes → text, by byte order mark and XML declaration.
+//!
+//! Windows tools write windows-1252 and call it ISO-8859-1, so both are read as windows-1252. A file that
+//! claims UTF-8 and is not falls back to the same table: what breaks is a letter in a name, not the layout.
+
+/// windows-1252, 0x80 to 0x9f; the rest equals ISO-8859-1. The five holes stay C1 controls.
+const HIGH_CONTROLS: [char; 32] = [
+    '\u{20ac}', '\u{81}', '\u{201a}', '\u{192}', '\u{201e}', '\u{2026}', '\u{2020}', '\u{2021}',
+    '\u{2c6}', '\u{2030}', '\u{160}', '\u{2039}', '\u{152}', '\u{8d}', '\u{17d}', '\u{8f}',
+    '\u{90}', '\u{2018}', '\u{2019}', '\u{201c}', '\u{201d}', '\u{2022}', '\u{2013}', '\u{2014}',
+    '\u{2dc}', '\u{2122}', '\u{161}', '\u{203a}', '\u{153}', '\u{9d}', '\u{17e}', '\u{178}',
+];
+
+pub(super) struct Decoded {
+    pub text: String,
+    /// What to tell the user about the encoding, if anything.
+    pub remark: Option<String>,
+}
+
+pub(super) fn decode(bytes: &[u8]) -> Decoded {
+    if let Some(rest) = bytes.strip_prefix(&[0xef, 0xbb, 0xbf]) {
+        return utf8(rest);
+    }
+    match bytes {
+        [0xff, 0xfe, rest @ ..] => return utf16(rest, u16::from_le_bytes),
+        [0xfe, 0xff, rest @ ..] => return utf16(rest, u16::from_be_bytes),
+        [b'<', 0, ..] => return utf16(bytes, u16::from_le_bytes),
+        [0, b'<', ..] => return utf16(bytes, u16::from_be_bytes),
+        _ => {}
+    }
+    match declared(bytes).as_deref() {
+        None | Some("utf-8" | "utf8" | "us-ascii" | "ascii") => utf8(bytes),
+        Some(
+            "iso-8859-1" | "iso8859-1" | "latin1" | "latin-1" | "windows-1252" | "cp1252"
+            | "iso-8859-15",
+        ) => Decoded {
+            text: windows_1252(bytes),
+            remark: None,
+        },
+        Some(other) => {
+            let mut decoded = utf8(bytes);
+            decoded.remark = Some(format!(
+                "encoding {other:?} is not supported; names may be unreadable"
+            ));
+            decoded
+        }
+    }
+}
+
+fn utf8(bytes: &[u8]) -> Decoded {
+    match std::str::from_utf8(bytes) {
+        Ok(text) => Decoded {
+            text: text.to_owned(),
+            remark: None,
+        },
+        Err(error) => Decoded {
+            text: windows_1252(bytes),
+            remark: Some(format!(
+                "byte {} is not UTF-8; the file is read as windows-1252",
+                error.valid_up_to()
+            )),
+        },
+    }
+}
+
+fn windows_1252(bytes: &[u8]) -> String {
+    bytes
+        .iter()
+        .map(|&byte| match byte {
+            0x80..=0x9f => HIGH_CONTROLS
+                .get(usize::from(byte - 0x80))
+                .copied()
+                .unwrap_or('\u{fffd}'),
+            _ => char::from(byte),
+        })
+        .collect()
+}
+
+fn utf16(bytes: &[u8], unit: fn([u8; 2]) -> u16) -> Decoded {
+    let units = bytes.chunks_exact(2).map(|pair| unit([pair[0], pair[1]]));
+    let text: String = char::decode_utf16(units)
+        .map(|c| c.unwrap_or('\u{fffd}'))
+        .collect();
+    Decoded {
+        text: text.trim_start_matches('\u{feff}').to_owned(),
+        remark: None,
+    }
+}
+
+/// The encoding that the XML declaration names, in lower case.
+fn declared(bytes: &[u8]) -> Option<String> {
+    let head = bytes.get(..bytes.len().min(256))?;
+    let head: String = head.iter().map(|&b| char::from(b)).collect();
+    let declaration = head
+        .trim_start()
+        .strip_prefix("<?xml")?
+        .split("?>")
+        .next()?;
+    let after = declaration
+        .split_once("encoding")?
+        .1
+        .trim_start()
+        .strip_prefix('=')?
+        .trim_start();
+    let quote = after.chars().next().filter(|c| matches!(c, '"' | '\''))?;
+    let name = after.get(1..)?.split(quote).next()?;
+    Some(name.trim().to_ascii_lowercase())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_encoding_yields_the_same_text() {
+        let plain = "<?xml version=\"1.0\"?><a>\u{fc}\u{b5}</a>";
+        let mut bom = vec![0xef, 0xbb, 0xbf];
+        bom.extend_from_slice(plain.as_bytes());
+        let mut little = vec![0xff, 0xfe];
+        little.extend(plain.encode_utf16().flat_map(u16::to_le_bytes));
+        let big: Vec<u8> = plain.encode_utf16().flat_map(u16::to_be_bytes).collect();
+        for bytes in [plain.as_bytes(), &bom, &little, &big] {
+            assert_eq!(decode(bytes).text, plain);
+        }
+    }
+
+    #[test]
+    fn declared_latin_1_is_read_as_windows_1252() {
+        let decoded = decode(b"<?xml version='1.0' encoding='ISO-8859-1'?><a>\xfc \x80</a>");
+        assert!(decoded.text.ends_with("<a>\u{fc} \u{20ac}</a>"));
+        assert_eq!(decoded.remark, None);
+    }
+
+    #[test]
+    fn broken_utf_8_is_remarked_and_read() {
+        let decoded = decode(b"<a>\xfc</a>");
+        assert_eq!(decoded.text, "<a>\u{fc}</a>");
+        assert!(decoded.remark.is_some());
+    }
+}

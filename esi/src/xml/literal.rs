@@ -1,0 +1,186 @@
+//! Default, minimum and maximum literals → little-endian bytes of the object's length.
+
+use super::number::{boolean, hex_bytes, number};
+use super::object::Literal;
+
+/// `Ok(None)`: the element is empty. The error text completes "default …".
+pub(super) fn bytes(
+    literal: &Literal,
+    type_name: &str,
+    bit_len: u32,
+) -> Result<Option<Vec<u8>>, String> {
+    let length = usize::try_from(bit_len.div_ceil(8)).unwrap_or(0);
+    match literal {
+        Literal::Value(text) | Literal::Data(text) if text.is_empty() => Ok(None),
+        Literal::Value(text) if is_text(type_name) => {
+            Ok(Some(fit(text.as_bytes().to_vec(), length)))
+        }
+        Literal::Value(text) => value(text, type_name, bit_len, length).map(Some),
+        Literal::Data(text) => match hex_bytes(text) {
+            Some(data) => Ok(Some(fit(data, length))),
+            None => Err(format!(
+                "{:?} is not a sequence of hexadecimal bytes",
+                short(text)
+            )),
+        },
+        Literal::Text(text) => Ok(Some(fit(text.as_bytes().to_vec(), length))),
+    }
+}
+
+/// `bit_len` bits of a hexadecimal block from `bit_offset` on.
+pub(super) fn slice(block: &str, bit_offset: u32, bit_len: u32) -> Option<Vec<u8>> {
+    let block = hex_bytes(block)?;
+    let (offset, length) = (
+        usize::try_from(bit_offset).ok()?,
+        usize::try_from(bit_len).ok()?,
+    );
+    if length == 0 || offset.checked_add(length)? > block.len().checked_mul(8)? {
+        return None;
+    }
+    let mut out = vec![0u8; length.div_ceil(8)];
+    for bit in 0..length {
+        let from = offset + bit;
+        let set = block.get(from / 8)? >> (from % 8) & 1;
+        *out.get_mut(bit / 8)? |= set << (bit % 8);
+    }
+    Some(out)
+}
+
+/// Length of ETG.1020's base types; 0 where the name says nothing.
+pub(super) fn base_bits(type_name: &str) -> u32 {
+    match type_name {
+        "BOOL" | "BIT" | "BIT1" => 1,
+        "SINT" | "USINT" | "BYTE" | "BITARR8" => 8,
+        "INT" | "UINT" | "WORD" | "BITARR16" => 16,
+        "INT24" | "UINT24" => 24,
+        "DINT" | "UDINT" | "DWORD" | "REAL" | "BITARR32" => 32,
+        "INT40" | "UINT40" => 40,
+        "INT48" | "UINT48" => 48,
+        "INT56" | "UINT56" => 56,
+        "LINT" | "ULINT" | "LWORD" | "LREAL" => 64,
+        _ => {
+            let bits = type_name
+                .strip_prefix("BIT")
+                .and_then(|n| n.parse::<u32>().ok())
+                .filter(|n| *n <= 64);
+            let text = type_name
+                .strip_prefix("STRING(")
+                .and_then(|rest| rest.strip_suffix(')'))
+                .and_then(|n| n.trim().parse::<u32>().ok())
+                .and_then(|n| n.checked_mul(8));
+            bits.or(text).unwrap_or(0)
+        }
+    }
+}
+
+fn is_text(type_name: &str) -> bool {
+    type_name.starts_with("STRING") || type_name.starts_with("VISIBLE_STRING")
+}
+
+fn value(text: &str, type_name: &str, bit_len: u32, length: usize) -> Result<Vec<u8>, String> {
+    let decimal = !text.contains(['x', 'X']);
+    match type_name {
+        "REAL" if decimal => {
+            return text
+                .parse::<f32>()
+                .map(|v| fit(v.to_le_bytes().to_vec(), length))
+                .map_err(|_| not_a_number(text));
+        }
+        "LREAL" if decimal => {
+            return text
+                .parse::<f64>()
+                .map(|v| fit(v.to_le_bytes().to_vec(), length))
+                .map_err(|_| not_a_number(text));
+        }
+        _ => {}
+    }
+    let value = number(text)
+        .or_else(|| boolean(text).map(i128::from))
+        .ok_or_else(|| not_a_number(text))?;
+    let fits = match bit_len {
+        0 => false,
+        1..=120 => value < 1i128 << bit_len && value >= -(1i128 << (bit_len - 1)),
+        _ => true,
+    };
+    if !fits {
+        return Err(format!("{:?} does not fit {bit_len} bits", short(text)));
+    }
+    let mut out = value.to_le_bytes().to_vec();
+    if length > out.len() {
+        out.resize(length, if value < 0 { 0xff } else { 0 });
+    }
+    out.truncate(length);
+    // A negative number in an odd length must not carry its sign past the last bit.
+    if bit_len % 8 != 0
+        && let Some(last) = out.last_mut()
+    {
+        *last &= (1u8 << (bit_len % 8)) - 1;
+    }
+    Ok(out)
+}
+
+fn not_a_number(text: &str) -> String {
+    format!("{:?} is not a number", short(text))
+}
+
+fn fit(mut bytes: Vec<u8>, length: usize) -> Vec<u8> {
+    bytes.resize(length, 0);
+    bytes
+}
+
+fn short(text: &str) -> String {
+    text.chars().take(40).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn v(text: &str) -> Literal {
+        Literal::Value(text.to_owned())
+    }
+
+    #[test]
+    fn values_by_type_and_length() {
+        for (text, type_name, bits, expected) in [
+            ("-1", "INT", 16, vec![0xff, 0xff]),
+            ("#xffff", "INT", 16, vec![0xff, 0xff]),
+            ("#x00B44700", "UDINT", 32, vec![0x00, 0x47, 0xb4, 0x00]),
+            ("true", "BOOL", 1, vec![1]),
+            ("-1", "BIT3", 3, vec![0x07]),
+            ("1.5", "REAL", 32, vec![0, 0, 0xc0, 0x3f]),
+            ("#x3f800000", "REAL", 32, vec![0, 0, 0x80, 0x3f]),
+            ("7", "STRING(3)", 24, vec![b'7', 0, 0]),
+        ] {
+            assert_eq!(
+                bytes(&v(text), type_name, bits),
+                Ok(Some(expected)),
+                "{text} {type_name}"
+            );
+        }
+        assert_eq!(bytes(&v(""), "INT", 16), Ok(None));
+        assert!(bytes(&v("256"), "USINT", 8).is_err());
+        assert!(bytes(&v("-129"), "SINT", 8).is_err());
+        assert!(bytes(&v("x"), "INT", 16).is_err());
+        assert!(bytes(&v("1"), "INT", 0).is_err());
+    }
+
+    #[test]
+    fn data_is_little_endian_already() {
+        assert_eq!(
+            bytes(&Literal::Data("0001".into()), "UINT", 16),
+            Ok(Some(vec![0, 1]))
+        );
+        assert_eq!(
+            bytes(&Literal::Data("01".into()), "UDINT", 32),
+            Ok(Some(vec![1, 0, 0, 0]))
+        );
+    }
+
+    #[test]
+    fn a_block_is_cut_at_bit_offsets() {
+        assert_eq!(slice("0200341278", 16, 16), Some(vec![0x34, 0x12]));
+        assert_eq!(slice("f0", 4, 4), Some(vec![0x0f]));
+        assert_eq!(slice("f0", 4, 8), None);
+    }
+}

@@ -1,0 +1,82 @@
+//! `Mailbox`: which protocols, what CoE may do, and the InitCmds. InitCmds of other protocols, and those in
+//! vendor-specific parts of the file, are not start-up commands and are left out.
+
+use super::cursor::{Cursor, Element};
+use super::text::Names;
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{Coe, InitCmd, Mailbox};
+
+pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mailbox, EsiError> {
+    let mut mailbox = Mailbox {
+        data_link_layer: c.attribute_flag(element, "DataLinkLayer")?,
+        ..Mailbox::default()
+    };
+    c.children(element, |c, el| {
+        match el.name {
+            "CoE" => mailbox.coe = Some(coe(c, el)?),
+            "FoE" => mailbox.foe = true,
+            "EoE" => mailbox.eoe = true,
+            "SoE" => mailbox.soe = true,
+            "AoE" => mailbox.aoe = true,
+            "VoE" => mailbox.voe = true,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    Ok(mailbox)
+}
+
+fn coe<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Coe, EsiError> {
+    let mut coe = Coe {
+        sdo_info: c.attribute_flag(element, "SdoInfo")?,
+        pdo_assign: c.attribute_flag(element, "PdoAssign")?,
+        pdo_config: c.attribute_flag(element, "PdoConfig")?,
+        pdo_upload: c.attribute_flag(element, "PdoUpload")?,
+        complete_access: c.attribute_flag(element, "CompleteAccess")?,
+        segmented_sdo: c.attribute_flag(element, "SegmentedSdo")?,
+        diag_history: c.attribute_flag(element, "DiagHistory")?,
+        init_cmds: Vec::new(),
+    };
+    c.children(element, |c, el| {
+        if el.name == "InitCmd" {
+            coe.init_cmds.push(init_cmd(c, el)?);
+        }
+        Ok(())
+    })?;
+    Ok(coe)
+}
+
+fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, EsiError> {
+    let mut cmd = InitCmd {
+        position: element.position,
+        transitions: Vec::new(),
+        index: 0,
+        sub: 0,
+        complete_access: c.attribute_flag(element, "CompleteAccess")?,
+        data: Vec::new(),
+        comment: String::new(),
+    };
+    let mut comments = Names::default();
+    let mut index = None;
+    c.children(element, |c, el| {
+        match el.name {
+            "Transition" => cmd.transitions.push(c.text(el)?.to_ascii_uppercase()),
+            "Index" => index = Some(c.number(el, "InitCmd index")?),
+            "SubIndex" => cmd.sub = c.number(el, "InitCmd subindex")?,
+            "Data" => cmd.data = c.hex_bytes(el, "InitCmd data")?,
+            "Comment" => comments.add(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    cmd.index = index.ok_or_else(|| {
+        c.error_at(
+            element,
+            EsiProblem::Missing {
+                what: "InitCmd/Index",
+            },
+        )
+    })?;
+    cmd.comment = comments.take();
+    Ok(cmd)
+}

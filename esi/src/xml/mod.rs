@@ -1,0 +1,48 @@
+//! The ESI file as a stream of XML events, one file per ETG.2000 element family.
+//!
+//! `decode` turns bytes into text, `cursor` walks elements with line, column and path, `number` reads literals.
+//! `info` is the root; below it `device`, `sync` (Fmmu, Sm), `pdo`, `mailbox`, `dc`, `slots`, `module`, `eeprom`
+//! and the dictionary: `datatype` and `object` read it as written, `resolve` joins the two.
+//!
+//! Rules here: unknown elements are skipped; what a layout or an address depends on is an error when it is
+//! wrong, everything else a warning; nothing in a file may make the reader panic, recurse without bound or
+//! allocate more than a fixed multiple of what real files need.
+
+mod cursor;
+mod datatype;
+mod dc;
+mod decode;
+mod device;
+mod eeprom;
+mod info;
+mod literal;
+mod mailbox;
+mod module;
+mod number;
+mod object;
+mod pdo;
+mod resolve;
+mod slots;
+mod sync;
+mod text;
+
+use crate::error::EsiError;
+use crate::model::{EsiFile, Position, Warning};
+
+/// Reads an ESI file (`EtherCATInfo`), or what `ethercat xml` prints (`EtherCATInfoList`).
+pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
+    let decoded = decode::decode(bytes);
+    let mut cursor = cursor::Cursor::new(&decoded.text);
+    let mut file = EsiFile::default();
+    info::read(&mut cursor, &mut file)?;
+    if let Some(message) = decoded.remark {
+        let position = Position { line: 1, column: 1 };
+        file.warnings.push(Warning {
+            position,
+            path: "EtherCATInfo".to_owned(),
+            message,
+        });
+    }
+    file.warnings.append(&mut cursor.warnings);
+    Ok(file)
+}

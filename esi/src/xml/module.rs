@@ -1,0 +1,45 @@
+//! `Modules/Module`: what may be put into a slot.
+
+use super::cursor::{Cursor, Element};
+use super::text::Names;
+use super::{device, mailbox, pdo};
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{Direction, Module};
+
+pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Module, EsiError> {
+    let mut module = Module {
+        position: element.position,
+        ..Module::default()
+    };
+    let mut names = Names::default();
+    let mut ident = None;
+    c.children(element, |c, el| {
+        match el.name {
+            "Type" => {
+                ident = c.attribute_number(el, "ModuleIdent")?;
+                module.type_name = c.text(el)?;
+            }
+            "Name" => names.add(c, el)?,
+            "RxPdo" => module.rx_pdos.push(pdo::read(c, el, Direction::Rx)?),
+            "TxPdo" => module.tx_pdos.push(pdo::read(c, el, Direction::Tx)?),
+            "Mailbox" => module.init_cmds = mailbox::read(c, el)?.coe.unwrap_or_default().init_cmds,
+            "DcOpModeName" => module.dc_mode = Some(c.text(el)?),
+            "Profile" => module
+                .dictionary
+                .objects
+                .extend(device::profile(c, el)?.1.objects),
+            _ => {}
+        }
+        Ok(())
+    })?;
+    module.ident = ident.ok_or_else(|| {
+        c.error_at(
+            element,
+            EsiProblem::Missing {
+                what: "ModuleIdent",
+            },
+        )
+    })?;
+    module.name = names.take();
+    Ok(module)
+}

@@ -1,0 +1,163 @@
+//! `Dictionary/Objects`, as written.
+
+use super::cursor::{Cursor, Element};
+use super::text::Names;
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{Access, PdoMapping, Position, Writable};
+
+pub(super) struct RawObject {
+    pub position: Position,
+    pub index: u16,
+    pub name: String,
+    pub type_name: String,
+    pub bit_size: u32,
+    pub info: Info,
+    pub flags: Flags,
+}
+
+/// Default and range of an object or of one of its subindices; literals are read when the type is known.
+#[derive(Default)]
+pub(super) struct Info {
+    pub default: Option<Literal>,
+    pub min: Option<Literal>,
+    pub max: Option<Literal>,
+    pub sub_items: Vec<(String, Info)>,
+}
+
+pub(super) enum Literal {
+    Value(String),
+    Data(String),
+    Text(String),
+}
+
+#[derive(Default, Clone, Copy)]
+pub(super) struct Flags {
+    pub access: Option<Access>,
+    pub pdo_mapping: Option<PdoMapping>,
+}
+
+pub(super) fn read<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    objects: &mut Vec<RawObject>,
+) -> Result<(), EsiError> {
+    c.children(element, |c, el| {
+        if el.name == "Object" {
+            objects.push(object(c, el)?);
+        }
+        Ok(())
+    })
+}
+
+fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject, EsiError> {
+    let mut names = Names::default();
+    let mut index = None;
+    let mut object = RawObject {
+        position: element.position,
+        index: 0,
+        name: String::new(),
+        type_name: String::new(),
+        bit_size: 0,
+        info: Info::default(),
+        flags: Flags::default(),
+    };
+    c.children(element, |c, el| {
+        match el.name {
+            "Index" => index = Some(c.number(el, "object index")?),
+            "Name" => names.add(c, el)?,
+            "Type" => object.type_name = c.text(el)?,
+            "BitSize" => object.bit_size = c.number(el, "BitSize")?,
+            "Info" => object.info = info(c, el)?,
+            "Flags" => object.flags = flags(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    object.index = index.ok_or_else(|| {
+        c.error_at(
+            element,
+            EsiProblem::Missing {
+                what: "Object/Index",
+            },
+        )
+    })?;
+    object.name = names.take();
+    Ok(object)
+}
+
+fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info, EsiError> {
+    let mut out = Info::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "DefaultValue" => out.default = Some(Literal::Value(c.text(el)?)),
+            "DefaultData" => out.default = Some(Literal::Data(c.text(el)?)),
+            "DefaultString" => out.default = Some(Literal::Text(c.text(el)?)),
+            "MinValue" => out.min = Some(Literal::Value(c.text(el)?)),
+            "MinData" => out.min = Some(Literal::Data(c.text(el)?)),
+            "MaxValue" => out.max = Some(Literal::Value(c.text(el)?)),
+            "MaxData" => out.max = Some(Literal::Data(c.text(el)?)),
+            "SubItem" => {
+                let mut names = Names::default();
+                let mut inner = Info::default();
+                c.children(el, |c, el| {
+                    match el.name {
+                        "Name" => names.add(c, el)?,
+                        "Info" => inner = info(c, el)?,
+                        _ => {}
+                    }
+                    Ok(())
+                })?;
+                out.sub_items.push((names.take(), inner));
+            }
+            _ => {}
+        }
+        Ok(())
+    })?;
+    Ok(out)
+}
+
+pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Flags, EsiError> {
+    let mut flags = Flags::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "Access" => {
+                let only = c
+                    .attribute(el, "WriteRestrictions")?
+                    .and_then(|text| restriction(&text));
+                let text = c.text(el)?.to_ascii_lowercase();
+                let (read, write) = (text.contains('r'), text.contains('w'));
+                let write = match (write, only) {
+                    (false, _) => Writable::Never,
+                    (true, None) => Writable::Always,
+                    (true, Some(states)) => states,
+                };
+                flags.access = (!text.is_empty()).then_some(Access { read, write });
+            }
+            "PdoMapping" => {
+                let text = c.text(el)?.to_ascii_lowercase();
+                flags.pdo_mapping = Some(PdoMapping {
+                    rx: text.contains('r'),
+                    tx: text.contains('t'),
+                });
+            }
+            _ => {}
+        }
+        Ok(())
+    })?;
+    Ok(flags)
+}
+
+/// `PreOP_SafeOP` → the states in which writing is allowed.
+fn restriction(text: &str) -> Option<Writable> {
+    let names: Vec<String> = text
+        .split(['_', ' '])
+        .map(|part| part.trim().to_ascii_lowercase())
+        .collect();
+    let has = |state: &str| names.iter().any(|name| name == state);
+    let (pre_op, safe_op, op) = (has("preop"), has("safeop"), has("op"));
+    (pre_op || safe_op || op).then_some(Writable::Only {
+        pre_op,
+        safe_op,
+        op,
+    })
+}

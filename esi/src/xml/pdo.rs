@@ -1,0 +1,85 @@
+//! `RxPdo` and `TxPdo`.
+
+use super::cursor::{Cursor, Element};
+use super::text::Names;
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{Direction, Entry, Pdo};
+
+pub(super) fn read<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    direction: Direction,
+) -> Result<Pdo, EsiError> {
+    let mut pdo = Pdo {
+        position: element.position,
+        direction,
+        index: 0,
+        name: String::new(),
+        sm: c.attribute_number(element, "Sm")?,
+        fixed: c.attribute_flag(element, "Fixed")?,
+        mandatory: c.attribute_flag(element, "Mandatory")?,
+        virtual_: c.attribute_flag(element, "Virtual")?,
+        overwritten_by_module: c.attribute_flag(element, "OverwrittenByModule")?,
+        exclude: Vec::new(),
+        entries: Vec::new(),
+    };
+    let mut names = Names::default();
+    let mut index = None;
+    c.children(element, |c, el| {
+        match el.name {
+            "Index" => index = Some(c.number(el, "PDO index")?),
+            "Name" => names.add(c, el)?,
+            "Exclude" => pdo.exclude.push(c.number(el, "excluded PDO index")?),
+            "Entry" => pdo.entries.push(entry(c, el)?),
+            _ => {}
+        }
+        Ok(())
+    })?;
+    pdo.index =
+        index.ok_or_else(|| c.error_at(element, EsiProblem::Missing { what: "PDO Index" }))?;
+    pdo.name = names.take();
+    Ok(pdo)
+}
+
+fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiError> {
+    let mut entry = Entry {
+        position: element.position,
+        index: 0,
+        sub: 0,
+        bit_len: 0,
+        name: String::new(),
+        data_type: String::new(),
+    };
+    let mut names = Names::default();
+    let mut index = None;
+    c.children(element, |c, el| {
+        match el.name {
+            "Index" => index = Some(c.number(el, "entry index")?),
+            "SubIndex" => entry.sub = c.number(el, "entry subindex")?,
+            "BitLen" => entry.bit_len = c.number(el, "BitLen")?,
+            "Name" => names.add(c, el)?,
+            "DataType" => entry.data_type = c.text(el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    entry.index = index.ok_or_else(|| {
+        c.error_at(
+            element,
+            EsiProblem::Missing {
+                what: "Entry/Index",
+            },
+        )
+    })?;
+    entry.name = names.take();
+    if entry.bit_len == 0 && entry.index != 0 {
+        c.warn(
+            element,
+            format!(
+                "0x{:04x}:{:02x} is mapped with a bit length of 0",
+                entry.index, entry.sub
+            ),
+        );
+    }
+    Ok(entry)
+}

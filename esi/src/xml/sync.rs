@@ -1,0 +1,57 @@
+//! `Fmmu` and `Sm`.
+
+use super::cursor::{Cursor, Element};
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{FmmuUse, SmUse, SyncManager};
+
+pub(super) fn fmmu<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<FmmuUse, EsiError> {
+    Ok(match c.text(element)?.to_ascii_lowercase().as_str() {
+        "outputs" => FmmuUse::Outputs,
+        "inputs" => FmmuUse::Inputs,
+        "mboxstate" => FmmuUse::MBoxState,
+        _ => FmmuUse::Other,
+    })
+}
+
+pub(super) fn sync_manager<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<SyncManager, EsiError> {
+    let start_address = c.attribute_number(element, "StartAddress")?;
+    let Some(start_address) = start_address else {
+        return Err(c.error_at(
+            element,
+            EsiProblem::Missing {
+                what: "StartAddress",
+            },
+        ));
+    };
+    // ETG.2000 lets bit 0 of Enable say enabled; the higher bits only say that it may be changed.
+    let enable: Option<u8> = match c.attribute(element, "Enable")?.as_deref().map(str::trim) {
+        Some("true") => Some(1),
+        Some("false") => Some(0),
+        _ => c.attribute_number(element, "Enable")?,
+    };
+    let mut sm = SyncManager {
+        position: element.position,
+        usage: SmUse::Other,
+        start_address,
+        default_size: c
+            .attribute_number(element, "DefaultSize")?
+            .unwrap_or_default(),
+        min_size: c.attribute_number(element, "MinSize")?,
+        max_size: c.attribute_number(element, "MaxSize")?,
+        control_byte: c
+            .attribute_number(element, "ControlByte")?
+            .unwrap_or_default(),
+        enable: enable.is_some_and(|bits| bits & 1 != 0),
+    };
+    sm.usage = match c.text(element)?.to_ascii_lowercase().as_str() {
+        "mboxout" => SmUse::MBoxOut,
+        "mboxin" => SmUse::MBoxIn,
+        "outputs" => SmUse::Outputs,
+        "inputs" => SmUse::Inputs,
+        _ => SmUse::Other,
+    };
+    Ok(sm)
+}
