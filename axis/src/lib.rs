@@ -1,1 +1,32 @@
-#![doc = "placeholder"]
+//! CiA 402 axes as pure functions: `(state, inputs, time) → (state, outputs)`.
+//!
+//! No I/O, no clock, no allocation, no panic: everything here may be called from the real-time cycle. Time arrives as
+//! `dt_s`, process data as plain integers, and what leaves is the next Controlword and set-points.
+//!
+//! From the bottom up:
+//!
+//! | module | what lives there |
+//! |---|---|
+//! | [`units`] | newtypes for drive-side and user-side quantities |
+//! | [`scale`] | counts ↔ user units, the drive's velocity unit (0x60A9), polarity, 32-bit wrap |
+//! | [`limits`] | what an axis may never exceed; checked once, enforced every cycle |
+//! | [`cia402`] | Statusword, Controlword, the power state machine, modes, error codes |
+//! | [`setpoint`] | hold, trapezoidal moves, ramps; each advanced one cycle at a time |
+//! | [`axis`] | one axis: commands in, guarded set-points out, supervision in between |
+//! | [`status`] | what an axis reports, and the reasons for which it stops or refuses |
+
+#![forbid(unsafe_code)]
+
+pub mod axis;
+pub mod cia402;
+pub mod limits;
+pub mod scale;
+pub mod setpoint;
+pub mod status;
+pub mod units;
+
+pub use axis::{Axis, AxisConfig, Command, ConfigError, Inputs, Outputs};
+pub use cia402::{Controlword, Mode, State, Statusword};
+pub use limits::{LimitError, Limits};
+pub use scale::{Scale, ScaleError, VelocityBase, VelocityUnit};
+pub use status::{AxisStatus, DriveFault, Refused, Trip};

@@ -1,0 +1,73 @@
+//! What the drive reports, in user units.
+
+use super::Inputs;
+use crate::scale::Scale;
+use crate::units::{Counts, PerMille, RawVelocity};
+
+/// Time constant of the velocity that is made from positions.
+const FILTER_S: f64 = 0.01;
+
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Actual {
+    counts: Option<Counts>,
+    position: f64,
+    velocity: f64,
+    torque: f64,
+    /// Since the last reading.
+    elapsed_s: f64,
+    measured_velocity: bool,
+}
+
+impl Actual {
+    pub(super) fn read(&mut self, inputs: &Inputs, scale: &Scale) {
+        if let Some(raw) = inputs.position {
+            let before = self.counts;
+            let counts = before.map_or(Counts(i64::from(raw)), |c| c.unwrap_next(raw));
+            let position = scale.position_to_user(counts).0;
+            if before.is_some() && self.elapsed_s > 0.0 {
+                let velocity = (position - self.position) / self.elapsed_s;
+                let weight = self.elapsed_s / (self.elapsed_s + FILTER_S);
+                self.velocity += (velocity - self.velocity) * weight;
+            }
+            self.counts = Some(counts);
+            self.position = position;
+        }
+        if let Some(raw) = inputs.velocity {
+            self.velocity = scale.velocity_to_user(RawVelocity(raw)).0;
+        }
+        if let Some(raw) = inputs.torque {
+            self.torque = scale.torque_to_user(PerMille(raw)).0;
+        }
+        self.measured_velocity = inputs.velocity.is_some();
+        self.elapsed_s = 0.0;
+    }
+
+    pub(super) fn pass(&mut self, dt_s: f64) {
+        self.elapsed_s = (self.elapsed_s + dt_s).min(1.0);
+    }
+
+    pub(super) const fn counts(&self) -> Option<Counts> {
+        self.counts
+    }
+
+    pub(super) const fn position(&self) -> f64 {
+        self.position
+    }
+
+    pub(super) const fn velocity(&self) -> f64 {
+        self.velocity
+    }
+
+    pub(super) const fn torque(&self) -> f64 {
+        self.torque
+    }
+
+    /// What the last digit of the velocity may be wrong by, user units per second.
+    pub(super) fn velocity_slack(&self, scale: &Scale) -> f64 {
+        if self.measured_velocity {
+            2.0 * scale.velocity_resolution()
+        } else {
+            scale.units_of_counts(2.0) / FILTER_S
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! Judging what the drive reports, and the last guard before the outputs.
+
+use super::{Axis, Plan, Wish};
+use crate::cia402::{Mode, State};
+use crate::limits::Limits;
+use crate::setpoint::braking_velocity;
+use crate::status::{DriveFault, Trip};
+
+/// How much faster than the limit, and for how many fresh cycles in a row.
+const OVER_VELOCITY: f64 = 1.2;
+const OVER_VELOCITY_CYCLES: u8 = 5;
+
+/// Rounding of a product of f64s.
+const ROUNDING: f64 = 1.0 + 1e-9;
+
+/// What supervision remembers while an axis is enabled.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Watch {
+    pub(super) following_error: f64,
+    pub(super) max_following_error: f64,
+    fast_cycles: u8,
+    /// The configured range, widened to where the axis stood when it was enabled, so that an axis outside its range can be
+    /// driven back; narrowed again as it comes back.
+    range: Option<[f64; 2]>,
+}
+
+impl Watch {
+    pub(super) fn starting_at(position: f64, limits: &Limits) -> Self {
+        Self {
+            range: limits
+                .position
+                .map(|[low, high]| [low.min(position), high.max(position)]),
+            ..Self::default()
+        }
+    }
+
+    fn narrow(&mut self, position: f64, limits: &Limits) {
+        if let (Some(range), Some([low, high])) = (&mut self.range, limits.position) {
+            range[0] = range[0].max(low.min(position));
+            range[1] = range[1].min(high.max(position));
+        }
+    }
+}
+
+impl Axis {
+    /// Fresh inputs only: state changes nobody asked for, and values outside the limits.
+    pub(super) fn judge(&mut self) {
+        let before = self.state;
+        self.state = State::from_statusword(self.statusword);
+        if self.state.is_fault() {
+            if !before.is_fault() {
+                self.fault.get_or_insert(DriveFault {
+                    statusword: self.statusword.bits(),
+                    code: None,
+                });
+                self.wish = Wish::Disabled;
+                self.reset = false;
+            }
+            return;
+        }
+        if self.reset {
+            self.reset = false;
+            self.fault = None;
+        }
+        if !self.active {
+            return;
+        }
+        if self.state != State::OperationEnabled {
+            match self.wish {
+                Wish::Enabled => self.trip(Trip::PowerLost { state: self.state }),
+                Wish::Disabling => self.wish = Wish::Disabled,
+                Wish::Disabled | Wish::QuickStop { .. } => {}
+            }
+            return;
+        }
+        if let Some(display) = self.mode_display
+            && !self.mode_confirmed()
+        {
+            self.trip(Trip::ModeLost {
+                expected: self.config.mode,
+                display: Mode::from_code(display),
+            });
+            return;
+        }
+        if let Some(trip) = self.exceeded() {
+            self.trip(trip);
+        }
+    }
+
+    /// The first cause stays.
+    fn trip(&mut self, trip: Trip) {
+        self.trip.get_or_insert(trip);
+        self.quick_stop(true);
+    }
+
+    fn exceeded(&mut self) -> Option<Trip> {
+        let limits = self.config.limits;
+        let position = self.actual.position();
+        let mut cause = None;
+        if self.config.mode == Mode::Csp {
+            let commanded = self.config.scale.position_to_user(self.sent).0;
+            let error = commanded - position;
+            self.watch.following_error = error;
+            self.watch.max_following_error = self.watch.max_following_error.max(error.abs());
+            if let Some(limit) = limits.following_error
+                && error.abs() > limit
+            {
+                cause = Some(Trip::FollowingError { error, limit });
+            }
+        }
+        if self.actual.counts().is_some()
+            && let Some([low, high]) = self.watch.range
+        {
+            let margin = limits.position_margin();
+            if position < low - margin || position > high + margin {
+                cause = cause.or(Some(Trip::PositionLimit {
+                    position,
+                    low,
+                    high,
+                }));
+            }
+            self.watch.narrow(position, &limits);
+        }
+        let velocity = self.actual.velocity();
+        let slack = self.actual.velocity_slack(&self.config.scale);
+        let fast = velocity.abs() > limits.velocity * OVER_VELOCITY + slack;
+        self.watch.fast_cycles = if fast {
+            self.watch.fast_cycles.saturating_add(1)
+        } else {
+            0
+        };
+        if self.watch.fast_cycles >= OVER_VELOCITY_CYCLES {
+            cause = cause.or(Some(Trip::OverVelocity {
+                velocity,
+                limit: limits.velocity,
+            }));
+        }
+        cause
+    }
+
+    /// The drive itself stands, as far as it can be told.
+    pub(super) fn standing(&self) -> bool {
+        let slack = self.actual.velocity_slack(&self.config.scale);
+        self.actual.velocity().abs() <= slack.max(self.config.limits.velocity * 0.01)
+    }
+
+    /// CSV: within 2 % of the target or 10 motor rpm of it, whichever is more; the latter never above a tenth of the limit.
+    pub(super) fn velocity_reached(&self) -> bool {
+        let Plan::Velocity(ramp) = self.plan else {
+            return false;
+        };
+        let ten_rpm = self.config.scale.units_per_turn() * 10.0 / 60.0;
+        let floor = ten_rpm.min(self.config.limits.velocity * 0.1);
+        let slack = self.actual.velocity_slack(&self.config.scale);
+        let window = (ramp.target.abs() * 0.02).max(floor).max(slack);
+        (self.actual.velocity() - ramp.target).abs() <= window
+    }
+
+    /// CSV: `target`, or the highest velocity from which the axis can still stop inside its range.
+    pub(super) fn allowed_by_range(&self, target: f64) -> f64 {
+        let Some([low, high]) = self.config.limits.position else {
+            return target;
+        };
+        if self.actual.counts().is_none() {
+            return target;
+        }
+        let acceleration = self.config.limits.acceleration;
+        // The reported position is a cycle old, and the next set-point takes another one to act.
+        let ahead = self.actual.position() + self.motion.velocity * self.dt_s * 2.0;
+        let up = braking_velocity((high - ahead).max(0.0), acceleration, self.dt_s);
+        let down = braking_velocity((ahead - low).max(0.0), acceleration, self.dt_s);
+        target.min(up).max(-down)
+    }
+
+    /// The last thing before the outputs: whatever was planned, nothing exceeds the limits.
+    pub(super) fn guard(&mut self, before: crate::setpoint::Motion, dt_s: f64) {
+        let limits = self.config.limits;
+        let planned = (self.motion, self.torque);
+        match self.config.mode {
+            Mode::Csp => {
+                let most = limits.velocity * dt_s * ROUNDING;
+                // Not `clamp`: it panics on bounds that are not numbers.
+                let mut position = self
+                    .motion
+                    .position
+                    .max(before.position - most)
+                    .min(before.position + most);
+                if let Some([low, high]) = limits.position {
+                    position = position
+                        .max(low.min(before.position))
+                        .min(high.max(before.position));
+                }
+                if position != self.motion.position {
+                    self.motion.position = position;
+                    self.motion.velocity = if dt_s > 0.0 {
+                        (position - before.position) / dt_s
+                    } else {
+                        before.velocity
+                    };
+                }
+            }
+            Mode::Csv => {
+                self.motion.velocity = self
+                    .motion
+                    .velocity
+                    .clamp(-limits.velocity, limits.velocity);
+            }
+            _ => self.torque = self.torque.max(-limits.torque).min(limits.torque),
+        }
+        if planned != (self.motion, self.torque) {
+            self.guarded_cycles = self.guarded_cycles.saturating_add(1);
+        }
+    }
+}

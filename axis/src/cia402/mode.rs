@@ -1,0 +1,76 @@
+//! Modes of operation (0x6060 and 0x6061).
+
+use core::fmt;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Mode {
+    /// Profile position.
+    Pp,
+    /// Profile velocity.
+    Pv,
+    /// Homing.
+    Hm,
+    /// Cyclic synchronous position.
+    Csp,
+    /// Cyclic synchronous velocity.
+    Csv,
+    /// Cyclic synchronous torque.
+    Cst,
+    /// Vendor modes (negative), none (0) and modes not used here.
+    Unknown(i8),
+}
+
+impl Mode {
+    #[must_use]
+    pub const fn from_code(code: i8) -> Self {
+        match code {
+            1 => Self::Pp,
+            3 => Self::Pv,
+            6 => Self::Hm,
+            8 => Self::Csp,
+            9 => Self::Csv,
+            10 => Self::Cst,
+            other => Self::Unknown(other),
+        }
+    }
+
+    #[must_use]
+    pub const fn code(self) -> i8 {
+        match self {
+            Self::Pp => 1,
+            Self::Pv => 3,
+            Self::Hm => 6,
+            Self::Csp => 8,
+            Self::Csv => 9,
+            Self::Cst => 10,
+            Self::Unknown(code) => code,
+        }
+    }
+}
+
+impl fmt::Display for Mode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Pp => f.write_str("PP"),
+            Self::Pv => f.write_str("PV"),
+            Self::Hm => f.write_str("HM"),
+            Self::Csp => f.write_str("CSP"),
+            Self::Csv => f.write_str("CSV"),
+            Self::Cst => f.write_str("CST"),
+            Self::Unknown(0) => f.write_str("none (0)"),
+            Self::Unknown(code) => write!(f, "mode {code}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_code_survives() {
+        for code in i8::MIN..=i8::MAX {
+            assert_eq!(Mode::from_code(code).code(), code);
+        }
+    }
+}

@@ -1,0 +1,111 @@
+//! The power state, read from the Statusword by the standard's mask/value table.
+
+use core::fmt;
+
+use super::words::Statusword;
+
+/// States of the power drive system (CiA 402-2, "Statusword, state coding").
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum State {
+    NotReadyToSwitchOn,
+    SwitchOnDisabled,
+    ReadyToSwitchOn,
+    SwitchedOn,
+    OperationEnabled,
+    QuickStopActive,
+    FaultReactionActive,
+    Fault,
+    /// A Statusword that the table does not list, kept whole.
+    Unknown(u16),
+}
+
+/// Mask, value, state. The rows exclude each other, so their order does not matter.
+const TABLE: [(u16, u16, State); 8] = [
+    (0x4F, 0x00, State::NotReadyToSwitchOn),
+    (0x4F, 0x40, State::SwitchOnDisabled),
+    (0x6F, 0x21, State::ReadyToSwitchOn),
+    (0x6F, 0x23, State::SwitchedOn),
+    (0x6F, 0x27, State::OperationEnabled),
+    (0x6F, 0x07, State::QuickStopActive),
+    (0x4F, 0x0F, State::FaultReactionActive),
+    (0x4F, 0x08, State::Fault),
+];
+
+impl State {
+    #[must_use]
+    pub fn from_statusword(word: Statusword) -> Self {
+        let bits = word.bits();
+        TABLE
+            .iter()
+            .find(|(mask, value, _)| bits & mask == *value)
+            .map_or(Self::Unknown(bits), |(_, _, state)| *state)
+    }
+
+    /// Fault or on the way into it.
+    #[must_use]
+    pub const fn is_fault(self) -> bool {
+        matches!(self, Self::Fault | Self::FaultReactionActive)
+    }
+}
+
+impl fmt::Display for State {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::NotReadyToSwitchOn => "Not ready to switch on",
+            Self::SwitchOnDisabled => "Switch on disabled",
+            Self::ReadyToSwitchOn => "Ready to switch on",
+            Self::SwitchedOn => "Switched on",
+            Self::OperationEnabled => "Operation enabled",
+            Self::QuickStopActive => "Quick stop active",
+            Self::FaultReactionActive => "Fault reaction active",
+            Self::Fault => "Fault",
+            Self::Unknown(word) => return write!(f, "unknown (Statusword {word:#06x})"),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state(bits: u16) -> State {
+        State::from_statusword(Statusword::from_bits_retain(bits))
+    }
+
+    /// Words as drives send them: voltage enabled, remote and vendor bits included.
+    #[test]
+    fn words_seen_on_real_buses() {
+        for (bits, expected) in [
+            (0x0000, State::NotReadyToSwitchOn),
+            (0x0240, State::SwitchOnDisabled),
+            (0x0250, State::SwitchOnDisabled),
+            (0x0160, State::SwitchOnDisabled),
+            (0x0221, State::ReadyToSwitchOn),
+            (0x0231, State::ReadyToSwitchOn),
+            (0x0233, State::SwitchedOn),
+            (0x1237, State::OperationEnabled),
+            (0x0217, State::QuickStopActive),
+            (0x021F, State::FaultReactionActive),
+            (0x0208, State::Fault),
+            (0x0218, State::Fault),
+            (0x0238, State::Fault),
+        ] {
+            assert_eq!(state(bits), expected, "{bits:#06x}");
+        }
+    }
+
+    #[test]
+    fn unlisted_words_survive() {
+        assert_eq!(state(0x0201), State::Unknown(0x0201));
+        assert_eq!(state(0xFFFF), State::Unknown(0xFFFF));
+        assert!(state(0xFFFF).to_string().contains("0xffff"));
+    }
+
+    #[test]
+    fn no_word_matches_two_rows() {
+        for bits in 0..=u16::MAX {
+            let rows = TABLE.iter().filter(|(m, v, _)| bits & m == *v).count();
+            assert!(rows <= 1, "{bits:#06x} matches {rows} rows");
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! Controlword (0x6040) and Statusword (0x6041). Unnamed bits survive: build them with `from_bits_retain`.
+
+use bitflags::bitflags;
+
+bitflags! {
+    /// 0x6041.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+    pub struct Statusword: u16 {
+        const READY_TO_SWITCH_ON = 1 << 0;
+        const SWITCHED_ON = 1 << 1;
+        const OPERATION_ENABLED = 1 << 2;
+        const FAULT = 1 << 3;
+        const VOLTAGE_ENABLED = 1 << 4;
+        /// Low active: set means that no quick stop is active.
+        const QUICK_STOP = 1 << 5;
+        const SWITCH_ON_DISABLED = 1 << 6;
+        const WARNING = 1 << 7;
+        const REMOTE = 1 << 9;
+        const TARGET_REACHED = 1 << 10;
+        const INTERNAL_LIMIT_ACTIVE = 1 << 11;
+        /// In the cyclic synchronous modes: the drive follows the command value.
+        const FOLLOWS_COMMAND = 1 << 12;
+        /// In CSP: the drive's own following error.
+        const FOLLOWING_ERROR = 1 << 13;
+        const _ = !0;
+    }
+}
+
+bitflags! {
+    /// 0x6040.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+    pub struct Controlword: u16 {
+        const SWITCH_ON = 1 << 0;
+        const ENABLE_VOLTAGE = 1 << 1;
+        /// Low active: cleared means quick stop.
+        const QUICK_STOP = 1 << 2;
+        const ENABLE_OPERATION = 1 << 3;
+        /// Acts on its rising edge.
+        const FAULT_RESET = 1 << 7;
+        const HALT = 1 << 8;
+        const _ = !0;
+    }
+}
+
+// The standard's commands.
+impl Controlword {
+    /// Transitions 7, 9, 10, 12.
+    pub const DISABLE_VOLTAGE_COMMAND: Self = Self::empty();
+    /// Transitions 2, 6, 8.
+    pub const SHUTDOWN_COMMAND: Self = Self::ENABLE_VOLTAGE.union(Self::QUICK_STOP);
+    /// Transition 3; in Operation enabled the same word means "disable operation", transition 5.
+    pub const SWITCH_ON_COMMAND: Self = Self::SHUTDOWN_COMMAND.union(Self::SWITCH_ON);
+    /// Transitions 4, 16.
+    pub const ENABLE_OPERATION_COMMAND: Self =
+        Self::SWITCH_ON_COMMAND.union(Self::ENABLE_OPERATION);
+    /// Transitions 7, 10, 11.
+    pub const QUICK_STOP_COMMAND: Self = Self::ENABLE_VOLTAGE;
+    /// Transition 15.
+    pub const FAULT_RESET_COMMAND: Self = Self::FAULT_RESET;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn command_words() {
+        for (word, bits) in [
+            (Controlword::DISABLE_VOLTAGE_COMMAND, 0x0000),
+            (Controlword::QUICK_STOP_COMMAND, 0x0002),
+            (Controlword::SHUTDOWN_COMMAND, 0x0006),
+            (Controlword::SWITCH_ON_COMMAND, 0x0007),
+            (Controlword::ENABLE_OPERATION_COMMAND, 0x000F),
+            (Controlword::FAULT_RESET_COMMAND, 0x0080),
+        ] {
+            assert_eq!(word.bits(), bits);
+        }
+    }
+
+    #[test]
+    fn vendor_bits_survive() {
+        assert_eq!(Statusword::from_bits_retain(0xD123).bits(), 0xD123);
+        assert_eq!(Controlword::from_bits_retain(0xF870).bits(), 0xF870);
+    }
+}

@@ -1,0 +1,163 @@
+//! What an axis may never exceed. Checked once by [`Limits::check`]; afterwards the guard in [`crate::axis`] relies on it.
+
+use crate::scale::Scale;
+use crate::units::UserVelocity;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Lowest and highest position, user units. `None`: endless.
+    pub position: Option<[f64; 2]>,
+    /// User units per second.
+    pub velocity: f64,
+    /// User units per second².
+    pub acceleration: f64,
+    /// Percent of rated torque.
+    pub torque: f64,
+    /// Largest difference between commanded and reported position, user units. The reported position is a few cycles old, so
+    /// this includes a few cycles of velocity. `None`: not supervised here.
+    pub following_error: Option<f64>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum LimitError {
+    #[error("limit {what} is {value}: it must be a finite number above zero")]
+    NotPositive { what: &'static str, value: f64 },
+    #[error("position range [{low}, {high}] is empty or not finite")]
+    EmptyRange { low: f64, high: f64 },
+    #[error(
+        "position range [{low}, {high}] is {counts:e} counts wide, more than the 2^31 a drive can tell apart"
+    )]
+    RangeTooWide { low: f64, high: f64, counts: f64 },
+    #[error("velocity limit {velocity} units/s is {raw:e} {unit}, more than 32 bits hold")]
+    VelocityNotRepresentable {
+        velocity: f64,
+        raw: f64,
+        unit: crate::scale::VelocityUnit,
+    },
+    #[error("torque limit {torque} % is more than the 3276.7 % that 16 bits of per mille hold")]
+    TorqueNotRepresentable { torque: f64 },
+}
+
+impl Limits {
+    pub fn check(&self, scale: &Scale) -> Result<(), LimitError> {
+        let positive = [
+            ("velocity", Some(self.velocity)),
+            ("acceleration", Some(self.acceleration)),
+            ("torque", Some(self.torque)),
+            ("following_error", self.following_error),
+        ];
+        for (what, value) in positive {
+            if let Some(value) = value
+                && !(value.is_finite() && value > 0.0)
+            {
+                return Err(LimitError::NotPositive { what, value });
+            }
+        }
+        if let Some([low, high]) = self.position {
+            if !(low.is_finite() && high.is_finite() && low < high) {
+                return Err(LimitError::EmptyRange { low, high });
+            }
+            let counts = (high - low) * scale.counts_per_unit();
+            if counts > f64::from(i32::MAX) {
+                return Err(LimitError::RangeTooWide { low, high, counts });
+            }
+        }
+        let raw = self.velocity / scale.velocity_resolution();
+        // Headroom, so that an over-velocity still has a value of its own.
+        if scale
+            .velocity_to_raw(UserVelocity(self.velocity * 1.5))
+            .0
+            .unsigned_abs()
+            >= i32::MAX.unsigned_abs()
+        {
+            return Err(LimitError::VelocityNotRepresentable {
+                velocity: self.velocity,
+                raw,
+                unit: scale.velocity_unit(),
+            });
+        }
+        if self.torque * 10.0 > f64::from(i16::MAX) {
+            return Err(LimitError::TorqueNotRepresentable {
+                torque: self.torque,
+            });
+        }
+        Ok(())
+    }
+
+    /// How far the reported position may leave the range before the axis is stopped: the following error's window, or 1 % of
+    /// the range.
+    #[must_use]
+    pub fn position_margin(&self) -> f64 {
+        let range = self.position.map_or(0.0, |[low, high]| high - low);
+        self.following_error.unwrap_or(range * 0.01)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GOOD: Limits = Limits {
+        position: Some([-50.0, 50.0]),
+        velocity: 200.0,
+        acceleration: 2000.0,
+        torque: 100.0,
+        following_error: Some(1.0),
+    };
+
+    #[test]
+    fn good_and_bad() {
+        let scale = Scale::new(2000.0, 5.0).unwrap();
+        assert_eq!(GOOD.check(&scale), Ok(()));
+        let bad = [
+            Limits {
+                velocity: 0.0,
+                ..GOOD
+            },
+            Limits {
+                velocity: f64::NAN,
+                ..GOOD
+            },
+            Limits {
+                velocity: 1e9,
+                ..GOOD
+            },
+            Limits {
+                acceleration: -1.0,
+                ..GOOD
+            },
+            Limits {
+                acceleration: f64::INFINITY,
+                ..GOOD
+            },
+            Limits {
+                torque: 0.0,
+                ..GOOD
+            },
+            Limits {
+                torque: 4000.0,
+                ..GOOD
+            },
+            Limits {
+                following_error: Some(0.0),
+                ..GOOD
+            },
+            Limits {
+                position: Some([1.0, 1.0]),
+                ..GOOD
+            },
+            Limits {
+                position: Some([f64::NAN, 1.0]),
+                ..GOOD
+            },
+            Limits {
+                position: Some([-1e9, 1e9]),
+                ..GOOD
+            },
+        ];
+        for limits in bad {
+            let error = limits.check(&scale).expect_err("must be refused");
+            assert!(!error.to_string().is_empty());
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! Stand still; brake first if moving.
+
+use super::{Motion, Ramp};
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hold {
+    pub acceleration: f64,
+}
+
+impl Hold {
+    /// RT: O(1).
+    #[must_use]
+    pub fn advance(self, motion: Motion, dt_s: f64) -> Motion {
+        let velocity = Ramp {
+            target: 0.0,
+            slope: self.acceleration,
+        }
+        .advance(motion.velocity, dt_s);
+        Motion {
+            position: motion.position + velocity * dt_s,
+            velocity,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn brakes_then_holds() {
+        let hold = Hold {
+            acceleration: 100.0,
+        };
+        let mut motion = Motion {
+            position: 1.0,
+            velocity: -10.0,
+        };
+        for _ in 0..1000 {
+            let next = hold.advance(motion, 0.001);
+            assert!((next.velocity - motion.velocity).abs() <= 0.1 + 1e-12);
+            motion = next;
+        }
+        assert_eq!(motion.velocity, 0.0);
+        // v²/2a = 0.5, less half a cycle.
+        assert!((motion.position - 0.5).abs() < 0.006);
+    }
+}

@@ -1,0 +1,46 @@
+//! A value that goes to its target at no more than a slope: velocity in CSV, torque in CST.
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ramp {
+    pub target: f64,
+    /// Per second.
+    pub slope: f64,
+}
+
+impl Ramp {
+    /// RT: O(1). Lands exactly on the target.
+    #[must_use]
+    pub fn advance(self, value: f64, dt_s: f64) -> f64 {
+        let most = self.slope * dt_s;
+        let left = self.target - value;
+        if left.abs() <= most {
+            self.target
+        } else {
+            value + most.copysign(left)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn never_steeper_and_arrives(start in -1e3..1e3f64, target in -1e3..1e3f64, slope in 1.0..1e5f64) {
+            let ramp = Ramp { target, slope };
+            let mut value = start;
+            for _ in 0..2_100_000 {
+                let next = ramp.advance(value, 0.001);
+                prop_assert!((next - value).abs() <= slope * 0.001 + 1e-9);
+                value = next;
+                if value == target {
+                    break;
+                }
+            }
+            prop_assert_eq!(value, target);
+        }
+    }
+}

@@ -1,0 +1,126 @@
+//! What an axis tells: its status, why it stopped, why it refused.
+
+use core::fmt;
+
+use crate::cia402::{Mode, State, Statusword, describe};
+
+/// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AxisStatus {
+    pub mode: Mode,
+    /// From the last fresh Statusword.
+    pub state: State,
+    pub time_in_state_s: f64,
+    pub statusword: Statusword,
+    /// As put into the last outputs.
+    pub controlword: u16,
+    /// Operation enabled, mode confirmed, set-points come from here. Before that, targets follow actual values.
+    pub enabled: bool,
+    /// Motion commands are taken: `enabled`, and neither disabling nor stopping for good.
+    pub ready: bool,
+    /// `mode_display` is the configured mode, or is not mapped.
+    pub mode_confirmed: bool,
+    /// The set-point is still changing.
+    pub moving: bool,
+    /// The set-point has arrived, and so has the axis (CSP: within the target window; CSV: within the velocity window).
+    pub in_target: bool,
+    /// Commanded and reported velocity are near zero.
+    pub at_rest: bool,
+    /// Reported position. 0 until one was reported.
+    pub position: f64,
+    /// Reported velocity, or the filtered difference of positions where velocity is not mapped.
+    pub velocity: f64,
+    /// Reported torque in percent of rated torque.
+    pub torque: f64,
+    /// As commanded in this cycle.
+    pub target_position: f64,
+    pub target_velocity: f64,
+    pub target_torque: f64,
+    /// Commanded (in the cycle before) minus reported position.
+    pub following_error: f64,
+    /// Largest amount since enabling.
+    pub max_following_error: f64,
+    /// Target minus reported position once a position move's set-point has arrived.
+    pub final_error_counts: Option<i64>,
+    /// A CSV velocity is held back so that the axis can stop before the end of its range.
+    pub held_by_range: bool,
+    /// Cycles in which the last guard had to change a set-point. Stays 0 unless something here is wrong.
+    pub guarded_cycles: u32,
+    /// Cycles since the last fresh inputs.
+    pub stale_cycles: u32,
+    /// The drive's first fault since the last reset.
+    pub fault: Option<DriveFault>,
+    /// Why the axis stopped itself, first cause since the last reset.
+    pub trip: Option<Trip>,
+    /// Reset pulses are being sent.
+    pub resetting: bool,
+    /// The last reset did not help.
+    pub reset_failed: bool,
+}
+
+/// A fault the drive reported.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DriveFault {
+    pub statusword: u16,
+    /// 0x603F or an emergency's code, if someone told ([`crate::Axis::note_error_code`]).
+    pub code: Option<u16>,
+}
+
+impl fmt::Display for DriveFault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.code {
+            Some(code) => write!(f, "drive fault {code:#06x}: {}", describe(code).text),
+            None => write!(f, "drive fault (Statusword {:#06x})", self.statusword),
+        }
+    }
+}
+
+/// Why an axis stopped itself. Values in user units.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Trip {
+    #[error("following error {error:.4} exceeds {limit:.4}")]
+    FollowingError { error: f64, limit: f64 },
+    #[error("position {position:.4} is outside [{low:.4}, {high:.4}]")]
+    PositionLimit { position: f64, low: f64, high: f64 },
+    #[error("velocity {velocity:.4} exceeds 1.2 × the limit of {limit:.4}")]
+    OverVelocity { velocity: f64, limit: f64 },
+    #[error("the drive left Operation enabled for {state} without being told to")]
+    PowerLost { state: State },
+    #[error("the drive changed its mode of operation from {expected} to {display}")]
+    ModeLost { expected: Mode, display: Mode },
+}
+
+/// Why a command was not taken. Nothing has changed. Values in user units.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Refused {
+    #[error("{what} is {value}: not a finite number")]
+    NotFinite { what: &'static str, value: f64 },
+    #[error("{what} is {value}: it must be above 0 and at most 1")]
+    NotAFraction { what: &'static str, value: f64 },
+    #[error("{what} is {value}: it must not be negative")]
+    Negative { what: &'static str, value: f64 },
+    #[error("position {position} is outside the range [{low}, {high}]")]
+    OutsideRange { position: f64, low: f64, high: f64 },
+    #[error("velocity {velocity} exceeds the limit of {limit}")]
+    TooFast { velocity: f64, limit: f64 },
+    #[error("torque {percent} % exceeds the limit of {limit} %")]
+    TooMuchTorque { percent: f64, limit: f64 },
+    #[error("{command} needs mode {needs}, the axis is in {mode}")]
+    WrongMode {
+        command: &'static str,
+        needs: Mode,
+        mode: Mode,
+    },
+    #[error("the axis is not enabled (drive: {state})")]
+    NotEnabled { state: State },
+    #[error("the drive has not confirmed mode {expected}, it shows {display}")]
+    ModeNotConfirmed { expected: Mode, display: Mode },
+    #[error("{0}; reset it first")]
+    Faulted(DriveFault),
+    #[error("the axis stopped itself: {0}; reset it first")]
+    Tripped(Trip),
+    #[error("the axis is stopping or being disabled")]
+    Stopping,
+    #[error("the axis still moves at {velocity} after a quick stop")]
+    StillMoving { velocity: f64 },
+}
