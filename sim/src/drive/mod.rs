@@ -1,1 +1,473 @@
-//! A CiA 402 drive: state machine, modes, control loops, motor and load.
+//! A CiA 402 drive: what happens between Controlword and Statusword, and between the target and the
+//! motor shaft.
+//!
+//! * `objects`: the objects it lives on, as slots of the device's store
+//! * `state`, `fault`: the power state machine, error codes, emergencies
+//! * `modes`, `profile`: set-points of CSP, CSV, CST, PP, PV and HM
+//! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms
+//! * `plant`: motor, load, friction, encoder
+//!
+//! The device calls [`Drive::sync`] when process data takes effect and [`Drive::control`] every 0.4 ms
+//! of its own time. Neither allocates. State and mask values are this crate's own: a misreading must
+//! not pass on both sides of the wire.
+
+mod control;
+mod fault;
+mod modes;
+mod objects;
+mod plant;
+mod profile;
+mod state;
+#[cfg(test)]
+mod tests;
+
+pub use fault::{DeviceError, Emergency};
+pub use plant::PlantParams;
+pub use state::State;
+
+use control::{Bounds, Controller, Demand};
+use fault::Faults;
+use modes::{Cycle, Frame, Mode, Motion, SetPoints, bit};
+use objects::{Objects, Parameters};
+use plant::Plant;
+use state::{Inputs, Power, Ramp, Request, Stop};
+
+use crate::Nanos;
+use crate::coe::store::ObjectStore;
+
+/// Position and velocity loop.
+pub const CONTROL_PERIOD_NS: Nanos = 400_000;
+/// The same in seconds.
+const CONTROL_STEP: f64 = 400e-6;
+
+/// Parameters are looked at anew after so many control cycles, as a drive's background task does.
+const PARAMETER_CYCLES: u32 = 5;
+/// A stop is over when the axis stands, or so many cycles after it should: a load may keep it moving.
+const SETTLE_CYCLES: u32 = 250;
+
+#[derive(Debug, Clone)]
+pub struct Drive {
+    objects: Objects,
+    parameters: Parameters,
+    parameters_age: u32,
+    params: PlantParams,
+    plant: Plant,
+    controller: Controller,
+    power: Power,
+    faults: Faults,
+    motion: Motion,
+    mode: Option<Mode>,
+    frame: Frame,
+    set_points: SetPoints,
+    /// A SYNC since Op was entered: there is a Controlword to obey.
+    commanded: bool,
+    in_op: bool,
+    /// Controlword edges since the last control cycle.
+    start: bool,
+    reset: bool,
+    /// The stop whose ramp is running, and for how long its end is overdue.
+    stopping: Option<Stop>,
+    overdue: u32,
+    following_cycles: u32,
+    following_error: bool,
+}
+
+impl Drive {
+    pub fn new(store: &mut ObjectStore, plant: PlantParams) -> Self {
+        let objects = Objects::bind(store, &plant);
+        let parameters = objects.parameters(store, &plant);
+        let motor = Plant::new(&plant);
+        let counts = motor.counts();
+        let mut drive = Self {
+            frame: Frame {
+                min: parameters.range_min,
+                width: parameters.range_width,
+                shift: 0,
+            },
+            objects,
+            parameters,
+            parameters_age: 0,
+            params: plant,
+            controller: Controller::new(&plant, counts),
+            plant: motor,
+            power: Power::new(plant.enable_cycles),
+            faults: Faults::default(),
+            motion: Motion::new(counts),
+            mode: None,
+            set_points: SetPoints::default(),
+            commanded: false,
+            in_op: false,
+            start: false,
+            reset: false,
+            stopping: None,
+            overdue: 0,
+            following_cycles: 0,
+            following_error: false,
+        };
+        drive.publish(store, &Demand::Off, false);
+        drive
+    }
+
+    /// SYNC0, or a SyncManager event where there is no distributed clock: set-points take effect.
+    pub fn sync(&mut self, store: &ObjectStore) {
+        let o = &self.objects;
+        let word = store.get(o.controlword).to_le_bytes();
+        let controlword = u16::from_le_bytes([word[0], word[1]]);
+        let rose = controlword & !self.set_points.controlword;
+        self.set_points = SetPoints {
+            controlword,
+            position: store.get_signed(o.target_position),
+            velocity: store.get_signed(o.target_velocity),
+            torque: store.get_signed(o.target_torque),
+            position_offset: store.get_signed(o.position_offset),
+            velocity_offset: store.get_signed(o.velocity_offset),
+            torque_offset: store.get_signed(o.torque_offset),
+        };
+        if !self.in_op {
+            return;
+        }
+        self.commanded = true;
+        self.start |= rose & 1 << 4 != 0;
+        self.reset |= rose & 1 << 7 != 0;
+        if let Some(mode) = self.mode
+            && self.follows()
+        {
+            self.motion
+                .take(mode, &self.set_points, &self.parameters, &self.frame);
+        }
+    }
+
+    /// One control cycle, every 0.4 ms of device time. Set-points and Controlword count only in Op.
+    pub fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
+        self.parameters_age += 1;
+        if self.parameters_age >= PARAMETER_CYCLES {
+            self.read_parameters(store);
+        }
+        self.controller.advance(&mut self.plant);
+        self.connect(in_op);
+        self.select_mode(store);
+        self.step_power(store);
+        let demand = self.demand();
+        self.supervise(&demand);
+        // A fault found just now begins its ramp in the next cycle, but cuts the power at once.
+        let demand = if self.power.powered() {
+            demand
+        } else {
+            Demand::Off
+        };
+        let bounds = Bounds {
+            current: self.parameters.current_limit,
+            speed: self.parameters.max_speed,
+        };
+        let limited = self.controller.ask(demand, &bounds);
+        if let Some(code) = self.faults.take_unrecorded() {
+            self.objects.record(store, code);
+        }
+        self.publish(store, &demand, limited);
+    }
+
+    /// The next emergency to send, oldest first.
+    pub fn take_emergency(&mut self) -> Option<Emergency> {
+        self.faults.take_emergency()
+    }
+
+    /// A fault whose cause is gone at once: the reaction runs, then a reset clears it.
+    pub fn inject_fault(&mut self, code: u16) {
+        self.raise(code, self.parameters.options.fault_ramp());
+    }
+
+    /// A fault whose cause stays, so that resets fail, until `None` takes it away.
+    pub fn set_fault_cause(&mut self, code: Option<u16>) {
+        self.faults.set_cause(code);
+        if let Some(code) = code {
+            self.inject_fault(code);
+        }
+    }
+
+    /// The drive never leaves this state once it is in it, not even by a fault.
+    pub fn hold_in(&mut self, state: Option<State>) {
+        self.power.hold_in(state);
+    }
+
+    /// What the communication side found. Only an enabled axis minds.
+    pub fn error(&mut self, error: DeviceError) {
+        if !self.enabled() {
+            return;
+        }
+        match error {
+            DeviceError::BusDown => self.disconnect(),
+            DeviceError::RxPdoTimeout if !self.mode.is_some_and(Mode::is_cyclic) => {}
+            DeviceError::RxPdoTimeout | DeviceError::SyncLost => {
+                self.raise(error.code(), self.parameters.options.fault_ramp());
+            }
+        }
+    }
+
+    /// Torque pulling towards negative positions, N·m.
+    pub fn set_load_torque(&mut self, torque: f64) {
+        self.plant.set_load_torque(torque);
+    }
+
+    /// A shaft that does not turn, whatever the motor does.
+    pub fn set_blocked(&mut self, blocked: bool) {
+        self.plant.set_blocked(blocked);
+    }
+
+    #[must_use]
+    pub fn state(&self) -> State {
+        self.power.state()
+    }
+
+    /// The output stage drives the motor.
+    #[must_use]
+    pub fn power_on(&self) -> bool {
+        self.power.powered()
+    }
+
+    /// The shaft's position in 0x6064's frame, but never wrapped.
+    #[must_use]
+    pub fn position_counts(&self) -> i64 {
+        self.plant.counts() + self.frame.shift
+    }
+
+    /// The shaft's true speed, not what the drive observes.
+    #[must_use]
+    pub fn velocity_rev_s(&self) -> f64 {
+        self.plant.velocity() / std::f64::consts::TAU
+    }
+
+    fn enabled(&self) -> bool {
+        matches!(
+            self.power.state(),
+            State::OperationEnabled | State::QuickStopActive
+        )
+    }
+
+    /// Set-points move the axis.
+    fn follows(&self) -> bool {
+        self.power.state() == State::OperationEnabled && self.power.stop().is_none()
+    }
+
+    fn read_parameters(&mut self, store: &ObjectStore) {
+        self.parameters_age = 0;
+        self.parameters = self.objects.parameters(store, &self.params);
+        self.frame.min = self.parameters.range_min;
+        self.frame.width = self.parameters.range_width;
+    }
+
+    fn connect(&mut self, in_op: bool) {
+        if in_op == self.in_op {
+            return;
+        }
+        self.in_op = in_op;
+        self.commanded = false;
+        self.start = false;
+        self.reset = false;
+        if in_op {
+            return;
+        }
+        if self.enabled() {
+            self.disconnect();
+        } else {
+            self.power.abandon();
+        }
+    }
+
+    /// 0x6007.
+    fn disconnect(&mut self) {
+        let reaction = match self.parameters.abort_option {
+            1 => self.parameters.options.fault_ramp(),
+            2 => None,
+            3 => Some(Ramp::QuickStop),
+            _ => return,
+        };
+        self.raise(DeviceError::BusDown.code(), reaction);
+    }
+
+    fn raise(&mut self, code: u16, reaction: fault::Reaction) {
+        let already = matches!(
+            self.power.state(),
+            State::FaultReactionActive | State::Fault
+        );
+        if self.power.raise(reaction) || already {
+            self.faults.latch(code);
+        }
+    }
+
+    fn select_mode(&mut self, store: &ObjectStore) {
+        let wanted = Mode::from_code(store.get_signed(self.objects.mode));
+        if wanted.is_some() && wanted != self.mode {
+            self.mode = wanted;
+            if self.follows() {
+                self.restart_motion();
+            }
+        }
+    }
+
+    fn restart_motion(&mut self) {
+        self.motion.restart(
+            self.controller.counts(),
+            self.controller.velocity(),
+            &self.frame,
+        );
+        self.following_cycles = 0;
+    }
+
+    fn step_power(&mut self, store: &ObjectStore) {
+        let request =
+            (self.in_op && self.commanded).then(|| Request::decode(self.set_points.controlword));
+        let reset = std::mem::take(&mut self.reset) && self.faults.cause().is_none();
+        let stopped = self.stopping.is_some()
+            && self.stopping == self.power.stop()
+            && self.overdue > 0
+            && (self.stands() || self.overdue > SETTLE_CYCLES);
+        let transition = self.power.step(&Inputs {
+            request,
+            reset,
+            stopped,
+            options: self.parameters.options,
+        });
+        match transition {
+            Some(4 | 16) => {
+                self.read_parameters(store);
+                self.restart_motion();
+            }
+            Some(15) => {
+                self.faults.clear();
+                self.following_error = false;
+            }
+            _ => {}
+        }
+        if self.power.stop() != self.stopping {
+            self.stopping = self.power.stop();
+            self.overdue = 0;
+            // A stop starts from what the axis does, not from what it was asked to do; an axis that is
+            // enabled again in the middle of a stop goes on from there, too.
+            if self.power.powered() {
+                self.restart_motion();
+            }
+        }
+    }
+
+    fn stands(&self) -> bool {
+        self.controller.velocity().abs() < 0.1 * f64::from(self.params.counts_per_turn)
+    }
+
+    fn demand(&mut self) -> Demand {
+        let start = std::mem::take(&mut self.start);
+        if !self.power.powered() {
+            return Demand::Off;
+        }
+        if let Some(stop) = self.power.stop() {
+            let (demand, over) = self.motion.stop(stop.ramp, &self.parameters);
+            self.overdue = self.overdue.saturating_add(u32::from(over));
+            return demand;
+        }
+        let cycle = Cycle {
+            parameters: &self.parameters,
+            set_points: &self.set_points,
+            start,
+            counts: self.controller.counts(),
+            velocity: self.controller.velocity(),
+        };
+        match self.mode {
+            Some(mode) => self.motion.demand(mode, &cycle, &mut self.frame),
+            None => self.motion.hold(),
+        }
+    }
+
+    /// Following error and position limits.
+    fn supervise(&mut self, demand: &Demand) {
+        if self.power.state() != State::OperationEnabled {
+            return;
+        }
+        let counts = self.controller.counts();
+        let error = self.motion.following_error(demand, counts).abs();
+        let outside = self
+            .parameters
+            .following_window
+            .is_some_and(|window| error > window);
+        self.following_error = outside;
+        self.following_cycles = if outside {
+            self.following_cycles + 1
+        } else {
+            0
+        };
+        let ramp = self.parameters.options.fault_ramp();
+        if outside && self.following_cycles > self.parameters.following_timeout {
+            self.raise(fault::FOLLOWING_ERROR, ramp);
+        } else if let Some((min, max)) = self.parameters.software_limits
+            && !matches!(demand, Demand::Position { .. })
+        {
+            // Position set-points are kept inside; speed and torque can only be stopped.
+            let (at, speed) = (counts + self.frame.shift, self.controller.velocity());
+            if (at > max && speed > 0.0) || (at < min && speed < 0.0) {
+                self.raise(fault::SOFTWARE_POSITION_LIMIT, ramp);
+            }
+        }
+    }
+
+    fn statusword(&self, limited: bool) -> u16 {
+        let state = self.power.state();
+        let mut word = state.bits();
+        let mut set = |on: bool, bit: u16| word |= if on { bit } else { 0 };
+        set(self.power.powered() || state == State::SwitchedOn, 1 << 4);
+        set(self.in_op, 1 << 9);
+        set(limited, bit::INTERNAL_LIMIT);
+        if let Some(mode) = self.mode {
+            let velocity = self.controller.velocity();
+            let bits = self
+                .motion
+                .status(mode, self.follows(), velocity, &self.parameters);
+            set(true, bits);
+            set(
+                self.following_error
+                    && matches!(mode, Mode::CyclicPosition | Mode::ProfilePosition),
+                bit::MODE_13,
+            );
+        }
+        word
+    }
+
+    fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
+        let (o, p) = (&self.objects, &self.parameters);
+        let counts = self.controller.counts();
+        let velocity = self.controller.velocity();
+        let torque_per_ampere = self.params.torque_constant / p.torque_unit.max(1e-12);
+        let current = self.controller.current();
+        store.set(o.statusword, i64::from(self.statusword(limited)));
+        store.set(o.error_code, i64::from(self.faults.code()));
+        store.set(o.error_register, i64::from(self.faults.register()));
+        store.set(o.mode_display, self.mode.map_or(0, Mode::code));
+        store.set(o.position, self.frame.show(counts));
+        store.set(o.velocity, whole(velocity / p.velocity_unit));
+        store.set(o.torque, whole(current * torque_per_ampere));
+        let error = self.motion.following_error(demand, counts);
+        store.set(o.following_error, whole(error));
+        let (position, speed) = match demand {
+            Demand::Off => (objects::float(counts), 0.0),
+            _ => self.motion.demanded(),
+        };
+        store.set(o.position_demand, self.frame.show(whole(position)));
+        store.set(o.velocity_demand, whole(speed / p.velocity_unit));
+        if let Some(slot) = o.velocity_averaged {
+            let averaged = self.controller.averaged_velocity();
+            store.set(slot, whole(averaged / p.velocity_unit));
+        }
+        if let Some(slot) = o.torque_averaged {
+            let averaged = self.controller.averaged_current();
+            store.set(slot, whole(averaged * torque_per_ampere));
+        }
+        if let Some(slot) = o.current {
+            store.set(slot, whole(current * 1e3));
+        }
+        if let Some(slot) = o.current_averaged {
+            store.set(slot, whole(self.controller.averaged_current() * 1e3));
+        }
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "saturates")]
+fn whole(value: f64) -> i64 {
+    value.round() as i64
+}

@@ -1,0 +1,439 @@
+//! The modes of operation: from set-points to what the control loops are asked for in one control
+//! cycle. Counts and seconds; positions are unwrapped encoder counts.
+
+use super::control::Demand;
+use super::objects::{Parameters, float};
+use super::profile::{Dynamics, Interpolator, Profile};
+use super::state::Ramp;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Mode {
+    ProfilePosition,
+    ProfileVelocity,
+    Homing,
+    CyclicPosition,
+    CyclicVelocity,
+    CyclicTorque,
+}
+
+impl Mode {
+    pub(super) fn from_code(code: i64) -> Option<Self> {
+        Some(match code {
+            1 => Self::ProfilePosition,
+            3 => Self::ProfileVelocity,
+            6 => Self::Homing,
+            8 => Self::CyclicPosition,
+            9 => Self::CyclicVelocity,
+            10 => Self::CyclicTorque,
+            _ => return None,
+        })
+    }
+
+    pub(super) fn code(self) -> i64 {
+        match self {
+            Self::ProfilePosition => 1,
+            Self::ProfileVelocity => 3,
+            Self::Homing => 6,
+            Self::CyclicPosition => 8,
+            Self::CyclicVelocity => 9,
+            Self::CyclicTorque => 10,
+        }
+    }
+
+    pub(super) fn is_cyclic(self) -> bool {
+        matches!(
+            self,
+            Self::CyclicPosition | Self::CyclicVelocity | Self::CyclicTorque
+        )
+    }
+}
+
+/// Process data as the last SYNC found it, in the objects' own units.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct SetPoints {
+    pub controlword: u16,
+    pub position: i64,
+    pub velocity: i64,
+    pub torque: i64,
+    pub position_offset: i64,
+    pub velocity_offset: i64,
+    pub torque_offset: i64,
+}
+
+impl SetPoints {
+    fn change_at_once(&self) -> bool {
+        self.controlword & 1 << 5 != 0
+    }
+
+    fn relative(&self) -> bool {
+        self.controlword & 1 << 6 != 0
+    }
+
+    fn halt(&self) -> bool {
+        self.controlword & 1 << 8 != 0
+    }
+}
+
+/// How encoder counts appear in 0x6064.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Frame {
+    pub min: i64,
+    pub width: i64,
+    /// What homing added.
+    pub shift: i64,
+}
+
+impl Frame {
+    pub(super) fn show(&self, counts: i64) -> i64 {
+        self.min + (counts + self.shift - self.min).rem_euclid(self.width)
+    }
+
+    /// From one shown position to another, the short way round.
+    fn way(&self, from: i64, to: i64) -> i64 {
+        let half = self.width / 2;
+        (to - from + half).rem_euclid(self.width) - half
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Move {
+    target: i64,
+    dynamics: Dynamics,
+}
+
+/// Statusword bits 8–15 as far as a mode sets them.
+pub(super) mod bit {
+    pub const TARGET_REACHED: u16 = 1 << 10;
+    pub const INTERNAL_LIMIT: u16 = 1 << 11;
+    /// Follows the command value, set-point acknowledged, speed is zero, homing attained.
+    pub const MODE_12: u16 = 1 << 12;
+    /// Following error, homing error.
+    pub const MODE_13: u16 = 1 << 13;
+    pub const REFERENCED: u16 = 1 << 15;
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Motion {
+    /// CSP: target as received last, and what it means in unwrapped counts.
+    received: i64,
+    target: i64,
+    position: Interpolator,
+    velocity: Interpolator,
+    /// The moving point of PP, PV, CSP under 0x6080, and of every stop.
+    profile: Profile,
+    active: Option<Move>,
+    next: Option<Move>,
+    acknowledged: bool,
+    reached: bool,
+    settled_cycles: u32,
+    homing_attained: bool,
+    homing_error: bool,
+    referenced: bool,
+    /// A set-point was cut by a position or speed limit.
+    cut: bool,
+    torque: f64,
+}
+
+/// What a mode is told in one control cycle.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Cycle<'a> {
+    pub parameters: &'a Parameters,
+    pub set_points: &'a SetPoints,
+    /// Controlword bit 4 rose.
+    pub start: bool,
+    pub counts: i64,
+    /// Counts/s.
+    pub velocity: f64,
+}
+
+impl Motion {
+    pub(super) fn new(counts: i64) -> Self {
+        Self {
+            received: counts,
+            target: counts,
+            position: Interpolator::at(float(counts)),
+            velocity: Interpolator::default(),
+            profile: Profile::at(float(counts), 0.0),
+            active: None,
+            next: None,
+            acknowledged: false,
+            reached: true,
+            settled_cycles: 0,
+            homing_attained: false,
+            homing_error: false,
+            referenced: false,
+            cut: false,
+            torque: 0.0,
+        }
+    }
+
+    /// Forgets every set-point: the axis is taken over as it stands or moves.
+    pub(super) fn restart(&mut self, counts: i64, velocity: f64, frame: &Frame) {
+        *self = Self {
+            received: frame.show(counts),
+            velocity: Interpolator::at(velocity),
+            // One cycle back, so that the first step of a ramp comes out where the axis is now.
+            profile: Profile::at(float(counts) - velocity * super::CONTROL_STEP, velocity),
+            referenced: self.referenced,
+            ..Self::new(counts)
+        };
+    }
+
+    /// A SYNC while the operation is enabled.
+    pub(super) fn take(
+        &mut self,
+        mode: Mode,
+        set_points: &SetPoints,
+        p: &Parameters,
+        frame: &Frame,
+    ) {
+        match mode {
+            Mode::CyclicPosition => {
+                let received = set_points.position + set_points.position_offset;
+                self.target += frame.way(self.received, received);
+                self.received = received;
+                let within = match p.software_limits {
+                    Some((min, max)) => self.target.clamp(min - frame.shift, max - frame.shift),
+                    None => self.target,
+                };
+                self.cut = within != self.target;
+                self.position.take(float(within), p.period_ns);
+            }
+            Mode::CyclicVelocity => {
+                let wanted =
+                    float(set_points.velocity + set_points.velocity_offset) * p.velocity_unit;
+                let within = wanted.clamp(-p.max_speed, p.max_speed);
+                self.cut = within != wanted;
+                self.velocity.take(within, p.period_ns);
+            }
+            Mode::CyclicTorque => {
+                self.cut = false;
+                self.torque = float(set_points.torque + set_points.torque_offset) * p.torque_unit;
+            }
+            Mode::ProfilePosition | Mode::ProfileVelocity | Mode::Homing => {}
+        }
+    }
+
+    /// One control cycle with the operation enabled. Homing may move the frame.
+    pub(super) fn demand(&mut self, mode: Mode, cycle: &Cycle, frame: &mut Frame) -> Demand {
+        let p = cycle.parameters;
+        let torque = float(cycle.set_points.torque_offset) * p.torque_unit;
+        match mode {
+            Mode::CyclicPosition => {
+                let (position, slope) = self.position.advance();
+                let reach = p.max_speed * super::CONTROL_STEP;
+                let before = self.profile.position;
+                let within = position.clamp(before - reach, before + reach);
+                let velocity = slope.clamp(-p.max_speed, p.max_speed);
+                if within != position {
+                    self.cut = true;
+                }
+                self.profile = Profile::at(within, velocity);
+                Demand::Position {
+                    position: within,
+                    velocity: velocity + float(cycle.set_points.velocity_offset) * p.velocity_unit,
+                    // Cyclic modes have no acceleration feed-forward: the slope of a slope of whole
+                    // counts is mostly noise.
+                    acceleration: 0.0,
+                    torque,
+                }
+            }
+            Mode::CyclicVelocity => {
+                let (velocity, _) = self.velocity.advance();
+                self.profile = Profile::at(float(cycle.counts), velocity);
+                Demand::Velocity {
+                    velocity,
+                    acceleration: 0.0,
+                    torque,
+                }
+            }
+            Mode::CyclicTorque => {
+                self.profile = Profile::at(float(cycle.counts), cycle.velocity);
+                Demand::Torque(self.torque)
+            }
+            Mode::ProfilePosition => {
+                self.profile_position(cycle, frame);
+                self.profile_demand(torque)
+            }
+            Mode::ProfileVelocity => {
+                let wanted = float(cycle.set_points.velocity) * p.velocity_unit;
+                let within = wanted.clamp(-p.max_speed, p.max_speed);
+                self.cut = within != wanted;
+                let target = if cycle.set_points.halt() { 0.0 } else { within };
+                let there =
+                    self.profile
+                        .ramp(target, p.profile.acceleration, p.profile.deceleration);
+                let tolerance = (0.02 * target.abs()).max(0.002 * p.max_speed);
+                self.reached = there && (cycle.velocity - target).abs() <= tolerance;
+                self.profile.position = float(cycle.counts);
+                Demand::Velocity {
+                    velocity: self.profile.velocity,
+                    acceleration: self.profile.acceleration,
+                    torque,
+                }
+            }
+            Mode::Homing => {
+                if cycle.start {
+                    self.home(cycle, frame);
+                }
+                self.profile
+                    .ramp(0.0, p.profile.acceleration, p.profile.deceleration);
+                self.profile_demand(torque)
+            }
+        }
+    }
+
+    /// One control cycle of a stop. True when the demanded speed is zero.
+    pub(super) fn stop(&mut self, ramp: Ramp, p: &Parameters) -> (Demand, bool) {
+        let deceleration = match ramp {
+            Ramp::SlowDown => p.profile.deceleration,
+            Ramp::QuickStop => p.quick_stop_deceleration,
+        };
+        let there = self.profile.ramp(0.0, deceleration, deceleration);
+        (self.profile_demand(0.0), there)
+    }
+
+    /// Holds the point where it is.
+    pub(super) fn hold(&mut self) -> Demand {
+        self.profile = Profile::at(self.profile.position, 0.0);
+        self.profile_demand(0.0)
+    }
+
+    fn profile_demand(&self, torque: f64) -> Demand {
+        Demand::Position {
+            position: self.profile.position,
+            velocity: self.profile.velocity,
+            acceleration: self.profile.acceleration,
+            torque,
+        }
+    }
+
+    fn profile_position(&mut self, cycle: &Cycle, frame: &Frame) {
+        let (p, set) = (cycle.parameters, cycle.set_points);
+        if cycle.start && self.next.is_none() {
+            self.accept(cycle, frame);
+        }
+        if set.controlword & 1 << 4 == 0 && self.next.is_none() {
+            self.acknowledged = false;
+        }
+        if set.halt() {
+            let stands = self
+                .profile
+                .ramp(0.0, p.profile.acceleration, p.profile.deceleration);
+            self.reached = stands;
+            return;
+        }
+        let Some(active) = self.active else {
+            self.profile
+                .ramp(0.0, p.profile.acceleration, p.profile.deceleration);
+            return;
+        };
+        let target = float(active.target);
+        if !self.profile.approach(target, &active.dynamics) {
+            self.settled_cycles = 0;
+            return;
+        }
+        let settled = match p.position_window {
+            None => true,
+            Some(window) => {
+                let inside = (target - float(cycle.counts)).abs() <= window;
+                self.settled_cycles = if inside { self.settled_cycles + 1 } else { 0 };
+                inside && self.settled_cycles > p.position_window_time
+            }
+        };
+        match self.next.take() {
+            Some(next) => {
+                self.active = Some(next);
+                self.reached = false;
+            }
+            None if settled => {
+                self.active = None;
+                self.reached = true;
+            }
+            None => {}
+        }
+    }
+
+    fn accept(&mut self, cycle: &Cycle, frame: &Frame) {
+        let (p, set) = (cycle.parameters, cycle.set_points);
+        let last = self
+            .next
+            .or(self.active)
+            .map_or(self.target, |accepted| accepted.target);
+        let target = if set.relative() {
+            last + set.position
+        } else {
+            last + frame.way(frame.show(last), set.position)
+        };
+        self.acknowledged = true;
+        let within = match p.software_limits {
+            Some((min, max)) => target.clamp(min - frame.shift, max - frame.shift),
+            None => target,
+        };
+        self.cut = within != target;
+        self.target = within;
+        let accepted = Move {
+            target: within,
+            dynamics: p.profile,
+        };
+        if self.active.is_none() || set.change_at_once() {
+            self.active = Some(accepted);
+            self.next = None;
+            self.reached = false;
+            self.settled_cycles = 0;
+        } else {
+            self.next = Some(accepted);
+        }
+    }
+
+    /// Methods 35 and 37: the axis is where home is.
+    fn home(&mut self, cycle: &Cycle, frame: &mut Frame) {
+        let here = matches!(cycle.parameters.homing_method, 35 | 37);
+        self.homing_attained = here;
+        self.homing_error = !here;
+        if here {
+            frame.shift = cycle.parameters.home_position - cycle.counts;
+            self.referenced = true;
+        }
+    }
+
+    /// Counts between demand and position; zero where no position is demanded.
+    pub(super) fn following_error(&self, demand: &Demand, counts: i64) -> f64 {
+        match demand {
+            Demand::Position { position, .. } => position - float(counts),
+            _ => 0.0,
+        }
+    }
+
+    /// Demanded position and speed, for 0x6062 and 0x606B.
+    pub(super) fn demanded(&self) -> (f64, f64) {
+        (self.profile.position, self.profile.velocity)
+    }
+
+    /// The mode's Statusword bits. `follows`: enabled and not stopping.
+    pub(super) fn status(&self, mode: Mode, follows: bool, velocity: f64, p: &Parameters) -> u16 {
+        let mut bits = 0;
+        let mut set = |on: bool, bit: u16| bits |= if on { bit } else { 0 };
+        set(follows && self.cut, bit::INTERNAL_LIMIT);
+        set(self.referenced, bit::REFERENCED);
+        match mode {
+            Mode::CyclicPosition | Mode::CyclicVelocity | Mode::CyclicTorque => {
+                set(follows && !self.cut, bit::MODE_12);
+            }
+            Mode::ProfilePosition => {
+                set(self.acknowledged, bit::MODE_12);
+                set(self.reached, bit::TARGET_REACHED);
+            }
+            Mode::ProfileVelocity => {
+                set(velocity.abs() <= 0.002 * p.max_speed, bit::MODE_12);
+                set(self.reached, bit::TARGET_REACHED);
+            }
+            Mode::Homing => {
+                set(self.homing_attained, bit::MODE_12);
+                set(self.homing_error, bit::MODE_13);
+                set(self.profile.velocity == 0.0, bit::TARGET_REACHED);
+            }
+        }
+        bits
+    }
+}

@@ -1,0 +1,171 @@
+//! The motor and what hangs on it: winding, rotor with load, friction, encoder.
+
+use std::f64::consts::TAU;
+
+/// One step of the current loop, in seconds.
+pub(super) const CURRENT_STEP: f64 = 40e-6;
+
+/// Motor, load and supply, in SI units. The default is a 70 W brushless motor of 45 mm with a load of
+/// about its own inertia.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlantParams {
+    /// Encoder counts per motor turn (four per line).
+    pub counts_per_turn: u32,
+    /// What 0x6064 shows at power-on, in counts.
+    pub initial_position: i32,
+    /// Rotor and load, kg·m².
+    pub inertia: f64,
+    /// N·m·s/rad.
+    pub viscous_friction: f64,
+    /// N·m, holding and sliding.
+    pub coulomb_friction: f64,
+    /// N·m, constantly pulling towards negative positions.
+    pub load_torque: f64,
+    /// N·m/A, and V·s/rad.
+    pub torque_constant: f64,
+    /// Ω.
+    pub resistance: f64,
+    /// H.
+    pub inductance: f64,
+    /// V.
+    pub supply_voltage: f64,
+    /// A; rated torque is this times the torque constant.
+    pub nominal_current: f64,
+    /// A; what the output stage never exceeds.
+    pub current_limit: f64,
+    /// rpm; the power-on value of 0x6080.
+    pub max_motor_speed: u32,
+    /// How long the output stage takes from Switched on to Operation enabled, in control cycles of
+    /// 0.4 ms.
+    pub enable_cycles: u32,
+}
+
+impl Default for PlantParams {
+    fn default() -> Self {
+        Self {
+            counts_per_turn: 2000,
+            initial_position: 0,
+            inertia: 3.6e-5,
+            viscous_friction: 2e-5,
+            coulomb_friction: 4e-3,
+            load_torque: 0.0,
+            torque_constant: 37e-3,
+            resistance: 0.6,
+            inductance: 0.46e-3,
+            supply_voltage: 48.0,
+            nominal_current: 3.2,
+            current_limit: 9.6,
+            max_motor_speed: 6000,
+            enable_cycles: 10,
+        }
+    }
+}
+
+impl PlantParams {
+    pub(super) fn counts_per_rad(&self) -> f64 {
+        f64::from(self.counts_per_turn.max(1)) / TAU
+    }
+
+    /// N·m.
+    pub(super) fn rated_torque(&self) -> f64 {
+        self.torque_constant * self.nominal_current
+    }
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Plant {
+    /// Encoder counts, with fraction.
+    position: f64,
+    /// rad/s.
+    velocity: f64,
+    /// A.
+    current: f64,
+    load_torque: f64,
+    blocked: bool,
+    coulomb: f64,
+    // Per current-loop step: what a volt, a volt of back-EMF, … do.
+    current_per_volt: f64,
+    current_decay: f64,
+    back_emf: f64,
+    velocity_per_torque: f64,
+    torque_constant: f64,
+    viscous: f64,
+    counts_per_velocity: f64,
+}
+
+impl Plant {
+    pub(super) fn new(p: &PlantParams) -> Self {
+        let inductance = p.inductance.max(1e-6);
+        Self {
+            // In the middle of a count, so that standing still is not standing on an edge.
+            position: f64::from(p.initial_position) + 0.5,
+            velocity: 0.0,
+            current: 0.0,
+            load_torque: p.load_torque,
+            blocked: false,
+            coulomb: p.coulomb_friction,
+            current_per_volt: CURRENT_STEP / inductance,
+            current_decay: (-CURRENT_STEP * p.resistance / inductance).exp(),
+            back_emf: p.torque_constant,
+            velocity_per_torque: CURRENT_STEP / p.inertia.max(1e-9),
+            torque_constant: p.torque_constant,
+            viscous: p.viscous_friction,
+            counts_per_velocity: CURRENT_STEP * p.counts_per_rad(),
+        }
+    }
+
+    /// What the encoder counted since power-on, from the initial position.
+    pub(super) fn counts(&self) -> i64 {
+        #[expect(clippy::cast_possible_truncation, reason = "saturates, centuries away")]
+        let counts = self.position.floor() as i64;
+        counts
+    }
+
+    pub(super) fn velocity(&self) -> f64 {
+        self.velocity
+    }
+
+    pub(super) fn current(&self) -> f64 {
+        self.current
+    }
+
+    pub(super) fn set_load_torque(&mut self, torque: f64) {
+        self.load_torque = torque;
+    }
+
+    pub(super) fn set_blocked(&mut self, blocked: bool) {
+        self.blocked = blocked;
+    }
+
+    /// Stands, and would go on standing without current.
+    pub(super) fn at_rest(&self) -> bool {
+        self.velocity == 0.0 && (self.blocked || self.load_torque.abs() <= self.coulomb)
+    }
+
+    /// The winding for one current-loop step at this voltage.
+    pub(super) fn energise(&mut self, voltage: f64) {
+        self.current = self.current * self.current_decay
+            + (voltage - self.back_emf * self.velocity) * self.current_per_volt;
+    }
+
+    /// Output stage off: the winding is open.
+    pub(super) fn open(&mut self) {
+        self.current = 0.0;
+    }
+
+    /// The mechanics for one current-loop step.
+    pub(super) fn turn(&mut self) {
+        if self.blocked {
+            self.velocity = 0.0;
+            return;
+        }
+        let torque =
+            self.torque_constant * self.current - self.viscous * self.velocity - self.load_torque;
+        let before = self.velocity;
+        let free = before + torque * self.velocity_per_torque;
+        // Friction takes away speed until there is none; it never drives.
+        let friction = self.coulomb * self.velocity_per_torque;
+        self.velocity = free.signum() * (free.abs() - friction).max(0.0);
+        self.position += 0.5 * (before + self.velocity) * self.counts_per_velocity;
+    }
+}

@@ -1,0 +1,275 @@
+//! The power state machine as the drive sees it: states, transitions 0–16, what stops the axis on the
+//! way. One call a control cycle, at most one transition a call.
+
+/// CiA 402 power drive system states.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum State {
+    NotReadyToSwitchOn,
+    SwitchOnDisabled,
+    ReadyToSwitchOn,
+    SwitchedOn,
+    OperationEnabled,
+    QuickStopActive,
+    FaultReactionActive,
+    Fault,
+}
+
+impl State {
+    /// Statusword bits 0–3, 5 and 6.
+    pub(super) fn bits(self) -> u16 {
+        match self {
+            Self::NotReadyToSwitchOn => 0x0000,
+            Self::SwitchOnDisabled => 0x0040,
+            Self::ReadyToSwitchOn => 0x0021,
+            Self::SwitchedOn => 0x0023,
+            Self::OperationEnabled => 0x0027,
+            Self::QuickStopActive => 0x0007,
+            Self::FaultReactionActive => 0x000f,
+            Self::Fault => 0x0008,
+        }
+    }
+}
+
+/// What a Controlword asks of the power state machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Request {
+    DisableVoltage,
+    QuickStop,
+    Shutdown,
+    SwitchOn,
+    EnableOperation,
+    /// Bit 7 is up and nothing asks for less power.
+    None,
+}
+
+impl Request {
+    pub(super) fn decode(controlword: u16) -> Self {
+        // Asking for less power counts even while bit 7 is up; asking for more does not.
+        match controlword & 0x8f {
+            w if w & 0x02 == 0 => Self::DisableVoltage,
+            w if w & 0x04 == 0 => Self::QuickStop,
+            w if w & 0x80 != 0 => Self::None,
+            w if w & 0x01 == 0 => Self::Shutdown,
+            w if w & 0x08 == 0 => Self::SwitchOn,
+            _ => Self::EnableOperation,
+        }
+    }
+}
+
+/// How fast to stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ramp {
+    /// Profile deceleration, 0x6084.
+    SlowDown,
+    /// Quick stop deceleration, 0x6085.
+    QuickStop,
+}
+
+/// A stop under way, and the state it ends in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Stop {
+    pub ramp: Ramp,
+    /// `None`: hold the axis where it stands.
+    pub then: Option<State>,
+}
+
+/// 0x605A, 0x605B, 0x605C, 0x605E as written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct OptionCodes {
+    pub quick_stop: i64,
+    pub shutdown: i64,
+    pub disable: i64,
+    pub fault: i64,
+}
+
+impl OptionCodes {
+    fn quick_stop(&self) -> Option<Stop> {
+        let (ramp, stays) = match self.quick_stop {
+            1 => (Ramp::SlowDown, false),
+            // 3 and 4 stop at the current and voltage limit: no steeper ramp is modelled.
+            2..=4 => (Ramp::QuickStop, false),
+            5 => (Ramp::SlowDown, true),
+            6..=8 => (Ramp::QuickStop, true),
+            _ => return None,
+        };
+        let then = (!stays).then_some(State::SwitchOnDisabled);
+        Some(Stop { ramp, then })
+    }
+
+    pub(super) fn fault_ramp(&self) -> Option<Ramp> {
+        match self.fault {
+            1 => Some(Ramp::SlowDown),
+            2..=4 => Some(Ramp::QuickStop),
+            _ => None,
+        }
+    }
+}
+
+/// What one control cycle tells the state machine.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Inputs {
+    /// `None`: no Controlword is being received.
+    pub request: Option<Request>,
+    /// Controlword bit 7 rose and the fault's cause is gone.
+    pub reset: bool,
+    /// The stop under way came to its end.
+    pub stopped: bool,
+    pub options: OptionCodes,
+}
+
+/// Self-test after power-on, in control cycles.
+const SELF_TEST: u32 = 5;
+
+#[derive(Debug, Clone)]
+pub(super) struct Power {
+    state: State,
+    stop: Option<Stop>,
+    hold: Option<State>,
+    /// Cycles until the next automatic step may happen.
+    wait: u32,
+    enable_cycles: u32,
+}
+
+impl Power {
+    pub(super) fn new(enable_cycles: u32) -> Self {
+        Self {
+            state: State::NotReadyToSwitchOn,
+            stop: None,
+            hold: None,
+            wait: SELF_TEST,
+            enable_cycles,
+        }
+    }
+
+    pub(super) fn state(&self) -> State {
+        self.state
+    }
+
+    pub(super) fn stop(&self) -> Option<Stop> {
+        self.stop
+    }
+
+    pub(super) fn hold_in(&mut self, state: Option<State>) {
+        self.hold = state;
+    }
+
+    /// The output stage drives the winding.
+    pub(super) fn powered(&self) -> bool {
+        match self.state {
+            State::OperationEnabled | State::QuickStopActive => true,
+            State::FaultReactionActive => self.stop.is_some(),
+            _ => false,
+        }
+    }
+
+    /// Transition 13. `ramp: None` lets the motor coast. False if the drive cannot or need not react.
+    pub(super) fn raise(&mut self, ramp: Option<Ramp>) -> bool {
+        if matches!(self.state, State::FaultReactionActive | State::Fault) {
+            return false;
+        }
+        let stop = ramp.filter(|_| self.powered()).map(|ramp| Stop {
+            ramp,
+            then: Some(State::Fault),
+        });
+        self.go(State::FaultReactionActive, stop)
+    }
+
+    /// One control cycle. Returns the transition's number in CiA 402, for the tests.
+    pub(super) fn step(&mut self, inputs: &Inputs) -> Option<u8> {
+        use State as S;
+        let request = inputs.request.unwrap_or(Request::None);
+        if let Some(Stop { then: Some(to), .. }) = self.stop
+            && inputs.stopped
+        {
+            let number = match (self.state, to) {
+                (S::FaultReactionActive, _) => 14,
+                (S::QuickStopActive, _) => 12,
+                (_, S::SwitchedOn) => 5,
+                _ => 8,
+            };
+            return self.go(to, None).then_some(number);
+        }
+        let (number, to, stop) = match (self.state, request) {
+            (S::NotReadyToSwitchOn, _) => {
+                self.wait = self.wait.saturating_sub(1);
+                if self.wait > 0 {
+                    return None;
+                }
+                (1, S::SwitchOnDisabled, None)
+            }
+            (S::SwitchOnDisabled, Request::Shutdown) => (2, S::ReadyToSwitchOn, None),
+            (S::ReadyToSwitchOn, Request::SwitchOn | Request::EnableOperation) => {
+                (3, S::SwitchedOn, None)
+            }
+            (S::SwitchedOn, Request::EnableOperation) => {
+                if self.wait < self.enable_cycles {
+                    self.wait += 1;
+                    return None;
+                }
+                (4, S::OperationEnabled, None)
+            }
+            (S::SwitchedOn, Request::Shutdown) => (6, S::ReadyToSwitchOn, None),
+            (S::ReadyToSwitchOn, Request::DisableVoltage | Request::QuickStop) => {
+                (7, S::SwitchOnDisabled, None)
+            }
+            (S::SwitchedOn, Request::DisableVoltage | Request::QuickStop) => {
+                (10, S::SwitchOnDisabled, None)
+            }
+            (S::OperationEnabled, Request::DisableVoltage) => (9, S::SwitchOnDisabled, None),
+            (S::OperationEnabled, Request::QuickStop) => match inputs.options.quick_stop() {
+                Some(stop) => (11, S::QuickStopActive, Some(stop)),
+                None => (11, S::SwitchOnDisabled, None),
+            },
+            (S::OperationEnabled, Request::SwitchOn) => {
+                return self.leave(5, S::SwitchedOn, inputs.options.disable);
+            }
+            (S::OperationEnabled, Request::Shutdown) => {
+                return self.leave(8, S::ReadyToSwitchOn, inputs.options.shutdown);
+            }
+            (S::OperationEnabled, Request::EnableOperation) => {
+                // Enabled again while a shutdown or disable ramp runs.
+                self.stop = None;
+                return None;
+            }
+            (S::QuickStopActive, Request::DisableVoltage) => (12, S::SwitchOnDisabled, None),
+            (S::QuickStopActive, Request::EnableOperation)
+                if self.stop.is_none_or(|stop| stop.then.is_none()) =>
+            {
+                (16, S::OperationEnabled, None)
+            }
+            (S::FaultReactionActive, _) if self.stop.is_none() => (14, S::Fault, None),
+            (S::Fault, _) if inputs.reset => (15, S::SwitchOnDisabled, None),
+            _ => return None,
+        };
+        self.go(to, stop).then_some(number)
+    }
+
+    /// Transitions 5 and 8: at once, or after a ramp during which the state stays.
+    fn leave(&mut self, number: u8, to: State, option: i64) -> Option<u8> {
+        if option == 1 {
+            self.stop = Some(Stop {
+                ramp: Ramp::SlowDown,
+                then: Some(to),
+            });
+            return None;
+        }
+        self.go(to, None).then_some(number)
+    }
+
+    /// No Controlword comes any more: whatever is not moving goes back to Switch on disabled.
+    pub(super) fn abandon(&mut self) {
+        if matches!(self.state, State::ReadyToSwitchOn | State::SwitchedOn) {
+            self.go(State::SwitchOnDisabled, None);
+        }
+    }
+
+    fn go(&mut self, to: State, stop: Option<Stop>) -> bool {
+        if self.hold == Some(self.state) && to != self.state {
+            return false;
+        }
+        self.state = to;
+        self.stop = stop;
+        self.wait = 0;
+        true
+    }
+}

@@ -1,0 +1,101 @@
+//! The drive on its own: a store without an ESI, process data written by hand.
+
+mod faults;
+mod motion;
+mod profiles;
+mod transitions;
+
+use super::*;
+use crate::coe::store::Slot;
+
+/// A drive with a bus around it: one SYNC a bus cycle, a control cycle every 0.4 ms.
+struct Rig {
+    store: ObjectStore,
+    drive: Drive,
+    in_op: bool,
+    cycle_ns: u64,
+    now_ns: u64,
+    control_ns: u64,
+}
+
+const MS: u64 = 1_000_000;
+
+impl Rig {
+    fn new(plant: PlantParams) -> Self {
+        let mut store = ObjectStore::default();
+        let drive = Drive::new(&mut store, plant);
+        let mut rig = Self {
+            store,
+            drive,
+            in_op: true,
+            cycle_ns: MS,
+            now_ns: 0,
+            control_ns: CONTROL_PERIOD_NS,
+        };
+        rig.set(0x60c2, 1, 1);
+        rig
+    }
+
+    fn slot(&self, index: u16, sub: u8) -> Slot {
+        self.store.slot(index, sub).expect("the drive made it")
+    }
+
+    fn set(&mut self, index: u16, sub: u8, value: i64) {
+        let slot = self.slot(index, sub);
+        self.store.set(slot, value);
+    }
+
+    fn get(&self, index: u16) -> i64 {
+        self.store.get_signed(self.slot(index, 0))
+    }
+
+    fn word(&self) -> i64 {
+        self.store.get(self.slot(0x6041, 0))
+    }
+
+    /// One bus cycle: SYNC, then the control cycles that fall into it.
+    fn cycle(&mut self) {
+        self.drive.sync(&self.store);
+        self.now_ns += self.cycle_ns;
+        while self.control_ns <= self.now_ns {
+            self.drive.control(&mut self.store, self.in_op);
+            self.control_ns += CONTROL_PERIOD_NS;
+        }
+    }
+
+    fn cycles(&mut self, n: u32) {
+        for _ in 0..n {
+            self.cycle();
+        }
+    }
+
+    /// One SYNC and one control cycle: at most one transition.
+    fn step(&mut self, controlword: i64) -> State {
+        self.set(0x6040, 0, controlword);
+        self.drive.sync(&self.store);
+        self.drive.control(&mut self.store, self.in_op);
+        self.drive.state()
+    }
+
+    fn run_ms(&mut self, ms: u64) {
+        self.cycles(u32::try_from(ms * MS / self.cycle_ns).unwrap());
+    }
+
+    fn enable(&mut self, mode: i64) {
+        self.set(0x6060, 0, mode);
+        self.set(0x6040, 0, 0);
+        self.run_ms(10);
+        for word in [0x06, 0x0f] {
+            self.set(0x6040, 0, word);
+            let position = self.get(0x6064);
+            self.set(0x607a, 0, position);
+            self.run_ms(10);
+        }
+        assert_eq!(self.drive.state(), State::OperationEnabled);
+        assert_eq!(self.get(0x6061), mode);
+    }
+}
+
+fn rig() -> Rig {
+    Rig::new(PlantParams::default())
+}

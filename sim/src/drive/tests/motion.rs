@@ -1,0 +1,209 @@
+//! How well the cyclic modes follow.
+
+use super::*;
+
+/// A trapezoid in counts: position at a time, and how long it takes.
+struct Trapezoid {
+    distance: f64,
+    speed: f64,
+    acceleration: f64,
+}
+
+impl Trapezoid {
+    fn duration(&self) -> f64 {
+        self.distance / self.speed + self.speed / self.acceleration
+    }
+
+    fn at(&self, t: f64) -> f64 {
+        let ramp = self.speed / self.acceleration;
+        let rest = self.duration() - t;
+        if t < ramp {
+            0.5 * self.acceleration * t * t
+        } else if rest > ramp {
+            0.5 * self.speed * ramp + self.speed * (t - ramp)
+        } else if rest > 0.0 {
+            self.distance - 0.5 * self.acceleration * rest * rest
+        } else {
+            self.distance
+        }
+    }
+}
+
+const TRAPEZOID: Trapezoid = Trapezoid {
+    distance: 10.0 * 2000.0,
+    speed: 25.0 * 2000.0,
+    acceleration: 150.0 * 2000.0,
+};
+
+/// Runs the trapezoid in CSP, then half a second of rest. Largest following error while moving, range
+/// of the position at rest relative to the target.
+fn csp(rig: &mut Rig) -> (i64, i64, i64) {
+    let start = rig.get(0x6064);
+    let cycle = f64::from(u32::try_from(rig.cycle_ns).unwrap()) * 1e-9;
+    let (mut worst, mut t) = (0, 0.0);
+    while t < TRAPEZOID.duration() {
+        t += cycle;
+        #[expect(clippy::cast_possible_truncation)]
+        let target = start + TRAPEZOID.at(t).round() as i64;
+        rig.set(0x607a, 0, target);
+        rig.cycle();
+        worst = worst.max(rig.get(0x60f4).abs());
+    }
+    let target = rig.get(0x607a);
+    rig.run_ms(100);
+    let (mut low, mut high) = (i64::MAX, i64::MIN);
+    for _ in 0..500 {
+        rig.cycle();
+        let off = rig.get(0x6064) - target;
+        (low, high) = (low.min(off), high.max(off));
+    }
+    assert_eq!(rig.drive.state(), State::OperationEnabled);
+    assert_eq!(rig.word() & 0x3c00, 0x1000, "follows the command value");
+    (worst, low, high)
+}
+
+#[test]
+fn csp_follows_a_trapezoid_and_stands_still() {
+    for (cycle_us, value, index) in [(250, 25, -5), (500, 5, -4), (1000, 1, -3), (2000, 2, -3)] {
+        let mut rig = rig();
+        rig.cycle_ns = cycle_us * 1000;
+        rig.set(0x60c2, 1, value);
+        rig.set(0x60c2, 2, index);
+        rig.enable(8);
+        for turn in 0..3 {
+            let (worst, low, high) = csp(&mut rig);
+            println!("{cycle_us} µs, {turn}: worst {worst}, rest {low}..{high}");
+            assert!(worst < 100, "{cycle_us} µs: {worst} counts");
+            assert!(low >= -1 && high <= 1, "{cycle_us} µs: {low}..{high}");
+        }
+    }
+}
+
+#[test]
+fn csp_holds_against_a_load() {
+    let mut rig = rig();
+    rig.enable(8);
+    rig.drive.set_load_torque(0.05);
+    rig.cycles(300);
+    let (worst, low, high) = csp(&mut rig);
+    println!("loaded: worst {worst}, rest {low}..{high}");
+    assert!(
+        worst < 100 && low >= -1 && high <= 1,
+        "{worst} {low}..{high}"
+    );
+    assert!((rig.get(0x6077) - 422).abs() < 50, "{}", rig.get(0x6077));
+}
+
+#[test]
+fn csp_without_interpolation_takes_set_points_as_steps() {
+    let mut smooth = rig();
+    smooth.enable(8);
+    let mut stepped = rig();
+    stepped.set(0x60c2, 1, 0);
+    stepped.enable(8);
+    let rough = |rig: &mut Rig| {
+        let mut spread = (i64::MAX, i64::MIN);
+        for n in 0..200 {
+            rig.set(0x607a, 0, n * 20);
+            rig.cycle();
+            if n > 100 {
+                let torque = rig.get(0x6077);
+                spread = (spread.0.min(torque), spread.1.max(torque));
+            }
+        }
+        spread.1 - spread.0
+    };
+    let (a, b) = (rough(&mut smooth), rough(&mut stepped));
+    println!("torque ripple: interpolated {a}, stepped {b} per mille");
+    assert!(b > 3 * a, "{a} {b}");
+}
+
+#[test]
+fn csp_positions_wrap_like_the_32_bit_counter_they_are() {
+    let mut rig = Rig::new(PlantParams {
+        initial_position: i32::MAX - 100,
+        ..PlantParams::default()
+    });
+    rig.enable(8);
+    assert_eq!(rig.get(0x6064), i64::from(i32::MAX) - 100);
+    for n in 0..50 {
+        rig.set(0x607a, 0, i64::from(i32::MAX) - 100 + n * 10);
+        rig.cycle();
+    }
+    rig.cycles(100);
+    assert_eq!(rig.get(0x6064), i64::from(i32::MIN) + 389);
+    assert_eq!(rig.drive.state(), State::OperationEnabled);
+}
+
+#[test]
+fn csv_reaches_its_speed() {
+    let mut rig = rig();
+    rig.enable(9);
+    for rpm in [1500, -3000, 60, 0] {
+        rig.set(0x60ff, 0, rpm);
+        rig.cycles(400);
+        let wanted = f64::from(i32::try_from(rpm).unwrap()) / 60.0;
+        let mut worst: f64 = 0.0;
+        for _ in 0..100 {
+            rig.cycle();
+            worst = worst.max((rig.drive.velocity_rev_s() - wanted).abs());
+        }
+        println!("csv {rpm} rpm: off by {worst} rev/s at most");
+        assert!(worst <= 0.01 * wanted.abs().max(2.0), "{rpm} rpm: {worst}");
+        assert!((rig.get(0x606c) - rpm).abs() <= 2 + rpm.abs() / 100);
+    }
+}
+
+#[test]
+fn velocity_units_follow_0x60a9() {
+    // Where a speed is whole counts per control cycle, quantisation does not show.
+    for (code, value) in [
+        (0x00b4_4700, 600),
+        (0xfdb4_4700, 600_000),
+        (0x00b5_0300, 20_000),
+    ] {
+        let mut rig = rig();
+        rig.set(0x60a9, 0, code);
+        rig.enable(9);
+        rig.set(0x60ff, 0, value);
+        rig.cycles(300);
+        assert!((rig.drive.velocity_rev_s() - 10.0).abs() < 0.1, "{code:x}");
+        assert!((rig.get(0x606c) - value).abs() * 100 < value, "{code:x}");
+    }
+}
+
+#[test]
+fn cst_accelerates_against_friction_to_a_bounded_speed() {
+    let mut rig = rig();
+    rig.enable(10);
+    rig.set(0x6071, 0, 20);
+    rig.cycles(500);
+    assert_eq!(rig.drive.velocity_rev_s(), 0.0, "friction is more");
+    rig.set(0x6071, 0, 80);
+    rig.cycles(100);
+    assert!((rig.get(0x6077) - 80).abs() <= 1);
+    let early = rig.drive.velocity_rev_s();
+    rig.cycles(20_000);
+    let late = rig.drive.velocity_rev_s();
+    println!("cst 8 %: {early} rev/s after 0.1 s, {late} at the end");
+    // (80 ‰ of 118.4 mN·m − 4 mN·m) / 20 µN·m·s
+    assert!(early > 1.0 && (late - 43.5).abs() < 1.0);
+
+    rig.set(0x6071, 0, 1000);
+    rig.cycles(5_000);
+    let fast = rig.drive.velocity_rev_s();
+    println!("cst 100 %: {fast} rev/s");
+    assert!(fast < 100.5 && fast > 90.0, "0x6080 bounds it: {fast}");
+    assert_ne!(rig.word() & 1 << 11, 0, "internal limit");
+}
+
+#[test]
+fn two_runs_are_the_same_to_the_bit() {
+    let run = || {
+        let mut rig = rig();
+        rig.enable(8);
+        csp(&mut rig);
+        rig.drive.velocity_rev_s().to_bits() ^ rig.get(0x6077).unsigned_abs()
+    };
+    assert_eq!(run(), run());
+}
