@@ -1,0 +1,97 @@
+//! Emergencies: what a device says unasked, kept until somebody takes them.
+
+use std::collections::VecDeque;
+use std::fmt;
+
+/// How many emergencies wait to be taken. Beyond it the newest are dropped and counted: the first tell the cause.
+pub const EMERGENCY_QUEUE: usize = 32;
+
+/// One CoE emergency (ETG.1000.6 Table 50).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Emergency {
+    /// As in 0x603F; 0x0000 says that an earlier error is gone.
+    pub code: u16,
+    /// Error register 0x1001.
+    pub register: u8,
+    /// The manufacturer's own.
+    pub data: [u8; 5],
+}
+
+impl Emergency {
+    pub(super) fn parse(content: &[u8]) -> Option<Self> {
+        let ([low, high, register, data @ ..], _) = content.split_first_chunk::<8>()?;
+        Some(Self {
+            code: u16::from_le_bytes([*low, *high]),
+            register: *register,
+            data: *data,
+        })
+    }
+
+    /// An earlier error is gone.
+    pub fn is_reset(&self) -> bool {
+        self.code == 0
+    }
+
+    /// What CiA 301 says of the code's class. What it says exactly is in the drive's fault table.
+    pub fn class(&self) -> &'static str {
+        match self.code {
+            0xa000 => "PreOp to SafeOp failed",
+            0xa001 => "SafeOp to Op failed",
+            _ => match self.code >> 8 {
+                0x00 => "error reset or no error",
+                0x10 => "generic error",
+                0x20..=0x2f => "current",
+                0x30..=0x3f => "voltage",
+                0x40..=0x4f => "temperature",
+                0x50..=0x5f => "device hardware",
+                0x60..=0x6f => "device software",
+                0x70..=0x7f => "additional modules",
+                0x81 => "communication",
+                0x82 => "protocol",
+                0x80 | 0x83..=0x8f => "monitoring",
+                0x90..=0x9f => "external error",
+                0xf0..=0xfe => "additional functions",
+                0xff => "device specific",
+                _ => "unknown class",
+            },
+        }
+    }
+}
+
+impl fmt::Display for Emergency {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [a, b, c, d, e] = self.data;
+        write!(
+            f,
+            "emergency {:#06x} ({}), error register {:#04x}, data {a:02x} {b:02x} {c:02x} {d:02x} {e:02x}",
+            self.code,
+            self.class(),
+            self.register
+        )
+    }
+}
+
+/// A bounded queue that keeps the first.
+#[derive(Debug, Default)]
+pub(super) struct Emergencies {
+    queue: VecDeque<Emergency>,
+    lost: u64,
+}
+
+impl Emergencies {
+    pub(super) fn push(&mut self, emergency: Emergency) {
+        if self.queue.len() < EMERGENCY_QUEUE {
+            self.queue.push_back(emergency);
+        } else {
+            self.lost += 1;
+        }
+    }
+
+    pub(super) fn take(&mut self) -> impl Iterator<Item = Emergency> + '_ {
+        self.queue.drain(..)
+    }
+
+    pub(super) fn lost(&self) -> u64 {
+        self.lost
+    }
+}

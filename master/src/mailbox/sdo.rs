@@ -1,0 +1,513 @@
+//! The CoE client of one SubDevice: SDO upload and download, expedited, normal and segmented, with complete access.
+
+use super::coe::{Answer, Message, Request, download_room, parse, segment_room};
+use super::emergency::Emergency;
+use super::error::{Phase, SdoError};
+use super::port::{Deadline, Port, Trouble};
+use super::{MailboxLayout, Timeouts, Wire};
+
+/// Bytes of the largest object that is read or written.
+pub const MAX_OBJECT: usize = 1 << 20;
+/// Messages that [`CoeClient::drain`] reads at most in one go.
+const DRAIN: usize = 64;
+
+const ABORT_TOGGLE: u32 = 0x0503_0000;
+const ABORT_TIMEOUT: u32 = 0x0504_0000;
+const ABORT_MEMORY: u32 = 0x0504_0005;
+const ABORT_GENERAL: u32 = 0x0800_0000;
+
+/// One SubDevice's CoE mailbox. One transfer at a time. A transfer that failed, or whose future was dropped, leaves
+/// nothing behind that the next one would take for its answer.
+#[derive(Debug)]
+pub struct CoeClient {
+    port: Port,
+    /// A transfer ended without its last answer; it may still come.
+    unsettled: bool,
+}
+
+/// What one transfer is about, and how long it may take.
+struct Transfer {
+    station: u16,
+    index: u16,
+    sub: u8,
+    complete: bool,
+    deadline: Deadline,
+    /// [`Port::forgotten`] at its beginning.
+    forgotten: u64,
+}
+
+/// Why a transfer ended, and what the device is told where it still waits for more.
+struct Ended {
+    error: SdoError,
+    abort: Option<u32>,
+}
+
+impl CoeClient {
+    pub fn new(layout: MailboxLayout) -> Self {
+        Self {
+            port: Port::new(layout),
+            unsettled: true,
+        }
+    }
+
+    /// The same with other timeouts.
+    #[must_use]
+    pub fn with_timeouts(mut self, timeouts: Timeouts) -> Self {
+        self.port.timeouts = timeouts;
+        self
+    }
+
+    pub fn layout(&self) -> &MailboxLayout {
+        &self.port.layout
+    }
+
+    /// Reads an object. With `complete` all of it from `sub` (0 or 1) on, as ETG.1000.6 lays it out.
+    pub async fn upload<W: Wire>(
+        &mut self,
+        w: &W,
+        index: u16,
+        sub: u8,
+        complete: bool,
+    ) -> Result<Vec<u8>, SdoError> {
+        let mut transfer = self.begin(w, index, sub, complete).await?;
+        let result = self.upload_in(w, &mut transfer).await;
+        self.end(w, &transfer, result).await
+    }
+
+    /// Writes an object. With `complete` all of it from `sub` (0 or 1) on.
+    pub async fn download<W: Wire>(
+        &mut self,
+        w: &W,
+        index: u16,
+        sub: u8,
+        complete: bool,
+        data: &[u8],
+    ) -> Result<(), SdoError> {
+        let mut transfer = self.begin(w, index, sub, complete).await?;
+        let result = self.download_in(w, &mut transfer, data).await;
+        self.end(w, &transfer, result).await
+    }
+
+    /// Empties the SubDevice's mailbox: keeps emergencies, forgets everything else. Returns how many messages it read.
+    pub async fn drain<W: Wire>(&mut self, w: &W) -> Result<usize, SdoError> {
+        self.port
+            .check()
+            .map_err(|trouble| self.explain_drain(trouble))?;
+        self.port
+            .drain(w, DRAIN)
+            .await
+            .map_err(|trouble| self.explain_drain(trouble))
+    }
+
+    /// What the SubDevice reported unasked since the last call, oldest first.
+    pub fn take_emergencies(&mut self) -> impl Iterator<Item = Emergency> + '_ {
+        self.port.emergencies.take()
+    }
+
+    /// How many emergencies found the queue full.
+    pub fn lost_emergencies(&self) -> u64 {
+        self.port.emergencies.lost()
+    }
+
+    /// How many messages came that nothing waited for, emergencies not counted.
+    pub fn set_aside(&self) -> u64 {
+        self.port.forgotten
+    }
+
+    async fn begin<W: Wire>(
+        &mut self,
+        w: &W,
+        index: u16,
+        sub: u8,
+        complete: bool,
+    ) -> Result<Transfer, SdoError> {
+        let mut transfer = Transfer {
+            station: self.port.layout.station,
+            index,
+            sub,
+            complete,
+            deadline: Deadline::after(w, self.port.timeouts.transfer),
+            forgotten: self.port.forgotten,
+        };
+        self.port
+            .check()
+            .map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
+        if self.unsettled {
+            let drained = self.port.drain(w, DRAIN).await;
+            drained.map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
+        }
+        self.unsettled = true;
+        transfer.deadline = Deadline::after(w, self.port.timeouts.transfer);
+        transfer.forgotten = self.port.forgotten;
+        Ok(transfer)
+    }
+
+    async fn end<W: Wire, T>(
+        &mut self,
+        w: &W,
+        transfer: &Transfer,
+        result: Result<T, Ended>,
+    ) -> Result<T, SdoError> {
+        match result {
+            Ok(value) => {
+                self.unsettled = false;
+                Ok(value)
+            }
+            Err(Ended { error, abort }) => {
+                if matches!(error, SdoError::Abort { .. }) {
+                    self.unsettled = false;
+                }
+                if let Some(code) = abort {
+                    // The device may not hear it; what matters to the caller is the first error.
+                    let farewell = Request::Abort {
+                        index: transfer.index,
+                        sub: transfer.sub,
+                        code,
+                    };
+                    let _ = self.port.send(w, &farewell).await;
+                }
+                Err(error)
+            }
+        }
+    }
+
+    async fn upload_in<W: Wire>(
+        &mut self,
+        w: &W,
+        transfer: &mut Transfer,
+    ) -> Result<Vec<u8>, Ended> {
+        let Transfer {
+            index,
+            sub,
+            complete,
+            ..
+        } = *transfer;
+        let (size, mut data) = self
+            .ask(
+                w,
+                transfer,
+                &Request::Upload {
+                    index,
+                    sub,
+                    complete,
+                },
+                |answer| match answer {
+                    Answer::Upload { size, data, .. } => Some((*size, data.to_vec())),
+                    _ => None,
+                },
+            )
+            .await?;
+        if size > MAX_OBJECT {
+            return Err(transfer.too_large(size).telling(ABORT_MEMORY));
+        }
+        if data.len() >= size {
+            return Ok(data);
+        }
+        let mut toggle = false;
+        loop {
+            let (seen, last, part) = self
+                .ask(
+                    w,
+                    transfer,
+                    &Request::UploadSegment { toggle },
+                    |answer| match answer {
+                        Answer::UploadSegment { toggle, last, data } => {
+                            Some((*toggle, *last, data.to_vec()))
+                        }
+                        _ => None,
+                    },
+                )
+                .await?;
+            if seen != toggle {
+                return Err(transfer
+                    .malformed("the toggle bit of a segment did not alternate")
+                    .telling(ABORT_TOGGLE));
+            }
+            if part.is_empty() && !last {
+                return Err(transfer
+                    .malformed("a segment without data")
+                    .telling(ABORT_GENERAL));
+            }
+            data.extend_from_slice(&part);
+            if data.len() > size || last && data.len() < size {
+                let what = format!("{size} bytes were announced, {} came", data.len());
+                let ended = transfer.malformed(what);
+                return Err(if last {
+                    ended
+                } else {
+                    ended.telling(ABORT_GENERAL)
+                });
+            }
+            if last {
+                return Ok(data);
+            }
+            toggle = !toggle;
+        }
+    }
+
+    async fn download_in<W: Wire>(
+        &mut self,
+        w: &W,
+        transfer: &mut Transfer,
+        data: &[u8],
+    ) -> Result<(), Ended> {
+        let Transfer {
+            index,
+            sub,
+            complete,
+            ..
+        } = *transfer;
+        let size = match u32::try_from(data.len()) {
+            Ok(size) if data.len() <= MAX_OBJECT => size,
+            _ => return Err(transfer.too_large(data.len())),
+        };
+        let expedited = (1..=4).contains(&data.len()) && !complete;
+        let room = download_room(self.port.layout.out_len);
+        let (first, mut rest) = if expedited {
+            (data, &[][..])
+        } else {
+            data.split_at(room.min(data.len()))
+        };
+        let request = if expedited {
+            Request::DownloadExpedited {
+                index,
+                sub,
+                data: first,
+            }
+        } else {
+            Request::Download {
+                index,
+                sub,
+                complete,
+                size,
+                data: first,
+            }
+        };
+        self.ask(w, transfer, &request, |answer| {
+            matches!(answer, Answer::Download { .. }).then_some(())
+        })
+        .await?;
+
+        let room = segment_room(self.port.layout.out_len);
+        let mut toggle = false;
+        while !rest.is_empty() {
+            let (part, remaining) = rest.split_at(room.min(rest.len()));
+            rest = remaining;
+            let request = Request::DownloadSegment {
+                toggle,
+                last: rest.is_empty(),
+                data: part,
+            };
+            let seen = self
+                .ask(w, transfer, &request, |answer| match answer {
+                    Answer::DownloadSegment { toggle } => Some(*toggle),
+                    _ => None,
+                })
+                .await?;
+            if seen != toggle {
+                return Err(transfer
+                    .malformed("the toggle bit of a segment did not alternate")
+                    .telling(ABORT_TOGGLE));
+            }
+            toggle = !toggle;
+        }
+        Ok(())
+    }
+
+    /// Sends a request and waits for its answer. `expected` picks what it needs out of the answer; what answers
+    /// something else is set aside.
+    async fn ask<W: Wire, T>(
+        &mut self,
+        w: &W,
+        transfer: &mut Transfer,
+        request: &Request<'_>,
+        expected: impl Fn(&Answer<'_>) -> Option<T>,
+    ) -> Result<T, Ended> {
+        let in_segments = matches!(
+            request,
+            Request::UploadSegment { .. } | Request::DownloadSegment { .. }
+        );
+        let told = |ended: Ended, code| {
+            if in_segments {
+                ended.telling(code)
+            } else {
+                ended
+            }
+        };
+        if let Err(trouble) = self.port.send(w, request).await {
+            return Err(transfer.trouble(&self.port, trouble));
+        }
+        let mut deadline = Deadline::after(w, self.port.timeouts.answer);
+        loop {
+            if transfer.deadline.passed(w) {
+                let ended = transfer.trouble(&self.port, Trouble::Timeout(Phase::Transfer));
+                return Err(told(ended, ABORT_TIMEOUT));
+            }
+            match self.port.receive(w, &mut deadline).await {
+                Ok(()) => {}
+                Err(trouble @ Trouble::Timeout(_)) => {
+                    return Err(told(transfer.trouble(&self.port, trouble), ABORT_TIMEOUT));
+                }
+                Err(trouble) => return Err(transfer.trouble(&self.port, trouble)),
+            }
+            match parse(self.port.message()) {
+                // Among segments, which carry no address, devices do not fill in that of an abort either.
+                Ok(Message::Sdo(Answer::Abort { index, code, .. }))
+                    if in_segments || index == transfer.index =>
+                {
+                    return Err(transfer.aborted(code));
+                }
+                Ok(Message::Sdo(answer)) if transfer.fits(&answer) => {
+                    if let Some(value) = expected(&answer) {
+                        return Ok(value);
+                    }
+                }
+                Ok(Message::Refused(code)) => return Err(transfer.refused(code)),
+                Ok(_) => {}
+                Err(flaw) => return Err(told(transfer.malformed(flaw), ABORT_GENERAL)),
+            }
+            self.port.set_aside();
+            deadline.pause(w).await;
+        }
+    }
+
+    fn explain_drain(&self, trouble: Trouble) -> SdoError {
+        let MailboxLayout {
+            station,
+            out_len,
+            in_len,
+            ..
+        } = self.port.layout;
+        match trouble {
+            Trouble::Wire(error) => SdoError::Wire(error),
+            Trouble::Layout => SdoError::Mailbox {
+                station,
+                out_len,
+                in_len,
+            },
+            // Draining waits for nothing, so nothing but the device can be missing.
+            Trouble::Gone | Trouble::Timeout(_) => SdoError::Gone { station },
+        }
+    }
+}
+
+impl Transfer {
+    /// Whether an answer is to this transfer, as far as it says. With complete access devices differ in the subindex.
+    fn fits(&self, answer: &Answer<'_>) -> bool {
+        match *answer {
+            Answer::Upload { index, sub, .. } | Answer::Download { index, sub } => {
+                index == self.index && (sub == self.sub || self.complete)
+            }
+            Answer::UploadSegment { .. } | Answer::DownloadSegment { .. } => true,
+            Answer::Abort { .. } => false,
+        }
+    }
+
+    fn trouble(&self, port: &Port, trouble: Trouble) -> Ended {
+        let Self {
+            station,
+            index,
+            sub,
+            ..
+        } = *self;
+        let MailboxLayout {
+            out_len, in_len, ..
+        } = port.layout;
+        Ended::from(match trouble {
+            Trouble::Gone => SdoError::Gone { station },
+            Trouble::Wire(error) => SdoError::Wire(error),
+            Trouble::Layout => SdoError::Mailbox {
+                station,
+                out_len,
+                in_len,
+            },
+            Trouble::Timeout(phase) => SdoError::Timeout {
+                station,
+                index,
+                sub,
+                phase,
+                after: match phase {
+                    Phase::Request | Phase::Repeat => port.timeouts.request,
+                    Phase::Answer => port.timeouts.answer,
+                    Phase::Transfer => port.timeouts.transfer,
+                },
+                set_aside: port.forgotten.saturating_sub(self.forgotten),
+            },
+        })
+    }
+
+    fn aborted(&self, code: u32) -> Ended {
+        let Self {
+            station,
+            index,
+            sub,
+            ..
+        } = *self;
+        Ended::from(SdoError::Abort {
+            station,
+            index,
+            sub,
+            code,
+        })
+    }
+
+    fn refused(&self, code: u16) -> Ended {
+        let Self {
+            station,
+            index,
+            sub,
+            ..
+        } = *self;
+        Ended::from(SdoError::Refused {
+            station,
+            index,
+            sub,
+            code,
+        })
+    }
+
+    fn malformed(&self, what: impl ToString) -> Ended {
+        let Self {
+            station,
+            index,
+            sub,
+            ..
+        } = *self;
+        Ended::from(SdoError::Malformed {
+            station,
+            index,
+            sub,
+            what: what.to_string(),
+        })
+    }
+
+    fn too_large(&self, size: usize) -> Ended {
+        let Self {
+            station,
+            index,
+            sub,
+            ..
+        } = *self;
+        Ended::from(SdoError::TooLarge {
+            station,
+            index,
+            sub,
+            size,
+        })
+    }
+}
+
+impl From<SdoError> for Ended {
+    fn from(error: SdoError) -> Self {
+        Self { error, abort: None }
+    }
+}
+
+impl Ended {
+    fn telling(self, code: u32) -> Self {
+        Self {
+            abort: Some(code),
+            ..self
+        }
+    }
+}
