@@ -2,13 +2,27 @@
 //!
 //! - [`model`]: what an ESI file says, as data; every origin of a derived value keeps its line
 //! - [`parse`] (`xml/`): the file's bytes → model
+//! - [`select`](mod@select): the user's choice of device, module, PDOs and DC mode
+//! - [`layout`]: that choice → bit offsets
+//! - [`startup`]: that choice → the SDOs to send before SafeOp
 
 #![forbid(unsafe_code)]
 
 mod error;
+pub mod layout;
+mod mode;
 pub mod model;
+pub mod select;
+pub mod startup;
 mod xml;
 
 pub use error::{EsiError, EsiProblem};
+pub use layout::{Field, Layout, SmLayout};
+pub use mode::{Mode, UnknownMode};
 pub use model::*;
+pub use select::{
+    Choice, DcSettings, DeviceQuery, EntryRef, SelectError, SelectedModule, Selection, UserSdo,
+    find_device, offered_modes, select,
+};
+pub use startup::StartupSdo;
 pub use xml::parse;

@@ -1,5 +1,7 @@
 //! Every recorded vendor file can be read, and the drive we know best is read exactly.
 
+#![allow(clippy::print_stdout)]
+
 mod common;
 
 use ecaxis_esi::parse;

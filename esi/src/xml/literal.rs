@@ -111,7 +111,7 @@ fn value(text: &str, type_name: &str, bit_len: u32, length: usize) -> Result<Vec
     }
     out.truncate(length);
     // A negative number in an odd length must not carry its sign past the last bit.
-    if bit_len % 8 != 0
+    if !bit_len.is_multiple_of(8)
         && let Some(last) = out.last_mut()
     {
         *last &= (1u8 << (bit_len % 8)) - 1;

@@ -169,7 +169,7 @@ fn record_items(types: &DataTypes, record: &DataType) -> (ObjectCode, Vec<Slot>)
                     };
                     slots.push(Slot {
                         sub,
-                        name: String::new(),
+                        name: format!("SubIndex {sub:03}"),
                         type_name: element.to_owned(),
                         bit_len: bits,
                         bit_offset: offset.saturating_add(bits.saturating_mul(number)),

@@ -1,0 +1,177 @@
+//! Where each mapped object lies: PDOs of one SyncManager are packed bit by bit in the order of assignment,
+//! each SyncManager starts at a byte.
+
+use crate::model::{Device, FmmuUse, Pdo};
+use crate::select::SelectError;
+
+/// The process data of one device.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Layout {
+    /// By SyncManager number; couplers have several in one direction.
+    pub outputs: Vec<SmLayout>,
+    pub inputs: Vec<SmLayout>,
+    pub rx: Vec<Field>,
+    pub tx: Vec<Field>,
+}
+
+/// One process data SyncManager.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SmLayout {
+    pub sm: u8,
+    pub start_address: u16,
+    pub control_byte: u8,
+    /// Bytes.
+    pub len: u16,
+    /// The FMMU that the ESI intends for it.
+    pub fmmu: Option<u8>,
+}
+
+/// One mapped object; gaps have no field.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Field {
+    pub pdo: u16,
+    pub index: u16,
+    pub sub: u8,
+    /// From the start of this direction's process data of the device, over all its SyncManagers.
+    pub bit_offset: u32,
+    pub bit_len: u16,
+    pub name: String,
+    pub data_type: String,
+}
+
+impl Layout {
+    /// `rx` and `tx` in the order of assignment, each with its SyncManager.
+    pub fn new(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Result<Self, SelectError> {
+        let (outputs, rx) = direction(device, rx, FmmuUse::Outputs)?;
+        let (inputs, tx) = direction(device, tx, FmmuUse::Inputs)?;
+        let layout = Self {
+            outputs,
+            inputs,
+            rx,
+            tx,
+        };
+        // Digital I/O controllers without a processor latch single bytes and need no buffers.
+        if device.mailbox.is_some() {
+            layout.check_memory()?;
+        }
+        Ok(layout)
+    }
+
+    #[must_use]
+    pub fn rx_bytes(&self) -> usize {
+        self.outputs.iter().map(|sm| usize::from(sm.len)).sum()
+    }
+
+    #[must_use]
+    pub fn tx_bytes(&self) -> usize {
+        self.inputs.iter().map(|sm| usize::from(sm.len)).sum()
+    }
+
+    #[must_use]
+    pub fn rx_field(&self, index: u16, sub: u8) -> Option<&Field> {
+        self.rx
+            .iter()
+            .find(|field| field.index == index && field.sub == sub)
+    }
+
+    #[must_use]
+    pub fn tx_field(&self, index: u16, sub: u8) -> Option<&Field> {
+        self.tx
+            .iter()
+            .find(|field| field.index == index && field.sub == sub)
+    }
+
+    /// A buffered SyncManager occupies three times its length of the device's memory.
+    fn check_memory(&self) -> Result<(), SelectError> {
+        const PROCESS_MEMORY: u16 = 0x1000;
+        let all = || self.outputs.iter().chain(&self.inputs);
+        for sm in
+            all().filter(|sm| sm.start_address >= PROCESS_MEMORY && sm.control_byte & 0x03 == 0)
+        {
+            let end = u32::from(sm.start_address) + 3 * u32::from(sm.len);
+            let hit = all().find(|other| {
+                other.start_address > sm.start_address
+                    && u32::from(other.start_address) < end
+                    && other.len > 0
+            });
+            if let Some(other) = hit {
+                return Err(SelectError::SyncManagersOverlap {
+                    sm: sm.sm,
+                    start: sm.start_address,
+                    len: sm.len,
+                    other: other.sm,
+                    other_start: other.start_address,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+fn direction(
+    device: &Device,
+    pdos: &[Pdo],
+    usage: FmmuUse,
+) -> Result<(Vec<SmLayout>, Vec<Field>), SelectError> {
+    let mut numbers: Vec<u8> = pdos.iter().filter_map(|pdo| pdo.sm).collect();
+    numbers.sort_unstable();
+    numbers.dedup();
+    let fmmus: Vec<u8> = (0u8..)
+        .zip(&device.fmmus)
+        .filter(|(_, u)| **u == usage)
+        .map(|(number, _)| number)
+        .collect();
+    let (mut sms, mut fields) = (Vec::new(), Vec::new());
+    let mut offset = 0u32;
+    for number in numbers {
+        let Some(sm) = device.sync_managers.get(usize::from(number)) else {
+            continue;
+        };
+        let start = offset;
+        for pdo in pdos.iter().filter(|pdo| pdo.sm == Some(number)) {
+            for entry in &pdo.entries {
+                if !entry.is_gap() {
+                    fields.push(Field {
+                        pdo: pdo.index,
+                        index: entry.index,
+                        sub: entry.sub,
+                        bit_offset: offset,
+                        bit_len: entry.bit_len,
+                        name: entry.name.clone(),
+                        data_type: entry.data_type.clone(),
+                    });
+                }
+                offset = offset.saturating_add(u32::from(entry.bit_len));
+            }
+        }
+        let bytes = (offset - start).div_ceil(8);
+        let max = sm
+            .max_size
+            .filter(|max| *max > 0)
+            .map_or(u32::from(u16::MAX), u32::from);
+        let direction = match usage {
+            FmmuUse::Outputs => "outputs",
+            _ => "inputs",
+        };
+        let len = u16::try_from(bytes).ok().filter(|_| bytes <= max).ok_or(
+            SelectError::SyncManagerFull {
+                sm: number,
+                direction,
+                len: bytes,
+                max,
+            },
+        )?;
+        offset = start.saturating_add(bytes.saturating_mul(8));
+        if len > 0 {
+            let fmmu = fmmus.get(sms.len()).or(fmmus.last()).copied();
+            sms.push(SmLayout {
+                sm: number,
+                start_address: sm.start_address,
+                control_byte: sm.control_byte,
+                len,
+                fmmu,
+            });
+        }
+    }
+    Ok((sms, fields))
+}

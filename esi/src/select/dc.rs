@@ -1,0 +1,126 @@
+//! Which DC operation mode, and its times at this bus cycle.
+
+use super::SelectError;
+use crate::model::{DcMode, Device, Position, SyncTime};
+
+/// What goes into the DC registers of one device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DcSettings {
+    pub name: String,
+    pub position: Position,
+    /// Low byte → 0x0980, high byte → 0x0981.
+    pub assign_activate: u16,
+    pub sync0_cycle_ns: u32,
+    pub sync0_shift_ns: i32,
+    pub sync1_cycle_ns: u32,
+    pub sync1_shift_ns: i32,
+}
+
+const SYNC0: u16 = 0x0200;
+const SYNC1: u16 = 0x0400;
+
+/// `None`: no distributed clock (an OpMode whose AssignActivate is 0, or none at all).
+///
+/// Without a wish a module's `DcOpModeName` decides; a synchronous drive takes the first OpMode that activates
+/// the clock, wherever it stands in the list; other devices take the first.
+pub(super) fn choose(
+    device: &Device,
+    wanted: Option<&str>,
+    by_module: Option<&str>,
+    synchronous: bool,
+    cycle_ns: u64,
+) -> Result<Option<DcSettings>, SelectError> {
+    let named = |name: &str| {
+        device.dc_modes.iter().find(|mode| {
+            mode.name.eq_ignore_ascii_case(name) || mode.description.eq_ignore_ascii_case(name)
+        })
+    };
+    let mode = match wanted {
+        Some(name) => match named(name) {
+            Some(mode) => Some(mode),
+            None if name.eq_ignore_ascii_case("off") || name.eq_ignore_ascii_case("none") => None,
+            None => {
+                let names: Vec<String> = device
+                    .dc_modes
+                    .iter()
+                    .map(|mode| {
+                        format!(
+                            "{:?} (AssignActivate 0x{:03x})",
+                            mode.name, mode.assign_activate
+                        )
+                    })
+                    .chain(["\"off\"".to_owned()])
+                    .collect();
+                return Err(SelectError::NoSuchDcMode {
+                    device: device.name.clone(),
+                    wanted: name.to_owned(),
+                    offered: names.join(", "),
+                });
+            }
+        },
+        None => by_module
+            .and_then(named)
+            .or_else(|| {
+                device
+                    .dc_modes
+                    .iter()
+                    .find(|mode| synchronous && mode.assign_activate != 0)
+            })
+            .or(device.dc_modes.first()),
+    };
+    match mode {
+        Some(mode) if mode.assign_activate != 0 => settings(mode, cycle_ns).map(Some),
+        _ => Ok(None),
+    }
+}
+
+fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, SelectError> {
+    let error = |what| SelectError::DcOutOfRange {
+        mode: mode.name.clone(),
+        cycle_ns,
+        what,
+    };
+    let bus = i128::from(cycle_ns);
+    // A SYNC signal that is activated and has neither cycle nor factor follows the bus.
+    let sync0 = match cycle(mode.sync0, bus) {
+        0 if mode.assign_activate & SYNC0 != 0 => bus,
+        cycle => cycle,
+    };
+    let sync1 = match cycle(mode.sync1, sync0) {
+        _ if mode.assign_activate & SYNC1 == 0 => 0,
+        0 => sync0,
+        cycle => cycle,
+    };
+    Ok(DcSettings {
+        name: mode.name.clone(),
+        position: mode.position,
+        assign_activate: mode.assign_activate,
+        sync0_cycle_ns: u32::try_from(sync0).map_err(|_| error("a SYNC0 cycle"))?,
+        sync0_shift_ns: i32::try_from(shift(mode.sync0, sync0))
+            .map_err(|_| error("a SYNC0 shift"))?,
+        sync1_cycle_ns: u32::try_from(sync1).map_err(|_| error("a SYNC1 cycle"))?,
+        sync1_shift_ns: i32::try_from(shift(mode.sync1, sync0))
+            .map_err(|_| error("a SYNC1 shift"))?,
+    })
+}
+
+fn cycle(time: SyncTime, base: i128) -> i128 {
+    if time.cycle_ns != 0 {
+        i128::from(time.cycle_ns)
+    } else {
+        scaled(time.factor, base)
+    }
+}
+
+fn shift(time: SyncTime, base: i128) -> i128 {
+    i128::from(time.shift_ns) + scaled(time.shift_factor, base)
+}
+
+/// ETG.2000: a positive factor multiplies, a negative one divides.
+fn scaled(factor: i32, base: i128) -> i128 {
+    match i128::from(factor) {
+        0 => 0,
+        factor if factor > 0 => base * factor,
+        factor => base / -factor,
+    }
+}

@@ -1,0 +1,106 @@
+//! Which device of a file is meant.
+
+use std::fmt;
+
+use super::SelectError;
+use crate::model::{Device, EsiFile};
+
+/// What is known about a device; `None` matches everything.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct DeviceQuery<'a> {
+    /// `Type` or `Name` of the device, upper and lower case alike.
+    pub name: Option<&'a str>,
+    pub product: Option<u32>,
+    pub revision: Option<u32>,
+}
+
+impl fmt::Display for DeviceQuery<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut parts = Vec::new();
+        if let Some(name) = self.name {
+            parts.push(format!("{name:?}"));
+        }
+        if let Some(product) = self.product {
+            parts.push(format!("product 0x{product:08x}"));
+        }
+        if let Some(revision) = self.revision {
+            parts.push(format!("revision 0x{revision:08x}"));
+        }
+        if parts.is_empty() {
+            parts.push("any device".to_owned());
+        }
+        f.write_str(&parts.join(", "))
+    }
+}
+
+/// The one device that `query` describes; of several revisions of one product the newest.
+pub fn find_device<'a>(
+    file: &'a EsiFile,
+    query: &DeviceQuery<'_>,
+) -> Result<&'a Device, SelectError> {
+    if file.devices.is_empty() {
+        return Err(SelectError::NoDevices);
+    }
+    let named = |device: &&Device| {
+        query.name.is_none_or(|name| {
+            let name = name.trim();
+            device.type_name.eq_ignore_ascii_case(name) || device.name.eq_ignore_ascii_case(name)
+        })
+    };
+    let matching: Vec<&Device> = file
+        .devices
+        .iter()
+        .filter(named)
+        .filter(|device| {
+            query
+                .product
+                .is_none_or(|product| device.identity.product == product)
+        })
+        .filter(|device| {
+            query
+                .revision
+                .is_none_or(|revision| device.identity.revision == revision)
+        })
+        .collect();
+    let Some(newest) = matching
+        .iter()
+        .copied()
+        .max_by_key(|device| device.identity.revision)
+    else {
+        let available = list(file.devices.iter());
+        return Err(SelectError::NoSuchDevice {
+            query: query.to_string(),
+            available,
+        });
+    };
+    if matching
+        .iter()
+        .any(|device| device.identity.product != newest.identity.product)
+    {
+        let available = list(matching.into_iter());
+        return Err(SelectError::Ambiguous {
+            query: query.to_string(),
+            available,
+        });
+    }
+    Ok(newest)
+}
+
+fn list<'a>(devices: impl Iterator<Item = &'a Device>) -> String {
+    const SHOWN: usize = 12;
+    let texts: Vec<String> = devices
+        .map(|device| {
+            let id = device.identity;
+            format!(
+                "{} ({}, product 0x{:08x} revision 0x{:08x})",
+                device.type_name, device.name, id.product, id.revision
+            )
+        })
+        .collect();
+    let more = texts.len().saturating_sub(SHOWN);
+    let mut text = texts.into_iter().take(SHOWN).collect::<Vec<_>>().join("; ");
+    if more > 0 {
+        text.push_str(&format!("; and {more} more"));
+    }
+    text
+}

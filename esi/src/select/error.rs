@@ -1,0 +1,138 @@
+//! Why a choice does not fit the ESI file.
+
+use crate::mode::Mode;
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SelectError {
+    #[error("the ESI file describes no device")]
+    NoDevices,
+    #[error("no device in the ESI file matches {query}; it contains {available}")]
+    NoSuchDevice { query: String, available: String },
+    #[error("{query} matches several devices: {available}")]
+    Ambiguous { query: String, available: String },
+    #[error("{device} offers no mode {mode}; the ESI offers {offered}")]
+    ModeNotOffered {
+        device: String,
+        mode: Mode,
+        offered: String,
+    },
+    #[error(
+        "{device}, slot {slot:?} needs a module and the ESI marks none as default; it offers {offered}"
+    )]
+    ModuleNeeded {
+        device: String,
+        slot: String,
+        offered: String,
+    },
+    #[error(
+        "{device} has {count} slots that need a module; one is supported, further slots must be optional"
+    )]
+    SeveralSlots { device: String, count: usize },
+    #[error("slot {slot:?} names module 0x{ident:08x}, which the ESI file does not describe")]
+    UnknownModule { slot: String, ident: u32 },
+    #[error("{device} has no DC mode {wanted:?}; the ESI offers {offered}")]
+    NoSuchDcMode {
+        device: String,
+        wanted: String,
+        offered: String,
+    },
+    #[error(
+        "DC mode {mode:?} at a bus cycle of {cycle_ns} ns gives {what} that does not fit its register"
+    )]
+    DcOutOfRange {
+        mode: String,
+        cycle_ns: u64,
+        what: &'static str,
+    },
+    #[error(
+        "PDO 0x{pdo:04x} is not assigned to a SyncManager and {device} has none for {direction}"
+    )]
+    NoSyncManager {
+        device: String,
+        pdo: u16,
+        direction: &'static str,
+    },
+    #[error(
+        "{list}: object 0x{index:04x}:{sub:02x} is neither in the dictionary nor in a PDO of the ESI, so its length is unknown"
+    )]
+    UnknownEntry {
+        list: &'static str,
+        index: u16,
+        sub: u8,
+    },
+    #[error("{list}: object 0x{index:04x}:{sub:02x} ({name}) cannot be mapped into a {direction}")]
+    NotMappable {
+        list: &'static str,
+        index: u16,
+        sub: u8,
+        name: String,
+        direction: &'static str,
+    },
+    #[error(
+        "{list}: {device} does not let its PDOs be configured (CoE PdoConfig is not set, or all are Fixed)"
+    )]
+    NotConfigurable { list: &'static str, device: String },
+    #[error("{list}: {count} entries, PDO 0x{pdo:04x} takes at most {max}")]
+    TooManyEntries {
+        list: &'static str,
+        pdo: u16,
+        count: usize,
+        max: usize,
+    },
+    #[error("{list}: mode {mode} needs 0x{index:04x} in it")]
+    MissingEntry {
+        list: &'static str,
+        mode: Mode,
+        index: u16,
+    },
+    #[error(
+        "{device} does not let its PDO assignment be changed (CoE PdoAssign is not set) and its default is {default}, not {wanted}"
+    )]
+    AssignmentFixed {
+        device: String,
+        default: String,
+        wanted: String,
+    },
+    #[error(
+        "PDO 0x{pdo:04x} of {device} would need other contents, which CoE PdoConfig does not allow"
+    )]
+    ContentsFixed { device: String, pdo: u16 },
+    #[error("SyncManager {sm} would carry {len} bytes of {direction}, it takes at most {max}")]
+    SyncManagerFull {
+        sm: u8,
+        direction: &'static str,
+        len: u32,
+        max: u32,
+    },
+    #[error(
+        "SyncManager {sm} (0x{start:04x}, {len} bytes, three buffers) reaches into SyncManager {other} at 0x{other_start:04x}"
+    )]
+    SyncManagersOverlap {
+        sm: u8,
+        start: u16,
+        len: u16,
+        other: u8,
+        other_start: u16,
+    },
+    #[error(
+        "a cycle of {cycle_ns} ns cannot be written to 0x60C2 (value {min}..{max} times a power of ten); nearest are {nearest}"
+    )]
+    CycleNotExpressible {
+        cycle_ns: u64,
+        min: u8,
+        max: u8,
+        nearest: String,
+    },
+    #[error(
+        "start-up SDO 0x{index:04x}:{sub:02x} ({name}) has {given} bytes, the object has {expected}"
+    )]
+    SdoLength {
+        index: u16,
+        sub: u8,
+        name: String,
+        given: usize,
+        expected: usize,
+    },
+    #[error("{device} has no CoE mailbox, so {what} cannot be written")]
+    NoCoe { device: String, what: &'static str },
+}

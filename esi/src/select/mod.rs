@@ -1,0 +1,168 @@
+//! The user's choice applied to what the ESI offers: device, module, PDOs and DC mode.
+//!
+//! `device` finds the device in the file, `module` fills the slot, `pdo` assigns and fills PDOs, `dc` picks the
+//! OpMode; [`select`] puts them together with layout and start-up list. Nothing here talks to a device.
+
+mod dc;
+mod device;
+mod error;
+mod module;
+mod pdo;
+
+pub use dc::DcSettings;
+pub use device::{DeviceQuery, find_device};
+pub use error::SelectError;
+
+use crate::layout::Layout;
+use crate::mode::Mode;
+use crate::model::{Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Pdo, Position};
+use crate::startup::{self, StartupSdo};
+
+/// An object to be mapped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct EntryRef {
+    pub index: u16,
+    pub sub: u8,
+}
+
+/// A start-up SDO of the user's.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UserSdo {
+    pub index: u16,
+    pub sub: u8,
+    /// Little-endian, as long as the object.
+    pub data: Vec<u8>,
+}
+
+/// What the user asks of one device.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Choice<'a> {
+    pub mode: Option<Mode>,
+    /// The user's own contents of the output PDO.
+    pub rx: Option<&'a [EntryRef]>,
+    /// The user's own contents of the input PDO.
+    pub tx: Option<&'a [EntryRef]>,
+    /// Name or description of a `Dc/OpMode`, or `off`.
+    pub dc_mode: Option<&'a str>,
+    pub cycle_ns: u64,
+    pub sdo: &'a [UserSdo],
+}
+
+/// One device, fully decided.
+#[derive(Debug, Clone)]
+pub struct Selection {
+    pub identity: Identity,
+    pub device_name: String,
+    pub module: Option<SelectedModule>,
+    pub mode: Option<Mode>,
+    /// As they will be on the wire, in the order of assignment; `sm` is always set.
+    pub rx: Vec<Pdo>,
+    pub tx: Vec<Pdo>,
+    /// The device's objects and the module's; where both have one, the module's.
+    pub dictionary: Dictionary,
+    /// `None`: free run or SyncManager-synchronous, no distributed clock.
+    pub dc: Option<DcSettings>,
+    pub layout: Layout,
+    pub startup: Vec<StartupSdo>,
+    /// What was decided that the user might not expect.
+    pub notes: Vec<String>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SelectedModule {
+    pub ident: u32,
+    pub type_name: String,
+    pub name: String,
+    pub slot_name: String,
+    pub position: Position,
+    pub init_cmds: Vec<InitCmd>,
+}
+
+/// Decides everything about one device.
+pub fn select(
+    file: &EsiFile,
+    device: &Device,
+    choice: &Choice<'_>,
+) -> Result<Selection, SelectError> {
+    let mut notes = Vec::new();
+    let placed = module::choose(file, device, choice.mode)?;
+    let dictionary = merged(device, placed);
+    let chooser = |direction| pdo::Chooser {
+        device,
+        placed,
+        dictionary: &dictionary,
+        direction,
+    };
+    let rx = chooser(Direction::Rx).choose(choice.mode, choice.rx, &mut notes)?;
+    let tx = chooser(Direction::Tx).choose(choice.mode, choice.tx, &mut notes)?;
+    let layout = Layout::new(device, &rx, &tx)?;
+    let dc = dc::choose(
+        device,
+        choice.dc_mode,
+        placed.and_then(|p| p.module.dc_mode.as_deref()),
+        choice.mode.is_some_and(Mode::is_cyclic),
+        choice.cycle_ns,
+    )?;
+    let module = placed.map(|p| SelectedModule {
+        ident: p.module.ident,
+        type_name: p.module.type_name.clone(),
+        name: p.module.name.clone(),
+        slot_name: p.slot.name.clone(),
+        position: p.module.position,
+        init_cmds: p.module.init_cmds.clone(),
+    });
+    let mut selection = Selection {
+        identity: device.identity,
+        device_name: device.name.clone(),
+        module,
+        mode: choice.mode,
+        rx,
+        tx,
+        dictionary,
+        dc,
+        layout,
+        startup: Vec::new(),
+        notes,
+    };
+    selection.startup = startup::list(device, &mut selection, choice)?;
+    Ok(selection)
+}
+
+fn merged(device: &Device, placed: Option<module::Placed<'_>>) -> Dictionary {
+    let mut dictionary = device.dictionary.clone();
+    for object in placed
+        .into_iter()
+        .flat_map(|p| &p.module.dictionary.objects)
+    {
+        match dictionary
+            .objects
+            .iter_mut()
+            .find(|known| known.index == object.index)
+        {
+            Some(known) => *known = object.clone(),
+            None => dictionary.objects.push(object.clone()),
+        }
+    }
+    dictionary
+}
+
+/// The modes that a device offers through its modules or PDO sets, for lists and error texts.
+#[must_use]
+pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
+    let has_slots = device
+        .slots
+        .as_ref()
+        .is_some_and(|slots| !slots.slots.is_empty());
+    Mode::ALL
+        .into_iter()
+        .filter(|&mode| {
+            if has_slots {
+                return module::choose(file, device, Some(mode))
+                    .is_ok_and(|placed| placed.is_some());
+            }
+            let control = |pdo: &Pdo, index| pdo.entries.iter().any(|entry| entry.index == index);
+            mode.target_object()
+                .is_some_and(|target| device.rx_pdos.iter().any(|pdo| control(pdo, target)))
+        })
+        .collect()
+}

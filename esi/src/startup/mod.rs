@@ -1,0 +1,272 @@
+//! The ordered list of SDOs that a device gets between PreOp and SafeOp.
+//!
+//! Module identities, PDO assignment cleared, PDO contents, PDO assignment, interpolation time, InitCmds of
+//! device and module, mode of operation, and the user's own last. What the device's CoE flags do not allow to be
+//! written is not written; then the ESI's defaults must already be what was chosen.
+
+mod interpolation;
+mod pdo;
+
+use crate::model::{Device, InitCmd, Writable};
+use crate::select::{Choice, SelectError, Selection};
+use crate::{Dictionary, Mode};
+
+/// One SDO download.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StartupSdo {
+    /// `PS` unless an InitCmd asks for another transition.
+    pub transition: &'static str,
+    pub index: u16,
+    pub sub: u8,
+    pub complete_access: bool,
+    pub data: Vec<u8>,
+    /// Name of the object, empty where the ESI has none.
+    pub name: String,
+    /// Which element or key it comes from.
+    pub origin: String,
+}
+
+const MODES_OF_OPERATION: u16 = 0x6060;
+const INTERPOLATION_TIME: u16 = 0x60c2;
+const MODULE_LIST: u16 = 0xf030;
+
+pub(crate) fn list(
+    device: &Device,
+    selection: &mut Selection,
+    choice: &Choice<'_>,
+) -> Result<Vec<StartupSdo>, SelectError> {
+    let Some(coe) = device
+        .mailbox
+        .as_ref()
+        .and_then(|mailbox| mailbox.coe.as_ref())
+    else {
+        return without_coe(device, selection, choice);
+    };
+    let mut list = List {
+        dictionary: selection.dictionary.clone(),
+        sdos: Vec::new(),
+    };
+    module_list(device, selection, &mut list);
+    pdo::configure(device, coe, selection, &mut list)?;
+    interpolation_time(selection, choice, &mut list)?;
+    init_cmds(&coe.init_cmds, "device", selection, &mut list);
+    if let Some(module) = selection.module.clone() {
+        let origin = format!("module {:?}", module.type_name);
+        init_cmds(&module.init_cmds, &origin, selection, &mut list);
+    }
+    mode(selection, &mut list);
+    user(choice, selection, &mut list)?;
+    Ok(list.sdos)
+}
+
+/// Devices without CoE get nothing; what only CoE could do is refused.
+fn without_coe(
+    device: &Device,
+    selection: &mut Selection,
+    choice: &Choice<'_>,
+) -> Result<Vec<StartupSdo>, SelectError> {
+    if !choice.sdo.is_empty() {
+        return Err(SelectError::NoCoe {
+            device: device.name.clone(),
+            what: "start-up SDOs",
+        });
+    }
+    pdo::check_unchanged(device, selection)?;
+    if selection.mode.is_some() {
+        selection
+            .notes
+            .push("the device has no CoE mailbox; its mode of operation is not written".to_owned());
+    }
+    Ok(Vec::new())
+}
+
+/// The list under construction.
+struct List {
+    dictionary: Dictionary,
+    sdos: Vec<StartupSdo>,
+}
+
+impl List {
+    fn push(&mut self, index: u16, sub: u8, data: Vec<u8>, origin: &str) {
+        self.sdos.push(StartupSdo {
+            transition: "PS",
+            index,
+            sub,
+            complete_access: false,
+            data,
+            name: self.name(index, sub),
+            origin: origin.to_owned(),
+        });
+    }
+
+    fn name(&self, index: u16, sub: u8) -> String {
+        let Some(object) = self.dictionary.object(index) else {
+            return String::new();
+        };
+        match object.items.iter().find(|item| item.sub == sub) {
+            Some(item) if object.items.len() > 1 && item.name != object.name => {
+                format!("{} / {}", object.name, item.name)
+            }
+            _ => object.name.clone(),
+        }
+    }
+}
+
+fn module_list(device: &Device, selection: &Selection, list: &mut List) {
+    let wanted = device
+        .slots
+        .as_ref()
+        .is_some_and(|slots| slots.download_module_ident_list);
+    if let (true, Some(module)) = (wanted, &selection.module) {
+        let origin = format!(
+            "module {:?} (line {})",
+            module.type_name, module.position.line
+        );
+        list.push(MODULE_LIST, 0, vec![0], &origin);
+        list.push(MODULE_LIST, 1, module.ident.to_le_bytes().to_vec(), &origin);
+        list.push(MODULE_LIST, 0, vec![1], &origin);
+    }
+}
+
+/// Cyclic set-points are interpolated over the bus cycle (CSP, CSV). In CST the EPOS4 application notes set the
+/// time to zero; that is written where the dictionary says that zero is allowed, because a time stored by an
+/// earlier configuration would otherwise stay.
+fn interpolation_time(
+    selection: &mut Selection,
+    choice: &Choice<'_>,
+    list: &mut List,
+) -> Result<(), SelectError> {
+    let Some(mode) = selection.mode.filter(|mode| mode.is_cyclic()) else {
+        return Ok(());
+    };
+    let dictionary = &selection.dictionary;
+    let item = dictionary.item(INTERPOLATION_TIME, 1);
+    let writable = match item {
+        Some(item) => item.access.write != Writable::Never,
+        None => dictionary.objects.is_empty() && mode != Mode::Cst,
+    };
+    if !writable {
+        if mode != Mode::Cst {
+            selection.notes.push(format!(
+                "the dictionary has no writable 0x60C2; the drive is not told the cycle of {} µs",
+                choice.cycle_ns / 1000
+            ));
+        }
+        return Ok(());
+    }
+    if mode == Mode::Cst {
+        let zero_allowed = item.is_some_and(|item| {
+            item.min
+                .as_ref()
+                .map_or(item.has_default && is_zero(&item.default), |min| {
+                    is_zero(min)
+                })
+        });
+        if zero_allowed {
+            list.push(INTERPOLATION_TIME, 1, vec![0], "mode cst");
+        }
+        return Ok(());
+    }
+    let (value, exponent) = interpolation::interpolation_time(dictionary, choice.cycle_ns)?;
+    list.push(INTERPOLATION_TIME, 1, vec![value], "bus.cycle");
+    list.push(
+        INTERPOLATION_TIME,
+        2,
+        exponent.to_le_bytes().to_vec(),
+        "bus.cycle",
+    );
+    Ok(())
+}
+
+fn is_zero(bytes: &[u8]) -> bool {
+    bytes.iter().all(|&byte| byte == 0)
+}
+
+/// InitCmds for the way up to Op. One that sets another mode than the chosen one is left out.
+fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list: &mut List) {
+    for cmd in commands {
+        let upwards = ["IP", "PS", "SO"]
+            .into_iter()
+            .find(|t| cmd.transitions.iter().any(|own| own == t));
+        let Some(transition) = upwards else { continue };
+        let sets = cmd.data.first().map(|&byte| i8::from_le_bytes([byte]));
+        if cmd.index == MODES_OF_OPERATION
+            && selection.mode.is_some_and(|mode| sets != Some(mode.code()))
+        {
+            selection.notes.push(format!(
+                "InitCmd of {origin} (line {}) sets another mode of operation and is left out",
+                cmd.position.line
+            ));
+            continue;
+        }
+        list.sdos.push(StartupSdo {
+            transition,
+            index: cmd.index,
+            sub: cmd.sub,
+            complete_access: cmd.complete_access,
+            data: cmd.data.clone(),
+            name: list.name(cmd.index, cmd.sub),
+            origin: format!("{origin} InitCmd (line {})", cmd.position.line),
+        });
+    }
+}
+
+fn mode(selection: &mut Selection, list: &mut List) {
+    let Some(mode) = selection.mode else { return };
+    if list
+        .sdos
+        .iter()
+        .any(|sdo| sdo.index == MODES_OF_OPERATION && sdo.transition == "PS")
+    {
+        return;
+    }
+    let dictionary = &selection.dictionary;
+    if !dictionary.objects.is_empty() && dictionary.object(MODES_OF_OPERATION).is_none() {
+        selection
+            .notes
+            .push("the dictionary has no 0x6060; the mode of operation is not written".to_owned());
+        return;
+    }
+    list.push(
+        MODES_OF_OPERATION,
+        0,
+        mode.code().to_le_bytes().to_vec(),
+        &format!("mode {mode}"),
+    );
+}
+
+fn user(
+    choice: &Choice<'_>,
+    selection: &mut Selection,
+    list: &mut List,
+) -> Result<(), SelectError> {
+    for sdo in choice.sdo {
+        match selection.dictionary.item(sdo.index, sdo.sub) {
+            Some(item) => {
+                let expected = item.default.len();
+                let text = item.type_name.contains("STRING") || item.type_name.contains("ARRAY");
+                if expected != 0 && expected != sdo.data.len() && !text {
+                    return Err(SelectError::SdoLength {
+                        index: sdo.index,
+                        sub: sdo.sub,
+                        name: list.name(sdo.index, sdo.sub),
+                        given: sdo.data.len(),
+                        expected,
+                    });
+                }
+            }
+            None if !selection.dictionary.objects.is_empty() => selection.notes.push(format!(
+                "start-up SDO 0x{:04x}:{:02x} is not in the ESI's dictionary",
+                sdo.index, sdo.sub
+            )),
+            None => {}
+        }
+        list.push(
+            sdo.index,
+            sdo.sub,
+            sdo.data.clone(),
+            "sdo of the machine file",
+        );
+    }
+    Ok(())
+}

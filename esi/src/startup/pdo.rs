@@ -1,0 +1,222 @@
+//! 0x16xx, 0x1Axx, 0x1C12, 0x1C13: contents and assignment of PDOs.
+
+use super::List;
+use crate::model::{Coe, Device, Direction, Pdo, Writable};
+use crate::select::{SelectError, Selection};
+
+/// The order of the maker's own example: assignments off, inputs' contents, outputs' contents, assignments on.
+pub(super) fn configure(
+    device: &Device,
+    coe: &Coe,
+    selection: &Selection,
+    list: &mut List,
+) -> Result<(), SelectError> {
+    let assignments = assignments(device, selection);
+    if !coe.pdo_assign {
+        check_assignment(device, selection)?;
+    }
+    if !coe.pdo_config {
+        check_contents(device, selection)?;
+    }
+    if coe.pdo_assign {
+        for (sm, _) in &assignments {
+            list.push(assign_object(*sm), 0, vec![0], &sm_origin(device, *sm));
+        }
+    }
+    if coe.pdo_config {
+        contents(device, Direction::Tx, selection, list);
+        contents(device, Direction::Rx, selection, list);
+    }
+    if coe.pdo_assign {
+        for (sm, pdos) in &assignments {
+            let index = assign_object(*sm);
+            for (sub, pdo) in (1u8..).zip(pdos) {
+                list.push(
+                    index,
+                    sub,
+                    pdo.index.to_le_bytes().to_vec(),
+                    &pdo_origin(selection, pdo),
+                );
+            }
+            let count = u8::try_from(pdos.len()).unwrap_or(u8::MAX);
+            list.push(index, 0, vec![count], &sm_origin(device, *sm));
+        }
+    }
+    Ok(())
+}
+
+/// For devices that nobody can write to.
+pub(super) fn check_unchanged(device: &Device, selection: &Selection) -> Result<(), SelectError> {
+    check_assignment(device, selection)?;
+    check_contents(device, selection)
+}
+
+fn assign_object(sm: u8) -> u16 {
+    0x1c10u16.saturating_add(u16::from(sm))
+}
+
+/// Every process data SyncManager with its PDOs, outputs first; one that carries nothing is cleared as well.
+fn assignments<'s>(device: &Device, selection: &'s Selection) -> Vec<(u8, Vec<&'s Pdo>)> {
+    use crate::model::SmUse::{Inputs, Outputs};
+    let mut numbers: Vec<u8> = (0u8..)
+        .zip(&device.sync_managers)
+        .filter(|(_, sm)| matches!(sm.usage, Outputs | Inputs))
+        .map(|(number, _)| number)
+        .chain(
+            selection
+                .rx
+                .iter()
+                .chain(&selection.tx)
+                .filter_map(|pdo| pdo.sm),
+        )
+        .collect();
+    numbers.sort_unstable();
+    numbers.dedup();
+    let known = |index| {
+        selection.dictionary.objects.is_empty() || selection.dictionary.object(index).is_some()
+    };
+    numbers
+        .into_iter()
+        .map(|number| {
+            let all = selection.rx.iter().chain(&selection.tx);
+            (
+                number,
+                all.filter(|pdo| pdo.sm == Some(number)).collect::<Vec<_>>(),
+            )
+        })
+        .filter(|(number, pdos)| !pdos.is_empty() || known(assign_object(*number)))
+        .collect()
+}
+
+fn contents(device: &Device, direction: Direction, selection: &Selection, list: &mut List) {
+    let (chosen, offered) = match direction {
+        Direction::Rx => (&selection.rx, &device.rx_pdos),
+        Direction::Tx => (&selection.tx, &device.tx_pdos),
+    };
+    for pdo in chosen.iter().filter(|pdo| !pdo.fixed) {
+        let origin = pdo_origin(selection, pdo);
+        list.push(pdo.index, 0, vec![0], &origin);
+        for (sub, entry) in (1u8..).zip(&pdo.entries) {
+            list.push(
+                pdo.index,
+                sub,
+                entry.mapping().to_le_bytes().to_vec(),
+                &origin,
+            );
+        }
+        let count = u8::try_from(pdo.entries.len()).unwrap_or(u8::MAX);
+        list.push(pdo.index, 0, vec![count], &origin);
+    }
+    // Some drives refuse an object that two mapping objects contain, assigned or not.
+    let unused = offered.iter().filter(|pdo| {
+        let assigned = chosen.iter().any(|other| other.index == pdo.index);
+        let writable = selection
+            .dictionary
+            .item(pdo.index, 0)
+            .is_some_and(|i| i.access.write != Writable::Never);
+        !assigned && !pdo.fixed && !pdo.mandatory && !pdo.virtual_ && writable
+    });
+    for pdo in unused {
+        list.push(
+            pdo.index,
+            0,
+            vec![0],
+            &format!("{} not used", pdo_origin(selection, pdo)),
+        );
+    }
+}
+
+fn check_assignment(device: &Device, selection: &Selection) -> Result<(), SelectError> {
+    for (chosen, offered, direction) in [
+        (&selection.rx, &device.rx_pdos, Direction::Rx),
+        (&selection.tx, &device.tx_pdos, Direction::Tx),
+    ] {
+        // A module's PDOs are assigned by the device itself once it knows the module.
+        let of_module = |index: u16| {
+            selection.module.is_some() && !offered.iter().any(|pdo| pdo.index == index)
+        };
+        let default: Vec<u16> = offered
+            .iter()
+            .filter(|pdo| pdo.sm.is_some() && !pdo.virtual_)
+            .map(|pdo| pdo.index)
+            .collect();
+        let wanted: Vec<u16> = chosen
+            .iter()
+            .map(|pdo| pdo.index)
+            .filter(|index| !of_module(*index))
+            .collect();
+        // The default may list PDOs that exclude each other; a subset that keeps its order is what remains of it.
+        let conflict_free =
+            wanted.len() == default.len() || has_excludes(offered, &default, direction);
+        if wanted.iter().any(|index| !default.contains(index)) || !conflict_free {
+            return Err(SelectError::AssignmentFixed {
+                device: device.name.clone(),
+                default: indices(&default),
+                wanted: indices(&wanted),
+            });
+        }
+    }
+    Ok(())
+}
+
+fn has_excludes(offered: &[Pdo], default: &[u16], direction: Direction) -> bool {
+    offered
+        .iter()
+        .filter(|pdo| pdo.direction == direction && default.contains(&pdo.index))
+        .any(|pdo| pdo.exclude.iter().any(|index| default.contains(index)))
+}
+
+fn check_contents(device: &Device, selection: &Selection) -> Result<(), SelectError> {
+    for pdo in selection.rx.iter().chain(&selection.tx) {
+        let offered = device
+            .rx_pdos
+            .iter()
+            .chain(&device.tx_pdos)
+            .find(|known| known.index == pdo.index);
+        if let Some(offered) = offered
+            && selection.module.is_none()
+            && offered.entries != pdo.entries
+        {
+            return Err(SelectError::ContentsFixed {
+                device: device.name.clone(),
+                pdo: pdo.index,
+            });
+        }
+    }
+    Ok(())
+}
+
+fn indices(list: &[u16]) -> String {
+    let texts: Vec<String> = list.iter().map(|index| format!("0x{index:04x}")).collect();
+    if texts.is_empty() {
+        "nothing".to_owned()
+    } else {
+        texts.join(", ")
+    }
+}
+
+fn sm_origin(device: &Device, sm: u8) -> String {
+    let line = device
+        .sync_managers
+        .get(usize::from(sm))
+        .map_or(0, |sm| sm.position.line);
+    format!("Sm {sm} (line {line})")
+}
+
+fn pdo_origin(selection: &Selection, pdo: &Pdo) -> String {
+    let kind = match pdo.direction {
+        Direction::Rx => "RxPdo",
+        Direction::Tx => "TxPdo",
+    };
+    let module = selection
+        .module
+        .as_ref()
+        .filter(|module| pdo.position.line > module.position.line)
+        .map_or_else(String::new, |module| {
+            format!("module {:?} ", module.type_name)
+        });
+    format!(
+        "{module}{kind} 0x{:04x} (line {})",
+        pdo.index, pdo.position.line
+    )
+}
