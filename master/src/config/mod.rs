@@ -1,1 +1,208 @@
-//! The machine file.
+//! The machine file: TOML as written ([`raw`](self)), then checked against the ESI files it names.
+//!
+//! | file | what lives there |
+//! |---|---|
+//! | `problem.rs` | a mistake with its place in the file; "did you mean" |
+//! | `duration.rs` | `"250us"` |
+//! | `fields.rs` | typed values out of TOML tables |
+//! | `raw.rs` | the file as written |
+//! | `check.rs` | raw → [`Machine`]: bus, names, places |
+//! | `device.rs` | one device: its ESI file, mode, PDOs, start-up SDOs, axis |
+//! | `steps.rs` | the demonstration program |
+//!
+//! Every mistake is collected; a file with five of them is refused once, with five answers.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+mod check;
+mod device;
+pub mod duration;
+mod fields;
+mod problem;
+mod raw;
+mod sdo;
+mod steps;
+#[cfg(test)]
+mod tests;
+
+pub use problem::{ConfigError, Problem};
+
+use ecaxis_esi as esi;
+
+/// A machine: what the file says, with everything derived from the ESI files beside it.
+#[derive(Debug, Clone)]
+pub struct Machine {
+    pub path: PathBuf,
+    pub bus: Bus,
+    /// In the order of the bus where every device is found by position, else as in the file.
+    pub devices: Vec<DeviceConfig>,
+    pub steps: Vec<Step>,
+    /// How often the steps are run, at least 1.
+    pub repeat: u32,
+}
+
+/// Times in nanoseconds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Bus {
+    pub nic: Nic,
+    pub cycle_ns: u64,
+    /// Consecutive cycles without a valid answer before the axes are stopped.
+    pub lost_frames: u32,
+    /// The CPU to pin the real-time thread to.
+    pub cpu: Option<usize>,
+    /// SCHED_FIFO priority of the real-time thread.
+    pub priority: u8,
+    /// How long before a cycle is due sleeping ends and spinning starts.
+    pub spin_ns: u64,
+    /// How long the bus may take from SafeOp to Op.
+    pub op_timeout_ns: u64,
+    /// How long a drive may take to Operation enabled.
+    pub enable_timeout_ns: u64,
+    /// SyncManager and PDI watchdog of every SubDevice.
+    pub watchdog_ns: u64,
+    pub exchange: Exchange,
+}
+
+impl Default for Bus {
+    fn default() -> Self {
+        Self {
+            nic: Nic::Sim,
+            cycle_ns: 1_000_000,
+            lost_frames: 3,
+            cpu: None,
+            priority: 80,
+            spin_ns: 100_000,
+            op_timeout_ns: 10_000_000_000,
+            enable_timeout_ns: 5_000_000_000,
+            watchdog_ns: 100_000_000,
+            exchange: Exchange::SameCycle,
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Nic {
+    /// The simulated bus, from the same ESI files.
+    Sim,
+    /// A network interface by name.
+    Interface(String),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Exchange {
+    /// The answers of a cycle's frames are waited for within the cycle.
+    SameCycle,
+}
+
+#[derive(Debug, Clone)]
+pub struct DeviceConfig {
+    pub name: String,
+    pub at: Locator,
+    pub esi_path: PathBuf,
+    pub esi: Arc<esi::EsiFile>,
+    pub device: Arc<esi::Device>,
+    pub selection: esi::Selection,
+    pub axis: Option<AxisSetup>,
+    /// Of its `[[device]]` in the machine file.
+    pub line: u32,
+}
+
+/// How a device is found on the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Locator {
+    /// 0 is the first behind the MainDevice.
+    Position(u16),
+    /// Configured station alias (register 0x0012).
+    Alias(u16),
+    /// Explicit device identification (requested through AL control, or ID switch).
+    Id(u16),
+}
+
+impl std::fmt::Display for Locator {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Position(n) => write!(f, "position {n}"),
+            Self::Alias(n) => write!(f, "alias {n}"),
+            Self::Id(n) => write!(f, "id {n}"),
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct AxisSetup {
+    pub config: ecaxis_axis::AxisConfig,
+    /// The user's name for the unit of positions, `mm`.
+    pub unit: String,
+    pub mode: esi::Mode,
+}
+
+/// One step of the demonstration program. Targets are pairs of (index into [`Machine::devices`],
+/// value in user units).
+#[derive(Debug, Clone, PartialEq)]
+pub enum Step {
+    /// Move and wait until every axis is in its target.
+    Move {
+        targets: Vec<(usize, f64)>,
+        /// Fraction of each axis' velocity limit.
+        speed: f64,
+        /// Fraction of each axis' acceleration limit.
+        ramp: f64,
+    },
+    /// Reach the velocities and go on turning.
+    Velocity {
+        targets: Vec<(usize, f64)>,
+        /// Fraction of each axis' acceleration limit.
+        ramp: f64,
+    },
+    /// Apply torques, percent of rated torque.
+    Torque {
+        targets: Vec<(usize, f64)>,
+        /// From the present torque to the new one.
+        ramp_ns: u64,
+    },
+    Dwell {
+        ns: u64,
+    },
+}
+
+/// Reads and checks a machine file and the ESI files it names.
+///
+/// # Errors
+/// [`ConfigError::Io`] where the file cannot be read, else everything that is wrong with it.
+pub fn load(path: &Path) -> Result<Machine, ConfigError> {
+    let io = |source| ConfigError::Io {
+        path: path.to_owned(),
+        source,
+    };
+    let bytes = std::fs::read(path).map_err(io)?;
+    let text = match String::from_utf8(bytes) {
+        Ok(text) => text,
+        Err(e) => {
+            let source = std::io::Error::new(std::io::ErrorKind::InvalidData, e.utf8_error());
+            return Err(io(source));
+        }
+    };
+    parse(path, &text)
+}
+
+/// Checks a machine file's text; `path` is what its ESI files are relative to.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
+    let mut problems = problem::Problems::new(path, text);
+    let (document, errors) = toml::de::DeTable::parse_recoverable(text);
+    for error in errors {
+        problems.add(error.span().unwrap_or(0..0), error.message());
+    }
+    // What follows would be guesses about text that has not been understood.
+    if !problems.is_empty() {
+        return Err(problems.into_error());
+    }
+    let raw = raw::read(&document, &mut problems);
+    match check::machine(path, raw, &mut problems) {
+        Some(machine) if problems.is_empty() => Ok(machine),
+        _ => Err(problems.into_error()),
+    }
+}

@@ -1,0 +1,281 @@
+//! Raw machine → checked machine: the bus, names and places; devices and steps have their own files.
+
+use std::path::Path;
+
+use toml::Spanned;
+
+use super::device::{self, Library};
+use super::problem::{Problems, Span};
+use super::raw::{RawBus, RawDevice, RawMachine};
+use super::steps::{self, Known};
+use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, duration};
+
+/// `None` only where something has been reported.
+pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
+    let cycle_span = raw.bus.cycle.as_ref().map_or(0..0, Spanned::span);
+    let bus = bus(raw.bus, p);
+    unique_names(&raw.devices, p);
+    let places = places(&raw.devices, p);
+
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut library = Library::new(folder, bus.as_ref().map(|b| (b.cycle_ns, cycle_span)));
+    let mut names = Vec::new();
+    let mut devices: Vec<Option<DeviceConfig>> = Vec::new();
+    for (raw, at) in raw.devices.into_iter().zip(places) {
+        names.push((
+            raw.name.as_ref().map(|n| n.get_ref().clone()),
+            raw.axis.is_some(),
+        ));
+        devices.push(device::check(raw, at, &mut library, p));
+    }
+    // Indices in steps are those of the machine, so the order is settled first.
+    if devices.iter().all(|d| {
+        matches!(
+            d,
+            Some(DeviceConfig {
+                at: Locator::Position(_),
+                ..
+            })
+        )
+    }) {
+        devices.sort_by_key(|d| match d {
+            Some(DeviceConfig {
+                at: Locator::Position(n),
+                ..
+            }) => *n,
+            _ => 0,
+        });
+    }
+    let known: Vec<Known<'_>> = devices
+        .iter()
+        .zip(&names)
+        .filter_map(|(device, (name, has_axis))| match device {
+            Some(device) => Some(Known::from(device)),
+            None => name.as_deref().map(|name| Known {
+                name,
+                axis: Err(*has_axis),
+            }),
+        })
+        .collect();
+    let steps = steps::check(raw.steps, &known, p);
+    Some(Machine {
+        path: path.to_owned(),
+        bus: bus?,
+        devices: devices.into_iter().collect::<Option<_>>()?,
+        steps,
+        repeat: raw.repeat.map_or(1, Spanned::into_inner),
+    })
+}
+
+fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
+    let defaults = Bus::default();
+    let cycle_ns = raw
+        .cycle
+        .as_ref()
+        .and_then(|c| in_range(c, 50_000, 100_000_000, "a cycle", p));
+    // The watchdogs count 100 µs in 16 bits.
+    let watchdog = raw
+        .watchdog
+        .as_ref()
+        .map(|w| in_range(w, 1_000_000, 6_553_500_000, "a watchdog", p));
+    let watchdog_ns = watchdog.unwrap_or(Some(defaults.watchdog_ns));
+    if let (Some(cycle), Some(watchdog)) = (cycle_ns, watchdog_ns)
+        && watchdog < cycle * 2
+    {
+        let at = raw
+            .watchdog
+            .as_ref()
+            .or(raw.cycle.as_ref())
+            .map_or(0..0, Spanned::span);
+        let message = format!(
+            "the watchdog of {} expires between two cycles of {}",
+            duration::show(watchdog),
+            duration::show(cycle),
+        );
+        p.add_hint(at, message, "make `watchdog` several cycles long");
+    }
+    if let (Some(spin), Some(cycle)) = (&raw.spin, cycle_ns)
+        && *spin.get_ref() > cycle
+    {
+        p.add(
+            spin.span(),
+            "spinning longer than a cycle never sleeps: `spin` must not exceed `cycle`",
+        );
+    }
+    let exchange = raw
+        .exchange
+        .map_or(Some(Exchange::SameCycle), |e| match e.get_ref().as_str() {
+            "same-cycle" => Some(Exchange::SameCycle),
+            other => {
+                p.add_hint(
+                    e.span(),
+                    format!("unknown exchange `{other}`"),
+                    "there is \"same-cycle\"",
+                );
+                None
+            }
+        });
+    let timeout = |value: Option<Spanned<u64>>, default: u64, p: &mut Problems<'_>| match value {
+        Some(value) => in_range(&value, 1_000_000, 600_000_000_000, "a timeout", p),
+        None => Some(default),
+    };
+    let op_timeout_ns = timeout(raw.op_timeout, defaults.op_timeout_ns, p);
+    let enable_timeout_ns = timeout(raw.enable_timeout, defaults.enable_timeout_ns, p);
+    let nic = match &raw.nic {
+        Some(name) => nic(name, p),
+        None => Some(Nic::Sim),
+    };
+    Some(Bus {
+        nic: nic?,
+        cycle_ns: cycle_ns?,
+        lost_frames: raw
+            .lost_frames
+            .map_or(defaults.lost_frames, Spanned::into_inner),
+        cpu: raw
+            .cpu
+            .and_then(|cpu| usize::try_from(cpu.into_inner()).ok()),
+        priority: raw.priority.map_or(defaults.priority, Spanned::into_inner),
+        spin_ns: raw.spin.map_or(defaults.spin_ns, Spanned::into_inner),
+        op_timeout_ns: op_timeout_ns?,
+        enable_timeout_ns: enable_timeout_ns?,
+        watchdog_ns: watchdog_ns?,
+        exchange: exchange?,
+    })
+}
+
+fn in_range(
+    ns: &Spanned<u64>,
+    low: u64,
+    high: u64,
+    what: &str,
+    p: &mut Problems<'_>,
+) -> Option<u64> {
+    let value = *ns.get_ref();
+    if (low..=high).contains(&value) {
+        return Some(value);
+    }
+    let message = format!(
+        "{what} of {} is not possible; it must be from {} to {}",
+        duration::show(value),
+        duration::show(low),
+        duration::show(high),
+    );
+    p.add(ns.span(), message);
+    None
+}
+
+fn nic(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<Nic> {
+    match name.get_ref().as_str() {
+        "sim" => Some(Nic::Sim),
+        // What Linux takes as the name of an interface.
+        other
+            if (1..16).contains(&other.len())
+                && !other.contains(|c: char| c == '/' || c.is_whitespace()) =>
+        {
+            Some(Nic::Interface(other.to_owned()))
+        }
+        other => {
+            let hint = "write an interface such as \"enp3s0\", or \"sim\"";
+            p.add_hint(
+                name.span(),
+                format!("\"{other}\" cannot be a network interface"),
+                hint,
+            );
+            None
+        }
+    }
+}
+
+fn unique_names(devices: &[RawDevice], p: &mut Problems<'_>) {
+    for (i, device) in devices.iter().enumerate() {
+        let Some(name) = &device.name else { continue };
+        if name.get_ref().trim().is_empty() {
+            p.add(name.span(), "a device needs a name");
+        }
+        let twin = devices[..i]
+            .iter()
+            .filter_map(|d| d.name.as_ref())
+            .find(|n| n.get_ref() == name.get_ref());
+        if let Some(twin) = twin {
+            let message = format!("the name \"{}\" is taken", name.get_ref());
+            p.add_hint(
+                name.span(),
+                message,
+                format!("line {} has it", p.line(&twin.span())),
+            );
+        }
+    }
+}
+
+/// Where each device is, `None` where that has been refused.
+fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
+    let mut places: Vec<Option<(Locator, Span)>> = Vec::new();
+    for device in devices {
+        let given = [
+            device
+                .position
+                .as_ref()
+                .map(|n| (Locator::Position(*n.get_ref()), n.span())),
+            device
+                .alias
+                .as_ref()
+                .map(|n| (Locator::Alias(*n.get_ref()), n.span())),
+            device
+                .id
+                .as_ref()
+                .map(|n| (Locator::Id(*n.get_ref()), n.span())),
+        ];
+        let mut given = given.into_iter().flatten();
+        let place = match (given.next(), given.next()) {
+            (Some(place), None) => Some(place),
+            (Some(_), Some((_, span))) => {
+                p.add(
+                    span,
+                    "a device is found by one of `position`, `alias` and `id`, not by two",
+                );
+                None
+            }
+            (None, _) if device.placed => None,
+            (None, _) => {
+                let message = "it is not said where on the bus the device is";
+                let hint = format!("add `position = {}`, or `alias` or `id`", places.len());
+                p.add_hint(device.span.clone(), message, hint);
+                None
+            }
+        };
+        if let Some((at, span)) = &place
+            && let Some((_, twin)) = places.iter().flatten().find(|(other, _)| other == at)
+        {
+            let hint = format!("line {} has it", p.line(twin));
+            p.add_hint(span.clone(), format!("{at} is taken"), hint);
+        }
+        places.push(place);
+    }
+    gaps(&places, p);
+    places
+        .into_iter()
+        .map(|place| place.map(|(at, _)| at))
+        .collect()
+}
+
+/// Every SubDevice is described, so positions have no holes.
+fn gaps(places: &[Option<(Locator, Span)>], p: &mut Problems<'_>) {
+    let mut positions: Vec<(u16, &Span)> = Vec::new();
+    for place in places {
+        match place {
+            Some((Locator::Position(n), span)) => positions.push((*n, span)),
+            _ => return,
+        }
+    }
+    positions.sort_by_key(|(n, _)| *n);
+    let mut next = 0_u16;
+    for (n, span) in positions {
+        if n > next {
+            let message = format!("nothing is at position {next}");
+            let hint = "positions count from 0, and every SubDevice on the bus has its [[device]]";
+            p.add_hint(span.clone(), message, hint);
+            return;
+        }
+        next = n.saturating_add(1);
+    }
+}

@@ -1,0 +1,492 @@
+//! One device: its ESI file, which device of it, mode, PDOs, start-up SDOs, axis.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ecaxis_axis::{Axis, AxisConfig, Limits, Scale, VelocityUnit};
+use ecaxis_esi as esi;
+use toml::Spanned;
+
+use super::problem::{Problems, Span, suggestion};
+use super::raw::{RawAxis, RawDevice, RawEntry, RawSdo, SdoValue};
+use super::{AxisSetup, DeviceConfig, Locator, sdo};
+
+/// What all devices share: where ESI files are, those read so far, and the cycle.
+pub(crate) struct Library<'f> {
+    folder: &'f Path,
+    /// Nanoseconds and where they are written; `None` where the cycle itself is wrong.
+    cycle: Option<(u64, Span)>,
+    /// `None`: could not be read, which has been reported.
+    files: BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>,
+}
+
+impl<'f> Library<'f> {
+    pub fn new(folder: &'f Path, cycle: Option<(u64, Span)>) -> Self {
+        Self {
+            folder,
+            cycle,
+            files: BTreeMap::new(),
+        }
+    }
+
+    fn file(
+        &mut self,
+        name: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<(PathBuf, Arc<esi::EsiFile>)> {
+        let path = self.folder.join(name.get_ref());
+        if let Some(known) = self.files.get(&path) {
+            return known.clone().map(|file| (path, file));
+        }
+        let read = match std::fs::read(&path) {
+            Ok(bytes) => esi::parse(&bytes).map_err(|e| {
+                (
+                    format!("{}:{e}", path.display()),
+                    "the file is damaged or is not an ESI file".to_owned(),
+                )
+            }),
+            Err(e) => Err((
+                format!("cannot read {}: {e}", path.display()),
+                neighbours(&path),
+            )),
+        };
+        let file = match read {
+            Ok(file) => Some(Arc::new(file)),
+            Err((message, hint)) => {
+                p.add_hint(name.span(), message, hint);
+                None
+            }
+        };
+        self.files.insert(path.clone(), file.clone());
+        file.map(|file| (path, file))
+    }
+}
+
+/// ESI files that could have been meant.
+fn neighbours(path: &Path) -> String {
+    let folder = path
+        .parent()
+        .filter(|p| !p.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
+    let Ok(entries) = std::fs::read_dir(folder) else {
+        return format!(
+            "paths are relative to the machine file, and there is no folder {}",
+            folder.display()
+        );
+    };
+    let mut names: Vec<String> = entries
+        .flatten()
+        .filter_map(|e| e.file_name().into_string().ok())
+        .filter(|n| n.to_ascii_lowercase().ends_with(".xml"))
+        .collect();
+    names.sort();
+    names.truncate(20);
+    if names.is_empty() {
+        return format!("there is no .xml file in {}", folder.display());
+    }
+    let word = path.file_name().unwrap_or_default().to_string_lossy();
+    let what = format!("ESI files in {}", folder.display());
+    suggestion(&word, names.iter().map(String::as_str), &what)
+}
+
+/// The name that the machine file uses for a mode of the axis.
+pub(crate) fn mode_name(mode: ecaxis_axis::Mode) -> String {
+    esi::Mode::from_code(mode.code()).map_or_else(|| mode.to_string(), |m| m.to_string())
+}
+
+pub(crate) fn check(
+    raw: RawDevice,
+    at: Option<Locator>,
+    library: &mut Library<'_>,
+    p: &mut Problems<'_>,
+) -> Option<DeviceConfig> {
+    let mode = mode(&raw, p);
+    let file = raw.esi.as_ref().and_then(|name| library.file(name, p));
+    let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
+    let chosen = match (&file, device, mode, &library.cycle) {
+        (Some((_, file)), Some(device), Ok(mode), Some((cycle_ns, cycle))) => {
+            let wanted = Wanted {
+                raw: &raw,
+                mode,
+                cycle_ns: *cycle_ns,
+                cycle: cycle.clone(),
+            };
+            wanted.select(file, device, p)
+        }
+        _ => None,
+    };
+    // An axis can be judged without its ESI, only less.
+    let axis = match (&raw.axis, mode) {
+        (Some(axis), Ok(Some(mode))) => Some(setup(axis, &raw.sdo, mode, chosen.as_ref(), p)),
+        _ => None,
+    };
+    let device = device.map(|d| Arc::new(d.clone()));
+    let (esi_path, file) = file?;
+    Some(DeviceConfig {
+        name: raw.name?.into_inner(),
+        at: at?,
+        esi_path,
+        device: device?,
+        esi: file,
+        selection: chosen?,
+        axis: match axis {
+            Some(axis) => Some(axis?),
+            None if raw.axis.is_some() => return None,
+            None => None,
+        },
+        line: p.line(&raw.span),
+    })
+}
+
+/// `Err`: wrong, and reported.
+fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> {
+    let cyclic = || {
+        esi::Mode::ALL
+            .into_iter()
+            .filter(|m| m.is_cyclic())
+            .map(esi::Mode::name)
+    };
+    let Some(text) = &raw.mode else {
+        let Some(axis) = &raw.axis else {
+            return Ok(None);
+        };
+        let message = "an axis needs a `mode` in its [[device]]";
+        p.add_hint(
+            axis.span.clone(),
+            message,
+            "add `mode = \"csp\"`, \"csv\" or \"cst\"",
+        );
+        return Err(());
+    };
+    match text.get_ref().parse::<esi::Mode>() {
+        Ok(mode) if mode.is_cyclic() && raw.axis.is_some() => Ok(Some(mode)),
+        Ok(mode) if mode.is_cyclic() => {
+            let message = "a device with a `mode` is a drive and needs a [device.axis]";
+            p.add_hint(
+                text.span(),
+                message,
+                "describe the axis, or leave `mode` out for an I/O device",
+            );
+            Err(())
+        }
+        Ok(mode) => {
+            let message = format!("mode \"{mode}\" is not driven every cycle");
+            p.add_hint(
+                text.span(),
+                message,
+                "axes run in \"csp\", \"csv\" or \"cst\"",
+            );
+            Err(())
+        }
+        Err(_) => {
+            let message = format!("unknown mode \"{}\"", text.get_ref());
+            p.add_hint(
+                text.span(),
+                message,
+                suggestion(text.get_ref(), cyclic(), "modes"),
+            );
+            Err(())
+        }
+    }
+}
+
+fn find<'e>(
+    raw: &RawDevice,
+    file: &'e esi::EsiFile,
+    p: &mut Problems<'_>,
+) -> Option<&'e esi::Device> {
+    let query = esi::DeviceQuery {
+        name: raw.type_name.as_ref().map(|n| n.get_ref().as_str()),
+        product: raw.product.as_ref().map(|n| *n.get_ref()),
+        revision: raw.revision.as_ref().map(|n| *n.get_ref()),
+    };
+    let at = None
+        .or(raw.type_name.as_ref().map(Spanned::span))
+        .or(raw.product.as_ref().map(Spanned::span))
+        .or(raw.revision.as_ref().map(Spanned::span))
+        .or(raw.esi.as_ref().map(Spanned::span));
+    match esi::find_device(file, &query) {
+        Ok(device) => Some(device),
+        Err(e) => {
+            let message = e.to_string();
+            let at = at.unwrap_or(raw.span.clone());
+            match e {
+                esi::SelectError::Ambiguous { .. } => {
+                    p.add_hint(at, message, "pick one with `type`, `product` or `revision`");
+                }
+                _ => p.add(at, message),
+            }
+            None
+        }
+    }
+}
+
+/// What the file asks of one device of an ESI file.
+struct Wanted<'r> {
+    raw: &'r RawDevice,
+    mode: Option<esi::Mode>,
+    cycle_ns: u64,
+    cycle: Span,
+}
+
+impl Wanted<'_> {
+    fn select(
+        &self,
+        file: &esi::EsiFile,
+        device: &esi::Device,
+        p: &mut Problems<'_>,
+    ) -> Option<esi::Selection> {
+        let entries = |list: &Option<Spanned<Vec<RawEntry>>>| {
+            let list = list.as_ref()?.get_ref().iter();
+            Some(
+                list.map(|e| esi::EntryRef {
+                    index: e.index,
+                    sub: e.sub,
+                })
+                .collect::<Vec<_>>(),
+            )
+        };
+        let (rx, tx) = (entries(&self.raw.rx), entries(&self.raw.tx));
+        let mut choice = esi::Choice {
+            mode: self.mode,
+            rx: rx.as_deref(),
+            tx: tx.as_deref(),
+            dc_mode: self.raw.dc.as_ref().map(|d| d.get_ref().as_str()),
+            cycle_ns: self.cycle_ns,
+            sdo: &[],
+        };
+        let first = esi::select(file, device, &choice)
+            .map_err(|e| self.report(&e, p))
+            .ok()?;
+        if self.raw.sdo.is_empty() {
+            return Some(first);
+        }
+        // The dictionary depends on the module, so values become bytes only now.
+        let mut sdos = Vec::new();
+        for raw in &self.raw.sdo {
+            let item = first.dictionary.item(raw.index, raw.sub);
+            let type_name = raw.type_name.as_ref().map(|t| t.get_ref().as_str());
+            match sdo::encode(raw.value.get_ref(), type_name, item) {
+                Ok(data) => sdos.push(esi::UserSdo {
+                    index: raw.index,
+                    sub: raw.sub,
+                    data,
+                }),
+                Err((message, hint)) => {
+                    let message = format!("SDO 0x{:04x}:{:02x}: {message}", raw.index, raw.sub);
+                    match hint {
+                        Some(hint) => p.add_hint(raw.span.clone(), message, hint),
+                        None => p.add(raw.value.span(), message),
+                    }
+                }
+            }
+        }
+        if sdos.len() < self.raw.sdo.len() {
+            return None;
+        }
+        choice.sdo = &sdos;
+        esi::select(file, device, &choice)
+            .map_err(|e| self.report(&e, p))
+            .ok()
+    }
+
+    fn report(&self, e: &esi::SelectError, p: &mut Problems<'_>) {
+        use esi::SelectError as E;
+        let raw = self.raw;
+        let device = raw.esi.as_ref().map_or(raw.span.clone(), Spanned::span);
+        let of = |value: Option<Span>| value.unwrap_or(device.clone());
+        let list = |name: &str| {
+            let list = if name.contains("rx") {
+                &raw.rx
+            } else {
+                &raw.tx
+            };
+            of(list.as_ref().map(Spanned::span))
+        };
+        let entry = |name: &str, index: u16, sub: u8| {
+            let entries = if name.contains("rx") {
+                &raw.rx
+            } else {
+                &raw.tx
+            };
+            let entries = entries
+                .as_ref()
+                .map(|l| l.get_ref().as_slice())
+                .unwrap_or_default();
+            let found = entries.iter().find(|e| e.index == index && e.sub == sub);
+            found.map_or(list(name), |e| e.span.clone())
+        };
+        let sdo = |index: u16, sub: u8| {
+            let found = raw.sdo.iter().find(|s| s.index == index && s.sub == sub);
+            of(found.map(|s| s.span.clone()))
+        };
+        let at = match e {
+            E::ModeNotOffered { .. } => of(raw.mode.as_ref().map(Spanned::span)),
+            E::NoSuchDcMode { .. } => of(raw.dc.as_ref().map(Spanned::span)),
+            E::CycleNotExpressible { .. } | E::DcOutOfRange { .. } => self.cycle.clone(),
+            E::UnknownEntry { list, index, sub }
+            | E::NotMappable {
+                list, index, sub, ..
+            } => entry(list, *index, *sub),
+            E::NotConfigurable { list: name, .. }
+            | E::TooManyEntries { list: name, .. }
+            | E::MissingEntry { list: name, .. } => list(name),
+            E::SdoLength { index, sub, .. } => sdo(*index, *sub),
+            _ => device.clone(),
+        };
+        match e {
+            E::ModuleNeeded { .. } => {
+                p.add_hint(at, e.to_string(), "pick one by its mode: `mode = \"csp\"`")
+            }
+            _ => p.add(at, e.to_string()),
+        }
+    }
+}
+
+fn setup(
+    raw: &RawAxis,
+    sdos: &[RawSdo],
+    mode: esi::Mode,
+    selection: Option<&esi::Selection>,
+    p: &mut Problems<'_>,
+) -> Option<AxisSetup> {
+    let unit = velocity_unit(raw, sdos, selection, p);
+    let scale = scale(raw, p);
+    let limits = limits(raw, p);
+    let (scale, limits) = (scale?.with_velocity_unit(unit?), limits?);
+    let mut config = AxisConfig::new(ecaxis_axis::Mode::from_code(mode.code()), scale, limits);
+    if let Some(window) = &raw.target_window {
+        config.target_window = *positive(window, "target_window", p)?;
+    }
+    if let Err(e) = Axis::new(config) {
+        p.add(raw.limits.span.clone(), e.to_string());
+        return None;
+    }
+    let unit = raw.unit.as_ref().map_or("turn", |u| u.get_ref().as_str());
+    Some(AxisSetup {
+        config,
+        unit: unit.to_owned(),
+        mode,
+    })
+}
+
+fn positive<'v>(value: &'v Spanned<f64>, what: &str, p: &mut Problems<'_>) -> Option<&'v f64> {
+    if *value.get_ref() > 0.0 {
+        return Some(value.get_ref());
+    }
+    p.add(
+        value.span(),
+        format!("`{what}` is {}, but must be above zero", value.get_ref()),
+    );
+    None
+}
+
+fn scale(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Scale> {
+    let encoder = raw.encoder.as_ref().and_then(|v| positive(v, "encoder", p));
+    let per_turn = match &raw.per_turn {
+        Some(v) => positive(v, "per_turn", p),
+        None => Some(&1.0),
+    };
+    let scale = match Scale::new(*encoder?, *per_turn?) {
+        Ok(scale) => scale,
+        Err(e) => {
+            p.add(
+                raw.per_turn
+                    .as_ref()
+                    .map_or(raw.span.clone(), Spanned::span),
+                e.to_string(),
+            );
+            return None;
+        }
+    };
+    let offset = raw.offset.as_ref().map_or(0.0, |o| *o.get_ref());
+    let invert = raw.invert.as_ref().is_some_and(|i| *i.get_ref());
+    scale.with_invert(invert).with_offset(offset).ok()
+}
+
+fn limits(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Limits> {
+    let raw = &raw.limits;
+    let mut ok = true;
+    let mut read = |value: &Option<Spanned<f64>>, what: &str| {
+        let value = value.as_ref().map(|v| positive(v, what, p).copied());
+        ok &= value != Some(None);
+        value.flatten()
+    };
+    let velocity = read(&raw.velocity, "limits.velocity");
+    let acceleration = read(&raw.acceleration, "limits.acceleration");
+    let torque = read(&raw.torque, "limits.torque");
+    let following_error = read(&raw.following_error, "limits.following_error");
+    if let Some(range) = &raw.position
+        && range.get_ref()[0] >= range.get_ref()[1]
+    {
+        p.add_hint(
+            range.span(),
+            "the range of positions is empty",
+            "write the lower end first",
+        );
+        ok = false;
+    }
+    let limits = Limits {
+        position: raw.position.as_ref().map(|r| *r.get_ref()),
+        velocity: velocity?,
+        acceleration: acceleration?,
+        torque: torque.unwrap_or(100.0),
+        following_error,
+    };
+    ok.then_some(limits)
+}
+
+const VELOCITY_UNITS: [(&str, VelocityUnit); 4] = [
+    ("rpm", VelocityUnit::RPM),
+    ("mrpm", VelocityUnit::MILLI_RPM),
+    ("counts/s", VelocityUnit::COUNTS_PER_SECOND),
+    ("turns/s", VelocityUnit::TURNS_PER_SECOND),
+];
+
+const SI_UNIT_VELOCITY: u16 = 0x60a9;
+
+/// What 0x60A9 will say: the file's word, the file's SDO, or the ESI's default.
+fn velocity_unit(
+    raw: &RawAxis,
+    sdos: &[RawSdo],
+    selection: Option<&esi::Selection>,
+    p: &mut Problems<'_>,
+) -> Option<VelocityUnit> {
+    if let Some(text) = &raw.velocity_unit {
+        let known = VELOCITY_UNITS
+            .iter()
+            .find(|(name, _)| *name == text.get_ref());
+        if known.is_none() {
+            let message = format!("unknown unit of velocity \"{}\"", text.get_ref());
+            let names = VELOCITY_UNITS.iter().map(|(name, _)| *name);
+            p.add_hint(
+                text.span(),
+                message,
+                suggestion(text.get_ref(), names, "units"),
+            );
+        }
+        return known.map(|(_, unit)| *unit);
+    }
+    let written = sdos.iter().find(|s| s.index == SI_UNIT_VELOCITY);
+    let written = written.and_then(|s| match s.value.get_ref() {
+        SdoValue::Integer(n) => u32::try_from(*n).ok(),
+        _ => None,
+    });
+    let default = || {
+        let item = selection?.dictionary.item(SI_UNIT_VELOCITY, 0)?;
+        let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
+        item.has_default.then_some(u32::from_le_bytes(bytes))
+    };
+    let Some(code) = written.or_else(default) else {
+        return Some(VelocityUnit::default());
+    };
+    let unit = VelocityUnit::from_si_code(code);
+    if unit.is_none() {
+        let message =
+            format!("the drive's velocity unit (0x60A9) is 0x{code:08x}, which is not understood");
+        let hint = "say it with `velocity_unit = \"rpm\"`, \"mrpm\", \"counts/s\" or \"turns/s\"";
+        p.add_hint(raw.span.clone(), message, hint);
+    }
+    unit
+}

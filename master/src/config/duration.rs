@@ -1,0 +1,176 @@
+//! Durations as people write them (`250us`, `1.5 s`), in whole nanoseconds.
+
+use super::problem::suggestion;
+
+const UNITS: [(&str, u64); 7] = [
+    ("ns", 1),
+    ("us", 1_000),
+    ("µs", 1_000),
+    ("ms", 1_000_000),
+    ("s", 1_000_000_000),
+    ("min", 60_000_000_000),
+    ("h", 3_600_000_000_000),
+];
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct DurationError {
+    pub message: String,
+    pub hint: String,
+    /// Bytes of the text that are at fault.
+    pub at: std::ops::Range<usize>,
+}
+
+/// Reads a duration: a decimal number and a unit.
+///
+/// # Errors
+/// Says which part of the text is not understood.
+pub fn parse(text: &str) -> Result<u64, DurationError> {
+    let error = |at: std::ops::Range<usize>, message: String, hint: &str| DurationError {
+        message,
+        hint: hint.to_owned(),
+        at: if at.is_empty() { 0..text.len() } else { at },
+    };
+    let example = "a number and a unit, such as \"1ms\" or \"250us\"";
+    let digits = text
+        .find(|c: char| !(c.is_ascii_digit() || c == '.' || c == '_'))
+        .unwrap_or(text.len());
+    let (number, rest) = text.split_at(digits);
+    let unit = rest.trim();
+    let unit_at = text.len() - rest.trim_start().len()..text.trim_end().len();
+    if number.is_empty() {
+        return Err(error(
+            0..text.len(),
+            format!("\"{text}\" is not a duration"),
+            example,
+        ));
+    }
+    if unit.is_empty() {
+        return Err(error(
+            0..text.len(),
+            format!("\"{text}\" has no unit"),
+            example,
+        ));
+    }
+    let Some((_, scale)) = UNITS.iter().find(|(name, _)| *name == unit) else {
+        let known = UNITS.iter().map(|(name, _)| *name);
+        let hint = suggestion(unit, known, "units");
+        return Err(error(
+            unit_at,
+            format!("unknown unit of time `{unit}`"),
+            &hint,
+        ));
+    };
+    nanoseconds(number, *scale).ok_or_else(|| {
+        error(
+            0..digits,
+            format!("\"{text}\" is not a whole number of nanoseconds, or too long"),
+            example,
+        )
+    })
+}
+
+fn nanoseconds(number: &str, scale: u64) -> Option<u64> {
+    let number = number.replace('_', "");
+    let (whole, fraction) = number.split_once('.').unwrap_or((&number, ""));
+    let fraction = fraction.trim_end_matches('0');
+    if whole.is_empty() || fraction.contains('.') {
+        return None;
+    }
+    let mut ns = whole.parse::<u64>().ok()?.checked_mul(scale)?;
+    if !fraction.is_empty() {
+        let ten = 10_u64.checked_pow(u32::try_from(fraction.len()).ok()?)?;
+        let part = u128::from(fraction.parse::<u64>().ok()?) * u128::from(scale);
+        if part % u128::from(ten) != 0 {
+            return None;
+        }
+        ns = ns.checked_add(u64::try_from(part / u128::from(ten)).ok()?)?;
+    }
+    Some(ns)
+}
+
+/// The shortest exact way to write a duration.
+#[must_use]
+pub fn show(ns: u64) -> String {
+    for (unit, scale) in [("s", 1_000_000_000_u64), ("ms", 1_000_000), ("µs", 1_000)] {
+        if ns >= scale {
+            let fraction = format!("{:09}", ns % scale * (1_000_000_000 / scale));
+            let fraction = fraction.trim_end_matches('0');
+            let point = if fraction.is_empty() { "" } else { "." };
+            return format!("{}{point}{fraction} {unit}", ns / scale);
+        }
+    }
+    format!("{ns} ns")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn good() {
+        for (text, ns) in [
+            ("1ms", 1_000_000),
+            ("250us", 250_000),
+            ("62.5 µs", 62_500),
+            ("1.5s", 1_500_000_000),
+            ("2min", 120_000_000_000),
+            ("1h", 3_600_000_000_000),
+            ("100_000ns", 100_000),
+            ("0s", 0),
+            ("1.000s", 1_000_000_000),
+        ] {
+            assert_eq!(parse(text), Ok(ns), "{text}");
+        }
+    }
+
+    #[test]
+    fn bad() {
+        for (text, message, at) in [
+            ("1mms", "unknown unit of time `mms`", 1..4),
+            ("10 sec", "unknown unit of time `sec`", 3..6),
+            ("", "\"\" is not a duration", 0..0),
+            ("fast", "\"fast\" is not a duration", 0..4),
+            ("-1ms", "\"-1ms\" is not a duration", 0..4),
+            ("500", "\"500\" has no unit", 0..3),
+            (
+                "1.5ns",
+                "\"1.5ns\" is not a whole number of nanoseconds, or too long",
+                0..3,
+            ),
+            (
+                "1.2.3s",
+                "\"1.2.3s\" is not a whole number of nanoseconds, or too long",
+                0..5,
+            ),
+            (
+                ".5s",
+                "\".5s\" is not a whole number of nanoseconds, or too long",
+                0..2,
+            ),
+            (
+                "99999999999h",
+                "\"99999999999h\" is not a whole number of nanoseconds, or too long",
+                0..11,
+            ),
+        ] {
+            let e = parse(text).unwrap_err();
+            assert_eq!((e.message.as_str(), e.at), (message, at), "{text}");
+        }
+        assert_eq!(parse("1mms").unwrap_err().hint, "did you mean `ms`?");
+    }
+
+    #[test]
+    fn shown() {
+        for (ns, text) in [
+            (0, "0 ns"),
+            (999, "999 ns"),
+            (62_500, "62.5 µs"),
+            (1_000_000, "1 ms"),
+            (1_500_000_000, "1.5 s"),
+            (3_600_000_000_000, "3600 s"),
+        ] {
+            assert_eq!(show(ns), text);
+        }
+    }
+}

@@ -1,0 +1,271 @@
+//! What is wrong with a machine file, and where: one [`Problem`] a mistake, with line, caret and a
+//! suggestion, all of them collected before anything is reported.
+
+use std::fmt;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+/// Why there is no machine.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    #[error("cannot read {}: {source}", path.display())]
+    Io {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    /// Everything that is wrong with the file, in the order of its lines.
+    #[error("{}", all(.0))]
+    Problems(Vec<Problem>),
+}
+
+fn all(problems: &[Problem]) -> String {
+    let texts: Vec<String> = problems.iter().map(Problem::to_string).collect();
+    texts.join("\n\n")
+}
+
+/// One mistake in the file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Problem {
+    pub path: PathBuf,
+    /// From 1.
+    pub line: u32,
+    /// From 1, in characters.
+    pub column: u32,
+    /// How many characters of the line it concerns, at least 1.
+    pub width: u32,
+    pub message: String,
+    pub hint: Option<String>,
+    pub source_line: String,
+}
+
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            path, line, column, ..
+        } = self;
+        let number = line.to_string();
+        let margin = " ".repeat(number.len());
+        // Tabs stay tabs before the caret, whatever their width on the reader's terminal.
+        let before: String = self
+            .source_line
+            .chars()
+            .take(column.saturating_sub(1) as usize)
+            .map(|c| if c == '\t' { '\t' } else { ' ' })
+            .collect();
+        let carets = "^".repeat(self.width.max(1) as usize);
+        writeln!(f, "error: {}", self.message)?;
+        writeln!(f, "{margin}--> {}:{line}:{column}", path.display())?;
+        writeln!(f, "{margin} |")?;
+        writeln!(f, "{number} | {}", self.source_line)?;
+        write!(f, "{margin} | {before}{carets}")?;
+        if let Some(hint) = &self.hint {
+            let mut lines = hint.lines();
+            write!(f, "\n{margin} = help: {}", lines.next().unwrap_or_default())?;
+            for line in lines {
+                write!(f, "\n{margin}         {line}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Bytes of the machine file.
+pub(crate) type Span = Range<usize>;
+
+/// The file's text and what has been found wrong with it so far.
+#[derive(Debug)]
+pub(crate) struct Problems<'s> {
+    path: &'s Path,
+    text: &'s str,
+    found: Vec<(usize, Problem)>,
+}
+
+impl<'s> Problems<'s> {
+    pub fn new(path: &'s Path, text: &'s str) -> Self {
+        Self {
+            path,
+            text,
+            found: Vec::new(),
+        }
+    }
+
+    pub fn add(&mut self, span: Span, message: impl Into<String>) {
+        self.push(span, message.into(), None);
+    }
+
+    pub fn add_hint(&mut self, span: Span, message: impl Into<String>, hint: impl Into<String>) {
+        self.push(span, message.into(), Some(hint.into()));
+    }
+
+    fn push(&mut self, span: Span, message: String, hint: Option<String>) {
+        let start = floor(self.text, span.start);
+        let end = floor(self.text, span.end).max(start);
+        let before = &self.text[..start];
+        let line_start = before.rfind('\n').map_or(0, |i| i + 1);
+        let rest = &self.text[line_start..];
+        let source_line = rest.lines().next().unwrap_or_default();
+        let column = self.text[line_start..start].chars().count() + 1;
+        // A span over several lines (a table, a long list) is underlined on its first.
+        let line_end = (line_start + source_line.len()).max(start);
+        let width = self.text[start..end.min(line_end)].chars().count().max(1);
+        let line = before.matches('\n').count() + 1;
+        let problem = Problem {
+            path: self.path.to_owned(),
+            line: small(line),
+            column: small(column),
+            width: small(width),
+            message,
+            hint,
+            source_line: source_line.to_owned(),
+        };
+        if !self.found.iter().any(|(_, p)| *p == problem) {
+            self.found.push((start, problem));
+        }
+    }
+
+    pub fn line(&self, span: &Span) -> u32 {
+        small(
+            self.text[..floor(self.text, span.start)]
+                .matches('\n')
+                .count()
+                + 1,
+        )
+    }
+
+    /// The text a span covers.
+    pub fn text(&self, span: &Span) -> &'s str {
+        let start = floor(self.text, span.start);
+        &self.text[start..floor(self.text, span.end).max(start)]
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.found.is_empty()
+    }
+
+    /// All problems in the order of the file.
+    pub fn into_error(mut self) -> ConfigError {
+        self.found.sort_by_key(|(start, _)| *start);
+        ConfigError::Problems(self.found.into_iter().map(|(_, p)| p).collect())
+    }
+}
+
+fn small(n: usize) -> u32 {
+    u32::try_from(n).unwrap_or(u32::MAX)
+}
+
+/// The last character boundary at or before `at`.
+fn floor(text: &str, at: usize) -> usize {
+    let mut at = at.min(text.len());
+    while !text.is_char_boundary(at) {
+        at -= 1;
+    }
+    at
+}
+
+/// The one of `known` that `word` was probably meant to be.
+pub(crate) fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    let word = word.to_lowercase();
+    known
+        .into_iter()
+        .map(|k| (distance(&word, &k.to_lowercase()), k))
+        .filter(|(d, k)| match k.chars().count().max(word.chars().count()) {
+            // Every one-letter name is one edit away from every other.
+            0..=2 => *d == 0,
+            longer => *d <= (longer / 3).max(1),
+        })
+        .min_by_key(|(d, _)| *d)
+        .map(|(_, k)| k)
+}
+
+/// ``did you mean `x`?``, or what there is to choose from.
+pub(crate) fn suggestion<'k>(
+    word: &str,
+    known: impl IntoIterator<Item = &'k str> + Clone,
+    what: &str,
+) -> String {
+    match nearest(word, known.clone()) {
+        Some(k) => format!("did you mean `{k}`?"),
+        None => format!("{what}: {}", list(known)),
+    }
+}
+
+/// `` `a`, `b` or `c` `` without its last word's ceremony: `` `a`, `b`, `c` ``.
+pub(crate) fn list<'k>(words: impl IntoIterator<Item = &'k str>) -> String {
+    let quoted: Vec<String> = words.into_iter().map(|k| format!("`{k}`")).collect();
+    quoted.join(", ")
+}
+
+/// Edits (insertion, deletion, substitution, neighbours swapped) that turn `a` into `b`.
+fn distance(a: &str, b: &str) -> usize {
+    let a: Vec<char> = a.chars().take(64).collect();
+    let b: Vec<char> = b.chars().take(64).collect();
+    let mut before_last: Vec<usize> = Vec::new();
+    let mut last: Vec<usize> = (0..=b.len()).collect();
+    for (i, ca) in a.iter().enumerate() {
+        let mut row = vec![i + 1];
+        for (j, cb) in b.iter().enumerate() {
+            let mut best = (last[j] + usize::from(ca != cb))
+                .min(last[j + 1] + 1)
+                .min(row[j] + 1);
+            if i > 0 && j > 0 && *ca == b[j - 1] && a[i - 1] == *cb {
+                best = best.min(before_last[j - 1] + 1);
+            }
+            row.push(best);
+        }
+        before_last = std::mem::replace(&mut last, row);
+    }
+    last[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn distances() {
+        for (a, b, d) in [
+            ("", "", 0),
+            ("cycle", "cycle", 0),
+            ("cycel", "cycle", 1),
+            ("nic", "nick", 1),
+            ("abc", "", 3),
+        ] {
+            assert_eq!(distance(a, b), d, "{a} {b}");
+        }
+        assert_eq!(nearest("cycel", ["nic", "cycle"]), Some("cycle"));
+        assert_eq!(nearest("mms", ["ns", "ms", "s"]), Some("ms"));
+        assert_eq!(nearest("frobnicate", ["nic", "cycle"]), None);
+    }
+
+    #[test]
+    fn caret_stands_under_what_is_meant() {
+        let text = "a = 1\n\tβeta = \"zwölf\" # c\nc = 2";
+        let mut problems = Problems::new(Path::new("m.toml"), text);
+        let at = text.find("\"zw").unwrap();
+        problems.add_hint(
+            at..at + "\"zwölf\"".len(),
+            "not a number",
+            "write 12\nor 13",
+        );
+        let ConfigError::Problems(found) = problems.into_error() else {
+            panic!()
+        };
+        assert_eq!((found[0].line, found[0].column, found[0].width), (2, 9, 7));
+        let expected = "error: not a number\n --> m.toml:2:9\n  |\n2 | \tβeta = \"zwölf\" # c\n  | \t       ^^^^^^^\n  = help: write 12\n          or 13";
+        assert_eq!(found[0].to_string(), expected);
+    }
+
+    #[test]
+    fn a_span_past_the_end_is_no_accident() {
+        for text in ["", "x", "ä", "x\n"] {
+            let mut problems = Problems::new(Path::new("m.toml"), text);
+            for start in 0..4 {
+                problems.add(start..9, "m");
+            }
+            let ConfigError::Problems(found) = problems.into_error() else {
+                panic!()
+            };
+            assert!(found.iter().all(|p| p.to_string().contains('^')));
+        }
+    }
+}

@@ -1,0 +1,455 @@
+//! The machine file as written: types are right, nothing is looked up or compared yet.
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::fields::{self, Fields};
+use super::problem::{Problems, Span};
+
+#[derive(Debug, Default)]
+pub(crate) struct RawMachine {
+    pub bus: RawBus,
+    pub devices: Vec<RawDevice>,
+    pub steps: Vec<RawStep>,
+    pub repeat: Option<Spanned<u32>>,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct RawBus {
+    pub nic: Option<Spanned<String>>,
+    pub cycle: Option<Spanned<u64>>,
+    pub lost_frames: Option<Spanned<u32>>,
+    pub cpu: Option<Spanned<u32>>,
+    pub priority: Option<Spanned<u8>>,
+    pub spin: Option<Spanned<u64>>,
+    pub op_timeout: Option<Spanned<u64>>,
+    pub enable_timeout: Option<Spanned<u64>>,
+    pub watchdog: Option<Spanned<u64>>,
+    pub exchange: Option<Spanned<String>>,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawDevice {
+    pub span: Span,
+    pub name: Option<Spanned<String>>,
+    pub esi: Option<Spanned<String>>,
+    /// Something says where it is, understood or not.
+    pub placed: bool,
+    pub position: Option<Spanned<u16>>,
+    pub alias: Option<Spanned<u16>>,
+    pub id: Option<Spanned<u16>>,
+    pub type_name: Option<Spanned<String>>,
+    pub product: Option<Spanned<u32>>,
+    pub revision: Option<Spanned<u32>>,
+    pub mode: Option<Spanned<String>>,
+    pub dc: Option<Spanned<String>>,
+    pub rx: Option<Spanned<Vec<RawEntry>>>,
+    pub tx: Option<Spanned<Vec<RawEntry>>>,
+    pub sdo: Vec<RawSdo>,
+    pub axis: Option<RawAxis>,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawEntry {
+    pub span: Span,
+    pub index: u16,
+    pub sub: u8,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawSdo {
+    pub span: Span,
+    pub index: u16,
+    pub sub: u8,
+    pub value: Spanned<SdoValue>,
+    pub type_name: Option<Spanned<String>>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum SdoValue {
+    Integer(i64),
+    Float(f64),
+    Boolean(bool),
+    Text(String),
+    Bytes(Vec<u8>),
+}
+
+#[derive(Debug)]
+pub(crate) struct RawAxis {
+    pub span: Span,
+    pub unit: Option<Spanned<String>>,
+    pub per_turn: Option<Spanned<f64>>,
+    pub encoder: Option<Spanned<f64>>,
+    pub invert: Option<Spanned<bool>>,
+    pub offset: Option<Spanned<f64>>,
+    pub target_window: Option<Spanned<f64>>,
+    pub velocity_unit: Option<Spanned<String>>,
+    pub limits: RawLimits,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct RawLimits {
+    pub span: Span,
+    pub position: Option<Spanned<[f64; 2]>>,
+    pub velocity: Option<Spanned<f64>>,
+    pub acceleration: Option<Spanned<f64>>,
+    pub torque: Option<Spanned<f64>>,
+    pub following_error: Option<Spanned<f64>>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Verb {
+    Move,
+    Velocity,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawTarget {
+    pub axis: Spanned<String>,
+    pub value: Spanned<f64>,
+}
+
+#[derive(Debug)]
+pub(crate) enum RawStep {
+    Motion {
+        verb: Verb,
+        targets: Vec<RawTarget>,
+        speed: Option<Spanned<f64>>,
+        ramp: Option<Spanned<f64>>,
+    },
+    Torque {
+        targets: Vec<RawTarget>,
+        ramp: Option<Spanned<u64>>,
+    },
+    Dwell(Spanned<u64>),
+}
+
+type Value<'d> = &'d Spanned<DeValue<'d>>;
+
+/// Reads `$field`, where it stands, with one of the readers of [`fields`].
+macro_rules! optional {
+    ($p:expr, $f:expr, $key:literal, $($reader:tt)+) => {
+        match $f.get($key) {
+            Some(v) => optional!(@ $p, v, $($reader)+),
+            None => None,
+        }
+    };
+    (@ $p:expr, $v:expr, integer($min:expr, $max:expr)) => { fields::integer($p, $v, $min, $max) };
+    (@ $p:expr, $v:expr, $reader:ident) => { fields::$reader($p, $v) };
+}
+
+pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> RawMachine {
+    let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
+    let mut machine = RawMachine {
+        repeat: optional!(p, f, "repeat", integer(1, 1_000_000)),
+        ..RawMachine::default()
+    };
+    let bus = f.need("bus", "[bus]\ncycle = \"1ms\"");
+    if let Some(bus) = bus.and_then(|v| fields::table(p, v, "[bus]")) {
+        machine.bus = read_bus(bus, p);
+    }
+    let devices = f.need(
+        "device",
+        "[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"",
+    );
+    for (value, span) in tables(p, devices, "[[device]]") {
+        let Some(fields) = fields::table(p, value, "[[device]]") else {
+            continue;
+        };
+        machine.devices.push(read_device(fields, span, p));
+    }
+    let steps = f.get("step");
+    for (value, span) in tables(p, steps, "[[step]]") {
+        let Some(fields) = fields::table(p, value, "[[step]]") else {
+            continue;
+        };
+        machine.steps.extend(read_step(fields, span, p));
+    }
+    f.done(p);
+    machine
+}
+
+fn tables<'d>(
+    p: &mut Problems<'_>,
+    value: Option<Value<'d>>,
+    wanted: &str,
+) -> Vec<(Value<'d>, Span)> {
+    let elements = value.and_then(|v| fields::array(p, v, &format!("{wanted} with two brackets")));
+    elements
+        .unwrap_or_default()
+        .into_iter()
+        .map(|v| (v, v.span()))
+        .collect()
+}
+
+fn read_bus(mut f: Fields<'_>, p: &mut Problems<'_>) -> RawBus {
+    let cycle = f.need("cycle", "cycle = \"1ms\"");
+    let bus = RawBus {
+        nic: optional!(p, f, "nic", string),
+        cycle: cycle.and_then(|v| fields::duration(p, v)),
+        lost_frames: optional!(p, f, "lost_frames", integer(1, 1000)),
+        cpu: optional!(p, f, "cpu", integer(0, 1023)),
+        priority: optional!(p, f, "priority", integer(1, 99)),
+        spin: optional!(p, f, "spin", duration),
+        op_timeout: optional!(p, f, "op_timeout", duration),
+        enable_timeout: optional!(p, f, "enable_timeout", duration),
+        watchdog: optional!(p, f, "watchdog", duration),
+        exchange: optional!(p, f, "exchange", string),
+    };
+    f.done(p);
+    bus
+}
+
+fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice {
+    let name = f.need("name", "name = \"x\"");
+    let esi = f.need("esi", "esi = \"esi/EPOS4.xml\"");
+    let placed = ["position", "alias", "id"]
+        .into_iter()
+        .any(|key| f.get(key).is_some());
+    let mut device = RawDevice {
+        span,
+        placed,
+        name: name.and_then(|v| fields::string(p, v)),
+        esi: esi.and_then(|v| fields::string(p, v)),
+        position: optional!(p, f, "position", integer(0, u16::MAX)),
+        alias: optional!(p, f, "alias", integer(1, u16::MAX)),
+        id: optional!(p, f, "id", integer(1, u16::MAX)),
+        type_name: optional!(p, f, "type", string),
+        product: optional!(p, f, "product", integer(0, u32::MAX)),
+        revision: optional!(p, f, "revision", integer(0, u32::MAX)),
+        mode: optional!(p, f, "mode", string),
+        dc: optional!(p, f, "dc", string),
+        rx: None,
+        tx: None,
+        sdo: Vec::new(),
+        axis: None,
+    };
+    if let Some(mut pdo) = f.get("pdo").and_then(|v| fields::table(p, v, "`pdo`")) {
+        device.rx = pdo.get("rx").and_then(|v| read_entries(v, p));
+        device.tx = pdo.get("tx").and_then(|v| read_entries(v, p));
+        pdo.done(p);
+    }
+    let sdos = f
+        .get("sdo")
+        .and_then(|v| fields::array(p, v, "a list of SDOs"));
+    for value in sdos.unwrap_or_default() {
+        let Some(fields) = fields::table(p, value, "`sdo`") else {
+            continue;
+        };
+        device.sdo.extend(read_sdo(fields, value.span(), p));
+    }
+    if let Some(value) = f.get("axis") {
+        let fields = fields::table(p, value, "[device.axis]");
+        device.axis = fields.map(|f| read_axis(f, value.span(), p));
+    }
+    f.done(p);
+    device
+}
+
+/// Objects as `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.
+fn read_entries(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<Vec<RawEntry>>> {
+    let all = value.span();
+    let mut entries = Vec::new();
+    for value in fields::array(p, value, "a list of objects")? {
+        let span = value.span();
+        let DeValue::String(text) = value.get_ref() else {
+            let Some(mut f) = fields::table(p, value, "a PDO entry") else {
+                continue;
+            };
+            let index = f.need("index", "index = 0x607A");
+            let index = index.and_then(|v| fields::integer(p, v, 1, u16::MAX));
+            let sub = optional!(p, f, "sub", integer(0, u8::MAX));
+            f.done(p);
+            if let Some(index) = index {
+                let sub = sub.map_or(0, Spanned::into_inner);
+                entries.push(RawEntry {
+                    span,
+                    index: index.into_inner(),
+                    sub,
+                });
+            }
+            continue;
+        };
+        let (index, sub) = text.split_once(':').unwrap_or((text, "0"));
+        let sub = i64::from_str_radix(sub.trim().trim_start_matches("0x"), 16).ok();
+        let index = fields::unquoted(index)
+            .and_then(|i| u16::try_from(i).ok())
+            .filter(|i| *i > 0);
+        match (index, sub.and_then(|s| u8::try_from(s).ok())) {
+            (Some(index), Some(sub)) => entries.push(RawEntry { span, index, sub }),
+            _ => p.add_hint(
+                span,
+                "not an object",
+                "write index and subindex as \"0x607A:00\"",
+            ),
+        }
+    }
+    Some(Spanned::new(all, entries))
+}
+
+fn read_sdo(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawSdo> {
+    let index = f.need("index", "index = 0x6065");
+    let index = index.and_then(|v| fields::integer(p, v, 1, u16::MAX));
+    let sub = optional!(p, f, "sub", integer(0, u8::MAX));
+    let type_name = optional!(p, f, "type", string);
+    let value = f.need("value", "value = 2000").and_then(|v| {
+        let read = match v.get_ref() {
+            DeValue::Integer(_) => {
+                SdoValue::Integer(fields::integer(p, v, i64::MIN, i64::MAX)?.into_inner())
+            }
+            DeValue::Float(_) => SdoValue::Float(fields::number(p, v)?.into_inner()),
+            DeValue::Boolean(b) => SdoValue::Boolean(*b),
+            DeValue::Array(_) => {
+                let bytes = fields::array(p, v, "a list of bytes")?;
+                let bytes = bytes.into_iter().map(|b| fields::integer(p, b, 0, u8::MAX));
+                SdoValue::Bytes(
+                    bytes
+                        .map(|b| b.map(Spanned::into_inner))
+                        .collect::<Option<_>>()?,
+                )
+            }
+            _ => SdoValue::Text(fields::string(p, v)?.into_inner()),
+        };
+        Some(Spanned::new(v.span(), read))
+    });
+    f.done(p);
+    let sub = sub.map_or(0, Spanned::into_inner);
+    Some(RawSdo {
+        span,
+        index: index?.into_inner(),
+        sub,
+        value: value?,
+        type_name,
+    })
+}
+
+fn read_axis(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAxis {
+    let encoder = f.need("encoder", "encoder = 2000");
+    let limits = f.need(
+        "limits",
+        "limits = { velocity = 200.0, acceleration = 2000.0 }",
+    );
+    let mut axis = RawAxis {
+        span: span.clone(),
+        unit: optional!(p, f, "unit", string),
+        per_turn: optional!(p, f, "per_turn", number),
+        encoder: encoder.and_then(|v| fields::number(p, v)),
+        invert: optional!(p, f, "invert", boolean),
+        offset: optional!(p, f, "offset", number),
+        target_window: optional!(p, f, "target_window", number),
+        velocity_unit: optional!(p, f, "velocity_unit", string),
+        limits: RawLimits::default(),
+    };
+    if let Some(value) = limits
+        && let Some(mut f) = fields::table(p, value, "`limits`")
+    {
+        let position = f.get("position").and_then(|v| {
+            let ends = fields::array(p, v, "a list of two positions")?;
+            let [low, high] = ends.as_slice() else {
+                p.add_hint(
+                    v.span(),
+                    "a range has two ends",
+                    "write `position = [-50.0, 50.0]`",
+                );
+                return None;
+            };
+            let range = [fields::number(p, low), fields::number(p, high)];
+            let [Some(low), Some(high)] = range else {
+                return None;
+            };
+            Some(Spanned::new(
+                v.span(),
+                [low.into_inner(), high.into_inner()],
+            ))
+        });
+        let velocity = f.need("velocity", "velocity = 200.0");
+        let acceleration = f.need("acceleration", "acceleration = 2000.0");
+        axis.limits = RawLimits {
+            span: value.span(),
+            position,
+            velocity: velocity.and_then(|v| fields::number(p, v)),
+            acceleration: acceleration.and_then(|v| fields::number(p, v)),
+            torque: optional!(p, f, "torque", number),
+            following_error: optional!(p, f, "following_error", number),
+        };
+        f.done(p);
+    }
+    f.done(p);
+    axis
+}
+
+fn read_step(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawStep> {
+    let (travel, velocity, torque) = (f.get("move"), f.get("velocity"), f.get("torque"));
+    let (dwell, speed, ramp) = (f.get("dwell"), f.get("speed"), f.get("ramp"));
+    let unknown = f.unknown();
+    f.done(p);
+    let kinds = "a step has one of `move = { x = 50.0 }`, `velocity = { v = 100.0 }`, \
+                 `torque = { t = 10.0 }`, `dwell = \"500ms\"`";
+    let mut refuse = |value: Option<Value<'_>>, message: &str| {
+        if let Some(value) = value {
+            p.add(value.span(), message);
+        }
+    };
+    match (travel, velocity, torque, dwell) {
+        (Some(value), None, None, None) => Some(RawStep::Motion {
+            verb: Verb::Move,
+            targets: read_targets(value, p)?,
+            speed: speed.and_then(|v| fields::number(p, v)),
+            ramp: ramp.and_then(|v| fields::number(p, v)),
+        }),
+        (None, Some(value), None, None) => {
+            refuse(
+                speed,
+                "`speed` belongs to `move`; a velocity is its own speed",
+            );
+            Some(RawStep::Motion {
+                verb: Verb::Velocity,
+                targets: read_targets(value, p)?,
+                speed: None,
+                ramp: ramp.and_then(|v| fields::number(p, v)),
+            })
+        }
+        (None, None, Some(value), None) => {
+            refuse(speed, "`speed` belongs to `move`");
+            let targets = read_targets(value, p)?;
+            let ramp = ramp.and_then(|v| fields::duration(p, v));
+            Some(RawStep::Torque { targets, ramp })
+        }
+        (None, None, None, Some(value)) => {
+            refuse(speed, "`speed` belongs to `move`");
+            refuse(ramp, "a dwell has no `ramp`");
+            fields::duration(p, value).map(RawStep::Dwell)
+        }
+        (None, None, None, None) => {
+            // An unknown key has been reported and was probably meant to be one of them.
+            if !unknown {
+                p.add_hint(span, "this step does nothing", kinds);
+            }
+            None
+        }
+        _ => {
+            p.add_hint(span, "this step does more than one thing", kinds);
+            None
+        }
+    }
+}
+
+fn read_targets(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawTarget>> {
+    let DeValue::Table(table) = value.get_ref() else {
+        p.add_hint(
+            value.span(),
+            "expected axes and targets",
+            "write `{ x = 50.0 }`",
+        );
+        return None;
+    };
+    let mut targets = Vec::new();
+    for (key, value) in table {
+        let axis = Spanned::new(key.span(), key.get_ref().to_string());
+        targets.extend(fields::number(p, value).map(|value| RawTarget { axis, value }));
+    }
+    if table.is_empty() {
+        p.add_hint(value.span(), "no axis is named", "write `{ x = 50.0 }`");
+    }
+    Some(targets)
+}

@@ -1,0 +1,315 @@
+use std::path::PathBuf;
+
+use super::*;
+
+/// A drive that takes CSP and CSV but not CST, with 0x60C2 and one object to set.
+const ESI: &str = r##"<?xml version="1.0" encoding="utf-8"?>
+<EtherCATInfo><Vendor><Id>#x1234</Id><Name>Test</Name></Vendor><Descriptions><Devices>
+<Device Physics="YY"><Type ProductCode="#x10" RevisionNo="#x1">D1</Type><Name>Drive one</Name>
+<Profile><ProfileNo>402</ProfileNo><Dictionary><DataTypes>
+<DataType><Name>UDINT</Name><BitSize>32</BitSize></DataType>
+<DataType><Name>USINT</Name><BitSize>8</BitSize></DataType>
+<DataType><Name>SINT</Name><BitSize>8</BitSize></DataType>
+<DataType><Name>DT60C2</Name><BitSize>32</BitSize>
+<SubItem><SubIdx>0</SubIdx><Name>n</Name><Type>USINT</Type><BitSize>8</BitSize><BitOffs>0</BitOffs><Flags><Access>ro</Access></Flags></SubItem>
+<SubItem><SubIdx>1</SubIdx><Name>value</Name><Type>USINT</Type><BitSize>8</BitSize><BitOffs>16</BitOffs><Flags><Access>rw</Access></Flags></SubItem>
+<SubItem><SubIdx>2</SubIdx><Name>index</Name><Type>SINT</Type><BitSize>8</BitSize><BitOffs>24</BitOffs><Flags><Access>rw</Access></Flags></SubItem>
+</DataType></DataTypes><Objects>
+<Object><Index>#x6065</Index><Name>Following error window</Name><Type>UDINT</Type><BitSize>32</BitSize><Info><DefaultData>D0070000</DefaultData></Info><Flags><Access>rw</Access></Flags></Object>
+<Object><Index>#x60A9</Index><Name>Velocity unit</Name><Type>UDINT</Type><BitSize>32</BitSize><Info><DefaultData>0047B4FD</DefaultData></Info><Flags><Access>rw</Access></Flags></Object>
+<Object><Index>#x60C2</Index><Name>Interpolation time</Name><Type>DT60C2</Type><BitSize>32</BitSize><Flags><Access>rw</Access></Flags></Object>
+</Objects></Dictionary></Profile>
+<Fmmu>Outputs</Fmmu><Fmmu>Inputs</Fmmu><Fmmu>MBoxState</Fmmu>
+<Sm MinSize="48" MaxSize="48" DefaultSize="48" StartAddress="#x1000" ControlByte="#x26" Enable="1">MBoxOut</Sm>
+<Sm MinSize="48" MaxSize="48" DefaultSize="48" StartAddress="#x1030" ControlByte="#x22" Enable="1">MBoxIn</Sm>
+<Sm StartAddress="#x1100" ControlByte="#x64" Enable="1">Outputs</Sm>
+<Sm StartAddress="#x1200" ControlByte="#x20" Enable="1">Inputs</Sm>
+<RxPdo Sm="2"><Index>#x1600</Index><Name>Out</Name>
+<Entry><Index>#x6040</Index><SubIndex>0</SubIndex><BitLen>16</BitLen><Name>Controlword</Name><DataType>UINT</DataType></Entry>
+<Entry><Index>#x607A</Index><SubIndex>0</SubIndex><BitLen>32</BitLen><Name>Target position</Name><DataType>DINT</DataType></Entry>
+<Entry><Index>#x60FF</Index><SubIndex>0</SubIndex><BitLen>32</BitLen><Name>Target velocity</Name><DataType>DINT</DataType></Entry></RxPdo>
+<TxPdo Sm="3"><Index>#x1A00</Index><Name>In</Name>
+<Entry><Index>#x6041</Index><SubIndex>0</SubIndex><BitLen>16</BitLen><Name>Statusword</Name><DataType>UINT</DataType></Entry>
+<Entry><Index>#x6064</Index><SubIndex>0</SubIndex><BitLen>32</BitLen><Name>Actual position</Name><DataType>DINT</DataType></Entry>
+<Entry><Index>#x606C</Index><SubIndex>0</SubIndex><BitLen>32</BitLen><Name>Actual velocity</Name><DataType>DINT</DataType></Entry></TxPdo>
+<Mailbox DataLinkLayer="1"><CoE SdoInfo="0" PdoAssign="1" PdoConfig="1" CompleteAccess="1"/></Mailbox>
+<Dc><OpMode><Name>DC</Name><Desc>DC</Desc><AssignActivate>#x300</AssignActivate><CycleTimeSync0 Factor="1">0</CycleTimeSync0></OpMode></Dc>
+</Device></Devices></Descriptions></EtherCATInfo>
+"##;
+
+const GOOD: &str = r#"repeat = 2
+
+[bus]
+nic = "sim"
+cycle = "1ms"
+
+[[device]]
+name = "x"
+esi = "D1.xml"
+position = 0
+mode = "csp"
+sdo = [{ index = 0x6065, value = 2500 }]
+
+[device.axis]
+unit = "mm"
+per_turn = 5.0
+encoder = 2000
+limits = { position = [-50.0, 50.0], velocity = 200.0, acceleration = 2000.0, torque = 100.0, following_error = 1.0 }
+
+[[device]]
+name = "v"
+esi = "D1.xml"
+position = 1
+mode = "csv"
+
+[device.axis]
+encoder = 2000
+limits = { velocity = 50, acceleration = 500 }
+
+[[step]]
+move = { x = 50.0 }
+speed = 0.5
+ramp = 0.3
+
+[[step]]
+velocity = { v = 25.0 }
+
+[[step]]
+dwell = "500ms"
+"#;
+
+fn with_esi(text: &str) -> Result<Machine, ConfigError> {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("D1.xml"), ESI).unwrap();
+    std::fs::write(folder.path().join("cut.xml"), &ESI[..2000]).unwrap();
+    parse(&folder.path().join("m.toml"), text)
+}
+
+/// The problems of the good file with one text replaced by another.
+fn broken(from: &str, to: &str) -> Vec<Problem> {
+    assert!(GOOD.contains(from), "{from}");
+    problems(&GOOD.replacen(from, to, 1))
+}
+
+fn problems(text: &str) -> Vec<Problem> {
+    match with_esi(text) {
+        Err(ConfigError::Problems(problems)) => problems,
+        other => panic!("expected problems: {other:?}"),
+    }
+}
+
+/// Exactly one problem with this message, hint (or part of it) and marked text.
+fn one(from: &str, to: &str, message: &str, hint: &str, marked: &str) {
+    let found = broken(from, to);
+    let [problem] = found.as_slice() else {
+        panic!("{from} → {to}: {found:#?}")
+    };
+    let at: String = problem
+        .source_line
+        .chars()
+        .skip(problem.column as usize - 1)
+        .take(problem.width as usize)
+        .collect();
+    assert!(problem.message.contains(message), "{problem}");
+    assert!(
+        problem.hint.as_deref().unwrap_or_default().contains(hint),
+        "{problem}"
+    );
+    assert_eq!(at, marked, "{problem}");
+    assert!(problem.line >= 1);
+}
+
+#[test]
+fn a_good_file_becomes_a_machine() {
+    let machine = with_esi(GOOD).unwrap();
+    assert_eq!(machine.repeat, 2);
+    assert_eq!(machine.bus, Bus::default());
+    assert_eq!(machine.devices.len(), 2);
+    let x = &machine.devices[0];
+    assert_eq!(
+        (x.name.as_str(), x.at, x.line),
+        ("x", Locator::Position(0), 7)
+    );
+    assert!(Arc::ptr_eq(&x.esi, &machine.devices[1].esi));
+    let axis = x.axis.as_ref().unwrap();
+    assert_eq!((axis.unit.as_str(), axis.mode), ("mm", esi::Mode::Csp));
+    assert_eq!(
+        axis.config.scale.velocity_unit(),
+        ecaxis_axis::VelocityUnit::MILLI_RPM
+    );
+    assert_eq!(axis.config.limits.position, Some([-50.0, 50.0]));
+    let user = x.selection.startup.last().unwrap();
+    assert_eq!(
+        (user.index, user.data.as_slice()),
+        (0x6065, [0xc4, 9, 0, 0].as_slice())
+    );
+    assert_eq!(
+        machine.devices[1]
+            .axis
+            .as_ref()
+            .unwrap()
+            .config
+            .limits
+            .torque,
+        100.0
+    );
+    assert_eq!(
+        machine.steps,
+        [
+            Step::Move {
+                targets: vec![(0, 50.0)],
+                speed: 0.5,
+                ramp: 0.3
+            },
+            Step::Velocity {
+                targets: vec![(1, 25.0)],
+                ramp: 1.0
+            },
+            Step::Dwell { ns: 500_000_000 },
+        ]
+    );
+}
+
+#[test]
+fn devices_are_sorted_and_steps_follow() {
+    let swapped = GOOD
+        .replace("position = 1", "position = 9")
+        .replace("position = 0", "position = 1");
+    let machine = with_esi(&swapped.replace("position = 9", "position = 0")).unwrap();
+    assert_eq!(machine.devices[0].name, "v");
+    assert_eq!(
+        machine.steps[0],
+        Step::Move {
+            targets: vec![(1, 50.0)],
+            speed: 0.5,
+            ramp: 0.3
+        }
+    );
+}
+
+#[test]
+#[rustfmt::skip] // one row a mistake
+fn every_way_to_be_wrong() {
+    for (from, to, message, hint, marked) in [
+        ("cycle =", "cycel =", "unknown key `cycel` in [bus]", "did you mean `cycle`?", "cycel"),
+        ("\"1ms\"", "\"1mms\"", "unknown unit of time `mms`", "did you mean `ms`?", "mms"),
+        ("\"1ms\"", "1", "a duration needs a unit", "\"1ms\"", "1"),
+        ("\"1ms\"", "\"10us\"", "a cycle of 10 µs is not possible", "", "\"10us\""),
+        ("\"1ms\"", "\"1.234567ms\"", "0x60C2", "", "\"1.234567ms\""),
+        ("nic = \"sim\"", "nic = \"a b\"", "cannot be a network interface", "enp3s0", "\"a b\""),
+        ("nic = \"sim\"", "lost_frames = 0", "a whole number from 1 to 1000, found 0", "", "0"),
+        ("nic = \"sim\"", "priority = true", "expected a whole number, found true or false", "", "true"),
+        ("nic = \"sim\"", "exchange = \"pipelined\"", "unknown exchange", "same-cycle", "\"pipelined\""),
+        ("nic = \"sim\"", "watchdog = \"1ms\"", "expires between two cycles", "", "\"1ms\""),
+        ("nic = \"sim\"", "spin = \"2ms\"", "never sleeps", "", "\"2ms\""),
+        ("[bus]", "[buss]", "unknown key `buss`", "did you mean `bus`?", "buss"),
+        ("[[step]]", "[[stpe]]", "unknown key `stpe`", "did you mean `step`?", "stpe"),
+        ("repeat = 2", "repeat = 0", "a whole number from 1", "", "0"),
+        ("name = \"v\"", "name = \"v\"\nfoo = 1", "unknown key `foo` in [[device]]", "known keys:", "foo"),
+        ("\"D1.xml\"", "\"D2.xml\"", "cannot read", "did you mean `D1.xml`?", "\"D2.xml\""),
+        ("\"D1.xml\"", "\"cut.xml\"", "cut.xml:", "damaged", "\"cut.xml\""),
+        ("position = 1", "position = 0", "position 0 is taken", "line 10 has it", "0"),
+        ("position = 1", "position = 2", "nothing is at position 1", "count from 0", "2"),
+        ("position = 1", "position = -1", "a whole number from 0 to 65535", "", "-1"),
+        ("position = 1", "position = 1\nalias = 5", "not by two", "", "5"),
+        ("position = 1\n", "", "not said where", "position = 1", "[[device]]"),
+        ("position = 0", "position = 0\nproduct = 0x11", "matches product 0x00000011", "", "0x11"),
+        ("position = 0", "position = 0\ndc = \"FreeRun\"", "no DC mode", "", "\"FreeRun\""),
+        ("\"csp\"", "\"cps\"", "unknown mode", "did you mean `csp`?", "\"cps\""),
+        ("\"csp\"", "\"pp\"", "not driven every cycle", "csv", "\"pp\""),
+        ("index = 0x6065", "index = 0x6066", "no such object", "type", "{ index = 0x6066, value = 2500 }"),
+        ("value = 2500", "value = -1", "does not fit", "", "-1"),
+        ("value = 2500", "valeu = 2500", "unknown key `valeu`", "did you mean `value`?", "valeu"),
+        ("encoder = 2000", "encoder = 0", "`encoder` is 0, but must be above zero", "", "0"),
+        ("encoder = 2000\n", "", "`encoder` is missing", "encoder = 2000", "[device.axis]"),
+        ("velocity = 200.0", "velocity = -200.0", "`limits.velocity` is -200", "", "-200.0"),
+        ("velocity = 200.0", "velocity = \"fast\"", "expected a number, found a string", "", "\"fast\""),
+        ("velocity = 200.0", "velocity = nan", "expected a finite number, found nan", "", "nan"),
+        ("[-50.0, 50.0]", "[50.0, -50.0]", "range of positions is empty", "lower end", "[50.0, -50.0]"),
+        ("[-50.0, 50.0]", "[50.0]", "two ends", "", "[50.0]"),
+        ("unit = \"mm\"", "velocity_unit = \"rmp\"", "unknown unit of velocity", "`rpm`", "\"rmp\""),
+        ("x = 50.0", "y = 50.0", "no device is named `y`", "axes: `x`, `v`", "y"),
+        ("x = 50.0", "v = 50.0", "`v` is in \"csv\"", "velocity =", "v"),
+        ("x = 50.0", "x = 50.1", "outside the axis' limits, -50 to 50 mm", "", "50.1"),
+        ("v = 25.0", "v = 51", "outside the axis' limits, -50 to 50 turn/s", "", "51"),
+        ("{ x = 50.0 }", "{}", "no axis is named", "", "{}"),
+        ("{ x = 50.0 }", "50.0", "expected axes and targets", "{ x = 50.0 }", "50.0"),
+        ("speed = 0.5", "speed = 5", "fraction of the axis' velocity limit", "up to 1.0", "5"),
+        ("ramp = 0.3", "dwell = \"1s\"", "more than one thing", "", "[[step]]"),
+        ("dwell = \"500ms\"", "", "does nothing", "dwell", "[[step]]"),
+        ("dwell = \"500ms\"", "dwel = \"500ms\"", "unknown key `dwel`", "`dwell`", "dwel"),
+        ("dwell = \"500ms\"", "dwell = \"500 parsec\"", "unknown unit of time `parsec`", "units:", "parsec"),
+    ] {
+        one(from, to, message, hint, marked);
+    }
+}
+
+#[test]
+fn modes_and_axes_belong_together() {
+    let found = broken("mode = \"csv\"\n", "");
+    assert_eq!(found.len(), 1, "{found:#?}");
+    assert!(found[0].message.contains("needs a `mode`"));
+    let (head, _) = GOOD.split_once("[device.axis]\nencoder").unwrap();
+    let found = problems(head);
+    assert_eq!(found.len(), 1, "{found:#?}");
+    assert!(found[0].message.contains("needs a [device.axis]"));
+}
+
+#[test]
+fn a_mode_the_esi_does_not_offer() {
+    let found = problems(&GOOD.replace("mode = \"csv\"", "mode = \"cst\""));
+    assert!(
+        found[0].message.contains("6071") || found[0].message.contains("cst"),
+        "{found:#?}"
+    );
+}
+
+#[test]
+fn everything_at_once() {
+    let text = GOOD
+        .replace("cycle = ", "cycel = ")
+        .replace("name = \"v\"", "name = \"x\"")
+        .replace(
+            "encoder = 2000\nlimits = { velocity = 50",
+            "encoder = 2000\nlimits = { velocity = 0",
+        )
+        .replace("dwell = \"500ms\"", "dwell = \"500mss\"")
+        .replace("x = 50.0", "q = 50.0");
+    let found = problems(&text);
+    let lines: Vec<u32> = found.iter().map(|p| p.line).collect();
+    assert_eq!(lines, [5, 21, 28, 31, 36, 39], "{found:#?}");
+}
+
+#[test]
+fn broken_toml_is_pointed_at() {
+    let found = problems("[bus\nnic = \"sim\"\n");
+    assert_eq!(found[0].line, 1);
+    let found = problems("");
+    assert!(found.iter().any(|p| p.message.contains("`bus` is missing")));
+    assert!(
+        found
+            .iter()
+            .any(|p| p.message.contains("`device` is missing"))
+    );
+}
+
+#[test]
+fn a_file_that_is_not_there() {
+    let e = load(&PathBuf::from("/nowhere/m.toml")).unwrap_err();
+    assert!(
+        e.to_string().starts_with("cannot read /nowhere/m.toml"),
+        "{e}"
+    );
+}
+
+proptest::proptest! {
+    #[test]
+    fn no_text_makes_it_stumble(cut in 0..GOOD.len(), with in ".{0,8}", len in 0..12_usize) {
+        let mut text = GOOD.to_owned();
+        let end = (cut + len).min(text.len());
+        text.replace_range(cut..end, &with);
+        if let Err(e) = parse(Path::new("m.toml"), &text) {
+            proptest::prop_assert!(!e.to_string().is_empty());
+        }
+    }
+}
