@@ -9,12 +9,16 @@ use super::plant::{CURRENT_STEP, Plant, PlantParams};
 /// Current-loop steps in one control cycle.
 const SUBSTEPS: u32 = 10;
 
-/// Bandwidths in rad/s. The observer is some four times faster than what it feeds, the current loop
+/// Bandwidths in rad/s. The observer is three times faster than what it feeds, the current loop
 /// more than ten times faster than the observer.
-const POSITION_BANDWIDTH: f64 = TAU * 25.0;
-const VELOCITY_BANDWIDTH: f64 = TAU * 30.0;
-const OBSERVER_BANDWIDTH: f64 = TAU * 100.0;
+const POSITION_BANDWIDTH: f64 = TAU * 20.0;
+const VELOCITY_BANDWIDTH: f64 = TAU * 20.0;
+const OBSERVER_BANDWIDTH: f64 = TAU * 60.0;
 const CURRENT_BANDWIDTH: f64 = TAU * 1000.0;
+
+/// Low-pass filters of what is shown, as the share of the new value: 2 ms and 10 ms.
+const FILTER: f64 = 0.2;
+const AVERAGE: f64 = 0.04;
 
 /// What the loops are asked for in one control cycle. Velocities in counts/s, accelerations in
 /// counts/s², torque as offset in N·m.
@@ -82,6 +86,7 @@ pub(super) struct Controller {
     current_integral: f64,
     /// A, over the last control cycle.
     current: f64,
+    filtered_velocity: f64,
     averaged_velocity: f64,
     averaged_current: f64,
 }
@@ -132,6 +137,7 @@ impl Controller {
             wanted: None,
             current_integral: 0.0,
             current: 0.0,
+            filtered_velocity: 0.0,
             averaged_velocity: 0.0,
             averaged_current: 0.0,
         }
@@ -145,6 +151,11 @@ impl Controller {
     /// Counts/s, as observed.
     pub(super) fn velocity(&self) -> f64 {
         self.observer.velocity * self.counts_per_rad
+    }
+
+    /// Counts/s, as 0x606C shows it.
+    pub(super) fn filtered_velocity(&self) -> f64 {
+        self.filtered_velocity * self.counts_per_rad
     }
 
     /// Counts/s.
@@ -248,6 +259,7 @@ impl Controller {
             plant.turn();
             sum += plant.current();
         }
+        plant.flush();
         self.current = sum / f64::from(SUBSTEPS);
     }
 
@@ -276,7 +288,25 @@ impl Controller {
         o.unexplained += o.load_gain * error;
         o.ahead += moved + o.position_gain * error - counted;
         self.counts = counts;
-        self.averaged_velocity += 0.04 * (o.velocity - self.averaged_velocity);
-        self.averaged_current += 0.04 * (self.current - self.averaged_current);
+        self.filtered_velocity += FILTER * (o.velocity - self.filtered_velocity);
+        self.averaged_velocity += AVERAGE * (o.velocity - self.averaged_velocity);
+        self.averaged_current += AVERAGE * (self.current - self.averaged_current);
+        for decaying in [
+            &mut o.velocity,
+            &mut o.unexplained,
+            &mut self.filtered_velocity,
+            &mut self.averaged_velocity,
+            &mut self.averaged_current,
+            &mut self.current_integral,
+        ] {
+            flush(decaying);
+        }
+    }
+}
+
+/// What decays towards zero would end as a subnormal number, which is slow to calculate with.
+pub(super) fn flush(value: &mut f64) {
+    if value.abs() < 1e-30 {
+        *value = 0.0;
     }
 }

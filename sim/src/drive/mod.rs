@@ -432,7 +432,7 @@ impl Drive {
     fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
         let (o, p) = (&self.objects, &self.parameters);
         let counts = self.controller.counts();
-        let velocity = self.controller.velocity();
+        let velocity = self.controller.filtered_velocity();
         let torque_per_ampere = self.params.torque_constant / p.torque_unit.max(1e-12);
         let current = self.controller.current();
         store.set(o.statusword, i64::from(self.statusword(limited)));

@@ -85,6 +85,10 @@ pub(super) struct Frame {
 
 impl Frame {
     pub(super) fn show(&self, counts: i64) -> i64 {
+        if self.width == 1 << 32 {
+            // The usual case, without a division.
+            return (counts + self.shift) << 32 >> 32;
+        }
         self.min + (counts + self.shift - self.min).rem_euclid(self.width)
     }
 

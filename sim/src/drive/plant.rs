@@ -148,6 +148,10 @@ impl Plant {
             + (voltage - self.back_emf * self.velocity) * self.current_per_volt;
     }
 
+    pub(super) fn flush(&mut self) {
+        super::control::flush(&mut self.current);
+    }
+
     /// Output stage off: the winding is open.
     pub(super) fn open(&mut self) {
         self.current = 0.0;
@@ -165,7 +169,7 @@ impl Plant {
         let free = before + torque * self.velocity_per_torque;
         // Friction takes away speed until there is none; it never drives.
         let friction = self.coulomb * self.velocity_per_torque;
-        self.velocity = free.signum() * (free.abs() - friction).max(0.0);
+        self.velocity = (free.abs() - friction).max(0.0).copysign(free);
         self.position += 0.5 * (before + self.velocity) * self.counts_per_velocity;
     }
 }

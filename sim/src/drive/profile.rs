@@ -46,9 +46,11 @@ impl Profile {
             *self = Self::at(target, 0.0);
             return true;
         }
-        // The speed from which the remaining way still suffices, in whole control cycles.
+        // The speed after this cycle from which the way left then suffices to come to rest: the root of
+        // v²/2a + (v₀ + v)/2·Δt = distance.
         let half = 0.5 * step;
-        let allowed = (half * half + 2.0 * limits.deceleration * distance.abs()).sqrt() - half;
+        let left = (distance.abs() - 0.5 * self.velocity * distance.signum() * DT).max(0.0);
+        let allowed = (half * half + 2.0 * limits.deceleration * left).sqrt() - half;
         let wanted = distance.signum() * allowed.min(limits.velocity);
         self.ramp(wanted, limits.acceleration, limits.deceleration);
         false
@@ -115,4 +117,77 @@ impl Interpolator {
 #[expect(clippy::cast_precision_loss, reason = "nanoseconds of a few cycles")]
 fn ratio(a: i64, b: i64) -> f64 {
     a as f64 / b as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Largest overshoot, and control cycles to the target.
+    fn approach(from: Profile, target: f64, limits: &Dynamics) -> (f64, u32) {
+        let (mut point, mut overshoot, mut cycles) = (from, 0.0_f64, 0);
+        let way = (target - from.position).signum();
+        while !point.approach(target, limits) {
+            overshoot = overshoot.max(way * (point.position - target));
+            assert!(point.velocity.abs() <= limits.velocity.max(from.velocity.abs()) + 1e-9);
+            cycles += 1;
+            assert!(cycles < 100_000, "{point:?}");
+        }
+        assert_eq!((point.position, point.velocity), (target, 0.0));
+        (overshoot, cycles)
+    }
+
+    #[test]
+    fn a_profile_ends_at_its_target_without_overshoot() {
+        let limits = Dynamics {
+            velocity: 50_000.0,
+            acceleration: 333_333.0,
+            deceleration: 250_000.0,
+        };
+        for distance in [0.3, 1.0, 7.0, 100.0, 4000.0, 20_000.0, -4001.0, -250_000.0] {
+            let (overshoot, cycles) = approach(Profile::at(5.0, 0.0), 5.0 + distance, &limits);
+            assert!(overshoot <= 0.1, "{distance}: {overshoot}");
+            let d = distance.abs();
+            let a = 2.0 / (1.0 / limits.acceleration + 1.0 / limits.deceleration);
+            let ideal = if d > 50_000.0 * 50_000.0 / a {
+                d / 50_000.0 + 50_000.0 / a
+            } else {
+                2.0 * (d / a).sqrt()
+            };
+            let took = f64::from(cycles) * DT;
+            assert!(
+                took < ideal + 0.01,
+                "{distance}: {took} s, ideally {ideal} s"
+            );
+        }
+    }
+
+    #[test]
+    fn a_profile_turns_round() {
+        let limits = Dynamics {
+            velocity: 10_000.0,
+            acceleration: 100_000.0,
+            deceleration: 100_000.0,
+        };
+        approach(Profile::at(0.0, 40_000.0), -100.0, &limits);
+        approach(Profile::at(0.0, -9_000.0), 50.0, &limits);
+    }
+
+    #[test]
+    fn interpolation_keeps_its_phase_when_sync_and_control_cycle_beat() {
+        let mut line = Interpolator::at(0.0);
+        let (mut control, mut worst) = (STEP_NS, 0.0_f64);
+        for cycle in 0..100 {
+            let sync = cycle * 1_000_000;
+            line.take(ratio(cycle, 1), 1_000_000);
+            while control <= sync + 1_000_000 {
+                let (value, slope) = line.advance();
+                // One period behind, to the nanosecond.
+                worst = worst.max((value - (ratio(control, 1_000_000) - 1.0).max(0.0)).abs());
+                assert!(cycle == 0 || (slope - 1000.0).abs() < 1e-9);
+                control += STEP_NS;
+            }
+        }
+        assert!(worst < 1e-9, "{worst}");
+    }
 }

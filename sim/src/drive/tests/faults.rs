@@ -33,7 +33,6 @@ fn leaving_op_while_moving_decelerates_then_faults() {
     assert_eq!(rig.word() & 0x4f, 0x0f);
     assert!(rig.drive.velocity_rev_s() > 45.0);
     let (ms, jerk) = until(&mut rig, State::Fault);
-    println!("50 rev/s stopped in {ms} ms, at most {jerk} rev/s per ms");
     // 10,000 rpm/s from 3000 rpm takes 300 ms.
     assert!((290..330).contains(&ms), "{ms}");
     assert!(jerk < 0.4, "{jerk}");
@@ -138,7 +137,6 @@ fn the_following_error_has_a_time_out_and_an_off_switch() {
     assert_eq!(rig.drive.state(), State::OperationEnabled);
     assert_ne!(rig.word() & 1 << 13, 0);
     let (ms, _) = until(&mut rig, State::FaultReactionActive);
-    println!("tripped {ms} ms after 50 ms");
     assert!(ms < 20);
 
     let mut rig = self::rig();
@@ -221,7 +219,6 @@ fn faults_stop_by_0x605e() {
         rig.cycles(300);
         rig.drive.inject_fault(0x2310);
         let (ms, _) = until(&mut rig, State::Fault);
-        println!("option {option}: {ms} ms");
         assert!(ms.abs_diff(stops_in) < 20, "option {option}: {ms} ms");
     }
     let mut rig = turning(1500);

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// A trapezoid in counts: position at a time, and how long it takes.
+/// A trapezoid in turns: position at a time, and how long it takes.
 struct Trapezoid {
     distance: f64,
     speed: f64,
@@ -30,21 +30,22 @@ impl Trapezoid {
 }
 
 const TRAPEZOID: Trapezoid = Trapezoid {
-    distance: 10.0 * 2000.0,
-    speed: 25.0 * 2000.0,
-    acceleration: 150.0 * 2000.0,
+    distance: 10.0,
+    speed: 25.0,
+    acceleration: 150.0,
 };
 
 /// Runs the trapezoid in CSP, then half a second of rest. Largest following error while moving, range
 /// of the position at rest relative to the target.
 fn csp(rig: &mut Rig) -> (i64, i64, i64) {
     let start = rig.get(0x6064);
+    let turn = f64::from(rig.counts_per_turn);
     let cycle = f64::from(u32::try_from(rig.cycle_ns).unwrap()) * 1e-9;
     let (mut worst, mut t) = (0, 0.0);
     while t < TRAPEZOID.duration() {
         t += cycle;
         #[expect(clippy::cast_possible_truncation)]
-        let target = start + TRAPEZOID.at(t).round() as i64;
+        let target = start + (turn * TRAPEZOID.at(t)).round() as i64;
         rig.set(0x607a, 0, target);
         rig.cycle();
         worst = worst.max(rig.get(0x60f4).abs());
@@ -70,9 +71,8 @@ fn csp_follows_a_trapezoid_and_stands_still() {
         rig.set(0x60c2, 1, value);
         rig.set(0x60c2, 2, index);
         rig.enable(8);
-        for turn in 0..3 {
+        for _ in 0..3 {
             let (worst, low, high) = csp(&mut rig);
-            println!("{cycle_us} µs, {turn}: worst {worst}, rest {low}..{high}");
             assert!(worst < 100, "{cycle_us} µs: {worst} counts");
             assert!(low >= -1 && high <= 1, "{cycle_us} µs: {low}..{high}");
         }
@@ -86,12 +86,49 @@ fn csp_holds_against_a_load() {
     rig.drive.set_load_torque(0.05);
     rig.cycles(300);
     let (worst, low, high) = csp(&mut rig);
-    println!("loaded: worst {worst}, rest {low}..{high}");
     assert!(
         worst < 100 && low >= -1 && high <= 1,
         "{worst} {low}..{high}"
     );
     assert!((rig.get(0x6077) - 422).abs() < 50, "{}", rig.get(0x6077));
+}
+
+#[test]
+fn csp_stands_still_with_other_motors() {
+    let default = PlantParams::default();
+    let plants = [
+        PlantParams {
+            counts_per_turn: 131_072,
+            ..default
+        },
+        PlantParams {
+            counts_per_turn: 256,
+            ..default
+        },
+        PlantParams {
+            inertia: 2e-4,
+            coulomb_friction: 0.02,
+            ..default
+        },
+        PlantParams {
+            inertia: 5e-6,
+            coulomb_friction: 0.0,
+            viscous_friction: 0.0,
+            ..default
+        },
+    ];
+    for plant in plants {
+        let mut rig = Rig::new(plant);
+        // The window is in counts, too.
+        rig.set(0x6065, 0, i64::from(plant.counts_per_turn));
+        rig.enable(8);
+        let (worst, low, high) = csp(&mut rig);
+        let bound = i64::from(plant.counts_per_turn) / 20;
+        assert!(
+            worst < bound && low >= -1 && high <= 1,
+            "{worst} {low}..{high}"
+        );
+    }
 }
 
 #[test]
@@ -114,7 +151,6 @@ fn csp_without_interpolation_takes_set_points_as_steps() {
         spread.1 - spread.0
     };
     let (a, b) = (rough(&mut smooth), rough(&mut stepped));
-    println!("torque ripple: interpolated {a}, stepped {b} per mille");
     assert!(b > 3 * a, "{a} {b}");
 }
 
@@ -148,7 +184,6 @@ fn csv_reaches_its_speed() {
             rig.cycle();
             worst = worst.max((rig.drive.velocity_rev_s() - wanted).abs());
         }
-        println!("csv {rpm} rpm: off by {worst} rev/s at most");
         assert!(worst <= 0.01 * wanted.abs().max(2.0), "{rpm} rpm: {worst}");
         assert!((rig.get(0x606c) - rpm).abs() <= 2 + rpm.abs() / 100);
     }
@@ -156,7 +191,6 @@ fn csv_reaches_its_speed() {
 
 #[test]
 fn velocity_units_follow_0x60a9() {
-    // Where a speed is whole counts per control cycle, quantisation does not show.
     for (code, value) in [
         (0x00b4_4700, 600),
         (0xfdb4_4700, 600_000),
@@ -185,14 +219,12 @@ fn cst_accelerates_against_friction_to_a_bounded_speed() {
     let early = rig.drive.velocity_rev_s();
     rig.cycles(20_000);
     let late = rig.drive.velocity_rev_s();
-    println!("cst 8 %: {early} rev/s after 0.1 s, {late} at the end");
     // (80 ‰ of 118.4 mN·m − 4 mN·m) / 20 µN·m·s
     assert!(early > 1.0 && (late - 43.5).abs() < 1.0);
 
     rig.set(0x6071, 0, 1000);
     rig.cycles(5_000);
     let fast = rig.drive.velocity_rev_s();
-    println!("cst 100 %: {fast} rev/s");
     assert!(fast < 100.5 && fast > 90.0, "0x6080 bounds it: {fast}");
     assert_ne!(rig.word() & 1 << 11, 0, "internal limit");
 }

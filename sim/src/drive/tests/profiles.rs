@@ -30,7 +30,6 @@ fn pp_moves_on_the_edge_and_acknowledges() {
     assert_eq!(rig.word() & 0x1000, 0, "ready for the next");
     let ms = until_reached(&mut rig);
     // 10 turns at 25 rev/s and 166.7 rev/s².
-    println!("pp: {ms} ms");
     assert!((545..570).contains(&ms), "{ms}");
     rig.cycles(100);
     assert!((rig.get(0x6064) - 20_000).abs() <= 1);
@@ -55,7 +54,7 @@ fn pp_buffers_one_set_point_or_changes_at_once() {
         rig.cycle();
         furthest = furthest.max(rig.get(0x6064));
     }
-    assert!((furthest - 4000).abs() <= 5, "{furthest}");
+    assert!((furthest - 4000).abs() <= 1, "{furthest}");
     assert!((rig.get(0x6064) - 1000).abs() <= 1);
 
     command(&mut rig, 10_000, 0x1f);
@@ -99,7 +98,6 @@ fn pv_ramps_to_its_speed() {
     rig.set(0x60ff, 0, 3000);
     rig.cycles(2);
     let ms = until_reached(&mut rig);
-    println!("pv: {ms} ms");
     assert!((295..340).contains(&ms), "{ms}");
     rig.cycles(100);
     assert!((rig.drive.velocity_rev_s() - 50.0).abs() < 0.5);
@@ -155,24 +153,4 @@ fn changing_the_mode_while_enabled_takes_over_where_the_axis_is() {
     assert_eq!(rig.get(0x6061), 8);
     assert!((rig.get(0x6064) - here).abs() <= 1);
     assert_eq!(rig.drive.state(), State::OperationEnabled);
-}
-
-#[test]
-fn zz_trace() {
-    let mut rig = rig();
-    rig.enable(1);
-    rig.set(0x607a, 0, 4000);
-    rig.set(0x6040, 0, 0x1f);
-    for n in 0..400 {
-        rig.cycle();
-        println!(
-            "{n} d {} p {} e {} v {} tq {} trueV {:.3}",
-            rig.get(0x6062),
-            rig.get(0x6064),
-            rig.get(0x60f4),
-            rig.get(0x606c),
-            rig.get(0x6077),
-            rig.drive.velocity_rev_s()
-        );
-    }
 }
