@@ -5,6 +5,7 @@
 //! - [`select`](mod@select): the user's choice of device, module, PDOs and DC mode
 //! - [`layout`]: that choice → bit offsets
 //! - [`startup`]: that choice → the SDOs to send before SafeOp
+//! - [`sii`]: the EEPROM image, from an ESI device or from bytes
 
 #![forbid(unsafe_code)]
 
@@ -13,6 +14,7 @@ pub mod layout;
 mod mode;
 pub mod model;
 pub mod select;
+pub mod sii;
 pub mod startup;
 mod xml;
 

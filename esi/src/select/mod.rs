@@ -15,7 +15,9 @@ pub use error::SelectError;
 
 use crate::layout::Layout;
 use crate::mode::Mode;
-use crate::model::{Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Pdo, Position};
+use crate::model::{
+    Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Module, Pdo, Position,
+};
 use crate::startup::{self, StartupSdo};
 
 /// An object to be mapped.
@@ -85,7 +87,7 @@ pub fn select(
     choice: &Choice<'_>,
 ) -> Result<Selection, SelectError> {
     let mut notes = Vec::new();
-    let placed = module::choose(file, device, choice.mode)?;
+    let placed = module::choose(&file.modules, device, choice.mode)?;
     let dictionary = merged(device, placed);
     let chooser = |direction| pdo::Chooser {
         device,
@@ -157,7 +159,7 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
         .into_iter()
         .filter(|&mode| {
             if has_slots {
-                return module::choose(file, device, Some(mode))
+                return module::choose(&file.modules, device, Some(mode))
                     .is_ok_and(|placed| placed.is_some());
             }
             let control = |pdo: &Pdo, index| pdo.entries.iter().any(|entry| entry.index == index);
@@ -165,4 +167,16 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
                 .is_some_and(|target| device.rx_pdos.iter().any(|pdo| control(pdo, target)))
         })
         .collect()
+}
+
+/// Every PDO of one direction, those of the default module in place; for images that know no choice.
+pub(crate) fn default_pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
+    let placed = module::choose(modules, device, None).unwrap_or(None);
+    pdo::Chooser {
+        device,
+        placed,
+        dictionary: &device.dictionary,
+        direction,
+    }
+    .available()
 }

@@ -2,7 +2,7 @@
 
 use super::SelectError;
 use crate::mode::Mode;
-use crate::model::{Device, EsiFile, Module, Slot};
+use crate::model::{Device, Module, Slot};
 
 const MODES_OF_OPERATION: u16 = 0x6060;
 
@@ -15,7 +15,7 @@ pub(super) struct Placed<'a> {
 
 /// `None`: the device has no slots, or an optional slot stays empty.
 pub(super) fn choose<'a>(
-    file: &'a EsiFile,
+    modules: &'a [Module],
     device: &'a Device,
     mode: Option<Mode>,
 ) -> Result<Option<Placed<'a>>, SelectError> {
@@ -41,7 +41,7 @@ pub(super) fn choose<'a>(
     else {
         return Ok(None);
     };
-    let offered = modules_of(file, slot)?;
+    let offered = modules_of(modules, slot)?;
     let found = match mode {
         Some(mode) => {
             let by_command = offered
@@ -79,11 +79,11 @@ pub(super) fn choose<'a>(
 }
 
 /// The modules that one slot takes.
-fn modules_of<'a>(file: &'a EsiFile, slot: &Slot) -> Result<Vec<&'a Module>, SelectError> {
+fn modules_of<'a>(modules: &'a [Module], slot: &Slot) -> Result<Vec<&'a Module>, SelectError> {
     slot.module_idents
         .iter()
         .map(|&(ident, _)| {
-            file.modules
+            modules
                 .iter()
                 .find(|module| module.ident == ident)
                 .ok_or_else(|| SelectError::UnknownModule {

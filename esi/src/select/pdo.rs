@@ -15,7 +15,7 @@ pub(super) struct Chooser<'a> {
 
 impl Chooser<'_> {
     /// Every PDO that could be assigned: the device's, with those of the module in their place.
-    fn available(&self) -> Vec<Pdo> {
+    pub fn available(&self) -> Vec<Pdo> {
         let (device, module) = match (self.direction, self.placed) {
             (Direction::Rx, placed) => (&self.device.rx_pdos, placed.map(|p| &p.module.rx_pdos)),
             (Direction::Tx, placed) => (&self.device.tx_pdos, placed.map(|p| &p.module.tx_pdos)),

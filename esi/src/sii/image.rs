@@ -1,0 +1,210 @@
+//! ESI device → EEPROM image contents.
+
+use super::datatype::type_code;
+use super::{General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiPdo, SiiSyncManager};
+use crate::model::{Device, Direction, Mailbox, Module, Pdo, SmUse};
+use crate::select::default_pdos;
+
+/// What differs from one piece of hardware to the next.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SiiOptions {
+    pub alias: u16,
+    pub serial: u32,
+}
+
+impl Sii {
+    #[must_use]
+    pub fn from_device(device: &Device, modules: &[Module], options: &SiiOptions) -> Self {
+        let mut config = [0u8; 14];
+        for (to, from) in config.iter_mut().zip(&device.eeprom.config_data) {
+            *to = *from;
+        }
+        if let Some(field) = config.get_mut(8..10) {
+            field.copy_from_slice(&options.alias.to_le_bytes());
+        }
+        let rx = default_pdos(device, modules, Direction::Rx);
+        let tx = default_pdos(device, modules, Direction::Tx);
+        Self {
+            config,
+            alias: options.alias,
+            checksum_ok: true,
+            identity: device.identity,
+            serial: options.serial,
+            bootstrap: bootstrap(&device.eeprom.bootstrap),
+            mailbox: mailbox_areas(device),
+            protocols: device.mailbox.as_ref().map(protocols).unwrap_or_default(),
+            byte_size: device.eeprom.byte_size,
+            general: Some(general(device)),
+            fmmus: device.fmmus.clone(),
+            sync_managers: sync_managers(device, &rx, &tx),
+            tx_pdos: tx.iter().map(pdo).collect(),
+            rx_pdos: rx.iter().map(pdo).collect(),
+            dc: device
+                .dc_modes
+                .iter()
+                .map(|mode| SiiDc {
+                    name: mode.name.clone(),
+                    description: mode.description.clone(),
+                    assign_activate: mode.assign_activate,
+                    cycle0_ns: u32::try_from(mode.sync0.cycle_ns).unwrap_or(0),
+                    shift0_ns: i32::try_from(mode.sync0.shift_ns).unwrap_or(0),
+                    shift1_ns: i32::try_from(mode.sync1.shift_ns).unwrap_or(0),
+                    sync0_factor: i16::try_from(mode.sync0.factor).unwrap_or(0),
+                    sync1_factor: i16::try_from(mode.sync1.factor).unwrap_or(0),
+                })
+                .collect(),
+            others: Vec::new(),
+            ended: true,
+        }
+    }
+}
+
+fn bootstrap(bytes: &[u8]) -> MailboxAreas {
+    let word = |number: usize| {
+        let pair = bytes
+            .get(number * 2..number * 2 + 2)
+            .and_then(|pair| pair.try_into().ok());
+        pair.map_or(0, u16::from_le_bytes)
+    };
+    MailboxAreas {
+        receive_offset: word(0),
+        receive_size: word(1),
+        send_offset: word(2),
+        send_size: word(3),
+    }
+}
+
+fn mailbox_areas(device: &Device) -> MailboxAreas {
+    let area = |usage| {
+        let sm = device.sync_managers.iter().find(|sm| sm.usage == usage);
+        sm.map_or((0, 0), |sm| (sm.start_address, sm.default_size))
+    };
+    let (receive_offset, receive_size) = area(SmUse::MBoxOut);
+    let (send_offset, send_size) = area(SmUse::MBoxIn);
+    MailboxAreas {
+        receive_offset,
+        receive_size,
+        send_offset,
+        send_size,
+    }
+}
+
+fn protocols(mailbox: &Mailbox) -> Protocols {
+    let bits = [
+        (mailbox.aoe, Protocols::AOE),
+        (mailbox.eoe, Protocols::EOE),
+        (mailbox.coe.is_some(), Protocols::COE),
+        (mailbox.foe, Protocols::FOE),
+        (mailbox.soe, Protocols::SOE),
+        (mailbox.voe, Protocols::VOE),
+    ];
+    Protocols(
+        bits.into_iter()
+            .filter(|(on, _)| *on)
+            .fold(0, |word, (_, bit)| word | bit),
+    )
+}
+
+fn general(device: &Device) -> General {
+    let mailbox = device.mailbox.as_ref();
+    let coe = mailbox.and_then(|mailbox| mailbox.coe.as_ref());
+    let coe_details = coe.map_or(0, |coe| {
+        let bits = [
+            true,
+            coe.sdo_info,
+            coe.pdo_assign,
+            coe.pdo_config,
+            coe.pdo_upload,
+            coe.complete_access,
+        ];
+        bits.into_iter()
+            .rev()
+            .fold(0, |byte, bit| byte << 1 | u8::from(bit))
+    });
+    let link_layer = mailbox.is_some_and(|mailbox| mailbox.data_link_layer);
+    General {
+        group: device.type_name.clone(),
+        image: String::new(),
+        order: device.type_name.clone(),
+        name: device.name.clone(),
+        coe_details,
+        foe: mailbox.is_some_and(|mailbox| mailbox.foe),
+        eoe: mailbox.is_some_and(|mailbox| mailbox.eoe),
+        flags: if link_layer { 0x04 } else { 0 },
+        ebus_ma: 0,
+        ports: ports(&device.physics),
+    }
+}
+
+/// `Physics`, first letter = port 0.
+fn ports(physics: &str) -> u16 {
+    physics
+        .chars()
+        .take(4)
+        .enumerate()
+        .fold(0, |word, (port, letter)| {
+            let code: u16 = match letter.to_ascii_uppercase() {
+                'Y' => 1,
+                'K' => 3,
+                'H' => 4,
+                _ => 0,
+            };
+            word | code << (4 * port)
+        })
+}
+
+/// A size that the ESI leaves open is what the default PDOs need.
+fn sync_managers(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Vec<SiiSyncManager> {
+    (0u8..)
+        .zip(&device.sync_managers)
+        .map(|(number, sm)| {
+            let bits: u32 = rx
+                .iter()
+                .chain(tx)
+                .filter(|pdo| pdo.sm == Some(number))
+                .map(Pdo::bit_len)
+                .fold(0, u32::saturating_add);
+            let len = match sm.default_size {
+                0 => u16::try_from(bits.div_ceil(8)).unwrap_or(u16::MAX),
+                size => size,
+            };
+            SiiSyncManager {
+                start_address: sm.start_address,
+                len,
+                control: sm.control_byte,
+                enable: u8::from(sm.enable),
+                usage: sm.usage,
+            }
+        })
+        .collect()
+}
+
+fn pdo(pdo: &Pdo) -> SiiPdo {
+    let flags = [
+        (pdo.mandatory, 0x01),
+        (pdo.fixed, 0x10),
+        (pdo.virtual_, 0x20),
+    ];
+    SiiPdo {
+        index: pdo.index,
+        name: pdo.name.clone(),
+        sm: pdo.sm,
+        synchronization: 0,
+        flags: flags
+            .into_iter()
+            .filter(|(on, _)| *on)
+            .fold(0, |word, (_, bit)| word | bit),
+        entries: pdo
+            .entries
+            .iter()
+            .map(|entry| SiiEntry {
+                index: entry.index,
+                sub: entry.sub,
+                name: entry.name.clone(),
+                data_type: type_code(&entry.data_type),
+                bit_len: u8::try_from(entry.bit_len).unwrap_or(u8::MAX),
+                flags: 0,
+            })
+            .collect(),
+    }
+}

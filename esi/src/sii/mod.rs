@@ -1,0 +1,208 @@
+//! The EEPROM image (SII, ETG.2010): what a SubDevice tells about itself before anybody has its ESI.
+//!
+//! `image` derives it from an ESI device, `emit` writes the bytes, `parse` reads them, `strings` and `crc` are the
+//! two details both need. [`Sii`] is the meeting point: `parse(emit(sii))` gives the same value again as long
+//! as its texts are ASCII of at most 63 characters.
+
+mod crc;
+mod datatype;
+mod emit;
+mod image;
+mod parse;
+mod strings;
+
+pub use crc::checksum;
+pub use image::SiiOptions;
+pub use parse::SiiError;
+
+use crate::model::{Device, FmmuUse, Identity, Module, SmUse};
+
+/// Categories start here.
+const HEADER_BYTES: usize = 0x80;
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Sii {
+    /// Words 0–3, 5 and 6: PDI control, PDI configuration, pulse length, extended PDI configuration, reserved.
+    pub config: [u8; 14],
+    /// Configured station alias (word 4, part of `config`).
+    pub alias: u16,
+    /// The checksum over `config` is right; a controller ignores an image where it is not.
+    pub checksum_ok: bool,
+    pub identity: Identity,
+    pub serial: u32,
+    pub bootstrap: MailboxAreas,
+    pub mailbox: MailboxAreas,
+    pub protocols: Protocols,
+    /// Bytes of EEPROM that the image claims.
+    pub byte_size: u32,
+    pub general: Option<General>,
+    pub fmmus: Vec<FmmuUse>,
+    pub sync_managers: Vec<SiiSyncManager>,
+    pub tx_pdos: Vec<SiiPdo>,
+    pub rx_pdos: Vec<SiiPdo>,
+    pub dc: Vec<SiiDc>,
+    /// Categories that are not interpreted: type and length in bytes.
+    pub others: Vec<(u16, usize)>,
+    /// The end mark was found.
+    pub ended: bool,
+}
+
+/// MainDevice → SubDevice (`receive`) and back (`send`), as the SubDevice sees it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct MailboxAreas {
+    pub receive_offset: u16,
+    pub receive_size: u16,
+    pub send_offset: u16,
+    pub send_size: u16,
+}
+
+/// Word 0x1C.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Protocols(pub u16);
+
+impl Protocols {
+    pub const AOE: u16 = 0x01;
+    pub const EOE: u16 = 0x02;
+    pub const COE: u16 = 0x04;
+    pub const FOE: u16 = 0x08;
+    pub const SOE: u16 = 0x10;
+    pub const VOE: u16 = 0x20;
+
+    #[must_use]
+    pub fn has(self, protocol: u16) -> bool {
+        self.0 & protocol != 0
+    }
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct General {
+    pub group: String,
+    pub image: String,
+    pub order: String,
+    pub name: String,
+    /// Bit 0 SDO, 1 SDO Info, 2 PDO assign, 3 PDO configuration, 4 PDO upload, 5 complete access.
+    pub coe_details: u8,
+    pub foe: bool,
+    pub eoe: bool,
+    /// Bit 1: no LRW, bit 2: mailbox data link layer.
+    pub flags: u8,
+    pub ebus_ma: i16,
+    /// Four bits a port: 0 none, 1 MII, 3 E-bus, 4 fast hot connect.
+    pub ports: u16,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SiiSyncManager {
+    pub start_address: u16,
+    pub len: u16,
+    pub control: u8,
+    /// Bit 0 enabled, bit 1 fixed contents, bit 2 virtual, bit 3 in Op only.
+    pub enable: u8,
+    pub usage: SmUse,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SiiPdo {
+    pub index: u16,
+    pub name: String,
+    /// `None`: not assigned by default.
+    pub sm: Option<u8>,
+    pub synchronization: u8,
+    /// Bit 0 mandatory, 4 fixed, 5 virtual.
+    pub flags: u16,
+    pub entries: Vec<SiiEntry>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SiiEntry {
+    pub index: u16,
+    pub sub: u8,
+    pub name: String,
+    /// Index of the base type in the object dictionary's type area (ETG.1020).
+    pub data_type: u8,
+    pub bit_len: u8,
+    pub flags: u16,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SiiDc {
+    pub name: String,
+    pub description: String,
+    pub assign_activate: u16,
+    pub cycle0_ns: u32,
+    pub shift0_ns: i32,
+    pub shift1_ns: i32,
+    pub sync0_factor: i16,
+    pub sync1_factor: i16,
+}
+
+impl SiiPdo {
+    #[must_use]
+    pub fn bit_len(&self) -> u32 {
+        self.entries
+            .iter()
+            .map(|entry| u32::from(entry.bit_len))
+            .sum()
+    }
+}
+
+/// The EEPROM image of a device as its ESI describes it. A modular device appears with its default module.
+#[must_use]
+pub fn emit(device: &Device, modules: &[Module], options: &SiiOptions) -> Vec<u8> {
+    Sii::from_device(device, modules, options).to_bytes()
+}
+
+/// Reads an EEPROM image.
+pub fn parse(bytes: &[u8]) -> Result<Sii, SiiError> {
+    parse::image(bytes)
+}
+
+/// Category types of ETG.2010.
+mod category {
+    pub const STRINGS: u16 = 10;
+    pub const GENERAL: u16 = 30;
+    pub const FMMU: u16 = 40;
+    pub const SYNC_MANAGER: u16 = 41;
+    pub const TX_PDO: u16 = 50;
+    pub const RX_PDO: u16 = 51;
+    pub const DC: u16 = 60;
+    pub const END: u16 = 0xffff;
+}
+
+fn fmmu_code(usage: FmmuUse) -> u8 {
+    match usage {
+        FmmuUse::Outputs => 1,
+        FmmuUse::Inputs => 2,
+        FmmuUse::MBoxState => 3,
+        FmmuUse::Other => 0,
+    }
+}
+
+fn fmmu_use(code: u8) -> FmmuUse {
+    match code {
+        1 => FmmuUse::Outputs,
+        2 => FmmuUse::Inputs,
+        3 => FmmuUse::MBoxState,
+        _ => FmmuUse::Other,
+    }
+}
+
+fn sm_code(usage: SmUse) -> u8 {
+    match usage {
+        SmUse::MBoxOut => 1,
+        SmUse::MBoxIn => 2,
+        SmUse::Outputs => 3,
+        SmUse::Inputs => 4,
+        SmUse::Other => 0,
+    }
+}
+
+fn sm_use(code: u8) -> SmUse {
+    match code {
+        1 => SmUse::MBoxOut,
+        2 => SmUse::MBoxIn,
+        3 => SmUse::Outputs,
+        4 => SmUse::Inputs,
+        _ => SmUse::Other,
+    }
+}

@@ -1,0 +1,219 @@
+//! Bytes → image contents. Every offset comes from outside and may point anywhere.
+
+use super::strings::Table;
+use super::{
+    General, HEADER_BYTES, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiPdo, SiiSyncManager,
+    category, checksum, fmmu_use, sm_use,
+};
+use crate::model::{FmmuUse, Identity};
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum SiiError {
+    #[error("the image has {len} bytes, the header alone needs 128")]
+    TooShort { len: usize },
+    #[error("category {category} at byte 0x{offset:x} claims {claimed} bytes, {left} are left")]
+    Category {
+        category: u16,
+        offset: usize,
+        claimed: usize,
+        left: usize,
+    },
+    #[error(
+        "PDO category {category}: PDO 0x{pdo:04x} claims {entries} entries, more than the category holds"
+    )]
+    Pdo {
+        category: u16,
+        pdo: u16,
+        entries: u8,
+    },
+}
+
+pub(super) fn image(bytes: &[u8]) -> Result<Sii, SiiError> {
+    let Some((header, body)) = bytes.split_at_checked(HEADER_BYTES) else {
+        return Err(SiiError::TooShort { len: bytes.len() });
+    };
+    let mut sii = read_header(header);
+    let (found, ended) = categories(body)?;
+    sii.ended = ended;
+    let strings = found.iter().find(|(kind, _)| *kind == category::STRINGS);
+    let strings = strings
+        .map(|(_, data)| Table::parse(data))
+        .unwrap_or_default();
+    for (kind, data) in found {
+        match kind {
+            category::STRINGS => {}
+            category::GENERAL => sii.general = Some(general(data, &strings)),
+            category::FMMU => sii.fmmus = fmmus(data),
+            category::SYNC_MANAGER => {
+                sii.sync_managers = data.chunks_exact(8).map(sync_manager).collect()
+            }
+            category::TX_PDO => sii.tx_pdos.extend(pdos(kind, data, &strings)?),
+            category::RX_PDO => sii.rx_pdos.extend(pdos(kind, data, &strings)?),
+            category::DC => {
+                sii.dc = data
+                    .chunks_exact(24)
+                    .map(|chunk| dc(chunk, &strings))
+                    .collect()
+            }
+            _ => sii.others.push((kind, data.len())),
+        }
+    }
+    Ok(sii)
+}
+
+fn read_header(header: &[u8]) -> Sii {
+    let mut config = [0; 14];
+    for (to, from) in config.iter_mut().zip(header) {
+        *to = *from;
+    }
+    let areas = |at: usize| MailboxAreas {
+        receive_offset: word(header, at),
+        receive_size: word(header, at + 2),
+        send_offset: word(header, at + 4),
+        send_size: word(header, at + 6),
+    };
+    Sii {
+        config,
+        alias: word(header, 8),
+        checksum_ok: byte(header, 14) == checksum(&config),
+        identity: Identity {
+            vendor: double_word(header, 0x10),
+            product: double_word(header, 0x14),
+            revision: double_word(header, 0x18),
+        },
+        serial: double_word(header, 0x1c),
+        bootstrap: areas(0x28),
+        mailbox: areas(0x30),
+        protocols: Protocols(word(header, 0x38)),
+        byte_size: (u32::from(word(header, 0x7c)) + 1) * 128,
+        ..Sii::default()
+    }
+}
+
+type Category<'a> = (u16, &'a [u8]);
+
+/// All categories up to the end mark; an image that just stops is accepted and said to be so.
+fn categories(body: &[u8]) -> Result<(Vec<Category<'_>>, bool), SiiError> {
+    let mut found = Vec::new();
+    let mut rest = body;
+    loop {
+        let Some((kind, after)) = rest.split_at_checked(2) else {
+            return Ok((found, false));
+        };
+        let kind = word(kind, 0);
+        if kind == category::END {
+            return Ok((found, true));
+        }
+        let Some((length, after)) = after.split_at_checked(2) else {
+            return Ok((found, false));
+        };
+        let claimed = usize::from(word(length, 0)) * 2;
+        let Some((data, after)) = after.split_at_checked(claimed) else {
+            let offset = HEADER_BYTES + body.len() - rest.len();
+            return Err(SiiError::Category {
+                category: kind,
+                offset,
+                claimed,
+                left: after.len(),
+            });
+        };
+        found.push((kind, data));
+        rest = after;
+    }
+}
+
+fn general(data: &[u8], strings: &Table) -> General {
+    General {
+        group: strings.text(byte(data, 0)),
+        image: strings.text(byte(data, 1)),
+        order: strings.text(byte(data, 2)),
+        name: strings.text(byte(data, 3)),
+        coe_details: byte(data, 5),
+        foe: byte(data, 6) != 0,
+        eoe: byte(data, 7) != 0,
+        flags: byte(data, 11),
+        ebus_ma: i16::from_le_bytes(word(data, 12).to_le_bytes()),
+        ports: word(data, 16),
+    }
+}
+
+fn fmmus(data: &[u8]) -> Vec<FmmuUse> {
+    // The last byte may only fill the word.
+    let used = match data.split_last() {
+        Some((0xff, before)) => before,
+        _ => data,
+    };
+    used.iter().map(|&code| fmmu_use(code)).collect()
+}
+
+fn sync_manager(data: &[u8]) -> SiiSyncManager {
+    SiiSyncManager {
+        start_address: word(data, 0),
+        len: word(data, 2),
+        control: byte(data, 4),
+        enable: byte(data, 6),
+        usage: sm_use(byte(data, 7)),
+    }
+}
+
+fn pdos(kind: u16, mut data: &[u8], strings: &Table) -> Result<Vec<SiiPdo>, SiiError> {
+    let mut found = Vec::new();
+    while let Some((head, after)) = data.split_at_checked(8) {
+        let (index, count) = (word(head, 0), byte(head, 2));
+        let Some((entries, after)) = after.split_at_checked(usize::from(count) * 8) else {
+            return Err(SiiError::Pdo {
+                category: kind,
+                pdo: index,
+                entries: count,
+            });
+        };
+        found.push(SiiPdo {
+            index,
+            name: strings.text(byte(head, 5)),
+            sm: Some(byte(head, 3)).filter(|sm| *sm != 0xff),
+            synchronization: byte(head, 4),
+            flags: word(head, 6),
+            entries: entries
+                .chunks_exact(8)
+                .map(|entry| SiiEntry {
+                    index: word(entry, 0),
+                    sub: byte(entry, 2),
+                    name: strings.text(byte(entry, 3)),
+                    data_type: byte(entry, 4),
+                    bit_len: byte(entry, 5),
+                    flags: word(entry, 6),
+                })
+                .collect(),
+        });
+        data = after;
+    }
+    Ok(found)
+}
+
+fn dc(data: &[u8], strings: &Table) -> SiiDc {
+    let signed = |at| i32::from_le_bytes(double_word(data, at).to_le_bytes());
+    let factor = |at| i16::from_le_bytes(word(data, at).to_le_bytes());
+    SiiDc {
+        cycle0_ns: double_word(data, 0),
+        shift0_ns: signed(4),
+        shift1_ns: signed(8),
+        sync1_factor: factor(12),
+        assign_activate: word(data, 14),
+        sync0_factor: factor(16),
+        name: strings.text(byte(data, 18)),
+        description: strings.text(byte(data, 19)),
+    }
+}
+
+/// Little-endian reads; what lies outside reads as 0, as in a shorter, older category.
+fn byte(data: &[u8], at: usize) -> u8 {
+    data.get(at).copied().unwrap_or(0)
+}
+
+fn word(data: &[u8], at: usize) -> u16 {
+    u16::from_le_bytes([byte(data, at), byte(data, at + 1)])
+}
+
+fn double_word(data: &[u8], at: usize) -> u32 {
+    u32::from(word(data, at)) | u32::from(word(data, at + 2)) << 16
+}
