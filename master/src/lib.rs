@@ -1,12 +1,30 @@
 //! An EtherCAT master application for CiA 402 drives in the cyclic synchronous modes.
 //!
-//! The layers, outermost first:
+//! The layers, from the file to the wire:
 //!
-//! - [`config`]: the machine file as written, then validated.
-//! - [`mailbox`]: CoE over raw datagrams, beside the cyclic loop.
-//! - [`link`]: what carries Ethernet frames.
+//! - [`config`]: the machine file as written, then validated;
+//! - [`session`]: one run of a machine, from the file to the summary;
+//! - [`supervise`]: everything beside the cycle while the machine runs;
+//! - [`bringup`]: from a silent wire to SafeOp; may block and allocate;
+//! - [`rt`]: the cycle; must not block or allocate;
+//! - [`mailbox`]: CoE over raw datagrams, beside the cycle;
+//! - [`link`]: what carries Ethernet frames;
+//! - [`clock`]: monotonic or virtual time.
+
+#![allow(
+    clippy::disallowed_types,
+    clippy::disallowed_methods,
+    clippy::disallowed_macros,
+    reason = "only the real-time folder is bound by clippy.toml; it denies them itself"
+)]
 
 pub mod al_status;
+pub mod bringup;
+pub mod clock;
 pub mod config;
 pub mod link;
 pub mod mailbox;
+pub mod rt;
+pub mod session;
+pub mod supervise;
+mod wire;

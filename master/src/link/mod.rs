@@ -3,9 +3,12 @@
 use std::fmt;
 
 pub mod capture;
+pub mod packet;
+pub mod port;
+pub mod recorded;
+pub mod sim;
 
-/// Nanoseconds of the session's clock (monotonic, or virtual).
-pub type Nanos = u64;
+pub use crate::clock::Nanos;
 
 /// Largest frame without FCS.
 pub const MAX_FRAME: usize = 1514;
@@ -22,6 +25,11 @@ pub trait Link: fmt::Debug + Send {
     /// time jump instead of spin.
     fn next_arrival(&self) -> Option<Nanos> {
         None
+    }
+
+    /// Ends a recording that goes on in this link, if there is one. Blocks.
+    fn finish(self: Box<Self>) -> std::io::Result<Option<capture::RecordStats>> {
+        Ok(None)
     }
 }
 

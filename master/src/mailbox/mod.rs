@@ -3,7 +3,7 @@
 //! - [`Wire`]: the two datagrams, the delay and the clock that everything here is made of.
 //! - `port`: the mailbox SyncManagers: taking turns, lost answers, emergencies in between.
 //! - `coe`: the bytes of mailbox, CoE and SDO headers (ETG.1000.4, ETG.1000.6).
-//! - `sdo`: [`CoeClient`], the transfers.
+//! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
 //! - `error`, `abort`, `emergency`, `objects`: what is said when something goes wrong.
 
 use std::time::Duration;
@@ -15,6 +15,9 @@ mod error;
 mod objects;
 mod port;
 mod sdo;
+#[cfg(test)]
+mod tests;
+mod transfer;
 
 pub use abort::{abort_text, mailbox_error_text};
 pub use emergency::{EMERGENCY_QUEUE, Emergency};

@@ -117,6 +117,7 @@ impl Port {
         request.emit(self.counter, self.layout.out_len, &mut self.outgoing);
         let mut deadline = Deadline::after(w, self.timeouts.request);
         let mut patience = Patience::default();
+        let mut lost = false;
         loop {
             // A write whose frame was lost may have arrived; sent again, the counter tells the SubDevice so.
             let written = w
@@ -126,12 +127,16 @@ impl Port {
                 Touched::Yes => return Ok(()),
                 Touched::No => {
                     // Full, or gone? A register answers in either case unless the device is gone.
-                    self.status(w, self.layout.out_sm, &mut patience).await?;
-                    if self.fetch(w, &mut patience).await? == Fetched::Message {
+                    let full = self.status(w, self.layout.out_sm, &mut patience).await?;
+                    if lost && full {
+                        // What fills it is this very request. Its answer may be next; it must not be set aside.
+                        return Ok(());
+                    }
+                    if !lost && self.fetch(w, &mut patience).await? == Fetched::Message {
                         self.set_aside();
                     }
                 }
-                Touched::Lost => {}
+                Touched::Lost => lost = true,
             }
             if deadline.passed(w) {
                 return Err(Trouble::Timeout(Phase::Request));

@@ -4,6 +4,7 @@ use super::coe::{Answer, Message, Request, download_room, parse, segment_room};
 use super::emergency::Emergency;
 use super::error::{Phase, SdoError};
 use super::port::{Deadline, Port, Trouble};
+use super::transfer::{Ended, Transfer, explain};
 use super::{MailboxLayout, Timeouts, Wire};
 
 /// Bytes of the largest object that is read or written.
@@ -23,23 +24,6 @@ pub struct CoeClient {
     port: Port,
     /// A transfer ended without its last answer; it may still come.
     unsettled: bool,
-}
-
-/// What one transfer is about, and how long it may take.
-struct Transfer {
-    station: u16,
-    index: u16,
-    sub: u8,
-    complete: bool,
-    deadline: Deadline,
-    /// [`Port::forgotten`] at its beginning.
-    forgotten: u64,
-}
-
-/// Why a transfer ended, and what the device is told where it still waits for more.
-struct Ended {
-    error: SdoError,
-    abort: Option<u32>,
 }
 
 impl CoeClient {
@@ -90,13 +74,13 @@ impl CoeClient {
 
     /// Empties the SubDevice's mailbox: keeps emergencies, forgets everything else. Returns how many messages it read.
     pub async fn drain<W: Wire>(&mut self, w: &W) -> Result<usize, SdoError> {
-        self.port
-            .check()
-            .map_err(|trouble| self.explain_drain(trouble))?;
-        self.port
-            .drain(w, DRAIN)
-            .await
-            .map_err(|trouble| self.explain_drain(trouble))
+        let drained = match self.port.check() {
+            Ok(()) => self.port.drain(w, DRAIN).await,
+            Err(trouble) => Err(trouble),
+        };
+        // Draining waits for no answer, so only the device itself can be missing.
+        let station = self.port.layout.station;
+        drained.map_err(|trouble| explain(&self.port, trouble, |_| SdoError::Gone { station }))
     }
 
     /// What the SubDevice reported unasked since the last call, oldest first.
@@ -121,7 +105,7 @@ impl CoeClient {
         sub: u8,
         complete: bool,
     ) -> Result<Transfer, SdoError> {
-        let mut transfer = Transfer {
+        let transfer = Transfer {
             station: self.port.layout.station,
             index,
             sub,
@@ -129,16 +113,12 @@ impl CoeClient {
             deadline: Deadline::after(w, self.port.timeouts.transfer),
             forgotten: self.port.forgotten,
         };
-        self.port
-            .check()
-            .map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
-        if self.unsettled {
-            let drained = self.port.drain(w, DRAIN).await;
-            drained.map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
-        }
+        let ready = match self.port.check() {
+            Ok(()) if self.unsettled => self.port.drain(w, DRAIN).await.map(drop),
+            checked => checked,
+        };
+        ready.map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
         self.unsettled = true;
-        transfer.deadline = Deadline::after(w, self.port.timeouts.transfer);
-        transfer.forgotten = self.port.forgotten;
         Ok(transfer)
     }
 
@@ -367,147 +347,11 @@ impl CoeClient {
                 Err(flaw) => return Err(told(transfer.malformed(flaw), ABORT_GENERAL)),
             }
             self.port.set_aside();
-            deadline.pause(w).await;
-        }
-    }
-
-    fn explain_drain(&self, trouble: Trouble) -> SdoError {
-        let MailboxLayout {
-            station,
-            out_len,
-            in_len,
-            ..
-        } = self.port.layout;
-        match trouble {
-            Trouble::Wire(error) => SdoError::Wire(error),
-            Trouble::Layout => SdoError::Mailbox {
-                station,
-                out_len,
-                in_len,
-            },
-            // Draining waits for nothing, so nothing but the device can be missing.
-            Trouble::Gone | Trouble::Timeout(_) => SdoError::Gone { station },
-        }
-    }
-}
-
-impl Transfer {
-    /// Whether an answer is to this transfer, as far as it says. With complete access devices differ in the subindex.
-    fn fits(&self, answer: &Answer<'_>) -> bool {
-        match *answer {
-            Answer::Upload { index, sub, .. } | Answer::Download { index, sub } => {
-                index == self.index && (sub == self.sub || self.complete)
+            if deadline.passed(w) {
+                let ended = transfer.trouble(&self.port, Trouble::Timeout(Phase::Answer));
+                return Err(told(ended, ABORT_TIMEOUT));
             }
-            Answer::UploadSegment { .. } | Answer::DownloadSegment { .. } => true,
-            Answer::Abort { .. } => false,
-        }
-    }
-
-    fn trouble(&self, port: &Port, trouble: Trouble) -> Ended {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        let MailboxLayout {
-            out_len, in_len, ..
-        } = port.layout;
-        Ended::from(match trouble {
-            Trouble::Gone => SdoError::Gone { station },
-            Trouble::Wire(error) => SdoError::Wire(error),
-            Trouble::Layout => SdoError::Mailbox {
-                station,
-                out_len,
-                in_len,
-            },
-            Trouble::Timeout(phase) => SdoError::Timeout {
-                station,
-                index,
-                sub,
-                phase,
-                after: match phase {
-                    Phase::Request | Phase::Repeat => port.timeouts.request,
-                    Phase::Answer => port.timeouts.answer,
-                    Phase::Transfer => port.timeouts.transfer,
-                },
-                set_aside: port.forgotten.saturating_sub(self.forgotten),
-            },
-        })
-    }
-
-    fn aborted(&self, code: u32) -> Ended {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        Ended::from(SdoError::Abort {
-            station,
-            index,
-            sub,
-            code,
-        })
-    }
-
-    fn refused(&self, code: u16) -> Ended {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        Ended::from(SdoError::Refused {
-            station,
-            index,
-            sub,
-            code,
-        })
-    }
-
-    fn malformed(&self, what: impl ToString) -> Ended {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        Ended::from(SdoError::Malformed {
-            station,
-            index,
-            sub,
-            what: what.to_string(),
-        })
-    }
-
-    fn too_large(&self, size: usize) -> Ended {
-        let Self {
-            station,
-            index,
-            sub,
-            ..
-        } = *self;
-        Ended::from(SdoError::TooLarge {
-            station,
-            index,
-            sub,
-            size,
-        })
-    }
-}
-
-impl From<SdoError> for Ended {
-    fn from(error: SdoError) -> Self {
-        Self { error, abort: None }
-    }
-}
-
-impl Ended {
-    fn telling(self, code: u32) -> Self {
-        Self {
-            abort: Some(code),
-            ..self
+            deadline.pause(w).await;
         }
     }
 }

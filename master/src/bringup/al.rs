@@ -1,0 +1,180 @@
+//! AL states, requested and awaited over raw datagrams so that a refusal names its device.
+//!
+//! Registers: AL control 0x0120, AL status 0x0130, AL status code 0x0134 (ETG.1000.4, 6.1).
+
+use std::fmt;
+use std::time::Duration;
+
+use super::DeviceRef;
+use crate::al_status::al_status_text;
+use crate::mailbox::{Wire, WireError};
+
+const AL_CONTROL: u16 = 0x0120;
+const AL_STATUS: u16 = 0x0130;
+const ERROR: u8 = 0x10;
+const ID_REQUEST: u8 = 0x20;
+const POLL: Duration = Duration::from_micros(500);
+
+/// ETG.1020 default for PreOp → SafeOp.
+pub const SAFE_OP_TIMEOUT: Duration = Duration::from_secs(10);
+/// ETG.1020 default for a way back.
+pub const BACK_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// A state of the EtherCAT state machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AlState {
+    Init,
+    PreOp,
+    Bootstrap,
+    SafeOp,
+    Op,
+    /// A value that no state has.
+    Unknown(u8),
+}
+
+impl AlState {
+    /// From the low nibble of AL status.
+    #[must_use]
+    pub fn from_status(status: u8) -> Self {
+        match status & 0x0f {
+            1 => Self::Init,
+            2 => Self::PreOp,
+            3 => Self::Bootstrap,
+            4 => Self::SafeOp,
+            8 => Self::Op,
+            other => Self::Unknown(other),
+        }
+    }
+
+    #[must_use]
+    pub fn code(self) -> u8 {
+        match self {
+            Self::Init => 1,
+            Self::PreOp => 2,
+            Self::Bootstrap => 3,
+            Self::SafeOp => 4,
+            Self::Op => 8,
+            Self::Unknown(code) => code,
+        }
+    }
+}
+
+impl fmt::Display for AlState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Init => "Init",
+            Self::PreOp => "PreOp",
+            Self::Bootstrap => "Bootstrap",
+            Self::SafeOp => "SafeOp",
+            Self::Op => "Op",
+            Self::Unknown(code) => return write!(f, "state 0x{code:x}"),
+        })
+    }
+}
+
+/// A SubDevice that did not go where it was sent.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    #[error(
+        "{device}: refused {wanted}: stays in {actual}, AL status code 0x{code:04x} ({})",
+        al_status_text(*code)
+    )]
+    Refused { device: DeviceRef, wanted: AlState, actual: AlState, code: u16 },
+    #[error("{device}: did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
+    Timeout { device: DeviceRef, wanted: AlState, actual: AlState, timeout: Duration },
+    #[error("{device}: no longer answers while it should go to {wanted}")]
+    Gone { device: DeviceRef, wanted: AlState },
+    #[error("{device}: changing to {wanted}: {source}")]
+    Wire { device: DeviceRef, wanted: AlState, source: WireError },
+}
+
+/// AL status and AL status code; `None` where the device does not answer.
+pub async fn read_status(
+    wire: &impl Wire,
+    station: u16,
+) -> Result<Option<(u8, u16)>, WireError> {
+    let mut status = [0; 6];
+    if wire.read(station, AL_STATUS, &mut status).await? != 1 {
+        return Ok(None);
+    }
+    Ok(Some((status[0], u16::from_le_bytes([status[4], status[5]]))))
+}
+
+/// Sends all devices to `wanted` and waits until the last is there. Errors that devices still hold
+/// are acknowledged first.
+pub async fn change_state(
+    wire: &impl Wire,
+    devices: &[DeviceRef],
+    wanted: AlState,
+    timeout: Duration,
+) -> Result<(), StateError> {
+    for device in devices {
+        let failed = |source| StateError::Wire { device: device.clone(), wanted, source };
+        if let Some((status, _)) = read_status(wire, device.station).await.map_err(failed)?
+            && status & ERROR != 0
+        {
+            write_control(wire, device.station, status & 0x0f | ERROR).await.map_err(failed)?;
+        }
+        if write_control(wire, device.station, wanted.code()).await.map_err(failed)? != 1 {
+            return Err(StateError::Gone { device: device.clone(), wanted });
+        }
+    }
+    wait_state(wire, devices, wanted, timeout).await
+}
+
+/// Waits until every device is in `wanted`.
+pub async fn wait_state(
+    wire: &impl Wire,
+    devices: &[DeviceRef],
+    wanted: AlState,
+    timeout: Duration,
+) -> Result<(), StateError> {
+    let end = wire.now().saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
+    for device in devices {
+        loop {
+            let failed = |source| StateError::Wire { device: device.clone(), wanted, source };
+            let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)?
+            else {
+                return Err(StateError::Gone { device: device.clone(), wanted });
+            };
+            let actual = AlState::from_status(status);
+            if status & ERROR != 0 {
+                return Err(StateError::Refused { device: device.clone(), wanted, actual, code });
+            }
+            if actual == wanted {
+                break;
+            }
+            if wire.now() >= end {
+                return Err(StateError::Timeout { device: device.clone(), wanted, actual, timeout });
+            }
+            wire.delay(POLL).await;
+        }
+    }
+    Ok(())
+}
+
+async fn write_control(wire: &impl Wire, station: u16, value: u8) -> Result<u16, WireError> {
+    wire.write(station, AL_CONTROL, &[value, 0]).await
+}
+
+/// The explicit device identification (ETG.1020, "Explicit Device Identification"): requested in
+/// AL control, answered in AL status code. `None` where the device does not offer it.
+pub async fn read_explicit_id(
+    wire: &impl Wire,
+    station: u16,
+) -> Result<Option<u16>, WireError> {
+    let Some((state, _)) = read_status(wire, station).await? else { return Ok(None) };
+    write_control(wire, station, state & 0x0f | ID_REQUEST).await?;
+    let mut id = None;
+    for _ in 0..20 {
+        match read_status(wire, station).await? {
+            Some((status, code)) if status & ID_REQUEST != 0 => {
+                id = Some(code);
+                break;
+            }
+            _ => wire.delay(POLL).await,
+        }
+    }
+    write_control(wire, station, state & 0x0f).await?;
+    Ok(id)
+}

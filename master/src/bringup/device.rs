@@ -1,0 +1,158 @@
+//! The steps of one SubDevice on its way from PreOp to SafeOp.
+
+use ecaxis_esi::layout::SmLayout;
+
+use super::{BringUpError, BusDevice, Step};
+use crate::config::{Bus, DeviceConfig};
+use crate::mailbox::Wire;
+use crate::rt::image::Region;
+
+/// FMMU registers (ETG.1000.4, Table 56): 16 bytes each.
+const FMMU: u16 = 0x0600;
+const FMMU_SIZE: u16 = 16;
+/// Number of FMMUs the controller has (ETG.1000.4, DL information).
+const FMMU_COUNT: u16 = 0x0004;
+const WATCHDOG_DIVIDER: u16 = 0x0400;
+const WATCHDOG_PROCESS_DATA: u16 = 0x0420;
+/// (2498 + 2) × 40 ns: the process-data watchdog counts in 100 µs.
+const DIVIDER_100_US: u16 = 2498;
+
+/// Downloads the start-up SDOs in order. The mailbox is emptied before, because a device may have
+/// sent emergencies while nobody listened, and after, because ethercrab's own CoE client cannot
+/// deal with them.
+pub(super) async fn start_up(
+    wire: &impl Wire,
+    config: &DeviceConfig,
+    device: &mut BusDevice,
+    progress: &mut dyn FnMut(Step),
+) -> Result<(), BringUpError> {
+    let list = &config.selection.startup;
+    let Some(coe) = device.coe.as_mut() else { return Ok(()) };
+    let mailbox_failed = |source| BringUpError::StartUp {
+        device: device.at.clone(),
+        index: 0,
+        sub: 0,
+        name: "emptying the mailbox".to_owned(),
+        value: "-".to_owned(),
+        origin: "bring-up".to_owned(),
+        source,
+    };
+    coe.drain(wire).await.map_err(mailbox_failed)?;
+    for (done, sdo) in list.iter().enumerate() {
+        coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data).await.map_err(
+            |source| BringUpError::StartUp {
+                device: device.at.clone(),
+                index: sdo.index,
+                sub: sdo.sub,
+                name: sdo.name.clone(),
+                value: format_value(&sdo.data),
+                origin: sdo.origin.clone(),
+                source,
+            },
+        )?;
+        progress(Step::StartUp { device: config.name.clone(), done: done + 1, of: list.len() });
+    }
+    coe.drain(wire).await.map_err(mailbox_failed)?;
+    Ok(())
+}
+
+/// Little-endian bytes as a user writes the number.
+fn format_value(data: &[u8]) -> String {
+    if data.len() > 8 {
+        return format!("{} bytes", data.len());
+    }
+    let value = data.iter().rev().fold(0_u64, |value, &byte| value << 8 | u64::from(byte));
+    format!("0x{value:0width$x}", width = data.len() * 2)
+}
+
+/// Moves outputs and inputs to the same logical address; one FMMU a SyncManager.
+pub(super) async fn map_process_data(
+    wire: &impl Wire,
+    config: &DeviceConfig,
+    device: &BusDevice,
+    region: Option<Region>,
+) -> Result<(), BringUpError> {
+    const STEP: &str = "configuring FMMUs";
+    const READ: u8 = 1;
+    const WRITE: u8 = 2;
+
+    let mut fmmus = Vec::new();
+    if let Some(region) = region {
+        let layout = &config.selection.layout;
+        for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
+            let mut logical = region.logical;
+            for sm in sms.iter().filter(|sm| sm.len > 0) {
+                fmmus.push(fmmu(logical, sm, kind));
+                logical = logical.saturating_add(u32::from(sm.len));
+            }
+        }
+    }
+    let mut count = [0];
+    read(wire, device, STEP, FMMU_COUNT, &mut count).await?;
+    fmmus.resize(usize::from(count[0]).max(fmmus.len()), [0; FMMU_SIZE as usize]);
+    for (i, fmmu) in fmmus.iter().enumerate() {
+        let register = FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
+        write(wire, device, STEP, register, fmmu).await?;
+    }
+    Ok(())
+}
+
+fn fmmu(logical: u32, sm: &SmLayout, kind: u8) -> [u8; FMMU_SIZE as usize] {
+    let [l0, l1, l2, l3] = logical.to_le_bytes();
+    let [n0, n1] = sm.len.to_le_bytes();
+    let [p0, p1] = sm.start_address.to_le_bytes();
+    // Start bit 0 to stop bit 7; physical start bit 0; enabled.
+    [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, 1, 0, 0, 0]
+}
+
+/// A device without its outputs for longer than this leaves Op by itself.
+pub(super) async fn set_watchdog(
+    wire: &impl Wire,
+    bus: &Bus,
+    device: &BusDevice,
+) -> Result<(), BringUpError> {
+    const STEP: &str = "setting the process-data watchdog";
+    let ticks = u16::try_from(bus.watchdog_ns / 100_000).unwrap_or(u16::MAX).max(1);
+    // A controller without these registers watches nothing; that is not an error.
+    for (register, value) in [(WATCHDOG_DIVIDER, DIVIDER_100_US), (WATCHDOG_PROCESS_DATA, ticks)] {
+        wire.write(device.at.station, register, &value.to_le_bytes()).await.map_err(|source| {
+            BringUpError::Wire { device: device.at.clone(), step: STEP, source }
+        })?;
+    }
+    Ok(())
+}
+
+/// A register write that the device must take.
+pub(super) async fn write(
+    wire: &impl Wire,
+    device: &BusDevice,
+    step: &'static str,
+    register: u16,
+    data: &[u8],
+) -> Result<(), BringUpError> {
+    taken(wire.write(device.at.station, register, data).await, device, step, register)
+}
+
+/// A register read that the device must answer.
+pub(super) async fn read(
+    wire: &impl Wire,
+    device: &BusDevice,
+    step: &'static str,
+    register: u16,
+    data: &mut [u8],
+) -> Result<(), BringUpError> {
+    taken(wire.read(device.at.station, register, data).await, device, step, register)
+}
+
+fn taken(
+    result: Result<u16, crate::mailbox::WireError>,
+    device: &BusDevice,
+    step: &'static str,
+    register: u16,
+) -> Result<(), BringUpError> {
+    match result {
+        Ok(1) => Ok(()),
+        Ok(_) => Err(BringUpError::NotTaken { device: device.at.clone(), step, register }),
+        Err(source) => Err(BringUpError::Wire { device: device.at.clone(), step, source }),
+    }
+}

@@ -1,0 +1,162 @@
+//! Who answers, and is it what the machine file says?
+
+use ecaxis_esi::model::Identity;
+use ethercrab::{MainDevice, SubDeviceIdentity};
+
+use super::{BringUpError, DeviceRef, Group, al, scan_error};
+use crate::config::{Locator, Machine};
+use crate::mailbox::WireError;
+use crate::wire::Datagrams;
+
+/// Broadcasts tried before the segment is called silent.
+const TRIES: u32 = 5;
+/// Station addresses as ethercrab gives them out.
+const FIRST_STATION: u16 = 0x1000;
+
+/// At least one SubDevice answers a broadcast.
+pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
+    for _ in 0..TRIES {
+        match wire.count().await {
+            Ok(count) if count > 0 => return Ok(count),
+            Ok(_) | Err(WireError::Timeout { .. }) => {}
+            Err(error) => {
+                return Err(BringUpError::Scan { step: "scanning", message: error.to_string() });
+            }
+        }
+    }
+    Err(BringUpError::NoAnswer)
+}
+
+/// ethercrab tells that a device did not reach PreOp, but neither which nor why: ask them all.
+pub(super) async fn explain_scan(
+    wire: &Datagrams,
+    machine: &Machine,
+    error: ethercrab::error::Error,
+) -> BringUpError {
+    let Ok(count) = answering(wire).await else { return BringUpError::NoAnswer };
+    for position in 0..count {
+        let station = FIRST_STATION.saturating_add(position);
+        if let Ok(Some((status, code))) = al::read_status(wire, station).await
+            && status & 0x10 != 0
+        {
+            let name = machine
+                .devices
+                .iter()
+                .find(|d| d.at == Locator::Position(position))
+                .map_or_else(|| format!("device {position}"), |d| d.name.clone());
+            return BringUpError::State(al::StateError::Refused {
+                device: DeviceRef { name, position, station },
+                wanted: al::AlState::PreOp,
+                actual: al::AlState::from_status(status),
+                code,
+            });
+        }
+    }
+    scan_error("scanning the segment and going to PreOp", &error)
+}
+
+/// For each device of the machine file its position on the bus. Every SubDevice must be named and
+/// be what its ESI says.
+pub(super) async fn assign(
+    wire: &Datagrams,
+    main_device: &MainDevice<'static>,
+    group: &Group,
+    machine: &Machine,
+) -> Result<Vec<u16>, BringUpError> {
+    let mut found = Vec::with_capacity(group.len());
+    for sub_device in group.iter(main_device) {
+        found.push((
+            identity(sub_device.identity()),
+            sub_device.alias_address(),
+            sub_device.configured_address(),
+        ));
+    }
+
+    let mut order = Vec::with_capacity(machine.devices.len());
+    let mut missing = Vec::new();
+    for config in &machine.devices {
+        let position = match config.at {
+            Locator::Position(position) => {
+                (usize::from(position) < found.len()).then_some(usize::from(position))
+            }
+            Locator::Alias(alias) => found.iter().position(|(_, a, _)| *a == alias),
+            Locator::Id(id) => find_id(wire, &found, id).await,
+        };
+        match position {
+            Some(position) => order.push(u16::try_from(position).unwrap_or(u16::MAX)),
+            None => match config.at {
+                Locator::Position(position) => {
+                    missing.push(format!("`{}` (position {position})", config.name));
+                }
+                Locator::Alias(alias) => {
+                    return Err(not_located(&config.name, format!("alias {alias}")));
+                }
+                Locator::Id(id) => {
+                    return Err(not_located(&config.name, format!("device identification {id}")));
+                }
+            },
+        }
+    }
+    if !missing.is_empty() {
+        let list: Vec<_> = found
+            .iter()
+            .enumerate()
+            .map(|(position, (identity, ..))| format!("position {position}: {}", known(machine, *identity)))
+            .collect();
+        return Err(BringUpError::Missing {
+            expected: machine.devices.len(),
+            found: found.len(),
+            missing: missing.join(", "),
+            list: list.join("; "),
+        });
+    }
+
+    for (config, &position) in machine.devices.iter().zip(&order) {
+        let (identity, _, station) = found[usize::from(position)];
+        let expected = config.selection.identity;
+        if (expected.vendor, expected.product, expected.revision)
+            != (identity.vendor, identity.product, identity.revision)
+        {
+            return Err(BringUpError::Identity {
+                device: DeviceRef { name: config.name.clone(), position, station },
+                esi: config.esi_path.display().to_string(),
+                expected: format!("{} ({expected})", config.selection.device_name),
+                found: known(machine, identity),
+            });
+        }
+    }
+    for (position, (identity, ..)) in found.iter().enumerate() {
+        let position = u16::try_from(position).unwrap_or(u16::MAX);
+        if !order.contains(&position) {
+            return Err(BringUpError::Unexpected { position, identity: known(machine, *identity) });
+        }
+    }
+    Ok(order)
+}
+
+fn not_located(name: &str, locator: String) -> BringUpError {
+    BringUpError::NotLocated { name: name.to_owned(), locator }
+}
+
+async fn find_id(wire: &Datagrams, found: &[(Identity, u16, u16)], id: u16) -> Option<usize> {
+    for (position, &(_, _, station)) in found.iter().enumerate() {
+        if matches!(al::read_explicit_id(wire, station).await, Ok(Some(actual)) if actual == id) {
+            return Some(position);
+        }
+    }
+    None
+}
+
+fn identity(from: SubDeviceIdentity) -> Identity {
+    Identity { vendor: from.vendor_id, product: from.product_id, revision: from.revision }
+}
+
+/// An identity with the name that one of the machine's ESI files gives it.
+fn known(machine: &Machine, identity: Identity) -> String {
+    machine
+        .devices
+        .iter()
+        .flat_map(|d| &d.esi.devices)
+        .find(|d| d.identity == identity)
+        .map_or_else(|| identity.to_string(), |d| format!("{} ({identity})", d.name))
+}

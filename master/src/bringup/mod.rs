@@ -1,0 +1,261 @@
+//! From a silent wire to SafeOp. MAY BLOCK AND ALLOCATE.
+//!
+//! ethercrab scans, addresses, reads the EEPROMs, sets up mailboxes, measures propagation delays
+//! and configures SyncManagers. Ours are the comparison with the machine file, the start-up SDOs,
+//! the shared logical addresses, SYNC0, watchdogs and the state changes, because those need the
+//! ESI or must name the device when they fail.
+
+use std::fmt;
+
+use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
+
+use crate::clock;
+use crate::config::{DeviceConfig, Machine};
+use crate::mailbox::{CoeClient, MailboxLayout, SdoError, WireError};
+use crate::rt::image::{self, ImagePlan, TooLarge};
+use crate::wire::Datagrams;
+
+pub mod al;
+mod clocks;
+mod device;
+mod identify;
+
+pub use al::{AlState, StateError};
+pub use clocks::DcPlan;
+
+/// SubDevices that ethercrab keeps in one group; a power of two.
+const MAX_SUBDEVICES: usize = 128;
+/// ethercrab's own process image. Ours replaces it; it only has to be large enough.
+const MAX_PDI: usize = 8192;
+
+type Group = SubDeviceGroup<MAX_SUBDEVICES, MAX_PDI>;
+
+/// Which SubDevice an error is about.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeviceRef {
+    pub name: String,
+    pub position: u16,
+    pub station: u16,
+}
+
+impl fmt::Display for DeviceRef {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "`{}` (position {}, station 0x{:04x})", self.name, self.position, self.station)
+    }
+}
+
+/// A SubDevice that was found and set up.
+#[derive(Debug)]
+pub struct BusDevice {
+    pub at: DeviceRef,
+    /// `None` where the device has no CoE mailbox.
+    pub coe: Option<CoeClient>,
+    pub dc: bool,
+    /// From the reference clock, nanoseconds.
+    pub propagation_delay: u32,
+}
+
+/// A segment in SafeOp, ready for cyclic exchange.
+#[derive(Debug)]
+pub struct Bus {
+    /// In the order of the machine file.
+    pub devices: Vec<BusDevice>,
+    pub image: ImagePlan,
+    pub dc: Option<DcPlan>,
+}
+
+/// What is being done, for the user to see.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Step {
+    Scan,
+    Found { devices: usize },
+    StartUp { device: String, done: usize, of: usize },
+    ProcessData { bytes: usize, frames: usize },
+    Clocks { reference: String, devices: usize },
+    State(AlState),
+}
+
+impl fmt::Display for Step {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Scan => f.write_str("scanning the segment"),
+            Self::Found { devices: 1 } => f.write_str("1 SubDevice, as in the machine file; in PreOp"),
+            Self::Found { devices } => {
+                write!(f, "{devices} SubDevices, all as in the machine file; in PreOp")
+            }
+            Self::StartUp { device, done, of } => write!(f, "`{device}`: start-up SDO {done}/{of}"),
+            Self::ProcessData { bytes, frames } => {
+                write!(f, "process image: {bytes} bytes in {frames} frame(s)")
+            }
+            Self::Clocks { reference, devices } => {
+                write!(f, "distributed clocks: `{reference}` is the reference, SYNC0 on {devices} device(s)")
+            }
+            Self::State(state) => write!(f, "all SubDevices in {state}"),
+        }
+    }
+}
+
+/// Why the bus did not come up.
+#[derive(Debug, thiserror::Error)]
+pub enum BringUpError {
+    #[error("no SubDevice answers")]
+    NoAnswer,
+    #[error("{step}: {message}")]
+    Scan { step: &'static str, message: String },
+    #[error("{found} SubDevice(s) answer, the machine file names {expected}: {missing} missing; found: {list}")]
+    Missing { expected: usize, found: usize, missing: String, list: String },
+    #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
+    Unexpected { position: u16, identity: String },
+    #[error("{device}: identify: the file `{esi}` describes {expected}, the device is {found}")]
+    Identity { device: DeviceRef, esi: String, expected: String, found: String },
+    #[error("`{name}`: no SubDevice has {locator}")]
+    NotLocated { name: String, locator: String },
+    #[error("{device}: start-up SDO 0x{index:04x}:{sub:02x} {name} = {value} (from {origin}): {source}")]
+    StartUp {
+        device: DeviceRef,
+        index: u16,
+        sub: u8,
+        name: String,
+        value: String,
+        origin: String,
+        source: SdoError,
+    },
+    #[error("{device}: the drive took {actual} bytes of {direction}, the ESI's layout has {expected}")]
+    Mapping { device: DeviceRef, direction: &'static str, expected: usize, actual: usize },
+    #[error("{device}: {source}")]
+    TooLarge { device: DeviceRef, source: TooLarge },
+    #[error("{device}: {step}: {source}")]
+    Wire { device: DeviceRef, step: &'static str, source: WireError },
+    #[error("{device}: {step}: register 0x{register:04x} did not take the write")]
+    NotTaken { device: DeviceRef, step: &'static str, register: u16 },
+    #[error("{device}: the ESI asks for SYNC0, the device has no distributed clock")]
+    NoClock { device: DeviceRef },
+    #[error(transparent)]
+    State(#[from] StateError),
+}
+
+/// Brings the segment from whatever it is in to SafeOp.
+pub async fn bring_up(
+    main_device: &'static MainDevice<'static>,
+    machine: &Machine,
+    progress: &mut dyn FnMut(Step),
+) -> Result<Bus, BringUpError> {
+    let wire = Datagrams::new(main_device);
+    progress(Step::Scan);
+    identify::answering(&wire).await?;
+
+    let group = match main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now).await {
+        Ok(group) => group,
+        Err(error) => return Err(identify::explain_scan(&wire, machine, error).await),
+    };
+    let order = identify::assign(&wire, main_device, &group, machine).await?;
+    progress(Step::Found { devices: order.len() });
+
+    let mut devices = Vec::with_capacity(order.len());
+    for (config, &position) in machine.devices.iter().zip(&order) {
+        let sub_device = group
+            .subdevice(main_device, usize::from(position))
+            .map_err(|e| scan_error("reading the scan's result", &e))?;
+        devices.push(BusDevice {
+            at: DeviceRef {
+                name: config.name.clone(),
+                position,
+                station: sub_device.configured_address(),
+            },
+            coe: mailbox_layout(config, sub_device.configured_address()).map(CoeClient::new),
+            dc: !matches!(sub_device.dc_support(), DcSupport::None),
+            propagation_delay: sub_device.propagation_delay(),
+        });
+    }
+
+    for (config, device) in machine.devices.iter().zip(&mut devices) {
+        device::start_up(&wire, config, device, progress).await?;
+    }
+
+    // ethercrab reads the accepted mapping back and sets the SyncManagers up from it.
+    let group = group
+        .into_pre_op_pdi(main_device)
+        .await
+        .map_err(|e| scan_error("reading the PDO mapping back", &e))?;
+    for ((config, device), &position) in machine.devices.iter().zip(&devices).zip(&order) {
+        let sub_device = group
+            .subdevice(main_device, usize::from(position))
+            .map_err(|e| scan_error("reading the PDO mapping back", &e))?;
+        let layout = &config.selection.layout;
+        for (direction, expected, actual) in [
+            ("outputs", layout.rx_bytes(), sub_device.outputs_raw().len()),
+            ("inputs", layout.tx_bytes(), sub_device.inputs_raw().len()),
+        ] {
+            if expected != actual {
+                return Err(BringUpError::Mapping {
+                    device: device.at.clone(),
+                    direction,
+                    expected,
+                    actual,
+                });
+            }
+        }
+    }
+    drop(group);
+
+    let sizes: Vec<_> = machine
+        .devices
+        .iter()
+        .map(|d| (d.selection.layout.rx_bytes(), d.selection.layout.tx_bytes()))
+        .collect();
+    let image = image::plan(&sizes).map_err(|source| BringUpError::TooLarge {
+        device: devices[source.device].at.clone(),
+        source,
+    })?;
+    for ((config, device), region) in machine.devices.iter().zip(&devices).zip(&image.regions) {
+        device::map_process_data(&wire, config, device, *region).await?;
+        device::set_watchdog(&wire, &machine.bus, device).await?;
+    }
+    progress(Step::ProcessData { bytes: image.len, frames: image.datagrams.len().max(1) });
+
+    let dc = clocks::configure(&wire, machine, &devices, progress).await?;
+
+    let at: Vec<_> = devices.iter().map(|d| d.at.clone()).collect();
+    al::change_state(&wire, &at, AlState::SafeOp, al::SAFE_OP_TIMEOUT).await?;
+    progress(Step::State(AlState::SafeOp));
+    Ok(Bus { devices, image, dc })
+}
+
+fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> BringUpError {
+    BringUpError::Scan { step, message: error.to_string() }
+}
+
+/// The mailbox as the ESI's first two SyncManagers describe it.
+fn mailbox_layout(config: &DeviceConfig, station: u16) -> Option<MailboxLayout> {
+    use ecaxis_esi::model::SmUse;
+
+    config.device.mailbox.as_ref()?.coe.as_ref()?;
+    let find = |usage| {
+        config
+            .device
+            .sync_managers
+            .iter()
+            .enumerate()
+            .find(|(_, sm)| sm.usage == usage)
+            .and_then(|(i, sm)| Some((u8::try_from(i).ok()?, sm)))
+    };
+    let (out_sm, out) = find(SmUse::MBoxOut)?;
+    let (in_sm, inp) = find(SmUse::MBoxIn)?;
+    Some(MailboxLayout {
+        station,
+        out_address: out.start_address,
+        out_len: out.default_size,
+        in_address: inp.start_address,
+        in_len: inp.default_size,
+        out_sm,
+        in_sm,
+    })
+}
+
+impl Bus {
+    /// Every device's address, in the order of the machine file.
+    #[must_use]
+    pub fn addresses(&self) -> Vec<DeviceRef> {
+        self.devices.iter().map(|d| d.at.clone()).collect()
+    }
+}

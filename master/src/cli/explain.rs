@@ -1,0 +1,369 @@
+//! `ecaxis explain`: everything that was derived from the ESI files, and from which element.
+
+use std::fmt::Write;
+use std::path::PathBuf;
+
+use ecaxis::config::{self, AxisSetup, DeviceConfig, Machine, Nic, Step, duration};
+use ecaxis::rt::image::{self, ImagePlan};
+use ecaxis_esi::{Field, SmLayout};
+
+use super::{Failure, hints, report::Table, result};
+
+/// Show what a machine file and its ESI files come to: PDOs, start-up SDOs, clocks, frames
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Machine file
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
+    let mut text = String::new();
+    // Writing into a String cannot fail.
+    let _ = explain(&machine, &mut text);
+    result(&text);
+    Ok(())
+}
+
+fn explain(machine: &Machine, out: &mut String) -> std::fmt::Result {
+    writeln!(out, "{}", machine.path.display())?;
+    bus(machine, out)?;
+    for device in &machine.devices {
+        self::device(device, out)?;
+    }
+    wire(machine, out)?;
+    program(machine, out)
+}
+
+fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
+    let bus = &machine.bus;
+    let nic = match &bus.nic {
+        Nic::Sim => "sim (the simulated bus, from the same ESI files)",
+        Nic::Interface(name) => name,
+    };
+    let cpu = bus.cpu.map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
+    let mut table = Table::new(&["setting", "value", "meaning"]);
+    table.row(["nic", nic, ""]);
+    table.row(["cycle", &duration::show(bus.cycle_ns), "from frame to frame; also 0x60C2 and SYNC0"]);
+    let lost = bus.lost_frames.to_string();
+    table.row(["lost_frames", &lost, "consecutive cycles without a valid answer stop the axes"]);
+    table.row(["exchange", "same-cycle", "answers are waited for within the cycle"]);
+    table.row(["priority", &format!("SCHED_FIFO {}", bus.priority), "of the real-time thread"]);
+    table.row(["cpu", &cpu, "where it runs"]);
+    table.row(["spin", &duration::show(bus.spin_ns), "before a cycle is due, sleeping becomes spinning"]);
+    let watchdog = duration::show(bus.watchdog_ns);
+    table.row(["watchdog", &watchdog, "SyncManager and PDI watchdog (0x0400, 0x0410, 0x0420)"]);
+    table.row(["op_timeout", &duration::show(bus.op_timeout_ns), "from SafeOp to Op"]);
+    let enable = duration::show(bus.enable_timeout_ns);
+    table.row(["enable_timeout", &enable, "until a drive reports Operation enabled"]);
+    writeln!(out, "\nbus\n{}", table.indented(2))
+}
+
+fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
+    let selection = &device.selection;
+    let esi = device.esi_path.display();
+    writeln!(out, "\ndevice `{}` at {} (line {})", device.name, device.at, device.line)?;
+    writeln!(out, "  {} {:?}, {esi}:{}", device.device.type_name, selection.device_name, device.device.position)?;
+    writeln!(out, "  {}", selection.identity)?;
+    if let Some(mode) = selection.mode {
+        writeln!(out, "  mode {mode} (0x6060 = {})", mode.code())?;
+    }
+    if let Some(module) = &selection.module {
+        writeln!(
+            out,
+            "  module {:?} (0x{:08x}) in slot {:?}, {esi}:{}",
+            module.type_name, module.ident, module.slot_name, module.position,
+        )?;
+    }
+    for note in &selection.notes {
+        writeln!(out, "  note: {note}")?;
+    }
+    if let Some(axis) = &device.axis {
+        self::axis(axis, out)?;
+    }
+    sync_managers(device, out)?;
+    let layout = &selection.layout;
+    fields("outputs", layout.rx_bytes(), &layout.rx, out)?;
+    fields("inputs", layout.tx_bytes(), &layout.tx, out)?;
+    clock(device, out)?;
+    startup(device, out)
+}
+
+fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
+    let (config, unit) = (&axis.config, &axis.unit);
+    let (scale, limits) = (&config.scale, &config.limits);
+    writeln!(
+        out,
+        "  axis: 1 turn = {} counts = {} {unit}{}; 1 {unit} = {} counts",
+        scale.counts_per_turn(),
+        scale.units_per_turn(),
+        if scale.inverted() { ", inverted" } else { "" },
+        scale.counts_per_unit(),
+    )?;
+    writeln!(
+        out,
+        "  velocities in {} (0x60A9), a resolution of {} {unit}/s",
+        scale.velocity_unit(),
+        rounded(scale.velocity_resolution()),
+    )?;
+    let position = match limits.position {
+        Some([low, high]) => format!("{low} to {high} {unit}"),
+        None => "endless".to_owned(),
+    };
+    let rpm = limits.velocity / scale.units_per_turn() * 60.0;
+    let following = match limits.following_error {
+        Some(error) => format!("{error} {unit}"),
+        None => "not supervised".to_owned(),
+    };
+    writeln!(
+        out,
+        "  limits: position {position}, velocity {} {unit}/s ({} rpm), acceleration {} {unit}/s², torque {} % of rated, following error {following}",
+        limits.velocity,
+        rounded(rpm),
+        limits.acceleration,
+        limits.torque,
+    )?;
+    writeln!(out, "  target window {} {unit}", rounded(config.target_window))
+}
+
+/// Six significant digits are enough to read.
+fn rounded(x: f64) -> f64 {
+    format!("{x:.5e}").parse().unwrap_or(x)
+}
+
+fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
+    let mut table = Table::new(&["SM", "use", "address", "bytes", "control", "FMMU"]);
+    let layout = &device.selection.layout;
+    let process: Vec<(&str, &SmLayout)> = layout
+        .outputs
+        .iter()
+        .map(|sm| ("outputs", sm))
+        .chain(layout.inputs.iter().map(|sm| ("inputs", sm)))
+        .collect();
+    for (number, sm) in device.device.sync_managers.iter().enumerate() {
+        let planned = process.iter().find(|(_, p)| usize::from(p.sm) == number);
+        let (usage, address, len, control, fmmu) = match planned {
+            Some((usage, p)) => {
+                let fmmu = p.fmmu.map_or("next free".to_owned(), |f| f.to_string());
+                ((*usage).to_owned(), p.start_address, p.len, p.control_byte, fmmu)
+            }
+            None => {
+                let usage = match sm.usage {
+                    ecaxis_esi::SmUse::MBoxOut => "mailbox out",
+                    ecaxis_esi::SmUse::MBoxIn => "mailbox in",
+                    _ => "unused",
+                };
+                (usage.to_owned(), sm.start_address, sm.default_size, sm.control_byte, String::new())
+            }
+        };
+        table.row([
+            &number.to_string(),
+            &usage,
+            &format!("0x{address:04x}"),
+            &len.to_string(),
+            &format!("0x{control:02x}"),
+            &fmmu,
+        ]);
+    }
+    writeln!(out, "\n{}", table.indented(2))
+}
+
+fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut String) -> std::fmt::Result {
+    writeln!(out, "\n  {what}: {bytes} bytes")?;
+    if fields.is_empty() {
+        return Ok(());
+    }
+    let mut table = Table::new(&["offset", "bits", "object", "type", "name", "PDO"]);
+    for field in fields {
+        table.row([
+            &format!("{}.{}", field.bit_offset / 8, field.bit_offset % 8),
+            &field.bit_len.to_string(),
+            &format!("0x{:04x}:{:02x}", field.index, field.sub),
+            &field.data_type,
+            &field.name,
+            &format!("0x{:04x}", field.pdo),
+        ]);
+    }
+    writeln!(out, "{}", table.indented(2))
+}
+
+fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
+    let Some(dc) = &device.selection.dc else {
+        return writeln!(out, "\n  no distributed clock (0x0980 = 0x0000)");
+    };
+    let sync = |cycle: u32, shift: i32| match cycle {
+        0 => "off".to_owned(),
+        cycle => {
+            let sign = if shift < 0 { "-" } else { "" };
+            let shift = duration::show(u64::from(shift.unsigned_abs()));
+            format!("every {}, shifted by {sign}{shift}", duration::show(u64::from(cycle)))
+        }
+    };
+    writeln!(
+        out,
+        "\n  distributed clock: OpMode {:?}, {}:{}",
+        dc.name,
+        device.esi_path.display(),
+        dc.position,
+    )?;
+    let [low, high] = dc.assign_activate.to_le_bytes();
+    writeln!(
+        out,
+        "    AssignActivate 0x{:04x}: 0x0980 = 0x{low:02x}, 0x0981 = 0x{high:02x}",
+        dc.assign_activate,
+    )?;
+    writeln!(out, "    SYNC0 {}", sync(dc.sync0_cycle_ns, dc.sync0_shift_ns))?;
+    writeln!(out, "    SYNC1 {}", sync(dc.sync1_cycle_ns, dc.sync1_shift_ns))
+}
+
+fn startup(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
+    let startup = &device.selection.startup;
+    if startup.is_empty() {
+        return writeln!(out, "\n  no start-up SDOs");
+    }
+    let mut table = Table::new(&["at", "object", "value", "name", "from"]);
+    for sdo in startup {
+        let object = match sdo.complete_access {
+            true => format!("0x{:04x} CA", sdo.index),
+            false => format!("0x{:04x}:{:02x}", sdo.index, sdo.sub),
+        };
+        table.row([sdo.transition, &object, &value(&sdo.data), &sdo.name, &sdo.origin]);
+    }
+    writeln!(out, "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}", table.indented(2))
+}
+
+/// Up to eight bytes as one number, more as bytes in the order of the wire.
+fn value(data: &[u8]) -> String {
+    let hex = |bytes: &mut dyn Iterator<Item = &u8>, gap: &str| {
+        let bytes: Vec<String> = bytes.map(|b| format!("{b:02x}")).collect();
+        bytes.join(gap)
+    };
+    match data.len() {
+        0 => String::new(),
+        1..=8 => format!("0x{}", hex(&mut data.iter().rev(), "")),
+        9..=24 => hex(&mut data.iter(), " "),
+        n => format!("{} … ({n} bytes)", hex(&mut data.iter().take(16), " ")),
+    }
+}
+
+/// Preamble, Ethernet header, FCS, gap.
+const ETHERNET: usize = 8 + 14 + 4 + 12;
+const ECAT_HEADER: usize = 2;
+/// Header and working counter.
+const DATAGRAM: usize = 12;
+const CLOCK: usize = DATAGRAM + 8;
+const AL_STATUS: usize = DATAGRAM + 2;
+const SHORTEST_PAYLOAD: usize = 46;
+const NS_PER_BYTE: usize = 80;
+const FORWARDING_NS: usize = 1_000;
+
+/// Bytes on the wire of each frame of a cycle, gap included.
+fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
+    let mut frames = vec![AL_STATUS + if clock { CLOCK } else { 0 }];
+    for (i, datagram) in plan.datagrams.iter().enumerate() {
+        let len = DATAGRAM + datagram.len;
+        match i {
+            0 => frames[0] += len,
+            _ => frames.push(len),
+        }
+    }
+    frames.into_iter().map(|len| ETHERNET + (ECAT_HEADER + len).max(SHORTEST_PAYLOAD)).collect()
+}
+
+fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
+    let layouts = machine.devices.iter().map(|d| &d.selection.layout);
+    let sizes: Vec<(usize, usize)> = layouts.map(|l| (l.rx_bytes(), l.tx_bytes())).collect();
+    let plan = match image::plan(&sizes) {
+        Ok(plan) => plan,
+        Err(e) => return writeln!(out, "\nprocess image\n  {e}"),
+    };
+    writeln!(out, "\nprocess image: {} bytes; outputs and inputs share addresses", plan.len)?;
+    let mut table = Table::new(&["device", "logical", "outputs", "inputs", "frame"]);
+    for (device, region) in machine.devices.iter().zip(&plan.regions) {
+        let Some(region) = region else { continue };
+        let at = format!("0x{:08x}", region.logical);
+        let (outputs, inputs) = (region.out_len.to_string(), region.in_len.to_string());
+        table.row([&device.name, &at, &outputs, &inputs, &(region.datagram + 1).to_string()]);
+    }
+    writeln!(out, "{}", table.indented(2))?;
+    let clock = machine.devices.iter().any(|d| d.selection.dc.is_some());
+    let frames = frame_bytes(&plan, clock);
+    let total: usize = frames.iter().sum();
+    let ns = (total - 12) * NS_PER_BYTE + machine.devices.len() * FORWARDING_NS;
+    let wkc: u32 = plan.datagrams.iter().map(|d| u32::from(d.expected_wkc)).sum();
+    let clock = if clock { "FRMW 0x0910, " } else { "" };
+    let ns = u64::try_from(ns).unwrap_or(u64::MAX);
+    writeln!(out, "\nframes a cycle: {} ({clock}LRW, BRD 0x0130), {total} bytes on the wire", frames.len())?;
+    writeln!(
+        out,
+        "  about {} µs from the first bit sent to the last received at 100 Mbit/s, {} % of the cycle",
+        ns.div_ceil(1000),
+        (ns * 100).div_ceil(machine.bus.cycle_ns),
+    )?;
+    writeln!(out, "  expected working counter {wkc}")
+}
+
+fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {
+    if machine.steps.is_empty() {
+        return writeln!(out, "\nno program: the axes are enabled and hold their positions");
+    }
+    writeln!(out, "\nprogram, {}", times(machine.repeat))?;
+    let axis = |index: usize| machine.devices.get(index).and_then(|d| Some((d, d.axis.as_ref()?)));
+    let targets = |targets: &[(usize, f64)], suffix: &str| {
+        let each = targets.iter().filter_map(|&(index, target)| {
+            let (device, axis) = axis(index)?;
+            let unit = if suffix == "%" { "" } else { &axis.unit };
+            Some(format!("{} → {target} {unit}{suffix}", device.name))
+        });
+        each.collect::<Vec<_>>().join(", ")
+    };
+    let percent = |fraction: f64| rounded(fraction * 100.0);
+    for (number, step) in machine.steps.iter().enumerate() {
+        let text = match step {
+            Step::Move { targets: t, speed, ramp } => format!(
+                "move {} at {} % of the velocity and {} % of the acceleration limit",
+                targets(t, ""),
+                percent(*speed),
+                percent(*ramp),
+            ),
+            Step::Velocity { targets: t, ramp } => {
+                format!("turn {} at {} % of the acceleration limit", targets(t, "/s"), percent(*ramp))
+            }
+            Step::Torque { targets: t, ramp_ns } => {
+                format!("torque {} within {}", targets(t, "%"), duration::show(*ramp_ns))
+            }
+            Step::Dwell { ns } => format!("wait {}", duration::show(*ns)),
+        };
+        writeln!(out, "  {}. {text}", number + 1)?;
+    }
+    Ok(())
+}
+
+fn times(n: u32) -> String {
+    if n == 1 { "once".to_owned() } else { format!("{n} times") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_on_the_wire_as_counted_by_hand() {
+        for (axes, bytes) in [(8, 168), (32, 456), (100, 1272)] {
+            let plan = image::plan(&vec![(12, 12); axes]).unwrap();
+            let frames = frame_bytes(&plan, true);
+            assert_eq!(frames.iter().sum::<usize>(), bytes + AL_STATUS, "{axes} axes");
+            assert_eq!(frames.len(), 1);
+        }
+        let idle = frame_bytes(&image::plan(&[]).unwrap(), false);
+        assert_eq!(idle, [84]);
+    }
+
+    #[test]
+    fn values_read_as_numbers() {
+        assert_eq!(value(&[0x10, 0x27]), "0x2710");
+        assert_eq!(value(&[1; 9]), "01 01 01 01 01 01 01 01 01");
+        assert_eq!(value(&[]), "");
+    }
+}

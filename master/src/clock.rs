@@ -1,0 +1,127 @@
+//! The session's clock: monotonic time, or virtual time that only moves when somebody waits.
+//!
+//! Also ethercrab's time source. Without its `std` feature ethercrab asks embassy-time for the
+//! time; nothing is ever scheduled there, because every executor here polls.
+
+use std::cell::Cell;
+use std::future::poll_fn;
+use std::task::{Poll, Waker};
+use std::time::Duration;
+
+use rustix::thread::{ClockId, clock_nanosleep_absolute};
+use rustix::time::{Timespec, clock_gettime};
+
+/// Nanoseconds of the session's clock.
+pub type Nanos = u64;
+
+const NANOS_PER_SECOND: u64 = 1_000_000_000;
+
+/// Where virtual time starts. Not zero, so that a clock read before the start would show.
+const VIRTUAL_EPOCH: Nanos = NANOS_PER_SECOND;
+
+thread_local! {
+    /// Virtual time of this thread; `None` where time is real.
+    static VIRTUAL: Cell<Option<Nanos>> = const { Cell::new(None) };
+}
+
+/// Which time a session runs in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Clock {
+    /// `CLOCK_MONOTONIC`.
+    Real,
+    /// Advances by waiting alone; one thread does everything.
+    Virtual,
+}
+
+/// The time of the thread's clock. RT: no system call beyond the clock.
+#[must_use]
+pub fn now() -> Nanos {
+    VIRTUAL.get().unwrap_or_else(monotonic)
+}
+
+fn monotonic() -> Nanos {
+    let t = clock_gettime(rustix::time::ClockId::Monotonic);
+    let seconds = u64::try_from(t.tv_sec).unwrap_or(0);
+    let nanos = u64::try_from(t.tv_nsec).unwrap_or(0);
+    seconds * NANOS_PER_SECOND + nanos
+}
+
+impl Clock {
+    /// Makes this the clock of the calling thread.
+    pub fn enter(self) {
+        VIRTUAL.set(match self {
+            Self::Real => None,
+            Self::Virtual => Some(VIRTUAL_EPOCH),
+        });
+    }
+
+    /// Sleeps until `spin` before `t`, then spins. RT: blocks on the clock only.
+    pub fn sleep_until(self, t: Nanos, spin: Nanos) {
+        match self {
+            Self::Virtual => VIRTUAL.set(VIRTUAL.get().map(|now| now.max(t))),
+            Self::Real => {
+                let wake = t.saturating_sub(spin);
+                if monotonic() < wake {
+                    let request = Timespec {
+                        tv_sec: i64::try_from(wake / NANOS_PER_SECOND).unwrap_or(i64::MAX),
+                        tv_nsec: i64::try_from(wake % NANOS_PER_SECOND).unwrap_or(0),
+                    };
+                    // A signal ends the sleep early; the loop below waits for the rest.
+                    let _ = clock_nanosleep_absolute(ClockId::Monotonic, &request);
+                }
+                while monotonic() < t {
+                    std::hint::spin_loop();
+                }
+            }
+        }
+    }
+
+    /// One turn of a waiting loop that wants to look again at `next` at the latest. RT.
+    pub fn relax(self, next: Nanos) {
+        match self {
+            Self::Virtual => VIRTUAL.set(VIRTUAL.get().map(|now| now.max(next))),
+            Self::Real => std::hint::spin_loop(),
+        }
+    }
+}
+
+/// Completes once the clock has moved on by `duration`.
+pub async fn delay(duration: Duration) {
+    let until = now().saturating_add(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX));
+    poll_fn(|_| if now() >= until { Poll::Ready(()) } else { Poll::Pending }).await;
+}
+
+#[derive(Debug)]
+struct Driver;
+
+impl embassy_time_driver::Driver for Driver {
+    /// Ticks are microseconds (feature `tick-hz-1_000_000`).
+    fn now(&self) -> u64 {
+        now() / 1_000
+    }
+
+    fn schedule_wake(&self, _at: u64, _waker: &Waker) {}
+}
+
+embassy_time_driver::time_driver_impl!(static DRIVER: Driver = Driver);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn virtual_time_moves_by_waiting_alone() {
+        std::thread::spawn(|| {
+            Clock::Virtual.enter();
+            let start = now();
+            assert_eq!(now(), start);
+            Clock::Virtual.sleep_until(start + 5_000_000, 100_000);
+            assert_eq!(now(), start + 5_000_000);
+            Clock::Virtual.relax(start);
+            assert_eq!(now(), start + 5_000_000, "time never goes back");
+            assert_eq!(embassy_time_driver::now(), now() / 1_000);
+        })
+        .join()
+        .expect("thread");
+    }
+}

@@ -1,0 +1,142 @@
+//! ethercrab's two ends on our link. ethercrab makes its own frames; whoever owns the link moves
+//! them: the pump during bring-up, the cycle afterwards.
+
+use std::future::Future;
+use std::pin::pin;
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+
+use ethercrab::{MainDevice, MainDeviceConfig, PduRx, PduStorage, PduTx, RetryBehaviour, Timeouts};
+
+use super::{Link, LinkError, MAX_FRAME};
+use crate::clock::{self, Clock, Nanos};
+
+/// EtherType of EtherCAT frames.
+pub const ETHERCAT: [u8; 2] = [0x88, 0xa4];
+
+/// Last byte of the source MAC of ethercrab's frames; ours differ, see `rt::exchange`.
+const ETHERCRAB_MAC_TAIL: u8 = 0x10;
+
+/// Frames that ethercrab may have under way; it takes one an awaited datagram.
+const FRAMES: usize = 16;
+/// Payload of one frame: headers and data of its datagrams.
+const FRAME_DATA: usize = PduStorage::element_size(1400);
+
+/// How far virtual time moves at most while nothing is under way.
+const IDLE_STEP: Nanos = 20_000;
+
+/// How long one datagram is waited for at least; a busy host answers late, not never.
+const PDU_TIMEOUT: Duration = Duration::from_millis(30);
+
+/// Static drift compensation cycles; the cyclic exchange goes on compensating.
+const STATIC_SYNC_CYCLES: u32 = 1_000;
+
+/// Both ends of ethercrab's PDU loop.
+pub struct Port {
+    tx: PduTx<'static>,
+    rx: PduRx<'static>,
+    /// Frames that ethercrab would not take: late, unknown, damaged.
+    pub refused: u64,
+}
+
+impl std::fmt::Debug for Port {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Port").field("refused", &self.refused).finish_non_exhaustive()
+    }
+}
+
+/// A MainDevice and the port that carries its frames. The storage lives as long as the process:
+/// a process drives a bus once, and ethercrab's futures borrow it for `'static`.
+///
+/// While the cycle runs, a datagram leaves with one cycle and returns in the next, so the time it
+/// is waited for must exceed a few cycles.
+#[must_use]
+pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, Port) {
+    let storage: &'static PduStorage<FRAMES, FRAME_DATA> = Box::leak(Box::new(PduStorage::new()));
+    let Ok((tx, rx, pdu_loop)) = storage.try_split() else {
+        unreachable!("a new storage splits once");
+    };
+    let timeouts = Timeouts {
+        pdu: Duration::from_nanos(cycle_ns.saturating_mul(5)).max(PDU_TIMEOUT),
+        wait_loop_delay: Duration::from_micros(200),
+        ..Timeouts::default()
+    };
+    let config = MainDeviceConfig {
+        dc_static_sync_iterations: STATIC_SYNC_CYCLES,
+        retry_behaviour: RetryBehaviour::Count(3),
+    };
+    let device = Box::leak(Box::new(MainDevice::new(pdu_loop, timeouts, config)));
+    (device, Port { tx, rx, refused: 0 })
+}
+
+impl Port {
+    /// Sends at most `most` frames that ethercrab has ready; returns how many. RT.
+    pub fn send(&mut self, link: &mut dyn Link, most: usize) -> Result<usize, LinkError> {
+        let mut sent = 0;
+        while sent < most {
+            let Some(frame) = self.tx.next_sendable_frame() else { break };
+            let mut failure = None;
+            let result = frame.send_blocking(|bytes| match link.send(bytes) {
+                Ok(()) => Ok(bytes.len()),
+                Err(error) => {
+                    failure = Some(error);
+                    Err(ethercrab::error::Error::SendFrame)
+                }
+            });
+            if let Some(error) = failure {
+                return Err(error);
+            }
+            if result.is_err() {
+                break;
+            }
+            sent += 1;
+        }
+        Ok(sent)
+    }
+
+    /// Hands a received frame to ethercrab if it is one of its own. What it refuses (an answer
+    /// after its timeout, a damaged frame) is counted and forgotten. RT.
+    pub fn receive(&mut self, frame: &[u8]) {
+        if belongs_to_ethercrab(frame) && self.rx.receive_frame(frame).is_err() {
+            self.refused += 1;
+        }
+    }
+}
+
+/// Whether a frame on the wire carries EtherCAT and ethercrab's source address.
+fn belongs_to_ethercrab(frame: &[u8]) -> bool {
+    frame.get(12..14) == Some(&ETHERCAT[..]) && frame.get(11) == Some(&ETHERCRAB_MAC_TAIL)
+}
+
+/// Runs `future` to its end and carries ethercrab's frames meanwhile. The bring-up's executor.
+pub fn pump<F: Future>(
+    port: &mut Port,
+    link: &mut dyn Link,
+    clock: Clock,
+    future: F,
+) -> Result<F::Output, LinkError> {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    let mut buf = [0; MAX_FRAME];
+    let mut idle: u32 = 0;
+    loop {
+        if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
+            return Ok(output);
+        }
+        let mut moved = port.send(link, usize::MAX)? > 0;
+        while let Some(len) = link.recv(&mut buf)? {
+            port.receive(&buf[..len]);
+            moved = true;
+        }
+        idle = if moved { 0 } else { idle.saturating_add(1) };
+        match clock {
+            Clock::Virtual => {
+                let next = link.next_arrival().unwrap_or_else(|| clock::now() + IDLE_STEP);
+                clock.relax(next);
+            }
+            // Frames come back within microseconds; a device at work takes milliseconds.
+            Clock::Real if idle > 2_000 => std::thread::sleep(Duration::from_micros(50)),
+            Clock::Real => std::hint::spin_loop(),
+        }
+    }
+}

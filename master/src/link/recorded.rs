@@ -1,0 +1,46 @@
+//! A link around a link that keeps every frame in a recording.
+
+use std::io;
+
+use super::capture::{Dir, RecordStats, Recorder};
+use super::{Link, LinkError, MAX_FRAME, Nanos};
+use crate::clock;
+
+/// Records what passes through.
+#[derive(Debug)]
+pub struct Recorded {
+    inner: Box<dyn Link>,
+    recorder: Recorder,
+    /// Added to the clock's time to give nanoseconds since 1970.
+    epoch: Nanos,
+}
+
+impl Recorded {
+    #[must_use]
+    pub fn new(inner: Box<dyn Link>, recorder: Recorder, epoch: Nanos) -> Self {
+        Self { inner, recorder, epoch }
+    }
+}
+
+impl Link for Recorded {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        self.recorder.frame(Dir::Out, clock::now() + self.epoch, frame);
+        self.inner.send(frame)
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        let received = self.inner.recv(buf)?;
+        if let Some(len) = received {
+            self.recorder.frame(Dir::In, clock::now() + self.epoch, &buf[..len]);
+        }
+        Ok(received)
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.inner.next_arrival()
+    }
+
+    fn finish(self: Box<Self>) -> io::Result<Option<RecordStats>> {
+        self.recorder.finish().map(Some)
+    }
+}

@@ -1,0 +1,484 @@
+//! Transfers that fail, each with its own error, and a client that is usable afterwards.
+
+use std::cell::Cell;
+use std::time::Duration;
+
+use super::mischief::{Mischief, emergency};
+use super::server::Server;
+use super::{STATION, block_on, client, layout};
+use crate::mailbox::{CoeClient, MAX_OBJECT, Phase, SdoError, Wire, WireError};
+
+const LONG: &[u8] = &[7; 100];
+const OBJECTS: &[(u16, u8, &[u8])] = &[
+    (0x1000, 0, &[0x92, 1, 2, 0]),
+    (0x6041, 0, &[0x37, 0x02]),
+    (0x2000, 0, LONG),
+];
+
+fn server(mischief: &[Mischief]) -> Server {
+    Server::new(48, OBJECTS, mischief)
+}
+
+/// What the first upload of `index` ends with; the next one must succeed once the mischief is over.
+fn upload_error(index: u16, mischief: &[Mischief]) -> (SdoError, Vec<Vec<u8>>) {
+    let server = server(mischief);
+    let mut client = client();
+    let error = block_on(client.upload(&server, index, 0, false)).unwrap_err();
+    let log = server.log();
+    server.forgive();
+    assert_eq!(
+        block_on(client.upload(&server, 0x6041, 0, false)).unwrap(),
+        [0x37, 0x02]
+    );
+    (error, log)
+}
+
+fn download_error(index: u16, data: &[u8], mischief: &[Mischief]) -> (SdoError, Vec<Vec<u8>>) {
+    let server = server(mischief);
+    let mut client = client();
+    let error = block_on(client.download(&server, index, 0, false, data)).unwrap_err();
+    let log = server.log();
+    server.forgive();
+    assert_eq!(
+        block_on(client.upload(&server, 0x6041, 0, false)).unwrap(),
+        [0x37, 0x02]
+    );
+    (error, log)
+}
+
+#[test]
+fn aborts_carry_their_code_and_say_what_it_means() {
+    let (error, _) = upload_error(0x6060, &[]);
+    assert_eq!(
+        error,
+        SdoError::Abort {
+            station: STATION,
+            index: 0x6060,
+            sub: 0,
+            code: 0x0602_0000
+        }
+    );
+    assert_eq!(
+        error.to_string(),
+        "station 0x1001: 0x6060:00 (Modes of operation) was refused with 0x06020000: the object does not exist"
+    );
+    let (error, _) = download_error(0x1000, &[1], &[]);
+    assert_eq!(error.abort_code(), Some(0x0601_0002));
+    let (error, _) = download_error(0x2abc, LONG, &[]);
+    assert_eq!(error.abort_code(), Some(0x0602_0000));
+}
+
+/// ETG.1000.6 files the abort under the request service, some stacks under the response service.
+#[test]
+fn an_abort_is_understood_under_either_service() {
+    for service in [0x20, 0x30] {
+        let abort = [
+            10, 0, 0, 0, 0, 0x13, 0, service, 0x80, 0x41, 0x60, 0, 0xc0, 0xff, 0x00, 0x0f,
+        ];
+        let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, abort.to_vec())]);
+        assert_eq!(error.abort_code(), Some(0x0f00_ffc0));
+        assert!(error.to_string().contains("wrong NMT state"), "{error}");
+    }
+}
+
+#[test]
+fn an_abort_among_segments_ends_the_transfer_whatever_its_address() {
+    let abort = [
+        10, 0, 0, 0, 0, 0x13, 0, 0x20, 0x80, 0, 0, 0, 0x22, 0x00, 0x00, 0x08,
+    ];
+    let (error, _) = upload_error(0x2000, &[Mischief::Replace(2, abort.to_vec())]);
+    assert_eq!(error.abort_code(), Some(0x0800_0022));
+    let (error, _) = download_error(0x2000, LONG, &[Mischief::Replace(3, abort.to_vec())]);
+    assert_eq!(error.abort_code(), Some(0x0800_0022));
+}
+
+#[test]
+fn a_mute_device_times_out() {
+    let (error, log) = upload_error(0x6041, &[Mischief::Mute]);
+    let after = Duration::from_millis(500);
+    let timeout = SdoError::Timeout {
+        station: STATION,
+        index: 0x6041,
+        sub: 0,
+        phase: Phase::Answer,
+        after,
+        set_aside: 0,
+    };
+    assert_eq!(error, timeout);
+    assert_eq!(log.len(), 1, "a request that came back is not sent again");
+}
+
+#[test]
+fn a_mailbox_that_stays_full_times_out() {
+    let server = server(&[Mischief::Deaf]);
+    let mut client = client();
+    // The first request finds room and no answer, the second finds no room.
+    let first = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            first,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                ..
+            }
+        ),
+        "{first}"
+    );
+    let before = server.now();
+    let second = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            second,
+            SdoError::Timeout {
+                phase: Phase::Request,
+                ..
+            }
+        ),
+        "{second}"
+    );
+    assert!(
+        second
+            .to_string()
+            .contains("the mailbox was not free within 100ms"),
+        "{second}"
+    );
+    assert!(server.now() - before < 150_000_000);
+}
+
+#[test]
+fn a_device_that_is_gone_is_not_waited_for() {
+    let server = server(&[Mischief::Off]);
+    let error = block_on(client().upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert_eq!(error, SdoError::Gone { station: STATION });
+    assert_eq!(
+        block_on(client().drain(&server)),
+        Err(SdoError::Gone { station: STATION })
+    );
+    assert!(server.now() < 10_000_000, "{}", server.now());
+}
+
+#[test]
+fn a_device_that_goes_in_mid_transfer_is_not_waited_for() {
+    let server = server(&[Mischief::Mute]);
+    let mut client = client();
+    block_on(client.drain(&server)).unwrap();
+    server.commit(Mischief::Off);
+    let error = block_on(client.download(&server, 0x2000, 0, false, LONG)).unwrap_err();
+    assert_eq!(error, SdoError::Gone { station: STATION });
+}
+
+#[test]
+fn a_mailbox_error_reply_ends_the_transfer() {
+    let reply = [4, 0, 0, 0, 0, 0x10, 1, 0, 2, 0];
+    let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, reply.to_vec())]);
+    assert_eq!(
+        error,
+        SdoError::Refused {
+            station: STATION,
+            index: 0x6041,
+            sub: 0,
+            code: 2
+        }
+    );
+    assert!(
+        error.to_string().contains("protocol is not supported"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_length_beyond_the_mailbox_is_malformed() {
+    for length in [43u16, 0x1000, 0xffff] {
+        let [low, high] = length.to_le_bytes();
+        let answer = [
+            low, high, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x41, 0x60, 0, 0, 0, 0, 0,
+        ];
+        let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, answer.to_vec())]);
+        assert!(
+            matches!(error, SdoError::Malformed { index: 0x6041, .. }),
+            "{error}"
+        );
+        assert!(
+            error
+                .to_string()
+                .contains(&format!("says {length}, the mailbox holds 42")),
+            "{error}"
+        );
+    }
+}
+
+#[test]
+fn answers_that_end_too_early_are_malformed() {
+    let answer = [
+        0, 0, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x41, 0x60, 0, 0x37, 0x02, 0, 0,
+    ];
+    for length in 0..10 {
+        let mut answer = answer;
+        answer[0] = length;
+        let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, answer.to_vec())]);
+        assert!(
+            matches!(error, SdoError::Malformed { .. }),
+            "{length}: {error}"
+        );
+    }
+}
+
+#[test]
+fn an_answer_to_something_else_only_is_a_timeout_that_says_so() {
+    let other = [
+        10, 0, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x64, 0x60, 0, 1, 0, 0, 0,
+    ];
+    let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, other.to_vec())]);
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                set_aside: 1,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert!(
+        error
+            .to_string()
+            .ends_with("(1 answer to something else was set aside)"),
+        "{error}"
+    );
+}
+
+/// The answer to a request that timed out must not be taken for that to the same request made later.
+#[test]
+fn a_late_answer_is_not_taken_for_the_next_one() {
+    let server = server(&[Mischief::Deaf]);
+    let mut client = client();
+    block_on(async {
+        client.upload(&server, 0x6041, 0, false).await.unwrap_err();
+        server.forgive();
+        server.delay(Duration::from_millis(5)).await;
+        server.set(0x6041, 0, &[0x50, 0x02]);
+        assert_eq!(
+            client.upload(&server, 0x6041, 0, false).await.unwrap(),
+            [0x50, 0x02]
+        );
+    });
+    assert_eq!(client.set_aside(), 1);
+}
+
+/// A device that does not take the old request before its emergencies are fetched, of which there are too many for
+/// one go.
+#[test]
+fn a_device_that_has_much_to_say_first_is_heard() {
+    let server = server(&[Mischief::Deaf]);
+    let mut client = client();
+    block_on(async {
+        client.upload(&server, 0x6041, 0, false).await.unwrap_err();
+        server.commit(Mischief::Blocked);
+        for _ in 0..70 {
+            server.say(&emergency(0x8130));
+        }
+        server.pardon(&Mischief::Deaf);
+        assert_eq!(
+            client.upload(&server, 0x1000, 0, false).await.unwrap(),
+            [0x92, 1, 2, 0]
+        );
+    });
+    let kept = u64::try_from(client.take_emergencies().count()).unwrap();
+    assert_eq!(kept + client.lost_emergencies(), 70);
+}
+
+/// Time passes only where the client waits, and there is always another message.
+#[test]
+fn a_flood_on_a_wire_that_takes_no_time_ends() {
+    struct Flood(Cell<u64>);
+    impl Wire for Flood {
+        async fn read(&self, _: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+            if register < 0x1000 {
+                buf.fill(u8::from(register == 0x080d) << 3);
+            } else {
+                let sdo_info = [10, 0, 0, 0, 0, 0x13, 0, 0x80, 2, 0, 0, 0, 0, 0, 0, 0];
+                buf[..16].copy_from_slice(&sdo_info);
+            }
+            Ok(1)
+        }
+        async fn write(&self, _: u16, _: u16, _: &[u8]) -> Result<u16, WireError> {
+            Ok(1)
+        }
+        async fn delay(&self, duration: Duration) {
+            self.0
+                .set(self.0.get() + u64::try_from(duration.as_nanos()).unwrap());
+        }
+        fn now(&self) -> u64 {
+            self.0.get()
+        }
+    }
+    let wire = Flood(Cell::new(0));
+    let error = block_on(client().upload(&wire, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert_eq!(block_on(client().drain(&wire)), Ok(64));
+}
+
+#[test]
+fn a_wrong_toggle_bit_ends_the_transfer_and_the_device_is_told() {
+    let toggle = [0x00, 0x20, 0x80, 0x00, 0x20, 0, 0x00, 0x00, 0x03, 0x05];
+    let (error, _) = upload_error(0x2000, &[Mischief::WrongToggle]);
+    assert!(error.to_string().contains("toggle"), "{error}");
+    let server = server(&[Mischief::WrongToggle]);
+    let mut client = client();
+    block_on(async {
+        let error = client
+            .download(&server, 0x2000, 0, false, LONG)
+            .await
+            .unwrap_err();
+        assert!(error.to_string().contains("toggle"), "{error}");
+        server.delay(Duration::from_millis(5)).await;
+    });
+    assert_eq!(server.log().last().unwrap()[..10], toggle);
+}
+
+#[test]
+fn sizes_that_are_not_kept_are_malformed() {
+    let (error, _) = upload_error(0x2000, &[Mischief::AnnounceSize(101)]);
+    assert!(
+        error
+            .to_string()
+            .contains("101 bytes were announced, 100 came"),
+        "{error}"
+    );
+    let (error, _) = upload_error(0x2000, &[Mischief::AnnounceSize(60)]);
+    assert!(
+        error
+            .to_string()
+            .contains("60 bytes were announced, 71 came"),
+        "{error}"
+    );
+    let (error, _) = upload_error(0x2000, &[Mischief::EmptySegments]);
+    assert!(
+        error.to_string().contains("a segment without data"),
+        "{error}"
+    );
+}
+
+#[test]
+fn objects_beyond_all_measure_are_refused_before_they_are_read_or_written() {
+    let (error, log) = upload_error(0x2000, &[Mischief::AnnounceSize(u32::MAX)]);
+    assert!(
+        matches!(
+            error,
+            SdoError::TooLarge {
+                size: 0xffff_ffff,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert_eq!(log.len(), 1);
+    let (error, log) = download_error(0x2000, &vec![0; MAX_OBJECT + 1], &[]);
+    assert!(matches!(error, SdoError::TooLarge { .. }), "{error}");
+    assert!(log.is_empty());
+}
+
+#[test]
+fn an_answer_lost_for_good_times_out() {
+    let (error, _) = upload_error(0x6041, &[Mischief::LoseAnswer(1), Mischief::NoRepeat]);
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Repeat,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    let again: Vec<_> = (1..=9).map(Mischief::LoseAnswer).collect();
+    let (error, _) = upload_error(0x6041, &again);
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Repeat,
+                ..
+            }
+        ),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_flood_of_emergencies_does_not_hold_the_client_up() {
+    let server = server(&[Mischief::Mute]);
+    for _ in 0..10_000 {
+        server.say(&emergency(0x8130));
+    }
+    let mut client = client();
+    let error = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert!(server.now() < 700_000_000, "{}", server.now());
+}
+
+#[test]
+fn mailboxes_that_cannot_carry_coe_are_refused_before_anything_is_sent() {
+    for len in [0, 6, 15, 1487] {
+        let server = server(&[]);
+        let mut client = CoeClient::new(layout(len));
+        let refused = SdoError::Mailbox {
+            station: STATION,
+            out_len: len,
+            in_len: len,
+        };
+        assert_eq!(
+            block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err(),
+            refused
+        );
+        assert_eq!(block_on(client.drain(&server)).unwrap_err(), refused);
+        assert_eq!(server.datagrams.get(), 0);
+    }
+}
+
+#[test]
+fn a_silent_bus_is_reported_as_such() {
+    struct Silent;
+    impl Wire for Silent {
+        async fn read(&self, station: u16, register: u16, _: &mut [u8]) -> Result<u16, WireError> {
+            Err(WireError::Timeout { station, register })
+        }
+        async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, WireError> {
+            Err(WireError::Timeout { station, register })
+        }
+        async fn delay(&self, _: Duration) {}
+        fn now(&self) -> u64 {
+            0
+        }
+    }
+    let error = block_on(client().upload(&Silent, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            SdoError::Wire(WireError::Timeout {
+                station: STATION,
+                ..
+            })
+        ),
+        "{error}"
+    );
+}

@@ -1,0 +1,47 @@
+//! The client against a small SDO server that shares no code with it.
+
+use std::pin::pin;
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+
+use super::{CoeClient, MailboxLayout, Timeouts};
+
+mod errors;
+mod hostile;
+mod mischief;
+mod server;
+mod transfers;
+
+const STATION: u16 = 0x1001;
+
+fn layout(len: u16) -> MailboxLayout {
+    MailboxLayout {
+        station: STATION,
+        out_address: 0x1000,
+        out_len: len,
+        in_address: 0x1400,
+        in_len: len,
+        out_sm: 0,
+        in_sm: 1,
+    }
+}
+
+fn client() -> CoeClient {
+    CoeClient::new(layout(48)).with_timeouts(Timeouts {
+        request: Duration::from_millis(100),
+        answer: Duration::from_millis(500),
+        transfer: Duration::from_secs(10),
+    })
+}
+
+/// Nothing in these tests waits for anything but virtual time, so a future is ready at once.
+fn block_on<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    match future
+        .as_mut()
+        .poll(&mut Context::from_waker(Waker::noop()))
+    {
+        Poll::Ready(value) => value,
+        Poll::Pending => panic!("a future that waits for nothing was not ready"),
+    }
+}

@@ -1,0 +1,420 @@
+//! One turn of the loop: wake, send, receive, check, step, publish.
+
+use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, State};
+
+use super::exchange::{Answer, Exchange, Received};
+use super::guard::{Guard, StopCause};
+use super::handover::{Event, Order, PhaseStatus, RtEnd, Snapshot};
+use super::image::AxisBits;
+use super::phase::Phase;
+use super::stats::Stats;
+use crate::clock::{self, Clock, Nanos};
+use crate::link::port::Port;
+use crate::link::{Link, LinkError, MAX_FRAME};
+
+/// An axis that is not at rest this long after the machine began to stop is disabled all the same.
+const STOP_PATIENCE: Nanos = 5_000_000_000;
+
+/// One axis and where its objects are.
+#[derive(Debug)]
+pub struct AxisSlot {
+    pub axis: Axis,
+    pub bits: AxisBits,
+    /// Largest following error while enabled, and the status of the last enabled cycle.
+    pub largest_following_error: f64,
+    pub last_enabled: Option<AxisStatus>,
+}
+
+impl AxisSlot {
+    #[must_use]
+    pub fn new(axis: Axis, bits: AxisBits) -> Self {
+        Self { axis, bits, largest_following_error: 0.0, last_enabled: None }
+    }
+
+    fn read(&self, image: &[u8], fresh: bool) -> Inputs {
+        let bits = &self.bits;
+        Inputs {
+            statusword: bits.statusword.get(image) as u16,
+            position: bits.position.map(|b| b.get(image) as i32),
+            velocity: bits.velocity.map(|b| b.get(image) as i32),
+            torque: bits.torque.map(|b| b.get(image) as i16),
+            mode_display: bits.mode_display.map(|b| b.get(image) as i8),
+            fresh,
+        }
+    }
+
+    fn write(&self, image: &mut [u8], outputs: &Outputs) {
+        let bits = &self.bits;
+        bits.controlword.set(image, i64::from(outputs.controlword));
+        for (to, value) in [
+            (bits.mode, i64::from(outputs.mode)),
+            (bits.target_position, i64::from(outputs.target_position)),
+            (bits.target_velocity, i64::from(outputs.target_velocity)),
+            (bits.target_torque, i64::from(outputs.target_torque)),
+        ] {
+            if let Some(to) = to {
+                to.set(image, value);
+            }
+        }
+    }
+}
+
+/// How the loop is timed.
+#[derive(Debug, Clone, Copy)]
+pub struct Timing {
+    pub cycle_ns: u64,
+    /// Spinning before the release; the rest is slept.
+    pub spin_ns: u64,
+}
+
+/// Everything that a cycle touches.
+#[derive(Debug)]
+pub struct Engine {
+    clock: Clock,
+    timing: Timing,
+    link: Box<dyn Link>,
+    port: Port,
+    exchange: Exchange,
+    axes: Vec<AxisSlot>,
+    phase: Option<Phase>,
+    phase_error: i64,
+    guard: Guard,
+    guarding: bool,
+    stats: Stats,
+    end: RtEnd,
+    next: Nanos,
+    stopping: Option<(StopCause, Nanos)>,
+    answer: Answer,
+    events_lost: u64,
+    orders_taken: u64,
+    halted: bool,
+    buf: [u8; MAX_FRAME],
+}
+
+/// What an engine is made of.
+#[derive(Debug)]
+pub struct Parts {
+    pub clock: Clock,
+    pub timing: Timing,
+    pub link: Box<dyn Link>,
+    pub port: Port,
+    pub exchange: Exchange,
+    pub axes: Vec<AxisSlot>,
+    pub phase: Option<Phase>,
+    pub guard: Guard,
+    pub end: RtEnd,
+}
+
+/// What remains when the loop has ended.
+#[derive(Debug)]
+pub struct Remains {
+    pub link: Box<dyn Link>,
+    pub port: Port,
+    pub axes: Vec<AxisSlot>,
+    pub stats: Stats,
+}
+
+impl Engine {
+    /// The first cycle is due one cycle from now.
+    #[must_use]
+    pub fn new(parts: Parts) -> Self {
+        Self {
+            clock: parts.clock,
+            timing: parts.timing,
+            link: parts.link,
+            port: parts.port,
+            exchange: parts.exchange,
+            axes: parts.axes,
+            phase: parts.phase,
+            phase_error: 0,
+            guard: parts.guard,
+            guarding: false,
+            stats: Stats::default(),
+            end: parts.end,
+            next: clock::now() + parts.timing.cycle_ns,
+            stopping: None,
+            answer: Answer::default(),
+            events_lost: 0,
+            orders_taken: 0,
+            halted: false,
+            buf: [0; MAX_FRAME],
+        }
+    }
+
+    /// Whether [`Order::Halt`] has been taken.
+    #[must_use]
+    pub fn halted(&self) -> bool {
+        self.halted
+    }
+
+    #[must_use]
+    pub fn into_remains(self) -> Remains {
+        Remains { link: self.link, port: self.port, axes: self.axes, stats: self.stats }
+    }
+
+    /// One cycle. RT: blocks on the clock and the wire only; O(image + axes).
+    pub fn cycle(&mut self) {
+        self.clock.sleep_until(self.next, self.timing.spin_ns);
+        let woke = clock::now();
+        let lateness = woke.saturating_sub(self.next);
+        self.stats.lateness.record(lateness);
+        self.stats.counters.cycles += 1;
+
+        self.send();
+        self.receive();
+        self.answer = self.exchange.answer();
+        self.count();
+        let adjust = self.follow_clock(lateness);
+        if self.guarding
+            && let Some(cause) = self.guard.check(&self.answer)
+        {
+            self.stop(cause);
+        }
+
+        self.take_order();
+        self.step_axes();
+        self.exchange.stage();
+        self.publish(woke);
+        self.plan_next(adjust);
+        self.stats.work.record(clock::now().saturating_sub(woke));
+    }
+
+    fn send(&mut self) {
+        let sent = self.exchange.send(self.link.as_mut());
+        self.note(sent);
+        // Mailbox frames follow the cyclic ones, one a cycle.
+        let sent = self.port.send(self.link.as_mut(), 1).map(|_| ());
+        self.note(sent);
+    }
+
+    fn note(&mut self, result: Result<(), LinkError>) {
+        if result.is_err() {
+            self.stats.counters.link_errors += 1;
+        }
+    }
+
+    /// Until the cyclic frames are back or half the cycle is over.
+    fn receive(&mut self) {
+        let released = self.next;
+        let deadline = released + self.timing.cycle_ns / 2;
+        loop {
+            loop {
+                match self.link.recv(&mut self.buf) {
+                    Ok(Some(len)) => self.sort(len),
+                    Ok(None) => break,
+                    Err(_) => {
+                        self.stats.counters.link_errors += 1;
+                        break;
+                    }
+                }
+            }
+            let now = clock::now();
+            if self.exchange.complete() {
+                self.stats.round_trip.record(now.saturating_sub(released));
+                return;
+            }
+            if now >= deadline {
+                return;
+            }
+            self.clock.relax(self.link.next_arrival().map_or(deadline, |at| at.min(deadline)));
+        }
+    }
+
+    fn sort(&mut self, len: usize) {
+        let frame = &self.buf[..len];
+        match self.exchange.receive(frame) {
+            Received::Current => {}
+            Received::Late => self.stats.counters.late_frames += 1,
+            Received::Foreign => self.port.receive(frame),
+        }
+    }
+
+    fn count(&mut self) {
+        if !self.answer.complete {
+            self.stats.counters.lost_frames += 1;
+        } else if !self.answer.inputs_fresh {
+            self.stats.counters.wkc_errors += 1;
+        }
+        self.stats.counters.refused_answers = self.port.refused;
+    }
+
+    /// Nanoseconds to add to the next cycle.
+    fn follow_clock(&mut self, lateness: Nanos) -> i64 {
+        let Some(phase) = &mut self.phase else { return 0 };
+        let Some(system_time) = self.answer.system_time else { return phase.holdover() };
+        let before = phase.locked();
+        let step = phase.update(system_time, lateness);
+        let now_locked = phase.locked();
+        self.phase_error = step.error;
+        if now_locked {
+            self.stats.phase.record(step.error.unsigned_abs());
+        }
+        let cycle = self.stats.counters.cycles;
+        match (before, now_locked) {
+            (false, true) => self.report(Event::PhaseLocked { cycle }),
+            (true, false) => self.report(Event::PhaseLost { cycle }),
+            _ => {}
+        }
+        step.adjust
+    }
+
+    fn take_order(&mut self) {
+        let Ok(order) = self.end.orders.pop() else {
+            if self.end.orders.is_abandoned() && !self.halted {
+                self.end_alone();
+            }
+            return;
+        };
+        self.orders_taken += 1;
+        match order {
+            Order::Axis { axis, command } => {
+                // A stopping machine takes no new motion.
+                if self.stopping.is_some() && command != Command::Disable {
+                    return;
+                }
+                if let Some(slot) = self.axes.get_mut(axis)
+                    && let Err(reason) = slot.axis.command(command)
+                {
+                    let cycle = self.stats.counters.cycles;
+                    self.report(Event::Refused { cycle, axis, reason });
+                }
+            }
+            Order::Guard => self.guarding = true,
+            Order::Stop => self.stop(StopCause::Requested),
+            Order::ErrorCode { axis, code } => {
+                if let Some(slot) = self.axes.get_mut(axis) {
+                    slot.axis.note_error_code(code);
+                }
+            }
+            Order::Halt => self.halted = true,
+        }
+    }
+
+    /// The supervisor is gone without saying so: stop, then end the loop.
+    fn end_alone(&mut self) {
+        self.stop(StopCause::Requested);
+        let since = self.stopping.map_or(self.next, |(_, since)| since);
+        self.halted = self.without_power() || self.next.saturating_sub(since) > 2 * STOP_PATIENCE;
+    }
+
+    fn without_power(&self) -> bool {
+        self.axes.iter().all(|slot| {
+            !matches!(
+                slot.axis.status().state,
+                State::OperationEnabled | State::QuickStopActive | State::FaultReactionActive
+            )
+        })
+    }
+
+    /// The first cause wins; all axes decelerate within their limits and are then disabled.
+    fn stop(&mut self, cause: StopCause) {
+        if self.stopping.is_some() {
+            return;
+        }
+        self.stopping = Some((cause, self.next));
+        for slot in &mut self.axes {
+            if slot.axis.status().enabled {
+                // An axis that cannot be told to decelerate has stopped by itself already.
+                let _ = slot.axis.command(Command::Stop);
+            } else {
+                let _ = slot.axis.command(Command::Disable);
+            }
+        }
+        let cycle = self.stats.counters.cycles;
+        self.report(Event::Stopping { cycle, cause });
+    }
+
+    fn step_axes(&mut self) {
+        let dt = self.timing.cycle_ns as f64 * 1e-9;
+        let fresh = self.answer.inputs_fresh && self.answer.complete;
+        let out_of_patience =
+            self.stopping.is_some_and(|(_, since)| self.next.saturating_sub(since) > STOP_PATIENCE);
+        let mut cause = None;
+        for (index, slot) in self.axes.iter_mut().enumerate() {
+            let inputs = slot.read(self.exchange.inputs(), fresh);
+            let outputs = slot.axis.step(&inputs, dt);
+            slot.write(self.exchange.outputs_mut(), &outputs);
+            let status = slot.axis.status();
+            if status.enabled {
+                slot.largest_following_error =
+                    slot.largest_following_error.max(status.following_error.abs());
+                slot.last_enabled = Some(status);
+            }
+            if self.stopping.is_some() {
+                if status.enabled && (status.at_rest && !status.moving || out_of_patience) {
+                    let _ = slot.axis.command(Command::Disable);
+                }
+            } else if cause.is_none() {
+                cause = match (status.fault, status.trip) {
+                    (Some(_), _) => Some(StopCause::DriveFault { axis: index }),
+                    (None, Some(trip)) => Some(StopCause::Trip { axis: index, trip }),
+                    (None, None) => None,
+                };
+            }
+        }
+        if let Some(cause) = cause {
+            self.stop(cause);
+        }
+    }
+
+    fn publish(&mut self, woke: Nanos) {
+        let stopped = self.stopping.is_some() && self.without_power();
+        let snapshot = self.end.snapshots.input_buffer_mut();
+        snapshot.time = woke;
+        snapshot.counters = self.stats.counters;
+        snapshot.phase = self.phase.as_ref().map(|phase| PhaseStatus {
+            locked: phase.locked(),
+            error_ns: self.phase_error,
+            drift_ppm: phase.drift_ppm(),
+        });
+        snapshot.inputs_fresh = self.answer.inputs_fresh;
+        snapshot.al_status = self.answer.al_status;
+        for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
+            *to = slot.axis.status();
+        }
+        for (to, diagnosis) in snapshot.diagnoses.iter_mut().zip(self.exchange.diagnoses()) {
+            *to = *diagnosis;
+        }
+        snapshot.stopping = self.stopping.map(|(cause, _)| cause);
+        snapshot.stopped = stopped;
+        snapshot.events_lost = self.events_lost;
+        snapshot.orders_taken = self.orders_taken;
+        self.end.snapshots.publish();
+    }
+
+    /// A cycle that is already over is left out instead of sent in a burst.
+    fn plan_next(&mut self, adjust: i64) {
+        self.next = (self.next + self.timing.cycle_ns).saturating_add_signed(adjust);
+        let now = clock::now();
+        if now > self.next {
+            let missed = (now - self.next) / self.timing.cycle_ns + 1;
+            self.stats.counters.overruns += missed;
+            self.next += missed * self.timing.cycle_ns;
+        }
+    }
+
+    fn report(&mut self, event: Event) {
+        if self.end.events.push(event).is_err() {
+            self.events_lost += 1;
+        }
+    }
+}
+
+/// The snapshot before the first cycle, with room for `axes` and `devices`.
+#[must_use]
+#[expect(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
+pub fn first_snapshot(axes: &[AxisSlot], devices: usize) -> Snapshot {
+    Snapshot {
+        time: clock::now(),
+        counters: super::stats::Counters::default(),
+        phase: None,
+        inputs_fresh: false,
+        al_status: None,
+        axes: axes.iter().map(|slot| slot.axis.status()).collect(),
+        diagnoses: vec![super::exchange::Diagnosis::default(); devices],
+        stopping: None,
+        stopped: false,
+        events_lost: 0,
+        orders_taken: 0,
+    }
+}

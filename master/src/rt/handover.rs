@@ -1,0 +1,92 @@
+//! The only ways into and out of the real-time thread: bounded, wait-free.
+
+use ecaxis_axis::{AxisStatus, Command, Refused};
+
+use super::exchange::Diagnosis;
+use super::guard::StopCause;
+use super::stats::Counters;
+use crate::clock::Nanos;
+
+/// Orders that may wait; the cycle takes one a cycle.
+const ORDERS: usize = 64;
+/// Events that may wait; more are counted, not kept.
+const EVENTS: usize = 256;
+
+/// To the cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Order {
+    Axis { axis: usize, command: Command },
+    /// From now on a bad bus stops the machine.
+    Guard,
+    /// Bring every axis to rest within its limits, then disable it.
+    Stop,
+    /// A drive's error code, read beside the cycle.
+    ErrorCode { axis: usize, code: u16 },
+    /// End the loop after this cycle.
+    Halt,
+}
+
+/// From the cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Event {
+    Refused { cycle: u64, axis: usize, reason: Refused },
+    Stopping { cycle: u64, cause: StopCause },
+    PhaseLocked { cycle: u64 },
+    PhaseLost { cycle: u64 },
+}
+
+/// The state of the machine after one cycle.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    pub time: Nanos,
+    pub counters: Counters,
+    /// `None` where no distributed clock is used.
+    pub phase: Option<PhaseStatus>,
+    pub inputs_fresh: bool,
+    pub al_status: Option<(u8, u16)>,
+    pub axes: Vec<AxisStatus>,
+    pub diagnoses: Vec<Diagnosis>,
+    /// First cause, once the machine is stopping.
+    pub stopping: Option<StopCause>,
+    /// Every axis is disabled after a stop.
+    pub stopped: bool,
+    /// Events that did not fit into the queue.
+    pub events_lost: u64,
+    /// Orders taken so far.
+    pub orders_taken: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PhaseStatus {
+    pub locked: bool,
+    pub error_ns: i64,
+    pub drift_ppm: f64,
+}
+
+/// The real-time end.
+#[derive(Debug)]
+pub struct RtEnd {
+    pub orders: rtrb::Consumer<Order>,
+    pub events: rtrb::Producer<Event>,
+    pub snapshots: triple_buffer::Input<Snapshot>,
+}
+
+/// Everybody else's end.
+#[derive(Debug)]
+pub struct OuterEnd {
+    pub orders: rtrb::Producer<Order>,
+    pub events: rtrb::Consumer<Event>,
+    pub snapshots: triple_buffer::Output<Snapshot>,
+}
+
+/// Prepares both ends with room for what `first` holds.
+#[must_use]
+pub fn ends(first: &Snapshot) -> (RtEnd, OuterEnd) {
+    let (order_in, order_out) = rtrb::RingBuffer::new(ORDERS);
+    let (event_in, event_out) = rtrb::RingBuffer::new(EVENTS);
+    let (snapshot_in, snapshot_out) = triple_buffer::triple_buffer(first);
+    (
+        RtEnd { orders: order_out, events: event_in, snapshots: snapshot_in },
+        OuterEnd { orders: order_in, events: event_out, snapshots: snapshot_out },
+    )
+}

@@ -1,0 +1,229 @@
+//! Where each SubDevice's process data lies: logical addresses, datagrams, frames, bits.
+
+use ecaxis_esi::layout::{Field, Layout};
+
+/// First logical address of the process image.
+pub const LOGICAL_BASE: u32 = 0x0001_0000;
+
+/// Room for LRW data in the first frame of a cycle, beside the clock, AL status and diagnostic
+/// datagrams: 1514 − 16 (headers) − 20 − 14 − 20 − 12.
+const FIRST_FRAME_DATA: usize = 1432;
+/// Room for LRW data in every further frame.
+const NEXT_FRAME_DATA: usize = 1486;
+
+/// The place of one SubDevice's outputs and inputs. Both start at the same logical address, so one
+/// byte of an LRW carries an output out and an input back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Region {
+    pub logical: u32,
+    /// Index into [`ImagePlan::datagrams`].
+    pub datagram: usize,
+    /// Offset in the image, which is all datagrams' data one after the other.
+    pub offset: usize,
+    pub out_len: usize,
+    pub in_len: usize,
+}
+
+/// One LRW.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LrwPlan {
+    pub logical: u32,
+    /// Offset of its data in the image.
+    pub offset: usize,
+    pub len: usize,
+    /// Sum over its SubDevices: 1 for inputs, 2 for outputs (ETG.1000.4, LRW).
+    pub expected_wkc: u16,
+}
+
+/// The whole image.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ImagePlan {
+    /// In the order of the devices given; `None` where a device has no process data.
+    pub regions: Vec<Option<Region>>,
+    pub datagrams: Vec<LrwPlan>,
+    pub len: usize,
+}
+
+/// A device whose process data does not fit into one frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("{len} bytes of process data do not fit into one frame of {NEXT_FRAME_DATA}")]
+pub struct TooLarge {
+    /// Index of the device.
+    pub device: usize,
+    pub len: usize,
+}
+
+/// Lays out devices of (output, input) bytes one after the other; none is split over two frames.
+pub fn plan(sizes: &[(usize, usize)]) -> Result<ImagePlan, TooLarge> {
+    let mut image = ImagePlan::default();
+    for (device, &(out_len, in_len)) in sizes.iter().enumerate() {
+        let len = out_len.max(in_len);
+        if len == 0 {
+            image.regions.push(None);
+            continue;
+        }
+        let room = if image.datagrams.len() <= 1 { FIRST_FRAME_DATA } else { NEXT_FRAME_DATA };
+        if len > NEXT_FRAME_DATA || (image.datagrams.is_empty() && len > FIRST_FRAME_DATA) {
+            return Err(TooLarge { device, len });
+        }
+        let logical = LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX));
+        let wkc = u16::from(in_len > 0) + 2 * u16::from(out_len > 0);
+        match image.datagrams.last_mut() {
+            Some(last) if last.len + len <= room => {
+                last.len += len;
+                last.expected_wkc += wkc;
+            }
+            _ => image.datagrams.push(LrwPlan { logical, offset: image.len, len, expected_wkc: wkc }),
+        }
+        image.regions.push(Some(Region {
+            logical,
+            datagram: image.datagrams.len() - 1,
+            offset: image.len,
+            out_len,
+            in_len,
+        }));
+        image.len += len;
+    }
+    Ok(image)
+}
+
+/// Bits of one object in the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bits {
+    byte: usize,
+    shift: u8,
+    len: u8,
+}
+
+impl Bits {
+    /// `None` where the field is longer than 64 bits or lies outside the region.
+    fn new(field: &Field, offset: usize, region_len: usize) -> Option<Self> {
+        let bit = usize::try_from(field.bit_offset).ok()?;
+        let len = u8::try_from(field.bit_len).ok().filter(|len| (1..=64).contains(len))?;
+        let end = (bit + usize::from(len)).div_ceil(8);
+        (end <= region_len).then(|| Self {
+            byte: offset + bit / 8,
+            shift: u8::try_from(bit % 8).unwrap_or(0),
+            len,
+        })
+    }
+
+    /// The bits as a sign-extended number. RT.
+    #[must_use]
+    pub fn get(self, image: &[u8]) -> i64 {
+        let end = self.byte + (usize::from(self.shift) + usize::from(self.len)).div_ceil(8);
+        let mut raw = 0_u128;
+        for (i, &byte) in image.get(self.byte..end).unwrap_or(&[]).iter().enumerate() {
+            raw |= u128::from(byte) << (8 * i);
+        }
+        let value = (raw >> self.shift) as u64;
+        let unused = 64 - u32::from(self.len);
+        ((value << unused) as i64) >> unused
+    }
+
+    /// Replaces the bits, leaving their neighbours. RT.
+    pub fn set(self, image: &mut [u8], value: i64) {
+        let end = self.byte + (usize::from(self.shift) + usize::from(self.len)).div_ceil(8);
+        let mask = (u128::from(u64::MAX >> (64 - u32::from(self.len)))) << self.shift;
+        let bits = (u128::from(value as u64) << self.shift) & mask;
+        for (i, byte) in image.get_mut(self.byte..end).unwrap_or(&mut []).iter_mut().enumerate() {
+            let keep = !((mask >> (8 * i)) as u8);
+            *byte = (*byte & keep) | ((bits >> (8 * i)) as u8);
+        }
+    }
+}
+
+/// The objects of a cyclic synchronous axis in the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct AxisBits {
+    pub controlword: Bits,
+    pub statusword: Bits,
+    pub mode: Option<Bits>,
+    pub mode_display: Option<Bits>,
+    pub target_position: Option<Bits>,
+    pub target_velocity: Option<Bits>,
+    pub target_torque: Option<Bits>,
+    pub position: Option<Bits>,
+    pub velocity: Option<Bits>,
+    pub torque: Option<Bits>,
+}
+
+/// An object without which an axis cannot be run is not in the process data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("object 0x{index:04x}:{sub:02x} is not in the process data")]
+pub struct NotMapped {
+    pub index: u16,
+    pub sub: u8,
+}
+
+impl AxisBits {
+    pub fn new(layout: &Layout, region: &Region) -> Result<Self, NotMapped> {
+        let out = |index| {
+            layout.rx_field(index, 0).and_then(|f| Bits::new(f, region.offset, region.out_len))
+        };
+        let inp = |index| {
+            layout.tx_field(index, 0).and_then(|f| Bits::new(f, region.offset, region.in_len))
+        };
+        Ok(Self {
+            controlword: out(0x6040).ok_or(NotMapped { index: 0x6040, sub: 0 })?,
+            statusword: inp(0x6041).ok_or(NotMapped { index: 0x6041, sub: 0 })?,
+            mode: out(0x6060),
+            mode_display: inp(0x6061),
+            target_position: out(0x607a),
+            target_velocity: out(0x60ff),
+            target_torque: out(0x6071),
+            position: inp(0x6064),
+            velocity: inp(0x606c),
+            torque: inp(0x6077),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn working_counters_and_addresses_of_a_drive_an_input_and_an_output() {
+        let image = plan(&[(12, 14), (0, 1), (1, 0), (0, 0)]).expect("fits");
+        assert_eq!(image.datagrams, [LrwPlan {
+            logical: LOGICAL_BASE,
+            offset: 0,
+            len: 16,
+            expected_wkc: 3 + 1 + 2,
+        }]);
+        assert_eq!(image.regions[1].map(|r| r.offset), Some(14));
+        assert_eq!(image.regions[2].map(|r| r.logical), Some(LOGICAL_BASE + 15));
+        assert_eq!(image.regions[3], None);
+    }
+
+    #[test]
+    fn a_hundred_axes_of_twelve_bytes_fit_into_one_frame() {
+        assert_eq!(plan(&[(12, 12); 100]).expect("fits").datagrams.len(), 1);
+        let many = plan(&[(12, 12); 300]).expect("fits");
+        assert_eq!(many.datagrams.len(), 3);
+        assert!(many.datagrams.iter().all(|d| d.len <= NEXT_FRAME_DATA));
+        assert_eq!(plan(&[(1500, 0)]), Err(TooLarge { device: 0, len: 1500 }));
+    }
+
+    proptest! {
+        #[test]
+        fn bits_come_back_and_neighbours_stay(
+            byte in 0_usize..8, shift in 0_u8..8, len in 1_u8..=64, value: i64, fill: u8,
+        ) {
+            let bits = Bits { byte, shift, len };
+            let mut image = [fill; 24];
+            bits.set(&mut image, value);
+            let unused = 64 - u32::from(len);
+            prop_assert_eq!(bits.get(&image), (value << unused) >> unused);
+            let before = Bits { byte: 0, shift: 0, len: 8 };
+            if byte > 0 {
+                prop_assert_eq!(before.get(&image) as u8, fill);
+            }
+            let mut again = image;
+            bits.set(&mut again, Bits { byte, shift, len }.get(&[fill; 24]));
+            prop_assert_eq!(again, [fill; 24]);
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! The real-time side. MUST NOT BLOCK OR ALLOCATE: nothing here waits for anything but the clock
+//! and the wire, allocates, locks or logs once a value has been prepared.
+//!
+//! - [`image`]: where each SubDevice's process data lies;
+//! - [`exchange`]: the frames of a cycle, built once and refilled;
+//! - [`phase`]: keeps the release of frames in phase with SYNC0;
+//! - [`guard`]: how many bad cycles the machine rides through;
+//! - [`stats`]: bounded histograms and counters;
+//! - [`handover`]: the queues to and from everybody else;
+//! - [`cycle`]: one turn of the loop, from wake-up to publishing;
+//! - [`thread`]: scheduling class, affinity and memory of the thread that turns it.
+//!
+//! Constructors run before the loop and may allocate; they are the only functions that may.
+
+#![deny(clippy::disallowed_types, clippy::disallowed_methods, clippy::disallowed_macros)]
+
+pub mod cycle;
+pub mod exchange;
+pub mod guard;
+pub mod handover;
+pub mod image;
+pub mod phase;
+pub mod stats;
+pub mod thread;

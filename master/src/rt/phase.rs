@@ -1,0 +1,169 @@
+//! Keeps the release of frames in phase with SYNC0.
+//!
+//! The error is where in the SYNC0 cycle the frame passed the reference clock, against where it
+//! should. A PI controller turns it into the length of the next cycle; the integral is the drift
+//! between this machine's clock and the reference. The measured lateness of the wake-up is taken
+//! out first, so that a late thread does not make the clock wander.
+
+use crate::clock::Nanos;
+
+const PROPORTIONAL: f64 = 0.1;
+/// Critically damped: Kp² ∕ 4.
+const INTEGRAL: f64 = PROPORTIONAL * PROPORTIONAL / 4.0;
+/// Cycles within the window before the phase counts as locked.
+const CYCLES_TO_LOCK: u32 = 50;
+/// Cycles outside before it counts as lost.
+const CYCLES_TO_UNLOCK: u32 = 20;
+
+/// The phase controller of one segment.
+#[derive(Debug, Clone)]
+pub struct Phase {
+    cycle: i64,
+    /// System time at which a frame should have passed, modulo the cycle.
+    target: i64,
+    /// Nanoseconds a cycle.
+    drift: f64,
+    locked: bool,
+    run: u32,
+}
+
+/// What one measurement told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PhaseStep {
+    /// Where the frame passed minus where it should have, wake-up lateness included.
+    pub error: i64,
+    /// To be added to the next cycle's length.
+    pub adjust: i64,
+}
+
+impl Phase {
+    /// `start` is the system time of a SYNC0 pulse. Frames should pass half a cycle before it: as
+    /// far from both pulses as can be.
+    #[must_use]
+    pub fn new(cycle_ns: u64, start: u64) -> Self {
+        let cycle = i64::try_from(cycle_ns).unwrap_or(i64::MAX).max(1);
+        let start = i64::try_from(start % cycle_ns.max(1)).unwrap_or(0);
+        Self { cycle, target: (start + cycle / 2) % cycle, drift: 0.0, locked: false, run: 0 }
+    }
+
+    #[must_use]
+    pub fn locked(&self) -> bool {
+        self.locked
+    }
+
+    /// Drift of the reference clock against ours in parts per million.
+    #[must_use]
+    pub fn drift_ppm(&self) -> f64 {
+        self.drift / self.cycle as f64 * 1e6
+    }
+
+    /// Takes a measurement in. RT.
+    ///
+    /// `system_time` is the reference clock's as the frame passed; `lateness` how long after its
+    /// planned release the frame was sent.
+    pub fn update(&mut self, system_time: u64, lateness: Nanos) -> PhaseStep {
+        let passed = i64::try_from(system_time % self.cycle.unsigned_abs()).unwrap_or(0);
+        let error = self.wrap(passed - self.target);
+        let lateness = i64::try_from(lateness).unwrap_or(i64::MAX).min(self.cycle);
+        let planned = self.wrap(error - lateness);
+        self.judge(planned);
+
+        // A single wild measurement may move a locked phase by a 1000th of a cycle, an unlocked
+        // one by a 50th: faster would look like jitter to the drives.
+        let bound = self.cycle as f64 / if self.locked { 100.0 } else { 5.0 };
+        let bounded = (planned as f64).clamp(-bound, bound);
+        if (planned as f64).abs() <= bound {
+            self.drift += INTEGRAL * bounded;
+            let most = self.cycle as f64 * 1e-3;
+            self.drift = self.drift.clamp(-most, most);
+        }
+        let adjust = -(PROPORTIONAL * bounded + self.drift);
+        PhaseStep { error, adjust: adjust.round() as i64 }
+    }
+
+    /// Without a measurement the drift estimate carries on. RT.
+    #[must_use]
+    pub fn holdover(&self) -> i64 {
+        -self.drift.round() as i64
+    }
+
+    fn judge(&mut self, error: i64) {
+        let inside = error.abs() <= if self.locked { self.cycle / 8 } else { self.cycle / 50 };
+        if inside == self.locked {
+            self.run = 0;
+            return;
+        }
+        self.run += 1;
+        if self.run >= if self.locked { CYCLES_TO_UNLOCK } else { CYCLES_TO_LOCK } {
+            self.locked = !self.locked;
+            self.run = 0;
+        }
+    }
+
+    /// Into ±half a cycle.
+    fn wrap(&self, value: i64) -> i64 {
+        (value + self.cycle / 2).rem_euclid(self.cycle) - self.cycle / 2
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Cycles until locked, and the largest error in the 1000 cycles after.
+    fn run(cycle: u64, offset: u64, ppm: f64, late: impl Fn(u64) -> u64) -> (u64, i64) {
+        let mut phase = Phase::new(cycle, 7_000_000);
+        let mut release = 50_000_000_u64;
+        let mut locked_at = None;
+        let mut largest = 0;
+        for k in 0..20_000 {
+            let lateness = late(k);
+            let local = (release + lateness) as f64;
+            let system_time = (local * (1.0 + ppm * 1e-6)) as u64 + offset;
+            let step = phase.update(system_time, lateness);
+            release = release.wrapping_add_signed(cycle as i64 + step.adjust);
+            match locked_at {
+                None if phase.locked() => locked_at = Some(k),
+                Some(at) if k > at + 2000 => {
+                    largest = largest.max((step.error - lateness as i64).abs());
+                }
+                _ => {}
+            }
+        }
+        (locked_at.expect("locks"), largest)
+    }
+
+    #[test]
+    fn locks_from_any_phase_against_drift() {
+        for cycle in [250_000, 1_000_000, 4_000_000] {
+            for offset in [0, 1, cycle / 3, cycle / 2, cycle - 1] {
+                for ppm in [-100.0, 0.0, 80.0] {
+                    let (at, largest) = run(cycle, offset, ppm, |_| 0);
+                    assert!(at < 1_000, "{cycle} {offset} {ppm}: locked after {at} cycles");
+                    assert!(largest < 100, "{cycle} {offset} {ppm}: {largest} ns");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_late_thread_does_not_move_the_phase() {
+        let (_, largest) = run(1_000_000, 0, 30.0, |k| if k % 97 == 0 { 300_000 } else { 2_000 });
+        assert!(largest < 500, "{largest} ns");
+    }
+
+    #[test]
+    fn unlocks_only_after_a_run_of_bad_measurements() {
+        let mut phase = Phase::new(1_000_000, 0);
+        for _ in 0..200 {
+            phase.update(500_000, 0);
+        }
+        assert!(phase.locked());
+        for _ in 0..CYCLES_TO_UNLOCK - 1 {
+            phase.update(0, 0);
+        }
+        assert!(phase.locked());
+        phase.update(0, 0);
+        assert!(!phase.locked());
+    }
+}

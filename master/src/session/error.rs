@@ -1,0 +1,97 @@
+//! Why a run failed: what, where, which code. What to do about it is the command line's to say.
+
+use ecaxis_axis::cia402::describe;
+use ecaxis_axis::{Mode, State, Trip};
+
+use crate::al_status::al_status_text;
+use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
+use crate::link::LinkError;
+use crate::link::packet::OpenError;
+use crate::rt::image::NotMapped;
+
+/// A machine or a bus that failed.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    #[error("the simulated bus: {0}")]
+    Sim(String),
+    #[error("the recording: {0}")]
+    Record(String),
+    #[error("starting a thread: {0}")]
+    Thread(String),
+    #[error("the link failed: {0}")]
+    Link(LinkError),
+    #[error("bring-up: {0}")]
+    BringUp(#[from] Box<BringUpError>),
+    #[error("{device}: {source}")]
+    NotMapped { device: DeviceRef, source: NotMapped },
+    #[error("{device}: {source}")]
+    Axis { device: DeviceRef, source: ecaxis_axis::ConfigError },
+    #[error("no process data comes back: {lost} frames lost, {wkc} with a wrong working counter")]
+    NoProcessData { lost: u64, wkc: u64 },
+    #[error("the release of frames does not lock to SYNC0: phase error {error_ns} ns")]
+    PhaseNotLocked { error_ns: i64 },
+    #[error(transparent)]
+    State(StateError),
+    #[error(
+        "{device}: does not reach Operation enabled within {timeout_ms} ms: stays in {state} \
+         (Statusword 0x{statusword:04x}){}{}",
+        mode_note(*mode_confirmed), code_note(*code)
+    )]
+    NotEnabled {
+        device: DeviceRef,
+        state: State,
+        statusword: u16,
+        mode_confirmed: bool,
+        code: Option<u16>,
+        timeout_ms: u64,
+    },
+    #[error(
+        "{device}: modes of operation display (0x6061) is {}, expected {}",
+        Mode::from_code(*display), Mode::from_code(*expected)
+    )]
+    WrongMode { device: DeviceRef, expected: i8, display: i8 },
+    #[error("{device}: drive fault (Statusword 0x{statusword:04x}){}", code_note(*code))]
+    DriveFault { device: DeviceRef, code: Option<u16>, statusword: u16 },
+    #[error("{device}: {trip}")]
+    Trip { device: DeviceRef, trip: Trip },
+    #[error("the bus is lost: {cycles} cycles in a row {}", lost_note(*answered, *wkc))]
+    BusLost { cycles: u32, wkc: (u16, u16), answered: bool },
+    #[error(
+        "{device}: left Op for {state}, AL status code 0x{code:04x} ({})",
+        al_status_text(*code)
+    )]
+    LeftOp { device: DeviceRef, state: AlState, code: u16 },
+    #[error("{device}: no longer answers")]
+    Gone { device: DeviceRef },
+    #[error("a SubDevice left Op (AL status 0x{al_status:02x}) and was back when it was asked")]
+    LeftOpBriefly { al_status: u8 },
+    #[error("step {step}: {device}: command refused: {reason}")]
+    Refused { device: DeviceRef, step: usize, reason: String },
+    #[error("step {step}: {device}: the target {target} is not reached, the axis is at {actual:.4}")]
+    NotReached { device: DeviceRef, step: usize, target: f64, actual: f64 },
+    #[error("interrupted")]
+    Interrupted,
+    #[error("internal error: {0}")]
+    Panicked(String),
+}
+
+fn mode_note(confirmed: bool) -> &'static str {
+    if confirmed { "" } else { ", the drive has not taken over the mode of operation" }
+}
+
+fn code_note(code: Option<u16>) -> String {
+    match code {
+        Some(code) => format!(", error code (0x603F) 0x{code:04x}: {}", describe(code).text),
+        None => String::new(),
+    }
+}
+
+fn lost_note(answered: bool, (seen, expected): (u16, u16)) -> String {
+    if answered {
+        format!("with working counter {seen} instead of {expected}")
+    } else {
+        "without an answer".to_owned()
+    }
+}

@@ -1,0 +1,307 @@
+//! One run of a machine: opens the link, brings the bus up, turns the cycle, and sums up.
+//!
+//! One thread owns the link. In real time it becomes the real-time thread and a second one runs
+//! the supervisor beside it; in virtual time it does both in turn, so that a run can be repeated.
+
+use std::future::Future;
+use std::path::PathBuf;
+use std::pin::pin;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::{Sender, channel};
+use std::task::{Context, Poll, Waker};
+use std::thread;
+
+use ecaxis_axis::Axis;
+use ecaxis_sim::FaultScript;
+use ethercrab::{Command as Datagram, MainDevice};
+
+use crate::bringup::{Bus, bring_up};
+use crate::clock::{Clock, Nanos};
+use crate::config::Machine;
+use crate::link::port::{Port, main_device, pump};
+use crate::link::Link;
+use crate::rt::{self, cycle::{AxisSlot, Engine, Parts, Remains, Timing, first_snapshot}};
+use crate::rt::exchange::Exchange;
+use crate::rt::guard::Guard;
+use crate::rt::handover::ends;
+use crate::rt::image::AxisBits;
+use crate::rt::phase::Phase;
+use crate::supervise::{Ended, Supervisor, executor};
+use crate::wire::Datagrams;
+
+mod error;
+mod open;
+mod progress;
+mod summary;
+
+pub use error::RunError;
+pub use progress::{AxisLine, Observer, Progress, Status};
+pub use summary::{AxisSummary, Summary};
+
+/// Stack of the thread that owns the link; ethercrab's futures hold its tables by value.
+const STACK: usize = 16 * 1024 * 1024;
+
+/// How a machine is run.
+#[derive(Debug, Clone)]
+pub struct Options {
+    pub clock: Clock,
+    /// Time limit of the program; it is repeated until then.
+    pub limit: Option<Nanos>,
+    /// Runs of the program instead of the file's.
+    pub repeat: Option<u32>,
+    /// Of the simulated bus.
+    pub seed: u64,
+    pub faults: Option<FaultScript>,
+    /// Keep every frame here.
+    pub record: Option<PathBuf>,
+    /// Enable the axes and run the program; otherwise stay in Op without power.
+    pub enable: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            clock: Clock::Real,
+            limit: None,
+            repeat: None,
+            seed: 1,
+            faults: None,
+            record: None,
+            enable: true,
+        }
+    }
+}
+
+/// How a run ended. There is a summary as soon as the cycle has run.
+#[derive(Debug)]
+pub struct Outcome {
+    pub summary: Option<Summary>,
+    pub result: Result<(), RunError>,
+}
+
+impl From<RunError> for Outcome {
+    fn from(error: RunError) -> Self {
+        Self { summary: None, result: Err(error) }
+    }
+}
+
+/// Runs a machine until its program, its time limit, `stop` or an error ends it. Blocks; tells the
+/// observer meanwhile.
+pub fn run(
+    machine: Machine,
+    options: Options,
+    stop: Arc<AtomicBool>,
+    observer: &mut dyn Observer,
+) -> Outcome {
+    let (progress, told) = channel();
+    let owner = thread::Builder::new()
+        .name("ecaxis-rt".to_owned())
+        .stack_size(STACK)
+        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress));
+    let owner = match owner {
+        Ok(owner) => owner,
+        Err(error) => return RunError::Thread(error.to_string()).into(),
+    };
+    for progress in told {
+        observer.progress(&progress);
+    }
+    owner.join().unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into())
+}
+
+fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
+    panic
+        .downcast_ref::<String>()
+        .cloned()
+        .or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()))
+        .unwrap_or_else(|| "unknown cause".to_owned())
+}
+
+/// A segment in SafeOp, with everything in place that turns its cycle.
+#[derive(Debug)]
+pub struct Prepared {
+    pub parts: Parts,
+    pub supervisor: Supervisor,
+}
+
+/// Opens the link and brings the bus to SafeOp, on the calling thread and its clock
+/// ([`Clock::enter`]).
+pub fn prepare(
+    machine: &Arc<Machine>,
+    options: &Options,
+    stop: Arc<AtomicBool>,
+    progress: Sender<Progress>,
+) -> Result<Prepared, RunError> {
+    let mut link = open::link(machine, options)?;
+    let (main_device, mut port) = main_device(machine.bus.cycle_ns);
+    match come_up(machine, options.clock, main_device, link.as_mut(), &mut port, &progress) {
+        Ok(bus) => {
+            let wire = Datagrams::new(main_device);
+            assemble(machine, options, stop, progress, bus, wire, (link, port))
+        }
+        Err(error) => {
+            go_silent(options.clock, main_device, link.as_mut(), &mut port);
+            // The bring-up's error is the one to report.
+            let _ = link.finish();
+            Err(error)
+        }
+    }
+}
+
+fn own_the_link(
+    machine: &Arc<Machine>,
+    options: &Options,
+    stop: Arc<AtomicBool>,
+    progress: Sender<Progress>,
+) -> Outcome {
+    options.clock.enter();
+    let told = progress.clone();
+    let Prepared { parts, supervisor } = match prepare(machine, options, stop, progress) {
+        Ok(prepared) => prepared,
+        Err(error) => return error.into(),
+    };
+    let engine = Engine::new(parts);
+    let (remains, (ended, result)) = match options.clock {
+        Clock::Virtual => turn_in_virtual_time(engine, supervisor),
+        Clock::Real => {
+            for denied in rt::thread::prepare(machine.bus.priority, machine.bus.cpu) {
+                let _ = told.send(Progress::Denied(denied));
+            }
+            match turn_in_real_time(engine, supervisor) {
+                Ok(done) => done,
+                Err(error) => return error.into(),
+            }
+        }
+    };
+    let Remains { link, axes, stats, .. } = remains;
+    let (record, result) = match link.finish() {
+        Ok(record) => (record, result),
+        Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),
+    };
+    let summary = Summary::new(machine, options.clock, &axes, &stats, ended, record);
+    Outcome { summary: Some(summary), result }
+}
+
+fn come_up(
+    machine: &Machine,
+    clock: Clock,
+    main_device: &'static MainDevice<'static>,
+    link: &mut dyn Link,
+    port: &mut Port,
+    progress: &Sender<Progress>,
+) -> Result<Bus, RunError> {
+    let mut tell = |step| {
+        let _ = progress.send(Progress::Step(step));
+    };
+    // ethercrab panics on some things a wire can carry (a SubDevice without an open port, say).
+    let run = std::panic::AssertUnwindSafe(|| {
+        pump(port, link, clock, Box::pin(bring_up(main_device, machine, &mut tell)))
+    });
+    match std::panic::catch_unwind(run) {
+        Ok(Ok(Ok(bus))) => Ok(bus),
+        Ok(Ok(Err(error))) => Err(RunError::BringUp(Box::new(error))),
+        Ok(Err(error)) => Err(RunError::Link(error)),
+        Err(panic) => Err(RunError::Panicked(panic_text(&*panic))),
+    }
+}
+
+/// After a failed bring-up: every SubDevice that listens back to Init.
+fn go_silent(
+    clock: Clock,
+    main_device: &'static MainDevice<'static>,
+    link: &mut dyn Link,
+    port: &mut Port,
+) {
+    let init = Datagram::bwr(0x0120).ignore_wkc().send(main_device, 0x0011_u16);
+    let _ = pump(port, link, clock, init);
+}
+
+fn assemble(
+    machine: &Arc<Machine>,
+    options: &Options,
+    stop: Arc<AtomicBool>,
+    progress: Sender<Progress>,
+    bus: Bus,
+    wire: Datagrams,
+    (link, port): (Box<dyn Link>, Port),
+) -> Result<Prepared, RunError> {
+    let mut slots = Vec::new();
+    let mut axes = Vec::new();
+    for (index, (device, region)) in machine.devices.iter().zip(&bus.image.regions).enumerate() {
+        let (Some(setup), Some(region)) = (&device.axis, region) else { continue };
+        let at = || bus.devices[index].at.clone();
+        let bits = AxisBits::new(&device.selection.layout, region)
+            .map_err(|source| RunError::NotMapped { device: at(), source })?;
+        let axis = Axis::new(setup.config)
+            .map_err(|source| RunError::Axis { device: at(), source })?;
+        slots.push(AxisSlot::new(axis, bits));
+        axes.push(index);
+    }
+    let stations: Vec<u16> = bus.devices.iter().map(|d| d.at.station).collect();
+    let devices = u16::try_from(stations.len()).unwrap_or(u16::MAX);
+    let (rt_end, outer) = ends(&first_snapshot(&slots, stations.len()));
+    let parts = Parts {
+        clock: options.clock,
+        timing: Timing { cycle_ns: machine.bus.cycle_ns, spin_ns: machine.bus.spin_ns },
+        link,
+        port,
+        exchange: Exchange::new(&bus.image, bus.dc.map(|dc| dc.reference), &stations),
+        axes: slots,
+        phase: bus.dc.map(|dc| Phase::new(dc.cycle_ns, dc.start)),
+        guard: Guard::new(machine.bus.lost_frames, devices),
+        end: rt_end,
+    };
+    let supervisor = Supervisor {
+        machine: Arc::clone(machine),
+        bus,
+        wire,
+        outer,
+        stop,
+        progress,
+        repeat: options.repeat.unwrap_or(machine.repeat),
+        limit: options.limit,
+        enable: options.enable,
+        axes,
+        orders_given: 0,
+        refused: None,
+    };
+    Ok(Prepared { parts, supervisor })
+}
+
+type Turned = (Remains, (Ended, Result<(), RunError>));
+
+/// The supervisor gets its turn after every cycle.
+fn turn_in_virtual_time(mut engine: Engine, supervisor: Supervisor) -> Turned {
+    let mut beside = pin!(supervisor.run());
+    let mut context = Context::from_waker(Waker::noop());
+    let mut result = None;
+    while !engine.halted() {
+        engine.cycle();
+        if result.is_none()
+            && let Poll::Ready(done) = beside.as_mut().poll(&mut context)
+        {
+            result = Some(done);
+        }
+    }
+    (engine.into_remains(), result.unwrap_or_else(died))
+}
+
+fn turn_in_real_time(mut engine: Engine, supervisor: Supervisor) -> Result<Turned, RunError> {
+    let beside = thread::Builder::new()
+        .name("ecaxis-mailbox".to_owned())
+        .spawn(move || executor::block_on(supervisor.run()))
+        .map_err(|error| RunError::Thread(error.to_string()))?;
+    while !engine.halted() {
+        engine.cycle();
+    }
+    let result = match beside.join() {
+        Ok(Ok(result)) => result,
+        Ok(Err(error)) => (Ended::default(), Err(RunError::Thread(error.to_string()))),
+        Err(panic) => (Ended::default(), Err(RunError::Panicked(panic_text(&*panic)))),
+    };
+    Ok((engine.into_remains(), result))
+}
+
+fn died() -> (Ended, Result<(), RunError>) {
+    (Ended::default(), Err(RunError::Panicked("the supervisor ended early".to_owned())))
+}

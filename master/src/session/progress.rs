@@ -1,0 +1,76 @@
+//! What a run tells while it goes on.
+
+use ecaxis_axis::{Mode, State};
+
+use crate::bringup::Step;
+use crate::clock::Nanos;
+use crate::config::Machine;
+use crate::rt::handover::{PhaseStatus, Snapshot};
+use crate::rt::stats::Counters;
+use crate::rt::thread::Denied;
+
+/// Listens to a run.
+pub trait Observer {
+    fn progress(&mut self, progress: &Progress);
+}
+
+/// One thing that happened.
+#[derive(Debug, Clone)]
+pub enum Progress {
+    Step(Step),
+    /// Something the operating system did not permit; the run goes on.
+    Denied(Denied),
+    Warning(String),
+    PhaseLocked { drift_ppm: f64 },
+    Enabled { axes: usize },
+    /// A step of the program begins; both count from 1.
+    Program { run: u32, step: usize, of: usize },
+    /// Once a second of the machine's time.
+    Status(Status),
+    Stopping,
+}
+
+/// The machine at one moment.
+#[derive(Debug, Clone)]
+pub struct Status {
+    pub time: Nanos,
+    pub counters: Counters,
+    pub phase: Option<PhaseStatus>,
+    pub axes: Vec<AxisLine>,
+}
+
+/// One axis at one moment.
+#[derive(Debug, Clone)]
+pub struct AxisLine {
+    pub name: String,
+    pub unit: String,
+    pub mode: Mode,
+    pub state: State,
+    /// User units, user units a second, percent of rated torque.
+    pub position: f64,
+    pub velocity: f64,
+    pub torque: f64,
+}
+
+impl Status {
+    #[must_use]
+    pub fn new(machine: &Machine, axes: &[usize], snapshot: &Snapshot) -> Self {
+        let axes = axes
+            .iter()
+            .zip(&snapshot.axes)
+            .filter_map(|(&device, status)| {
+                let device = machine.devices.get(device)?;
+                Some(AxisLine {
+                    name: device.name.clone(),
+                    unit: device.axis.as_ref()?.unit.clone(),
+                    mode: status.mode,
+                    state: status.state,
+                    position: status.position,
+                    velocity: status.velocity,
+                    torque: status.torque,
+                })
+            })
+            .collect();
+        Self { time: snapshot.time, counters: snapshot.counters, phase: snapshot.phase, axes }
+    }
+}

@@ -1,0 +1,116 @@
+//! What stopped the machine, in words: asks the devices while they still answer.
+
+use ecaxis_axis::AxisStatus;
+
+use super::{Break, Supervisor};
+use crate::bringup::al;
+use crate::clock::Nanos;
+use crate::rt::guard::StopCause;
+use crate::rt::handover::{Order, Snapshot};
+use crate::session::{Progress, RunError};
+
+const ERROR_CODE: u16 = 0x603f;
+const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
+
+impl Supervisor {
+    pub(super) async fn explain_stop(&mut self, cause: StopCause, snapshot: &Snapshot) -> RunError {
+        match cause {
+            // `tick` asks only for causes that are failures.
+            StopCause::Requested => RunError::Interrupted,
+            StopCause::DriveFault { axis } => {
+                let code = self.error_code(axis).await;
+                if let Some(code) = code {
+                    self.order(Order::ErrorCode { axis, code }).await;
+                }
+                RunError::DriveFault {
+                    device: self.device_of(axis),
+                    code,
+                    statusword: snapshot
+                        .axes
+                        .get(axis)
+                        .and_then(|s| s.fault)
+                        .map_or(0, |fault| fault.statusword),
+                }
+            }
+            StopCause::Trip { axis, trip } => RunError::Trip { device: self.device_of(axis), trip },
+            StopCause::BusLost { cycles, last_wkc, answered } => {
+                RunError::BusLost { cycles, wkc: last_wkc, answered }
+            }
+            StopCause::LeftOp { al_status } => {
+                for device in self.bus.addresses() {
+                    match al::read_status(&self.wire, device.station).await {
+                        Ok(Some((status, code))) if status != 8 => {
+                            let state = al::AlState::from_status(status);
+                            return RunError::LeftOp { device, state, code };
+                        }
+                        Ok(None) => {
+                            return RunError::Gone { device };
+                        }
+                        _ => {}
+                    }
+                }
+                RunError::LeftOpBriefly { al_status }
+            }
+        }
+    }
+
+    pub(super) async fn not_enabled(
+        &mut self,
+        axis: usize,
+        status: AxisStatus,
+        timeout: Nanos,
+    ) -> RunError {
+        let code = self.error_code(axis).await.filter(|code| *code != 0);
+        RunError::NotEnabled {
+            device: self.device_of(axis),
+            state: status.state,
+            statusword: status.statusword,
+            mode_confirmed: status.mode_confirmed,
+            code,
+            timeout_ms: timeout / 1_000_000,
+        }
+    }
+
+    /// Object 0x603F over CoE.
+    async fn error_code(&mut self, axis: usize) -> Option<u16> {
+        match self.upload(axis, ERROR_CODE).await?.as_slice() {
+            &[low, high] => Some(u16::from_le_bytes([low, high])),
+            _ => None,
+        }
+    }
+
+    async fn upload(&mut self, axis: usize, index: u16) -> Option<Vec<u8>> {
+        let device = *self.axes.get(axis)?;
+        let coe = self.bus.devices.get_mut(device)?.coe.as_mut()?;
+        let result = coe.upload(&self.wire, index, 0, false).await;
+        let emergencies: Vec<_> = coe.take_emergencies().collect();
+        let name = self.axis_name(axis);
+        for emergency in emergencies {
+            self.tell(Progress::Warning(format!("`{name}`: {emergency}")));
+        }
+        result.ok()
+    }
+
+    /// Modes of operation display is in the process data of most drives, and is then checked every
+    /// cycle; the others are asked here.
+    pub(super) async fn confirm_modes(&mut self) -> Result<(), Break> {
+        for axis in 0..self.axes.len() {
+            let device = &self.machine.devices[self.axes[axis]];
+            let Some(setup) = &device.axis else { continue };
+            let expected = setup.config.mode.code();
+            if device.selection.layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_some() {
+                continue;
+            }
+            if let Some(&[display]) = self.upload(axis, MODES_OF_OPERATION_DISPLAY).await.as_deref()
+                && i8::from_le_bytes([display]) != expected
+            {
+                return Err(Break::Failed(RunError::WrongMode {
+                    device: self.device_of(axis),
+                    expected,
+                    display: i8::from_le_bytes([display]),
+                }));
+            }
+        }
+        Ok(())
+    }
+}
