@@ -124,7 +124,7 @@ pub enum Command {
     },
 }
 
-/// What the user wants, in the order of how hard it is to leave.
+/// What the axis is to do with the power; [`Axis::settle_wish`] leads from one to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Wish {
     Disabled,
@@ -144,6 +144,9 @@ enum Plan {
     Velocity(Ramp),
     Torque(Ramp),
 }
+
+/// Less is no cycle at all; it would only make quotients overflow.
+const SHORTEST_CYCLE_S: f64 = 1e-6;
 
 /// Longest cycle taken at face value. A longer one would be a jump of the set-point, not a cycle.
 const LONGEST_CYCLE_S: f64 = 0.1;
@@ -170,6 +173,7 @@ pub struct Axis {
     torque: f64,
     /// Target position as sent in the last cycle.
     sent: Counts,
+    sent_before: Counts,
     dt_s: f64,
     watch: supervise::Watch,
     held_by_range: bool,
@@ -210,6 +214,7 @@ impl Axis {
             motion: Motion::default(),
             torque: 0.0,
             sent: Counts::default(),
+            sent_before: Counts::default(),
             dt_s: 0.0,
             watch: supervise::Watch::default(),
             held_by_range: false,
@@ -226,7 +231,7 @@ impl Axis {
         &self.config
     }
 
-    /// Adds the drive's error code to the fault that is being reported. RT: O(1).
+    /// Adds the drive's error code to the fault that is being reported; ignored where none is. The first code stays. RT: O(1).
     pub fn note_error_code(&mut self, code: u16) {
         if let Some(fault) = &mut self.fault
             && code != 0
@@ -240,9 +245,10 @@ impl Axis {
         self.take(command)
     }
 
-    /// One cycle. RT: O(1), never blocks or allocates.
+    /// One cycle of `dt_s` seconds (the nominal cycle time, 1 µs to 0.1 s; what is not is cut down to it, or no time at all).
+    /// RT: O(1), never blocks or allocates.
     pub fn step(&mut self, inputs: &Inputs, dt_s: f64) -> Outputs {
-        let dt_s = if dt_s > 0.0 {
+        let dt_s = if dt_s >= SHORTEST_CYCLE_S {
             dt_s.min(LONGEST_CYCLE_S)
         } else {
             0.0
@@ -253,6 +259,7 @@ impl Axis {
             self.judge();
         } else {
             self.stale_cycles = self.stale_cycles.saturating_add(1);
+            self.watch.lost(self.sent_before);
         }
         self.actual.pass(dt_s);
         self.settle_wish(dt_s);
@@ -260,11 +267,13 @@ impl Axis {
         if inputs.fresh {
             self.update_active();
         }
+        let sent = self.sent;
         if self.active {
             self.advance(dt_s);
         } else {
             self.follow();
         }
+        self.sent_before = sent;
         self.outputs()
     }
 
@@ -455,7 +464,7 @@ impl Axis {
             mode: self.config.mode,
             state: self.state,
             time_in_state_s: self.memory.in_state_s(),
-            statusword: self.statusword,
+            statusword: self.statusword.bits(),
             controlword: self.controlword.bits(),
             enabled: self.active,
             ready: self.active && self.wish == Wish::Enabled,
@@ -483,7 +492,3 @@ impl Axis {
         }
     }
 }
-
-#[cfg(test)]
-#[path = "axis/tests.rs"]
-mod tests;

@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::cia402::{Mode, State, Statusword, describe};
+use crate::cia402::{Mode, State, describe};
 
 /// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -11,7 +11,7 @@ pub struct AxisStatus {
     /// From the last fresh Statusword.
     pub state: State,
     pub time_in_state_s: f64,
-    pub statusword: Statusword,
+    pub statusword: u16,
     /// As put into the last outputs.
     pub controlword: u16,
     /// Operation enabled, mode confirmed, set-points come from here. Before that, targets follow actual values.

@@ -57,6 +57,10 @@ impl Axis {
                 });
             }
         }
+        // The power is on its way off and the drive has not answered yet: what it answers would look like a loss.
+        if self.active && self.wish == Wish::Disabled {
+            return Err(Refused::Stopping);
+        }
         self.wish = Wish::Enabled;
         Ok(())
     }

@@ -5,10 +5,14 @@ use crate::cia402::{Mode, State};
 use crate::limits::Limits;
 use crate::setpoint::braking_velocity;
 use crate::status::{DriveFault, Trip};
+use crate::units::Counts;
 
 /// How much faster than the limit, and for how many fresh cycles in a row.
 const OVER_VELOCITY: f64 = 1.2;
 const OVER_VELOCITY_CYCLES: u8 = 5;
+
+/// Fresh cycles after a lost frame until the drive has the newest target and its report shows it.
+const CATCH_UP_CYCLES: u8 = 2;
 
 /// Rounding of a product of f64s.
 const ROUNDING: f64 = 1.0 + 1e-9;
@@ -19,6 +23,9 @@ pub(super) struct Watch {
     pub(super) following_error: f64,
     pub(super) max_following_error: f64,
     fast_cycles: u8,
+    /// The last target the drive surely has, and for how many fresh cycles in a row it has got newer ones.
+    known: Option<Counts>,
+    fresh_cycles: u8,
     /// The configured range, widened to where the axis stood when it was enabled, so that an axis outside its range can be
     /// driven back; narrowed again as it comes back.
     range: Option<[f64; 2]>,
@@ -32,6 +39,14 @@ impl Watch {
                 .map(|[low, high]| [low.min(position), high.max(position)]),
             ..Self::default()
         }
+    }
+
+    /// A frame was lost; `sent` is the target of the last one that came back.
+    pub(super) fn lost(&mut self, sent: Counts) {
+        if self.known.is_none() || self.fresh_cycles > 0 {
+            self.known = Some(sent);
+        }
+        self.fresh_cycles = 0;
     }
 
     fn narrow(&mut self, position: f64, limits: &Limits) {
@@ -87,10 +102,12 @@ impl Axis {
         }
     }
 
-    /// The first cause stays.
+    /// The first cause stays. An axis already being disabled is not made to wait for another quick stop.
     fn trip(&mut self, trip: Trip) {
         self.trip.get_or_insert(trip);
-        self.quick_stop(true);
+        if self.wish != Wish::Disabled {
+            self.quick_stop(true);
+        }
     }
 
     fn exceeded(&mut self) -> Option<Trip> {
@@ -98,10 +115,21 @@ impl Axis {
         let position = self.actual.position();
         let mut cause = None;
         if self.config.mode == Mode::Csp {
-            let commanded = self.config.scale.position_to_user(self.sent).0;
-            let error = commanded - position;
-            self.watch.following_error = error;
+            let scale = &self.config.scale;
+            let commanded = scale.position_to_user(self.sent).0;
+            self.watch.following_error = commanded - position;
+            let known = self
+                .watch
+                .known
+                .map_or(commanded, |known| scale.position_to_user(known).0);
+            // Frames that were lost took targets with them: then the axis may be anywhere on the way between.
+            let nearest = position.max(commanded.min(known)).min(commanded.max(known));
+            let error = nearest - position;
             self.watch.max_following_error = self.watch.max_following_error.max(error.abs());
+            self.watch.fresh_cycles = self.watch.fresh_cycles.saturating_add(1);
+            if self.watch.fresh_cycles >= CATCH_UP_CYCLES {
+                self.watch.known = None;
+            }
             if let Some(limit) = limits.following_error
                 && error.abs() > limit
             {

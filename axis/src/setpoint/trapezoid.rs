@@ -5,6 +5,10 @@
 
 use super::Motion;
 
+/// Braking is planned with this part of the acceleration. Rounding makes some cycles a hair too fast; with nothing in reserve
+/// that could only add up, and end beyond the target.
+const PLANNED: f64 = 1.0 - 1e-4;
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trapezoid {
     pub target: f64,
@@ -23,7 +27,10 @@ impl Trapezoid {
             self.braking = self.braking.max(earlier).min(limit);
             let left = self.target - motion.position;
             let towards = left * motion.velocity > 0.0;
-            if towards && motion.velocity.abs() > braking_velocity(left.abs(), self.braking, dt_s) {
+            if towards
+                && motion.velocity.abs()
+                    > braking_velocity(left.abs(), self.braking * PLANNED, dt_s)
+            {
                 self.braking = limit;
             }
         }
@@ -37,7 +44,7 @@ impl Trapezoid {
             return motion;
         }
         let left = self.target - motion.position;
-        let brake = braking_velocity(left.abs(), self.acceleration, dt_s);
+        let brake = braking_velocity(left.abs(), self.acceleration * PLANNED, dt_s);
         let wanted = brake.min(self.velocity).copysign(left);
         // More than the gentle deceleration only where that would overshoot: too fast for the distance, or going away.
         let too_fast = motion.velocity * left <= 0.0

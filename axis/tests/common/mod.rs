@@ -1,0 +1,235 @@
+//! A drive of the book for these tests: the standard's transitions, an ideal motor, one cycle of delay each way.
+
+#![allow(dead_code)]
+
+use ecaxis_axis::{
+    Axis, AxisConfig, AxisStatus, Command, Inputs, Limits, Mode, Outputs, Scale, State,
+    VelocityUnit,
+};
+
+pub const DT: f64 = 0.001;
+
+pub const LIMITS: Limits = Limits {
+    position: Some([-50.0, 50.0]),
+    velocity: 200.0,
+    acceleration: 2000.0,
+    torque: 100.0,
+    following_error: Some(1.0),
+};
+
+/// 2000 counts and 5 mm per turn, velocities in mrpm.
+pub fn scale() -> Scale {
+    Scale::new(2000.0, 5.0)
+        .unwrap()
+        .with_velocity_unit(VelocityUnit::MILLI_RPM)
+}
+
+pub fn axis(mode: Mode) -> Axis {
+    Axis::new(AxisConfig::new(mode, scale(), LIMITS)).unwrap()
+}
+
+#[derive(Debug, Clone)]
+pub struct Drive {
+    pub state: State,
+    pub mode: i8,
+    pub position: f64,
+    pub velocity: f64,
+    pub torque: i16,
+    /// Quick stop option code 6 (stays in Quick stop active) or 2 (goes on to Switch on disabled).
+    pub quick_stop_stays: bool,
+    /// The motor does not move.
+    pub blocked: bool,
+    /// Faults that come back at once after a reset.
+    pub stubborn: bool,
+    pub resets: u32,
+    controlword: u16,
+}
+
+impl Drive {
+    pub fn at(position: i32) -> Self {
+        Self {
+            state: State::NotReadyToSwitchOn,
+            mode: 0,
+            position: f64::from(position),
+            velocity: 0.0,
+            torque: 0,
+            quick_stop_stays: true,
+            blocked: false,
+            stubborn: false,
+            resets: 0,
+            controlword: 0,
+        }
+    }
+
+    pub fn statusword(&self) -> u16 {
+        match self.state {
+            State::NotReadyToSwitchOn => 0x0000,
+            State::SwitchOnDisabled => 0x0240,
+            State::ReadyToSwitchOn => 0x0231,
+            State::SwitchedOn => 0x0233,
+            State::OperationEnabled => 0x1237,
+            State::QuickStopActive => 0x0217,
+            State::FaultReactionActive => 0x021F,
+            State::Fault => 0x0218,
+            State::Unknown(word) => word,
+        }
+    }
+
+    pub fn raw_position(&self) -> i32 {
+        (self.position.round() as i64) as i32
+    }
+
+    pub fn inputs(&self) -> Inputs {
+        Inputs {
+            statusword: self.statusword(),
+            position: Some(self.raw_position()),
+            velocity: Some((self.velocity / 2000.0 * 60_000.0).round() as i32),
+            torque: Some(self.torque),
+            mode_display: Some(self.mode),
+            fresh: true,
+        }
+    }
+
+    pub fn fault(&mut self) {
+        self.state = State::FaultReactionActive;
+    }
+
+    /// Takes the outputs and moves for one cycle.
+    pub fn cycle(&mut self, out: &Outputs, dt: f64) {
+        let edge = out.controlword & !self.controlword & 0x80 != 0;
+        self.controlword = out.controlword;
+        self.mode = out.mode;
+        let w = out.controlword & 0x0F;
+        self.state = match self.state {
+            State::NotReadyToSwitchOn => State::SwitchOnDisabled,
+            State::SwitchOnDisabled if w & 7 == 6 => State::ReadyToSwitchOn,
+            State::ReadyToSwitchOn if w & 7 == 7 => State::SwitchedOn,
+            State::ReadyToSwitchOn if w & 2 == 0 || w & 6 == 2 => State::SwitchOnDisabled,
+            State::SwitchedOn if w == 0x0F => State::OperationEnabled,
+            State::SwitchedOn if w & 7 == 6 => State::ReadyToSwitchOn,
+            State::SwitchedOn if w & 2 == 0 || w & 6 == 2 => State::SwitchOnDisabled,
+            State::OperationEnabled if w == 7 => State::SwitchedOn,
+            State::OperationEnabled if w & 7 == 6 => State::ReadyToSwitchOn,
+            State::OperationEnabled if w & 2 == 0 => State::SwitchOnDisabled,
+            State::OperationEnabled if w & 6 == 2 => State::QuickStopActive,
+            State::QuickStopActive if w & 2 == 0 => State::SwitchOnDisabled,
+            State::QuickStopActive if w == 0x0F => State::OperationEnabled,
+            State::QuickStopActive if self.velocity == 0.0 && !self.quick_stop_stays => {
+                State::SwitchOnDisabled
+            }
+            State::FaultReactionActive => State::Fault,
+            State::Fault if edge => {
+                self.resets += 1;
+                if self.stubborn {
+                    State::Fault
+                } else {
+                    State::SwitchOnDisabled
+                }
+            }
+            other => other,
+        };
+        let before = self.position;
+        self.torque = 0;
+        match self.state {
+            _ if self.blocked => self.velocity = 0.0,
+            State::OperationEnabled => match out.mode {
+                8 => {
+                    let step = out.target_position.wrapping_sub(self.raw_position());
+                    self.position += f64::from(step);
+                    // After lost frames the set-point steps; a real motor would not have that velocity.
+                    self.velocity = ((self.position - before) / dt).clamp(-100_000.0, 100_000.0);
+                }
+                9 => {
+                    self.velocity = f64::from(out.target_velocity) / 60_000.0 * 2000.0;
+                    self.position += self.velocity * dt;
+                }
+                _ => {
+                    self.torque = out.target_torque;
+                    self.velocity += f64::from(out.target_torque) * 100.0 * dt;
+                    self.position += self.velocity * dt;
+                }
+            },
+            // Braking, or friction.
+            _ => {
+                let less = 1_600_000.0 * dt;
+                self.velocity -= self.velocity.clamp(-less, less);
+                self.position += self.velocity * dt;
+            }
+        }
+    }
+}
+
+/// An axis and its drive, with one cycle of delay from the drive's inputs to the outputs' effect.
+#[derive(Debug, Clone)]
+pub struct Rig {
+    pub axis: Axis,
+    pub drive: Drive,
+    pub out: Outputs,
+}
+
+impl Rig {
+    pub fn new(axis: Axis, drive: Drive) -> Self {
+        let mut rig = Self {
+            axis,
+            drive,
+            out: Outputs {
+                controlword: 0,
+                mode: 0,
+                target_position: 0,
+                target_velocity: 0,
+                target_torque: 0,
+            },
+        };
+        let inputs = rig.drive.inputs();
+        rig.out = rig.axis.step(&inputs, DT);
+        rig
+    }
+
+    pub fn of(mode: Mode) -> Self {
+        Self::new(axis(mode), Drive::at(0))
+    }
+
+    /// A rig whose axis is enabled.
+    pub fn enabled(mode: Mode) -> Self {
+        let mut rig = Self::of(mode);
+        rig.axis.command(Command::Enable).unwrap();
+        rig.until(|s| s.ready, 100);
+        rig
+    }
+
+    pub fn cycle(&mut self) -> AxisStatus {
+        self.cycle_with(true)
+    }
+
+    pub fn cycle_with(&mut self, fresh: bool) -> AxisStatus {
+        let mut inputs = self.drive.inputs();
+        inputs.fresh = fresh;
+        if fresh {
+            self.drive.cycle(&self.out, DT);
+        }
+        self.out = self.axis.step(&inputs, DT);
+        self.axis.status()
+    }
+
+    pub fn run(&mut self, cycles: u32) -> AxisStatus {
+        for _ in 0..cycles {
+            self.cycle();
+        }
+        self.axis.status()
+    }
+
+    #[track_caller]
+    pub fn until(&mut self, done: impl Fn(&AxisStatus) -> bool, cycles: u32) -> AxisStatus {
+        for _ in 0..cycles {
+            let status = self.cycle();
+            if done(&status) {
+                return status;
+            }
+        }
+        panic!(
+            "not after {cycles} cycles: {:#?}\n{:#?}",
+            self.axis.status(),
+            self.drive
+        );
+    }
+}

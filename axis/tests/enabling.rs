@@ -1,0 +1,307 @@
+//! Getting power on and off: no step at the moment of enabling, no power nobody asked for.
+
+mod common;
+
+use common::{Drive, LIMITS, Rig, axis, scale};
+use ecaxis_axis::{
+    Axis, AxisConfig, Command, ConfigError, Inputs, Limits, Mode, Refused, State, Trip,
+};
+
+#[test]
+fn nothing_happens_without_a_command() {
+    for mode in [Mode::Csp, Mode::Csv, Mode::Cst] {
+        let mut rig = Rig::of(mode);
+        let status = rig.run(1000);
+        assert_eq!(status.state, State::SwitchOnDisabled);
+        assert_eq!(rig.out.controlword, 0);
+        assert!(!status.enabled && !status.moving);
+        assert!((status.time_in_state_s - 0.998).abs() < 0.003);
+    }
+}
+
+#[test]
+fn targets_follow_until_enabled_and_start_where_the_axis_is() {
+    for start in [0, 123_456, i32::MAX - 3, i32::MIN] {
+        let mut rig = Rig::new(axis(Mode::Csp), Drive::at(start));
+        // Someone turns the shaft.
+        rig.drive.velocity = 40_000.0;
+        rig.axis.command(Command::Enable).unwrap();
+        loop {
+            let reported = rig.drive.raw_position();
+            let status = rig.cycle();
+            assert_eq!(
+                rig.out.target_position, reported,
+                "same inputs, same position"
+            );
+            if status.enabled {
+                break;
+            }
+        }
+        let held = rig.out.target_position;
+        rig.run(100);
+        assert_eq!(rig.out.target_position, held);
+    }
+}
+
+#[test]
+fn disable_decelerates_first() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    let go = Command::MoveTo {
+        position: 50.0,
+        speed: 1.0,
+        ramp: 1.0,
+    };
+    rig.axis.command(go).unwrap();
+    rig.run(200);
+    rig.axis.command(Command::Disable).unwrap();
+    assert_eq!(rig.axis.command(go), Err(Refused::Stopping));
+    let mut braking = 0;
+    while rig.cycle().enabled {
+        braking += 1;
+    }
+    assert!(
+        (100..110).contains(&braking),
+        "200 mm/s at 2000 mm/s²: {braking}"
+    );
+    let status = rig.until(|s| s.state == State::SwitchOnDisabled, 10);
+    assert_eq!((status.trip, status.fault), (None, None));
+    // And back.
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 20);
+}
+
+#[test]
+fn enabling_again_while_the_power_goes_is_refused() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis.command(Command::Disable).unwrap();
+    rig.cycle();
+    assert_eq!(rig.axis.command(Command::Enable), Err(Refused::Stopping));
+    let status = rig.until(|s| s.state == State::SwitchOnDisabled, 10);
+    assert_eq!(status.trip, None);
+}
+
+#[test]
+fn quick_stop_holds_then_enables_again() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis
+        .command(Command::MoveTo {
+            position: 50.0,
+            speed: 1.0,
+            ramp: 1.0,
+        })
+        .unwrap();
+    rig.run(200);
+    rig.axis.command(Command::QuickStop).unwrap();
+    rig.cycle();
+    assert_eq!(rig.out.controlword, 0x0002);
+    rig.until(|s| s.state == State::QuickStopActive, 5);
+    assert!(matches!(
+        rig.axis.command(Command::Enable),
+        Err(Refused::StillMoving { .. })
+    ));
+    let status = rig.run(500);
+    assert_eq!(status.state, State::QuickStopActive);
+    assert_eq!(status.trip, None);
+    rig.axis.command(Command::Enable).unwrap();
+    rig.cycle();
+    assert_eq!(rig.out.controlword, 0x000F);
+    rig.until(|s| s.ready, 10);
+}
+
+#[test]
+fn quick_stop_that_ends_disabled() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.drive.quick_stop_stays = false;
+    rig.axis.command(Command::QuickStop).unwrap();
+    rig.until(|s| s.state == State::SwitchOnDisabled, 10);
+    assert_eq!(rig.run(10).state, State::SwitchOnDisabled);
+    assert_eq!(rig.out.controlword, 0);
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 20);
+}
+
+#[test]
+fn a_fault_disables_until_reset_and_enabled() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis
+        .command(Command::MoveTo {
+            position: 50.0,
+            speed: 1.0,
+            ramp: 1.0,
+        })
+        .unwrap();
+    rig.run(200);
+    rig.drive.fault();
+    let status = rig.until(|s| s.state == State::Fault, 5);
+    rig.axis.note_error_code(0x8611);
+    rig.axis.note_error_code(0x1000);
+    let fault = rig.axis.status().fault.unwrap();
+    assert_eq!(fault.code, Some(0x8611));
+    assert!(fault.to_string().contains("following error"));
+    assert_eq!(status.trip, None, "a drive fault is not a trip");
+    // Enable alone does not reset.
+    assert!(matches!(
+        rig.axis.command(Command::Enable),
+        Err(Refused::Faulted(_))
+    ));
+    rig.run(300);
+    assert_eq!((rig.drive.state, rig.drive.resets), (State::Fault, 0));
+    // Reset alone does not enable.
+    rig.axis.command(Command::ResetFault).unwrap();
+    let status = rig.run(300);
+    assert_eq!(
+        (status.state, rig.drive.resets),
+        (State::SwitchOnDisabled, 1)
+    );
+    assert_eq!((status.fault, status.resetting), (None, false));
+    rig.axis.command(Command::Enable).unwrap();
+    let status = rig.until(|s| s.ready, 20);
+    assert!(!status.moving, "the old move is gone");
+}
+
+#[test]
+fn reset_and_enable_in_one_breath() {
+    let mut rig = Rig::of(Mode::Csv);
+    rig.drive.state = State::Fault;
+    rig.run(5);
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 200);
+}
+
+#[test]
+fn a_fault_that_stays() {
+    let mut rig = Rig::of(Mode::Csp);
+    rig.drive.state = State::Fault;
+    rig.drive.stubborn = true;
+    rig.run(5);
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.axis.command(Command::Enable).unwrap();
+    let status = rig.until(|s| s.reset_failed, 1000);
+    assert_eq!(rig.drive.resets, 3);
+    assert!(!status.resetting && status.fault.is_some());
+    rig.run(1000);
+    assert_eq!(rig.drive.resets, 3);
+    // Another try is possible.
+    rig.drive.stubborn = false;
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.until(|s| s.state == State::SwitchOnDisabled, 200);
+}
+
+#[test]
+fn losing_power_unasked_is_a_trip() {
+    for state in [
+        State::SwitchOnDisabled,
+        State::SwitchedOn,
+        State::Unknown(0x8001),
+    ] {
+        let mut rig = Rig::enabled(Mode::Csp);
+        rig.drive.state = state;
+        let status = rig.cycle();
+        assert_eq!(status.trip, Some(Trip::PowerLost { state }));
+        rig.drive.state = State::SwitchOnDisabled;
+        rig.run(200);
+        assert_eq!(
+            rig.drive.state,
+            State::SwitchOnDisabled,
+            "no power again by itself"
+        );
+        assert!(matches!(
+            rig.axis.command(Command::Enable),
+            Err(Refused::Tripped(_))
+        ));
+        rig.axis.command(Command::ResetFault).unwrap();
+        rig.axis.command(Command::Enable).unwrap();
+        rig.until(|s| s.ready, 20);
+    }
+}
+
+#[test]
+fn no_motion_until_the_mode_is_confirmed() {
+    let mut rig = Rig::of(Mode::Csp);
+    rig.axis.command(Command::Enable).unwrap();
+    for _ in 0..20 {
+        let mut inputs = rig.drive.inputs();
+        inputs.mode_display = Some(1);
+        rig.drive.cycle(&rig.out, common::DT);
+        rig.out = rig.axis.step(&inputs, common::DT);
+        assert_eq!(Some(rig.out.target_position), inputs.position);
+    }
+    let status = rig.axis.status();
+    assert_eq!(status.state, State::OperationEnabled);
+    assert!(!status.mode_confirmed && !status.enabled);
+    let go = Command::MoveTo {
+        position: 1.0,
+        speed: 1.0,
+        ramp: 1.0,
+    };
+    assert_eq!(
+        rig.axis.command(go),
+        Err(Refused::ModeNotConfirmed {
+            expected: Mode::Csp,
+            display: Mode::Pp
+        })
+    );
+    rig.until(|s| s.ready, 3);
+    rig.axis.command(go).unwrap();
+    // And a mode that changes under way stops the axis.
+    rig.run(20);
+    let mut inputs = rig.drive.inputs();
+    inputs.mode_display = Some(6);
+    rig.out = rig.axis.step(&inputs, common::DT);
+    assert!(matches!(
+        rig.axis.status().trip,
+        Some(Trip::ModeLost { .. })
+    ));
+    assert_eq!(rig.out.controlword, 0x0002);
+    assert_eq!(Some(rig.out.target_position), inputs.position);
+}
+
+#[test]
+fn csp_without_a_position_gets_no_power() {
+    let mut axis = axis(Mode::Csp);
+    axis.command(Command::Enable).unwrap();
+    let inputs = Inputs {
+        statusword: 0x0233,
+        fresh: true,
+        ..Inputs::default()
+    };
+    for _ in 0..10 {
+        assert_eq!(axis.step(&inputs, 0.001).controlword & 0x09, 0);
+    }
+}
+
+#[test]
+fn stale_words_decide_nothing() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    let mut inputs = rig.drive.inputs();
+    inputs.statusword = 0x0218;
+    inputs.fresh = false;
+    let out = rig.axis.step(&inputs, common::DT);
+    assert_eq!(out.controlword, 0x000F);
+    assert_eq!(rig.axis.status().fault, None);
+    assert_eq!(rig.axis.status().stale_cycles, 1);
+    // But a command is obeyed.
+    rig.axis.command(Command::QuickStop).unwrap();
+    assert_eq!(rig.axis.step(&inputs, common::DT).controlword, 0x0002);
+}
+
+#[test]
+fn configurations_that_cannot_work() {
+    for mode in [Mode::Pp, Mode::Pv, Mode::Hm, Mode::Unknown(-1)] {
+        assert_eq!(
+            Axis::new(AxisConfig::new(mode, scale(), LIMITS)).err(),
+            Some(ConfigError::Mode(mode))
+        );
+    }
+    let bad = Limits {
+        velocity: f64::NAN,
+        ..LIMITS
+    };
+    assert!(Axis::new(AxisConfig::new(Mode::Csp, scale(), bad)).is_err());
+    let config = AxisConfig {
+        target_window: 0.0,
+        ..AxisConfig::new(Mode::Csp, scale(), LIMITS)
+    };
+    assert!(Axis::new(config).is_err());
+}

@@ -1,0 +1,325 @@
+//! Moves, velocities and torques, and what is refused.
+
+mod common;
+
+use common::{DT, Drive, LIMITS, Rig, scale};
+use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Refused, Scale, State, VelocityUnit};
+
+const fn to(position: f64) -> Command {
+    Command::MoveTo {
+        position,
+        speed: 1.0,
+        ramp: 1.0,
+    }
+}
+
+#[test]
+fn csp_lands_on_the_count() {
+    for (target, counts) in [
+        (50.0, 20_000),
+        (-50.0, -20_000),
+        (12.345_678, 4938),
+        (0.0, 0),
+    ] {
+        let mut rig = Rig::enabled(Mode::Csp);
+        rig.axis.command(to(target)).unwrap();
+        let status = rig.until(|s| s.in_target, 1000);
+        assert_eq!(rig.out.target_position, counts);
+        let status = if status.at_rest { status } else { rig.run(3) };
+        assert_eq!(status.final_error_counts, Some(0));
+        assert!(status.at_rest && !status.moving);
+        assert!((status.position - target).abs() < 0.002);
+        assert_eq!(status.guarded_cycles, 0);
+    }
+}
+
+#[test]
+fn following_error_is_a_few_cycles_of_velocity() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis.command(to(50.0)).unwrap();
+    let status = rig.until(|s| s.in_target && s.at_rest, 1000);
+    // 200 mm/s and the cycle between the command and its report.
+    assert!(
+        (0.19..0.61).contains(&status.max_following_error),
+        "{}",
+        status.max_following_error
+    );
+    assert_eq!(status.trip, None);
+}
+
+#[test]
+fn speed_and_ramp_are_fractions() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis
+        .command(Command::MoveTo {
+            position: 40.0,
+            speed: 0.25,
+            ramp: 0.1,
+        })
+        .unwrap();
+    let (mut fastest, mut steepest, mut before) = (0.0f64, 0.0f64, 0.0f64);
+    while !rig.axis.status().in_target {
+        let status = rig.cycle();
+        fastest = fastest.max(status.target_velocity);
+        steepest = steepest.max((status.target_velocity - before).abs() / DT);
+        before = status.target_velocity;
+    }
+    assert!((fastest - 50.0).abs() < 1e-9);
+    assert!((steepest - 200.0).abs() < 1e-6);
+}
+
+#[test]
+fn reversal_and_stop() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis.command(to(50.0)).unwrap();
+    rig.run(250);
+    rig.axis.command(to(-50.0)).unwrap();
+    rig.run(150);
+    rig.axis.command(Command::Stop).unwrap();
+    let status = rig.until(|s| !s.moving, 200);
+    assert_eq!(status.target_velocity, 0.0);
+    assert!(status.ready);
+    let held = rig.out.target_position;
+    assert_eq!(rig.run(50).final_error_counts, None);
+    assert_eq!(rig.out.target_position, held);
+    rig.axis.command(to(-50.0)).unwrap();
+    rig.until(|s| s.in_target, 1000);
+}
+
+#[test]
+fn lost_frames_do_not_stop_the_trajectory() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis.command(to(50.0)).unwrap();
+    rig.run(200);
+    let before = rig.out.target_position;
+    rig.cycle_with(false);
+    let status = rig.cycle_with(false);
+    assert_eq!(rig.out.target_position - before, 160);
+    assert_eq!(status.stale_cycles, 2);
+    let status = rig.until(|s| s.in_target, 1000);
+    assert_eq!((status.stale_cycles, status.trip), (0, None));
+}
+
+/// The targets of lost frames never reached the drive: that it is behind them is not its fault.
+#[test]
+fn lost_frames_are_not_a_following_error() {
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis.command(to(50.0)).unwrap();
+    rig.run(200);
+    for _ in 0..6 {
+        rig.cycle_with(false);
+    }
+    let status = rig.cycle();
+    assert!(status.following_error > 1.0 && status.trip.is_none());
+    let status = rig.until(|s| s.in_target, 1000);
+    assert!(status.max_following_error < 0.61);
+    // Nor does losing every other frame hide a blocked motor.
+    rig.axis.command(to(-50.0)).unwrap();
+    rig.drive.blocked = true;
+    for cycle in 0..300 {
+        rig.cycle_with(cycle % 2 == 0);
+    }
+    assert!(rig.axis.status().trip.is_some());
+}
+
+#[test]
+fn across_the_end_of_32_bits() {
+    let scale = Scale::new(2000.0, 5.0)
+        .unwrap()
+        .with_velocity_unit(VelocityUnit::MILLI_RPM);
+    let limits = Limits {
+        position: None,
+        ..LIMITS
+    };
+    let axis = Axis::new(AxisConfig::new(Mode::Csp, scale, limits)).unwrap();
+    let mut rig = Rig::new(axis, Drive::at(i32::MAX - 100));
+    rig.axis.command(Command::Enable).unwrap();
+    let start = rig.until(|s| s.ready, 20).position;
+    rig.axis.command(to(start + 10.0)).unwrap();
+    let status = rig.until(|s| s.in_target && s.at_rest, 1000);
+    assert_eq!(rig.out.target_position, i32::MIN + 3899);
+    assert!((status.position - start - 10.0).abs() < 1e-6);
+    assert_eq!(status.trip, None);
+}
+
+#[test]
+fn inverted_axis_with_offset() {
+    let scale = scale().with_invert(true).with_offset(10.0).unwrap();
+    let axis = Axis::new(AxisConfig::new(Mode::Csp, scale, LIMITS)).unwrap();
+    let mut rig = Rig::new(axis, Drive::at(0));
+    rig.axis.command(Command::Enable).unwrap();
+    assert_eq!(rig.until(|s| s.ready, 20).position, 10.0);
+    rig.axis.command(to(15.0)).unwrap();
+    rig.until(|s| s.in_target, 1000);
+    assert_eq!(rig.out.target_position, -2000);
+}
+
+#[test]
+fn csv_ramps_and_reports() {
+    let mut rig = Rig::enabled(Mode::Csv);
+    rig.axis
+        .command(Command::Velocity {
+            velocity: 20.0,
+            ramp: 0.05,
+        })
+        .unwrap();
+    let status = rig.run(100);
+    assert!(status.moving && !status.in_target);
+    assert_eq!(
+        rig.out.target_velocity, 120_000,
+        "10 mm/s after 0.1 s of 100 mm/s²"
+    );
+    let status = rig.until(|s| s.in_target, 300);
+    assert_eq!(rig.out.target_velocity, 240_000);
+    assert!(!status.at_rest);
+    rig.axis.command(Command::Stop).unwrap();
+    let status = rig.until(|s| s.in_target && s.at_rest, 100);
+    assert_eq!((rig.out.target_velocity, status.target_velocity), (0, 0.0));
+}
+
+#[test]
+fn csv_stops_inside_its_range() {
+    let mut rig = Rig::enabled(Mode::Csv);
+    rig.axis
+        .command(Command::Velocity {
+            velocity: 200.0,
+            ramp: 1.0,
+        })
+        .unwrap();
+    let status = rig.run(2000);
+    assert_eq!(status.trip, None);
+    assert!(status.held_by_range);
+    assert!(
+        (49.0..50.5).contains(&status.position),
+        "{}",
+        status.position
+    );
+    assert!(status.target_velocity.abs() < 0.5);
+    // And out again.
+    rig.axis
+        .command(Command::Velocity {
+            velocity: -10.0,
+            ramp: 1.0,
+        })
+        .unwrap();
+    rig.until(|s| s.in_target && s.position < 48.0, 1000);
+}
+
+#[test]
+fn cst_ramps_and_stops() {
+    let mut rig = Rig::enabled(Mode::Cst);
+    rig.axis
+        .command(Command::Torque {
+            percent: 20.0,
+            ramp_s: 0.1,
+        })
+        .unwrap();
+    let status = rig.run(50);
+    assert!((status.target_torque - 10.0).abs() < 1e-9);
+    assert_eq!(rig.out.target_torque, 100);
+    rig.until(|s| s.in_target, 60);
+    assert_eq!(rig.out.target_torque, 200);
+    rig.axis.command(Command::Stop).unwrap();
+    rig.until(|s| s.in_target, 30);
+    assert_eq!(rig.out.target_torque, 0);
+    // No ramp asked for: as steep as configured, 1000 % per second.
+    rig.axis
+        .command(Command::Torque {
+            percent: -5.0,
+            ramp_s: 0.0,
+        })
+        .unwrap();
+    rig.cycle();
+    assert_eq!(rig.out.target_torque, -10);
+}
+
+#[test]
+fn refusals_say_why_and_change_nothing() {
+    let mut rig = Rig::of(Mode::Csp);
+    rig.run(5);
+    assert_eq!(
+        rig.axis.command(to(1.0)),
+        Err(Refused::NotEnabled {
+            state: State::SwitchOnDisabled
+        })
+    );
+    let mut rig = Rig::enabled(Mode::Csp);
+    rig.axis.command(to(10.0)).unwrap();
+    rig.run(20);
+    let cases = [
+        (to(50.001), "outside the range [-50, 50]"),
+        (to(f64::NAN), "not a finite number"),
+        (to(f64::INFINITY), "not a finite number"),
+        (
+            Command::MoveTo {
+                position: 0.0,
+                speed: 0.0,
+                ramp: 1.0,
+            },
+            "speed is 0",
+        ),
+        (
+            Command::MoveTo {
+                position: 0.0,
+                speed: 1.1,
+                ramp: 1.0,
+            },
+            "speed is 1.1",
+        ),
+        (
+            Command::MoveTo {
+                position: 0.0,
+                speed: 1.0,
+                ramp: f64::NAN,
+            },
+            "ramp is NaN",
+        ),
+        (
+            Command::Velocity {
+                velocity: 1.0,
+                ramp: 1.0,
+            },
+            "needs mode CSV, the axis is in CSP",
+        ),
+        (
+            Command::Torque {
+                percent: 1.0,
+                ramp_s: 1.0,
+            },
+            "needs mode CST, the axis is in CSP",
+        ),
+    ];
+    for (command, text) in cases {
+        let before = format!("{:?}", rig.axis);
+        let refused = rig.axis.command(command).expect_err("must be refused");
+        assert!(refused.to_string().contains(text), "{refused}");
+        assert_eq!(format!("{:?}", rig.axis), before);
+    }
+    let mut rig = Rig::enabled(Mode::Csv);
+    assert!(matches!(
+        rig.axis.command(to(1.0)),
+        Err(Refused::WrongMode { .. })
+    ));
+    assert!(matches!(
+        rig.axis.command(Command::Velocity {
+            velocity: -201.0,
+            ramp: 1.0
+        }),
+        Err(Refused::TooFast { limit: 200.0, .. })
+    ));
+    let mut rig = Rig::enabled(Mode::Cst);
+    assert!(matches!(
+        rig.axis.command(Command::Torque {
+            percent: 100.1,
+            ramp_s: 0.0
+        }),
+        Err(Refused::TooMuchTorque { limit: 100.0, .. })
+    ));
+    assert!(matches!(
+        rig.axis.command(Command::Torque {
+            percent: 1.0,
+            ramp_s: -1.0
+        }),
+        Err(Refused::Negative { .. })
+    ));
+}
