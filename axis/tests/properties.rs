@@ -81,6 +81,7 @@ struct Checker {
     asked: Asked,
     before: Outputs,
     velocity_before: f64,
+    planned_before: f64,
     /// In the cycle before, the set-point was the axis's own and not the actual value.
     enabled_before: bool,
     /// Half the position range; wider for an axis that was enabled outside it.
@@ -114,6 +115,12 @@ impl Checker {
             prop_assert_eq!(out.target_torque, 0);
         }
         let held = status.enabled && self.enabled_before;
+        // What was planned, before rounding to counts: to the last digit.
+        let planned = (status.target_velocity - self.planned_before).abs();
+        let most = LIMITS.acceleration * DT * (1.0 + 1e-6);
+        prop_assert!(!held || planned <= most, "velocity changed by {planned}");
+        prop_assert!(status.target_velocity.abs() <= LIMITS.velocity);
+        self.planned_before = status.target_velocity;
         match self.mode {
             Mode::Csp if held => {
                 // Rounding to whole counts: one for a step, two for the difference of steps.
@@ -169,6 +176,7 @@ fn scenario(mode: Mode, events: &[(Event, u8)]) -> Result<u32, TestCaseError> {
         asked: Asked::default(),
         before: rig.out,
         velocity_before: 0.0,
+        planned_before: 0.0,
         enabled_before: false,
         range: 50.0,
     };
