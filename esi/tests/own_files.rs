@@ -1,0 +1,153 @@
+//! The ESI files that come with ecaxis say what they should, without a warning.
+
+use std::path::Path;
+
+use ecaxis_esi::{
+    Choice, DeviceQuery, EsiFile, Mode, Selection, find_device, offered_modes, parse, select, sii,
+};
+
+const MODES: [Mode; 3] = [Mode::Csp, Mode::Csv, Mode::Cst];
+
+fn file(name: &str) -> EsiFile {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../configs/esi")
+        .join(name);
+    let file = parse(&std::fs::read(path).unwrap()).unwrap();
+    assert!(file.warnings.is_empty(), "{:?}", file.warnings);
+    file
+}
+
+fn choose(file: &EsiFile, mode: Option<Mode>) -> Selection {
+    let device = find_device(file, &DeviceQuery::default()).unwrap();
+    select(
+        file,
+        device,
+        &Choice {
+            mode,
+            cycle_ns: 1_000_000,
+            ..Choice::default()
+        },
+    )
+    .unwrap()
+}
+
+fn value(selection: &Selection, index: u16, sub: u8) -> Option<Vec<u8>> {
+    selection
+        .startup
+        .iter()
+        .rev()
+        .find(|sdo| (sdo.index, sdo.sub) == (index, sub))
+        .map(|sdo| sdo.data.clone())
+}
+
+#[test]
+fn epos4_modes_are_modules() {
+    let file = file("EPOS4.xml");
+    let device = &file.devices[0];
+    assert_eq!(
+        offered_modes(&file, device),
+        [Mode::Pp, Mode::Pv, Mode::Csp, Mode::Csv, Mode::Cst]
+    );
+    for mode in MODES {
+        let selection = choose(&file, Some(mode));
+        let ident = selection.module.as_ref().unwrap().ident;
+        assert_eq!(
+            value(&selection, 0xf030, 1),
+            Some(ident.to_le_bytes().to_vec())
+        );
+        assert_eq!(
+            value(&selection, 0x6060, 0),
+            Some(vec![mode.code().to_le_bytes()[0]])
+        );
+        assert_eq!(selection.dc.as_ref().unwrap().assign_activate, 0x300);
+        assert!(selection.notes.is_empty(), "{mode}: {:?}", selection.notes);
+        for index in [0x6040, mode.target_object().unwrap()] {
+            assert!(
+                selection.layout.rx_field(index, 0).is_some(),
+                "{mode} 0x{index:04x}"
+            );
+        }
+        for index in [0x6041, 0x6061, mode.actual_object()] {
+            assert!(
+                selection.layout.tx_field(index, 0).is_some(),
+                "{mode} 0x{index:04x}"
+            );
+        }
+    }
+    let csp = choose(&file, Some(Mode::Csp));
+    assert_eq!((csp.layout.rx_bytes(), csp.layout.tx_bytes()), (12, 13));
+    assert_eq!(
+        (value(&csp, 0x60c2, 1), value(&csp, 0x60c2, 2)),
+        (Some(vec![1]), Some(vec![0xfd]))
+    );
+    // Without a wish the slot's default module is taken.
+    assert_eq!(choose(&file, None).module.unwrap().type_name, "CSP");
+}
+
+#[test]
+fn idx_modes_are_pdo_sets() {
+    let file = file("IDX.xml");
+    for (mode, rx, tx) in [
+        (Mode::Csp, 0x1600, 0x1a00),
+        (Mode::Csv, 0x1601, 0x1a00),
+        (Mode::Cst, 0x1602, 0x1a00),
+    ] {
+        let selection = choose(&file, Some(mode));
+        assert_eq!((selection.rx.len(), selection.tx.len()), (1, 1));
+        assert_eq!(
+            (selection.rx[0].index, selection.tx[0].index),
+            (rx, tx),
+            "{mode}"
+        );
+        assert_eq!(
+            value(&selection, 0x1c12, 1),
+            Some(rx.to_le_bytes().to_vec())
+        );
+        // SM-synchronous stands first in the file; a synchronous mode wants the clock all the same.
+        assert_eq!(selection.dc.as_ref().unwrap().name, "DC");
+        let cleared = (0x1600u16..0x1604).filter(|pdo| *pdo != rx);
+        assert!(
+            cleared
+                .into_iter()
+                .all(|pdo| value(&selection, pdo, 0) == Some(vec![0])),
+            "{mode}"
+        );
+    }
+}
+
+#[test]
+fn io8_is_bits_without_a_mailbox() {
+    let selection = choose(&file("IO8.xml"), None);
+    assert!(selection.startup.is_empty() && selection.dc.is_none());
+    assert_eq!(
+        (selection.layout.rx_bytes(), selection.layout.tx_bytes()),
+        (1, 1)
+    );
+    let offsets: Vec<u32> = selection
+        .layout
+        .rx
+        .iter()
+        .map(|field| field.bit_offset)
+        .collect();
+    assert_eq!(offsets, [0, 1, 2, 3, 4, 5, 6, 7]);
+}
+
+#[test]
+fn their_images_fit_their_eeproms() {
+    for name in ["EPOS4.xml", "IDX.xml", "IO8.xml"] {
+        let file = file(name);
+        let image = sii::emit(&file.devices[0], &file.modules, &sii::SiiOptions::default());
+        assert_eq!(image.len(), 2048, "{name}");
+        let sii = sii::parse(&image).unwrap();
+        assert_eq!(sii.identity, file.devices[0].identity);
+        let layout = choose(&file, None).layout;
+        for sm in layout.outputs.iter().chain(&layout.inputs) {
+            assert_eq!(
+                sii.sync_managers[usize::from(sm.sm)].len,
+                sm.len,
+                "{name} SM{}",
+                sm.sm
+            );
+        }
+    }
+}
