@@ -42,29 +42,71 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         Nic::Sim => "sim (the simulated bus, from the same ESI files)",
         Nic::Interface(name) => name,
     };
-    let cpu = bus.cpu.map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
+    let cpu = bus
+        .cpu
+        .map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
     let mut table = Table::new(&["setting", "value", "meaning"]);
     table.row(["nic", nic, ""]);
-    table.row(["cycle", &duration::show(bus.cycle_ns), "from frame to frame; also 0x60C2 and SYNC0"]);
+    table.row([
+        "cycle",
+        &duration::show(bus.cycle_ns),
+        "from frame to frame; also 0x60C2 and SYNC0",
+    ]);
     let lost = bus.lost_frames.to_string();
-    table.row(["lost_frames", &lost, "consecutive cycles without a valid answer stop the axes"]);
-    table.row(["exchange", "same-cycle", "answers are waited for within the cycle"]);
-    table.row(["priority", &format!("SCHED_FIFO {}", bus.priority), "of the real-time thread"]);
+    table.row([
+        "lost_frames",
+        &lost,
+        "consecutive cycles without a valid answer stop the axes",
+    ]);
+    table.row([
+        "exchange",
+        "same-cycle",
+        "answers are waited for within the cycle",
+    ]);
+    table.row([
+        "priority",
+        &format!("SCHED_FIFO {}", bus.priority),
+        "of the real-time thread",
+    ]);
     table.row(["cpu", &cpu, "where it runs"]);
-    table.row(["spin", &duration::show(bus.spin_ns), "before a cycle is due, sleeping becomes spinning"]);
+    table.row([
+        "spin",
+        &duration::show(bus.spin_ns),
+        "before a cycle is due, sleeping becomes spinning",
+    ]);
     let watchdog = duration::show(bus.watchdog_ns);
-    table.row(["watchdog", &watchdog, "SyncManager and PDI watchdog (0x0400, 0x0410, 0x0420)"]);
-    table.row(["op_timeout", &duration::show(bus.op_timeout_ns), "from SafeOp to Op"]);
+    table.row([
+        "watchdog",
+        &watchdog,
+        "SyncManager and PDI watchdog (0x0400, 0x0410, 0x0420)",
+    ]);
+    table.row([
+        "op_timeout",
+        &duration::show(bus.op_timeout_ns),
+        "from SafeOp to Op",
+    ]);
     let enable = duration::show(bus.enable_timeout_ns);
-    table.row(["enable_timeout", &enable, "until a drive reports Operation enabled"]);
+    table.row([
+        "enable_timeout",
+        &enable,
+        "until a drive reports Operation enabled",
+    ]);
     writeln!(out, "\nbus\n{}", table.indented(2))
 }
 
 fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
     let selection = &device.selection;
     let esi = device.esi_path.display();
-    writeln!(out, "\ndevice `{}` at {} (line {})", device.name, device.at, device.line)?;
-    writeln!(out, "  {} {:?}, {esi}:{}", device.device.type_name, selection.device_name, device.device.position)?;
+    writeln!(
+        out,
+        "\ndevice `{}` at {} (line {})",
+        device.name, device.at, device.line
+    )?;
+    writeln!(
+        out,
+        "  {} {:?}, {esi}:{}",
+        device.device.type_name, selection.device_name, device.device.position
+    )?;
     writeln!(out, "  {}", selection.identity)?;
     if let Some(mode) = selection.mode {
         writeln!(out, "  mode {mode} (0x6060 = {})", mode.code())?;
@@ -124,7 +166,11 @@ fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
         limits.acceleration,
         limits.torque,
     )?;
-    writeln!(out, "  target window {} {unit}", rounded(config.target_window))
+    writeln!(
+        out,
+        "  target window {} {unit}",
+        rounded(config.target_window)
+    )
 }
 
 /// Six significant digits are enough to read.
@@ -146,7 +192,13 @@ fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
         let (usage, address, len, control, fmmu) = match planned {
             Some((usage, p)) => {
                 let fmmu = p.fmmu.map_or("next free".to_owned(), |f| f.to_string());
-                ((*usage).to_owned(), p.start_address, p.len, p.control_byte, fmmu)
+                (
+                    (*usage).to_owned(),
+                    p.start_address,
+                    p.len,
+                    p.control_byte,
+                    fmmu,
+                )
             }
             None => {
                 let usage = match sm.usage {
@@ -154,7 +206,13 @@ fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
                     ecaxis_esi::SmUse::MBoxIn => "mailbox in",
                     _ => "unused",
                 };
-                (usage.to_owned(), sm.start_address, sm.default_size, sm.control_byte, String::new())
+                (
+                    usage.to_owned(),
+                    sm.start_address,
+                    sm.default_size,
+                    sm.control_byte,
+                    String::new(),
+                )
             }
         };
         table.row([
@@ -197,7 +255,10 @@ fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
         cycle => {
             let sign = if shift < 0 { "-" } else { "" };
             let shift = duration::show(u64::from(shift.unsigned_abs()));
-            format!("every {}, shifted by {sign}{shift}", duration::show(u64::from(cycle)))
+            format!(
+                "every {}, shifted by {sign}{shift}",
+                duration::show(u64::from(cycle))
+            )
         }
     };
     writeln!(
@@ -213,8 +274,16 @@ fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
         "    AssignActivate 0x{:04x}: 0x0980 = 0x{low:02x}, 0x0981 = 0x{high:02x}",
         dc.assign_activate,
     )?;
-    writeln!(out, "    SYNC0 {}", sync(dc.sync0_cycle_ns, dc.sync0_shift_ns))?;
-    writeln!(out, "    SYNC1 {}", sync(dc.sync1_cycle_ns, dc.sync1_shift_ns))
+    writeln!(
+        out,
+        "    SYNC0 {}",
+        sync(dc.sync0_cycle_ns, dc.sync0_shift_ns)
+    )?;
+    writeln!(
+        out,
+        "    SYNC1 {}",
+        sync(dc.sync1_cycle_ns, dc.sync1_shift_ns)
+    )
 }
 
 fn startup(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
@@ -228,9 +297,19 @@ fn startup(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
             true => format!("0x{:04x} CA", sdo.index),
             false => format!("0x{:04x}:{:02x}", sdo.index, sdo.sub),
         };
-        table.row([sdo.transition, &object, &value(&sdo.data), &sdo.name, &sdo.origin]);
+        table.row([
+            sdo.transition,
+            &object,
+            &value(&sdo.data),
+            &sdo.name,
+            &sdo.origin,
+        ]);
     }
-    writeln!(out, "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}", table.indented(2))
+    writeln!(
+        out,
+        "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}",
+        table.indented(2)
+    )
 }
 
 /// Up to eight bytes as one number, more as bytes in the order of the wire.
@@ -268,7 +347,10 @@ fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
             _ => frames.push(len),
         }
     }
-    frames.into_iter().map(|len| ETHERNET + (ECAT_HEADER + len).max(SHORTEST_PAYLOAD)).collect()
+    frames
+        .into_iter()
+        .map(|len| ETHERNET + (ECAT_HEADER + len).max(SHORTEST_PAYLOAD))
+        .collect()
 }
 
 fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
@@ -278,23 +360,41 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
         Ok(plan) => plan,
         Err(e) => return writeln!(out, "\nprocess image\n  {e}"),
     };
-    writeln!(out, "\nprocess image: {} bytes; outputs and inputs share addresses", plan.len)?;
+    writeln!(
+        out,
+        "\nprocess image: {} bytes; outputs and inputs share addresses",
+        plan.len
+    )?;
     let mut table = Table::new(&["device", "logical", "outputs", "inputs", "frame"]);
     for (device, region) in machine.devices.iter().zip(&plan.regions) {
         let Some(region) = region else { continue };
         let at = format!("0x{:08x}", region.logical);
         let (outputs, inputs) = (region.out_len.to_string(), region.in_len.to_string());
-        table.row([&device.name, &at, &outputs, &inputs, &(region.datagram + 1).to_string()]);
+        table.row([
+            &device.name,
+            &at,
+            &outputs,
+            &inputs,
+            &(region.datagram + 1).to_string(),
+        ]);
     }
     writeln!(out, "{}", table.indented(2))?;
     let clock = machine.devices.iter().any(|d| d.selection.dc.is_some());
     let frames = frame_bytes(&plan, clock);
     let total: usize = frames.iter().sum();
     let ns = (total - 12) * NS_PER_BYTE + machine.devices.len() * FORWARDING_NS;
-    let wkc: u32 = plan.datagrams.iter().map(|d| u32::from(d.expected_wkc)).sum();
+    let wkc: u32 = plan
+        .datagrams
+        .iter()
+        .map(|d| u32::from(d.expected_wkc))
+        .sum();
     let clock = if clock { "FRMW 0x0910, " } else { "" };
     let ns = u64::try_from(ns).unwrap_or(u64::MAX);
-    writeln!(out, "\nframes a cycle: {} ({clock}LRW, BRD 0x0130), {total} bytes on the wire", frames.len())?;
+    writeln!(
+        out,
+        "\nframes a cycle: {} ({clock}LRW, BRD 0x0130), {total} bytes on the wire",
+        frames.len()
+    )?;
     writeln!(
         out,
         "  about {} µs from the first bit sent to the last received at 100 Mbit/s, {} % of the cycle",
@@ -306,10 +406,18 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
 
 fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {
     if machine.steps.is_empty() {
-        return writeln!(out, "\nno program: the axes are enabled and hold their positions");
+        return writeln!(
+            out,
+            "\nno program: the axes are enabled and hold their positions"
+        );
     }
     writeln!(out, "\nprogram, {}", times(machine.repeat))?;
-    let axis = |index: usize| machine.devices.get(index).and_then(|d| Some((d, d.axis.as_ref()?)));
+    let axis = |index: usize| {
+        machine
+            .devices
+            .get(index)
+            .and_then(|d| Some((d, d.axis.as_ref()?)))
+    };
     let targets = |targets: &[(usize, f64)], suffix: &str| {
         let each = targets.iter().filter_map(|&(index, target)| {
             let (device, axis) = axis(index)?;
@@ -321,17 +429,32 @@ fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let percent = |fraction: f64| rounded(fraction * 100.0);
     for (number, step) in machine.steps.iter().enumerate() {
         let text = match step {
-            Step::Move { targets: t, speed, ramp } => format!(
+            Step::Move {
+                targets: t,
+                speed,
+                ramp,
+            } => format!(
                 "move {} at {} % of the velocity and {} % of the acceleration limit",
                 targets(t, ""),
                 percent(*speed),
                 percent(*ramp),
             ),
             Step::Velocity { targets: t, ramp } => {
-                format!("turn {} at {} % of the acceleration limit", targets(t, "/s"), percent(*ramp))
+                format!(
+                    "turn {} at {} % of the acceleration limit",
+                    targets(t, "/s"),
+                    percent(*ramp)
+                )
             }
-            Step::Torque { targets: t, ramp_ns } => {
-                format!("torque {} within {}", targets(t, "%"), duration::show(*ramp_ns))
+            Step::Torque {
+                targets: t,
+                ramp_ns,
+            } => {
+                format!(
+                    "torque {} within {}",
+                    targets(t, "%"),
+                    duration::show(*ramp_ns)
+                )
             }
             Step::Dwell { ns } => format!("wait {}", duration::show(*ns)),
         };
@@ -341,7 +464,11 @@ fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {
 }
 
 fn times(n: u32) -> String {
-    if n == 1 { "once".to_owned() } else { format!("{n} times") }
+    if n == 1 {
+        "once".to_owned()
+    } else {
+        format!("{n} times")
+    }
 }
 
 #[cfg(test)]
@@ -353,7 +480,11 @@ mod tests {
         for (axes, bytes) in [(8, 168), (32, 456), (100, 1272)] {
             let plan = image::plan(&vec![(12, 12); axes]).unwrap();
             let frames = frame_bytes(&plan, true);
-            assert_eq!(frames.iter().sum::<usize>(), bytes + AL_STATUS, "{axes} axes");
+            assert_eq!(
+                frames.iter().sum::<usize>(),
+                bytes + AL_STATUS,
+                "{axes} axes"
+            );
             assert_eq!(frames.len(), 1);
         }
         let idle = frame_bytes(&image::plan(&[]).unwrap(), false);

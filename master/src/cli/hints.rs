@@ -21,7 +21,11 @@ pub(crate) struct Failure {
 
 impl Failure {
     pub fn new(code: u8, message: impl Into<String>) -> Self {
-        Self { code, message: message.into(), hints: Vec::new() }
+        Self {
+            code,
+            message: message.into(),
+            hints: Vec::new(),
+        }
     }
 
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
@@ -30,7 +34,11 @@ impl Failure {
     }
 
     pub fn print(&self) {
-        let prefix = if self.message.starts_with("error: ") { "" } else { "error: " };
+        let prefix = if self.message.starts_with("error: ") {
+            ""
+        } else {
+            "error: "
+        };
         note(&format!("{prefix}{}", self.message));
         for hint in &self.hints {
             note(&format!("  = help: {hint}"));
@@ -44,7 +52,11 @@ pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
     match error {
         ConfigError::Io { .. } => failure.hint(machine_files(path)),
         ConfigError::Problems(problems) if problems.len() > 1 => {
-            let message = format!("{error}\n\n{} problems in {}", problems.len(), path.display());
+            let message = format!(
+                "{error}\n\n{} problems in {}",
+                problems.len(),
+                path.display()
+            );
             Failure::new(WRONG, message)
         }
         ConfigError::Problems(_) => failure,
@@ -53,10 +65,20 @@ pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
 
 /// Machine files that could have been meant.
 fn machine_files(path: &Path) -> String {
-    let nearby = [path.parent().unwrap_or(Path::new("")), Path::new("."), Path::new("configs")];
+    let nearby = [
+        path.parent().unwrap_or(Path::new("")),
+        Path::new("."),
+        Path::new("configs"),
+    ];
     for folder in nearby {
-        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-        let Ok(entries) = std::fs::read_dir(folder) else { continue };
+        let folder = if folder.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            folder
+        };
+        let Ok(entries) = std::fs::read_dir(folder) else {
+            continue;
+        };
         let mut names: Vec<String> = entries
             .flatten()
             .map(|e| e.path())

@@ -8,7 +8,9 @@ pub(crate) struct Table {
 
 impl Table {
     pub fn new(head: &[&str]) -> Self {
-        Self { rows: vec![head.iter().map(|cell| (*cell).to_owned()).collect()] }
+        Self {
+            rows: vec![head.iter().map(|cell| (*cell).to_owned()).collect()],
+        }
     }
 
     pub fn row<const N: usize>(&mut self, cells: [&str; N]) {
@@ -24,9 +26,14 @@ impl Table {
         };
         let widths: Vec<usize> = (0..columns).map(width).collect();
         let line = |row: &Vec<String>| {
-            let cells = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}"));
+            let cells = row
+                .iter()
+                .zip(&widths)
+                .map(|(cell, width)| format!("{cell:<width$}"));
             let cells: Vec<String> = cells.collect();
-            format!("{}{}", " ".repeat(by), cells.join("  ")).trim_end().to_owned()
+            format!("{}{}", " ".repeat(by), cells.join("  "))
+                .trim_end()
+                .to_owned()
         };
         self.rows.iter().map(line).collect::<Vec<_>>().join("\n")
     }
