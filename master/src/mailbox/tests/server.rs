@@ -50,6 +50,8 @@ pub struct Server {
     inner: RefCell<Inner>,
     now: Cell<u64>,
     pub datagrams: Cell<u64>,
+    /// How long a request lies in the mailbox.
+    pub thinking: Cell<u64>,
     len: usize,
 }
 
@@ -83,6 +85,7 @@ impl Server {
             }),
             now: Cell::new(0),
             datagrams: Cell::new(0),
+            thinking: Cell::new(THINKING),
             len: usize::from(len),
         }
     }
@@ -161,8 +164,9 @@ impl Inner {
     }
 
     fn serve(&mut self, request: &[u8], len: usize) {
-        let counter = request[5] >> 4 & 7;
-        if counter != 0 && counter == self.last_counter {
+        let counter = request[5] >> 4;
+        assert!((1..=7).contains(&counter), "counter {counter}");
+        if counter == self.last_counter {
             return;
         }
         self.last_counter = counter;
@@ -482,7 +486,7 @@ impl Wire for Server {
                     return Ok(0);
                 }
                 inner.out_mailbox = Some(data.to_vec());
-                inner.ready_at = self.now.get() + THINKING;
+                inner.ready_at = self.now.get() + self.thinking.get();
                 if inner.is(&Mischief::LoseRequestEcho(inner.requests_written)) {
                     return lost;
                 }
