@@ -1,7 +1,5 @@
 //! Whatever a file contains: an error with a position or a usable result, never a panic, never unbounded memory.
 
-mod common;
-
 use std::path::Path;
 
 use ecaxis_esi::{Choice, EsiError, EsiFile, EsiProblem, Mode, parse, select, sii};

@@ -426,3 +426,34 @@ fn a_coupler_terminal_has_bits_and_no_sdos() {
     assert_eq!(selection.layout.tx.len(), 8);
     assert!(selection.startup.is_empty());
 }
+
+/// The configuration that another tool made of the same file: 1C12 = [1602], 1C13 = [1A02], then 9 before Op.
+/// Contents are not written, PdoConfig is not set.
+#[test]
+fn the_same_assignment_as_a_recorded_eni() {
+    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
+        return;
+    };
+    let selection = choose(&file, &for_mode(Mode::Csv)).unwrap();
+    let sdos = written(&selection.startup);
+    assert_eq!(
+        sdos[..6],
+        [
+            (0x1c12, 0, 0),
+            (0x1c13, 0, 0),
+            (0x1c12, 1, 0x1602),
+            (0x1c12, 0, 1),
+            (0x1c13, 1, 0x1a02),
+            (0x1c13, 0, 1)
+        ]
+    );
+    let last = selection.startup.last().unwrap();
+    assert_eq!(
+        (last.transition, last.index, last.data.as_slice()),
+        ("SO", 0x6060, &[9][..])
+    );
+    assert_eq!(
+        (selection.layout.rx_bytes(), selection.layout.tx_bytes()),
+        (8, 8)
+    );
+}

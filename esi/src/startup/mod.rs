@@ -14,7 +14,7 @@ use crate::{Dictionary, Mode};
 /// One SDO download.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StartupSdo {
-    /// `PS` unless an InitCmd asks for another transition.
+    /// `PS` unless an InitCmd asks for `IP` (once PreOp is reached) or `SO` (before Op); sorted in that order.
     pub transition: &'static str,
     pub index: u16,
     pub sub: u8,
@@ -25,6 +25,9 @@ pub struct StartupSdo {
     /// Which element or key it comes from.
     pub origin: String,
 }
+
+/// The transitions on the way to Op, in their order.
+const UPWARDS: [&str; 3] = ["IP", "PS", "SO"];
 
 const MODES_OF_OPERATION: u16 = 0x6060;
 const INTERPOLATION_TIME: u16 = 0x60c2;
@@ -56,6 +59,12 @@ pub(crate) fn list(
     }
     mode(selection, &mut list);
     user(choice, selection, &mut list)?;
+    // By transition; within one, the order above stays.
+    list.sdos.sort_by_key(|sdo| {
+        UPWARDS
+            .iter()
+            .position(|transition| *transition == sdo.transition)
+    });
     Ok(list.sdos)
 }
 
@@ -185,7 +194,7 @@ fn is_zero(bytes: &[u8]) -> bool {
 /// InitCmds for the way up to Op. One that sets another mode than the chosen one is left out.
 fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list: &mut List) {
     for cmd in commands {
-        let upwards = ["IP", "PS", "SO"]
+        let upwards = UPWARDS
             .into_iter()
             .find(|t| cmd.transitions.iter().any(|own| own == t));
         let Some(transition) = upwards else { continue };
