@@ -425,7 +425,7 @@ impl Motion {
                 set(follows && !self.cut, bit::MODE_12);
             }
             Mode::ProfilePosition => {
-                set(self.acknowledged, bit::MODE_12);
+                set(self.acknowledged && follows, bit::MODE_12);
                 set(self.reached, bit::TARGET_REACHED);
             }
             Mode::ProfileVelocity => {

@@ -79,8 +79,9 @@ struct ParameterSlots {
     homing_method: Slot,
     home_position: Option<Slot>,
     home_offset: Option<Slot>,
-    unit_velocity: Slot,
-    unit_acceleration: Slot,
+    /// A drive without 0x60A9 and 0x60AA counts in encoder counts and seconds.
+    unit_velocity: Option<Slot>,
+    unit_acceleration: Option<Slot>,
     period_value: Slot,
     period_index: Slot,
     output_current_limit: Option<Slot>,
@@ -138,10 +139,21 @@ impl Binder<'_> {
         }
     }
 
-    fn fill_existing(&mut self, index: u16, sub: u8, default: i64) -> Option<Slot> {
+    /// A maker's own object. Elsewhere the same index means something else, so the name decides.
+    fn own(&self, index: u16, sub: u8, name: &str) -> Option<Slot> {
         let slot = self.0.slot(index, sub)?;
-        self.fill(slot, default);
-        Some(slot)
+        (self.0.item(slot)?.name == name).then_some(slot)
+    }
+
+    /// Motor data: commissioning has set it, whatever the ESI's factory value is.
+    fn motor_data(&mut self, slot: Slot, value: i64) -> Slot {
+        self.0.set(slot, value);
+        slot
+    }
+
+    fn own_motor_data(&mut self, index: u16, sub: u8, name: &str, value: i64) -> Option<Slot> {
+        let slot = self.own(index, sub, name)?;
+        Some(self.motor_data(slot, value))
     }
 }
 
@@ -160,16 +172,52 @@ impl Objects {
     pub(super) fn bind(store: &mut ObjectStore, plant: &PlantParams) -> Self {
         let mut b = Binder(store);
         let history = [0, 1, 2, 3, 4, 5].map(|sub| b.0.slot(0x1003, sub));
-        b.fill_existing(0x3001, 1, whole(plant.nominal_current * 1e3));
-        let output_current_limit = b.fill_existing(0x3001, 2, whole(plant.current_limit * 1e3));
-        b.fill_existing(0x3001, 5, whole(plant.torque_constant * 1e6));
-        b.fill_existing(0x2200, 1, whole(plant.supply_voltage * 10.0));
+        b.own_motor_data(
+            0x3001,
+            1,
+            "Nominal current",
+            whole(plant.nominal_current * 1e3),
+        );
+        let output_current_limit = b.own_motor_data(
+            0x3001,
+            2,
+            "Output current limit",
+            whole(plant.current_limit * 1e3),
+        );
+        b.own_motor_data(
+            0x3001,
+            5,
+            "Torque constant",
+            whole(plant.torque_constant * 1e6),
+        );
+        b.own_motor_data(
+            0x2200,
+            1,
+            "Power supply voltage",
+            whole(plant.supply_voltage * 10.0),
+        );
         b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
         b.bind(0x60fd, 0, "Digital inputs", 32, RO);
         b.bind(0x60fe, 1, "Physical outputs", 32, RW);
-        let rated = whole(plant.rated_torque() * 1e6);
-        let speed = i64::from(plant.max_motor_speed);
+        let rated_torque = b.bind(0x6076, 0, "Motor rated torque", 32, RW);
+        b.motor_data(rated_torque, whole(plant.rated_torque() * 1e6));
+        let max_motor_speed = b.bind(0x6080, 0, "Max motor speed", 32, RW);
+        b.motor_data(max_motor_speed, i64::from(plant.max_motor_speed));
+        let (unit_velocity, unit_acceleration) = (b.0.slot(0x60a9, 0), b.0.slot(0x60aa, 0));
+        let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
+        let mut unit = |slot: Option<Slot>, default, of: fn(i64, f64) -> f64| {
+            slot.map_or(1.0, |slot| {
+                b.fill(slot, default);
+                of(b.0.get(slot), counts_per_turn)
+            })
+        };
+        // rpm and rpm/s in the drive's units.
+        let per_rpm = counts_per_turn / 60.0 / unit(unit_velocity, RPM, velocity_unit);
+        let per_rpm_s =
+            counts_per_turn / 60.0 / unit(unit_acceleration, RPM_PER_S, acceleration_unit);
+        let speed = |rpm: f64| whole(rpm * per_rpm).clamp(1, 0xffff_ffff);
+        let acceleration = whole(10_000.0 * per_rpm_s).clamp(1, 0xffff_ffff);
         let parameters = ParameterSlots {
             quick_stop_option: b.with_default(0x605a, 0, "Quick stop option code", 16, 6),
             shutdown_option: b.bind(0x605b, 0, "Shutdown option code", 16, RW),
@@ -181,7 +229,7 @@ impl Objects {
             position_window: b.with_default(0x6067, 0, "Position window", 32, 0xffff_ffff),
             position_window_time: b.bind(0x6068, 0, "Position window time", 16, RW),
             max_torque: b.0.slot(0x6072, 0),
-            rated_torque: b.with_default(0x6076, 0, "Motor rated torque", 32, rated),
+            rated_torque,
             range: [
                 b.bind(0x607b, 1, "Min position range limit", 32, RW),
                 b.bind(0x607b, 2, "Max position range limit", 32, RW),
@@ -190,24 +238,42 @@ impl Objects {
                 b.bind(0x607d, 1, "Min position limit", 32, RW),
                 b.bind(0x607d, 2, "Max position limit", 32, RW),
             ],
-            max_profile_velocity: b.with_default(0x607f, 0, "Max profile velocity", 32, 50_000),
-            max_motor_speed: b.with_default(0x6080, 0, "Max motor speed", 32, speed),
-            profile_velocity: b.with_default(0x6081, 0, "Profile velocity", 32, 1000),
-            profile_acceleration: b.with_default(0x6083, 0, "Profile acceleration", 32, 10_000),
-            profile_deceleration: b.with_default(0x6084, 0, "Profile deceleration", 32, 10_000),
+            max_profile_velocity: b.with_default(
+                0x607f,
+                0,
+                "Max profile velocity",
+                32,
+                speed(50_000.0),
+            ),
+            max_motor_speed,
+            profile_velocity: b.with_default(0x6081, 0, "Profile velocity", 32, speed(1000.0)),
+            profile_acceleration: b.with_default(
+                0x6083,
+                0,
+                "Profile acceleration",
+                32,
+                acceleration,
+            ),
+            profile_deceleration: b.with_default(
+                0x6084,
+                0,
+                "Profile deceleration",
+                32,
+                acceleration,
+            ),
             quick_stop_deceleration: b.with_default(
                 0x6085,
                 0,
                 "Quick stop deceleration",
                 32,
-                10_000,
+                acceleration,
             ),
             max_acceleration: b.with_default(0x60c5, 0, "Max acceleration", 32, 0xffff_ffff),
             homing_method: b.with_default(0x6098, 0, "Homing method", 8, 37),
-            home_position: b.0.slot(0x30b0, 0),
+            home_position: b.own(0x30b0, 0, "Home position"),
             home_offset: b.0.slot(0x607c, 0),
-            unit_velocity: b.with_default(0x60a9, 0, "SI unit velocity", 32, RPM),
-            unit_acceleration: b.with_default(0x60aa, 0, "SI unit acceleration", 32, RPM_PER_S),
+            unit_velocity,
+            unit_acceleration,
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
             period_index: b.with_default(0x60c2, 2, "Interpolation time index", 8, -3),
             output_current_limit,
@@ -224,11 +290,11 @@ impl Objects {
             position: b.bind(0x6064, 0, "Position actual value", 32, RO),
             velocity_demand: b.bind(0x606b, 0, "Velocity demand value", 32, RO),
             velocity: b.bind(0x606c, 0, "Velocity actual value", 32, RO),
-            velocity_averaged: b.0.slot(0x30d3, 1),
+            velocity_averaged: b.own(0x30d3, 1, "Velocity actual value averaged"),
             torque: b.bind(0x6077, 0, "Torque actual value", 16, RO),
-            torque_averaged: b.0.slot(0x30d2, 1),
-            current: b.0.slot(0x30d1, 2),
-            current_averaged: b.0.slot(0x30d1, 1),
+            torque_averaged: b.own(0x30d2, 1, "Torque actual value averaged"),
+            current: b.own(0x30d1, 2, "Current actual value"),
+            current_averaged: b.own(0x30d1, 1, "Current actual value averaged"),
             following_error: b.bind(0x60f4, 0, "Following error actual value", 32, RO),
             target_position: b.bind(0x607a, 0, "Target position", 32, RW),
             target_velocity: b.bind(0x60ff, 0, "Target velocity", 32, RW),
@@ -262,8 +328,12 @@ impl Objects {
     pub(super) fn parameters(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
         let p = &self.parameters;
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
-        let velocity_unit = velocity_unit(store.get(p.unit_velocity), counts_per_turn);
-        let acceleration_unit = acceleration_unit(store.get(p.unit_acceleration), counts_per_turn);
+        let velocity_unit = p
+            .unit_velocity
+            .map_or(1.0, |slot| velocity_unit(store.get(slot), counts_per_turn));
+        let acceleration_unit = p.unit_acceleration.map_or(1.0, |slot| {
+            acceleration_unit(store.get(slot), counts_per_turn)
+        });
         let speed = |slot| float(store.get(slot)) * velocity_unit;
         let acceleration = |slot| float(store.get(slot).max(1)) * acceleration_unit;
         let window = |slot| {

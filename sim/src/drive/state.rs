@@ -273,3 +273,65 @@ impl Power {
         true
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use State as S;
+
+    /// CiA 402 figure "power drive system FSA", without transition 13.
+    const ARROWS: [(u8, State, State); 15] = [
+        (1, S::NotReadyToSwitchOn, S::SwitchOnDisabled),
+        (2, S::SwitchOnDisabled, S::ReadyToSwitchOn),
+        (3, S::ReadyToSwitchOn, S::SwitchedOn),
+        (4, S::SwitchedOn, S::OperationEnabled),
+        (5, S::OperationEnabled, S::SwitchedOn),
+        (6, S::SwitchedOn, S::ReadyToSwitchOn),
+        (7, S::ReadyToSwitchOn, S::SwitchOnDisabled),
+        (8, S::OperationEnabled, S::ReadyToSwitchOn),
+        (9, S::OperationEnabled, S::SwitchOnDisabled),
+        (10, S::SwitchedOn, S::SwitchOnDisabled),
+        (11, S::OperationEnabled, S::QuickStopActive),
+        (12, S::QuickStopActive, S::SwitchOnDisabled),
+        (14, S::FaultReactionActive, S::Fault),
+        (15, S::Fault, S::SwitchOnDisabled),
+        (16, S::QuickStopActive, S::OperationEnabled),
+    ];
+
+    #[test]
+    fn every_controlword_in_every_state_follows_an_arrow() {
+        let options = OptionCodes {
+            quick_stop: 6,
+            shutdown: 0,
+            disable: 0,
+            fault: 2,
+        };
+        let mut taken = Vec::new();
+        for (_, state, _) in ARROWS {
+            for word in 0..=u16::MAX {
+                for flags in 0..4 {
+                    let mut power = Power::new(0);
+                    power.state = state;
+                    let number = power.step(&Inputs {
+                        request: Some(Request::decode(word)),
+                        reset: flags & 1 != 0,
+                        stopped: flags & 2 != 0,
+                        options,
+                    });
+                    match number {
+                        None => assert_eq!(power.state, state),
+                        Some(number) => {
+                            assert!(ARROWS.contains(&(number, state, power.state)), "{word:x}");
+                            taken.push(number);
+                        }
+                    }
+                }
+            }
+            taken.sort_unstable();
+            taken.dedup();
+        }
+        // 1 waits for the self-test.
+        let all = ARROWS.map(|(number, ..)| number);
+        assert_eq!(taken, all[1..]);
+    }
+}

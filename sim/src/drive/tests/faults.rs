@@ -293,8 +293,7 @@ fn the_history_has_the_newest_first() {
     let mut store = ObjectStore::default();
     for sub in 0..=5 {
         let bits = if sub == 0 { 8 } else { 32 };
-        let access = ecaxis_esi::model::Access::default();
-        store.ensure(0x1003, sub, "Error history", bits, access, &[]);
+        store.ensure(0x1003, sub, "Error history", bits, Access::default(), &[]);
     }
     let mut drive = Drive::new(&mut store, PlantParams::default());
     for code in [0x2310, 0x4210] {

@@ -1,9 +1,12 @@
 //! The drive on its own: a store without an ESI, process data written by hand.
 
+mod devices;
 mod faults;
 mod motion;
 mod profiles;
 mod transitions;
+
+use ecaxis_esi::model::Access;
 
 use super::*;
 use crate::coe::store::Slot;
@@ -24,6 +27,9 @@ const MS: u64 = 1_000_000;
 impl Rig {
     fn new(plant: PlantParams) -> Self {
         let mut store = ObjectStore::default();
+        for unit in [0x60a9, 0x60aa] {
+            store.ensure(unit, 0, "SI unit", 32, Access::default(), &[]);
+        }
         let drive = Drive::new(&mut store, plant);
         let mut rig = Self {
             store,

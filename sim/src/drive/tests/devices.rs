@@ -1,0 +1,108 @@
+//! The drive on the dictionaries of real devices.
+
+use std::path::PathBuf;
+
+use ecaxis_esi::model::{Dictionary, EsiFile};
+
+use super::*;
+
+/// From `ECAXIS_FIXTURES`, or `../shared/fixtures` beside the workspace. Absent: says so; on CI that is
+/// a failure.
+fn esi(path: &str) -> Option<EsiFile> {
+    let root = std::env::var_os("ECAXIS_FIXTURES").map_or_else(
+        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/fixtures"),
+        PathBuf::from,
+    );
+    let path = root.join("esi").join(path);
+    match std::fs::read(&path) {
+        Ok(bytes) => Some(ecaxis_esi::parse(&bytes).unwrap()),
+        Err(error) => {
+            assert!(std::env::var_os("CI").is_none(), "{path:?}: {error}");
+            None
+        }
+    }
+}
+
+fn rig_of(dictionaries: &[&Dictionary]) -> Rig {
+    let mut store = ObjectStore::from_dictionary(dictionaries);
+    let drive = Drive::new(&mut store, PlantParams::default());
+    let mut rig = rig();
+    (rig.store, rig.drive) = (store, drive);
+    rig.set(0x60c2, 1, 1);
+    rig
+}
+
+fn moves_a_turn(rig: &mut Rig) {
+    rig.enable(8);
+    let start = rig.get(0x6064);
+    for n in 1..=200 {
+        rig.set(0x607a, 0, start + 10 * n);
+        rig.cycle();
+    }
+    rig.run_ms(100);
+    assert_eq!(rig.drive.state(), State::OperationEnabled);
+    assert!((rig.get(0x6064) - start - 2000).abs() <= 1);
+}
+
+#[test]
+fn epos4_with_its_csp_module() {
+    let Some(file) = esi("maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
+        return;
+    };
+    let device = file.devices.first().unwrap();
+    let module = file
+        .modules
+        .iter()
+        .find(|module| module.name.contains("CSP") || module.type_name.contains("CSP"))
+        .unwrap();
+    let mut rig = rig_of(&[&device.dictionary, &module.dictionary]);
+    let value = |rig: &Rig, index, sub| rig.store.get(rig.slot(index, sub));
+    for (index, sub, expected) in [
+        (0x6065, 0, 2000),
+        (0x6085, 0, 10_000),
+        (0x605a, 0, 6),
+        (0x60a9, 0, 0x00b4_4700),
+        (0x6076, 0, 118_400),
+        (0x3001, 1, 3200),
+        (0x3001, 2, 9600),
+        (0x3001, 5, 37_000),
+        (0x60c2, 1, 1),
+    ] {
+        assert_eq!(value(&rig, index, sub), expected, "0x{index:04x}:{sub}");
+    }
+    moves_a_turn(&mut rig);
+    assert!(rig.drive.objects.velocity_averaged.is_some());
+}
+
+#[test]
+fn drives_of_other_makers() {
+    for path in [
+        "elmo/Elmo_ECAT_00010420_V11.xml",
+        "synapticon/SOMANET_CiA_402_v4.xml",
+        "stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml",
+        "inovance/SV660_EOE_1Axis_V9.12.xml",
+    ] {
+        let Some(file) = esi(path) else {
+            return;
+        };
+        let device = file.devices.first().unwrap();
+        let mut rig = rig_of(&[&device.dictionary]);
+        moves_a_turn(&mut rig);
+        // Only one of them has 0x60A9; the others count in counts per second.
+        let rpm = rig.store.slot(0x60a9, 0).is_some();
+        assert_eq!(rpm, path.starts_with("synapticon"), "{path}");
+        rig.set(0x60ff, 0, if rpm { 600 } else { 20_000 });
+        rig.set(0x6060, 0, 9);
+        rig.run_ms(300);
+        assert!((rig.drive.velocity_rev_s() - 10.0).abs() < 0.1, "{path}");
+    }
+}
+
+#[test]
+fn a_drive_without_unit_objects_has_the_same_dynamics_in_counts() {
+    let mut store = ObjectStore::default();
+    Drive::new(&mut store, PlantParams::default());
+    let value = |index| store.get(store.slot(index, 0).unwrap());
+    // 10,000 rpm/s, 1000 rpm.
+    assert_eq!((value(0x6085), value(0x6081)), (333_333, 33_333));
+}
