@@ -1,10 +1,34 @@
-//! A simulated EtherCAT segment with its own frame codec. Deterministic under virtual time.
+//! A simulated EtherCAT segment: SubDevices made from ESI files, on a line, with their own clocks.
+//! Deterministic under virtual time; shares no code with any MainDevice, so that one misreading
+//! cannot pass on both sides.
+//!
+//! From the wire inwards:
+//!
+//! * [`network`]: the line, delays, loss; [`Segment`] is where frames go in
+//! * [`frame`]: the datagram codec
+//! * [`esc`]: the SubDevice controller: registers, FMMUs, SyncManagers, EEPROM, distributed clocks
+//! * [`device`]: the controller and the application behind it: state machine, mailbox, process data
+//! * [`coe`]: object dictionary and SDO server
+//! * [`drive`]: a CiA 402 drive down to the motor shaft
+//! * [`faults`]: what goes wrong on purpose
+//! * [`serve`]: the segment on a real network interface, for any MainDevice
 
 mod bits;
 pub mod coe;
+pub mod device;
 pub mod drive;
 pub mod esc;
+pub mod faults;
 pub mod frame;
+pub mod network;
+pub mod serve;
+
+pub use device::{DeviceOptions, SimDevice, SimError};
+pub use drive::PlantParams;
+pub use esc::al::AlState;
+pub use faults::{FaultScript, ScriptError};
+pub use network::{Segment, SegmentOptions, Transit};
+pub use serve::{ServeError, ServeStats, serve};
 
 /// True time of the simulated world, in nanoseconds. Every device's own clock drifts from it.
 pub type Nanos = u64;

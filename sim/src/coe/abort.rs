@@ -1,0 +1,34 @@
+//! SDO abort codes (CiA 301 table 22, ETG.1000.6 table 41).
+
+use std::fmt;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Abort(pub u32);
+
+impl Abort {
+    pub const TOGGLE: Self = Self(0x0503_0000);
+    pub const COMMAND: Self = Self(0x0504_0001);
+    pub const WRITE_ONLY: Self = Self(0x0601_0001);
+    pub const READ_ONLY: Self = Self(0x0601_0002);
+    /// Subindex 0 must be 0 while entries change.
+    pub const COUNT_NOT_ZERO: Self = Self(0x0601_0003);
+    pub const NO_COMPLETE_ACCESS: Self = Self(0x0601_0004);
+    pub const NO_OBJECT: Self = Self(0x0602_0000);
+    pub const NOT_MAPPABLE: Self = Self(0x0604_0041);
+    pub const MAPPING_TOO_LONG: Self = Self(0x0604_0042);
+    pub const INCOMPATIBLE: Self = Self(0x0604_0043);
+    pub const LENGTH: Self = Self(0x0607_0010);
+    pub const TOO_LONG: Self = Self(0x0607_0012);
+    pub const TOO_SHORT: Self = Self(0x0607_0013);
+    pub const NO_SUBINDEX: Self = Self(0x0609_0011);
+    pub const VALUE: Self = Self(0x0609_0030);
+    pub const VALUE_TOO_HIGH: Self = Self(0x0609_0031);
+    pub const VALUE_TOO_LOW: Self = Self(0x0609_0032);
+    pub const WRONG_STATE: Self = Self(0x0800_0022);
+}
+
+impl fmt::Display for Abort {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "SDO abort 0x{:08x}", self.0)
+    }
+}

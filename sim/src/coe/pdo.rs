@@ -1,0 +1,486 @@
+//! PDO assignment (0x1C10 + SyncManager) and mapping (0x16xx, 0x1Axx): what a client may write
+//! there, what modules change, and the bit layout that results.
+
+use ecaxis_esi::model::{Access, Device, Direction, Module, Pdo, SmUse, Writable};
+
+use super::Abort;
+use super::store::{ObjectStore, Slot};
+use crate::esc::al::AlState;
+
+/// 0x1C10 is SyncManager 0.
+const ASSIGNMENT: u16 = 0x1c10;
+const MODULE_LIST: u16 = 0xf030;
+const DETECTED_MODULES: u16 = 0xf050;
+const MAX_ASSIGNED: u8 = 8;
+const MAX_MAPPED: u8 = 16;
+
+/// A PDO the device knows.
+#[derive(Debug, Clone)]
+struct KnownPdo {
+    index: u16,
+    direction: Direction,
+    fixed: bool,
+    exclude: Vec<u16>,
+}
+
+/// Process data of one SyncManager.
+#[derive(Debug, Clone)]
+pub struct ProcessSm {
+    pub sm: u8,
+    pub direction: Direction,
+    max_len: Option<u16>,
+}
+
+/// PDO contents a module brings into its slot.
+#[derive(Debug, Clone)]
+struct ModulePdos {
+    slot: usize,
+    ident: u32,
+    /// PDO index and its mapping entries.
+    contents: Vec<(u16, Vec<u32>)>,
+}
+
+/// One object inside the process data of a SyncManager.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Mapped {
+    pub slot: Slot,
+    pub bit: usize,
+    pub bits: usize,
+}
+
+#[derive(Debug, Clone, Default)]
+pub struct PdoRules {
+    pdos: Vec<KnownPdo>,
+    sms: Vec<ProcessSm>,
+    modules: Vec<ModulePdos>,
+    /// Idents each slot accepts.
+    slots: Vec<Vec<u32>>,
+    /// (direction, index << 8 | sub) that the ESI's PDOs contain, mappable whatever the flags say.
+    known_entries: Vec<(Direction, u32)>,
+}
+
+impl PdoRules {
+    /// Reads the ESI and puts the power-on assignment and mapping into the store.
+    #[must_use]
+    pub fn new(store: &mut ObjectStore, device: &Device, modules: &[Module]) -> Self {
+        let mut rules = Self::default();
+        let coe = device
+            .mailbox
+            .as_ref()
+            .and_then(|mailbox| mailbox.coe.as_ref());
+        let (assign, config) = coe.map_or((false, false), |coe| (coe.pdo_assign, coe.pdo_config));
+        for pdo in device.rx_pdos.iter().chain(&device.tx_pdos) {
+            rules.learn(store, pdo, pdo.index, config);
+        }
+        rules.learn_modules(store, device, modules, config);
+        for (n, sm) in device.sync_managers.iter().enumerate().take(8) {
+            let direction = match sm.usage {
+                SmUse::Outputs => Direction::Rx,
+                SmUse::Inputs => Direction::Tx,
+                _ => continue,
+            };
+            let Ok(n) = u8::try_from(n) else { continue };
+            rules.sms.push(ProcessSm {
+                sm: n,
+                direction,
+                max_len: sm.max_size,
+            });
+            let all = if direction == Direction::Rx {
+                &device.rx_pdos
+            } else {
+                &device.tx_pdos
+            };
+            let assigned: Vec<u16> = all
+                .iter()
+                .filter(|pdo| pdo.sm == Some(n))
+                .map(|pdo| pdo.index)
+                .collect();
+            rules.fill(
+                store,
+                ASSIGNMENT + u16::from(n),
+                16,
+                &assigned,
+                MAX_ASSIGNED,
+                assign,
+            );
+        }
+        rules.plug_defaults(store, device);
+        rules
+    }
+
+    fn learn(&mut self, store: &mut ObjectStore, pdo: &Pdo, index: u16, config: bool) {
+        if !self.pdos.iter().any(|known| known.index == index) {
+            self.pdos.push(KnownPdo {
+                index,
+                direction: pdo.direction,
+                fixed: pdo.fixed,
+                exclude: pdo.exclude.clone(),
+            });
+            let entries: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
+            self.fill(store, index, 32, &entries, MAX_MAPPED, config && !pdo.fixed);
+        }
+        for entry in pdo.entries.iter().filter(|entry| !entry.is_gap()) {
+            let access = Access {
+                read: true,
+                write: if pdo.direction == Direction::Rx {
+                    Writable::Always
+                } else {
+                    Writable::Never
+                },
+            };
+            store.ensure(
+                entry.index,
+                entry.sub,
+                &entry.name,
+                u32::from(entry.bit_len),
+                access,
+                &[],
+            );
+            let key = (pdo.direction, entry.mapping() >> 8);
+            if !self.known_entries.contains(&key) {
+                self.known_entries.push(key);
+            }
+        }
+    }
+
+    fn learn_modules(
+        &mut self,
+        store: &mut ObjectStore,
+        device: &Device,
+        modules: &[Module],
+        config: bool,
+    ) {
+        let Some(slots) = &device.slots else { return };
+        for (position, slot) in expand(slots).enumerate() {
+            self.slots
+                .push(slot.module_idents.iter().map(|(ident, _)| *ident).collect());
+            let shift = slots
+                .pdo_increment
+                .wrapping_mul(u16::try_from(position).unwrap_or(0));
+            for module in modules {
+                if !slot
+                    .module_idents
+                    .iter()
+                    .any(|(ident, _)| *ident == module.ident)
+                {
+                    continue;
+                }
+                let mut contents = Vec::new();
+                for pdo in module.rx_pdos.iter().chain(&module.tx_pdos) {
+                    let index = pdo.index.wrapping_add(shift);
+                    self.learn(store, pdo, index, config);
+                    contents.push((
+                        index,
+                        pdo.entries.iter().map(|entry| entry.mapping()).collect(),
+                    ));
+                }
+                self.modules.push(ModulePdos {
+                    slot: position,
+                    ident: module.ident,
+                    contents,
+                });
+            }
+        }
+    }
+
+    /// The default modules' contents and the module lists.
+    fn plug_defaults(&mut self, store: &mut ObjectStore, device: &Device) {
+        let Some(slots) = &device.slots else { return };
+        let defaults: Vec<u32> = expand(slots)
+            .map(|slot| {
+                let default = slot.module_idents.iter().find(|(_, default)| *default);
+                default.map_or(0, |(ident, _)| *ident)
+            })
+            .collect();
+        let max = u8::try_from(defaults.len()).unwrap_or(u8::MAX);
+        self.fill(store, MODULE_LIST, 32, &defaults, max, true);
+        self.fill(store, DETECTED_MODULES, 32, &defaults, max, false);
+        for (slot, ident) in defaults.iter().enumerate() {
+            self.plug(store, slot, *ident);
+        }
+    }
+
+    /// Creates a list object where it is missing and sets count and elements.
+    fn fill<T: Copy + Into<u32>>(
+        &self,
+        store: &mut ObjectStore,
+        index: u16,
+        bits: u32,
+        values: &[T],
+        room: u8,
+        writable: bool,
+    ) {
+        let write = if writable {
+            Writable::Only {
+                pre_op: true,
+                safe_op: false,
+                op: false,
+            }
+        } else {
+            Writable::Never
+        };
+        let access = Access { read: true, write };
+        let used = u8::try_from(values.len()).unwrap_or(u8::MAX);
+        let subs = if writable { used.max(room) } else { used };
+        let exists = store.has_object(index);
+        let count = store.ensure(index, 0, "SubIndex 000", 8, access, &[]);
+        store.set(count, i64::from(used));
+        if writable {
+            store.set_access(count, write);
+        }
+        for sub in 1..=subs {
+            let slot = match store.slot(index, sub) {
+                None if exists && sub > used => continue,
+                _ => store.ensure(index, sub, &format!("SubIndex {sub:03}"), bits, access, &[]),
+            };
+            if writable {
+                store.set_access(slot, write);
+            }
+            let value = values.get(usize::from(sub) - 1).map_or(0, |v| (*v).into());
+            store.set(slot, i64::from(value));
+        }
+    }
+
+    fn plug(&self, store: &mut ObjectStore, slot: usize, ident: u32) {
+        let Some(module) = self
+            .modules
+            .iter()
+            .find(|m| (m.slot, m.ident) == (slot, ident))
+        else {
+            return;
+        };
+        for (index, entries) in &module.contents {
+            for sub in 1..=u8::MAX {
+                let Some(slot) = store.slot(*index, sub) else {
+                    break;
+                };
+                let value = entries.get(usize::from(sub) - 1).copied().unwrap_or(0);
+                store.set(slot, i64::from(value));
+            }
+            if let Some(count) = store.slot(*index, 0) {
+                store.set(count, i64::try_from(entries.len()).unwrap_or(0));
+            }
+        }
+    }
+
+    /// Assignment, mapping and module lists: only the first "count" elements mean something.
+    pub(crate) fn is_list(&self, index: u16) -> bool {
+        self.assignment(index).is_some()
+            || self.pdo(index).is_some()
+            || matches!(index, MODULE_LIST | DETECTED_MODULES)
+    }
+
+    fn pdo(&self, index: u16) -> Option<&KnownPdo> {
+        self.pdos.iter().find(|pdo| pdo.index == index)
+    }
+
+    fn assignment(&self, index: u16) -> Option<&ProcessSm> {
+        self.sms
+            .iter()
+            .find(|sm| ASSIGNMENT + u16::from(sm.sm) == index)
+    }
+
+    /// Whether a write keeps assignment and mapping sound.
+    pub(crate) fn before_write(
+        &self,
+        store: &ObjectStore,
+        index: u16,
+        sub: u8,
+        value: i64,
+        state: AlState,
+    ) -> Result<(), Abort> {
+        if !self.is_list(index) {
+            return Ok(());
+        }
+        if state != AlState::PreOp {
+            return Err(Abort::WRONG_STATE);
+        }
+        if self.pdo(index).is_some_and(|pdo| pdo.fixed) {
+            return Err(Abort::READ_ONLY);
+        }
+        if index == MODULE_LIST {
+            return self.check_module(sub, value);
+        }
+        let count = store.slot(index, 0).map_or(0, |slot| store.get(slot));
+        if sub != 0 {
+            if count != 0 {
+                return Err(Abort::COUNT_NOT_ZERO);
+            }
+            return match self.assignment(index) {
+                Some(sm) => self.check_assigned(value, sm.direction),
+                None => self.check_entry(store, index, value),
+            };
+        }
+        if u8::try_from(value)
+            .ok()
+            .and_then(|n| store.slot(index, n))
+            .is_none()
+        {
+            return Err(Abort::VALUE_TOO_HIGH);
+        }
+        match self.assignment(index) {
+            Some(sm) => self.check_assignment(store, sm, index, value),
+            None => self.check_mapping(store, index, value),
+        }
+    }
+
+    /// A module list entry changes its slot's PDOs.
+    pub(crate) fn after_write(&self, store: &mut ObjectStore, index: u16, sub: u8, value: i64) {
+        if index == MODULE_LIST && sub > 0 {
+            let ident = u32::try_from(value).unwrap_or(0);
+            self.plug(store, usize::from(sub) - 1, ident);
+            if let Some(slot) = store.slot(DETECTED_MODULES, sub) {
+                store.set(slot, value);
+            }
+        }
+    }
+
+    fn check_module(&self, sub: u8, value: i64) -> Result<(), Abort> {
+        let Some(position) = usize::from(sub).checked_sub(1) else {
+            let most = i64::try_from(self.slots.len()).unwrap_or(i64::MAX);
+            return if value <= most {
+                Ok(())
+            } else {
+                Err(Abort::VALUE_TOO_HIGH)
+            };
+        };
+        let fits = self
+            .slots
+            .get(position)
+            .is_some_and(|idents| value == 0 || idents.iter().any(|i| i64::from(*i) == value));
+        if fits { Ok(()) } else { Err(Abort::VALUE) }
+    }
+
+    fn check_assigned(&self, value: i64, direction: Direction) -> Result<(), Abort> {
+        let pdo = u16::try_from(value).ok().and_then(|index| self.pdo(index));
+        let fits = value == 0 || pdo.is_some_and(|pdo| pdo.direction == direction);
+        if fits {
+            Ok(())
+        } else {
+            Err(Abort::NOT_MAPPABLE)
+        }
+    }
+
+    fn check_entry(&self, store: &ObjectStore, pdo: u16, value: i64) -> Result<(), Abort> {
+        let Some(direction) = self.pdo(pdo).map(|pdo| pdo.direction) else {
+            return Err(Abort::NOT_MAPPABLE);
+        };
+        let value = u32::try_from(value).map_err(|_| Abort::VALUE)?;
+        let [bits, sub, low, high] = value.to_le_bytes();
+        let index = u16::from_le_bytes([low, high]);
+        if index == 0 {
+            return Ok(());
+        }
+        let Some(item) = store.slot(index, sub).and_then(|slot| store.item(slot)) else {
+            return Err(Abort::NOT_MAPPABLE);
+        };
+        let flagged = match direction {
+            Direction::Rx => item.mapping.rx,
+            Direction::Tx => item.mapping.tx,
+        };
+        let mappable = flagged || self.known_entries.contains(&(direction, value >> 8));
+        if mappable && item.bit_len & 0xff == u32::from(bits) {
+            Ok(())
+        } else {
+            Err(Abort::NOT_MAPPABLE)
+        }
+    }
+
+    fn check_assignment(
+        &self,
+        store: &ObjectStore,
+        sm: &ProcessSm,
+        index: u16,
+        count: i64,
+    ) -> Result<(), Abort> {
+        let assigned: Vec<u16> = elements(store, index, count).map(|v| v as u16).collect();
+        for pdo in assigned.iter().filter_map(|index| self.pdo(*index)) {
+            if pdo.exclude.iter().any(|other| assigned.contains(other)) {
+                return Err(Abort::INCOMPATIBLE);
+            }
+        }
+        let bits: usize = assigned.iter().map(|pdo| mapped_bits(store, *pdo)).sum();
+        self.check_len(sm, bits)
+    }
+
+    fn check_mapping(&self, store: &ObjectStore, index: u16, count: i64) -> Result<(), Abort> {
+        for entry in elements(store, index, count) {
+            self.check_entry(store, index, i64::from(entry))?;
+        }
+        let bits: usize = elements(store, index, count)
+            .map(|entry| (entry & 0xff) as usize)
+            .sum();
+        let direction = self.pdo(index).map(|pdo| pdo.direction);
+        self.sms
+            .iter()
+            .filter(|sm| Some(sm.direction) == direction)
+            .try_for_each(|sm| self.check_len(sm, bits))
+    }
+
+    fn check_len(&self, sm: &ProcessSm, bits: usize) -> Result<(), Abort> {
+        let most = sm
+            .max_len
+            .filter(|len| *len > 0)
+            .map_or(usize::MAX, usize::from);
+        if bits.div_ceil(8) > most {
+            Err(Abort::MAPPING_TOO_LONG)
+        } else {
+            Ok(())
+        }
+    }
+
+    pub(crate) fn process_sms(&self) -> &[ProcessSm] {
+        &self.sms
+    }
+
+    /// The bit layout of a SyncManager as assignment and mapping now stand, and its bytes.
+    pub(crate) fn layout(&self, store: &ObjectStore, sm: u8, out: &mut Vec<Mapped>) -> usize {
+        out.clear();
+        let mut bit = 0;
+        let assignment = ASSIGNMENT + u16::from(sm);
+        for pdo in elements(store, assignment, count(store, assignment)) {
+            let pdo = (pdo & 0xffff) as u16;
+            for entry in elements(store, pdo, count(store, pdo)) {
+                let [_, sub, low, high] = entry.to_le_bytes();
+                let index = u16::from_le_bytes([low, high]);
+                let slot = store.slot(index, sub).filter(|_| index != 0);
+                // Items beyond 255 bits only keep the low byte of their length in the mapping.
+                let bits = match slot.and_then(|slot| store.item(slot)) {
+                    Some(item) => usize::try_from(item.bit_len).unwrap_or(0),
+                    None => (entry & 0xff) as usize,
+                };
+                if let Some(slot) = slot {
+                    out.push(Mapped { slot, bit, bits });
+                }
+                bit += bits;
+            }
+        }
+        bit.div_ceil(8)
+    }
+}
+
+/// The slots of a modular device one by one; a slot with several instances counts several times.
+fn expand(slots: &ecaxis_esi::model::Slots) -> impl Iterator<Item = &ecaxis_esi::model::Slot> + '_ {
+    slots.slots.iter().flat_map(|slot| {
+        let n = usize::try_from(slot.max_instances.clamp(1, 254)).unwrap_or(1);
+        std::iter::repeat_n(slot, n)
+    })
+}
+
+fn count(store: &ObjectStore, index: u16) -> i64 {
+    store.slot(index, 0).map_or(0, |slot| store.get(slot))
+}
+
+/// Elements 1 to `count` of a list object.
+fn elements(store: &ObjectStore, index: u16, count: i64) -> impl Iterator<Item = u32> + '_ {
+    let count = u8::try_from(count).unwrap_or(0);
+    (1..=count)
+        .filter_map(move |sub| store.slot(index, sub))
+        .map(|slot| store.get(slot) as u32)
+}
+
+fn mapped_bits(store: &ObjectStore, pdo: u16) -> usize {
+    elements(store, pdo, count(store, pdo))
+        .map(|entry| (entry & 0xff) as usize)
+        .sum()
+}

@@ -1,0 +1,276 @@
+//! Devices from ESI files.
+
+use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse};
+use ecaxis_esi::sii::{self, SiiOptions};
+
+use super::esm::Al;
+use super::mailbox::Mailbox;
+use super::process::ProcessData;
+use super::{
+    Application, CONTROL_PERIOD_NS, Fresh, IO_PERIOD_NS, MailboxLimits, SYNC_LOG, SimDevice,
+};
+use crate::coe::pdo::PdoRules;
+use crate::coe::store::ObjectStore;
+use crate::drive::{Drive, PlantParams};
+use crate::esc::{Esc, EscConfig};
+
+/// CiA 402.
+const DRIVE_PROFILE: u32 = 402;
+
+/// What the ESI does not say about one particular device.
+#[derive(Debug, Clone)]
+pub struct DeviceOptions {
+    pub serial: u32,
+    pub alias: u16,
+    pub clock_drift_ppm: f64,
+    /// Local time at power-on.
+    pub clock_offset_ns: u64,
+    pub plant: PlantParams,
+    /// From port 0 to port 1, and back.
+    pub delay_ns: u64,
+    /// EEPROM contents in place of those made from the ESI.
+    pub sii: Option<Vec<u8>>,
+}
+
+impl Default for DeviceOptions {
+    fn default() -> Self {
+        Self {
+            serial: 0,
+            alias: 0,
+            clock_drift_ppm: 0.0,
+            clock_offset_ns: 0,
+            plant: PlantParams::default(),
+            delay_ns: 500,
+            sii: None,
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SimError {
+    #[error(
+        "device `{device}`: SyncManager {sm} (0x{start:04x}, {len} bytes) does not lie in process RAM"
+    )]
+    SyncManagerOutside {
+        device: String,
+        sm: usize,
+        start: u16,
+        len: u16,
+    },
+}
+
+impl SimDevice {
+    /// A device as the ESI describes it, powered on and in Init. Modular devices start with the
+    /// default module of every slot.
+    pub fn from_esi(
+        device: &Device,
+        modules: &[Module],
+        options: DeviceOptions,
+    ) -> Result<Self, SimError> {
+        let memory = memory(device)?;
+        let image = match options.sii {
+            Some(image) => image,
+            None => {
+                let own = SiiOptions {
+                    alias: options.alias,
+                    serial: options.serial,
+                };
+                sii::emit(device, modules, &own)
+            }
+        };
+        let mut store = ObjectStore::from_dictionary(&dictionaries(device, modules));
+        identify(&mut store, device, options.serial);
+        let pdo = PdoRules::new(&mut store, device, modules);
+        let process = pdo
+            .process_sms()
+            .iter()
+            .map(|sm| ProcessData {
+                sm: usize::from(sm.sm),
+                direction: sm.direction,
+                map: Vec::new(),
+                len: 0,
+            })
+            .collect();
+        let is_drive = device.profile == Some(DRIVE_PROFILE) && device.mailbox.is_some();
+        let application = if is_drive {
+            Application::Drive(Box::new(Drive::new(&mut store, options.plant)))
+        } else {
+            Application::Io {
+                mirrors: Vec::new(),
+                held: Vec::new(),
+            }
+        };
+        let esc = Esc::new(
+            EscConfig {
+                ports: ports(&device.physics),
+                with_dc: is_drive || !device.dc_modes.is_empty(),
+                memory,
+                clock_offset_ns: options.clock_offset_ns,
+                clock_drift_ppm: options.clock_drift_ppm,
+            },
+            image,
+        );
+        let coe = device
+            .mailbox
+            .as_ref()
+            .and_then(|mailbox| mailbox.coe.as_ref());
+        let tick_ns = if is_drive {
+            CONTROL_PERIOD_NS
+        } else {
+            IO_PERIOD_NS
+        };
+        let mut sim = Self {
+            name: device.type_name.clone(),
+            delay_ns: options.delay_ns,
+            fresh: Box::new(Fresh {
+                store: store.clone(),
+                application: application.clone(),
+            }),
+            esc,
+            memory,
+            store,
+            pdo,
+            process,
+            application,
+            mailbox: mailbox(device),
+            mailbox_limits: mailbox_limits(device),
+            boot_mailbox: boot_mailbox(device),
+            has_coe: coe.is_some(),
+            has_boot: device.eeprom.bootstrap.iter().any(|b| *b != 0) && device.mailbox.is_some(),
+            complete_access: coe.is_some_and(|coe| coe.complete_access),
+            al: Al::default(),
+            tick: 0,
+            tick_ns,
+            sync_log: [0; SYNC_LOG],
+            sync_count: 0,
+            refusals: Vec::new(),
+            forced_aborts: Vec::new(),
+        };
+        sim.power_on(0);
+        Ok(sim)
+    }
+}
+
+/// Modules that may be plugged, the device, its default modules: the later wins.
+fn dictionaries<'a>(device: &'a Device, modules: &'a [Module]) -> Vec<&'a Dictionary> {
+    let Some(slots) = &device.slots else {
+        return vec![&device.dictionary];
+    };
+    let idents = || slots.slots.iter().flat_map(|slot| &slot.module_idents);
+    let is = |module: &Module, default: bool| {
+        idents().any(|(ident, is_default)| *ident == module.ident && *is_default == default)
+    };
+    let others = modules
+        .iter()
+        .filter(|module| is(module, false))
+        .map(|m| &m.dictionary);
+    let defaults = modules
+        .iter()
+        .filter(|module| is(module, true))
+        .map(|m| &m.dictionary);
+    others.chain([&device.dictionary]).chain(defaults).collect()
+}
+
+/// Object 0x1018 says what the EEPROM says.
+fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
+    if device
+        .mailbox
+        .as_ref()
+        .is_none_or(|mailbox| mailbox.coe.is_none())
+    {
+        return;
+    }
+    let ro = Access::default();
+    let identity = [
+        ("Vendor ID", device.identity.vendor),
+        ("Product code", device.identity.product),
+        ("Revision number", device.identity.revision),
+        ("Serial number", serial),
+    ];
+    store.ensure(
+        0x1000,
+        0,
+        "Device type",
+        32,
+        ro,
+        &device.profile.unwrap_or(0).to_le_bytes(),
+    );
+    store.ensure(0x1018, 0, "SubIndex 000", 8, ro, &[4]);
+    for (sub, (name, value)) in (1..).zip(identity) {
+        let slot = store.ensure(0x1018, sub, name, 32, ro, &[]);
+        store.set(slot, i64::from(value));
+    }
+}
+
+/// Two bits a port; a device without `Physics` has two MII ports.
+fn ports(physics: &str) -> u8 {
+    if physics.is_empty() {
+        return 0x0f;
+    }
+    physics
+        .bytes()
+        .take(4)
+        .enumerate()
+        .fold(0, |ports, (n, letter)| {
+            let kind = match letter {
+                b'K' | b'E' => 2,
+                b'Y' | b'H' => 3,
+                _ => 0,
+            };
+            ports | kind << (2 * n)
+        })
+}
+
+/// Process RAM ends where an ET1100's does, or where the ESI's SyncManagers need it.
+fn memory(device: &Device) -> Result<usize, SimError> {
+    let mut end = 0x3000;
+    for (n, sm) in device.sync_managers.iter().enumerate() {
+        let (start, len) = (sm.start_address, sm.max_size.unwrap_or(sm.default_size));
+        let mailbox = matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn);
+        let buffers = if mailbox { 1 } else { 3 };
+        let last = usize::from(start) + usize::from(len) * buffers;
+        if start != 0 && (start < 0x0f00 || last > 0x1_0000) {
+            return Err(SimError::SyncManagerOutside {
+                device: device.type_name.clone(),
+                sm: n,
+                start,
+                len,
+            });
+        }
+        end = end.max(last);
+    }
+    Ok(end)
+}
+
+fn mailbox(device: &Device) -> Option<Mailbox> {
+    let find = |usage| {
+        device
+            .sync_managers
+            .iter()
+            .take(8)
+            .position(|sm| sm.usage == usage)
+    };
+    device.mailbox.as_ref()?;
+    Some(Mailbox::new(find(SmUse::MBoxOut)?, find(SmUse::MBoxIn)?))
+}
+
+fn mailbox_limits(device: &Device) -> [MailboxLimits; 8] {
+    let mut limits = [MailboxLimits::default(); 8];
+    for (limit, sm) in limits.iter_mut().zip(&device.sync_managers) {
+        *limit = MailboxLimits {
+            start: sm.start_address,
+            min: sm.min_size.unwrap_or(sm.default_size),
+            max: sm.max_size.unwrap_or(sm.default_size).max(sm.default_size),
+        };
+    }
+    limits
+}
+
+/// (address, length) of the receive and send mailbox in Bootstrap.
+fn boot_mailbox(device: &Device) -> ((u16, u16), (u16, u16)) {
+    let word = |n: usize| match device.eeprom.bootstrap.get(n * 2..n * 2 + 2) {
+        Some([low, high]) => u16::from_le_bytes([*low, *high]),
+        _ => 0,
+    };
+    ((word(0), word(1)), (word(2), word(3)))
+}

@@ -1,0 +1,305 @@
+//! State changes: what each transition demands and does.
+
+use ecaxis_esi::model::Direction;
+
+use super::{Application, SimDevice};
+use crate::drive::DeviceError;
+use crate::esc::al::{self, AlState, Request, code, judge};
+use crate::esc::dc::Sync0;
+use crate::esc::registers as reg;
+use crate::esc::sm::{Filled, Mode, SyncManager};
+
+/// Between AL control and AL status.
+const TRANSITION_NS: u64 = 200_000;
+/// How long a device waits for the first SYNC0 on the way to Op.
+const FIRST_SYNC_NS: u64 = 5_000_000_000;
+
+#[derive(Debug, Clone)]
+pub(super) struct Al {
+    pub(super) state: AlState,
+    pub(super) code: u16,
+    control: u16,
+    pub(super) due: u64,
+    /// Op was requested; SYNC0 has been armed but not seen yet.
+    pub(super) waits_for_sync: bool,
+}
+
+impl Default for Al {
+    fn default() -> Self {
+        Self {
+            state: AlState::Init,
+            code: 0,
+            control: 1,
+            due: u64::MAX,
+            waits_for_sync: false,
+        }
+    }
+}
+
+impl SimDevice {
+    pub(super) fn al_requested(&mut self, control: u16, local: u64) {
+        self.al.control = control;
+        self.al.waits_for_sync = false;
+        self.al.due = local + TRANSITION_NS;
+    }
+
+    /// The request's time has come, or the wait for SYNC0 is over.
+    pub(super) fn al_step(&mut self, local: u64) {
+        self.al.due = u64::MAX;
+        if std::mem::take(&mut self.al.waits_for_sync) {
+            return self.finish_op();
+        }
+        match judge(self.al.state, self.al.code != 0, self.al.control) {
+            Request::Ignored => {}
+            Request::Stay => self.settle(self.al.state, 0),
+            Request::Refused(code) => self.settle(self.al.state, code),
+            Request::Change(to) => match self.demand(to) {
+                Err(code) => self.settle(self.al.state, code),
+                Ok(()) if to == AlState::Op && self.sync_is_on() => {
+                    self.al.waits_for_sync = true;
+                    self.al.code = 0;
+                    self.al.due = local + FIRST_SYNC_NS;
+                    self.first_sync_seen();
+                }
+                Ok(()) => self.enter(to),
+            },
+        }
+    }
+
+    /// On the way to Op with a SYNC0 that runs: the wait is over.
+    pub(super) fn first_sync_seen(&mut self) {
+        let pulses = self.esc.dc.as_ref().map_or(0, |dc| dc.pulses);
+        let never = self
+            .esc
+            .dc
+            .as_ref()
+            .is_some_and(|dc| dc.sync0 == Sync0::NeverStarts);
+        if self.al.waits_for_sync && (pulses > 0 || never) {
+            self.al.waits_for_sync = false;
+            self.al.due = u64::MAX;
+            self.finish_op();
+        }
+    }
+
+    fn finish_op(&mut self) {
+        if self.esc.dc.as_ref().is_some_and(|dc| dc.pulses > 0) {
+            self.enter(AlState::Op);
+        } else {
+            self.settle(self.al.state, code::NO_SYNC_ERROR);
+        }
+    }
+
+    fn settle(&mut self, state: AlState, code: u16) {
+        self.al.state = state;
+        self.al.code = code;
+        self.esc.set_al(state, code);
+        if code == 0 && self.al.control & al::DEVICE_ID != 0 {
+            let id = self.esc.u16_at(reg::STATION_ALIAS);
+            let status = u16::from(state.code()) | al::DEVICE_ID;
+            self.esc.put(reg::AL_STATUS, &status.to_le_bytes());
+            self.esc.put(reg::AL_STATUS_CODE, &id.to_le_bytes());
+        }
+    }
+
+    fn sync_is_on(&self) -> bool {
+        self.esc
+            .dc
+            .as_ref()
+            .is_some_and(|dc| dc.sync0 != Sync0::Off)
+    }
+
+    /// What must hold before `to` is entered.
+    fn demand(&self, to: AlState) -> Result<(), u16> {
+        if let Some((_, code)) = self.refusals.iter().find(|(state, _)| *state == to) {
+            return Err(*code);
+        }
+        let rising = to > self.al.state;
+        match to {
+            AlState::PreOp if rising => self.check_mailbox(code::INVALID_MAILBOX_PREOP),
+            AlState::Boot if !self.has_boot => Err(code::BOOT_NOT_SUPPORTED),
+            AlState::Boot => self.check_mailbox(code::INVALID_MAILBOX_BOOT),
+            AlState::SafeOp if rising => {
+                self.check_process_data()?;
+                self.check_sync()
+            }
+            AlState::Op => self.check_sync(),
+            _ => Ok(()),
+        }
+    }
+
+    fn check_mailbox(&self, code: u16) -> Result<(), u16> {
+        let Some(mailbox) = &self.mailbox else {
+            return Ok(());
+        };
+        let fits = |n: usize, filled: Filled, boot: &(u16, u16)| {
+            let (Some(sm), Some(limits)) = (self.esc.sms.get(n), self.mailbox_limits.get(n)) else {
+                return false;
+            };
+            let place = if code == code::INVALID_MAILBOX_BOOT {
+                (sm.start, sm.len) == *boot
+            } else {
+                sm.start == limits.start && (limits.min..=limits.max).contains(&sm.len)
+            };
+            sm.enabled && sm.mode == Mode::Mailbox && sm.filled == filled && place
+        };
+        let good = fits(mailbox.receive, Filled::ByMainDevice, &self.boot_mailbox.0)
+            && fits(mailbox.send, Filled::ByDevice, &self.boot_mailbox.1);
+        if good { Ok(()) } else { Err(code) }
+    }
+
+    /// SyncManagers against the device's own mapping. A buffered one takes three times its length.
+    fn check_process_data(&self) -> Result<(), u16> {
+        for data in &self.process {
+            let outputs = data.direction == Direction::Rx;
+            let code = if outputs {
+                code::INVALID_OUTPUTS
+            } else {
+                code::INVALID_INPUTS
+            };
+            let filled = if outputs {
+                Filled::ByMainDevice
+            } else {
+                Filled::ByDevice
+            };
+            let Some(sm) = self.esc.sms.get(data.sm) else {
+                return Err(code);
+            };
+            let len = self.pdo_len(data.sm);
+            if len == 0 {
+                if sm.enabled && sm.len > 0 {
+                    return Err(code);
+                }
+                continue;
+            }
+            let good = sm.enabled
+                && usize::from(sm.len) == len
+                && sm.mode == Mode::Buffered
+                && sm.filled == filled
+                && sm.start >= 0x1000
+                && self.is_free(data.sm, sm);
+            if !good {
+                return Err(code);
+            }
+        }
+        Ok(())
+    }
+
+    fn pdo_len(&self, sm: usize) -> usize {
+        let mut map = Vec::new();
+        self.pdo
+            .layout(&self.store, u8::try_from(sm).unwrap_or(0), &mut map)
+    }
+
+    fn is_free(&self, n: usize, sm: &SyncManager) -> bool {
+        let buffers =
+            |sm: &SyncManager| usize::from(sm.len) * if sm.mode == Mode::Buffered { 3 } else { 1 };
+        let (start, len) = (usize::from(sm.start), buffers(sm));
+        let others = self
+            .esc
+            .sms
+            .iter()
+            .enumerate()
+            .filter(|(other, sm)| *other != n && sm.enabled);
+        let clear = others
+            .map(|(_, sm)| (usize::from(sm.start), buffers(sm)))
+            .all(|(s, l)| l == 0 || s >= start + len || start >= s + l);
+        clear && start + len <= self.memory
+    }
+
+    fn check_sync(&self) -> Result<(), u16> {
+        let activation = self
+            .esc
+            .bytes(reg::DC_ACTIVATION, 1)
+            .first()
+            .copied()
+            .unwrap_or(0);
+        if self.esc.dc.is_none() || activation & 1 == 0 {
+            return Ok(());
+        }
+        if activation & 2 == 0 {
+            return Err(code::INVALID_DC_SYNC);
+        }
+        if self.esc.u32_at(reg::DC_SYNC0_CYCLE) == 0 {
+            return Err(code::INVALID_SYNC_CYCLE);
+        }
+        match self.esc.dc.as_ref().map(|dc| dc.sync0) {
+            Some(Sync0::NeverStarts) if self.al.state == AlState::SafeOp => {
+                Err(code::NO_SYNC_ERROR)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn enter(&mut self, to: AlState) {
+        let from = self.al.state;
+        match to {
+            AlState::SafeOp if from < to => {
+                self.lay_out();
+                self.close_process_data(false);
+            }
+            AlState::Init | AlState::PreOp | AlState::Boot => {
+                self.close_process_data(true);
+                self.esc.watchdog.stop();
+            }
+            _ => {}
+        }
+        if to == AlState::Init || from == AlState::Init {
+            if let Some(mailbox) = &mut self.mailbox {
+                mailbox.reset();
+            }
+        }
+        self.settle(to, 0);
+        self.latch_inputs();
+        self.pump_mailbox();
+    }
+
+    pub(super) fn close_process_data(&mut self, closed: bool) {
+        for data in &self.process {
+            if let Some(sm) = self.esc.sms.get_mut(data.sm) {
+                sm.closed_by_device = closed;
+                sm.full = false;
+            }
+            self.esc.refresh_sm(data.sm);
+        }
+    }
+
+    /// An error takes the device down by itself.
+    fn fall_to(&mut self, state: AlState, code: u16, error: DeviceError) {
+        if state < AlState::SafeOp {
+            self.close_process_data(true);
+        }
+        self.al.waits_for_sync = false;
+        self.al.due = u64::MAX;
+        self.settle(state, code);
+        if let Application::Drive(drive) = &mut self.application {
+            drive.error(error);
+        }
+    }
+
+    pub(super) fn watchdog_expired(&mut self) {
+        self.esc.expire_watchdog();
+        if self.al.state == AlState::Op {
+            self.fall_to(
+                AlState::SafeOp,
+                code::SM_WATCHDOG,
+                DeviceError::RxPdoTimeout,
+            );
+        }
+    }
+
+    /// The MainDevice changed SyncManagers or SYNC0 under a running application.
+    pub(super) fn configuration_changed(&mut self, sms: bool, sync: bool) {
+        if self.al.state < AlState::SafeOp || self.al.state == AlState::Boot {
+            return;
+        }
+        if sms && let Err(code) = self.check_process_data() {
+            self.fall_to(AlState::PreOp, code, DeviceError::BusDown);
+        } else if sync && self.al.state == AlState::Op && !self.sync_is_on() {
+            self.fall_to(
+                AlState::SafeOp,
+                code::FATAL_SYNC_ERROR,
+                DeviceError::SyncLost,
+            );
+        }
+    }
+}

@@ -1,0 +1,333 @@
+//! A SubDevice: an ESC, the application behind it and the device's own time.
+//!
+//! * `build`: from an ESI device
+//! * `esm`: state changes and what they demand
+//! * `mailbox`: requests and replies
+//! * `process`: process data and objects
+//!
+//! Everything a device does by itself happens in [`SimDevice::advance`], in the order of its clock.
+
+mod build;
+mod esm;
+mod mailbox;
+mod process;
+
+use crate::Nanos;
+use crate::coe::pdo::PdoRules;
+use crate::coe::store::{ObjectStore, Slot};
+use crate::drive::{CONTROL_PERIOD_NS, Drive, Emergency, State};
+use crate::esc::Esc;
+use crate::esc::al::AlState;
+use crate::frame;
+pub use build::{DeviceOptions, SimError};
+use esm::Al;
+use mailbox::Mailbox;
+use process::{Mirror, ProcessData};
+
+/// How often a device without a drive looks after its inputs.
+const IO_PERIOD_NS: u64 = 1_000_000;
+/// Pulses remembered by [`SimDevice::sync0_log`].
+const SYNC_LOG: usize = 64;
+
+/// What the device is for.
+#[derive(Debug, Clone)]
+enum Application {
+    Drive(Box<Drive>),
+    Io {
+        mirrors: Vec<Mirror>,
+        held: Vec<Slot>,
+    },
+}
+
+/// Where a mailbox SyncManager must lie.
+#[derive(Debug, Clone, Copy, Default)]
+struct MailboxLimits {
+    start: u16,
+    min: u16,
+    max: u16,
+}
+
+/// State at power-on, to return to after a power cycle.
+#[derive(Debug, Clone)]
+struct Fresh {
+    store: ObjectStore,
+    application: Application,
+}
+
+#[derive(Debug, Clone)]
+pub struct SimDevice {
+    name: String,
+    pub(crate) delay_ns: u64,
+    pub(crate) esc: Esc,
+    memory: usize,
+    store: ObjectStore,
+    pdo: PdoRules,
+    process: Vec<ProcessData>,
+    application: Application,
+    mailbox: Option<Mailbox>,
+    mailbox_limits: [MailboxLimits; 8],
+    boot_mailbox: ((u16, u16), (u16, u16)),
+    has_coe: bool,
+    has_boot: bool,
+    complete_access: bool,
+    al: Al,
+    tick: u64,
+    tick_ns: u64,
+    sync_log: [Nanos; SYNC_LOG],
+    sync_count: u64,
+    fresh: Box<Fresh>,
+    pub(crate) refusals: Vec<(AlState, u16)>,
+    pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
+}
+
+impl SimDevice {
+    /// The ESI's type name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    #[must_use]
+    pub fn al_state(&self) -> AlState {
+        self.al.state
+    }
+
+    /// 0 while there is no error.
+    #[must_use]
+    pub fn al_status_code(&self) -> u16 {
+        self.al.code
+    }
+
+    #[must_use]
+    pub fn station_address(&self) -> u16 {
+        self.esc.station_address()
+    }
+
+    #[must_use]
+    pub fn esc(&self) -> &Esc {
+        &self.esc
+    }
+
+    #[must_use]
+    pub fn drive(&self) -> Option<&Drive> {
+        match &self.application {
+            Application::Drive(drive) => Some(drive),
+            Application::Io { .. } => None,
+        }
+    }
+
+    pub fn drive_mut(&mut self) -> Option<&mut Drive> {
+        match &mut self.application {
+            Application::Drive(drive) => Some(drive),
+            Application::Io { .. } => None,
+        }
+    }
+
+    /// An object's value as an upload would carry it, access rights aside.
+    #[must_use]
+    pub fn object(&self, index: u16, sub: u8) -> Option<Vec<u8>> {
+        let slot = self.store.slot(index, sub)?;
+        Some(crate::coe::read_item(&self.store, slot))
+    }
+
+    #[must_use]
+    pub fn store(&self) -> &ObjectStore {
+        &self.store
+    }
+
+    pub fn store_mut(&mut self) -> &mut ObjectStore {
+        &mut self.store
+    }
+
+    /// The EEPROM's contents.
+    #[must_use]
+    pub fn sii(&self) -> &[u8] {
+        self.esc.eeprom.image()
+    }
+
+    /// System time (0x0910) at a true time; `None` without distributed clocks.
+    #[must_use]
+    pub fn system_time(&self, now: Nanos) -> Option<u64> {
+        self.esc
+            .dc
+            .as_ref()
+            .map(|dc| dc.system(self.esc.clock.local(now)))
+    }
+
+    /// SYNC0 pulses since power-on.
+    #[must_use]
+    pub fn sync0_count(&self) -> u64 {
+        self.sync_count
+    }
+
+    /// True times of the last SYNC0 pulses, oldest first.
+    pub fn sync0_log(&self) -> impl Iterator<Item = Nanos> + '_ {
+        let kept = self.sync_count.min(SYNC_LOG as u64);
+        (self.sync_count - kept..self.sync_count)
+            .filter_map(|n| self.sync_log.get((n % SYNC_LOG as u64) as usize))
+            .copied()
+    }
+
+    /// Everything volatile is lost; objects return to their defaults.
+    pub(crate) fn power_on(&mut self, now: Nanos) {
+        self.esc.power_on(now);
+        self.store = self.fresh.store.clone();
+        self.application = self.fresh.application.clone();
+        self.al = Al::default();
+        if let Some(mailbox) = &mut self.mailbox {
+            mailbox.reset();
+        }
+        self.close_process_data(true);
+        self.tick = self.esc.clock.local(now) + self.tick_ns;
+        (self.sync_count, self.sync_log) = (0, [0; SYNC_LOG]);
+    }
+
+    /// Lets the device live up to `now`. Allocates only for mailbox traffic and state changes.
+    pub(crate) fn advance(&mut self, now: Nanos) {
+        let local = self.esc.clock.local(now);
+        loop {
+            let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.next_pulse());
+            let mailbox = self
+                .mailbox
+                .as_ref()
+                .map_or(u64::MAX, |mailbox| mailbox.due);
+            let (al, eeprom) = (self.al.due, self.esc.eeprom.due());
+            let watchdog = self.esc.watchdog.due();
+            let due = sync
+                .min(self.tick)
+                .min(mailbox)
+                .min(al)
+                .min(eeprom)
+                .min(watchdog);
+            if due > local {
+                return;
+            }
+            if due == sync {
+                self.sync0(due);
+            } else if due == self.tick {
+                self.tick();
+            } else if due == watchdog {
+                self.watchdog_expired();
+            } else if due == eeprom {
+                self.esc.finish_eeprom();
+            } else if due == mailbox {
+                self.serve_mailbox();
+            } else {
+                self.al_step(due);
+            }
+        }
+    }
+
+    fn sync0(&mut self, local: u64) {
+        let at = (self.sync_count % SYNC_LOG as u64) as usize;
+        if let Some(entry) = self.sync_log.get_mut(at) {
+            *entry = self.esc.clock.true_time(local);
+        }
+        self.sync_count += 1;
+        self.esc.fire_sync0();
+        self.first_sync_seen();
+        self.exchange();
+    }
+
+    fn tick(&mut self) {
+        self.tick += self.tick_ns;
+        let in_op = self.al.state == AlState::Op;
+        if let Application::Drive(drive) = &mut self.application {
+            drive.control(&mut self.store, in_op);
+            while let Some(emergency) = drive.take_emergency() {
+                self.send_emergency(&emergency);
+                let Application::Drive(_) = &self.application else {
+                    return;
+                };
+                return self.drain_emergencies();
+            }
+        } else if self.outputs_are_none() {
+            self.latch_inputs();
+        }
+    }
+
+    fn drain_emergencies(&mut self) {
+        while let Some(emergency) = self.drive_mut().and_then(Drive::take_emergency) {
+            self.send_emergency(&emergency);
+        }
+    }
+
+    fn send_emergency(&mut self, emergency: &Emergency) {
+        if self.al.state == AlState::Init || !self.has_coe {
+            return;
+        }
+        if let Some(mailbox) = &mut self.mailbox {
+            mailbox.emergency(emergency);
+        }
+        self.pump_mailbox();
+    }
+
+    /// Nothing but the device's own time can make it latch inputs.
+    fn outputs_are_none(&self) -> bool {
+        !self
+            .process
+            .iter()
+            .any(|d| d.len > 0 && d.direction == ecaxis_esi::model::Direction::Rx)
+    }
+
+    /// Processes a frame whose first byte arrives at `now`; true if receive times were latched.
+    pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> bool {
+        let local = self.esc.clock.local(now);
+        let mut datagram = frame::next(bytes, None);
+        while let Some(d) = datagram {
+            self.esc.execute(bytes, &d, now, local);
+            datagram = frame::next(bytes, Some(&d));
+        }
+        let raised = self.esc.take_raised();
+        if let Some(control) = raised.al_control {
+            self.al_requested(control, local);
+        }
+        if raised.sm_written | raised.sm_read != 0 || raised.repeat_request.is_some() {
+            self.mailbox_events(
+                raised.sm_written,
+                raised.sm_read,
+                raised.repeat_request,
+                local,
+            );
+        }
+        if raised.sm_configured || raised.sync_changed {
+            self.configuration_changed(raised.sm_configured, raised.sync_changed);
+        }
+        if raised.sm_written != 0 && self.follows_sm(raised.sm_written) {
+            self.exchange();
+        }
+        self.esc.take_latch()
+    }
+
+    /// Outputs arrived and no SYNC0 decides when they count.
+    fn follows_sm(&self, written: u8) -> bool {
+        let dc = self.esc.dc.as_ref();
+        self.al.state >= AlState::SafeOp
+            && dc.is_none_or(|dc| dc.sync0 == crate::esc::dc::Sync0::Off)
+            && self.process.iter().any(|d| written >> d.sm & 1 != 0)
+    }
+
+    /// Fault injection: identity in EEPROM and object 0x1018.
+    pub(crate) fn patch_identity(&mut self, word: usize, sub: u8, value: u32) {
+        self.esc.eeprom.patch(word, value);
+        for store in [&mut self.store, &mut self.fresh.store] {
+            if let Some(slot) = store.slot(0x1018, sub) {
+                store.set(slot, i64::from(value));
+            }
+        }
+    }
+
+    pub(crate) fn inject_emergency(&mut self, code: u16) {
+        self.send_emergency(&Emergency {
+            code,
+            register: 1,
+            data: [0; 5],
+        });
+    }
+
+    pub(crate) fn hold_drive_in(&mut self, state: Option<State>) {
+        if let Some(drive) = self.drive_mut() {
+            drive.hold_in(state);
+        }
+    }
+}

@@ -1,0 +1,141 @@
+//! Process data: SyncManager buffers ↔ objects. Layouts are made when SafeOp is entered; afterwards
+//! nothing here allocates.
+
+use ecaxis_esi::model::Direction;
+
+use super::{Application, SimDevice};
+use crate::bits;
+use crate::coe::pdo::Mapped;
+use crate::coe::store::{ObjectStore, Slot};
+use crate::esc::al::AlState;
+
+/// The process data of one SyncManager.
+#[derive(Debug, Clone)]
+pub(super) struct ProcessData {
+    pub(super) sm: usize,
+    pub(super) direction: Direction,
+    pub(super) map: Vec<Mapped>,
+    /// Bytes.
+    pub(super) len: usize,
+}
+
+/// An input that copies an output, as I/O devices without a process behind them do here.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Mirror {
+    from: Slot,
+    pub(super) to: Slot,
+}
+
+impl SimDevice {
+    /// Makes the layouts anew from assignment and mapping.
+    pub(super) fn lay_out(&mut self) {
+        for data in &mut self.process {
+            let sm = u8::try_from(data.sm).unwrap_or(0);
+            data.len = self.pdo.layout(&self.store, sm, &mut data.map);
+        }
+        if let Application::Io { mirrors, held } = &mut self.application {
+            let of = |direction| {
+                self.process
+                    .iter()
+                    .filter(move |d| d.direction == direction)
+                    .flat_map(|d| &d.map)
+            };
+            *mirrors = of(Direction::Rx)
+                .zip(of(Direction::Tx))
+                .filter(|(_, to)| !held.contains(&to.slot))
+                .map(|(from, to)| Mirror {
+                    from: from.slot,
+                    to: to.slot,
+                })
+                .collect();
+        }
+    }
+
+    /// Takes outputs, if they count in this state, and latches inputs.
+    pub(super) fn exchange(&mut self) {
+        if self.al.state == AlState::Op {
+            self.take_outputs();
+        }
+        self.latch_inputs();
+    }
+
+    fn take_outputs(&mut self) {
+        for data in self.process.iter().filter(|d| d.direction == Direction::Rx) {
+            let Some(sm) = self.esc.sms.get(data.sm).filter(|sm| sm.full) else {
+                continue;
+            };
+            let buffer = self.esc.bytes(sm.start, sm.len);
+            for m in &data.map {
+                bits::copy(self.store.bytes_mut(m.slot), 0, buffer, m.bit, m.bits);
+            }
+        }
+        match &mut self.application {
+            Application::Drive(drive) => drive.sync(&self.store),
+            Application::Io { mirrors, .. } => copy_mirrors(&mut self.store, mirrors),
+        }
+    }
+
+    pub(super) fn latch_inputs(&mut self) {
+        if self.al.state < AlState::SafeOp {
+            return;
+        }
+        for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {
+            let Some(sm) = self.esc.sms.get_mut(data.sm).filter(|sm| sm.is_open()) else {
+                continue;
+            };
+            let first = !sm.full;
+            sm.full = true;
+            let (start, len) = (sm.start, sm.len);
+            let buffer = self.esc.bytes_mut(start, len);
+            for m in &data.map {
+                bits::copy(buffer, m.bit, self.store.bytes(m.slot), 0, m.bits);
+            }
+            if first {
+                self.esc.refresh_sm(data.sm);
+            }
+        }
+    }
+
+    /// What is in the buffers of a direction, SyncManager after SyncManager.
+    fn buffers(&self, direction: Direction) -> Vec<u8> {
+        let of_direction = self.process.iter().filter(|d| d.direction == direction);
+        of_direction
+            .filter_map(|d| self.esc.sms.get(d.sm))
+            .flat_map(|sm| self.esc.bytes(sm.start, sm.len))
+            .copied()
+            .collect()
+    }
+
+    /// Output process data as last received.
+    #[must_use]
+    pub fn outputs(&self) -> Vec<u8> {
+        self.buffers(Direction::Rx)
+    }
+
+    /// Input process data as last latched.
+    #[must_use]
+    pub fn inputs(&self) -> Vec<u8> {
+        self.buffers(Direction::Tx)
+    }
+
+    /// Sets an input object of an I/O device; it no longer mirrors an output. False if there is no
+    /// such object.
+    pub fn set_input(&mut self, index: u16, sub: u8, value: i64) -> bool {
+        let Some(slot) = self.store.slot(index, sub) else {
+            return false;
+        };
+        self.store.set(slot, value);
+        if let Application::Io { mirrors, held } = &mut self.application {
+            mirrors.retain(|mirror| mirror.to != slot);
+            held.push(slot);
+        }
+        true
+    }
+}
+
+fn copy_mirrors(store: &mut ObjectStore, mirrors: &[Mirror]) {
+    for mirror in mirrors {
+        let value = store.get(mirror.from);
+        store.set(mirror.to, value);
+    }
+}

@@ -1,0 +1,577 @@
+//! Faults on demand: a TOML script says what goes wrong, when, where and for how long. The same
+//! seed gives the same run.
+//!
+//! ```toml
+//! seed = 7
+//!
+//! [[fault]]
+//! at = "1.5s"           # omitted: from the start
+//! for = "200ms"         # omitted: for good
+//! device = 0
+//! kind = "refuse-state"
+//! state = "safeop"
+//! code = 0x001e
+//! ```
+
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::Nanos;
+use crate::device::SimDevice;
+use crate::drive::State;
+use crate::esc::al::AlState;
+
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FaultScript {
+    pub seed: Option<u64>,
+    pub faults: Vec<Fault>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fault {
+    pub at: Nanos,
+    /// `None`: for good.
+    pub duration: Option<Nanos>,
+    pub device: usize,
+    pub kind: FaultKind,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub enum FaultKind {
+    /// Frames vanish, on the way out or on the way back.
+    FrameLoss {
+        count: Option<u32>,
+        probability: Option<f64>,
+    },
+    /// The drive detects this error itself.
+    DriveFault {
+        code: u16,
+    },
+    /// The SDO server answers one subindex with an abort.
+    SdoAbort {
+        index: u16,
+        sub: u8,
+        code: u32,
+    },
+    /// The device refuses to enter a state.
+    RefuseState {
+        state: AlState,
+        code: u16,
+    },
+    /// The drive's power state machine does not leave a state.
+    Stuck {
+        state: State,
+    },
+    /// EEPROM and 0x1018 name another device.
+    Identity {
+        vendor: Option<u32>,
+        product: Option<u32>,
+        revision: Option<u32>,
+    },
+    /// Unplugged and without power: the line ends in front of it; it comes back in Init.
+    Absent,
+    /// The cable at the MainDevice is unplugged.
+    Silent,
+    Emergency {
+        code: u16,
+    },
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ScriptError {
+    #[error("{0}")]
+    Toml(String),
+    #[error("line {line}: fault of kind `{kind}`: {problem}")]
+    Fault {
+        line: usize,
+        kind: String,
+        problem: String,
+    },
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawScript {
+    seed: Option<u64>,
+    #[serde(default)]
+    fault: Vec<RawFault>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawFault {
+    at: Option<String>,
+    #[serde(rename = "for")]
+    duration: Option<String>,
+    device: Option<usize>,
+    kind: Spanned<String>,
+    count: Option<u32>,
+    probability: Option<f64>,
+    code: Option<u32>,
+    index: Option<u16>,
+    sub: Option<u8>,
+    state: Option<String>,
+    vendor: Option<u32>,
+    product: Option<u32>,
+    revision: Option<u32>,
+}
+
+impl FaultScript {
+    pub fn parse(text: &str) -> Result<Self, ScriptError> {
+        let raw: RawScript =
+            toml::from_str(text).map_err(|error| ScriptError::Toml(error.to_string()))?;
+        let faults = raw.fault.into_iter().map(|fault| {
+            let at = fault.kind.span().start;
+            let line = text.bytes().take(at).filter(|b| *b == b'\n').count() + 1;
+            let kind = fault.kind.get_ref().clone();
+            check(fault).map_err(|problem| ScriptError::Fault {
+                line,
+                kind,
+                problem,
+            })
+        });
+        Ok(Self {
+            seed: raw.seed,
+            faults: faults.collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+fn check(raw: RawFault) -> Result<Fault, String> {
+    let name = raw.kind.get_ref().as_str();
+    let code16 = || {
+        let code = raw.code.ok_or("`code` is missing")?;
+        u16::try_from(code).map_err(|_| format!("`code` 0x{code:x} does not fit 16 bits"))
+    };
+    let state = || raw.state.as_deref().ok_or("`state` is missing");
+    let mut allowed: Vec<&str> = Vec::new();
+    let kind = match name {
+        "frame-loss" => {
+            allowed.extend(["count", "probability"]);
+            if raw.count.is_some() == raw.probability.is_some() {
+                return Err("needs either `count` or `probability`".into());
+            }
+            if raw.probability.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
+                return Err("`probability` must lie between 0 and 1".into());
+            }
+            FaultKind::FrameLoss {
+                count: raw.count,
+                probability: raw.probability,
+            }
+        }
+        "drive-fault" => {
+            allowed.push("code");
+            FaultKind::DriveFault { code: code16()? }
+        }
+        "emergency" => {
+            allowed.push("code");
+            FaultKind::Emergency { code: code16()? }
+        }
+        "sdo-abort" => {
+            allowed.extend(["index", "sub", "code"]);
+            FaultKind::SdoAbort {
+                index: raw.index.ok_or("`index` is missing")?,
+                sub: raw.sub.unwrap_or(0),
+                code: raw.code.ok_or("`code` is missing")?,
+            }
+        }
+        "refuse-state" => {
+            allowed.extend(["state", "code"]);
+            FaultKind::RefuseState {
+                state: al_state(state()?)?,
+                code: code16()?,
+            }
+        }
+        "stuck" => {
+            allowed.push("state");
+            FaultKind::Stuck {
+                state: drive_state(state()?)?,
+            }
+        }
+        "identity" => {
+            allowed.extend(["vendor", "product", "revision"]);
+            if raw.vendor.or(raw.product).or(raw.revision).is_none() {
+                return Err("needs `vendor`, `product` or `revision`".into());
+            }
+            FaultKind::Identity {
+                vendor: raw.vendor,
+                product: raw.product,
+                revision: raw.revision,
+            }
+        }
+        "absent" => FaultKind::Absent,
+        "silent" => FaultKind::Silent,
+        _ => {
+            return Err(
+                "unknown; known are frame-loss, drive-fault, sdo-abort, refuse-state, stuck, \
+                        identity, absent, silent, emergency"
+                    .into(),
+            );
+        }
+    };
+    let given = [
+        ("count", raw.count.is_some()),
+        ("probability", raw.probability.is_some()),
+        ("code", raw.code.is_some()),
+        ("index", raw.index.is_some()),
+        ("sub", raw.sub.is_some()),
+        ("state", raw.state.is_some()),
+        ("vendor", raw.vendor.is_some()),
+        ("product", raw.product.is_some()),
+        ("revision", raw.revision.is_some()),
+    ];
+    if let Some((key, _)) = given
+        .iter()
+        .find(|(key, given)| *given && !allowed.contains(key))
+    {
+        return Err(format!("`{key}` means nothing here"));
+    }
+    Ok(Fault {
+        at: raw.at.as_deref().map_or(Ok(0), duration)?,
+        duration: raw.duration.as_deref().map(duration).transpose()?,
+        device: raw.device.unwrap_or(0),
+        kind,
+    })
+}
+
+fn duration(text: &str) -> Result<Nanos, String> {
+    let bad = || format!("`{text}` is not a duration such as \"1.5s\", \"250ms\" or \"10us\"");
+    let split = text
+        .find(|c: char| c.is_ascii_alphabetic())
+        .ok_or_else(bad)?;
+    let (number, unit) = text.split_at(split);
+    let factor = match unit {
+        "ns" => 1.0,
+        "us" => 1e3,
+        "ms" => 1e6,
+        "s" => 1e9,
+        "min" => 60e9,
+        _ => return Err(bad()),
+    };
+    let value: f64 = number.trim().parse().map_err(|_| bad())?;
+    let ns = value * factor;
+    if (0.0..1e18).contains(&ns) {
+        Ok(ns.round() as Nanos)
+    } else {
+        Err(bad())
+    }
+}
+
+fn al_state(name: &str) -> Result<AlState, String> {
+    Ok(match name {
+        "init" => AlState::Init,
+        "preop" => AlState::PreOp,
+        "boot" => AlState::Boot,
+        "safeop" => AlState::SafeOp,
+        "op" => AlState::Op,
+        _ => return Err(format!("`{name}` is not init, preop, boot, safeop or op")),
+    })
+}
+
+fn drive_state(name: &str) -> Result<State, String> {
+    Ok(match name {
+        "not-ready-to-switch-on" => State::NotReadyToSwitchOn,
+        "switch-on-disabled" => State::SwitchOnDisabled,
+        "ready-to-switch-on" => State::ReadyToSwitchOn,
+        "switched-on" => State::SwitchedOn,
+        "operation-enabled" => State::OperationEnabled,
+        "quick-stop-active" => State::QuickStopActive,
+        "fault-reaction-active" => State::FaultReactionActive,
+        "fault" => State::Fault,
+        _ => {
+            return Err(format!(
+                "`{name}` is not a CiA 402 state such as switch-on-disabled"
+            ));
+        }
+    })
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Pending,
+    Active,
+    Over,
+}
+
+#[derive(Debug)]
+struct Running {
+    fault: Fault,
+    phase: Phase,
+    /// Frames still to lose.
+    left: u32,
+    /// EEPROM words 8–13 before an identity fault.
+    saved: [u32; 3],
+}
+
+/// What happens to one frame.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Loss {
+    pub(crate) on_the_way_out: bool,
+    pub(crate) on_the_way_back: bool,
+}
+
+/// The script while it runs.
+#[derive(Debug)]
+pub(crate) struct Faults {
+    running: Vec<Running>,
+    random: u64,
+}
+
+impl Faults {
+    pub(crate) fn new(seed: u64) -> Self {
+        Self {
+            running: Vec::new(),
+            random: seed,
+        }
+    }
+
+    pub(crate) fn set(&mut self, script: FaultScript) {
+        if let Some(seed) = script.seed {
+            self.random = seed;
+        }
+        let running = script.faults.into_iter().map(|fault| Running {
+            left: match fault.kind {
+                FaultKind::FrameLoss {
+                    count: Some(count), ..
+                } => count,
+                _ => 0,
+            },
+            fault,
+            phase: Phase::Pending,
+            saved: [0; 3],
+        });
+        // Those that still act must be ended first; they end now.
+        for old in &mut self.running {
+            if old.phase == Phase::Active {
+                old.fault.duration = Some(0);
+            }
+        }
+        self.running.retain(|old| old.phase == Phase::Active);
+        self.running.extend(running);
+    }
+
+    /// splitmix64.
+    fn random(&mut self) -> u64 {
+        self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.random ^ self.random >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ z >> 31
+    }
+
+    /// Time of the first start or end up to `to` that is still to be applied, not before `from`.
+    pub(crate) fn next_change(&self, from: Nanos, to: Nanos) -> Option<Nanos> {
+        let due = self.running.iter().filter_map(|r| match r.phase {
+            Phase::Pending => Some(r.fault.at),
+            Phase::Active => Some(r.fault.at.saturating_add(r.fault.duration?)),
+            Phase::Over => None,
+        });
+        due.min().filter(|at| *at <= to).map(|at| at.max(from))
+    }
+
+    pub(crate) fn apply(&mut self, now: Nanos, devices: &mut [SimDevice]) {
+        for running in &mut self.running {
+            let device = devices.get_mut(running.fault.device);
+            let end = running
+                .fault
+                .duration
+                .map(|d| running.fault.at.saturating_add(d));
+            match (running.phase, device) {
+                (Phase::Pending, device) if running.fault.at <= now => {
+                    running.phase = Phase::Active;
+                    if let Some(device) = device {
+                        running.start(device);
+                    }
+                }
+                (Phase::Active, device) if end.is_some_and(|end| end <= now) => {
+                    running.phase = Phase::Over;
+                    if let Some(device) = device {
+                        running.end(device, now);
+                    }
+                }
+                _ => {}
+            }
+        }
+        for (n, device) in devices.iter_mut().enumerate() {
+            device.refusals.clear();
+            device.forced_aborts.clear();
+            let mut held = None;
+            for fault in self.active().filter(|fault| fault.device == n) {
+                match fault.kind {
+                    FaultKind::RefuseState { state, code } => device.refusals.push((state, code)),
+                    FaultKind::SdoAbort { index, sub, code } => {
+                        device.forced_aborts.push((index, sub, code));
+                    }
+                    FaultKind::Stuck { state } => held = Some(state),
+                    _ => {}
+                }
+            }
+            device.hold_drive_in(held);
+        }
+    }
+
+    fn active(&self) -> impl Iterator<Item = &Fault> {
+        self.running
+            .iter()
+            .filter(|r| r.phase == Phase::Active)
+            .map(|r| &r.fault)
+    }
+
+    /// Devices in front of the first absent one.
+    pub(crate) fn present(&self, devices: usize) -> usize {
+        let absent = self
+            .active()
+            .filter(|fault| fault.kind == FaultKind::Absent);
+        absent
+            .map(|fault| fault.device)
+            .min()
+            .unwrap_or(devices)
+            .min(devices)
+    }
+
+    /// Decides about the frame that is sent now.
+    pub(crate) fn lose(&mut self, _now: Nanos) -> Loss {
+        let mut loss = Loss::default();
+        for n in 0..self.running.len() {
+            let Some(running) = self.running.get_mut(n).filter(|r| r.phase == Phase::Active) else {
+                continue;
+            };
+            let lost = match running.fault.kind {
+                FaultKind::Silent => {
+                    loss.on_the_way_out = true;
+                    continue;
+                }
+                FaultKind::FrameLoss { count: Some(_), .. } => {
+                    let lost = running.left > 0;
+                    running.left = running.left.saturating_sub(1);
+                    lost
+                }
+                FaultKind::FrameLoss {
+                    probability: Some(p),
+                    ..
+                } => {
+                    // 53 bits: exactly representable.
+                    ((self.random() >> 11) as f64) < p * (1_u64 << 53) as f64
+                }
+                _ => false,
+            };
+            if lost {
+                let out = self.random() & 1 == 0;
+                loss.on_the_way_out |= out;
+                loss.on_the_way_back |= !out;
+            }
+        }
+        loss
+    }
+}
+
+impl Running {
+    fn start(&mut self, device: &mut SimDevice) {
+        match self.fault.kind {
+            FaultKind::DriveFault { code } => {
+                if let Some(drive) = device.drive_mut() {
+                    drive.inject_fault(code);
+                }
+            }
+            FaultKind::Emergency { code } => device.inject_emergency(code),
+            FaultKind::Identity {
+                vendor,
+                product,
+                revision,
+            } => {
+                for (n, value) in [vendor, product, revision].into_iter().enumerate() {
+                    let word = 8 + n as u32 * 2;
+                    let rom = &device.esc.eeprom;
+                    let old = u32::from(rom.word(word)) | u32::from(rom.word(word + 1)) << 16;
+                    if let Some(saved) = self.saved.get_mut(n) {
+                        *saved = old;
+                    }
+                    patch(device, n, value.unwrap_or(old));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn end(&self, device: &mut SimDevice, now: Nanos) {
+        match self.fault.kind {
+            FaultKind::Absent => device.power_on(now),
+            FaultKind::Identity { .. } => {
+                for (n, value) in self.saved.into_iter().enumerate() {
+                    patch(device, n, value);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Vendor, product and revision are SII words 8, 10 and 12 and 0x1018:01 to 03.
+fn patch(device: &mut SimDevice, n: usize, value: u32) {
+    device.patch_identity(8 + n * 2, n as u8 + 1, value);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_kind_parses() {
+        let script = FaultScript::parse(
+            r#"
+            seed = 9
+            [[fault]]
+            at = "1.5s"
+            for = "20ms"
+            kind = "frame-loss"
+            count = 3
+            [[fault]]
+            device = 1
+            kind = "drive-fault"
+            code = 0x8611
+            [[fault]]
+            kind = "sdo-abort"
+            index = 0x6065
+            code = 0x06010002
+            [[fault]]
+            kind = "refuse-state"
+            state = "safeop"
+            code = 0x001e
+            [[fault]]
+            kind = "stuck"
+            state = "switch-on-disabled"
+            [[fault]]
+            kind = "identity"
+            product = 5
+            [[fault]]
+            kind = "absent"
+            [[fault]]
+            kind = "silent"
+            [[fault]]
+            kind = "emergency"
+            code = 0x2310
+            "#,
+        )
+        .unwrap();
+        assert_eq!(script.seed, Some(9));
+        assert_eq!(script.faults.len(), 9);
+        assert_eq!(script.faults[0].at, 1_500_000_000);
+        assert_eq!(script.faults[0].duration, Some(20_000_000));
+        assert_eq!(
+            script.faults[1].kind,
+            FaultKind::DriveFault { code: 0x8611 }
+        );
+    }
+
+    #[test]
+    fn errors_name_line_and_field() {
+        let error = |text: &str| FaultScript::parse(text).unwrap_err().to_string();
+        assert_eq!(
+            error("[[fault]]\nkind = \"sdo-abort\"\ncode = 1\n"),
+            "line 2: fault of kind `sdo-abort`: `index` is missing"
+        );
+        assert!(error("[[fault]]\nkind = \"absent\"\ncode = 1\n").contains("`code` means nothing"));
+        assert!(error("[[fault]]\nkind = \"melt\"\n").contains("known are frame-loss"));
+        assert!(error("[[fault]]\nat = \"soon\"\nkind = \"absent\"\n").contains("not a duration"));
+        assert!(error("[[fault]]\nkind = \"silent\"\nwhen = 1\n").contains("when"));
+    }
+}

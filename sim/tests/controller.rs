@@ -1,0 +1,377 @@
+//! Registers, working counters, FMMUs, EEPROM and states, as seen over the wire.
+
+mod common;
+
+use common::*;
+use ecaxis_sim::frame::FrameBuilder;
+use ecaxis_sim::{AlState, DeviceOptions, FaultScript};
+use proptest::prelude::*;
+
+fn three_io() -> Bus {
+    let mut bus = Bus::new((0..3).map(|_| sim(&io_device())).collect());
+    assert_eq!(bus.address_all(), 3);
+    bus
+}
+
+#[test]
+fn every_command_counts_as_the_standard_says() {
+    let mut bus = three_io();
+    let position = 0u16.wrapping_sub(1);
+    // (command, address, expected working counter); 0x0f80 is no register, 0x1e00 is free RAM.
+    let ram = [
+        (0, 0, 0),
+        (1, position, 1),
+        (2, position, 1),
+        (3, position, 3),
+        (4, 0x1002, 1),
+        (5, 0x1002, 1),
+        (6, 0x1002, 3),
+        (7, 0, 3),
+        (8, 0, 3),
+        (9, 0, 9),
+        (13, position, 3),
+        (14, 0x1002, 3),
+        (14, 0x7777, 3),
+        (4, 0x7777, 0),
+        (15, 0, 0),
+    ];
+    for (command, adp, expected) in ram {
+        assert_eq!(
+            bus.datagram(command, adp, 0x1e00, &[1, 2]).1,
+            expected,
+            "command {command}"
+        );
+        assert_eq!(
+            bus.datagram(command, adp, 0x0f80, &[1, 2]).1,
+            0,
+            "command {command}"
+        );
+    }
+}
+
+#[test]
+fn read_only_registers_do_not_count_writes() {
+    let mut bus = three_io();
+    assert_eq!(bus.datagram(8, 0, 0x130, &[0, 0]).1, 0);
+    assert_eq!(bus.datagram(9, 0, 0x130, &[0, 0]).1, 3);
+    // No distributed clocks: nothing at 0x0900.
+    assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 0);
+    assert_eq!(bus.datagram(7, 0, 0x910, &[0; 8]).1, 0);
+}
+
+#[test]
+fn a_broadcast_read_ors_and_positions_count_up() {
+    let mut bus = three_io();
+    bus.write(0x1001, 0x1e00, &[0x01]);
+    bus.write(0x1003, 0x1e00, &[0x80]);
+    assert_eq!(bus.datagram(7, 0, 0x1e00, &[0]), (vec![0x81], 3));
+    let bytes = bus
+        .frame(FrameBuilder::default().datagram(1, 5, 0, &[0]).build())
+        .unwrap();
+    assert_eq!(bytes[18..20], 8u16.to_le_bytes());
+    // The reply is told from the request by its source address.
+    assert_eq!(bytes[6], 0x12);
+}
+
+#[test]
+fn information_registers_describe_the_controller() {
+    let mut bus = Bus::new(vec![
+        sim(&coe_device()),
+        sim_with(
+            &io_device(),
+            DeviceOptions {
+                alias: 0x55,
+                ..DeviceOptions::default()
+            },
+        ),
+    ]);
+    bus.address_all();
+    assert_eq!(
+        bus.read(0x1001, 0, 10),
+        [0x11, 0, 2, 0, 8, 8, 8, 0x0f, 0xcc, 0]
+    );
+    assert_eq!(bus.read(0x1002, 7, 3), [0x0a, 0xc0, 0]);
+    assert_eq!(bus.read_u16(0x1002, 0x12), 0x55);
+    assert_eq!(
+        bus.datagram(4, 0x55, 0, &[0]).1,
+        0,
+        "the alias is not enabled"
+    );
+    bus.write(0x1002, 0x103, &[1]);
+    assert_eq!(bus.datagram(4, 0x55, 0, &[0]).1, 1);
+    assert_eq!(bus.read_u16(0x1001, 0x110), 0x5a33, "linked on both ports");
+    assert_eq!(bus.read_u16(0x1002, 0x110), 0x5613, "the line's end");
+}
+
+#[test]
+fn a_closed_port_cuts_the_line() {
+    let mut bus = three_io();
+    bus.write(0x1001, 0x101, &[0x0c]);
+    assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 1);
+    assert_eq!(bus.read_u16(0x1001, 0x110), 0x5633);
+    bus.write(0x1001, 0x101, &[0]);
+    bus.datagram(7, 0, 0, &[0]);
+    assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 3);
+}
+
+#[test]
+fn bits_of_several_devices_share_a_logical_byte() {
+    let mut bus = three_io();
+    for (n, station) in (0..3u8).zip(0x1001..) {
+        // Two bits each into RAM at bit 4; read back from the same place.
+        let at = n * 2;
+        let fmmu = |kind| [0, 0, 1, 0, 1, 0, at, at + 1, 0, 0x1e, 4, kind, 1, 0, 0, 0];
+        bus.write(station, 0x600, &fmmu(2));
+        bus.write(station, 0x610, &fmmu(1));
+        bus.write(station, 0x1e00, &[0xc3]);
+    }
+    assert_eq!(bus.logical(11, 0x1_0000, &[0b10_01_11]).1, 3);
+    let values = [0x1001, 0x1002, 0x1003].map(|s| bus.read(s, 0x1e00, 1)[0]);
+    assert_eq!(values, [0xf3, 0xd3, 0xe3]);
+    assert_eq!(bus.logical(10, 0x1_0000, &[0]), (vec![0b10_01_11], 3));
+    // LRW: written first, then read: what was written comes back; 3 for each device.
+    assert_eq!(
+        bus.logical(12, 0x1_0000, &[0b01_10_00]),
+        (vec![0b01_10_00], 9)
+    );
+    assert_eq!(bus.logical(12, 0x2_0000, &[0]).1, 0);
+}
+
+#[test]
+fn the_eeprom_is_read_and_written_through_registers() {
+    let options = DeviceOptions {
+        alias: 0x1234,
+        serial: 99,
+        ..DeviceOptions::default()
+    };
+    let mut bus = Bus::new(vec![sim_with(&coe_device(), options)]);
+    bus.address_all();
+    let mut image = Vec::new();
+    for word in (0..0x40u32).step_by(4) {
+        let mut request = vec![0, 1];
+        request.extend_from_slice(&word.to_le_bytes());
+        bus.write(0x1001, 0x502, &request);
+        assert_ne!(bus.read_u16(0x1001, 0x502) & 0x8000, 0, "busy");
+        bus.wait(100_000);
+        let status = bus.read_u16(0x1001, 0x502);
+        assert_eq!(status & 0xff40, 0x0040, "ready, 8 bytes, no checksum error");
+        image.extend(bus.read(0x1001, 0x508, 8));
+    }
+    assert_eq!(image, bus.segment.device(0).unwrap().sii()[..0x80]);
+    assert_eq!(image[8..10], [0x34, 0x12]);
+    assert_eq!(image[16..20], 0x333u32.to_le_bytes());
+    assert_eq!(image[28..32], 99u32.to_le_bytes());
+
+    let write = |bus: &mut Bus, control: u8| {
+        bus.write(0x1001, 0x508, &[0x78, 0x56]);
+        bus.write(0x1001, 0x502, &[control, 2, 4, 0, 0, 0]);
+        bus.wait(1_000_000);
+        bus.read_u16(0x1001, 0x502)
+    };
+    assert_ne!(write(&mut bus, 0) & 0x4000, 0, "no write enable");
+    assert_eq!(write(&mut bus, 1) & 0xe000, 0);
+    assert_eq!(bus.segment.device(0).unwrap().sii()[8..10], [0x78, 0x56]);
+
+    // The device's side owns it: the interface does not answer writes.
+    bus.write(0x1001, 0x500, &[1]);
+    assert_eq!(bus.datagram(5, 0x1001, 0x502, &[0, 1, 0, 0, 0, 0]).1, 0);
+    bus.write(0x1001, 0x500, &[0]);
+    bus.write(0x1001, 0x502, &[0, 1, 0, 0, 0, 0]);
+}
+
+#[test]
+fn states_change_only_as_the_table_allows() {
+    let mut bus = Bus::new(vec![sim(&coe_device())]);
+    bus.address_all();
+    let s = 0x1001;
+    assert_eq!(bus.request(s, 4), (0x11, 0x11));
+    assert_eq!(bus.request(s, 2), (0x11, 0x11), "unacknowledged");
+    assert_eq!(bus.request(s, 0x11), (1, 0));
+    assert_eq!(bus.request(s, 7), (0x11, 0x12));
+    assert_eq!(bus.request(s, 0x12), (0x11, 0x16), "mailbox not configured");
+    bus.sm(s, 0, 0x1000, 48, 0x26);
+    bus.sm(s, 1, 0x1030, 40, 0x22);
+    assert_eq!(bus.request(s, 0x12), (0x11, 0x16), "mailbox too short");
+    bus.write(s, 0x80e, &[0]);
+    bus.sm(s, 1, 0x1030, 48, 0x22);
+    assert_eq!(bus.request(s, 0x12), (2, 0));
+    assert_eq!(bus.request(s, 8), (0x12, 0x11));
+    assert_eq!(bus.request(s, 0x13), (0x12, 0x11));
+    assert_eq!(bus.request(s, 0x11), (1, 0));
+    assert_eq!(bus.request(s, 3), (0x11, 0x13), "no bootstrap");
+    assert_eq!(bus.request(s, 0x12), (2, 0));
+    assert_eq!(bus.request(s, 4), (0x12, 0x1d));
+    bus.sm(s, 2, 0x1100, 3, 0x64);
+    assert_eq!(bus.request(s, 0x14), (0x12, 0x1d), "one byte short");
+    bus.write(s, 0x816, &[0]);
+    bus.sm(s, 2, 0x1100, 4, 0x64);
+    assert_eq!(bus.request(s, 0x14), (0x12, 0x1e));
+    bus.sm(s, 3, 0x1108, 4, 0x20);
+    assert_eq!(
+        bus.request(s, 0x14),
+        (0x12, 0x1d),
+        "in the second of SM2's three buffers"
+    );
+    bus.write(s, 0x81e, &[0]);
+    bus.sm(s, 3, 0x1200, 4, 0x20);
+    assert_eq!(bus.request(s, 0x14), (4, 0));
+    assert_eq!(bus.request(s, 8), (8, 0));
+    assert_eq!(bus.request(s, 4), (4, 0));
+    assert_eq!(bus.request(s, 8), (8, 0));
+    assert_eq!(bus.request(s, 2), (2, 0));
+    assert_eq!(bus.request(s, 4), (4, 0));
+    assert_eq!(bus.request(s, 1), (1, 0));
+}
+
+fn io_in_op() -> Bus {
+    let mut bus = Bus::new(vec![sim(&io_device())]);
+    bus.address_all();
+    let s = 0x1001;
+    bus.to(s, PREOP);
+    bus.sm(s, 0, 0x1000, 2, 0x44);
+    bus.sm(s, 1, 0x1100, 2, 0x00);
+    bus.fmmu(s, 0, 0x1000, 2, 0x1000, 2);
+    bus.fmmu(s, 1, 0x1000, 2, 0x1100, 1);
+    assert_eq!(
+        bus.logical(12, 0x1000, &[9, 9]).1,
+        0,
+        "process data are closed in PreOp"
+    );
+    bus.to(s, SAFEOP);
+    assert_eq!(
+        bus.logical(12, 0x1000, &[9, 9]),
+        (vec![0, 0], 3),
+        "outputs do not count in SafeOp"
+    );
+    bus.to(s, OP);
+    bus
+}
+
+#[test]
+fn inputs_mirror_outputs_unless_they_are_set() {
+    let mut bus = io_in_op();
+    assert_eq!(bus.logical(12, 0x1000, &[5, 6]).1, 3);
+    assert_eq!(bus.logical(12, 0x1000, &[5, 6]).0, [5, 6]);
+    assert_eq!(bus.segment.device(0).unwrap().outputs(), [5, 6]);
+    assert!(
+        bus.segment
+            .device_mut(0)
+            .unwrap()
+            .set_input(0x6000, 2, 0x77)
+    );
+    bus.logical(12, 0x1000, &[8, 8]);
+    assert_eq!(bus.logical(12, 0x1000, &[8, 8]).0, [8, 0x77]);
+}
+
+#[test]
+fn the_watchdog_takes_an_operating_device_to_safe_op() {
+    let mut bus = io_in_op();
+    bus.logical(12, 0x1000, &[1, 2]);
+    bus.wait(99_000_000);
+    assert_eq!(bus.read_u16(0x1001, 0x130), 8);
+    bus.logical(12, 0x1000, &[1, 2]);
+    bus.wait(101_000_000);
+    assert_eq!(
+        (bus.read_u16(0x1001, 0x130), bus.read_u16(0x1001, 0x134)),
+        (0x14, 0x1b)
+    );
+    assert_eq!(bus.read(0x1001, 0x440, 4), [0, 0, 1, 0]);
+    assert_eq!(bus.segment.device(0).unwrap().al_state(), AlState::SafeOp);
+    bus.logical(12, 0x1000, &[1, 2]);
+    assert_eq!(bus.request(0x1001, 0x18), (8, 0));
+}
+
+#[test]
+fn disabling_a_sync_manager_in_op_is_an_error() {
+    let mut bus = io_in_op();
+    bus.write(0x1001, 0x806, &[0]);
+    bus.wait(1_000_000);
+    assert_eq!(
+        (bus.read_u16(0x1001, 0x130), bus.read_u16(0x1001, 0x134)),
+        (0x12, 0x1d)
+    );
+}
+
+#[test]
+fn an_absent_device_ends_the_line_and_comes_back_in_init() {
+    let mut bus = three_io();
+    let script = "[[fault]]\nat = \"1s\"\nfor = \"1s\"\ndevice = 1\nkind = \"absent\"\n";
+    bus.segment.set_faults(FaultScript::parse(script).unwrap());
+    bus.to(0x1002, PREOP);
+    assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 3);
+    bus.wait(1_000_000_000);
+    assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 1);
+    assert_eq!(bus.read_u16(0x1001, 0x110), 0x5613);
+    bus.wait(1_000_000_000);
+    assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 3);
+    assert_eq!(
+        bus.datagram(4, 0x1002, 0, &[0]).1,
+        0,
+        "no station address any more"
+    );
+    assert_eq!(bus.read_u16(0x1003, 0x130), 1);
+}
+
+#[test]
+fn frames_get_lost_as_the_script_says() {
+    let mut bus = three_io();
+    let script = "[[fault]]\nkind = \"frame-loss\"\ncount = 2\n";
+    bus.segment.set_faults(FaultScript::parse(script).unwrap());
+    let brd = || FrameBuilder::default().datagram(7, 0, 0, &[0]).build();
+    let came_back: Vec<bool> = (0..4).map(|_| bus.frame(brd()).is_some()).collect();
+    assert_eq!(came_back, [false, false, true, true]);
+    bus.segment
+        .set_faults(FaultScript::parse("[[fault]]\nkind = \"silent\"\n").unwrap());
+    assert!(bus.frame(brd()).is_none());
+    bus.segment.set_faults(FaultScript::default());
+    assert!(bus.frame(brd()).is_some());
+}
+
+#[test]
+fn identity_and_refusals_follow_the_script() {
+    let mut bus = three_io();
+    let script = "[[fault]]\ndevice = 0\nkind = \"identity\"\nproduct = 0xabcd\n\
+                  [[fault]]\ndevice = 1\nkind = \"refuse-state\"\nstate = \"preop\"\ncode = 0x16\n";
+    bus.segment.set_faults(FaultScript::parse(script).unwrap());
+    assert_eq!(bus.request(0x1002, 2), (0x11, 0x16));
+    bus.to(0x1001, PREOP);
+    assert_eq!(
+        bus.segment.device(0).unwrap().sii()[20..24],
+        0xabcdu32.to_le_bytes()
+    );
+}
+
+fn random_devices() -> Bus {
+    let mut bus = Bus::new(vec![sim(&coe_device()), sim(&io_device())]);
+    bus.address_all();
+    bus.preop(0x1001);
+    bus
+}
+
+proptest! {
+    #[test]
+    fn random_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        let mut bus = random_devices();
+        let len = bytes.len();
+        if let Some(back) = bus.frame(bytes) {
+            prop_assert_eq!(back.len(), len);
+        }
+    }
+
+    #[test]
+    fn random_datagrams_never_panic(
+        datagrams in prop::collection::vec(
+            (0u8..16, prop_oneof![Just(0u16), Just(0x1001), Just(0x1002), any::<u16>()],
+             prop_oneof![0u16..0x1400, any::<u16>()],
+             prop::collection::vec(any::<u8>(), 0..64)),
+            1..20),
+    ) {
+        let mut bus = random_devices();
+        for (command, adp, ado, data) in datagrams {
+            let frame = FrameBuilder::default().datagram(command, adp, ado, &data).build();
+            let len = frame.len();
+            prop_assert_eq!(bus.frame(frame).map(|f| f.len()), Some(len));
+            bus.wait(300_000);
+        }
+    }
+}
