@@ -188,6 +188,17 @@ fn own_entries_replace_the_module_s() {
         ]
     );
 
+    let origin = &selection
+        .startup
+        .iter()
+        .find(|sdo| sdo.index == 0x1600)
+        .unwrap()
+        .origin;
+    assert!(
+        origin.starts_with("pdo.rx in module \"CSP Mode\" RxPdo 0x1600 (line "),
+        "{origin}"
+    );
+
     let without_target = [entry(0x6040)];
     let error = choose(
         &file,

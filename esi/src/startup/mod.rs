@@ -50,7 +50,7 @@ pub(crate) fn list(
         sdos: Vec::new(),
     };
     module_list(device, selection, &mut list);
-    pdo::configure(device, coe, selection, &mut list)?;
+    pdo::configure(device, coe, selection, choice, &mut list)?;
     interpolation_time(selection, choice, &mut list)?;
     init_cmds(&coe.init_cmds, "device", selection, &mut list);
     if let Some(module) = selection.module.clone() {

@@ -2,13 +2,14 @@
 
 use super::List;
 use crate::model::{Coe, Device, Direction, Pdo, Writable};
-use crate::select::{SelectError, Selection};
+use crate::select::{Choice, SelectError, Selection};
 
 /// The order of the maker's own example: assignments off, inputs' contents, outputs' contents, assignments on.
 pub(super) fn configure(
     device: &Device,
     coe: &Coe,
     selection: &Selection,
+    choice: &Choice<'_>,
     list: &mut List,
 ) -> Result<(), SelectError> {
     let assignments = assignments(device, selection);
@@ -24,8 +25,8 @@ pub(super) fn configure(
         }
     }
     if coe.pdo_config {
-        contents(device, Direction::Tx, selection, list);
-        contents(device, Direction::Rx, selection, list);
+        contents(device, Direction::Tx, selection, choice, list);
+        contents(device, Direction::Rx, selection, choice, list);
     }
     if coe.pdo_assign {
         for (sm, pdos) in &assignments {
@@ -35,7 +36,7 @@ pub(super) fn configure(
                     index,
                     sub,
                     pdo.index.to_le_bytes().to_vec(),
-                    &pdo_origin(selection, pdo),
+                    &pdo_origin(device, selection, pdo),
                 );
             }
             let count = u8::try_from(pdos.len()).unwrap_or(u8::MAX);
@@ -88,13 +89,23 @@ fn assignments<'s>(device: &Device, selection: &'s Selection) -> Vec<(u8, Vec<&'
         .collect()
 }
 
-fn contents(device: &Device, direction: Direction, selection: &Selection, list: &mut List) {
+fn contents(
+    device: &Device,
+    direction: Direction,
+    selection: &Selection,
+    choice: &Choice<'_>,
+    list: &mut List,
+) {
     let (chosen, offered) = match direction {
         Direction::Rx => (&selection.rx, &device.rx_pdos),
         Direction::Tx => (&selection.tx, &device.tx_pdos),
     };
+    let own = match direction {
+        Direction::Rx => choice.rx.map(|_| "pdo.rx in "),
+        Direction::Tx => choice.tx.map(|_| "pdo.tx in "),
+    };
     for pdo in chosen.iter().filter(|pdo| !pdo.fixed) {
-        let origin = pdo_origin(selection, pdo);
+        let origin = own.unwrap_or_default().to_owned() + &pdo_origin(device, selection, pdo);
         list.push(pdo.index, 0, vec![0], &origin);
         for (sub, entry) in (1u8..).zip(&pdo.entries) {
             list.push(
@@ -121,7 +132,7 @@ fn contents(device: &Device, direction: Direction, selection: &Selection, list: 
             pdo.index,
             0,
             vec![0],
-            &format!("{} not used", pdo_origin(selection, pdo)),
+            &format!("{} not used", pdo_origin(device, selection, pdo)),
         );
     }
 }
@@ -203,15 +214,15 @@ fn sm_origin(device: &Device, sm: u8) -> String {
     format!("Sm {sm} (line {line})")
 }
 
-fn pdo_origin(selection: &Selection, pdo: &Pdo) -> String {
-    let kind = match pdo.direction {
-        Direction::Rx => "RxPdo",
-        Direction::Tx => "TxPdo",
+fn pdo_origin(device: &Device, selection: &Selection, pdo: &Pdo) -> String {
+    let (kind, of_device) = match pdo.direction {
+        Direction::Rx => ("RxPdo", &device.rx_pdos),
+        Direction::Tx => ("TxPdo", &device.tx_pdos),
     };
     let module = selection
         .module
         .as_ref()
-        .filter(|module| pdo.position.line > module.position.line)
+        .filter(|_| of_device.iter().all(|known| known.position != pdo.position))
         .map_or_else(String::new, |module| {
             format!("module {:?} ", module.type_name)
         });
