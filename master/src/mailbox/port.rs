@@ -1,6 +1,7 @@
 //! The two mailbox SyncManagers of one SubDevice (ETG.1000.4 clause on mailboxes): one message at a time each way,
 //! with what is needed when frames get lost.
 
+use std::mem;
 use std::time::Duration;
 
 use super::coe::{MAILBOX_MIN, Message, Request, parse};
@@ -75,6 +76,8 @@ pub(super) struct Port {
     pub(super) forgotten: u64,
     outgoing: Vec<u8>,
     incoming: Vec<u8>,
+    /// The SubDevice has taken the last request, so what fills its mailbox next is the next one.
+    pub(super) free: bool,
     /// 1 to 7; tells the SubDevice a new message from one sent again.
     counter: u8,
 }
@@ -88,6 +91,7 @@ impl Port {
             forgotten: 0,
             outgoing: Vec::with_capacity(usize::from(layout.out_len)),
             incoming: vec![0; usize::from(layout.in_len)],
+            free: false,
             counter: 0,
         }
     }
@@ -117,9 +121,10 @@ impl Port {
         request.emit(self.counter, self.layout.out_len, &mut self.outgoing);
         let mut deadline = Deadline::after(w, self.timeouts.request);
         let mut patience = Patience::default();
-        let mut lost = false;
+        let mut arrived = mem::take(&mut self.free);
         loop {
-            // A write whose frame was lost may have arrived; sent again, the counter tells the SubDevice so.
+            // A write whose frame was lost may have arrived; sent again, the counter tells the SubDevice so. The wire may
+            // send again as well, so that a free mailbox is found full.
             let written = w
                 .write(self.layout.station, self.layout.out_address, &self.outgoing)
                 .await;
@@ -128,15 +133,15 @@ impl Port {
                 Touched::No => {
                     // Full, or gone? A register answers in either case unless the device is gone.
                     let full = self.status(w, self.layout.out_sm, &mut patience).await?;
-                    if lost && full {
-                        // What fills it is this very request. Its answer may be next; it must not be set aside.
+                    if arrived && full {
+                        // What fills it is this very request, as far as can be known. Its answer may be next; it must not be set aside.
                         return Ok(());
                     }
-                    if !lost && self.fetch(w, &mut patience).await? == Fetched::Message {
+                    if !arrived && self.fetch(w, &mut patience).await? == Fetched::Message {
                         self.set_aside();
                     }
                 }
-                Touched::Lost => lost = true,
+                Touched::Lost => arrived = true,
             }
             if deadline.passed(w) {
                 return Err(Trouble::Timeout(Phase::Request));
@@ -239,6 +244,7 @@ impl Port {
                 Fetched::Nothing => break,
             }
         }
+        self.free = !self.status(w, self.layout.out_sm, &mut patience).await?;
         Ok(count)
     }
 

@@ -335,10 +335,12 @@ impl CoeClient {
                 Ok(Message::Sdo(Answer::Abort { index, code, .. }))
                     if in_segments || index == transfer.index =>
                 {
+                    self.port.free = true;
                     return Err(transfer.aborted(code));
                 }
                 Ok(Message::Sdo(answer)) if transfer.fits(&answer) => {
                     if let Some(value) = expected(&answer) {
+                        self.port.free = true;
                         return Ok(value);
                     }
                 }

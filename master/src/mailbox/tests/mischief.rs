@@ -9,6 +9,9 @@ pub enum Mischief {
     LoseFetch(u32),
     /// The frame with the n-th request is lost on its way back: the request has arrived.
     LoseRequestEcho(u32),
+    /// As `LoseAnswer` and `LoseRequestEcho`, but the wire itself tries again and tells the second working counter.
+    FetchTwice(u32),
+    RequestTwice(u32),
     /// The frame with the n-th request never arrives.
     LoseRequest(u32),
     /// Sends these bytes in place of the n-th answer.

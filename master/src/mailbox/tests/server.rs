@@ -454,6 +454,9 @@ impl Wire for Server {
             if inner.is(&Mischief::LoseAnswer(inner.answers_fetched)) {
                 return lost;
             }
+            if inner.is(&Mischief::FetchTwice(inner.answers_fetched)) {
+                return Ok(0);
+            }
             buf.copy_from_slice(&message);
             return Ok(1);
         }
@@ -489,6 +492,15 @@ impl Wire for Server {
                 inner.ready_at = self.now.get() + self.thinking.get();
                 if inner.is(&Mischief::LoseRequestEcho(inner.requests_written)) {
                     return lost;
+                }
+                if inner.is(&Mischief::RequestTwice(inner.requests_written)) {
+                    drop(inner);
+                    self.pass(FRAME_TIME);
+                    let mut inner = self.inner.borrow_mut();
+                    if inner.out_mailbox.is_some() {
+                        return Ok(0);
+                    }
+                    inner.out_mailbox = Some(data.to_vec());
                 }
                 Ok(1)
             }

@@ -148,14 +148,20 @@ fn a_full_mailbox_does_not_block_a_request() {
 #[test]
 fn the_answer_to_a_request_sent_twice_is_not_set_aside() {
     for thinking in 0..100 {
-        for (emergencies, mischief) in [(0, &[][..]), (1, &[]), (1, &[Mischief::Blocked])] {
-            let server = Server::new(48, &[(0x6041, 0, &[1, 0])], mischief);
+        for (emergencies, mischief) in [
+            (0, vec![Mischief::LoseRequestEcho(2)]),
+            (1, vec![Mischief::LoseRequestEcho(2)]),
+            (1, vec![Mischief::LoseRequestEcho(2), Mischief::Blocked]),
+            (0, vec![Mischief::RequestTwice(2)]),
+            (1, vec![Mischief::RequestTwice(2)]),
+            (1, vec![Mischief::RequestTwice(2), Mischief::Blocked]),
+        ] {
+            let server = Server::new(48, &[(0x6041, 0, &[1, 0])], &mischief);
             server.thinking.set(10_000 * thinking);
             let mut client = client();
             block_on(async {
                 client.upload(&server, 0x6041, 0, false).await.unwrap();
                 (0..emergencies).for_each(|_| server.say(&emergency(0x8130)));
-                server.commit(Mischief::LoseRequestEcho(2));
                 client.upload(&server, 0x6041, 0, false).await.unwrap();
             });
             let seen = (client.take_emergencies().count(), client.set_aside());
@@ -200,6 +206,8 @@ fn lost_frames_cost_time_and_nothing_else() {
             Mischief::LoseFetch(n),
             Mischief::LoseRequest(n),
             Mischief::LoseRequestEcho(n),
+            Mischief::FetchTwice(n),
+            Mischief::RequestTwice(n),
         ] {
             let server = Server::new(
                 48,
