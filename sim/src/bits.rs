@@ -2,7 +2,7 @@
 
 /// Copies `len` bits. Bits outside stay as they are; what does not fit either slice is left out.
 pub(crate) fn copy(to: &mut [u8], to_bit: usize, from: &[u8], from_bit: usize, len: usize) {
-    if to_bit % 8 == 0 && from_bit % 8 == 0 && len % 8 == 0 {
+    if (to_bit | from_bit | len).is_multiple_of(8) {
         let n = len / 8;
         if let (Some(to), Some(from)) = (
             to.get_mut(to_bit / 8..to_bit / 8 + n),

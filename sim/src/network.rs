@@ -139,10 +139,10 @@ impl Segment {
     pub fn transit(&mut self, bytes: &mut [u8], now: Nanos) -> Transit {
         self.advance(now);
         let epoch = self.epoch.unwrap_or(now);
-        let start = self.latest_start(now.saturating_sub(epoch));
+        let start = now.saturating_sub(epoch).max(self.wire_free);
         let wire = frame::wire_time(bytes.len());
         self.wire_free = start + wire;
-        let loss = self.faults.lose(start);
+        let loss = self.faults.lose();
         if loss.on_the_way_out || self.reach == 0 {
             return Transit::Lost;
         }
@@ -157,10 +157,6 @@ impl Segment {
         Transit::Back {
             at: epoch + back + wire,
         }
-    }
-
-    fn latest_start(&self, now: Nanos) -> Nanos {
-        now.max(self.wire_free)
     }
 
     /// First byte sent at `start`; returns when it comes back.
@@ -190,11 +186,11 @@ impl Segment {
                 at += self.devices.get(n).map_or(0, |device| device.delay_ns);
             }
         }
-        let control = self
-            .devices
-            .iter()
-            .any(|device| device.esc.port1_forced_closed());
-        if control || self.reach < self.devices.len() {
+        let mut changed = false;
+        for device in &mut self.devices {
+            changed |= device.esc.take_loop_control();
+        }
+        if changed {
             self.update_links();
         }
         at + self.cable_ns

@@ -243,10 +243,10 @@ impl SimDevice {
             }
             _ => {}
         }
-        if to == AlState::Init || from == AlState::Init {
-            if let Some(mailbox) = &mut self.mailbox {
-                mailbox.reset();
-            }
+        if (to == AlState::Init || from == AlState::Init)
+            && let Some(mailbox) = &mut self.mailbox
+        {
+            mailbox.reset();
         }
         self.settle(to, 0);
         self.latch_inputs();

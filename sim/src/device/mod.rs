@@ -234,19 +234,13 @@ impl SimDevice {
         let in_op = self.al.state == AlState::Op;
         if let Application::Drive(drive) = &mut self.application {
             drive.control(&mut self.store, in_op);
-            while let Some(emergency) = drive.take_emergency() {
-                self.send_emergency(&emergency);
-                let Application::Drive(_) = &self.application else {
-                    return;
-                };
-                return self.drain_emergencies();
-            }
+            self.send_emergencies();
         } else if self.outputs_are_none() {
             self.latch_inputs();
         }
     }
 
-    fn drain_emergencies(&mut self) {
+    fn send_emergencies(&mut self) {
         while let Some(emergency) = self.drive_mut().and_then(Drive::take_emergency) {
             self.send_emergency(&emergency);
         }

@@ -199,6 +199,7 @@ impl Esc {
             self.station = self.u16_at(reg::STATION_ADDRESS);
         }
         if touched(reg::DL_CONTROL, 4) {
+            self.loop_control = true;
             let enabled = self.u32_at(reg::DL_CONTROL) & 0x0100_0000 != 0;
             self.alias = enabled.then(|| self.u16_at(reg::STATION_ALIAS));
         }

@@ -118,7 +118,7 @@ impl Esc {
             let len = (o.physical_bit + o.bits).div_ceil(8) - start;
             if start < reg::ADDRESS_SPACE {
                 let bytes = data.get(o.data_bit / 8..(o.data_bit + o.bits) / 8);
-                let aligned = (o.data_bit | o.physical_bit | o.bits) % 8 == 0;
+                let aligned = (o.data_bit | o.physical_bit | o.bits).is_multiple_of(8);
                 if let (true, Some(bytes), Ok(start)) = (aligned, bytes, u16::try_from(start)) {
                     any |= self.write(start, bytes, now, local);
                 }

@@ -65,6 +65,7 @@ pub struct Esc {
     station: u16,
     alias: Option<u16>,
     latch: bool,
+    loop_control: bool,
 }
 
 impl Esc {
@@ -83,6 +84,7 @@ impl Esc {
             station: 0,
             alias: None,
             latch: false,
+            loop_control: false,
             config,
         };
         esc.power_on(0);
@@ -213,6 +215,11 @@ impl Esc {
     /// Whether the frame just seen asked to latch receive times; the network fills in port 1.
     pub(crate) fn take_latch(&mut self) -> bool {
         std::mem::take(&mut self.latch)
+    }
+
+    /// Whether DL control, and so perhaps the line's end, changed.
+    pub(crate) fn take_loop_control(&mut self) -> bool {
+        std::mem::take(&mut self.loop_control)
     }
 
     pub(crate) fn latch_return(&mut self, now: Nanos) {

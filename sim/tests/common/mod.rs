@@ -1,5 +1,6 @@
 //! A MainDevice just big enough to test SubDevices: one datagram at a time, virtual time.
 #![allow(dead_code, reason = "every test binary uses its own part")]
+#![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 use std::path::PathBuf;
 
