@@ -2,7 +2,14 @@
 
 use std::path::Path;
 
-use ecaxis::config::ConfigError;
+use ecaxis::bringup::{BringUpError, StateError};
+use ecaxis::config::{ConfigError, Nic};
+use ecaxis::link::packet::OpenError;
+use ecaxis::mailbox::SdoError;
+use ecaxis::session::RunError;
+use ecaxis_axis::cia402::describe;
+use ecaxis_axis::{State, Trip};
+use ecaxis_sim::ServeError;
 
 use super::note;
 
@@ -43,6 +50,230 @@ impl Failure {
         for hint in &self.hints {
             note(&format!("  = help: {hint}"));
         }
+    }
+}
+
+/// A run that failed. Hints depend on whether the bus is a real one.
+pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
+    let failure = Failure::new(FAILED, error.to_string());
+    let hint = match error {
+        RunError::Open(open) => return interface(failure, open),
+        RunError::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
+        RunError::State(state) => self::state(state),
+        RunError::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
+        RunError::NotMapped { source, .. } => format!(
+            "add \"0x{:04x}:{:02x}\" to the device's `pdo` lists, or leave them out to take the ESI's",
+            source.index, source.sub,
+        ),
+        RunError::NoProcessData { .. } => {
+            "`ecaxis explain` shows the expected layout; a device without an FMMU left answers no process data".to_owned()
+        }
+        RunError::PhaseNotLocked { .. } => {
+            "wake-ups are too irregular: run with real-time priority (`ecaxis run` warns if it has none), or a longer `cycle`".to_owned()
+        }
+        RunError::NotEnabled { state, code, mode_confirmed, .. } => not_enabled(*state, *code, *mode_confirmed),
+        RunError::WrongMode { .. } => {
+            "the drive refused the mode: check that its firmware supports it and that no parameter forbids it".to_owned()
+        }
+        RunError::DriveFault { code: Some(code), .. } => describe(*code).hint.to_owned(),
+        RunError::DriveFault { code: None, .. } => "read 0x603F and the error history 0x1003 of the drive".to_owned(),
+        RunError::Trip { trip, .. } => self::trip(trip).to_owned(),
+        RunError::BusLost { answered: false, .. } => {
+            "check cables and power; `lost_frames` sets how many bad cycles are ridden through".to_owned()
+        }
+        RunError::BusLost { answered: true, .. } => {
+            "a SubDevice dropped out: check its power and the cable to it".to_owned()
+        }
+        RunError::LeftOp { code, .. } => al_status(*code).to_owned(),
+        RunError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
+        RunError::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
+        RunError::NotReached { .. } => {
+            "check load and tuning, or give the axis a wider `target_window`".to_owned()
+        }
+        RunError::Refused { .. } | RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
+        RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
+        RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,
+    };
+    failure.hint(hint)
+}
+
+fn interface(failure: Failure, error: &OpenError) -> Failure {
+    match error {
+        OpenError::NoSuchInterface { .. } => {
+            // The file or the command line names it.
+            Failure {
+                code: WRONG,
+                ..failure
+            }
+            .hint(interfaces())
+        }
+        OpenError::NotPermitted { .. } => failure.hint(capabilities()),
+        OpenError::Down { nic } => failure.hint(format!("sudo ip link set {nic} up")),
+        OpenError::NoCarrier { .. } => {
+            failure.hint("plug the cable into the first SubDevice's IN port and switch it on")
+        }
+        OpenError::Mtu { nic, .. } => failure.hint(format!("sudo ip link set {nic} mtu 1500")),
+        OpenError::Io { .. } => failure,
+    }
+}
+
+/// The interfaces of this computer.
+fn interfaces() -> String {
+    let mut names: Vec<String> = std::fs::read_dir("/sys/class/net")
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .filter(|name| name != "lo")
+        .collect();
+    names.sort();
+    if names.is_empty() {
+        return "this computer has no network interface; `--sim` runs without one".to_owned();
+    }
+    format!("this computer has {}", names.join(", "))
+}
+
+/// How to permit raw sockets, real-time priority and locked memory without being root.
+pub(crate) fn capabilities() -> String {
+    let exe = std::env::current_exe().unwrap_or_else(|_| "ecaxis".into());
+    format!(
+        "sudo setcap cap_net_raw,cap_sys_nice,cap_ipc_lock+ep {}",
+        exe.display()
+    )
+}
+
+fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
+    let hint = match error {
+        BringUpError::NoAnswer => {
+            let failure = match nic {
+                Nic::Interface(name) => failure
+                    .hint(format!("is `{name}` the right interface? {}", interfaces()))
+                    .hint("check that the first SubDevice has power and its IN port is connected"),
+                Nic::Sim => failure,
+            };
+            return failure;
+        }
+        BringUpError::Missing { .. } => {
+            "check power and the cable behind the last one found, or take the missing [[device]] out of the file".to_owned()
+        }
+        BringUpError::Unexpected { position, .. } => {
+            format!("add a [[device]] with `position = {position}`, or disconnect it")
+        }
+        BringUpError::Identity { .. } => {
+            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`".to_owned()
+        }
+        BringUpError::NotLocated { .. } => {
+            "set the device's alias or ID switch, or find it by `position`".to_owned()
+        }
+        BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
+        BringUpError::Mapping { .. } => {
+            "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
+        }
+        BringUpError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
+        BringUpError::NoClock { .. } => {
+            "run the device without distributed clock: `dc = \"off\"`".to_owned()
+        }
+        BringUpError::Scan { .. } | BringUpError::Wire { .. } | BringUpError::NotTaken { .. } => {
+            "frames are lost or a device restarts: check cables and supply, and look with `--record`".to_owned()
+        }
+        BringUpError::State(state) => self::state(state),
+    };
+    failure.hint(hint)
+}
+
+fn sdo(error: &SdoError, origin: &str) -> String {
+    match error {
+        SdoError::Abort { code, .. } => match code {
+            0x0602_0000 | 0x0609_0011 => {
+                "the drive has no such object: its firmware does not match the ESI file"
+            }
+            0x0609_0030..=0x0609_0036 if origin.contains("cycle") => {
+                "the drive does not take this cycle time: try another `cycle`"
+            }
+            0x0609_0030..=0x0609_0036 => "the value is outside what the drive allows",
+            0x0601_0000..=0x0601_0003 => "the object cannot be written: take it out of `sdo`",
+            0x0607_0010..=0x0607_0013 => "the drive has another length for it: its firmware does not match the ESI file",
+            0x0604_0041..=0x0604_0042 => "the drive cannot map this: check `pdo.rx` and `pdo.tx`",
+            0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
+            _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
+        },
+        SdoError::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
+        _ => "look at the exchange with `--record`",
+    }
+    .to_owned()
+}
+
+fn state(error: &StateError) -> String {
+    match error {
+        StateError::Refused { code, .. } => al_status(*code).to_owned(),
+        StateError::Timeout { .. } => {
+            "switch the device off and on, then look at its own display or error history".to_owned()
+        }
+        StateError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
+        StateError::Wire { .. } => "check the cables".to_owned(),
+    }
+}
+
+/// What to look at for an AL status code (ETG.1020).
+fn al_status(code: u16) -> &'static str {
+    match code {
+        0x0016 | 0x0017 | 0x001d..=0x001f | 0x0024..=0x0026 => {
+            "the device expects another process data layout: compare `ecaxis explain` with its mapping, and its firmware with the ESI file"
+        }
+        0x001a | 0x002c | 0x002d | 0x0031..=0x0034 => {
+            "the device misses SYNC0 or process data in time: check wake-up lateness, or use a longer `cycle`"
+        }
+        0x001b => {
+            "no outputs arrived within the watchdog time: check cables and wake-up lateness, or set a longer `watchdog`"
+        }
+        0x0028 | 0x0030 => {
+            "the device does not take this kind of synchronisation: try another `dc`"
+        }
+        0x0035 | 0x0036 => "the device does not take this cycle time: try another `cycle`",
+        0x0011 | 0x0012 => "the state was asked for out of order; switch the device off and on",
+        0x0050 | 0x0051 => {
+            "the device's EEPROM is not readable or empty: load it with the maker's tool"
+        }
+        _ => "look the code up in the device's manual",
+    }
+}
+
+fn not_enabled(state: State, code: Option<u16>, mode_confirmed: bool) -> String {
+    match (state, code) {
+        (State::Fault | State::FaultReactionActive, Some(code)) if code != 0 => describe(code).hint.to_owned(),
+        (State::Fault | State::FaultReactionActive, _) => "read the drive's error history (0x1003)".to_owned(),
+        (State::OperationEnabled, _) if !mode_confirmed => {
+            "the drive does not take the mode over: check that 0x6060 is mapped or written, and supported".to_owned()
+        }
+        _ => "check the supply of the power stage, STO and enable inputs, and that no other tool controls the drive".to_owned(),
+    }
+}
+
+fn trip(trip: &Trip) -> &'static str {
+    match trip {
+        Trip::FollowingError { .. } => {
+            "is the axis free to move and tuned? lower `speed` and `ramp`, or raise `limits.following_error`"
+        }
+        Trip::PositionLimit { .. } => {
+            "move the axis back by hand, or check `limits.position` and `offset`"
+        }
+        Trip::OverVelocity { .. } => "check `encoder`, `per_turn` and the drive's tuning",
+        Trip::PowerLost { .. } => "check STO, enable inputs and the supply of the power stage",
+        Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
+    }
+}
+
+/// The simulated bus on an interface.
+pub(crate) fn serve(error: &ServeError) -> Failure {
+    let failure = Failure::new(FAILED, error.to_string());
+    match error {
+        ServeError::NoSuchInterface(_) => Failure {
+            code: WRONG,
+            ..failure
+        }
+        .hint(interfaces()),
+        ServeError::NotPermitted(_) => failure.hint(capabilities()),
+        ServeError::Io { .. } => failure,
     }
 }
 
@@ -93,4 +324,138 @@ fn machine_files(path: &Path) -> String {
         }
     }
     "name a machine file, such as configs/demo.toml".to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use ecaxis::bringup::{AlState, DeviceRef};
+
+    use super::*;
+
+    fn device() -> DeviceRef {
+        DeviceRef {
+            name: "x".into(),
+            position: 0,
+            station: 0x1001,
+        }
+    }
+
+    fn hints_of(error: &RunError) -> (u8, String) {
+        let failure = run(error, &Nic::Interface("eth9".into()));
+        (failure.code, failure.hints.join("\n"))
+    }
+
+    #[test]
+    fn every_failure_says_what_next() {
+        let sdo = |code| SdoError::Abort {
+            station: 0x1001,
+            index: 0x60c2,
+            sub: 1,
+            code,
+        };
+        let start_up = |code, origin: &str| {
+            RunError::BringUp(Box::new(BringUpError::StartUp {
+                device: device(),
+                index: 0x60c2,
+                sub: 1,
+                name: String::new(),
+                value: "1".into(),
+                origin: origin.into(),
+                source: sdo(code),
+            }))
+        };
+        let bring_up = |error| RunError::BringUp(Box::new(error));
+        let refused = |code| {
+            bring_up(BringUpError::State(StateError::Refused {
+                device: device(),
+                wanted: AlState::SafeOp,
+                actual: AlState::PreOp,
+                code,
+            }))
+        };
+        let not_enabled = |state, code| RunError::NotEnabled {
+            device: device(),
+            state,
+            statusword: 0,
+            mode_confirmed: true,
+            code,
+            timeout_ms: 5000,
+        };
+        let missing = BringUpError::Missing {
+            expected: 2,
+            found: 1,
+            missing: "`y`".into(),
+            list: "EPOS4".into(),
+        };
+        for (error, code, hint) in [
+            (
+                RunError::Open(OpenError::NoSuchInterface { nic: "x".into() }),
+                WRONG,
+                "this computer has",
+            ),
+            (
+                RunError::Open(OpenError::NotPermitted { nic: "x".into() }),
+                FAILED,
+                "sudo setcap cap_net_raw",
+            ),
+            (
+                RunError::Open(OpenError::Down { nic: "x".into() }),
+                FAILED,
+                "ip link set x up",
+            ),
+            (
+                bring_up(BringUpError::NoAnswer),
+                FAILED,
+                "is `eth9` the right interface?",
+            ),
+            (bring_up(missing), FAILED, "behind the last one found"),
+            (
+                start_up(0x0609_0030, "bus.cycle"),
+                FAILED,
+                "another `cycle`",
+            ),
+            (start_up(0x0602_0000, "ESI"), FAILED, "firmware"),
+            (refused(0x001e), FAILED, "process data layout"),
+            (refused(0x0035), FAILED, "cycle time"),
+            (not_enabled(State::SwitchOnDisabled, None), FAILED, "STO"),
+            (
+                not_enabled(State::Fault, Some(0x8611)),
+                FAILED,
+                describe(0x8611).hint,
+            ),
+            (
+                RunError::DriveFault {
+                    device: device(),
+                    code: Some(0x2310),
+                    statusword: 8,
+                },
+                FAILED,
+                describe(0x2310).hint,
+            ),
+            (
+                RunError::Trip {
+                    device: device(),
+                    trip: Trip::FollowingError {
+                        error: 2.0,
+                        limit: 1.0,
+                    },
+                },
+                FAILED,
+                "following_error",
+            ),
+            (
+                RunError::BusLost {
+                    cycles: 3,
+                    wkc: (0, 6),
+                    answered: false,
+                },
+                FAILED,
+                "cables",
+            ),
+        ] {
+            let (got, text) = hints_of(&error);
+            assert_eq!(got, code, "{error}");
+            assert!(text.contains(hint), "{error}: {text}");
+        }
+    }
 }

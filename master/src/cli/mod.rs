@@ -1,17 +1,22 @@
 //! The command line: one file a verb, each with its arguments and `run`.
 //!
 //! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
-//! failures into advice; [`report`] turns a run into a table.
+//! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile.
 
 use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use tracing_subscriber::EnvFilter;
 
 mod check;
 mod explain;
 mod hints;
+mod progress;
 mod report;
+mod run;
+mod signals;
+mod sim;
 
 pub(crate) use hints::Failure;
 
@@ -25,16 +30,56 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    Run(run::Args),
     Check(check::Args),
     Explain(explain::Args),
+    Sim(sim::Args),
+}
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Verbosity {
+    /// Log what happens; twice for more. RUST_LOG overrides it
+    #[arg(short, long, action = clap::ArgAction::Count)]
+    verbose: u8,
+}
+
+impl Verbosity {
+    /// Log lines come in between.
+    pub fn plain(&self) -> bool {
+        self.verbose > 0
+    }
+
+    fn start_logging(&self) {
+        let level = match self.verbose {
+            0 => "warn,ethercrab=error",
+            1 => "info,ecaxis=debug",
+            2 => "debug,ecaxis=trace",
+            _ => "trace",
+        };
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+        tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(io::stderr)
+            .with_ansi(stderr_is_terminal())
+            .with_timer(tracing_subscriber::fmt::time::uptime())
+            .init();
+    }
 }
 
 /// Exit codes: 0 done, 1 the machine or the bus failed, 2 the file or the command line is wrong.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
+    match &cli.verb {
+        Verb::Run(run::Args { verbosity, .. }) | Verb::Sim(sim::Args { verbosity, .. }) => {
+            verbosity.start_logging();
+        }
+        Verb::Check(_) | Verb::Explain(_) => {}
+    }
     let done = match cli.verb {
+        Verb::Run(args) => run::run(&args),
         Verb::Check(args) => check::run(&args),
         Verb::Explain(args) => explain::run(&args),
+        Verb::Sim(args) => sim::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -59,4 +104,28 @@ pub(crate) fn note(text: &str) {
 
 pub(crate) fn stderr_is_terminal() -> bool {
     io::stderr().is_terminal()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arguments_are_consistent() {
+        <Cli as clap::CommandFactory>::command().debug_assert();
+        for (line, good) in [
+            ("ecaxis run", true),
+            (
+                "ecaxis run m.toml --sim --virtual --for 1h --repeat 2 --seed 7 --json",
+                true,
+            ),
+            ("ecaxis run --nic eth0 --sim", false),
+            ("ecaxis run --for 10", false),
+            ("ecaxis run --repeat 0", false),
+            ("ecaxis check", false),
+            ("ecaxis sim m.toml --nic veth0", true),
+        ] {
+            assert_eq!(Cli::try_parse_from(line.split(' ')).is_ok(), good, "{line}");
+        }
+    }
 }

@@ -13,7 +13,7 @@ const UNITS: [(&str, u64); 7] = [
 ];
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{message}")]
+#[error("{message}; {hint}")]
 pub struct DurationError {
     pub message: String,
     pub hint: String,

@@ -7,7 +7,9 @@
 //! | `fields.rs` | typed values out of TOML tables |
 //! | `raw.rs` | the file as written |
 //! | `check.rs` | raw → [`Machine`]: bus, names, places |
-//! | `device.rs` | one device: its ESI file, mode, PDOs, start-up SDOs, axis |
+//! | `device.rs` | one device: its ESI file, mode, PDOs |
+//! | `sdo.rs` | values of start-up SDOs as bytes |
+//! | `axis.rs` | units and limits |
 //! | `steps.rs` | the demonstration program |
 //!
 //! Every mistake is collected; a file with five of them is refused once, with five answers.
@@ -15,6 +17,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod axis;
 mod check;
 mod device;
 pub mod duration;

@@ -221,6 +221,7 @@ fn every_way_to_be_wrong() {
         ("value = 2500", "value = -1", "does not fit", "", "-1"),
         ("value = 2500", "valeu = 2500", "unknown key `valeu`", "did you mean `value`?", "valeu"),
         ("encoder = 2000", "encoder = 0", "`encoder` is 0, but must be above zero", "", "0"),
+        ("encoder = 2000", "encoder = 1e10", "more than 32 bits", "", "1e10"),
         ("encoder = 2000\n", "", "`encoder` is missing", "encoder = 2000", "[device.axis]"),
         ("velocity = 200.0", "velocity = -200.0", "`limits.velocity` is -200", "", "-200.0"),
         ("velocity = 200.0", "velocity = \"fast\"", "expected a number, found a string", "", "\"fast\""),

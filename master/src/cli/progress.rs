@@ -1,0 +1,162 @@
+//! What a run tells while it goes on, on stderr: a line that is rewritten on a terminal, lines
+//! elsewhere.
+
+use std::time::{Duration, Instant};
+
+use ecaxis::bringup::Step;
+use ecaxis::clock::Clock;
+use ecaxis::session::{AxisLine, Observer, Progress, Status};
+use ecaxis_axis::Mode;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{hints, note, stderr_is_terminal};
+
+/// Virtual time makes an hour of status lines in seconds; people read one a second.
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+
+pub(crate) struct Teller {
+    /// `None`: plain lines.
+    bar: Option<ProgressBar>,
+    clock: Clock,
+    cycle_ns: u64,
+    last_passing: Option<Instant>,
+    advised: bool,
+}
+
+impl Teller {
+    /// `plain`: do not rewrite lines, log lines come in between.
+    pub fn new(clock: Clock, cycle_ns: u64, plain: bool) -> Self {
+        let bar = (stderr_is_terminal() && !plain).then(|| {
+            let bar = ProgressBar::new_spinner();
+            let style = ProgressStyle::with_template("{spinner} {wide_msg}");
+            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()))
+        });
+        Self {
+            bar,
+            clock,
+            cycle_ns,
+            last_passing: None,
+            advised: false,
+        }
+    }
+
+    /// Something that stays on the screen.
+    fn line(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| note(text)),
+            None => note(text),
+        }
+    }
+
+    /// Something that the next of its kind replaces.
+    fn passing(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => {
+                bar.set_message(text.to_owned());
+                bar.tick();
+            }
+            None => note(text),
+        }
+    }
+
+    /// At most one of these a second where lines stay or time is virtual.
+    fn occasional(&mut self, text: impl FnOnce() -> String) {
+        if self
+            .last_passing
+            .is_none_or(|last| last.elapsed() >= STATUS_PERIOD)
+        {
+            self.last_passing = Some(Instant::now());
+            self.passing(&text());
+        }
+    }
+}
+
+impl Observer for Teller {
+    fn progress(&mut self, progress: &Progress) {
+        match progress {
+            // One line a device is enough where lines stay.
+            Progress::Step(Step::StartUp { done, of, .. }) if self.bar.is_none() && done < of => {}
+            Progress::Step(step @ (Step::StartUp { .. } | Step::Scan)) => {
+                self.passing(&step.to_string());
+            }
+            Progress::Step(step) => self.line(&step.to_string()),
+            Progress::Denied(denied) => {
+                self.line(&format!("warning: {denied}"));
+                if !self.advised {
+                    self.advised = true;
+                    self.line(&format!("  = help: {}", hints::capabilities()));
+                }
+            }
+            Progress::Warning(text) => self.line(&format!("warning: {text}")),
+            Progress::PhaseLocked { drift_ppm } => {
+                self.line(&format!(
+                    "frames locked to SYNC0, clocks {drift_ppm:+.1} ppm apart"
+                ));
+            }
+            Progress::Enabled { axes: 1 } => self.line("1 axis in Operation enabled"),
+            Progress::Enabled { axes } => self.line(&format!("{axes} axes in Operation enabled")),
+            Progress::Program { run, step, of } => {
+                let text = format!("run {run}, step {step}/{of}");
+                if *run == 1 && self.bar.is_none() {
+                    self.line(&text);
+                } else {
+                    self.occasional(|| text);
+                }
+            }
+            Progress::Status(status) if self.clock == Clock::Virtual => {
+                let cycle_ns = self.cycle_ns;
+                self.occasional(|| status_line(status, cycle_ns));
+            }
+            Progress::Status(status) => self.passing(&status_line(status, self.cycle_ns)),
+            Progress::Stopping => self.line("stopping: axes to rest, power off, bus to Init"),
+        }
+    }
+}
+
+impl Drop for Teller {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn status_line(status: &Status, cycle_ns: u64) -> String {
+    let counters = &status.counters;
+    let turns = counters.cycles.saturating_add(counters.overruns);
+    let mut text = format!(
+        "{:7.1} s  cycle {}  lost {}  wkc {}",
+        turns as f64 * cycle_ns as f64 * 1e-9,
+        counters.cycles,
+        counters.lost_frames,
+        counters.wkc_errors,
+    );
+    if let Some(phase) = &status.phase {
+        text += &format!(
+            "  phase {:+} ns{}",
+            phase.error_ns,
+            if phase.locked { "" } else { " (not locked)" }
+        );
+    }
+    for axis in &status.axes {
+        text += "  ";
+        text += &axis_text(axis);
+    }
+    text
+}
+
+fn axis_text(axis: &AxisLine) -> String {
+    let AxisLine {
+        name,
+        unit,
+        position,
+        velocity,
+        torque,
+        ..
+    } = axis;
+    match axis.mode {
+        Mode::Csv => format!("{name} {velocity:.2} {unit}/s"),
+        Mode::Cst => format!("{name} {torque:.1} %"),
+        _ => format!("{name} {position:.3} {unit}"),
+    }
+}
