@@ -17,7 +17,7 @@ fn three_io() -> Bus {
 fn every_command_counts_as_the_standard_says() {
     let mut bus = three_io();
     let position = 0u16.wrapping_sub(1);
-    // (command, address, expected working counter); 0x0f80 is no register, 0x1e00 is free RAM.
+    // (command, address, expected working counter); 0x0e00 is no register, 0x1e00 is free RAM.
     let ram = [
         (0, 0, 0),
         (1, position, 1),
@@ -42,7 +42,7 @@ fn every_command_counts_as_the_standard_says() {
             "command {command}"
         );
         assert_eq!(
-            bus.datagram(command, adp, 0x0f80, &[1, 2]).1,
+            bus.datagram(command, adp, 0x0e00, &[1, 2]).1,
             0,
             "command {command}"
         );

@@ -6,6 +6,7 @@ use ecaxis_esi::model::{Access, Device, Direction, Module, Pdo, SmUse, Writable}
 use super::Abort;
 use super::store::{ObjectStore, Slot};
 use crate::esc::al::AlState;
+use crate::esc::sm::Mode;
 
 /// 0x1C10 is SyncManager 0.
 const ASSIGNMENT: u16 = 0x1c10;
@@ -28,6 +29,8 @@ struct KnownPdo {
 pub struct ProcessSm {
     pub sm: u8,
     pub direction: Direction,
+    /// Three buffers, or one as some makers' terminals have it.
+    pub mode: Mode,
     max_len: Option<u16>,
 }
 
@@ -83,6 +86,7 @@ impl PdoRules {
             rules.sms.push(ProcessSm {
                 sm: n,
                 direction,
+                mode: Mode::from_control(sm.control_byte),
                 max_len: sm.max_size,
             });
             let all = if direction == Direction::Rx {

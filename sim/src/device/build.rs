@@ -87,6 +87,7 @@ impl SimDevice {
             .map(|sm| ProcessData {
                 sm: usize::from(sm.sm),
                 direction: sm.direction,
+                mode: sm.mode,
                 map: Vec::new(),
                 len: 0,
             })
@@ -229,7 +230,7 @@ fn memory(device: &Device) -> Result<usize, SimError> {
         let mailbox = matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn);
         let buffers = if mailbox { 1 } else { 3 };
         let last = usize::from(start) + usize::from(len) * buffers;
-        if start != 0 && (start < 0x0f00 || last > 0x1_0000) {
+        if last > 0x1_0000 {
             return Err(SimError::SyncManagerOutside {
                 device: device.type_name.clone(),
                 sm: n,

@@ -8,12 +8,16 @@ use crate::bits;
 use crate::coe::pdo::Mapped;
 use crate::coe::store::{ObjectStore, Slot};
 use crate::esc::al::AlState;
+use crate::esc::registers::ADDRESS_SPACE;
+use crate::esc::sm::{Mode, SyncManager};
 
 /// The process data of one SyncManager.
 #[derive(Debug, Clone)]
 pub(super) struct ProcessData {
     pub(super) sm: usize,
     pub(super) direction: Direction,
+    /// As the ESI has it.
+    pub(super) mode: Mode,
     pub(super) map: Vec<Mapped>,
     /// Bytes.
     pub(super) len: usize,
@@ -56,7 +60,20 @@ impl SimDevice {
         if self.al.state == AlState::Op {
             self.take_outputs();
         }
+        self.empty_single_buffers();
         self.latch_inputs();
+    }
+
+    /// An output area with one buffer only takes the next data once these have been fetched.
+    fn empty_single_buffers(&mut self) {
+        for data in &self.process {
+            if data.mode == Mode::Mailbox && data.direction == Direction::Rx {
+                if let Some(sm) = self.esc.sms.get_mut(data.sm) {
+                    sm.full = false;
+                }
+                self.esc.refresh_sm(data.sm);
+            }
+        }
     }
 
     fn take_outputs(&mut self) {
@@ -80,7 +97,9 @@ impl SimDevice {
             return;
         }
         for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {
-            let Some(sm) = self.esc.sms.get_mut(data.sm).filter(|sm| sm.is_open()) else {
+            let ram =
+                |sm: &&mut SyncManager| sm.is_open() && usize::from(sm.start) >= ADDRESS_SPACE;
+            let Some(sm) = self.esc.sms.get_mut(data.sm).filter(ram) else {
                 continue;
             };
             let first = !sm.full;

@@ -44,7 +44,7 @@ pub struct EscConfig {
     /// Two bits a port: 0 none, 1 not configured, 2 EBUS, 3 MII.
     pub ports: u8,
     pub with_dc: bool,
-    /// Highest address + 1; registers included.
+    /// End of process RAM.
     pub memory: usize,
     pub clock_offset_ns: u64,
     pub clock_drift_ppm: f64,

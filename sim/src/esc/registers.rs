@@ -1,6 +1,7 @@
 //! The register map: addresses, which bytes exist and which the MainDevice may write.
 
-pub const ADDRESS_SPACE: usize = 0x1000;
+/// Registers end here; digital outputs (0x0F00), user RAM (0x0F80) and process RAM follow.
+pub const ADDRESS_SPACE: usize = 0x0f00;
 
 pub const TYPE: u16 = 0x0000;
 pub const STATION_ADDRESS: u16 = 0x0010;
@@ -96,6 +97,8 @@ const DC: &[(u16, u16, bool)] = &[
     (0x0990, 0x0997, true),
     (0x0998, 0x099f, false),
     (0x09a0, 0x09a7, true),
+    (0x09a8, 0x09a9, true),
+    (0x09ae, 0x09cf, false),
 ];
 
 /// Per byte: bit 0 exists, bit 1 writable.

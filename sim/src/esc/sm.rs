@@ -10,6 +10,17 @@ pub enum Mode {
     Reserved,
 }
 
+impl Mode {
+    #[must_use]
+    pub fn from_control(control: u8) -> Self {
+        match control & 3 {
+            0 => Self::Buffered,
+            2 => Self::Mailbox,
+            _ => Self::Reserved,
+        }
+    }
+}
+
 /// Who fills the area.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Filled {
@@ -52,11 +63,7 @@ impl SyncManager {
         if !self.enabled {
             self.start = u16::from_le_bytes([r[0], r[1]]);
             self.len = u16::from_le_bytes([r[2], r[3]]);
-            self.mode = match r[4] & 3 {
-                0 => Mode::Buffered,
-                2 => Mode::Mailbox,
-                _ => Mode::Reserved,
-            };
+            self.mode = Mode::from_control(r[4]);
             self.filled = if r[4] >> 2 & 3 == 1 {
                 Filled::ByMainDevice
             } else {
@@ -80,6 +87,14 @@ impl SyncManager {
     pub fn overlaps(&self, start: usize, len: usize) -> bool {
         let (own, own_len) = (usize::from(self.start), usize::from(self.len));
         own_len > 0 && len > 0 && start < own + own_len && own < start + len
+    }
+
+    /// Bytes of memory it takes: three buffers in process RAM, one for mailboxes and for the digital
+    /// outputs in front of it.
+    #[must_use]
+    pub fn footprint(&self) -> usize {
+        let three = self.mode == Mode::Buffered && self.start >= 0x1000;
+        usize::from(self.len) * if three { 3 } else { 1 }
     }
 
     #[must_use]

@@ -459,13 +459,16 @@ pub fn sim_with(device: &Device, options: DeviceOptions) -> SimDevice {
     SimDevice::from_esi(device, &[], options).unwrap()
 }
 
-/// Bytes of a fixture; `None` (said aloud) where the fixtures are not there, a failure under CI.
-pub fn fixture(path: &str) -> Option<Vec<u8>> {
-    let root = std::env::var_os("ECAXIS_FIXTURES").map_or_else(
+pub fn fixtures() -> PathBuf {
+    std::env::var_os("ECAXIS_FIXTURES").map_or_else(
         || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/fixtures"),
         PathBuf::from,
-    );
-    match std::fs::read(root.join(path)) {
+    )
+}
+
+/// Bytes of a fixture; `None` (said aloud) where the fixtures are not there, a failure under CI.
+pub fn fixture(path: &str) -> Option<Vec<u8>> {
+    match std::fs::read(fixtures().join(path)) {
         Ok(bytes) => Some(bytes),
         Err(error) => {
             assert!(std::env::var_os("CI").is_none(), "fixture {path}: {error}");
