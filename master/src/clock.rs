@@ -40,7 +40,7 @@ pub fn now() -> Nanos {
 }
 
 fn monotonic() -> Nanos {
-    let t = clock_gettime(rustix::time::ClockId::Monotonic);
+    let t = clock_gettime(ClockId::Monotonic);
     let seconds = u64::try_from(t.tv_sec).unwrap_or(0);
     let nanos = u64::try_from(t.tv_nsec).unwrap_or(0);
     seconds * NANOS_PER_SECOND + nanos

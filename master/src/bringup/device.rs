@@ -10,16 +10,16 @@ use crate::rt::image::Region;
 /// FMMU registers (ETG.1000.4, Table 56): 16 bytes each.
 const FMMU: u16 = 0x0600;
 const FMMU_SIZE: u16 = 16;
-/// Number of FMMUs the controller has (ETG.1000.4, DL information).
-const FMMU_COUNT: u16 = 0x0004;
+/// SyncManager registers (ETG.1000.4, Table 58): 8 bytes each.
+const SYNC_MANAGER: u16 = 0x0800;
+const SYNC_MANAGER_SIZE: u16 = 8;
 const WATCHDOG_DIVIDER: u16 = 0x0400;
 const WATCHDOG_PROCESS_DATA: u16 = 0x0420;
 /// (2498 + 2) × 40 ns: the process-data watchdog counts in 100 µs.
 const DIVIDER_100_US: u16 = 2498;
 
 /// Downloads the start-up SDOs in order. The mailbox is emptied before, because a device may have
-/// sent emergencies while nobody listened, and after, because ethercrab's own CoE client cannot
-/// deal with them.
+/// sent emergencies while nobody listened.
 pub(super) async fn start_up(
     wire: &impl Wire,
     config: &DeviceConfig,
@@ -28,16 +28,9 @@ pub(super) async fn start_up(
 ) -> Result<(), BringUpError> {
     let list = &config.selection.startup;
     let Some(coe) = device.coe.as_mut() else { return Ok(()) };
-    let mailbox_failed = |source| BringUpError::StartUp {
-        device: device.at.clone(),
-        index: 0,
-        sub: 0,
-        name: "emptying the mailbox".to_owned(),
-        value: "-".to_owned(),
-        origin: "bring-up".to_owned(),
-        source,
-    };
-    coe.drain(wire).await.map_err(mailbox_failed)?;
+    coe.drain(wire)
+        .await
+        .map_err(|source| BringUpError::Mailbox { device: device.at.clone(), source })?;
     for (done, sdo) in list.iter().enumerate() {
         coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data).await.map_err(
             |source| BringUpError::StartUp {
@@ -52,7 +45,6 @@ pub(super) async fn start_up(
         )?;
         progress(Step::StartUp { device: config.name.clone(), done: done + 1, of: list.len() });
     }
-    coe.drain(wire).await.map_err(mailbox_failed)?;
     Ok(())
 }
 
@@ -65,36 +57,42 @@ fn format_value(data: &[u8]) -> String {
     format!("0x{value:0width$x}", width = data.len() * 2)
 }
 
-/// Moves outputs and inputs to the same logical address; one FMMU a SyncManager.
+/// Configures the SyncManagers of the process data, and one FMMU for each. Outputs and inputs start
+/// at the same logical address.
 pub(super) async fn map_process_data(
     wire: &impl Wire,
     config: &DeviceConfig,
     device: &BusDevice,
     region: Option<Region>,
 ) -> Result<(), BringUpError> {
-    const STEP: &str = "configuring FMMUs";
     const READ: u8 = 1;
     const WRITE: u8 = 2;
 
+    let layout = &config.selection.layout;
     let mut fmmus = Vec::new();
-    if let Some(region) = region {
-        let layout = &config.selection.layout;
-        for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
-            let mut logical = region.logical;
-            for sm in sms.iter().filter(|sm| sm.len > 0) {
+    for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
+        let mut logical = region.map_or(0, |region| region.logical);
+        for sm in sms {
+            let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm.sm);
+            write(wire, device, "configuring SyncManagers", register, &sync_manager(sm)).await?;
+            if sm.len > 0 {
                 fmmus.push(fmmu(logical, sm, kind));
                 logical = logical.saturating_add(u32::from(sm.len));
             }
         }
     }
-    let mut count = [0];
-    read(wire, device, STEP, FMMU_COUNT, &mut count).await?;
-    fmmus.resize(usize::from(count[0]).max(fmmus.len()), [0; FMMU_SIZE as usize]);
     for (i, fmmu) in fmmus.iter().enumerate() {
         let register = FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
-        write(wire, device, STEP, register, fmmu).await?;
+        write(wire, device, "configuring FMMUs", register, fmmu).await?;
     }
     Ok(())
+}
+
+/// A SyncManager without data stays off: a device refuses an active one of length 0.
+fn sync_manager(sm: &SmLayout) -> [u8; SYNC_MANAGER_SIZE as usize] {
+    let [p0, p1] = sm.start_address.to_le_bytes();
+    let [n0, n1] = sm.len.to_le_bytes();
+    [p0, p1, n0, n1, sm.control_byte, 0, u8::from(sm.len > 0), 0]
 }
 
 fn fmmu(logical: u32, sm: &SmLayout, kind: u8) -> [u8; FMMU_SIZE as usize] {

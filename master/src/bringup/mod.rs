@@ -1,9 +1,9 @@
 //! From a silent wire to SafeOp. MAY BLOCK AND ALLOCATE.
 //!
 //! ethercrab scans, addresses, reads the EEPROMs, sets up mailboxes, measures propagation delays
-//! and configures SyncManagers. Ours are the comparison with the machine file, the start-up SDOs,
-//! the shared logical addresses, SYNC0, watchdogs and the state changes, because those need the
-//! ESI or must name the device when they fail.
+//! and goes to PreOp. Ours are the comparison with the machine file, the start-up SDOs, SyncManagers
+//! and FMMUs of the process data, SYNC0, watchdogs and the further state changes, because those
+//! need the ESI or must name the device when they fail.
 
 use std::fmt;
 
@@ -19,14 +19,15 @@ pub mod al;
 mod clocks;
 mod device;
 mod identify;
+mod mapping;
 
 pub use al::{AlState, StateError};
 pub use clocks::DcPlan;
 
 /// SubDevices that ethercrab keeps in one group; a power of two.
 const MAX_SUBDEVICES: usize = 128;
-/// ethercrab's own process image. Ours replaces it; it only has to be large enough.
-const MAX_PDI: usize = 8192;
+/// ethercrab's own process image, which stays unused.
+const MAX_PDI: usize = 1;
 
 type Group = SubDeviceGroup<MAX_SUBDEVICES, MAX_PDI>;
 
@@ -120,8 +121,12 @@ pub enum BringUpError {
         origin: String,
         source: SdoError,
     },
-    #[error("{device}: the drive took {actual} bytes of {direction}, the ESI's layout has {expected}")]
-    Mapping { device: DeviceRef, direction: &'static str, expected: usize, actual: usize },
+    #[error("{device}: reading the PDO mapping back: 0x{index:04x}:{sub:02x} holds {actual}, the ESI's layout has {expected}")]
+    Mapping { device: DeviceRef, index: u16, sub: u8, expected: String, actual: String },
+    #[error("{device}: emptying the mailbox: {source}")]
+    Mailbox { device: DeviceRef, source: SdoError },
+    #[error("{device}: reading the PDO mapping back: {source}")]
+    ReadBack { device: DeviceRef, source: SdoError },
     #[error("{device}: {source}")]
     TooLarge { device: DeviceRef, source: TooLarge },
     #[error("{device}: {step}: {source}")]
@@ -170,32 +175,10 @@ pub async fn bring_up(
 
     for (config, device) in machine.devices.iter().zip(&mut devices) {
         device::start_up(&wire, config, device, progress).await?;
+        mapping::compare(&wire, config, device).await?;
     }
 
-    // ethercrab reads the accepted mapping back and sets the SyncManagers up from it.
-    let group = group
-        .into_pre_op_pdi(main_device)
-        .await
-        .map_err(|e| scan_error("reading the PDO mapping back", &e))?;
-    for ((config, device), &position) in machine.devices.iter().zip(&devices).zip(&order) {
-        let sub_device = group
-            .subdevice(main_device, usize::from(position))
-            .map_err(|e| scan_error("reading the PDO mapping back", &e))?;
-        let layout = &config.selection.layout;
-        for (direction, expected, actual) in [
-            ("outputs", layout.rx_bytes(), sub_device.outputs_raw().len()),
-            ("inputs", layout.tx_bytes(), sub_device.inputs_raw().len()),
-        ] {
-            if expected != actual {
-                return Err(BringUpError::Mapping {
-                    device: device.at.clone(),
-                    direction,
-                    expected,
-                    actual,
-                });
-            }
-        }
-    }
+    // From here on ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
 
     let sizes: Vec<_> = machine

@@ -66,7 +66,7 @@ impl PacketLink {
         address.sll_family = u16::try_from(libc::AF_PACKET).unwrap_or(0);
         address.sll_protocol = ETHERCAT.to_be();
         address.sll_ifindex = index;
-        let length = libc::socklen_t::try_from(mem::size_of::<libc::sockaddr_ll>()).unwrap_or(0);
+        let length = libc::socklen_t::try_from(size_of::<libc::sockaddr_ll>()).unwrap_or(0);
         // SAFETY: the address lives through the call and `length` is its size.
         let bound = unsafe {
             libc::bind(socket.as_raw_fd(), (&raw const address).cast::<libc::sockaddr>(), length)
@@ -136,7 +136,7 @@ fn check_interface(nic: &str) -> Result<(), OpenError> {
 }
 
 fn set_option(socket: &OwnedFd, level: i32, name: i32, value: i32) -> io::Result<()> {
-    let length = libc::socklen_t::try_from(mem::size_of::<i32>()).unwrap_or(0);
+    let length = libc::socklen_t::try_from(size_of::<i32>()).unwrap_or(0);
     // SAFETY: `value` lives through the call and `length` is its size.
     let result = unsafe {
         libc::setsockopt(socket.as_raw_fd(), level, name, (&raw const value).cast(), length)

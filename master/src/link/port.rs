@@ -58,6 +58,8 @@ pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, Port) {
     };
     let timeouts = Timeouts {
         pdu: Duration::from_nanos(cycle_ns.saturating_mul(5)).max(PDU_TIMEOUT),
+        // Whole operations must outlast the repetition of a lost datagram.
+        eeprom: Duration::from_secs(1),
         wait_loop_delay: Duration::from_micros(200),
         ..Timeouts::default()
     };

@@ -15,6 +15,9 @@ use crate::link::{Link, LinkError, MAX_FRAME};
 /// An axis that is not at rest this long after the machine began to stop is disabled all the same.
 const STOP_PATIENCE: Nanos = 5_000_000_000;
 
+/// An axis at rest settles on its target this long before its power is taken away.
+const SETTLE: Nanos = 100_000_000;
+
 /// One axis and where its objects are.
 #[derive(Debug)]
 pub struct AxisSlot {
@@ -23,12 +26,14 @@ pub struct AxisSlot {
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
     pub last_enabled: Option<AxisStatus>,
+    /// How long a stopping axis has been at rest.
+    rested: Nanos,
 }
 
 impl AxisSlot {
     #[must_use]
     pub fn new(axis: Axis, bits: AxisBits) -> Self {
-        Self { axis, bits, largest_following_error: 0.0, last_enabled: None }
+        Self { axis, bits, largest_following_error: 0.0, last_enabled: None, rested: 0 }
     }
 
     fn read(&self, image: &[u8], fresh: bool) -> Inputs {
@@ -230,10 +235,12 @@ impl Engine {
     }
 
     fn count(&mut self) {
-        if !self.answer.complete {
-            self.stats.counters.lost_frames += 1;
-        } else if !self.answer.inputs_fresh {
-            self.stats.counters.wkc_errors += 1;
+        if self.guarding {
+            if !self.answer.complete {
+                self.stats.counters.lost_frames += 1;
+            } else if !self.answer.inputs_fresh {
+                self.stats.counters.wkc_errors += 1;
+            }
         }
         self.stats.counters.refused_answers = self.port.refused;
     }
@@ -280,6 +287,7 @@ impl Engine {
                 }
             }
             Order::Guard => self.guarding = true,
+            Order::Unguard => self.guarding = false,
             Order::Stop => self.stop(StopCause::Requested),
             Order::ErrorCode { axis, code } => {
                 if let Some(slot) = self.axes.get_mut(axis) {
@@ -337,11 +345,13 @@ impl Engine {
             let status = slot.axis.status();
             if status.enabled {
                 slot.largest_following_error =
-                    slot.largest_following_error.max(status.following_error.abs());
+                    slot.largest_following_error.max(status.max_following_error);
                 slot.last_enabled = Some(status);
             }
             if self.stopping.is_some() {
-                if status.enabled && (status.at_rest && !status.moving || out_of_patience) {
+                let at_rest = status.at_rest && !status.moving;
+                slot.rested = if at_rest { slot.rested + self.timing.cycle_ns } else { 0 };
+                if status.enabled && (slot.rested >= SETTLE || out_of_patience) {
                     let _ = slot.axis.command(Command::Disable);
                 }
             } else if cause.is_none() {

@@ -16,8 +16,10 @@ const EVENTS: usize = 256;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Order {
     Axis { axis: usize, command: Command },
-    /// From now on a bad bus stops the machine.
+    /// From now on bad cycles are counted, and too many stop the machine.
     Guard,
+    /// The segment is about to leave Op: wrong working counters are expected.
+    Unguard,
     /// Bring every axis to rest within its limits, then disable it.
     Stop,
     /// A drive's error code, read beside the cycle.

@@ -28,8 +28,8 @@ pub enum RunError {
     NotMapped { device: DeviceRef, source: NotMapped },
     #[error("{device}: {source}")]
     Axis { device: DeviceRef, source: ecaxis_axis::ConfigError },
-    #[error("no process data comes back: {lost} frames lost, {wkc} with a wrong working counter")]
-    NoProcessData { lost: u64, wkc: u64 },
+    #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
+    NoProcessData { al_status: Option<(u8, u16)> },
     #[error("the release of frames does not lock to SYNC0: phase error {error_ns} ns")]
     PhaseNotLocked { error_ns: i64 },
     #[error(transparent)]
@@ -75,6 +75,15 @@ pub enum RunError {
     Interrupted,
     #[error("internal error: {0}")]
     Panicked(String),
+}
+
+fn al_note(al_status: Option<(u8, u16)>) -> String {
+    match al_status {
+        Some((status, count)) => {
+            format!("the working counter is wrong; {count} SubDevice(s) answer, AL status 0x{status:02x}")
+        }
+        None => "cyclic frames do not return in time".to_owned(),
+    }
 }
 
 fn mode_note(confirmed: bool) -> &'static str {

@@ -36,6 +36,7 @@ mod progress;
 mod summary;
 
 pub use error::RunError;
+pub use open::simulated_bus;
 pub use progress::{AxisLine, Observer, Progress, Status};
 pub use summary::{AxisSummary, Summary};
 

@@ -2,7 +2,7 @@
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice};
+use ecaxis_sim::{DeviceOptions, FaultScript, Segment, SegmentOptions, SimDevice};
 
 use super::{Options, RunError};
 use crate::clock::{self, Clock};
@@ -15,7 +15,7 @@ use crate::link::sim::SimLink;
 
 pub(super) fn link(machine: &Machine, options: &Options) -> Result<Box<dyn Link>, RunError> {
     let link: Box<dyn Link> = match &machine.bus.nic {
-        Nic::Sim => Box::new(SimLink::new(segment(machine, options)?)),
+        Nic::Sim => Box::new(SimLink::new(simulated_bus(machine, options.seed, options.faults.as_ref())?)),
         Nic::Interface(nic) => Box::new(PacketLink::open(nic)?),
     };
     let Some(path) = &options.record else { return Ok(link) };
@@ -38,7 +38,11 @@ fn since_1970() -> u64 {
 }
 
 /// The simulated bus that the machine file describes: every device from its own ESI.
-pub fn segment(machine: &Machine, options: &Options) -> Result<Segment, RunError> {
+pub fn simulated_bus(
+    machine: &Machine,
+    seed: u64,
+    faults: Option<&FaultScript>,
+) -> Result<Segment, RunError> {
     let mut placed: Vec<Option<&DeviceConfig>> = machine.devices.iter().map(|_| None).collect();
     for device in &machine.devices {
         if let Locator::Position(position) = device.at
@@ -54,8 +58,8 @@ pub fn segment(machine: &Machine, options: &Options) -> Result<Segment, RunError
         let Some(device) = place.or_else(|| others.next()) else { continue };
         devices.push(sim_device(device, devices.len())?);
     }
-    let mut segment = Segment::new(devices, SegmentOptions { seed: options.seed, ..SegmentOptions::default() });
-    if let Some(faults) = &options.faults {
+    let mut segment = Segment::new(devices, SegmentOptions { seed, ..SegmentOptions::default() });
+    if let Some(faults) = faults {
         segment.set_faults(faults.clone());
     }
     Ok(segment)
@@ -76,7 +80,8 @@ fn sim_device(device: &DeviceConfig, position: usize) -> Result<SimDevice, RunEr
         Locator::Alias(alias) | Locator::Id(alias) => options.alias = alias,
     }
     if let Some(axis) = &device.axis {
-        options.plant.counts_per_turn = axis.config.scale.counts_per_turn();
+        // Validated as a positive number that fits.
+        options.plant.counts_per_turn = axis.config.scale.counts_per_turn().round() as u32;
     }
     SimDevice::from_esi(&device.device, &device.esi.modules, options)
         .map_err(|error| RunError::Sim(format!("`{}`: {error}", device.name)))

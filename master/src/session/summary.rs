@@ -1,5 +1,6 @@
 //! What a run comes to, in numbers.
 
+use ecaxis_axis::{AxisStatus, Mode, Scale};
 use serde::Serialize;
 
 use crate::clock::Clock;
@@ -55,6 +56,10 @@ pub struct AxisSummary {
     pub trip: Option<String>,
 }
 
+fn error_counts(scale: &Scale, status: &AxisStatus) -> i64 {
+    ((status.target_position - status.position) * scale.counts_per_unit()).round() as i64
+}
+
 impl Summary {
     pub(super) fn new(
         machine: &Machine,
@@ -77,7 +82,8 @@ impl Summary {
                     was_enabled: slot.last_enabled.is_some(),
                     final_position: last.position,
                     target_position: last.target_position,
-                    final_error_counts: last.final_error_counts,
+                    final_error_counts: (last.mode == Mode::Csp && slot.last_enabled.is_some())
+                        .then(|| error_counts(&setup.config.scale, &last)),
                     largest_following_error: slot.largest_following_error,
                     final_state: now.state.to_string(),
                     fault: now.fault.map(|fault| fault.to_string()),

@@ -131,7 +131,7 @@ impl Supervisor {
             }
             if clock::now().saturating_sub(start) > LOCK_TIMEOUT {
                 return Err(Break::Failed(if good == 0 {
-                    RunError::NoProcessData { lost: snapshot.counters.lost_frames, wkc: snapshot.counters.wkc_errors }
+                    RunError::NoProcessData { al_status: snapshot.al_status }
                 } else {
                     RunError::PhaseNotLocked { error_ns: snapshot.phase.map_or(0, |p| p.error_ns) }
                 }));
@@ -219,6 +219,7 @@ impl Supervisor {
             clock::delay(TICK).await;
         }
         self.pass_events_on();
+        self.order(Order::Unguard).await;
         if lost {
             return Ok(());
         }

@@ -1,0 +1,128 @@
+//! What the whole-bus tests share: machines as text, runs under virtual time, the fixtures.
+
+#![allow(dead_code, reason = "every test binary uses a part")]
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use ecaxis::clock::Clock;
+use ecaxis::config::{self, Machine};
+use ecaxis::session::{self, Observer, Options, Outcome, Progress, Summary};
+use ecaxis_sim::FaultScript;
+
+/// The workspace's root.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().expect("the workspace exists")
+}
+
+/// A machine file given as text; paths in it are relative to `configs/`.
+pub fn machine(text: &str) -> Machine {
+    match config::parse(&root().join("configs/test.toml"), text) {
+        Ok(machine) => machine,
+        Err(error) => panic!("{error}"),
+    }
+}
+
+/// One of the machine files of the project.
+pub fn load(name: &str) -> Machine {
+    match config::load(&root().join("configs").join(name)) {
+        Ok(machine) => machine,
+        Err(error) => panic!("{error}"),
+    }
+}
+
+/// A third-party file to test against. `None`, with the reason printed, where it is absent; on CI
+/// that is a failure.
+pub fn fixture(path: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os("ECAXIS_FIXTURES")
+        .map_or_else(|| root().join("../shared/fixtures"), PathBuf::from);
+    let file = folder.join(path);
+    if file.exists() {
+        return Some(file);
+    }
+    assert!(std::env::var_os("CI").is_none(), "{} is missing on CI", file.display());
+    println!("skipped: {} is not here (set ECAXIS_FIXTURES)", file.display());
+    None
+}
+
+#[derive(Debug, Default)]
+pub struct Heard(pub Vec<Progress>);
+
+impl Observer for Heard {
+    fn progress(&mut self, progress: &Progress) {
+        self.0.push(progress.clone());
+    }
+}
+
+impl Heard {
+    pub fn warnings(&self) -> Vec<&str> {
+        self.0
+            .iter()
+            .filter_map(|p| match p {
+                Progress::Warning(text) => Some(text.as_str()),
+                _ => None,
+            })
+            .collect()
+    }
+}
+
+pub fn virtual_time() -> Options {
+    Options { clock: Clock::Virtual, ..Options::default() }
+}
+
+pub fn faults(script: &str) -> Options {
+    let faults = FaultScript::parse(script).unwrap_or_else(|error| panic!("{error}"));
+    Options { faults: Some(faults), ..virtual_time() }
+}
+
+pub fn run(machine: Machine, options: Options) -> (Outcome, Heard) {
+    let mut heard = Heard::default();
+    let outcome = session::run(machine, options, Arc::new(AtomicBool::new(false)), &mut heard);
+    (outcome, heard)
+}
+
+/// Runs a machine that must do its whole program.
+pub fn run_well(machine: Machine, options: Options) -> Summary {
+    let (outcome, heard) = run(machine, options);
+    if let Err(error) = outcome.result {
+        panic!("{error}; warnings: {:?}", heard.warnings());
+    }
+    outcome.summary.expect("a summary")
+}
+
+/// Runs a machine that must fail; the error's text, and the summary if the cycle ran.
+pub fn run_badly(machine: Machine, options: Options) -> (String, Option<Summary>) {
+    let (outcome, _) = run(machine, options);
+    match outcome.result {
+        Err(error) => (error.to_string(), outcome.summary),
+        Ok(()) => panic!("the run must fail; it ended with {:#?}", outcome.summary),
+    }
+}
+
+/// A machine of `count` CSP axes `a0`, `a1` … at 1 ms that move 80 turns and back, 1.7 s each.
+pub fn axes(count: usize) -> String {
+    let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
+    for i in 0..count {
+        text += &format!(
+            r#"
+[[device]]
+name = "a{i}"
+esi = "esi/EPOS4.xml"
+position = {i}
+mode = "csp"
+[device.axis]
+unit = "turn"
+per_turn = 1.0
+encoder = 2000
+limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }}
+"#
+        );
+    }
+    for target in [80.0, 0.0] {
+        text += "\n[[step]]\nmove = { ";
+        text += &(0..count).map(|i| format!("a{i} = {target}")).collect::<Vec<_>>().join(", ");
+        text += " }\n";
+    }
+    text
+}

@@ -1,0 +1,167 @@
+//! The main job on the simulated bus under virtual time: a machine file goes in, moving axes come
+//! out.
+
+mod common;
+
+use common::{axes, fixture, load, machine, run, run_well, virtual_time};
+use ecaxis::session::{Options, Progress};
+
+#[test]
+fn the_demo_moves_both_axes_ten_turns_and_back_twice() {
+    let summary = run_well(load("demo.toml"), virtual_time());
+    assert_eq!(summary.program_runs, 2);
+    assert_eq!(summary.axes.len(), 2);
+    for axis in &summary.axes {
+        assert!(axis.was_enabled, "{axis:?}");
+        assert_eq!(axis.target_position, 0.0, "{axis:?}");
+        let error = axis.final_error_counts.expect("CSP reports its error");
+        assert!(error.abs() <= 1, "{axis:?}");
+        assert!(axis.largest_following_error > 0.0, "an axis that moved has followed: {axis:?}");
+        assert_eq!((&axis.fault, &axis.trip), (&None, &None));
+    }
+    assert_eq!(summary.counters.lost_frames, 0);
+    assert_eq!(summary.counters.wkc_errors, 0);
+    let phase = summary.dc_phase_error.expect("the demo uses distributed clocks");
+    assert!(phase.p99_ns < 10_000, "locked to SYNC0 within a hundredth of the cycle: {phase:?}");
+}
+
+#[test]
+fn three_modes_at_once_each_in_its_own() {
+    let summary = run_well(load("modes.toml"), virtual_time());
+    let modes: Vec<_> = summary.axes.iter().map(|axis| axis.mode.as_str()).collect();
+    assert_eq!(modes, ["csp", "csv", "cst"]);
+    for axis in &summary.axes {
+        // The axis is enabled only while 0x6061 shows its mode.
+        assert!(axis.was_enabled, "{axis:?}");
+    }
+}
+
+#[test]
+fn every_axis_of_the_modes_machine_moves() {
+    let (outcome, heard) = run(load("modes.toml"), virtual_time());
+    outcome.result.expect("runs");
+    let mut largest = [0.0_f64; 3];
+    for progress in &heard.0 {
+        if let Progress::Status(status) = progress {
+            for (largest, axis) in largest.iter_mut().zip(&status.axes) {
+                *largest = largest.max(axis.position.abs());
+            }
+        }
+    }
+    assert!(largest.iter().all(|moved| *moved > 0.1), "{largest:?}");
+}
+
+/// The vendor's own ESI instead of ours, slots, modules and all.
+#[test]
+fn the_vendors_epos4_in_each_cyclic_mode() {
+    let Some(esi) = fixture("esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
+        return;
+    };
+    for (mode, step, limits) in [
+        ("csp", "move = { x = 10.0 }", "position = [-50.0, 50.0],"),
+        ("csv", "velocity = { x = 20.0 }", ""),
+        ("cst", "torque = { x = 20.0 }", ""),
+    ] {
+        let text = format!(
+            r#"
+            [bus]
+            nic = "sim"
+            cycle = "1ms"
+            [[device]]
+            name = "x"
+            esi = "{}"
+            position = 0
+            mode = "{mode}"
+            [device.axis]
+            unit = "turn"
+            per_turn = 1.0
+            encoder = 2000
+            limits = {{ {limits} velocity = 50.0, acceleration = 200.0, torque = 100.0 }}
+            [[step]]
+            {step}
+            [[step]]
+            dwell = "200ms"
+            "#,
+            esi.display()
+        );
+        let summary = run_well(machine(&text), virtual_time());
+        let axis = &summary.axes[0];
+        assert!(axis.was_enabled, "{mode}: {axis:?}");
+        if mode == "csp" {
+            assert!(axis.final_error_counts.is_some_and(|e| e.abs() <= 1), "{axis:?}");
+            assert!((axis.final_position - 10.0).abs() < 0.001, "{axis:?}");
+        }
+    }
+}
+
+/// The application notes' `SetupDriveCommandingCSP`, object by object: assignments cleared, the
+/// one PDO each way rewritten, the other three emptied, assigned again, 1 ms, mode 8.
+#[test]
+fn the_vendors_start_up_list_has_the_effect_of_the_application_notes() {
+    let Some(esi) = fixture("esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
+        return;
+    };
+    let text = axes(1).replace("esi/EPOS4.xml", &esi.display().to_string());
+    let machine = machine(&text);
+    let list: Vec<_> = machine.devices[0]
+        .selection
+        .startup
+        .iter()
+        .map(|sdo| {
+            let value = sdo.data.iter().rev().fold(0_u64, |v, b| v << 8 | u64::from(*b));
+            (sdo.index, sdo.sub, value)
+        })
+        .collect();
+    let at = |wanted: (u16, u8, u64)| {
+        list.iter().position(|sdo| *sdo == wanted).unwrap_or_else(|| panic!("{wanted:x?} in {list:x?}"))
+    };
+    let last = |index, sub| list.iter().rev().find(|s| s.0 == index && s.1 == sub).map(|s| s.2);
+
+    for sm in [0x1c12, 0x1c13] {
+        let cleared = at((sm, 0, 0));
+        let assigned = at((sm, 0, 1));
+        assert!(cleared < assigned);
+        let pdo = if sm == 0x1c12 { 0x1600 } else { 0x1a00 };
+        assert!(at((sm, 1, pdo)) < assigned);
+        // Contents change only while nothing is assigned and the PDO counts no entries.
+        let emptied = at((pdo as u16, 0, 0));
+        let first_entry = list.iter().position(|s| s.0 == pdo as u16 && s.1 == 1).expect("an entry");
+        assert!(cleared < emptied && emptied < first_entry && first_entry < at((sm, 1, pdo)));
+    }
+    assert_eq!(last(0x1600, 1), Some(0x6040_0010));
+    assert_eq!(last(0x1600, 2), Some(0x607a_0020));
+    assert_eq!(last(0x1a00, 1), Some(0x6041_0010));
+    assert_eq!(last(0x1a00, 2), Some(0x6064_0020));
+    for other in [0x1601, 0x1602, 0x1603, 0x1a01, 0x1a02, 0x1a03] {
+        assert_eq!(last(other, 0), Some(0), "0x{other:04x} is emptied");
+    }
+    assert_eq!(last(0x60c2, 1), Some(1), "1 ms");
+    assert_eq!(last(0x6060, 0), Some(8), "CSP");
+}
+
+#[test]
+fn the_same_seed_gives_the_same_summary_and_the_same_recording() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let run = |name: &str, seed| {
+        let record = folder.path().join(name);
+        let limit = Some(20_000_000_000);
+        let options = Options { seed, limit, record: Some(record.clone()), ..virtual_time() };
+        let summary = run_well(load("demo.toml"), options);
+        assert!(summary.machine_seconds > 20.0, "{summary:?}");
+        let json = serde_json::to_string(&summary).expect("a summary is JSON");
+        (json, std::fs::read(record).expect("the recording"))
+    };
+    let first = run("first.pcapng", 7);
+    let second = run("second.pcapng", 7);
+    assert_eq!(first.0, second.0);
+    assert!(first.1.len() > 1_000_000, "{} bytes", first.1.len());
+    assert!(first.1 == second.1, "the recordings differ");
+}
+
+#[test]
+fn positions_on_the_bus_need_not_follow_the_file() {
+    let text = axes(3).replace("position = 0", "position = 9").replace("position = 2", "position = 0");
+    let summary = run_well(machine(&text.replace("position = 9", "position = 2")), virtual_time());
+    assert_eq!(summary.axes.len(), 3);
+    assert!(summary.axes.iter().all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1)));
+}
