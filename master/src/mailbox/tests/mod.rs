@@ -9,6 +9,7 @@ use super::{CoeClient, MailboxLayout, Timeouts};
 mod errors;
 mod hostile;
 mod mischief;
+mod recorded;
 mod server;
 mod transfers;
 

@@ -1,0 +1,105 @@
+//! What real devices and another MainDevice said: an EK1914 and an EL3004 to ethercrab, a LAN9252 to SOEM.
+
+use crate::mailbox::coe::{Answer, Message, Request, parse};
+
+/// Mailbox header and CoE message as recorded, without the padding that fills the mailbox.
+fn emitted(request: &Request<'_>, counter: u8) -> Vec<u8> {
+    let mut out = vec![0xa5; 7];
+    request.emit(counter, 128, &mut out);
+    assert_eq!(out.len(), 128);
+    let (message, padding) = out.split_at(16);
+    assert!(padding.iter().all(|byte| *byte == 0));
+    message.to_vec()
+}
+
+fn bytes(hex: &str) -> Vec<u8> {
+    let digits: Vec<char> = hex.chars().filter(|c| !c.is_whitespace()).collect();
+    let pair = |p: &[char]| u8::from_str_radix(&p.iter().collect::<String>(), 16).unwrap();
+    digits.chunks(2).map(pair).collect()
+}
+
+#[test]
+fn requests_are_those_of_other_main_devices() {
+    let up = |index, sub, complete| Request::Upload {
+        index,
+        sub,
+        complete,
+    };
+    let down = |index, sub, data| Request::DownloadExpedited { index, sub, data };
+    for (request, counter, recorded) in [
+        (
+            up(0x1008, 0, false),
+            1,
+            "0a0000000013 0020 4008100000000000",
+        ),
+        (
+            up(0x1c13, 4, false),
+            4,
+            "0a0000000043 0020 40131c0400000000",
+        ),
+        (up(0x1c12, 0, true), 2, "0a0000000023 0020 50121c0000000000"),
+        (
+            down(0x1c12, 0, &[0]),
+            1,
+            "0a0000000013 0020 2f121c0000000000",
+        ),
+        (
+            down(0x1c13, 1, &[0, 0x1a]),
+            3,
+            "0a0000000033 0020 2b131c01001a0000",
+        ),
+        (
+            down(0xf008, 0, &[1, 0, 0, 0]),
+            2,
+            "0a0000000023 0020 2308f00001000000",
+        ),
+    ] {
+        assert_eq!(emitted(&request, counter), bytes(recorded), "{request:?}");
+    }
+}
+
+#[test]
+fn answers_of_real_devices_are_understood() {
+    let up = |index, sub, size, data| Answer::Upload {
+        index,
+        sub,
+        size,
+        data,
+    };
+    for (recorded, answer) in [
+        (
+            "100000000013 0030 4108100006000000 454b31393134",
+            up(0x1008, 0, 6, &b"EK1914"[..]),
+        ),
+        (
+            "0a0000000013 0030 4b0a100030380000",
+            up(0x100a, 0, 2, b"08"),
+        ),
+        (
+            "0a0000000033 0030 4308f00001000000",
+            up(0xf008, 0, 4, &[1, 0, 0, 0]),
+        ),
+        ("0a0000000053 0030 4f131c0004000000", up(0x1c13, 0, 1, &[4])),
+        // Complete access: subindex 0 in 16 bits, then the elements.
+        (
+            "100000000013 0030 51001c0006000000 040001020304",
+            up(0x1c00, 0, 6, &[4, 0, 1, 2, 3, 4]),
+        ),
+        (
+            "0a0000000023 0030 53121c0001000116",
+            up(0x1c12, 0, 4, &[1, 0, 1, 0x16]),
+        ),
+        // The answer to an expedited download echoes its data.
+        (
+            "0a0000000033 0030 60131c01001a0000",
+            Answer::Download {
+                index: 0x1c13,
+                sub: 1,
+            },
+        ),
+    ] {
+        let mut mailbox = bytes(recorded);
+        mailbox.resize(128, 0xa5);
+        assert_eq!(parse(&mailbox), Ok(Message::Sdo(answer)));
+    }
+}
