@@ -6,9 +6,7 @@ use ecaxis_esi::sii::{self, SiiOptions};
 use super::esm::Al;
 use super::mailbox::Mailbox;
 use super::process::ProcessData;
-use super::{
-    Application, CONTROL_PERIOD_NS, Fresh, IO_PERIOD_NS, MailboxLimits, SYNC_LOG, SimDevice,
-};
+use super::{Application, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
@@ -115,11 +113,6 @@ impl SimDevice {
             .mailbox
             .as_ref()
             .and_then(|mailbox| mailbox.coe.as_ref());
-        let tick_ns = if is_drive {
-            CONTROL_PERIOD_NS
-        } else {
-            IO_PERIOD_NS
-        };
         let mut sim = Self {
             name: device.type_name.clone(),
             delay_ns: options.delay_ns,
@@ -141,7 +134,6 @@ impl SimDevice {
             complete_access: coe.is_some_and(|coe| coe.complete_access),
             al: Al::default(),
             tick: 0,
-            tick_ns,
             sync_log: [0; SYNC_LOG],
             sync_count: 0,
             refusals: Vec::new(),

@@ -55,7 +55,7 @@ impl SimDevice {
             Request::Refused(code) => self.settle(self.al.state, code),
             Request::Change(to) => match self.demand(to) {
                 Err(code) => self.settle(self.al.state, code),
-                Ok(()) if to == AlState::Op && self.sync_is_on() => {
+                Ok(()) if to == AlState::Op && self.sync0_decides() => {
                     self.al.waits_for_sync = true;
                     self.al.code = 0;
                     self.al.due = local + FIRST_SYNC_NS;
@@ -99,13 +99,6 @@ impl SimDevice {
             self.esc.put(reg::AL_STATUS, &status.to_le_bytes());
             self.esc.put(reg::AL_STATUS_CODE, &id.to_le_bytes());
         }
-    }
-
-    fn sync_is_on(&self) -> bool {
-        self.esc
-            .dc
-            .as_ref()
-            .is_some_and(|dc| dc.sync0 != Sync0::Off)
     }
 
     /// What must hold before `to` is entered.
@@ -298,7 +291,7 @@ impl SimDevice {
         }
         if sms && let Err(code) = self.check_process_data() {
             self.fall_to(AlState::PreOp, code, DeviceError::BusDown);
-        } else if sync && self.al.state == AlState::Op && !self.sync_is_on() {
+        } else if sync && self.al.state == AlState::Op && !self.sync0_decides() {
             self.fall_to(
                 AlState::SafeOp,
                 code::FATAL_SYNC_ERROR,

@@ -18,14 +18,13 @@ use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::{CONTROL_PERIOD_NS, Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
+use crate::esc::dc::Sync0;
 use crate::frame;
 pub use build::{DeviceOptions, SimError};
 use esm::Al;
 use mailbox::Mailbox;
 use process::{Mirror, ProcessData};
 
-/// How often a device without a drive looks after its inputs.
-const IO_PERIOD_NS: u64 = 1_000_000;
 /// Pulses remembered by [`SimDevice::sync0_log`].
 const SYNC_LOG: usize = 64;
 
@@ -71,8 +70,8 @@ pub struct SimDevice {
     has_boot: bool,
     complete_access: bool,
     al: Al,
+    /// Local time of the drive's next control cycle.
     tick: u64,
-    tick_ns: u64,
     sync_log: [Nanos; SYNC_LOG],
     sync_count: u64,
     fresh: Box<Fresh>,
@@ -178,7 +177,10 @@ impl SimDevice {
             mailbox.reset();
         }
         self.close_process_data(true);
-        self.tick = self.esc.clock.local(now) + self.tick_ns;
+        self.tick = match self.application {
+            Application::Drive(_) => self.esc.clock.local(now) + CONTROL_PERIOD_NS,
+            Application::Io { .. } => u64::MAX,
+        };
         (self.sync_count, self.sync_log) = (0, [0; SYNC_LOG]);
     }
 
@@ -230,12 +232,13 @@ impl SimDevice {
     }
 
     fn tick(&mut self) {
-        self.tick += self.tick_ns;
+        self.tick += CONTROL_PERIOD_NS;
         let in_op = self.al.state == AlState::Op;
         if let Application::Drive(drive) = &mut self.application {
             drive.control(&mut self.store, in_op);
             self.send_emergencies();
-        } else if self.outputs_are_none() {
+        }
+        if self.outputs_are_none() && !self.sync0_decides() {
             self.latch_inputs();
         }
     }
@@ -267,6 +270,10 @@ impl SimDevice {
     /// Processes a frame whose first byte arrives at `now`; true if receive times were latched.
     pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> bool {
         let local = self.esc.clock.local(now);
+        if matches!(self.application, Application::Io { .. }) && !self.sync0_decides() {
+            // As digital inputs do: sampled when a frame begins.
+            self.latch_inputs();
+        }
         let mut datagram = frame::next(bytes, None);
         while let Some(d) = datagram {
             self.esc.execute(bytes, &d, now, local);
@@ -295,10 +302,16 @@ impl SimDevice {
 
     /// Outputs arrived and no SYNC0 decides when they count.
     fn follows_sm(&self, written: u8) -> bool {
-        let dc = self.esc.dc.as_ref();
         self.al.state >= AlState::SafeOp
-            && dc.is_none_or(|dc| dc.sync0 == crate::esc::dc::Sync0::Off)
+            && !self.sync0_decides()
             && self.process.iter().any(|d| written >> d.sm & 1 != 0)
+    }
+
+    fn sync0_decides(&self) -> bool {
+        self.esc
+            .dc
+            .as_ref()
+            .is_some_and(|dc| dc.sync0 != Sync0::Off)
     }
 
     /// Fault injection: identity in EEPROM and object 0x1018.
