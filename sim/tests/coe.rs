@@ -2,7 +2,7 @@
 
 mod common;
 
-use Refusal::{Abort, Mailbox};
+use Refusal::Abort;
 use common::*;
 use ecaxis_sim::FaultScript;
 
@@ -223,8 +223,37 @@ fn injected_aborts_and_emergencies_arrive() {
         bus.fetch(S),
         Some((3, vec![0, 0x10, 0x10, 0x23, 1, 0, 0, 0, 0, 0]))
     );
-    // An emergency may arrive in front of a reply.
-    let _ = Mailbox(0);
+}
+
+#[test]
+fn an_fmmu_shows_that_a_reply_waits() {
+    let mut bus = preop();
+    // Bit 3 of 0x080D at bit 2 of logical 0x500.
+    bus.write(
+        S,
+        0x620,
+        &[0, 5, 0, 0, 1, 0, 2, 2, 0x0d, 8, 3, 1, 1, 0, 0, 0],
+    );
+    assert_eq!(bus.logical(10, 0x500, &[0]), (vec![0], 1));
+    bus.send_mailbox(S, 3, &[0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0]);
+    bus.wait(1_000_000);
+    assert_eq!(bus.logical(10, 0x500, &[0]), (vec![4], 1));
+    bus.fetch(S).unwrap();
+    assert_eq!(bus.logical(10, 0x500, &[0]), (vec![0], 1));
+}
+
+#[test]
+fn in_init_mailboxes_are_not_served() {
+    let mut bus = Bus::new(vec![sim(&coe_device())]);
+    bus.address_all();
+    bus.sm(S, 0, 0x1000, 48, 0x26);
+    bus.sm(S, 1, 0x1030, 48, 0x22);
+    bus.send_mailbox(S, 3, &[0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0]);
+    bus.wait(1_000_000);
+    assert_eq!(bus.fetch(S), None);
+    assert_eq!(bus.read(S, 0x805, 1), [8]);
+    bus.to(S, PREOP);
+    assert_eq!(bus.read(S, 0x805, 1), [0], "forgotten on the way to PreOp");
 }
 
 #[test]

@@ -56,8 +56,8 @@ impl SimDevice {
             Request::Change(to) => match self.demand(to) {
                 Err(code) => self.settle(self.al.state, code),
                 Ok(()) if to == AlState::Op && self.sync0_decides() => {
+                    self.settle(self.al.state, 0);
                     self.al.waits_for_sync = true;
-                    self.al.code = 0;
                     self.al.due = local + FIRST_SYNC_NS;
                     self.first_sync_seen();
                 }
@@ -244,6 +244,12 @@ impl SimDevice {
             && let Some(mailbox) = &mut self.mailbox
         {
             mailbox.reset();
+            for n in [mailbox.receive, mailbox.send] {
+                if let Some(sm) = self.esc.sms.get_mut(n) {
+                    sm.reset();
+                }
+                self.esc.refresh_sm(n);
+            }
         }
         self.settle(to, 0);
         self.latch_inputs();

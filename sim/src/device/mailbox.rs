@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use super::SimDevice;
 use crate::coe::{self, Dictionary, SdoServer, service};
 use crate::drive::Emergency;
+use crate::esc::al::AlState;
 
 /// Between a request arriving and the device having worked on it.
 const REQUEST_NS: u64 = 200_000;
@@ -105,7 +106,12 @@ impl SimDevice {
         repeat: Option<bool>,
         local: u64,
     ) {
-        let Some(mailbox) = &mut self.mailbox else {
+        // In Init nobody looks after mailboxes.
+        let Some(mailbox) = self
+            .mailbox
+            .as_mut()
+            .filter(|_| self.al.state != AlState::Init)
+        else {
             return;
         };
         if written >> mailbox.receive & 1 != 0 {
@@ -209,7 +215,7 @@ impl SimDevice {
         let Some(payload) = request.get(HEADER..HEADER + len) else {
             return mailbox.error(detail::INVALID_SIZE);
         };
-        if kind & 0x0f != TYPE_COE || !self.has_coe {
+        if kind & 0x0f != TYPE_COE || !self.has_coe || state == AlState::Boot {
             return mailbox.error(detail::UNSUPPORTED_PROTOCOL);
         }
         let (Some(&[c0, c1]), Some(body)) = (payload.get(..2), payload.get(2..)) else {

@@ -252,10 +252,11 @@ impl Esc {
             let sm = &mut self.sms[n];
             let was_enabled = sm.enabled;
             sm.configure(&r);
-            let (start, len) = (sm.start.to_le_bytes(), sm.len.to_le_bytes());
-            // An enabled SyncManager keeps its configuration; show what counts.
-            if was_enabled && sm.enabled {
-                self.put(base, &[start[0], start[1], len[0], len[1]]);
+            if was_enabled {
+                // An enabled SyncManager kept its configuration; show what counts.
+                let (start, len) = (sm.start.to_le_bytes(), sm.len.to_le_bytes());
+                let kept = [start[0], start[1], len[0], len[1], sm.control];
+                self.put(base, &kept);
             }
             self.refresh_sm(n);
             self.raised.sm_configured = true;

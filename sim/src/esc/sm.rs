@@ -34,6 +34,8 @@ pub enum Filled {
 pub struct SyncManager {
     pub start: u16,
     pub len: u16,
+    /// Register byte 4, as last accepted.
+    pub control: u8,
     pub mode: Mode,
     pub filled: Filled,
     pub watchdog: bool,
@@ -63,6 +65,7 @@ impl SyncManager {
         if !self.enabled {
             self.start = u16::from_le_bytes([r[0], r[1]]);
             self.len = u16::from_le_bytes([r[2], r[3]]);
+            self.control = r[4];
             self.mode = Mode::from_control(r[4]);
             self.filled = if r[4] >> 2 & 3 == 1 {
                 Filled::ByMainDevice
