@@ -149,7 +149,7 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
                 Nic::Interface(name) => failure
                     .hint(format!("is `{name}` the right interface? {}", interfaces()))
                     .hint("check that the first SubDevice has power and its IN port is connected"),
-                Nic::Sim => failure,
+                Nic::Sim => failure.hint("a fault script that silences the bus does this"),
             };
             return failure;
         }
@@ -166,6 +166,9 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }
         BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
+        BringUpError::Mailbox { source, .. } | BringUpError::ReadBack { source, .. } => {
+            sdo(source, "bring-up")
+        }
         BringUpError::Mapping { .. } => {
             "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
         }

@@ -136,3 +136,41 @@ pub(super) fn faults(path: &std::path::Path) -> Result<FaultScript, Failure> {
     FaultScript::parse(&text)
         .map_err(|e| Failure::new(hints::WRONG, format!("{}: {e}", path.display())))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use ecaxis::session::{Observer, Progress};
+
+    use super::*;
+
+    struct Silent;
+
+    impl Observer for Silent {
+        fn progress(&mut self, _: &Progress) {}
+    }
+
+    fn printed(seed: u64) -> (String, String) {
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        let machine = config::load(&configs.join("demo.toml")).unwrap();
+        let options = Options {
+            clock: Clock::Virtual,
+            repeat: Some(1),
+            seed,
+            ..Options::default()
+        };
+        let outcome = session::run(machine, options, Arc::default(), &mut Silent);
+        outcome.result.unwrap();
+        let summary = outcome.summary.unwrap();
+        (
+            report::summary(&summary),
+            serde_json::to_string(&summary).unwrap(),
+        )
+    }
+
+    #[test]
+    fn virtual_runs_print_the_same_bytes() {
+        assert_eq!(printed(7), printed(7));
+    }
+}

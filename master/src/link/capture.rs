@@ -216,6 +216,8 @@ fn write_all(mut ring: Consumer<u8>, mut file: Pcapng<BufWriter<File>>) -> io::R
 /// pcapng blocks, written by hand: one section, one Ethernet interface, nanoseconds.
 struct Pcapng<W> {
     out: W,
+    /// One block, so that the file is written once a frame.
+    block: Vec<u8>,
     written: u64,
 }
 
@@ -242,7 +244,11 @@ impl<W: Write> Pcapng<W> {
         head.extend(0_u32.to_le_bytes());
         head.extend(32_u32.to_le_bytes());
         out.write_all(&head)?;
-        Ok(Self { out, written: 0 })
+        Ok(Self {
+            out,
+            block: Vec::with_capacity(48 + MAX_FRAME),
+            written: 0,
+        })
     }
 
     fn packet(&mut self, dir: Dir, at: Nanos, frame: &[u8]) -> io::Result<()> {
@@ -267,10 +273,12 @@ impl<W: Write> Pcapng<W> {
         tail[4..8].copy_from_slice(&dir.flag().to_le_bytes());
         tail[12..16].copy_from_slice(&total.to_le_bytes());
 
-        self.out.write_all(&head)?;
-        self.out.write_all(frame)?;
-        self.out.write_all(&[0; 3][..padding])?;
-        self.out.write_all(&tail)?;
+        self.block.clear();
+        self.block.extend_from_slice(&head);
+        self.block.extend_from_slice(frame);
+        self.block.extend_from_slice(&[0; 3][..padding]);
+        self.block.extend_from_slice(&tail);
+        self.out.write_all(&self.block)?;
         self.written += 1;
         Ok(())
     }
