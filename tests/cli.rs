@@ -84,7 +84,7 @@ fn a_cycle_that_0x60c2_cannot_express() {
 #[test]
 fn an_interface_that_does_not_exist() {
     let output = with_file("run", &axes(1), &["--nic", "nonet7"]);
-    fails(output, 1, &["nonet7", "does not exist"]);
+    fails(output, 2, &["nonet7", "does not exist"]);
 }
 
 #[test]

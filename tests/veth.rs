@@ -1,5 +1,7 @@
 //! Two processes, the simulated bus and the master, on the two ends of a veth pair. Needs root.
 
+#![allow(clippy::print_stdout, reason = "a skipped test says why")]
+
 mod common;
 
 use std::path::Path;

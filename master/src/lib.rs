@@ -11,13 +11,6 @@
 //! - [`link`]: what carries Ethernet frames;
 //! - [`clock`]: monotonic or virtual time.
 
-#![allow(
-    clippy::disallowed_types,
-    clippy::disallowed_methods,
-    clippy::disallowed_macros,
-    reason = "only the real-time folder is bound by clippy.toml; it denies them itself"
-)]
-
 pub mod al_status;
 pub mod bringup;
 pub mod clock;

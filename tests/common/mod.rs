@@ -1,6 +1,7 @@
 //! What the whole-bus tests share: machines as text, runs under virtual time, the fixtures.
 
 #![allow(dead_code, reason = "every test binary uses a part")]
+#![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -5,6 +5,8 @@
 //! and FMMUs of the process data, SYNC0, watchdogs and the further state changes, because those
 //! need the ESI or must name the device when they fail.
 
+#![allow(clippy::result_large_err, reason = "an error here carries the whole address and ends the run")]
+
 use std::fmt;
 
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};

@@ -28,7 +28,10 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
     let faults = args.faults.as_deref().map(run::faults).transpose()?;
-    let seed = faults.as_ref().and_then(|f| f.seed).unwrap_or(session::Options::default().seed);
+    let seed = faults
+        .as_ref()
+        .and_then(|f| f.seed)
+        .unwrap_or(session::Options::default().seed);
     let segment = session::simulated_bus(&machine, seed, faults.as_ref())
         .map_err(|error| hints::run(&error, &machine.bus.nic))?;
 

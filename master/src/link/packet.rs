@@ -35,7 +35,6 @@ impl PacketLink {
     /// Opens the interface. Blocks and allocates.
     pub fn open(nic: &str) -> Result<Self, OpenError> {
         let index = interface_index(nic)?;
-        check_interface(nic)?;
         // SAFETY: plain system call; the result is checked.
         let fd = unsafe {
             libc::socket(
@@ -54,6 +53,7 @@ impl PacketLink {
         }
         // SAFETY: `fd` is a valid descriptor that nothing else owns.
         let socket = unsafe { OwnedFd::from_raw_fd(fd) };
+        check_interface(nic)?;
 
         // Our own transmissions would otherwise come back as received frames.
         set_option(&socket, libc::SOL_PACKET, libc::PACKET_IGNORE_OUTGOING, 1)

@@ -412,7 +412,7 @@ impl Engine {
 
 /// The snapshot before the first cycle, with room for `axes` and `devices`.
 #[must_use]
-#[expect(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
+#[allow(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
 pub fn first_snapshot(axes: &[AxisSlot], devices: usize) -> Snapshot {
     Snapshot {
         time: clock::now(),

@@ -150,7 +150,7 @@ pub struct Exchange {
 impl Exchange {
     /// Builds the frames. `stations` in the order in which devices are reported.
     #[must_use]
-    #[expect(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
+    #[allow(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
     pub fn new(plan: &ImagePlan, reference: Option<u16>, stations: &[u16]) -> Self {
         let mut frames = vec![new_frame(0)];
         let clock = reference.map(|station| {
@@ -351,7 +351,7 @@ fn sign_magnitude(raw: u32) -> i32 {
     if raw & 0x8000_0000 == 0 { amount } else { -amount }
 }
 
-#[expect(clippy::disallowed_methods, reason = "prepares")]
+#[allow(clippy::disallowed_methods, reason = "prepares")]
 fn new_frame(number: u8) -> Frame {
     let mut bytes = Vec::with_capacity(crate::link::MAX_FRAME);
     bytes.extend_from_slice(&[0xff; 6]);

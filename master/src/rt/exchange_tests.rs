@@ -1,5 +1,3 @@
-#![expect(clippy::disallowed_methods, clippy::disallowed_macros, reason = "tests")]
-
 use super::*;
 use crate::link::MAX_FRAME;
 use crate::rt::image::plan;

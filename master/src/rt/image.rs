@@ -54,6 +54,7 @@ pub struct TooLarge {
 }
 
 /// Lays out devices of (output, input) bytes one after the other; none is split over two frames.
+#[allow(clippy::disallowed_methods, reason = "prepares")]
 pub fn plan(sizes: &[(usize, usize)]) -> Result<ImagePlan, TooLarge> {
     let mut image = ImagePlan::default();
     for (device, &(out_len, in_len)) in sizes.iter().enumerate() {

@@ -72,7 +72,8 @@ impl Phase {
         // one by a 50th: faster would look like jitter to the drives.
         let bound = self.cycle as f64 / if self.locked { 100.0 } else { 5.0 };
         let bounded = (planned as f64).clamp(-bound, bound);
-        if (planned as f64).abs() <= bound {
+        // The way to the target says nothing about drift.
+        if planned.abs() <= self.cycle / 50 {
             self.drift += INTEGRAL * bounded;
             let most = self.cycle as f64 * 1e-3;
             self.drift = self.drift.clamp(-most, most);

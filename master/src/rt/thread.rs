@@ -23,7 +23,7 @@ pub enum Denied {
 }
 
 /// Makes the calling thread a real-time thread as far as that is permitted.
-#[expect(clippy::disallowed_methods, reason = "prepares")]
+#[allow(clippy::disallowed_methods, reason = "prepares")]
 pub fn prepare(priority: u8, cpu: Option<usize>) -> Vec<Denied> {
     let mut denied = Vec::new();
     if let Err(error) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE) {
@@ -48,6 +48,7 @@ pub fn prepare(priority: u8, cpu: Option<usize>) -> Vec<Denied> {
     denied
 }
 
+#[allow(clippy::disallowed_methods, reason = "prepares")]
 fn set_fifo(priority: u8) -> Result<(), String> {
     let value = ThreadPriorityValue::try_from(priority)?;
     set_thread_priority_and_policy(
