@@ -32,14 +32,19 @@ fn whole_cycle(c: &mut Criterion) {
     for count in [2, 16] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/bench.toml");
         let machine = config::parse(&path, &machine(count)).expect("a valid machine");
-        let options = Options { clock: Clock::Virtual, ..Options::default() };
+        let options = Options {
+            clock: Clock::Virtual,
+            ..Options::default()
+        };
         options.clock.enter();
         let (progress, _told) = channel();
         let stop = Arc::new(AtomicBool::new(false));
         let prepared = prepare(&Arc::new(machine), &options, stop, progress).expect("comes up");
         let mut engine = Engine::new(prepared.parts);
         group.throughput(Throughput::Elements(count as u64));
-        group.bench_function(BenchmarkId::from_parameter(count), |b| b.iter(|| engine.cycle()));
+        group.bench_function(BenchmarkId::from_parameter(count), |b| {
+            b.iter(|| engine.cycle())
+        });
     }
     group.finish();
 }
@@ -55,8 +60,9 @@ fn step_axes(c: &mut Criterion) {
         following_error: None,
     };
     let config = AxisConfig::new(Mode::Csp, scale, limits);
-    let mut axes: Vec<Axis> =
-        (0..100).map(|_| Axis::new(config).expect("a valid axis")).collect();
+    let mut axes: Vec<Axis> = (0..100)
+        .map(|_| Axis::new(config).expect("a valid axis"))
+        .collect();
     let mut inputs = Inputs {
         statusword: 0x0240,
         position: Some(0),
@@ -71,7 +77,12 @@ fn step_axes(c: &mut Criterion) {
             inputs.statusword = statusword;
             axis.step(&inputs, 1e-3);
         }
-        axis.command(Command::MoveTo { position: 1e6, speed: 0.5, ramp: 0.5 }).expect("moves");
+        axis.command(Command::MoveTo {
+            position: 1e6,
+            speed: 0.5,
+            ramp: 0.5,
+        })
+        .expect("moves");
     }
     let mut group = c.benchmark_group("step_axes");
     group.throughput(Throughput::Elements(100));

@@ -35,14 +35,22 @@ fn main() {
         round(SPIN, &mut spinning);
     }
     let (sleeping, spinning) = (sleeping.summary(), spinning.summary());
-    println!("wake-up lateness at 1 kHz, {ROUNDS} rounds of {CYCLES_A_ROUND} cycles each, in turns");
-    println!("{:>8} {:>12} {:>12} {:>8}", "", "sleep", "sleep+spin", "ratio");
+    println!(
+        "wake-up lateness at 1 kHz, {ROUNDS} rounds of {CYCLES_A_ROUND} cycles each, in turns"
+    );
+    println!(
+        "{:>8} {:>12} {:>12} {:>8}",
+        "", "sleep", "sleep+spin", "ratio"
+    );
     for (name, a, b) in [
         ("p50", sleeping.p50_ns, spinning.p50_ns),
         ("p99", sleeping.p99_ns, spinning.p99_ns),
         ("p99.9", sleeping.p99_9_ns, spinning.p99_9_ns),
         ("max", sleeping.max_ns, spinning.max_ns),
     ] {
-        println!("{name:>8} {a:>9} ns {b:>9} ns {:>8.3}", b as f64 / a.max(1) as f64);
+        println!(
+            "{name:>8} {a:>9} ns {b:>9} ns {:>8.3}",
+            b as f64 / a.max(1) as f64
+        );
     }
 }

@@ -97,12 +97,23 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
     const CYCLES: u64 = 100_000;
     let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"20s\"\ncount = 2\n\
                   [[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"60s\"\ncode = 0x8611\n";
-    let options = Options { repeat: Some(1_000_000), ..faults(script) };
+    let options = Options {
+        repeat: Some(1_000_000),
+        ..faults(script)
+    };
     options.clock.enter();
     let (progress, _told) = channel();
     let machine = Arc::new(machine(&axes(3)));
-    let Prepared { mut parts, supervisor } =
-        prepare(&machine, &options, Arc::new(AtomicBool::new(false)), progress).expect("comes up");
+    let Prepared {
+        mut parts,
+        supervisor,
+    } = prepare(
+        &machine,
+        &options,
+        Arc::new(AtomicBool::new(false)),
+        progress,
+    )
+    .expect("comes up");
     parts.link = Box::new(Unmetered(parts.link));
     let mut engine = Engine::new(parts);
     let mut beside = pin!(supervisor.run());
@@ -123,9 +134,19 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
     let counted = COUNT.get();
     let remains = engine.into_remains();
     assert_eq!(remains.stats.counters.cycles, CYCLES);
-    assert!(remains.stats.counters.lost_frames >= 1, "{:?}", remains.stats.counters);
     assert!(
-        matches!(result, Some(Err(RunError::DriveFault { code: Some(0x8611), .. }))),
+        remains.stats.counters.lost_frames >= 1,
+        "{:?}",
+        remains.stats.counters
+    );
+    assert!(
+        matches!(
+            result,
+            Some(Err(RunError::DriveFault {
+                code: Some(0x8611),
+                ..
+            }))
+        ),
         "{result:?}"
     );
     assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));

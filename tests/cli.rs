@@ -71,7 +71,9 @@ fn a_truncated_esi_file() {
 fn a_mode_the_esi_does_not_offer() {
     let text = axes(1).replace("\"csp\"", "\"cxp\"");
     fails(with_file("check", &text, &[]), 2, &["cxp", "csp"]);
-    let text = axes(1).replace("\"csp\"", "\"hm\"").replace("move =", "dwell = \"1s\" #");
+    let text = axes(1)
+        .replace("\"csp\"", "\"hm\"")
+        .replace("move =", "dwell = \"1s\" #");
     fails(with_file("check", &text, &[]), 2, &["hm"]);
 }
 
@@ -93,14 +95,24 @@ fn every_problem_of_a_file_at_once() {
         .replace("cycle =", "cicle =")
         .replace("name = \"a1\"", "name = \"a0\"")
         .replace("velocity = 50.0", "velocity = -50.0");
-    fails(with_file("check", &text, &[]), 2, &["cicle", "a0", "velocity"]);
+    fails(
+        with_file("check", &text, &[]),
+        2,
+        &["cicle", "a0", "velocity"],
+    );
 }
 
 #[test]
 fn errors_on_the_command_line() {
     assert_eq!(ecaxis(&["run", "--cycles"]).status.code(), Some(2));
-    assert_eq!(ecaxis(&["run", "configs/no-such.toml"]).status.code(), Some(2));
-    assert_eq!(ecaxis(&["check", "configs/demo.toml"]).status.code(), Some(0));
+    assert_eq!(
+        ecaxis(&["run", "configs/no-such.toml"]).status.code(),
+        Some(2)
+    );
+    assert_eq!(
+        ecaxis(&["check", "configs/demo.toml"]).status.code(),
+        Some(0)
+    );
 }
 
 #[test]
@@ -108,7 +120,12 @@ fn explain_prints_the_modules_pdo_contents() {
     let output = ecaxis(&["explain", "configs/modes.toml"]);
     assert!(output.status.success());
     let text = String::from_utf8_lossy(&output.stdout);
-    for part in ["0x6040", "0x607A", "0x60FF", "0x6071", "0x6041", "0x6064", "0x60C2", "0x1C12"] {
-        assert!(text.to_uppercase().contains(&part.to_uppercase()), "`{part}` is not in:\n{text}");
+    for part in [
+        "0x6040", "0x607A", "0x60FF", "0x6071", "0x6041", "0x6064", "0x60C2", "0x1C12",
+    ] {
+        assert!(
+            text.to_uppercase().contains(&part.to_uppercase()),
+            "`{part}` is not in:\n{text}"
+        );
     }
 }

@@ -16,13 +16,21 @@ fn the_demo_moves_both_axes_ten_turns_and_back_twice() {
         assert_eq!(axis.target_position, 0.0, "{axis:?}");
         let error = axis.final_error_counts.expect("CSP reports its error");
         assert!(error.abs() <= 1, "{axis:?}");
-        assert!(axis.largest_following_error > 0.0, "an axis that moved has followed: {axis:?}");
+        assert!(
+            axis.largest_following_error > 0.0,
+            "an axis that moved has followed: {axis:?}"
+        );
         assert_eq!((&axis.fault, &axis.trip), (&None, &None));
     }
     assert_eq!(summary.counters.lost_frames, 0);
     assert_eq!(summary.counters.wkc_errors, 0);
-    let phase = summary.dc_phase_error.expect("the demo uses distributed clocks");
-    assert!(phase.p99_ns < 10_000, "locked to SYNC0 within a hundredth of the cycle: {phase:?}");
+    let phase = summary
+        .dc_phase_error
+        .expect("the demo uses distributed clocks");
+    assert!(
+        phase.p99_ns < 10_000,
+        "locked to SYNC0 within a hundredth of the cycle: {phase:?}"
+    );
 }
 
 #[test]
@@ -88,7 +96,10 @@ fn the_vendors_epos4_in_each_cyclic_mode() {
         let axis = &summary.axes[0];
         assert!(axis.was_enabled, "{mode}: {axis:?}");
         if mode == "csp" {
-            assert!(axis.final_error_counts.is_some_and(|e| e.abs() <= 1), "{axis:?}");
+            assert!(
+                axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+                "{axis:?}"
+            );
             assert!((axis.final_position - 10.0).abs() < 0.001, "{axis:?}");
         }
     }
@@ -108,14 +119,25 @@ fn the_vendors_start_up_list_has_the_effect_of_the_application_notes() {
         .startup
         .iter()
         .map(|sdo| {
-            let value = sdo.data.iter().rev().fold(0_u64, |v, b| v << 8 | u64::from(*b));
+            let value = sdo
+                .data
+                .iter()
+                .rev()
+                .fold(0_u64, |v, b| v << 8 | u64::from(*b));
             (sdo.index, sdo.sub, value)
         })
         .collect();
     let at = |wanted: (u16, u8, u64)| {
-        list.iter().position(|sdo| *sdo == wanted).unwrap_or_else(|| panic!("{wanted:x?} in {list:x?}"))
+        list.iter()
+            .position(|sdo| *sdo == wanted)
+            .unwrap_or_else(|| panic!("{wanted:x?} in {list:x?}"))
     };
-    let last = |index, sub| list.iter().rev().find(|s| s.0 == index && s.1 == sub).map(|s| s.2);
+    let last = |index, sub| {
+        list.iter()
+            .rev()
+            .find(|s| s.0 == index && s.1 == sub)
+            .map(|s| s.2)
+    };
 
     for sm in [0x1c12, 0x1c13] {
         let cleared = at((sm, 0, 0));
@@ -125,7 +147,10 @@ fn the_vendors_start_up_list_has_the_effect_of_the_application_notes() {
         assert!(at((sm, 1, pdo)) < assigned);
         // Contents change only while nothing is assigned and the PDO counts no entries.
         let emptied = at((pdo as u16, 0, 0));
-        let first_entry = list.iter().position(|s| s.0 == pdo as u16 && s.1 == 1).expect("an entry");
+        let first_entry = list
+            .iter()
+            .position(|s| s.0 == pdo as u16 && s.1 == 1)
+            .expect("an entry");
         assert!(cleared < emptied && emptied < first_entry && first_entry < at((sm, 1, pdo)));
     }
     assert_eq!(last(0x1600, 1), Some(0x6040_0010));
@@ -145,7 +170,12 @@ fn the_same_seed_gives_the_same_summary_and_the_same_recording() {
     let run = |name: &str, seed| {
         let record = folder.path().join(name);
         let limit = Some(20_000_000_000);
-        let options = Options { seed, limit, record: Some(record.clone()), ..virtual_time() };
+        let options = Options {
+            seed,
+            limit,
+            record: Some(record.clone()),
+            ..virtual_time()
+        };
         let summary = run_well(load("demo.toml"), options);
         assert!(summary.machine_seconds > 20.0, "{summary:?}");
         let json = serde_json::to_string(&summary).expect("a summary is JSON");
@@ -160,8 +190,18 @@ fn the_same_seed_gives_the_same_summary_and_the_same_recording() {
 
 #[test]
 fn positions_on_the_bus_need_not_follow_the_file() {
-    let text = axes(3).replace("position = 0", "position = 9").replace("position = 2", "position = 0");
-    let summary = run_well(machine(&text.replace("position = 9", "position = 2")), virtual_time());
+    let text = axes(3)
+        .replace("position = 0", "position = 9")
+        .replace("position = 2", "position = 0");
+    let summary = run_well(
+        machine(&text.replace("position = 9", "position = 2")),
+        virtual_time(),
+    );
     assert_eq!(summary.axes.len(), 3);
-    assert!(summary.axes.iter().all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1)));
+    assert!(
+        summary
+            .axes
+            .iter()
+            .all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1))
+    );
 }

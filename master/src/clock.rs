@@ -88,7 +88,14 @@ impl Clock {
 /// Completes once the clock has moved on by `duration`.
 pub async fn delay(duration: Duration) {
     let until = now().saturating_add(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX));
-    poll_fn(|_| if now() >= until { Poll::Ready(()) } else { Poll::Pending }).await;
+    poll_fn(|_| {
+        if now() >= until {
+            Poll::Ready(())
+        } else {
+            Poll::Pending
+        }
+    })
+    .await;
 }
 
 #[derive(Debug)]

@@ -23,13 +23,23 @@ impl Datagrams {
 
     /// How many SubDevices answer a broadcast read.
     pub async fn count(&self) -> Result<u16, WireError> {
-        let answer = Command::brd(0).with_wkc(0).receive_slice(self.device, 1).await;
+        let answer = Command::brd(0)
+            .with_wkc(0)
+            .receive_slice(self.device, 1)
+            .await;
         working_counter(answer.map(|_| ()), 0, 0, 0)
     }
 
     /// One word by position in the segment, before station addresses are known to be right.
-    pub async fn read_position(&self, position: u16, register: u16) -> Result<Option<u16>, WireError> {
-        match Command::aprd(position, register).receive_slice(self.device, 2).await {
+    pub async fn read_position(
+        &self,
+        position: u16,
+        register: u16,
+    ) -> Result<Option<u16>, WireError> {
+        match Command::aprd(position, register)
+            .receive_slice(self.device, 2)
+            .await
+        {
             Ok(pdu) => Ok(<[u8; 2]>::try_from(&*pdu).ok().map(u16::from_le_bytes)),
             Err(Error::WorkingCounter { .. }) => Ok(None),
             Err(error) => Err(failed(error, position, register)),
@@ -41,7 +51,9 @@ impl Wire for Datagrams {
     async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
         let len = u16::try_from(buf.len())
             .map_err(|_| WireError::Other(format!("a datagram cannot read {} bytes", buf.len())))?;
-        let answer = Command::fprd(station, register).receive_slice(self.device, len).await;
+        let answer = Command::fprd(station, register)
+            .receive_slice(self.device, len)
+            .await;
         working_counter(
             answer.map(|pdu| {
                 for (to, from) in buf.iter_mut().zip(pdu.iter()) {
@@ -55,7 +67,9 @@ impl Wire for Datagrams {
     }
 
     async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
-        let answer = Command::fpwr(station, register).send_receive_slice(self.device, data).await;
+        let answer = Command::fpwr(station, register)
+            .send_receive_slice(self.device, data)
+            .await;
         working_counter(answer.map(|_| ()), 1, station, register)
     }
 

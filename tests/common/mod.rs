@@ -14,7 +14,10 @@ use ecaxis_sim::FaultScript;
 
 /// The workspace's root.
 pub fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().expect("the workspace exists")
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("..")
+        .canonicalize()
+        .expect("the workspace exists")
 }
 
 /// A machine file given as text; paths in it are relative to `configs/`.
@@ -42,8 +45,15 @@ pub fn fixture(path: &str) -> Option<PathBuf> {
     if file.exists() {
         return Some(file);
     }
-    assert!(std::env::var_os("CI").is_none(), "{} is missing on CI", file.display());
-    println!("skipped: {} is not here (set ECAXIS_FIXTURES)", file.display());
+    assert!(
+        std::env::var_os("CI").is_none(),
+        "{} is missing on CI",
+        file.display()
+    );
+    println!(
+        "skipped: {} is not here (set ECAXIS_FIXTURES)",
+        file.display()
+    );
     None
 }
 
@@ -69,17 +79,28 @@ impl Heard {
 }
 
 pub fn virtual_time() -> Options {
-    Options { clock: Clock::Virtual, ..Options::default() }
+    Options {
+        clock: Clock::Virtual,
+        ..Options::default()
+    }
 }
 
 pub fn faults(script: &str) -> Options {
     let faults = FaultScript::parse(script).unwrap_or_else(|error| panic!("{error}"));
-    Options { faults: Some(faults), ..virtual_time() }
+    Options {
+        faults: Some(faults),
+        ..virtual_time()
+    }
 }
 
 pub fn run(machine: Machine, options: Options) -> (Outcome, Heard) {
     let mut heard = Heard::default();
-    let outcome = session::run(machine, options, Arc::new(AtomicBool::new(false)), &mut heard);
+    let outcome = session::run(
+        machine,
+        options,
+        Arc::new(AtomicBool::new(false)),
+        &mut heard,
+    );
     (outcome, heard)
 }
 
@@ -122,7 +143,10 @@ limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, t
     }
     for target in [80.0, 0.0] {
         text += "\n[[step]]\nmove = { ";
-        text += &(0..count).map(|i| format!("a{i} = {target}")).collect::<Vec<_>>().join(", ");
+        text += &(0..count)
+            .map(|i| format!("a{i} = {target}"))
+            .collect::<Vec<_>>()
+            .join(", ");
         text += " }\n";
     }
     text

@@ -79,25 +79,39 @@ pub enum StateError {
         "{device}: refused {wanted}: stays in {actual}, AL status code 0x{code:04x} ({})",
         al_status_text(*code)
     )]
-    Refused { device: DeviceRef, wanted: AlState, actual: AlState, code: u16 },
+    Refused {
+        device: DeviceRef,
+        wanted: AlState,
+        actual: AlState,
+        code: u16,
+    },
     #[error("{device}: did not reach {wanted} within {} ms, is in {actual}", timeout.as_millis())]
-    Timeout { device: DeviceRef, wanted: AlState, actual: AlState, timeout: Duration },
+    Timeout {
+        device: DeviceRef,
+        wanted: AlState,
+        actual: AlState,
+        timeout: Duration,
+    },
     #[error("{device}: no longer answers while it should go to {wanted}")]
     Gone { device: DeviceRef, wanted: AlState },
     #[error("{device}: changing to {wanted}: {source}")]
-    Wire { device: DeviceRef, wanted: AlState, source: WireError },
+    Wire {
+        device: DeviceRef,
+        wanted: AlState,
+        source: WireError,
+    },
 }
 
 /// AL status and AL status code; `None` where the device does not answer.
-pub async fn read_status(
-    wire: &impl Wire,
-    station: u16,
-) -> Result<Option<(u8, u16)>, WireError> {
+pub async fn read_status(wire: &impl Wire, station: u16) -> Result<Option<(u8, u16)>, WireError> {
     let mut status = [0; 6];
     if wire.read(station, AL_STATUS, &mut status).await? != 1 {
         return Ok(None);
     }
-    Ok(Some((status[0], u16::from_le_bytes([status[4], status[5]]))))
+    Ok(Some((
+        status[0],
+        u16::from_le_bytes([status[4], status[5]]),
+    )))
 }
 
 /// Sends all devices to `wanted` and waits until the last is there. Errors that devices still hold
@@ -109,14 +123,27 @@ pub async fn change_state(
     timeout: Duration,
 ) -> Result<(), StateError> {
     for device in devices {
-        let failed = |source| StateError::Wire { device: device.clone(), wanted, source };
+        let failed = |source| StateError::Wire {
+            device: device.clone(),
+            wanted,
+            source,
+        };
         if let Some((status, _)) = read_status(wire, device.station).await.map_err(failed)?
             && status & ERROR != 0
         {
-            write_control(wire, device.station, status & 0x0f | ERROR).await.map_err(failed)?;
+            write_control(wire, device.station, status & 0x0f | ERROR)
+                .await
+                .map_err(failed)?;
         }
-        if write_control(wire, device.station, wanted.code()).await.map_err(failed)? != 1 {
-            return Err(StateError::Gone { device: device.clone(), wanted });
+        if write_control(wire, device.station, wanted.code())
+            .await
+            .map_err(failed)?
+            != 1
+        {
+            return Err(StateError::Gone {
+                device: device.clone(),
+                wanted,
+            });
         }
     }
     wait_state(wire, devices, wanted, timeout).await
@@ -129,23 +156,42 @@ pub async fn wait_state(
     wanted: AlState,
     timeout: Duration,
 ) -> Result<(), StateError> {
-    let end = wire.now().saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
+    let end = wire
+        .now()
+        .saturating_add(u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX));
     for device in devices {
         loop {
-            let failed = |source| StateError::Wire { device: device.clone(), wanted, source };
+            let failed = |source| StateError::Wire {
+                device: device.clone(),
+                wanted,
+                source,
+            };
             let Some((status, code)) = read_status(wire, device.station).await.map_err(failed)?
             else {
-                return Err(StateError::Gone { device: device.clone(), wanted });
+                return Err(StateError::Gone {
+                    device: device.clone(),
+                    wanted,
+                });
             };
             let actual = AlState::from_status(status);
             if status & ERROR != 0 {
-                return Err(StateError::Refused { device: device.clone(), wanted, actual, code });
+                return Err(StateError::Refused {
+                    device: device.clone(),
+                    wanted,
+                    actual,
+                    code,
+                });
             }
             if actual == wanted {
                 break;
             }
             if wire.now() >= end {
-                return Err(StateError::Timeout { device: device.clone(), wanted, actual, timeout });
+                return Err(StateError::Timeout {
+                    device: device.clone(),
+                    wanted,
+                    actual,
+                    timeout,
+                });
             }
             wire.delay(POLL).await;
         }
@@ -159,11 +205,10 @@ async fn write_control(wire: &impl Wire, station: u16, value: u8) -> Result<u16,
 
 /// The explicit device identification (ETG.1020, "Explicit Device Identification"): requested in
 /// AL control, answered in AL status code. `None` where the device does not offer it.
-pub async fn read_explicit_id(
-    wire: &impl Wire,
-    station: u16,
-) -> Result<Option<u16>, WireError> {
-    let Some((state, _)) = read_status(wire, station).await? else { return Ok(None) };
+pub async fn read_explicit_id(wire: &impl Wire, station: u16) -> Result<Option<u16>, WireError> {
+    let Some((state, _)) = read_status(wire, station).await? else {
+        return Ok(None);
+    };
     write_control(wire, station, state & 0x0f | ID_REQUEST).await?;
     let mut id = None;
     for _ in 0..20 {

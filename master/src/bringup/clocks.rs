@@ -48,10 +48,17 @@ pub(super) async fn configure(
         .filter_map(|(config, device)| Some((config.selection.dc.as_ref()?, device)))
         .collect();
     if let Some((_, device)) = wanting.iter().find(|(_, device)| !device.dc) {
-        return Err(BringUpError::NoClock { device: device.at.clone() });
+        return Err(BringUpError::NoClock {
+            device: device.at.clone(),
+        });
     }
-    let reference = devices.iter().filter(|d| d.dc).min_by_key(|d| d.at.position);
-    let (false, Some(reference)) = (wanting.is_empty(), reference) else { return Ok(None) };
+    let reference = devices
+        .iter()
+        .filter(|d| d.dc)
+        .min_by_key(|d| d.at.position);
+    let (false, Some(reference)) = (wanting.is_empty(), reference) else {
+        return Ok(None);
+    };
 
     let mut now = [0; 8];
     read(wire, reference, STEP, SYSTEM_TIME, &mut now).await?;
@@ -64,10 +71,39 @@ pub(super) async fn configure(
         write(wire, device, STEP, ACTIVATION, &[0, 0]).await?;
         let first = start.wrapping_add_signed(i64::from(dc.sync0_shift_ns));
         write(wire, device, STEP, START_TIME, &first.to_le_bytes()).await?;
-        write(wire, device, STEP, SYNC0_CYCLE, &dc.sync0_cycle_ns.to_le_bytes()).await?;
-        write(wire, device, STEP, SYNC1_CYCLE, &dc.sync1_cycle_ns.to_le_bytes()).await?;
-        write(wire, device, STEP, ACTIVATION, &dc.assign_activate.to_le_bytes()).await?;
+        write(
+            wire,
+            device,
+            STEP,
+            SYNC0_CYCLE,
+            &dc.sync0_cycle_ns.to_le_bytes(),
+        )
+        .await?;
+        write(
+            wire,
+            device,
+            STEP,
+            SYNC1_CYCLE,
+            &dc.sync1_cycle_ns.to_le_bytes(),
+        )
+        .await?;
+        write(
+            wire,
+            device,
+            STEP,
+            ACTIVATION,
+            &dc.assign_activate.to_le_bytes(),
+        )
+        .await?;
     }
-    progress(Step::Clocks { reference: reference.at.name.clone(), devices: wanting.len() });
-    Ok(Some(DcPlan { reference: reference.at.station, cycle_ns: cycle, start, devices: wanting.len() }))
+    progress(Step::Clocks {
+        reference: reference.at.name.clone(),
+        devices: wanting.len(),
+    });
+    Ok(Some(DcPlan {
+        reference: reference.at.station,
+        cycle_ns: cycle,
+        start,
+        devices: wanting.len(),
+    }))
 }

@@ -27,13 +27,19 @@ pub(super) async fn start_up(
     progress: &mut dyn FnMut(Step),
 ) -> Result<(), BringUpError> {
     let list = &config.selection.startup;
-    let Some(coe) = device.coe.as_mut() else { return Ok(()) };
+    let Some(coe) = device.coe.as_mut() else {
+        return Ok(());
+    };
     coe.drain(wire)
         .await
-        .map_err(|source| BringUpError::Mailbox { device: device.at.clone(), source })?;
+        .map_err(|source| BringUpError::Mailbox {
+            device: device.at.clone(),
+            source,
+        })?;
     for (done, sdo) in list.iter().enumerate() {
-        coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data).await.map_err(
-            |source| BringUpError::StartUp {
+        coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data)
+            .await
+            .map_err(|source| BringUpError::StartUp {
                 device: device.at.clone(),
                 index: sdo.index,
                 sub: sdo.sub,
@@ -41,9 +47,12 @@ pub(super) async fn start_up(
                 value: format_value(&sdo.data),
                 origin: sdo.origin.clone(),
                 source,
-            },
-        )?;
-        progress(Step::StartUp { device: config.name.clone(), done: done + 1, of: list.len() });
+            })?;
+        progress(Step::StartUp {
+            device: config.name.clone(),
+            done: done + 1,
+            of: list.len(),
+        });
     }
     Ok(())
 }
@@ -53,7 +62,10 @@ fn format_value(data: &[u8]) -> String {
     if data.len() > 8 {
         return format!("{} bytes", data.len());
     }
-    let value = data.iter().rev().fold(0_u64, |value, &byte| value << 8 | u64::from(byte));
+    let value = data
+        .iter()
+        .rev()
+        .fold(0_u64, |value, &byte| value << 8 | u64::from(byte));
     format!("0x{value:0width$x}", width = data.len() * 2)
 }
 
@@ -74,7 +86,14 @@ pub(super) async fn map_process_data(
         let mut logical = region.map_or(0, |region| region.logical);
         for sm in sms {
             let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm.sm);
-            write(wire, device, "configuring SyncManagers", register, &sync_manager(sm)).await?;
+            write(
+                wire,
+                device,
+                "configuring SyncManagers",
+                register,
+                &sync_manager(sm),
+            )
+            .await?;
             if sm.len > 0 {
                 fmmus.push(fmmu(logical, sm, kind));
                 logical = logical.saturating_add(u32::from(sm.len));
@@ -110,12 +129,21 @@ pub(super) async fn set_watchdog(
     device: &BusDevice,
 ) -> Result<(), BringUpError> {
     const STEP: &str = "setting the process-data watchdog";
-    let ticks = u16::try_from(bus.watchdog_ns / 100_000).unwrap_or(u16::MAX).max(1);
+    let ticks = u16::try_from(bus.watchdog_ns / 100_000)
+        .unwrap_or(u16::MAX)
+        .max(1);
     // A controller without these registers watches nothing; that is not an error.
-    for (register, value) in [(WATCHDOG_DIVIDER, DIVIDER_100_US), (WATCHDOG_PROCESS_DATA, ticks)] {
-        wire.write(device.at.station, register, &value.to_le_bytes()).await.map_err(|source| {
-            BringUpError::Wire { device: device.at.clone(), step: STEP, source }
-        })?;
+    for (register, value) in [
+        (WATCHDOG_DIVIDER, DIVIDER_100_US),
+        (WATCHDOG_PROCESS_DATA, ticks),
+    ] {
+        wire.write(device.at.station, register, &value.to_le_bytes())
+            .await
+            .map_err(|source| BringUpError::Wire {
+                device: device.at.clone(),
+                step: STEP,
+                source,
+            })?;
     }
     Ok(())
 }
@@ -128,7 +156,12 @@ pub(super) async fn write(
     register: u16,
     data: &[u8],
 ) -> Result<(), BringUpError> {
-    taken(wire.write(device.at.station, register, data).await, device, step, register)
+    taken(
+        wire.write(device.at.station, register, data).await,
+        device,
+        step,
+        register,
+    )
 }
 
 /// A register read that the device must answer.
@@ -139,7 +172,12 @@ pub(super) async fn read(
     register: u16,
     data: &mut [u8],
 ) -> Result<(), BringUpError> {
-    taken(wire.read(device.at.station, register, data).await, device, step, register)
+    taken(
+        wire.read(device.at.station, register, data).await,
+        device,
+        step,
+        register,
+    )
 }
 
 fn taken(
@@ -150,7 +188,15 @@ fn taken(
 ) -> Result<(), BringUpError> {
     match result {
         Ok(1) => Ok(()),
-        Ok(_) => Err(BringUpError::NotTaken { device: device.at.clone(), step, register }),
-        Err(source) => Err(BringUpError::Wire { device: device.at.clone(), step, source }),
+        Ok(_) => Err(BringUpError::NotTaken {
+            device: device.at.clone(),
+            step,
+            register,
+        }),
+        Err(source) => Err(BringUpError::Wire {
+            device: device.at.clone(),
+            step,
+            source,
+        }),
     }
 }

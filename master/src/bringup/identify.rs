@@ -20,7 +20,10 @@ pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
             Ok(count) if count > 0 => return Ok(count),
             Ok(_) | Err(WireError::Timeout { .. }) => {}
             Err(error) => {
-                return Err(BringUpError::Scan { step: "scanning", message: error.to_string() });
+                return Err(BringUpError::Scan {
+                    step: "scanning",
+                    message: error.to_string(),
+                });
             }
         }
     }
@@ -33,7 +36,9 @@ pub(super) async fn explain_scan(
     machine: &Machine,
     error: ethercrab::error::Error,
 ) -> BringUpError {
-    let Ok(count) = answering(wire).await else { return BringUpError::NoAnswer };
+    let Ok(count) = answering(wire).await else {
+        return BringUpError::NoAnswer;
+    };
     for position in 0..count {
         let station = FIRST_STATION.saturating_add(position);
         if let Ok(Some((status, code))) = al::read_status(wire, station).await
@@ -45,7 +50,11 @@ pub(super) async fn explain_scan(
                 .find(|d| d.at == Locator::Position(position))
                 .map_or_else(|| format!("device {position}"), |d| d.name.clone());
             return BringUpError::State(al::StateError::Refused {
-                device: DeviceRef { name, position, station },
+                device: DeviceRef {
+                    name,
+                    position,
+                    station,
+                },
                 wanted: al::AlState::PreOp,
                 actual: al::AlState::from_status(status),
                 code,
@@ -92,7 +101,10 @@ pub(super) async fn assign(
                     return Err(not_located(&config.name, format!("alias {alias}")));
                 }
                 Locator::Id(id) => {
-                    return Err(not_located(&config.name, format!("device identification {id}")));
+                    return Err(not_located(
+                        &config.name,
+                        format!("device identification {id}"),
+                    ));
                 }
             },
         }
@@ -101,7 +113,9 @@ pub(super) async fn assign(
         let list: Vec<_> = found
             .iter()
             .enumerate()
-            .map(|(position, (identity, ..))| format!("position {position}: {}", known(machine, *identity)))
+            .map(|(position, (identity, ..))| {
+                format!("position {position}: {}", known(machine, *identity))
+            })
             .collect();
         return Err(BringUpError::Missing {
             expected: machine.devices.len(),
@@ -118,7 +132,11 @@ pub(super) async fn assign(
             != (identity.vendor, identity.product, identity.revision)
         {
             return Err(BringUpError::Identity {
-                device: DeviceRef { name: config.name.clone(), position, station },
+                device: DeviceRef {
+                    name: config.name.clone(),
+                    position,
+                    station,
+                },
                 esi: config.esi_path.display().to_string(),
                 expected: format!("{} ({expected})", config.selection.device_name),
                 found: known(machine, identity),
@@ -128,14 +146,20 @@ pub(super) async fn assign(
     for (position, (identity, ..)) in found.iter().enumerate() {
         let position = u16::try_from(position).unwrap_or(u16::MAX);
         if !order.contains(&position) {
-            return Err(BringUpError::Unexpected { position, identity: known(machine, *identity) });
+            return Err(BringUpError::Unexpected {
+                position,
+                identity: known(machine, *identity),
+            });
         }
     }
     Ok(order)
 }
 
 fn not_located(name: &str, locator: String) -> BringUpError {
-    BringUpError::NotLocated { name: name.to_owned(), locator }
+    BringUpError::NotLocated {
+        name: name.to_owned(),
+        locator,
+    }
 }
 
 async fn find_id(wire: &Datagrams, found: &[(Identity, u16, u16)], id: u16) -> Option<usize> {
@@ -148,7 +172,11 @@ async fn find_id(wire: &Datagrams, found: &[(Identity, u16, u16)], id: u16) -> O
 }
 
 fn identity(from: SubDeviceIdentity) -> Identity {
-    Identity { vendor: from.vendor_id, product: from.product_id, revision: from.revision }
+    Identity {
+        vendor: from.vendor_id,
+        product: from.product_id,
+        revision: from.revision,
+    }
 }
 
 /// An identity with the name that one of the machine's ESI files gives it.
@@ -158,5 +186,8 @@ fn known(machine: &Machine, identity: Identity) -> String {
         .iter()
         .flat_map(|d| &d.esi.devices)
         .find(|d| d.identity == identity)
-        .map_or_else(|| identity.to_string(), |d| format!("{} ({identity})", d.name))
+        .map_or_else(
+            || identity.to_string(),
+            |d| format!("{} ({identity})", d.name),
+        )
 }

@@ -53,7 +53,9 @@ async fn compare_contents(
     device: &mut BusDevice,
     pdo: &Pdo,
 ) -> Result<(), BringUpError> {
-    let Some(actual) = read_list(wire, device, pdo.index).await? else { return Ok(()) };
+    let Some(actual) = read_list(wire, device, pdo.index).await? else {
+        return Ok(());
+    };
     let expected: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
     let len = actual.len().max(expected.len());
     for place in 0..len {
@@ -72,7 +74,9 @@ async fn read_list(
     device: &mut BusDevice,
     index: u16,
 ) -> Result<Option<Vec<u32>>, BringUpError> {
-    let Some(count) = read(wire, device, index, 0).await? else { return Ok(None) };
+    let Some(count) = read(wire, device, index, 0).await? else {
+        return Ok(None);
+    };
     let count = u8::try_from(count).unwrap_or(u8::MAX);
     let mut list = Vec::with_capacity(usize::from(count));
     for sub in 1..=count {
@@ -90,13 +94,21 @@ async fn read(
     index: u16,
     sub: u8,
 ) -> Result<Option<u32>, BringUpError> {
-    let Some(coe) = device.coe.as_mut() else { return Ok(None) };
+    let Some(coe) = device.coe.as_mut() else {
+        return Ok(None);
+    };
     match coe.upload(wire, index, sub, false).await {
-        Ok(data) => {
-            Ok(Some(data.iter().take(4).rev().fold(0, |value, byte| value << 8 | u32::from(*byte))))
-        }
+        Ok(data) => Ok(Some(
+            data.iter()
+                .take(4)
+                .rev()
+                .fold(0, |value, byte| value << 8 | u32::from(*byte)),
+        )),
         Err(SdoError::Abort { .. }) => Ok(None),
-        Err(source) => Err(BringUpError::ReadBack { device: device.at.clone(), source }),
+        Err(source) => Err(BringUpError::ReadBack {
+            device: device.at.clone(),
+            source,
+        }),
     }
 }
 
@@ -109,7 +121,10 @@ fn differs(
     digits: usize,
 ) -> BringUpError {
     let show = |value: Option<u32>| {
-        value.map_or_else(|| "nothing".to_owned(), |value| format!("0x{value:0digits$x}"))
+        value.map_or_else(
+            || "nothing".to_owned(),
+            |value| format!("0x{value:0digits$x}"),
+        )
     };
     BringUpError::Mapping {
         device: device.at.clone(),

@@ -5,7 +5,10 @@
 //! and FMMUs of the process data, SYNC0, watchdogs and the further state changes, because those
 //! need the ESI or must name the device when they fail.
 
-#![allow(clippy::result_large_err, reason = "an error here carries the whole address and ends the run")]
+#![allow(
+    clippy::result_large_err,
+    reason = "an error here carries the whole address and ends the run"
+)]
 
 use std::fmt;
 
@@ -43,7 +46,11 @@ pub struct DeviceRef {
 
 impl fmt::Display for DeviceRef {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "`{}` (position {}, station 0x{:04x})", self.name, self.position, self.station)
+        write!(
+            f,
+            "`{}` (position {}, station 0x{:04x})",
+            self.name, self.position, self.station
+        )
     }
 }
 
@@ -71,10 +78,22 @@ pub struct Bus {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
     Scan,
-    Found { devices: usize },
-    StartUp { device: String, done: usize, of: usize },
-    ProcessData { bytes: usize, frames: usize },
-    Clocks { reference: String, devices: usize },
+    Found {
+        devices: usize,
+    },
+    StartUp {
+        device: String,
+        done: usize,
+        of: usize,
+    },
+    ProcessData {
+        bytes: usize,
+        frames: usize,
+    },
+    Clocks {
+        reference: String,
+        devices: usize,
+    },
     State(AlState),
 }
 
@@ -82,16 +101,24 @@ impl fmt::Display for Step {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Scan => f.write_str("scanning the segment"),
-            Self::Found { devices: 1 } => f.write_str("1 SubDevice, as in the machine file; in PreOp"),
+            Self::Found { devices: 1 } => {
+                f.write_str("1 SubDevice, as in the machine file; in PreOp")
+            }
             Self::Found { devices } => {
-                write!(f, "{devices} SubDevices, all as in the machine file; in PreOp")
+                write!(
+                    f,
+                    "{devices} SubDevices, all as in the machine file; in PreOp"
+                )
             }
             Self::StartUp { device, done, of } => write!(f, "`{device}`: start-up SDO {done}/{of}"),
             Self::ProcessData { bytes, frames } => {
                 write!(f, "process image: {bytes} bytes in {frames} frame(s)")
             }
             Self::Clocks { reference, devices } => {
-                write!(f, "distributed clocks: `{reference}` is the reference, SYNC0 on {devices} device(s)")
+                write!(
+                    f,
+                    "distributed clocks: `{reference}` is the reference, SYNC0 on {devices} device(s)"
+                )
             }
             Self::State(state) => write!(f, "all SubDevices in {state}"),
         }
@@ -105,15 +132,29 @@ pub enum BringUpError {
     NoAnswer,
     #[error("{step}: {message}")]
     Scan { step: &'static str, message: String },
-    #[error("{found} SubDevice(s) answer, the machine file names {expected}: {missing} missing; found: {list}")]
-    Missing { expected: usize, found: usize, missing: String, list: String },
+    #[error(
+        "{found} SubDevice(s) answer, the machine file names {expected}: {missing} missing; found: {list}"
+    )]
+    Missing {
+        expected: usize,
+        found: usize,
+        missing: String,
+        list: String,
+    },
     #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
     Unexpected { position: u16, identity: String },
     #[error("{device}: identify: the file `{esi}` describes {expected}, the device is {found}")]
-    Identity { device: DeviceRef, esi: String, expected: String, found: String },
+    Identity {
+        device: DeviceRef,
+        esi: String,
+        expected: String,
+        found: String,
+    },
     #[error("`{name}`: no SubDevice has {locator}")]
     NotLocated { name: String, locator: String },
-    #[error("{device}: start-up SDO 0x{index:04x}:{sub:02x} {name} = {value} (from {origin}): {source}")]
+    #[error(
+        "{device}: start-up SDO 0x{index:04x}:{sub:02x} {name} = {value} (from {origin}): {source}"
+    )]
     StartUp {
         device: DeviceRef,
         index: u16,
@@ -123,8 +164,16 @@ pub enum BringUpError {
         origin: String,
         source: SdoError,
     },
-    #[error("{device}: reading the PDO mapping back: 0x{index:04x}:{sub:02x} holds {actual}, the ESI's layout has {expected}")]
-    Mapping { device: DeviceRef, index: u16, sub: u8, expected: String, actual: String },
+    #[error(
+        "{device}: reading the PDO mapping back: 0x{index:04x}:{sub:02x} holds {actual}, the ESI's layout has {expected}"
+    )]
+    Mapping {
+        device: DeviceRef,
+        index: u16,
+        sub: u8,
+        expected: String,
+        actual: String,
+    },
     #[error("{device}: emptying the mailbox: {source}")]
     Mailbox { device: DeviceRef, source: SdoError },
     #[error("{device}: reading the PDO mapping back: {source}")]
@@ -132,9 +181,17 @@ pub enum BringUpError {
     #[error("{device}: {source}")]
     TooLarge { device: DeviceRef, source: TooLarge },
     #[error("{device}: {step}: {source}")]
-    Wire { device: DeviceRef, step: &'static str, source: WireError },
+    Wire {
+        device: DeviceRef,
+        step: &'static str,
+        source: WireError,
+    },
     #[error("{device}: {step}: register 0x{register:04x} did not take the write")]
-    NotTaken { device: DeviceRef, step: &'static str, register: u16 },
+    NotTaken {
+        device: DeviceRef,
+        step: &'static str,
+        register: u16,
+    },
     #[error("{device}: the ESI asks for SYNC0, the device has no distributed clock")]
     NoClock { device: DeviceRef },
     #[error(transparent)]
@@ -151,12 +208,17 @@ pub async fn bring_up(
     progress(Step::Scan);
     identify::answering(&wire).await?;
 
-    let group = match main_device.init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now).await {
+    let group = match main_device
+        .init_single_group::<MAX_SUBDEVICES, MAX_PDI>(clock::now)
+        .await
+    {
         Ok(group) => group,
         Err(error) => return Err(identify::explain_scan(&wire, machine, error).await),
     };
     let order = identify::assign(&wire, main_device, &group, machine).await?;
-    progress(Step::Found { devices: order.len() });
+    progress(Step::Found {
+        devices: order.len(),
+    });
 
     let mut devices = Vec::with_capacity(order.len());
     for (config, &position) in machine.devices.iter().zip(&order) {
@@ -196,7 +258,10 @@ pub async fn bring_up(
         device::map_process_data(&wire, config, device, *region).await?;
         device::set_watchdog(&wire, &machine.bus, device).await?;
     }
-    progress(Step::ProcessData { bytes: image.len, frames: image.datagrams.len().max(1) });
+    progress(Step::ProcessData {
+        bytes: image.len,
+        frames: image.datagrams.len().max(1),
+    });
 
     let dc = clocks::configure(&wire, machine, &devices, progress).await?;
 
@@ -207,7 +272,10 @@ pub async fn bring_up(
 }
 
 fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> BringUpError {
-    BringUpError::Scan { step, message: error.to_string() }
+    BringUpError::Scan {
+        step,
+        message: error.to_string(),
+    }
 }
 
 /// The mailbox as the ESI's first two SyncManagers describe it.

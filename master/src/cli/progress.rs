@@ -88,11 +88,7 @@ impl Observer for Teller {
                 }
             }
             Progress::Warning(text) => self.line(&format!("warning: {text}")),
-            Progress::PhaseLocked { drift_ppm } => {
-                self.line(&format!(
-                    "frames locked to SYNC0, clocks {drift_ppm:+.1} ppm apart"
-                ));
-            }
+            Progress::PhaseLocked => self.line("frames leave in phase with SYNC0"),
             Progress::Enabled { axes: 1 } => self.line("1 axis in Operation enabled"),
             Progress::Enabled { axes } => self.line(&format!("{axes} axes in Operation enabled")),
             Progress::Program { run, step, of } => {

@@ -5,9 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use ecaxis::config;
+use ecaxis::rt::thread;
 use ecaxis::session;
 
 use super::{Failure, hints, note, result, run, signals};
+
+/// SCHED_FIFO priority of the simulated bus; below that of a master on the same computer.
+const PRIORITY: u8 = 70;
 
 /// Serve the machine's bus, simulated, on a network interface until Ctrl-C
 #[derive(Debug, clap::Args)]
@@ -41,6 +45,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     note(&format!(
         "{count} simulated SubDevices answer on `{nic}`; Ctrl-C ends it"
     ));
+    // Devices of silicon answer whatever else the computer does.
+    for denied in thread::prepare(PRIORITY, None) {
+        note(&format!("warning: {denied}"));
+    }
     let stats = ecaxis_sim::serve(segment, nic, &stop).map_err(|e| hints::serve(&e))?;
     result(&format!(
         "{} frames answered, {} lost on purpose, {} not sent\n",

@@ -22,7 +22,11 @@ pub enum OpenError {
     #[error("the interface `{nic}` carries frames of at most {mtu} bytes, 1500 are needed")]
     Mtu { nic: String, mtu: u32 },
     #[error("the interface `{nic}`: {what}: {source}")]
-    Io { nic: String, what: &'static str, source: io::Error },
+    Io {
+        nic: String,
+        what: &'static str,
+        source: io::Error,
+    },
 }
 
 /// One interface, taken for EtherCAT frames only.
@@ -46,9 +50,15 @@ impl PacketLink {
         if fd < 0 {
             let error = io::Error::last_os_error();
             return Err(if error.kind() == io::ErrorKind::PermissionDenied {
-                OpenError::NotPermitted { nic: nic.to_owned() }
+                OpenError::NotPermitted {
+                    nic: nic.to_owned(),
+                }
             } else {
-                OpenError::Io { nic: nic.to_owned(), what: "opening a raw socket", source: error }
+                OpenError::Io {
+                    nic: nic.to_owned(),
+                    what: "opening a raw socket",
+                    source: error,
+                }
             });
         }
         // SAFETY: `fd` is a valid descriptor that nothing else owns.
@@ -56,8 +66,13 @@ impl PacketLink {
         check_interface(nic)?;
 
         // Our own transmissions would otherwise come back as received frames.
-        set_option(&socket, libc::SOL_PACKET, libc::PACKET_IGNORE_OUTGOING, 1)
-            .map_err(|source| OpenError::Io { nic: nic.to_owned(), what: "PACKET_IGNORE_OUTGOING", source })?;
+        set_option(&socket, libc::SOL_PACKET, libc::PACKET_IGNORE_OUTGOING, 1).map_err(
+            |source| OpenError::Io {
+                nic: nic.to_owned(),
+                what: "PACKET_IGNORE_OUTGOING",
+                source,
+            },
+        )?;
         // Cyclic frames must not wait behind a traffic shaper; an older kernel does without.
         let _ = set_option(&socket, libc::SOL_PACKET, libc::PACKET_QDISC_BYPASS, 1);
 
@@ -69,7 +84,11 @@ impl PacketLink {
         let length = libc::socklen_t::try_from(size_of::<libc::sockaddr_ll>()).unwrap_or(0);
         // SAFETY: the address lives through the call and `length` is its size.
         let bound = unsafe {
-            libc::bind(socket.as_raw_fd(), (&raw const address).cast::<libc::sockaddr>(), length)
+            libc::bind(
+                socket.as_raw_fd(),
+                (&raw const address).cast::<libc::sockaddr>(),
+                length,
+            )
         };
         if bound < 0 {
             return Err(OpenError::Io {
@@ -103,7 +122,9 @@ impl Link for PacketLink {
 }
 
 fn interface_index(nic: &str) -> Result<i32, OpenError> {
-    let missing = || OpenError::NoSuchInterface { nic: nic.to_owned() };
+    let missing = || OpenError::NoSuchInterface {
+        nic: nic.to_owned(),
+    };
     let name = std::ffi::CString::new(nic).map_err(|_| missing())?;
     // SAFETY: `name` is a NUL-terminated string that lives through the call.
     let index = unsafe { libc::if_nametoindex(name.as_ptr()) };
@@ -122,15 +143,24 @@ fn check_interface(nic: &str) -> Result<(), OpenError> {
     // Reading `carrier` fails with EINVAL while the interface is down.
     match read("carrier").as_deref() {
         Ok("1") => {}
-        Ok(_) => return Err(OpenError::NoCarrier { nic: nic.to_owned() }),
+        Ok(_) => {
+            return Err(OpenError::NoCarrier {
+                nic: nic.to_owned(),
+            });
+        }
         Err(error) if error.raw_os_error() == Some(libc::EINVAL) => {
-            return Err(OpenError::Down { nic: nic.to_owned() });
+            return Err(OpenError::Down {
+                nic: nic.to_owned(),
+            });
         }
         // No sysfs: nothing to check against.
         Err(_) => return Ok(()),
     }
     match read("mtu").ok().and_then(|text| text.parse::<u32>().ok()) {
-        Some(mtu) if mtu < 1500 => Err(OpenError::Mtu { nic: nic.to_owned(), mtu }),
+        Some(mtu) if mtu < 1500 => Err(OpenError::Mtu {
+            nic: nic.to_owned(),
+            mtu,
+        }),
         _ => Ok(()),
     }
 }
@@ -139,15 +169,27 @@ fn set_option(socket: &OwnedFd, level: i32, name: i32, value: i32) -> io::Result
     let length = libc::socklen_t::try_from(size_of::<i32>()).unwrap_or(0);
     // SAFETY: `value` lives through the call and `length` is its size.
     let result = unsafe {
-        libc::setsockopt(socket.as_raw_fd(), level, name, (&raw const value).cast(), length)
+        libc::setsockopt(
+            socket.as_raw_fd(),
+            level,
+            name,
+            (&raw const value).cast(),
+            length,
+        )
     };
-    if result < 0 { Err(io::Error::last_os_error()) } else { Ok(()) }
+    if result < 0 {
+        Err(io::Error::last_os_error())
+    } else {
+        Ok(())
+    }
 }
 
 /// The interfaces of this machine that could carry EtherCAT, for error messages.
 #[must_use]
 pub fn interfaces() -> Vec<String> {
-    let Ok(entries) = std::fs::read_dir("/sys/class/net") else { return Vec::new() };
+    let Ok(entries) = std::fs::read_dir("/sys/class/net") else {
+        return Vec::new();
+    };
     let mut names: Vec<String> = entries
         .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
         .filter(|name| name != "lo")

@@ -41,7 +41,9 @@ pub struct Port {
 
 impl std::fmt::Debug for Port {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Port").field("refused", &self.refused).finish_non_exhaustive()
+        f.debug_struct("Port")
+            .field("refused", &self.refused)
+            .finish_non_exhaustive()
     }
 }
 
@@ -76,7 +78,9 @@ impl Port {
     pub fn send(&mut self, link: &mut dyn Link, most: usize) -> Result<usize, LinkError> {
         let mut sent = 0;
         while sent < most {
-            let Some(frame) = self.tx.next_sendable_frame() else { break };
+            let Some(frame) = self.tx.next_sendable_frame() else {
+                break;
+            };
             let mut failure = None;
             let result = frame.send_blocking(|bytes| match link.send(bytes) {
                 Ok(()) => Ok(bytes.len()),
@@ -133,7 +137,9 @@ pub fn pump<F: Future>(
         idle = if moved { 0 } else { idle.saturating_add(1) };
         match clock {
             Clock::Virtual => {
-                let next = link.next_arrival().unwrap_or_else(|| clock::now() + IDLE_STEP);
+                let next = link
+                    .next_arrival()
+                    .unwrap_or_else(|| clock::now() + IDLE_STEP);
                 clock.relax(next);
             }
             // Frames come back within microseconds; a device at work takes milliseconds.

@@ -18,20 +18,26 @@ pub struct Recorded {
 impl Recorded {
     #[must_use]
     pub fn new(inner: Box<dyn Link>, recorder: Recorder, epoch: Nanos) -> Self {
-        Self { inner, recorder, epoch }
+        Self {
+            inner,
+            recorder,
+            epoch,
+        }
     }
 }
 
 impl Link for Recorded {
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
-        self.recorder.frame(Dir::Out, clock::now() + self.epoch, frame);
+        self.recorder
+            .frame(Dir::Out, clock::now() + self.epoch, frame);
         self.inner.send(frame)
     }
 
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
         let received = self.inner.recv(buf)?;
         if let Some(len) = received {
-            self.recorder.frame(Dir::In, clock::now() + self.epoch, &buf[..len]);
+            self.recorder
+                .frame(Dir::In, clock::now() + self.epoch, &buf[..len]);
         }
         Ok(received)
     }

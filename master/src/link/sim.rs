@@ -31,9 +31,20 @@ impl SimLink {
     /// The segment's time starts now.
     #[must_use]
     pub fn new(segment: Segment) -> Self {
-        let ring =
-            (0..IN_FLIGHT).map(|_| Slot { at: 0, len: 0, frame: [0; MAX_FRAME] }).collect();
-        Self { segment, start: clock::now(), ring, head: 0, count: 0 }
+        let ring = (0..IN_FLIGHT)
+            .map(|_| Slot {
+                at: 0,
+                len: 0,
+                frame: [0; MAX_FRAME],
+            })
+            .collect();
+        Self {
+            segment,
+            start: clock::now(),
+            ring,
+            head: 0,
+            count: 0,
+        }
     }
 
     #[must_use]

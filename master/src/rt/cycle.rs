@@ -33,7 +33,13 @@ pub struct AxisSlot {
 impl AxisSlot {
     #[must_use]
     pub fn new(axis: Axis, bits: AxisBits) -> Self {
-        Self { axis, bits, largest_following_error: 0.0, last_enabled: None, rested: 0 }
+        Self {
+            axis,
+            bits,
+            largest_following_error: 0.0,
+            last_enabled: None,
+            rested: 0,
+        }
     }
 
     fn read(&self, image: &[u8], fresh: bool) -> Inputs {
@@ -154,7 +160,12 @@ impl Engine {
 
     #[must_use]
     pub fn into_remains(self) -> Remains {
-        Remains { link: self.link, port: self.port, axes: self.axes, stats: self.stats }
+        Remains {
+            link: self.link,
+            port: self.port,
+            axes: self.axes,
+            stats: self.stats,
+        }
     }
 
     /// One cycle. RT: blocks on the clock and the wire only; O(image + axes).
@@ -221,7 +232,11 @@ impl Engine {
             if now >= deadline {
                 return;
             }
-            self.clock.relax(self.link.next_arrival().map_or(deadline, |at| at.min(deadline)));
+            self.clock.relax(
+                self.link
+                    .next_arrival()
+                    .map_or(deadline, |at| at.min(deadline)),
+            );
         }
     }
 
@@ -247,8 +262,12 @@ impl Engine {
 
     /// Nanoseconds to add to the next cycle.
     fn follow_clock(&mut self, lateness: Nanos) -> i64 {
-        let Some(phase) = &mut self.phase else { return 0 };
-        let Some(system_time) = self.answer.system_time else { return phase.holdover() };
+        let Some(phase) = &mut self.phase else {
+            return 0;
+        };
+        let Some(system_time) = self.answer.system_time else {
+            return phase.holdover();
+        };
         let before = phase.locked();
         let step = phase.update(system_time, lateness);
         let now_locked = phase.locked();
@@ -283,7 +302,11 @@ impl Engine {
                     && let Err(reason) = slot.axis.command(command)
                 {
                     let cycle = self.stats.counters.cycles;
-                    self.report(Event::Refused { cycle, axis, reason });
+                    self.report(Event::Refused {
+                        cycle,
+                        axis,
+                        reason,
+                    });
                 }
             }
             Order::Guard => self.guarding = true,
@@ -335,8 +358,9 @@ impl Engine {
     fn step_axes(&mut self) {
         let dt = self.timing.cycle_ns as f64 * 1e-9;
         let fresh = self.answer.inputs_fresh && self.answer.complete;
-        let out_of_patience =
-            self.stopping.is_some_and(|(_, since)| self.next.saturating_sub(since) > STOP_PATIENCE);
+        let out_of_patience = self
+            .stopping
+            .is_some_and(|(_, since)| self.next.saturating_sub(since) > STOP_PATIENCE);
         let mut cause = None;
         for (index, slot) in self.axes.iter_mut().enumerate() {
             let inputs = slot.read(self.exchange.inputs(), fresh);
@@ -350,7 +374,11 @@ impl Engine {
             }
             if self.stopping.is_some() {
                 let at_rest = status.at_rest && !status.moving;
-                slot.rested = if at_rest { slot.rested + self.timing.cycle_ns } else { 0 };
+                slot.rested = if at_rest {
+                    slot.rested + self.timing.cycle_ns
+                } else {
+                    0
+                };
                 if status.enabled && (slot.rested >= SETTLE || out_of_patience) {
                     let _ = slot.axis.command(Command::Disable);
                 }
@@ -412,7 +440,11 @@ impl Engine {
 
 /// The snapshot before the first cycle, with room for `axes` and `devices`.
 #[must_use]
-#[allow(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
+#[allow(
+    clippy::disallowed_methods,
+    clippy::disallowed_macros,
+    reason = "prepares"
+)]
 pub fn first_snapshot(axes: &[AxisSlot], devices: usize) -> Snapshot {
     Snapshot {
         time: clock::now(),

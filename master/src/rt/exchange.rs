@@ -150,11 +150,21 @@ pub struct Exchange {
 impl Exchange {
     /// Builds the frames. `stations` in the order in which devices are reported.
     #[must_use]
-    #[allow(clippy::disallowed_methods, clippy::disallowed_macros, reason = "prepares")]
+    #[allow(
+        clippy::disallowed_methods,
+        clippy::disallowed_macros,
+        reason = "prepares"
+    )]
     pub fn new(plan: &ImagePlan, reference: Option<u16>, stations: &[u16]) -> Self {
         let mut frames = vec![new_frame(0)];
         let clock = reference.map(|station| {
-            push(&mut frames[0], 0, FRMW, u32::from(SYSTEM_TIME) << 16 | u32::from(station), 8)
+            push(
+                &mut frames[0],
+                0,
+                FRMW,
+                u32::from(SYSTEM_TIME) << 16 | u32::from(station),
+                8,
+            )
         });
         let mut lrws: Vec<Lrw> = Vec::with_capacity(plan.datagrams.len());
         for (i, datagram) in plan.datagrams.iter().enumerate() {
@@ -186,7 +196,9 @@ impl Exchange {
             al: None,
         };
         // Room for the longest probe, so that staging never grows the buffer.
-        exchange.frames[0].bytes.reserve_exact(DATAGRAM_HEADER + 8 + WKC);
+        exchange.frames[0]
+            .bytes
+            .reserve_exact(DATAGRAM_HEADER + 8 + WKC);
         exchange.stage();
         exchange
     }
@@ -232,7 +244,9 @@ impl Exchange {
 
     /// The diagnostic datagram is the last of the first frame, so its length may change.
     fn stage_probe(&mut self) {
-        let Some(&station) = self.stations.get(self.probe.0) else { return };
+        let Some(&station) = self.stations.get(self.probe.0) else {
+            return;
+        };
         let (register, len) = Probe::ALL[self.probe.1].register_and_len();
         let frame = &mut self.frames[0].bytes;
         frame.truncate(self.probe_at);
@@ -256,7 +270,9 @@ impl Exchange {
             return Received::Foreign;
         }
         let number = frame.get(10).map_or(usize::MAX, |n| usize::from(*n));
-        let Some(sent) = self.frames.get_mut(number) else { return Received::Foreign };
+        let Some(sent) = self.frames.get_mut(number) else {
+            return Received::Foreign;
+        };
         if sent.answered
             || frame.get(FIRST_DATAGRAM + 1) != Some(&self.cycle)
             || !same_headers(&sent.bytes, frame)
@@ -275,7 +291,9 @@ impl Exchange {
         }
         if number == 0 {
             self.system_time = self.clock.filter(|p| p.wkc(frame) > 0).and_then(|place| {
-                Some(u64::from_le_bytes(frame.get(place.data())?.try_into().ok()?))
+                Some(u64::from_le_bytes(
+                    frame.get(place.data())?.try_into().ok()?,
+                ))
             });
             self.al = frame
                 .get(self.al_status.data())
@@ -291,10 +309,16 @@ impl Exchange {
             return;
         }
         let len = Probe::ALL[probe].register_and_len().1;
-        let place = Place { frame: 0, offset: self.probe_at, len };
-        if let (1, Some(data), Some(to)) =
-            (place.wkc(frame), frame.get(place.data()), self.diagnoses.get_mut(device))
-        {
+        let place = Place {
+            frame: 0,
+            offset: self.probe_at,
+            len,
+        };
+        if let (1, Some(data), Some(to)) = (
+            place.wkc(frame),
+            frame.get(place.data()),
+            self.diagnoses.get_mut(device),
+        ) {
             match (Probe::ALL[probe], data) {
                 (Probe::AlStatus, &[status, _, _, _, low, high]) => {
                     to.al_status = status;
@@ -332,7 +356,10 @@ impl Exchange {
         let expected = self.lrws.iter().map(|lrw| lrw.expected_wkc).sum();
         Answer {
             complete,
-            inputs_fresh: self.lrws.iter().all(|lrw| lrw.wkc == Some(lrw.expected_wkc)),
+            inputs_fresh: self
+                .lrws
+                .iter()
+                .all(|lrw| lrw.wkc == Some(lrw.expected_wkc)),
             wkc: (seen, expected),
             system_time: self.system_time.take(),
             al_status: self.al.take(),
@@ -348,7 +375,11 @@ impl Exchange {
 /// 0x092C: bit 31 is the sign (own clock behind), the rest the amount.
 fn sign_magnitude(raw: u32) -> i32 {
     let amount = i32::try_from(raw & 0x7fff_ffff).unwrap_or(i32::MAX);
-    if raw & 0x8000_0000 == 0 { amount } else { -amount }
+    if raw & 0x8000_0000 == 0 {
+        amount
+    } else {
+        -amount
+    }
 }
 
 #[allow(clippy::disallowed_methods, reason = "prepares")]
@@ -358,12 +389,19 @@ fn new_frame(number: u8) -> Frame {
     bytes.extend_from_slice(&[0x10, 0x10, 0x10, 0x10, number, MAC_TAIL]);
     bytes.extend_from_slice(&ETHERCAT);
     bytes.extend_from_slice(&[0, 0]);
-    Frame { bytes, answered: false }
+    Frame {
+        bytes,
+        answered: false,
+    }
 }
 
 /// Appends a datagram with room for `len` bytes.
 fn push(frame: &mut Frame, number: usize, command: u8, address: u32, len: usize) -> Place {
-    let place = Place { frame: number, offset: frame.bytes.len(), len };
+    let place = Place {
+        frame: number,
+        offset: frame.bytes.len(),
+        len,
+    };
     frame.bytes.resize(place.end(), 0);
     write_header(&mut frame.bytes, place.offset, command, address, len);
     place
@@ -385,7 +423,9 @@ fn clear_wkc(frame: &mut [u8], place: Place) {
 
 /// Writes the EtherCAT header, the cycle's index and the "more follows" flags of all datagrams.
 fn number(frame: &mut [u8], cycle: u8) {
-    let [low, high] = u16::try_from(frame.len() - FIRST_DATAGRAM).unwrap_or(0).to_le_bytes();
+    let [low, high] = u16::try_from(frame.len() - FIRST_DATAGRAM)
+        .unwrap_or(0)
+        .to_le_bytes();
     frame[ETHERNET_HEADER] = low;
     frame[ETHERNET_HEADER + 1] = high & 0x07 | 0x10;
     let mut at = FIRST_DATAGRAM;

@@ -12,7 +12,14 @@ fn reflect(exchange: &Exchange, number: usize, input: u8) -> Vec<u8> {
         let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 7]));
         let data = at + DATAGRAM_HEADER;
         let wkc = match frame[at] {
-            LRW => exchange.lrws.iter().find(|l| l.place.frame == number).expect("lrw").expected_wkc,
+            LRW => {
+                exchange
+                    .lrws
+                    .iter()
+                    .find(|l| l.place.frame == number)
+                    .expect("lrw")
+                    .expected_wkc
+            }
             _ => 1,
         };
         frame[data..data + len].fill(input);
@@ -35,7 +42,10 @@ fn frame_bytes_for_8_32_and_100_axes() {
         let lengths: Vec<_> = exchange.frame_lengths().collect();
         assert_eq!(lengths.len(), 1, "{count} axes in one frame");
         assert_eq!(exchange.probe_at, cyclic);
-        assert!(lengths[0] <= cyclic + 20, "the diagnostic datagram takes at most 20 bytes");
+        assert!(
+            lengths[0] <= cyclic + 20,
+            "the diagnostic datagram takes at most 20 bytes"
+        );
     }
 }
 
@@ -54,7 +64,11 @@ fn an_answer_is_taken_once_and_only_in_its_cycle() {
     assert_eq!(exchange.inputs(), [0x5a; 24]);
 
     exchange.stage();
-    assert_eq!(exchange.receive(&first), Received::Late, "an answer of the cycle before");
+    assert_eq!(
+        exchange.receive(&first),
+        Received::Late,
+        "an answer of the cycle before"
+    );
     assert!(!exchange.answer().complete);
 }
 
@@ -82,12 +96,15 @@ fn the_diagnostic_slot_walks_through_devices_and_probes() {
         exchange.stage();
     }
     assert_eq!(seen, [(0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2)]);
-    assert_eq!(exchange.diagnoses()[1], Diagnosis {
-        al_status: 1,
-        al_code: 0x0101,
-        clock_difference: 0x0101_0101,
-        rx_errors: [1; 8],
-    });
+    assert_eq!(
+        exchange.diagnoses()[1],
+        Diagnosis {
+            al_status: 1,
+            al_code: 0x0101,
+            clock_difference: 0x0101_0101,
+            rx_errors: [1; 8],
+        }
+    );
 }
 
 #[test]

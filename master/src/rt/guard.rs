@@ -15,9 +15,16 @@ pub enum StopCause {
     /// The drive of this axis reported a fault.
     DriveFault { axis: usize },
     /// This axis stopped itself.
-    Trip { axis: usize, trip: ecaxis_axis::Trip },
+    Trip {
+        axis: usize,
+        trip: ecaxis_axis::Trip,
+    },
     /// So many cycles in a row without a valid answer.
-    BusLost { cycles: u32, last_wkc: (u16, u16), answered: bool },
+    BusLost {
+        cycles: u32,
+        last_wkc: (u16, u16),
+        answered: bool,
+    },
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
 }
@@ -35,12 +42,21 @@ impl Guard {
     /// `lost_frames` bad cycles in a row stop the machine; `devices` SubDevices must answer.
     #[must_use]
     pub fn new(lost_frames: u32, devices: u16) -> Self {
-        Self { lost_frames: lost_frames.max(1), devices, bad: 0, al: 0 }
+        Self {
+            lost_frames: lost_frames.max(1),
+            devices,
+            bad: 0,
+            al: 0,
+        }
     }
 
     /// Looks at one cycle. RT.
     pub fn check(&mut self, answer: &Answer) -> Option<StopCause> {
-        self.bad = if answer.inputs_fresh && answer.complete { 0 } else { self.bad + 1 };
+        self.bad = if answer.inputs_fresh && answer.complete {
+            0
+        } else {
+            self.bad + 1
+        };
         if self.bad >= self.lost_frames {
             return Some(StopCause::BusLost {
                 cycles: self.bad,
@@ -73,8 +89,13 @@ mod tests {
         system_time: None,
         al_status: Some((OP, 2)),
     };
-    const LOST: Answer =
-        Answer { complete: false, inputs_fresh: false, wkc: (0, 3), system_time: None, al_status: None };
+    const LOST: Answer = Answer {
+        complete: false,
+        inputs_fresh: false,
+        wkc: (0, 3),
+        system_time: None,
+        al_status: None,
+    };
 
     #[test]
     fn rides_through_fewer_bad_cycles_than_the_limit() {
@@ -86,18 +107,33 @@ mod tests {
         }
         guard.check(&LOST);
         guard.check(&LOST);
-        assert!(matches!(guard.check(&LOST), Some(StopCause::BusLost { cycles: 3, .. })));
+        assert!(matches!(
+            guard.check(&LOST),
+            Some(StopCause::BusLost { cycles: 3, .. })
+        ));
     }
 
     #[test]
     fn a_device_that_leaves_op_stops_the_machine() {
         let mut guard = Guard::new(3, 2);
-        let left = Answer { al_status: Some((0x1c, 2)), ..GOOD };
+        let left = Answer {
+            al_status: Some((0x1c, 2)),
+            ..GOOD
+        };
         assert_eq!(guard.check(&left), None);
-        assert_eq!(guard.check(&left), Some(StopCause::LeftOp { al_status: 0x1c }));
+        assert_eq!(
+            guard.check(&left),
+            Some(StopCause::LeftOp { al_status: 0x1c })
+        );
         let mut guard = Guard::new(3, 2);
-        let gone = Answer { al_status: Some((OP, 1)), ..GOOD };
+        let gone = Answer {
+            al_status: Some((OP, 1)),
+            ..GOOD
+        };
         guard.check(&gone);
-        assert_eq!(guard.check(&gone), Some(StopCause::LeftOp { al_status: OP }));
+        assert_eq!(
+            guard.check(&gone),
+            Some(StopCause::LeftOp { al_status: OP })
+        );
     }
 }

@@ -15,7 +15,10 @@ const EVENTS: usize = 256;
 /// To the cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Order {
-    Axis { axis: usize, command: Command },
+    Axis {
+        axis: usize,
+        command: Command,
+    },
     /// From now on bad cycles are counted, and too many stop the machine.
     Guard,
     /// The segment is about to leave Op: wrong working counters are expected.
@@ -23,7 +26,10 @@ pub enum Order {
     /// Bring every axis to rest within its limits, then disable it.
     Stop,
     /// A drive's error code, read beside the cycle.
-    ErrorCode { axis: usize, code: u16 },
+    ErrorCode {
+        axis: usize,
+        code: u16,
+    },
     /// End the loop after this cycle.
     Halt,
 }
@@ -31,10 +37,21 @@ pub enum Order {
 /// From the cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Event {
-    Refused { cycle: u64, axis: usize, reason: Refused },
-    Stopping { cycle: u64, cause: StopCause },
-    PhaseLocked { cycle: u64 },
-    PhaseLost { cycle: u64 },
+    Refused {
+        cycle: u64,
+        axis: usize,
+        reason: Refused,
+    },
+    Stopping {
+        cycle: u64,
+        cause: StopCause,
+    },
+    PhaseLocked {
+        cycle: u64,
+    },
+    PhaseLost {
+        cycle: u64,
+    },
 }
 
 /// The state of the machine after one cycle.
@@ -88,7 +105,15 @@ pub fn ends(first: &Snapshot) -> (RtEnd, OuterEnd) {
     let (event_in, event_out) = rtrb::RingBuffer::new(EVENTS);
     let (snapshot_in, snapshot_out) = triple_buffer::triple_buffer(first);
     (
-        RtEnd { orders: order_out, events: event_in, snapshots: snapshot_in },
-        OuterEnd { orders: order_in, events: event_out, snapshots: snapshot_out },
+        RtEnd {
+            orders: order_out,
+            events: event_in,
+            snapshots: snapshot_in,
+        },
+        OuterEnd {
+            orders: order_in,
+            events: event_out,
+            snapshots: snapshot_out,
+        },
     )
 }

@@ -63,7 +63,11 @@ pub fn plan(sizes: &[(usize, usize)]) -> Result<ImagePlan, TooLarge> {
             image.regions.push(None);
             continue;
         }
-        let room = if image.datagrams.len() <= 1 { FIRST_FRAME_DATA } else { NEXT_FRAME_DATA };
+        let room = if image.datagrams.len() <= 1 {
+            FIRST_FRAME_DATA
+        } else {
+            NEXT_FRAME_DATA
+        };
         if len > NEXT_FRAME_DATA || (image.datagrams.is_empty() && len > FIRST_FRAME_DATA) {
             return Err(TooLarge { device, len });
         }
@@ -74,7 +78,12 @@ pub fn plan(sizes: &[(usize, usize)]) -> Result<ImagePlan, TooLarge> {
                 last.len += len;
                 last.expected_wkc += wkc;
             }
-            _ => image.datagrams.push(LrwPlan { logical, offset: image.len, len, expected_wkc: wkc }),
+            _ => image.datagrams.push(LrwPlan {
+                logical,
+                offset: image.len,
+                len,
+                expected_wkc: wkc,
+            }),
         }
         image.regions.push(Some(Region {
             logical,
@@ -100,7 +109,9 @@ impl Bits {
     /// `None` where the field is longer than 64 bits or lies outside the region.
     fn new(field: &Field, offset: usize, region_len: usize) -> Option<Self> {
         let bit = usize::try_from(field.bit_offset).ok()?;
-        let len = u8::try_from(field.bit_len).ok().filter(|len| (1..=64).contains(len))?;
+        let len = u8::try_from(field.bit_len)
+            .ok()
+            .filter(|len| (1..=64).contains(len))?;
         let end = (bit + usize::from(len)).div_ceil(8);
         (end <= region_len).then(|| Self {
             byte: offset + bit / 8,
@@ -127,7 +138,12 @@ impl Bits {
         let end = self.byte + (usize::from(self.shift) + usize::from(self.len)).div_ceil(8);
         let mask = (u128::from(u64::MAX >> (64 - u32::from(self.len)))) << self.shift;
         let bits = (u128::from(value as u64) << self.shift) & mask;
-        for (i, byte) in image.get_mut(self.byte..end).unwrap_or(&mut []).iter_mut().enumerate() {
+        for (i, byte) in image
+            .get_mut(self.byte..end)
+            .unwrap_or(&mut [])
+            .iter_mut()
+            .enumerate()
+        {
             let keep = !((mask >> (8 * i)) as u8);
             *byte = (*byte & keep) | ((bits >> (8 * i)) as u8);
         }
@@ -160,14 +176,24 @@ pub struct NotMapped {
 impl AxisBits {
     pub fn new(layout: &Layout, region: &Region) -> Result<Self, NotMapped> {
         let out = |index| {
-            layout.rx_field(index, 0).and_then(|f| Bits::new(f, region.offset, region.out_len))
+            layout
+                .rx_field(index, 0)
+                .and_then(|f| Bits::new(f, region.offset, region.out_len))
         };
         let inp = |index| {
-            layout.tx_field(index, 0).and_then(|f| Bits::new(f, region.offset, region.in_len))
+            layout
+                .tx_field(index, 0)
+                .and_then(|f| Bits::new(f, region.offset, region.in_len))
         };
         Ok(Self {
-            controlword: out(0x6040).ok_or(NotMapped { index: 0x6040, sub: 0 })?,
-            statusword: inp(0x6041).ok_or(NotMapped { index: 0x6041, sub: 0 })?,
+            controlword: out(0x6040).ok_or(NotMapped {
+                index: 0x6040,
+                sub: 0,
+            })?,
+            statusword: inp(0x6041).ok_or(NotMapped {
+                index: 0x6041,
+                sub: 0,
+            })?,
             mode: out(0x6060),
             mode_display: inp(0x6061),
             target_position: out(0x607a),
@@ -188,12 +214,15 @@ mod tests {
     #[test]
     fn working_counters_and_addresses_of_a_drive_an_input_and_an_output() {
         let image = plan(&[(12, 14), (0, 1), (1, 0), (0, 0)]).expect("fits");
-        assert_eq!(image.datagrams, [LrwPlan {
-            logical: LOGICAL_BASE,
-            offset: 0,
-            len: 16,
-            expected_wkc: 3 + 1 + 2,
-        }]);
+        assert_eq!(
+            image.datagrams,
+            [LrwPlan {
+                logical: LOGICAL_BASE,
+                offset: 0,
+                len: 16,
+                expected_wkc: 3 + 1 + 2,
+            }]
+        );
         assert_eq!(image.regions[1].map(|r| r.offset), Some(14));
         assert_eq!(image.regions[2].map(|r| r.logical), Some(LOGICAL_BASE + 15));
         assert_eq!(image.regions[3], None);
@@ -205,7 +234,13 @@ mod tests {
         let many = plan(&[(12, 12); 300]).expect("fits");
         assert_eq!(many.datagrams.len(), 3);
         assert!(many.datagrams.iter().all(|d| d.len <= NEXT_FRAME_DATA));
-        assert_eq!(plan(&[(1500, 0)]), Err(TooLarge { device: 0, len: 1500 }));
+        assert_eq!(
+            plan(&[(1500, 0)]),
+            Err(TooLarge {
+                device: 0,
+                len: 1500
+            })
+        );
     }
 
     proptest! {

@@ -14,7 +14,11 @@
 
 #![cfg_attr(
     not(test),
-    deny(clippy::disallowed_types, clippy::disallowed_methods, clippy::disallowed_macros)
+    deny(
+        clippy::disallowed_types,
+        clippy::disallowed_methods,
+        clippy::disallowed_macros
+    )
 )]
 
 pub mod cycle;

@@ -10,10 +10,11 @@ use crate::clock::Nanos;
 const PROPORTIONAL: f64 = 0.1;
 /// Critically damped: Kp² ∕ 4.
 const INTEGRAL: f64 = PROPORTIONAL * PROPORTIONAL / 4.0;
-/// Cycles within the window before the phase counts as locked.
-const CYCLES_TO_LOCK: u32 = 50;
-/// Cycles outside before it counts as lost.
-const CYCLES_TO_UNLOCK: u32 = 20;
+/// Score at which the phase counts as locked; a measurement inside the window adds one, one outside
+/// takes one away, so that a single late answer on a busy host does not start the count anew.
+const LOCKED_SCORE: u32 = 50;
+/// Highest score: so many measurements outside, and the phase counts as lost.
+const BEST_SCORE: u32 = 70;
 
 /// The phase controller of one segment.
 #[derive(Debug, Clone)]
@@ -24,7 +25,7 @@ pub struct Phase {
     /// Nanoseconds a cycle.
     drift: f64,
     locked: bool,
-    run: u32,
+    score: u32,
 }
 
 /// What one measurement told.
@@ -43,7 +44,13 @@ impl Phase {
     pub fn new(cycle_ns: u64, start: u64) -> Self {
         let cycle = i64::try_from(cycle_ns).unwrap_or(i64::MAX).max(1);
         let start = i64::try_from(start % cycle_ns.max(1)).unwrap_or(0);
-        Self { cycle, target: (start + cycle / 2) % cycle, drift: 0.0, locked: false, run: 0 }
+        Self {
+            cycle,
+            target: (start + cycle / 2) % cycle,
+            drift: 0.0,
+            locked: false,
+            score: 0,
+        }
     }
 
     #[must_use]
@@ -79,7 +86,10 @@ impl Phase {
             self.drift = self.drift.clamp(-most, most);
         }
         let adjust = -(PROPORTIONAL * bounded + self.drift);
-        PhaseStep { error, adjust: adjust.round() as i64 }
+        PhaseStep {
+            error,
+            adjust: adjust.round() as i64,
+        }
     }
 
     /// Without a measurement the drift estimate carries on. RT.
@@ -89,16 +99,17 @@ impl Phase {
     }
 
     fn judge(&mut self, error: i64) {
-        let inside = error.abs() <= if self.locked { self.cycle / 8 } else { self.cycle / 50 };
-        if inside == self.locked {
-            self.run = 0;
-            return;
-        }
-        self.run += 1;
-        if self.run >= if self.locked { CYCLES_TO_UNLOCK } else { CYCLES_TO_LOCK } {
-            self.locked = !self.locked;
-            self.run = 0;
-        }
+        let window = if self.locked {
+            self.cycle / 8
+        } else {
+            self.cycle / 25
+        };
+        self.score = if error.abs() <= window {
+            (self.score + 1).min(BEST_SCORE)
+        } else {
+            self.score.saturating_sub(1)
+        };
+        self.locked = self.score >= LOCKED_SCORE;
     }
 
     /// Into ±half a cycle.
@@ -140,7 +151,10 @@ mod tests {
             for offset in [0, 1, cycle / 3, cycle / 2, cycle - 1] {
                 for ppm in [-100.0, 0.0, 80.0] {
                     let (at, largest) = run(cycle, offset, ppm, |_| 0);
-                    assert!(at < 1_000, "{cycle} {offset} {ppm}: locked after {at} cycles");
+                    assert!(
+                        at < 1_000,
+                        "{cycle} {offset} {ppm}: locked after {at} cycles"
+                    );
                     assert!(largest < 100, "{cycle} {offset} {ppm}: {largest} ns");
                 }
             }
@@ -149,7 +163,9 @@ mod tests {
 
     #[test]
     fn a_late_thread_does_not_move_the_phase() {
-        let (_, largest) = run(1_000_000, 0, 30.0, |k| if k % 97 == 0 { 300_000 } else { 2_000 });
+        let (_, largest) = run(1_000_000, 0, 30.0, |k| {
+            if k % 97 == 0 { 300_000 } else { 2_000 }
+        });
         assert!(largest < 500, "{largest} ns");
     }
 
@@ -160,7 +176,7 @@ mod tests {
             phase.update(500_000, 0);
         }
         assert!(phase.locked());
-        for _ in 0..CYCLES_TO_UNLOCK - 1 {
+        for _ in 0..BEST_SCORE - LOCKED_SCORE {
             phase.update(0, 0);
         }
         assert!(phase.locked());

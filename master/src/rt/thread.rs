@@ -14,7 +14,9 @@ const STACK_TO_TOUCH: usize = 256 * 1024;
 /// Something that was not permitted.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Denied {
-    #[error("SCHED_FIFO priority {priority} is not permitted ({reason}): other programs can delay the cycle")]
+    #[error(
+        "SCHED_FIFO priority {priority} is not permitted ({reason}): other programs can delay the cycle"
+    )]
     Priority { priority: u8, reason: String },
     #[error("CPU {cpu} cannot be taken ({reason}): the thread may move between CPUs")]
     Affinity { cpu: usize, reason: String },
@@ -27,7 +29,9 @@ pub enum Denied {
 pub fn prepare(priority: u8, cpu: Option<usize>) -> Vec<Denied> {
     let mut denied = Vec::new();
     if let Err(error) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE) {
-        denied.push(Denied::MemoryLock { reason: error.to_string() });
+        denied.push(Denied::MemoryLock {
+            reason: error.to_string(),
+        });
     }
     touch_stack();
     if let Some(cpu) = cpu {

@@ -25,9 +25,15 @@ pub enum RunError {
     #[error("bring-up: {0}")]
     BringUp(#[from] Box<BringUpError>),
     #[error("{device}: {source}")]
-    NotMapped { device: DeviceRef, source: NotMapped },
+    NotMapped {
+        device: DeviceRef,
+        source: NotMapped,
+    },
     #[error("{device}: {source}")]
-    Axis { device: DeviceRef, source: ecaxis_axis::ConfigError },
+    Axis {
+        device: DeviceRef,
+        source: ecaxis_axis::ConfigError,
+    },
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
     NoProcessData { al_status: Option<(u8, u16)> },
     #[error("the release of frames does not lock to SYNC0: phase error {error_ns} ns")]
@@ -51,26 +57,53 @@ pub enum RunError {
         "{device}: modes of operation display (0x6061) is {}, expected {}",
         Mode::from_code(*display), Mode::from_code(*expected)
     )]
-    WrongMode { device: DeviceRef, expected: i8, display: i8 },
+    WrongMode {
+        device: DeviceRef,
+        expected: i8,
+        display: i8,
+    },
     #[error("{device}: drive fault (Statusword 0x{statusword:04x}){}", code_note(*code))]
-    DriveFault { device: DeviceRef, code: Option<u16>, statusword: u16 },
+    DriveFault {
+        device: DeviceRef,
+        code: Option<u16>,
+        statusword: u16,
+    },
     #[error("{device}: {trip}")]
     Trip { device: DeviceRef, trip: Trip },
     #[error("the bus is lost: {cycles} cycles in a row {}", lost_note(*answered, *wkc))]
-    BusLost { cycles: u32, wkc: (u16, u16), answered: bool },
+    BusLost {
+        cycles: u32,
+        wkc: (u16, u16),
+        answered: bool,
+    },
     #[error(
         "{device}: left Op for {state}, AL status code 0x{code:04x} ({})",
         al_status_text(*code)
     )]
-    LeftOp { device: DeviceRef, state: AlState, code: u16 },
+    LeftOp {
+        device: DeviceRef,
+        state: AlState,
+        code: u16,
+    },
     #[error("{device}: no longer answers")]
     Gone { device: DeviceRef },
     #[error("a SubDevice left Op (AL status 0x{al_status:02x}) and was back when it was asked")]
     LeftOpBriefly { al_status: u8 },
     #[error("step {step}: {device}: command refused: {reason}")]
-    Refused { device: DeviceRef, step: usize, reason: String },
-    #[error("step {step}: {device}: the target {target} is not reached, the axis is at {actual:.4}")]
-    NotReached { device: DeviceRef, step: usize, target: f64, actual: f64 },
+    Refused {
+        device: DeviceRef,
+        step: usize,
+        reason: String,
+    },
+    #[error(
+        "step {step}: {device}: the target {target} is not reached, the axis is at {actual:.4}"
+    )]
+    NotReached {
+        device: DeviceRef,
+        step: usize,
+        target: f64,
+        actual: f64,
+    },
     #[error("interrupted")]
     Interrupted,
     #[error("internal error: {0}")]
@@ -80,19 +113,28 @@ pub enum RunError {
 fn al_note(al_status: Option<(u8, u16)>) -> String {
     match al_status {
         Some((status, count)) => {
-            format!("the working counter is wrong; {count} SubDevice(s) answer, AL status 0x{status:02x}")
+            format!(
+                "the working counter is wrong; {count} SubDevice(s) answer, AL status 0x{status:02x}"
+            )
         }
         None => "cyclic frames do not return in time".to_owned(),
     }
 }
 
 fn mode_note(confirmed: bool) -> &'static str {
-    if confirmed { "" } else { ", the drive has not taken over the mode of operation" }
+    if confirmed {
+        ""
+    } else {
+        ", the drive has not taken over the mode of operation"
+    }
 }
 
 fn code_note(code: Option<u16>) -> String {
     match code {
-        Some(code) => format!(", error code (0x603F) 0x{code:04x}: {}", describe(code).text),
+        Some(code) => format!(
+            ", error code (0x603F) 0x{code:04x}: {}",
+            describe(code).text
+        ),
         None => String::new(),
     }
 }

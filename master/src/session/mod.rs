@@ -19,14 +19,17 @@ use ethercrab::{Command as Datagram, MainDevice};
 use crate::bringup::{Bus, bring_up};
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
-use crate::link::port::{Port, main_device, pump};
 use crate::link::Link;
-use crate::rt::{self, cycle::{AxisSlot, Engine, Parts, Remains, Timing, first_snapshot}};
+use crate::link::port::{Port, main_device, pump};
 use crate::rt::exchange::Exchange;
 use crate::rt::guard::Guard;
 use crate::rt::handover::ends;
 use crate::rt::image::AxisBits;
 use crate::rt::phase::Phase;
+use crate::rt::{
+    self,
+    cycle::{AxisSlot, Engine, Parts, Remains, Timing, first_snapshot},
+};
 use crate::supervise::{Ended, Supervisor, executor};
 use crate::wire::Datagrams;
 
@@ -83,7 +86,10 @@ pub struct Outcome {
 
 impl From<RunError> for Outcome {
     fn from(error: RunError) -> Self {
-        Self { summary: None, result: Err(error) }
+        Self {
+            summary: None,
+            result: Err(error),
+        }
     }
 }
 
@@ -107,7 +113,9 @@ pub fn run(
     for progress in told {
         observer.progress(&progress);
     }
-    owner.join().unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into())
+    owner
+        .join()
+        .unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into())
 }
 
 fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
@@ -135,7 +143,14 @@ pub fn prepare(
 ) -> Result<Prepared, RunError> {
     let mut link = open::link(machine, options)?;
     let (main_device, mut port) = main_device(machine.bus.cycle_ns);
-    match come_up(machine, options.clock, main_device, link.as_mut(), &mut port, &progress) {
+    match come_up(
+        machine,
+        options.clock,
+        main_device,
+        link.as_mut(),
+        &mut port,
+        &progress,
+    ) {
         Ok(bus) => {
             let wire = Datagrams::new(main_device);
             assemble(machine, options, stop, progress, bus, wire, (link, port))
@@ -174,13 +189,18 @@ fn own_the_link(
             }
         }
     };
-    let Remains { link, axes, stats, .. } = remains;
+    let Remains {
+        link, axes, stats, ..
+    } = remains;
     let (record, result) = match link.finish() {
         Ok(record) => (record, result),
         Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),
     };
     let summary = Summary::new(machine, options.clock, &axes, &stats, ended, record);
-    Outcome { summary: Some(summary), result }
+    Outcome {
+        summary: Some(summary),
+        result,
+    }
 }
 
 fn come_up(
@@ -196,7 +216,12 @@ fn come_up(
     };
     // ethercrab panics on some things a wire can carry (a SubDevice without an open port, say).
     let run = std::panic::AssertUnwindSafe(|| {
-        pump(port, link, clock, Box::pin(bring_up(main_device, machine, &mut tell)))
+        pump(
+            port,
+            link,
+            clock,
+            Box::pin(bring_up(main_device, machine, &mut tell)),
+        )
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Ok(bus))) => Ok(bus),
@@ -213,7 +238,9 @@ fn go_silent(
     link: &mut dyn Link,
     port: &mut Port,
 ) {
-    let init = Datagram::bwr(0x0120).ignore_wkc().send(main_device, 0x0011_u16);
+    let init = Datagram::bwr(0x0120)
+        .ignore_wkc()
+        .send(main_device, 0x0011_u16);
     let _ = pump(port, link, clock, init);
 }
 
@@ -229,12 +256,20 @@ fn assemble(
     let mut slots = Vec::new();
     let mut axes = Vec::new();
     for (index, (device, region)) in machine.devices.iter().zip(&bus.image.regions).enumerate() {
-        let (Some(setup), Some(region)) = (&device.axis, region) else { continue };
+        let (Some(setup), Some(region)) = (&device.axis, region) else {
+            continue;
+        };
         let at = || bus.devices[index].at.clone();
-        let bits = AxisBits::new(&device.selection.layout, region)
-            .map_err(|source| RunError::NotMapped { device: at(), source })?;
-        let axis = Axis::new(setup.config)
-            .map_err(|source| RunError::Axis { device: at(), source })?;
+        let bits = AxisBits::new(&device.selection.layout, region).map_err(|source| {
+            RunError::NotMapped {
+                device: at(),
+                source,
+            }
+        })?;
+        let axis = Axis::new(setup.config).map_err(|source| RunError::Axis {
+            device: at(),
+            source,
+        })?;
         slots.push(AxisSlot::new(axis, bits));
         axes.push(index);
     }
@@ -243,7 +278,10 @@ fn assemble(
     let (rt_end, outer) = ends(&first_snapshot(&slots, stations.len()));
     let parts = Parts {
         clock: options.clock,
-        timing: Timing { cycle_ns: machine.bus.cycle_ns, spin_ns: machine.bus.spin_ns },
+        timing: Timing {
+            cycle_ns: machine.bus.cycle_ns,
+            spin_ns: machine.bus.spin_ns,
+        },
         link,
         port,
         exchange: Exchange::new(&bus.image, bus.dc.map(|dc| dc.reference), &stations),
@@ -298,11 +336,17 @@ fn turn_in_real_time(mut engine: Engine, supervisor: Supervisor) -> Result<Turne
     let result = match beside.join() {
         Ok(Ok(result)) => result,
         Ok(Err(error)) => (Ended::default(), Err(RunError::Thread(error.to_string()))),
-        Err(panic) => (Ended::default(), Err(RunError::Panicked(panic_text(&*panic)))),
+        Err(panic) => (
+            Ended::default(),
+            Err(RunError::Panicked(panic_text(&*panic))),
+        ),
     };
     Ok((engine.into_remains(), result))
 }
 
 fn died() -> (Ended, Result<(), RunError>) {
-    (Ended::default(), Err(RunError::Panicked("the supervisor ended early".to_owned())))
+    (
+        Ended::default(),
+        Err(RunError::Panicked("the supervisor ended early".to_owned())),
+    )
 }

@@ -15,10 +15,16 @@ use crate::link::sim::SimLink;
 
 pub(super) fn link(machine: &Machine, options: &Options) -> Result<Box<dyn Link>, RunError> {
     let link: Box<dyn Link> = match &machine.bus.nic {
-        Nic::Sim => Box::new(SimLink::new(simulated_bus(machine, options.seed, options.faults.as_ref())?)),
+        Nic::Sim => Box::new(SimLink::new(simulated_bus(
+            machine,
+            options.seed,
+            options.faults.as_ref(),
+        )?)),
         Nic::Interface(nic) => Box::new(PacketLink::open(nic)?),
     };
-    let Some(path) = &options.record else { return Ok(link) };
+    let Some(path) = &options.record else {
+        return Ok(link);
+    };
     let (mode, epoch) = match options.clock {
         // A run in virtual time is to be recorded the same every time, and may wait for the disk.
         Clock::Virtual => (Mode::Inline, 0),
@@ -52,13 +58,24 @@ pub fn simulated_bus(
         }
     }
     // Devices found by alias or identification may stand anywhere: they fill the gaps in order.
-    let mut others = machine.devices.iter().filter(|d| !matches!(d.at, Locator::Position(_)));
+    let mut others = machine
+        .devices
+        .iter()
+        .filter(|d| !matches!(d.at, Locator::Position(_)));
     let mut devices = Vec::with_capacity(placed.len());
     for place in placed {
-        let Some(device) = place.or_else(|| others.next()) else { continue };
+        let Some(device) = place.or_else(|| others.next()) else {
+            continue;
+        };
         devices.push(sim_device(device, devices.len())?);
     }
-    let mut segment = Segment::new(devices, SegmentOptions { seed, ..SegmentOptions::default() });
+    let mut segment = Segment::new(
+        devices,
+        SegmentOptions {
+            seed,
+            ..SegmentOptions::default()
+        },
+    );
     if let Some(faults) = faults {
         segment.set_faults(faults.clone());
     }

@@ -21,10 +21,17 @@ pub enum Progress {
     /// Something the operating system did not permit; the run goes on.
     Denied(Denied),
     Warning(String),
-    PhaseLocked { drift_ppm: f64 },
-    Enabled { axes: usize },
+    /// Frames leave in phase with SYNC0.
+    PhaseLocked,
+    Enabled {
+        axes: usize,
+    },
     /// A step of the program begins; both count from 1.
-    Program { run: u32, step: usize, of: usize },
+    Program {
+        run: u32,
+        step: usize,
+        of: usize,
+    },
     /// Once a second of the machine's time.
     Status(Status),
     Stopping,
@@ -71,6 +78,11 @@ impl Status {
                 })
             })
             .collect();
-        Self { time: snapshot.time, counters: snapshot.counters, phase: snapshot.phase, axes }
+        Self {
+            time: snapshot.time,
+            counters: snapshot.counters,
+            phase: snapshot.phase,
+            axes,
+        }
     }
 }

@@ -69,7 +69,10 @@ impl Summary {
         ended: Ended,
         record: Option<RecordStats>,
     ) -> Self {
-        let setups = machine.devices.iter().filter_map(|d| Some((d, d.axis.as_ref()?)));
+        let setups = machine
+            .devices
+            .iter()
+            .filter_map(|d| Some((d, d.axis.as_ref()?)));
         let axes = setups
             .zip(axes)
             .map(|((device, setup), slot)| {

@@ -10,7 +10,10 @@ use std::task::{Context, Poll, Wake, Waker};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 
 /// Futures that wait for the clock are not woken; they are asked again this often.
-const TICK: Timespec = Timespec { tv_sec: 0, tv_nsec: 500_000 };
+const TICK: Timespec = Timespec {
+    tv_sec: 0,
+    tv_nsec: 500_000,
+};
 
 struct Bell(OwnedFd);
 
@@ -27,7 +30,10 @@ impl Wake for Bell {
 
 /// Runs a future to its end on this thread.
 pub fn block_on<F: Future>(future: F) -> std::io::Result<F::Output> {
-    let bell = Arc::new(Bell(eventfd(0, EventfdFlags::NONBLOCK | EventfdFlags::CLOEXEC)?));
+    let bell = Arc::new(Bell(eventfd(
+        0,
+        EventfdFlags::NONBLOCK | EventfdFlags::CLOEXEC,
+    )?));
     let waker = Waker::from(Arc::clone(&bell));
     let mut context = Context::from_waker(&waker);
     let mut future = pin!(future);

@@ -32,16 +32,29 @@ impl Supervisor {
                         .map_or(0, |fault| fault.statusword),
                 }
             }
-            StopCause::Trip { axis, trip } => RunError::Trip { device: self.device_of(axis), trip },
-            StopCause::BusLost { cycles, last_wkc, answered } => {
-                RunError::BusLost { cycles, wkc: last_wkc, answered }
-            }
+            StopCause::Trip { axis, trip } => RunError::Trip {
+                device: self.device_of(axis),
+                trip,
+            },
+            StopCause::BusLost {
+                cycles,
+                last_wkc,
+                answered,
+            } => RunError::BusLost {
+                cycles,
+                wkc: last_wkc,
+                answered,
+            },
             StopCause::LeftOp { al_status } => {
                 for device in self.bus.addresses() {
                     match al::read_status(&self.wire, device.station).await {
                         Ok(Some((status, code))) if status != 8 => {
                             let state = al::AlState::from_status(status);
-                            return RunError::LeftOp { device, state, code };
+                            return RunError::LeftOp {
+                                device,
+                                state,
+                                code,
+                            };
                         }
                         Ok(None) => {
                             return RunError::Gone { device };
@@ -98,10 +111,18 @@ impl Supervisor {
             let device = &self.machine.devices[self.axes[axis]];
             let Some(setup) = &device.axis else { continue };
             let expected = setup.config.mode.code();
-            if device.selection.layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_some() {
+            if device
+                .selection
+                .layout
+                .tx_field(MODES_OF_OPERATION_DISPLAY, 0)
+                .is_some()
+            {
                 continue;
             }
-            if let Some(&[display]) = self.upload(axis, MODES_OF_OPERATION_DISPLAY).await.as_deref()
+            if let Some(&[display]) = self
+                .upload(axis, MODES_OF_OPERATION_DISPLAY)
+                .await
+                .as_deref()
                 && i8::from_le_bytes([display]) != expected
             {
                 return Err(Break::Failed(RunError::WrongMode {

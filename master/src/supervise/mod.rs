@@ -102,7 +102,9 @@ impl Supervisor {
         self.await_phase(last_status).await?;
         let devices = self.bus.addresses();
         let timeout = Duration::from_nanos(self.machine.bus.op_timeout_ns);
-        al::change_state(&self.wire, &devices, AlState::Op, timeout).await.map_err(RunError::State)?;
+        al::change_state(&self.wire, &devices, AlState::Op, timeout)
+            .await
+            .map_err(RunError::State)?;
         self.tell(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.order(Order::Guard).await;
         if !self.enable {
@@ -123,17 +125,20 @@ impl Supervisor {
             let fresh = snapshot.inputs_fresh;
             good = if fresh { good.max(1) } else { 0 };
             if locked && fresh && cycles > GOOD_CYCLES {
-                if let Some(phase) = snapshot.phase {
-                    let drift_ppm = phase.drift_ppm;
-                    self.tell(Progress::PhaseLocked { drift_ppm });
+                if snapshot.phase.is_some() {
+                    self.tell(Progress::PhaseLocked);
                 }
                 return Ok(());
             }
             if clock::now().saturating_sub(start) > LOCK_TIMEOUT {
                 return Err(Break::Failed(if good == 0 {
-                    RunError::NoProcessData { al_status: snapshot.al_status }
+                    RunError::NoProcessData {
+                        al_status: snapshot.al_status,
+                    }
                 } else {
-                    RunError::PhaseNotLocked { error_ns: snapshot.phase.map_or(0, |p| p.error_ns) }
+                    RunError::PhaseNotLocked {
+                        error_ns: snapshot.phase.map_or(0, |p| p.error_ns),
+                    }
                 }));
             }
         }
@@ -141,20 +146,30 @@ impl Supervisor {
 
     async fn enable_axes(&mut self, last_status: &mut Nanos) -> Result<(), Break> {
         for axis in 0..self.axes.len() {
-            self.order(Order::Axis { axis, command: Command::Enable }).await;
+            self.order(Order::Axis {
+                axis,
+                command: Command::Enable,
+            })
+            .await;
         }
         let start = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns;
         loop {
             let snapshot = self.tick(last_status).await?;
-            let Some(waiting) = snapshot.axes.iter().position(|axis| !axis.ready) else { break };
+            let Some(waiting) = snapshot.axes.iter().position(|axis| !axis.ready) else {
+                break;
+            };
             if clock::now().saturating_sub(start) > timeout {
                 let status = snapshot.axes[waiting];
-                return Err(Break::Failed(self.not_enabled(waiting, status, timeout).await));
+                return Err(Break::Failed(
+                    self.not_enabled(waiting, status, timeout).await,
+                ));
             }
         }
         self.confirm_modes().await?;
-        self.tell(Progress::Enabled { axes: self.axes.len() });
+        self.tell(Progress::Enabled {
+            axes: self.axes.len(),
+        });
         Ok(())
     }
 
@@ -163,7 +178,10 @@ impl Supervisor {
         let start = clock::now();
         loop {
             self.tick(last_status).await?;
-            if self.limit.is_some_and(|limit| clock::now().saturating_sub(start) >= limit) {
+            if self
+                .limit
+                .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
+            {
                 return Ok(());
             }
         }
@@ -176,7 +194,11 @@ impl Supervisor {
         self.pass_events_on();
         if clock::now().saturating_sub(*last_status) >= STATUS_PERIOD {
             *last_status = clock::now();
-            self.tell(Progress::Status(Status::new(&self.machine, &self.axes, &snapshot)));
+            self.tell(Progress::Status(Status::new(
+                &self.machine,
+                &self.axes,
+                &snapshot,
+            )));
         }
         if let Some(cause) = snapshot.stopping
             && cause != StopCause::Requested
@@ -213,7 +235,9 @@ impl Supervisor {
         let patience = if lost { LOST_BUS_TIMEOUT } else { STOP_TIMEOUT };
         while !self.outer.snapshots.read().stopped {
             if clock::now().saturating_sub(start) > patience {
-                self.tell(Progress::Warning("not every axis has confirmed that it is disabled".to_owned()));
+                self.tell(Progress::Warning(
+                    "not every axis has confirmed that it is disabled".to_owned(),
+                ));
                 break;
             }
             clock::delay(TICK).await;
@@ -252,10 +276,17 @@ impl Supervisor {
     }
 
     fn device_of(&self, axis: usize) -> DeviceRef {
-        self.axes.get(axis).and_then(|&device| self.bus.devices.get(device)).map_or_else(
-            || DeviceRef { name: format!("axis {axis}"), position: 0, station: 0 },
-            |device| device.at.clone(),
-        )
+        self.axes
+            .get(axis)
+            .and_then(|&device| self.bus.devices.get(device))
+            .map_or_else(
+                || DeviceRef {
+                    name: format!("axis {axis}"),
+                    position: 0,
+                    station: 0,
+                },
+                |device| device.at.clone(),
+            )
     }
 
     fn axis_name(&self, axis: usize) -> String {

@@ -28,7 +28,11 @@ impl Supervisor {
                 if self.over(start) {
                     return Ok(());
                 }
-                self.tell(Progress::Program { run: ended.runs + 1, step: index + 1, of: steps.len() });
+                self.tell(Progress::Program {
+                    run: ended.runs + 1,
+                    step: index + 1,
+                    of: steps.len(),
+                });
                 self.run_step(index, step, start, last_status).await?;
             }
             ended.runs += 1;
@@ -39,7 +43,8 @@ impl Supervisor {
     }
 
     fn over(&self, start: Nanos) -> bool {
-        self.limit.is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
+        self.limit
+            .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
     }
 
     async fn hold(&mut self, start: Nanos, last_status: &mut Nanos) -> Result<(), Break> {
@@ -57,13 +62,19 @@ impl Supervisor {
         last_status: &mut Nanos,
     ) -> Result<(), Break> {
         let command: &dyn Fn(f64) -> Command = match step {
-            Step::Move { speed, ramp, .. } => {
-                &|position| Command::MoveTo { position, speed: *speed, ramp: *ramp }
-            }
-            Step::Velocity { ramp, .. } => &|velocity| Command::Velocity { velocity, ramp: *ramp },
-            Step::Torque { ramp_ns, .. } => {
-                &|percent| Command::Torque { percent, ramp_s: *ramp_ns as f64 * 1e-9 }
-            }
+            Step::Move { speed, ramp, .. } => &|position| Command::MoveTo {
+                position,
+                speed: *speed,
+                ramp: *ramp,
+            },
+            Step::Velocity { ramp, .. } => &|velocity| Command::Velocity {
+                velocity,
+                ramp: *ramp,
+            },
+            Step::Torque { ramp_ns, .. } => &|percent| Command::Torque {
+                percent,
+                ramp_s: *ramp_ns as f64 * 1e-9,
+            },
             Step::Dwell { ns } => {
                 let until = clock::now() + ns;
                 while clock::now() < until && !self.over(start) {
@@ -72,15 +83,22 @@ impl Supervisor {
                 return Ok(());
             }
         };
-        let (Step::Move { targets, .. } | Step::Velocity { targets, .. } | Step::Torque { targets, .. }) =
-            step
+        let (Step::Move { targets, .. }
+        | Step::Velocity { targets, .. }
+        | Step::Torque { targets, .. }) = step
         else {
             return Ok(());
         };
         let mut waiting = Vec::with_capacity(targets.len());
         for &(device, target) in targets {
-            let Some(axis) = self.axes.iter().position(|&d| d == device) else { continue };
-            self.order(Order::Axis { axis, command: command(target) }).await;
+            let Some(axis) = self.axes.iter().position(|&d| d == device) else {
+                continue;
+            };
+            self.order(Order::Axis {
+                axis,
+                command: command(target),
+            })
+            .await;
             waiting.push((axis, target));
         }
         self.await_targets(index, &waiting, last_status).await
@@ -111,10 +129,17 @@ impl Supervisor {
                 }));
             }
             let late = waiting.iter().find_map(|&(axis, target)| {
-                status(axis).filter(|s| !s.in_target).map(|s| (axis, target, s))
+                status(axis)
+                    .filter(|s| !s.in_target)
+                    .map(|s| (axis, target, s))
             });
-            let Some((axis, target, last)) = late else { return Ok(()) };
-            if waiting.iter().any(|&(axis, _)| status(axis).is_some_and(|s| s.moving)) {
+            let Some((axis, target, last)) = late else {
+                return Ok(());
+            };
+            if waiting
+                .iter()
+                .any(|&(axis, _)| status(axis).is_some_and(|s| s.moving))
+            {
                 settling_since = None;
                 continue;
             }
