@@ -209,10 +209,10 @@ impl Engine {
         }
     }
 
-    /// Until the cyclic frames are back or half the cycle is over.
+    /// Until the cyclic frames are back or three quarters of the cycle are over.
     fn receive(&mut self) {
         let released = self.next;
-        let deadline = released + self.timing.cycle_ns / 2;
+        let deadline = released + self.timing.cycle_ns / 4 * 3;
         loop {
             loop {
                 match self.link.recv(&mut self.buf) {

@@ -18,7 +18,7 @@ use ethercrab::{Command as Datagram, MainDevice};
 
 use crate::bringup::{Bus, bring_up};
 use crate::clock::{Clock, Nanos};
-use crate::config::Machine;
+use crate::config::{self, Machine};
 use crate::link::Link;
 use crate::link::port::{Port, main_device, pump};
 use crate::rt::exchange::Exchange;
@@ -176,18 +176,12 @@ fn own_the_link(
         Ok(prepared) => prepared,
         Err(error) => return error.into(),
     };
-    let engine = Engine::new(parts);
     let (remains, (ended, result)) = match options.clock {
-        Clock::Virtual => turn_in_virtual_time(engine, supervisor),
-        Clock::Real => {
-            for denied in rt::thread::prepare(machine.bus.priority, machine.bus.cpu) {
-                let _ = told.send(Progress::Denied(denied));
-            }
-            match turn_in_real_time(engine, supervisor) {
-                Ok(done) => done,
-                Err(error) => return error.into(),
-            }
-        }
+        Clock::Virtual => turn_in_virtual_time(parts, supervisor),
+        Clock::Real => match turn_in_real_time(parts, supervisor, &machine.bus, &told) {
+            Ok(done) => done,
+            Err(error) => return error.into(),
+        },
     };
     let Remains {
         link, axes, stats, ..
@@ -310,7 +304,8 @@ fn assemble(
 type Turned = (Remains, (Ended, Result<(), RunError>));
 
 /// The supervisor gets its turn after every cycle.
-fn turn_in_virtual_time(mut engine: Engine, supervisor: Supervisor) -> Turned {
+fn turn_in_virtual_time(parts: Parts, supervisor: Supervisor) -> Turned {
+    let mut engine = Engine::new(parts);
     let mut beside = pin!(supervisor.run());
     let mut context = Context::from_waker(Waker::noop());
     let mut result = None;
@@ -325,11 +320,22 @@ fn turn_in_virtual_time(mut engine: Engine, supervisor: Supervisor) -> Turned {
     (engine.into_remains(), result.unwrap_or_else(died))
 }
 
-fn turn_in_real_time(mut engine: Engine, supervisor: Supervisor) -> Result<Turned, RunError> {
+fn turn_in_real_time(
+    parts: Parts,
+    supervisor: Supervisor,
+    config: &config::Bus,
+    told: &Sender<Progress>,
+) -> Result<Turned, RunError> {
+    // Started first, because a thread inherits the scheduling class and CPU of its parent.
     let beside = thread::Builder::new()
         .name("ecaxis-mailbox".to_owned())
         .spawn(move || executor::block_on(supervisor.run()))
         .map_err(|error| RunError::Thread(error.to_string()))?;
+    for denied in rt::thread::prepare(config.priority, config.cpu) {
+        let _ = told.send(Progress::Denied(denied));
+    }
+    // Locking the memory takes milliseconds; the first cycle is due one cycle from here.
+    let mut engine = Engine::new(parts);
     while !engine.halted() {
         engine.cycle();
     }
