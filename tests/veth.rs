@@ -100,7 +100,7 @@ fn the_demo_over_a_real_interface() {
         .expect("a temporary file");
     std::fs::write(
         file.path(),
-        demo.replace("[bus]", "[bus]\nlost_frames = 80\nwatchdog = \"500ms\""),
+        demo.replace("lost_frames = 20", "lost_frames = 80\nwatchdog = \"500ms\""),
     )
     .expect("written");
     let file = file.path().to_str().expect("a path in UTF-8");
