@@ -118,9 +118,10 @@ fn the_demo_over_a_real_interface() {
         .output()
         .expect("the binary runs");
     let errors = String::from_utf8_lossy(&output.stderr);
-    let summary: serde_json::Value = serde_json::from_slice(&output.stdout)
+    let result: serde_json::Value = serde_json::from_slice(&output.stdout)
         .unwrap_or_else(|e| panic!("{e}: {}; {errors}", String::from_utf8_lossy(&output.stdout)));
-    assert!(output.status.success(), "{errors}\n{summary:#}");
+    assert!(output.status.success(), "{errors}\n{result:#}");
+    let summary = &result["summary"];
     let axes = summary["axes"].as_array().expect("axes");
     assert_eq!(axes.len(), 2);
     for axis in axes {
