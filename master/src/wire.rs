@@ -21,6 +21,11 @@ impl Datagrams {
         Self { device }
     }
 
+    #[must_use]
+    pub fn main_device(&self) -> &'static MainDevice<'static> {
+        self.device
+    }
+
     /// How many SubDevices answer a broadcast read.
     pub async fn count(&self) -> Result<u16, WireError> {
         let answer = Command::brd(0)

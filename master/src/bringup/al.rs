@@ -14,6 +14,8 @@ const AL_STATUS: u16 = 0x0130;
 const ERROR: u8 = 0x10;
 const ID_REQUEST: u8 = 0x20;
 const POLL: Duration = Duration::from_micros(500);
+/// 200 ms for a device to take an acknowledgement.
+const ACKNOWLEDGE_POLLS: u32 = 400;
 
 /// ETG.1020 default for PreOp → SafeOp.
 pub const SAFE_OP_TIMEOUT: Duration = Duration::from_secs(10);
@@ -123,30 +125,74 @@ pub async fn change_state(
     timeout: Duration,
 ) -> Result<(), StateError> {
     for device in devices {
-        let failed = |source| StateError::Wire {
-            device: device.clone(),
-            wanted,
-            source,
-        };
-        if let Some((status, _)) = read_status(wire, device.station).await.map_err(failed)?
-            && status & ERROR != 0
-        {
-            write_control(wire, device.station, status & 0x0f | ERROR)
-                .await
-                .map_err(failed)?;
-        }
-        if write_control(wire, device.station, wanted.code())
-            .await
-            .map_err(failed)?
-            != 1
-        {
-            return Err(StateError::Gone {
-                device: device.clone(),
-                wanted,
-            });
-        }
+        request(wire, device, wanted).await?;
     }
     wait_state(wire, devices, wanted, timeout).await
+}
+
+/// Sends every device that answers to a lower state, however many do not; the first trouble is told
+/// at the end.
+pub async fn lower_state(
+    wire: &impl Wire,
+    devices: &[DeviceRef],
+    wanted: AlState,
+    timeout: Duration,
+) -> Result<(), StateError> {
+    let mut trouble = None;
+    for device in devices {
+        if let Err(error) = request(wire, device, wanted).await {
+            let silent = matches!(error, StateError::Wire { .. });
+            trouble.get_or_insert(error);
+            // Not a device but the wire: the others would only cost their time-outs.
+            if silent {
+                break;
+            }
+        }
+    }
+    if !matches!(trouble, Some(StateError::Wire { .. })) {
+        for device in devices {
+            if let Err(error) =
+                wait_state(wire, std::slice::from_ref(device), wanted, timeout).await
+            {
+                trouble.get_or_insert(error);
+            }
+        }
+    }
+    trouble.map_or(Ok(()), Err)
+}
+
+/// Acknowledges an error that the device still holds, then asks for a state.
+async fn request(wire: &impl Wire, device: &DeviceRef, wanted: AlState) -> Result<(), StateError> {
+    let failed = |source| StateError::Wire {
+        device: device.clone(),
+        wanted,
+        source,
+    };
+    let gone = || StateError::Gone {
+        device: device.clone(),
+        wanted,
+    };
+    let status = read_status(wire, device.station).await.map_err(failed)?;
+    let (status, _) = status.ok_or_else(gone)?;
+    if status & ERROR != 0 {
+        write_control(wire, device.station, status & 0x0f | ERROR)
+            .await
+            .map_err(failed)?;
+        // A request that comes before the device has read the acknowledgement is lost.
+        for _ in 0..ACKNOWLEDGE_POLLS {
+            match read_status(wire, device.station).await.map_err(failed)? {
+                Some((status, _)) if status & ERROR != 0 => wire.delay(POLL).await,
+                _ => break,
+            }
+        }
+    }
+    match write_control(wire, device.station, wanted.code())
+        .await
+        .map_err(failed)?
+    {
+        1 => Ok(()),
+        _ => Err(gone()),
+    }
 }
 
 /// Waits until every device is in `wanted`.

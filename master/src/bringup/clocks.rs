@@ -9,6 +9,7 @@ use super::{BringUpError, BusDevice, Step};
 use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::mailbox::Wire;
+use crate::rt::phase::ClockPlan;
 
 const STEP: &str = "starting SYNC0";
 const SYSTEM_TIME: u16 = 0x0910;
@@ -21,18 +22,10 @@ const SYNC1_CYCLE: u16 = 0x09a4;
 /// The first pulse must still lie ahead when the last device has been told of it.
 const START_DELAY: Nanos = 100_000_000;
 const START_DELAY_PER_DEVICE: Nanos = 5_000_000;
-
-/// What the cyclic exchange needs to keep the clocks together and itself in phase.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct DcPlan {
-    /// Station address of the reference clock.
-    pub reference: u16,
-    pub cycle_ns: u64,
-    /// System time of a SYNC0 pulse without shift.
-    pub start: u64,
-    /// Devices that run on SYNC0.
-    pub devices: usize,
-}
+/// So much of it must be left when the last one knows.
+const START_MARGIN: Nanos = 10_000_000;
+/// Lost datagrams can use the delay up; then again, with more.
+const TRIES: u32 = 3;
 
 /// `None` where no device asks for distributed clocks.
 pub(super) async fn configure(
@@ -40,7 +33,7 @@ pub(super) async fn configure(
     machine: &Machine,
     devices: &[BusDevice],
     progress: &mut dyn FnMut(Step),
-) -> Result<Option<DcPlan>, BringUpError> {
+) -> Result<Option<ClockPlan>, BringUpError> {
     let wanting: Vec<_> = machine
         .devices
         .iter()
@@ -60,50 +53,106 @@ pub(super) async fn configure(
         return Ok(None);
     };
 
-    let mut now = [0; 8];
-    read(wire, reference, STEP, SYSTEM_TIME, &mut now).await?;
     let cycle = machine.bus.cycle_ns;
-    let ahead = START_DELAY
+    let mut ahead = START_DELAY
         + START_DELAY_PER_DEVICE * u64::try_from(wanting.len()).unwrap_or(u64::MAX / 1_000_000_000);
-    let start = (u64::from_le_bytes(now).wrapping_add(ahead) / cycle + 1).wrapping_mul(cycle);
-
-    for (dc, device) in &wanting {
-        write(wire, device, STEP, ACTIVATION, &[0, 0]).await?;
-        let first = start.wrapping_add_signed(i64::from(dc.sync0_shift_ns));
-        write(wire, device, STEP, START_TIME, &first.to_le_bytes()).await?;
-        write(
-            wire,
-            device,
-            STEP,
-            SYNC0_CYCLE,
-            &dc.sync0_cycle_ns.to_le_bytes(),
-        )
-        .await?;
-        write(
-            wire,
-            device,
-            STEP,
-            SYNC1_CYCLE,
-            &dc.sync1_cycle_ns.to_le_bytes(),
-        )
-        .await?;
-        write(
-            wire,
-            device,
-            STEP,
-            ACTIVATION,
-            &dc.assign_activate.to_le_bytes(),
-        )
-        .await?;
+    for _ in 0..TRIES {
+        let now = system_time(wire, reference).await?;
+        let start = (now.wrapping_add(ahead) / cycle + 1).wrapping_mul(cycle);
+        for (dc, device) in &wanting {
+            write(wire, device, STEP, ACTIVATION, &[0, 0]).await?;
+            let first = start.wrapping_add_signed(i64::from(dc.sync0_shift_ns));
+            write(wire, device, STEP, START_TIME, &first.to_le_bytes()).await?;
+            write(
+                wire,
+                device,
+                STEP,
+                SYNC0_CYCLE,
+                &dc.sync0_cycle_ns.to_le_bytes(),
+            )
+            .await?;
+            write(
+                wire,
+                device,
+                STEP,
+                SYNC1_CYCLE,
+                &dc.sync1_cycle_ns.to_le_bytes(),
+            )
+            .await?;
+            write(
+                wire,
+                device,
+                STEP,
+                ACTIVATION,
+                &dc.assign_activate.to_le_bytes(),
+            )
+            .await?;
+        }
+        // A device that is told of a start in the past never gives a pulse.
+        let shifts = || wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
+        let first = start.wrapping_add_signed(shifts().min().unwrap_or(0));
+        let told = system_time(wire, reference).await?;
+        if told.wrapping_add(START_MARGIN) < first {
+            progress(Step::Clocks {
+                reference: reference.at.name.clone(),
+                devices: wanting.len(),
+            });
+            return Ok(Some(ClockPlan {
+                reference: reference.at.station,
+                clocks: u16::try_from(devices.iter().filter(|d| d.dc).count()).unwrap_or(u16::MAX),
+                cycle_ns: cycle,
+                release: start.wrapping_add(between_pulses(cycle, shifts())),
+            }));
+        }
+        ahead *= 2;
     }
-    progress(Step::Clocks {
-        reference: reference.at.name.clone(),
-        devices: wanting.len(),
-    });
-    Ok(Some(DcPlan {
-        reference: reference.at.station,
-        cycle_ns: cycle,
-        start,
-        devices: wanting.len(),
-    }))
+    Err(BringUpError::NoStart {
+        device: reference.at.clone(),
+    })
+}
+
+async fn system_time(wire: &impl Wire, reference: &BusDevice) -> Result<u64, BringUpError> {
+    let mut time = [0; 8];
+    read(wire, reference, STEP, SYSTEM_TIME, &mut time).await?;
+    Ok(u64::from_le_bytes(time))
+}
+
+/// The middle of the longest pause between the SYNC0 pulses of a cycle, nanoseconds after the pulse
+/// without shift: there a frame is as far from every pulse as can be.
+fn between_pulses(cycle: u64, shifts: impl Iterator<Item = i64>) -> u64 {
+    let period = i64::try_from(cycle).unwrap_or(i64::MAX).max(1);
+    let mut pulses: Vec<i64> = shifts.map(|shift| shift.rem_euclid(period)).collect();
+    pulses.sort_unstable();
+    let following = pulses.iter().skip(1).copied();
+    let wrapped = pulses.first().map(|first| first + period);
+    let (gap, start) = pulses
+        .iter()
+        .zip(following.chain(wrapped))
+        .map(|(&pulse, next)| (next - pulse, pulse))
+        .max_by_key(|&(gap, start)| (gap, -start))
+        .unwrap_or((period, 0));
+    (start + gap / 2).rem_euclid(period).unsigned_abs()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::between_pulses;
+
+    #[test]
+    fn frames_pass_in_the_longest_pause() {
+        for (shifts, expected) in [
+            (&[0][..], 500_000),
+            (&[500_000], 0),
+            (&[-250_000], 250_000),
+            (&[0, 0, 200_000], 600_000),
+            (&[0, 500_000], 250_000),
+            (&[], 500_000),
+        ] {
+            assert_eq!(
+                between_pulses(1_000_000, shifts.iter().copied()),
+                expected,
+                "{shifts:?}"
+            );
+        }
+    }
 }

@@ -11,8 +11,8 @@ use crate::rt::image::Region;
 const FMMU: u16 = 0x0600;
 const FMMU_SIZE: u16 = 16;
 /// SyncManager registers (ETG.1000.4, Table 58): 8 bytes each.
-const SYNC_MANAGER: u16 = 0x0800;
-const SYNC_MANAGER_SIZE: u16 = 8;
+pub(super) const SYNC_MANAGER: u16 = 0x0800;
+pub(super) const SYNC_MANAGER_SIZE: u16 = 8;
 const WATCHDOG_DIVIDER: u16 = 0x0400;
 const WATCHDOG_PROCESS_DATA: u16 = 0x0420;
 /// (2498 + 2) × 40 ns: the process-data watchdog counts in 100 µs.

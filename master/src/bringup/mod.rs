@@ -15,19 +15,21 @@ use std::fmt;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use crate::clock;
-use crate::config::{DeviceConfig, Machine};
-use crate::mailbox::{CoeClient, MailboxLayout, SdoError, WireError};
-use crate::rt::image::{self, ImagePlan, TooLarge};
+use crate::config::Machine;
+use crate::mailbox::{CoeClient, SdoError, WireError};
+use crate::rt::image::ImagePlan;
+use crate::rt::phase::ClockPlan;
 use crate::wire::Datagrams;
 
 pub mod al;
 mod clocks;
 mod device;
+mod held;
 mod identify;
+mod mailbox;
 mod mapping;
 
 pub use al::{AlState, StateError};
-pub use clocks::DcPlan;
 
 /// SubDevices that ethercrab keeps in one group; a power of two.
 const MAX_SUBDEVICES: usize = 128;
@@ -61,6 +63,8 @@ pub struct BusDevice {
     /// `None` where the device has no CoE mailbox.
     pub coe: Option<CoeClient>,
     pub dc: bool,
+    /// Outputs that no axis drives and that must not be zero: index, subindex, value.
+    pub held: Vec<(u16, u8, i64)>,
     /// From the reference clock, nanoseconds.
     pub propagation_delay: u32,
 }
@@ -71,7 +75,7 @@ pub struct Bus {
     /// In the order of the machine file.
     pub devices: Vec<BusDevice>,
     pub image: ImagePlan,
-    pub dc: Option<DcPlan>,
+    pub dc: Option<ClockPlan>,
 }
 
 /// What is being done, for the user to see.
@@ -178,8 +182,6 @@ pub enum BringUpError {
     Mailbox { device: DeviceRef, source: SdoError },
     #[error("{device}: reading the PDO mapping back: {source}")]
     ReadBack { device: DeviceRef, source: SdoError },
-    #[error("{device}: {source}")]
-    TooLarge { device: DeviceRef, source: TooLarge },
     #[error("{device}: {step}: {source}")]
     Wire {
         device: DeviceRef,
@@ -194,6 +196,14 @@ pub enum BringUpError {
     },
     #[error("{device}: the ESI asks for SYNC0, the device has no distributed clock")]
     NoClock { device: DeviceRef },
+    #[error("{device}: starting SYNC0: telling all devices takes longer than the start lies ahead")]
+    NoStart { device: DeviceRef },
+    #[error("{device}: the mailbox is at {actual}, the ESI says {expected}")]
+    MailboxMoved {
+        device: DeviceRef,
+        expected: String,
+        actual: String,
+    },
     #[error(transparent)]
     State(#[from] StateError),
 }
@@ -202,6 +212,7 @@ pub enum BringUpError {
 pub async fn bring_up(
     main_device: &'static MainDevice<'static>,
     machine: &Machine,
+    image: ImagePlan,
     progress: &mut dyn FnMut(Step),
 ) -> Result<Bus, BringUpError> {
     let wire = Datagrams::new(main_device);
@@ -225,13 +236,15 @@ pub async fn bring_up(
         let sub_device = group
             .subdevice(main_device, usize::from(position))
             .map_err(|e| scan_error("reading the scan's result", &e))?;
+        let at = DeviceRef {
+            name: config.name.clone(),
+            position,
+            station: sub_device.configured_address(),
+        };
         devices.push(BusDevice {
-            at: DeviceRef {
-                name: config.name.clone(),
-                position,
-                station: sub_device.configured_address(),
-            },
-            coe: mailbox_layout(config, sub_device.configured_address()).map(CoeClient::new),
+            coe: mailbox::open(&wire, config, &at).await?.map(CoeClient::new),
+            at,
+            held: Vec::new(),
             dc: !matches!(sub_device.dc_support(), DcSupport::None),
             propagation_delay: sub_device.propagation_delay(),
         });
@@ -240,20 +253,12 @@ pub async fn bring_up(
     for (config, device) in machine.devices.iter().zip(&mut devices) {
         device::start_up(&wire, config, device, progress).await?;
         mapping::compare(&wire, config, device).await?;
+        held::read(&wire, config, device).await?;
     }
 
     // From here on ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
 
-    let sizes: Vec<_> = machine
-        .devices
-        .iter()
-        .map(|d| (d.selection.layout.rx_bytes(), d.selection.layout.tx_bytes()))
-        .collect();
-    let image = image::plan(&sizes).map_err(|source| BringUpError::TooLarge {
-        device: devices[source.device].at.clone(),
-        source,
-    })?;
     for ((config, device), region) in machine.devices.iter().zip(&devices).zip(&image.regions) {
         device::map_process_data(&wire, config, device, *region).await?;
         device::set_watchdog(&wire, &machine.bus, device).await?;
@@ -276,33 +281,6 @@ fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> BringUpErr
         step,
         message: error.to_string(),
     }
-}
-
-/// The mailbox as the ESI's first two SyncManagers describe it.
-fn mailbox_layout(config: &DeviceConfig, station: u16) -> Option<MailboxLayout> {
-    use ecaxis_esi::model::SmUse;
-
-    config.device.mailbox.as_ref()?.coe.as_ref()?;
-    let find = |usage| {
-        config
-            .device
-            .sync_managers
-            .iter()
-            .enumerate()
-            .find(|(_, sm)| sm.usage == usage)
-            .and_then(|(i, sm)| Some((u8::try_from(i).ok()?, sm)))
-    };
-    let (out_sm, out) = find(SmUse::MBoxOut)?;
-    let (in_sm, inp) = find(SmUse::MBoxIn)?;
-    Some(MailboxLayout {
-        station,
-        out_address: out.start_address,
-        out_len: out.default_size,
-        in_address: inp.start_address,
-        in_len: inp.default_size,
-        out_sm,
-        in_sm,
-    })
 }
 
 impl Bus {

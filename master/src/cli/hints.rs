@@ -90,6 +90,9 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::NotReached { .. } => {
             "check load and tuning, or give the axis a wider `target_window`".to_owned()
         }
+        RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
+        RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
+        RunError::NotDisabled { .. } => "the drive does not obey its Controlword: take its power away by hand, then look at its fault".to_owned(),
         RunError::Refused { .. } | RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
         RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,
@@ -172,7 +175,12 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
         BringUpError::Mapping { .. } => {
             "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
         }
-        BringUpError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
+        BringUpError::MailboxMoved { .. } => {
+            "the device's EEPROM is not of this ESI file: use the ESI file of its firmware".to_owned()
+        }
+        BringUpError::NoStart { .. } => {
+            "frames are lost or the computer is overloaded: check cables, and stop other programs".to_owned()
+        }
         BringUpError::NoClock { .. } => {
             "run the device without distributed clock: `dc = \"off\"`".to_owned()
         }

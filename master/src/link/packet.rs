@@ -44,7 +44,8 @@ impl PacketLink {
             libc::socket(
                 libc::AF_PACKET,
                 libc::SOCK_RAW | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC,
-                i32::from(ETHERCAT.to_be()),
+                // Receives nothing, from any interface, until it is bound.
+                0,
             )
         };
         if fd < 0 {

@@ -12,8 +12,8 @@ use crate::clock::{self, Clock, Nanos};
 use crate::link::port::Port;
 use crate::link::{Link, LinkError, MAX_FRAME};
 
-/// An axis that is not at rest this long after the machine began to stop is disabled all the same.
-const STOP_PATIENCE: Nanos = 5_000_000_000;
+/// Frames taken in a row without looking at the clock; more than a cycle and a mailbox ever bring.
+const FRAMES_AT_ONCE: usize = 32;
 
 /// An axis at rest settles on its target this long before its power is taken away.
 const SETTLE: Nanos = 100_000_000;
@@ -26,6 +26,9 @@ pub struct AxisSlot {
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
     pub last_enabled: Option<AxisStatus>,
+    /// Enabling was ordered and the drive had no fault since: from now on a fault stops the machine.
+    armed: bool,
+    ordered: bool,
     /// How long a stopping axis has been at rest.
     rested: Nanos,
 }
@@ -38,6 +41,8 @@ impl AxisSlot {
             bits,
             largest_following_error: 0.0,
             last_enabled: None,
+            armed: false,
+            ordered: false,
             rested: 0,
         }
     }
@@ -76,6 +81,9 @@ pub struct Timing {
     pub cycle_ns: u64,
     /// Spinning before the release; the rest is slept.
     pub spin_ns: u64,
+    /// How long the slowest axis may take from full speed to rest. One that is not at rest this long
+    /// after the machine began to stop is left to its drive's own quick stop.
+    pub stop_patience_ns: u64,
 }
 
 /// Everything that a cycle touches.
@@ -177,7 +185,7 @@ impl Engine {
         self.stats.counters.cycles += 1;
 
         self.send();
-        self.receive();
+        self.receive(woke);
         self.answer = self.exchange.answer();
         self.count();
         let adjust = self.follow_clock(lateness);
@@ -210,11 +218,13 @@ impl Engine {
     }
 
     /// Until the cyclic frames are back or three quarters of the cycle are over.
-    fn receive(&mut self) {
+    fn receive(&mut self, woke: Nanos) {
         let released = self.next;
-        let deadline = released + self.timing.cycle_ns / 4 * 3;
+        let quarter = self.timing.cycle_ns / 4;
+        // A thread that woke late still gives its frame time to come back.
+        let deadline = (released + 3 * quarter).max(woke + quarter);
         loop {
-            loop {
+            for _ in 0..FRAMES_AT_ONCE {
                 match self.link.recv(&mut self.buf) {
                     Ok(Some(len)) => self.sort(len),
                     Ok(None) => break,
@@ -298,9 +308,11 @@ impl Engine {
                 if self.stopping.is_some() && command != Command::Disable {
                     return;
                 }
-                if let Some(slot) = self.axes.get_mut(axis)
-                    && let Err(reason) = slot.axis.command(command)
-                {
+                let Some(slot) = self.axes.get_mut(axis) else {
+                    return;
+                };
+                slot.ordered |= command == Command::Enable;
+                if let Err(reason) = slot.axis.command(command) {
                     let cycle = self.stats.counters.cycles;
                     self.report(Event::Refused {
                         cycle,
@@ -325,27 +337,29 @@ impl Engine {
     fn end_alone(&mut self) {
         self.stop(StopCause::Requested);
         let since = self.stopping.map_or(self.next, |(_, since)| since);
-        self.halted = self.without_power() || self.next.saturating_sub(since) > 2 * STOP_PATIENCE;
+        self.halted = self.without_power()
+            || self.next.saturating_sub(since) > 2 * self.timing.stop_patience_ns;
     }
 
     fn without_power(&self) -> bool {
-        self.axes.iter().all(|slot| {
-            !matches!(
-                slot.axis.status().state,
-                State::OperationEnabled | State::QuickStopActive | State::FaultReactionActive
-            )
-        })
+        self.axes
+            .iter()
+            .all(|slot| !has_power(slot.axis.status().state))
     }
 
-    /// The first cause wins; all axes decelerate within their limits and are then disabled.
+    /// The first cause wins. All axes decelerate within their limits and are then disabled; where the
+    /// bus is not to be trusted, the drives do it by themselves, from the velocity that they know.
     fn stop(&mut self, cause: StopCause) {
         if self.stopping.is_some() {
             return;
         }
         self.stopping = Some((cause, self.next));
+        let blind = matches!(cause, StopCause::BusLost { .. } | StopCause::LeftOp { .. });
         for slot in &mut self.axes {
-            if slot.axis.status().enabled {
-                // An axis that cannot be told to decelerate has stopped by itself already.
+            // An axis that does not take a command has no power, or is losing it already.
+            if blind {
+                quick_stop(&mut slot.axis);
+            } else if slot.axis.status().enabled {
                 let _ = slot.axis.command(Command::Stop);
             } else {
                 let _ = slot.axis.command(Command::Disable);
@@ -358,15 +372,16 @@ impl Engine {
     fn step_axes(&mut self) {
         let dt = self.timing.cycle_ns as f64 * 1e-9;
         let fresh = self.answer.inputs_fresh && self.answer.complete;
-        let out_of_patience = self
-            .stopping
-            .is_some_and(|(_, since)| self.next.saturating_sub(since) > STOP_PATIENCE);
+        let out_of_patience = self.stopping.is_some_and(|(_, since)| {
+            self.next.saturating_sub(since) > self.timing.stop_patience_ns
+        });
         let mut cause = None;
         for (index, slot) in self.axes.iter_mut().enumerate() {
             let inputs = slot.read(self.exchange.inputs(), fresh);
             let outputs = slot.axis.step(&inputs, dt);
             slot.write(self.exchange.outputs_mut(), &outputs);
             let status = slot.axis.status();
+            slot.armed |= slot.ordered && status.fault.is_none();
             if status.enabled {
                 slot.largest_following_error =
                     slot.largest_following_error.max(status.max_following_error);
@@ -379,10 +394,12 @@ impl Engine {
                 } else {
                     0
                 };
-                if status.enabled && (slot.rested >= SETTLE || out_of_patience) {
+                if status.enabled && out_of_patience {
+                    quick_stop(&mut slot.axis);
+                } else if status.enabled && slot.rested >= SETTLE {
                     let _ = slot.axis.command(Command::Disable);
                 }
-            } else if cause.is_none() {
+            } else if cause.is_none() && slot.armed {
                 cause = match (status.fault, status.trip) {
                     (Some(_), _) => Some(StopCause::DriveFault { axis: index }),
                     (None, Some(trip)) => Some(StopCause::Trip { axis: index, trip }),
@@ -436,6 +453,21 @@ impl Engine {
             self.events_lost += 1;
         }
     }
+}
+
+/// Whether a drive in this state can move its axis.
+#[must_use]
+pub fn has_power(state: State) -> bool {
+    matches!(
+        state,
+        State::OperationEnabled | State::QuickStopActive | State::FaultReactionActive
+    )
+}
+
+/// The drive's own quick stop, then no power.
+fn quick_stop(axis: &mut Axis) {
+    let _ = axis.command(Command::QuickStop);
+    let _ = axis.command(Command::Disable);
 }
 
 /// The snapshot before the first cycle, with room for `axes` and `devices`.

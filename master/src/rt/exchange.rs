@@ -6,6 +6,7 @@
 //! the datagram index numbers the cycle, so that late and repeated frames are recognised.
 
 use super::image::ImagePlan;
+use super::phase::ClockPlan;
 use crate::link::port::ETHERCAT;
 use crate::link::{Link, LinkError};
 
@@ -133,6 +134,11 @@ pub struct Answer {
 pub struct Exchange {
     frames: Vec<Frame>,
     clock: Option<Place>,
+    /// Working counter of the FRMW if every clock is there.
+    clock_wkc: u16,
+    /// What a clock is set to if the reference before it does not answer: its own time, nearly.
+    expected_time: u64,
+    cycle_ns: u64,
     lrws: Vec<Lrw>,
     al_status: Place,
     probe_at: usize,
@@ -155,14 +161,14 @@ impl Exchange {
         clippy::disallowed_macros,
         reason = "prepares"
     )]
-    pub fn new(plan: &ImagePlan, reference: Option<u16>, stations: &[u16]) -> Self {
+    pub fn new(plan: &ImagePlan, clock: Option<&ClockPlan>, stations: &[u16]) -> Self {
         let mut frames = vec![new_frame(0)];
-        let clock = reference.map(|station| {
+        let place = clock.map(|clock| {
             push(
                 &mut frames[0],
                 0,
                 FRMW,
-                u32::from(SYSTEM_TIME) << 16 | u32::from(station),
+                u32::from(SYSTEM_TIME) << 16 | u32::from(clock.reference),
                 8,
             )
         });
@@ -182,7 +188,10 @@ impl Exchange {
         let probe_at = frames[0].bytes.len();
         let mut exchange = Self {
             frames,
-            clock,
+            clock: place,
+            clock_wkc: clock.map_or(0, |clock| clock.clocks),
+            expected_time: 0,
+            cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
             lrws,
             al_status,
             probe_at,
@@ -231,11 +240,19 @@ impl Exchange {
             clear_wkc(frame, lrw.place);
         }
         self.stage_probe();
+        self.expected_time = self
+            .system_time
+            .unwrap_or(self.expected_time)
+            .wrapping_add(self.cycle_ns);
         let first = &mut self.frames[0].bytes;
-        for place in self.clock.iter().chain([&self.al_status]) {
-            first[place.data()].fill(0);
-            clear_wkc(first, *place);
+        if let Some(place) = self.clock {
+            first[place.data()].copy_from_slice(&self.expected_time.to_le_bytes());
+            clear_wkc(first, place);
         }
+        first[self.al_status.data()].fill(0);
+        clear_wkc(first, self.al_status);
+        self.system_time = None;
+        self.al = None;
         for frame in &mut self.frames {
             frame.answered = false;
             number(&mut frame.bytes, self.cycle);
@@ -290,7 +307,8 @@ impl Exchange {
             }
         }
         if number == 0 {
-            self.system_time = self.clock.filter(|p| p.wkc(frame) > 0).and_then(|place| {
+            let clock = self.clock.filter(|p| p.wkc(frame) == self.clock_wkc);
+            self.system_time = clock.and_then(|place| {
                 Some(u64::from_le_bytes(
                     frame.get(place.data())?.try_into().ok()?,
                 ))
@@ -350,9 +368,14 @@ impl Exchange {
     }
 
     /// Sums the cycle up. RT.
-    pub fn answer(&mut self) -> Answer {
+    #[must_use]
+    pub fn answer(&self) -> Answer {
         let complete = self.complete();
-        let seen: u16 = self.lrws.iter().filter_map(|lrw| lrw.wkc).sum();
+        let seen = self
+            .lrws
+            .iter()
+            .filter_map(|lrw| lrw.wkc)
+            .fold(0, u16::saturating_add);
         let expected = self.lrws.iter().map(|lrw| lrw.expected_wkc).sum();
         Answer {
             complete,
@@ -361,8 +384,8 @@ impl Exchange {
                 .iter()
                 .all(|lrw| lrw.wkc == Some(lrw.expected_wkc)),
             wkc: (seen, expected),
-            system_time: self.system_time.take(),
-            al_status: self.al.take(),
+            system_time: self.system_time,
+            al_status: self.al,
         }
     }
 

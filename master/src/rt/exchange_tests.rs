@@ -32,7 +32,13 @@ fn reflect(exchange: &Exchange, number: usize, input: u8) -> Vec<u8> {
 fn axes(count: usize) -> Exchange {
     let plan = plan(&vec![(12, 12); count]).expect("fits");
     let stations: Vec<u16> = (0..count).map(|i| 0x1000 + i as u16).collect();
-    Exchange::new(&plan, Some(0x1000), &stations)
+    let clock = ClockPlan {
+        reference: 0x1000,
+        clocks: 1,
+        cycle_ns: 1_000_000,
+        release: 0,
+    };
+    Exchange::new(&plan, Some(&clock), &stations)
 }
 
 #[test]
@@ -135,6 +141,6 @@ proptest! {
             frame[..n].copy_from_slice(&template[..n]);
         }
         exchange.receive(&frame);
-        exchange.answer();
+        let _ = exchange.answer();
     }
 }

@@ -107,7 +107,8 @@ pub struct Bits {
 
 impl Bits {
     /// `None` where the field is longer than 64 bits or lies outside the region.
-    fn new(field: &Field, offset: usize, region_len: usize) -> Option<Self> {
+    #[must_use]
+    pub fn new(field: &Field, offset: usize, region_len: usize) -> Option<Self> {
         let bit = usize::try_from(field.bit_offset).ok()?;
         let len = u8::try_from(field.bit_len)
             .ok()

@@ -16,10 +16,24 @@ const LOCKED_SCORE: u32 = 50;
 /// Highest score: so many measurements outside, and the phase counts as lost.
 const BEST_SCORE: u32 = 70;
 
+/// What the cyclic exchange needs to know to keep the clocks together and itself in phase.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ClockPlan {
+    /// Station address of the reference clock.
+    pub reference: u16,
+    /// SubDevices with a distributed clock, the reference among them.
+    pub clocks: u16,
+    pub cycle_ns: u64,
+    /// A system time at which a frame should pass the reference clock, and every cycle from then.
+    pub release: u64,
+}
+
 /// The phase controller of one segment.
 #[derive(Debug, Clone)]
 pub struct Phase {
     cycle: i64,
+    /// System time of the last measurement, extended to 64 bits.
+    time: Option<u64>,
     /// System time at which a frame should have passed, modulo the cycle.
     target: i64,
     /// Nanoseconds a cycle.
@@ -38,15 +52,14 @@ pub struct PhaseStep {
 }
 
 impl Phase {
-    /// `start` is the system time of a SYNC0 pulse. Frames should pass half a cycle before it: as
-    /// far from both pulses as can be.
     #[must_use]
-    pub fn new(cycle_ns: u64, start: u64) -> Self {
-        let cycle = i64::try_from(cycle_ns).unwrap_or(i64::MAX).max(1);
-        let start = i64::try_from(start % cycle_ns.max(1)).unwrap_or(0);
+    pub fn new(plan: &ClockPlan) -> Self {
+        let cycle = i64::try_from(plan.cycle_ns).unwrap_or(i64::MAX).max(1);
+        let target = i64::try_from(plan.release % plan.cycle_ns.max(1)).unwrap_or(0);
         Self {
             cycle,
-            target: (start + cycle / 2) % cycle,
+            time: None,
+            target,
             drift: 0.0,
             locked: false,
             score: 0,
@@ -69,6 +82,7 @@ impl Phase {
     /// `system_time` is the reference clock's as the frame passed; `lateness` how long after its
     /// planned release the frame was sent.
     pub fn update(&mut self, system_time: u64, lateness: Nanos) -> PhaseStep {
+        let system_time = self.extend(system_time);
         let passed = i64::try_from(system_time % self.cycle.unsigned_abs()).unwrap_or(0);
         let error = self.wrap(passed - self.target);
         let lateness = i64::try_from(lateness).unwrap_or(i64::MAX).min(self.cycle);
@@ -112,6 +126,20 @@ impl Phase {
         self.locked = self.score >= LOCKED_SCORE;
     }
 
+    /// A clock of 32 bits wraps every 4.3 s, in the middle of a cycle; measurements are closer
+    /// together than half of that.
+    fn extend(&mut self, raw: u64) -> u64 {
+        let time = match self.time {
+            None => raw,
+            Some(last) => {
+                let passed = (raw as u32).wrapping_sub(last as u32) as i32;
+                last.wrapping_add_signed(i64::from(passed))
+            }
+        };
+        self.time = Some(time);
+        time
+    }
+
     /// Into ±half a cycle.
     fn wrap(&self, value: i64) -> i64 {
         (value + self.cycle / 2).rem_euclid(self.cycle) - self.cycle / 2
@@ -122,9 +150,27 @@ impl Phase {
 mod tests {
     use super::*;
 
+    fn plan(cycle_ns: u64, release: u64) -> ClockPlan {
+        ClockPlan {
+            reference: 0x1000,
+            clocks: 1,
+            cycle_ns,
+            release,
+        }
+    }
+
+    #[test]
+    fn a_clock_of_32_bits_keeps_its_phase_when_it_wraps() {
+        let mut phase = Phase::new(&plan(1_000_000, 0));
+        for k in 0..10_000_u64 {
+            let step = phase.update((k * 1_000_000) & 0xffff_ffff, 0);
+            assert_eq!(step.error, 0, "cycle {k}");
+        }
+    }
+
     /// Cycles until locked, and the largest error in the 1000 cycles after.
     fn run(cycle: u64, offset: u64, ppm: f64, late: impl Fn(u64) -> u64) -> (u64, i64) {
-        let mut phase = Phase::new(cycle, 7_000_000);
+        let mut phase = Phase::new(&plan(cycle, 7_000_000));
         let mut release = 50_000_000_u64;
         let mut locked_at = None;
         let mut largest = 0;
@@ -171,7 +217,7 @@ mod tests {
 
     #[test]
     fn unlocks_only_after_a_run_of_bad_measurements() {
-        let mut phase = Phase::new(1_000_000, 0);
+        let mut phase = Phase::new(&plan(1_000_000, 500_000));
         for _ in 0..200 {
             phase.update(500_000, 0);
         }

@@ -7,7 +7,7 @@ use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::link::LinkError;
 use crate::link::packet::OpenError;
-use crate::rt::image::NotMapped;
+use crate::rt::image::{NotMapped, TooLarge};
 
 /// A machine or a bus that failed.
 #[derive(Debug, thiserror::Error)]
@@ -24,14 +24,13 @@ pub enum RunError {
     Link(LinkError),
     #[error("bring-up: {0}")]
     BringUp(#[from] Box<BringUpError>),
-    #[error("{device}: {source}")]
-    NotMapped {
-        device: DeviceRef,
-        source: NotMapped,
-    },
-    #[error("{device}: {source}")]
+    #[error("`{name}`: {source}")]
+    TooLarge { name: String, source: TooLarge },
+    #[error("`{name}`: {source}")]
+    NotMapped { name: String, source: NotMapped },
+    #[error("`{name}`: {source}")]
     Axis {
-        device: DeviceRef,
+        name: String,
         source: ecaxis_axis::ConfigError,
     },
     #[error("no process data comes back in SafeOp: {}", al_note(*al_status))]
@@ -104,6 +103,13 @@ pub enum RunError {
         target: f64,
         actual: f64,
     },
+    #[error("{device}: the clock does not settle: {difference_ns} ns from the reference")]
+    ClockNotSettled {
+        device: DeviceRef,
+        difference_ns: i32,
+    },
+    #[error("{device}: could not be brought to rest and disabled: stays in {state}")]
+    NotDisabled { device: DeviceRef, state: State },
     #[error("interrupted")]
     Interrupted,
     #[error("internal error: {0}")]

@@ -24,13 +24,13 @@ use crate::link::port::{Port, main_device, pump};
 use crate::rt::exchange::Exchange;
 use crate::rt::guard::Guard;
 use crate::rt::handover::ends;
-use crate::rt::image::AxisBits;
+use crate::rt::image::{self, AxisBits, Bits, ImagePlan};
 use crate::rt::phase::Phase;
 use crate::rt::{
     self,
     cycle::{AxisSlot, Engine, Parts, Remains, Timing, first_snapshot},
 };
-use crate::supervise::{Ended, Supervisor, executor};
+use crate::supervise::{Ended, Supervisor, executor, interruptible};
 use crate::wire::Datagrams;
 
 mod error;
@@ -141,25 +141,124 @@ pub fn prepare(
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
 ) -> Result<Prepared, RunError> {
+    // Whatever can be known to fail without a bus fails before there is one.
+    let (image, slots, axes) = plan(machine)?;
     let mut link = open::link(machine, options)?;
     let (main_device, mut port) = main_device(machine.bus.cycle_ns);
-    match come_up(
-        machine,
-        options.clock,
-        main_device,
-        link.as_mut(),
-        &mut port,
-        &progress,
-    ) {
+    let carried = Carried {
+        clock: options.clock,
+        stop: &stop,
+        link: link.as_mut(),
+        port: &mut port,
+    };
+    match come_up(machine, main_device, image, carried, &progress) {
         Ok(bus) => {
             let wire = Datagrams::new(main_device);
-            assemble(machine, options, stop, progress, bus, wire, (link, port))
+            let timing = Timing {
+                cycle_ns: machine.bus.cycle_ns,
+                spin_ns: machine.bus.spin_ns,
+                stop_patience_ns: stop_patience(machine),
+            };
+            let clock = options.clock;
+            let stations: Vec<u16> = bus.devices.iter().map(|d| d.at.station).collect();
+            let (rt_end, outer) = ends(&first_snapshot(&slots, stations.len()));
+            let mut exchange = Exchange::new(&bus.image, bus.dc.as_ref(), &stations);
+            hold_outputs(machine, &bus, &mut exchange);
+            exchange.stage();
+            let parts = Parts {
+                clock,
+                timing,
+                link,
+                port,
+                exchange,
+                axes: slots,
+                phase: bus.dc.as_ref().map(Phase::new),
+                guard: Guard::new(
+                    machine.bus.lost_frames,
+                    u16::try_from(stations.len()).unwrap_or(u16::MAX),
+                ),
+                end: rt_end,
+            };
+            let supervisor = Supervisor {
+                machine: Arc::clone(machine),
+                bus,
+                wire,
+                outer,
+                stop,
+                progress,
+                repeat: options.repeat.unwrap_or(machine.repeat),
+                limit: options.limit,
+                enable: options.enable,
+                axes,
+                stop_patience: timing.stop_patience_ns,
+                orders_given: 0,
+                refused: None,
+                last_status: crate::clock::now(),
+            };
+            Ok(Prepared { parts, supervisor })
         }
         Err(error) => {
             go_silent(options.clock, main_device, link.as_mut(), &mut port);
             // The bring-up's error is the one to report.
             let _ = link.finish();
             Err(error)
+        }
+    }
+}
+
+type Plan = (ImagePlan, Vec<AxisSlot>, Vec<usize>);
+
+/// The process image, and every axis with its place in it.
+fn plan(machine: &Machine) -> Result<Plan, RunError> {
+    let layouts = machine.devices.iter().map(|d| &d.selection.layout);
+    let sizes: Vec<_> = layouts.map(|l| (l.rx_bytes(), l.tx_bytes())).collect();
+    let name = |index: usize| machine.devices[index].name.clone();
+    let image = image::plan(&sizes).map_err(|source| RunError::TooLarge {
+        name: name(source.device),
+        source,
+    })?;
+    let mut slots = Vec::new();
+    let mut axes = Vec::new();
+    for (index, (device, region)) in machine.devices.iter().zip(&image.regions).enumerate() {
+        let (Some(setup), Some(region)) = (&device.axis, region) else {
+            continue;
+        };
+        let bits = AxisBits::new(&device.selection.layout, region).map_err(|source| {
+            RunError::NotMapped {
+                name: name(index),
+                source,
+            }
+        })?;
+        let axis = Axis::new(setup.config).map_err(|source| RunError::Axis {
+            name: name(index),
+            source,
+        })?;
+        slots.push(AxisSlot::new(axis, bits));
+        axes.push(index);
+    }
+    Ok((image, slots, axes))
+}
+
+/// From full speed to rest within the limits of the slowest axis, and a second for the drive.
+fn stop_patience(machine: &Machine) -> Nanos {
+    let setups = machine.devices.iter().filter_map(|d| d.axis.as_ref());
+    let slowest = setups
+        .map(|setup| setup.config.limits.velocity / setup.config.limits.acceleration)
+        .fold(0.0, f64::max);
+    // Longer than an hour is as good as for ever; the cast saturates.
+    1_000_000_000 + (slowest.min(3600.0) * 1e9) as Nanos
+}
+
+/// Puts the outputs that no axis drives to the values that their drives hold.
+fn hold_outputs(machine: &Machine, bus: &Bus, exchange: &mut Exchange) {
+    let devices = machine.devices.iter().zip(&bus.devices);
+    for ((config, device), region) in devices.zip(&bus.image.regions) {
+        let Some(region) = region else { continue };
+        for &(index, sub, value) in &device.held {
+            let field = config.selection.layout.rx_field(index, sub);
+            if let Some(bits) = field.and_then(|f| Bits::new(f, region.offset, region.out_len)) {
+                bits.set(exchange.outputs_mut(), value);
+            }
         }
     }
 }
@@ -176,6 +275,7 @@ fn own_the_link(
         Ok(prepared) => prepared,
         Err(error) => return error.into(),
     };
+    let wire = supervisor.wire;
     let (remains, (ended, result)) = match options.clock {
         Clock::Virtual => turn_in_virtual_time(parts, supervisor),
         Clock::Real => match turn_in_real_time(parts, supervisor, &machine.bus, &told) {
@@ -184,8 +284,14 @@ fn own_the_link(
         },
     };
     let Remains {
-        link, axes, stats, ..
+        mut link,
+        mut port,
+        axes,
+        stats,
     } = remains;
+    if result.is_err() {
+        go_silent(options.clock, wire.main_device(), link.as_mut(), &mut port);
+    }
     let (record, result) = match link.finish() {
         Ok(record) => (record, result),
         Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),
@@ -197,35 +303,45 @@ fn own_the_link(
     }
 }
 
+/// What carries the bring-up's frames, and what may end it.
+struct Carried<'a> {
+    clock: Clock,
+    stop: &'a AtomicBool,
+    link: &'a mut dyn Link,
+    port: &'a mut Port,
+}
+
 fn come_up(
     machine: &Machine,
-    clock: Clock,
     main_device: &'static MainDevice<'static>,
-    link: &mut dyn Link,
-    port: &mut Port,
+    image: ImagePlan,
+    carried: Carried<'_>,
     progress: &Sender<Progress>,
 ) -> Result<Bus, RunError> {
     let mut tell = |step| {
         let _ = progress.send(Progress::Step(step));
     };
+    let Carried {
+        clock,
+        stop,
+        link,
+        port,
+    } = carried;
     // ethercrab panics on some things a wire can carry (a SubDevice without an open port, say).
     let run = std::panic::AssertUnwindSafe(|| {
-        pump(
-            port,
-            link,
-            clock,
-            Box::pin(bring_up(main_device, machine, &mut tell)),
-        )
+        let bring_up = Box::pin(bring_up(main_device, machine, image, &mut tell));
+        pump(port, link, clock, interruptible(stop, bring_up))
     });
     match std::panic::catch_unwind(run) {
-        Ok(Ok(Ok(bus))) => Ok(bus),
-        Ok(Ok(Err(error))) => Err(RunError::BringUp(Box::new(error))),
+        Ok(Ok(Some(Ok(bus)))) => Ok(bus),
+        Ok(Ok(Some(Err(error)))) => Err(RunError::BringUp(Box::new(error))),
+        Ok(Ok(None)) => Err(RunError::Interrupted),
         Ok(Err(error)) => Err(RunError::Link(error)),
         Err(panic) => Err(RunError::Panicked(panic_text(&*panic))),
     }
 }
 
-/// After a failed bring-up: every SubDevice that listens back to Init.
+/// Every SubDevice that listens back to Init, whatever it is doing.
 fn go_silent(
     clock: Clock,
     main_device: &'static MainDevice<'static>,
@@ -236,69 +352,6 @@ fn go_silent(
         .ignore_wkc()
         .send(main_device, 0x0011_u16);
     let _ = pump(port, link, clock, init);
-}
-
-fn assemble(
-    machine: &Arc<Machine>,
-    options: &Options,
-    stop: Arc<AtomicBool>,
-    progress: Sender<Progress>,
-    bus: Bus,
-    wire: Datagrams,
-    (link, port): (Box<dyn Link>, Port),
-) -> Result<Prepared, RunError> {
-    let mut slots = Vec::new();
-    let mut axes = Vec::new();
-    for (index, (device, region)) in machine.devices.iter().zip(&bus.image.regions).enumerate() {
-        let (Some(setup), Some(region)) = (&device.axis, region) else {
-            continue;
-        };
-        let at = || bus.devices[index].at.clone();
-        let bits = AxisBits::new(&device.selection.layout, region).map_err(|source| {
-            RunError::NotMapped {
-                device: at(),
-                source,
-            }
-        })?;
-        let axis = Axis::new(setup.config).map_err(|source| RunError::Axis {
-            device: at(),
-            source,
-        })?;
-        slots.push(AxisSlot::new(axis, bits));
-        axes.push(index);
-    }
-    let stations: Vec<u16> = bus.devices.iter().map(|d| d.at.station).collect();
-    let devices = u16::try_from(stations.len()).unwrap_or(u16::MAX);
-    let (rt_end, outer) = ends(&first_snapshot(&slots, stations.len()));
-    let parts = Parts {
-        clock: options.clock,
-        timing: Timing {
-            cycle_ns: machine.bus.cycle_ns,
-            spin_ns: machine.bus.spin_ns,
-        },
-        link,
-        port,
-        exchange: Exchange::new(&bus.image, bus.dc.map(|dc| dc.reference), &stations),
-        axes: slots,
-        phase: bus.dc.map(|dc| Phase::new(dc.cycle_ns, dc.start)),
-        guard: Guard::new(machine.bus.lost_frames, devices),
-        end: rt_end,
-    };
-    let supervisor = Supervisor {
-        machine: Arc::clone(machine),
-        bus,
-        wire,
-        outer,
-        stop,
-        progress,
-        repeat: options.repeat.unwrap_or(machine.repeat),
-        limit: options.limit,
-        enable: options.enable,
-        axes,
-        orders_given: 0,
-        refused: None,
-    };
-    Ok(Prepared { parts, supervisor })
 }
 
 type Turned = (Remains, (Ended, Result<(), RunError>));

@@ -2,7 +2,7 @@
 
 use ecaxis_axis::AxisStatus;
 
-use super::{Break, Supervisor};
+use super::Supervisor;
 use crate::bringup::al;
 use crate::clock::Nanos;
 use crate::rt::guard::StopCause;
@@ -84,6 +84,16 @@ impl Supervisor {
         }
     }
 
+    /// A drive may still hold a fault from before this run; the first step of enabling it clears it.
+    pub(super) async fn tell_of_old_fault(&mut self, axis: usize) {
+        let name = self.axis_name(axis);
+        let code = self.error_code(axis).await.unwrap_or(0);
+        let text = ecaxis_axis::cia402::describe(code).text;
+        self.tell(Progress::Warning(format!(
+            "`{name}` was in fault 0x{code:04x} ({text}) before this run; it is reset"
+        )));
+    }
+
     /// Object 0x603F over CoE.
     async fn error_code(&mut self, axis: usize) -> Option<u16> {
         match self.upload(axis, ERROR_CODE).await?.as_slice() {
@@ -106,7 +116,7 @@ impl Supervisor {
 
     /// Modes of operation display is in the process data of most drives, and is then checked every
     /// cycle; the others are asked here.
-    pub(super) async fn confirm_modes(&mut self) -> Result<(), Break> {
+    pub(super) async fn confirm_modes(&mut self) -> Result<(), RunError> {
         for axis in 0..self.axes.len() {
             let device = &self.machine.devices[self.axes[axis]];
             let Some(setup) = &device.axis else { continue };
@@ -125,11 +135,11 @@ impl Supervisor {
                 .as_deref()
                 && i8::from_le_bytes([display]) != expected
             {
-                return Err(Break::Failed(RunError::WrongMode {
+                return Err(RunError::WrongMode {
                     device: self.device_of(axis),
                     expected,
                     display: i8::from_le_bytes([display]),
-                }));
+                });
             }
         }
         Ok(())

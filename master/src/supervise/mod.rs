@@ -2,16 +2,20 @@
 //! of the program, and what to say when something stops it. MAY BLOCK AND ALLOCATE; talks to the
 //! cycle through `rt::handover` alone.
 
+use std::future::{Future, poll_fn};
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Sender;
+use std::task::Poll;
 use std::time::Duration;
 
 use ecaxis_axis::{Command, Refused};
 
-use crate::bringup::{AlState, Bus, DeviceRef, al};
+use crate::bringup::{AlState, Bus, DeviceRef, StateError, al};
 use crate::clock::{self, Nanos};
 use crate::config::Machine;
+use crate::rt::cycle::has_power;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, Order, OuterEnd, Snapshot};
 use crate::session::{Progress, RunError, Status};
@@ -25,11 +29,15 @@ mod program;
 const TICK: Duration = Duration::from_millis(1);
 /// How long the phase may take to lock.
 const LOCK_TIMEOUT: Nanos = 5_000_000_000;
-/// Good cycles before Op is asked for.
-const GOOD_CYCLES: u64 = 20;
-/// After this the stop is taken for done whatever the drives say; longer than the cycle's patience.
-const STOP_TIMEOUT: Nanos = 8_000_000_000;
-/// On a lost bus nobody can report that it stands.
+/// Cycles before Op is asked for, besides those in which the diagnostic slot visits every device.
+const FIRST_CYCLES: u64 = 20;
+/// Diagnostic reads per device.
+const PROBES: usize = 3;
+/// A clock closer to the reference than this has settled.
+const SETTLED_NS: u32 = 1_000;
+/// The drives' own quick stop may take so long after the cycle's patience is over.
+const STOP_MARGIN: Nanos = 3_000_000_000;
+/// On a bus that has been silent for so long nobody can report that it stands.
 const LOST_BUS_TIMEOUT: Nanos = 1_000_000_000;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
 
@@ -49,10 +57,14 @@ pub struct Supervisor {
     pub enable: bool,
     /// Indices into the machine's devices, one an axis of the cycle.
     pub axes: Vec<usize>,
+    /// How long the cycle waits for its slowest axis to come to rest.
+    pub stop_patience: Nanos,
     /// Orders handed over so far.
     pub orders_given: u64,
     /// The last command that an axis did not take.
     pub refused: Option<(usize, Refused)>,
+    /// When the last status was told.
+    pub last_status: Nanos,
 }
 
 /// How the machine's program ended.
@@ -64,33 +76,27 @@ pub struct Ended {
     pub interrupted: bool,
 }
 
-/// What ends the program before its last step.
-enum Break {
-    /// The user, or the time limit.
-    Interrupted,
-    Failed(RunError),
-}
-
-impl From<RunError> for Break {
-    fn from(error: RunError) -> Self {
-        Self::Failed(error)
-    }
+/// Runs a future until it ends or the user wants everything to; `None` then.
+pub async fn interruptible<F: Future>(stop: &AtomicBool, future: F) -> Option<F::Output> {
+    let mut future = pin!(future);
+    poll_fn(|context| {
+        if stop.load(Ordering::Relaxed) {
+            return Poll::Ready(None);
+        }
+        future.as_mut().poll(context).map(Some)
+    })
+    .await
 }
 
 impl Supervisor {
     /// The whole life beside the cycle. The cycle ends when this has ended.
     pub async fn run(mut self) -> (Ended, Result<(), RunError>) {
         let mut ended = Ended::default();
-        let mut last_status = clock::now();
-        let mut result = match self.work(&mut ended, &mut last_status).await {
-            Ok(()) => Ok(()),
-            Err(Break::Interrupted) => {
-                ended.interrupted = true;
-                Ok(())
-            }
-            Err(Break::Failed(error)) => Err(error),
-        };
-        let back = self.wind_down(result.is_ok()).await;
+        let stop = Arc::clone(&self.stop);
+        let worked = interruptible(&stop, self.work(&mut ended)).await;
+        ended.interrupted = worked.is_none();
+        let mut result = worked.unwrap_or(Ok(()));
+        let back = self.wind_down().await;
         if result.is_ok() {
             result = back;
         }
@@ -98,8 +104,8 @@ impl Supervisor {
         (ended, result)
     }
 
-    async fn work(&mut self, ended: &mut Ended, last_status: &mut Nanos) -> Result<(), Break> {
-        self.await_phase(last_status).await?;
+    async fn work(&mut self, ended: &mut Ended) -> Result<(), RunError> {
+        self.await_phase().await?;
         let devices = self.bus.addresses();
         let timeout = Duration::from_nanos(self.machine.bus.op_timeout_ns);
         al::change_state(&self.wire, &devices, AlState::Op, timeout)
@@ -108,62 +114,80 @@ impl Supervisor {
         self.tell(Progress::Step(crate::bringup::Step::State(AlState::Op)));
         self.order(Order::Guard).await;
         if !self.enable {
-            return self.idle(last_status).await;
+            return self.hold(clock::now()).await;
         }
-        self.enable_axes(last_status).await?;
-        self.run_program(ended, last_status).await
+        self.enable_axes().await?;
+        self.run_program(ended).await
     }
 
-    /// Frames must be in phase with SYNC0 before a device may leave SafeOp.
-    async fn await_phase(&mut self, last_status: &mut Nanos) -> Result<(), Break> {
+    /// Frames must be in phase with SYNC0, and the clocks together, before a device may leave
+    /// SafeOp.
+    async fn await_phase(&mut self) -> Result<(), RunError> {
         let start = clock::now();
-        let mut good = 0;
+        let probes = u64::try_from(PROBES * self.bus.devices.len()).unwrap_or(u64::MAX);
         loop {
-            let snapshot = self.tick(last_status).await?;
-            let cycles = snapshot.counters.cycles;
+            let snapshot = self.tick().await?;
+            let looked_at_all = snapshot.counters.cycles > FIRST_CYCLES.saturating_add(probes);
             let locked = snapshot.phase.is_none_or(|phase| phase.locked);
-            let fresh = snapshot.inputs_fresh;
-            good = if fresh { good.max(1) } else { 0 };
-            if locked && fresh && cycles > GOOD_CYCLES {
+            let unsettled = self.unsettled_clock(&snapshot);
+            if looked_at_all && snapshot.inputs_fresh && locked && unsettled.is_none() {
                 if snapshot.phase.is_some() {
                     self.tell(Progress::PhaseLocked);
                 }
                 return Ok(());
             }
             if clock::now().saturating_sub(start) > LOCK_TIMEOUT {
-                return Err(Break::Failed(if good == 0 {
-                    RunError::NoProcessData {
+                return Err(match (snapshot.phase, unsettled) {
+                    _ if !snapshot.inputs_fresh => RunError::NoProcessData {
                         al_status: snapshot.al_status,
-                    }
-                } else {
-                    RunError::PhaseNotLocked {
-                        error_ns: snapshot.phase.map_or(0, |p| p.error_ns),
-                    }
-                }));
+                    },
+                    (Some(phase), None) => RunError::PhaseNotLocked {
+                        error_ns: phase.error_ns,
+                    },
+                    (_, Some((device, difference_ns))) => RunError::ClockNotSettled {
+                        device,
+                        difference_ns,
+                    },
+                    (None, None) => RunError::NoProcessData {
+                        al_status: snapshot.al_status,
+                    },
+                });
             }
         }
     }
 
-    async fn enable_axes(&mut self, last_status: &mut Nanos) -> Result<(), Break> {
+    fn unsettled_clock(&self, snapshot: &Snapshot) -> Option<(DeviceRef, i32)> {
+        // The reference compares itself with nothing.
+        let reference = self.bus.dc?.reference;
+        let devices = self.bus.devices.iter().zip(&snapshot.diagnoses);
+        devices
+            .filter(|(device, _)| device.dc && device.at.station != reference)
+            .find(|(_, found)| found.clock_difference.unsigned_abs() > SETTLED_NS)
+            .map(|(device, found)| (device.at.clone(), found.clock_difference))
+    }
+
+    async fn enable_axes(&mut self) -> Result<(), RunError> {
+        let snapshot = self.tick().await?;
         for axis in 0..self.axes.len() {
-            self.order(Order::Axis {
-                axis,
-                command: Command::Enable,
-            })
-            .await;
+            if snapshot.axes.get(axis).is_some_and(|s| s.fault.is_some()) {
+                self.tell_of_old_fault(axis).await;
+                let command = Command::ResetFault;
+                self.order(Order::Axis { axis, command }).await;
+            }
+            let command = Command::Enable;
+            self.order(Order::Axis { axis, command }).await;
         }
         let start = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns;
         loop {
-            let snapshot = self.tick(last_status).await?;
+            let snapshot = self.tick().await?;
             let Some(waiting) = snapshot.axes.iter().position(|axis| !axis.ready) else {
                 break;
             };
-            if clock::now().saturating_sub(start) > timeout {
-                let status = snapshot.axes[waiting];
-                return Err(Break::Failed(
-                    self.not_enabled(waiting, status, timeout).await,
-                ));
+            let status = snapshot.axes[waiting];
+            let failed = status.reset_failed && snapshot.orders_taken >= self.orders_given;
+            if failed || clock::now().saturating_sub(start) > timeout {
+                return Err(self.not_enabled(waiting, status, timeout).await);
             }
         }
         self.confirm_modes().await?;
@@ -173,27 +197,16 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Op without power until the user or the time limit ends it.
-    async fn idle(&mut self, last_status: &mut Nanos) -> Result<(), Break> {
-        let start = clock::now();
-        loop {
-            self.tick(last_status).await?;
-            if self
-                .limit
-                .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
-            {
-                return Ok(());
-            }
-        }
-    }
-
-    /// Waits for the next look at the cycle; ends the program if the user or the cycle has.
-    async fn tick(&mut self, last_status: &mut Nanos) -> Result<Snapshot, Break> {
+    /// Waits for the next look at the cycle; fails if the cycle has stopped the machine.
+    async fn tick(&mut self) -> Result<Snapshot, RunError> {
         clock::delay(TICK).await;
+        if self.outer.orders.is_abandoned() {
+            return Err(RunError::Thread("the cycle has ended by itself".to_owned()));
+        }
         let snapshot = self.outer.snapshots.read().clone();
         self.pass_events_on();
-        if clock::now().saturating_sub(*last_status) >= STATUS_PERIOD {
-            *last_status = clock::now();
+        if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
+            self.last_status = clock::now();
             self.tell(Progress::Status(Status::new(
                 &self.machine,
                 &self.axes,
@@ -203,10 +216,7 @@ impl Supervisor {
         if let Some(cause) = snapshot.stopping
             && cause != StopCause::Requested
         {
-            return Err(Break::Failed(self.explain_stop(cause, &snapshot).await));
-        }
-        if self.stop.load(Ordering::Relaxed) {
-            return Err(Break::Interrupted);
+            return Err(self.explain_stop(cause, &snapshot).await);
         }
         Ok(snapshot)
     }
@@ -224,47 +234,78 @@ impl Supervisor {
     }
 
     /// Axes to rest, power off, and the segment back to Init, as far as it still answers.
-    async fn wind_down(&mut self, well: bool) -> Result<(), RunError> {
+    async fn wind_down(&mut self) -> Result<(), RunError> {
         self.tell(Progress::Stopping);
-        let lost = matches!(
-            self.outer.snapshots.read().stopping,
-            Some(StopCause::BusLost { .. })
-        );
         self.order(Order::Stop).await;
-        let start = clock::now();
-        let patience = if lost { LOST_BUS_TIMEOUT } else { STOP_TIMEOUT };
-        while !self.outer.snapshots.read().stopped {
-            if clock::now().saturating_sub(start) > patience {
-                self.tell(Progress::Warning(
-                    "not every axis has confirmed that it is disabled".to_owned(),
-                ));
-                break;
-            }
-            clock::delay(TICK).await;
-        }
+        let result = self.await_rest().await;
         self.pass_events_on();
         self.order(Order::Unguard).await;
-        if lost {
-            return Ok(());
-        }
         let devices = self.bus.addresses();
+        let mut lowered = Ok(());
         for state in [AlState::SafeOp, AlState::PreOp, AlState::Init] {
-            match al::change_state(&self.wire, &devices, state, al::BACK_TIMEOUT).await {
+            match al::lower_state(&self.wire, &devices, state, al::BACK_TIMEOUT).await {
                 Ok(()) => self.tell(Progress::Step(crate::bringup::Step::State(state))),
-                Err(error) if well => return Err(RunError::State(error)),
-                // The first error is the one to report.
-                Err(error) => self.tell(Progress::Warning(error.to_string())),
+                Err(error) => {
+                    let silent = matches!(error, StateError::Wire { .. });
+                    self.tell(Progress::Warning(error.to_string()));
+                    if lowered.is_ok() {
+                        lowered = Err(RunError::State(error));
+                    }
+                    if silent {
+                        break;
+                    }
+                }
             }
         }
-        Ok(())
+        result.and(lowered)
+    }
+
+    /// Until every axis is without power, the patience is over, or nobody has answered for long.
+    async fn await_rest(&mut self) -> Result<(), RunError> {
+        let start = clock::now();
+        let mut last_answer = start;
+        loop {
+            clock::delay(TICK).await;
+            let snapshot = self.outer.snapshots.read().clone();
+            let now = clock::now();
+            if snapshot.inputs_fresh {
+                last_answer = now;
+            }
+            let waited = now.saturating_sub(start);
+            let over = waited > self.stop_patience + STOP_MARGIN
+                || now.saturating_sub(last_answer) > LOST_BUS_TIMEOUT
+                || self.outer.orders.is_abandoned();
+            if !snapshot.stopped && !over {
+                continue;
+            }
+            // A fault that came while the machine was stopping has not been told yet.
+            for (axis, status) in snapshot.axes.iter().enumerate() {
+                let cause = match (status.fault, status.trip) {
+                    (Some(_), _) => StopCause::DriveFault { axis },
+                    (None, Some(trip)) => StopCause::Trip { axis, trip },
+                    (None, None) => continue,
+                };
+                if self.enable {
+                    return Err(self.explain_stop(cause, &snapshot).await);
+                }
+            }
+            let powered = snapshot
+                .axes
+                .iter()
+                .position(|status| has_power(status.state));
+            return match powered {
+                Some(axis) if !snapshot.stopped => Err(RunError::NotDisabled {
+                    device: self.device_of(axis),
+                    state: snapshot.axes[axis].state,
+                }),
+                _ => Ok(()),
+            };
+        }
     }
 
     /// Hands an order over; the queue is longer than what one wait can fill.
     async fn order(&mut self, order: Order) {
-        while self.outer.orders.push(order).is_err() {
-            if self.outer.orders.is_abandoned() {
-                return;
-            }
+        while !self.outer.orders.is_abandoned() && self.outer.orders.push(order).is_err() {
             clock::delay(TICK).await;
         }
         self.orders_given += 1;

@@ -2,7 +2,7 @@
 
 use ecaxis_axis::{AxisStatus, Command};
 
-use super::{Break, Ended, Supervisor};
+use super::{Ended, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
 use crate::rt::handover::Order;
@@ -12,16 +12,12 @@ use crate::session::{Progress, RunError};
 const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
 
 impl Supervisor {
-    pub(super) async fn run_program(
-        &mut self,
-        ended: &mut Ended,
-        last_status: &mut Nanos,
-    ) -> Result<(), Break> {
+    pub(super) async fn run_program(&mut self, ended: &mut Ended) -> Result<(), RunError> {
         let start = clock::now();
         let steps = self.machine.steps.clone();
         if steps.is_empty() {
             // Without a program the axes hold their position until somebody ends it.
-            return self.hold(start, last_status).await;
+            return self.hold(start).await;
         }
         loop {
             for (index, step) in steps.iter().enumerate() {
@@ -33,7 +29,10 @@ impl Supervisor {
                     step: index + 1,
                     of: steps.len(),
                 });
-                self.run_step(index, step, start, last_status).await?;
+                self.run_step(index, step, start).await?;
+            }
+            if self.over(start) {
+                return Ok(());
             }
             ended.runs += 1;
             if self.limit.is_none() && ended.runs >= self.repeat {
@@ -47,20 +46,15 @@ impl Supervisor {
             .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
     }
 
-    async fn hold(&mut self, start: Nanos, last_status: &mut Nanos) -> Result<(), Break> {
+    /// Until the time limit ends it; the user can at any time.
+    pub(super) async fn hold(&mut self, start: Nanos) -> Result<(), RunError> {
         while !self.over(start) {
-            self.tick(last_status).await?;
+            self.tick().await?;
         }
         Ok(())
     }
 
-    async fn run_step(
-        &mut self,
-        index: usize,
-        step: &Step,
-        start: Nanos,
-        last_status: &mut Nanos,
-    ) -> Result<(), Break> {
+    async fn run_step(&mut self, index: usize, step: &Step, start: Nanos) -> Result<(), RunError> {
         let command: &dyn Fn(f64) -> Command = match step {
             Step::Move { speed, ramp, .. } => &|position| Command::MoveTo {
                 position,
@@ -78,7 +72,7 @@ impl Supervisor {
             Step::Dwell { ns } => {
                 let until = clock::now() + ns;
                 while clock::now() < until && !self.over(start) {
-                    self.tick(last_status).await?;
+                    self.tick().await?;
                 }
                 return Ok(());
             }
@@ -101,7 +95,7 @@ impl Supervisor {
             .await;
             waiting.push((axis, target));
         }
-        self.await_targets(index, &waiting, last_status).await
+        self.await_targets(index, &waiting, start).await
     }
 
     /// Until every axis has arrived; an axis whose set-point has arrived but which does not follow
@@ -110,23 +104,27 @@ impl Supervisor {
         &mut self,
         step: usize,
         waiting: &[(usize, f64)],
-        last_status: &mut Nanos,
-    ) -> Result<(), Break> {
+        start: Nanos,
+    ) -> Result<(), RunError> {
         // The orders are taken one a cycle; until then the status is that of the step before.
         let ordered = self.orders_given;
         let mut settling_since = None;
         loop {
-            let snapshot = self.tick(last_status).await?;
+            let snapshot = self.tick().await?;
+            if self.over(start) {
+                // Winding down brings the axes to rest from wherever they are.
+                return Ok(());
+            }
             if snapshot.orders_taken < ordered {
                 continue;
             }
             let status = |axis: usize| snapshot.axes.get(axis).copied();
             if let Some((axis, reason)) = self.refused.take() {
-                return Err(Break::Failed(RunError::Refused {
+                return Err(RunError::Refused {
                     device: self.device_of(axis),
                     step: step + 1,
                     reason: reason.to_string(),
-                }));
+                });
             }
             let late = waiting.iter().find_map(|&(axis, target)| {
                 status(axis)
@@ -145,12 +143,12 @@ impl Supervisor {
             }
             let since = *settling_since.get_or_insert_with(clock::now);
             if clock::now().saturating_sub(since) > SETTLE_TIMEOUT {
-                return Err(Break::Failed(RunError::NotReached {
+                return Err(RunError::NotReached {
                     device: self.device_of(axis),
                     step: step + 1,
                     target,
                     actual: reported(&last),
-                }));
+                });
             }
         }
     }

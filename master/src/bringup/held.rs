@@ -1,0 +1,56 @@
+//! Outputs that are in the process data and that no axis drives.
+//!
+//! Zero is right for offsets, digital outputs and the targets of other modes. It is wrong for what
+//! bounds a motion: a maximal torque or velocity of zero holds the drive fast. Those keep the value
+//! that the drive itself holds, read before its process data begins to count.
+
+use ecaxis_esi::layout::Field;
+
+use super::{BringUpError, BusDevice};
+use crate::config::DeviceConfig;
+use crate::mailbox::{SdoError, Wire};
+
+/// Objects for which zero is a value like any other, or the only safe one.
+const ZERO_IS_SAFE: [u16; 11] = [
+    0x6040, 0x6060, 0x6071, 0x607a, 0x60b0, 0x60b1, 0x60b2, 0x60b8, 0x60fe, 0x60ff, 0x0000,
+];
+
+/// Reads what must be held into `device.held`.
+pub(super) async fn read(
+    wire: &impl Wire,
+    config: &DeviceConfig,
+    device: &mut BusDevice,
+) -> Result<(), BringUpError> {
+    if config.axis.is_none() {
+        return Ok(());
+    }
+    let bounds = |field: &&Field| !ZERO_IS_SAFE.contains(&field.index);
+    for field in config.selection.layout.rx.iter().filter(bounds) {
+        let Some(coe) = device.coe.as_mut() else {
+            return Ok(());
+        };
+        let data = match coe.upload(wire, field.index, field.sub, false).await {
+            Ok(data) => data,
+            // What cannot be read over CoE is as the ESI says.
+            Err(SdoError::Abort { .. }) => config
+                .selection
+                .dictionary
+                .item(field.index, field.sub)
+                .map(|item| item.default.clone())
+                .unwrap_or_default(),
+            Err(source) => {
+                return Err(BringUpError::ReadBack {
+                    device: device.at.clone(),
+                    source,
+                });
+            }
+        };
+        let value = data
+            .iter()
+            .take(8)
+            .rev()
+            .fold(0_i64, |value, byte| value << 8 | i64::from(*byte));
+        device.held.push((field.index, field.sub, value));
+    }
+    Ok(())
+}
