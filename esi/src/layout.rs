@@ -1,8 +1,15 @@
 //! Where each mapped object lies: PDOs of one SyncManager are packed bit by bit in the order of assignment,
 //! each SyncManager starts at a byte.
 
-use crate::model::{Device, FmmuUse, Pdo};
+use crate::model::{Device, FmmuUse, Pdo, SmUse};
 use crate::select::SelectError;
+
+/// Terminals map registers into their process data: outputs at 0x0F00, system and latch times from 0x0910 on.
+/// What lies below configures the controller itself.
+const FIRST_ADDRESS: u16 = 0x0900;
+const ADDRESS_SPACE: u32 = 0x1_0000;
+/// Where process memory starts.
+const PROCESS_MEMORY: u16 = 0x1000;
 
 /// The process data of one device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -24,6 +31,13 @@ pub struct SmLayout {
     pub len: u16,
     /// The FMMU that the ESI intends for it.
     pub fmmu: Option<u8>,
+}
+
+impl SmLayout {
+    /// Three buffers, of which each side always has one.
+    fn is_buffered(&self) -> bool {
+        self.start_address >= PROCESS_MEMORY && self.control_byte & 0x03 == 0
+    }
 }
 
 /// One mapped object; gaps have no field.
@@ -50,6 +64,7 @@ impl Layout {
             rx,
             tx,
         };
+        layout.check_addresses(device)?;
         // Digital I/O controllers without a processor latch single bytes and need no buffers.
         if device.mailbox.is_some() {
             layout.check_memory()?;
@@ -81,13 +96,42 @@ impl Layout {
             .find(|field| field.index == index && field.sub == sub)
     }
 
+    /// Every SyncManager in use, the mailbox's as well, has its memory.
+    fn check_addresses(&self, device: &Device) -> Result<(), SelectError> {
+        let has_mailbox = device.mailbox.is_some();
+        let used = |number: u8| {
+            let mut all = self.outputs.iter().chain(&self.inputs);
+            all.find(|sm| sm.sm == number).map(|sm| {
+                let buffers = if has_mailbox && sm.is_buffered() {
+                    3
+                } else {
+                    1
+                };
+                buffers * u32::from(sm.len)
+            })
+        };
+        for (number, sm) in (0..=u8::MAX).zip(&device.sync_managers) {
+            let mailbox = has_mailbox && matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn);
+            let len = used(number).or_else(|| mailbox.then_some(u32::from(sm.default_size)));
+            if let Some(len) = len
+                && (sm.start_address < FIRST_ADDRESS
+                    || u32::from(sm.start_address) + len > ADDRESS_SPACE)
+            {
+                return Err(SelectError::SyncManagerOutside {
+                    sm: number,
+                    position: sm.position,
+                    start: sm.start_address,
+                    len,
+                });
+            }
+        }
+        Ok(())
+    }
+
     /// A buffered SyncManager occupies three times its length of the device's memory.
     fn check_memory(&self) -> Result<(), SelectError> {
-        const PROCESS_MEMORY: u16 = 0x1000;
         let all = || self.outputs.iter().chain(&self.inputs);
-        for sm in
-            all().filter(|sm| sm.start_address >= PROCESS_MEMORY && sm.control_byte & 0x03 == 0)
-        {
+        for sm in all().filter(|sm| sm.is_buffered()) {
             let end = u32::from(sm.start_address) + 3 * u32::from(sm.len);
             let hit = all().find(|other| {
                 other.start_address > sm.start_address
@@ -116,7 +160,7 @@ fn direction(
     let mut numbers: Vec<u8> = pdos.iter().filter_map(|pdo| pdo.sm).collect();
     numbers.sort_unstable();
     numbers.dedup();
-    let fmmus: Vec<u8> = (0u8..)
+    let fmmus: Vec<u8> = (0..=u8::MAX)
         .zip(&device.fmmus)
         .filter(|(_, u)| **u == usage)
         .map(|(number, _)| number)

@@ -68,7 +68,7 @@ pub struct Device {
     pub name: String,
     /// `Physics`: one letter a port, Y = MII/EBUS as the device has it (`"YY"`, `"YKKY"`).
     pub physics: String,
-    /// `Profile/ProfileNo`: 402 for drives, 5001 for modular devices.
+    /// `Profile/ProfileNo` or `Profile/ChannelInfo/ProfileNo`: 402 for drives, 5001 for modular devices.
     pub profile: Option<u32>,
     pub fmmus: Vec<FmmuUse>,
     pub sync_managers: Vec<SyncManager>,
@@ -264,6 +264,8 @@ pub struct Module {
     pub ident: u32,
     pub type_name: String,
     pub name: String,
+    /// As [`Device::profile`].
+    pub profile: Option<u32>,
     pub rx_pdos: Vec<Pdo>,
     pub tx_pdos: Vec<Pdo>,
     pub init_cmds: Vec<InitCmd>,

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use ecaxis_esi::{
-    Choice, DeviceQuery, EsiFile, Mode, Selection, find_device, offered_modes, parse, select, sii,
+    Choice, DeviceQuery, EsiFile, Mode, SelectError, Selection, Writable, find_device,
+    offered_modes, parse, select, sii,
 };
 
 const MODES: [Mode; 3] = [Mode::Csp, Mode::Csv, Mode::Cst];
@@ -150,4 +151,93 @@ fn their_images_fit_their_eeproms() {
             );
         }
     }
+}
+
+#[test]
+fn a_read_only_mode_is_not_written() {
+    let mut file = file("IDX.xml");
+    let items = file.devices[0].dictionary.objects.iter_mut();
+    for object in items.filter(|object| object.index == 0x6060) {
+        object.items[0].access.write = Writable::Never;
+    }
+    let selection = choose(&file, Some(Mode::Csp));
+    assert_eq!(value(&selection, 0x6060, 0), None);
+    let noted = |note: &String| note.contains("0x6060 is read-only");
+    assert!(selection.notes.iter().any(noted), "{:?}", selection.notes);
+}
+
+#[test]
+fn sync_managers_must_lie_in_a_device_s_memory() {
+    let with = |sm: usize, start: u16| {
+        let mut file = file("IDX.xml");
+        file.devices[0].sync_managers[sm].start_address = start;
+        let choice = Choice {
+            mode: Some(Mode::Csp),
+            cycle_ns: 1_000_000,
+            ..Choice::default()
+        };
+        let position = file.devices[0].sync_managers[sm].position;
+        (select(&file, &file.devices[0], &choice), position)
+    };
+    let fits = choose(&file("IDX.xml"), Some(Mode::Csp)).layout.outputs[0].len;
+    // Three buffers, and the last byte of the address space.
+    let last = u16::try_from(0x1_0000 - 3 * u32::from(fits)).unwrap();
+    assert!(with(2, last).0.is_ok());
+    for (sm, start) in [(2, last + 1), (2, 0x0800), (0, 0xfff0), (1, 0x0120)] {
+        let (result, position) = with(sm, start);
+        let error = result.unwrap_err();
+        assert!(
+            matches!(error, SelectError::SyncManagerOutside { sm: n, start: at, .. }
+                if usize::from(n) == sm && at == start),
+            "{error}"
+        );
+        assert!(position.line > 0 && error.to_string().contains(&format!("Sm at {position} ")));
+    }
+}
+
+#[test]
+fn profiles_of_devices_and_modules_stand_in_the_profile_or_in_a_channel() {
+    let file = |device: &str, module: &str| {
+        let text = format!(
+            "<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices><Device>\
+             <Type ProductCode=\"1\">D</Type><Profile>{device}</Profile></Device></Devices>\
+             <Modules><Module><Type ModuleIdent=\"1\">M</Type><Profile>{module}</Profile></Module>\
+             </Modules></Descriptions></EtherCATInfo>"
+        );
+        let file = parse(text.as_bytes()).unwrap();
+        (file.devices[0].profile, file.modules[0].profile)
+    };
+    let no = |n: u32| format!("<ProfileNo>{n}</ProfileNo>");
+    let channel = |n: u32| format!("<ChannelInfo>{}</ChannelInfo>", no(n));
+    assert_eq!(
+        file(&no(5001), &(channel(402) + &channel(401))),
+        (Some(5001), Some(402))
+    );
+    assert_eq!(
+        file(&(channel(402) + &no(5001)), ""),
+        (Some(5001), None),
+        "the device's own number wins"
+    );
+}
+
+/// More than a byte can count is cut short; the device itself will refuse it.
+#[test]
+fn three_hundred_of_everything() {
+    let mut file = file("IDX.xml");
+    let device = &mut file.devices[0];
+    let sm = device.sync_managers[2].clone();
+    device.sync_managers.resize(300, sm);
+    device.fmmus.resize(300, device.fmmus[0]);
+    let mut entry = device.rx_pdos[0].entries[0].clone();
+    entry.bit_len = 1;
+    device.rx_pdos[0].entries.resize(300, entry);
+    let choice = Choice {
+        mode: Some(Mode::Csp),
+        cycle_ns: 1_000_000,
+        ..Choice::default()
+    };
+    let selection = select(&file, &file.devices[0], &choice).unwrap();
+    assert_eq!(value(&selection, 0x1600, 0), Some(vec![255]));
+    let options = sii::SiiOptions::default();
+    assert!(sii::parse(&sii::emit(&file.devices[0], &file.modules, &options)).is_ok());
 }

@@ -468,3 +468,56 @@ fn the_same_assignment_as_a_recorded_eni() {
         (8, 8)
     );
 }
+
+/// Elmo's InitCmd sets 2 for its own 2 ms; the drive must learn the cycle of this bus.
+#[test]
+fn a_device_s_own_interpolation_time_yields_to_the_bus_cycle() {
+    let Some(file) = file("esi/elmo/Elmo_ECAT_00010420_V11.xml") else {
+        return;
+    };
+    let commanded = |device: &&ecaxis_esi::Device| {
+        let coe = device.mailbox.as_ref().and_then(|m| m.coe.as_ref());
+        coe.is_some_and(|coe| coe.init_cmds.iter().any(|cmd| cmd.index == 0x60c2))
+    };
+    let device = file.devices.iter().find(commanded).unwrap();
+    let fast = Choice {
+        cycle_ns: MS / 4,
+        ..for_mode(Mode::Csp)
+    };
+    let selection = select(&file, device, &fast).unwrap();
+    let times: Vec<_> = written(&selection.startup)
+        .into_iter()
+        .filter(|sdo| sdo.0 == 0x60c2)
+        .collect();
+    assert_eq!(times, [(0x60c2, 1, 25), (0x60c2, 2, 0xfb)]);
+    let left_out = |selection: &Selection| {
+        let notes = selection.notes.iter();
+        notes.filter(|note| note.contains("0x60C2:01")).count()
+    };
+    assert_eq!(left_out(&selection), 1, "{:?}", selection.notes);
+    // Where nothing follows from the cycle, the maker's value stays.
+    let any = Choice {
+        cycle_ns: MS / 4,
+        ..Choice::default()
+    };
+    let selection = select(&file, device, &any).unwrap();
+    assert!(written(&selection.startup).contains(&(0x60c2, 1, 2)));
+    assert_eq!(left_out(&selection), 0);
+}
+
+/// One `ChannelInfo` per axis is another way to say that it is a drive.
+#[test]
+fn the_profile_may_stand_in_a_channel() {
+    for path in [
+        "esi/stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml",
+        "esi/inovance/SV660_EOE_1Axis_V9.12.xml",
+        "esi/hpmicro/ECAT_CIA402.xml",
+    ] {
+        let Some(file) = file(path) else { return };
+        assert_eq!(file.devices[0].profile, Some(402), "{path}");
+        let selection = choose(&file, &for_mode(Mode::Csp)).unwrap();
+        for index in [0x6040, 0x607a] {
+            assert!(selection.layout.rx_field(index, 0).is_some(), "{path}");
+        }
+    }
+}

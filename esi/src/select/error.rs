@@ -1,6 +1,7 @@
 //! Why a choice does not fit the ESI file.
 
 use crate::mode::Mode;
+use crate::model::Position;
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SelectError {
@@ -113,6 +114,16 @@ pub enum SelectError {
         len: u16,
         other: u8,
         other_start: u16,
+    },
+    #[error(
+        "SyncManager {sm} (Sm at {position} of the ESI, 0x{start:04x}, {len} bytes) does not lie in a SubDevice's memory, 0x0900 to 0xffff"
+    )]
+    SyncManagerOutside {
+        sm: u8,
+        position: Position,
+        start: u16,
+        /// Bytes, with all buffers.
+        len: u32,
     },
     #[error(
         "a cycle of {cycle_ns} ns cannot be written to 0x60C2 (value {min}..{max} times a power of ten); nearest are {nearest}"

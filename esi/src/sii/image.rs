@@ -155,7 +155,7 @@ fn ports(physics: &str) -> u16 {
 
 /// A size that the ESI leaves open is what the default PDOs need.
 fn sync_managers(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Vec<SiiSyncManager> {
-    (0u8..)
+    (0..=u8::MAX)
         .zip(&device.sync_managers)
         .map(|(number, sm)| {
             let bits: u32 = rx

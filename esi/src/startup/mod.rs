@@ -48,6 +48,7 @@ pub(crate) fn list(
     let mut list = List {
         dictionary: selection.dictionary.clone(),
         sdos: Vec::new(),
+        knows_period: false,
     };
     module_list(device, selection, &mut list);
     pdo::configure(device, coe, selection, choice, &mut list)?;
@@ -93,6 +94,8 @@ fn without_coe(
 struct List {
     dictionary: Dictionary,
     sdos: Vec<StartupSdo>,
+    /// 0x60C2 is written from cycle and mode.
+    knows_period: bool,
 }
 
 impl List {
@@ -173,6 +176,7 @@ fn interpolation_time(
         });
         if zero_allowed {
             list.push(INTERPOLATION_TIME, 1, vec![0], "mode cst");
+            list.knows_period = true;
         }
         return Ok(());
     }
@@ -184,6 +188,7 @@ fn interpolation_time(
         exponent.to_le_bytes().to_vec(),
         "bus.cycle",
     );
+    list.knows_period = true;
     Ok(())
 }
 
@@ -191,7 +196,8 @@ fn is_zero(bytes: &[u8]) -> bool {
     bytes.iter().all(|&byte| byte == 0)
 }
 
-/// InitCmds for the way up to Op. One that sets another mode than the chosen one is left out.
+/// InitCmds for the way up to Op. One that sets another mode than the chosen one is left out, and so is one that
+/// writes the interpolation time of the maker's usual cycle over that of this bus.
 fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list: &mut List) {
     for cmd in commands {
         let upwards = UPWARDS
@@ -205,6 +211,13 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
             selection.notes.push(format!(
                 "InitCmd of {origin} (line {}) sets another mode of operation and is left out",
                 cmd.position.line
+            ));
+            continue;
+        }
+        if cmd.index == INTERPOLATION_TIME && list.knows_period {
+            selection.notes.push(format!(
+                "InitCmd of {origin} (line {}) writes 0x60C2:{:02x}, which follows from cycle and mode; it is left out",
+                cmd.position.line, cmd.sub
             ));
             continue;
         }
@@ -234,6 +247,16 @@ fn mode(selection: &mut Selection, list: &mut List) {
         selection
             .notes
             .push("the dictionary has no 0x6060; the mode of operation is not written".to_owned());
+        return;
+    }
+    let read_only = dictionary
+        .item(MODES_OF_OPERATION, 0)
+        .is_some_and(|item| item.access.write == Writable::Never);
+    if read_only {
+        selection.notes.push(
+            "0x6060 is read-only in the dictionary; the mode of operation is not written"
+                .to_owned(),
+        );
         return;
     }
     list.push(

@@ -31,7 +31,7 @@ pub(super) fn configure(
     if coe.pdo_assign {
         for (sm, pdos) in &assignments {
             let index = assign_object(*sm);
-            for (sub, pdo) in (1u8..).zip(pdos) {
+            for (sub, pdo) in (1..=u8::MAX).zip(pdos) {
                 list.push(
                     index,
                     sub,
@@ -59,7 +59,7 @@ fn assign_object(sm: u8) -> u16 {
 /// Every process data SyncManager with its PDOs, outputs first; one that carries nothing is cleared as well.
 fn assignments<'s>(device: &Device, selection: &'s Selection) -> Vec<(u8, Vec<&'s Pdo>)> {
     use crate::model::SmUse::{Inputs, Outputs};
-    let mut numbers: Vec<u8> = (0u8..)
+    let mut numbers: Vec<u8> = (0..=u8::MAX)
         .zip(&device.sync_managers)
         .filter(|(_, sm)| matches!(sm.usage, Outputs | Inputs))
         .map(|(number, _)| number)
@@ -107,7 +107,7 @@ fn contents(
     for pdo in chosen.iter().filter(|pdo| !pdo.fixed) {
         let origin = own.unwrap_or_default().to_owned() + &pdo_origin(device, selection, pdo);
         list.push(pdo.index, 0, vec![0], &origin);
-        for (sub, entry) in (1u8..).zip(&pdo.entries) {
+        for (sub, entry) in (1..=u8::MAX).zip(&pdo.entries) {
             list.push(
                 pdo.index,
                 sub,

@@ -67,16 +67,23 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
     Ok(device)
 }
 
-/// `Profile`, of a device or of a module: the profile number and the resolved dictionary.
+/// `Profile`, of a device or of a module: the profile number and the resolved dictionary. The number stands in
+/// `Profile` itself or, newer, in one `ChannelInfo` per axis; then the first axis counts.
 pub(super) fn profile<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
 ) -> Result<(Option<u32>, Dictionary), EsiError> {
-    let mut number = None;
+    let (mut number, mut of_channel) = (None, None);
     let mut dictionary = Dictionary::default();
     c.children(element, |c, el| {
         match el.name {
             "ProfileNo" => number = number.or(Some(c.number(el, "ProfileNo")?)),
+            "ChannelInfo" => c.children(el, |c, el| {
+                if el.name == "ProfileNo" {
+                    of_channel = of_channel.or(Some(c.number(el, "ProfileNo")?));
+                }
+                Ok(())
+            })?,
             "Dictionary" => {
                 let mut types = datatype::DataTypes::default();
                 let mut objects = Vec::new();
@@ -100,5 +107,5 @@ pub(super) fn profile<'a>(
         }
         Ok(())
     })?;
-    Ok((number, dictionary))
+    Ok((number.or(of_channel), dictionary))
 }

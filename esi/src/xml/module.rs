@@ -24,10 +24,11 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Modu
             "TxPdo" => module.tx_pdos.push(pdo::read(c, el, Direction::Tx)?),
             "Mailbox" => module.init_cmds = mailbox::read(c, el)?.coe.unwrap_or_default().init_cmds,
             "DcOpModeName" => module.dc_mode = Some(c.text(el)?),
-            "Profile" => module
-                .dictionary
-                .objects
-                .extend(device::profile(c, el)?.1.objects),
+            "Profile" => {
+                let (number, dictionary) = device::profile(c, el)?;
+                module.profile = module.profile.or(number);
+                module.dictionary.objects.extend(dictionary.objects);
+            }
             _ => {}
         }
         Ok(())
