@@ -90,14 +90,9 @@ fn open(nic: &str) -> Result<OwnedFd, ServeError> {
     if index == 0 {
         return Err(ServeError::NoSuchInterface(nic.to_owned()));
     }
+    // Without a protocol it receives nothing until `bind` names one; other interfaces' frames stay out.
     // SAFETY: plain system call; the result is checked.
-    let fd = unsafe {
-        libc::socket(
-            libc::AF_PACKET,
-            libc::SOCK_RAW | libc::SOCK_CLOEXEC,
-            i32::from(ETHERTYPE.to_be()),
-        )
-    };
+    let fd = unsafe { libc::socket(libc::AF_PACKET, libc::SOCK_RAW | libc::SOCK_CLOEXEC, 0) };
     if fd < 0 {
         let source = io::Error::last_os_error();
         return Err(if source.kind() == io::ErrorKind::PermissionDenied {

@@ -14,6 +14,8 @@ use crate::esc::{Esc, EscConfig};
 
 /// CiA 402.
 const DRIVE_PROFILE: u32 = 402;
+const CONTROLWORD: u16 = 0x6040;
+const STATUSWORD: u16 = 0x6041;
 
 /// What the ESI does not say about one particular device.
 #[derive(Debug, Clone)]
@@ -90,7 +92,7 @@ impl SimDevice {
                 len: 0,
             })
             .collect();
-        let is_drive = device.profile == Some(DRIVE_PROFILE) && device.mailbox.is_some();
+        let is_drive = device.mailbox.is_some() && is_drive(device, &store);
         let application = if is_drive {
             Application::Drive(Box::new(Drive::new(&mut store, options.plant)))
         } else {
@@ -142,6 +144,12 @@ impl SimDevice {
         sim.power_on(0);
         Ok(sim)
     }
+}
+
+/// By its profile, or because there is a Controlword and a Statusword in a dictionary or a PDO, be it a module's.
+fn is_drive(device: &Device, store: &ObjectStore) -> bool {
+    device.profile == Some(DRIVE_PROFILE)
+        || [CONTROLWORD, STATUSWORD].map(|index| store.has_object(index)) == [true, true]
 }
 
 /// Modules that may be plugged, the device, its default modules: the later wins.

@@ -37,21 +37,26 @@ impl SimDevice {
             let sm = u8::try_from(data.sm).unwrap_or(0);
             data.len = self.pdo.layout(&self.store, sm, &mut data.map);
         }
-        if let Application::Io { mirrors, held } = &mut self.application {
-            let of = |direction| {
-                self.process
-                    .iter()
-                    .filter(move |d| d.direction == direction)
-                    .flat_map(|d| &d.map)
-            };
-            *mirrors = of(Direction::Rx)
-                .zip(of(Direction::Tx))
-                .filter(|(_, to)| !held.contains(&to.slot))
-                .map(|(from, to)| Mirror {
-                    from: from.slot,
-                    to: to.slot,
-                })
-                .collect();
+        let of = |direction| {
+            self.process
+                .iter()
+                .filter(move |d| d.direction == direction)
+                .flat_map(|d| &d.map)
+        };
+        match &mut self.application {
+            Application::Drive(drive) => {
+                drive.set_mapped(|slot| of(Direction::Rx).any(|mapped| mapped.slot == slot));
+            }
+            Application::Io { mirrors, held } => {
+                *mirrors = of(Direction::Rx)
+                    .zip(of(Direction::Tx))
+                    .filter(|(_, to)| !held.contains(&to.slot))
+                    .map(|(from, to)| Mirror {
+                        from: from.slot,
+                        to: to.slot,
+                    })
+                    .collect();
+            }
         }
     }
 

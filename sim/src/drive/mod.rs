@@ -33,7 +33,7 @@ use plant::Plant;
 use state::{Inputs, Power, Ramp, Request, Stop};
 
 use crate::Nanos;
-use crate::coe::store::ObjectStore;
+use crate::coe::store::{ObjectStore, Slot};
 
 /// Position and velocity loop.
 pub const CONTROL_PERIOD_NS: Nanos = 400_000;
@@ -108,6 +108,12 @@ impl Drive {
         drive
     }
 
+    /// Tells which objects the output process data carries, each time that is decided anew. A limit of
+    /// zero that is received acts; one that is only an object without a value does not.
+    pub fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
+        self.objects.set_mapped(is_mapped);
+    }
+
     /// SYNC0, or a SyncManager event where there is no distributed clock: set-points take effect.
     pub fn sync(&mut self, store: &ObjectStore) {
         let o = &self.objects;
@@ -123,6 +129,9 @@ impl Drive {
             velocity_offset: store.get_signed(o.velocity_offset),
             torque_offset: store.get_signed(o.torque_offset),
         };
+        if self.objects.limits_are_mapped() {
+            self.parameters_age = PARAMETER_CYCLES;
+        }
         if !self.in_op {
             return;
         }

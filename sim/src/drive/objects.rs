@@ -52,6 +52,14 @@ pub(super) struct Objects {
     pub velocity_offset: Slot,
     pub torque_offset: Slot,
     parameters: ParameterSlots,
+    mapped: MappedLimits,
+}
+
+/// Limits that come with the process data: then zero means zero, where an unset object means "no limit".
+#[derive(Debug, Clone, Copy, Default)]
+struct MappedLimits {
+    torque: bool,
+    speed: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -151,6 +159,16 @@ impl Binder<'_> {
         slot
     }
 
+    /// Commissioning has fitted the software limits to the machine; factory values that shut out the
+    /// place where it stands cannot be meant.
+    fn drop_limits_without(&mut self, [min, max]: [Slot; 2], position: i64) {
+        let (low, high) = (self.0.get_signed(min), self.0.get_signed(max));
+        if low < high && !(low..=high).contains(&position) {
+            self.0.set(min, i64::from(i32::MIN));
+            self.0.set(max, i64::from(i32::MAX));
+        }
+    }
+
     fn own_motor_data(&mut self, index: u16, sub: u8, name: &str, value: i64) -> Option<Slot> {
         let slot = self.own(index, sub, name)?;
         Some(self.motor_data(slot, value))
@@ -218,6 +236,11 @@ impl Objects {
             counts_per_turn / 60.0 / unit(unit_acceleration, RPM_PER_S, acceleration_unit);
         let speed = |rpm: f64| whole(rpm * per_rpm).clamp(1, 0xffff_ffff);
         let acceleration = whole(10_000.0 * per_rpm_s).clamp(1, 0xffff_ffff);
+        let limits = [
+            b.bind(0x607d, 1, "Min position limit", 32, RW),
+            b.bind(0x607d, 2, "Max position limit", 32, RW),
+        ];
+        b.drop_limits_without(limits, i64::from(plant.initial_position));
         let parameters = ParameterSlots {
             quick_stop_option: b.with_default(0x605a, 0, "Quick stop option code", 16, 6),
             shutdown_option: b.bind(0x605b, 0, "Shutdown option code", 16, RW),
@@ -234,10 +257,7 @@ impl Objects {
                 b.bind(0x607b, 1, "Min position range limit", 32, RW),
                 b.bind(0x607b, 2, "Max position range limit", 32, RW),
             ],
-            limits: [
-                b.bind(0x607d, 1, "Min position limit", 32, RW),
-                b.bind(0x607d, 2, "Max position limit", 32, RW),
-            ],
+            limits,
             max_profile_velocity: b.with_default(
                 0x607f,
                 0,
@@ -303,7 +323,21 @@ impl Objects {
             velocity_offset: b.bind(0x60b1, 0, "Velocity offset", 32, RW),
             torque_offset: b.bind(0x60b2, 0, "Torque offset", 16, RW),
             parameters,
+            mapped: MappedLimits::default(),
         }
+    }
+
+    /// Which outputs the process data now carries.
+    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
+        self.mapped = MappedLimits {
+            torque: self.parameters.max_torque.is_some_and(&is_mapped),
+            speed: is_mapped(self.parameters.max_motor_speed),
+        };
+    }
+
+    /// Parameters change with the process data.
+    pub(super) fn limits_are_mapped(&self) -> bool {
+        self.mapped.torque || self.mapped.speed
     }
 
     /// 0x1003: the newest error first.
@@ -349,7 +383,11 @@ impl Objects {
             _ => (i64::from(i32::MIN), i64::from(i32::MAX)),
         };
         // 0x6080 is in rpm whatever 0x60A9 says.
-        let max_speed = float(store.get(p.max_motor_speed)) * counts_per_turn / 60.0;
+        let max_speed = match store.get(p.max_motor_speed) {
+            0 if !self.mapped.speed => i64::from(plant.max_motor_speed),
+            rpm => rpm.max(0),
+        };
+        let max_speed = float(max_speed) * counts_per_turn / 60.0;
         let profile_limit = speed(p.max_profile_velocity).min(max_speed);
         let max_acceleration = acceleration(p.max_acceleration);
         let rated_torque = float(store.get(p.rated_torque)) * 1e-6;
@@ -358,8 +396,9 @@ impl Objects {
             .map(|slot| float(store.get(slot)) * 1e-3)
             .map_or(plant.current_limit, |limit| limit.min(plant.current_limit));
         let current_limit = match p.max_torque.map(|slot| store.get(slot)) {
-            Some(limit) if limit > 0 && plant.torque_constant > 0.0 => {
-                current_limit.min(float(limit) * 1e-3 * rated_torque / plant.torque_constant)
+            Some(limit) if (limit > 0 || self.mapped.torque) && plant.torque_constant > 0.0 => {
+                let torque = float(limit.max(0)) * 1e-3 * rated_torque;
+                current_limit.min(torque / plant.torque_constant)
             }
             _ => current_limit,
         };

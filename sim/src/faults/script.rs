@@ -20,6 +20,8 @@ pub struct Fault {
     pub duration: Option<Nanos>,
     pub device: usize,
     pub kind: FaultKind,
+    /// Line of the script.
+    pub line: u32,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -73,6 +75,12 @@ pub enum ScriptError {
         kind: String,
         problem: String,
     },
+    #[error("line {line}: there is no device {device}; the bus has {devices}, counted from 0")]
+    NoSuchDevice {
+        line: u32,
+        device: usize,
+        devices: usize,
+    },
 }
 
 #[derive(Debug, Deserialize)]
@@ -110,7 +118,8 @@ impl FaultScript {
             let at = fault.kind.span().start;
             let line = text.bytes().take(at).filter(|b| *b == b'\n').count() + 1;
             let kind = fault.kind.get_ref().clone();
-            check(fault).map_err(|problem| ScriptError::Fault {
+            let number = u32::try_from(line).unwrap_or(u32::MAX);
+            check(fault, number).map_err(|problem| ScriptError::Fault {
                 line,
                 kind,
                 problem,
@@ -121,9 +130,24 @@ impl FaultScript {
             faults: faults.collect::<Result<_, _>>()?,
         })
     }
+
+    /// Whether a bus of so many devices has every device that the script names.
+    pub fn check(&self, devices: usize) -> Result<(), ScriptError> {
+        match self.faults.iter().find(|fault| {
+            let whole_bus = matches!(fault.kind, FaultKind::FrameLoss { .. } | FaultKind::Silent);
+            fault.device >= devices && !(whole_bus && fault.device == 0)
+        }) {
+            Some(fault) => Err(ScriptError::NoSuchDevice {
+                line: fault.line,
+                device: fault.device,
+                devices,
+            }),
+            None => Ok(()),
+        }
+    }
 }
 
-fn check(raw: RawFault) -> Result<Fault, String> {
+fn check(raw: RawFault, line: u32) -> Result<Fault, String> {
     let name = raw.kind.get_ref().as_str();
     let code16 = || {
         let code = raw.code.ok_or("`code` is missing")?;
@@ -217,6 +241,7 @@ fn check(raw: RawFault) -> Result<Fault, String> {
         duration: raw.duration.as_deref().map(duration).transpose()?,
         device: raw.device.unwrap_or(0),
         kind,
+        line,
     })
 }
 
@@ -243,8 +268,9 @@ fn duration(text: &str) -> Result<Nanos, String> {
     }
 }
 
+/// However people write it: `SafeOp`, `safe-op`, `safeop`.
 fn al_state(name: &str) -> Result<AlState, String> {
-    Ok(match name {
+    Ok(match name.to_ascii_lowercase().replace('-', "").as_str() {
         "init" => AlState::Init,
         "preop" => AlState::PreOp,
         "boot" => AlState::Boot,
@@ -335,5 +361,41 @@ mod tests {
         assert!(error("[[fault]]\nkind = \"melt\"\n").contains("known are frame-loss"));
         assert!(error("[[fault]]\nat = \"soon\"\nkind = \"absent\"\n").contains("not a duration"));
         assert!(error("[[fault]]\nkind = \"silent\"\nwhen = 1\n").contains("when"));
+    }
+
+    #[test]
+    fn states_as_people_write_them() {
+        for (state, spellings) in [
+            (AlState::Init, &["init", "Init", "INIT"][..]),
+            (AlState::PreOp, &["PreOp", "pre-op", "preop", "PRE-OP"]),
+            (AlState::SafeOp, &["SafeOp", "safe-op", "safeop", "Safe-Op"]),
+            (AlState::Op, &["Op", "op", "OP"]),
+            (AlState::Boot, &["boot", "Boot"]),
+        ] {
+            for spelling in spellings {
+                assert_eq!(al_state(spelling), Ok(state), "{spelling}");
+            }
+        }
+        assert_eq!(
+            al_state("Running").unwrap_err(),
+            "`Running` is not init, preop, boot, safeop or op"
+        );
+    }
+
+    #[test]
+    fn a_device_that_is_not_there_is_named_with_its_line() {
+        let script = FaultScript::parse(
+            "[[fault]]\nkind = \"silent\"\n\n[[fault]]\ndevice = 2\nkind = \"absent\"\n",
+        )
+        .unwrap();
+        let lines: Vec<u32> = script.faults.iter().map(|fault| fault.line).collect();
+        assert_eq!(lines, [2, 6]);
+        assert_eq!(script.check(3), Ok(()));
+        assert_eq!(
+            script.check(2).unwrap_err().to_string(),
+            "line 6: there is no device 2; the bus has 2, counted from 0"
+        );
+        let silent = FaultScript::parse("[[fault]]\nkind = \"silent\"\n").unwrap();
+        assert_eq!(silent.check(0), Ok(()));
     }
 }

@@ -98,6 +98,19 @@ fn drives_of_other_makers() {
     }
 }
 
+/// Its factory limits (0x607D, 7,129,736 to 9,713,015) leave out the zero it stands at.
+#[test]
+fn factory_limits_beside_the_axis_are_not_meant() {
+    let Some(file) = esi("myactuator/MT-Device_250702.xml") else {
+        return;
+    };
+    let dictionary = &file.devices.first().unwrap().dictionary;
+    let limit = |sub| dictionary.item(0x607d, sub).unwrap().default.clone();
+    assert_eq!(limit(1), 7_129_736_i32.to_le_bytes());
+    assert_eq!(limit(2), 9_713_015_i32.to_le_bytes());
+    moves_a_turn(&mut rig_of(&[dictionary]));
+}
+
 #[test]
 fn a_drive_without_unit_objects_has_the_same_dynamics_in_counts() {
     let mut store = ObjectStore::default();

@@ -289,6 +289,35 @@ fn software_limits_keep_csp_inside_and_trip_csv() {
 }
 
 #[test]
+fn software_limits_of_the_esi_hold_if_the_axis_stands_between_them() {
+    let limits = |initial_position, min: i32, max: i32| {
+        let mut store = ObjectStore::default();
+        for (sub, value) in [(1, min), (2, max)] {
+            store.ensure(
+                0x607d,
+                sub,
+                "Limit",
+                32,
+                Access::default(),
+                &value.to_le_bytes(),
+            );
+        }
+        let plant = PlantParams {
+            initial_position,
+            ..PlantParams::default()
+        };
+        let drive = Drive::new(&mut store, plant);
+        drive.parameters.software_limits
+    };
+    assert_eq!(limits(0, -10, 10), Some((-10, 10)));
+    assert_eq!(limits(10, -10, 10), Some((-10, 10)));
+    let none = Some((i64::from(i32::MIN), i64::from(i32::MAX)));
+    assert_eq!(limits(11, -10, 10), none);
+    assert_eq!(limits(0, 5, 10), none);
+    assert_eq!(limits(0, 0, 0), None);
+}
+
+#[test]
 fn the_history_has_the_newest_first() {
     let mut store = ObjectStore::default();
     for sub in 0..=5 {

@@ -1,6 +1,7 @@
 //! How well the cyclic modes follow.
 
 use super::*;
+use crate::drive::objects::float;
 
 /// A trapezoid in turns: position at a time, and how long it takes.
 struct Trapezoid {
@@ -238,4 +239,57 @@ fn two_runs_are_the_same_to_the_bit() {
         rig.drive.velocity_rev_s().to_bits() ^ rig.get(0x6077).unsigned_abs()
     };
     assert_eq!(run(), run());
+}
+
+/// A drive with 0x6072, in CSV, asked for 10 rev/s with these limits; rev/s after 0.3 s.
+fn speed_with(max_torque: i64, max_speed: i64, mapped: &[u16]) -> f64 {
+    let mut store = ObjectStore::default();
+    for unit in [0x60a9, 0x60aa] {
+        store.ensure(unit, 0, "SI unit", 32, Access::default(), &[]);
+    }
+    store.ensure(0x6072, 0, "Max torque", 16, Access::default(), &[]);
+    let mut rig = rig();
+    rig.drive = Drive::new(&mut store, PlantParams::default());
+    rig.store = store;
+    let slots: Vec<Slot> = mapped.iter().map(|index| rig.slot(*index, 0)).collect();
+    rig.drive.set_mapped(|slot| slots.contains(&slot));
+    rig.set(0x60c2, 1, 1);
+    rig.set(0x6065, 0, 0xffff_ffff);
+    rig.enable(9);
+    rig.set(0x6072, 0, max_torque);
+    rig.set(0x6080, 0, max_speed);
+    rig.set(0x60ff, 0, 600);
+    rig.run_ms(300);
+    rig.drive.velocity_rev_s()
+}
+
+#[test]
+fn limits_of_zero_act_only_if_they_are_received() {
+    let moves = |speed: f64| (speed - 10.0).abs() < 0.1;
+    assert!(moves(speed_with(0, 0, &[])));
+    assert!(moves(speed_with(1000, 6000, &[0x6072, 0x6080])));
+    assert!(moves(speed_with(0, 6000, &[0x6080])));
+    assert!(moves(speed_with(1000, 0, &[0x6072])));
+    assert_eq!(speed_with(0, 6000, &[0x6072]), 0.0);
+    assert!(speed_with(1000, 0, &[0x6080]).abs() < 0.01);
+    // A limit below the target, mapped or not.
+    for mapped in [&[][..], &[0x6080]] {
+        assert!((speed_with(0, 300, mapped) - 5.0).abs() < 0.1);
+    }
+}
+
+/// A mapped limit changes with the process data, not with the drive's background task.
+#[test]
+fn a_received_torque_limit_acts_in_the_next_control_cycle() {
+    let mut store = ObjectStore::default();
+    let limit = store.ensure(0x6072, 0, "Max torque", 16, Access::default(), &[]);
+    let mut drive = Drive::new(&mut store, PlantParams::default());
+    drive.set_mapped(|slot| slot == limit);
+    for permille in [1000, 0, 500] {
+        store.set(limit, permille);
+        drive.sync(&store);
+        drive.control(&mut store, true);
+        let expected = 3.2e-3 * float(permille);
+        assert!((drive.parameters.current_limit - expected).abs() < 1e-3);
+    }
 }

@@ -1,0 +1,167 @@
+//! What an ESI offers for a drive becomes a simulated drive, in every cyclic mode.
+
+#![allow(clippy::print_stderr, reason = "tests say what they did")]
+
+mod common;
+
+use common::*;
+use ecaxis_esi::model::{Device, Entry, EsiFile};
+use ecaxis_esi::{Choice, Mode, offered_modes, select};
+use ecaxis_sim::{DeviceOptions, SimDevice};
+
+fn choice(mode: Mode) -> Choice<'static> {
+    Choice {
+        mode: Some(mode),
+        cycle_ns: 1_000_000,
+        ..Choice::default()
+    }
+}
+
+fn has_coe(device: &Device) -> bool {
+    let mailbox = device.mailbox.as_ref();
+    mailbox.is_some_and(|mailbox| mailbox.coe.is_some())
+}
+
+fn esi_files() -> Vec<(String, EsiFile)> {
+    let mut folders = vec![fixtures().join("esi")];
+    let mut files = Vec::new();
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path
+                .extension()
+                .is_some_and(|e| e.eq_ignore_ascii_case("xml"))
+                && let Ok(file) = ecaxis_esi::parse(&std::fs::read(&path).unwrap())
+            {
+                files.push((path.display().to_string(), file));
+            }
+        }
+    }
+    files
+}
+
+#[test]
+fn drives_that_say_so_in_a_channel() {
+    for path in [
+        "esi/stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml",
+        "esi/inovance/SV660_EOE_1Axis_V9.12.xml",
+        "esi/hpmicro/ECAT_CIA402.xml",
+    ] {
+        let Some(bytes) = fixture(path) else { return };
+        let file = ecaxis_esi::parse(&bytes).unwrap();
+        let device = &file.devices[0];
+        let selection = select(&file, device, &choice(Mode::Csp)).unwrap();
+        assert_eq!(selection.mode, Some(Mode::Csp), "{path}");
+        let sim = SimDevice::from_esi(device, &file.modules, DeviceOptions::default()).unwrap();
+        assert!(sim.drive().is_some(), "{path}");
+    }
+}
+
+#[test]
+fn every_drive_in_every_cyclic_mode_it_offers() {
+    if fixture("README.md").is_none() {
+        return;
+    }
+    let (mut drives, mut chosen, mut refused) = (0, 0, Vec::new());
+    for (path, file) in esi_files() {
+        for device in file
+            .devices
+            .iter()
+            .filter(|device| device.profile == Some(402) && has_coe(device))
+        {
+            drives += 1;
+            let sim = SimDevice::from_esi(device, &file.modules, DeviceOptions::default())
+                .unwrap_or_else(|error| panic!("{path}: {}: {error}", device.name));
+            assert!(sim.drive().is_some(), "{path}: {}", device.name);
+            for mode in offered_modes(&file, device) {
+                if !mode.is_cyclic() {
+                    continue;
+                }
+                match select(&file, device, &choice(mode)) {
+                    Ok(selection) => {
+                        chosen += 1;
+                        for field in selection.layout.rx.iter().chain(&selection.layout.tx) {
+                            assert!(
+                                sim.object(field.index, field.sub).is_some(),
+                                "{path}: {} {mode}: 0x{:04x}",
+                                device.name,
+                                field.index
+                            );
+                        }
+                        for note in &selection.notes {
+                            eprintln!("{} {mode}: {note}", device.type_name);
+                        }
+                    }
+                    Err(error) => refused.push(format!("{} {mode}: {error}", device.name)),
+                }
+            }
+        }
+    }
+    eprintln!(
+        "{drives} drives, {chosen} selections\n{}",
+        refused.join("\n")
+    );
+    assert!(drives >= 10 && chosen >= 25, "{drives}, {chosen}");
+}
+
+/// No profile number, no dictionary entry for it: the PDOs show that it is a drive. A torque limit that the
+/// process data brings acts from the first cycle, also as zero.
+#[test]
+fn a_drive_known_by_its_pdos_obeys_a_torque_limit_of_zero() {
+    const S: u16 = 0x1001;
+    let mut device = coe_device();
+    let entries = |entries: &mut Vec<Entry>, list: &[(u16, u16)]| {
+        let template = entries[0].clone();
+        *entries = list
+            .iter()
+            .map(|&(index, bit_len)| Entry {
+                index,
+                sub: 0,
+                bit_len,
+                ..template.clone()
+            })
+            .collect();
+    };
+    entries(
+        &mut device.rx_pdos[0].entries,
+        &[(0x6040, 16), (0x60ff, 32), (0x6072, 16)],
+    );
+    entries(
+        &mut device.tx_pdos[0].entries,
+        &[(0x6041, 16), (0x606c, 32)],
+    );
+    assert_eq!(device.profile, None);
+    assert!(sim(&device).drive().is_some());
+    assert!(sim(&coe_device()).drive().is_none());
+
+    let mut bus = Bus::new(vec![sim(&device)]);
+    bus.address_all();
+    bus.preop(S);
+    bus.download(S, 0x6060, 0, &[9]).unwrap();
+    bus.sm(S, 2, 0x1100, 8, 0x64);
+    bus.sm(S, 3, 0x1200, 6, 0x20);
+    bus.to(S, SAFEOP);
+    bus.to(S, OP);
+    let speed = |bus: &mut Bus, limit: u16| {
+        for _ in 0..400 {
+            let status = bus.read(S, 0x1200, 6);
+            let controlword: u16 = match status[0] & 0x6f {
+                0x21 => 0x07,
+                0x23 | 0x27 => 0x0f,
+                _ => 0x06,
+            };
+            let mut outputs = controlword.to_le_bytes().to_vec();
+            outputs.extend(20_000_i32.to_le_bytes());
+            outputs.extend(limit.to_le_bytes());
+            bus.write(S, 0x1100, &outputs);
+            bus.wait(1_000_000);
+        }
+        let status = bus.read(S, 0x1200, 6);
+        assert_eq!(status[0] & 0x6f, 0x27);
+        i32::from_le_bytes(status[2..6].try_into().unwrap())
+    };
+    assert_eq!(speed(&mut bus, 0), 0);
+    assert!((19_000..21_000).contains(&speed(&mut bus, 1000)));
+}
