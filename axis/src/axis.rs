@@ -12,10 +12,13 @@ use crate::status::{AxisStatus, DriveFault, Refused, Trip};
 use crate::units::{Counts, PerMille, Percent, RawVelocity, UserUnits, UserVelocity};
 
 mod actual;
+mod blind;
 mod command;
 mod supervise;
+mod wish;
 
 use actual::Actual;
+use wish::Wish;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisConfig {
@@ -70,7 +73,8 @@ pub struct Inputs {
     pub torque: Option<i16>,
     /// 0x6061.
     pub mode_display: Option<i8>,
-    /// `false`: this cycle's frame was lost; the values are old and no decision is made on them.
+    /// `false`: this cycle's frame was lost; the values are old and no decision is made on them. The set-point runs on for two
+    /// such cycles in a row, then it waits.
     pub fresh: bool,
 }
 
@@ -124,19 +128,6 @@ pub enum Command {
     },
 }
 
-/// What the axis is to do with the power; [`Axis::settle_wish`] leads from one to the next.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Wish {
-    Disabled,
-    Enabled,
-    /// Brake, then disable.
-    Disabling,
-    QuickStop {
-        then_disable: bool,
-        elapsed_s: f64,
-    },
-}
-
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Plan {
     Hold(Hold),
@@ -150,9 +141,6 @@ const SHORTEST_CYCLE_S: f64 = 1e-6;
 
 /// Longest cycle taken at face value. A longer one would be a jump of the set-point, not a cycle.
 const LONGEST_CYCLE_S: f64 = 0.1;
-
-/// A quick stop that was to end disabled ends so after this time even if the axis still turns.
-const QUICK_STOP_LIMIT_S: f64 = 2.0;
 
 #[derive(Debug, Clone)]
 pub struct Axis {
@@ -179,6 +167,8 @@ pub struct Axis {
     held_by_range: bool,
     guarded_cycles: u32,
     stale_cycles: u32,
+    /// CSP: lost frames stopped a set-point that was moving, and none has come through since.
+    cut_short: bool,
     fault: Option<DriveFault>,
     trip: Option<Trip>,
 }
@@ -220,6 +210,7 @@ impl Axis {
             held_by_range: false,
             guarded_cycles: 0,
             stale_cycles: 0,
+            cut_short: false,
             fault: None,
             trip: None,
             config,
@@ -268,10 +259,12 @@ impl Axis {
             self.update_active();
         }
         let sent = self.sent;
-        if self.active {
-            self.advance(dt_s);
-        } else {
+        if !self.active {
             self.follow();
+        } else if self.frozen() {
+            self.freeze();
+        } else {
+            self.advance(dt_s);
         }
         self.sent_before = sent;
         self.outputs()
@@ -279,6 +272,7 @@ impl Axis {
 
     fn read(&mut self, inputs: &Inputs) {
         self.stale_cycles = 0;
+        self.cut_short = false;
         self.statusword = Statusword::from_bits_retain(inputs.statusword);
         self.mode_display = inputs.mode_display;
         self.actual.read(inputs, &self.config.scale);
@@ -289,36 +283,12 @@ impl Axis {
             .is_none_or(|display| display == self.config.mode.code())
     }
 
-    /// Where a wish has been fulfilled, the next one follows from it.
-    fn settle_wish(&mut self, dt_s: f64) {
-        let stopping = matches!(self.state, State::OperationEnabled | State::QuickStopActive);
-        self.wish = match self.wish {
-            Wish::Disabling if !self.active || self.setpoint_at_rest() => Wish::Disabled,
-            Wish::QuickStop { .. } if !stopping => Wish::Disabled,
-            Wish::QuickStop {
-                then_disable: true,
-                elapsed_s,
-            } => {
-                let stopped = self.state == State::QuickStopActive && self.standing();
-                if stopped || elapsed_s > QUICK_STOP_LIMIT_S {
-                    Wish::Disabled
-                } else {
-                    Wish::QuickStop {
-                        then_disable: true,
-                        elapsed_s: elapsed_s + dt_s,
-                    }
-                }
-            }
-            other => other,
-        };
-    }
-
     fn switch_power(&mut self, fresh: bool, dt_s: f64) {
         let blind = self.config.mode == Mode::Csp && self.actual.counts().is_none();
         let power = match self.wish {
             // There is nothing a position target could follow.
-            Wish::Enabled | Wish::Disabling if blind => Power::Disabled,
-            Wish::Enabled | Wish::Disabling => Power::Enabled,
+            Wish::Enabled | Wish::Disabling { .. } if blind => Power::Disabled,
+            Wish::Enabled | Wish::Disabling { .. } => Power::Enabled,
             Wish::Disabled => Power::Disabled,
             Wish::QuickStop { .. } => Power::QuickStop,
         };

@@ -20,7 +20,7 @@ pub struct AxisStatus {
     pub ready: bool,
     /// `mode_display` is the configured mode, or is not mapped.
     pub mode_confirmed: bool,
-    /// The set-point is still changing.
+    /// The set-point is still changing, or waits for lost frames before it goes on.
     pub moving: bool,
     /// The set-point has arrived, and so has the axis (CSP: within the target window; CSV: within the velocity window).
     pub in_target: bool,

@@ -87,7 +87,7 @@ fn reversal_and_stop() {
 }
 
 #[test]
-fn lost_frames_do_not_stop_the_trajectory() {
+fn two_lost_frames_do_not_stop_the_trajectory() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.axis.command(to(50.0)).unwrap();
     rig.run(200);
@@ -110,7 +110,7 @@ fn lost_frames_are_not_a_following_error() {
         rig.cycle_with(false);
     }
     let status = rig.cycle();
-    assert!(status.following_error > 1.0 && status.trip.is_none());
+    assert!(status.following_error > 0.5 && status.trip.is_none());
     let status = rig.until(|s| s.in_target, 1000);
     assert!(status.max_following_error < 0.61);
     // Nor does losing every other frame hide a blocked motor.

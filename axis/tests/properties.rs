@@ -60,6 +60,7 @@ fn event() -> impl Strategy<Value = Event> {
         1 => any::<u16>().prop_map(Event::Word),
         1 => prop::sample::select(states).prop_map(Event::Jump),
         3 => (1u8..6).prop_map(Event::Lose),
+        1 => (1u8..=100).prop_map(Event::Lose),
         1 => any::<bool>().prop_map(Event::Block),
         1 => any::<i8>().prop_map(Event::Mode),
     ]
@@ -115,6 +116,18 @@ impl Checker {
             prop_assert_eq!(out.target_torque, 0);
         }
         let held = status.enabled && self.enabled_before;
+        // Too many lost frames: nothing moves, and in CSP what follows starts from rest.
+        let frozen = held && status.stale_cycles > 2;
+        if frozen {
+            let targets =
+                |out: &Outputs| (out.target_position, out.target_velocity, out.target_torque);
+            prop_assert_eq!(targets(&out), targets(&self.before));
+            if self.mode == Mode::Csp {
+                prop_assert_eq!(status.target_velocity, 0.0);
+                self.planned_before = 0.0;
+                self.velocity_before = 0.0;
+            }
+        }
         // What was planned, before rounding to counts: to the last digit.
         let planned = (status.target_velocity - self.planned_before).abs();
         let most = LIMITS.acceleration * DT * (1.0 + 1e-6);

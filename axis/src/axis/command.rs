@@ -72,7 +72,9 @@ impl Axis {
                 then_disable: true,
                 elapsed_s,
             },
-            _ if self.active => Wish::Disabling,
+            // Asked for already, and perhaps granted without the set-point at rest: no power again.
+            Wish::Disabling { .. } | Wish::Disabled => self.wish,
+            _ if self.active => Wish::Disabling { frozen_s: 0.0 },
             _ => Wish::Disabled,
         };
     }
@@ -88,6 +90,8 @@ impl Axis {
                 then_disable: before || then_disable,
                 elapsed_s,
             },
+            // No power, or on its way off, perhaps after a quick stop that took too long: not from the beginning again.
+            Wish::Disabled => Wish::Disabled,
             _ => Wish::QuickStop {
                 then_disable,
                 elapsed_s: 0.0,

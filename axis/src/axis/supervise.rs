@@ -83,7 +83,7 @@ impl Axis {
         if self.state != State::OperationEnabled {
             match self.wish {
                 Wish::Enabled => self.trip(Trip::PowerLost { state: self.state }),
-                Wish::Disabling => self.wish = Wish::Disabled,
+                Wish::Disabling { .. } => self.wish = Wish::Disabled,
                 Wish::Disabled | Wish::QuickStop { .. } => {}
             }
             return;

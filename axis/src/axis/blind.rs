@@ -1,0 +1,27 @@
+//! What happens to the set-point while frames are lost.
+//!
+//! A lost frame takes its targets with it, and the first one that gets through makes up for all of them in one step. So only
+//! [`RIDE_THROUGH_CYCLES`] are planned blind; then the set-point waits where it is, as the drive does with the last target it
+//! got.
+
+use super::Axis;
+use crate::cia402::Mode;
+
+/// The drive is never further behind than these and the cycle whose loss was not known yet.
+const RIDE_THROUGH_CYCLES: u32 = 2;
+
+impl Axis {
+    /// Too many lost frames in a row: nothing is planned until one gets through.
+    pub(super) const fn frozen(&self) -> bool {
+        self.stale_cycles > RIDE_THROUGH_CYCLES
+    }
+
+    /// Instead of an advance. The plan stays: in CSP it goes on from rest, for the drive stands at its last target; in CSV and
+    /// CST it goes on from the velocity or torque that the drive has kept.
+    pub(super) fn freeze(&mut self) {
+        if self.config.mode == Mode::Csp {
+            self.cut_short |= self.motion.velocity != 0.0;
+            self.motion.velocity = 0.0;
+        }
+    }
+}
