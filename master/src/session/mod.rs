@@ -194,6 +194,7 @@ pub fn prepare(
                 orders_given: 0,
                 refused: None,
                 last_status: crate::clock::now(),
+                listened: (crate::clock::now(), 0),
             };
             Ok(Prepared { parts, supervisor })
         }

@@ -4,7 +4,7 @@ use ecaxis_axis::AxisStatus;
 
 use super::Supervisor;
 use crate::bringup::al;
-use crate::clock::Nanos;
+use crate::clock::{self, Nanos};
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Order, Snapshot};
 use crate::session::{Progress, RunError};
@@ -106,12 +106,40 @@ impl Supervisor {
         let device = *self.axes.get(axis)?;
         let coe = self.bus.devices.get_mut(device)?.coe.as_mut()?;
         let result = coe.upload(&self.wire, index, 0, false).await;
-        let emergencies: Vec<_> = coe.take_emergencies().collect();
-        let name = self.axis_name(axis);
-        for emergency in emergencies {
-            self.tell(Progress::Warning(format!("`{name}`: {emergency}")));
-        }
+        self.tell_emergencies(device);
         result.ok()
+    }
+
+    /// Empties the mailbox of the next device and passes its emergencies on.
+    pub(super) async fn listen(&mut self) {
+        let (_, device) = self.listened;
+        if let Some(coe) = self
+            .bus
+            .devices
+            .get_mut(device)
+            .and_then(|d| d.coe.as_mut())
+        {
+            // A device that is gone is the cycle's to notice.
+            let _ = coe.drain(&self.wire).await;
+            self.tell_emergencies(device);
+        }
+        let next = (device + 1) % self.bus.devices.len().max(1);
+        self.listened = (clock::now(), next);
+    }
+
+    fn tell_emergencies(&mut self, device: usize) {
+        let Some(device) = self.bus.devices.get_mut(device) else {
+            return;
+        };
+        let emergencies: Vec<_> = device
+            .coe
+            .iter_mut()
+            .flat_map(|c| c.take_emergencies())
+            .collect();
+        let at = device.at.clone();
+        for emergency in emergencies {
+            self.tell(Progress::Warning(format!("{at}: {emergency}")));
+        }
     }
 
     /// Modes of operation display is in the process data of most drives, and is then checked every

@@ -40,6 +40,8 @@ const STOP_MARGIN: Nanos = 3_000_000_000;
 /// On a bus that has been silent for so long nobody can report that it stands.
 const LOST_BUS_TIMEOUT: Nanos = 1_000_000_000;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
+/// One mailbox after the other is looked into for emergencies.
+const LISTEN_PERIOD: Nanos = 50_000_000;
 
 /// Drives a machine from SafeOp through its program and back to Init.
 #[derive(Debug)]
@@ -65,6 +67,8 @@ pub struct Supervisor {
     pub refused: Option<(usize, Refused)>,
     /// When the last status was told.
     pub last_status: Nanos,
+    /// When a mailbox was last listened to, and the device whose turn is next.
+    pub listened: (Nanos, usize),
 }
 
 /// How the machine's program ended.
@@ -217,6 +221,9 @@ impl Supervisor {
             && cause != StopCause::Requested
         {
             return Err(self.explain_stop(cause, &snapshot).await);
+        }
+        if clock::now().saturating_sub(self.listened.0) >= LISTEN_PERIOD {
+            self.listen().await;
         }
         Ok(snapshot)
     }

@@ -1,0 +1,325 @@
+//! How a machine comes to rest, whatever ends its motion: by the set-points that reach the drives,
+//! read from the recording, and by what the run says in the end.
+
+mod common;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use common::{axes, faults, machine, run_badly, run_well, virtual_time};
+use ecaxis::config::Machine;
+use ecaxis::session::{self, Observer, Options, Progress, RunError, Summary};
+use pcap_file::pcapng::{Block, PcapNgReader};
+
+/// Counts per turn, and the fastest set-point change a cycle of 1 ms may bring at 50 turns a second.
+const COUNTS: i64 = 2000;
+const STEP: i64 = 50 * COUNTS / 1000;
+/// The same at the speed of [`patient`].
+const SLOW_STEP: i64 = STEP * 2 / 5;
+const OPERATION_ENABLED: u16 = 0x0f;
+
+/// What reached the drives in one cycle: Controlword and target position of each axis.
+type Outputs = Vec<(u16, i32)>;
+
+/// The process data of the cyclic frames that came back, as it left: what the drives took.
+fn delivered_bytes(recording: &Path) -> Vec<Vec<u8>> {
+    const FIRST_LRW_DATA: usize = 16 + 20 + 10;
+    let file = std::fs::File::open(recording).expect("the recording");
+    let mut reader = PcapNgReader::new(file).expect("pcapng");
+    let mut sent: Option<Vec<u8>> = None;
+    let mut cycles = Vec::new();
+    while let Some(block) = reader.next_block() {
+        let Block::EnhancedPacket(packet) = block.expect("a block") else {
+            continue;
+        };
+        let frame = packet.data;
+        if frame.get(11) != Some(&0x20) {
+            continue;
+        }
+        if frame[6] & 0x02 == 0 {
+            sent = Some(frame.to_vec());
+        } else if let Some(sent) = sent.take() {
+            cycles.push(sent[FIRST_LRW_DATA..].to_vec());
+        }
+    }
+    cycles
+}
+
+/// Controlword and target position of every axis in CSP of our own ESI: 12 bytes out, 13 in.
+fn delivered(recording: &Path, axes: usize) -> Vec<Outputs> {
+    const REGION: usize = 13;
+    let axis = |data: &[u8], i: usize| {
+        let at = i * REGION;
+        let word = u16::from_le_bytes([data[at], data[at + 1]]);
+        let target = data[at + 2..at + 6].try_into().expect("four bytes");
+        (word, i32::from_le_bytes(target))
+    };
+    delivered_bytes(recording)
+        .iter()
+        .map(|data| (0..axes).map(|i| axis(data, i)).collect())
+        .collect()
+}
+
+/// Largest change of an enabled axis' target between two frames that reached it.
+fn largest_step(cycles: &[Outputs], axis: usize) -> i64 {
+    cycles
+        .windows(2)
+        .filter(|pair| pair[0][axis].0 == OPERATION_ENABLED && pair[1][axis].0 == OPERATION_ENABLED)
+        .map(|pair| (i64::from(pair[1][axis].1) - i64::from(pair[0][axis].1)).abs())
+        .max()
+        .expect("the axis was enabled")
+}
+
+fn record(options: Options, folder: &tempfile::TempDir) -> (Options, std::path::PathBuf) {
+    let path = folder.path().join("run.pcapng");
+    (
+        Options {
+            record: Some(path.clone()),
+            ..options
+        },
+        path,
+    )
+}
+
+/// Axes whose bus rides through 20 lost frames. They move at two fifths of their limit: a drive that
+/// loses its targets at full speed overshoots so far that its way back would trip the supervision.
+fn patient(count: usize) -> Machine {
+    let text = axes(count).replace("cycle =", "lost_frames = 20\ncycle =");
+    machine(&text.replace("\nmove =", "\nspeed = 0.4\nmove ="))
+}
+
+#[test]
+fn no_set_point_jumps_after_a_burst_of_lost_frames() {
+    for count in [1, 2, 3, 10, 19] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let script = format!("[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\ncount = {count}\n");
+        let (options, path) = record(faults(&script), &folder);
+        let summary = run_well(patient(2), options);
+        assert!(
+            summary.counters.lost_frames >= count,
+            "{:?}",
+            summary.counters
+        );
+        let cycles = delivered(&path, 2);
+        assert!(cycles.len() > 3000, "{} cycles", cycles.len());
+        for axis in 0..2 {
+            let step = largest_step(&cycles, axis);
+            assert!(step >= SLOW_STEP - 1, "the axis reached its speed: {step}");
+            assert!(
+                step <= 3 * SLOW_STEP + 1,
+                "{count} lost: a step of {step} counts"
+            );
+        }
+        assert!(
+            summary
+                .axes
+                .iter()
+                .all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1))
+        );
+    }
+}
+
+#[test]
+fn a_device_that_drops_out_takes_no_power_for_granted() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"1.5s\"\n";
+    let (options, path) = record(faults(script), &folder);
+    let (error, summary) = run_badly(machine(&axes(2)), options);
+    assert!(
+        error.contains("`a1`") && error.contains("no longer answers"),
+        "{error}"
+    );
+    let cycles = delivered(&path, 2);
+    let last_enabled = cycles
+        .iter()
+        .rposition(|c| c[0].0 == OPERATION_ENABLED)
+        .expect("enabled");
+    let first_enabled = cycles
+        .iter()
+        .position(|c| c[0].0 == OPERATION_ENABLED)
+        .expect("enabled");
+    assert!(
+        last_enabled > first_enabled + 500,
+        "it moved before the fault"
+    );
+    assert!(
+        last_enabled < 1_600,
+        "the healthy axis is told to stop at once, not after {last_enabled} cycles"
+    );
+    let last = cycles.last().expect("cycles");
+    assert_eq!(
+        last[0].0 & 0x0008,
+        0,
+        "the last Controlword takes power away: {last:?}"
+    );
+    assert!(summary.expect("ran").machine_seconds < 8.0);
+}
+
+#[test]
+fn a_bus_that_comes_back_finds_no_axis_enabled() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\ncount = 40\n";
+    let (options, path) = record(faults(script), &folder);
+    let (error, summary) = run_badly(patient(2), options);
+    assert!(error.contains("the bus is lost"), "{error}");
+    let cycles = delivered(&path, 2);
+    for axis in 0..2 {
+        assert!(largest_step(&cycles, axis) <= 3 * STEP + 1);
+        assert_eq!(cycles.last().expect("cycles")[axis].0 & 0x0008, 0);
+    }
+    for axis in summary.expect("ran").axes {
+        assert_ne!(axis.final_state, "Operation enabled");
+    }
+}
+
+#[test]
+fn a_fault_while_the_machine_stops_fails_the_run() {
+    let text = axes(2).replace("acceleration = 500.0", "acceleration = 25.0");
+    // Two seconds of ramp: at 1.2 s the axes move, at 1.6 s they are being stopped.
+    let options = Options {
+        limit: Some(1_000_000_000),
+        ..faults("[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"1.6s\"\ncode = 0x7305\n")
+    };
+    let (error, _) = run_badly(machine(&text), options);
+    assert!(
+        error.contains("`a1`") && error.contains("0x7305"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_drive_that_does_not_let_go_fails_the_run() {
+    let script =
+        "[[fault]]\nkind = \"stuck\"\ndevice = 1\nat = \"1.5s\"\nstate = \"operation-enabled\"\n";
+    let (error, summary) = run_badly(machine(&axes(2)), faults(script));
+    assert!(
+        error.contains("`a1`") && error.contains("disabled"),
+        "{error}"
+    );
+    assert!(summary.expect("ran").machine_seconds < 12.0, "bounded");
+}
+
+#[test]
+fn a_gentle_machine_gets_the_time_its_ramp_takes() {
+    // From 40 turns a second at 5 turns/s²: 8 s, longer than any fixed patience.
+    let text = axes(1)
+        .replace("acceleration = 500.0", "acceleration = 5.0")
+        .replace("[-100.0, 100.0]", "[-2000.0, 2000.0]")
+        .replace("a0 = 80", "a0 = 1500");
+    let options = Options {
+        limit: Some(9_000_000_000),
+        ..virtual_time()
+    };
+    let summary = run_well(machine(&text), options);
+    let axis = &summary.axes[0];
+    assert_eq!((&axis.fault, &axis.trip), (&None, &None), "{axis:?}");
+    assert!(
+        axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+        "{axis:?}"
+    );
+    assert!(
+        summary.machine_seconds > 15.0,
+        "it took its ramp: {summary:?}"
+    );
+}
+
+#[test]
+fn a_fault_from_before_the_run_is_reset_once() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"100ms\"\ncode = 0x3210\n";
+    let (outcome, heard) = common::run(machine(&axes(2)), faults(script));
+    outcome.result.expect("the fault is gone after its reset");
+    let warnings = heard.warnings().join("\n");
+    assert!(
+        warnings.contains("`a0`") && warnings.contains("0x3210"),
+        "{warnings}"
+    );
+}
+
+#[test]
+fn an_emergency_in_motion_is_told_and_stops_nothing() {
+    let script = "[[fault]]\nkind = \"emergency\"\ndevice = 1\nat = \"1.5s\"\ncode = 0x5000\n";
+    let (outcome, heard) = common::run(machine(&axes(2)), faults(script));
+    outcome.result.expect("an emergency alone is no fault");
+    let warnings = heard.warnings();
+    let told = warnings
+        .iter()
+        .filter(|w| w.contains("`a1`") && w.contains("0x5000"))
+        .count();
+    assert_eq!(told, 1, "{warnings:?}");
+}
+
+/// Stops the run as a user would, when something has happened.
+struct Interrupter<F> {
+    stop: Arc<AtomicBool>,
+    when: F,
+}
+
+impl<F: FnMut(&Progress) -> bool> Observer for Interrupter<F> {
+    fn progress(&mut self, progress: &Progress) {
+        if (self.when)(progress) {
+            self.stop.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<(), RunError>) {
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut observer = Interrupter {
+        stop: Arc::clone(&stop),
+        when,
+    };
+    // Real time, because the user is another thread.
+    let outcome = session::run(machine(&axes(1)), Options::default(), stop, &mut observer);
+    (outcome.summary, outcome.result)
+}
+
+#[test]
+fn an_interruption_in_motion_brings_the_axes_to_rest() {
+    let (summary, result) = interrupted(
+        |progress| matches!(progress, Progress::Status(status) if status.axes[0].position > 5.0),
+    );
+    result.expect("an orderly stop");
+    let summary = summary.expect("the cycle ran");
+    assert!(summary.interrupted);
+    let axis = &summary.axes[0];
+    assert!(
+        axis.final_position < 79.9 || summary.program_runs == 0,
+        "{axis:?}"
+    );
+    assert!(
+        axis.final_error_counts.is_some_and(|e| e.abs() <= 2),
+        "{axis:?}"
+    );
+    assert_ne!(axis.final_state, "Operation enabled");
+}
+
+#[test]
+fn an_interruption_during_bring_up_ends_it() {
+    let (summary, result) = interrupted(|progress| matches!(progress, Progress::Step(_)));
+    assert!(matches!(result, Err(RunError::Interrupted)), "{result:?}");
+    assert!(summary.is_none());
+}
+
+#[test]
+fn a_bound_that_nobody_drives_keeps_the_drives_own_value() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (options, path) = record(
+        Options {
+            limit: Some(100_000_000),
+            ..virtual_time()
+        },
+        &folder,
+    );
+    let pdo = "mode = \"csp\"\npdo.rx = [\"0x6040:00\", \"0x607A:00\", \"0x6072:00\"]";
+    run_well(machine(&axes(1).replace("mode = \"csp\"", pdo)), options);
+    let cycles = delivered_bytes(&path);
+    assert!(cycles.len() > 100);
+    for data in cycles {
+        assert_ne!(
+            data[6..8],
+            [0, 0],
+            "a maximal torque of zero would hold the axis fast"
+        );
+    }
+}
