@@ -115,17 +115,96 @@ fn errors_on_the_command_line() {
     );
 }
 
+/// The objects of a PDO table, in order: lines like `2.0  32  0x607a:00  DINT …`.
+fn printed_objects(text: &str) -> Vec<(u16, u8, u16)> {
+    text.lines()
+        .filter_map(|line| {
+            let mut words = line.split_whitespace();
+            let (byte, bit) = words.next()?.split_once('.')?;
+            byte.parse::<u32>().ok()?;
+            bit.parse::<u32>().ok()?;
+            let bits = words.next()?.parse().ok()?;
+            let (index, sub) = words.next()?.strip_prefix("0x")?.split_once(':')?;
+            Some((
+                u16::from_str_radix(index, 16).ok()?,
+                u8::from_str_radix(sub, 16).ok()?,
+                bits,
+            ))
+        })
+        .collect()
+}
+
 #[test]
 fn explain_prints_the_modules_pdo_contents() {
     let output = ecaxis(&["explain", "configs/modes.toml"]);
     assert!(output.status.success());
     let text = String::from_utf8_lossy(&output.stdout);
-    for part in [
-        "0x6040", "0x607A", "0x60FF", "0x6071", "0x6041", "0x6064", "0x60C2", "0x1C12",
-    ] {
-        assert!(
-            text.to_uppercase().contains(&part.to_uppercase()),
-            "`{part}` is not in:\n{text}"
+    let esi = std::fs::read(root().join("configs/esi/EPOS4.xml")).expect("our ESI");
+    let esi = ecaxis_esi::parse(&esi).expect("a valid ESI");
+    let mut expected = Vec::new();
+    for name in ["CSP", "CSV", "CST"] {
+        let module = esi.modules.iter().find(|m| m.type_name == name).expect("a module a mode");
+        let pdos = module.rx_pdos.iter().chain(&module.tx_pdos);
+        expected.extend(
+            pdos.flat_map(|pdo| &pdo.entries)
+                .map(|entry| (entry.index, entry.sub, entry.bit_len)),
         );
     }
+    assert_eq!(printed_objects(&text), expected, "{text}");
+}
+
+/// Runs the demonstration in virtual time against a fault script.
+fn with_faults(script: &str) -> (i32, String) {
+    let file = tempfile::NamedTempFile::new().expect("a temporary file");
+    std::fs::write(file.path(), script).expect("written");
+    let path = file.path().to_str().expect("a path in UTF-8");
+    let output = ecaxis(&["run", "configs/demo.toml", "--virtual", "--faults", path]);
+    (
+        output.status.code().expect("an exit code"),
+        String::from_utf8_lossy(&output.stderr).into_owned(),
+    )
+}
+
+#[test]
+fn every_failure_of_the_bus_has_its_code_device_step_cause_and_hint() {
+    let fault = |line: &str| format!("[[fault]]\n{line}\n");
+    for (script, parts) in [
+        (fault("kind = \"silent\""), &["no SubDevice answers"][..]),
+        (
+            fault("kind = \"absent\"\ndevice = 1"),
+            &["`y`", "position 1", "missing"],
+        ),
+        (
+            fault("kind = \"identity\"\ndevice = 1\nrevision = 0x99"),
+            &["`y`", "identify", "IDX.xml", "0x00000099"],
+        ),
+        (
+            fault("kind = \"sdo-abort\"\ndevice = 0\nindex = 0x60c2\nsub = 1\ncode = 0x06090030"),
+            &["`x`", "start-up SDO", "0x60c2:01", "0x06090030", "out of range"],
+        ),
+        (
+            fault("kind = \"refuse-state\"\ndevice = 1\nstate = \"safeop\"\ncode = 0x001e"),
+            &["`y`", "SafeOp", "0x001e", "invalid input configuration"],
+        ),
+        (
+            fault("kind = \"stuck\"\ndevice = 1\nstate = \"switch-on-disabled\""),
+            &["`y`", "Operation enabled", "Switch on disabled"],
+        ),
+        (
+            fault("kind = \"drive-fault\"\ndevice = 1\nat = \"1.2s\"\ncode = 0x8611"),
+            &["`y`", "drive fault", "0x8611", "following error"],
+        ),
+    ] {
+        let (code, text) = with_faults(&script);
+        assert_eq!(code, 1, "{script}{text}");
+        for part in parts.iter().chain(&["error:", "= help:"]) {
+            assert!(text.contains(part), "`{part}` is not in:\n{text}");
+        }
+    }
+}
+
+#[test]
+fn an_esi_file_of_another_device() {
+    let text = axes(1).replace("EPOS4.xml", "IO8.xml");
+    fails(with_file("check", &text, &[]), 2, &["no mode csp", "mode", "^"]);
 }

@@ -68,7 +68,7 @@ fn the_vendors_epos4_in_each_cyclic_mode() {
     for (mode, step, limits) in [
         ("csp", "move = { x = 10.0 }", "position = [-50.0, 50.0],"),
         ("csv", "velocity = { x = 20.0 }", ""),
-        ("cst", "torque = { x = 20.0 }", ""),
+        ("cst", "torque = { x = 5.0 }", ""),
     ] {
         let text = format!(
             r#"
@@ -88,13 +88,25 @@ fn the_vendors_epos4_in_each_cyclic_mode() {
             [[step]]
             {step}
             [[step]]
-            dwell = "200ms"
+            dwell = "1500ms"
             "#,
             esi.display()
         );
-        let summary = run_well(machine(&text), virtual_time());
+        let (outcome, heard) = run(machine(&text), virtual_time());
+        outcome.result.expect("the program runs");
+        let summary = outcome.summary.expect("a summary");
         let axis = &summary.axes[0];
         assert!(axis.was_enabled, "{mode}: {axis:?}");
+        let last = heard.0.iter().rev().find_map(|progress| match progress {
+            Progress::Status(status) => Some(status.axes[0].clone()),
+            _ => None,
+        });
+        let last = last.expect("a status a second");
+        match mode {
+            "csv" => assert!((last.velocity - 20.0).abs() < 0.4, "{last:?}"),
+            "cst" => assert!((last.torque - 5.0).abs() < 1.0 && last.velocity > 1.0, "{last:?}"),
+            _ => {}
+        }
         if mode == "csp" {
             assert!(
                 axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
