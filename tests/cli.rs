@@ -143,7 +143,11 @@ fn explain_prints_the_modules_pdo_contents() {
     let esi = ecaxis_esi::parse(&esi).expect("a valid ESI");
     let mut expected = Vec::new();
     for name in ["CSP", "CSV", "CST"] {
-        let module = esi.modules.iter().find(|m| m.type_name == name).expect("a module a mode");
+        let module = esi
+            .modules
+            .iter()
+            .find(|m| m.type_name == name)
+            .expect("a module a mode");
         let pdos = module.rx_pdos.iter().chain(&module.tx_pdos);
         expected.extend(
             pdos.flat_map(|pdo| &pdo.entries)
@@ -180,7 +184,13 @@ fn every_failure_of_the_bus_has_its_code_device_step_cause_and_hint() {
         ),
         (
             fault("kind = \"sdo-abort\"\ndevice = 0\nindex = 0x60c2\nsub = 1\ncode = 0x06090030"),
-            &["`x`", "start-up SDO", "0x60c2:01", "0x06090030", "out of range"],
+            &[
+                "`x`",
+                "start-up SDO",
+                "0x60c2:01",
+                "0x06090030",
+                "out of range",
+            ],
         ),
         (
             fault("kind = \"refuse-state\"\ndevice = 1\nstate = \"safeop\"\ncode = 0x001e"),
@@ -206,5 +216,9 @@ fn every_failure_of_the_bus_has_its_code_device_step_cause_and_hint() {
 #[test]
 fn an_esi_file_of_another_device() {
     let text = axes(1).replace("EPOS4.xml", "IO8.xml");
-    fails(with_file("check", &text, &[]), 2, &["no mode csp", "mode", "^"]);
+    fails(
+        with_file("check", &text, &[]),
+        2,
+        &["no mode csp", "mode", "^"],
+    );
 }

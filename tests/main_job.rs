@@ -104,7 +104,10 @@ fn the_vendors_epos4_in_each_cyclic_mode() {
         let last = last.expect("a status a second");
         match mode {
             "csv" => assert!((last.velocity - 20.0).abs() < 0.4, "{last:?}"),
-            "cst" => assert!((last.torque - 5.0).abs() < 1.0 && last.velocity > 1.0, "{last:?}"),
+            "cst" => assert!(
+                (last.torque - 5.0).abs() < 1.0 && last.velocity > 1.0,
+                "{last:?}"
+            ),
             _ => {}
         }
         if mode == "csp" {

@@ -174,6 +174,7 @@ async fn request(wire: &impl Wire, device: &DeviceRef, wanted: AlState) -> Resul
     };
     let status = read_status(wire, device.station).await.map_err(failed)?;
     let (status, _) = status.ok_or_else(gone)?;
+    tracing::debug!(%device, "AL status 0x{status:02x}, requesting {wanted}");
     if status & ERROR != 0 {
         write_control(wire, device.station, status & 0x0f | ERROR)
             .await

@@ -92,6 +92,7 @@ pub(super) async fn configure(
         let shifts = || wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
         let first = start.wrapping_add_signed(shifts().min().unwrap_or(0));
         let told = system_time(wire, reference).await?;
+        tracing::debug!(start, told, "SYNC0 started");
         if told.wrapping_add(START_MARGIN) < first {
             progress(Step::Clocks {
                 reference: reference.at.name.clone(),

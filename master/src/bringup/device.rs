@@ -48,6 +48,11 @@ pub(super) async fn start_up(
                 origin: sdo.origin.clone(),
                 source,
             })?;
+        tracing::debug!(
+            device = %device.at,
+            "SDO 0x{:04x}:{:02x} {} = {} ({})",
+            sdo.index, sdo.sub, sdo.name, format_value(&sdo.data), sdo.origin
+        );
         progress(Step::StartUp {
             device: config.name.clone(),
             done: done + 1,

@@ -50,6 +50,7 @@ pub(super) async fn read(
             .take(8)
             .rev()
             .fold(0_i64, |value, byte| value << 8 | i64::from(*byte));
+        tracing::debug!(device = %device.at, "0x{:04x}:{:02x} is held at {value}", field.index, field.sub);
         device.held.push((field.index, field.sub, value));
     }
     Ok(())

@@ -241,6 +241,13 @@ pub async fn bring_up(
             position,
             station: sub_device.configured_address(),
         };
+        tracing::debug!(
+            device = %at,
+            "found {}, {:?}, {} ns behind the first clock",
+            config.selection.device_name,
+            sub_device.dc_support(),
+            sub_device.propagation_delay()
+        );
         devices.push(BusDevice {
             coe: mailbox::open(&wire, config, &at).await?.map(CoeClient::new),
             at,

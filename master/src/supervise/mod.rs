@@ -230,6 +230,7 @@ impl Supervisor {
 
     fn pass_events_on(&mut self) {
         while let Ok(event) = self.outer.events.pop() {
+            tracing::debug!(?event);
             match event {
                 Event::PhaseLost { cycle } => self.tell(Progress::Warning(format!(
                     "cycle {cycle}: the release of frames has lost its phase to SYNC0"
