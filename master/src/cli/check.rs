@@ -1,6 +1,6 @@
 //! `ecaxis check`: a machine file against the ESI files it names, without a bus.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use ecaxis::config::{self, ConfigError, Machine, duration};
 use serde_json::json;
@@ -20,34 +20,55 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let loaded = config::load(&args.file);
-    if args.json {
-        result(&format!("{:#}\n", as_json(&loaded)));
-    }
-    let machine = loaded.map_err(|e| hints::config(&args.file, &e))?;
-    if !args.json {
-        result(&summary(&machine));
-    }
-    Ok(())
+    let text = match &loaded {
+        _ if args.json => format!("{:#}\n", as_json(&args.file, &loaded)),
+        Ok(machine) => summary(machine),
+        Err(_) => String::new(),
+    };
+    let written = result(&text);
+    loaded.map_err(|e| hints::config(&args.file, &e))?;
+    written
 }
 
-fn as_json(loaded: &Result<Machine, ConfigError>) -> serde_json::Value {
+fn as_json(path: &Path, loaded: &Result<Machine, ConfigError>) -> serde_json::Value {
     match loaded {
-        Ok(machine) => json!({ "ok": true, "devices": machine.devices.len(), "problems": [] }),
-        Err(ConfigError::Io { .. }) => json!({ "ok": false, "problems": [] }),
-        Err(ConfigError::Problems(problems)) => {
-            let problems = problems.iter().map(|p| {
-                json!({
-                    "file": p.path.display().to_string(),
-                    "line": p.line,
-                    "column": p.column,
-                    "width": p.width,
-                    "message": p.message,
-                    "hint": p.hint,
-                })
-            });
-            json!({ "ok": false, "problems": problems.collect::<Vec<_>>() })
-        }
+        Ok(machine) => json!({
+            "ok": true, "error": null, "devices": machine.devices.len(), "problems": [],
+        }),
+        Err(e) => json!({ "ok": false, "error": in_short(path, e), "problems": problems(e) }),
     }
+}
+
+/// One line, without what [`problems`] tells.
+pub(super) fn in_short(path: &Path, error: &ConfigError) -> String {
+    match error {
+        ConfigError::Problems(problems) if problems.len() == 1 => {
+            format!("1 problem in {}", path.display())
+        }
+        ConfigError::Problems(problems) => {
+            format!("{} problems in {}", problems.len(), path.display())
+        }
+        ConfigError::Io { .. } | ConfigError::NotText { .. } => error.to_string(),
+    }
+}
+
+/// The mistakes in a machine file, for programs.
+pub(super) fn problems(error: &ConfigError) -> serde_json::Value {
+    let problems = match error {
+        ConfigError::Problems(problems) => problems.as_slice(),
+        ConfigError::Io { .. } | ConfigError::NotText { .. } => &[],
+    };
+    let each = problems.iter().map(|p| {
+        json!({
+            "file": p.path.display().to_string(),
+            "line": p.line,
+            "column": p.column,
+            "width": p.width,
+            "message": p.message,
+            "hint": p.hint,
+        })
+    });
+    each.collect()
 }
 
 fn summary(machine: &Machine) -> String {

@@ -3,7 +3,9 @@
 use std::fmt::Write;
 use std::path::PathBuf;
 
-use ecaxis::config::{self, AxisSetup, DeviceConfig, Machine, Nic, Step, duration};
+use ecaxis::config::{
+    self, AxisSetup, DeviceConfig, Machine, Nic, Step, VelocityUnitFrom, duration,
+};
 use ecaxis::rt::image::{self, ImagePlan};
 use ecaxis_esi::{Field, SmLayout};
 
@@ -22,8 +24,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut text = String::new();
     // Writing into a String cannot fail.
     let _ = explain(&machine, &mut text);
-    result(&text);
-    Ok(())
+    result(&text)
 }
 
 fn explain(machine: &Machine, out: &mut String) -> std::fmt::Result {
@@ -39,14 +40,14 @@ fn explain(machine: &Machine, out: &mut String) -> std::fmt::Result {
 fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let bus = &machine.bus;
     let nic = match &bus.nic {
-        Nic::Sim => "sim (the simulated bus, from the same ESI files)",
-        Nic::Interface(name) => name,
+        Nic::Sim => ["nic", "sim", "the simulated bus, from the same ESI files"],
+        Nic::Interface(name) => ["nic", name, ""],
     };
     let cpu = bus
         .cpu
         .map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
     let mut table = Table::new(&["setting", "value", "meaning"]);
-    table.row(["nic", nic, ""]);
+    table.row(nic);
     table.row([
         "cycle",
         &duration::show(bus.cycle_ns),
@@ -145,8 +146,14 @@ fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
     )?;
     writeln!(
         out,
-        "  velocities in {} (0x60A9), a resolution of {} {unit}/s",
+        "  velocities in {} ({}), a resolution of {} {unit}/s",
         scale.velocity_unit(),
+        match axis.velocity_unit_from {
+            VelocityUnitFrom::Esi => "0x60A9 in the ESI",
+            VelocityUnitFrom::Sdo => "0x60A9 from `sdo`",
+            VelocityUnitFrom::File => "assumed, as `velocity_unit` says",
+            VelocityUnitFrom::Nothing => "assumed: the ESI has no value for 0x60A9",
+        },
         rounded(scale.velocity_resolution()),
     )?;
     let position = match limits.position {
@@ -160,7 +167,7 @@ fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
     };
     writeln!(
         out,
-        "  limits: position {position}, velocity {} {unit}/s ({} rpm), acceleration {} {unit}/s², torque {} % of rated, following error {following}",
+        "  limits: position {position}, velocity {} {unit}/s ({} rpm), acceleration {} {unit}/s²,\n          torque {} % of rated, following error {following}",
         limits.velocity,
         rounded(rpm),
         limits.acceleration,
@@ -301,7 +308,7 @@ fn startup(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
             sdo.transition,
             &object,
             &value(&sdo.data),
-            &sdo.name,
+            short_name(&sdo.name),
             &sdo.origin,
         ]);
     }
@@ -310,6 +317,14 @@ fn startup(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
         "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}",
         table.indented(2)
     )
+}
+
+/// The object's index stands beside it, so the entry's own name is enough where it has one.
+fn short_name(name: &str) -> &str {
+    match name.split_once(" / ") {
+        Some((_, entry)) if !entry.starts_with("SubIndex") => entry,
+        _ => name,
+    }
 }
 
 /// Up to eight bytes as one number, more as bytes in the order of the wire.
@@ -472,29 +487,5 @@ fn times(n: u32) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn bytes_on_the_wire_as_counted_by_hand() {
-        for (axes, bytes) in [(8, 168), (32, 456), (100, 1272)] {
-            let plan = image::plan(&vec![(12, 12); axes]).unwrap();
-            let frames = frame_bytes(&plan, true);
-            assert_eq!(
-                frames.iter().sum::<usize>(),
-                bytes + AL_STATUS,
-                "{axes} axes"
-            );
-            assert_eq!(frames.len(), 1);
-        }
-        let idle = frame_bytes(&image::plan(&[]).unwrap(), false);
-        assert_eq!(idle, [84]);
-    }
-
-    #[test]
-    fn values_read_as_numbers() {
-        assert_eq!(value(&[0x10, 0x27]), "0x2710");
-        assert_eq!(value(&[1; 9]), "01 01 01 01 01 01 01 01 01");
-        assert_eq!(value(&[]), "");
-    }
-}
+#[path = "explain_tests.rs"]
+mod tests;

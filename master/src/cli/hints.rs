@@ -1,11 +1,13 @@
 //! Failures as the user sees them: exit code, message, and what to do about it.
 
+use std::io::ErrorKind;
 use std::path::Path;
 
+use ecaxis::al_status::al_status_hint;
 use ecaxis::bringup::{BringUpError, StateError};
 use ecaxis::config::{ConfigError, Nic};
 use ecaxis::link::packet::OpenError;
-use ecaxis::mailbox::SdoError;
+use ecaxis::mailbox::{ObjectAddress, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::{State, Trip};
@@ -55,7 +57,7 @@ impl Failure {
 
 /// A run that failed. Hints depend on whether the bus is a real one.
 pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
-    let failure = Failure::new(FAILED, error.to_string());
+    let failure = Failure::new(FAILED, message(error));
     let hint = match error {
         RunError::Open(open) => return interface(failure, open),
         RunError::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
@@ -100,7 +102,46 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
     failure.hint(hint)
 }
 
-fn interface(failure: Failure, error: &OpenError) -> Failure {
+/// The error's text, with the address of an SDO once: its own errors carry it, too.
+fn message(error: &RunError) -> String {
+    let text = error.to_string();
+    let RunError::BringUp(error) = error else {
+        return text;
+    };
+    let (device, source, named) = match error.as_ref() {
+        BringUpError::StartUp {
+            device,
+            index,
+            sub,
+            source,
+            ..
+        } => {
+            let object = ObjectAddress {
+                index: *index,
+                sub: *sub,
+            };
+            (device, source, Some(object.to_string()))
+        }
+        BringUpError::Mailbox { device, source } | BringUpError::ReadBack { device, source } => {
+            (device, source, None)
+        }
+        _ => return text,
+    };
+    let long = source.to_string();
+    let mut short = long.as_str();
+    let station = format!("station {:#06x}", device.station);
+    for known in [Some(station), named].into_iter().flatten() {
+        if let Some(rest) = short.strip_prefix(&known) {
+            short = rest.trim_start_matches(':').trim_start();
+        }
+    }
+    match text.strip_suffix(&long) {
+        Some(head) => head.to_owned() + short,
+        None => text,
+    }
+}
+
+pub(crate) fn interface(failure: Failure, error: &OpenError) -> Failure {
     match error {
         OpenError::NoSuchInterface { .. } => {
             // The file or the command line names it.
@@ -192,19 +233,42 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
     failure.hint(hint)
 }
 
+/// `origin` is what asked for it; `OWN_SDO` for the user's own list.
 fn sdo(error: &SdoError, origin: &str) -> String {
+    let own = origin == OWN_SDO;
     match error {
         SdoError::Abort { code, .. } => match code {
+            0x0602_0000 | 0x0609_0011 if own => {
+                "the drive has no such object: check `index` and `sub` in `sdo`"
+            }
             0x0602_0000 | 0x0609_0011 => {
                 "the drive has no such object: its firmware does not match the ESI file"
             }
             0x0609_0030..=0x0609_0036 if origin.contains("cycle") => {
                 "the drive does not take this cycle time: try another `cycle`"
             }
-            0x0609_0030..=0x0609_0036 => "the value is outside what the drive allows",
-            0x0601_0000..=0x0601_0003 => "the object cannot be written: take it out of `sdo`",
+            0x0609_0030..=0x0609_0036 if own => {
+                "the value is outside what the drive allows: check `value` in `sdo`"
+            }
+            0x0609_0030..=0x0609_0036 => {
+                "the value is outside what the drive allows: its firmware does not match the ESI file"
+            }
+            0x0601_0000..=0x0601_0003 if own => {
+                "the object cannot be written: take it out of `sdo`"
+            }
+            0x0601_0000..=0x0601_0003 => {
+                "the drive does not let it be written: its firmware does not match the ESI file"
+            }
+            0x0607_0010..=0x0607_0013 if own => {
+                "the drive has another length for it: give its `type` in `sdo`"
+            }
             0x0607_0010..=0x0607_0013 => "the drive has another length for it: its firmware does not match the ESI file",
-            0x0604_0041..=0x0604_0042 => "the drive cannot map this: check `pdo.rx` and `pdo.tx`",
+            0x0604_0041..=0x0604_0042 if origin.starts_with("pdo.") => {
+                "the drive cannot map this: take it out of `pdo.rx` or `pdo.tx`"
+            }
+            0x0604_0041..=0x0604_0042 => {
+                "the drive cannot map what the ESI file lists: choose other objects with `pdo.rx` and `pdo.tx`"
+            }
             0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
@@ -213,6 +277,9 @@ fn sdo(error: &SdoError, origin: &str) -> String {
     }
     .to_owned()
 }
+
+/// What a start-up SDO of the machine file has as its origin.
+const OWN_SDO: &str = "sdo of the machine file";
 
 fn state(error: &StateError) -> String {
     match error {
@@ -227,26 +294,7 @@ fn state(error: &StateError) -> String {
 
 /// What to look at for an AL status code (ETG.1020).
 fn al_status(code: u16) -> &'static str {
-    match code {
-        0x0016 | 0x0017 | 0x001d..=0x001f | 0x0024..=0x0026 => {
-            "the device expects another process data layout: compare `ecaxis explain` with its mapping, and its firmware with the ESI file"
-        }
-        0x001a | 0x002c | 0x002d | 0x0031..=0x0034 => {
-            "the device misses SYNC0 or process data in time: check wake-up lateness, or use a longer `cycle`"
-        }
-        0x001b => {
-            "no outputs arrived within the watchdog time: check cables and wake-up lateness, or set a longer `watchdog`"
-        }
-        0x0028 | 0x0030 => {
-            "the device does not take this kind of synchronisation: try another `dc`"
-        }
-        0x0035 | 0x0036 => "the device does not take this cycle time: try another `cycle`",
-        0x0011 | 0x0012 => "the state was asked for out of order; switch the device off and on",
-        0x0050 | 0x0051 => {
-            "the device's EEPROM is not readable or empty: load it with the maker's tool"
-        }
-        _ => "look the code up in the device's manual",
-    }
+    al_status_hint(code).unwrap_or("look the code up in the device's manual")
 }
 
 fn not_enabled(state: State, code: Option<u16>, mode_confirmed: bool) -> String {
@@ -292,7 +340,14 @@ pub(crate) fn serve(error: &ServeError) -> Failure {
 pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
     let failure = Failure::new(WRONG, error.to_string());
     match error {
-        ConfigError::Io { .. } => failure.hint(machine_files(path)),
+        ConfigError::Io { source, .. } if source.kind() == ErrorKind::NotFound => {
+            failure.hint(machine_files(path))
+        }
+        ConfigError::Io { source, .. } if source.kind() == ErrorKind::IsADirectory => {
+            failure.hint("name the machine file in it")
+        }
+        ConfigError::Io { .. } => failure.hint("look at the file's permissions"),
+        ConfigError::NotText { .. } => failure.hint("a machine file is TOML, in UTF-8"),
         ConfigError::Problems(problems) if problems.len() > 1 => {
             let message = format!(
                 "{error}\n\n{} problems in {}",
@@ -338,135 +393,5 @@ fn machine_files(path: &Path) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use ecaxis::bringup::{AlState, DeviceRef};
-
-    use super::*;
-
-    fn device() -> DeviceRef {
-        DeviceRef {
-            name: "x".into(),
-            position: 0,
-            station: 0x1001,
-        }
-    }
-
-    fn hints_of(error: &RunError) -> (u8, String) {
-        let failure = run(error, &Nic::Interface("eth9".into()));
-        (failure.code, failure.hints.join("\n"))
-    }
-
-    #[test]
-    fn every_failure_says_what_next() {
-        let sdo = |code| SdoError::Abort {
-            station: 0x1001,
-            index: 0x60c2,
-            sub: 1,
-            code,
-        };
-        let start_up = |code, origin: &str| {
-            RunError::BringUp(Box::new(BringUpError::StartUp {
-                device: device(),
-                index: 0x60c2,
-                sub: 1,
-                name: String::new(),
-                value: "1".into(),
-                origin: origin.into(),
-                source: sdo(code),
-            }))
-        };
-        let bring_up = |error| RunError::BringUp(Box::new(error));
-        let refused = |code| {
-            bring_up(BringUpError::State(StateError::Refused {
-                device: device(),
-                wanted: AlState::SafeOp,
-                actual: AlState::PreOp,
-                code,
-            }))
-        };
-        let not_enabled = |state, code| RunError::NotEnabled {
-            device: device(),
-            state,
-            statusword: 0,
-            mode_confirmed: true,
-            code,
-            timeout_ms: 5000,
-        };
-        let missing = BringUpError::Missing {
-            expected: 2,
-            found: 1,
-            missing: "`y`".into(),
-            list: "EPOS4".into(),
-        };
-        for (error, code, hint) in [
-            (
-                RunError::Open(OpenError::NoSuchInterface { nic: "x".into() }),
-                WRONG,
-                "this computer has",
-            ),
-            (
-                RunError::Open(OpenError::NotPermitted { nic: "x".into() }),
-                FAILED,
-                "sudo setcap cap_net_raw",
-            ),
-            (
-                RunError::Open(OpenError::Down { nic: "x".into() }),
-                FAILED,
-                "ip link set x up",
-            ),
-            (
-                bring_up(BringUpError::NoAnswer),
-                FAILED,
-                "is `eth9` the right interface?",
-            ),
-            (bring_up(missing), FAILED, "behind the last one found"),
-            (
-                start_up(0x0609_0030, "bus.cycle"),
-                FAILED,
-                "another `cycle`",
-            ),
-            (start_up(0x0602_0000, "ESI"), FAILED, "firmware"),
-            (refused(0x001e), FAILED, "process data layout"),
-            (refused(0x0035), FAILED, "cycle time"),
-            (not_enabled(State::SwitchOnDisabled, None), FAILED, "STO"),
-            (
-                not_enabled(State::Fault, Some(0x8611)),
-                FAILED,
-                describe(0x8611).hint,
-            ),
-            (
-                RunError::DriveFault {
-                    device: device(),
-                    code: Some(0x2310),
-                    statusword: 8,
-                },
-                FAILED,
-                describe(0x2310).hint,
-            ),
-            (
-                RunError::Trip {
-                    device: device(),
-                    trip: Trip::FollowingError {
-                        error: 2.0,
-                        limit: 1.0,
-                    },
-                },
-                FAILED,
-                "following_error",
-            ),
-            (
-                RunError::BusLost {
-                    cycles: 3,
-                    wkc: (0, 6),
-                    answered: false,
-                },
-                FAILED,
-                "cables",
-            ),
-        ] {
-            let (got, text) = hints_of(&error);
-            assert_eq!(got, code, "{error}");
-            assert!(text.contains(hint), "{error}: {text}");
-        }
-    }
-}
+#[path = "hints_tests.rs"]
+mod tests;

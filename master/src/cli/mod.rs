@@ -1,7 +1,8 @@
 //! The command line: one file a verb, each with its arguments and `run`.
 //!
 //! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
-//! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile.
+//! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile;
+//! [`record`] keeps a recording from destroying another file.
 
 use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
@@ -13,6 +14,7 @@ mod check;
 mod explain;
 mod hints;
 mod progress;
+mod record;
 mod report;
 mod run;
 mod signals;
@@ -90,10 +92,21 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// A result on stdout. A reader that has gone (`| head`) is no failure.
-pub(crate) fn result(text: &str) {
+/// A result on stdout.
+pub(crate) fn result(text: &str) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
+}
+
+/// A reader that has gone (`| head`) is no failure.
+fn written(done: io::Result<()>) -> Result<(), Failure> {
+    match done {
+        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Failure::new(
+            hints::FAILED,
+            format!("cannot write the result: {e}"),
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// A line on stderr.
@@ -109,6 +122,16 @@ pub(crate) fn stderr_is_terminal() -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_a_reader_that_has_gone_is_no_failure() {
+        assert_eq!(written(Ok(())), Ok(()));
+        let gone = io::Error::from(io::ErrorKind::BrokenPipe);
+        assert_eq!(written(Err(gone)), Ok(()));
+        let full = written(Err(io::Error::from(io::ErrorKind::StorageFull))).unwrap_err();
+        assert_eq!(full.code, hints::FAILED);
+        assert!(full.message.contains("cannot write the result"));
+    }
 
     #[test]
     fn arguments_are_consistent() {

@@ -1,17 +1,17 @@
 //! `ecaxis run`: brings a machine up, runs its program, sums up.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use ecaxis::clock::Clock;
-use ecaxis::config::{self, Machine, Nic, duration};
-use ecaxis::session::{self, Options, Outcome};
+use ecaxis::config::{self, ConfigError, Machine, Nic, duration};
+use ecaxis::session::{self, Options, Outcome, RunError};
 use ecaxis_sim::FaultScript;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::progress::Teller;
-use super::{Failure, hints, report, result, signals};
+use super::{Failure, check, hints, note, record, report, result, signals};
 
 /// Bring a machine up, run its program, and show what the bus and the axes did
 #[derive(Debug, clap::Args)]
@@ -51,8 +51,17 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let machine = load(args).map_err(|failure| told(args, failure))?;
-    let options = options(args, &machine).map_err(|failure| told(args, failure))?;
+    let machine = match load(args) {
+        Ok(machine) => machine,
+        Err(error) => {
+            let short = check::in_short(&args.file, &error);
+            let failure = hints::config(&args.file, &error);
+            tell(args, &short, &failure.hints, check::problems(&error));
+            return Err(failure);
+        }
+    };
+    let options =
+        options(args, &machine).inspect_err(|f| tell(args, &f.message, &f.hints, json!([])))?;
     let nic = machine.bus.nic.clone();
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
@@ -63,34 +72,43 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } = session::run(machine, options, stop, &mut teller);
     drop(teller);
 
+    // The user's own wish is no failure, but a script must not take it for a finished run.
+    let interrupted = matches!(ended, Err(RunError::Interrupted));
     let failure = ended.err().map(|error| hints::run(&error, &nic));
-    if args.json {
+    let text = if args.json {
         let report = json!({
             "ok": failure.is_none(),
             "error": failure.as_ref().map(|f| &f.message),
             "hints": failure.as_ref().map_or(&[][..], |f| &f.hints),
+            "problems": [],
             "summary": summary,
         });
-        result(&format!("{report:#}\n"));
-    } else if let Some(summary) = &summary {
-        result(&report::summary(summary));
+        format!("{report:#}\n")
+    } else {
+        summary.as_ref().map(report::summary).unwrap_or_default()
+    };
+    let written = result(&text);
+    match failure {
+        Some(_) if interrupted => note("interrupted"),
+        Some(failure) => return Err(failure),
+        None => {}
     }
-    failure.map_or(Ok(()), Err)
+    written
 }
 
 /// A script that asked for JSON gets it for a file that is wrong, too.
-fn told(args: &Args, failure: Failure) -> Failure {
+fn tell(args: &Args, error: &str, hints: &[String], problems: Value) {
     if args.json {
         let report = json!({
-            "ok": false, "error": failure.message, "hints": failure.hints, "summary": null,
+            "ok": false, "error": error, "hints": hints, "problems": problems, "summary": null,
         });
-        result(&format!("{report:#}\n"));
+        // What is wrong with the file goes to stderr as well, and decides the exit code.
+        let _ = result(&format!("{report:#}\n"));
     }
-    failure
 }
 
-fn load(args: &Args) -> Result<Machine, Failure> {
-    let mut machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
+fn load(args: &Args) -> Result<Machine, ConfigError> {
+    let mut machine = config::load(&args.file)?;
     if args.sim || args.nic.as_deref() == Some("sim") {
         machine.bus.nic = Nic::Sim;
     } else if let Some(nic) = &args.nic {
@@ -111,7 +129,17 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
             return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
         }
     }
-    let faults = args.faults.as_deref().map(faults).transpose()?;
+    if args.virtual_time && machine.steps.is_empty() && args.time.is_none() {
+        let message = "--virtual without a program would never end";
+        return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
+    }
+    let script = args.faults.as_deref();
+    let faults = script
+        .map(|path| faults(path, machine.devices.len()))
+        .transpose()?;
+    if let Some(path) = &args.record {
+        record::check(path, machine, script)?;
+    }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();
     Ok(Options {
@@ -129,18 +157,19 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     })
 }
 
-/// A fault script from its file.
-pub(super) fn faults(path: &std::path::Path) -> Result<FaultScript, Failure> {
+/// A fault script from its file, for a bus of so many devices.
+pub(super) fn faults(path: &Path, devices: usize) -> Result<FaultScript, Failure> {
     let text = std::fs::read_to_string(path)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
-    FaultScript::parse(&text)
-        .map_err(|e| Failure::new(hints::WRONG, format!("{}: {e}", path.display())))
+    let script = FaultScript::parse(&text).and_then(|script| {
+        script.check(devices)?;
+        Ok(script)
+    });
+    script.map_err(|e| Failure::new(hints::WRONG, format!("{}: {e}", path.display())))
 }
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use ecaxis::session::{Observer, Progress};
 
     use super::*;
@@ -167,6 +196,40 @@ mod tests {
             report::summary(&summary),
             serde_json::to_string(&summary).unwrap(),
         )
+    }
+
+    fn refused(options: &[&str], machine: &str) -> Failure {
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            args: Args,
+        }
+        let line = ["run", "m.toml"].iter().chain(options);
+        let args = <Line as clap::Parser>::parse_from(line).args;
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        let demo = std::fs::read_to_string(configs.join("demo.toml")).unwrap();
+        let (head, _) = demo.split_once("[[step]]").unwrap();
+        let text = if machine == "demo" { &demo } else { head };
+        let machine = config::parse(&configs.join("demo.toml"), text).unwrap();
+        super::options(&args, &machine).unwrap_err()
+    }
+
+    #[test]
+    fn virtual_time_needs_an_end() {
+        let failure = refused(&["--virtual", "--repeat", "3"], "no steps");
+        assert_eq!(failure.code, hints::WRONG);
+        assert!(failure.hints[0].contains("--for 10s"));
+    }
+
+    #[test]
+    fn a_fault_of_a_device_that_is_not_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("f.toml");
+        std::fs::write(&script, "\n[[fault]]\nkind = \"absent\"\ndevice = 2\n").unwrap();
+        let failure = refused(&["--faults", script.to_str().unwrap()], "demo");
+        assert_eq!(failure.code, hints::WRONG);
+        assert!(failure.message.contains("line 3"), "{failure:?}");
+        assert!(failure.message.contains("device 2"), "{failure:?}");
     }
 
     #[test]

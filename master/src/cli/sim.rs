@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use ecaxis::config;
+use ecaxis::link::packet::{OpenError, PacketLink};
 use ecaxis::rt::thread;
 use ecaxis::session;
 
@@ -30,8 +31,15 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    if args.nic == "sim" {
+        let message = "`sim` is this bus itself; it needs a network interface to answer on";
+        return Err(Failure::new(hints::WRONG, message)
+            .hint("`ecaxis run FILE --sim` needs no interface; `ip link add veth0 type veth peer name veth1` makes two that are connected"));
+    }
     let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
-    let faults = args.faults.as_deref().map(run::faults).transpose()?;
+    let devices = machine.devices.len();
+    let faults = args.faults.as_deref();
+    let faults = faults.map(|f| run::faults(f, devices)).transpose()?;
     let seed = faults
         .as_ref()
         .and_then(|f| f.seed)
@@ -41,9 +49,24 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
-    let (count, nic) = (machine.devices.len(), &args.nic);
+    let nic = &args.nic;
+    // What cannot be opened is told before anything is said to answer.
+    match PacketLink::open(nic) {
+        Ok(_) => {}
+        Err(e @ (OpenError::Down { .. } | OpenError::NoCarrier { .. } | OpenError::Mtu { .. })) => {
+            note(&format!("warning: {e}"));
+        }
+        Err(e) => {
+            return Err(hints::interface(
+                Failure::new(hints::FAILED, e.to_string()),
+                &e,
+            ));
+        }
+    }
     note(&format!(
-        "{count} simulated SubDevices answer on `{nic}`; Ctrl-C ends it"
+        "{devices} simulated SubDevice{} answer{} on `{nic}`; Ctrl-C ends it",
+        if devices == 1 { "" } else { "s" },
+        if devices == 1 { "s" } else { "" },
     ));
     // Devices of silicon answer whatever else the computer does.
     for denied in thread::prepare(PRIORITY, None) {
@@ -55,6 +78,5 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         stats.frames.saturating_sub(stats.lost + stats.send_errors),
         stats.lost,
         stats.send_errors,
-    ));
-    Ok(())
+    ))
 }

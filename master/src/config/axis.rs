@@ -1,12 +1,15 @@
 //! One axis: units, limits, and the unit of the drive's velocities.
 
-use ecaxis_axis::{Axis, AxisConfig, Limits, Scale, VelocityUnit};
+use ecaxis_axis::{
+    Axis, AxisConfig, ConfigError, LimitError, Limits, Scale, ScaleError, VelocityUnit,
+};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-use super::AxisSetup;
-use super::problem::{Problems, suggestion};
-use super::raw::{RawAxis, RawSdo, SdoValue};
+use super::problem::{Problems, Span, suggestion};
+use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
+use super::units::unit;
+use super::{AxisSetup, VelocityUnitFrom};
 
 pub(crate) fn setup(
     raw: &RawAxis,
@@ -15,42 +18,111 @@ pub(crate) fn setup(
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<AxisSetup> {
-    let unit = velocity_unit(raw, sdos, selection, p);
-    let scale = scale(raw, p);
-    let limits = limits(raw, p);
-    let (scale, limits) = (scale?.with_velocity_unit(unit?), limits?);
+    let velocity = velocity_unit(raw, sdos, selection, p);
+    let name = unit(raw.unit.as_ref(), p);
+    // A wrong name is no reason to leave the figures unread.
+    let shown = name.as_deref().unwrap_or("units");
+    let scale = scale(raw, shown, p);
+    let limits = limits(&raw.limits, shown, p);
+    let ((velocity_unit, velocity_unit_from), limits) = (velocity?, limits?);
+    let scale = scale?.with_velocity_unit(velocity_unit);
     let mut config = AxisConfig::new(ecaxis_axis::Mode::from_code(mode.code()), scale, limits);
     if let Some(window) = &raw.target_window {
-        config.target_window = *positive(window, "target_window", p)?;
+        config.target_window = *positive(window, "target_window", shown, p)?;
     }
     if let Err(e) = Axis::new(config) {
-        p.add(raw.limits.span.clone(), e.to_string());
+        let (at, message) = refused(&e, raw, shown);
+        p.add(at, message);
         return None;
     }
-    let unit = raw.unit.as_ref().map_or("turn", |u| u.get_ref().as_str());
     Some(AxisSetup {
         config,
-        unit: unit.to_owned(),
+        unit: name?,
         mode,
+        velocity_unit_from,
     })
 }
 
-fn positive<'v>(value: &'v Spanned<f64>, what: &str, p: &mut Problems<'_>) -> Option<&'v f64> {
+/// `unit` may be empty.
+fn positive<'v>(
+    value: &'v Spanned<f64>,
+    what: &str,
+    unit: &str,
+    p: &mut Problems<'_>,
+) -> Option<&'v f64> {
     if *value.get_ref() > 0.0 {
         return Some(value.get_ref());
     }
-    p.add(
-        value.span(),
-        format!("`{what}` is {}, but must be above zero", value.get_ref()),
+    let gap = if unit.is_empty() { "" } else { " " };
+    let message = format!(
+        "`{what}` is {}{gap}{unit}, but must be above zero",
+        value.get_ref()
     );
+    p.add(value.span(), message);
     None
+}
+
+/// What the axis refuses, at the key that is to blame and in the user's unit.
+fn refused(error: &ConfigError, raw: &RawAxis, unit: &str) -> (Span, String) {
+    let limits = &raw.limits;
+    let of = |value: Option<Span>| value.unwrap_or(limits.span.clone());
+    let velocity = of(limits.velocity.as_ref().map(Spanned::span));
+    let position = of(limits.position.as_ref().map(Spanned::span));
+    let torque = of(limits.torque.as_ref().map(Spanned::span));
+    match error {
+        ConfigError::Limit(LimitError::RangeTooWide { low, high, counts }) => (
+            position,
+            format!(
+                "`limits.position` of {low} to {high} {unit} is {counts:.3e} counts wide, more than \
+                 the 2^31 that a drive can tell apart"
+            ),
+        ),
+        ConfigError::Limit(LimitError::VelocityNotRepresentable {
+            velocity: limit,
+            raw,
+            unit: drive,
+        }) => (
+            velocity,
+            format!(
+                "`limits.velocity` of {limit} {unit}/s is {raw:.3e} {drive}, more than 32 bits hold"
+            ),
+        ),
+        ConfigError::Limit(LimitError::TorqueNotRepresentable { torque: limit }) => (
+            torque,
+            format!("`limits.torque` of {limit} % is more than the 3276.7 % that 16 bits hold"),
+        ),
+        ConfigError::Limit(LimitError::EmptyRange { .. }) => (position, error.to_string()),
+        ConfigError::NotPositive { .. } => (
+            of(raw.target_window.as_ref().map(Spanned::span)),
+            error.to_string(),
+        ),
+        ConfigError::Limit(LimitError::NotPositive { .. }) | ConfigError::Mode(_) => {
+            (limits.span.clone(), error.to_string())
+        }
+    }
 }
 
 /// Counts of a motor turn.
 const MOST_COUNTS: f64 = 2_147_483_648.0;
 
-fn scale(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Scale> {
-    let encoder = raw.encoder.as_ref().and_then(|v| positive(v, "encoder", p));
+fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<Scale> {
+    let encoder = raw
+        .encoder
+        .as_ref()
+        .and_then(|v| positive(v, "encoder", "", p));
+    if let Some(at) = raw
+        .encoder
+        .as_ref()
+        .filter(|v| *v.get_ref() > 0.0 && *v.get_ref() < 1.0)
+    {
+        p.add_hint(
+            at.span(),
+            format!("`encoder` is {}, less than one count a turn", at.get_ref()),
+            "write the counts of one motor turn, four to a line of an incremental encoder; \
+             a gear belongs into `per_turn`",
+        );
+        return None;
+    }
     if let Some(at) = raw.encoder.as_ref().filter(|v| *v.get_ref() > MOST_COUNTS) {
         p.add(
             at.span(),
@@ -59,18 +131,20 @@ fn scale(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Scale> {
         return None;
     }
     let per_turn = match &raw.per_turn {
-        Some(v) => positive(v, "per_turn", p),
+        Some(v) => positive(v, "per_turn", unit, p),
         None => Some(&1.0),
     };
     let scale = match Scale::new(*encoder?, *per_turn?) {
         Ok(scale) => scale,
         Err(e) => {
-            p.add(
-                raw.per_turn
-                    .as_ref()
-                    .map_or(raw.span.clone(), Spanned::span),
-                e.to_string(),
-            );
+            let at = raw.per_turn.as_ref().or(raw.encoder.as_ref());
+            let message = match e {
+                ScaleError::Unusable { counts_per_unit } => {
+                    format!("1 {unit} is {counts_per_unit:.3e} counts, outside 1e-6 … 1e15")
+                }
+                _ => e.to_string(),
+            };
+            p.add(at.map_or(raw.span.clone(), Spanned::span), message);
             return None;
         }
     };
@@ -79,18 +153,32 @@ fn scale(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Scale> {
     scale.with_invert(invert).with_offset(offset).ok()
 }
 
-fn limits(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Limits> {
-    let raw = &raw.limits;
+fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
     let mut ok = true;
-    let mut read = |value: &Option<Spanned<f64>>, what: &str| {
-        let value = value.as_ref().map(|v| positive(v, what, p).copied());
+    let mut read = |value: &Option<Spanned<f64>>, what: &str, unit: &str| {
+        let value = value.as_ref().map(|v| positive(v, what, unit, p).copied());
         ok &= value != Some(None);
         value.flatten()
     };
-    let velocity = read(&raw.velocity, "limits.velocity");
-    let acceleration = read(&raw.acceleration, "limits.acceleration");
-    let torque = read(&raw.torque, "limits.torque");
-    let following_error = read(&raw.following_error, "limits.following_error");
+    let velocity = read(&raw.velocity, "limits.velocity", &format!("{unit}/s"));
+    let acceleration = read(
+        &raw.acceleration,
+        "limits.acceleration",
+        &format!("{unit}/s²"),
+    );
+    let torque = read(&raw.torque, "limits.torque", "%");
+    let following_error = read(&raw.following_error, "limits.following_error", unit);
+    if let (Some(velocity), Some(acceleration), Some(at)) =
+        (velocity, acceleration, &raw.acceleration)
+        && let Some(time) = too_long(velocity, acceleration)
+    {
+        let message = format!(
+            "`limits.acceleration` of {acceleration} {unit}/s² takes {time} to stop from the \
+             {velocity} {unit}/s of `limits.velocity`"
+        );
+        p.add_hint(at.span(), message, "a stop may last an hour at most");
+        ok = false;
+    }
     if let Some(range) = &raw.position
         && range.get_ref()[0] >= range.get_ref()[1]
     {
@@ -111,6 +199,21 @@ fn limits(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Limits> {
     ok.then_some(limits)
 }
 
+/// How long it takes to reach a velocity, where that is more than an hour.
+pub(crate) fn too_long(velocity: f64, acceleration: f64) -> Option<String> {
+    const HOUR: f64 = 3600.0;
+    let seconds = velocity / acceleration;
+    // Not a comparison with `>`: infinity over infinity is too long as well.
+    if seconds <= HOUR {
+        return None;
+    }
+    Some(if seconds < 1000.0 * HOUR {
+        format!("{:.1} h", seconds / HOUR)
+    } else {
+        format!("{:.3e} h", seconds / HOUR)
+    })
+}
+
 const VELOCITY_UNITS: [(&str, VelocityUnit); 4] = [
     ("rpm", VelocityUnit::RPM),
     ("mrpm", VelocityUnit::MILLI_RPM),
@@ -126,7 +229,7 @@ fn velocity_unit(
     sdos: &[RawSdo],
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
-) -> Option<VelocityUnit> {
+) -> Option<(VelocityUnit, VelocityUnitFrom)> {
     if let Some(text) = &raw.velocity_unit {
         let known = VELOCITY_UNITS
             .iter()
@@ -140,7 +243,7 @@ fn velocity_unit(
                 suggestion(text.get_ref(), names, "units"),
             );
         }
-        return known.map(|(_, unit)| *unit);
+        return known.map(|(_, unit)| (*unit, VelocityUnitFrom::File));
     }
     let written = sdos.iter().find(|s| s.index == SI_UNIT_VELOCITY);
     let written = written.and_then(|s| match s.value.get_ref() {
@@ -152,8 +255,10 @@ fn velocity_unit(
         let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
         item.has_default.then_some(u32::from_le_bytes(bytes))
     };
-    let Some(code) = written.or_else(default) else {
-        return Some(VelocityUnit::default());
+    let written = written.map(|code| (code, VelocityUnitFrom::Sdo));
+    let default = || default().map(|code| (code, VelocityUnitFrom::Esi));
+    let Some((code, from)) = written.or_else(default) else {
+        return Some((VelocityUnit::default(), VelocityUnitFrom::Nothing));
     };
     let unit = VelocityUnit::from_si_code(code);
     if unit.is_none() {
@@ -162,5 +267,5 @@ fn velocity_unit(
         let hint = "say it with `velocity_unit = \"rpm\"`, \"mrpm\", \"counts/s\" or \"turns/s\"";
         p.add_hint(raw.span.clone(), message, hint);
     }
-    unit
+    Some((unit?, from))
 }

@@ -93,6 +93,8 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
             duration::show(cycle),
         );
         p.add_hint(at, message, "make `watchdog` several cycles long");
+    } else if let (Some(cycle), Some(watchdog)) = (cycle_ns, watchdog_ns) {
+        ridden_through(&raw, cycle, watchdog, p);
     }
     if let (Some(spin), Some(cycle)) = (&raw.spin, cycle_ns)
         && *spin.get_ref() > cycle
@@ -135,12 +137,40 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
             .cpu
             .and_then(|cpu| usize::try_from(cpu.into_inner()).ok()),
         priority: raw.priority.map_or(defaults.priority, Spanned::into_inner),
-        spin_ns: raw.spin.map_or(defaults.spin_ns, Spanned::into_inner),
+        spin_ns: match raw.spin {
+            Some(spin) => spin.into_inner(),
+            None => defaults.spin_ns.min(cycle_ns? / 4),
+        },
         op_timeout_ns: op_timeout_ns?,
         enable_timeout_ns: enable_timeout_ns?,
         watchdog_ns: watchdog_ns?,
         exchange: exchange?,
     })
+}
+
+/// The axes must be told to stop before the drives' watchdogs end it their way.
+fn ridden_through(raw: &RawBus, cycle: u64, watchdog: u64, p: &mut Problems<'_>) {
+    let lost = raw
+        .lost_frames
+        .as_ref()
+        .map_or(Bus::default().lost_frames, |l| *l.get_ref());
+    let gap = u64::from(lost) * cycle;
+    if gap < watchdog {
+        return;
+    }
+    let at = raw.lost_frames.as_ref().map(Spanned::span);
+    let at = at.or(raw.watchdog.as_ref().map(Spanned::span));
+    let at = at.or(raw.cycle.as_ref().map(Spanned::span));
+    let message = format!(
+        "`lost_frames` = {lost} cycles of {} are {}, but the drives' `watchdog` stops them after {}",
+        duration::show(cycle),
+        duration::show(gap),
+        duration::show(watchdog),
+    );
+    // At least 1, because the watchdog is two cycles or more.
+    let most = (watchdog - 1) / cycle;
+    let hint = format!("write `lost_frames = {most}` or less, or a longer `watchdog`");
+    p.add_hint(at.unwrap_or(0..0), message, hint);
 }
 
 fn in_range(

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-use super::problem::{Problems, Span, suggestion};
+use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, axis, sdo};
 
@@ -45,10 +45,14 @@ impl<'f> Library<'f> {
                     "the file is damaged or is not an ESI file".to_owned(),
                 )
             }),
-            Err(e) => Err((
-                format!("cannot read {}: {e}", path.display()),
-                neighbours(&path),
-            )),
+            Err(e) => {
+                let hint = match e.kind() {
+                    std::io::ErrorKind::NotFound => neighbours(&path),
+                    std::io::ErrorKind::IsADirectory => neighbours(&path.join("-")),
+                    _ => "look at the file's permissions".to_owned(),
+                };
+                Err((unreadable(&path, &e), hint))
+            }
         };
         let file = match read {
             Ok(file) => Some(Arc::new(file)),

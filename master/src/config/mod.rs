@@ -10,6 +10,7 @@
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `axis.rs` | units and limits |
+//! | `units.rs` | the names of units of positions |
 //! | `steps.rs` | the demonstration program |
 //!
 //! Every mistake is collected; a file with five of them is refused once, with five answers.
@@ -28,6 +29,7 @@ mod sdo;
 mod steps;
 #[cfg(test)]
 mod tests;
+mod units;
 
 pub use problem::{ConfigError, Problem};
 
@@ -67,6 +69,9 @@ pub struct Bus {
     pub exchange: Exchange,
 }
 
+/// What `spin` is where the file does not say, unless that were more than a quarter of the cycle.
+const LONGEST_SPIN_NS: u64 = 100_000;
+
 impl Default for Bus {
     fn default() -> Self {
         Self {
@@ -75,7 +80,7 @@ impl Default for Bus {
             lost_frames: 3,
             cpu: None,
             priority: 80,
-            spin_ns: 100_000,
+            spin_ns: LONGEST_SPIN_NS,
             op_timeout_ns: 10_000_000_000,
             enable_timeout_ns: 5_000_000_000,
             watchdog_ns: 100_000_000,
@@ -138,6 +143,20 @@ pub struct AxisSetup {
     /// The user's name for the unit of positions, `mm`.
     pub unit: String,
     pub mode: esi::Mode,
+    pub velocity_unit_from: VelocityUnitFrom,
+}
+
+/// What says in which unit the drive has its velocities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum VelocityUnitFrom {
+    /// `velocity_unit`.
+    File,
+    /// A start-up SDO of the machine file that writes 0x60A9.
+    Sdo,
+    /// The default of 0x60A9 in the ESI file.
+    Esi,
+    /// It is assumed.
+    Nothing,
 }
 
 /// One step of the demonstration program. Targets are pairs of (index into [`Machine::devices`],
@@ -172,20 +191,17 @@ pub enum Step {
 /// Reads and checks a machine file and the ESI files it names.
 ///
 /// # Errors
-/// [`ConfigError::Io`] where the file cannot be read, else everything that is wrong with it.
+/// [`ConfigError::Io`] where the file cannot be read, [`ConfigError::NotText`] where it is no text, else
+/// everything that is wrong with it.
 pub fn load(path: &Path) -> Result<Machine, ConfigError> {
-    let io = |source| ConfigError::Io {
+    let bytes = std::fs::read(path).map_err(|source| ConfigError::Io {
         path: path.to_owned(),
         source,
-    };
-    let bytes = std::fs::read(path).map_err(io)?;
-    let text = match String::from_utf8(bytes) {
-        Ok(text) => text,
-        Err(e) => {
-            let source = std::io::Error::new(std::io::ErrorKind::InvalidData, e.utf8_error());
-            return Err(io(source));
-        }
-    };
+    })?;
+    let text = String::from_utf8(bytes).map_err(|e| ConfigError::NotText {
+        path: path.to_owned(),
+        source: e.utf8_error(),
+    })?;
     parse(path, &text)
 }
 

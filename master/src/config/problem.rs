@@ -8,14 +8,27 @@ use std::path::{Path, PathBuf};
 /// Why there is no machine.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("{}", unreadable(path, source))]
     Io {
         path: PathBuf,
         source: std::io::Error,
     },
+    #[error("{} is not text: {source}", path.display())]
+    NotText {
+        path: PathBuf,
+        source: std::str::Utf8Error,
+    },
     /// Everything that is wrong with the file, in the order of its lines.
     #[error("{}", all(.0))]
     Problems(Vec<Problem>),
+}
+
+/// Why a file cannot be read.
+pub(crate) fn unreadable(path: &Path, error: &std::io::Error) -> String {
+    match error.kind() {
+        std::io::ErrorKind::IsADirectory => format!("{} is a folder, not a file", path.display()),
+        _ => format!("cannot read {}: {error}", path.display()),
+    }
 }
 
 fn all(problems: &[Problem]) -> String {

@@ -2,6 +2,7 @@
 
 use toml::Spanned;
 
+use super::axis::too_long;
 use super::problem::{Problems, suggestion};
 use super::raw::{RawStep, RawTarget, Verb};
 use super::{AxisSetup, DeviceConfig, Step};
@@ -52,11 +53,19 @@ fn one(step: RawStep, devices: &[Known<'_>], p: &mut Problems<'_>) -> Option<Ste
             speed,
             ramp,
         } => {
+            let ramp_at = ramp.as_ref().map(Spanned::span);
             let speed = fraction(speed, "speed", p);
             let ramp = fraction(ramp, "ramp", p);
+            let slow = |targets: &[(usize, f64)], p: &mut Problems<'_>| {
+                let at = ramp_at.clone()?;
+                ramps(targets, verb, speed?, ramp?, devices).map(|message| {
+                    p.add_hint(at, message, "a ramp may last an hour at most");
+                })
+            };
             match verb {
                 Verb::Move => {
                     let targets = resolve(targets, "move", Mode::Csp, devices, p)?;
+                    slow(&targets, p);
                     Some(Step::Move {
                         targets,
                         speed: speed?,
@@ -65,6 +74,7 @@ fn one(step: RawStep, devices: &[Known<'_>], p: &mut Problems<'_>) -> Option<Ste
                 }
                 Verb::Velocity => {
                     let targets = resolve(targets, "velocity", Mode::Csv, devices, p)?;
+                    slow(&targets, p);
                     Some(Step::Velocity {
                         targets,
                         ramp: ramp?,
@@ -73,6 +83,29 @@ fn one(step: RawStep, devices: &[Known<'_>], p: &mut Problems<'_>) -> Option<Ste
             }
         }
     }
+}
+
+/// What is wrong where an axis would take more than an hour to reach its velocity.
+fn ramps(
+    targets: &[(usize, f64)],
+    verb: Verb,
+    speed: f64,
+    ramp: f64,
+    devices: &[Known<'_>],
+) -> Option<String> {
+    targets.iter().find_map(|&(index, target)| {
+        let device = devices.get(index)?;
+        let limits = &device.axis.ok()?.config.limits;
+        let velocity = match verb {
+            Verb::Move => limits.velocity * speed,
+            Verb::Velocity => target.abs(),
+        };
+        let time = too_long(velocity, limits.acceleration * ramp)?;
+        let name = device.name;
+        Some(format!(
+            "with a `ramp` of {ramp}, `{name}` takes {time} to reach its velocity"
+        ))
+    })
 }
 
 fn fraction(value: Option<Spanned<f64>>, what: &str, p: &mut Problems<'_>) -> Option<f64> {

@@ -171,6 +171,34 @@ fn a_good_file_becomes_a_machine() {
 }
 
 #[test]
+fn units_of_ones_own_and_what_says_the_velocity_unit() {
+    for (text, shown) in [("custom:slots", "slots"), ("μm", "µm"), ("°", "°")] {
+        let machine = with_esi(&GOOD.replace("\"mm\"", &format!("\"{text}\""))).unwrap();
+        assert_eq!(machine.devices[0].axis.as_ref().unwrap().unit, shown);
+    }
+    let from = |text: &str| {
+        let axis = with_esi(text).unwrap().devices[0].axis.clone();
+        axis.unwrap().velocity_unit_from
+    };
+    assert_eq!(from(GOOD), VelocityUnitFrom::Esi);
+    let said = GOOD.replace("unit = \"mm\"", "unit = \"mm\"\nvelocity_unit = \"rpm\"");
+    assert_eq!(from(&said), VelocityUnitFrom::File);
+    let written = GOOD.replace(
+        "{ index = 0x6065, value = 2500 }",
+        "{ index = 0x60A9, value = 0x00B44700 }",
+    );
+    assert_eq!(from(&written), VelocityUnitFrom::Sdo);
+}
+
+#[test]
+fn spinning_takes_no_more_than_a_quarter_of_the_cycle() {
+    let short = GOOD.replace("\"1ms\"", "\"200us\"");
+    assert_eq!(with_esi(&short).unwrap().bus.spin_ns, 50_000);
+    let said = short.replace("nic = \"sim\"", "spin = \"100us\"");
+    assert_eq!(with_esi(&said).unwrap().bus.spin_ns, 100_000);
+}
+
+#[test]
 fn devices_are_sorted_and_steps_follow() {
     let swapped = GOOD
         .replace("position = 1", "position = 9")
@@ -200,6 +228,9 @@ fn every_way_to_be_wrong() {
         ("nic = \"sim\"", "lost_frames = 0", "a whole number from 1 to 1000, found 0", "", "0"),
         ("nic = \"sim\"", "priority = true", "expected a whole number, found true or false", "", "true"),
         ("nic = \"sim\"", "exchange = \"pipelined\"", "unknown exchange", "same-cycle", "\"pipelined\""),
+        ("nic = \"sim\"", "lost_frames = 100", "are 100 ms, but the drives' `watchdog` stops them after 100 ms", "lost_frames = 99", "100"),
+        ("nic = \"sim\"", "watchdog = \"2ms\"", "`lost_frames` = 3 cycles of 1 ms", "lost_frames = 1", "\"2ms\""),
+        ("\"1ms\"", "\"40ms\"", "are 120 ms", "lost_frames = 2", "\"40ms\""),
         ("nic = \"sim\"", "watchdog = \"1ms\"", "expires between two cycles", "", "\"1ms\""),
         ("nic = \"sim\"", "spin = \"2ms\"", "never sleeps", "", "\"2ms\""),
         ("[bus]", "[buss]", "unknown key `buss`", "did you mean `bus`?", "buss"),
@@ -221,9 +252,19 @@ fn every_way_to_be_wrong() {
         ("value = 2500", "value = -1", "does not fit", "", "-1"),
         ("value = 2500", "valeu = 2500", "unknown key `valeu`", "did you mean `value`?", "valeu"),
         ("encoder = 2000", "encoder = 0", "`encoder` is 0, but must be above zero", "", "0"),
+        ("encoder = 2000", "encoder = 0.5", "less than one count a turn", "four to a line", "0.5"),
         ("encoder = 2000", "encoder = 1e10", "more than 32 bits", "", "1e10"),
         ("encoder = 2000\n", "", "`encoder` is missing", "encoder = 2000", "[device.axis]"),
-        ("velocity = 200.0", "velocity = -200.0", "`limits.velocity` is -200", "", "-200.0"),
+        ("velocity = 200.0", "velocity = -200.0", "`limits.velocity` is -200 mm/s", "", "-200.0"),
+        ("velocity = 200.0", "velocity = 1e6", "1000000 mm/s is 1.200e10 mrpm", "", "1e6"),
+        ("acceleration = 2000.0", "acceleration = 1e-3", "0.001 mm/s² takes 55.6 h to stop from the 200 mm/s", "an hour", "1e-3"),
+        ("ramp = 0.3", "ramp = 1e-6", "`x` takes 13.9 h to reach its velocity", "an hour", "1e-6"),
+        ("torque = 100.0", "torque = 4000.0", "`limits.torque` of 4000 %", "", "4000.0"),
+        ("[-50.0, 50.0]", "[-5e9, 5e9]", "-5000000000 to 5000000000 mm is 4.000e12 counts wide", "", "[-5e9, 5e9]"),
+        ("per_turn = 5.0", "per_turn = 1e-20", "1 mm is 2.000e23 counts", "", "1e-20"),
+        ("unit = \"mm\"", "unit = \"mmm\"", "unknown unit `mmm`", "did you mean `mm`?", "\"mmm\""),
+        ("unit = \"mm\"", "unit = \"slots\"", "unknown unit `slots`", "`unit = \"custom:slots\"`", "\"slots\""),
+        ("unit = \"mm\"", "unit = \"custom: \"", "1 to 16 characters", "", "\"custom: \""),
         ("velocity = 200.0", "velocity = \"fast\"", "expected a number, found a string", "", "\"fast\""),
         ("velocity = 200.0", "velocity = nan", "expected a finite number, found nan", "", "nan"),
         ("[-50.0, 50.0]", "[50.0, -50.0]", "range of positions is empty", "lower end", "[50.0, -50.0]"),

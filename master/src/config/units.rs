@@ -1,0 +1,45 @@
+//! Units of positions. They are only shown, never converted; a list of them finds the misspelt one.
+
+use toml::Spanned;
+
+use super::problem::{Problems, suggestion};
+
+const DEFAULT: &str = "turn";
+
+const KNOWN: [&str; 23] = [
+    "mm", "um", "µm", "nm", "cm", "m", "in", "inch", "ft", "deg", "°", "rad", "mrad", "arcmin",
+    "arcsec", "turn", "turns", "rev", "revs", "count", "counts", "inc", "%",
+];
+
+/// What precedes a unit that is not in the list.
+const CUSTOM: &str = "custom:";
+
+/// The unit's name as it is shown.
+pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<String> {
+    let Some(given) = given else {
+        return Some(DEFAULT.to_owned());
+    };
+    let word = given.get_ref().trim();
+    if let Some(own) = word.strip_prefix(CUSTOM) {
+        let own = own.trim();
+        if (1..=16).contains(&own.chars().count()) && !own.contains(char::is_control) {
+            return Some(own.to_owned());
+        }
+        let message = "a unit's name has 1 to 16 characters";
+        p.add_hint(given.span(), message, "write `unit = \"custom:slots\"`");
+        return None;
+    }
+    // Both are the same sign to a reader: Greek mu and the micro sign.
+    let word = word.replace('μ', "µ");
+    if KNOWN.contains(&word.as_str()) {
+        return Some(word);
+    }
+    let known = suggestion(&word, KNOWN, "units");
+    let own = if word.is_empty() { "slots" } else { &word };
+    p.add_hint(
+        given.span(),
+        format!("unknown unit `{word}`"),
+        format!("{known}\nfor a unit of your own write `unit = \"{CUSTOM}{own}\"`"),
+    );
+    None
+}
