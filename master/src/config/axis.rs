@@ -119,7 +119,7 @@ fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<Scale> {
             at.span(),
             format!("`encoder` is {}, less than one count a turn", at.get_ref()),
             "write the counts of one motor turn, four to a line of an incremental encoder; \
-             a gear belongs into `per_turn`",
+             a gear belongs in `per_turn`",
         );
         return None;
     }
