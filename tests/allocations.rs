@@ -13,6 +13,7 @@ use std::task::{Context, Poll, Waker};
 
 use common::{axes, faults, machine};
 use ecaxis::clock::Nanos;
+use ecaxis::link::capture::{Dir, Mode, Recorder};
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
 use ecaxis::rt::cycle::Engine;
 use ecaxis::session::{Options, Prepared, RunError, prepare};
@@ -90,6 +91,28 @@ fn the_counter_counts() {
     METERED.set(false);
     drop(boxed);
     assert_eq!(COUNT.get(), 1);
+}
+
+/// The bus above is unmetered, and so is what records it; the recorder of a real-time run is not the
+/// bus's, so it is metered here.
+#[test]
+fn recording_beside_the_cycle_allocates_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.pcapng");
+    let mut recorder = Recorder::create(&path, Mode::Background).expect("a recording");
+    let frame = [0x5a; MAX_FRAME];
+    COUNT.set(0);
+    METERED.set(true);
+    for at in 0..1_000 {
+        recorder.frame(Dir::Out, at, &frame[..128]);
+        recorder.frame(Dir::In, at, &frame);
+    }
+    METERED.set(false);
+    let counted = COUNT.get();
+    let stats = recorder.finish().expect("written");
+    assert_eq!(stats.written + stats.dropped, 2_000);
+    assert!(stats.written > 0);
+    assert_eq!(counted, 0);
 }
 
 #[test]
