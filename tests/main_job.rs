@@ -4,6 +4,7 @@
 mod common;
 
 use common::{axes, fixture, load, machine, run, run_well, virtual_time};
+use ecaxis::bringup::{AlState, Step};
 use ecaxis::session::{Options, Progress};
 
 #[test]
@@ -177,6 +178,38 @@ fn the_vendors_start_up_list_has_the_effect_of_the_application_notes() {
     }
     assert_eq!(last(0x60c2, 1), Some(1), "1 ms");
     assert_eq!(last(0x6060, 0), Some(8), "CSP");
+}
+
+/// A device whose ESI wants a command between SafeOp and Op gets it there: by then the state says
+/// SafeOp, and what comes before has been sent in PreOp.
+#[test]
+fn start_up_commands_wait_for_their_transition() {
+    let Some(esi) = fixture("esi/hpmicro/ECAT_CIA402.xml") else {
+        return;
+    };
+    let text = axes(1).replace("esi/EPOS4.xml", &esi.display().to_string());
+    let machine = machine(&text);
+    let count = |late: bool| {
+        let list = &machine.devices[0].selection.startup;
+        list.iter()
+            .filter(|sdo| (sdo.transition == "SO") == late)
+            .count()
+    };
+    let (early, late) = (count(false), count(true));
+    assert!(late > 0, "this ESI has InitCmds of SafeOp → Op");
+    let (outcome, heard) = run(machine, virtual_time());
+    outcome.result.expect("runs");
+    let mut safe_op = false;
+    let mut sent = (0, 0);
+    for progress in &heard.0 {
+        match progress {
+            Progress::Step(Step::State(AlState::SafeOp)) => safe_op = true,
+            Progress::Step(Step::StartUp { .. }) if safe_op => sent.1 += 1,
+            Progress::Step(Step::StartUp { .. }) => sent.0 += 1,
+            _ => {}
+        }
+    }
+    assert_eq!(sent, (early, late));
 }
 
 #[test]

@@ -18,15 +18,34 @@ const WATCHDOG_PROCESS_DATA: u16 = 0x0420;
 /// (2498 + 2) × 40 ns: the process-data watchdog counts in 100 µs.
 const DIVIDER_100_US: u16 = 2498;
 
-/// Downloads the start-up SDOs in order. The mailbox is emptied before, because a device may have
+/// When start-up SDOs are sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Moment {
+    /// Before SafeOp is asked for: those of Init → PreOp too, which a mailbox can only take now.
+    InPreOp,
+    /// Before Op is asked for.
+    InSafeOp,
+}
+
+/// Downloads the start-up SDOs of one moment in order. The mailbox is emptied before, because a device may have
 /// sent emergencies while nobody listened.
 pub(super) async fn start_up(
     wire: &impl Wire,
     config: &DeviceConfig,
     device: &mut BusDevice,
+    moment: Moment,
     progress: &mut dyn FnMut(Step),
 ) -> Result<(), BringUpError> {
-    let list = &config.selection.startup;
+    let due = |transition: &str| (transition == "SO") == (moment == Moment::InSafeOp);
+    let list: Vec<_> = config
+        .selection
+        .startup
+        .iter()
+        .filter(|sdo| due(sdo.transition))
+        .collect();
+    if list.is_empty() && moment == Moment::InSafeOp {
+        return Ok(());
+    }
     let Some(coe) = device.coe.as_mut() else {
         return Ok(());
     };

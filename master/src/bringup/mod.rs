@@ -30,6 +30,7 @@ mod mailbox;
 mod mapping;
 
 pub use al::{AlState, StateError};
+use device::Moment;
 
 /// SubDevices that ethercrab keeps in one group; a power of two.
 const MAX_SUBDEVICES: usize = 128;
@@ -258,7 +259,7 @@ pub async fn bring_up(
     }
 
     for (config, device) in machine.devices.iter().zip(&mut devices) {
-        device::start_up(&wire, config, device, progress).await?;
+        device::start_up(&wire, config, device, Moment::InPreOp, progress).await?;
         mapping::compare(&wire, config, device).await?;
         held::read(&wire, config, device).await?;
     }
@@ -280,6 +281,9 @@ pub async fn bring_up(
     let at: Vec<_> = devices.iter().map(|d| d.at.clone()).collect();
     al::change_state(&wire, &at, AlState::SafeOp, al::SAFE_OP_TIMEOUT).await?;
     progress(Step::State(AlState::SafeOp));
+    for (config, device) in machine.devices.iter().zip(&mut devices) {
+        device::start_up(&wire, config, device, Moment::InSafeOp, progress).await?;
+    }
     Ok(Bus { devices, image, dc })
 }
 
