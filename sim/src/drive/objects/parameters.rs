@@ -1,59 +1,12 @@
-//! The objects the drive reads and writes, as slots; power-on values for those an ESI leaves empty.
+//! What a drive is told once and then works by: option codes, limits, profiles, units.
 
-use ecaxis_esi::model::{Access, Writable};
-
-use super::plant::PlantParams;
-use super::profile::Dynamics;
-use super::state::OptionCodes;
+use super::binder::{Binder, RW};
+use super::units::{RPM, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
+use super::{float, whole};
 use crate::coe::store::{ObjectStore, Slot};
-
-const RW: Access = Access {
-    read: true,
-    write: Writable::Always,
-};
-const RO: Access = Access {
-    read: true,
-    write: Writable::Never,
-};
-
-/// rpm, the power-on value of 0x60A9.
-const RPM: i64 = 0x00b4_4700;
-/// rpm/s, of 0x60AA.
-const RPM_PER_S: i64 = 0x00c0_0300;
-const COUNTS: i64 = 0x00b5_0000;
-
-/// PP, PV, HM, CSP, CSV, CST.
-const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;
-
-#[derive(Debug, Clone)]
-pub(super) struct Objects {
-    pub error_register: Slot,
-    pub error_code: Slot,
-    /// 0x1003:0 and the entries behind it, where the ESI has them.
-    history: [Option<Slot>; 6],
-    pub controlword: Slot,
-    pub statusword: Slot,
-    pub mode: Slot,
-    pub mode_display: Slot,
-    pub position_demand: Slot,
-    pub position: Slot,
-    pub velocity_demand: Slot,
-    pub velocity: Slot,
-    pub velocity_averaged: Option<Slot>,
-    pub torque: Slot,
-    pub torque_averaged: Option<Slot>,
-    pub current: Option<Slot>,
-    pub current_averaged: Option<Slot>,
-    pub following_error: Slot,
-    pub target_position: Slot,
-    pub target_velocity: Slot,
-    pub target_torque: Slot,
-    pub position_offset: Slot,
-    pub velocity_offset: Slot,
-    pub torque_offset: Slot,
-    parameters: ParameterSlots,
-    mapped: MappedLimits,
-}
+use crate::drive::plant::PlantParams;
+use crate::drive::profile::Dynamics;
+use crate::drive::state::OptionCodes;
 
 /// Limits that come with the process data: then zero means zero, where an unset object means "no limit".
 #[derive(Debug, Clone, Copy, Default)]
@@ -63,7 +16,7 @@ struct MappedLimits {
 }
 
 #[derive(Debug, Clone)]
-struct ParameterSlots {
+pub(super) struct ParameterSlots {
     quick_stop_option: Slot,
     shutdown_option: Slot,
     disable_option: Slot,
@@ -93,11 +46,12 @@ struct ParameterSlots {
     period_value: Slot,
     period_index: Slot,
     output_current_limit: Option<Slot>,
+    mapped: MappedLimits,
 }
 
 /// The parameters in counts and seconds.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Parameters {
+pub(in crate::drive) struct Parameters {
     pub options: OptionCodes,
     /// 0x6007: what a lost connection does.
     pub abort_option: i64,
@@ -126,98 +80,14 @@ pub(super) struct Parameters {
     pub period_ns: i64,
 }
 
-struct Binder<'a>(&'a mut ObjectStore);
-
-impl Binder<'_> {
-    fn bind(&mut self, index: u16, sub: u8, name: &str, bits: u32, access: Access) -> Slot {
-        self.0.ensure(index, sub, name, bits, access, &[])
-    }
-
-    /// A parameter. An ESI without a default leaves zero there, which is not what a drive powers up
-    /// with.
-    fn with_default(&mut self, index: u16, sub: u8, name: &str, bits: u32, default: i64) -> Slot {
-        let slot = self.bind(index, sub, name, bits, RW);
-        self.fill(slot, default);
-        slot
-    }
-
-    fn fill(&mut self, slot: Slot, default: i64) {
-        if self.0.get(slot) == 0 {
-            self.0.set(slot, default);
-        }
-    }
-
-    /// A maker's own object. Elsewhere the same index means something else, so the name decides.
-    fn own(&self, index: u16, sub: u8, name: &str) -> Option<Slot> {
-        let slot = self.0.slot(index, sub)?;
-        (self.0.item(slot)?.name == name).then_some(slot)
-    }
-
-    /// Motor data: commissioning has set it, whatever the ESI's factory value is.
-    fn motor_data(&mut self, slot: Slot, value: i64) -> Slot {
-        self.0.set(slot, value);
-        slot
-    }
-
-    /// Commissioning has fitted the software limits to the machine; factory values that shut out the
-    /// place where it stands cannot be meant.
-    fn drop_limits_without(&mut self, [min, max]: [Slot; 2], position: i64) {
-        let (low, high) = (self.0.get_signed(min), self.0.get_signed(max));
-        if low < high && !(low..=high).contains(&position) {
-            self.0.set(min, i64::from(i32::MIN));
-            self.0.set(max, i64::from(i32::MAX));
-        }
-    }
-
-    fn own_motor_data(&mut self, index: u16, sub: u8, name: &str, value: i64) -> Option<Slot> {
-        let slot = self.own(index, sub, name)?;
-        Some(self.motor_data(slot, value))
-    }
-}
-
-#[expect(clippy::cast_possible_truncation, reason = "saturates")]
-fn whole(value: f64) -> i64 {
-    value.round() as i64
-}
-
-/// Fits whatever the dictionary's type is; a store value never needs more than 53 bits here.
-#[expect(clippy::cast_precision_loss, reason = "32-bit objects")]
-pub(super) fn float(value: i64) -> f64 {
-    value as f64
-}
-
-impl Objects {
-    pub(super) fn bind(store: &mut ObjectStore, plant: &PlantParams) -> Self {
-        let mut b = Binder(store);
-        let history = [0, 1, 2, 3, 4, 5].map(|sub| b.0.slot(0x1003, sub));
-        b.own_motor_data(
-            0x3001,
-            1,
-            "Nominal current",
-            whole(plant.nominal_current * 1e3),
-        );
+impl ParameterSlots {
+    pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
         let output_current_limit = b.own_motor_data(
             0x3001,
             2,
             "Output current limit",
             whole(plant.current_limit * 1e3),
         );
-        b.own_motor_data(
-            0x3001,
-            5,
-            "Torque constant",
-            whole(plant.torque_constant * 1e6),
-        );
-        b.own_motor_data(
-            0x2200,
-            1,
-            "Power supply voltage",
-            whole(plant.supply_voltage * 10.0),
-        );
-        b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
-        b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
-        b.bind(0x60fd, 0, "Digital inputs", 32, RO);
-        b.bind(0x60fe, 1, "Physical outputs", 32, RW);
         let rated_torque = b.bind(0x6076, 0, "Motor rated torque", 32, RW);
         b.motor_data(rated_torque, whole(plant.rated_torque() * 1e6));
         let max_motor_speed = b.bind(0x6080, 0, "Max motor speed", 32, RW);
@@ -241,7 +111,7 @@ impl Objects {
             b.bind(0x607d, 2, "Max position limit", 32, RW),
         ];
         b.drop_limits_without(limits, i64::from(plant.initial_position));
-        let parameters = ParameterSlots {
+        Self {
             quick_stop_option: b.with_default(0x605a, 0, "Quick stop option code", 16, 6),
             shutdown_option: b.bind(0x605b, 0, "Shutdown option code", 16, RW),
             disable_option: b.with_default(0x605c, 0, "Disable operation option code", 16, 1),
@@ -297,32 +167,6 @@ impl Objects {
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
             period_index: b.with_default(0x60c2, 2, "Interpolation time index", 8, -3),
             output_current_limit,
-        };
-        Self {
-            error_register: b.bind(0x1001, 0, "Error register", 8, RO),
-            error_code: b.bind(0x603f, 0, "Error code", 16, RO),
-            history,
-            controlword: b.bind(0x6040, 0, "Controlword", 16, RW),
-            statusword: b.bind(0x6041, 0, "Statusword", 16, RO),
-            mode: b.with_default(0x6060, 0, "Modes of operation", 8, 1),
-            mode_display: b.bind(0x6061, 0, "Modes of operation display", 8, RO),
-            position_demand: b.bind(0x6062, 0, "Position demand value", 32, RO),
-            position: b.bind(0x6064, 0, "Position actual value", 32, RO),
-            velocity_demand: b.bind(0x606b, 0, "Velocity demand value", 32, RO),
-            velocity: b.bind(0x606c, 0, "Velocity actual value", 32, RO),
-            velocity_averaged: b.own(0x30d3, 1, "Velocity actual value averaged"),
-            torque: b.bind(0x6077, 0, "Torque actual value", 16, RO),
-            torque_averaged: b.own(0x30d2, 1, "Torque actual value averaged"),
-            current: b.own(0x30d1, 2, "Current actual value"),
-            current_averaged: b.own(0x30d1, 1, "Current actual value averaged"),
-            following_error: b.bind(0x60f4, 0, "Following error actual value", 32, RO),
-            target_position: b.bind(0x607a, 0, "Target position", 32, RW),
-            target_velocity: b.bind(0x60ff, 0, "Target velocity", 32, RW),
-            target_torque: b.bind(0x6071, 0, "Target torque", 16, RW),
-            position_offset: b.bind(0x60b0, 0, "Position offset", 32, RW),
-            velocity_offset: b.bind(0x60b1, 0, "Velocity offset", 32, RW),
-            torque_offset: b.bind(0x60b2, 0, "Torque offset", 16, RW),
-            parameters,
             mapped: MappedLimits::default(),
         }
     }
@@ -330,8 +174,8 @@ impl Objects {
     /// Which outputs the process data now carries.
     pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
         self.mapped = MappedLimits {
-            torque: self.parameters.max_torque.is_some_and(&is_mapped),
-            speed: is_mapped(self.parameters.max_motor_speed),
+            torque: self.max_torque.is_some_and(&is_mapped),
+            speed: is_mapped(self.max_motor_speed),
         };
     }
 
@@ -340,27 +184,9 @@ impl Objects {
         self.mapped.torque || self.mapped.speed
     }
 
-    /// 0x1003: the newest error first.
-    pub(super) fn record(&self, store: &mut ObjectStore, code: u16) {
-        let [Some(count), entries @ ..] = self.history else {
-            return;
-        };
-        let mut carried = i64::from(code);
-        let mut used = 0;
-        for slot in entries.into_iter().flatten() {
-            let older = store.get(slot);
-            store.set(slot, carried);
-            used += 1;
-            carried = older;
-            if carried == 0 {
-                break;
-            }
-        }
-        store.set(count, used);
-    }
-
-    pub(super) fn parameters(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
-        let p = &self.parameters;
+    /// What the objects say now.
+    pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
+        let p = self;
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
         let velocity_unit = p
             .unit_velocity
@@ -434,70 +260,5 @@ impl Objects {
             current_limit,
             period_ns: period_ns(store.get(p.period_value), store.get_signed(p.period_index)),
         }
-    }
-}
-
-/// 0x60C2 in nanoseconds; what cannot be a cycle time counts as "no interpolation".
-fn period_ns(value: i64, index: i64) -> i64 {
-    let Some(power) = index.checked_add(9).and_then(|e| u32::try_from(e).ok()) else {
-        return 0;
-    };
-    10i64
-        .checked_pow(power)
-        .and_then(|ns| ns.checked_mul(value))
-        .filter(|ns| (0..=10_000_000_000).contains(ns))
-        .unwrap_or(0)
-}
-
-/// SI unit codes: prefix (power of ten), numerator, denominator, reserved; high byte first.
-fn prefix(code: i64) -> f64 {
-    let prefix = i32::from(((code >> 24) & 0xff) as u8 as i8);
-    10f64.powi(prefix)
-}
-
-/// Counts/s per unit of velocity.
-fn velocity_unit(code: i64, counts_per_turn: f64) -> f64 {
-    let numerator = match (code >> 16) & 0xff {
-        0xb5 => 1.0,
-        _ => counts_per_turn,
-    };
-    let denominator = match (code >> 8) & 0xff {
-        0x03 => 1.0,
-        _ => 60.0,
-    };
-    prefix(code) * numerator / denominator
-}
-
-/// Counts/s² per unit of acceleration; 0xC0 is revolutions per minute, per second.
-fn acceleration_unit(code: i64, counts_per_turn: f64) -> f64 {
-    let numerator = match (code >> 16) & 0xff {
-        0xb5 => 1.0,
-        0xb4 => counts_per_turn,
-        _ => counts_per_turn / 60.0,
-    };
-    prefix(code) * numerator
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn units_by_code() {
-        let rpm = 2000.0 / 60.0;
-        assert_eq!(velocity_unit(0x00b4_4700, 2000.0), rpm);
-        assert!((velocity_unit(0xfdb4_4700, 2000.0) - rpm * 1e-3).abs() < 1e-12);
-        assert_eq!(velocity_unit(0x00b5_0300, 2000.0), 1.0);
-        assert_eq!(velocity_unit(0x00b4_0300, 2000.0), 2000.0);
-        assert_eq!(acceleration_unit(0x00c0_0300, 2000.0), rpm);
-    }
-
-    #[test]
-    fn interpolation_period() {
-        assert_eq!(period_ns(1, -3), 1_000_000);
-        assert_eq!(period_ns(25, -5), 250_000);
-        assert_eq!(period_ns(0, -3), 0);
-        assert_eq!(period_ns(255, 127), 0);
-        assert_eq!(period_ns(1, -10), 0);
     }
 }

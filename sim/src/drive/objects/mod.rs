@@ -1,0 +1,150 @@
+//! The objects the drive reads and writes, as slots; power-on values for those an ESI leaves empty.
+//!
+//! * `binder`: from a dictionary's entries to slots
+//! * `parameters`: option codes, limits, profiles
+//! * `units`: SI unit codes, interpolation time
+
+mod binder;
+mod parameters;
+mod units;
+
+use super::plant::PlantParams;
+use crate::coe::store::{ObjectStore, Slot};
+
+use binder::{Binder, RO, RW};
+use parameters::ParameterSlots;
+use units::COUNTS;
+
+pub(super) use parameters::Parameters;
+
+/// PP, PV, HM, CSP, CSV, CST.
+const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;
+
+#[derive(Debug, Clone)]
+pub(super) struct Objects {
+    pub error_register: Slot,
+    pub error_code: Slot,
+    /// 0x1003:0 and the entries behind it, where the ESI has them.
+    history: [Option<Slot>; 6],
+    pub controlword: Slot,
+    pub statusword: Slot,
+    pub mode: Slot,
+    pub mode_display: Slot,
+    pub position_demand: Slot,
+    pub position: Slot,
+    pub velocity_demand: Slot,
+    pub velocity: Slot,
+    pub velocity_averaged: Option<Slot>,
+    pub torque: Slot,
+    pub torque_averaged: Option<Slot>,
+    pub current: Option<Slot>,
+    pub current_averaged: Option<Slot>,
+    pub following_error: Slot,
+    pub target_position: Slot,
+    pub target_velocity: Slot,
+    pub target_torque: Slot,
+    pub position_offset: Slot,
+    pub velocity_offset: Slot,
+    pub torque_offset: Slot,
+    parameters: ParameterSlots,
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "saturates")]
+fn whole(value: f64) -> i64 {
+    value.round() as i64
+}
+
+/// Fits whatever the dictionary's type is; a store value never needs more than 53 bits here.
+#[expect(clippy::cast_precision_loss, reason = "32-bit objects")]
+pub(super) fn float(value: i64) -> f64 {
+    value as f64
+}
+
+impl Objects {
+    pub(super) fn bind(store: &mut ObjectStore, plant: &PlantParams) -> Self {
+        let mut b = Binder(store);
+        let history = [0, 1, 2, 3, 4, 5].map(|sub| b.0.slot(0x1003, sub));
+        b.own_motor_data(
+            0x3001,
+            1,
+            "Nominal current",
+            whole(plant.nominal_current * 1e3),
+        );
+        b.own_motor_data(
+            0x3001,
+            5,
+            "Torque constant",
+            whole(plant.torque_constant * 1e6),
+        );
+        b.own_motor_data(
+            0x2200,
+            1,
+            "Power supply voltage",
+            whole(plant.supply_voltage * 10.0),
+        );
+        b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
+        b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
+        b.bind(0x60fd, 0, "Digital inputs", 32, RO);
+        b.bind(0x60fe, 1, "Physical outputs", 32, RW);
+        let parameters = ParameterSlots::bind(&mut b, plant);
+        Self {
+            error_register: b.bind(0x1001, 0, "Error register", 8, RO),
+            error_code: b.bind(0x603f, 0, "Error code", 16, RO),
+            history,
+            controlword: b.bind(0x6040, 0, "Controlword", 16, RW),
+            statusword: b.bind(0x6041, 0, "Statusword", 16, RO),
+            mode: b.with_default(0x6060, 0, "Modes of operation", 8, 1),
+            mode_display: b.bind(0x6061, 0, "Modes of operation display", 8, RO),
+            position_demand: b.bind(0x6062, 0, "Position demand value", 32, RO),
+            position: b.bind(0x6064, 0, "Position actual value", 32, RO),
+            velocity_demand: b.bind(0x606b, 0, "Velocity demand value", 32, RO),
+            velocity: b.bind(0x606c, 0, "Velocity actual value", 32, RO),
+            velocity_averaged: b.own(0x30d3, 1, "Velocity actual value averaged"),
+            torque: b.bind(0x6077, 0, "Torque actual value", 16, RO),
+            torque_averaged: b.own(0x30d2, 1, "Torque actual value averaged"),
+            current: b.own(0x30d1, 2, "Current actual value"),
+            current_averaged: b.own(0x30d1, 1, "Current actual value averaged"),
+            following_error: b.bind(0x60f4, 0, "Following error actual value", 32, RO),
+            target_position: b.bind(0x607a, 0, "Target position", 32, RW),
+            target_velocity: b.bind(0x60ff, 0, "Target velocity", 32, RW),
+            target_torque: b.bind(0x6071, 0, "Target torque", 16, RW),
+            position_offset: b.bind(0x60b0, 0, "Position offset", 32, RW),
+            velocity_offset: b.bind(0x60b1, 0, "Velocity offset", 32, RW),
+            torque_offset: b.bind(0x60b2, 0, "Torque offset", 16, RW),
+            parameters,
+        }
+    }
+
+    /// Which outputs the process data now carries.
+    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
+        self.parameters.set_mapped(is_mapped);
+    }
+
+    /// Parameters change with the process data.
+    pub(super) fn limits_are_mapped(&self) -> bool {
+        self.parameters.limits_are_mapped()
+    }
+
+    /// 0x1003: the newest error first.
+    pub(super) fn record(&self, store: &mut ObjectStore, code: u16) {
+        let [Some(count), entries @ ..] = self.history else {
+            return;
+        };
+        let mut carried = i64::from(code);
+        let mut used = 0;
+        for slot in entries.into_iter().flatten() {
+            let older = store.get(slot);
+            store.set(slot, carried);
+            used += 1;
+            carried = older;
+            if carried == 0 {
+                break;
+            }
+        }
+        store.set(count, used);
+    }
+
+    pub(super) fn parameters(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
+        self.parameters.read(store, plant)
+    }
+}
