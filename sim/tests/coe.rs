@@ -4,7 +4,7 @@ mod common;
 
 use Refusal::Abort;
 use common::*;
-use ecaxis_sim::FaultScript;
+use ecaxis_sim::{DeviceOptions, FaultScript};
 
 const S: u16 = 0x1001;
 
@@ -267,4 +267,19 @@ fn going_back_to_init_forgets_the_mailbox() {
     bus.preop(S);
     assert_eq!(bus.fetch(S), None);
     assert_eq!(bus.upload(S, 0x2003, 0).unwrap(), [7, 0, 0, 0]);
+}
+
+fn octets() -> Vec<u8> {
+    (0..500).map(|n| (7 * n + n / 256) as u8).collect()
+}
+
+#[test]
+fn long_objects_pass_mailboxes_of_every_size() {
+    for len in [16, 17, 23, 24, 48, 128, 256, 510, 511, 1024, 1486] {
+        let mut bus = mailbox_bus(len, DeviceOptions::default());
+        assert_eq!(bus.upload(S, 0x2000, 0).unwrap(), octets(), "{len} bytes");
+        let data: Vec<u8> = (0..64).map(|n| n ^ len as u8).collect();
+        bus.download(S, 0x2001, 0, &data).unwrap();
+        assert_eq!(bus.upload(S, 0x2001, 0).unwrap(), data, "{len} bytes");
+    }
 }

@@ -19,6 +19,8 @@ pub const OP: u8 = 8;
 pub struct Bus {
     pub segment: Segment,
     pub now: u64,
+    /// Address and length of the mailbox to write and the one to read, of all devices.
+    pub mailboxes: [(u16, u16); 2],
     counter: u8,
 }
 
@@ -34,6 +36,7 @@ impl Bus {
         Self {
             segment: Segment::new(devices, SegmentOptions::default()),
             now: 0,
+            mailboxes: [(0x1000, 48), (0x1030, 48)],
             counter: 0,
         }
     }
@@ -143,11 +146,16 @@ impl Bus {
         self.write(station, 0x600 + n * 16, &r);
     }
 
-    /// Mailboxes of [`coe_device`] and the EPOS4: 48 bytes at 0x1000 and 0x1030.
+    /// Mailboxes of [`coe_device`] and the EPOS4 unless said otherwise: 48 bytes at 0x1000 and 0x1030.
     pub fn preop(&mut self, station: u16) {
-        self.sm(station, 0, 0x1000, 48, 0x26);
-        self.sm(station, 1, 0x1030, 48, 0x22);
+        self.start_mailboxes(station);
         self.to(station, PREOP);
+    }
+
+    pub fn start_mailboxes(&mut self, station: u16) {
+        let [receive, send] = self.mailboxes;
+        self.sm(station, 0, receive.0, receive.1, 0x26);
+        self.sm(station, 1, send.0, send.1, 0x22);
     }
 
     /// Sends a mailbox message (header made here) and returns the reply without its header.
@@ -159,17 +167,24 @@ impl Bus {
 
     pub fn send_mailbox(&mut self, station: u16, kind: u8, payload: &[u8]) {
         self.counter = self.counter % 7 + 1;
-        let mut message = vec![0; 48];
+        let mut message = vec![0; usize::from(self.mailboxes[0].1)];
         message[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
         message[5] = kind | self.counter << 4;
         message[6..6 + payload.len()].copy_from_slice(payload);
-        self.write(station, 0x1000, &message);
+        self.write(station, self.mailboxes[0].0, &message);
     }
 
     pub fn fetch(&mut self, station: u16) -> Option<(u8, Vec<u8>)> {
-        let (data, wkc) = self.datagram(4, station, 0x1030, &[0; 48]);
+        let data = self.fetch_raw(station)?;
         let len = usize::from(u16::from_le_bytes([data[0], data[1]]));
-        (wkc == 1).then(|| (data[5] & 0x0f, data[6..6 + len].to_vec()))
+        Some((data[5] & 0x0f, data[6..6 + len].to_vec()))
+    }
+
+    /// A whole mailbox with its header; `None` while it is empty.
+    pub fn fetch_raw(&mut self, station: u16) -> Option<Vec<u8>> {
+        let (start, len) = self.mailboxes[1];
+        let (data, wkc) = self.datagram(4, station, start, &vec![0; usize::from(len)]);
+        (wkc == 1).then_some(data)
     }
 
     /// One SDO request; everything after the CoE header.
@@ -230,7 +245,7 @@ impl Bus {
         self.download_with(station, 0, index, sub, data)
     }
 
-    /// `flags` 0x10: complete access. Up to 4 bytes go expedited, up to 32 normal, else segmented.
+    /// `flags` 0x10: complete access. Up to 4 bytes go expedited, what fits one mailbox normal, else segmented.
     pub fn download_with(
         &mut self,
         station: u16,
@@ -248,12 +263,13 @@ impl Bus {
         }
         let mut request = vec![0x21 | flags, low, high, sub];
         request.extend_from_slice(&(data.len() as u32).to_le_bytes());
-        let (now, mut rest) = data.split_at(data.len().min(32));
+        let room = usize::from(self.mailboxes[0].1);
+        let (now, mut rest) = data.split_at(data.len().min(room - 16));
         request.extend_from_slice(now);
         self.sdo(station, &request)?;
         let mut toggle = 0;
         while !rest.is_empty() {
-            let (now, later) = rest.split_at(rest.len().min(39));
+            let (now, later) = rest.split_at(rest.len().min(room - 9));
             let unused = 7usize.saturating_sub(now.len()) as u8;
             let mut segment = vec![toggle | unused << 1 | u8::from(later.is_empty())];
             segment.extend_from_slice(now);
@@ -457,6 +473,23 @@ pub fn sim(device: &Device) -> SimDevice {
 
 pub fn sim_with(device: &Device, options: DeviceOptions) -> SimDevice {
     SimDevice::from_esi(device, &[], options).unwrap()
+}
+
+/// The device made for judging mailboxes.
+pub fn mailbox_device() -> Device {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/judges/esi/mailbox.xml");
+    let file = ecaxis_esi::parse(&std::fs::read(path).unwrap()).unwrap();
+    assert!(file.warnings.is_empty(), "{:?}", file.warnings);
+    file.devices.into_iter().next().unwrap()
+}
+
+/// [`mailbox_device`] in PreOp with mailboxes of this many bytes each.
+pub fn mailbox_bus(len: u16, options: DeviceOptions) -> Bus {
+    let mut bus = Bus::new(vec![sim_with(&mailbox_device(), options)]);
+    bus.mailboxes = [(0x1000, len), (0x1600, len)];
+    bus.address_all();
+    bus.preop(0x1001);
+    bus
 }
 
 pub fn fixtures() -> PathBuf {
