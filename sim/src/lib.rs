@@ -26,6 +26,7 @@ pub mod serve;
 pub use device::{DeviceOptions, SimDevice, SimError};
 pub use drive::PlantParams;
 pub use esc::al::AlState;
+pub use esc::info::EscInfo;
 pub use faults::{FaultScript, ScriptError};
 pub use network::{Segment, SegmentOptions, Transit};
 pub use serve::{ServeError, ServeStats, serve};

@@ -4,7 +4,7 @@ mod common;
 
 use common::*;
 use ecaxis_sim::frame::FrameBuilder;
-use ecaxis_sim::{AlState, DeviceOptions, FaultScript};
+use ecaxis_sim::{AlState, DeviceOptions, EscInfo, FaultScript};
 use proptest::prelude::*;
 
 fn three_io() -> Bus {
@@ -54,8 +54,8 @@ fn read_only_registers_do_not_count_writes() {
     let mut bus = three_io();
     assert_eq!(bus.datagram(8, 0, 0x130, &[0, 0]).1, 0);
     assert_eq!(bus.datagram(9, 0, 0x130, &[0, 0]).1, 3);
-    // No distributed clocks: nothing at 0x0900.
-    assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 0);
+    // Distributed clocks not in use: nothing but receive times.
+    assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 3);
     assert_eq!(bus.datagram(7, 0, 0x910, &[0; 8]).1, 0);
 }
 
@@ -90,7 +90,7 @@ fn information_registers_describe_the_controller() {
         bus.read(0x1001, 0, 10),
         [0x11, 0, 2, 0, 8, 8, 8, 0x0f, 0xcc, 0]
     );
-    assert_eq!(bus.read(0x1002, 7, 3), [0x0a, 0xc0, 0]);
+    assert_eq!(bus.read(0x1002, 7, 3), [0x0a, 0xcc, 0]);
     assert_eq!(bus.read_u16(0x1002, 0x12), 0x55);
     assert_eq!(
         bus.datagram(4, 0x55, 0, &[0]).1,
@@ -374,4 +374,39 @@ proptest! {
             bus.wait(300_000);
         }
     }
+}
+
+#[test]
+fn a_smaller_chip_lacks_the_upper_units_and_reads_four_bytes() {
+    let options = DeviceOptions {
+        esc: EscInfo::LAN9252,
+        ..DeviceOptions::default()
+    };
+    let mut bus = Bus::new(vec![sim_with(&io_device(), options)]);
+    bus.address_all();
+    assert_eq!(
+        bus.read(0x1001, 0, 10),
+        [0xc0, 2, 0, 0, 3, 4, 4, 0x0a, 0xcc, 1]
+    );
+    for (ado, len, wkc) in [
+        (0x620, 16, 1),
+        (0x630, 16, 0),
+        (0x620, 32, 1),
+        (0x818, 8, 1),
+        (0x820, 8, 0),
+    ] {
+        assert_eq!(
+            bus.datagram(8, 0, ado, &vec![0; len]).1,
+            wkc,
+            "0x{ado:04x}, {len} bytes"
+        );
+    }
+    bus.write(0x1001, 0x508, &[0xee; 8]);
+    bus.write(0x1001, 0x502, &[0, 1, 8, 0, 0, 0]);
+    bus.wait(1_000_000);
+    assert_eq!(bus.read_u16(0x1001, 0x502) & 0x00c0, 0x0080);
+    assert_eq!(
+        bus.read(0x1001, 0x508, 8),
+        [0x11, 1, 0, 0, 0xee, 0xee, 0xee, 0xee]
+    );
 }

@@ -10,7 +10,7 @@ use super::{Application, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
-use crate::esc::{Esc, EscConfig};
+use crate::esc::{Esc, EscConfig, EscInfo};
 
 /// CiA 402.
 const DRIVE_PROFILE: u32 = 402;
@@ -30,6 +30,8 @@ pub struct DeviceOptions {
     pub delay_ns: u64,
     /// EEPROM contents in place of those made from the ESI.
     pub sii: Option<Vec<u8>>,
+    /// The chip. Process RAM grows where the device's SyncManagers need more.
+    pub esc: EscInfo,
 }
 
 impl Default for DeviceOptions {
@@ -42,6 +44,7 @@ impl Default for DeviceOptions {
             plant: PlantParams::default(),
             delay_ns: 500,
             sii: None,
+            esc: EscInfo::default(),
         }
     }
 }
@@ -67,7 +70,7 @@ impl SimDevice {
         modules: &[Module],
         options: DeviceOptions,
     ) -> Result<Self, SimError> {
-        let memory = memory(device)?;
+        let ram_kib = ram_kib(device)?;
         let image = match options.sii {
             Some(image) => image,
             None => {
@@ -103,9 +106,12 @@ impl SimDevice {
         };
         let esc = Esc::new(
             EscConfig {
+                info: EscInfo {
+                    ram_kib: options.esc.ram_kib.max(ram_kib),
+                    ..options.esc
+                },
                 ports: ports(&device.physics),
                 with_dc: is_drive || !device.dc_modes.is_empty(),
-                memory,
                 clock_offset_ns: options.clock_offset_ns,
                 clock_drift_ppm: options.clock_drift_ppm,
             },
@@ -123,7 +129,6 @@ impl SimDevice {
                 application: application.clone(),
             }),
             esc,
-            memory,
             store,
             pdo,
             process,
@@ -222,9 +227,9 @@ fn ports(physics: &str) -> u8 {
         })
 }
 
-/// Process RAM ends where an ET1100's does, or where the ESI's SyncManagers need it.
-fn memory(device: &Device) -> Result<usize, SimError> {
-    let mut end = 0x3000;
+/// Process RAM that the device's SyncManagers need.
+fn ram_kib(device: &Device) -> Result<u8, SimError> {
+    let mut end = 0x1000;
     for (n, sm) in device.sync_managers.iter().enumerate() {
         let (start, len) = (sm.start_address, sm.max_size.unwrap_or(sm.default_size));
         let mailbox = matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn);
@@ -240,7 +245,7 @@ fn memory(device: &Device) -> Result<usize, SimError> {
         }
         end = end.max(last);
     }
-    Ok(end)
+    Ok(u8::try_from((end - 0x1000).div_ceil(1024)).unwrap_or(u8::MAX))
 }
 
 fn mailbox(device: &Device) -> Option<Mailbox> {

@@ -200,7 +200,7 @@ impl SimDevice {
             let other = area(other);
             other.is_empty() || other.start >= own.end || own.start >= other.end
         });
-        clear && own.end <= self.memory
+        clear && own.end <= self.esc.memory()
     }
 
     fn check_sync(&self) -> Result<(), u16> {

@@ -58,7 +58,6 @@ pub struct SimDevice {
     name: String,
     pub(crate) delay_ns: u64,
     pub(crate) esc: Esc,
-    memory: usize,
     store: ObjectStore,
     pdo: PdoRules,
     process: Vec<ProcessData>,

@@ -183,12 +183,11 @@ impl Esc {
     }
 
     fn latch_arrival(&mut self, local: u64) {
-        if self.dc.is_none() {
-            return;
-        }
         let [a, b, c, d, ..] = local.to_le_bytes();
         self.put(reg::DC_RECEIVE_TIMES, &[a, b, c, d]);
-        self.put(reg::DC_RECEIVE_TIME_PU, &local.to_le_bytes());
+        if self.dc.is_some() {
+            self.put(reg::DC_RECEIVE_TIME_PU, &local.to_le_bytes());
+        }
         self.latch = true;
     }
 

@@ -1,12 +1,12 @@
 //! The SII EEPROM behind registers 0x0500–0x050F.
 
-/// Time a read or reload and a write take.
-const READ_NS: u64 = 50_000;
+use super::info::EscInfo;
+use super::info::eeprom::EIGHT_BYTES;
+
+/// Time a write takes.
 const WRITE_NS: u64 = 500_000;
 
 pub const WRITE_ENABLE: u16 = 0x0001;
-/// Reads return 8 bytes; word addresses are two bytes on the I²C bus.
-pub const FEATURES: u16 = 0x00c0;
 pub const CHECKSUM_ERROR: u16 = 0x0800;
 pub const COMMAND_ERROR: u16 = 0x2000;
 pub const WRITE_ENABLE_ERROR: u16 = 0x4000;
@@ -22,15 +22,20 @@ enum Job {
 #[derive(Debug, Clone)]
 pub struct Eeprom {
     image: Vec<u8>,
+    /// Bits of the status that tell of the chip, see [`super::info::eeprom`].
+    features: u16,
+    read_ns: u64,
     job: Option<(Job, u64)>,
     error: u16,
 }
 
 impl Eeprom {
     #[must_use]
-    pub fn new(image: Vec<u8>) -> Self {
+    pub fn new(image: Vec<u8>, info: &EscInfo) -> Self {
         let mut eeprom = Self {
             image,
+            features: info.eeprom,
+            read_ns: info.eeprom_read_ns,
             job: None,
             error: 0,
         };
@@ -84,13 +89,13 @@ impl Eeprom {
         self.error &= CHECKSUM_ERROR;
         self.job = match control >> 8 & 7 {
             0 => None,
-            1 => Some((Job::Read(address), local + READ_NS)),
+            1 => Some((Job::Read(address), local + self.read_ns)),
             2 if control & WRITE_ENABLE == 0 => {
                 self.error |= WRITE_ENABLE_ERROR;
                 None
             }
             2 => Some((Job::Write(address, data), local + WRITE_NS)),
-            4 => Some((Job::Reload, local + READ_NS)),
+            4 => Some((Job::Reload, local + self.read_ns)),
             _ => {
                 self.error |= COMMAND_ERROR;
                 None
@@ -103,15 +108,16 @@ impl Eeprom {
         self.job.map_or(u64::MAX, |(_, due)| due)
     }
 
-    /// Ends the running job; the bytes for the data register, if it was a read.
-    pub fn finish(&mut self) -> Option<[u8; 8]> {
+    /// Ends the running job; the bytes for the data register and how many count, if it was a read.
+    pub fn finish(&mut self) -> Option<([u8; 8], usize)> {
         match self.job.take()?.0 {
             Job::Read(word) => {
                 let mut out = [0xff; 8];
                 for (n, pair) in (0..4).zip(out.chunks_exact_mut(2)) {
                     pair.copy_from_slice(&self.word(word.wrapping_add(n)).to_le_bytes());
                 }
-                Some(out)
+                let eight = self.features & EIGHT_BYTES != 0;
+                Some((out, if eight { 8 } else { 4 }))
             }
             Job::Write(word, data) => {
                 let at = usize::try_from(word)
@@ -132,7 +138,7 @@ impl Eeprom {
 
     #[must_use]
     pub fn status(&self) -> u16 {
-        FEATURES | self.error | if self.job.is_some() { BUSY } else { 0 }
+        self.features | self.error | if self.job.is_some() { BUSY } else { 0 }
     }
 }
 
@@ -142,19 +148,19 @@ mod tests {
 
     #[test]
     fn reads_eight_bytes_and_ones_beyond_the_end() {
-        let mut eeprom = Eeprom::new((0..32).collect());
+        let mut eeprom = Eeprom::new((0..32).collect(), &EscInfo::default());
         eeprom.command(0x0100, 14, [0; 2], 0);
         assert_eq!(eeprom.status() & BUSY, BUSY);
         assert_eq!(
             eeprom.finish(),
-            Some([28, 29, 30, 31, 0xff, 0xff, 0xff, 0xff])
+            Some(([28, 29, 30, 31, 0xff, 0xff, 0xff, 0xff], 8))
         );
         assert_eq!(eeprom.status() & BUSY, 0);
     }
 
     #[test]
     fn writes_need_the_enable_bit() {
-        let mut eeprom = Eeprom::new(vec![0; 32]);
+        let mut eeprom = Eeprom::new(vec![0; 32], &EscInfo::default());
         eeprom.command(0x0200, 4, [1, 2], 0);
         assert_eq!(eeprom.status() & WRITE_ENABLE_ERROR, WRITE_ENABLE_ERROR);
         eeprom.command(0x0201, 4, [1, 2], 0);
@@ -168,10 +174,10 @@ mod tests {
         let mut image = vec![0; 32];
         // ETG.2010: polynomial x^8 + x^2 + x + 1, start value 0xff.
         image[..15].copy_from_slice(&[8, 0, 0, 0x44, 0x88, 0x13, 1, 0, 0, 0, 0, 0, 0, 0, 0]);
-        let bad = Eeprom::new(image.clone());
+        let bad = Eeprom::new(image.clone(), &EscInfo::default());
         let good = (0..=255).any(|crc| {
             image[14] = crc;
-            Eeprom::new(image.clone()).status() & CHECKSUM_ERROR == 0
+            Eeprom::new(image.clone(), &EscInfo::default()).status() & CHECKSUM_ERROR == 0
         });
         assert!(good && bad.status() & BUSY == 0);
     }

@@ -5,6 +5,7 @@ pub mod al;
 pub mod dc;
 pub mod eeprom;
 pub mod fmmu;
+pub mod info;
 pub mod registers;
 pub mod sm;
 pub mod watchdog;
@@ -17,6 +18,7 @@ use al::AlState;
 use dc::{Clock, Dc};
 use eeprom::Eeprom;
 use fmmu::Fmmu;
+pub use info::EscInfo;
 use registers as reg;
 use registers::RegisterMap;
 use sm::SyncManager;
@@ -38,14 +40,18 @@ pub struct Raised {
     pub sync_changed: bool,
 }
 
+/// Where process RAM starts.
+const PROCESS_RAM: usize = 0x1000;
+const MAX_RAM_KIB: u8 = 60;
+
 /// Fixed properties of an ESC.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub struct EscConfig {
-    /// Two bits a port: 0 none, 1 not configured, 2 EBUS, 3 MII.
+    pub info: EscInfo,
+    /// Two bits a port: 0 none, 1 not configured, 2 EBUS, 3 MII; counts where `info` leaves it open.
     pub ports: u8,
+    /// System time and SYNC units (0x0910–0x09FF) are switched on; the chip needs distributed clocks.
     pub with_dc: bool,
-    /// End of process RAM.
-    pub memory: usize,
     pub clock_offset_ns: u64,
     pub clock_drift_ppm: f64,
 }
@@ -72,13 +78,13 @@ impl Esc {
     #[must_use]
     pub fn new(config: EscConfig, sii: Vec<u8>) -> Self {
         let mut esc = Self {
-            mem: vec![0; config.memory.clamp(0x3000, 0x1_0000)],
-            map: RegisterMap::new(config.with_dc),
+            mem: vec![0; PROCESS_RAM + usize::from(config.info.ram_kib.min(MAX_RAM_KIB)) * 1024],
+            map: RegisterMap::new(&config.info, config.with_dc),
             fmmus: [None; 8],
             sms: [SyncManager::default(); 8],
             clock: Clock::new(0, config.clock_offset_ns, config.clock_drift_ppm),
             dc: None,
-            eeprom: Eeprom::new(sii),
+            eeprom: Eeprom::new(sii, &config.info),
             watchdog: Watchdog::default(),
             raised: Raised::default(),
             station: 0,
@@ -101,18 +107,17 @@ impl Esc {
             self.config.clock_offset_ns,
             self.config.clock_drift_ppm,
         );
-        self.dc = self.config.with_dc.then(Dc::default);
+        let EscConfig { info, with_dc, .. } = self.config;
+        self.dc = (with_dc && info.has(info::feature::DC)).then(Dc::default);
         self.watchdog = Watchdog::default();
         self.raised = Raised::default();
         (self.station, self.alias, self.latch) = (0, None, false);
 
-        let ram_kib = ((self.mem.len() - reg::ADDRESS_SPACE) / 1024).min(255) as u8;
-        let features: u16 = if self.config.with_dc { 0x00cc } else { 0x00c0 };
-        let [f0, f1] = features.to_le_bytes();
-        self.put(
-            reg::TYPE,
-            &[0x11, 0, 2, 0, 8, 8, ram_kib, self.config.ports, f0, f1],
-        );
+        let ([b0, b1], [f0, f1]) = (info.build.to_le_bytes(), info.features.to_le_bytes());
+        let ports = info.ports.unwrap_or(self.config.ports);
+        self.put(reg::TYPE, &[info.kind, info.revision, b0, b1]);
+        self.put(reg::TYPE + 4, &[info.fmmus, info.sync_managers]);
+        self.put(reg::TYPE + 6, &[info.ram_kib, ports, f0, f1]);
         let alias = self.eeprom.word(4);
         self.put(reg::STATION_ALIAS, &alias.to_le_bytes());
         self.put(reg::PDI_CONTROL, &self.eeprom.word(0).to_le_bytes());
@@ -122,7 +127,10 @@ impl Esc {
         self.put(reg::WD_PDI, &watchdog::DEFAULT_COUNT.to_le_bytes());
         self.put(reg::WD_PROCESS_DATA, &watchdog::DEFAULT_COUNT.to_le_bytes());
         self.put(reg::WD_STATUS, &[1]);
-        if self.config.with_dc {
+        if info.has(info::feature::DC) {
+            self.put(reg::DC_RECEIVE_TIMES, info.receive_times.as_flattened());
+        }
+        if self.dc.is_some() {
             self.put(reg::DC_SPEED_START, &[0x00, 0x10]);
             self.put(reg::DC_FILTER, &[0x04, 0x0c]);
             self.put(reg::DC_PULSE_LENGTH, &self.eeprom.word(2).to_le_bytes());
@@ -133,6 +141,12 @@ impl Esc {
         self.refresh_eeprom();
         self.set_al(AlState::Init, 0);
         self.set_link(false);
+    }
+
+    /// End of process RAM.
+    #[must_use]
+    pub fn memory(&self) -> usize {
+        self.mem.len()
     }
 
     /// Register or RAM contents as the device's own side sees them.
@@ -238,8 +252,8 @@ impl Esc {
     }
 
     pub(crate) fn finish_eeprom(&mut self) {
-        if let Some(data) = self.eeprom.finish() {
-            self.put(reg::EEPROM_DATA, &data);
+        if let Some((data, len)) = self.eeprom.finish() {
+            self.put(reg::EEPROM_DATA, data.get(..len).unwrap_or(&data));
         }
         self.refresh_eeprom();
     }

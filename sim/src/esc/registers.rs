@@ -1,7 +1,12 @@
 //! The register map: addresses, which bytes exist and which the MainDevice may write.
 
+use super::info::{EscInfo, feature};
+
 /// Registers end here; digital outputs (0x0F00), user RAM (0x0F80) and process RAM follow.
 pub const ADDRESS_SPACE: usize = 0x0f00;
+
+/// FMMUs and SyncManagers that the simulator can hold.
+pub const MAX_UNITS: u8 = 8;
 
 pub const TYPE: u16 = 0x0000;
 pub const STATION_ADDRESS: u16 = 0x0010;
@@ -45,7 +50,7 @@ pub const DC_NEXT_SYNC1: u16 = 0x0998;
 pub const DC_SYNC0_CYCLE: u16 = 0x09a0;
 pub const DC_SYNC1_CYCLE: u16 = 0x09a4;
 
-/// (first, last, writable) of the registers every device here has.
+/// (first, last, writable) of the registers every chip here has.
 const BASE: &[(u16, u16, bool)] = &[
     (0x0000, 0x0009, false),
     (0x0010, 0x0011, true),
@@ -75,14 +80,13 @@ const BASE: &[(u16, u16, bool)] = &[
     (0x0500, 0x0500, true),
     (0x0501, 0x0501, false),
     (0x0502, 0x050f, true),
-    (0x0600, 0x067f, true),
-    (0x0800, 0x083f, true),
 ];
 
-/// Distributed clocks.
+/// Receive times: in every chip with distributed clocks, used or not.
+const RECEIVE_TIMES: &[(u16, u16, bool)] = &[(0x0900, 0x0903, true), (0x0904, 0x090f, false)];
+
+/// System time and SYNC units.
 const DC: &[(u16, u16, bool)] = &[
-    (0x0900, 0x0903, true),
-    (0x0904, 0x090f, false),
     (0x0910, 0x0917, true),
     (0x0918, 0x091f, false),
     (0x0920, 0x0927, true),
@@ -107,17 +111,23 @@ pub struct RegisterMap(Vec<u8>);
 
 impl RegisterMap {
     #[must_use]
-    pub fn new(with_dc: bool) -> Self {
+    pub fn new(info: &EscInfo, with_dc: bool) -> Self {
         let mut map = vec![0; ADDRESS_SPACE];
-        let dc = if with_dc { DC } else { &[] };
-        for (first, last, writable) in BASE.iter().chain(dc) {
+        let (receive_times, dc) = match (info.has(feature::DC), with_dc) {
+            (true, true) => (RECEIVE_TIMES, DC),
+            (true, false) => (RECEIVE_TIMES, &[] as &[_]),
+            (false, _) => (&[] as &[_], &[] as &[_]),
+        };
+        for (first, last, writable) in BASE.iter().chain(receive_times).chain(dc) {
             let range = usize::from(*first)..=usize::from(*last);
             map[range].fill(if *writable { 3 } else { 1 });
         }
+        let fmmus = usize::from(info.fmmus.min(MAX_UNITS)) * 16;
+        map[usize::from(FMMU)..][..fmmus].fill(3);
         // Status and PDI control of each SyncManager belong to the device.
-        for n in 0..8 {
-            map[usize::from(SM) + n * 8 + 5] = 1;
-            map[usize::from(SM) + n * 8 + 7] = 1;
+        let sms = usize::from(info.sync_managers.min(MAX_UNITS)) * 8;
+        for sm in map[usize::from(SM)..][..sms].chunks_exact_mut(8) {
+            sm.copy_from_slice(&[3, 3, 3, 3, 3, 1, 3, 1]);
         }
         Self(map)
     }
