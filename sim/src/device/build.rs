@@ -1,7 +1,7 @@
 //! Devices from ESI files.
 
 use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse};
-use ecaxis_esi::sii::{self, SiiOptions};
+use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 
 use super::esm::Al;
 use super::mailbox::Mailbox;
@@ -60,6 +60,8 @@ pub enum SimError {
         start: u16,
         len: u16,
     },
+    #[error("EEPROM image: {0}")]
+    Image(#[from] SiiError),
 }
 
 impl SimDevice {
@@ -111,7 +113,7 @@ impl SimDevice {
                     ..options.esc
                 },
                 ports: ports(&device.physics),
-                with_dc: is_drive || !device.dc_modes.is_empty(),
+                with_dc: is_drive || uses_dc(device),
                 clock_offset_ns: options.clock_offset_ns,
                 clock_drift_ppm: options.clock_drift_ppm,
             },
@@ -155,6 +157,12 @@ impl SimDevice {
 fn is_drive(device: &Device, store: &ObjectStore) -> bool {
     device.profile == Some(DRIVE_PROFILE)
         || [CONTROLWORD, STATUSWORD].map(|index| store.has_object(index)) == [true, true]
+}
+
+/// The high byte of the PDI control word switches SYNC and latch units on; some makers only offer OpModes.
+fn uses_dc(device: &Device) -> bool {
+    let units = device.eeprom.config_data.get(1).map_or(0, |b| b & 0x0c);
+    units != 0 || !device.dc_modes.is_empty()
 }
 
 /// Modules that may be plugged, the device, its default modules: the later wins.

@@ -1,6 +1,7 @@
 //! A SubDevice: an ESC, the application behind it and the device's own time.
 //!
 //! * `build`: from an ESI device
+//! * `from_sii`: from an EEPROM image
 //! * `esm`: state changes and what they demand
 //! * `mailbox`: requests and replies
 //! * `process`: process data and objects
@@ -9,6 +10,7 @@
 
 mod build;
 mod esm;
+mod from_sii;
 mod mailbox;
 mod process;
 
