@@ -1,6 +1,6 @@
 //! `ecaxis sim`: the machine file's bus, simulated, on a network interface for any MainDevice.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -8,6 +8,8 @@ use ecaxis::config;
 use ecaxis::link::packet::{OpenError, PacketLink};
 use ecaxis::rt::thread;
 use ecaxis::session;
+use ecaxis_sim::{Segment, ServeStats};
+use serde_json::{Value, json};
 
 use super::{Failure, hints, note, result, run, signals};
 
@@ -26,6 +28,12 @@ pub(crate) struct Args {
     /// Fault script
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
+    /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …
+    #[arg(long, value_name = "FOLDER")]
+    sii: Option<PathBuf>,
+    /// Print the statistics as JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     pub verbosity: super::Verbosity,
 }
@@ -44,8 +52,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .as_ref()
         .and_then(|f| f.seed)
         .unwrap_or(session::Options::default().seed);
-    let segment = session::simulated_bus(&machine, seed, faults.as_ref())
+    let mut segment = session::simulated_bus(&machine, seed, faults.as_ref())
         .map_err(|error| hints::run(&error, &machine.bus.nic))?;
+    if let Some(folder) = &args.sii {
+        write_images(&segment, folder)?;
+    }
 
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
@@ -72,11 +83,87 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     for denied in thread::prepare(PRIORITY, None) {
         note(&format!("warning: {denied}"));
     }
-    let stats = ecaxis_sim::serve(segment, nic, &stop).map_err(|e| hints::serve(&e))?;
-    result(&format!(
-        "{} frames answered, {} lost on purpose, {} not sent\n",
-        stats.frames.saturating_sub(stats.lost + stats.send_errors),
-        stats.lost,
-        stats.send_errors,
-    ))
+    let stats = ecaxis_sim::serve(&mut segment, nic, &stop).map_err(|e| hints::serve(&e))?;
+    let report = report(&stats, &segment);
+    result(&if args.json {
+        format!("{report:#}\n")
+    } else {
+        text(&report)
+    })
+}
+
+fn write_images(segment: &Segment, folder: &Path) -> Result<(), Failure> {
+    let failed = |path: &Path, e: std::io::Error| {
+        Failure::new(
+            hints::FAILED,
+            format!("cannot write {}: {e}", path.display()),
+        )
+    };
+    std::fs::create_dir_all(folder).map_err(|e| failed(folder, e))?;
+    for (position, device) in devices(segment) {
+        let path = folder.join(format!("{position}.bin"));
+        std::fs::write(&path, device.sii()).map_err(|e| failed(&path, e))?;
+    }
+    Ok(())
+}
+
+fn devices(segment: &Segment) -> impl Iterator<Item = (usize, &ecaxis_sim::SimDevice)> {
+    (0..segment.len()).filter_map(|n| Some((n, segment.device(n)?)))
+}
+
+fn report(stats: &ServeStats, segment: &Segment) -> Value {
+    let turnaround = &stats.turnaround;
+    let us = |share| turnaround.quantile(share).map(|ns| ns as f64 / 1e3);
+    let devices: Vec<Value> = devices(segment)
+        .map(|(position, device)| {
+            json!({
+                "position": position,
+                "type": device.name(),
+                "state": device.al_state().to_string(),
+                "al_status_code": device.al_status_code(),
+            })
+        })
+        .collect();
+    json!({
+        "frames": stats.frames,
+        "answered": stats.answered,
+        "lost_on_purpose": stats.lost,
+        "malformed": stats.malformed,
+        "not_ethercat": stats.foreign,
+        "not_sent": stats.send_errors,
+        "turnaround_us": { "p50": us(0.5), "p99": us(0.99), "max": us(1.0) },
+        "devices": devices,
+    })
+}
+
+fn text(report: &Value) -> String {
+    let mut text = format!(
+        "{} frames answered, {} lost on purpose, {} malformed, {} not EtherCAT, {} not sent\n",
+        report["answered"],
+        report["lost_on_purpose"],
+        report["malformed"],
+        report["not_ethercat"],
+        report["not_sent"],
+    );
+    let turnaround = |share| report["turnaround_us"][share].as_f64();
+    if let (Some(p50), Some(p99), Some(max)) =
+        (turnaround("p50"), turnaround("p99"), turnaround("max"))
+    {
+        text += &format!("turnaround: p50 {p50:.1} µs, p99 {p99:.1} µs, max {max:.1} µs\n");
+    }
+    for device in report["devices"].as_array().into_iter().flatten() {
+        let name = |key| device[key].as_str().unwrap_or_default();
+        text += &format!(
+            "  {:>3}  {:<24} {}",
+            device["position"],
+            name("type"),
+            name("state"),
+        );
+        match device["al_status_code"].as_u64() {
+            None | Some(0) => {}
+            Some(code) => text += &format!(", error {code:#06x}"),
+        }
+        text.push('\n');
+    }
+    text
 }

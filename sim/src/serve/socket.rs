@@ -1,0 +1,194 @@
+//! A raw socket on one interface, with the kernel's time of arrival for every frame.
+
+use std::ffi::CString;
+use std::io;
+use std::mem;
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::ptr;
+
+use super::ServeError;
+use crate::Nanos;
+
+/// Room for one control message with a time stamp, aligned as its header wants it.
+type Control = [u64; 8];
+
+#[derive(Debug)]
+pub(super) struct RawSocket(OwnedFd);
+
+/// A frame that is in the caller's buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Received {
+    pub(super) len: usize,
+    /// Monotonic time at which it reached the interface.
+    pub(super) at: Nanos,
+    /// It was longer than the buffer.
+    pub(super) cut: bool,
+}
+
+impl RawSocket {
+    pub(super) fn open(nic: &str) -> Result<Self, ServeError> {
+        let failed = |what| {
+            move |source| ServeError::Io {
+                nic: nic.to_owned(),
+                what,
+                source,
+            }
+        };
+        let name = CString::new(nic).map_err(|_| ServeError::NoSuchInterface(nic.to_owned()))?;
+        // SAFETY: `name` is NUL-terminated and lives through the call.
+        let index = unsafe { libc::if_nametoindex(name.as_ptr()) };
+        let index = i32::try_from(index).unwrap_or(0);
+        if index == 0 {
+            return Err(ServeError::NoSuchInterface(nic.to_owned()));
+        }
+        // Without a protocol it receives nothing until `bind` names one; other interfaces' frames stay out.
+        // SAFETY: plain system call; the result is checked.
+        let fd = unsafe { libc::socket(libc::AF_PACKET, libc::SOCK_RAW | libc::SOCK_CLOEXEC, 0) };
+        if fd < 0 {
+            let source = io::Error::last_os_error();
+            return Err(if source.kind() == io::ErrorKind::PermissionDenied {
+                ServeError::NotPermitted(nic.to_owned())
+            } else {
+                failed("opening a raw socket")(source)
+            });
+        }
+        // SAFETY: `fd` is a valid descriptor that nothing else owns.
+        let socket = Self(unsafe { OwnedFd::from_raw_fd(fd) });
+
+        let timeout = libc::timeval {
+            tv_sec: 0,
+            tv_usec: 1_000,
+        };
+        socket
+            .set(libc::SOL_SOCKET, libc::SO_RCVTIMEO, &timeout)
+            .map_err(failed("setting the receive timeout"))?;
+        // Without stamps the time of the receive call has to do.
+        let _ = socket.set(libc::SOL_SOCKET, libc::SO_TIMESTAMPNS, &1_i32);
+        // Our own replies would otherwise come back; older kernels are covered by the packet type.
+        let _ = socket.set(libc::SOL_PACKET, libc::PACKET_IGNORE_OUTGOING, &1_i32);
+        // Replies must not wait behind a traffic shaper.
+        let _ = socket.set(libc::SOL_PACKET, libc::PACKET_QDISC_BYPASS, &1_i32);
+        // A MainDevice's destination address is the broadcast address, but need not be.
+        let everything = libc::packet_mreq {
+            mr_ifindex: index,
+            mr_type: libc::PACKET_MR_PROMISC as libc::c_ushort,
+            mr_alen: 0,
+            mr_address: [0; 8],
+        };
+        socket
+            .set(libc::SOL_PACKET, libc::PACKET_ADD_MEMBERSHIP, &everything)
+            .map_err(failed("switching to promiscuous mode"))?;
+
+        // SAFETY: all-zero is a valid sockaddr_ll.
+        let mut address: libc::sockaddr_ll = unsafe { mem::zeroed() };
+        address.sll_family = libc::AF_PACKET as libc::c_ushort;
+        address.sll_protocol = (libc::ETH_P_ALL as u16).to_be();
+        address.sll_ifindex = index;
+        // SAFETY: the address lives through the call and the length is its size.
+        let bound = unsafe {
+            libc::bind(
+                socket.0.as_raw_fd(),
+                (&raw const address).cast(),
+                size_of_val(&address) as libc::socklen_t,
+            )
+        };
+        if bound < 0 {
+            return Err(failed("binding the socket")(io::Error::last_os_error()));
+        }
+        Ok(socket)
+    }
+
+    fn set<T>(&self, level: i32, name: i32, value: &T) -> io::Result<()> {
+        // SAFETY: the value lives through the call and the length is its size.
+        let result = unsafe {
+            libc::setsockopt(
+                self.0.as_raw_fd(),
+                level,
+                name,
+                (&raw const *value).cast(),
+                size_of::<T>() as libc::socklen_t,
+            )
+        };
+        if result < 0 {
+            Err(io::Error::last_os_error())
+        } else {
+            Ok(())
+        }
+    }
+
+    /// The next frame; `None` after a millisecond without one.
+    pub(super) fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
+        // SAFETY: all-zero is a valid sockaddr_ll and a valid msghdr.
+        let (mut from, mut message): (libc::sockaddr_ll, libc::msghdr) =
+            unsafe { (mem::zeroed(), mem::zeroed()) };
+        let mut control: Control = [0; 8];
+        let mut part = libc::iovec {
+            iov_base: buffer.as_mut_ptr().cast(),
+            iov_len: buffer.len(),
+        };
+        message.msg_name = (&raw mut from).cast();
+        message.msg_namelen = size_of_val(&from) as libc::socklen_t;
+        message.msg_iov = &raw mut part;
+        message.msg_iovlen = 1;
+        message.msg_control = (&raw mut control).cast();
+        message.msg_controllen = size_of_val(&control);
+        // SAFETY: every pointer in `message` is valid for the length beside it.
+        let len = unsafe { libc::recvmsg(self.0.as_raw_fd(), &raw mut message, 0) };
+        let Ok(len) = usize::try_from(len) else {
+            let error = io::Error::last_os_error();
+            return match error.raw_os_error() {
+                // An interface that goes down and up again is a pulled cable, not the end.
+                Some(libc::EAGAIN | libc::EINTR | libc::ENETDOWN) => Ok(None),
+                _ => Err(error),
+            };
+        };
+        if from.sll_pkttype == libc::PACKET_OUTGOING {
+            return Ok(None);
+        }
+        let now = clock(libc::CLOCK_MONOTONIC);
+        // Stamps are of the clock that may be set; how long ago it was is not.
+        let age =
+            stamp(&message).map_or(0, |stamp| clock(libc::CLOCK_REALTIME).saturating_sub(stamp));
+        Ok(Some(Received {
+            len,
+            at: now.saturating_sub(age),
+            cut: message.msg_flags & libc::MSG_TRUNC != 0,
+        }))
+    }
+
+    /// False if the interface does not take it.
+    pub(super) fn send(&self, bytes: &[u8]) -> bool {
+        // SAFETY: the buffer is valid for its length.
+        let sent = unsafe { libc::send(self.0.as_raw_fd(), bytes.as_ptr().cast(), bytes.len(), 0) };
+        usize::try_from(sent) == Ok(bytes.len())
+    }
+}
+
+/// The kernel's time of arrival among the control messages.
+fn stamp(message: &libc::msghdr) -> Option<Nanos> {
+    // SAFETY: the kernel has filled `msg_control` up to `msg_controllen`.
+    let header = unsafe { libc::CMSG_FIRSTHDR(message).as_ref()? };
+    if (header.cmsg_level, header.cmsg_type) != (libc::SOL_SOCKET, libc::SO_TIMESTAMPNS) {
+        return None;
+    }
+    // SAFETY: a message of this type carries a timespec, which need not be aligned.
+    let time: libc::timespec = unsafe { ptr::read_unaligned(libc::CMSG_DATA(header).cast()) };
+    nanos(&time)
+}
+
+/// A clock's time in nanoseconds.
+pub(super) fn clock(id: libc::clockid_t) -> Nanos {
+    let mut time = libc::timespec {
+        tv_sec: 0,
+        tv_nsec: 0,
+    };
+    // SAFETY: `time` is a valid timespec to write to; the clocks used here always exist.
+    unsafe { libc::clock_gettime(id, &raw mut time) };
+    nanos(&time).unwrap_or(0)
+}
+
+fn nanos(time: &libc::timespec) -> Option<Nanos> {
+    let seconds = u64::try_from(time.tv_sec).ok()?;
+    let rest = u64::try_from(time.tv_nsec).ok()?;
+    seconds.checked_mul(1_000_000_000)?.checked_add(rest)
+}

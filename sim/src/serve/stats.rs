@@ -1,0 +1,121 @@
+//! What was served, and how quickly.
+
+use crate::Nanos;
+
+/// Steps within each power of two.
+const STEPS: usize = 8;
+const BUCKETS: usize = 64 * STEPS;
+
+#[derive(Debug, Clone, Default)]
+pub struct ServeStats {
+    /// EtherCAT frames received.
+    pub frames: u64,
+    /// Replies sent.
+    pub answered: u64,
+    /// Lost on purpose, by the fault script.
+    pub lost: u64,
+    /// Went round unprocessed, as SubDevices pass on what they cannot read, or too long for that.
+    pub malformed: u64,
+    /// Not EtherCAT: destroyed, as SubDevices do unless told otherwise.
+    pub foreign: u64,
+    pub send_errors: u64,
+    /// From a frame's arrival at the interface until its reply is sent.
+    pub turnaround: Histogram,
+}
+
+/// Durations in buckets an eighth of a power of two wide: bounded, and exact to 12 %.
+#[derive(Debug, Clone)]
+pub struct Histogram {
+    counts: Vec<u64>,
+    max: Nanos,
+}
+
+impl Default for Histogram {
+    fn default() -> Self {
+        Self {
+            counts: vec![0; BUCKETS],
+            max: 0,
+        }
+    }
+}
+
+impl Histogram {
+    pub fn add(&mut self, value: Nanos) {
+        if let Some(count) = self.counts.get_mut(bucket(value)) {
+            *count += 1;
+        }
+        self.max = self.max.max(value);
+    }
+
+    #[must_use]
+    pub fn max(&self) -> Nanos {
+        self.max
+    }
+
+    /// The value that a share of all does not exceed; `None` where there is none.
+    #[must_use]
+    pub fn quantile(&self, share: f64) -> Option<Nanos> {
+        let all: u64 = self.counts.iter().sum();
+        let wanted = (share.clamp(0.0, 1.0) * all as f64).ceil() as u64;
+        let mut seen = 0;
+        let found = self.counts.iter().position(|count| {
+            seen += count;
+            *count > 0 && seen >= wanted
+        })?;
+        Some(upper(found).min(self.max))
+    }
+}
+
+/// Below `STEPS` a bucket a value, above that `STEPS` buckets a power of two.
+fn bucket(value: Nanos) -> usize {
+    let steps = STEPS as u64;
+    let exponent = (value | steps).ilog2() - steps.ilog2();
+    let within = (value >> exponent) as usize;
+    // From the first power of two on, `within` lies between STEPS and 2·STEPS.
+    exponent as usize * STEPS + within
+}
+
+/// The largest value of a bucket.
+fn upper(bucket: usize) -> Nanos {
+    let exponent = (bucket / STEPS).saturating_sub(1);
+    let within = (bucket - exponent * STEPS) as u128;
+    u64::try_from(((within + 1) << exponent) - 1).unwrap_or(Nanos::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buckets_are_in_order_and_bound_their_values() {
+        let mut last = 0;
+        for shift in 0..64 {
+            for value in [
+                1_u64 << shift,
+                (1 << shift) + (1 << shift) / 3,
+                u64::MAX >> (63 - shift),
+            ] {
+                let at = bucket(value);
+                assert!(at < BUCKETS, "{value}");
+                assert!(at >= last, "{value}");
+                assert!(upper(at) >= value, "{value}");
+                assert!(upper(at) - value <= value / 8 + 1, "{value}");
+                last = at;
+            }
+        }
+    }
+
+    #[test]
+    fn quantiles_of_a_known_distribution() {
+        let mut histogram = Histogram::default();
+        assert_eq!(histogram.quantile(0.5), None);
+        for value in 1..=1000 {
+            histogram.add(value);
+        }
+        for (share, exact) in [(0.0, 1), (0.5, 500), (0.99, 990), (1.0, 1000)] {
+            let got = histogram.quantile(share).unwrap();
+            assert!((exact..=exact + exact / 8).contains(&got), "{share}: {got}");
+        }
+        assert_eq!(histogram.max(), 1000);
+    }
+}

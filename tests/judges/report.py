@@ -1,0 +1,48 @@
+"""Named checks: each says what is asserted, and one that fails does not hide the next."""
+
+import time
+
+
+class Stop(Exception):
+    """What follows makes no sense any more."""
+
+
+class Report:
+    def __init__(self):
+        self.passed = 0
+        self.failed = []
+        self._section = ""
+        self._start = time.monotonic()
+
+    def section(self, name):
+        self._section = name
+        print(f"\n== {name} ({time.monotonic() - self._start:.1f} s)", flush=True)
+
+    def note(self, text):
+        print(f"     {text}", flush=True)
+
+    def check(self, name, ok, detail=""):
+        """Asserts `ok`; `detail` explains a failure, and is worth reading otherwise."""
+        if ok:
+            self.passed += 1
+        else:
+            self.failed.append(f"{self._section}: {name}: {detail}")
+        print(f"{'ok  ' if ok else 'FAIL'} {name}{f': {detail}' if detail != '' else ''}", flush=True)
+        return bool(ok)
+
+    def equal(self, name, got, expected, show=str):
+        if got == expected:
+            return self.check(name, True, show(got))
+        return self.check(name, False, f"{show(got)}, not {show(expected)}")
+
+    def need(self, name, ok, detail=""):
+        """A check without which the rest of the section makes no sense."""
+        if not self.check(name, ok, detail):
+            raise Stop(name)
+
+    def finish(self):
+        """The exit code."""
+        print(f"\n{self.passed} checks passed, {len(self.failed)} failed")
+        for failure in self.failed:
+            print(f"  {failure}")
+        return 1 if self.failed else 0

@@ -1,0 +1,193 @@
+"""What the judges sit at: a veth pair, `ecaxis sim` on one end of it, a recorder on the other."""
+
+import contextlib
+import ctypes.util
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+import esi
+
+HERE = pathlib.Path(__file__).resolve().parent
+ROOT = HERE.parent.parent
+PREFIX = "ecj"
+
+
+class Skip(Exception):
+    """This computer cannot do it; nothing is wrong with the program."""
+
+
+def fixture(path):
+    """A third-party file to test against; on CI it has to be there."""
+    folder = pathlib.Path(os.environ.get("ECAXIS_FIXTURES") or ROOT / "../shared/fixtures")
+    file = (folder / path).resolve()
+    if file.exists():
+        return file
+    if os.environ.get("CI"):
+        raise RuntimeError(f"{file} is missing on CI")
+    raise Skip(f"{file} is not here (set ECAXIS_FIXTURES)")
+
+
+def ip(*arguments):
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+
+
+@contextlib.contextmanager
+def veth_pair():
+    """Names of two connected interfaces, removed afterwards, however this ends."""
+    if os.geteuid() != 0:
+        raise Skip("a veth pair needs root")
+    # What a killed run left behind.
+    for name in os.listdir("/sys/class/net"):
+        left = re.fullmatch(rf"{PREFIX}(\d+)a", name)
+        if left and not os.path.exists(f"/proc/{left[1]}"):
+            subprocess.run(["ip", "link", "del", name], capture_output=True)
+    a, b = f"{PREFIX}{os.getpid()}a", f"{PREFIX}{os.getpid()}b"
+    try:
+        ip("link", "add", a, "type", "veth", "peer", "name", b)
+    except (RuntimeError, FileNotFoundError) as error:
+        raise Skip(f"no veth pair can be made: {error}") from None
+    try:
+        for nic in (a, b):
+            # No address resolution or router solicitation of the host's on this wire.
+            with contextlib.suppress(OSError):
+                pathlib.Path(f"/proc/sys/net/ipv6/conf/{nic}/disable_ipv6").write_text("1")
+            ip("link", "set", nic, "up")
+        deadline = time.monotonic() + 5
+        for nic in (a, b):
+            while pathlib.Path(f"/sys/class/net/{nic}/carrier").read_text().strip() != "1":
+                if time.monotonic() > deadline:
+                    raise RuntimeError(f"{nic} has no carrier")
+                time.sleep(0.01)
+        yield a, b
+    finally:
+        subprocess.run(["ip", "link", "del", a], capture_output=True)
+
+
+def binary():
+    """The program under test: ECAXIS, or what cargo builds."""
+    given = os.environ.get("ECAXIS")
+    if given:
+        return pathlib.Path(given).resolve()
+    profile = os.environ.get("ECAXIS_PROFILE", "dev")
+    build = ["cargo", "build", "--quiet", "--bin", "ecaxis", "--profile", profile]
+    subprocess.run(build, cwd=ROOT, check=True)
+    target = pathlib.Path(os.environ.get("CARGO_TARGET_DIR") or ROOT / "target")
+    return (ROOT / target / ("debug" if profile == "dev" else profile) / "ecaxis").resolve()
+
+
+class Machine:
+    """A machine file, and what its ESI files say of each device."""
+
+    def __init__(self):
+        self.devices = []
+        self.names = []
+        self._text = ['[bus]\nnic = "sim"\ncycle = "1ms"\n']
+
+    def add(self, name, path, type_name, revision=None, module=None, more=""):
+        device = esi.read(path, type_name, revision, module)
+        position = len(self.devices)
+        self._text.append(
+            f'[[device]]\nname = "{name}"\nesi = "{path}"\ntype = "{type_name}"\n'
+            f"revision = {device.revision}\nposition = {position}\n{more}"
+        )
+        self.devices.append(device)
+        self.names.append(name)
+        return self
+
+    def index(self, name):
+        return self.names.index(name)
+
+    def write(self, folder):
+        path = pathlib.Path(folder) / "machine.toml"
+        path.write_text("\n".join(self._text))
+        return path
+
+
+def drive(machine, name, path, type_name):
+    """A drive whose ESI has a CSP module; encoder and limits as any machine file has them."""
+    return machine.add(
+        name,
+        path,
+        type_name,
+        module="CSP",
+        more='mode = "csp"\n[device.axis]\nunit = "turn"\nencoder = 2000\n'
+        "limits = { position = [-1000.0, 1000.0], velocity = 50.0, acceleration = 500.0, "
+        "torque = 100.0, following_error = 1.0 }\n",
+    )
+
+
+@contextlib.contextmanager
+def process(arguments, **more):
+    """A child that does not outlive the block, nor this process."""
+    libc = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6")
+    die_with_parent = lambda: libc.prctl(1, signal.SIGKILL)  # noqa: E731 PR_SET_PDEATHSIG
+    child = subprocess.Popen(arguments, text=True, preexec_fn=die_with_parent, **more)
+    try:
+        yield child
+    finally:
+        if child.poll() is None:
+            child.kill()
+        child.wait()
+
+
+class Served:
+    """A bus that is being served; after `end`, its exit code and output."""
+
+    def __init__(self, child, errors):
+        self.child = child
+        self.errors = errors
+        self.output = None
+
+    def end(self):
+        if self.output is None:
+            self.child.send_signal(signal.SIGINT)
+            try:
+                self.output, _ = self.child.communicate(timeout=10)
+            except subprocess.TimeoutExpired:
+                self.child.kill()
+                self.output, _ = self.child.communicate()
+        return self.child.returncode, self.output
+
+
+@contextlib.contextmanager
+def served(program, machine, nic, faults=None, options=()):
+    """`ecaxis sim` with this machine on the interface, answering already."""
+    with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as folder:
+        command = [str(program), "sim", str(machine.write(folder)), "--nic", nic, *options]
+        if faults:
+            script = pathlib.Path(folder) / "faults.toml"
+            script.write_text(faults)
+            command += ["--faults", str(script)]
+        errors = pathlib.Path(folder) / "errors"
+        with errors.open("w") as err, process(command, stdout=subprocess.PIPE, stderr=err) as child:
+            deadline = time.monotonic() + 20
+            while "answer" not in errors.read_text():
+                if child.poll() is not None or time.monotonic() > deadline:
+                    raise RuntimeError(f"{' '.join(command)}: {errors.read_text()}")
+                time.sleep(0.02)
+            bus = Served(child, errors)
+            yield bus
+            bus.end()
+
+
+@contextlib.contextmanager
+def recorded(nic, path):
+    """Every frame on the interface, both ways, as pcapng."""
+    command = [sys.executable, str(HERE / "recorder.py"), nic, str(path)]
+    with process(command, stdout=subprocess.PIPE) as child:
+        child.stdout.readline()
+        yield
+        # What has been received is to be written.
+        time.sleep(0.2)
+        child.send_signal(signal.SIGTERM)
+        child.wait(timeout=30)
+        if child.returncode:
+            raise RuntimeError(f"the recorder failed: {child.returncode}")

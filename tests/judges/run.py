@@ -1,0 +1,67 @@
+#!/usr/bin/env python3
+"""Other people's tools judge the simulated bus.
+
+pysoem (SOEM's MainDevice) brings a bus up that `ecaxis sim` serves on one end of a veth pair, and
+works with it. Run in an environment with `requirements.txt` installed, as root:
+
+    python tests/judges/run.py [SECTION …] [--keep FOLDER]
+
+Without root the judges are skipped, which they say. Elsewhere what is missing is an error with CI
+set, otherwise also a reason to skip. ECAXIS names the program to judge; without it, cargo builds it
+(ECAXIS_PROFILE: dev).
+"""
+
+import argparse
+import os
+import pathlib
+import signal
+import sys
+import tempfile
+
+import rig
+from report import Report, Stop
+
+SECTIONS = ["bringup", "overlap", "mailbox", "faults"]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sections", nargs="*", choices=[[], *SECTIONS], metavar="SECTION")
+    parser.add_argument("--keep", help="folder that keeps the recordings")
+    arguments = parser.parse_args()
+    # `finally` blocks are to run, and the interfaces to go, however this ends.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    report = Report()
+    try:
+        run(arguments, report)
+    except rig.Skip as skip:
+        print(f"skipped: {skip}")
+        return 0
+    return report.finish()
+
+
+def run(arguments, report):
+    if os.geteuid() != 0:
+        raise rig.Skip("the judges need root")
+    try:
+        import pysoem  # noqa: F401
+    except ImportError as error:
+        if os.environ.get("CI"):
+            raise
+        raise rig.Skip(f"{error}; pip install -r tests/judges/requirements.txt") from None
+    import sections
+
+    program = rig.binary()
+    with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary, rig.veth_pair() as nics:
+        folder = pathlib.Path(arguments.keep or temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        bench = sections.Bench(program, *nics, folder, report)
+        for name in arguments.sections or SECTIONS:
+            try:
+                getattr(sections, name)(bench)
+            except Stop:
+                report.note("the rest of this section is left out")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

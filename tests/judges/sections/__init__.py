@@ -1,0 +1,79 @@
+"""What the judges look at, section by section; each serves a bus of its own."""
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pysoem
+
+import rig
+from report import Report
+
+from .bringup import bringup, overlap
+from .faults import faults
+from .mailbox import mailbox
+
+__all__ = ["Bench", "bringup", "faults", "mailbox", "overlap"]
+
+MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
+OWN = rig.ROOT / "configs/esi"
+
+
+@dataclass
+class Bench:
+    """Where a section works."""
+
+    program: Path
+    # The simulated bus answers here …
+    bus: str
+    # … and the MainDevice asks here.
+    nic: str
+    folder: Path
+    report: Report
+
+    def machine(self):
+        """Two drives, a coupler and three terminals."""
+        maxon = rig.fixture(MAXON)
+        couplers = rig.fixture("esi/beckhoff/Beckhoff EK11xx.xml")
+        inputs = rig.fixture("esi/beckhoff/Beckhoff EL1xxx.xml")
+        machine = rig.Machine()
+        for name in ("x", "y"):
+            rig.drive(machine, name, maxon, "EPOS4")
+        machine.add("coupler", couplers, "EK1100")
+        machine.add("four", inputs, "EL1004")
+        machine.add("eight", inputs, "EL1018")
+        machine.add("io", OWN / "IO8.xml", "IO8")
+        return machine
+
+    @contextlib.contextmanager
+    def serve(self, machine, name, faults=None, options=()):
+        """The bus, served and recorded."""
+        recording = self.folder / f"{name}.pcapng"
+        with rig.served(self.program, machine, self.bus, faults, options) as bus:
+            with rig.recorded(self.nic, recording):
+                yield bus
+            code, output = bus.end()
+            self.report.equal("the simulated bus ends in order on SIGINT", code, 0)
+            for line in output.strip().splitlines():
+                self.report.note(line)
+
+    @contextlib.contextmanager
+    def master(self):
+        master = pysoem.Master()
+        master.open(self.nic)
+        try:
+            yield master
+        finally:
+            master.state = pysoem.INIT_STATE
+            master.write_state()
+            master.close()
+
+    def found(self, master, machine):
+        """Every device, with the identity its ESI gives."""
+        self.report.equal("config_init finds all", master.config_init(), len(machine.devices))
+        if len(master.slaves) != len(machine.devices):
+            return
+        for name, slave, device in zip(machine.names, master.slaves, machine.devices):
+            show = lambda i: "/".join(f"0x{n:08x}" for n in i)  # noqa: E731
+            got = (slave.man, slave.id, slave.rev)
+            self.report.equal(f"{name}: identity as in the ESI", got, device.identity, show)

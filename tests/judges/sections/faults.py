@@ -1,0 +1,94 @@
+"""What goes wrong, and the way back to Op with `recover` and `reconfig`."""
+
+import time
+
+import pysoem
+
+import cycle as cyclic
+
+from .bringup import expected_wkc
+
+
+def faults(bench):
+    watchdog(bench)
+    outage(bench, "a device loses its power", 'device = 1\nkind = "absent"\n')
+    outage(bench, "the cable at the MainDevice", 'kind = "silent"\n')
+
+
+def prepared(bench, master, machine, watchdog_ms):
+    bench.found(master, machine)
+    master.config_map()
+    for slave, device in zip(master.slaves, machine.devices):
+        if device.rx_bits:
+            slave.set_watchdog("processdata", watchdog_ms)
+    cycle = cyclic.to_op(master, expected_wkc(machine))
+    bench.report.need("Op", cycle is not None, cyclic.states(master))
+    return cycle
+
+
+def watchdog(bench):
+    report = bench.report
+    report.section("process-data watchdog")
+    machine = bench.machine()
+    with bench.serve(machine, "watchdog"), bench.master() as master:
+        cycle = prepared(bench, master, machine, 300)
+        report.equal("the watchdog reads back", master.slaves[0].get_watchdog("processdata"), 300.0)
+        time.sleep(1)
+        for name, device, state in zip(machine.names, machine.devices, cyclic.states(master)):
+            watched = device.rx_bits > 0
+            report.equal(f"{name} after a second's silence", state, "SafeOp+Error" if watched else "Op")
+        codes = {s.al_status for s, d in zip(master.slaves, machine.devices) if d.rx_bits}
+        report.equal("AL status code of those", codes, {0x001B})
+        back(bench, cycle, master)
+
+
+def outage(bench, what, fault):
+    report = bench.report
+    report.section(what)
+    machine = bench.machine()
+    script = f'[[fault]]\nat = "4s"\nfor = "1500ms"\n{fault}'
+    with bench.serve(machine, "outage", script), bench.master() as master:
+        cycle = prepared(bench, master, machine, 300)
+        broken = cycle.until(lambda: sum(cycle.wrong.values()) + cycle.missed > 100, 10)
+        report.need("the bus breaks", broken, cycle)
+        back(bench, cycle, master)
+
+
+def back(bench, cycle, master):
+    """SOEM's usual way: acknowledge, ask for Op, reconfigure, recover, until all are there."""
+    report = bench.report
+    used = {}
+
+    def count(step):
+        used[step] = used.get(step, 0) + 1
+
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        cycle.run(20)
+        master.read_state()
+        for slave in master.slaves:
+            if slave.state == pysoem.SAFEOP_STATE + pysoem.STATE_ERROR:
+                count("acknowledge")
+                slave.state = pysoem.SAFEOP_STATE + pysoem.STATE_ACK
+                slave.write_state()
+            elif slave.state == pysoem.SAFEOP_STATE:
+                count("ask for Op")
+                slave.state = pysoem.OP_STATE
+                slave.write_state()
+            elif slave.state > pysoem.NONE_STATE and slave.state != pysoem.OP_STATE:
+                count("reconfig")
+                if slave.reconfig(500):
+                    slave.is_lost = False
+            elif slave.state == pysoem.NONE_STATE or slave.is_lost:
+                slave.is_lost = True
+                count("recover")
+                if slave.recover(500):
+                    slave.is_lost = False
+        if set(cyclic.states(master)) == {"Op"}:
+            break
+    report.equal("all are back in Op", cyclic.states(master), ["Op"] * len(master.slaves))
+    report.note(f"{used}")
+    cycle.forget()
+    cycle.run(200)
+    report.check("with the full working counter", cycle.good > 190, cycle)
+    report.check("and no wrong one", not cycle.wrong, cycle)
