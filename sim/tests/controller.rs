@@ -410,3 +410,18 @@ fn a_smaller_chip_lacks_the_upper_units_and_reads_four_bytes() {
         [0x11, 1, 0, 0, 0xee, 0xee, 0xee, 0xee]
     );
 }
+
+#[test]
+fn the_application_takes_its_time_with_state_changes() {
+    let options = DeviceOptions {
+        state_change_ns: 5_000_000,
+        ..DeviceOptions::default()
+    };
+    let mut bus = Bus::new(vec![sim_with(&io_device(), options)]);
+    bus.address_all();
+    bus.write(0x1001, 0x120, &[PREOP, 0]);
+    bus.wait(4_900_000);
+    assert_eq!(bus.read_u16(0x1001, 0x130), u16::from(INIT));
+    bus.wait(100_000);
+    assert_eq!(bus.read_u16(0x1001, 0x130), u16::from(PREOP));
+}

@@ -7,6 +7,7 @@ use super::esm::Al;
 use super::mailbox::Mailbox;
 use super::process::ProcessData;
 use super::{Application, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
+use crate::Nanos;
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
@@ -30,6 +31,8 @@ pub struct DeviceOptions {
     pub delay_ns: u64,
     /// EEPROM contents in place of those made from the ESI.
     pub sii: Option<Vec<u8>>,
+    /// What the application needs to see a request in AL control and to answer it in AL status.
+    pub state_change_ns: Nanos,
     /// The chip. Process RAM grows where the device's SyncManagers need more.
     pub esc: EscInfo,
 }
@@ -44,6 +47,7 @@ impl Default for DeviceOptions {
             plant: PlantParams::default(),
             delay_ns: 500,
             sii: None,
+            state_change_ns: 200_000,
             esc: EscInfo::default(),
         }
     }
@@ -126,6 +130,7 @@ impl SimDevice {
         let mut sim = Self {
             name: device.type_name.clone(),
             delay_ns: options.delay_ns,
+            state_change_ns: options.state_change_ns,
             fresh: Box::new(Fresh {
                 store: store.clone(),
                 application: application.clone(),

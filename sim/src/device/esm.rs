@@ -9,8 +9,6 @@ use crate::esc::dc::Sync0;
 use crate::esc::registers as reg;
 use crate::esc::sm::{Filled, Mode, SyncManager};
 
-/// Between AL control and AL status.
-const TRANSITION_NS: u64 = 200_000;
 /// How long a device waits for the first SYNC0 on the way to Op.
 const FIRST_SYNC_NS: u64 = 5_000_000_000;
 
@@ -40,7 +38,7 @@ impl SimDevice {
     pub(super) fn al_requested(&mut self, control: u16, local: u64) {
         self.al.control = control;
         self.al.waits_for_sync = false;
-        self.al.due = local + TRANSITION_NS;
+        self.al.due = local.saturating_add(self.state_change_ns);
     }
 
     /// The request's time has come, or the wait for SYNC0 is over.

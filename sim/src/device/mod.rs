@@ -59,6 +59,7 @@ struct Fresh {
 pub struct SimDevice {
     name: String,
     pub(crate) delay_ns: u64,
+    state_change_ns: Nanos,
     pub(crate) esc: Esc,
     store: ObjectStore,
     pdo: PdoRules,
