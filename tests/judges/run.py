@@ -21,7 +21,7 @@ import tempfile
 import rig
 from report import Report, Stop
 
-SECTIONS = ["bringup", "overlap", "mailbox", "faults"]
+SECTIONS = ["bringup", "overlap", "mailbox", "faults", "recordings"]
 
 
 def main():

@@ -1,6 +1,7 @@
 """What the judges look at, section by section; each serves a bus of its own."""
 
 import contextlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from report import Report
 from .bringup import bringup, overlap
 from .faults import faults
 from .mailbox import mailbox
+from .recordings import judge, recordings
 
-__all__ = ["Bench", "bringup", "faults", "mailbox", "overlap"]
+__all__ = ["Bench", "bringup", "faults", "mailbox", "overlap", "recordings"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
@@ -30,6 +32,7 @@ class Bench:
     nic: str
     folder: Path
     report: Report
+    on_ci: bool = bool(os.environ.get("CI"))
 
     def machine(self):
         """Two drives, a coupler and three terminals."""
@@ -46,8 +49,8 @@ class Bench:
         return machine
 
     @contextlib.contextmanager
-    def serve(self, machine, name, faults=None, options=()):
-        """The bus, served and recorded."""
+    def serve(self, machine, name, faults=None, options=(), steady=True):
+        """The bus, served, recorded, and the recording judged."""
         recording = self.folder / f"{name}.pcapng"
         with rig.served(self.program, machine, self.bus, faults, options) as bus:
             with rig.recorded(self.nic, recording):
@@ -56,6 +59,7 @@ class Bench:
             self.report.equal("the simulated bus ends in order on SIGINT", code, 0)
             for line in output.strip().splitlines():
                 self.report.note(line)
+        judge(self, recording, len(machine.devices), steady)
 
     @contextlib.contextmanager
     def master(self):

@@ -47,7 +47,7 @@ def outage(bench, what, fault):
     report.section(what)
     machine = bench.machine()
     script = f'[[fault]]\nat = "4s"\nfor = "1500ms"\n{fault}'
-    with bench.serve(machine, "outage", script), bench.master() as master:
+    with bench.serve(machine, "outage", script, steady=False), bench.master() as master:
         cycle = prepared(bench, master, machine, 300)
         broken = cycle.until(lambda: sum(cycle.wrong.values()) + cycle.missed > 100, 10)
         report.need("the bus breaks", broken, cycle)
