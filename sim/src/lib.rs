@@ -24,7 +24,7 @@ pub mod network;
 pub mod serve;
 
 pub use device::{DeviceOptions, SimDevice, SimError};
-pub use drive::PlantParams;
+pub use drive::{PlantParams, Track};
 pub use esc::al::AlState;
 pub use esc::info::EscInfo;
 pub use faults::{FaultScript, ScriptError};

@@ -115,6 +115,11 @@ impl Dictionary<'_> {
                     return Err(Abort::VALUE_TOO_LOW);
                 }
             }
+            if let Some(choices) = item.choices
+                && !choices.contains(&value_of(data, true))
+            {
+                return Err(Abort::VALUE);
+            }
             self.pdo
                 .before_write(self.store, index, sub, value, self.state)?;
             self.store.set(slot, value);

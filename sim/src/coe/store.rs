@@ -27,6 +27,8 @@ pub struct Item {
     pub mapping: PdoMapping,
     pub min: Option<i64>,
     pub max: Option<i64>,
+    /// The only values that a client may write.
+    pub choices: Option<&'static [i64]>,
     range: Range<usize>,
 }
 
@@ -82,6 +84,7 @@ impl ObjectStore {
                                 .max
                                 .as_deref()
                                 .map(|b| number(b, item.bit_len, is_signed(base))),
+                            choices: None,
                             range: 0..0,
                         },
                         &item.default,
@@ -138,6 +141,7 @@ impl ObjectStore {
                 mapping: PdoMapping { rx: true, tx: true },
                 min: None,
                 max: None,
+                choices: None,
                 range: 0..0,
             },
             default,
@@ -191,6 +195,13 @@ impl ObjectStore {
     pub fn set_access(&mut self, slot: Slot, write: Writable) {
         if let Some(item) = self.items.get_mut(slot.0 as usize) {
             item.access.write = write;
+        }
+    }
+
+    /// Makes CoE clients write nothing but these values.
+    pub fn set_choices(&mut self, slot: Slot, choices: &'static [i64]) {
+        if let Some(item) = self.items.get_mut(slot.0 as usize) {
+            item.choices = Some(choices);
         }
     }
 

@@ -4,9 +4,11 @@
 use ecaxis_esi::model::Direction;
 
 use super::{Application, SimDevice};
+use crate::Nanos;
 use crate::bits;
 use crate::coe::pdo::Mapped;
 use crate::coe::store::{ObjectStore, Slot};
+use crate::drive::CONTROL_PERIOD_NS;
 use crate::esc::al::AlState;
 use crate::esc::registers::ADDRESS_SPACE;
 use crate::esc::sm::{Mode, SyncManager};
@@ -142,6 +144,24 @@ impl SimDevice {
         self.buffers(Direction::Tx)
     }
 
+    /// A wire to one of a drive's digital inputs ([`crate::drive::input`] names the bits of 0x60FD), from
+    /// this true time on. False if this is no drive.
+    pub fn set_digital_input(&mut self, now: Nanos, bit: u8, on: bool) -> bool {
+        self.advance(now);
+        let left = self.tick.saturating_sub(self.esc.clock.local(now));
+        let Application::Drive(drive) = &mut self.application else {
+            return false;
+        };
+        drive.set_input(bit, on, 1.0 - share(left, CONTROL_PERIOD_NS));
+        true
+    }
+
+    /// A drive's digital outputs, by the bits of 0x60FE.
+    #[must_use]
+    pub fn digital_outputs(&self) -> Option<u32> {
+        self.drive().map(|drive| drive.outputs(&self.store))
+    }
+
     /// Sets an input object of an I/O device; it no longer mirrors an output. False if there is no
     /// such object.
     pub fn set_input(&mut self, index: u16, sub: u8, value: i64) -> bool {
@@ -155,6 +175,12 @@ impl SimDevice {
         }
         true
     }
+}
+
+/// Of one control period; more than a whole one is one.
+fn share(part: Nanos, whole: Nanos) -> f64 {
+    let short = |ns: Nanos| f64::from(u32::try_from(ns).unwrap_or(u32::MAX));
+    (short(part) / short(whole)).min(1.0)
 }
 
 fn copy_mirrors(store: &mut ObjectStore, mirrors: &[Mirror]) {

@@ -33,6 +33,8 @@ impl DeviceError {
 }
 
 pub(super) const FOLLOWING_ERROR: u16 = 0x8611;
+pub(super) const NEGATIVE_LIMIT_SWITCH: u16 = 0x8a80;
+pub(super) const POSITIVE_LIMIT_SWITCH: u16 = 0x8a81;
 pub(super) const SOFTWARE_POSITION_LIMIT: u16 = 0x8a82;
 
 /// 0x1001 for a fault code: the generic bit and the bit of its family.

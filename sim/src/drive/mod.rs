@@ -3,7 +3,9 @@
 //!
 //! * `objects`: the objects it lives on, as slots of the device's store
 //! * `state`, `fault`: the power state machine, error codes, emergencies
+//! * `supervise`, `publish`: what stops the axis by itself; what the drive shows of itself
 //! * `modes`, `profile`: set-points of CSP, CSV, CST, PP, PV and HM
+//! * `io`, `touch_probe`, `track`: inputs, latched positions, and the switches along the axis
 //! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms
 //! * `plant`: motor, load, friction, encoder
 //!
@@ -13,24 +15,33 @@
 
 mod control;
 mod fault;
+mod io;
 mod modes;
 mod objects;
 mod plant;
 mod profile;
+mod publish;
 mod state;
+mod supervise;
 #[cfg(test)]
 mod tests;
+mod touch_probe;
+mod track;
 
 pub use fault::{DeviceError, Emergency};
+pub use io::input;
 pub use plant::PlantParams;
 pub use state::State;
+pub use track::Track;
 
 use control::{Bounds, Controller, Demand};
 use fault::Faults;
-use modes::{Cycle, Frame, Mode, Motion, SetPoints, bit};
-use objects::{Objects, Parameters};
+use io::Inputs as DigitalInputs;
+use modes::{Cycle, Frame, Mode, Motion, SetPoints};
+use objects::{HomingParameters, Objects, Parameters};
 use plant::Plant;
-use state::{Inputs, Power, Ramp, Request, Stop};
+use state::{Inputs, Power, Request, Stop};
+use touch_probe::TouchProbes;
 
 use crate::Nanos;
 use crate::coe::store::{ObjectStore, Slot};
@@ -50,12 +61,15 @@ pub struct Drive {
     objects: Objects,
     parameters: Parameters,
     parameters_age: u32,
+    homing: HomingParameters,
     params: PlantParams,
     plant: Plant,
     controller: Controller,
     power: Power,
     faults: Faults,
     motion: Motion,
+    inputs: DigitalInputs,
+    probes: TouchProbes,
     mode: Option<Mode>,
     frame: Frame,
     set_points: SetPoints,
@@ -70,6 +84,7 @@ pub struct Drive {
     overdue: u32,
     following_cycles: u32,
     following_error: bool,
+    warning: bool,
 }
 
 impl Drive {
@@ -78,6 +93,7 @@ impl Drive {
         let parameters = objects.parameters(store, &plant);
         let motor = Plant::new(&plant);
         let counts = motor.counts();
+        let inputs = DigitalInputs::new(&plant, &motor);
         let mut drive = Self {
             frame: Frame {
                 min: parameters.range_min,
@@ -87,12 +103,15 @@ impl Drive {
             objects,
             parameters,
             parameters_age: 0,
+            homing: HomingParameters::default(),
             params: plant,
             controller: Controller::new(&plant, counts),
             plant: motor,
             power: Power::new(plant.enable_cycles),
             faults: Faults::default(),
             motion: Motion::new(counts),
+            inputs,
+            probes: TouchProbes::default(),
             mode: None,
             set_points: SetPoints::default(),
             commanded: false,
@@ -103,7 +122,10 @@ impl Drive {
             overdue: 0,
             following_cycles: 0,
             following_error: false,
+            warning: false,
         };
+        drive.read_parameters(store);
+        drive.show_inputs(store);
         drive.publish(store, &Demand::Off, false);
         drive
     }
@@ -149,10 +171,12 @@ impl Drive {
     /// One control cycle, every 0.4 ms of device time. Set-points and Controlword count only in Op.
     pub fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
         self.parameters_age += 1;
-        if self.parameters_age >= PARAMETER_CYCLES {
+        // What was written before a start counts for what it starts.
+        if self.parameters_age >= PARAMETER_CYCLES || self.start {
             self.read_parameters(store);
         }
         self.controller.advance(&mut self.plant);
+        self.watch_inputs(store);
         self.connect(in_op);
         self.select_mode(store);
         self.step_power(store);
@@ -198,18 +222,22 @@ impl Drive {
         self.power.hold_in(state);
     }
 
-    /// What the communication side found. Only an enabled axis minds.
-    pub fn error(&mut self, error: DeviceError) {
-        if !self.enabled() {
-            return;
-        }
-        match error {
-            DeviceError::BusDown => self.disconnect(),
-            DeviceError::RxPdoTimeout if !self.mode.is_some_and(Mode::is_cyclic) => {}
-            DeviceError::RxPdoTimeout | DeviceError::SyncLost => {
-                self.raise(error.code(), self.parameters.options.fault_ramp());
-            }
-        }
+    /// A wire to one of the inputs of 0x60FD ([`input`]), in parallel to the track's switch. It is seen
+    /// in the next control cycle, but a touch probe latches where the axis was `after` (0 to 1) of the
+    /// control period had passed.
+    pub fn set_input(&mut self, bit: u8, on: bool, after: f64) {
+        self.inputs.set(bit, on, after);
+    }
+
+    /// 0x60FE as it reaches the terminals.
+    #[must_use]
+    pub fn outputs(&self, store: &ObjectStore) -> u32 {
+        self.objects.io.outputs(store)
+    }
+
+    /// Statusword bit 7.
+    pub fn set_warning(&mut self, on: bool) {
+        self.warning = on;
     }
 
     /// Torque pulling towards negative positions, N·m.
@@ -260,8 +288,28 @@ impl Drive {
     fn read_parameters(&mut self, store: &ObjectStore) {
         self.parameters_age = 0;
         self.parameters = self.objects.parameters(store, &self.params);
+        if self.mode == Some(Mode::Homing) {
+            self.homing = self.objects.homing(store, &self.params);
+        }
         self.frame.min = self.parameters.range_min;
         self.frame.width = self.parameters.range_width;
+        let (polarity, live) = self.objects.io.wiring(store);
+        self.inputs.configure(polarity, live);
+    }
+
+    fn show_inputs(&mut self, store: &mut ObjectStore) {
+        if let Some(inputs) = self.inputs.take_change() {
+            self.objects.io.publish(store, inputs);
+        }
+    }
+
+    /// Switches, probes.
+    fn watch_inputs(&mut self, store: &mut ObjectStore) {
+        self.inputs.advance(&self.plant);
+        self.show_inputs(store);
+        if let Some(slots) = &self.objects.probes {
+            self.probes.step(store, slots, &self.inputs, &self.frame);
+        }
     }
 
     fn connect(&mut self, in_op: bool) {
@@ -276,30 +324,9 @@ impl Drive {
             return;
         }
         if self.enabled() {
-            self.disconnect();
+            self.lose_connection(DeviceError::BusDown);
         } else {
             self.power.abandon();
-        }
-    }
-
-    /// 0x6007.
-    fn disconnect(&mut self) {
-        let reaction = match self.parameters.abort_option {
-            1 => self.parameters.options.fault_ramp(),
-            2 => None,
-            3 => Some(Ramp::QuickStop),
-            _ => return,
-        };
-        self.raise(DeviceError::BusDown.code(), reaction);
-    }
-
-    fn raise(&mut self, code: u16, reaction: fault::Reaction) {
-        let already = matches!(
-            self.power.state(),
-            State::FaultReactionActive | State::Fault
-        );
-        if self.power.raise(reaction) || already {
-            self.faults.latch(code);
         }
     }
 
@@ -307,6 +334,8 @@ impl Drive {
         let wanted = Mode::from_code(store.get_signed(self.objects.mode));
         if wanted.is_some() && wanted != self.mode {
             self.mode = wanted;
+            self.read_parameters(store);
+            self.motion.forget_homing();
             if self.follows() {
                 self.restart_motion();
             }
@@ -339,6 +368,7 @@ impl Drive {
         match transition {
             Some(4 | 16) => {
                 self.read_parameters(store);
+                self.motion.forget_homing();
                 self.restart_motion();
             }
             Some(15) => {
@@ -359,7 +389,18 @@ impl Drive {
     }
 
     fn stands(&self) -> bool {
-        self.controller.velocity().abs() < 0.1 * f64::from(self.params.counts_per_turn)
+        self.is_slow(self.controller.velocity())
+    }
+
+    /// Below a tenth of a turn a second: as good as standing.
+    fn is_slow(&self, velocity: f64) -> bool {
+        velocity.abs() < 0.1 * f64::from(self.params.counts_per_turn)
+    }
+
+    /// Profile modes and homing always know Controlword bit 8, the cyclic modes only where 0x605D says
+    /// what it does.
+    fn halts(&self, mode: Mode) -> bool {
+        !mode.is_cyclic() || self.parameters.options.halt.is_some()
     }
 
     fn demand(&mut self) -> Demand {
@@ -367,116 +408,26 @@ impl Drive {
         if !self.power.powered() {
             return Demand::Off;
         }
+        let cycle = Cycle {
+            parameters: &self.parameters,
+            homing: &self.homing,
+            set_points: &self.set_points,
+            start,
+            halted: self.set_points.halt() && self.mode.is_some_and(|mode| self.halts(mode)),
+            counts: self.controller.counts(),
+            velocity: self.controller.velocity(),
+            stands: self.stands(),
+            current: self.controller.current(),
+            inputs: &self.inputs,
+        };
         if let Some(stop) = self.power.stop() {
-            let (demand, over) = self.motion.stop(stop.ramp, &self.parameters);
+            let (demand, over) = self.motion.stop(stop.ramp, self.mode, &cycle);
             self.overdue = self.overdue.saturating_add(u32::from(over));
             return demand;
         }
-        let cycle = Cycle {
-            parameters: &self.parameters,
-            set_points: &self.set_points,
-            start,
-            counts: self.controller.counts(),
-            velocity: self.controller.velocity(),
-        };
         match self.mode {
             Some(mode) => self.motion.demand(mode, &cycle, &mut self.frame),
             None => self.motion.hold(),
         }
     }
-
-    /// Following error and position limits.
-    fn supervise(&mut self, demand: &Demand) {
-        if self.power.state() != State::OperationEnabled {
-            return;
-        }
-        let counts = self.controller.counts();
-        let error = self.motion.following_error(demand, counts).abs();
-        let outside = self
-            .parameters
-            .following_window
-            .is_some_and(|window| error > window);
-        self.following_error = outside;
-        self.following_cycles = if outside {
-            self.following_cycles + 1
-        } else {
-            0
-        };
-        let ramp = self.parameters.options.fault_ramp();
-        if outside && self.following_cycles > self.parameters.following_timeout {
-            self.raise(fault::FOLLOWING_ERROR, ramp);
-        } else if let Some((min, max)) = self.parameters.software_limits
-            && !matches!(demand, Demand::Position { .. })
-        {
-            // Position set-points are kept inside; speed and torque can only be stopped.
-            let (at, speed) = (counts + self.frame.shift, self.controller.velocity());
-            if (at > max && speed > 0.0) || (at < min && speed < 0.0) {
-                self.raise(fault::SOFTWARE_POSITION_LIMIT, ramp);
-            }
-        }
-    }
-
-    fn statusword(&self, limited: bool) -> u16 {
-        let state = self.power.state();
-        let mut word = state.bits();
-        let mut set = |on: bool, bit: u16| word |= if on { bit } else { 0 };
-        set(self.power.powered() || state == State::SwitchedOn, 1 << 4);
-        set(self.in_op, 1 << 9);
-        set(limited, bit::INTERNAL_LIMIT);
-        if let Some(mode) = self.mode {
-            let velocity = self.controller.velocity();
-            let bits = self
-                .motion
-                .status(mode, self.follows(), velocity, &self.parameters);
-            set(true, bits);
-            set(
-                self.following_error
-                    && matches!(mode, Mode::CyclicPosition | Mode::ProfilePosition),
-                bit::MODE_13,
-            );
-        }
-        word
-    }
-
-    fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
-        let (o, p) = (&self.objects, &self.parameters);
-        let counts = self.controller.counts();
-        let velocity = self.controller.filtered_velocity();
-        let torque_per_ampere = self.params.torque_constant / p.torque_unit.max(1e-12);
-        let current = self.controller.current();
-        store.set(o.statusword, i64::from(self.statusword(limited)));
-        store.set(o.error_code, i64::from(self.faults.code()));
-        store.set(o.error_register, i64::from(self.faults.register()));
-        store.set(o.mode_display, self.mode.map_or(0, Mode::code));
-        store.set(o.position, self.frame.show(counts));
-        store.set(o.velocity, whole(velocity / p.velocity_unit));
-        store.set(o.torque, whole(current * torque_per_ampere));
-        let error = self.motion.following_error(demand, counts);
-        store.set(o.following_error, whole(error));
-        let (position, speed) = match demand {
-            Demand::Off => (objects::float(counts), 0.0),
-            _ => self.motion.demanded(),
-        };
-        store.set(o.position_demand, self.frame.show(whole(position)));
-        store.set(o.velocity_demand, whole(speed / p.velocity_unit));
-        if let Some(slot) = o.velocity_averaged {
-            let averaged = self.controller.averaged_velocity();
-            store.set(slot, whole(averaged / p.velocity_unit));
-        }
-        if let Some(slot) = o.torque_averaged {
-            let averaged = self.controller.averaged_current();
-            store.set(slot, whole(averaged * torque_per_ampere));
-        }
-        if let Some(slot) = o.current {
-            store.set(slot, whole(current * 1e3));
-        }
-        if let Some(slot) = o.current_averaged {
-            store.set(slot, whole(self.controller.averaged_current() * 1e3));
-        }
-    }
-}
-
-#[expect(clippy::cast_possible_truncation, reason = "saturates")]
-fn whole(value: f64) -> i64 {
-    value.round() as i64
 }

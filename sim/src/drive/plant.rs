@@ -2,6 +2,8 @@
 
 use std::f64::consts::TAU;
 
+use super::track::Track;
+
 /// One step of the current loop, in seconds.
 pub(super) const CURRENT_STEP: f64 = 40e-6;
 
@@ -38,6 +40,8 @@ pub struct PlantParams {
     /// How long the output stage takes from Switched on to Operation enabled, in control cycles of
     /// 0.4 ms.
     pub enable_cycles: u32,
+    /// What stands along the axis.
+    pub track: Track,
 }
 
 impl Default for PlantParams {
@@ -57,6 +61,7 @@ impl Default for PlantParams {
             current_limit: 9.6,
             max_motor_speed: 6000,
             enable_cycles: 10,
+            track: Track::default(),
         }
     }
 }
@@ -82,6 +87,8 @@ pub(super) struct Plant {
     current: f64,
     load_torque: f64,
     blocked: bool,
+    /// Mechanical ends, in counts.
+    ends: (f64, f64),
     coulomb: f64,
     // Per current-loop step: what a volt, a volt of back-EMF, … do.
     current_per_volt: f64,
@@ -103,6 +110,13 @@ impl Plant {
             current: 0.0,
             load_torque: p.load_torque,
             blocked: false,
+            ends: p
+                .track
+                .ends
+                .filter(|(low, high)| low <= high)
+                .map_or((f64::NEG_INFINITY, f64::INFINITY), |(low, high)| {
+                    (f64::from(low) + 0.5, f64::from(high) + 0.5)
+                }),
             coulomb: p.coulomb_friction,
             current_per_volt: CURRENT_STEP / inductance,
             current_decay: (-CURRENT_STEP * p.resistance / inductance).exp(),
@@ -119,6 +133,11 @@ impl Plant {
         #[expect(clippy::cast_possible_truncation, reason = "saturates, centuries away")]
         let counts = self.position.floor() as i64;
         counts
+    }
+
+    /// Counts with fraction.
+    pub(super) fn position(&self) -> f64 {
+        self.position
     }
 
     pub(super) fn velocity(&self) -> f64 {
@@ -171,5 +190,9 @@ impl Plant {
         let friction = self.coulomb * self.velocity_per_torque;
         self.velocity = (free.abs() - friction).max(0.0).copysign(free);
         self.position += 0.5 * (before + self.velocity) * self.counts_per_velocity;
+        if self.position < self.ends.0 || self.position > self.ends.1 {
+            self.position = self.position.clamp(self.ends.0, self.ends.1);
+            self.velocity = 0.0;
+        }
     }
 }

@@ -1,6 +1,8 @@
 //! The power state machine as the drive sees it: states, transitions 0–16, what stops the axis on the
 //! way. One call a control cycle, at most one transition a call.
 
+use super::fault::Reaction;
+
 /// CiA 402 power drive system states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum State {
@@ -63,6 +65,8 @@ pub(super) enum Ramp {
     SlowDown,
     /// Quick stop deceleration, 0x6085.
     QuickStop,
+    /// No ramp: as fast as the current limit and the supply voltage allow.
+    Limit,
 }
 
 /// A stop under way, and the state it ends in.
@@ -73,33 +77,61 @@ pub(super) struct Stop {
     pub then: Option<State>,
 }
 
-/// 0x605A, 0x605B, 0x605C, 0x605E as written.
+/// 0x605A to 0x605E and 0x6007 as written (CiA 402-2, "device control objects"). What a drive does not know it
+/// refuses to be written: see [`OptionCodes::QUICK_STOP`] and the others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct OptionCodes {
     pub quick_stop: i64,
     pub shutdown: i64,
     pub disable: i64,
+    pub halt: Option<i64>,
     pub fault: i64,
+    pub abort: i64,
 }
 
 impl OptionCodes {
+    pub(super) const QUICK_STOP: &[i64] = &[0, 1, 2, 3, 4, 5, 6, 7, 8];
+    pub(super) const SHUTDOWN: &[i64] = &[0, 1];
+    pub(super) const DISABLE: &[i64] = &[0, 1];
+    pub(super) const HALT: &[i64] = &[1, 2, 3, 4];
+    pub(super) const FAULT: &[i64] = &[0, 1, 2, 3, 4];
+    pub(super) const ABORT: &[i64] = &[0, 1, 2, 3];
+
     fn quick_stop(&self) -> Option<Stop> {
-        let (ramp, stays) = match self.quick_stop {
-            1 => (Ramp::SlowDown, false),
-            // 3 and 4 stop at the current and voltage limit: no steeper ramp is modelled.
-            2..=4 => (Ramp::QuickStop, false),
-            5 => (Ramp::SlowDown, true),
-            6..=8 => (Ramp::QuickStop, true),
+        let ramp = match self.quick_stop {
+            1 | 5 => Ramp::SlowDown,
+            2 | 6 => Ramp::QuickStop,
+            3 | 4 | 7 | 8 => Ramp::Limit,
             _ => return None,
         };
-        let then = (!stays).then_some(State::SwitchOnDisabled);
+        let then = (self.quick_stop < 5).then_some(State::SwitchOnDisabled);
         Some(Stop { ramp, then })
     }
 
     pub(super) fn fault_ramp(&self) -> Option<Ramp> {
         match self.fault {
             1 => Some(Ramp::SlowDown),
-            2..=4 => Some(Ramp::QuickStop),
+            2 => Some(Ramp::QuickStop),
+            3 | 4 => Some(Ramp::Limit),
+            _ => None,
+        }
+    }
+
+    /// The axis stays enabled in any case.
+    pub(super) fn halt_ramp(&self) -> Ramp {
+        match self.halt {
+            Some(2) => Ramp::QuickStop,
+            Some(3 | 4) => Ramp::Limit,
+            _ => Ramp::SlowDown,
+        }
+    }
+
+    /// What a communication error does to an enabled axis; `None`: nothing at all.
+    pub(super) fn connection_reaction(&self) -> Option<Reaction> {
+        match self.abort {
+            1 => Some(self.fault_ramp()),
+            2 => Some(None),
+            3 => Some(Some(Ramp::QuickStop)),
             _ => None,
         }
     }
@@ -156,8 +188,8 @@ impl Power {
     /// The output stage drives the winding.
     pub(super) fn powered(&self) -> bool {
         match self.state {
-            State::OperationEnabled | State::QuickStopActive => true,
-            State::FaultReactionActive => self.stop.is_some(),
+            State::OperationEnabled => true,
+            State::QuickStopActive | State::FaultReactionActive => self.stop.is_some(),
             _ => false,
         }
     }
@@ -216,10 +248,9 @@ impl Power {
                 (10, S::SwitchOnDisabled, None)
             }
             (S::OperationEnabled, Request::DisableVoltage) => (9, S::SwitchOnDisabled, None),
-            (S::OperationEnabled, Request::QuickStop) => match inputs.options.quick_stop() {
-                Some(stop) => (11, S::QuickStopActive, Some(stop)),
-                None => (11, S::SwitchOnDisabled, None),
-            },
+            (S::OperationEnabled, Request::QuickStop) => {
+                (11, S::QuickStopActive, inputs.options.quick_stop())
+            }
             (S::OperationEnabled, Request::SwitchOn) => {
                 return self.leave(5, S::SwitchedOn, inputs.options.disable);
             }
@@ -232,8 +263,9 @@ impl Power {
                 return None;
             }
             (S::QuickStopActive, Request::DisableVoltage) => (12, S::SwitchOnDisabled, None),
+            (S::QuickStopActive, _) if self.stop.is_none() => (12, S::SwitchOnDisabled, None),
             (S::QuickStopActive, Request::EnableOperation)
-                if self.stop.is_none_or(|stop| stop.then.is_none()) =>
+                if self.stop.is_some_and(|stop| stop.then.is_none()) =>
             {
                 (16, S::OperationEnabled, None)
             }
@@ -304,7 +336,9 @@ mod tests {
             quick_stop: 6,
             shutdown: 0,
             disable: 0,
+            halt: None,
             fault: 2,
+            abort: 3,
         };
         let mut taken = Vec::new();
         for (_, state, _) in ARROWS {
@@ -312,6 +346,9 @@ mod tests {
                 for flags in 0..4 {
                     let mut power = Power::new(0);
                     power.state = state;
+                    if state == S::QuickStopActive {
+                        power.stop = options.quick_stop();
+                    }
                     let number = power.step(&Inputs {
                         request: Some(Request::decode(word)),
                         reset: flags & 1 != 0,

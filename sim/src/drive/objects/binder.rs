@@ -49,6 +49,14 @@ impl Binder<'_> {
         }
     }
 
+    /// The values that a client may write. A drive whose ESI starts from another one knows more than is
+    /// known here.
+    pub(super) fn choose(&mut self, slot: Slot, choices: &'static [i64]) {
+        if choices.contains(&self.0.get_signed(slot)) {
+            self.0.set_choices(slot, choices);
+        }
+    }
+
     /// A maker's own object. Elsewhere the same index means something else, so the name decides.
     pub(super) fn own(&self, index: u16, sub: u8, name: &str) -> Option<Slot> {
         let slot = self.0.slot(index, sub)?;

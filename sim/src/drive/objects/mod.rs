@@ -1,21 +1,34 @@
 //! The objects the drive reads and writes, as slots; power-on values for those an ESI leaves empty.
 //!
 //! * `binder`: from a dictionary's entries to slots
-//! * `parameters`: option codes, limits, profiles
+//! * `parameters`: limits, profiles, and what the other files read
+//! * `homing`: where home is and how to get there
+//! * `io`: digital inputs and outputs
+//! * `probe`: touch probes
+//! * `options`: option codes
+//! * `velocity`: when a speed is reached, zero or slipping
 //! * `units`: SI unit codes, interpolation time
 
 mod binder;
+mod homing;
+mod io;
+mod options;
 mod parameters;
+mod probe;
 mod units;
+mod velocity;
 
 use super::plant::PlantParams;
 use crate::coe::store::{ObjectStore, Slot};
 
 use binder::{Binder, RO, RW};
+use io::IoSlots;
 use parameters::ParameterSlots;
 use units::COUNTS;
 
+pub(super) use homing::HomingParameters;
 pub(super) use parameters::Parameters;
+pub(super) use probe::ProbeSlots;
 
 /// PP, PV, HM, CSP, CSV, CST.
 const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;
@@ -47,11 +60,18 @@ pub(super) struct Objects {
     pub velocity_offset: Slot,
     pub torque_offset: Slot,
     parameters: ParameterSlots,
+    pub io: IoSlots,
+    pub probes: Option<ProbeSlots>,
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "saturates")]
 fn whole(value: f64) -> i64 {
     value.round() as i64
+}
+
+/// Milliseconds in control cycles of 0.4 ms.
+fn cycles(ms: i64) -> u32 {
+    u32::try_from((ms * 5 + 1) / 2).unwrap_or(u32::MAX)
 }
 
 /// Fits whatever the dictionary's type is; a store value never needs more than 53 bits here.
@@ -84,8 +104,6 @@ impl Objects {
         );
         b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
-        b.bind(0x60fd, 0, "Digital inputs", 32, RO);
-        b.bind(0x60fe, 1, "Physical outputs", 32, RW);
         let parameters = ParameterSlots::bind(&mut b, plant);
         Self {
             error_register: b.bind(0x1001, 0, "Error register", 8, RO),
@@ -112,6 +130,8 @@ impl Objects {
             velocity_offset: b.bind(0x60b1, 0, "Velocity offset", 32, RW),
             torque_offset: b.bind(0x60b2, 0, "Torque offset", 16, RW),
             parameters,
+            io: IoSlots::bind(&mut b),
+            probes: ProbeSlots::find(&b),
         }
     }
 
@@ -146,5 +166,9 @@ impl Objects {
 
     pub(super) fn parameters(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
         self.parameters.read(store, plant)
+    }
+
+    pub(super) fn homing(&self, store: &ObjectStore, plant: &PlantParams) -> HomingParameters {
+        self.parameters.read_homing(store, plant)
     }
 }

@@ -1,8 +1,11 @@
 //! What a drive is told once and then works by: option codes, limits, profiles, units.
 
 use super::binder::{Binder, RW};
+use super::homing::{HomingParameters, HomingSlots};
+use super::options::OptionSlots;
 use super::units::{RPM, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
-use super::{float, whole};
+use super::velocity::{VelocitySlots, VelocityWindows};
+use super::{cycles, float, whole};
 use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::plant::PlantParams;
 use crate::drive::profile::Dynamics;
@@ -17,11 +20,8 @@ struct MappedLimits {
 
 #[derive(Debug, Clone)]
 pub(super) struct ParameterSlots {
-    quick_stop_option: Slot,
-    shutdown_option: Slot,
-    disable_option: Slot,
-    fault_option: Slot,
-    abort_option: Slot,
+    options: OptionSlots,
+    velocity: VelocitySlots,
     following_window: Slot,
     following_timeout: Slot,
     position_window: Slot,
@@ -37,9 +37,7 @@ pub(super) struct ParameterSlots {
     profile_deceleration: Slot,
     quick_stop_deceleration: Slot,
     max_acceleration: Slot,
-    homing_method: Slot,
-    home_position: Option<Slot>,
-    home_offset: Option<Slot>,
+    homing: HomingSlots,
     /// A drive without 0x60A9 and 0x60AA counts in encoder counts and seconds.
     unit_velocity: Option<Slot>,
     unit_acceleration: Option<Slot>,
@@ -53,8 +51,6 @@ pub(super) struct ParameterSlots {
 #[derive(Debug, Clone, Copy)]
 pub(in crate::drive) struct Parameters {
     pub options: OptionCodes,
-    /// 0x6007: what a lost connection does.
-    pub abort_option: i64,
     /// Counts; `None`: not supervised.
     pub following_window: Option<f64>,
     /// Control cycles.
@@ -65,11 +61,13 @@ pub(in crate::drive) struct Parameters {
     pub range_min: i64,
     pub range_width: i64,
     pub software_limits: Option<(i64, i64)>,
+    /// 0x6080.
     pub max_speed: f64,
+    /// 0x607F, and 0x6080.
+    pub max_profile_speed: f64,
+    pub velocity: VelocityWindows,
     pub profile: Dynamics,
     pub quick_stop_deceleration: f64,
-    pub homing_method: i64,
-    pub home_position: i64,
     /// Counts/s that one unit of 0x60FF and 0x606C is.
     pub velocity_unit: f64,
     /// N·m that a thousandth of rated torque is.
@@ -112,11 +110,8 @@ impl ParameterSlots {
         ];
         b.drop_limits_without(limits, i64::from(plant.initial_position));
         Self {
-            quick_stop_option: b.with_default(0x605a, 0, "Quick stop option code", 16, 6),
-            shutdown_option: b.bind(0x605b, 0, "Shutdown option code", 16, RW),
-            disable_option: b.with_default(0x605c, 0, "Disable operation option code", 16, 1),
-            fault_option: b.with_default(0x605e, 0, "Fault reaction option code", 16, 2),
-            abort_option: b.with_default(0x6007, 0, "Abort connection option code", 16, 3),
+            options: OptionSlots::bind(b),
+            velocity: VelocitySlots::find(b),
             following_window: b.with_default(0x6065, 0, "Following error window", 32, 2000),
             following_timeout: b.bind(0x6066, 0, "Following error time out", 16, RW),
             position_window: b.with_default(0x6067, 0, "Position window", 32, 0xffff_ffff),
@@ -159,9 +154,7 @@ impl ParameterSlots {
                 acceleration,
             ),
             max_acceleration: b.with_default(0x60c5, 0, "Max acceleration", 32, 0xffff_ffff),
-            homing_method: b.with_default(0x6098, 0, "Homing method", 8, 37),
-            home_position: b.own(0x30b0, 0, "Home position"),
-            home_offset: b.0.slot(0x607c, 0),
+            homing: HomingSlots::bind(b, per_rpm, per_rpm_s),
             unit_velocity,
             unit_acceleration,
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
@@ -184,16 +177,29 @@ impl ParameterSlots {
         self.mapped.torque || self.mapped.speed
     }
 
+    /// Counts/s and counts/s² that a unit of speed and of acceleration is.
+    fn units(&self, store: &ObjectStore, counts_per_turn: f64) -> (f64, f64) {
+        let velocity = self
+            .unit_velocity
+            .map_or(1.0, |slot| velocity_unit(store.get(slot), counts_per_turn));
+        let acceleration = self.unit_acceleration.map_or(1.0, |slot| {
+            acceleration_unit(store.get(slot), counts_per_turn)
+        });
+        (velocity, acceleration)
+    }
+
+    /// Needed only in homing mode, hence apart.
+    pub(super) fn read_homing(&self, store: &ObjectStore, plant: &PlantParams) -> HomingParameters {
+        let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
+        let (velocity_unit, acceleration_unit) = self.units(store, counts_per_turn);
+        self.homing.read(store, velocity_unit, acceleration_unit)
+    }
+
     /// What the objects say now.
     pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
         let p = self;
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
-        let velocity_unit = p
-            .unit_velocity
-            .map_or(1.0, |slot| velocity_unit(store.get(slot), counts_per_turn));
-        let acceleration_unit = p.unit_acceleration.map_or(1.0, |slot| {
-            acceleration_unit(store.get(slot), counts_per_turn)
-        });
+        let (velocity_unit, acceleration_unit) = self.units(store, counts_per_turn);
         let speed = |slot| float(store.get(slot)) * velocity_unit;
         let acceleration = |slot| float(store.get(slot).max(1)) * acceleration_unit;
         let window = |slot| {
@@ -201,8 +207,7 @@ impl ParameterSlots {
                 .filter(|&w| w < 0xffff_ffff)
                 .map(float)
         };
-        // Milliseconds in control cycles of 0.4 ms.
-        let cycles = |slot| u32::try_from((store.get(slot) * 5 + 1) / 2).unwrap_or(u32::MAX);
+        let cycles = |slot| cycles(store.get(slot));
         let pair = |[min, max]: [Slot; 2]| (store.get_signed(min), store.get_signed(max));
         let (range_min, range_max) = match pair(p.range) {
             (min, max) if min < max => (min, max),
@@ -229,13 +234,8 @@ impl ParameterSlots {
             _ => current_limit,
         };
         Parameters {
-            options: OptionCodes {
-                quick_stop: store.get_signed(p.quick_stop_option),
-                shutdown: store.get_signed(p.shutdown_option),
-                disable: store.get_signed(p.disable_option),
-                fault: store.get_signed(p.fault_option),
-            },
-            abort_option: store.get_signed(p.abort_option),
+            options: p.options.read(store),
+            velocity: p.velocity.read(store, velocity_unit),
             following_window: window(p.following_window),
             following_timeout: cycles(p.following_timeout),
             position_window: window(p.position_window),
@@ -244,17 +244,13 @@ impl ParameterSlots {
             range_width: range_max - range_min + 1,
             software_limits: Some(pair(p.limits)).filter(|(min, max)| min < max),
             max_speed,
+            max_profile_speed: profile_limit,
             profile: Dynamics {
                 velocity: speed(p.profile_velocity).min(profile_limit),
                 acceleration: acceleration(p.profile_acceleration).min(max_acceleration),
                 deceleration: acceleration(p.profile_deceleration).min(max_acceleration),
             },
             quick_stop_deceleration: acceleration(p.quick_stop_deceleration),
-            homing_method: store.get_signed(p.homing_method),
-            home_position: p
-                .home_position
-                .or(p.home_offset)
-                .map_or(0, |slot| store.get_signed(slot)),
             velocity_unit,
             torque_unit: rated_torque * 1e-3,
             current_limit,

@@ -2,7 +2,12 @@
 
 mod devices;
 mod faults;
+mod halts;
+mod homing;
+mod inputs;
 mod motion;
+mod options;
+mod probes;
 mod profiles;
 mod transitions;
 
@@ -24,11 +29,21 @@ struct Rig {
 
 const MS: u64 = 1_000_000;
 
+/// An object that a drive has only where its ESI says so: index, subindex, bits, name.
+type Extra = (u16, u8, u32, &'static str);
+
 impl Rig {
     fn new(plant: PlantParams) -> Self {
+        Self::with(plant, &[])
+    }
+
+    fn with(plant: PlantParams, extras: &[Extra]) -> Self {
         let mut store = ObjectStore::default();
         for unit in [0x60a9, 0x60aa] {
             store.ensure(unit, 0, "SI unit", 32, Access::default(), &[]);
+        }
+        for (index, sub, bits, name) in extras {
+            store.ensure(*index, *sub, name, *bits, Access::default(), &[]);
         }
         let drive = Drive::new(&mut store, plant);
         let mut rig = Self {
@@ -55,6 +70,13 @@ impl Rig {
 
     fn get(&self, index: u16) -> i64 {
         self.store.get_signed(self.slot(index, 0))
+    }
+
+    /// Emergencies since the last call.
+    fn emergencies(&mut self) -> Vec<u16> {
+        std::iter::from_fn(|| self.drive.take_emergency())
+            .map(|emergency| emergency.code)
+            .collect()
     }
 
     fn word(&self) -> i64 {

@@ -118,12 +118,12 @@ fn homing_here() {
     assert_eq!(rig.get(0x6064), 0);
     assert_eq!(rig.word() & 0x3400, 0x1400, "attained");
 
-    rig.set(0x6098, 0, 7);
+    rig.set(0x6098, 0, 5);
     rig.set(0x6040, 0, 0x0f);
     rig.cycles(5);
     rig.set(0x6040, 0, 0x1f);
     rig.cycles(3);
-    assert_ne!(rig.word() & 1 << 13, 0, "no switch to search");
+    assert_ne!(rig.word() & 1 << 13, 0, "no such method");
 }
 
 #[test]

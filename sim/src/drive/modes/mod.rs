@@ -1,10 +1,24 @@
 //! The modes of operation: from set-points to what the control loops are asked for in one control
 //! cycle. Counts and seconds; positions are unwrapped encoder counts.
+//!
+//! * here: what a mode is told, the cyclic modes, the Statusword's bits
+//! * `position`, `velocity`: profile position and profile velocity
+//! * `homing`: home, by whatever method
+//! * `stop`: coming to rest, for halts and the power state machine's stops
+
+mod homing;
+mod position;
+mod stop;
+mod velocity;
 
 use super::control::Demand;
-use super::objects::{Parameters, float};
-use super::profile::{Dynamics, Interpolator, Profile};
-use super::state::Ramp;
+use super::io::Inputs;
+use super::objects::{HomingParameters, Parameters, float};
+use super::profile::{Interpolator, Profile};
+use homing::Homing;
+pub(super) use homing::METHODS;
+use position::PointToPoint;
+use velocity::Reached;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Mode {
@@ -61,15 +75,28 @@ pub(super) struct SetPoints {
 }
 
 impl SetPoints {
+    /// Bit 4: new set-point, or homing operation start.
+    fn starts(&self) -> bool {
+        self.controlword & 1 << 4 != 0
+    }
+
+    /// Bit 5.
     fn change_at_once(&self) -> bool {
         self.controlword & 1 << 5 != 0
     }
 
+    /// Bit 6.
     fn relative(&self) -> bool {
         self.controlword & 1 << 6 != 0
     }
 
-    fn halt(&self) -> bool {
+    /// Bit 9: pass one target on the way to the next.
+    fn change_on_set_point(&self) -> bool {
+        self.controlword & 1 << 9 != 0
+    }
+
+    /// Bit 8.
+    pub(super) fn halt(&self) -> bool {
         self.controlword & 1 << 8 != 0
     }
 }
@@ -99,19 +126,13 @@ impl Frame {
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Move {
-    target: i64,
-    dynamics: Dynamics,
-}
-
 /// Statusword bits 8–15 as far as a mode sets them.
 pub(super) mod bit {
     pub const TARGET_REACHED: u16 = 1 << 10;
     pub const INTERNAL_LIMIT: u16 = 1 << 11;
     /// Follows the command value, set-point acknowledged, speed is zero, homing attained.
     pub const MODE_12: u16 = 1 << 12;
-    /// Following error, homing error.
+    /// Following error, homing error, slippage.
     pub const MODE_13: u16 = 1 << 13;
     pub const REFERENCED: u16 = 1 << 15;
 }
@@ -125,13 +146,13 @@ pub(super) struct Motion {
     velocity: Interpolator,
     /// The moving point of PP, PV, CSP under 0x6080, and of every stop.
     profile: Profile,
-    active: Option<Move>,
-    next: Option<Move>,
-    acknowledged: bool,
+    point_to_point: PointToPoint,
+    speed: Reached,
+    /// A stop at the current limit came to its end: the point that the axis now holds.
+    held: bool,
+    halted: bool,
     reached: bool,
-    settled_cycles: u32,
-    homing_attained: bool,
-    homing_error: bool,
+    homing: Homing,
     referenced: bool,
     /// A set-point was cut by a position or speed limit.
     cut: bool,
@@ -142,12 +163,19 @@ pub(super) struct Motion {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cycle<'a> {
     pub parameters: &'a Parameters,
+    pub homing: &'a HomingParameters,
+    pub inputs: &'a Inputs,
     pub set_points: &'a SetPoints,
     /// Controlword bit 4 rose.
     pub start: bool,
+    /// Controlword bit 8, where the mode obeys it.
+    pub halted: bool,
     pub counts: i64,
     /// Counts/s.
     pub velocity: f64,
+    pub stands: bool,
+    /// A.
+    pub current: f64,
 }
 
 impl Motion {
@@ -158,13 +186,12 @@ impl Motion {
             position: Interpolator::at(float(counts)),
             velocity: Interpolator::default(),
             profile: Profile::at(float(counts), 0.0),
-            active: None,
-            next: None,
-            acknowledged: false,
+            point_to_point: PointToPoint::at(counts),
+            speed: Reached::default(),
+            held: false,
+            halted: false,
             reached: true,
-            settled_cycles: 0,
-            homing_attained: false,
-            homing_error: false,
+            homing: Homing::default(),
             referenced: false,
             cut: false,
             torque: 0.0,
@@ -178,6 +205,7 @@ impl Motion {
             velocity: Interpolator::at(velocity),
             // One cycle back, so that the first step of a ramp comes out where the axis is now.
             profile: Profile::at(float(counts) - velocity * super::CONTROL_STEP, velocity),
+            homing: self.homing.interrupted(),
             referenced: self.referenced,
             ..Self::new(counts)
         };
@@ -223,6 +251,22 @@ impl Motion {
         let p = cycle.parameters;
         let torque = float(cycle.set_points.torque_offset) * p.torque_unit;
         match mode {
+            Mode::ProfilePosition => self.take_set_point(cycle, frame),
+            Mode::Homing if cycle.start => self.begin_homing(cycle, frame),
+            _ => {}
+        }
+        self.halted = cycle.halted;
+        if cycle.halted {
+            let ramp = p.options.halt_ramp();
+            let (demand, stands) = self.stop(ramp, Some(mode), cycle);
+            self.reached = stands;
+            // Goes on from here once the halt is over.
+            self.position = Interpolator::at(self.profile.position);
+            self.velocity = Interpolator::at(self.profile.velocity);
+            return demand;
+        }
+        self.held = false;
+        match mode {
             Mode::CyclicPosition => {
                 let (position, slope) = self.position.advance();
                 let reach = p.max_speed * super::CONTROL_STEP;
@@ -256,45 +300,15 @@ impl Motion {
                 Demand::Torque(self.torque)
             }
             Mode::ProfilePosition => {
-                self.profile_position(cycle, frame);
+                self.profile_position(cycle);
                 self.profile_demand(torque)
             }
-            Mode::ProfileVelocity => {
-                let wanted = float(cycle.set_points.velocity) * p.velocity_unit;
-                let within = wanted.clamp(-p.max_speed, p.max_speed);
-                self.cut = within != wanted;
-                let target = if cycle.set_points.halt() { 0.0 } else { within };
-                let there =
-                    self.profile
-                        .ramp(target, p.profile.acceleration, p.profile.deceleration);
-                let tolerance = (0.02 * target.abs()).max(0.002 * p.max_speed);
-                self.reached = there && (cycle.velocity - target).abs() <= tolerance;
-                self.profile.position = float(cycle.counts);
-                Demand::Velocity {
-                    velocity: self.profile.velocity,
-                    acceleration: self.profile.acceleration,
-                    torque,
-                }
-            }
+            Mode::ProfileVelocity => self.profile_velocity(cycle, torque),
             Mode::Homing => {
-                if cycle.start {
-                    self.home(cycle, frame);
-                }
-                self.profile
-                    .ramp(0.0, p.profile.acceleration, p.profile.deceleration);
+                self.home(cycle, frame);
                 self.profile_demand(torque)
             }
         }
-    }
-
-    /// One control cycle of a stop. True when the demanded speed is zero.
-    pub(super) fn stop(&mut self, ramp: Ramp, p: &Parameters) -> (Demand, bool) {
-        let deceleration = match ramp {
-            Ramp::SlowDown => p.profile.deceleration,
-            Ramp::QuickStop => p.quick_stop_deceleration,
-        };
-        let there = self.profile.ramp(0.0, deceleration, deceleration);
-        (self.profile_demand(0.0), there)
     }
 
     /// Holds the point where it is.
@@ -312,93 +326,14 @@ impl Motion {
         }
     }
 
-    fn profile_position(&mut self, cycle: &Cycle, frame: &Frame) {
-        let (p, set) = (cycle.parameters, cycle.set_points);
-        if cycle.start && self.next.is_none() {
-            self.accept(cycle, frame);
-        }
-        if set.controlword & 1 << 4 == 0 && self.next.is_none() {
-            self.acknowledged = false;
-        }
-        if set.halt() {
-            let stands = self
-                .profile
-                .ramp(0.0, p.profile.acceleration, p.profile.deceleration);
-            self.reached = stands;
-            return;
-        }
-        let Some(active) = self.active else {
-            self.profile
-                .ramp(0.0, p.profile.acceleration, p.profile.deceleration);
-            return;
-        };
-        let target = float(active.target);
-        if !self.profile.approach(target, &active.dynamics) {
-            self.settled_cycles = 0;
-            return;
-        }
-        let settled = match p.position_window {
-            None => true,
-            Some(window) => {
-                let inside = (target - float(cycle.counts)).abs() <= window;
-                self.settled_cycles = if inside { self.settled_cycles + 1 } else { 0 };
-                inside && self.settled_cycles > p.position_window_time
-            }
-        };
-        match self.next.take() {
-            Some(next) => {
-                self.active = Some(next);
-                self.reached = false;
-            }
-            None if settled => {
-                self.active = None;
-                self.reached = true;
-            }
-            None => {}
-        }
+    /// An error ends homing, not only the motion.
+    pub(super) fn fail_homing(&mut self) {
+        self.homing.fail();
     }
 
-    fn accept(&mut self, cycle: &Cycle, frame: &Frame) {
-        let (p, set) = (cycle.parameters, cycle.set_points);
-        let last = self
-            .next
-            .or(self.active)
-            .map_or(self.target, |accepted| accepted.target);
-        let target = if set.relative() {
-            last + set.position
-        } else {
-            last + frame.way(frame.show(last), set.position)
-        };
-        self.acknowledged = true;
-        let within = match p.software_limits {
-            Some((min, max)) => target.clamp(min - frame.shift, max - frame.shift),
-            None => target,
-        };
-        self.cut = within != target;
-        self.target = within;
-        let accepted = Move {
-            target: within,
-            dynamics: p.profile,
-        };
-        if self.active.is_none() || set.change_at_once() {
-            self.active = Some(accepted);
-            self.next = None;
-            self.reached = false;
-            self.settled_cycles = 0;
-        } else {
-            self.next = Some(accepted);
-        }
-    }
-
-    /// Methods 35 and 37: the axis is where home is.
-    fn home(&mut self, cycle: &Cycle, frame: &mut Frame) {
-        let here = matches!(cycle.parameters.homing_method, 35 | 37);
-        self.homing_attained = here;
-        self.homing_error = !here;
-        if here {
-            frame.shift = cycle.parameters.home_position - cycle.counts;
-            self.referenced = true;
-        }
+    /// What homing said last is history.
+    pub(super) fn forget_homing(&mut self) {
+        self.homing = Homing::default();
     }
 
     /// Counts between demand and position; zero where no position is demanded.
@@ -422,20 +357,19 @@ impl Motion {
         set(self.referenced, bit::REFERENCED);
         match mode {
             Mode::CyclicPosition | Mode::CyclicVelocity | Mode::CyclicTorque => {
-                set(follows && !self.cut, bit::MODE_12);
+                set(follows && !self.cut && !self.halted, bit::MODE_12);
             }
             Mode::ProfilePosition => {
-                set(self.acknowledged && follows, bit::MODE_12);
+                set(self.point_to_point.acknowledged() && follows, bit::MODE_12);
                 set(self.reached, bit::TARGET_REACHED);
             }
             Mode::ProfileVelocity => {
-                set(velocity.abs() <= 0.002 * p.max_speed, bit::MODE_12);
+                set(self.speed.is_zero(velocity, p), bit::MODE_12);
+                set(follows && self.speed.slips(), bit::MODE_13);
                 set(self.reached, bit::TARGET_REACHED);
             }
             Mode::Homing => {
-                set(self.homing_attained, bit::MODE_12);
-                set(self.homing_error, bit::MODE_13);
-                set(self.profile.velocity == 0.0, bit::TARGET_REACHED);
+                bits |= self.homing.bits(self.profile.velocity == 0.0, self.halted);
             }
         }
         bits

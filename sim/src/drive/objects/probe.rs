@@ -1,0 +1,61 @@
+//! Touch probe objects, where the ESI has them.
+
+use super::binder::Binder;
+use crate::coe::store::{ObjectStore, Slot};
+
+#[derive(Debug, Clone)]
+pub(in crate::drive) struct ProbeSlots {
+    pub function: Slot,
+    pub status: Slot,
+    /// By probe, then positive and negative edge: 0x60BA–0x60BD.
+    positions: [[Option<Slot>; 2]; 2],
+    /// 0x60D5–0x60D8.
+    counters: [[Option<Slot>; 2]; 2],
+    /// 0x60D0.
+    sources: [Option<Slot>; 2],
+}
+
+impl ProbeSlots {
+    pub(super) fn find(b: &Binder<'_>) -> Option<Self> {
+        let four = |first: u16| {
+            [[first, first + 1], [first + 2, first + 3]]
+                .map(|edges| edges.map(|index| b.0.slot(index, 0)))
+        };
+        Some(Self {
+            function: b.0.slot(0x60b8, 0)?,
+            status: b.0.slot(0x60b9, 0)?,
+            positions: four(0x60ba),
+            counters: four(0x60d5),
+            sources: [1, 2].map(|sub| b.0.slot(0x60d0, sub)),
+        })
+    }
+
+    /// A probe without a place for its positions is none.
+    pub(in crate::drive) fn exists(&self, probe: usize) -> bool {
+        self.positions
+            .get(probe)
+            .is_some_and(|edges| edges.iter().any(Option::is_some))
+    }
+
+    /// 0x60D0.
+    pub(in crate::drive) fn source(&self, store: &ObjectStore, probe: usize) -> Option<i64> {
+        let slot = (*self.sources.get(probe)?)?;
+        Some(store.get_signed(slot))
+    }
+
+    pub(in crate::drive) fn latch(
+        &self,
+        store: &mut ObjectStore,
+        probe: usize,
+        edge: usize,
+        position: i64,
+    ) {
+        let at = |slots: &[[Option<Slot>; 2]; 2]| *slots.get(probe)?.get(edge)?;
+        if let Some(slot) = at(&self.positions) {
+            store.set(slot, position);
+        }
+        if let Some(slot) = at(&self.counters) {
+            store.set(slot, store.get(slot).wrapping_add(1));
+        }
+    }
+}

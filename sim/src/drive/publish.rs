@@ -1,0 +1,74 @@
+//! What the drive shows of itself: Statusword and actual values.
+
+use super::control::Demand;
+use super::modes::{Mode, bit};
+use super::objects::float;
+use super::{Drive, State};
+use crate::coe::store::ObjectStore;
+
+impl Drive {
+    fn statusword(&self, limited: bool) -> u16 {
+        let state = self.power.state();
+        let mut word = state.bits();
+        let mut set = |on: bool, bit: u16| word |= if on { bit } else { 0 };
+        set(self.power.powered() || state == State::SwitchedOn, 1 << 4);
+        set(self.warning, 1 << 7);
+        set(self.in_op, 1 << 9);
+        set(limited || self.at_limit_switch(), bit::INTERNAL_LIMIT);
+        if let Some(mode) = self.mode {
+            let velocity = self.controller.velocity();
+            let bits = self
+                .motion
+                .status(mode, self.follows(), velocity, &self.parameters);
+            set(true, bits);
+            set(
+                self.following_error
+                    && matches!(mode, Mode::CyclicPosition | Mode::ProfilePosition),
+                bit::MODE_13,
+            );
+        }
+        word
+    }
+
+    pub(super) fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
+        let (o, p) = (&self.objects, &self.parameters);
+        let counts = self.controller.counts();
+        let velocity = self.controller.filtered_velocity();
+        let torque_per_ampere = self.params.torque_constant / p.torque_unit.max(1e-12);
+        let current = self.controller.current();
+        store.set(o.statusword, i64::from(self.statusword(limited)));
+        store.set(o.error_code, i64::from(self.faults.code()));
+        store.set(o.error_register, i64::from(self.faults.register()));
+        store.set(o.mode_display, self.mode.map_or(0, Mode::code));
+        store.set(o.position, self.frame.show(counts));
+        store.set(o.velocity, whole(velocity / p.velocity_unit));
+        store.set(o.torque, whole(current * torque_per_ampere));
+        let error = self.motion.following_error(demand, counts);
+        store.set(o.following_error, whole(error));
+        let (position, speed) = match demand {
+            Demand::Off => (float(counts), 0.0),
+            _ => self.motion.demanded(),
+        };
+        store.set(o.position_demand, self.frame.show(whole(position)));
+        store.set(o.velocity_demand, whole(speed / p.velocity_unit));
+        if let Some(slot) = o.velocity_averaged {
+            let averaged = self.controller.averaged_velocity();
+            store.set(slot, whole(averaged / p.velocity_unit));
+        }
+        if let Some(slot) = o.torque_averaged {
+            let averaged = self.controller.averaged_current();
+            store.set(slot, whole(averaged * torque_per_ampere));
+        }
+        if let Some(slot) = o.current {
+            store.set(slot, whole(current * 1e3));
+        }
+        if let Some(slot) = o.current_averaged {
+            store.set(slot, whole(self.controller.averaged_current() * 1e3));
+        }
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "saturates")]
+fn whole(value: f64) -> i64 {
+    value.round() as i64
+}
