@@ -45,6 +45,23 @@ fn three_modes_at_once_each_in_its_own() {
     }
 }
 
+/// Terminals without mailbox, mode or axis beside a drive: mapped, carried every cycle, nothing asked of them.
+#[test]
+fn a_coupler_and_terminals_in_front_of_an_axis() {
+    let machine = load("terminals.toml");
+    let names: Vec<_> = machine.devices.iter().map(|d| d.name.as_str()).collect();
+    assert_eq!(
+        names,
+        ["coupler", "switches", "valves", "doors", "lamps", "x"]
+    );
+    let summary = run_well(machine, virtual_time());
+    assert_eq!(summary.devices, 6);
+    assert_eq!(summary.counters.wkc_errors, 0);
+    assert_eq!(summary.counters.lost_frames, 0);
+    assert_eq!(summary.axes.len(), 1);
+    assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
+}
+
 #[test]
 fn every_axis_of_the_modes_machine_moves() {
     let (outcome, heard) = run(load("modes.toml"), virtual_time());

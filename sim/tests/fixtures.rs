@@ -1,13 +1,15 @@
-//! Every device of every ESI file at hand becomes a SubDevice that reaches Op.
+//! Every device of every ESI file at hand becomes a SubDevice that a MainDevice takes from Init to Op
+//! without having seen the ESI.
 
 #![allow(clippy::print_stderr, reason = "tests say what they did")]
 
 mod common;
+mod main_device;
 
 use std::path::{Path, PathBuf};
 
 use common::*;
-use ecaxis_esi::model::{Device, SmUse, SyncManager};
+use ecaxis_esi::model::Device;
 use ecaxis_sim::{DeviceOptions, SimDevice};
 
 fn files(folder: &Path, out: &mut Vec<PathBuf>) {
@@ -24,71 +26,73 @@ fn files(folder: &Path, out: &mut Vec<PathBuf>) {
     }
 }
 
-/// Configures the SyncManagers as the ESI has them and climbs to Op; what the device objected to.
-fn climb(device: &Device, sim: SimDevice) -> Result<(), String> {
-    const S: u16 = 0x1001;
-    let mut bus = Bus::new(vec![sim]);
-    bus.address_all();
-    let step = |bus: &mut Bus, state: u16| match bus.request(S, state) {
-        (status, 0) if status == state => Ok(()),
-        (_, code) => Err(format!("state {state} refused with 0x{code:04x}")),
-    };
-    let sms = || (0u16..).zip(&device.sync_managers).take(8);
-    for (n, sm) in sms() {
-        if device.mailbox.is_some() && matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn) {
-            bus.sm(S, n, sm.start_address, sm.default_size, sm.control_byte);
-        }
-    }
-    step(&mut bus, 2)?;
-    for (n, sm) in sms() {
-        let len = bus
-            .segment
-            .device(0)
-            .map_or(0, |d| d.pdo_len(usize::from(n)));
-        if matches!(sm.usage, SmUse::Outputs | SmUse::Inputs) && len > 0 {
-            bus.sm(S, n, sm.start_address, len as u16, sm.control_byte);
-        }
-    }
-    step(&mut bus, 4)?;
-    step(&mut bus, 8)?;
-    bus.wait(20_000_000);
-    step(&mut bus, 8)
-}
+/// Vendor and product code of devices that cannot get there, and not for the simulator's fault.
+const EXCUSED: &[(u32, u32)] = &[
+    // LAN9252-DIGIO-2PORT-BIDIR: by its ESI the MainDevice fills its inputs, so that nobody can read them.
+    (0xe000_04d8, 0x20),
+];
 
 #[test]
 fn every_device_reaches_op() {
-    let Some(readme) = fixture("README.md") else {
+    if fixture("README.md").is_none() {
         return;
-    };
-    drop(readme);
+    }
     let mut paths = Vec::new();
     files(&fixtures().join("esi"), &mut paths);
     paths.sort();
-    let (mut count, mut problems) = (0, Vec::new());
+    let (mut count, mut problems, mut excused) = (0, Vec::new(), 0);
     for path in paths {
-        let Ok(file) = ecaxis_esi::parse(&std::fs::read(&path).unwrap()) else {
-            continue;
-        };
-        for device in &file.devices {
-            // One maker writes inputs that the MainDevice would have to fill.
-            let nonsense =
-                |sm: &SyncManager| sm.usage == SmUse::Inputs && sm.control_byte & 0x0c == 0x04;
-            if device.sync_managers.iter().any(nonsense) {
+        let file = match ecaxis_esi::parse(&std::fs::read(&path).unwrap()) {
+            Ok(file) => file,
+            Err(error) => {
+                problems.push(format!("{}: {error}", path.display()));
                 continue;
             }
+        };
+        for device in &file.devices {
             count += 1;
             let result = SimDevice::from_esi(device, &file.modules, DeviceOptions::default())
                 .map_err(|error| error.to_string())
                 .and_then(|sim| climb(device, sim));
-            if let Err(problem) = result {
-                problems.push(format!(
-                    "{}: {}: {problem}",
-                    path.display(),
+            if EXCUSED.contains(&(device.identity.vendor, device.identity.product)) {
+                assert!(
+                    result.is_err(),
+                    "{} is excused for nothing",
                     device.type_name
+                );
+                excused += 1;
+            } else if let Err(problem) = result {
+                problems.push(format!(
+                    "{}: {} {}: {problem}",
+                    path.display(),
+                    device.type_name,
+                    device.identity,
                 ));
             }
         }
     }
-    eprintln!("{count} devices");
+    eprintln!("{count} devices, {excused} excused");
     assert!(problems.is_empty(), "{}", problems.join("\n"));
+}
+
+fn climb(device: &Device, sim: SimDevice) -> Result<(), String> {
+    const S: u16 = 0x1001;
+    let mut bus = Bus::new(vec![sim]);
+    bus.address_all();
+    let (learned, mapped) = main_device::bring_up(&mut bus, S)?;
+    let identity = &device.identity;
+    let found = [8, 10, 12].map(|word| main_device::number(&learned.image[word * 2..word * 2 + 4]));
+    let wanted = [identity.vendor, identity.product, identity.revision].map(u64::from);
+    if found != wanted {
+        return Err(format!("EEPROM says {found:x?}"));
+    }
+    let has_pdos = device
+        .rx_pdos
+        .iter()
+        .chain(&device.tx_pdos)
+        .any(|pdo| pdo.sm.is_some() && pdo.bit_len() > 0);
+    if has_pdos && mapped.len() == 0 {
+        return Err("its process data were not found".into());
+    }
+    Ok(())
 }

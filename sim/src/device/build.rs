@@ -11,6 +11,7 @@ use crate::Nanos;
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
+use crate::esc::registers::ADDRESS_SPACE;
 use crate::esc::{Esc, EscConfig, EscInfo};
 
 /// CiA 402.
@@ -93,6 +94,7 @@ impl SimDevice {
         let process = pdo
             .process_sms()
             .iter()
+            .filter(|sm| !is_virtual(device, sm.sm))
             .map(|sm| ProcessData {
                 sm: usize::from(sm.sm),
                 direction: sm.direction,
@@ -219,6 +221,12 @@ fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
         let slot = store.ensure(0x1018, sub, name, 32, ro, &[]);
         store.set(slot, i64::from(value));
     }
+}
+
+/// A SyncManager in name only: its "area" are registers, such as a latch's times, which an FMMU reads without it.
+fn is_virtual(device: &Device, sm: u8) -> bool {
+    let sm = device.sync_managers.get(usize::from(sm));
+    sm.is_some_and(|sm| (1..ADDRESS_SPACE).contains(&usize::from(sm.start_address)))
 }
 
 /// Two bits a port; a device without `Physics` has two MII ports.

@@ -38,7 +38,26 @@ impl SimDevice {
     pub(super) fn al_requested(&mut self, control: u16, local: u64) {
         self.al.control = control;
         self.al.waits_for_sync = false;
+        if self.esc.emulates_device() {
+            return self.emulate(control);
+        }
         self.al.due = local.saturating_add(self.state_change_ns);
+    }
+
+    /// No application judges the request. The acknowledge bit is copied, too, and then looks like an error
+    /// (ET1100 data sheet, section II, "Device emulation"; EK1100 and EL1004 do so in recordings).
+    fn emulate(&mut self, control: u16) {
+        let to = AlState::from_code((control & 0x0f) as u8);
+        let refusal = self.refusals.iter().find(|(state, _)| Some(*state) == to);
+        if let Some((_, code)) = refusal {
+            return self.settle(self.al.state, *code);
+        }
+        if let Some(to) = to {
+            self.enter(to);
+        }
+        let status = control & (0x0f | al::ERROR);
+        self.esc.put(reg::AL_STATUS, &status.to_le_bytes());
+        self.esc.put(reg::AL_STATUS_CODE, &[0, 0]);
     }
 
     /// The request's time has come, or the wait for SYNC0 is over.
@@ -167,9 +186,7 @@ impl SimDevice {
                 && sm.mode == data.mode
                 && sm.filled == filled
                 && self.is_free(data.sm, sm);
-            // Terminals that show latch times let a SyncManager look at the registers.
-            let registers = usize::from(sm.start) < reg::ADDRESS_SPACE && sm.start != 0;
-            if !good && !registers {
+            if !good {
                 return Err(code);
             }
         }
@@ -227,6 +244,9 @@ impl SimDevice {
 
     fn enter(&mut self, to: AlState) {
         let from = self.al.state;
+        if from == AlState::Op && to != from {
+            self.drop_outputs();
+        }
         match to {
             AlState::SafeOp if from < to => {
                 self.lay_out();
@@ -254,7 +274,9 @@ impl SimDevice {
         self.pump_mailbox();
     }
 
+    /// Only an application can hold SyncManagers closed.
     pub(super) fn close_process_data(&mut self, closed: bool) {
+        let closed = closed && !self.esc.emulates_device();
         for data in &self.process {
             if let Some(sm) = self.esc.sms.get_mut(data.sm) {
                 sm.closed_by_device = closed;
@@ -266,6 +288,7 @@ impl SimDevice {
 
     /// An error takes the device down by itself.
     fn fall_to(&mut self, state: AlState, code: u16, error: DeviceError) {
+        self.drop_outputs();
         if state < AlState::SafeOp {
             self.close_process_data(true);
         }
@@ -279,6 +302,10 @@ impl SimDevice {
 
     pub(super) fn watchdog_expired(&mut self) {
         self.esc.expire_watchdog();
+        self.drop_outputs();
+        if self.esc.emulates_device() {
+            return;
+        }
         if self.al.state == AlState::Op {
             self.fall_to(
                 AlState::SafeOp,
@@ -290,7 +317,8 @@ impl SimDevice {
 
     /// The MainDevice changed SyncManagers or SYNC0 under a running application.
     pub(super) fn configuration_changed(&mut self, sms: bool, sync: bool) {
-        if self.al.state < AlState::SafeOp || self.al.state == AlState::Boot {
+        let unjudged = self.al.state < AlState::SafeOp || self.esc.emulates_device();
+        if unjudged || self.al.state == AlState::Boot {
             return;
         }
         if sms && let Err(code) = self.check_process_data() {

@@ -178,6 +178,7 @@ impl SimDevice {
         if let Some(mailbox) = &mut self.mailbox {
             mailbox.reset();
         }
+        self.lay_out();
         self.close_process_data(true);
         self.tick = match self.application {
             Application::Drive(_) => self.esc.clock.local(now) + CONTROL_PERIOD_NS,

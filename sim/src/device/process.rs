@@ -64,10 +64,25 @@ impl SimDevice {
 
     /// Takes outputs, if they count in this state, and latches inputs.
     pub(super) fn exchange(&mut self) {
-        if self.al.state == AlState::Op {
+        // An emulated device stays in Op without outputs to obey.
+        if self.al.state == AlState::Op && !self.esc.watchdog.expired {
             self.take_outputs();
         }
         self.empty_single_buffers();
+        self.latch_inputs();
+    }
+
+    /// Digital and analogue outputs go to their safe state, zero. A drive reacts by itself.
+    pub(super) fn drop_outputs(&mut self) {
+        let Application::Io { mirrors, .. } = &self.application else {
+            return;
+        };
+        for data in self.process.iter().filter(|d| d.direction == Direction::Rx) {
+            for m in &data.map {
+                self.store.bytes_mut(m.slot).fill(0);
+            }
+        }
+        copy_mirrors(&mut self.store, mirrors);
         self.latch_inputs();
     }
 
@@ -100,7 +115,7 @@ impl SimDevice {
     }
 
     pub(super) fn latch_inputs(&mut self) {
-        if self.al.state < AlState::SafeOp {
+        if self.al.state < AlState::SafeOp && !self.esc.emulates_device() {
             return;
         }
         for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {

@@ -221,6 +221,13 @@ impl Esc {
             .is_some_and(|b| b >> 2 & 3 == 3)
     }
 
+    /// Device emulation (bit 0 of 0x0141): nobody stands behind the controller, and AL status follows AL
+    /// control by itself.
+    #[must_use]
+    pub fn emulates_device(&self) -> bool {
+        self.u16_at(reg::PDI_CONTROL) & 0x0100 != 0
+    }
+
     #[must_use]
     pub fn station_address(&self) -> u16 {
         self.station
