@@ -328,6 +328,12 @@ pub struct ObjectItem {
     pub max: Option<Vec<u8>>,
     pub access: Access,
     pub pdo_mapping: PdoMapping,
+    /// `Backup`: kept over a power cycle once parameters are stored.
+    pub backup: bool,
+    /// `Setting`: belongs to what a machine configures at start-up.
+    pub setting: bool,
+    /// `Unit`, coded as in ETG.1004; 0 where the file gives none.
+    pub unit: u32,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -8,7 +8,8 @@
 //! * [`frame`]: the datagram codec
 //! * [`esc`]: the SubDevice controller: registers, FMMUs, SyncManagers, EEPROM, distributed clocks
 //! * [`device`]: the controller and the application behind it: state machine, mailbox, process data
-//! * [`coe`]: object dictionary and SDO server
+//! * [`coe`]: object dictionary, SDO server, SDO Information
+//! * [`foe`]: a device's files
 //! * [`drive`]: a CiA 402 drive down to the motor shaft
 //! * [`faults`]: what goes wrong on purpose
 //! * [`serve`]: the segment on a real network interface, for any MainDevice
@@ -19,15 +20,17 @@ pub mod device;
 pub mod drive;
 pub mod esc;
 pub mod faults;
+pub mod foe;
 pub mod frame;
 pub mod network;
 pub mod serve;
 
-pub use device::{DeviceOptions, SimDevice, SimError};
+pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
 pub use drive::{PlantParams, Track};
 pub use esc::al::AlState;
 pub use esc::info::EscInfo;
 pub use faults::{FaultScript, ScriptError};
+pub use foe::{FileStore, FoeOptions};
 pub use network::{Segment, SegmentOptions, Transit};
 pub use serve::{ServeError, ServeStats, serve};
 

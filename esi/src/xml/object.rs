@@ -1,6 +1,7 @@
 //! `Dictionary/Objects`, as written.
 
 use super::cursor::{Cursor, Element};
+use super::number::{boolean, number};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Access, PdoMapping, Position, Writable};
@@ -21,6 +22,7 @@ pub(super) struct Info {
     pub default: Option<Literal>,
     pub min: Option<Literal>,
     pub max: Option<Literal>,
+    pub unit: u32,
     pub sub_items: Vec<(String, Info)>,
 }
 
@@ -34,6 +36,8 @@ pub(super) enum Literal {
 pub(super) struct Flags {
     pub access: Option<Access>,
     pub pdo_mapping: Option<PdoMapping>,
+    pub backup: Option<bool>,
+    pub setting: Option<bool>,
 }
 
 pub(super) fn read<'a>(
@@ -96,6 +100,10 @@ fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info, EsiError>
             "MinData" => out.min = Some(Literal::Data(c.text(el)?)),
             "MaxValue" => out.max = Some(Literal::Value(c.text(el)?)),
             "MaxData" => out.max = Some(Literal::Data(c.text(el)?)),
+            "Unit" => {
+                let unit = number(&c.text(el)?).and_then(|unit| u32::try_from(unit).ok());
+                out.unit = unit.unwrap_or(0);
+            }
             "SubItem" => {
                 let mut names = Names::default();
                 let mut inner = Info::default();
@@ -140,6 +148,8 @@ pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fla
                     tx: text.contains('t'),
                 });
             }
+            "Backup" => flags.backup = boolean(&c.text(el)?),
+            "Setting" => flags.setting = boolean(&c.text(el)?),
             _ => {}
         }
         Ok(())

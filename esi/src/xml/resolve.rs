@@ -105,6 +105,9 @@ pub(super) fn object<'a>(
                 .pdo_mapping
                 .or(raw.flags.pdo_mapping)
                 .unwrap_or_default(),
+            backup: slot.flags.backup.or(raw.flags.backup).unwrap_or(false),
+            setting: slot.flags.setting.or(raw.flags.setting).unwrap_or(false),
+            unit: own.unit,
         });
     }
     items.sort_by_key(|item| item.sub);

@@ -7,16 +7,24 @@ pub struct Abort(pub u32);
 
 impl Abort {
     pub const TOGGLE: Self = Self(0x0503_0000);
+    pub const TIMEOUT: Self = Self(0x0504_0000);
     pub const COMMAND: Self = Self(0x0504_0001);
+    pub const OUT_OF_MEMORY: Self = Self(0x0504_0005);
+    pub const UNSUPPORTED_ACCESS: Self = Self(0x0601_0000);
     pub const WRITE_ONLY: Self = Self(0x0601_0001);
     pub const READ_ONLY: Self = Self(0x0601_0002);
     /// Subindex 0 must be 0 while entries change.
     pub const COUNT_NOT_ZERO: Self = Self(0x0601_0003);
-    pub const NO_COMPLETE_ACCESS: Self = Self(0x0601_0004);
+    /// No complete access to objects of variable length.
+    pub const VARIABLE_LENGTH: Self = Self(0x0601_0004);
+    pub const EXCEEDS_MAILBOX: Self = Self(0x0601_0005);
+    /// Process data write it.
+    pub const MAPPED: Self = Self(0x0601_0006);
     pub const NO_OBJECT: Self = Self(0x0602_0000);
     pub const NOT_MAPPABLE: Self = Self(0x0604_0041);
     pub const MAPPING_TOO_LONG: Self = Self(0x0604_0042);
     pub const INCOMPATIBLE: Self = Self(0x0604_0043);
+    /// Not the length that the transfer announced.
     pub const LENGTH: Self = Self(0x0607_0010);
     pub const TOO_LONG: Self = Self(0x0607_0012);
     pub const TOO_SHORT: Self = Self(0x0607_0013);
@@ -24,6 +32,7 @@ impl Abort {
     pub const VALUE: Self = Self(0x0609_0030);
     pub const VALUE_TOO_HIGH: Self = Self(0x0609_0031);
     pub const VALUE_TOO_LOW: Self = Self(0x0609_0032);
+    pub const NOT_STORED: Self = Self(0x0800_0020);
     pub const WRONG_STATE: Self = Self(0x0800_0022);
 }
 

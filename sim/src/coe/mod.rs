@@ -1,29 +1,93 @@
-//! CANopen over EtherCAT: the object dictionary and the server that answers for it.
+//! CANopen over EtherCAT: the object dictionary and the servers that answer for it.
 //!
 //! * `store`: every object as a slot in one arena
-//! * `objects`: reading and writing with access rights, ranges and complete access
+//! * `datatype`: what values mean, their codes and ranges
+//! * `objects`: reading and writing with access rights and complete access
 //! * `pdo`: PDO assignment and mapping, modules
 //! * `sdo`: the SDO server: expedited, normal and segmented transfers
+//! * `info`: SDO Information: what objects there are
+//!
+//! Messages in, answers out; mailboxes, their counters and queues are the device's.
 
 mod abort;
+mod datatype;
+mod info;
 mod objects;
 pub mod pdo;
 mod sdo;
 pub mod store;
 
 pub use abort::Abort;
-pub(crate) use objects::{Dictionary, read_item};
-pub(crate) use sdo::SdoServer;
+pub(crate) use objects::{Dictionary, ParameterCommand, read_item};
+
+use crate::device::mailbox::{Answer, Detail, Room};
+use sdo::SdoServer;
 
 /// CoE services (the header's upper four bits).
-pub(crate) mod service {
-    pub(crate) const EMERGENCY: u8 = 1;
-    pub(crate) const SDO_REQUEST: u8 = 2;
-    pub(crate) const SDO_RESPONSE: u8 = 3;
-    pub(crate) const SDO_INFORMATION: u8 = 8;
+mod service {
+    pub(super) const EMERGENCY: u8 = 1;
+    pub(super) const SDO_REQUEST: u8 = 2;
+    pub(super) const SDO_RESPONSE: u8 = 3;
+    pub(super) const RXPDO_REMOTE_REQUEST: u8 = 7;
+    pub(super) const SDO_INFORMATION: u8 = 8;
+}
+
+/// What a client may use.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CoeServices {
+    pub(crate) sdo_info: bool,
+    pub(crate) segmented: bool,
+    /// Bytes that a segmented transfer may take.
+    pub(crate) buffer: usize,
+}
+
+#[derive(Debug, Clone, Default)]
+pub(crate) struct CoeServer {
+    sdo: SdoServer,
+}
+
+impl CoeServer {
+    /// Answers one CoE message.
+    pub(crate) fn request(
+        &mut self,
+        dictionary: &mut Dictionary<'_>,
+        services: CoeServices,
+        message: &[u8],
+        room: Room,
+    ) -> Answer {
+        let Some((&[low, high], body)) = message.split_first_chunk() else {
+            return Answer::Error(Detail::TooShort);
+        };
+        match (u16::from_le_bytes([low, high]) >> 12) as u8 {
+            service::SDO_REQUEST => self.sdo.request(dictionary, services, body, room),
+            service::SDO_INFORMATION if services.sdo_info => info::request(dictionary, body, room),
+            service::EMERGENCY..=service::RXPDO_REMOTE_REQUEST | service::SDO_INFORMATION => {
+                Answer::Error(Detail::ServiceNotSupported)
+            }
+            _ => Answer::Error(Detail::InvalidHeader),
+        }
+    }
+
+    /// A segmented transfer waits for the client.
+    pub(crate) fn is_waiting(&self) -> bool {
+        self.sdo.is_waiting()
+    }
+
+    /// The client took too long; the message that tells it.
+    pub(crate) fn expire(&mut self) -> Option<Vec<u8>> {
+        self.sdo.expire()
+    }
+}
+
+pub(crate) fn emergency(code: u16, register: u8, data: [u8; 5]) -> Vec<u8> {
+    let mut message = header(service::EMERGENCY).to_vec();
+    message.extend_from_slice(&code.to_le_bytes());
+    message.push(register);
+    message.extend_from_slice(&data);
+    message
 }
 
 /// CoE header: number 0 and the service.
-pub(crate) fn header(service: u8) -> [u8; 2] {
+fn header(service: u8) -> [u8; 2] {
     (u16::from(service) << 12).to_le_bytes()
 }

@@ -1,11 +1,25 @@
 //! Objects as a CoE client may read and write them.
 
-use ecaxis_esi::model::Writable;
+use ecaxis_esi::model::{ObjectCode, Writable};
 
-use super::Abort;
 use super::pdo::PdoRules;
-use super::store::{ObjectStore, Slot};
+use super::store::{Item, ObjectStore, Slot};
+use super::{Abort, datatype};
+use crate::coe::datatype::Kind;
 use crate::esc::al::AlState;
+
+const STORE_PARAMETERS: u16 = 0x1010;
+const RESTORE_PARAMETERS: u16 = 0x1011;
+
+/// Their objects are enumerations, of variable length.
+const ENUMERATIONS: std::ops::Range<u16> = 0x0800..0x1000;
+
+/// What a client asked for by writing the right word to 0x1010 or 0x1011 (CiA 301).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ParameterCommand {
+    Store,
+    Restore,
+}
 
 /// What an SDO request works on.
 #[derive(Debug)]
@@ -14,21 +28,21 @@ pub(crate) struct Dictionary<'a> {
     pub(crate) pdo: &'a mut PdoRules,
     pub(crate) state: AlState,
     pub(crate) complete_access: bool,
+    /// Objects in a PDO that is received now cannot be written.
+    pub(crate) refuse_mapped: bool,
     /// Injected aborts: index, subindex, code.
     pub(crate) forced: &'a [(u16, u8, u32)],
+    pub(crate) command: Option<ParameterCommand>,
 }
 
 impl Dictionary<'_> {
-    fn find(&self, index: u16, sub: u8) -> Result<Slot, Abort> {
-        if let Some((.., code)) = self
-            .forced
-            .iter()
-            .find(|(i, s, _)| (*i, *s) == (index, sub))
-        {
+    fn find(&self, index: u16, sub: u8) -> Result<(Slot, &Item), Abort> {
+        let mut forced = self.forced.iter();
+        if let Some((.., code)) = forced.find(|(i, s, _)| (*i, *s) == (index, sub)) {
             return Err(Abort(*code));
         }
-        self.store
-            .slot(index, sub)
+        let slot = self.store.slot(index, sub);
+        slot.and_then(|slot| Some((slot, self.store.item(slot)?)))
             .ok_or(if self.store.has_object(index) {
                 Abort::NO_SUBINDEX
             } else {
@@ -36,58 +50,74 @@ impl Dictionary<'_> {
             })
     }
 
-    pub(crate) fn read(&self, index: u16, sub: u8) -> Result<Vec<u8>, Abort> {
-        let slot = self.find(index, sub)?;
-        if self.store.item(slot).is_some_and(|item| !item.access.read) {
+    /// An item, or under complete access the object from subindex 0 or 1 on.
+    pub(crate) fn read(&self, index: u16, sub: u8, complete: bool) -> Result<Vec<u8>, Abort> {
+        if self.is_whole(index, sub, complete)? {
+            return Ok(self.read_all(index, sub));
+        }
+        let (slot, item) = self.find(index, sub)?;
+        if !item.access.read {
             return Err(Abort::WRITE_ONLY);
         }
         Ok(read_item(self.store, slot))
     }
 
-    /// All subindices from `first` (0 or 1) on, packed; subindex 0 takes 16 bits.
-    pub(crate) fn read_all(&self, index: u16, first: u8) -> Result<Vec<u8>, Abort> {
-        let start = self.check_complete(index, first)?;
-        let count = self
-            .store
-            .slot(index, 0)
-            .map_or(0, |slot| self.store.get(slot));
-        let mut out = Vec::new();
-        for slot in self.store.object(index) {
-            let Some(item) = self.store.item(slot) else {
-                continue;
-            };
-            let beyond = self.pdo.is_list(index) && i64::from(item.sub) > count;
-            if item.sub < first || beyond || !item.access.read {
-                continue;
-            }
-            let at = usize::try_from(item.bit_offset)
-                .unwrap_or(0)
-                .saturating_sub(start);
-            let bits = usize::try_from(item.bit_len).unwrap_or(0);
-            let padded = if item.sub == 0 { 16 } else { bits };
-            out.resize(out.len().max((at + padded).div_ceil(8)), 0);
-            crate::bits::copy(&mut out, at, self.store.bytes(slot), 0, bits);
+    /// Whether complete access means more than one item here. Without subindices there is nothing to complete.
+    fn is_whole(&self, index: u16, sub: u8, complete: bool) -> Result<bool, Abort> {
+        if !complete {
+            return Ok(false);
         }
-        Ok(out)
-    }
-
-    fn check_complete(&self, index: u16, first: u8) -> Result<usize, Abort> {
-        self.find(index, first)?;
-        if !self.complete_access {
-            return Err(Abort::NO_COMPLETE_ACCESS);
-        }
-        match first {
-            0 => Ok(0),
-            1 => Ok(16),
-            _ => Err(Abort::NO_SUBINDEX),
-        }
-    }
-
-    pub(crate) fn write(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
-        let slot = self.find(index, sub)?;
-        let Some(item) = self.store.item(slot) else {
+        if !self.store.has_object(index) {
             return Err(Abort::NO_OBJECT);
-        };
+        }
+        if !self.complete_access || sub > 1 {
+            return Err(Abort::UNSUPPORTED_ACCESS);
+        }
+        if ENUMERATIONS.contains(&index) {
+            return Err(Abort::VARIABLE_LENGTH);
+        }
+        self.find(index, sub)?;
+        Ok(self.store.object_code(index) != ObjectCode::Var)
+    }
+
+    /// The items of complete access with their place in the data, in bits; subindex 0 takes 16. Of a list only the
+    /// elements that count.
+    fn places(
+        &self,
+        index: u16,
+        first: u8,
+        count: i64,
+    ) -> impl Iterator<Item = (Slot, &Item, usize)> {
+        let start = if first == 0 { 0 } else { 16 };
+        let list = self.pdo.is_list(index);
+        self.store
+            .object(index)
+            .filter_map(|slot| Some((slot, self.store.item(slot)?)))
+            .filter(move |(_, item)| item.sub >= first && !(list && i64::from(item.sub) > count))
+            .map(move |(slot, item)| (slot, item, (item.bit_offset as usize).saturating_sub(start)))
+    }
+
+    fn count(&self, index: u16) -> i64 {
+        let count = self.store.slot(index, 0);
+        count.map_or(0, |slot| self.store.get(slot))
+    }
+
+    /// Gaps, and items that cannot be read, are zero.
+    fn read_all(&self, index: u16, first: u8) -> Vec<u8> {
+        let mut out = Vec::new();
+        for (slot, item, at) in self.places(index, first, self.count(index)) {
+            let bits = item.bit_len as usize;
+            let padded = if item.sub == 0 { bits.max(16) } else { bits };
+            out.resize(out.len().max((at + padded).div_ceil(8)), 0);
+            if item.access.read {
+                crate::bits::copy(&mut out, at, self.store.bytes(slot), 0, bits);
+            }
+        }
+        out
+    }
+
+    /// Whether an item may be written now, whatever the value.
+    fn check_access(&self, item: &Item) -> Result<(), Abort> {
         match (item.access.write, self.state) {
             (Writable::Never, _) => return Err(Abort::READ_ONLY),
             (Writable::Only { pre_op: true, .. }, AlState::PreOp)
@@ -96,125 +126,151 @@ impl Dictionary<'_> {
             | (Writable::Always, _) => {}
             (Writable::Only { .. }, _) => return Err(Abort::WRONG_STATE),
         }
-        let len = usize::try_from(item.bit_len.div_ceil(8)).unwrap_or(0);
-        if data.len() > len {
-            return Err(Abort::TOO_LONG);
-        }
-        if data.len() < len && !item.text {
-            return Err(Abort::TOO_SHORT);
-        }
-        if item.bit_len <= 64 && !item.text {
-            let value = value_of(data, item.signed);
-            if let (Some(min), Some(max)) = (item.min, item.max)
-                && min < max
-            {
-                if value > max {
-                    return Err(Abort::VALUE_TOO_HIGH);
-                }
-                if value < min {
-                    return Err(Abort::VALUE_TOO_LOW);
-                }
-            }
-            if let Some(choices) = item.choices
-                && !choices.contains(&value_of(data, true))
-            {
-                return Err(Abort::VALUE);
-            }
-            self.pdo
-                .before_write(self.store, index, sub, value, self.state)?;
-            self.store.set(slot, value);
-            self.pdo.after_write(self.store, index, sub, value);
-        } else {
-            let bytes = self.store.bytes_mut(slot);
-            let (head, tail) = bytes.split_at_mut(data.len());
-            head.copy_from_slice(data);
-            tail.fill(0);
+        let running = matches!(self.state, AlState::SafeOp | AlState::Op);
+        if self.refuse_mapped && running && self.pdo.receives(self.store, item.index, item.sub) {
+            return Err(Abort::MAPPED);
         }
         Ok(())
     }
 
-    /// Most bytes a download may carry, so that a too long one is refused at once.
+    /// Most bytes a download may carry, so that what cannot succeed is refused at once.
     pub(crate) fn capacity(&self, index: u16, sub: u8, complete: bool) -> Result<usize, Abort> {
-        if complete {
-            let start = self.check_complete(index, sub)?;
-            let bits = self
-                .store
-                .object(index)
-                .filter_map(|slot| self.store.item(slot))
-                .map(|item| item.bit_offset + item.bit_len.max(if item.sub == 0 { 16 } else { 0 }))
-                .max();
-            let bytes = bits.unwrap_or(0).div_ceil(8);
-            return Ok(usize::try_from(bytes)
-                .unwrap_or(0)
-                .saturating_sub(start / 8));
+        if self.is_whole(index, sub, complete)? {
+            let ends = self.places(index, sub, i64::MAX).map(|(_, item, at)| {
+                at + (item.bit_len as usize).max(if item.sub == 0 { 16 } else { 0 })
+            });
+            return Ok(ends.max().unwrap_or(0).div_ceil(8));
         }
-        let slot = self.find(index, sub)?;
-        let bits = self.store.item(slot).map_or(0, |item| item.bit_len);
-        Ok(usize::try_from(bits.div_ceil(8)).unwrap_or(0))
+        let (_, item) = self.find(index, sub)?;
+        self.check_access(item)?;
+        Ok(item.bit_len.div_ceil(8) as usize)
     }
 
-    /// A complete-access download. Lists (PDO assignment and mapping) are emptied first and get
-    /// their count last, as if the client had done it item by item.
-    pub(crate) fn write_all(&mut self, index: u16, first: u8, data: &[u8]) -> Result<(), Abort> {
-        let start = self.check_complete(index, first)?;
-        let slots: Vec<Slot> = self.store.object(index).collect();
-        let list = self.pdo.is_list(index);
-        let mut wrote = false;
-        if list && first == 0 {
-            self.write(index, 0, &[0])?;
-            wrote = true;
+    pub(crate) fn write(
+        &mut self,
+        index: u16,
+        sub: u8,
+        complete: bool,
+        data: &[u8],
+    ) -> Result<(), Abort> {
+        if self.is_whole(index, sub, complete)? {
+            self.write_all(index, sub, data)
+        } else {
+            self.write_item(index, sub, data)
         }
-        for slot in slots {
-            let Some(item) = self.store.item(slot) else {
-                continue;
-            };
-            if item.sub < first || (item.sub == 0 && list) {
-                continue;
-            }
-            let at = usize::try_from(item.bit_offset)
-                .unwrap_or(0)
-                .saturating_sub(start);
-            let bits = usize::try_from(item.bit_len).unwrap_or(0);
-            if at + bits > data.len() * 8 {
+    }
+
+    fn write_item(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
+        let (slot, item) = self.find(index, sub)?;
+        self.check_access(item)?;
+        let len = item.bit_len.div_ceil(8) as usize;
+        if data.len() > len {
+            return Err(Abort::TOO_LONG);
+        }
+        if data.len() < len && item.kind != Kind::Text {
+            return Err(Abort::TOO_SHORT);
+        }
+        if matches!(index, STORE_PARAMETERS | RESTORE_PARAMETERS) && sub > 0 {
+            self.command = Some(command(index, data)?);
+            return Ok(());
+        }
+        let (min, max) = (item.min.as_deref(), item.max.as_deref());
+        datatype::check(item.kind, item.bit_len, data, min, max)?;
+        if let Some(choices) = item.choices
+            && !choices.contains(&extended(data))
+        {
+            return Err(Abort::VALUE);
+        }
+        let value = low_bits(data);
+        self.pdo
+            .before_write(self.store, index, sub, value, self.state)?;
+        let bytes = self.store.bytes_mut(slot);
+        for (n, byte) in bytes.iter_mut().enumerate() {
+            *byte = data.get(n).copied().unwrap_or(0);
+        }
+        self.pdo.after_write(self.store, index, sub, value);
+        Ok(())
+    }
+
+    /// A complete-access download: items that cannot be written keep their values, data that end between two items leave
+    /// the rest alone. Lists (PDO assignment and mapping) are emptied first and get their count last, as if the
+    /// client had done it item by item.
+    fn write_all(&mut self, index: u16, first: u8, data: &[u8]) -> Result<(), Abort> {
+        let list = self.pdo.is_list(index);
+        let count = match data.first() {
+            Some(count) if list && first == 0 => i64::from(*count),
+            _ => i64::MAX,
+        };
+        let mut values = Vec::new();
+        let mut refused = Abort::READ_ONLY;
+        for (_, item, at) in self.places(index, first, count) {
+            let bits = item.bit_len as usize;
+            let left = (data.len() * 8).saturating_sub(at);
+            if left == 0 && count == i64::MAX {
                 break;
             }
-            if item.access.write == Writable::Never {
-                continue;
+            if left < bits {
+                return Err(Abort::TOO_SHORT);
+            }
+            match self.check_access(item) {
+                Ok(()) => {}
+                Err(Abort::READ_ONLY) => continue,
+                Err(abort) => {
+                    refused = abort;
+                    continue;
+                }
             }
             let mut value = vec![0; bits.div_ceil(8)];
             crate::bits::copy(&mut value, 0, data, at, bits);
-            let sub = item.sub;
-            let used = data.first().copied().unwrap_or(0);
-            if list && first == 0 && sub > used {
-                break;
-            }
-            self.write(index, sub, &value)?;
-            wrote = true;
+            values.push((item.sub, value));
         }
-        if list
-            && first == 0
-            && let Some(count) = data.first()
-        {
-            self.write(index, 0, &[*count])?;
+        if values.is_empty() {
+            return Err(refused);
         }
-        if wrote { Ok(()) } else { Err(Abort::READ_ONLY) }
+        if list && first == 0 {
+            self.write_item(index, 0, &[0])?;
+            // The count comes last.
+            values.rotate_left(1);
+        }
+        values
+            .iter()
+            .try_for_each(|(sub, value)| self.write_item(index, *sub, value))
     }
 }
 
 /// Bytes as an upload carries them; a text ends before its padding.
 pub(crate) fn read_item(store: &ObjectStore, slot: Slot) -> Vec<u8> {
     let bytes = store.bytes(slot);
-    if store.item(slot).is_some_and(|item| item.text) {
+    if store.item(slot).is_some_and(|item| item.kind == Kind::Text) {
         let len = bytes.iter().position(|b| *b == 0).unwrap_or(bytes.len());
         return bytes.get(..len.max(1)).unwrap_or(bytes).to_vec();
     }
     bytes.to_vec()
 }
 
-fn value_of(data: &[u8], signed: bool) -> i64 {
-    let negative = signed && data.last().is_some_and(|b| b & 0x80 != 0);
+/// Anything but the signature must not store or restore (CiA 301, objects 0x1010 and 0x1011).
+fn command(index: u16, data: &[u8]) -> Result<ParameterCommand, Abort> {
+    match (index, data) {
+        (STORE_PARAMETERS, b"save") => Ok(ParameterCommand::Store),
+        (RESTORE_PARAMETERS, b"load") => Ok(ParameterCommand::Restore),
+        _ => Err(Abort::NOT_STORED),
+    }
+}
+
+/// A value's two's complement; of long ones the low 64 bits.
+fn extended(data: &[u8]) -> i64 {
+    let negative = data.last().is_some_and(|last| last & 0x80 != 0);
     let mut raw = [if negative { 0xff } else { 0 }; 8];
     for (to, from) in raw.iter_mut().zip(data) {
+        *to = *from;
+    }
+    i64::from_le_bytes(raw)
+}
+
+/// What PDO rules look at: their objects are unsigned and of 32 bits at most.
+fn low_bits(data: &[u8]) -> i64 {
+    let mut raw = [0; 8];
+    for (to, from) in raw.iter_mut().zip(data.iter().take(7)) {
         *to = *from;
     }
     i64::from_le_bytes(raw)

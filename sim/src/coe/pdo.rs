@@ -1,10 +1,10 @@
 //! PDO assignment (0x1C10 + SyncManager) and mapping (0x16xx, 0x1Axx): what a client may write
 //! there, what modules change, and the bit layout that results.
 
-use ecaxis_esi::model::{Access, Device, Direction, Module, Pdo, SmUse, Writable};
+use ecaxis_esi::model::{Access, Device, Direction, Module, ObjectCode, Pdo, SmUse, Writable};
 
 use super::Abort;
-use super::store::{ObjectStore, Slot};
+use super::store::{Item, ObjectStore, Slot};
 use crate::esc::al::AlState;
 use crate::esc::sm::Mode;
 
@@ -99,14 +99,12 @@ impl PdoRules {
                 .filter(|pdo| pdo.sm == Some(n))
                 .map(|pdo| pdo.index)
                 .collect();
-            rules.fill(
-                store,
-                ASSIGNMENT + u16::from(n),
-                16,
-                &assigned,
-                MAX_ASSIGNED,
-                assign,
-            );
+            let index = ASSIGNMENT + u16::from(n);
+            if !store.has_object(index) {
+                let name = format!("SyncManager {n} PDO assignment");
+                store.describe(index, ObjectCode::Array, &name);
+            }
+            rules.fill(store, index, 16, &assigned, MAX_ASSIGNED, assign);
         }
         rules.plug_defaults(store, device);
         rules
@@ -121,6 +119,9 @@ impl PdoRules {
                 exclude: pdo.exclude.clone(),
             });
             let entries: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
+            if !store.has_object(index) {
+                store.describe(index, ObjectCode::Record, &pdo.name);
+            }
             self.fill(store, index, 32, &entries, MAX_MAPPED, config && !pdo.fixed);
         }
         for entry in pdo.entries.iter().filter(|entry| !entry.is_gap()) {
@@ -132,14 +133,12 @@ impl PdoRules {
                     Writable::Never
                 },
             };
-            store.ensure(
-                entry.index,
-                entry.sub,
-                &entry.name,
-                u32::from(entry.bit_len),
-                access,
-                &[],
-            );
+            let new = store.slot(entry.index, entry.sub).is_none();
+            let bits = u32::from(entry.bit_len);
+            let slot = store.ensure(entry.index, entry.sub, &entry.name, bits, access, &[]);
+            if new {
+                store.set_type(slot, &entry.data_type);
+            }
             let key = (pdo.direction, entry.mapping() >> 8);
             if !self.known_entries.contains(&key) {
                 self.known_entries.push(key);
@@ -378,16 +377,33 @@ impl PdoRules {
         let Some(item) = store.slot(index, sub).and_then(|slot| store.item(slot)) else {
             return Err(Abort::NOT_MAPPABLE);
         };
-        let flagged = match direction {
-            Direction::Rx => item.mapping.rx,
-            Direction::Tx => item.mapping.tx,
-        };
-        let mappable = flagged || self.known_entries.contains(&(direction, value >> 8));
-        if mappable && item.bit_len & 0xff == u32::from(bits) {
+        if self.mappable(direction, item) && item.bit_len & 0xff == u32::from(bits) {
             Ok(())
         } else {
             Err(Abort::NOT_MAPPABLE)
         }
+    }
+
+    /// By its flags, or because the ESI's own PDOs contain it.
+    pub(crate) fn mappable(&self, direction: Direction, item: &Item) -> bool {
+        let flagged = match direction {
+            Direction::Rx => item.mapping.rx,
+            Direction::Tx => item.mapping.tx,
+        };
+        let key = u32::from(item.index) << 8 | u32::from(item.sub);
+        flagged || self.known_entries.contains(&(direction, key))
+    }
+
+    /// Whether the item stands in a PDO that is received, as assignment and mapping now are.
+    pub(crate) fn receives(&self, store: &ObjectStore, index: u16, sub: u8) -> bool {
+        let key = u32::from(index) << 8 | u32::from(sub);
+        let mut outputs = self.sms.iter().filter(|sm| sm.direction == Direction::Rx);
+        outputs.any(|sm| {
+            let assignment = ASSIGNMENT + u16::from(sm.sm);
+            elements(store, assignment, count(store, assignment))
+                .flat_map(|pdo| elements(store, pdo as u16, count(store, pdo as u16)))
+                .any(|entry| entry >> 8 == key)
+        })
     }
 
     fn check_assignment(

@@ -1,140 +1,176 @@
 //! The SDO server (ETG.1000.6 §5.6.2). Requests in, responses out; no mailbox in sight.
 
-use super::{Abort, Dictionary, service};
+use super::{Abort, CoeServices, Dictionary, service};
+use crate::device::mailbox::{Answer, Detail, Room};
 
 /// Command, index, subindex, four data bytes.
 const INITIATE: usize = 8;
 /// CoE header in front of every message.
 const COE: usize = 2;
+/// A segment is never shorter than the CAN frame it imitates.
+const MIN_SEGMENT: usize = 7;
+
+const COMPLETE: u8 = 0x10;
+const TOGGLE: u8 = 0x10;
+const EXPEDITED: u8 = 0x02;
+const SIZE_INDICATED: u8 = 0x01;
+const LAST: u8 = 0x01;
+
+type Address = (u16, u8);
 
 #[derive(Debug, Clone)]
-enum Transfer {
+struct Transfer {
+    address: Address,
+    toggle: u8,
+    data: Vec<u8>,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Kind {
     Upload {
-        index: u16,
-        sub: u8,
-        data: Vec<u8>,
+        /// Bytes sent.
         at: usize,
-        toggle: bool,
     },
     Download {
-        index: u16,
-        sub: u8,
         complete: bool,
-        data: Vec<u8>,
-        size: usize,
-        toggle: bool,
+        /// As announced.
+        size: Option<usize>,
+        /// Most that the object takes.
+        capacity: usize,
     },
 }
 
 #[derive(Debug, Clone, Default)]
-pub(crate) struct SdoServer {
+pub(super) struct SdoServer {
     transfer: Option<Transfer>,
 }
 
+enum Refusal {
+    Abort(Abort),
+    Mailbox(Detail),
+}
+
+impl From<Abort> for Refusal {
+    fn from(abort: Abort) -> Self {
+        Self::Abort(abort)
+    }
+}
+
+type Reply = Result<Vec<u8>, Refusal>;
+
 impl SdoServer {
-    pub(crate) fn reset(&mut self) {
-        self.transfer = None;
+    pub(super) fn is_waiting(&self) -> bool {
+        self.transfer.is_some()
     }
 
-    /// Answers one request (what follows the CoE header) with a CoE message of at most `limit`
-    /// bytes; an abort by the client has no answer.
-    pub(crate) fn request(
+    pub(super) fn expire(&mut self) -> Option<Vec<u8>> {
+        let transfer = self.transfer.take()?;
+        Some(abort(Abort::TIMEOUT, transfer.address))
+    }
+
+    /// Answers one request (what follows the CoE header); an abort by the client has no answer.
+    pub(super) fn request(
         &mut self,
         dictionary: &mut Dictionary<'_>,
+        services: CoeServices,
         request: &[u8],
-        limit: usize,
-    ) -> Option<Vec<u8>> {
-        let command = *request.first()?;
-        let address = match request.get(1..4) {
-            Some(&[low, high, sub]) => (u16::from_le_bytes([low, high]), sub),
-            _ => (0, 0),
+        room: Room,
+    ) -> Answer {
+        let Some((&command, segment)) = request.split_first() else {
+            return Answer::Error(Detail::TooShort);
         };
-        let result = match command >> 5 {
-            0 => self.download_segment(dictionary, command, request.get(1..).unwrap_or_default()),
-            1 => self.download(dictionary, command, address, request),
-            2 => self.upload(dictionary, command, address, limit),
-            3 => self.upload_segment(command, limit),
-            4 => {
-                self.transfer = None;
-                return None;
+        let specifier = command >> 5;
+        // A segment's data may be shorter than an initiate request.
+        let address = match segment {
+            _ if specifier == 0 => (0, 0),
+            [low, high, sub, _, _, _, _, ..] => (u16::from_le_bytes([*low, *high]), *sub),
+            _ => return Answer::Error(Detail::TooShort),
+        };
+        let under_way = self.transfer.take();
+        let of_transfer = under_way.as_ref().map_or((0, 0), |t| t.address);
+        let (address, result) = match specifier {
+            0 => {
+                let reply = self.download_segment(dictionary, under_way, command, segment);
+                (of_transfer, reply)
             }
-            _ => Err((Abort::COMMAND, address)),
+            1 => (
+                address,
+                self.download(dictionary, services, command, address, request),
+            ),
+            2 if request.len() > INITIATE => (address, Err(Refusal::Mailbox(Detail::InvalidSize))),
+            2 => (
+                address,
+                self.upload(dictionary, services, command, address, room),
+            ),
+            3 => {
+                let reply = self.upload_segment(under_way, command, room);
+                (of_transfer, reply)
+            }
+            4 => return Answer::None,
+            _ => (address, Err(Abort::COMMAND.into())),
         };
-        Some(result.unwrap_or_else(|(abort, (index, sub))| {
-            self.transfer = None;
-            let mut out = super::header(service::SDO_REQUEST).to_vec();
-            out.push(0x80);
-            out.extend_from_slice(&index.to_le_bytes());
-            out.push(sub);
-            out.extend_from_slice(&abort.0.to_le_bytes());
-            out
-        }))
+        match result {
+            Ok(reply) => Answer::One(reply),
+            Err(Refusal::Abort(code)) => Answer::One(abort(code, address)),
+            Err(Refusal::Mailbox(detail)) => Answer::Error(detail),
+        }
     }
 
     fn upload(
         &mut self,
         dictionary: &Dictionary<'_>,
+        services: CoeServices,
         command: u8,
-        address @ (index, sub): (u16, u8),
-        limit: usize,
+        address @ (index, sub): Address,
+        room: Room,
     ) -> Reply {
-        let data = if command & 0x10 != 0 {
-            dictionary.read_all(index, sub)
-        } else {
-            dictionary.read(index, sub)
-        }
-        .map_err(|abort| (abort, address))?;
-        self.transfer = None;
+        let complete = command & COMPLETE;
+        let data = dictionary.read(index, sub, complete != 0)?;
         if (1..=4).contains(&data.len()) {
             let unused = (4 - data.len()) as u8;
-            let mut out = initiate(0x43 | unused << 2 | command & 0x10, address);
-            out.extend_from_slice(&data);
-            out.resize(COE + INITIATE, 0);
-            return Ok(out);
+            let specifier = 0x40 | complete | unused << 2 | EXPEDITED | SIZE_INDICATED;
+            return Ok(initiate(specifier, address, &data));
         }
-        let mut out = initiate(0x41 | command & 0x10, address);
-        out.extend_from_slice(&u32::try_from(data.len()).unwrap_or(u32::MAX).to_le_bytes());
-        let now = data.len().min(limit.saturating_sub(COE + INITIATE));
+        let len = u32::try_from(data.len()).map_err(|_| Abort::OUT_OF_MEMORY)?;
+        let specifier = 0x40 | complete | SIZE_INDICATED;
+        let mut out = initiate(specifier, address, &len.to_le_bytes());
+        let now = data.len().min(room.send.saturating_sub(COE + INITIATE));
         out.extend_from_slice(data.get(..now).unwrap_or_default());
         if now < data.len() {
-            self.transfer = Some(Transfer::Upload {
-                index,
-                sub,
+            check_segmented(services, data.len())?;
+            self.transfer = Some(Transfer {
+                address,
+                toggle: 0,
                 data,
-                at: now,
-                toggle: false,
+                kind: Kind::Upload { at: now },
             });
         }
         Ok(out)
     }
 
-    fn upload_segment(&mut self, command: u8, limit: usize) -> Reply {
-        let Some(Transfer::Upload {
-            index,
-            sub,
-            data,
-            at,
-            toggle,
-        }) = &mut self.transfer
-        else {
-            return Err((Abort::COMMAND, (0, 0)));
+    fn upload_segment(&mut self, transfer: Option<Transfer>, command: u8, room: Room) -> Reply {
+        let Some(mut transfer) = transfer else {
+            return Err(Abort::COMMAND.into());
         };
-        if (command & 0x10 != 0) != *toggle {
-            return Err((Abort::TOGGLE, (*index, *sub)));
+        let Kind::Upload { at } = &mut transfer.kind else {
+            return Err(Abort::COMMAND.into());
+        };
+        if command & TOGGLE != transfer.toggle {
+            return Err(Abort::TOGGLE.into());
         }
-        let rest = data.get(*at..).unwrap_or_default();
-        let now = rest.len().min(limit.saturating_sub(COE + 1));
+        let rest = transfer.data.get(*at..).unwrap_or_default();
+        let now = rest.len().min(room.send.saturating_sub(COE + 1));
         let last = now == rest.len();
-        let unused = 7_usize.saturating_sub(now) as u8;
+        let unused = MIN_SEGMENT.saturating_sub(now) as u8;
         let mut out = super::header(service::SDO_RESPONSE).to_vec();
-        out.push(command & 0x10 | unused << 1 | u8::from(last));
+        out.push(transfer.toggle | unused << 1 | if last { LAST } else { 0 });
         out.extend_from_slice(rest.get(..now).unwrap_or_default());
-        // A segment is never shorter than the CAN frame it imitates.
-        out.resize(out.len().max(COE + INITIATE), 0);
+        out.resize(out.len().max(COE + 1 + MIN_SEGMENT), 0);
         *at += now;
-        *toggle = !*toggle;
-        if last {
-            self.transfer = None;
+        transfer.toggle ^= TOGGLE;
+        if !last {
+            self.transfer = Some(transfer);
         }
         Ok(out)
     }
@@ -142,117 +178,144 @@ impl SdoServer {
     fn download(
         &mut self,
         dictionary: &mut Dictionary<'_>,
+        services: CoeServices,
         command: u8,
-        address @ (index, sub): (u16, u8),
+        address @ (index, sub): Address,
         request: &[u8],
     ) -> Reply {
-        let fail = |abort| (abort, address);
-        self.transfer = None;
-        let complete = command & 0x10 != 0;
-        let capacity = dictionary.capacity(index, sub, complete).map_err(fail)?;
-        let value = request.get(4..INITIATE).ok_or(fail(Abort::LENGTH))?;
-        if command & 0x02 != 0 {
-            let len = if command & 0x01 != 0 {
-                4 - usize::from(command >> 2 & 3)
-            } else {
-                capacity.min(4)
+        let complete = command & COMPLETE != 0;
+        let capacity = dictionary.capacity(index, sub, complete)?;
+        let value = request.get(4..INITIATE).unwrap_or_default();
+        let rest = request.get(INITIATE..).unwrap_or_default();
+        let sized = command & SIZE_INDICATED != 0;
+        if command & EXPEDITED != 0 {
+            if !rest.is_empty() {
+                return Err(Refusal::Mailbox(Detail::InvalidSize));
+            }
+            let len = match sized {
+                true => 4 - usize::from(command >> 2 & 3),
+                // The object's own length, then.
+                false => capacity.min(4),
             };
             let data = value.get(..len).unwrap_or_default();
-            commit(dictionary, address, complete, data).map_err(fail)?;
+            check_capacity(data.len(), capacity)?;
+            dictionary.write(index, sub, complete, data)?;
         } else {
             let size = <[u8; 4]>::try_from(value).map_or(0, u32::from_le_bytes);
             let size = usize::try_from(size).unwrap_or(usize::MAX);
-            if size > capacity {
-                return Err(fail(Abort::TOO_LONG));
+            // A complete size that is right counts even where it is not indicated.
+            let size = Some(size).filter(|size| sized || (*size > 0 && *size == rest.len()));
+            check_capacity(size.unwrap_or(rest.len()), capacity)?;
+            if size.is_some_and(|size| rest.len() > size) {
+                return Err(Refusal::Mailbox(Detail::InvalidSize));
             }
-            let rest = request.get(INITIATE..).unwrap_or_default();
-            if rest.len() >= size {
-                let data = rest.get(..size).unwrap_or_default();
-                commit(dictionary, address, complete, data).map_err(fail)?;
+            if size == Some(rest.len()) {
+                dictionary.write(index, sub, complete, rest)?;
             } else {
-                let mut data = Vec::with_capacity(size);
-                data.extend_from_slice(rest);
-                self.transfer = Some(Transfer::Download {
-                    index,
-                    sub,
+                check_segmented(services, size.unwrap_or(capacity))?;
+                let kind = Kind::Download {
                     complete,
-                    data,
                     size,
-                    toggle: false,
+                    capacity,
+                };
+                self.transfer = Some(Transfer {
+                    address,
+                    toggle: 0,
+                    data: rest.to_vec(),
+                    kind,
                 });
             }
         }
-        let mut out = initiate(0x60 | command & 0x10, address);
-        out.resize(COE + INITIATE, 0);
-        Ok(out)
+        Ok(initiate(0x60 | command & COMPLETE, address, &[]))
     }
 
     fn download_segment(
         &mut self,
         dictionary: &mut Dictionary<'_>,
+        transfer: Option<Transfer>,
         command: u8,
-        payload: &[u8],
+        segment: &[u8],
     ) -> Reply {
-        let Some(Transfer::Download {
-            index,
-            sub,
+        let Some(mut transfer) = transfer else {
+            return Err(Abort::COMMAND.into());
+        };
+        let Kind::Download {
             complete,
-            data,
             size,
-            toggle,
-        }) = &mut self.transfer
+            capacity,
+        } = transfer.kind
         else {
-            return Err((Abort::COMMAND, (0, 0)));
+            return Err(Abort::COMMAND.into());
         };
-        let (address, complete) = ((*index, *sub), *complete);
-        if (command & 0x10 != 0) != *toggle {
-            return Err((Abort::TOGGLE, address));
+        if command & TOGGLE != transfer.toggle {
+            return Err(Abort::TOGGLE.into());
         }
-        let unused = if payload.len() <= 7 {
-            usize::from(command >> 1 & 7)
-        } else {
-            0
+        let unused = match segment.len() {
+            ..=MIN_SEGMENT => usize::from(command >> 1 & 7),
+            _ => 0,
         };
-        let used = payload.len().saturating_sub(unused);
-        if data.len() + used > *size {
-            return Err((Abort::TOO_LONG, address));
+        let used = segment.len().saturating_sub(unused);
+        let so_far = transfer.data.len() + used;
+        if size.is_some_and(|size| so_far > size) {
+            return Err(Abort::LENGTH.into());
         }
-        data.extend_from_slice(payload.get(..used).unwrap_or_default());
-        *toggle = !*toggle;
-        if command & 0x01 != 0 {
-            let (data, size) = (std::mem::take(data), *size);
-            self.transfer = None;
-            if data.len() < size {
-                return Err((Abort::TOO_SHORT, address));
-            }
-            commit(dictionary, address, complete, &data).map_err(|abort| (abort, address))?;
-        }
+        check_capacity(so_far, capacity)?;
+        transfer
+            .data
+            .extend_from_slice(segment.get(..used).unwrap_or_default());
         let mut out = super::header(service::SDO_RESPONSE).to_vec();
-        out.push(0x20 | command & 0x10);
+        out.push(0x20 | transfer.toggle);
         out.resize(COE + INITIATE, 0);
+        if command & LAST == 0 {
+            transfer.toggle ^= TOGGLE;
+            self.transfer = Some(transfer);
+            return Ok(out);
+        }
+        if size.is_some_and(|size| so_far < size) {
+            return Err(Abort::LENGTH.into());
+        }
+        let (index, sub) = transfer.address;
+        dictionary.write(index, sub, complete, &transfer.data)?;
         Ok(out)
     }
 }
 
-type Reply = Result<Vec<u8>, (Abort, (u16, u8))>;
+fn check_capacity(len: usize, capacity: usize) -> Result<(), Abort> {
+    if len > capacity {
+        Err(Abort::TOO_LONG)
+    } else {
+        Ok(())
+    }
+}
 
-fn initiate(command: u8, (index, sub): (u16, u8)) -> Vec<u8> {
+/// Whether a transfer of this many bytes may continue in segments.
+fn check_segmented(services: CoeServices, len: usize) -> Result<(), Abort> {
+    if !services.segmented {
+        Err(Abort::EXCEEDS_MAILBOX)
+    } else if len > services.buffer {
+        Err(Abort::OUT_OF_MEMORY)
+    } else {
+        Ok(())
+    }
+}
+
+/// Up to four data bytes.
+fn initiate(command: u8, (index, sub): Address, data: &[u8]) -> Vec<u8> {
     let mut out = super::header(service::SDO_RESPONSE).to_vec();
     out.push(command);
     out.extend_from_slice(&index.to_le_bytes());
     out.push(sub);
+    out.extend_from_slice(data);
+    out.resize(COE + INITIATE, 0);
     out
 }
 
-fn commit(
-    dictionary: &mut Dictionary<'_>,
-    (index, sub): (u16, u8),
-    complete: bool,
-    data: &[u8],
-) -> Result<(), Abort> {
-    if complete {
-        dictionary.write_all(index, sub, data)
-    } else {
-        dictionary.write(index, sub, data)
-    }
+/// Aborts travel as requests, in both directions.
+fn abort(abort: Abort, (index, sub): Address) -> Vec<u8> {
+    let mut out = super::header(service::SDO_REQUEST).to_vec();
+    out.push(0x80);
+    out.extend_from_slice(&index.to_le_bytes());
+    out.push(sub);
+    out.extend_from_slice(&abort.0.to_le_bytes());
+    out
 }

@@ -4,7 +4,9 @@
 
 use std::ops::Range;
 
-use ecaxis_esi::model::{Access, Dictionary, PdoMapping, Writable};
+use ecaxis_esi::model::{Access, Dictionary, ObjectCode, PdoMapping, Writable};
+
+use super::datatype::{self, Kind};
 
 /// A subindex that exists, as a handle that stays valid for the store's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -19,23 +21,48 @@ pub struct Item {
     pub bit_len: u32,
     /// Offset inside the object under complete access (subindex 0 takes 16 bits).
     pub bit_offset: u32,
-    /// Two's complement: [`ObjectStore::get`] extends the sign.
-    pub signed: bool,
-    /// Text of variable length: an upload ends at the first zero byte, a shorter download is padded.
-    pub text: bool,
+    /// Index of the base type (ETG.1020), as SDO Information tells it.
+    pub data_type: u16,
+    pub(crate) kind: Kind,
     pub access: Access,
     pub mapping: PdoMapping,
-    pub min: Option<i64>,
-    pub max: Option<i64>,
+    pub backup: bool,
+    pub setting: bool,
+    /// ETG.1004; 0 where there is none.
+    pub unit: u32,
+    pub has_default: bool,
+    /// Little-endian, of the item's length.
+    pub min: Option<Vec<u8>>,
+    pub max: Option<Vec<u8>>,
     /// The only values that a client may write.
     pub choices: Option<&'static [i64]>,
     range: Range<usize>,
+}
+
+impl Item {
+    /// Two's complement: [`ObjectStore::get`] extends the sign.
+    #[must_use]
+    pub fn signed(&self) -> bool {
+        self.kind == Kind::Signed
+    }
+}
+
+/// What the dictionary says about an object as a whole.
+#[derive(Debug, Clone)]
+struct Object {
+    index: u16,
+    name: String,
+    code: ObjectCode,
 }
 
 /// All objects of one device.
 #[derive(Debug, Clone, Default)]
 pub struct ObjectStore {
     arena: Vec<u8>,
+    /// The arena as the device left its maker.
+    defaults: Vec<u8>,
+    /// Sorted by index; objects nobody described are not in it.
+    objects: Vec<Object>,
     items: Vec<Item>,
     /// Sorted by (index, subindex).
     order: Vec<(u32, Slot)>,
@@ -59,8 +86,9 @@ impl ObjectStore {
                 {
                     continue;
                 }
+                store.describe(object.index, object.code, &object.name);
                 for item in &object.items {
-                    let base = item.type_name.trim();
+                    let data_type = data_type(&item.type_name, item.bit_len);
                     store.insert(
                         Item {
                             index: object.index,
@@ -72,18 +100,16 @@ impl ObjectStore {
                             },
                             bit_len: item.bit_len,
                             bit_offset: item.bit_offset,
-                            signed: is_signed(base),
-                            text: base.starts_with("STRING"),
+                            data_type,
+                            kind: datatype::kind(data_type, item.bit_len),
                             access: item.access,
                             mapping: item.pdo_mapping,
-                            min: item
-                                .min
-                                .as_deref()
-                                .map(|b| number(b, item.bit_len, is_signed(base))),
-                            max: item
-                                .max
-                                .as_deref()
-                                .map(|b| number(b, item.bit_len, is_signed(base))),
+                            backup: item.backup,
+                            setting: item.setting,
+                            unit: item.unit,
+                            has_default: item.has_default,
+                            min: item.min.clone(),
+                            max: item.max.clone(),
                             choices: None,
                             range: 0..0,
                         },
@@ -92,7 +118,100 @@ impl ObjectStore {
                 }
             }
         }
+        store.keep_defaults();
         store
+    }
+
+    /// Says what an object is called and made of; for objects that [`Self::ensure`] created.
+    pub fn describe(&mut self, index: u16, code: ObjectCode, name: &str) {
+        let object = Object {
+            index,
+            name: name.to_owned(),
+            code,
+        };
+        match self.objects.binary_search_by_key(&index, |o| o.index) {
+            Ok(at) => self.objects[at] = object,
+            Err(at) => self.objects.insert(at, object),
+        }
+    }
+
+    fn description(&self, index: u16) -> Option<&Object> {
+        let at = self
+            .objects
+            .binary_search_by_key(&index, |o| o.index)
+            .ok()?;
+        self.objects.get(at)
+    }
+
+    /// The object's name; its first item's where nobody said.
+    #[must_use]
+    pub fn object_name(&self, index: u16) -> &str {
+        let first = || {
+            let slot = self.object(index).next()?;
+            self.item(slot).map(|item| item.name.as_str())
+        };
+        let described = self.description(index).map(|object| object.name.as_str());
+        described.or_else(first).unwrap_or_default()
+    }
+
+    /// What the object is made of; several subindices make a record where nobody knows better.
+    #[must_use]
+    pub fn object_code(&self, index: u16) -> ObjectCode {
+        match self.description(index).map(|object| object.code) {
+            Some(code @ (ObjectCode::Array | ObjectCode::Record)) => code,
+            _ if self.highest_sub(index) == 0 => ObjectCode::Var,
+            _ => ObjectCode::Record,
+        }
+    }
+
+    /// The highest subindex there is.
+    #[must_use]
+    pub fn highest_sub(&self, index: u16) -> u8 {
+        let last = self.object(index).last();
+        last.and_then(|slot| self.item(slot))
+            .map_or(0, |item| item.sub)
+    }
+
+    /// Indices of all objects, rising.
+    pub fn indices(&self) -> impl Iterator<Item = u16> + '_ {
+        let mut before = None;
+        self.order.iter().filter_map(move |(key, _)| {
+            let index = (key >> 8) as u16;
+            (before.replace(index) != Some(index)).then_some(index)
+        })
+    }
+
+    /// All subindices of all objects.
+    pub fn slots(&self) -> impl Iterator<Item = Slot> + '_ {
+        self.order.iter().map(|(_, slot)| *slot)
+    }
+
+    /// Makes the present values the defaults: what SDO Information tells and a restore brings back.
+    pub(crate) fn keep_defaults(&mut self) {
+        self.defaults.clone_from(&self.arena);
+    }
+
+    pub(crate) fn default_bytes(&self, slot: Slot) -> &[u8] {
+        let range = self.item(slot).map_or(0..0, |item| item.range.clone());
+        self.defaults.get(range).unwrap_or_default()
+    }
+
+    /// Copies one value from a store that has the same slots.
+    pub(crate) fn copy_from(&mut self, other: &Self, slot: Slot) {
+        overwrite(self.bytes_mut(slot), other.bytes(slot));
+    }
+
+    pub(crate) fn restore(&mut self, slot: Slot) {
+        let Some(item) = self.items.get(slot.0 as usize) else {
+            return;
+        };
+        let (to, from) = (
+            self.arena.get_mut(item.range.clone()),
+            self.defaults.get(item.range.clone()),
+        );
+        if let (Some(to), Some(from)) = (to, from) {
+            overwrite(to, from);
+        }
     }
 
     /// The slot of an existing subindex.
@@ -128,6 +247,8 @@ impl ObjectStore {
                 .max()
                 .unwrap_or(16)
         };
+        // What the standards call the communication area stays out of process data.
+        let mappable = index >= 0x2000;
         self.insert(
             Item {
                 index,
@@ -135,10 +256,17 @@ impl ObjectStore {
                 name: name.to_owned(),
                 bit_len,
                 bit_offset,
-                signed: false,
-                text: false,
+                data_type: datatype::unsigned(bit_len),
+                kind: datatype::kind(datatype::unsigned(bit_len), bit_len),
                 access,
-                mapping: PdoMapping { rx: true, tx: true },
+                mapping: PdoMapping {
+                    rx: mappable,
+                    tx: mappable,
+                },
+                backup: false,
+                setting: false,
+                unit: 0,
+                has_default: false,
                 min: None,
                 max: None,
                 choices: None,
@@ -205,11 +333,20 @@ impl ObjectStore {
         }
     }
 
+    /// Names the base type of an item that [`Self::ensure`] created; unknown names change nothing.
+    pub fn set_type(&mut self, slot: Slot, name: &str) {
+        if let (Some(item), code @ 1..) =
+            (self.items.get_mut(slot.0 as usize), datatype::code(name))
+        {
+            item.data_type = code;
+        }
+    }
+
     /// The value, sign-extended if the dictionary's type is signed; of long items the low 64 bits.
     #[must_use]
     pub fn get(&self, slot: Slot) -> i64 {
         self.item(slot).map_or(0, |item| {
-            number(self.slice(item), item.bit_len, item.signed)
+            number(self.slice(item), item.bit_len, item.signed())
         })
     }
 
@@ -255,11 +392,18 @@ impl ObjectStore {
     }
 }
 
-fn is_signed(type_name: &str) -> bool {
-    matches!(
-        type_name,
-        "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
-    )
+/// The base type's index; a type without one is judged by its length.
+fn data_type(name: &str, bit_len: u32) -> u16 {
+    match datatype::code(name) {
+        0 => datatype::unsigned(bit_len),
+        code => code,
+    }
+}
+
+fn overwrite(to: &mut [u8], from: &[u8]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to = *from;
+    }
 }
 
 fn number(bytes: &[u8], bit_len: u32, signed: bool) -> i64 {

@@ -4,7 +4,7 @@ use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse};
 use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 
 use super::esm::Al;
-use super::mailbox::Mailbox;
+use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
 use super::{Application, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
 use crate::Nanos;
@@ -13,6 +13,7 @@ use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
 use crate::esc::registers::ADDRESS_SPACE;
 use crate::esc::{Esc, EscConfig, EscInfo};
+use crate::foe::FileStore;
 
 /// CiA 402.
 const DRIVE_PROFILE: u32 = 402;
@@ -36,6 +37,7 @@ pub struct DeviceOptions {
     pub state_change_ns: Nanos,
     /// The chip. Process RAM grows where the device's SyncManagers need more.
     pub esc: EscInfo,
+    pub mailbox: MailboxOptions,
 }
 
 impl Default for DeviceOptions {
@@ -50,6 +52,7 @@ impl Default for DeviceOptions {
             sii: None,
             state_change_ns: 200_000,
             esc: EscInfo::default(),
+            mailbox: MailboxOptions::default(),
         }
     }
 }
@@ -125,10 +128,12 @@ impl SimDevice {
             },
             image,
         );
+        store.keep_defaults();
         let coe = device
             .mailbox
             .as_ref()
             .and_then(|mailbox| mailbox.coe.as_ref());
+        let has_foe = device.mailbox.as_ref().is_some_and(|mailbox| mailbox.foe);
         let mut sim = Self {
             name: device.type_name.clone(),
             delay_ns: options.delay_ns,
@@ -146,8 +151,12 @@ impl SimDevice {
             mailbox_limits: mailbox_limits(device),
             boot_mailbox: boot_mailbox(device),
             has_coe: coe.is_some(),
+            has_foe: options.mailbox.has_foe.unwrap_or(has_foe),
+            sdo_info: coe.is_some_and(|coe| coe.sdo_info),
             has_boot: device.eeprom.bootstrap.iter().any(|b| *b != 0) && device.mailbox.is_some(),
             complete_access: coe.is_some_and(|coe| coe.complete_access),
+            mailbox_options: options.mailbox,
+            files: FileStore::default(),
             al: Al::default(),
             tick: 0,
             sync_log: [0; SYNC_LOG],

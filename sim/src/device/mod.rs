@@ -4,6 +4,7 @@
 //! * `from_sii`: from an EEPROM image
 //! * `esm`: state changes and what they demand
 //! * `mailbox`: requests and replies
+//! * `parameters`: what outlives a power cycle
 //! * `process`: process data and objects
 //!
 //! Everything a device does by itself happens in [`SimDevice::advance`], in the order of its clock.
@@ -11,7 +12,8 @@
 mod build;
 mod esm;
 mod from_sii;
-mod mailbox;
+pub(crate) mod mailbox;
+mod parameters;
 mod process;
 
 use crate::Nanos;
@@ -21,10 +23,12 @@ use crate::drive::{CONTROL_PERIOD_NS, Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::Sync0;
+use crate::foe::FileStore;
 use crate::frame;
 pub use build::{DeviceOptions, SimError};
 use esm::Al;
 use mailbox::Mailbox;
+pub use mailbox::MailboxOptions;
 use process::{Mirror, ProcessData};
 
 /// Pulses remembered by [`SimDevice::sync0_log`].
@@ -69,8 +73,12 @@ pub struct SimDevice {
     mailbox_limits: [MailboxLimits; 8],
     boot_mailbox: ((u16, u16), (u16, u16)),
     has_coe: bool,
+    has_foe: bool,
     has_boot: bool,
+    sdo_info: bool,
     complete_access: bool,
+    mailbox_options: MailboxOptions,
+    files: FileStore,
     al: Al,
     /// Local time of the drive's next control cycle.
     tick: u64,
@@ -192,10 +200,7 @@ impl SimDevice {
         let local = self.esc.clock.local(now);
         loop {
             let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.next_pulse());
-            let mailbox = self
-                .mailbox
-                .as_ref()
-                .map_or(u64::MAX, |mailbox| mailbox.due);
+            let mailbox = self.mailbox.as_ref().map_or(u64::MAX, Mailbox::due);
             let (al, eeprom) = (self.al.due, self.esc.eeprom.due());
             let watchdog = self.esc.watchdog.due();
             let due = sync
@@ -216,7 +221,7 @@ impl SimDevice {
             } else if due == eeprom {
                 self.esc.finish_eeprom();
             } else if due == mailbox {
-                self.serve_mailbox();
+                self.serve_mailbox(due);
             } else {
                 self.al_step(due);
             }
@@ -248,18 +253,8 @@ impl SimDevice {
 
     fn send_emergencies(&mut self) {
         while let Some(emergency) = self.drive_mut().and_then(Drive::take_emergency) {
-            self.send_emergency(&emergency);
+            self.queue_emergency(&emergency);
         }
-    }
-
-    fn send_emergency(&mut self, emergency: &Emergency) {
-        if self.al.state == AlState::Init || !self.has_coe {
-            return;
-        }
-        if let Some(mailbox) = &mut self.mailbox {
-            mailbox.emergency(emergency);
-        }
-        self.pump_mailbox();
     }
 
     /// Nothing but the device's own time can make it latch inputs.
@@ -287,12 +282,7 @@ impl SimDevice {
             self.al_requested(control, local);
         }
         if raised.sm_written | raised.sm_read != 0 || raised.repeat_request.is_some() {
-            self.mailbox_events(
-                raised.sm_written,
-                raised.sm_read,
-                raised.repeat_request,
-                local,
-            );
+            self.mailbox_events(raised.sm_read, raised.repeat_request, local);
         }
         if raised.sm_configured || raised.sync_changed {
             self.configuration_changed(raised.sm_configured, raised.sync_changed);
@@ -328,7 +318,7 @@ impl SimDevice {
     }
 
     pub(crate) fn inject_emergency(&mut self, code: u16) {
-        self.send_emergency(&Emergency {
+        self.queue_emergency(&Emergency {
             code,
             register: 1,
             data: [0; 5],

@@ -13,6 +13,7 @@ use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice, Transit};
 
 pub const INIT: u8 = 1;
 pub const PREOP: u8 = 2;
+pub const BOOT: u8 = 3;
 pub const SAFEOP: u8 = 4;
 pub const OP: u8 = 8;
 
@@ -283,6 +284,14 @@ impl Bus {
     }
 }
 
+/// A whole mailbox of this length with a header of one's own.
+pub fn message(len: usize, header: [u8; 6], payload: &[u8]) -> Vec<u8> {
+    let mut out = header.to_vec();
+    out.extend_from_slice(payload);
+    out.resize(len, 0);
+    out
+}
+
 fn sm(usage: SmUse, start_address: u16, default_size: u16, control_byte: u8) -> SyncManager {
     SyncManager {
         position: Default::default(),
@@ -376,6 +385,7 @@ pub fn item(sub: u8, bit_len: u32, bit_offset: u32, write: Writable, default: &[
         max: None,
         access: Access { read: true, write },
         pdo_mapping: PdoMapping { rx: true, tx: true },
+        ..ObjectItem::default()
     }
 }
 

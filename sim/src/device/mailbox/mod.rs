@@ -1,0 +1,337 @@
+//! The device's end of the mailbox (ETG.1000.4 §5.6): requests in, one at a time; answers and emergencies out in order.
+//!
+//! * `queue`: messages on their way out, counters, what is sent again
+//! * `options`: what the ESI leaves open
+//!
+//! CoE and FoE are [`crate::coe`] and [`crate::foe`]. A request stays in its SyncManager until the device comes round to
+//! fetch it; while it works, or while too many answers wait, the next one stays there too, and the mailbox is full.
+
+mod options;
+mod queue;
+
+pub use options::MailboxOptions;
+use queue::{Class, Queue};
+
+use super::SimDevice;
+use crate::coe::{self, CoeServer, CoeServices, Dictionary, ParameterCommand};
+use crate::drive::Emergency;
+use crate::esc::al::AlState;
+use crate::esc::registers as reg;
+use crate::foe::{FoeRequest, FoeServer};
+
+/// Between a request arriving and the device fetching it.
+const FETCH_NS: u64 = 100_000;
+const HEADER: usize = 6;
+
+/// Mailbox types (ETG.1000.4 table 29).
+mod protocol {
+    pub(super) const ERROR: u8 = 0;
+    pub(super) const COE: u8 = 3;
+    pub(super) const FOE: u8 = 4;
+}
+
+/// Mailbox error details (ETG.1000.4 table 30).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Detail {
+    /// The mailbox header itself.
+    Syntax = 1,
+    UnsupportedProtocol = 2,
+    InvalidChannel = 3,
+    ServiceNotSupported = 4,
+    /// The protocol's header.
+    InvalidHeader = 5,
+    TooShort = 6,
+    NoMoreMemory = 7,
+    InvalidSize = 8,
+}
+
+/// What a protocol makes of a request. Messages without the mailbox header.
+#[derive(Debug)]
+pub(crate) enum Answer {
+    None,
+    One(Vec<u8>),
+    Parts(Vec<Vec<u8>>),
+    Error(Detail),
+}
+
+/// Bytes that a message may have, mailbox header aside.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Room {
+    /// From the MainDevice.
+    pub(crate) receive: usize,
+    /// To the MainDevice.
+    pub(crate) send: usize,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Mailbox {
+    /// SyncManager numbers.
+    pub(super) receive: usize,
+    pub(super) send: usize,
+    queue: Queue,
+    /// Local times; `u64::MAX`: not due.
+    fetch_due: u64,
+    answer_due: u64,
+    transfer_due: u64,
+    /// What is being worked on.
+    request: Vec<u8>,
+    coe: CoeServer,
+    foe: FoeServer,
+}
+
+impl Mailbox {
+    pub(super) fn new(receive: usize, send: usize) -> Self {
+        Self {
+            receive,
+            send,
+            queue: Queue::default(),
+            fetch_due: u64::MAX,
+            answer_due: u64::MAX,
+            transfer_due: u64::MAX,
+            request: Vec::new(),
+            coe: CoeServer::default(),
+            foe: FoeServer::default(),
+        }
+    }
+
+    /// Leaving or entering Init forgets everything under way.
+    pub(super) fn reset(&mut self) {
+        *self = Self::new(self.receive, self.send);
+    }
+
+    /// When [`SimDevice::serve_mailbox`] has something to do, in local time.
+    pub(super) fn due(&self) -> u64 {
+        self.fetch_due.min(self.answer_due).min(self.transfer_due)
+    }
+
+    fn is_working(&self) -> bool {
+        self.answer_due != u64::MAX
+    }
+}
+
+impl SimDevice {
+    /// The MainDevice emptied a mailbox, or asks for the last message again.
+    pub(super) fn mailbox_events(&mut self, read: u8, repeat: Option<bool>, local: u64) {
+        // In Init nobody looks after mailboxes.
+        let Some(mailbox) = self
+            .mailbox
+            .as_mut()
+            .filter(|_| self.al.state != AlState::Init)
+        else {
+            return;
+        };
+        let n = mailbox.send;
+        if read >> n & 1 != 0 {
+            mailbox.queue.fetched();
+        }
+        if let Some(toggle) = repeat
+            && let Some(sm) = self.esc.sms.get_mut(n)
+            && mailbox.queue.repeat(toggle, sm.full)
+        {
+            sm.reset();
+            let acknowledge = reg::SM + u16::try_from(n).unwrap_or(0) * 8 + 7;
+            self.esc.put(acknowledge, &[u8::from(toggle) << 1]);
+        }
+        self.pump_mailbox();
+        self.plan_fetch(local);
+    }
+
+    /// A request that lies there is fetched as soon as there is room for its answer.
+    fn plan_fetch(&mut self, local: u64) {
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        let sm = self.esc.sms.get(mailbox.receive);
+        let lies_there = sm.is_some_and(|sm| sm.full);
+        if lies_there
+            && mailbox.fetch_due == u64::MAX
+            && !mailbox.is_working()
+            && mailbox.queue.takes_requests()
+        {
+            mailbox.fetch_due = local.saturating_add(FETCH_NS);
+        }
+    }
+
+    /// Moves the next message into the send SyncManager if that is free.
+    pub(super) fn pump_mailbox(&mut self) {
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        let n = mailbox.send;
+        let Some(sm) = self
+            .esc
+            .sms
+            .get_mut(n)
+            .filter(|sm| sm.is_open() && !sm.full)
+        else {
+            return;
+        };
+        let Some(message) = mailbox.queue.next(usize::from(sm.len)) else {
+            return;
+        };
+        sm.full = true;
+        let (start, len) = (sm.start, sm.len);
+        let area = self.esc.bytes_mut(start, len);
+        area.fill(0);
+        for (to, from) in area.iter_mut().zip(message) {
+            *to = *from;
+        }
+        self.esc.refresh_sm(n);
+    }
+
+    /// Something is due: a request to fetch, an answer, the end of a transfer that the client gave up.
+    pub(super) fn serve_mailbox(&mut self, local: u64) {
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        if mailbox.fetch_due <= local {
+            mailbox.fetch_due = u64::MAX;
+            self.fetch_request(local);
+        } else if mailbox.answer_due <= local {
+            mailbox.answer_due = u64::MAX;
+            let request = std::mem::take(&mut mailbox.request);
+            self.answer(&request);
+            self.watch_transfer(local);
+        } else {
+            mailbox.transfer_due = u64::MAX;
+            if let Some(message) = mailbox.coe.expire() {
+                mailbox.queue.push(protocol::COE, &message, Class::Notice);
+            }
+        }
+        self.pump_mailbox();
+        self.plan_fetch(local);
+    }
+
+    fn fetch_request(&mut self, local: u64) {
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        let n = mailbox.receive;
+        let Some(sm) = self.esc.sms.get_mut(n).filter(|sm| sm.full) else {
+            return;
+        };
+        sm.full = false;
+        let (start, len) = (sm.start, sm.len);
+        self.esc.refresh_sm(n);
+        mailbox.request = self.esc.bytes(start, len).to_vec();
+        mailbox.answer_due = local.saturating_add(self.mailbox_options.processing_ns);
+        mailbox.transfer_due = u64::MAX;
+    }
+
+    fn watch_transfer(&mut self, local: u64) {
+        if let Some(mailbox) = &mut self.mailbox
+            && let Some(timeout) = self.mailbox_options.sdo_timeout_ns
+            && mailbox.coe.is_waiting()
+        {
+            mailbox.transfer_due = local.saturating_add(timeout);
+        }
+    }
+
+    fn answer(&mut self, request: &[u8]) {
+        let room = self.room();
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        let Some((&[low, high, _, _, channel, kind], rest)) = request.split_first_chunk() else {
+            return;
+        };
+        let len = usize::from(u16::from_le_bytes([low, high]));
+        let message = request.get(..HEADER + len).unwrap_or(request);
+        if mailbox.queue.is_repeated(kind >> 4 & 7, message) {
+            return;
+        }
+        let Some(payload) = rest.get(..len) else {
+            return mailbox.queue.error(Detail::InvalidSize);
+        };
+        if kind & 0x80 != 0 {
+            return mailbox.queue.error(Detail::Syntax);
+        }
+        // Six bits of channel, two of priority.
+        if channel & 0x3f != 0 {
+            return mailbox.queue.error(Detail::InvalidChannel);
+        }
+        if mailbox.queue.is_last_place() {
+            return mailbox.queue.error(Detail::NoMoreMemory);
+        }
+        let protocol = kind & 0x0f;
+        let answer = self.protocol_answer(protocol, payload, room);
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        match answer {
+            Answer::None => {}
+            Answer::One(message) => mailbox.queue.push(protocol, &message, Class::Answer),
+            Answer::Parts(parts) => mailbox.queue.push_parts(protocol, &parts),
+            Answer::Error(detail) => mailbox.queue.error(detail),
+        }
+    }
+
+    fn protocol_answer(&mut self, protocol: u8, payload: &[u8], room: Room) -> Answer {
+        let state = self.al.state;
+        let options = &self.mailbox_options;
+        let Some(mailbox) = &mut self.mailbox else {
+            return Answer::None;
+        };
+        match protocol {
+            // In Bootstrap there is nothing but files.
+            protocol::COE if self.has_coe && state != AlState::Boot => {
+                let services = CoeServices {
+                    sdo_info: options.sdo_info.unwrap_or(self.sdo_info),
+                    segmented: options.segmented,
+                    buffer: options.sdo_buffer,
+                };
+                let mut dictionary = Dictionary {
+                    store: &mut self.store,
+                    pdo: &mut self.pdo,
+                    state,
+                    complete_access: options.complete_access.unwrap_or(self.complete_access),
+                    refuse_mapped: options.refuse_mapped,
+                    forced: &self.forced_aborts,
+                    command: None,
+                };
+                let coe = &mut mailbox.coe;
+                let answer = coe.request(&mut dictionary, services, payload, room);
+                match dictionary.command {
+                    Some(ParameterCommand::Store) => self.store_parameters(),
+                    Some(ParameterCommand::Restore) => self.restore_parameters(),
+                    None => {}
+                }
+                answer
+            }
+            protocol::FOE if self.has_foe => mailbox.foe.request(
+                &mut self.files,
+                FoeRequest {
+                    options: &options.foe,
+                    bootstrap: state == AlState::Boot,
+                    message: payload,
+                    room,
+                },
+            ),
+            _ => Answer::Error(Detail::UnsupportedProtocol),
+        }
+    }
+
+    fn room(&self) -> Room {
+        let room = |n: Option<usize>| {
+            let sm = n.and_then(|n| self.esc.sms.get(n));
+            sm.map_or(0, |sm| usize::from(sm.len).saturating_sub(HEADER))
+        };
+        Room {
+            receive: room(self.mailbox.as_ref().map(|mailbox| mailbox.receive)),
+            send: room(self.mailbox.as_ref().map(|mailbox| mailbox.send)),
+        }
+    }
+
+    pub(super) fn queue_emergency(&mut self, emergency: &Emergency) {
+        if matches!(self.al.state, AlState::Init | AlState::Boot) || !self.has_coe {
+            return;
+        }
+        if let Some(mailbox) = &mut self.mailbox {
+            let message = coe::emergency(emergency.code, emergency.register, emergency.data);
+            mailbox
+                .queue
+                .push(protocol::COE, &message, Class::Emergency);
+        }
+        self.pump_mailbox();
+    }
+}

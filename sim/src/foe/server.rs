@@ -1,0 +1,230 @@
+//! One transfer: packets counted from 1, each acknowledged; the first one shorter than the mailbox, perhaps empty, is the last.
+
+use super::{FileStore, FoeError, FoeOptions};
+use crate::device::mailbox::{Answer, Detail, Room};
+
+/// Opcode, a reserved byte, and password, packet number, error code or progress.
+const HEADER: usize = 6;
+
+mod opcode {
+    pub(super) const READ: u8 = 1;
+    pub(super) const WRITE: u8 = 2;
+    pub(super) const DATA: u8 = 3;
+    pub(super) const ACK: u8 = 4;
+    pub(super) const ERROR: u8 = 5;
+    pub(super) const BUSY: u8 = 6;
+}
+
+#[derive(Debug, Clone)]
+enum Transfer {
+    Read {
+        data: Vec<u8>,
+        /// Start of the packet that waits for its acknowledgement.
+        at: usize,
+        packet: u32,
+    },
+    Write {
+        name: String,
+        data: Vec<u8>,
+        /// The next one expected.
+        packet: u32,
+        /// It has been put off once.
+        was_busy: bool,
+    },
+}
+
+#[derive(Debug, Clone, Default)]
+pub(crate) struct FoeServer {
+    transfer: Option<Transfer>,
+}
+
+/// A message and what it meets.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FoeRequest<'a> {
+    pub(crate) options: &'a FoeOptions,
+    pub(crate) bootstrap: bool,
+    /// Without the mailbox header.
+    pub(crate) message: &'a [u8],
+    pub(crate) room: Room,
+}
+
+type Reply = Result<Option<Vec<u8>>, FoeError>;
+
+impl FoeServer {
+    pub(crate) fn request(&mut self, files: &mut FileStore, request: FoeRequest<'_>) -> Answer {
+        let Some((&[opcode, _, a, b, c, d], rest)) = request.message.split_first_chunk() else {
+            return Answer::Error(Detail::TooShort);
+        };
+        if request.room.send <= HEADER || request.room.receive <= HEADER {
+            return Answer::Error(Detail::NoMoreMemory);
+        }
+        let number = u32::from_le_bytes([a, b, c, d]);
+        let reply = match (opcode, self.transfer.take()) {
+            (opcode::READ, None) => self.read(files, request, number, rest),
+            (opcode::WRITE, None) => self.write(files, request, number, rest),
+            (opcode::DATA, Some(transfer @ Transfer::Write { .. })) => {
+                self.data(files, request, transfer, number, rest)
+            }
+            (opcode::ACK, Some(transfer @ Transfer::Read { .. })) => {
+                self.acknowledged(transfer, number, request.room)
+            }
+            (opcode::BUSY, Some(transfer @ Transfer::Read { .. })) => {
+                self.send(transfer, request.room)
+            }
+            // The client gives up; that is not answered.
+            (opcode::ERROR, _) => Ok(None),
+            // Also a new request while a transfer is under way; that is over then.
+            _ => Err(FoeError::Illegal),
+        };
+        match reply {
+            Ok(None) => Answer::None,
+            Ok(Some(message)) => Answer::One(message),
+            Err(error) => {
+                let mut out = message(opcode::ERROR, error as u32);
+                out.extend_from_slice(error.text().as_bytes());
+                out.truncate(request.room.send);
+                Answer::One(out)
+            }
+        }
+    }
+
+    fn read(
+        &mut self,
+        files: &FileStore,
+        request: FoeRequest<'_>,
+        password: u32,
+        name: &[u8],
+    ) -> Reply {
+        let name = allowed(request, password, name)?;
+        let data = files.get(&name).ok_or(FoeError::NotFound)?.to_vec();
+        let first = Transfer::Read {
+            data,
+            at: 0,
+            packet: 1,
+        };
+        self.send(first, request.room)
+    }
+
+    /// The packet that is due, for the first time or once more.
+    fn send(&mut self, transfer: Transfer, room: Room) -> Reply {
+        let Transfer::Read { data, at, packet } = &transfer else {
+            return Err(FoeError::Illegal);
+        };
+        let mut out = message(opcode::DATA, *packet);
+        let rest = data.get(*at..).unwrap_or_default();
+        let len = rest.len().min(room.send - HEADER);
+        out.extend_from_slice(rest.get(..len).unwrap_or_default());
+        self.transfer = Some(transfer);
+        Ok(Some(out))
+    }
+
+    fn acknowledged(&mut self, mut transfer: Transfer, number: u32, room: Room) -> Reply {
+        let Transfer::Read { data, at, packet } = &mut transfer else {
+            return Err(FoeError::Illegal);
+        };
+        if number != *packet {
+            return Err(FoeError::PacketNumber);
+        }
+        let full = room.send - HEADER;
+        if data.len().saturating_sub(*at) < full {
+            return Ok(None);
+        }
+        *at += full;
+        *packet = packet.wrapping_add(1);
+        self.send(transfer, room)
+    }
+
+    fn write(
+        &mut self,
+        files: &FileStore,
+        request: FoeRequest<'_>,
+        password: u32,
+        name: &[u8],
+    ) -> Reply {
+        let name = allowed(request, password, name)?;
+        if name.is_empty() {
+            return Err(FoeError::Illegal);
+        }
+        if request.options.read_only.contains(&name) {
+            return Err(FoeError::AccessDenied);
+        }
+        if !files.has_room(&name, 0, request.options.capacity) {
+            return Err(FoeError::DiskFull);
+        }
+        self.transfer = Some(Transfer::Write {
+            name,
+            data: Vec::new(),
+            packet: 1,
+            was_busy: false,
+        });
+        Ok(Some(message(opcode::ACK, 0)))
+    }
+
+    fn data(
+        &mut self,
+        files: &mut FileStore,
+        request: FoeRequest<'_>,
+        transfer: Transfer,
+        number: u32,
+        bytes: &[u8],
+    ) -> Reply {
+        let Transfer::Write {
+            name,
+            mut data,
+            packet,
+            was_busy,
+        } = transfer
+        else {
+            return Err(FoeError::Illegal);
+        };
+        if number != packet {
+            return Err(FoeError::PacketNumber);
+        }
+        if !files.has_room(&name, data.len() + bytes.len(), request.options.capacity) {
+            return Err(FoeError::DiskFull);
+        }
+        let every = request.options.busy_every;
+        if every > 0 && packet.is_multiple_of(every) && !was_busy {
+            self.transfer = Some(Transfer::Write {
+                name,
+                data,
+                packet,
+                was_busy: true,
+            });
+            // Half done: 50 of 100.
+            return Ok(Some(message(opcode::BUSY, 100 << 16 | 50)));
+        }
+        data.extend_from_slice(bytes);
+        if bytes.len() < request.room.receive - HEADER {
+            files.write(name, data);
+        } else {
+            self.transfer = Some(Transfer::Write {
+                name,
+                data,
+                packet: packet.wrapping_add(1),
+                was_busy: false,
+            });
+        }
+        Ok(Some(message(opcode::ACK, packet)))
+    }
+}
+
+/// The file's name, if the request may touch it. Some clients end it with a zero byte; what is not UTF-8 is replaced.
+fn allowed(request: FoeRequest<'_>, password: u32, name: &[u8]) -> Result<String, FoeError> {
+    let options = request.options;
+    if options.password != 0 && password != options.password {
+        return Err(FoeError::NoRights);
+    }
+    let name = name.split(|b| *b == 0).next().unwrap_or_default();
+    let name = String::from_utf8_lossy(name).into_owned();
+    if !request.bootstrap && options.bootstrap_only.contains(&name) {
+        return Err(FoeError::BootstrapOnly);
+    }
+    Ok(name)
+}
+
+fn message(opcode: u8, number: u32) -> Vec<u8> {
+    let mut out = vec![opcode, 0];
+    out.extend_from_slice(&number.to_le_bytes());
+    out
+}
