@@ -35,13 +35,14 @@ class Bench:
     on_ci: bool = bool(os.environ.get("CI"))
 
     def machine(self):
-        """Two drives, a coupler and three terminals."""
+        """Two drives, a device with a large mailbox, a coupler and three terminals."""
         maxon = rig.fixture(MAXON)
         couplers = rig.fixture("esi/beckhoff/Beckhoff EK11xx.xml")
         inputs = rig.fixture("esi/beckhoff/Beckhoff EL1xxx.xml")
         machine = rig.Machine()
         for name in ("x", "y"):
             rig.drive(machine, name, maxon, "EPOS4")
+        machine.add("mailbox", rig.HERE / "esi/mailbox.xml", "Mailbox")
         machine.add("coupler", couplers, "EK1100")
         machine.add("four", inputs, "EL1004")
         machine.add("eight", inputs, "EL1018")
