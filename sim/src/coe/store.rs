@@ -2,7 +2,7 @@
 //! SDO transfers and the drive all work on slots, so that nothing is looked up or allocated while
 //! cycling.
 
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 use ecaxis_esi::model::{Access, Dictionary, ObjectCode, PdoMapping, Writable};
 
@@ -312,6 +312,16 @@ impl ObjectStore {
     #[must_use]
     pub fn has_object(&self, index: u16) -> bool {
         self.object(index).next().is_some()
+    }
+
+    #[must_use]
+    pub fn has_any(&self, indices: RangeInclusive<u16>) -> bool {
+        let start = self
+            .order
+            .partition_point(|(k, _)| *k < key(*indices.start(), 0));
+        self.order
+            .get(start)
+            .is_some_and(|(k, _)| *k <= key(*indices.end(), u8::MAX))
     }
 
     #[must_use]

@@ -6,7 +6,7 @@
 //! * `supervise`, `publish`: what stops the axis by itself; what the drive shows of itself
 //! * `modes`, `profile`: set-points of CSP, CSV, CST, PP, PV and HM
 //! * `io`, `touch_probe`, `track`: inputs, latched positions, and the switches along the axis
-//! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms
+//! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms, gains
 //! * `plant`: motor, load, friction, encoder
 //!
 //! The device calls [`Drive::sync`] when process data takes effect and [`Drive::control`] every 0.4 ms
@@ -34,7 +34,7 @@ pub use plant::PlantParams;
 pub use state::State;
 pub use track::Track;
 
-use control::{Bounds, Controller, Demand};
+use control::{Bounds, Controller, Demand, Tuning};
 use fault::Faults;
 use io::Inputs as DigitalInputs;
 use modes::{Cycle, Frame, Mode, Motion, SetPoints};
@@ -53,6 +53,8 @@ const CONTROL_STEP: f64 = 400e-6;
 
 /// Parameters are looked at anew after so many control cycles, as a drive's background task does.
 const PARAMETER_CYCLES: u32 = 5;
+/// The control parameters every so many of these.
+const TUNING_ROUNDS: u32 = 5;
 /// A stop is over when the axis stands, or so many cycles after it should: a load may keep it moving.
 const SETTLE_CYCLES: u32 = 250;
 
@@ -62,6 +64,8 @@ pub struct Drive {
     parameters: Parameters,
     parameters_age: u32,
     homing: HomingParameters,
+    tuning: Tuning,
+    tuning_age: u32,
     params: PlantParams,
     plant: Plant,
     controller: Controller,
@@ -91,6 +95,7 @@ impl Drive {
     pub fn new(store: &mut ObjectStore, plant: PlantParams) -> Self {
         let objects = Objects::bind(store, &plant);
         let parameters = objects.parameters(store, &plant);
+        let tuning = objects.tuning(store);
         let motor = Plant::new(&plant);
         let counts = motor.counts();
         let inputs = DigitalInputs::new(&plant, &motor);
@@ -105,7 +110,9 @@ impl Drive {
             parameters_age: 0,
             homing: HomingParameters::default(),
             params: plant,
-            controller: Controller::new(&plant, counts),
+            controller: Controller::new(&tuning, &plant, &motor),
+            tuning,
+            tuning_age: 0,
             plant: motor,
             power: Power::new(plant.enable_cycles),
             faults: Faults::default(),
@@ -295,6 +302,15 @@ impl Drive {
         self.frame.width = self.parameters.range_width;
         let (polarity, live) = self.objects.io.wiring(store);
         self.inputs.configure(polarity, live);
+        self.tuning_age += 1;
+        if self.tuning_age >= TUNING_ROUNDS {
+            self.tuning_age = 0;
+            let tuning = self.objects.tuning(store);
+            if tuning != self.tuning {
+                self.controller.tune(&tuning);
+                self.tuning = tuning;
+            }
+        }
     }
 
     fn show_inputs(&mut self, store: &mut ObjectStore) {

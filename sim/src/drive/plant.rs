@@ -35,6 +35,8 @@ pub struct PlantParams {
     pub nominal_current: f64,
     /// A; what the output stage never exceeds.
     pub current_limit: f64,
+    /// Of the winding, s. How long the output stage may give more than the nominal current.
+    pub thermal_time_constant: f64,
     /// rpm; the power-on value of 0x6080.
     pub max_motor_speed: u32,
     /// How long the output stage takes from Switched on to Operation enabled, in control cycles of
@@ -59,6 +61,7 @@ impl Default for PlantParams {
             supply_voltage: 48.0,
             nominal_current: 3.2,
             current_limit: 9.6,
+            thermal_time_constant: 30.0,
             max_motor_speed: 6000,
             enable_cycles: 10,
             track: Track::default(),
@@ -90,19 +93,30 @@ pub(super) struct Plant {
     /// Mechanical ends, in counts.
     ends: (f64, f64),
     coulomb: f64,
-    // Per current-loop step: what a volt, a volt of back-EMF, … do.
-    current_per_volt: f64,
-    current_decay: f64,
-    back_emf: f64,
-    velocity_per_torque: f64,
     torque_constant: f64,
-    viscous: f64,
+    counts_per_rad: f64,
+    // Per current-loop step: what is left of current and speed, what a volt and a newton metre do.
+    current_decay: f64,
+    current_per_volt: f64,
+    velocity_decay: f64,
+    velocity_per_torque: f64,
     counts_per_velocity: f64,
+}
+
+/// `x' = (u − drag·x) / storage` over one current-loop step with `u` held: what is left of x, and what
+/// a unit of u adds.
+fn first_order(storage: f64, drag: f64) -> (f64, f64) {
+    let x = CURRENT_STEP * drag / storage;
+    let gain = if x > 0.0 { -(-x).exp_m1() / x } else { 1.0 };
+    ((-x).exp(), gain * CURRENT_STEP / storage)
 }
 
 impl Plant {
     pub(super) fn new(p: &PlantParams) -> Self {
-        let inductance = p.inductance.max(1e-6);
+        let (current_decay, current_per_volt) =
+            first_order(p.inductance.max(1e-6), p.resistance.max(0.0));
+        let (velocity_decay, velocity_per_torque) =
+            first_order(p.inertia.max(1e-9), p.viscous_friction.max(0.0));
         Self {
             // In the middle of a count, so that standing still is not standing on an edge.
             position: f64::from(p.initial_position) + 0.5,
@@ -118,12 +132,12 @@ impl Plant {
                     (f64::from(low) + 0.5, f64::from(high) + 0.5)
                 }),
             coulomb: p.coulomb_friction,
-            current_per_volt: CURRENT_STEP / inductance,
-            current_decay: (-CURRENT_STEP * p.resistance / inductance).exp(),
-            back_emf: p.torque_constant,
-            velocity_per_torque: CURRENT_STEP / p.inertia.max(1e-9),
             torque_constant: p.torque_constant,
-            viscous: p.viscous_friction,
+            counts_per_rad: p.counts_per_rad(),
+            current_decay,
+            current_per_volt,
+            velocity_decay,
+            velocity_per_torque,
             counts_per_velocity: CURRENT_STEP * p.counts_per_rad(),
         }
     }
@@ -138,6 +152,24 @@ impl Plant {
     /// Counts with fraction.
     pub(super) fn position(&self) -> f64 {
         self.position
+    }
+
+    /// The encoder edge passed last: its position in counts, and how long ago that was in seconds, going
+    /// by the present speed; at most `within`.
+    pub(super) fn edge(&self, within: f64) -> (f64, f64) {
+        let speed = self.velocity * self.counts_per_rad;
+        let edge = if speed < 0.0 {
+            self.position.ceil()
+        } else {
+            self.position.floor()
+        };
+        let (way, speed) = ((self.position - edge).abs(), speed.abs());
+        let age = if way < speed * within {
+            way / speed
+        } else {
+            within
+        };
+        (edge, age)
     }
 
     pub(super) fn velocity(&self) -> f64 {
@@ -161,31 +193,32 @@ impl Plant {
         self.velocity == 0.0 && (self.blocked || self.load_torque.abs() <= self.coulomb)
     }
 
-    /// The winding for one current-loop step at this voltage.
-    pub(super) fn energise(&mut self, voltage: f64) {
-        self.current = self.current * self.current_decay
-            + (voltage - self.back_emf * self.velocity) * self.current_per_volt;
+    /// One current-loop step at this voltage.
+    pub(super) fn drive(&mut self, voltage: f64) {
+        let before = self.current;
+        let back_emf = self.torque_constant * self.velocity;
+        self.current = before * self.current_decay + (voltage - back_emf) * self.current_per_volt;
+        self.turn(0.5 * (before + self.current));
+    }
+
+    /// One current-loop step with the winding open.
+    pub(super) fn coast(&mut self) {
+        self.current = 0.0;
+        self.turn(0.0);
     }
 
     pub(super) fn flush(&mut self) {
         super::control::flush(&mut self.current);
     }
 
-    /// Output stage off: the winding is open.
-    pub(super) fn open(&mut self) {
-        self.current = 0.0;
-    }
-
-    /// The mechanics for one current-loop step.
-    pub(super) fn turn(&mut self) {
+    fn turn(&mut self, current: f64) {
         if self.blocked {
             self.velocity = 0.0;
             return;
         }
-        let torque =
-            self.torque_constant * self.current - self.viscous * self.velocity - self.load_torque;
+        let torque = self.torque_constant * current - self.load_torque;
         let before = self.velocity;
-        let free = before + torque * self.velocity_per_torque;
+        let free = before * self.velocity_decay + torque * self.velocity_per_torque;
         // Friction takes away speed until there is none; it never drives.
         let friction = self.coulomb * self.velocity_per_torque;
         self.velocity = (free.abs() - friction).max(0.0).copysign(free);

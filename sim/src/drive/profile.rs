@@ -1,6 +1,7 @@
 //! Trapezoidal profiles, one control cycle at a time. Counts and seconds throughout.
 
 use super::CONTROL_STEP as DT;
+use super::control::Feed;
 
 /// A point moving under limits.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -24,6 +25,13 @@ impl Profile {
             position,
             velocity,
             acceleration: 0.0,
+        }
+    }
+
+    pub(super) fn feed(&self) -> Feed {
+        Feed {
+            velocity: self.velocity,
+            acceleration: self.acceleration,
         }
     }
 

@@ -33,8 +33,8 @@ impl Drive {
     pub(super) fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
         let (o, p) = (&self.objects, &self.parameters);
         let counts = self.controller.counts();
-        let velocity = self.controller.filtered_velocity();
-        let torque_per_ampere = self.params.torque_constant / p.torque_unit.max(1e-12);
+        let velocity = self.controller.velocity();
+        let torque_per_ampere = self.tuning.torque_constant / p.torque_unit.max(1e-12);
         let current = self.controller.current();
         store.set(o.statusword, i64::from(self.statusword(limited)));
         store.set(o.error_code, i64::from(self.faults.code()));
@@ -64,6 +64,12 @@ impl Drive {
         }
         if let Some(slot) = o.current_averaged {
             store.set(slot, whole(self.controller.averaged_current() * 1e3));
+        }
+        if let Some(slot) = o.current_demand {
+            store.set(slot, whole(self.controller.current_demand() * 1e3));
+        }
+        if let Some(slot) = o.thermal_level {
+            store.set(slot, whole(self.controller.thermal_level() * 1e2));
         }
     }
 }

@@ -11,7 +11,7 @@ mod position;
 mod stop;
 mod velocity;
 
-use super::control::Demand;
+use super::control::{Demand, Feed};
 use super::io::Inputs;
 use super::objects::{HomingParameters, Parameters, float};
 use super::profile::{Interpolator, Profile};
@@ -279,10 +279,10 @@ impl Motion {
                 self.profile = Profile::at(within, velocity);
                 Demand::Position {
                     position: within,
-                    velocity: velocity + float(cycle.set_points.velocity_offset) * p.velocity_unit,
-                    // Cyclic modes have no acceleration feed-forward: the slope of a slope of whole
-                    // counts is mostly noise.
-                    acceleration: 0.0,
+                    feed: Feed {
+                        velocity: float(cycle.set_points.velocity_offset) * p.velocity_unit,
+                        acceleration: 0.0,
+                    },
                     torque,
                 }
             }
@@ -291,7 +291,7 @@ impl Motion {
                 self.profile = Profile::at(float(cycle.counts), velocity);
                 Demand::Velocity {
                     velocity,
-                    acceleration: 0.0,
+                    feed: Feed::default(),
                     torque,
                 }
             }
@@ -320,8 +320,7 @@ impl Motion {
     fn profile_demand(&self, torque: f64) -> Demand {
         Demand::Position {
             position: self.profile.position,
-            velocity: self.profile.velocity,
-            acceleration: self.profile.acceleration,
+            feed: self.profile.feed(),
             torque,
         }
     }

@@ -1,7 +1,7 @@
 //! Coming to rest: for Controlword bit 8 and for the stops of the power state machine.
 
 use super::{Cycle, Mode, Motion};
-use crate::drive::control::Demand;
+use crate::drive::control::{Demand, Feed};
 use crate::drive::objects::float;
 use crate::drive::profile::Profile;
 use crate::drive::state::Ramp;
@@ -32,7 +32,7 @@ impl Motion {
             self.profile = Profile::at(float(cycle.counts), cycle.velocity);
             let demand = Demand::Velocity {
                 velocity: 0.0,
-                acceleration: 0.0,
+                feed: Feed::default(),
                 torque: 0.0,
             };
             return (demand, false);

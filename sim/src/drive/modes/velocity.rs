@@ -61,7 +61,7 @@ impl Motion {
         self.profile.position = float(cycle.counts);
         Demand::Velocity {
             velocity: self.profile.velocity,
-            acceleration: self.profile.acceleration,
+            feed: self.profile.feed(),
             torque,
         }
     }

@@ -63,6 +63,20 @@ impl Binder<'_> {
         (self.0.item(slot)?.name == name).then_some(slot)
     }
 
+    /// A maker's own record, for a dictionary that says nothing about any.
+    pub(super) fn add_own<'r>(
+        &mut self,
+        index: u16,
+        name: &str,
+        rows: impl Iterator<Item = (u8, &'r str, u32)>,
+    ) {
+        let count = self.bind(index, 0, name, 8, RO);
+        for (sub, name, bits) in rows {
+            self.bind(index, sub, name, bits, RW);
+            self.0.set(count, i64::from(sub));
+        }
+    }
+
     /// Motor data: commissioning has set it, whatever the ESI's factory value is.
     pub(super) fn motor_data(&mut self, slot: Slot, value: i64) -> Slot {
         self.0.set(slot, value);

@@ -1,6 +1,8 @@
 //! The objects the drive reads and writes, as slots; power-on values for those an ESI leaves empty.
 //!
 //! * `binder`: from a dictionary's entries to slots
+//! * `motor`: motor data
+//! * `gains`: control parameters
 //! * `parameters`: limits, profiles, and what the other files read
 //! * `homing`: where home is and how to get there
 //! * `io`: digital inputs and outputs
@@ -10,18 +12,24 @@
 //! * `units`: SI unit codes, interpolation time
 
 mod binder;
+mod gains;
 mod homing;
 mod io;
+mod motor;
 mod options;
 mod parameters;
 mod probe;
 mod units;
 mod velocity;
 
+use std::ops::RangeInclusive;
+
+use super::control::Tuning;
 use super::plant::PlantParams;
 use crate::coe::store::{ObjectStore, Slot};
 
 use binder::{Binder, RO, RW};
+use gains::TuningSlots;
 use io::IoSlots;
 use parameters::ParameterSlots;
 use units::COUNTS;
@@ -32,6 +40,10 @@ pub(super) use probe::ProbeSlots;
 
 /// PP, PV, HM, CSP, CSV, CST.
 const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;
+
+/// An ESI that lists none of these leaves out its maker's objects; one that lists some means others
+/// than a maxon drive's, or has them itself.
+const MAKERS_OWN: RangeInclusive<u16> = 0x2000..=0x5fff;
 
 #[derive(Debug, Clone)]
 pub(super) struct Objects {
@@ -52,6 +64,8 @@ pub(super) struct Objects {
     pub torque_averaged: Option<Slot>,
     pub current: Option<Slot>,
     pub current_averaged: Option<Slot>,
+    pub current_demand: Option<Slot>,
+    pub thermal_level: Option<Slot>,
     pub following_error: Slot,
     pub target_position: Slot,
     pub target_velocity: Slot,
@@ -62,6 +76,7 @@ pub(super) struct Objects {
     parameters: ParameterSlots,
     pub io: IoSlots,
     pub probes: Option<ProbeSlots>,
+    tuning: TuningSlots,
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "saturates")]
@@ -84,24 +99,12 @@ impl Objects {
     pub(super) fn bind(store: &mut ObjectStore, plant: &PlantParams) -> Self {
         let mut b = Binder(store);
         let history = [0, 1, 2, 3, 4, 5].map(|sub| b.0.slot(0x1003, sub));
-        b.own_motor_data(
-            0x3001,
-            1,
-            "Nominal current",
-            whole(plant.nominal_current * 1e3),
-        );
-        b.own_motor_data(
-            0x3001,
-            5,
-            "Torque constant",
-            whole(plant.torque_constant * 1e6),
-        );
-        b.own_motor_data(
-            0x2200,
-            1,
-            "Power supply voltage",
-            whole(plant.supply_voltage * 10.0),
-        );
+        if !b.0.has_any(MAKERS_OWN) {
+            motor::add(&mut b);
+            TuningSlots::add(&mut b);
+        }
+        motor::fill(&mut b, plant);
+        let tuning = TuningSlots::bind(&mut b, plant);
         b.with_default(0x6502, 0, "Supported drive modes", 32, SUPPORTED_MODES);
         b.with_default(0x60a8, 0, "SI unit position", 32, COUNTS);
         let parameters = ParameterSlots::bind(&mut b, plant);
@@ -122,6 +125,8 @@ impl Objects {
             torque_averaged: b.own(0x30d2, 1, "Torque actual value averaged"),
             current: b.own(0x30d1, 2, "Current actual value"),
             current_averaged: b.own(0x30d1, 1, "Current actual value averaged"),
+            current_demand: b.own(0x30d0, 0, "Current demand value"),
+            thermal_level: b.own(0x3200, 1, "I2t level motor"),
             following_error: b.bind(0x60f4, 0, "Following error actual value", 32, RO),
             target_position: b.bind(0x607a, 0, "Target position", 32, RW),
             target_velocity: b.bind(0x60ff, 0, "Target velocity", 32, RW),
@@ -132,6 +137,7 @@ impl Objects {
             parameters,
             io: IoSlots::bind(&mut b),
             probes: ProbeSlots::find(&b),
+            tuning,
         }
     }
 
@@ -170,5 +176,9 @@ impl Objects {
 
     pub(super) fn homing(&self, store: &ObjectStore, plant: &PlantParams) -> HomingParameters {
         self.parameters.read_homing(store, plant)
+    }
+
+    pub(super) fn tuning(&self, store: &ObjectStore) -> Tuning {
+        self.tuning.read(store)
     }
 }

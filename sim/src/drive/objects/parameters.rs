@@ -80,12 +80,6 @@ pub(in crate::drive) struct Parameters {
 
 impl ParameterSlots {
     pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
-        let output_current_limit = b.own_motor_data(
-            0x3001,
-            2,
-            "Output current limit",
-            whole(plant.current_limit * 1e3),
-        );
         let rated_torque = b.bind(0x6076, 0, "Motor rated torque", 32, RW);
         b.motor_data(rated_torque, whole(plant.rated_torque() * 1e6));
         let max_motor_speed = b.bind(0x6080, 0, "Max motor speed", 32, RW);
@@ -159,7 +153,7 @@ impl ParameterSlots {
             unit_acceleration,
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
             period_index: b.with_default(0x60c2, 2, "Interpolation time index", 8, -3),
-            output_current_limit,
+            output_current_limit: b.own(0x3001, 2, "Output current limit"),
             mapped: MappedLimits::default(),
         }
     }

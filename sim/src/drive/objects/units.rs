@@ -20,7 +20,7 @@ pub(super) fn period_ns(value: i64, index: i64) -> i64 {
 }
 
 /// SI unit codes: prefix (power of ten), numerator, denominator, reserved; high byte first.
-fn prefix(code: i64) -> f64 {
+pub(super) fn prefix(code: i64) -> f64 {
     let prefix = i32::from(((code >> 24) & 0xff) as u8 as i8);
     10f64.powi(prefix)
 }

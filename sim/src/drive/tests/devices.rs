@@ -39,7 +39,7 @@ fn moves_a_turn(rig: &mut Rig) {
         rig.set(0x607a, 0, start + 10 * n);
         rig.cycle();
     }
-    rig.run_ms(100);
+    rig.run_ms(200);
     assert_eq!(rig.drive.state(), State::OperationEnabled);
     assert!((rig.get(0x6064) - start - 2000).abs() <= 1);
 }

@@ -109,12 +109,12 @@ fn every_method_from_every_side() {
             };
             assert_eq!(shown, expected, "method {method} from {start}");
             rig.run_ms(200);
-            // In the track's counts the axis is where the switch or index is, to a count or two.
+            // In the track's counts the axis is where the switch or index is, to a few counts.
             let off = rig.drive.plant.counts() - home;
             let bound = if method == 33 || method == 34 || home % 100 == 0 {
                 1
             } else {
-                2
+                3
             };
             assert!(off.abs() <= bound, "method {method} from {start}: {off}");
             let shown = rig.get(0x6064) - 50_000;
@@ -278,7 +278,7 @@ fn homing_is_interrupted() {
         assert_eq!(bits(rig), shown);
         let stood = rig.drive.position_counts();
         rig.run_ms(300);
-        assert_eq!(rig.drive.position_counts(), stood);
+        assert!((rig.drive.position_counts() - stood).abs() <= 1);
     };
 
     let mut rig = searching();

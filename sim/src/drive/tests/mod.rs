@@ -17,9 +17,9 @@ use super::*;
 use crate::coe::store::Slot;
 
 /// A drive with a bus around it: one SYNC a bus cycle, a control cycle every 0.4 ms.
-struct Rig {
-    store: ObjectStore,
-    drive: Drive,
+pub(super) struct Rig {
+    pub(super) store: ObjectStore,
+    pub(super) drive: Drive,
     in_op: bool,
     counts_per_turn: u32,
     cycle_ns: u64,
@@ -33,7 +33,7 @@ const MS: u64 = 1_000_000;
 type Extra = (u16, u8, u32, &'static str);
 
 impl Rig {
-    fn new(plant: PlantParams) -> Self {
+    pub(super) fn new(plant: PlantParams) -> Self {
         Self::with(plant, &[])
     }
 
@@ -59,16 +59,16 @@ impl Rig {
         rig
     }
 
-    fn slot(&self, index: u16, sub: u8) -> Slot {
+    pub(super) fn slot(&self, index: u16, sub: u8) -> Slot {
         self.store.slot(index, sub).expect("the drive made it")
     }
 
-    fn set(&mut self, index: u16, sub: u8, value: i64) {
+    pub(super) fn set(&mut self, index: u16, sub: u8, value: i64) {
         let slot = self.slot(index, sub);
         self.store.set(slot, value);
     }
 
-    fn get(&self, index: u16) -> i64 {
+    pub(super) fn get(&self, index: u16) -> i64 {
         self.store.get_signed(self.slot(index, 0))
     }
 
@@ -107,11 +107,11 @@ impl Rig {
         self.drive.state()
     }
 
-    fn run_ms(&mut self, ms: u64) {
+    pub(super) fn run_ms(&mut self, ms: u64) {
         self.cycles(u32::try_from(ms * MS / self.cycle_ns).unwrap());
     }
 
-    fn enable(&mut self, mode: i64) {
+    pub(super) fn enable(&mut self, mode: i64) {
         self.set(0x6060, 0, mode);
         self.set(0x6040, 0, 0);
         self.run_ms(10);
