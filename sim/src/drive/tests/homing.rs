@@ -109,12 +109,13 @@ fn every_method_from_every_side() {
             };
             assert_eq!(shown, expected, "method {method} from {start}");
             rig.run_ms(200);
-            // In the track's counts the axis is where the switch or index is, to a few counts.
+            // In the track's counts the axis is where the switch or index is. Switches are looked at once
+            // a control cycle, in which the axis still slowing down makes five counts.
             let off = rig.drive.plant.counts() - home;
             let bound = if method == 33 || method == 34 || home % 100 == 0 {
                 1
             } else {
-                3
+                5
             };
             assert!(off.abs() <= bound, "method {method} from {start}: {off}");
             let shown = rig.get(0x6064) - 50_000;
