@@ -1,0 +1,54 @@
+//! Every published EEPROM image becomes a SubDevice that a MainDevice takes from Init to Op.
+
+#![allow(clippy::print_stderr, reason = "tests say what they did")]
+
+mod common;
+mod main_device;
+
+use common::*;
+use ecaxis_sim::{DeviceOptions, SimDevice};
+
+fn climb(image: &[u8]) -> Result<String, String> {
+    const S: u16 = 0x1001;
+    let sim = SimDevice::from_sii(image, DeviceOptions::default()).map_err(|e| e.to_string())?;
+    let name = sim.name().to_owned();
+    let mut bus = Bus::new(vec![sim]);
+    bus.address_all();
+    let (learned, mapped) = main_device::bring_up(&mut bus, S)?;
+    // The end mark is the last that the MainDevice reads.
+    let read = learned.image.len().min(image.len()) - 8;
+    if learned.image[..read] != image[..read] {
+        return Err("the EEPROM reads differently".into());
+    }
+    let (outputs, inputs) = (mapped.outputs, mapped.inputs);
+    Ok(format!("{name}: {outputs} bytes out, {inputs} in"))
+}
+
+#[test]
+fn every_image_reaches_op() {
+    if fixture("README.md").is_none() {
+        return;
+    }
+    let mut paths = Vec::new();
+    for folder in std::fs::read_dir(fixtures().join("sii")).unwrap() {
+        for file in std::fs::read_dir(folder.unwrap().path()).unwrap() {
+            paths.push(file.unwrap().path());
+        }
+    }
+    paths.sort();
+    let (mut count, mut problems) = (0, Vec::new());
+    for path in paths {
+        let image = std::fs::read(&path).unwrap();
+        // One of them is Intel HEX text of another.
+        if image.starts_with(b":") {
+            continue;
+        }
+        count += 1;
+        match climb(&image) {
+            Ok(what) => eprintln!("{what}"),
+            Err(problem) => problems.push(format!("{}: {problem}", path.display())),
+        }
+    }
+    assert!(count >= 15, "{count} images");
+    assert!(problems.is_empty(), "{}", problems.join("\n"));
+}
