@@ -3,7 +3,7 @@
 
 #[path = "../../sim/tests/common/mod.rs"]
 mod common;
-#[path = "../../sim/tests/common/hostile.rs"]
+#[path = "../../sim/tests/common/hostile/mod.rs"]
 mod hostile;
 
 use std::cell::RefCell;

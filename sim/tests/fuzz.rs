@@ -6,7 +6,7 @@
 #![allow(clippy::print_stderr, reason = "how much was tried is worth seeing")]
 
 mod common;
-#[path = "common/hostile.rs"]
+#[path = "common/hostile/mod.rs"]
 mod hostile;
 
 use ecaxis_sim::{DeviceOptions, FaultScript, SimDevice};

@@ -72,6 +72,35 @@ def _mapped(owner, tag):
     return chosen
 
 
+def default_data(path, index):
+    """An object's DefaultData."""
+    for o in ElementTree.parse(path).getroot().iter("Object"):
+        if number(o.findtext("Index")) == index:
+            return bytes.fromhex(o.findtext("Info/DefaultData"))
+    raise KeyError(f"{path} has no {index:#06x}")
+
+
+def objects(path, type_name):
+    """{index: (name, [(sub, name, bits)])} of a device's dictionary; items that are arrays are left out."""
+    root = ElementTree.parse(path).getroot()
+    for device in root.iter("Device"):
+        if (device.findtext("Type") or "").strip() == type_name:
+            break
+    else:
+        raise KeyError(f"{path} has no {type_name}")
+    items = {}
+    for kind in device.iter("DataType"):
+        if kind.find("SubItem") is None:
+            continue
+        subs = [(s.findtext("SubIdx"), s.findtext("Name"), s.findtext("BitSize")) for s in kind.iter("SubItem")]
+        if all(sub for sub, _, _ in subs):
+            items[kind.findtext("Name")] = [(number(s), n, number(b)) for s, n, b in subs]
+    return {
+        number(o.findtext("Index")): (o.findtext("Name"), items.get(o.findtext("Type"), []))
+        for o in device.iter("Object")
+    }
+
+
 def read(path, type_name, revision=None, module=None):
     """The device of this type; `module` matches the type name of the module in its only slot.
 

@@ -1,6 +1,6 @@
 //! Devices from ESI files.
 
-use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse};
+use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse, SyncManager};
 use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 
 use super::esm::Al;
@@ -201,7 +201,7 @@ fn dictionaries<'a>(device: &'a Device, modules: &'a [Module]) -> Vec<&'a Dictio
     others.chain([&device.dictionary]).chain(defaults).collect()
 }
 
-/// Object 0x1018 says what the EEPROM says.
+/// Object 0x1018 says what the EEPROM says, 0x1C00 what the SyncManagers are for; every device with CoE has them.
 fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
     if device
         .mailbox
@@ -229,6 +229,24 @@ fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
     for (sub, (name, value)) in (1..).zip(identity) {
         let slot = store.ensure(0x1018, sub, name, 32, ro, &[]);
         store.set(slot, i64::from(value));
+    }
+    let types: Vec<u8> = device.sync_managers.iter().take(8).map(sm_type).collect();
+    let count = u8::try_from(types.len()).unwrap_or(8);
+    store.ensure(0x1c00, 0, "SubIndex 000", 8, ro, &[count]);
+    for (sub, kind) in (1..).zip(types) {
+        let name = format!("SyncManager {}", sub - 1);
+        store.ensure(0x1c00, sub, &name, 8, ro, &[kind]);
+    }
+}
+
+/// Object 0x1C00 (ETG.1000.6, SyncManager communication type): 0 unused, 1 and 2 mailbox out and in, 3 and 4 process data out and in.
+fn sm_type(sm: &SyncManager) -> u8 {
+    match sm.usage {
+        SmUse::MBoxOut => 1,
+        SmUse::MBoxIn => 2,
+        SmUse::Outputs => 3,
+        SmUse::Inputs => 4,
+        SmUse::Other => 0,
     }
 }
 

@@ -47,7 +47,7 @@ fn device(sii: &Sii) -> Device {
         tx_pdos: pdos(&sii.tx_pdos, Direction::Tx),
         mailbox: mailbox(sii, &general),
         dc_modes: sii.dc.iter().map(dc_mode).collect(),
-        dictionary: dictionary(sii, &general, &sync_managers),
+        dictionary: dictionary(sii, &general),
         sync_managers,
         eeprom: Eeprom {
             byte_size: sii.byte_size,
@@ -206,41 +206,20 @@ fn bootstrap(areas: MailboxAreas) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// Device name and SyncManager communication types; identity and PDOs are added with every device.
-fn dictionary(sii: &Sii, general: &General, sync_managers: &[SyncManager]) -> Dictionary {
+/// The device name; identity, SyncManagers and PDOs are added with every device.
+fn dictionary(sii: &Sii, general: &General) -> Dictionary {
     if !has_mailbox(sii) || !sii.protocols.has(Protocols::COE) {
         return Dictionary::default();
     }
     let name = type_name(sii, general).into_bytes();
-    let mut types: Vec<u8> = sync_managers.iter().take(8).map(sm_type).collect();
-    types.insert(0, u8::try_from(types.len()).unwrap_or(8));
-    let types = (0..).zip(types).map(|(sub, value)| {
-        let offset = if sub == 0 { 0 } else { 8 + 8 * u32::from(sub) };
-        item(sub, "USINT", offset, vec![value])
-    });
-    let object = |index, name: &str, items| Object {
-        index,
-        name: name.to_owned(),
-        items,
-        ..Object::default()
-    };
     let text = format!("STRING({})", name.len());
     Dictionary {
-        objects: vec![
-            object(0x1008, "Device name", vec![item(0, &text, 0, name)]),
-            object(0x1c00, "Sync manager type", types.collect()),
-        ],
-    }
-}
-
-/// Object 0x1C00 (ETG.1000.6): 0 unused, 1 and 2 mailbox out and in, 3 and 4 process data out and in.
-fn sm_type(sm: &SyncManager) -> u8 {
-    match sm.usage {
-        SmUse::MBoxOut => 1,
-        SmUse::MBoxIn => 2,
-        SmUse::Outputs => 3,
-        SmUse::Inputs => 4,
-        SmUse::Other => 0,
+        objects: vec![Object {
+            index: 0x1008,
+            name: "Device name".to_owned(),
+            items: vec![item(0, &text, 0, name)],
+            ..Object::default()
+        }],
     }
 }
 

@@ -35,9 +35,10 @@ def watchdog(bench):
         report.equal("the watchdog reads back", master.slaves[0].get_watchdog("processdata"), 300.0)
         time.sleep(1)
         for name, device, state in zip(machine.names, machine.devices, cyclic.states(master)):
-            watched = device.rx_bits > 0
+            # Without an application behind it the controller clears the outputs and says nothing.
+            watched = device.rx_bits > 0 and device.mailbox
             report.equal(f"{name} after a second's silence", state, "SafeOp+Error" if watched else "Op")
-        codes = {s.al_status for s, d in zip(master.slaves, machine.devices) if d.rx_bits}
+        codes = {s.al_status for s, d in zip(master.slaves, machine.devices) if d.rx_bits and d.mailbox}
         report.equal("AL status code of those", codes, {0x001B})
         back(bench, cycle, master)
 

@@ -1,9 +1,19 @@
-"""SDOs, EEPROM, files, emergencies."""
+"""SDOs, SDO Information, files, EEPROM, emergencies."""
 
 import struct
 import time
 
 import pysoem
+
+import esi
+import pcapng
+import rig
+from cycle import reach
+
+EMERGENCY = '[[fault]]\nat = "3s"\ndevice = 0\nkind = "emergency"\ncode = 0x2310\n'
+ESI = rig.HERE / "esi/mailbox.xml"
+BLOB = esi.default_data(ESI, 0x2000)
+FOE, FOE_ERROR, NOT_FOUND = 4, 5, 0x8001
 
 
 def mailbox(bench):
@@ -11,27 +21,43 @@ def mailbox(bench):
     report.section("mailbox and EEPROM")
     machine = bench.machine()
     images = bench.folder / "sii"
-    script = '[[fault]]\nat = "2s"\ndevice = 0\nkind = "emergency"\ncode = 0x2310\n'
     options = ["--sii", str(images)]
-    with bench.serve(machine, "mailbox", script, options), bench.master() as master:
+    with bench.serve(machine, "mailbox", EMERGENCY, options), bench.master() as master:
         bench.found(master, machine)
-        x = master.slaves[0]
+        at = machine.index("mailbox")
+        large, x = master.slaves[at], master.slaves[0]
         eeprom(bench, master, machine, images)
-        sdo(bench, x, machine.devices[0])
+        small_objects(bench, x, machine.devices[0])
+        large_objects(bench, large, "mailboxes of 48 bytes")
+        files(bench, large, "mailboxes of 48 bytes")
+        resize(bench, master, large, 1024)
+        large_objects(bench, large, "mailboxes of 1024 bytes")
+        files(bench, large, "mailboxes of 1024 bytes")
         emergency(bench, x)
+        bootstrap(bench, master, x)
+        dictionary(bench, large)
+    file_errors(bench)
 
 
-def sdo(bench, slave, device):
+def refused(bench, what, code, action):
+    try:
+        bench.report.check(f"{what} is refused", False, f"accepted: {action()}")
+    except pysoem.SdoError as error:
+        bench.report.equal(f"{what} is refused", error.abort_code, code, hex)
+
+
+def small_objects(bench, slave, device):
     report = bench.report
     for sub, expected in enumerate(device.identity, 1):
         got = struct.unpack("<I", slave.sdo_read(0x1018, sub))[0]
         report.equal(f"0x1018:{sub:02} is the identity", got, expected, hex)
     name = slave.sdo_read(0x1008, 0)
     report.check("0x1008 is a name", name[:5] == b"EPOS4", name)
-    old = struct.unpack("<I", slave.sdo_read(0x6065, 0))[0]
-    slave.sdo_write(0x6065, 0, struct.pack("<I", 4321))
-    report.equal("an SDO is written and read back", slave.sdo_read(0x6065, 0), struct.pack("<I", 4321))
-    slave.sdo_write(0x6065, 0, struct.pack("<I", old))
+    old = slave.sdo_read(0x6065, 0)
+    new = struct.pack("<I", 4321)
+    slave.sdo_write(0x6065, 0, new)
+    report.equal("an SDO is written and read back", slave.sdo_read(0x6065, 0), new)
+    slave.sdo_write(0x6065, 0, old)
     for what, index, sub, data, code in (
         ("an object that does not exist", 0x5FFF, 0, None, 0x06020000),
         ("a subindex that does not exist", 0x1018, 99, None, 0x06090011),
@@ -39,11 +65,103 @@ def sdo(bench, slave, device):
         ("too many bytes", 0x6065, 0, bytes(8), 0x06070012),
         ("too few bytes", 0x6065, 0, bytes(2), 0x06070013),
     ):
-        try:
-            slave.sdo_read(index, sub) if data is None else slave.sdo_write(index, sub, data)
-            report.check(f"{what} is refused", False, "accepted")
-        except pysoem.SdoError as error:
-            report.equal(f"{what} is refused", error.abort_code, code, hex)
+        if data is None:
+            refused(bench, what, code, lambda: slave.sdo_read(index, sub))  # noqa: B023
+        else:
+            refused(bench, what, code, lambda: slave.sdo_write(index, sub, data))  # noqa: B023
+
+
+def large_objects(bench, slave, how):
+    report = bench.report
+    got = slave.sdo_read(0x2000, 0, 1000)
+    report.check(f"an object of 500 bytes is read, {how}", got == BLOB, f"{len(got)} bytes")
+    for data in (bytes(range(64)), bytes(64)):
+        slave.sdo_write(0x2001, 0, data)
+        back = slave.sdo_read(0x2001, 0)
+        report.check(f"64 bytes are written and read back, {how}", back == data, back[:4].hex())
+    array = slave.sdo_read(0x2011, 0, ca=True)
+    words = struct.unpack("<H8H", array)
+    report.equal(f"complete access reads an array, {how}", words, (8, *range(0x101, 0x809, 0x101)))
+    refused(bench, "a value below its limit", 0x06090032, lambda: slave.sdo_write(0x2020, 0, struct.pack("<i", -1001)))
+    refused(bench, "a value above its limit", 0x06090031, lambda: slave.sdo_write(0x2020, 0, struct.pack("<i", 1001)))
+    refused(bench, "reading what is write only", 0x06010001, lambda: slave.sdo_read(0x2024, 0))
+    refused(bench, "writing 500 bytes to what is read only", 0x06010002, lambda: slave.sdo_write(0x2000, 0, BLOB))
+
+
+def resize(bench, master, slave, size):
+    """Other mailboxes than the EEPROM names, as amended in Init."""
+    reach(master, pysoem.INIT_STATE)
+    slave.amend_mbx("out", 0x1000, size)
+    slave.amend_mbx("in", 0x1600, size)
+    name = f"PreOp with mailboxes of {size} bytes"
+    bench.report.check(name, reach(master, pysoem.PREOP_STATE), slave.al_status)
+
+
+def files(bench, slave, how):
+    report = bench.report
+    data = BLOB * 3
+    # What fills the last packet needs an empty one behind it; 36 and 1012 bytes are a packet.
+    for size in (0, 1, 36, 72, 1012, 1500):
+        written = slave.foe_write("judge.bin", 0, data[:size])
+        back = slave.foe_read("judge.bin", 0, 2000)
+        good = written > 0 and back == data[:size]
+        report.check(f"a file of {size} bytes is written and read back, {how}", good, len(back))
+    report.equal("a file that does not exist yields nothing", slave.foe_read("nothing.bin", 0, 10), b"")
+
+
+def file_errors(bench):
+    """pysoem keeps FoE's errors to itself; the recording shows them."""
+    exchanges, _ = pcapng.exchanges(bench.folder / "mailbox.pcapng")
+    codes = set()
+    for exchange in exchanges:
+        for answer in exchange.answer or []:
+            data = answer.data
+            if answer.wkc == 1 and len(data) >= 12 and data[5] & 0x0F == FOE and data[6] == FOE_ERROR:
+                codes.add(struct.unpack_from("<I", data, 8)[0])
+    bench.report.equal("its FoE error code", codes, {NOT_FOUND}, lambda c: ", ".join(map(hex, c)))
+
+
+def bootstrap(bench, master, slave):
+    """A firmware update, with the mailboxes that the vendor's ESI gives for Bootstrap."""
+    report = bench.report
+    reach(master, pysoem.INIT_STATE)
+    slave.amend_mbx("out", 0x1000, 100)
+    slave.amend_mbx("in", 0x1064, 100)
+    slave.state = pysoem.BOOT_STATE
+    slave.write_state()
+    reached = slave.state_check(pysoem.BOOT_STATE, 2_000_000)
+    report.equal("Bootstrap", reached, pysoem.BOOT_STATE, hex)
+    firmware = bytes(n * n & 0xFF for n in range(5_000))
+    report.check("firmware is written", slave.foe_write("EPOS4.bin", 0, firmware) > 0)
+    report.check("and read back", slave.foe_read("EPOS4.bin", 0, 10_000) == firmware)
+    reach(master, pysoem.INIT_STATE)
+    slave.amend_mbx("out", 0x1000, 48)
+    slave.amend_mbx("in", 0x1030, 48)
+    report.check("back to PreOp", reach(master, pysoem.PREOP_STATE), slave.al_status)
+    name = slave.sdo_read(0x1008, 0)
+    report.check("and its CoE answers", name[:5] == b"EPOS4", name)
+
+
+def dictionary(bench, slave):
+    """SDO Information against the ESI. SOEM takes a description from a single message, hence large mailboxes."""
+    report = bench.report
+    expected = esi.objects(ESI, "Mailbox")
+    described = {entry.index: entry for entry in slave.od}
+    missing = [hex(index) for index in expected if index not in described]
+    report.equal("SDO Information lists every object of the ESI", missing, [])
+    wrong = []
+    for index, (name, items) in expected.items():
+        entry = described.get(index)
+        if entry is None:
+            continue
+        # SOEM keeps 40 characters.
+        if entry.name.decode() != name[:40]:
+            wrong.append(f"{index:#06x}: {entry.name}")
+        for sub, item, bits in items:
+            got = entry.entries[sub] if sub < len(entry.entries) else None
+            if got is None or (got.name.decode(), got.bit_length) != (item[:40], bits):
+                wrong.append(f"{index:#06x}:{sub:02}: {got and (got.name, got.bit_length)}")
+    report.equal("names and lengths as in the ESI", wrong, [])
 
 
 def eeprom(bench, master, machine, images):
