@@ -3,8 +3,8 @@
 mod common;
 
 use common::*;
-use ecaxis_sim::drive::input;
-use ecaxis_sim::{DeviceOptions, SimDevice};
+use ecaxis_sim::drive::{State, input};
+use ecaxis_sim::{DeviceOptions, PlantParams, SimDevice, Track};
 
 const EPOS4: &str = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml";
 const VALUE_RANGE: u32 = 0x0609_0030;
@@ -91,4 +91,255 @@ fn inputs_and_outputs_are_wired_to_the_device() {
     let mut terminal = sim(&coe_device());
     assert!(!terminal.set_digital_input(0, input::HOME, true));
     assert_eq!(terminal.digital_outputs(), None);
+}
+
+const STATION: u16 = 0x1001;
+const CYCLE: u64 = 1_000_000;
+/// Process data of the CSP module, either way.
+const BYTES: u16 = 17;
+
+/// An EPOS4 with the CSP module's process data, a MainDevice that exchanges them every millisecond.
+struct Axis {
+    bus: Bus,
+    outputs: Outputs,
+    inputs: Inputs,
+}
+
+/// 0x6040, 0x607A, 0x6060, 0x60FE:01.
+#[derive(Default)]
+struct Outputs {
+    controlword: u16,
+    target: i32,
+    mode: i8,
+    digital: u32,
+}
+
+/// 0x6041, 0x6064, 0x6061, 0x60FD.
+#[derive(Default)]
+struct Inputs {
+    statusword: u16,
+    position: i32,
+    mode: i8,
+    digital: u32,
+}
+
+impl Axis {
+    /// In SafeOp.
+    fn new(track: Track) -> Option<Self> {
+        let file = ecaxis_esi::parse(&fixture(EPOS4)?).unwrap();
+        let options = DeviceOptions {
+            plant: PlantParams {
+                track,
+                ..PlantParams::default()
+            },
+            ..DeviceOptions::default()
+        };
+        let device = SimDevice::from_esi(&file.devices[0], &file.modules, options).unwrap();
+        let mut bus = Bus::new(vec![device]);
+        bus.address_all();
+        bus.preop(STATION);
+        bus.download(STATION, 0x60c2, 1, &[1]).unwrap();
+        bus.sm(STATION, 2, 0x1060, BYTES, 0x64);
+        bus.sm(STATION, 3, 0x10f0, BYTES, 0x20);
+        bus.fmmu(STATION, 0, 0, BYTES, 0x1060, 2);
+        bus.fmmu(STATION, 1, 0, BYTES, 0x10f0, 1);
+        bus.to(STATION, SAFEOP);
+        Some(Self {
+            bus,
+            outputs: Outputs {
+                mode: 8,
+                ..Outputs::default()
+            },
+            inputs: Inputs::default(),
+        })
+    }
+
+    fn cycle(&mut self) {
+        let mut data = [0; BYTES as usize];
+        data[..2].copy_from_slice(&self.outputs.controlword.to_le_bytes());
+        data[2..6].copy_from_slice(&self.outputs.target.to_le_bytes());
+        data[12] = self.outputs.mode.cast_unsigned();
+        data[13..17].copy_from_slice(&self.outputs.digital.to_le_bytes());
+        let next = self.bus.now + CYCLE;
+        let (data, _) = self.bus.logical(12, 0, &data);
+        self.inputs = Inputs {
+            statusword: u16::from_le_bytes([data[0], data[1]]),
+            position: i32::from_le_bytes(data[2..6].try_into().unwrap()),
+            mode: data[12].cast_signed(),
+            digital: u32::from_le_bytes(data[13..17].try_into().unwrap()),
+        };
+        self.bus.now = next;
+    }
+
+    fn cycles(&mut self, n: u32) {
+        (0..n).for_each(|_| self.cycle());
+    }
+
+    /// Op, and Operation enabled in the mode asked for.
+    fn enable(&mut self) {
+        self.cycle();
+        self.bus.request(STATION, 8);
+        for controlword in [0x06, 0x07, 0x0f] {
+            self.outputs.controlword = controlword;
+            for _ in 0..10 {
+                self.outputs.target = self.inputs.position;
+                self.cycle();
+            }
+        }
+        assert_eq!(self.inputs.statusword & 0x6f, 0x27);
+        assert_eq!(self.inputs.mode, self.outputs.mode);
+    }
+
+    fn device(&mut self) -> &mut SimDevice {
+        self.bus.segment.device_mut(0).unwrap()
+    }
+}
+
+#[test]
+fn process_data_count_only_in_op() {
+    let Some(mut axis) = Axis::new(Track::default()) else {
+        return;
+    };
+    axis.outputs = Outputs {
+        controlword: 0x06,
+        mode: 9,
+        digital: 0x0001_0000,
+        target: 0,
+    };
+    axis.cycles(50);
+    assert_eq!(axis.inputs.statusword & 0x26f, 0x40, "not remote");
+    assert_ne!(axis.inputs.mode, 9);
+    assert_eq!(axis.device().digital_outputs(), Some(0));
+    axis.bus.request(STATION, 8);
+    axis.cycles(50);
+    assert_eq!(axis.inputs.statusword & 0x26f, 0x221, "remote");
+    assert_eq!(axis.inputs.mode, 9);
+    assert_eq!(axis.device().digital_outputs(), Some(0x0001_0000));
+    axis.bus.request(STATION, 4);
+    axis.outputs.digital = 0;
+    axis.cycles(50);
+    assert_eq!(axis.inputs.statusword & 0x26f, 0x40);
+    assert_eq!(axis.device().digital_outputs(), Some(0x0001_0000));
+}
+
+#[test]
+fn an_axis_homes_on_its_limit_switch_and_goes_on_in_csp() {
+    let Some(mut axis) = Axis::new(Track {
+        negative_limit: Some(-7000),
+        index: Some(300),
+        ..Track::default()
+    }) else {
+        return;
+    };
+    axis.bus.download(STATION, 0x6098, 0, &[1]).unwrap();
+    for (sub, rpm) in [(1, 300_u32), (2, 60)] {
+        axis.bus
+            .download(STATION, 0x6099, sub, &rpm.to_le_bytes())
+            .unwrap();
+    }
+    axis.bus
+        .download(STATION, 0x30b0, 0, &1234_i32.to_le_bytes())
+        .unwrap();
+    axis.outputs.mode = 6;
+    axis.enable();
+    axis.outputs.controlword = 0x1f;
+    axis.cycles(2);
+    let mut struck = false;
+    for n in 0.. {
+        axis.cycle();
+        struck |= axis.inputs.digital & 1 != 0;
+        match axis.inputs.statusword & 0x3400 {
+            0 => assert!(n < 10_000),
+            word => {
+                assert_eq!(word, 0x1400, "attained and reached");
+                break;
+            }
+        }
+    }
+    assert!(struck);
+    axis.cycles(100);
+    assert!((axis.inputs.position - 1234).abs() <= 1);
+    // The first index above −7000 is −5700.
+    let moved = axis.device().drive().unwrap().position_counts() - 1234;
+    assert!(moved.abs() <= 1);
+
+    axis.outputs.mode = 8;
+    axis.outputs.controlword = 0x0f;
+    axis.outputs.target = axis.inputs.position;
+    axis.cycles(10);
+    assert_eq!(axis.inputs.mode, 8);
+    for _ in 0..400 {
+        axis.outputs.target += 10;
+        axis.cycle();
+    }
+    axis.cycles(100);
+    let off = axis.inputs.position - axis.outputs.target;
+    assert!(off.abs() <= 1, "{off}");
+    // Down again onto the switch: −7000 is now −66.
+    for _ in 0..600 {
+        axis.outputs.target -= 10;
+        axis.cycle();
+    }
+    assert_eq!(axis.inputs.statusword & 0x4f, 0x08);
+    assert_eq!(
+        axis.bus.upload(STATION, 0x603f, 0).unwrap(),
+        0x8a80_u16.to_le_bytes()
+    );
+    let (kind, emergency) = axis.bus.fetch(STATION).expect("an emergency");
+    assert_eq!((kind, &emergency[2..5]), (3, &[0x80, 0x8a, 0x21][..]));
+}
+
+/// At 100 counts a millisecond a whole control cycle would be 40 counts.
+#[test]
+fn a_touch_probe_latches_where_the_axis_was_when_its_wire_changed() {
+    let Some(mut axis) = Axis::new(Track::default()) else {
+        return;
+    };
+    axis.enable();
+    for n in 0..600_u32 {
+        axis.outputs.target += i32::try_from(n.min(200)).unwrap() / 2;
+        axis.cycle();
+    }
+    axis.bus
+        .download(STATION, 0x60b8, 0, &0x11_u16.to_le_bytes())
+        .unwrap();
+    for (n, delay) in [130_000, 470_000, 10_000, 999_000].into_iter().enumerate() {
+        let latched = |axis: &mut Axis| {
+            let data = axis.bus.upload(STATION, 0x60ba, 0).unwrap();
+            i32::from_le_bytes(data.try_into().unwrap())
+        };
+        let run = |axis: &mut Axis, cycles| {
+            for _ in 0..cycles {
+                axis.outputs.target += 100;
+                axis.cycle();
+            }
+        };
+        run(&mut axis, 20);
+        let at = axis.bus.now - CYCLE + delay;
+        axis.bus.segment.advance(at);
+        let device = axis.device();
+        assert!(device.set_digital_input(at, input::TOUCH_PROBE_1, true));
+        run(&mut axis, 3);
+        // The axis moves evenly: from the position at a later millisecond back to that moment.
+        let now = axis.bus.now;
+        axis.bus.segment.advance(now);
+        let position = axis.device().drive().unwrap().position_counts();
+        let tick = now / 400_000 * 400_000;
+        let back = (tick - at) as f64 * 1e-6 * 100.0;
+        let off = f64::from(latched(&mut axis)) - (position as f64 - back);
+        assert!(off.abs() <= 3.0, "{n}: off by {off}");
+        for function in [0_u16, 0x11] {
+            axis.device()
+                .set_digital_input(now, input::TOUCH_PROBE_1, false);
+            axis.bus
+                .download(STATION, 0x60b8, 0, &function.to_le_bytes())
+                .unwrap();
+            axis.bus.now = axis.bus.now.next_multiple_of(CYCLE);
+            run(&mut axis, 2);
+        }
+    }
+    assert_eq!(
+        axis.device().drive().unwrap().state(),
+        State::OperationEnabled
+    );
 }

@@ -9,6 +9,7 @@ mod motion;
 mod options;
 mod probes;
 mod profiles;
+mod speeds;
 mod transitions;
 
 use ecaxis_esi::model::Access;

@@ -72,6 +72,133 @@ fn pp_buffers_one_set_point_or_changes_at_once() {
     assert!((rig.get(0x6064) - 1500).abs() <= 1, "relative");
 }
 
+/// Controlword bits 4 to 6 and 9, row by row: where the axis is seen on its way to rest.
+#[test]
+fn rows_of_the_set_point_handshake() {
+    struct Row {
+        word: i64,
+        /// Relative to the first target of 4000, or absolute.
+        second: i64,
+        end: i64,
+        /// Whether it came to rest at 4000 first.
+        rests: bool,
+    }
+    let rows = [
+        // One after the other; at once; the same relative to the target accepted last.
+        Row {
+            word: 0x1f,
+            second: 9000,
+            end: 9000,
+            rests: true,
+        },
+        Row {
+            word: 0x3f,
+            second: 9000,
+            end: 9000,
+            rests: false,
+        },
+        Row {
+            word: 0x5f,
+            second: 5000,
+            end: 9000,
+            rests: true,
+        },
+        Row {
+            word: 0x7f,
+            second: 5000,
+            end: 9000,
+            rests: false,
+        },
+        // On set-point: past 4000 at full speed.
+        Row {
+            word: 0x21f,
+            second: 9000,
+            end: 9000,
+            rests: false,
+        },
+        Row {
+            word: 0x25f,
+            second: 5000,
+            end: 9000,
+            rests: false,
+        },
+        // Bit 5 decides before bit 9.
+        Row {
+            word: 0x23f,
+            second: 9000,
+            end: 9000,
+            rests: false,
+        },
+    ];
+    for row in rows {
+        let mut rig = rig();
+        rig.set(0x6081, 0, 600);
+        rig.enable(1);
+        rig.set(0x607a, 0, 4000);
+        rig.set(0x6040, 0, 0x1f);
+        rig.cycles(3);
+        rig.set(0x6040, 0, 0x0f);
+        rig.cycles(100);
+        rig.set(0x607a, 0, row.second);
+        rig.set(0x6040, 0, row.word);
+        rig.cycles(3);
+        assert_ne!(rig.word() & 1 << 12, 0, "0x{:x}: acknowledged", row.word);
+        rig.set(0x6040, 0, 0x0f);
+        rig.cycles(3);
+        let waits = row.word & 1 << 5 == 0;
+        assert_eq!(rig.word() & 1 << 12 != 0, waits, "0x{:x}: full", row.word);
+        let (mut slowest, mut at_full_speed) = (f64::MAX, 0);
+        for _ in 0..1500 {
+            rig.cycle();
+            if (3900..=4100).contains(&rig.get(0x6064)) {
+                slowest = slowest.min(rig.drive.velocity_rev_s());
+            }
+            at_full_speed += u32::from(rig.drive.velocity_rev_s() > 9.8);
+        }
+        assert_eq!(slowest < 2.0, row.rests, "0x{:x}: {slowest}", row.word);
+        assert!(at_full_speed > 100);
+        assert!((rig.get(0x6064) - row.end).abs() <= 1, "0x{:x}", row.word);
+        assert_eq!(rig.word() & 0x1400, 0x0400, "0x{:x}", row.word);
+    }
+}
+
+#[test]
+fn pp_targets_beyond_the_software_limits_end_there() {
+    let mut rig = rig();
+    rig.set(0x607d, 1, -1000);
+    rig.set(0x607d, 2, 3000);
+    rig.enable(1);
+    for (target, end, limited) in [(9000, 3000, true), (-9000, -1000, true), (50, 50, false)] {
+        rig.set(0x607a, 0, target);
+        for word in [0x1f, 0x0f] {
+            rig.set(0x6040, 0, word);
+            rig.run_ms(3);
+        }
+        rig.run_ms(900);
+        assert!((rig.get(0x6064) - end).abs() <= 1, "{target}");
+        assert_eq!(rig.word() & 1 << 11 != 0, limited, "{target}");
+        assert_eq!(rig.drive.state(), State::OperationEnabled);
+    }
+}
+
+/// 0x6067 and 0x6068.
+#[test]
+fn a_position_is_reached_after_its_time_in_the_window() {
+    let reached = |window, time| {
+        let mut rig = rig();
+        rig.set(0x6067, 0, window);
+        rig.set(0x6068, 0, time);
+        rig.enable(1);
+        rig.set(0x607a, 0, 2000);
+        rig.set(0x6040, 0, 0x1f);
+        rig.cycles(2);
+        until_reached(&mut rig)
+    };
+    let plain = reached(0xffff_ffff, 0);
+    let late = reached(10, 250);
+    assert!((245..300).contains(&(late - plain)), "{plain} {late}");
+}
+
 #[test]
 fn pp_halts_and_goes_on() {
     let mut rig = rig();
