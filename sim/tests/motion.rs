@@ -274,7 +274,7 @@ fn an_axis_homes_on_its_limit_switch_and_goes_on_in_csp() {
     }
     axis.cycles(100);
     let off = axis.inputs.position - axis.outputs.target;
-    assert!(off.abs() <= 1, "{off}");
+    assert!(off.abs() <= 3, "{off}");
     // Down again onto the switch: −7000 is now −66.
     for _ in 0..600 {
         axis.outputs.target -= 10;
@@ -327,7 +327,7 @@ fn a_touch_probe_latches_where_the_axis_was_when_its_wire_changed() {
         let tick = now / 400_000 * 400_000;
         let back = (tick - at) as f64 * 1e-6 * 100.0;
         let off = f64::from(latched(&mut axis)) - (position as f64 - back);
-        assert!(off.abs() <= 3.0, "{n}: off by {off}");
+        assert!(off.abs() <= 6.0, "{n}: off by {off}");
         for function in [0_u16, 0x11] {
             axis.device()
                 .set_digital_input(now, input::TOUCH_PROBE_1, false);
