@@ -1,5 +1,4 @@
-//! Ethernet frames that carry EtherCAT datagrams, processed in place. Anything that is not a
-//! well-formed type 1 EtherCAT frame passes untouched.
+//! Ethernet frames that carry EtherCAT datagrams, processed in place.
 
 use std::ops::Range;
 
@@ -143,21 +142,50 @@ fn parse_one(frame: &[u8], at: usize, end: usize) -> Option<Datagram> {
     (start + len + WKC <= end).then_some(datagram)
 }
 
-/// Whether the whole frame is well-formed.
+/// What a SubDevice makes of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Well-formed, of type 1.
+    EtherCat,
+    /// Has EtherCAT's EtherType, but its datagrams do not fit together.
+    Malformed,
+    /// Another protocol.
+    Foreign,
+}
+
 #[must_use]
-pub fn is_valid(frame: &[u8]) -> bool {
+pub fn kind(frame: &[u8]) -> Kind {
+    if frame.get(12..14) != Some(&ETHERTYPE.to_be_bytes()) {
+        return Kind::Foreign;
+    }
     let Some((mut at, end)) = bounds(frame) else {
-        return false;
+        return Kind::Malformed;
     };
     loop {
         let Some(datagram) = parse_one(frame, at, end) else {
-            return false;
+            return Kind::Malformed;
         };
         if !datagram.has_next(frame) {
-            return true;
+            return Kind::EtherCat;
         }
         at = datagram.data.end + WKC;
     }
+}
+
+/// Sets the circulating bit (bit 14 of the length) in every datagram; false where the first has it
+/// already.
+pub fn circulate(frame: &mut [u8]) -> bool {
+    const CIRCULATING: u16 = 0x4000;
+    let mut datagram = next(frame, None);
+    while let Some(d) = datagram {
+        let len = read_u16(frame, d.header + 6).unwrap_or(0);
+        if len & CIRCULATING != 0 {
+            return false;
+        }
+        write_u16(frame, d.header + 6, len | CIRCULATING);
+        datagram = next(frame, Some(&d));
+    }
+    true
 }
 
 /// The datagram that starts a frame or follows `previous`.
@@ -244,7 +272,7 @@ mod tests {
             .datagram(7, 0, 0x130, &[0, 0])
             .logical(12, 0x0001_0002, &[1, 2, 3])
             .build();
-        assert!(is_valid(&frame));
+        assert_eq!(kind(&frame), Kind::EtherCat);
         let first = next(&frame, None).unwrap();
         assert_eq!((first.command, first.ado(&frame)), (Command::Brd, 0x130));
         let second = next(&frame, Some(&first)).unwrap();
@@ -257,9 +285,10 @@ mod tests {
     fn a_length_beyond_the_frame_is_malformed() {
         let mut frame = FrameBuilder::default().datagram(7, 0, 0, &[0; 4]).build();
         frame[22] = 200;
-        assert!(!is_valid(&frame));
-        assert!(!is_valid(&[]));
-        assert!(!is_valid(&frame[..18]));
+        assert_eq!(kind(&frame), Kind::Malformed);
+        assert_eq!(kind(&frame[..18]), Kind::Malformed);
+        assert_eq!(kind(&frame[..12]), Kind::Foreign);
+        assert_eq!(kind(&[]), Kind::Foreign);
     }
 
     #[test]

@@ -1,10 +1,10 @@
-//! A simulated EtherCAT segment: SubDevices made from ESI files, on a line, with their own clocks.
+//! A simulated EtherCAT segment: SubDevices made from ESI files, cabled, with their own clocks.
 //! Deterministic under virtual time; shares no code with any MainDevice, so that one misreading
 //! cannot pass on both sides.
 //!
 //! From the wire inwards:
 //!
-//! * [`network`]: the line, delays, loss; [`Segment`] is where frames go in
+//! * [`network`]: ports, cables, delays, loss; [`Segment`] is where frames go in
 //! * [`frame`]: the datagram codec
 //! * [`esc`]: the SubDevice controller: registers, FMMUs, SyncManagers, EEPROM, distributed clocks
 //! * [`device`]: the controller and the application behind it: state machine, mailbox, process data
@@ -23,15 +23,18 @@ pub mod faults;
 pub mod foe;
 pub mod frame;
 pub mod network;
+mod random;
 pub mod serve;
 
 pub use device::{DeviceOptions, MailboxOptions, SimDevice, SimError};
 pub use drive::{PlantParams, Track};
 pub use esc::al::AlState;
 pub use esc::info::EscInfo;
+pub use esc::ports::Medium;
 pub use faults::{FaultScript, ScriptError};
 pub use foe::{FileStore, FoeOptions};
-pub use network::{Segment, SegmentOptions, Transit};
+pub use network::topology::{SecondPort, Topology, TopologyError, Uplink, Wish};
+pub use network::{Nic, Segment, SegmentOptions, Transit};
 pub use serve::{ServeError, ServeStats, serve};
 
 /// True time of the simulated world, in nanoseconds. Every device's own clock drifts from it.

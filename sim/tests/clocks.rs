@@ -235,7 +235,7 @@ fn run() -> Vec<u8> {
             .datagram(4, 0x1003, 0x910, &[0; 8])
             .build();
         match bus.segment.transit(&mut bytes, bus.now + n * CYCLE) {
-            Transit::Back { at } => {
+            Transit::Back { at, .. } => {
                 seen.extend(bytes);
                 seen.extend(at.to_le_bytes());
             }
@@ -258,7 +258,7 @@ fn frames_queue_up_on_the_wire() {
             .datagram(7, 0, 0x1e00, &vec![0; len])
             .build();
         match bus.segment.transit(&mut bytes, bus.now) {
-            Transit::Back { at } => at - bus.now,
+            Transit::Back { at, .. } => at - bus.now,
             Transit::Lost => panic!("lost"),
         }
     };

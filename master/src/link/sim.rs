@@ -64,7 +64,8 @@ impl Link for SimLink {
         let now = clock::now().saturating_sub(self.start);
         let slot = &mut self.ring[(self.head + self.count) % IN_FLIGHT];
         slot.frame[..frame.len()].copy_from_slice(frame);
-        if let Transit::Back { at } = self.segment.transit(&mut slot.frame[..frame.len()], now) {
+        if let Transit::Back { at, .. } = self.segment.transit(&mut slot.frame[..frame.len()], now)
+        {
             slot.at = at + self.start;
             slot.len = frame.len();
             self.count += 1;

@@ -6,11 +6,12 @@ use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 use super::esm::Al;
 use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
-use super::{Application, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
+use super::{Application, Delays, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
+use crate::esc::ports::Medium;
 use crate::esc::registers::ADDRESS_SPACE;
 use crate::esc::{Esc, EscConfig, EscInfo};
 use crate::foe::FileStore;
@@ -29,8 +30,11 @@ pub struct DeviceOptions {
     /// Local time at power-on.
     pub clock_offset_ns: u64,
     pub plant: PlantParams,
-    /// From port 0 to port 1, and back.
-    pub delay_ns: u64,
+    /// From one port to the next; `None`: 500 out of a port with a PHY, 150 to the E-bus.
+    pub forwarding_ns: Option<u64>,
+    /// What the processing unit, between port 0 and the next, adds to that. Real ESCs take 20 to
+    /// 40; a MainDevice that does not know it misses the delays by half of it per device.
+    pub processing_ns: u64,
     /// EEPROM contents in place of those made from the ESI.
     pub sii: Option<Vec<u8>>,
     /// What the application needs to see a request in AL control and to answer it in AL status.
@@ -48,7 +52,8 @@ impl Default for DeviceOptions {
             clock_drift_ppm: 0.0,
             clock_offset_ns: 0,
             plant: PlantParams::default(),
-            delay_ns: 500,
+            forwarding_ns: None,
+            processing_ns: 0,
             sii: None,
             state_change_ns: 200_000,
             esc: EscInfo::default(),
@@ -121,7 +126,7 @@ impl SimDevice {
                     ram_kib: options.esc.ram_kib.max(ram_kib),
                     ..options.esc
                 },
-                ports: ports(&device.physics),
+                ports: Medium::descriptor(Medium::from_physics(&device.physics)),
                 with_dc: is_drive || uses_dc(device),
                 clock_offset_ns: options.clock_offset_ns,
                 clock_drift_ppm: options.clock_drift_ppm,
@@ -136,7 +141,11 @@ impl SimDevice {
         let has_foe = device.mailbox.as_ref().is_some_and(|mailbox| mailbox.foe);
         let mut sim = Self {
             name: device.type_name.clone(),
-            delay_ns: options.delay_ns,
+            delays: Delays {
+                forwarding_ns: options.forwarding_ns,
+                processing_ns: options.processing_ns,
+            },
+            powered: true,
             state_change_ns: options.state_change_ns,
             fresh: Box::new(Fresh {
                 store: store.clone(),
@@ -254,25 +263,6 @@ fn sm_type(sm: &SyncManager) -> u8 {
 fn is_virtual(device: &Device, sm: u8) -> bool {
     let sm = device.sync_managers.get(usize::from(sm));
     sm.is_some_and(|sm| (1..ADDRESS_SPACE).contains(&usize::from(sm.start_address)))
-}
-
-/// Two bits a port; a device without `Physics` has two MII ports.
-fn ports(physics: &str) -> u8 {
-    if physics.is_empty() {
-        return 0x0f;
-    }
-    physics
-        .bytes()
-        .take(4)
-        .enumerate()
-        .fold(0, |ports, (n, letter)| {
-            let kind = match letter {
-                b'K' | b'E' => 2,
-                b'Y' | b'H' => 3,
-                _ => 0,
-            };
-            ports | kind << (2 * n)
-        })
 }
 
 /// Process RAM that the device's SyncManagers need.

@@ -59,10 +59,29 @@ struct Fresh {
     application: Application,
 }
 
+/// Through the device, from the first bit in to the first bit out.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Delays {
+    /// From one port to the next; `None`: as usual for the port it leaves at.
+    pub(crate) forwarding_ns: Option<u64>,
+    /// What the processing unit adds.
+    pub(crate) processing_ns: u64,
+}
+
+/// What a frame has done to a device that concerns the network.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Seen {
+    /// Receive times are to be latched at every port it passes.
+    pub(crate) latches: bool,
+    /// DL control was written.
+    pub(crate) dl_control: bool,
+}
+
 #[derive(Debug, Clone)]
 pub struct SimDevice {
     name: String,
-    pub(crate) delay_ns: u64,
+    pub(crate) delays: Delays,
+    pub(crate) powered: bool,
     state_change_ns: Nanos,
     pub(crate) esc: Esc,
     store: ObjectStore,
@@ -177,8 +196,14 @@ impl SimDevice {
             .copied()
     }
 
+    /// Without power nothing happens in it any more; it keeps what [`SimDevice::power_on`] clears.
+    pub(crate) fn power_off(&mut self) {
+        self.powered = false;
+    }
+
     /// Everything volatile is lost; objects return to their defaults.
     pub(crate) fn power_on(&mut self, now: Nanos) {
+        self.powered = true;
         self.esc.power_on(now);
         self.store = self.fresh.store.clone();
         self.application = self.fresh.application.clone();
@@ -197,6 +222,9 @@ impl SimDevice {
 
     /// Lets the device live up to `now`. Allocates only for mailbox traffic and state changes.
     pub(crate) fn advance(&mut self, now: Nanos) {
+        if !self.powered {
+            return;
+        }
         let local = self.esc.clock.local(now);
         loop {
             let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.next_pulse());
@@ -265,8 +293,8 @@ impl SimDevice {
             .any(|d| d.len > 0 && d.direction == ecaxis_esi::model::Direction::Rx)
     }
 
-    /// Processes a frame whose first byte arrives at `now`; true if receive times were latched.
-    pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> bool {
+    /// Processes a frame whose first byte arrives at `now`.
+    pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> Seen {
         let local = self.esc.clock.local(now);
         if matches!(self.application, Application::Io { .. }) && !self.sync0_decides() {
             // As digital inputs do: sampled when a frame begins.
@@ -290,7 +318,10 @@ impl SimDevice {
         if raised.sm_written != 0 && self.follows_sm(raised.sm_written) {
             self.exchange();
         }
-        self.esc.take_latch()
+        Seen {
+            latches: self.esc.take_latch(),
+            dl_control: self.esc.dl_control_changed(),
+        }
     }
 
     /// Outputs arrived and no SYNC0 decides when they count.

@@ -163,6 +163,7 @@ impl Esc {
         }
         for (address, value) in (start..).zip(data) {
             let special = (usize::from(reg::DC_RECEIVE_TIMES)..0x0918).contains(&address)
+                || overlaps(address, 1, reg::RX_ERRORS, 0x14)
                 || overlaps(address, 1, reg::AL_CONTROL, 2);
             if !special && self.map.writable(address, 1) {
                 self.mem[address] = *value;
@@ -183,8 +184,6 @@ impl Esc {
     }
 
     fn latch_arrival(&mut self, local: u64) {
-        let [a, b, c, d, ..] = local.to_le_bytes();
-        self.put(reg::DC_RECEIVE_TIMES, &[a, b, c, d]);
         if self.dc.is_some() {
             self.put(reg::DC_RECEIVE_TIME_PU, &local.to_le_bytes());
         }
@@ -198,13 +197,11 @@ impl Esc {
             self.station = self.u16_at(reg::STATION_ADDRESS);
         }
         if touched(reg::DL_CONTROL, 4) {
-            self.loop_control = true;
+            self.dl_control_written(touched(reg::DL_CONTROL + 1, 1));
             let enabled = self.u32_at(reg::DL_CONTROL) & 0x0100_0000 != 0;
             self.alias = enabled.then(|| self.u16_at(reg::STATION_ALIAS));
         }
-        if touched(reg::ERROR_COUNTERS, 0x14) {
-            self.put(reg::ERROR_COUNTERS, &[0; 0x14]);
-        }
+        self.clear_counters(touched);
         if touched(reg::WD_COUNTER, 2) {
             self.put(reg::WD_COUNTER, &[0; 2]);
         }

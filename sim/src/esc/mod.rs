@@ -6,6 +6,7 @@ pub mod dc;
 pub mod eeprom;
 pub mod fmmu;
 pub mod info;
+pub mod ports;
 pub mod registers;
 pub mod sm;
 pub mod watchdog;
@@ -19,6 +20,7 @@ use dc::{Clock, Dc};
 use eeprom::Eeprom;
 use fmmu::Fmmu;
 pub use info::EscInfo;
+use ports::Ports;
 use registers as reg;
 use registers::RegisterMap;
 use sm::SyncManager;
@@ -71,7 +73,7 @@ pub struct Esc {
     station: u16,
     alias: Option<u16>,
     latch: bool,
-    loop_control: bool,
+    ports: Ports,
 }
 
 impl Esc {
@@ -90,7 +92,7 @@ impl Esc {
             station: 0,
             alias: None,
             latch: false,
-            loop_control: false,
+            ports: Ports::new(config.info.ports.unwrap_or(config.ports)),
             config,
         };
         esc.power_on(0);
@@ -140,7 +142,10 @@ impl Esc {
         }
         self.refresh_eeprom();
         self.set_al(AlState::Init, 0);
-        self.set_link(false);
+        self.ports = Ports::new(ports);
+        // EEPROM loaded, PDI watchdog not expired.
+        self.put(reg::DL_STATUS, &[0x03, 0]);
+        self.show_ports();
     }
 
     /// End of process RAM.
@@ -199,28 +204,6 @@ impl Esc {
         self.put(reg::ECAT_EVENT, &events.to_le_bytes());
     }
 
-    /// DL status: port 0 always linked, ports 2 and 3 absent, port 1 as the line goes on.
-    pub(crate) fn set_link(&mut self, next: bool) {
-        let port1 = match (next, self.port1_forced_closed()) {
-            (true, false) => 0x0800 | 0x20,
-            (true, true) => 0x0400 | 0x20,
-            (false, _) => 0x0400,
-        };
-        let status: u16 = 0x5003 | 0x0200 | 0x10 | port1;
-        if self.u16_at(reg::DL_STATUS) != status {
-            self.put(reg::DL_STATUS, &status.to_le_bytes());
-            self.ecat_event(0x04);
-        }
-    }
-
-    /// Loop control "closed" for port 1 cuts the line behind this device.
-    #[must_use]
-    pub fn port1_forced_closed(&self) -> bool {
-        self.bytes(reg::DL_CONTROL + 1, 1)
-            .first()
-            .is_some_and(|b| b >> 2 & 3 == 3)
-    }
-
     /// Device emulation (bit 0 of 0x0141): nobody stands behind the controller, and AL status follows AL
     /// control by itself.
     #[must_use]
@@ -233,19 +216,9 @@ impl Esc {
         self.station
     }
 
-    /// Whether the frame just seen asked to latch receive times; the network fills in port 1.
+    /// Whether the frame just seen asked to latch receive times; the network fills them in.
     pub(crate) fn take_latch(&mut self) -> bool {
         std::mem::take(&mut self.latch)
-    }
-
-    /// Whether DL control, and so perhaps the line's end, changed.
-    pub(crate) fn take_loop_control(&mut self) -> bool {
-        std::mem::take(&mut self.loop_control)
-    }
-
-    pub(crate) fn latch_return(&mut self, now: Nanos) {
-        let local = self.clock.local(now) as u32;
-        self.put(reg::DC_RECEIVE_TIMES + 4, &local.to_le_bytes());
     }
 
     pub(crate) fn take_raised(&mut self) -> Raised {

@@ -21,7 +21,12 @@ pub const PDI_CONFIG: u16 = 0x0150;
 pub const ECAT_EVENT_MASK: u16 = 0x0200;
 pub const ECAT_EVENT: u16 = 0x0210;
 pub const AL_EVENT: u16 = 0x0220;
-pub const ERROR_COUNTERS: u16 = 0x0300;
+/// Invalid frame and RX error counter of each port, then forwarded RX errors.
+pub const RX_ERRORS: u16 = 0x0300;
+pub const FORWARDED_ERRORS: u16 = 0x0308;
+pub const PROCESSING_UNIT_ERRORS: u16 = 0x030c;
+pub const PDI_ERRORS: u16 = 0x030d;
+pub const LOST_LINK: u16 = 0x0310;
 pub const WD_DIVIDER: u16 = 0x0400;
 pub const WD_PDI: u16 = 0x0410;
 pub const WD_PROCESS_DATA: u16 = 0x0420;

@@ -17,6 +17,7 @@ mod script;
 
 use crate::Nanos;
 use crate::device::SimDevice;
+use crate::random::Random;
 pub use script::{Fault, FaultKind, FaultScript, ScriptError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,20 +48,20 @@ pub(crate) struct Loss {
 #[derive(Debug)]
 pub(crate) struct Faults {
     running: Vec<Running>,
-    random: u64,
+    random: Random,
 }
 
 impl Faults {
     pub(crate) fn new(seed: u64) -> Self {
         Self {
             running: Vec::new(),
-            random: seed,
+            random: Random::new(seed),
         }
     }
 
     pub(crate) fn set(&mut self, script: FaultScript) {
         if let Some(seed) = script.seed {
-            self.random = seed;
+            self.random = Random::new(seed);
         }
         let running = script.faults.into_iter().map(|fault| Running {
             left: match fault.kind {
@@ -83,22 +84,14 @@ impl Faults {
         self.running.extend(running);
     }
 
-    /// splitmix64.
-    fn random(&mut self) -> u64 {
-        self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.random ^ self.random >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ z >> 31
-    }
-
-    /// Time of the first start or end up to `to` that is still to be applied, not before `from`.
-    pub(crate) fn next_change(&self, from: Nanos, to: Nanos) -> Option<Nanos> {
+    /// Time of the next start or end that is still to be applied.
+    pub(crate) fn next_change(&self) -> Option<Nanos> {
         let due = self.running.iter().filter_map(|r| match r.phase {
             Phase::Pending => Some(r.fault.at),
             Phase::Active => Some(r.fault.at.saturating_add(r.fault.duration?)),
             Phase::Over => None,
         });
-        due.min().filter(|at| *at <= to).map(|at| at.max(from))
+        due.min()
     }
 
     pub(crate) fn apply(&mut self, now: Nanos, devices: &mut [SimDevice]) {
@@ -118,7 +111,7 @@ impl Faults {
                 (Phase::Active, device) if end.is_some_and(|end| end <= now) => {
                     running.phase = Phase::Over;
                     if let Some(device) = device {
-                        running.end(device, now);
+                        running.end(device);
                     }
                 }
                 _ => {}
@@ -149,16 +142,21 @@ impl Faults {
             .map(|r| &r.fault)
     }
 
-    /// Devices in front of the first absent one.
-    pub(crate) fn present(&self, devices: usize) -> usize {
-        let absent = self
-            .active()
-            .filter(|fault| fault.kind == FaultKind::Absent);
-        absent
-            .map(|fault| fault.device)
-            .min()
-            .unwrap_or(devices)
-            .min(devices)
+    /// The device has no power.
+    pub(crate) fn is_off(&self, device: usize) -> bool {
+        self.active()
+            .any(|fault| fault.device == device && fault.kind == FaultKind::Absent)
+    }
+
+    /// The cable at the port is broken.
+    pub(crate) fn is_cut(&self, device: usize, port: u8) -> bool {
+        self.active()
+            .any(|fault| fault.device == device && fault.kind == FaultKind::LinkBreak { port })
+    }
+
+    /// The cable at the MainDevice is unplugged.
+    pub(crate) fn is_silent(&self) -> bool {
+        self.active().any(|fault| fault.kind == FaultKind::Silent)
     }
 
     /// Decides about the frame that is sent now.
@@ -169,10 +167,6 @@ impl Faults {
                 continue;
             };
             let lost = match running.fault.kind {
-                FaultKind::Silent => {
-                    loss.on_the_way_out = true;
-                    continue;
-                }
                 FaultKind::FrameLoss { count: Some(_), .. } => {
                     let lost = running.left > 0;
                     running.left = running.left.saturating_sub(1);
@@ -181,14 +175,11 @@ impl Faults {
                 FaultKind::FrameLoss {
                     probability: Some(p),
                     ..
-                } => {
-                    // 53 bits: exactly representable.
-                    ((self.random() >> 11) as f64) < p * (1_u64 << 53) as f64
-                }
+                } => self.random.chance(p),
                 _ => false,
             };
             if lost {
-                let out = self.random() & 1 == 0;
+                let out = self.random.next() & 1 == 0;
                 loss.on_the_way_out |= out;
                 loss.on_the_way_back |= !out;
             }
@@ -225,15 +216,11 @@ impl Running {
         }
     }
 
-    fn end(&self, device: &mut SimDevice, now: Nanos) {
-        match self.fault.kind {
-            FaultKind::Absent => device.power_on(now),
-            FaultKind::Identity { .. } => {
-                for (n, value) in self.saved.into_iter().enumerate() {
-                    patch(device, n, value);
-                }
+    fn end(&self, device: &mut SimDevice) {
+        if let FaultKind::Identity { .. } = self.fault.kind {
+            for (n, value) in self.saved.into_iter().enumerate() {
+                patch(device, n, value);
             }
-            _ => {}
         }
     }
 }

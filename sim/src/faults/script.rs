@@ -56,10 +56,15 @@ pub enum FaultKind {
         product: Option<u32>,
         revision: Option<u32>,
     },
-    /// Unplugged and without power: the line ends in front of it; it comes back in Init.
+    /// Without power: its neighbours lose their link, what is behind it or fed by it through the
+    /// E-bus is out of reach; it comes back in Init.
     Absent,
     /// The cable at the MainDevice is unplugged.
     Silent,
+    /// The cable at the device's port carries nothing; both ends lose their link.
+    LinkBreak {
+        port: u8,
+    },
     Emergency {
         code: u16,
     },
@@ -98,6 +103,7 @@ struct RawFault {
     #[serde(rename = "for")]
     duration: Option<String>,
     device: Option<usize>,
+    port: Option<u8>,
     kind: Spanned<String>,
     count: Option<u32>,
     probability: Option<f64>,
@@ -211,15 +217,24 @@ fn check(raw: RawFault, line: u32) -> Result<Fault, String> {
         }
         "absent" => FaultKind::Absent,
         "silent" => FaultKind::Silent,
+        "link-break" => {
+            allowed.push("port");
+            let port = raw.port.unwrap_or(0);
+            if port > 3 {
+                return Err(format!("`port` {port}: ports are 0 to 3"));
+            }
+            FaultKind::LinkBreak { port }
+        }
         _ => {
             return Err(
                 "unknown; known are frame-loss, drive-fault, sdo-abort, refuse-state, stuck, \
-                        identity, absent, silent, emergency"
+                        identity, absent, silent, emergency, link-break"
                     .into(),
             );
         }
     };
     let given = [
+        ("port", raw.port.is_some()),
         ("count", raw.count.is_some()),
         ("probability", raw.probability.is_some()),
         ("code", raw.code.is_some()),
@@ -337,11 +352,16 @@ mod tests {
             [[fault]]
             kind = "emergency"
             code = 0x2310
+            [[fault]]
+            device = 3
+            kind = "link-break"
+            port = 1
             "#,
         )
         .unwrap();
         assert_eq!(script.seed, Some(9));
-        assert_eq!(script.faults.len(), 9);
+        assert_eq!(script.faults.len(), 10);
+        assert_eq!(script.faults[9].kind, FaultKind::LinkBreak { port: 1 });
         assert_eq!(script.faults[0].at, 1_500_000_000);
         assert_eq!(script.faults[0].duration, Some(20_000_000));
         assert_eq!(
@@ -358,6 +378,7 @@ mod tests {
             "line 2: fault of kind `sdo-abort`: `index` is missing"
         );
         assert!(error("[[fault]]\nkind = \"absent\"\ncode = 1\n").contains("`code` means nothing"));
+        assert!(error("[[fault]]\nkind = \"link-break\"\nport = 4\n").contains("ports are 0 to 3"));
         assert!(error("[[fault]]\nkind = \"melt\"\n").contains("known are frame-loss"));
         assert!(error("[[fault]]\nat = \"soon\"\nkind = \"absent\"\n").contains("not a duration"));
         assert!(error("[[fault]]\nkind = \"silent\"\nwhen = 1\n").contains("when"));

@@ -9,7 +9,7 @@ mod stats;
 use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::frame::{self, ETHERTYPE};
+use crate::frame::{self, ETHERTYPE, Kind};
 use crate::{Segment, Transit};
 use socket::{RawSocket, clock};
 pub use stats::{Histogram, ServeStats};
@@ -64,7 +64,7 @@ pub fn serve(
             stats.malformed += 1;
             continue;
         }
-        if !frame::is_valid(bytes) {
+        if frame::kind(bytes) != Kind::EtherCat {
             stats.malformed += 1;
         }
         match segment.transit(bytes, received.at) {

@@ -34,8 +34,12 @@ pub enum Refusal {
 
 impl Bus {
     pub fn new(devices: Vec<SimDevice>) -> Self {
+        Self::over(Segment::new(devices, SegmentOptions::default()))
+    }
+
+    pub fn over(segment: Segment) -> Self {
         Self {
-            segment: Segment::new(devices, SegmentOptions::default()),
+            segment,
             now: 0,
             mailboxes: [(0x1000, 48), (0x1030, 48)],
             counter: 0,
@@ -45,7 +49,7 @@ impl Bus {
     /// Sends a frame, waits for it; `None` if it was lost.
     pub fn frame(&mut self, mut bytes: Vec<u8>) -> Option<Vec<u8>> {
         match self.segment.transit(&mut bytes, self.now) {
-            Transit::Back { at } => {
+            Transit::Back { at, .. } => {
                 assert!(at > self.now);
                 self.now = at;
                 Some(bytes)

@@ -1,0 +1,378 @@
+//! The network: devices, the cables between their ports, and a frame's way through them.
+//!
+//! * [`topology`]: which port leads to which device
+//! * `wiring`: the cables, and whether they carry anything
+//! * `route`: the way of a frame, worked out whenever links or loops change
+//!
+//! A frame is followed from end to end at once, with the time at which it passes each device; what
+//! it does there takes effect in that order.
+
+mod route;
+pub mod topology;
+mod wiring;
+
+use crate::Nanos;
+use crate::device::SimDevice;
+use crate::esc::ports::Medium;
+use crate::faults::{FaultScript, Faults};
+use crate::frame::{self, Kind};
+use route::{Goal, Route};
+use topology::Topology;
+pub use wiring::Nic;
+use wiring::{End, Wiring};
+
+#[derive(Debug, Clone)]
+pub struct SegmentOptions {
+    /// Seed of everything random, unless the fault script brings its own.
+    pub seed: u64,
+    /// Propagation on each cable, one way, unless the topology says otherwise; contacts of the
+    /// E-bus take 5 ns.
+    pub cable_ns: u64,
+}
+
+impl Default for SegmentOptions {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            cable_ns: 25,
+        }
+    }
+}
+
+/// What became of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Transit {
+    Lost,
+    Back {
+        /// Completely received by the MainDevice at this time.
+        at: Nanos,
+        /// The port of the MainDevice that received it.
+        nic: Nic,
+        /// The same frame arrives a second time.
+        again: Option<Nanos>,
+    },
+}
+
+/// A bus of SubDevices; time starts with the first frame or step.
+#[derive(Debug)]
+pub struct Segment {
+    devices: Vec<SimDevice>,
+    topology: Topology,
+    wiring: Wiring,
+    /// From the MainDevice's first and second port.
+    routes: [Route; 2],
+    /// Switched off by hand; faults do so on their own account.
+    off: Vec<bool>,
+    faults: Faults,
+    /// The caller's time that is this world's 0.
+    epoch: Option<Nanos>,
+    /// At each port, a frame cannot leave before the one in front of it has.
+    wire_free: [Nanos; 2],
+    latest: Nanos,
+    /// Nothing happens to the network by itself before.
+    next_change: Nanos,
+    /// Per device: the frame under way latches receive times.
+    latches: Vec<bool>,
+    /// The frame under way wrote DL control.
+    settles: bool,
+}
+
+impl Segment {
+    /// Devices at the ports that [`Topology::by_order`] finds for them; one that finds none is not
+    /// connected.
+    #[must_use]
+    pub fn new(devices: Vec<SimDevice>, options: SegmentOptions) -> Self {
+        let topology = Topology::possible(&topology::media(&devices));
+        Self::with_topology(devices, topology, options)
+    }
+
+    #[must_use]
+    pub fn with_topology(
+        devices: Vec<SimDevice>,
+        topology: Topology,
+        options: SegmentOptions,
+    ) -> Self {
+        let n = devices.len();
+        let mut segment = Self {
+            wiring: Wiring::new(&topology, &devices, options.cable_ns),
+            topology,
+            routes: Default::default(),
+            off: vec![false; n],
+            faults: Faults::new(options.seed),
+            epoch: None,
+            wire_free: [0; 2],
+            latest: 0,
+            next_change: Nanos::MAX,
+            latches: vec![false; n],
+            settles: false,
+            devices,
+        };
+        segment.relink();
+        segment
+    }
+
+    /// Replaces the faults; times in the script count from the segment's first frame or step.
+    pub fn set_faults(&mut self, script: FaultScript) {
+        self.faults.set(script);
+        self.schedule();
+    }
+
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.devices.len()
+    }
+
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.devices.is_empty()
+    }
+
+    #[must_use]
+    pub fn device(&self, position: usize) -> Option<&SimDevice> {
+        self.devices.get(position)
+    }
+
+    pub fn device_mut(&mut self, position: usize) -> Option<&mut SimDevice> {
+        self.devices.get_mut(position)
+    }
+
+    #[must_use]
+    pub fn topology(&self) -> &Topology {
+        &self.topology
+    }
+
+    /// How long a frame takes from the MainDevice's first port to a device's processing unit, first
+    /// bit to first bit; `None` where it does not come there.
+    #[must_use]
+    pub fn delay_ns(&self, device: usize) -> Option<Nanos> {
+        let route = self.routes.first()?;
+        let visit = route.visits.iter().find(|visit| visit.device == device);
+        visit.map(|visit| visit.after)
+    }
+
+    /// Whether there is a cable at the port.
+    #[must_use]
+    pub fn has_cable(&self, device: usize, port: u8) -> bool {
+        self.wiring.cable(End::Port { device, port }).is_some()
+    }
+
+    /// Pulls the cable at a port, or plugs it in again; false where there is none.
+    pub fn plug(&mut self, device: usize, port: u8, plugged: bool) -> bool {
+        let cable = self.wiring.cable(End::Port { device, port });
+        let Some(cable) = cable.and_then(|n| self.wiring.cables.get_mut(n)) else {
+            return false;
+        };
+        cable.pulled = !plugged;
+        self.relink();
+        true
+    }
+
+    /// Takes a device's power, or gives it back: it starts in Init. Devices that it feeds through the
+    /// E-bus go with it.
+    pub fn power(&mut self, device: usize, on: bool) {
+        if let Some(off) = self.off.get_mut(device) {
+            *off = !on;
+            self.relink();
+        }
+    }
+
+    /// Puts another device in a device's place, powered on, and returns the old one.
+    pub fn swap(&mut self, device: usize, other: SimDevice) -> Option<SimDevice> {
+        let was_off = *self.off.get(device)?;
+        self.power(device, false);
+        let old = std::mem::replace(self.devices.get_mut(device)?, other);
+        if let Some(new) = self.devices.get_mut(device) {
+            new.power_off();
+        }
+        self.power(device, !was_off);
+        Some(old)
+    }
+
+    /// The caller's time as true time of the simulated world.
+    #[must_use]
+    pub fn world_time(&self, now: Nanos) -> Nanos {
+        now.saturating_sub(self.epoch.unwrap_or(now))
+    }
+
+    /// Lets devices, clocks and faults run up to `now`.
+    pub fn advance(&mut self, now: Nanos) {
+        let epoch = *self.epoch.get_or_insert(now);
+        let to = now.saturating_sub(epoch).max(self.latest);
+        // Faults strike at their own time, not at the next frame.
+        while self.next_change <= to {
+            let at = self.next_change.max(self.latest);
+            self.run_to(at);
+            self.change(at);
+        }
+        self.run_to(to);
+    }
+
+    fn run_to(&mut self, to: Nanos) {
+        for device in &mut self.devices {
+            device.advance(to);
+        }
+        self.latest = self.latest.max(to);
+    }
+
+    /// Faults begin or end, temporary settings run out.
+    fn change(&mut self, at: Nanos) {
+        self.faults.apply(at, &mut self.devices);
+        for device in &mut self.devices {
+            device.esc.revert_ports(at);
+        }
+        self.relink();
+        self.schedule();
+    }
+
+    fn schedule(&mut self) {
+        let reverts = self.devices.iter().filter_map(|d| d.esc.ports_due());
+        let next = reverts.chain(self.faults.next_change()).min();
+        self.next_change = next.unwrap_or(Nanos::MAX);
+    }
+
+    /// Power, then links, then the ways of frames follow from what is plugged in and switched on.
+    fn relink(&mut self) {
+        for n in 0..self.devices.len() {
+            let switched = !self.off.get(n).is_none_or(|off| *off) && !self.faults.is_off(n);
+            let fed = self.topology.uplink(n).is_none_or(|up| {
+                let own = self.devices.get(n).map(|d| d.esc.media()[0]);
+                let upper = self.devices.get(up.device);
+                own != Some(Medium::Ebus) || upper.is_none_or(|upper| upper.powered)
+            });
+            let Some(device) = self.devices.get_mut(n) else {
+                continue;
+            };
+            match (device.powered, switched && fed) {
+                (true, false) => device.power_off(),
+                (false, true) => device.power_on(self.latest),
+                _ => {}
+            }
+        }
+        let faults = &self.faults;
+        for cable in &mut self.wiring.cables {
+            let cut = cable.ends.iter().any(|end| match *end {
+                End::MainDevice(nic) => nic == Nic::Primary && faults.is_silent(),
+                End::Port { device, port } => faults.is_cut(device, port),
+            });
+            let powered = cable.ends.iter().all(|end| match *end {
+                End::MainDevice(_) => true,
+                End::Port { device, .. } => self.devices.get(device).is_some_and(|d| d.powered),
+            });
+            cable.up = powered && !cut && !cable.pulled;
+            for end in cable.ends {
+                if let End::Port { device, port } = end
+                    && let Some(device) = self.devices.get_mut(device)
+                {
+                    device.esc.set_link(port, cable.up);
+                }
+            }
+        }
+        self.reroute();
+    }
+
+    fn reroute(&mut self) {
+        for (route, nic) in self.routes.iter_mut().zip([Nic::Primary, Nic::Secondary]) {
+            route.trace(nic, &self.wiring, &self.devices);
+        }
+    }
+
+    /// The frame's walk through the devices and back, sent at `now` (never decreasing). In place.
+    pub fn transit(&mut self, bytes: &mut [u8], now: Nanos) -> Transit {
+        self.transit_from(Nic::Primary, bytes, now)
+    }
+
+    /// As [`Segment::transit`], sent from either port of the MainDevice.
+    pub fn transit_from(&mut self, nic: Nic, bytes: &mut [u8], now: Nanos) -> Transit {
+        self.advance(now);
+        let epoch = self.epoch.unwrap_or(now);
+        let free = &mut self.wire_free[nic as usize];
+        let start = now.saturating_sub(epoch).max(*free);
+        let wire = frame::wire_time(bytes.len());
+        *free = start + wire;
+        let loss = self.faults.lose();
+        if loss.on_the_way_out {
+            return Transit::Lost;
+        }
+        let came_through = self.walk(nic, bytes, start);
+        let route = &self.routes[nic as usize];
+        let (goal, back) = (route.goal, start + route.time + wire);
+        if came_through
+            && let Goal::Closed { device, port } = goal
+            && let Some(device) = self.devices.get_mut(device)
+        {
+            device.esc.frame_at_closed_port(port);
+            self.reroute();
+        }
+        self.settle(back);
+        match goal {
+            Goal::Back(nic) if came_through && !loss.on_the_way_back => Transit::Back {
+                at: epoch + back,
+                nic,
+                again: None,
+            },
+            _ => Transit::Lost,
+        }
+    }
+
+    /// First bit sent at `start`; false where a device destroys the frame.
+    fn walk(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos) -> bool {
+        let route = &self.routes[nic as usize];
+        match frame::kind(bytes) {
+            Kind::EtherCat => {}
+            Kind::Foreign => return !route.ethercat_only,
+            Kind::Malformed => {
+                for visit in &route.visits {
+                    if let Some(device) = self.devices.get_mut(visit.device) {
+                        device.esc.count_processing_error();
+                    }
+                }
+                return true;
+            }
+        }
+        let mut latches = false;
+        for visit in &route.visits {
+            if visit.marks_circulating && !frame::circulate(bytes) {
+                return false;
+            }
+            let Some(device) = self.devices.get_mut(visit.device) else {
+                continue;
+            };
+            let at = start + visit.after;
+            device.advance(at);
+            let seen = device.process(bytes, at);
+            latches |= seen.latches;
+            self.settles |= seen.dl_control;
+            if let Some(latch) = self.latches.get_mut(visit.device) {
+                *latch = seen.latches;
+            }
+        }
+        if latches {
+            for pass in &route.passes {
+                if self.latches.get(pass.device) == Some(&true)
+                    && let Some(device) = self.devices.get_mut(pass.device)
+                {
+                    device.esc.latch_port(pass.port, start + pass.after);
+                }
+            }
+        }
+        // SubDevices mark what they pass on: the source address becomes a local one.
+        if route.ethercat_only
+            && let Some(source) = bytes.get_mut(6)
+        {
+            *source |= 0x02;
+        }
+        true
+    }
+
+    /// DL control that the frame wrote takes effect when it is over.
+    fn settle(&mut self, at: Nanos) {
+        if !std::mem::take(&mut self.settles) {
+            return;
+        }
+        for device in &mut self.devices {
+            device.esc.settle_ports(at);
+        }
+        self.reroute();
+        self.schedule();
+    }
+}

@@ -1,0 +1,121 @@
+//! Cables between ports, and whether they carry anything.
+
+use super::topology::{SecondPort, Topology};
+use crate::device::SimDevice;
+use crate::esc::ports::{Medium, PORTS};
+
+/// A port of the MainDevice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Nic {
+    Primary,
+    /// The other end of a ring.
+    Secondary,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum End {
+    MainDevice(Nic),
+    Port { device: usize, port: u8 },
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Cable {
+    pub(super) ends: [End; 2],
+    pub(super) ns: u64,
+    /// Pulled by hand; faults do so on their own account.
+    pub(super) pulled: bool,
+    /// Both ends have a link.
+    pub(super) up: bool,
+}
+
+#[derive(Debug)]
+pub(super) struct Wiring {
+    pub(super) cables: Vec<Cable>,
+    /// Cable at each port of each device.
+    at: Vec<[Option<usize>; PORTS]>,
+    nics: [Option<usize>; 2],
+    pub(super) second: SecondPort,
+}
+
+/// Between two contacts of the E-bus, one way.
+const EBUS_NS: u64 = 5;
+
+impl Wiring {
+    pub(super) fn new(topology: &Topology, devices: &[SimDevice], cable_ns: u64) -> Self {
+        let mut wiring = Self {
+            cables: Vec::new(),
+            at: vec![[None; PORTS]; devices.len()],
+            nics: [None; 2],
+            second: SecondPort::Listens,
+        };
+        let ebus = |device: usize| {
+            let device = devices.get(device);
+            device.is_some_and(|d| d.esc().media()[0] == Medium::Ebus)
+        };
+        for (device, uplink) in topology.uplinks.iter().enumerate().take(devices.len()) {
+            let upper = match uplink {
+                Some(up) => End::Port {
+                    device: up.device,
+                    port: up.port,
+                },
+                None if device == 0 => End::MainDevice(Nic::Primary),
+                None => continue,
+            };
+            let usual = if ebus(device) && uplink.is_some() {
+                EBUS_NS
+            } else {
+                cable_ns
+            };
+            let own = topology.cable_ns.get(device).copied().flatten();
+            wiring.lay(upper, End::Port { device, port: 0 }, own.unwrap_or(usual));
+        }
+        if let Some((last, second)) = topology.ring {
+            let last = End::Port {
+                device: last.device,
+                port: last.port,
+            };
+            wiring.lay(last, End::MainDevice(Nic::Secondary), cable_ns);
+            wiring.second = second;
+        }
+        wiring
+    }
+
+    fn lay(&mut self, a: End, b: End, ns: u64) {
+        let n = self.cables.len();
+        self.cables.push(Cable {
+            ends: [a, b],
+            ns,
+            pulled: false,
+            up: false,
+        });
+        for end in [a, b] {
+            match end {
+                End::MainDevice(nic) => self.nics[nic as usize] = Some(n),
+                End::Port { device, port } => {
+                    if let Some(at) = self
+                        .at
+                        .get_mut(device)
+                        .and_then(|ports| ports.get_mut(usize::from(port)))
+                    {
+                        *at = Some(n);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Number of the cable at an end.
+    pub(super) fn cable(&self, end: End) -> Option<usize> {
+        match end {
+            End::MainDevice(nic) => self.nics[nic as usize],
+            End::Port { device, port } => *self.at.get(device)?.get(usize::from(port))?,
+        }
+    }
+
+    /// Where a frame that leaves at `end` arrives, and how long it takes.
+    pub(super) fn other_end(&self, end: End) -> Option<(End, u64)> {
+        let cable = self.cables.get(self.cable(end)?)?;
+        let [a, b] = cable.ends;
+        cable.up.then_some((if a == end { b } else { a }, cable.ns))
+    }
+}
