@@ -108,7 +108,8 @@ fn a_closed_port_cuts_the_line() {
     let mut bus = three_io();
     bus.write(0x1001, 0x101, &[0x0c]);
     assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 1);
-    assert_eq!(bus.read_u16(0x1001, 0x110), 0x5633);
+    // Closed, though there is a link.
+    assert_eq!(bus.read_u16(0x1001, 0x110), 0x5e33);
     bus.write(0x1001, 0x101, &[0]);
     bus.datagram(7, 0, 0, &[0]);
     assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 3);
@@ -309,7 +310,11 @@ fn an_absent_device_ends_the_line_and_comes_back_in_init() {
         0,
         "no station address any more"
     );
-    assert_eq!(bus.read_u16(0x1003, 0x130), 1);
+    assert_eq!(
+        bus.datagram(4, 0x1003, 0, &[0]).1,
+        0,
+        "the one in front of it fed it"
+    );
 }
 
 #[test]
@@ -370,7 +375,10 @@ proptest! {
         for (command, adp, ado, data) in datagrams {
             let frame = FrameBuilder::default().datagram(command, adp, ado, &data).build();
             let len = frame.len();
-            prop_assert_eq!(bus.frame(frame).map(|f| f.len()), Some(len));
+            // Who opens a port without a link loses frames.
+            if let Some(back) = bus.frame(frame) {
+                prop_assert_eq!(back.len(), len);
+            }
             bus.wait(300_000);
         }
     }
