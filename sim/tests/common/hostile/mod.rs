@@ -9,7 +9,7 @@ use std::path::Path;
 
 use ecaxis_esi::model::EsiFile;
 use ecaxis_esi::{Choice, Mode, select};
-use ecaxis_sim::frame::{self, Command, FrameBuilder};
+use ecaxis_sim::frame::{self, Command, FrameBuilder, Kind};
 use ecaxis_sim::{AlState, DeviceOptions, FaultScript, Segment, SimDevice, Transit};
 
 use crate::common::{Bus, INIT, OP, PREOP, SAFEOP};
@@ -189,7 +189,7 @@ impl Hostile {
         let victim = &self.victims[n];
         let position = 0_u16.wrapping_sub(n as u16);
         let mut frame = FrameBuilder::default()
-            .datagram(2, position, 0x103, &[0])
+            .datagram(2, position, 0x100, &[1, 0, 7, 0])
             .datagram(2, position, 0x010, &victim.station.to_le_bytes());
         for (number, start, len, control) in &victim.sync_managers {
             let (s, l) = (start.to_le_bytes(), len.to_le_bytes());
@@ -425,7 +425,7 @@ pub fn exchange(segment: &mut Segment, now: u64, sent: &[u8]) -> Option<Vec<u8>>
     let mut back = sent.to_vec();
     match segment.transit(&mut back, now) {
         Transit::Lost => None,
-        Transit::Back { at } => {
+        Transit::Back { at, .. } => {
             assert!(at > now, "back before it was sent");
             compare(segment.len(), sent, &back);
             Some(back)
@@ -441,10 +441,13 @@ fn wkc(bytes: &[u8]) -> u16 {
 fn compare(devices: usize, sent: &[u8], back: &[u8]) {
     assert_eq!(sent.len(), back.len(), "length");
     let mut expected = sent.to_vec();
-    if let Some(source) = expected.get_mut(6) {
-        *source |= 0x02;
+    // Unless DL control says that other protocols may pass, the source is marked.
+    if let (Some(source), Some(back)) = (expected.get_mut(6), back.get(6))
+        && *back == *source | 0x02
+    {
+        *source = *back;
     }
-    if !frame::is_valid(sent) {
+    if frame::kind(sent) != Kind::EtherCat {
         assert_eq!(expected, back, "what is not well-formed passes untouched");
         return;
     }
