@@ -164,7 +164,15 @@ fn a_start_time_in_the_past_never_starts_and_refuses_op() {
     bus.to(0x1001, SAFEOP);
     bus.wait(100_000_000);
     assert_eq!(bus.segment.device(0).unwrap().sync0_count(), 0);
-    assert_eq!(bus.request(0x1001, 8), (0x14, 0x2d));
+    // The device cannot know: it waits for a pulse until its patience is over.
+    assert_eq!(bus.request(0x1001, 8), (4, 0));
+    bus.wait(4_900_000_000);
+    assert_eq!(bus.read_u16(0x1001, 0x130), 4);
+    bus.wait(200_000_000);
+    assert_eq!(
+        (bus.read_u16(0x1001, 0x130), bus.read_u16(0x1001, 0x134)),
+        (0x14, 0x2d)
+    );
 }
 
 #[test]
@@ -219,6 +227,200 @@ fn outputs_take_effect_and_inputs_are_latched_at_sync0() {
     );
     bus.wait(CYCLE);
     assert_eq!(bus.logical(12, 0, &[1, 0, 2, 0]), (vec![1, 0, 2, 0], 3));
+}
+
+/// Parts per million, nanoseconds at power-on.
+const EIGHT: [(f64, u64); 8] = [
+    (12.0, 5_000),
+    (50.0, 7_000_000),
+    (-50.0, 123_456_789),
+    (37.5, 99),
+    (-43.0, 1_000_000_000),
+    (4.0, 0),
+    (-21.0, 77_777_777_777),
+    (29.0, 4_294_967_000),
+];
+
+/// A bus whose MainDevice is this test: it measures delays, sets offsets and sends the reference's time on.
+struct Eight {
+    bus: Bus,
+    next: u64,
+}
+
+impl Eight {
+    fn new(jitter: u32) -> Self {
+        let devices = (1..).zip(EIGHT).map(|(seed, (ppm, offset))| {
+            let options = DeviceOptions {
+                clock_drift_ppm: ppm,
+                clock_offset_ns: offset,
+                clock_jitter_ns: jitter,
+                jitter_seed: seed,
+                ..DeviceOptions::default()
+            };
+            sim_with(&coe_device(), options)
+        });
+        let mut bus = Bus::new(devices.collect());
+        assert_eq!(bus.address_all(), 8);
+        let mut eight = Self { bus, next: 0 };
+        eight.set_up();
+        eight
+    }
+
+    fn stations() -> std::ops::Range<u16> {
+        0x1001..0x1009
+    }
+
+    fn device(&self, n: usize) -> &ecaxis_sim::SimDevice {
+        self.bus.segment.device(n).unwrap()
+    }
+
+    fn set_up(&mut self) {
+        let bus = &mut self.bus;
+        // Delays are averaged over several measurements, as time stamps may be noisy.
+        let mut spans = [0_u64; 8];
+        for _ in 0..16 {
+            assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 8);
+            for (span, station) in spans[..7].iter_mut().zip(Self::stations()) {
+                let times = bus.read(station, 0x900, 8);
+                let port = |n: usize| u32::from_le_bytes(times[n..n + 4].try_into().unwrap());
+                *span += u64::from(port(4).wrapping_sub(port(0)));
+            }
+        }
+        let mut delay = 0;
+        for (n, station) in Self::stations().enumerate() {
+            if n > 0 {
+                delay += (spans[n - 1] - spans[n]) / 2;
+            }
+            let total = u32::try_from(delay / 16).unwrap();
+            bus.write(station, 0x928, &total.to_le_bytes());
+        }
+        assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 8);
+        let epoch = 800_000_000_000_000_000_u64;
+        for station in Self::stations() {
+            let local = u64::from_le_bytes(bus.read(station, 0x918, 8).try_into().unwrap());
+            bus.write(station, 0x920, &epoch.wrapping_sub(local).to_le_bytes());
+        }
+        assert_eq!(bus.datagram(8, 0, 0x930, &[0, 0x10]).1, 8, "filters anew");
+        self.next = (bus.now / CYCLE + 1) * CYCLE;
+    }
+
+    /// One cycle: the reference's time, and what the others think of it.
+    fn cycle(&mut self) -> Vec<u32> {
+        self.bus.now = self.next;
+        self.next += CYCLE;
+        let frame = Self::stations().fold(
+            FrameBuilder::default().datagram(14, 0x1001, 0x910, &[0; 8]),
+            |frame, station| frame.datagram(4, station, 0x92c, &[0; 4]),
+        );
+        let bytes = self.bus.frame(frame.build()).unwrap();
+        let first = ecaxis_sim::frame::next(&bytes, None).unwrap();
+        assert_eq!(first.wkc(&bytes), 8);
+        let mut differences = Vec::new();
+        let mut at = ecaxis_sim::frame::next(&bytes, Some(&first));
+        while let Some(datagram) = at {
+            let raw = bytes[datagram.data.clone()].try_into().unwrap();
+            differences.push(u32::from_le_bytes(raw) & 0x7fff_ffff);
+            at = ecaxis_sim::frame::next(&bytes, Some(&datagram));
+        }
+        assert_eq!(differences.len(), 8);
+        differences
+    }
+
+    /// System times of all devices at one instant of true time, from the reference's.
+    fn apart(&self) -> Vec<i64> {
+        let time = |n| self.device(n).system_time(self.bus.now).unwrap();
+        (0..8)
+            .map(|n| time(n).wrapping_sub(time(0)).cast_signed())
+            .collect()
+    }
+
+    fn spread(&self) -> i64 {
+        let apart = self.apart();
+        apart.iter().max().unwrap() - apart.iter().min().unwrap()
+    }
+
+    /// Largest difference in true time between the pulses of one cycle, over the pulses logged.
+    fn pulses_apart(&self) -> u64 {
+        let logs: Vec<Vec<u64>> = (0..8)
+            .map(|n| self.device(n).sync0_log().collect())
+            .collect();
+        let len = logs[0].len();
+        assert!(len >= 32 && logs.iter().all(|log| log.len() == len));
+        let spread = |n: usize| {
+            let pulses = || logs.iter().map(|log| log[n]);
+            pulses().max().unwrap() - pulses().min().unwrap()
+        };
+        (0..len).map(spread).max().unwrap()
+    }
+
+    fn start_sync0(&mut self) {
+        let now = self.device(0).system_time(self.bus.now).unwrap();
+        let start = (now / CYCLE + 100) * CYCLE + CYCLE / 2;
+        for station in Self::stations() {
+            activate(&mut self.bus, station, start);
+        }
+        self.next = (self.bus.now / CYCLE + 1) * CYCLE;
+    }
+}
+
+/// Ten seconds of system times at 1 kHz: (milliseconds until 0x092C stays below 100, largest 0x092C afterwards,
+/// largest true difference, largest difference of pulses).
+fn ten_seconds(eight: &mut Eight) -> (u64, u32, i64, u64) {
+    const MS: u64 = 10_000;
+    let (mut locked, mut worst, mut apart, mut pulses) = (0, 0, 0, 0);
+    for ms in 0..MS {
+        let largest = eight.cycle().into_iter().max().unwrap();
+        if largest >= 100 {
+            (locked, worst, apart) = (ms + 1, 0, 0);
+            continue;
+        }
+        worst = worst.max(largest);
+        apart = apart.max(eight.spread());
+        if ms == 3_000 {
+            eight.start_sync0();
+        }
+        // The log keeps 64 pulses: every pulse is looked at.
+        if ms > 3_300 && ms % 60 == 0 {
+            pulses = pulses.max(eight.pulses_apart());
+        }
+    }
+    (locked, worst, apart, pulses)
+}
+
+#[test]
+fn eight_clocks_lock_fire_together_and_part_at_their_crystals_rates() {
+    let mut eight = Eight::new(0);
+    let (locked, worst, apart, pulses) = ten_seconds(&mut eight);
+    assert!(locked < 1_000, "locked after {locked} ms");
+    assert!(worst < 100, "0x092C: {worst} ns");
+    assert!(apart < 100, "clocks: {apart} ns");
+    assert!(pulses < 200, "SYNC0: {pulses} ns");
+
+    // Without system times the clocks go on at the rates they have learnt.
+    eight.bus.wait(1_000_000_000);
+    let spread = eight.spread();
+    assert!(spread < 300, "{spread} ns after a second without FRMW");
+
+    // Without what was learnt each runs at its crystal's rate.
+    assert_eq!(eight.bus.datagram(8, 0, 0x930, &[0, 0x10]).1, 8);
+    let before = eight.apart();
+    eight.bus.wait(1_000_000_000);
+    let after = eight.apart();
+    for n in 1..8 {
+        let ppm = (after[n] - before[n]) as f64 * 1e-3;
+        let expected = EIGHT[n].0 - EIGHT[0].0;
+        let error = (ppm - expected).abs() / expected.abs();
+        assert!(error < 0.02, "device {n}: {ppm} ppm instead of {expected}");
+    }
+}
+
+#[test]
+fn eight_clocks_with_noisy_time_stamps_lock_as_well() {
+    let mut eight = Eight::new(10);
+    let (locked, worst, apart, pulses) = ten_seconds(&mut eight);
+    assert!(locked < 1_000, "locked after {locked} ms");
+    assert!(worst < 100 && apart < 100, "{worst} ns, {apart} ns");
+    assert!((1..200).contains(&pulses), "SYNC0: {pulses} ns");
 }
 
 fn run() -> Vec<u8> {

@@ -34,12 +34,13 @@ fn a_mailbox_is_locked_until_it_is_emptied() {
     let upload = [0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0];
     assert_eq!(bus.fetch(S), None, "nothing to read");
     bus.send_mailbox(S, 3, &upload);
-    assert_eq!(bus.read(S, 0x805, 1), [8]);
+    assert_eq!(bus.read(S, 0x805, 1), [9], "full, written");
     assert_eq!(bus.datagram(5, S, 0x1000, &[0; 48]).1, 0, "still full");
     bus.wait(1_000_000);
     assert_eq!(
         (bus.read(S, 0x805, 1), bus.read(S, 0x80d, 1)),
-        (vec![0], vec![8])
+        (vec![2], vec![9]),
+        "read by the device; full, written by it"
     );
     assert_eq!(
         bus.datagram(4, S, 0x1050, &[0; 16]).1,
@@ -49,7 +50,7 @@ fn a_mailbox_is_locked_until_it_is_emptied() {
     let (kind, reply) = bus.fetch(S).unwrap();
     assert_eq!((kind, &reply[..3]), (3, &[0, 0x30, 0x43][..]));
     assert_eq!(bus.fetch(S), None);
-    assert_eq!(bus.read(S, 0x80d, 1), [0]);
+    assert_eq!(bus.read(S, 0x80d, 1), [2], "empty, read");
 }
 
 #[test]
@@ -78,7 +79,7 @@ fn in_init_mailboxes_are_not_served() {
     bus.send_mailbox(S, 3, &[0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0]);
     bus.wait(1_000_000);
     assert_eq!(bus.fetch(S), None);
-    assert_eq!(bus.read(S, 0x805, 1), [8]);
+    assert_eq!(bus.read(S, 0x805, 1), [9], "full, written");
     bus.to(S, PREOP);
     assert_eq!(bus.read(S, 0x805, 1), [0], "forgotten on the way to PreOp");
 }
@@ -185,7 +186,7 @@ fn whoever_never_fetches_is_told_and_then_held_back() {
         bus.wait(1_000_000);
         assert_eq!(
             bus.read(S, 0x805, 1),
-            [if n < 5 { 0 } else { 8 }],
+            [if n < 5 { 2 } else { 9 }],
             "request {n}"
         );
     }
@@ -254,7 +255,7 @@ fn another_request_under_the_last_counter_is_dropped() {
         &counted(5, &[0, 0x20, 0x2f, 0, 0x20, 0, 3, 0, 0, 0]),
     );
     bus.wait(1_000_000);
-    assert_eq!((bus.fetch(S), bus.read(S, 0x805, 1)), (None, vec![0]));
+    assert_eq!((bus.fetch(S), bus.read(S, 0x805, 1)), (None, vec![2]));
 }
 
 #[test]
@@ -285,10 +286,10 @@ fn a_request_repeated_while_the_device_works_on_it_is_answered_once() {
     let request = counted(1, &UPLOAD);
     bus.write(S, 0x1000, &request);
     bus.wait(1_000_000);
-    assert_eq!(bus.read(S, 0x805, 1), [0], "fetched");
+    assert_eq!(bus.read(S, 0x805, 1), [2], "fetched");
     bus.write(S, 0x1000, &request);
     bus.wait(15_000_000);
-    assert_eq!(bus.read(S, 0x805, 1), [8], "busy with the first");
+    assert_eq!(bus.read(S, 0x805, 1), [9], "busy with the first");
     assert_eq!(bus.fetch(S), None);
     bus.wait(50_000_000);
     assert!(bus.fetch(S).is_some());

@@ -395,7 +395,7 @@ impl Exchange {
     }
 }
 
-/// 0x092C: bit 31 is the sign (own clock behind), the rest the amount.
+/// 0x092C, received − own time: bit 31 is the sign (own clock ahead), the rest the amount.
 fn sign_magnitude(raw: u32) -> i32 {
     let amount = i32::try_from(raw & 0x7fff_ffff).unwrap_or(i32::MAX);
     if raw & 0x8000_0000 == 0 {

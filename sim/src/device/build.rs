@@ -6,13 +6,14 @@ use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 use super::esm::Al;
 use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
-use super::{Application, Delays, Fresh, MailboxLimits, SYNC_LOG, SimDevice};
+use super::{Application, Delays, Fresh, MailboxLimits, SimDevice};
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::drive::{Drive, PlantParams};
+use crate::esc::info::Needs;
 use crate::esc::ports::Medium;
-use crate::esc::registers::ADDRESS_SPACE;
+use crate::esc::registers::{ADDRESS_SPACE, PROCESS_RAM};
 use crate::esc::{Esc, EscConfig, EscInfo};
 use crate::foe::FileStore;
 
@@ -29,6 +30,9 @@ pub struct DeviceOptions {
     pub clock_drift_ppm: f64,
     /// Local time at power-on.
     pub clock_offset_ns: u64,
+    /// Noise on the time stamps of frames, ± nanoseconds, drawn from a seed.
+    pub clock_jitter_ns: u32,
+    pub jitter_seed: u64,
     pub plant: PlantParams,
     /// From one port to the next; `None`: 500 out of a port with a PHY, 150 to the E-bus.
     pub forwarding_ns: Option<u64>,
@@ -39,8 +43,8 @@ pub struct DeviceOptions {
     pub sii: Option<Vec<u8>>,
     /// What the application needs to see a request in AL control and to answer it in AL status.
     pub state_change_ns: Nanos,
-    /// The chip. Process RAM grows where the device's SyncManagers need more.
-    pub esc: EscInfo,
+    /// The chip; `None`: the smallest in which the device fits. Process RAM grows where SyncManagers need more.
+    pub esc: Option<EscInfo>,
     pub mailbox: MailboxOptions,
 }
 
@@ -51,12 +55,14 @@ impl Default for DeviceOptions {
             alias: 0,
             clock_drift_ppm: 0.0,
             clock_offset_ns: 0,
+            clock_jitter_ns: 0,
+            jitter_seed: 0,
             plant: PlantParams::default(),
             forwarding_ns: None,
             processing_ns: 0,
             sii: None,
             state_change_ns: 200_000,
-            esc: EscInfo::default(),
+            esc: None,
             mailbox: MailboxOptions::default(),
         }
     }
@@ -85,7 +91,7 @@ impl SimDevice {
         modules: &[Module],
         options: DeviceOptions,
     ) -> Result<Self, SimError> {
-        let ram_kib = ram_kib(device)?;
+        let ram_end = ram_end(device)?;
         let image = match options.sii {
             Some(image) => image,
             None => {
@@ -120,16 +126,31 @@ impl SimDevice {
                 held: Vec::new(),
             }
         };
+        let ram_end = ram_end.max(mapped_end(device, &pdo, &store)).min(0x1_0000);
+        let ram_kib = count((ram_end - PROCESS_RAM).div_ceil(1024));
+        let needs = Needs {
+            ports: Medium::descriptor(Medium::from_physics(&device.physics)),
+            fmmus: count(device.fmmus.len()),
+            sync_managers: count(device.sync_managers.len()),
+            ram_kib,
+            clock: is_drive || uses_dc(device),
+            sync: is_drive || !device.dc_modes.is_empty(),
+        };
+        let info = options
+            .esc
+            .unwrap_or_else(|| EscInfo::fitting(&needs, image.len()));
         let esc = Esc::new(
             EscConfig {
                 info: EscInfo {
-                    ram_kib: options.esc.ram_kib.max(ram_kib),
-                    ..options.esc
+                    ram_kib: info.ram_kib.max(ram_kib),
+                    ..info
                 },
-                ports: Medium::descriptor(Medium::from_physics(&device.physics)),
-                with_dc: is_drive || uses_dc(device),
+                ports: needs.ports,
+                with_dc: needs.clock,
                 clock_offset_ns: options.clock_offset_ns,
                 clock_drift_ppm: options.clock_drift_ppm,
+                clock_jitter_ns: options.clock_jitter_ns,
+                jitter_seed: options.jitter_seed,
             },
             image,
         );
@@ -168,8 +189,9 @@ impl SimDevice {
             files: FileStore::default(),
             al: Al::default(),
             tick: 0,
-            sync_log: [0; SYNC_LOG],
-            sync_count: 0,
+            pulses: Default::default(),
+            local: 0,
+            hangs: false,
             refusals: Vec::new(),
             forced_aborts: Vec::new(),
         };
@@ -265,9 +287,13 @@ fn is_virtual(device: &Device, sm: u8) -> bool {
     sm.is_some_and(|sm| (1..ADDRESS_SPACE).contains(&usize::from(sm.start_address)))
 }
 
-/// Process RAM that the device's SyncManagers need.
-fn ram_kib(device: &Device) -> Result<u8, SimError> {
-    let mut end = 0x1000;
+fn count(n: usize) -> u8 {
+    u8::try_from(n).unwrap_or(u8::MAX)
+}
+
+/// Where the process RAM that the device's SyncManagers need ends, as far as the ESI gives their sizes.
+fn ram_end(device: &Device) -> Result<usize, SimError> {
+    let mut end = PROCESS_RAM;
     for (n, sm) in device.sync_managers.iter().enumerate() {
         let (start, len) = (sm.start_address, sm.max_size.unwrap_or(sm.default_size));
         let mailbox = matches!(sm.usage, SmUse::MBoxOut | SmUse::MBoxIn);
@@ -283,7 +309,20 @@ fn ram_kib(device: &Device) -> Result<u8, SimError> {
         }
         end = end.max(last);
     }
-    Ok(u8::try_from((end - 0x1000).div_ceil(1024)).unwrap_or(u8::MAX))
+    Ok(end)
+}
+
+/// The same for the PDOs that are assigned at power-on. What modules will be plugged nobody knows: such a device
+/// gets 8 KiB.
+fn mapped_end(device: &Device, pdo: &PdoRules, store: &ObjectStore) -> usize {
+    let mut map = Vec::new();
+    let modular = if device.slots.is_some() { 0x3000 } else { 0 };
+    device
+        .sync_managers
+        .iter()
+        .zip(0..)
+        .map(|(sm, n)| usize::from(sm.start_address) + 3 * pdo.layout(store, n, &mut map))
+        .fold(modular, usize::max)
 }
 
 fn mailbox(device: &Device) -> Option<Mailbox> {

@@ -5,7 +5,6 @@ use ecaxis_esi::model::Direction;
 use super::{Application, SimDevice};
 use crate::drive::DeviceError;
 use crate::esc::al::{self, AlState, Request, code, judge};
-use crate::esc::dc::Sync0;
 use crate::esc::registers as reg;
 use crate::esc::sm::{Filled, Mode, SyncManager};
 
@@ -44,8 +43,8 @@ impl SimDevice {
         self.al.due = local.saturating_add(self.state_change_ns);
     }
 
-    /// No application judges the request. The acknowledge bit is copied, too, and then looks like an error
-    /// (ET1100 data sheet, section II, "Device emulation"; EK1100 and EL1004 do so in recordings).
+    /// The controller has answered already, and no application could refuse. It copies the acknowledge bit, too, which
+    /// then looks like an error (EK1100 and EL1004 do so in recordings).
     fn emulate(&mut self, control: u16) {
         let to = AlState::from_code((control & 0x0f) as u8);
         let refusal = self.refusals.iter().find(|(state, _)| Some(*state) == to);
@@ -53,10 +52,9 @@ impl SimDevice {
             return self.settle(self.al.state, *code);
         }
         if let Some(to) = to {
-            self.enter(to);
+            self.change(to);
+            self.latch_inputs();
         }
-        let status = control & (0x0f | al::ERROR);
-        self.esc.put(reg::AL_STATUS, &status.to_le_bytes());
         self.esc.put(reg::AL_STATUS_CODE, &[0, 0]);
     }
 
@@ -66,6 +64,7 @@ impl SimDevice {
         if std::mem::take(&mut self.al.waits_for_sync) {
             return self.finish_op();
         }
+        self.esc.read_al_control();
         match judge(self.al.state, self.al.code != 0, self.al.control) {
             Request::Ignored => {}
             Request::Stay => self.settle(self.al.state, 0),
@@ -85,13 +84,7 @@ impl SimDevice {
 
     /// On the way to Op with a SYNC0 that runs: the wait is over.
     pub(super) fn first_sync_seen(&mut self) {
-        let pulses = self.esc.dc.as_ref().map_or(0, |dc| dc.pulses);
-        let never = self
-            .esc
-            .dc
-            .as_ref()
-            .is_some_and(|dc| dc.sync0 == Sync0::NeverStarts);
-        if self.al.waits_for_sync && (pulses > 0 || never) {
+        if self.al.waits_for_sync && self.sync0_pulses() > 0 {
             self.al.waits_for_sync = false;
             self.al.due = u64::MAX;
             self.finish_op();
@@ -99,7 +92,7 @@ impl SimDevice {
     }
 
     fn finish_op(&mut self) {
-        if self.esc.dc.as_ref().is_some_and(|dc| dc.pulses > 0) {
+        if self.sync0_pulses() > 0 {
             self.enter(AlState::Op);
         } else {
             self.settle(self.al.state, code::NO_SYNC_ERROR);
@@ -112,8 +105,8 @@ impl SimDevice {
         self.esc.set_al(state, code);
         if code == 0 && self.al.control & al::DEVICE_ID != 0 {
             let id = self.esc.u16_at(reg::STATION_ALIAS);
-            let status = u16::from(state.code()) | al::DEVICE_ID;
-            self.esc.put(reg::AL_STATUS, &status.to_le_bytes());
+            self.esc
+                .put_al_status(u16::from(state.code()) | al::DEVICE_ID);
             self.esc.put(reg::AL_STATUS_CODE, &id.to_le_bytes());
         }
     }
@@ -234,29 +227,27 @@ impl SimDevice {
         if self.esc.u32_at(reg::DC_SYNC0_CYCLE) == 0 {
             return Err(code::INVALID_SYNC_CYCLE);
         }
-        match self.esc.dc.as_ref().map(|dc| dc.sync0) {
-            Some(Sync0::NeverStarts) if self.al.state == AlState::SafeOp => {
-                Err(code::NO_SYNC_ERROR)
-            }
-            _ => Ok(()),
-        }
+        Ok(())
     }
 
     fn enter(&mut self, to: AlState) {
-        let from = self.al.state;
+        self.change(to);
+        self.settle(to, 0);
+        self.latch_inputs();
+        self.pump_mailbox();
+    }
+
+    /// What leaving one state and entering another does to SyncManagers and outputs.
+    fn change(&mut self, to: AlState) {
+        let from = std::mem::replace(&mut self.al.state, to);
         if from == AlState::Op && to != from {
             self.drop_outputs();
         }
-        match to {
-            AlState::SafeOp if from < to => {
-                self.lay_out();
-                self.close_process_data(false);
-            }
-            AlState::Init | AlState::PreOp | AlState::Boot => {
-                self.close_process_data(true);
-                self.esc.watchdog.stop();
-            }
-            _ => {}
+        if from < AlState::SafeOp && to >= AlState::SafeOp {
+            self.lay_out();
+            self.close_process_data(false);
+        } else if to < AlState::SafeOp {
+            self.close_process_data(true);
         }
         if (to == AlState::Init || from == AlState::Init)
             && let Some(mailbox) = &mut self.mailbox
@@ -269,20 +260,13 @@ impl SimDevice {
                 self.esc.refresh_sm(n);
             }
         }
-        self.settle(to, 0);
-        self.latch_inputs();
-        self.pump_mailbox();
     }
 
     /// Only an application can hold SyncManagers closed.
     pub(super) fn close_process_data(&mut self, closed: bool) {
         let closed = closed && !self.esc.emulates_device();
         for data in &self.process {
-            if let Some(sm) = self.esc.sms.get_mut(data.sm) {
-                sm.closed_by_device = closed;
-                sm.full = false;
-            }
-            self.esc.refresh_sm(data.sm);
+            self.esc.close_sm(data.sm, closed);
         }
     }
 
@@ -303,10 +287,8 @@ impl SimDevice {
     pub(super) fn watchdog_expired(&mut self) {
         self.esc.expire_watchdog();
         self.drop_outputs();
-        if self.esc.emulates_device() {
-            return;
-        }
-        if self.al.state == AlState::Op {
+        let minds = self.application_runs() && !self.esc.emulates_device();
+        if self.al.state == AlState::Op && minds {
             self.fall_to(
                 AlState::SafeOp,
                 code::SM_WATCHDOG,
@@ -317,8 +299,8 @@ impl SimDevice {
 
     /// The MainDevice changed SyncManagers or SYNC0 under a running application.
     pub(super) fn configuration_changed(&mut self, sms: bool, sync: bool) {
-        let unjudged = self.al.state < AlState::SafeOp || self.esc.emulates_device();
-        if unjudged || self.al.state == AlState::Boot {
+        let minds = self.application_runs() && !self.esc.emulates_device();
+        if self.al.state < AlState::SafeOp || !minds {
             return;
         }
         if sms && let Err(code) = self.check_process_data() {

@@ -151,7 +151,7 @@ fn the_chip_and_its_ports_show_in_the_information_registers() {
         ),
     ] {
         let options = DeviceOptions {
-            esc,
+            esc: Some(esc),
             ..DeviceOptions::default()
         };
         let device = SimDevice::from_sii(&image, options).unwrap();

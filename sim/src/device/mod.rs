@@ -22,7 +22,7 @@ use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::{CONTROL_PERIOD_NS, Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
-use crate::esc::dc::Sync0;
+use crate::esc::dc::sync::Edges;
 use crate::foe::FileStore;
 use crate::frame;
 pub use build::{DeviceOptions, SimError};
@@ -33,6 +33,39 @@ use process::{Mirror, ProcessData};
 
 /// Pulses remembered by [`SimDevice::sync0_log`].
 const SYNC_LOG: usize = 64;
+
+/// True times of a SYNC output's pulses.
+#[derive(Debug, Clone)]
+struct PulseLog {
+    count: u64,
+    times: [Nanos; SYNC_LOG],
+}
+
+impl Default for PulseLog {
+    fn default() -> Self {
+        Self {
+            count: 0,
+            times: [0; SYNC_LOG],
+        }
+    }
+}
+
+impl PulseLog {
+    fn push(&mut self, at: Nanos) {
+        if let Some(entry) = self.times.get_mut((self.count % SYNC_LOG as u64) as usize) {
+            *entry = at;
+        }
+        self.count += 1;
+    }
+
+    /// The last ones, oldest first.
+    fn last(&self) -> impl Iterator<Item = Nanos> + '_ {
+        let kept = self.count.min(SYNC_LOG as u64);
+        (self.count - kept..self.count)
+            .filter_map(|n| self.times.get((n % SYNC_LOG as u64) as usize))
+            .copied()
+    }
+}
 
 /// What the device is for.
 #[derive(Debug, Clone)]
@@ -101,8 +134,12 @@ pub struct SimDevice {
     al: Al,
     /// Local time of the drive's next control cycle.
     tick: u64,
-    sync_log: [Nanos; SYNC_LOG],
-    sync_count: u64,
+    /// SYNC0 and SYNC1.
+    pulses: [PulseLog; 2],
+    /// Local time of what is going on.
+    local: u64,
+    /// The application hangs; its controller does not.
+    hangs: bool,
     fresh: Box<Fresh>,
     pub(crate) refusals: Vec<(AlState, u16)>,
     pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
@@ -134,6 +171,11 @@ impl SimDevice {
     #[must_use]
     pub fn esc(&self) -> &Esc {
         &self.esc
+    }
+
+    /// The controller as the device's own side has it.
+    pub fn esc_mut(&mut self) -> &mut Esc {
+        &mut self.esc
     }
 
     #[must_use]
@@ -185,15 +227,53 @@ impl SimDevice {
     /// SYNC0 pulses since power-on.
     #[must_use]
     pub fn sync0_count(&self) -> u64 {
-        self.sync_count
+        self.pulses[0].count
     }
 
     /// True times of the last SYNC0 pulses, oldest first.
     pub fn sync0_log(&self) -> impl Iterator<Item = Nanos> + '_ {
-        let kept = self.sync_count.min(SYNC_LOG as u64);
-        (self.sync_count - kept..self.sync_count)
-            .filter_map(|n| self.sync_log.get((n % SYNC_LOG as u64) as usize))
-            .copied()
+        self.pulses[0].last()
+    }
+
+    /// True times of the last SYNC1 pulses, oldest first.
+    pub fn sync1_log(&self) -> impl Iterator<Item = Nanos> + '_ {
+        self.pulses[1].last()
+    }
+
+    /// An input wired to LATCH0 (0) or LATCH1 (1) has this level at this true time.
+    pub fn set_latch(&mut self, n: usize, level: bool, now: Nanos) {
+        let local = self.esc.clock.local(now);
+        self.esc.latch_input(n, level, local);
+    }
+
+    /// The application stops, as a crashed processor does, while its controller goes on; or starts again where
+    /// it was. Nobody triggers the watchdog of the process data interface meanwhile.
+    pub fn set_hanging(&mut self, hangs: bool, now: Nanos) {
+        if hangs == self.hangs {
+            return;
+        }
+        self.advance(now);
+        let local = self.esc.clock.local(now);
+        self.hangs = hangs;
+        self.esc.pdi_stops(hangs, local);
+        if !hangs {
+            // Interrupts that have waited.
+            self.esc.acknowledge_sync(0);
+            self.esc.acknowledge_sync(1);
+            self.start_ticking(local);
+        }
+    }
+
+    /// An application without a sound configuration in its EEPROM never starts.
+    fn application_runs(&self) -> bool {
+        !self.hangs && self.esc.is_loaded()
+    }
+
+    fn start_ticking(&mut self, local: u64) {
+        self.tick = match self.application {
+            Application::Drive(_) => local + CONTROL_PERIOD_NS,
+            Application::Io { .. } => u64::MAX,
+        };
     }
 
     /// Without power nothing happens in it any more; it keeps what [`SimDevice::power_on`] clears.
@@ -213,11 +293,10 @@ impl SimDevice {
         }
         self.lay_out();
         self.close_process_data(true);
-        self.tick = match self.application {
-            Application::Drive(_) => self.esc.clock.local(now) + CONTROL_PERIOD_NS,
-            Application::Io { .. } => u64::MAX,
-        };
-        (self.sync_count, self.sync_log) = (0, [0; SYNC_LOG]);
+        self.hangs = false;
+        self.local = self.esc.clock.local(now);
+        self.start_ticking(self.local);
+        self.pulses = Default::default();
     }
 
     /// Lets the device live up to `now`. Allocates only for mailbox traffic and state changes.
@@ -227,44 +306,68 @@ impl SimDevice {
         }
         let local = self.esc.clock.local(now);
         loop {
-            let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.next_pulse());
-            let mailbox = self.mailbox.as_ref().map_or(u64::MAX, Mailbox::due);
-            let (al, eeprom) = (self.al.due, self.esc.eeprom.due());
-            let watchdog = self.esc.watchdog.due();
-            let due = sync
-                .min(self.tick)
-                .min(mailbox)
-                .min(al)
-                .min(eeprom)
-                .min(watchdog);
+            let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.sync.due());
+            let (eeprom, watchdog) = (self.esc.eeprom.due(), self.esc.watchdog.due());
+            let pdi = self.esc.pdi_watchdog_due();
+            let (tick, mailbox, al) = if self.application_runs() {
+                let mailbox = self.mailbox.as_ref().map_or(u64::MAX, Mailbox::due);
+                (self.tick, mailbox, self.al.due)
+            } else {
+                (u64::MAX, u64::MAX, u64::MAX)
+            };
+            let own = tick.min(mailbox).min(al);
+            let due = sync.min(eeprom).min(watchdog).min(pdi).min(own);
             if due > local {
                 return;
             }
+            self.local = due;
             if due == sync {
-                self.sync0(due);
-            } else if due == self.tick {
+                let edges = self.esc.fire_sync(due);
+                self.synchronized(edges);
+            } else if due == tick {
                 self.tick();
             } else if due == watchdog {
                 self.watchdog_expired();
             } else if due == eeprom {
-                self.esc.finish_eeprom();
+                self.eeprom_finished(due);
             } else if due == mailbox {
                 self.serve_mailbox(due);
-            } else {
+            } else if due == al {
                 self.al_step(due);
+            } else {
+                self.esc.expire_pdi_watchdog();
             }
         }
     }
 
-    fn sync0(&mut self, local: u64) {
-        let at = (self.sync_count % SYNC_LOG as u64) as usize;
-        if let Some(entry) = self.sync_log.get_mut(at) {
-            *entry = self.esc.clock.true_time(local);
+    /// SYNC outputs rose.
+    fn synchronized(&mut self, edges: Edges) {
+        let at = self.esc.clock.true_time(self.local);
+        for (log, rose) in self.pulses.iter_mut().zip([edges.sync0, edges.sync1]) {
+            if rose {
+                log.push(at);
+            }
         }
-        self.sync_count += 1;
-        self.esc.fire_sync0();
-        self.first_sync_seen();
-        self.exchange();
+        if !self.application_runs() {
+            return;
+        }
+        if edges.sync1 {
+            self.esc.acknowledge_sync(1);
+        }
+        if edges.sync0 {
+            self.esc.acknowledge_sync(0);
+            self.first_sync_seen();
+            self.exchange();
+        }
+    }
+
+    fn eeprom_finished(&mut self, local: u64) {
+        let was_loaded = self.esc.is_loaded();
+        self.esc.finish_eeprom();
+        if !was_loaded && self.esc.is_loaded() {
+            self.close_process_data(true);
+            self.start_ticking(local);
+        }
     }
 
     fn tick(&mut self) {
@@ -295,17 +398,30 @@ impl SimDevice {
 
     /// Processes a frame whose first byte arrives at `now`.
     pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> Seen {
-        let local = self.esc.clock.local(now);
+        let local = self.esc.begin_frame(now);
+        self.local = local;
         if matches!(self.application, Application::Io { .. }) && !self.sync0_decides() {
             // As digital inputs do: sampled when a frame begins.
             self.latch_inputs();
         }
         let mut datagram = frame::next(bytes, None);
         while let Some(d) = datagram {
-            self.esc.execute(bytes, &d, now, local);
+            self.esc.execute(bytes, &d);
             datagram = frame::next(bytes, Some(&d));
         }
+        self.esc.end_frame();
         let raised = self.esc.take_raised();
+        if raised.reset {
+            let links = self.esc.links();
+            self.power_on(now);
+            for (port, up) in (0..).zip(links) {
+                self.esc.set_link(port, up);
+            }
+            return Seen {
+                latches: false,
+                dl_control: true,
+            };
+        }
         if let Some(control) = raised.al_control {
             self.al_requested(control, local);
         }
@@ -314,6 +430,10 @@ impl SimDevice {
         }
         if raised.sm_configured || raised.sync_changed {
             self.configuration_changed(raised.sm_configured, raised.sync_changed);
+        }
+        if raised.ping != Edges::default() {
+            self.esc.note_sync(raised.ping);
+            self.synchronized(raised.ping);
         }
         if raised.sm_written != 0 && self.follows_sm(raised.sm_written) {
             self.exchange();
@@ -332,10 +452,12 @@ impl SimDevice {
     }
 
     fn sync0_decides(&self) -> bool {
-        self.esc
-            .dc
-            .as_ref()
-            .is_some_and(|dc| dc.sync0 != Sync0::Off)
+        self.esc.dc.as_ref().is_some_and(|dc| dc.sync.sync0_on())
+    }
+
+    /// SYNC0 pulses since it was activated.
+    fn sync0_pulses(&self) -> u64 {
+        self.esc.dc.as_ref().map_or(0, |dc| dc.sync.pulses)
     }
 
     /// Fault injection: identity in EEPROM and object 0x1018.

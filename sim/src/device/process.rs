@@ -65,7 +65,7 @@ impl SimDevice {
     /// Takes outputs, if they count in this state, and latches inputs.
     pub(super) fn exchange(&mut self) {
         // An emulated device stays in Op without outputs to obey.
-        if self.al.state == AlState::Op && !self.esc.watchdog.expired {
+        if self.al.state == AlState::Op && !self.esc.watchdog.expired() {
             self.take_outputs();
         }
         self.empty_single_buffers();
@@ -100,10 +100,9 @@ impl SimDevice {
 
     fn take_outputs(&mut self) {
         for data in self.process.iter().filter(|d| d.direction == Direction::Rx) {
-            let Some(sm) = self.esc.sms.get(data.sm).filter(|sm| sm.full) else {
+            let Some(buffer) = self.esc.fetch_buffer(data.sm, self.local) else {
                 continue;
             };
-            let buffer = self.esc.bytes(sm.start, sm.len);
             for m in &data.map {
                 bits::copy(self.store.bytes_mut(m.slot), 0, buffer, m.bit, m.bits);
             }
@@ -119,21 +118,18 @@ impl SimDevice {
             return;
         }
         for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {
-            let ram =
-                |sm: &&mut SyncManager| sm.is_open() && usize::from(sm.start) >= ADDRESS_SPACE;
-            let Some(sm) = self.esc.sms.get_mut(data.sm).filter(ram) else {
+            // Registers that a SyncManager looks at are not the device's to fill.
+            let ram = |sm: &&SyncManager| usize::from(sm.start) >= ADDRESS_SPACE;
+            if self.esc.sms.get(data.sm).filter(ram).is_none() {
+                continue;
+            }
+            let Some(buffer) = self.esc.fill_buffer(data.sm) else {
                 continue;
             };
-            let first = !sm.full;
-            sm.full = true;
-            let (start, len) = (sm.start, sm.len);
-            let buffer = self.esc.bytes_mut(start, len);
             for m in &data.map {
                 bits::copy(buffer, m.bit, self.store.bytes(m.slot), 0, m.bits);
             }
-            if first {
-                self.esc.refresh_sm(data.sm);
-            }
+            self.esc.filled_buffer(data.sm, self.local);
         }
     }
 
@@ -141,8 +137,7 @@ impl SimDevice {
     fn buffers(&self, direction: Direction) -> Vec<u8> {
         let of_direction = self.process.iter().filter(|d| d.direction == direction);
         of_direction
-            .filter_map(|d| self.esc.sms.get(d.sm))
-            .flat_map(|sm| self.esc.bytes(sm.start, sm.len))
+            .flat_map(|d| self.esc.latest_buffer(d.sm))
             .copied()
             .collect()
     }

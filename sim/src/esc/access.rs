@@ -1,9 +1,9 @@
-//! Physical reads and writes with their side effects.
+//! What datagrams read and write. RAM is written at once; writes to registers wait until the frame has been
+//! received well (shadow buffers, Beckhoff ESC data sheet, section I, 3.4) and are then carried out in `apply`.
 
+use super::Esc;
 use super::registers as reg;
-use super::sm::{Access, Filled, Mode};
-use super::{Esc, al};
-use crate::Nanos;
+use super::sm::Filled;
 
 /// What happens to the datagram's bytes on a read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -12,287 +12,282 @@ pub(super) enum Combine {
     Or,
 }
 
+/// Register writes of the frame under way.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Shadow {
+    bytes: Vec<u8>,
+    /// Address and length.
+    spans: Vec<(u16, u16)>,
+}
+
+impl Shadow {
+    pub(super) fn with_capacity() -> Self {
+        Self {
+            bytes: Vec::with_capacity(1536),
+            spans: Vec::with_capacity(128),
+        }
+    }
+
+    fn push(&mut self, start: usize, bytes: &[u8]) {
+        if let (Ok(start), Ok(len)) = (u16::try_from(start), u16::try_from(bytes.len())) {
+            self.bytes.extend_from_slice(bytes);
+            self.spans.push((start, len));
+        }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.spans.is_empty()
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.bytes.clear();
+        self.spans.clear();
+    }
+
+    /// Address and bytes of each write, in order.
+    pub(super) fn writes(&self) -> impl Iterator<Item = (usize, &[u8])> {
+        let mut rest = self.bytes.as_slice();
+        self.spans.iter().map_while(move |(start, len)| {
+            let (bytes, after) = rest.split_at_checked(usize::from(*len))?;
+            rest = after;
+            Some((usize::from(*start), bytes))
+        })
+    }
+}
+
 impl Esc {
-    /// Reads into `out`; false where the access is not answered.
-    pub(super) fn read(
-        &mut self,
-        start: u16,
-        out: &mut [u8],
-        combine: Combine,
-        local: u64,
-    ) -> bool {
-        let (start, len) = (usize::from(start), out.len());
-        if !self.begin_read(start, len, local) {
-            return false;
-        }
-        let Some(from) = self.mem.get(start..start + len) else {
-            return false;
-        };
-        match combine {
-            Combine::Replace => out.copy_from_slice(from),
-            Combine::Or => out.iter_mut().zip(from).for_each(|(to, from)| *to |= from),
-        }
-        self.end_read(start, len);
-        true
-    }
-
-    pub(super) fn begin_read(&mut self, start: usize, len: usize, local: u64) -> bool {
-        if len == 0 || start + len > self.mem.len() {
-            return false;
-        }
-        if start < reg::ADDRESS_SPACE {
-            if start + len > reg::ADDRESS_SPACE || !self.map.readable(start, len) {
-                return false;
-            }
-            if let Some(dc) = &self.dc
-                && overlaps(start, len, reg::DC_SYSTEM_TIME, 8)
+    /// Reads into `out`; false where nothing of it is answered.
+    pub(super) fn read(&mut self, start: u16, out: &mut [u8], combine: Combine) -> bool {
+        let start = usize::from(start);
+        let end = start + out.len();
+        let mut any = false;
+        let mut at = start;
+        while at < end {
+            let (len, place) = self.readable(at, end);
+            let (from, to) = (at - start, at - start + len);
+            if let (Some(place), Some(to)) = (place, out.get_mut(from..to))
+                && let Some(from) = self.mem.get(place..place + len)
             {
-                let time = dc.local_copy(local);
-                self.put(reg::DC_SYSTEM_TIME, &time.to_le_bytes());
+                match combine {
+                    Combine::Replace => to.copy_from_slice(from),
+                    Combine::Or => to.iter_mut().zip(from).for_each(|(to, from)| *to |= from),
+                }
+                any = true;
             }
-            return true;
+            at += len;
         }
-        !self
-            .sms
-            .iter()
-            .any(|sm| sm.overlaps(start, len) && sm.may_read(start, len) == Access::Denied)
+        any
     }
 
-    pub(super) fn end_read(&mut self, start: usize, len: usize) {
-        if start < reg::ADDRESS_SPACE {
-            for (register, event) in [(reg::AL_STATUS, 0x08_u16), (reg::DL_STATUS, 0x04)] {
-                if overlaps(start, len, register, 2) {
-                    let events = self.u16_at(reg::ECAT_EVENT) & !event;
-                    self.put(reg::ECAT_EVENT, &events.to_le_bytes());
-                }
+    /// The next bytes from `at` on (below `end`) that are read alike, and where they are.
+    pub(super) fn readable(&mut self, at: usize, end: usize) -> (usize, Option<usize>) {
+        if at >= reg::ADDRESS_SPACE {
+            return self.stretch(at, end, Filled::ByDevice);
+        }
+        let end = end.min(reg::ADDRESS_SPACE);
+        let answers = self.map.readable(at, end);
+        if answers {
+            self.before_read(at, end);
+        }
+        (end - at, answers.then_some(at))
+    }
+
+    /// Registers that are made when they are read, and events that reading acknowledges.
+    fn before_read(&mut self, start: usize, end: usize) {
+        let read = |first: u16, len: usize| overlaps(start, end, first, len);
+        if start >= usize::from(reg::DC_RECEIVE_TIMES) {
+            return self.before_dc_read(start, end);
+        }
+        for (register, event) in [
+            (reg::AL_STATUS, super::event::AL_STATUS),
+            (reg::DL_STATUS, super::event::DL_STATUS),
+        ] {
+            if read(register, 2) {
+                self.frame.acknowledged |= event;
             }
+        }
+    }
+
+    /// Values of more than a byte are frozen when their first byte is read.
+    fn before_dc_read(&mut self, start: usize, end: usize) {
+        let Some(dc) = &self.dc else { return };
+        let first = |register: u16| (start..end).contains(&usize::from(register));
+        let read = |first: u16, len: usize| overlaps(start, end, first, len);
+        if read(reg::DC_SYSTEM_TIME, 8) {
+            let time = dc.local_copy(self.frame.stamp);
+            return self.put(reg::DC_SYSTEM_TIME, &time.to_le_bytes());
+        }
+        if first(reg::DC_DIFFERENCE) {
+            let difference = dc.difference_register();
+            self.put(reg::DC_DIFFERENCE, &difference.to_le_bytes());
+        }
+        let Some(dc) = &self.dc else { return };
+        if read(reg::DC_SPEED_DIFF, 2) {
+            let speed = dc.speed_register();
+            self.put(reg::DC_SPEED_DIFF, &speed.to_le_bytes());
+        }
+        let Some(dc) = &self.dc else { return };
+        if end <= usize::from(reg::DC_ACTIVATION) {
             return;
         }
+        let (next0, next1) = (dc.sync.next_sync0(), dc.sync.next_sync1());
+        let status = dc.sync.status();
+        let waits = [dc.sync.waits(0), dc.sync.waits(1)].map(u8::from);
+        let latches = dc.latches;
+        self.put(reg::DC_ACTIVATION_STATUS, &[status]);
+        self.put(reg::DC_SYNC_STATUS, &waits);
+        if first(reg::DC_START_TIME) {
+            self.put(reg::DC_START_TIME, &next0.to_le_bytes());
+        }
+        if first(reg::DC_NEXT_SYNC1) {
+            self.put(reg::DC_NEXT_SYNC1, &next1.to_le_bytes());
+        }
+        self.put(reg::DC_LATCH_STATUS, &latches.map(|latch| latch.status()));
+        for n in 0..4_u16 {
+            let at = reg::DC_LATCH_TIMES + n * 8;
+            let latch = latches.get(usize::from(n / 2));
+            if let Some(latch) = latch.filter(|_| first(at)) {
+                self.put(at, &latch.time(usize::from(n % 2)).to_le_bytes());
+            }
+            if read(at, 8) {
+                self.frame.latches_read |= 1 << n;
+            }
+        }
+    }
+
+    /// The next bytes of RAM from `at` on (below `end`) with one owner, and where they are in memory;
+    /// `None` where the MainDevice may not read (`filled` by the device) or write them (by itself).
+    pub(super) fn stretch(
+        &mut self,
+        at: usize,
+        end: usize,
+        filled: Filled,
+    ) -> (usize, Option<usize>) {
+        let memory = self.mem.len();
+        if at >= memory || at >= reg::PROCESS_RAM && !self.loaded {
+            return (end - at, None);
+        }
+        let mut end = end.min(memory);
         for n in 0..self.sms.len() {
-            let sm = &mut self.sms[n];
-            if sm.mode == Mode::Mailbox && sm.overlaps(start, len) {
-                let access = sm.may_read(start, len);
-                sm.did_read(access);
-                if access == Access::Completes {
-                    self.raised.sm_read |= 1 << n;
-                    self.refresh_sm(n);
-                }
-            }
-        }
-    }
-
-    /// Writes `data`; false where the access is not accepted.
-    pub(super) fn write(&mut self, start: u16, data: &[u8], now: Nanos, local: u64) -> bool {
-        let (start, len) = (usize::from(start), data.len());
-        if start < reg::ADDRESS_SPACE {
-            return self.write_registers(start, data, now, local);
-        }
-        if !self.begin_write(start, len) {
-            return false;
-        }
-        if let Some(to) = self.mem.get_mut(start..start + len) {
-            to.copy_from_slice(data);
-        }
-        self.end_write(start, len, local);
-        true
-    }
-
-    /// Whether process RAM takes these bytes.
-    pub(super) fn begin_write(&self, start: usize, len: usize) -> bool {
-        len > 0
-            && start >= reg::ADDRESS_SPACE
-            && start + len <= self.mem.len()
-            && !self
-                .sms
-                .iter()
-                .any(|sm| sm.overlaps(start, len) && sm.may_write(start, len) == Access::Denied)
-    }
-
-    pub(super) fn end_write(&mut self, start: usize, len: usize, local: u64) {
-        for n in 0..self.sms.len() {
-            let sm = &mut self.sms[n];
-            if !sm.overlaps(start, len) {
-                continue;
-            }
-            let access = sm.may_write(start, len);
-            sm.did_write(access);
-            if access == Access::Completes {
-                let watchdog = sm.watchdog && sm.mode == Mode::Buffered;
-                self.raised.sm_written |= 1 << n;
-                self.refresh_sm(n);
-                if watchdog {
-                    let divider = self.u16_at(reg::WD_DIVIDER);
-                    let count = self.u16_at(reg::WD_PROCESS_DATA);
-                    self.watchdog.trigger(local, divider, count);
-                    self.put(reg::WD_STATUS, &[1]);
-                }
-            }
-        }
-    }
-
-    fn write_registers(&mut self, start: usize, data: &[u8], now: Nanos, local: u64) -> bool {
-        let len = data.len();
-        if len == 0
-            || start + len > reg::ADDRESS_SPACE
-            || !self.map.writable(start, len)
-            || self.eeprom_locked(start, len)
-        {
-            return false;
-        }
-        if overlaps(start, len, reg::AL_CONTROL, 2) {
-            // The upper byte is optional.
-            let low = byte_at(start, data, reg::AL_CONTROL).unwrap_or(0);
-            let control = u16::from(low) & (0x0f | al::ERROR | al::DEVICE_ID);
-            self.put(reg::AL_CONTROL, &control.to_le_bytes());
-            self.raised.al_control = Some(control);
-        }
-        if overlaps(start, len, reg::DC_RECEIVE_TIMES, 4) {
-            self.latch_arrival(local);
-        }
-        if overlaps(start, len, reg::DC_SYSTEM_TIME, 4) {
-            let skip = usize::from(reg::DC_SYSTEM_TIME).saturating_sub(start);
-            if let (Some(Ok(raw)), Some(dc)) = (
-                data.get(skip..skip + 4).map(<[u8; 4]>::try_from),
-                &mut self.dc,
-            ) {
-                dc.compare(&mut self.clock, now, local, u32::from_le_bytes(raw));
-                let (difference, speed) = (dc.difference_register(), dc.speed_register());
-                self.put(reg::DC_DIFFERENCE, &difference.to_le_bytes());
-                self.put(reg::DC_SPEED_DIFF, &speed.to_le_bytes());
-            }
-        }
-        for (address, value) in (start..).zip(data) {
-            let special = (usize::from(reg::DC_RECEIVE_TIMES)..0x0918).contains(&address)
-                || overlaps(address, 1, reg::RX_ERRORS, 0x14)
-                || overlaps(address, 1, reg::AL_CONTROL, 2);
-            if !special && self.map.writable(address, 1) {
-                self.mem[address] = *value;
-            }
-        }
-        self.after_register_write(start, data, now, local);
-        true
-    }
-
-    /// The device's side owns the EEPROM: only 0x0500 still answers to writes.
-    fn eeprom_locked(&self, start: usize, len: usize) -> bool {
-        start > usize::from(reg::EEPROM_CONFIG)
-            && overlaps(start, len, reg::EEPROM_CONTROL, 14)
-            && self
-                .bytes(reg::EEPROM_CONFIG, 1)
-                .first()
-                .is_some_and(|b| b & 1 != 0)
-    }
-
-    fn latch_arrival(&mut self, local: u64) {
-        if self.dc.is_some() {
-            self.put(reg::DC_RECEIVE_TIME_PU, &local.to_le_bytes());
-        }
-        self.latch = true;
-    }
-
-    fn after_register_write(&mut self, start: usize, data: &[u8], now: Nanos, local: u64) {
-        let len = data.len();
-        let touched = |first: u16, n: usize| overlaps(start, len, first, n);
-        if touched(reg::STATION_ADDRESS, 2) {
-            self.station = self.u16_at(reg::STATION_ADDRESS);
-        }
-        if touched(reg::DL_CONTROL, 4) {
-            self.dl_control_written(touched(reg::DL_CONTROL + 1, 1));
-            let enabled = self.u32_at(reg::DL_CONTROL) & 0x0100_0000 != 0;
-            self.alias = enabled.then(|| self.u16_at(reg::STATION_ALIAS));
-        }
-        self.clear_counters(touched);
-        if touched(reg::WD_COUNTER, 2) {
-            self.put(reg::WD_COUNTER, &[0; 2]);
-        }
-        if touched(reg::EEPROM_CONTROL, 2) {
-            let word = |at: u16| self.u16_at(at);
-            let written = byte_at(start, data, reg::EEPROM_CONTROL + 1).map_or(0, u16::from);
-            let control = word(reg::EEPROM_CONTROL) & 0xff | written << 8;
-            let data = word(reg::EEPROM_DATA).to_le_bytes();
-            self.eeprom
-                .command(control, self.u32_at(reg::EEPROM_ADDRESS), data, local);
-            self.put(reg::EEPROM_CONTROL, &[0, 0]);
-            self.refresh_eeprom();
-        }
-        if touched(reg::FMMU, 0x80) {
-            self.parse_fmmus();
-        }
-        if touched(reg::SM, 0x40) {
-            self.parse_sms(start, len);
-        }
-        if self.dc.is_some() && start >= usize::from(reg::DC_SYSTEM_TIME) {
-            self.after_dc_write(start, len, now, local);
-        }
-    }
-
-    fn parse_fmmus(&mut self) {
-        for (fmmu, r) in self
-            .fmmus
-            .iter_mut()
-            .zip(self.mem[usize::from(reg::FMMU)..].chunks_exact(16))
-        {
-            *fmmu = r.try_into().ok().and_then(super::Fmmu::from_registers);
-        }
-    }
-
-    fn parse_sms(&mut self, start: usize, len: usize) {
-        for n in 0..self.sms.len() {
-            let base = reg::SM + n as u16 * 8;
-            if !overlaps(start, len, base, 8) {
-                continue;
-            }
-            let Ok(r) = <[u8; 8]>::try_from(self.bytes(base, 8)) else {
+            let Some(sm) = self.sms.get_mut(n).filter(|sm| sm.guards()) else {
                 continue;
             };
-            let sm = &mut self.sms[n];
-            let was_enabled = sm.enabled;
-            sm.configure(&r);
-            if was_enabled {
-                // An enabled SyncManager kept its configuration; show what counts.
-                let (start, len) = (sm.start.to_le_bytes(), sm.len.to_le_bytes());
-                let kept = [start[0], start[1], len[0], len[1], sm.control];
-                self.put(base, &kept);
+            let area = sm.area();
+            if area.contains(&at) {
+                let len = area.end.min(end) - at;
+                let (len, place) = sm.access(filled, at - area.start, len, memory);
+                if place.is_some() {
+                    self.frame.touched |= 1 << n;
+                }
+                return (len, place);
             }
-            self.refresh_sm(n);
-            self.raised.sm_configured = true;
-            let sm = &self.sms[n];
-            if sm.mode == Mode::Mailbox && sm.filled == Filled::ByDevice && sm.enabled {
-                self.raised.repeat_request = Some(r[6] & 2 != 0);
+            if area.start > at {
+                end = end.min(area.start);
             }
         }
+        if at < reg::PROCESS_RAM {
+            let write = filled == Filled::ByMainDevice;
+            let (len, can) = self.map.run(at, end.min(reg::PROCESS_RAM), write);
+            return (len, can.then_some(at));
+        }
+        (end - at, Some(at))
     }
 
-    fn after_dc_write(&mut self, start: usize, len: usize, now: Nanos, local: u64) {
-        let touched = |first: u16, n: usize| overlaps(start, len, first, n);
-        let offset = self.u64_at(reg::DC_OFFSET);
-        let delay = self.u32_at(reg::DC_DELAY);
-        let depth = self.bytes(reg::DC_FILTER, 1).first().copied().unwrap_or(0);
-        let activation = self
-            .bytes(reg::DC_ACTIVATION, 1)
-            .first()
-            .copied()
-            .unwrap_or(0);
-        let start_time = self.u64_at(reg::DC_START_TIME);
-        let cycle = self.u32_at(reg::DC_SYNC0_CYCLE);
-        let Some(dc) = &mut self.dc else { return };
-        dc.offset = offset;
-        dc.delay = delay;
-        if touched(reg::DC_SPEED_START, 2) || touched(reg::DC_FILTER, 2) {
-            dc.reset_loop(&mut self.clock, now, depth);
+    /// Writes `data`; false where nothing of it is accepted.
+    pub(super) fn write(&mut self, start: u16, data: &[u8]) -> bool {
+        let start = usize::from(start);
+        let end = start + data.len();
+        if !self.may_write(start, end) {
+            return false;
         }
-        if touched(reg::DC_ACTIVATION, 1) {
-            dc.activate(activation, start_time, cycle, local);
-            self.raised.sync_changed = true;
+        let mut any = false;
+        let mut at = start;
+        while at < end {
+            if at < reg::ADDRESS_SPACE {
+                let stop = end.min(reg::ADDRESS_SPACE);
+                if let Some(bytes) = data.get(at - start..stop - start) {
+                    any |= self.write_registers(at, bytes);
+                }
+                at = stop;
+                continue;
+            }
+            let (len, place) = self.stretch(at, end, Filled::ByMainDevice);
+            let (from, to) = (at - start, at - start + len);
+            if let (Some(place), Some(from)) = (place, data.get(from..to))
+                && let Some(to) = self.mem.get_mut(place..place + len)
+            {
+                to.copy_from_slice(from);
+                any = true;
+            }
+            at += len;
         }
+        any
+    }
+
+    /// Whether write protection lets a write through.
+    pub(super) fn may_write(&self, start: usize, end: usize) -> bool {
+        let protected = |register| self.byte_at(register) & 1 != 0;
+        let registers = protected(reg::WRITE_PROTECTION);
+        let all = protected(reg::ESC_WRITE_PROTECTION);
+        self.guard.allows(start, end, registers, all)
+    }
+
+    /// Puts what may be written now into the shadow; false where that is nothing.
+    pub(super) fn write_registers(&mut self, start: usize, data: &[u8]) -> bool {
+        self.guard.note(start, data);
+        if self.map.freely_writable(start, start + data.len()) {
+            self.shadow.push(start, data);
+            return !data.is_empty();
+        }
+        let mut any = false;
+        let mut at = 0;
+        while at < data.len() {
+            let accepted = (at..data.len())
+                .take_while(|n| self.accepts(start + n))
+                .count();
+            if let Some(bytes) = data.get(at..at + accepted).filter(|b| !b.is_empty()) {
+                self.shadow.push(start + at, bytes);
+                any = true;
+            }
+            at += accepted + 1;
+        }
+        any
+    }
+
+    fn accepts(&self, at: usize) -> bool {
+        self.map.writable(at) && (!self.map.conditional(at) || self.condition(at))
+    }
+
+    /// Whether other registers allow writing this one.
+    fn condition(&self, at: usize) -> bool {
+        let within = |first: u16, len: usize| overlaps(at, at + 1, first, len);
+        let cyclic_control = || self.byte_at(reg::DC_CYCLIC_CONTROL);
+        if within(reg::AL_CONTROL, 2) {
+            return !self.al_locked;
+        }
+        if within(reg::EEPROM_CONTROL, 14) {
+            return !self.eeprom.is_busy() && !self.device_has_eeprom();
+        }
+        if within(reg::SM, 0x80) {
+            let n = (at - usize::from(reg::SM)) / 8;
+            return self.sms.get(n).is_some_and(|sm| !sm.enabled);
+        }
+        // SYNC1 may be assigned the other way than SYNC0.
+        if within(reg::DC_SYNC1_CYCLE, 4) {
+            return matches!(cyclic_control() & 3, 0 | 3);
+        }
+        if within(reg::DC_LATCH_CONTROL, 1) {
+            return cyclic_control() & 0x10 == 0;
+        }
+        if within(reg::DC_LATCH_CONTROL + 1, 1) {
+            return cyclic_control() & 0x20 == 0;
+        }
+        cyclic_control() & 1 == 0
     }
 }
 
-pub(super) fn overlaps(start: usize, len: usize, first: u16, n: usize) -> bool {
+/// Whether `start..end` meets the `len` bytes from `first` on.
+pub(super) fn overlaps(start: usize, end: usize, first: u16, len: usize) -> bool {
     let first = usize::from(first);
-    start < first + n && first < start + len
-}
-
-fn byte_at(start: usize, data: &[u8], address: u16) -> Option<u8> {
-    data.get(usize::from(address).checked_sub(start)?).copied()
+    start < first + len && first < end
 }

@@ -76,16 +76,17 @@ pub enum Request {
     Refused(u16),
 }
 
-/// Judges AL control against the present state.
+/// Judges AL control against the present state. An error must be acknowledged, except on the way to Init.
 #[must_use]
 pub fn judge(current: AlState, error: bool, control: u16) -> Request {
-    if error && control & ERROR == 0 {
+    use AlState::{Boot, Init, Op, PreOp, SafeOp};
+    let wanted = AlState::from_code((control & 0x0f) as u8);
+    if error && control & ERROR == 0 && wanted != Some(Init) {
         return Request::Ignored;
     }
-    let Some(wanted) = AlState::from_code((control & 0x0f) as u8) else {
+    let Some(wanted) = wanted else {
         return Request::Refused(code::UNKNOWN_STATE);
     };
-    use AlState::{Boot, Init, Op, PreOp, SafeOp};
     match (current, wanted) {
         (from, to) if from == to => Request::Stay,
         (_, Init)
@@ -118,7 +119,12 @@ mod tests {
             for (to, expected) in columns.into_iter().zip(row) {
                 let control = u16::from(to.code());
                 assert_eq!(judge(from, false, control), expected, "{from} to {to}");
-                assert_eq!(judge(from, true, control), Request::Ignored);
+                let unacknowledged = if to == Init {
+                    expected
+                } else {
+                    Request::Ignored
+                };
+                assert_eq!(judge(from, true, control), unacknowledged);
                 assert_eq!(judge(from, true, control | ERROR), expected);
             }
         }

@@ -1,16 +1,21 @@
-//! The SII EEPROM behind registers 0x0500–0x050F.
+//! The SII EEPROM behind registers 0x0502–0x050F (Beckhoff ESC data sheet, section I, 11; section II, 2.11).
 
 use super::info::EscInfo;
-use super::info::eeprom::EIGHT_BYTES;
+use super::info::eeprom::{EIGHT_BYTES, TWO_BYTE_ADDRESS};
 
 /// Time a write takes.
 const WRITE_NS: u64 = 500_000;
 
+/// Bits of the control and status register 0x0502.
 pub const WRITE_ENABLE: u16 = 0x0001;
 pub const CHECKSUM_ERROR: u16 = 0x0800;
+pub const NOT_LOADED: u16 = 0x1000;
 pub const COMMAND_ERROR: u16 = 0x2000;
 pub const WRITE_ENABLE_ERROR: u16 = 0x4000;
 pub const BUSY: u16 = 0x8000;
+
+/// A checksum that is taken for right, whatever the configuration.
+const ANY_CHECKSUM: u16 = 0x88a4;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Job {
@@ -19,11 +24,33 @@ enum Job {
     Reload,
 }
 
+impl Job {
+    /// Command bits 10:8, which show while it is under way.
+    fn code(self) -> u16 {
+        match self {
+            Self::Read(_) => 0x0100,
+            Self::Write(..) => 0x0200,
+            Self::Reload => 0x0400,
+        }
+    }
+}
+
+/// What became of a job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Finished {
+    /// Bytes for the data register, and how many of them the controller brings.
+    Read([u8; 8], usize),
+    Written,
+    /// The configuration area is to be taken over, if it is sound.
+    Reloaded,
+}
+
 #[derive(Debug, Clone)]
 pub struct Eeprom {
     image: Vec<u8>,
     /// Bits of the status that tell of the chip, see [`super::info::eeprom`].
     features: u16,
+    /// Time a read or reload takes.
     read_ns: u64,
     job: Option<(Job, u64)>,
     error: u16,
@@ -32,20 +59,23 @@ pub struct Eeprom {
 impl Eeprom {
     #[must_use]
     pub fn new(image: Vec<u8>, info: &EscInfo) -> Self {
-        let mut eeprom = Self {
+        Self {
             image,
             features: info.eeprom,
             read_ns: info.eeprom_read_ns,
             job: None,
             error: 0,
-        };
-        eeprom.check();
-        eeprom
+        }
     }
 
-    /// Sets the checksum error while the first 14 bytes and their CRC disagree.
-    fn check(&mut self) {
-        self.error &= !CHECKSUM_ERROR;
+    /// Everything but the contents is forgotten.
+    pub fn power_on(&mut self) {
+        (self.job, self.error) = (None, 0);
+    }
+
+    /// Words 0 to 6, if the checksum in word 7 fits (ETG.2010: x^8 + x^2 + x + 1, start value 0xff).
+    /// Otherwise the error shows from now on.
+    pub fn configuration(&mut self) -> Option<[u16; 7]> {
         let crc = self.image.get(..14).map(|head| {
             head.iter().fold(0xff_u8, |crc, byte| {
                 (0..8).fold(crc ^ byte, |crc, _| {
@@ -53,9 +83,18 @@ impl Eeprom {
                 })
             })
         });
-        if crc.is_none() || crc != self.image.get(14).copied() {
+        let sound = crc.is_some() && crc == self.image.get(14).copied()
+            || self.image.len() > 15 && self.word(7) == ANY_CHECKSUM;
+        if !sound {
             self.error |= CHECKSUM_ERROR;
+            return None;
         }
+        self.error &= !CHECKSUM_ERROR;
+        let mut words = [0; 7];
+        for (n, word) in (0..).zip(&mut words) {
+            *word = self.word(n);
+        }
+        Some(words)
     }
 
     #[must_use]
@@ -81,21 +120,33 @@ impl Eeprom {
         }
     }
 
-    /// A write to the control register with its address and data registers.
+    /// Word addresses that reach the chip.
+    fn address(&self, word: u32) -> u32 {
+        let bits = if self.features & TWO_BYTE_ADDRESS != 0 {
+            18
+        } else {
+            10
+        };
+        word & ((1 << bits) - 1)
+    }
+
+    /// A command from the control register with what stands in the address and data registers.
     pub fn command(&mut self, control: u16, address: u32, data: [u8; 2], local: u64) {
-        if self.job.is_some() {
+        if self.is_busy() {
             return;
         }
-        self.error &= CHECKSUM_ERROR;
+        // Any valid command clears these.
+        self.error &= !(COMMAND_ERROR | WRITE_ENABLE_ERROR);
+        let address = self.address(address);
         self.job = match control >> 8 & 7 {
             0 => None,
-            1 => Some((Job::Read(address), local + self.read_ns)),
+            1 => Some((Job::Read(address), local.saturating_add(self.read_ns))),
             2 if control & WRITE_ENABLE == 0 => {
                 self.error |= WRITE_ENABLE_ERROR;
                 None
             }
-            2 => Some((Job::Write(address, data), local + WRITE_NS)),
-            4 => Some((Job::Reload, local + self.read_ns)),
+            2 => Some((Job::Write(address, data), local.saturating_add(WRITE_NS))),
+            4 => Some((Job::Reload, local.saturating_add(self.read_ns))),
             _ => {
                 self.error |= COMMAND_ERROR;
                 None
@@ -104,20 +155,25 @@ impl Eeprom {
     }
 
     #[must_use]
+    pub fn is_busy(&self) -> bool {
+        self.job.is_some()
+    }
+
+    #[must_use]
     pub fn due(&self) -> u64 {
         self.job.map_or(u64::MAX, |(_, due)| due)
     }
 
-    /// Ends the running job; the bytes for the data register and how many count, if it was a read.
-    pub fn finish(&mut self) -> Option<([u8; 8], usize)> {
-        match self.job.take()?.0 {
+    /// Ends the running job.
+    pub fn finish(&mut self) -> Option<Finished> {
+        Some(match self.job.take()?.0 {
             Job::Read(word) => {
                 let mut out = [0xff; 8];
                 for (n, pair) in (0..4).zip(out.chunks_exact_mut(2)) {
                     pair.copy_from_slice(&self.word(word.wrapping_add(n)).to_le_bytes());
                 }
                 let eight = self.features & EIGHT_BYTES != 0;
-                Some((out, if eight { 8 } else { 4 }))
+                Finished::Read(out, if eight { 8 } else { 4 })
             }
             Job::Write(word, data) => {
                 let at = usize::try_from(word)
@@ -127,18 +183,17 @@ impl Eeprom {
                     Some(bytes) => bytes.copy_from_slice(&data),
                     None => self.error |= COMMAND_ERROR,
                 }
-                None
+                Finished::Written
             }
-            Job::Reload => {
-                self.check();
-                None
-            }
-        }
+            Job::Reload => Finished::Reloaded,
+        })
     }
 
+    /// 0x0502 without the write enable bit and the loading error.
     #[must_use]
     pub fn status(&self) -> u16 {
-        self.features | self.error | if self.job.is_some() { BUSY } else { 0 }
+        let job = self.job.map_or(0, |(job, _)| BUSY | job.code());
+        self.features | self.error | job
     }
 }
 
@@ -146,39 +201,98 @@ impl Eeprom {
 mod tests {
     use super::*;
 
-    #[test]
-    fn reads_eight_bytes_and_ones_beyond_the_end() {
-        let mut eeprom = Eeprom::new((0..32).collect(), &EscInfo::default());
-        eeprom.command(0x0100, 14, [0; 2], 0);
-        assert_eq!(eeprom.status() & BUSY, BUSY);
-        assert_eq!(
-            eeprom.finish(),
-            Some(([28, 29, 30, 31, 0xff, 0xff, 0xff, 0xff], 8))
-        );
-        assert_eq!(eeprom.status() & BUSY, 0);
+    fn with_features(image: Vec<u8>, eeprom: u16) -> Eeprom {
+        let info = EscInfo {
+            eeprom,
+            ..EscInfo::ET1100
+        };
+        Eeprom::new(image, &info)
+    }
+
+    fn eeprom(image: Vec<u8>) -> Eeprom {
+        with_features(image, EIGHT_BYTES)
     }
 
     #[test]
-    fn writes_need_the_enable_bit() {
-        let mut eeprom = Eeprom::new(vec![0; 32], &EscInfo::default());
-        eeprom.command(0x0200, 4, [1, 2], 0);
-        assert_eq!(eeprom.status() & WRITE_ENABLE_ERROR, WRITE_ENABLE_ERROR);
+    fn reads_as_many_bytes_as_the_controller_can_and_ones_beyond_the_end() {
+        let bytes = [28, 29, 30, 31, 0xff, 0xff, 0xff, 0xff];
+        for (features, len) in [(EIGHT_BYTES, 8), (0, 4)] {
+            let mut eeprom = with_features((0..32).collect(), features);
+            eeprom.command(0x0100, 14, [0; 2], 0);
+            assert_eq!(eeprom.status(), features | BUSY | 0x0100);
+            assert_eq!(eeprom.finish(), Some(Finished::Read(bytes, len)));
+            assert_eq!(eeprom.status(), features);
+        }
+    }
+
+    #[test]
+    fn a_small_chip_sees_ten_bits_of_the_address() {
+        let read = |features, word| {
+            let mut eeprom = with_features((0..32).collect(), features);
+            eeprom.command(0x0100, word, [0; 2], 0);
+            eeprom.finish()
+        };
+        let word_2 = Some(Finished::Read([4, 5, 6, 7, 8, 9, 10, 11], 4));
+        assert_eq!(read(0, 0x402), word_2);
+        assert_ne!(read(TWO_BYTE_ADDRESS, 0x402), word_2);
+        assert_eq!(read(TWO_BYTE_ADDRESS, 0x4_0002), word_2);
+    }
+
+    #[test]
+    fn errors_stay_until_the_next_valid_command() {
+        // (control, error bits afterwards)
+        let rows = [
+            (0x0200, WRITE_ENABLE_ERROR),
+            (0x0300, COMMAND_ERROR),
+            (0x0501, COMMAND_ERROR),
+            (0x0700, COMMAND_ERROR),
+            (0x0000, 0),
+            (0x0200, WRITE_ENABLE_ERROR),
+            (0x0100, 0),
+        ];
+        let mut eeprom = eeprom(vec![0; 32]);
+        for (control, expected) in rows {
+            eeprom.command(control, 4, [1, 2], 0);
+            eeprom.finish();
+            let errors = eeprom.status() & (COMMAND_ERROR | WRITE_ENABLE_ERROR);
+            assert_eq!(errors, expected, "0x{control:04x}");
+        }
+    }
+
+    #[test]
+    fn writes_take_their_time_and_stay() {
+        let mut eeprom = eeprom(vec![0; 32]);
         eeprom.command(0x0201, 4, [1, 2], 0);
+        assert_eq!(eeprom.word(4), 0);
+        eeprom.command(0x0201, 5, [3, 4], 0);
+        assert_eq!(eeprom.finish(), Some(Finished::Written));
+        eeprom.power_on();
+        assert_eq!((eeprom.word(4), eeprom.word(5)), (0x0201, 0), "busy");
+        eeprom.command(0x0201, 16, [1, 2], 0);
         eeprom.finish();
-        assert_eq!(eeprom.word(4), 0x0201);
-        assert_eq!(eeprom.status() & WRITE_ENABLE_ERROR, 0);
+        assert_eq!(eeprom.status() & COMMAND_ERROR, COMMAND_ERROR, "no memory");
     }
 
     #[test]
     fn the_crc_covers_the_first_14_bytes() {
         let mut image = vec![0; 32];
-        // ETG.2010: polynomial x^8 + x^2 + x + 1, start value 0xff.
         image[..15].copy_from_slice(&[8, 0, 0, 0x44, 0x88, 0x13, 1, 0, 0, 0, 0, 0, 0, 0, 0]);
-        let bad = Eeprom::new(image.clone(), &EscInfo::default());
-        let good = (0..=255).any(|crc| {
-            image[14] = crc;
-            Eeprom::new(image.clone(), &EscInfo::default()).status() & CHECKSUM_ERROR == 0
-        });
-        assert!(good && bad.status() & BUSY == 0);
+        let sound: Vec<u8> = (0..=255)
+            .filter(|crc| {
+                image[14] = *crc;
+                eeprom(image.clone()).configuration().is_some()
+            })
+            .collect();
+        assert_eq!(sound.len(), 1);
+        image[14] = sound[0];
+        let words = eeprom(image.clone()).configuration().unwrap();
+        assert_eq!(words[..3], [8, 0x4400, 0x1388]);
+        image[14] ^= 1;
+        let mut bad = eeprom(image.clone());
+        assert_eq!(bad.configuration(), None);
+        assert_eq!(bad.status() & CHECKSUM_ERROR, CHECKSUM_ERROR);
+        image[14..16].copy_from_slice(&ANY_CHECKSUM.to_le_bytes());
+        assert!(eeprom(image).configuration().is_some());
+        assert_eq!(eeprom(vec![0; 7]).configuration(), None);
     }
 }

@@ -1,50 +1,41 @@
-//! One datagram at one SubDevice: addressing, data and working counter.
+//! One datagram at one SubDevice: addressing, data and working counter (Beckhoff ESC data sheet, section I, 2.4
+//! and 2.5).
 
 use super::Esc;
 use super::access::Combine;
+use super::fmmu::{self, Overlap, Use};
 use super::registers as reg;
-use crate::Nanos;
+use super::sm::Filled;
 use crate::bits;
 use crate::frame::{Command, Datagram};
 
-/// Longest physical read-modify-write; a datagram cannot be longer.
-const MAX_DATA: usize = 1500;
-
 impl Esc {
-    /// Processes a datagram in place. `now` is when the frame's first byte arrived.
-    pub fn execute(&mut self, frame: &mut [u8], datagram: &Datagram, now: Nanos, local: u64) {
+    /// Processes a datagram of the frame that [`Esc::begin_frame`] announced, in place.
+    pub fn execute(&mut self, frame: &mut [u8], datagram: &Datagram) {
         use Command as C;
         let adp = datagram.adp(frame);
         match datagram.command {
             C::Nop | C::Unknown(_) => {}
-            C::Lrd | C::Lwr | C::Lrw => self.logical(frame, datagram, now, local),
+            C::Lrd | C::Lwr | C::Lrw => self.logical(frame, datagram),
             C::Aprd | C::Apwr | C::Aprw | C::Armw => {
                 datagram.set_adp(frame, adp.wrapping_add(1));
-                self.physical(frame, datagram, adp == 0, now, local);
+                self.physical(frame, datagram, adp == 0);
             }
             C::Brd | C::Bwr | C::Brw => {
                 datagram.set_adp(frame, adp.wrapping_add(1));
-                self.physical(frame, datagram, true, now, local);
+                self.physical(frame, datagram, true);
             }
             C::Fprd | C::Fpwr | C::Fprw | C::Frmw => {
                 let addressed = adp == self.station || Some(adp) == self.alias;
-                self.physical(frame, datagram, addressed, now, local);
+                self.physical(frame, datagram, addressed);
             }
         }
-        let irq = self.u16_at(reg::ECAT_EVENT) & self.u16_at(reg::ECAT_EVENT_MASK);
-        if irq != 0 {
-            datagram.or_irq(frame, irq);
+        if self.frame.irq != 0 {
+            datagram.or_irq(frame, self.frame.irq);
         }
     }
 
-    fn physical(
-        &mut self,
-        frame: &mut [u8],
-        datagram: &Datagram,
-        addressed: bool,
-        now: Nanos,
-        local: u64,
-    ) {
+    fn physical(&mut self, frame: &mut [u8], datagram: &Datagram, addressed: bool) {
         use Command as C;
         let ado = datagram.ado(frame);
         let Some(data) = frame.get_mut(datagram.data.clone()) else {
@@ -52,29 +43,32 @@ impl Esc {
         };
         let count = |done: bool, n: u16| if done { n } else { 0 };
         let wkc = match datagram.command {
-            C::Aprd | C::Fprd if addressed => {
-                count(self.read(ado, data, Combine::Replace, local), 1)
+            C::Aprd | C::Fprd if addressed => count(self.read(ado, data, Combine::Replace), 1),
+            C::Brd => count(self.read(ado, data, Combine::Or), 1),
+            C::Fpwr | C::Bwr if addressed => {
+                let done = self.write(ado, data);
+                // Only these two take the time at every port.
+                self.frame.latches_ports |= done && touches_receive_times(ado, data);
+                count(done, 1)
             }
-            C::Brd => count(self.read(ado, data, Combine::Or, local), 1),
-            C::Apwr | C::Fpwr | C::Bwr if addressed => count(self.write(ado, data, now, local), 1),
+            C::Apwr if addressed => count(self.write(ado, data), 1),
             C::Aprw | C::Fprw | C::Brw if addressed => {
-                let mut written = [0; MAX_DATA];
-                let Some(written) = written.get_mut(..data.len()) else {
-                    return;
-                };
-                written.copy_from_slice(data);
+                let mut arrived = std::mem::take(&mut self.scratch);
+                arrived.clear();
+                arrived.extend_from_slice(data);
                 let how = if datagram.command == C::Brw {
                     Combine::Or
                 } else {
                     Combine::Replace
                 };
-                let read = self.read(ado, data, how, local);
-                count(read, 1) + count(self.write(ado, written, now, local), 2)
+                let read = self.read(ado, data, how);
+                let offset = self.u16_at(reg::READ_WRITE_OFFSET);
+                let written = self.write(ado.wrapping_add(offset), &arrived);
+                self.scratch = arrived;
+                count(read, 1) + count(written, 2)
             }
-            C::Armw | C::Frmw if addressed => {
-                count(self.read(ado, data, Combine::Replace, local), 1)
-            }
-            C::Armw | C::Frmw => count(self.write(ado, data, now, local), 1),
+            C::Armw | C::Frmw if addressed => count(self.read(ado, data, Combine::Replace), 1),
+            C::Armw | C::Frmw => count(self.write(ado, data), 1),
             _ => 0,
         };
         if wkc > 0 {
@@ -82,72 +76,126 @@ impl Esc {
         }
     }
 
-    fn logical(&mut self, frame: &mut [u8], datagram: &Datagram, now: Nanos, local: u64) {
+    fn logical(&mut self, frame: &mut [u8], datagram: &Datagram) {
         let address = datagram.logical(frame);
         let Some(data) = frame.get_mut(datagram.data.clone()) else {
             return;
         };
-        let mut wkc = 0;
-        // What arrived goes out to the device before inputs take its place, also where several
-        // FMMUs share logical addresses.
-        if datagram.command != Command::Lrd && self.logical_write(address, data, now, local) {
-            wkc += if datagram.command == Command::Lrw {
-                2
-            } else {
-                1
-            };
-        }
-        if datagram.command != Command::Lwr && self.logical_read(address, data, local) {
-            wkc += 1;
-        }
+        let wkc = match datagram.command {
+            Command::Lrd => u16::from(self.logical_read(address, data)),
+            Command::Lwr => u16::from(self.logical_write(address, data)),
+            // Reading comes first, and what arrived is written.
+            _ if self.fmmus.looped() => {
+                let mut arrived = std::mem::take(&mut self.scratch);
+                arrived.clear();
+                arrived.extend_from_slice(data);
+                let read = self.logical_read(address, data);
+                let written = self.logical_write(address, &arrived);
+                self.scratch = arrived;
+                u16::from(read) + u16::from(written) * 2
+            }
+            // The same, without a copy: nothing that is read has been written.
+            _ => {
+                let written = self.logical_write(address, data);
+                let read = self.logical_read(address, data);
+                u16::from(read) + u16::from(written) * 2
+            }
+        };
         if wkc > 0 {
             datagram.add_wkc(frame, wkc);
         }
     }
 
-    fn logical_write(&mut self, address: u32, data: &[u8], now: Nanos, local: u64) -> bool {
+    fn logical_write(&mut self, address: u32, data: &[u8]) -> bool {
         let mut any = false;
-        for n in 0..self.fmmus.len() {
-            let Some(fmmu) = self.fmmus[n].filter(|fmmu| fmmu.write) else {
-                continue;
-            };
-            let Some(o) = fmmu.overlap(address, data.len()) else {
-                continue;
-            };
-            let start = o.physical_bit / 8;
-            let len = (o.physical_bit + o.bits).div_ceil(8) - start;
-            if start < reg::ADDRESS_SPACE {
-                let bytes = data.get(o.data_bit / 8..(o.data_bit + o.bits) / 8);
-                let aligned = (o.data_bit | o.physical_bit | o.bits).is_multiple_of(8);
-                if let (true, Some(bytes), Ok(start)) = (aligned, bytes, u16::try_from(start)) {
-                    any |= self.write(start, bytes, now, local);
-                }
-            } else if self.begin_write(start, len) {
-                bits::copy(&mut self.mem, o.physical_bit, data, o.data_bit, o.bits);
-                self.end_write(start, len, local);
-                any = true;
+        for n in 0..fmmu::COUNT {
+            let mut from = 0;
+            while let Some((overlap, next)) =
+                self.fmmus
+                    .next_overlap(n, Use::Write, address, data.len(), from)
+            {
+                any |= self.write_bits(&overlap, data);
+                from = next;
             }
         }
         any
     }
 
-    fn logical_read(&mut self, address: u32, data: &mut [u8], local: u64) -> bool {
+    fn logical_read(&mut self, address: u32, data: &mut [u8]) -> bool {
         let mut any = false;
-        for n in 0..self.fmmus.len() {
-            let Some(fmmu) = self.fmmus[n].filter(|fmmu| fmmu.read) else {
-                continue;
-            };
-            let Some(o) = fmmu.overlap(address, data.len()) else {
-                continue;
-            };
-            let start = o.physical_bit / 8;
-            let len = (o.physical_bit + o.bits).div_ceil(8) - start;
-            if self.begin_read(start, len, local) {
-                bits::copy(data, o.data_bit, &self.mem, o.physical_bit, o.bits);
-                self.end_read(start, len);
-                any = true;
+        for n in 0..fmmu::COUNT {
+            let mut from = 0;
+            while let Some((overlap, next)) =
+                self.fmmus
+                    .next_overlap(n, Use::Read, address, data.len(), from)
+            {
+                any |= self.read_bits(&overlap, data);
+                from = next;
             }
         }
         any
     }
+
+    fn read_bits(&mut self, overlap: &Overlap, data: &mut [u8]) -> bool {
+        let (mut at, end) = overlap.physical_bytes();
+        let mut any = false;
+        while at < end {
+            let (len, place) = self.readable(at, end);
+            if let Some(place) = place {
+                let part = overlap.within(at, at + len);
+                let from = place * 8 + part.physical_bit - at * 8;
+                bits::copy(data, part.data_bit, &self.mem, from, part.bits);
+                any = true;
+            }
+            at += len;
+        }
+        any
+    }
+
+    fn write_bits(&mut self, overlap: &Overlap, data: &[u8]) -> bool {
+        let (mut at, end) = overlap.physical_bytes();
+        if !self.may_write(at, end) {
+            return false;
+        }
+        let mut any = false;
+        while at < end {
+            if at < reg::ADDRESS_SPACE {
+                let stop = end.min(reg::ADDRESS_SPACE);
+                any |= self.write_register_bits(at, stop, &overlap.within(at, stop), data);
+                at = stop;
+                continue;
+            }
+            let (len, place) = self.stretch(at, end, Filled::ByMainDevice);
+            if let Some(place) = place {
+                let part = overlap.within(at, at + len);
+                let to = place * 8 + part.physical_bit - at * 8;
+                bits::copy(&mut self.mem, to, data, part.data_bit, part.bits);
+                any = true;
+            }
+            at += len;
+        }
+        any
+    }
+
+    /// Registers are written in whole bytes; bits that are not mapped keep what they show.
+    fn write_register_bits(&mut self, at: usize, end: usize, part: &Overlap, data: &[u8]) -> bool {
+        let mut bytes = std::mem::take(&mut self.register_bytes);
+        bytes.clear();
+        bytes.extend_from_slice(self.mem.get(at..end).unwrap_or_default());
+        bits::copy(
+            &mut bytes,
+            part.physical_bit - at * 8,
+            data,
+            part.data_bit,
+            part.bits,
+        );
+        let done = self.write_registers(at, &bytes);
+        self.register_bytes = bytes;
+        done
+    }
+}
+
+fn touches_receive_times(ado: u16, data: &[u8]) -> bool {
+    let start = usize::from(ado);
+    super::access::overlaps(start, start + data.len(), reg::DC_RECEIVE_TIMES, 4)
 }

@@ -1,4 +1,9 @@
-//! Fieldbus memory management units: logical bits ↔ physical bits.
+//! Fieldbus memory management units: logical bits ↔ physical bits (Beckhoff ESC data sheet, section I, 7).
+//! Bits beside those mapped keep their value everywhere; real controllers promise that only for digital
+//! outputs and leave them undefined elsewhere.
+
+/// FMMUs that a controller here can have.
+pub const COUNT: usize = 8;
 
 /// One configured FMMU.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -21,6 +26,27 @@ pub struct Overlap {
     /// First bit in the physical address space.
     pub physical_bit: usize,
     pub bits: usize,
+}
+
+impl Overlap {
+    /// First physical byte and the one behind the last.
+    #[must_use]
+    pub fn physical_bytes(&self) -> (usize, usize) {
+        let end = self.physical_bit + self.bits;
+        (self.physical_bit / 8, end.div_ceil(8))
+    }
+
+    /// What of it lies in these physical bytes.
+    #[must_use]
+    pub fn within(&self, start: usize, end: usize) -> Self {
+        let first = self.physical_bit.max(start * 8);
+        let last = (self.physical_bit + self.bits).min(end * 8);
+        Self {
+            data_bit: self.data_bit + (first - self.physical_bit),
+            physical_bit: first,
+            bits: last.saturating_sub(first),
+        }
+    }
 }
 
 impl Fmmu {
@@ -59,6 +85,106 @@ impl Fmmu {
                 + usize::from(self.physical_bit)
                 + usize::try_from(first - mine).ok()?,
             bits: usize::try_from(bits).ok()?,
+        })
+    }
+}
+
+/// Which way data go.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Use {
+    Read,
+    Write,
+}
+
+impl Fmmu {
+    fn is_for(&self, way: Use) -> bool {
+        match way {
+            Use::Read => self.read,
+            Use::Write => self.write,
+        }
+    }
+
+    fn logical_bytes(&self) -> std::ops::Range<u64> {
+        let start = u64::from(self.logical);
+        start..start + (u64::from(self.start_bit) + self.bits()).div_ceil(8)
+    }
+
+    fn physical_bytes(&self) -> std::ops::Range<u64> {
+        let start = u64::from(self.physical);
+        start..start + (u64::from(self.physical_bit) + self.bits()).div_ceil(8)
+    }
+}
+
+fn meet(a: &std::ops::Range<u64>, b: &std::ops::Range<u64>) -> bool {
+    a.start < b.end && b.start < a.end
+}
+
+/// Those of one controller.
+#[derive(Debug, Clone, Default)]
+pub struct Fmmus {
+    list: [Option<Fmmu>; COUNT],
+    /// Two of the same use want one logical byte: the lower number gets it.
+    contested: bool,
+    /// Memory that is read is also written.
+    looped: bool,
+}
+
+impl Fmmus {
+    /// From the registers of all of them.
+    #[must_use]
+    pub fn from_registers(registers: &[u8]) -> Self {
+        let mut list = [None; COUNT];
+        for (fmmu, r) in list.iter_mut().zip(registers.chunks_exact(16)) {
+            *fmmu = r.try_into().ok().and_then(Fmmu::from_registers);
+        }
+        let pairs = || {
+            let used = list.iter().flatten().enumerate();
+            used.flat_map(|(n, a)| list.iter().flatten().skip(n + 1).map(move |b| (a, b)))
+        };
+        let same_use = |a: &Fmmu, b: &Fmmu| a.read && b.read || a.write && b.write;
+        let other_use = |a: &Fmmu, b: &Fmmu| a.read && b.write || a.write && b.read;
+        Self {
+            list,
+            contested: pairs()
+                .any(|(a, b)| same_use(a, b) && meet(&a.logical_bytes(), &b.logical_bytes())),
+            looped: list.iter().flatten().any(|f| f.read && f.write)
+                || pairs().any(|(a, b)| {
+                    other_use(a, b) && meet(&a.physical_bytes(), &b.physical_bytes())
+                }),
+        }
+    }
+
+    /// Whether reading before writing makes a difference.
+    #[must_use]
+    pub fn looped(&self) -> bool {
+        self.looped
+    }
+
+    /// What FMMU `n` maps of a datagram, from byte `from` of its data on, and where to go on asking.
+    #[must_use]
+    pub fn next_overlap(
+        &self,
+        n: usize,
+        way: Use,
+        address: u32,
+        len: usize,
+        from: usize,
+    ) -> Option<(Overlap, usize)> {
+        let is_for = |fmmu: &&Fmmu| fmmu.is_for(way);
+        let fmmu = self.list.get(n)?.as_ref().filter(is_for)?;
+        if !self.contested {
+            return (from == 0).then_some((fmmu.overlap(address, len)?, len));
+        }
+        let lower = self.list.get(..n)?;
+        (from..len).find_map(|at| {
+            let byte = address.checked_add(u32::try_from(at).ok()?)?;
+            let mut overlap = fmmu.overlap(byte, 1)?;
+            overlap.data_bit += at * 8;
+            let taken = lower.iter().flatten().filter(is_for);
+            let free = !taken
+                .into_iter()
+                .any(|f| f.logical_bytes().contains(&u64::from(byte)));
+            free.then_some((overlap, at + 1))
         })
     }
 }
@@ -113,5 +239,43 @@ mod tests {
         assert_eq!(Fmmu::from_registers(&r), None);
         assert_eq!(Fmmu::from_registers(&registers(0, 0, (0, 7), 0, 0)), None);
         assert_eq!(Fmmu::from_registers(&registers(0, 1, (5, 2), 0, 0)), None);
+    }
+
+    #[test]
+    fn the_lower_number_gets_a_contested_byte() {
+        let mut all = [0; 128];
+        // 0x1000–0x1001 and 0x1001–0x1002; a third of the other use does not matter.
+        all[..16].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
+        all[16..32].copy_from_slice(&registers(0x1001, 2, (0, 7), 0x1200, 0));
+        all[32..48].copy_from_slice(&registers(0x1001, 1, (0, 7), 0x1300, 0));
+        all[32 + 11] = 2;
+        let fmmus = Fmmus::from_registers(&all);
+        let mapped = |n, way| {
+            let mut from = 0;
+            let mut seen = Vec::new();
+            while let Some((o, next)) = fmmus.next_overlap(n, way, 0x1000, 4, from) {
+                seen.push((o.data_bit / 8, o.physical_bit / 8, o.bits));
+                from = next;
+            }
+            seen
+        };
+        assert_eq!(mapped(0, Use::Read), [(0, 0x1100, 8), (1, 0x1101, 8)]);
+        assert_eq!(mapped(1, Use::Read), [(2, 0x1201, 8)]);
+        assert_eq!(mapped(2, Use::Write), [(1, 0x1300, 8)]);
+        assert_eq!(mapped(2, Use::Read), []);
+        assert_eq!(mapped(7, Use::Read), []);
+    }
+
+    #[test]
+    fn uncontested_ones_map_in_one_go() {
+        let mut all = [0; 48];
+        all[..16].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
+        all[16..32].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
+        all[16 + 11] = 2;
+        let fmmus = Fmmus::from_registers(&all);
+        assert!(fmmus.looped());
+        let (overlap, next) = fmmus.next_overlap(0, Use::Read, 0x0fff, 8, 0).unwrap();
+        assert_eq!((overlap.data_bit, overlap.bits), (8, 16));
+        assert_eq!(fmmus.next_overlap(0, Use::Read, 0x0fff, 8, next), None);
     }
 }

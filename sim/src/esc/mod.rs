@@ -1,5 +1,13 @@
-//! An EtherCAT SubDevice controller: 4 KiB of registers, process RAM, and what register accesses
-//! set in motion. Knows nothing of CoE or drives; it raises events for the device around it.
+//! An EtherCAT SubDevice controller: 4 KiB of registers, process RAM, and what accesses set in motion. Knows nothing
+//! of CoE or drives; it raises events for the device around it.
+//!
+//! From the wire inwards:
+//!
+//! * `execute`: a datagram; `access`: what it reads and writes; `guard`: what it may not
+//! * `apply`: a frame's beginning and end, and what register writes do
+//! * `fmmu`, `sm`: where logical addresses lead, and who may touch RAM
+//! * `al`, `eeprom`, `watchdog`, `dc`: what lives behind registers; `registers`, `info`: which of them there are
+//! * `ports`: links and loops; `device_side`: the controller as the device's own side sees it
 
 pub mod al;
 pub mod dc;
@@ -12,13 +20,22 @@ pub mod sm;
 pub mod watchdog;
 
 mod access;
+mod apply;
+mod device_side;
 mod execute;
+mod guard;
+#[cfg(test)]
+mod sm_tests;
 
 use crate::Nanos;
+use access::Shadow;
 use al::AlState;
-use dc::{Clock, Dc};
+use apply::Frame;
+use dc::sync::Edges;
+use dc::{Clock, Dc, Jitter, Width};
 use eeprom::Eeprom;
-use fmmu::Fmmu;
+use fmmu::Fmmus;
+use guard::Guard;
 pub use info::EscInfo;
 use ports::Ports;
 use registers as reg;
@@ -26,13 +43,27 @@ use registers::RegisterMap;
 use sm::SyncManager;
 use watchdog::Watchdog;
 
+/// Bits of the event registers.
+pub(crate) mod event {
+    /// MainDevice's events, 0x0210; SyncManagers follow from bit 4 on.
+    pub(crate) const DC_LATCH: u16 = 0x0001;
+    pub(crate) const DL_STATUS: u16 = 0x0004;
+    pub(crate) const AL_STATUS: u16 = 0x0008;
+    /// Device's events, 0x0220; SyncManagers follow from bit 8 on.
+    pub(crate) const AL_CONTROL: u32 = 0x0001;
+    pub(crate) const DEVICE_DC_LATCH: u32 = 0x0002;
+    pub(crate) const SYNC0: u32 = 0x0004;
+    pub(crate) const SM_ACTIVATION: u32 = 0x0010;
+    pub(crate) const WATCHDOG: u32 = 0x0040;
+}
+
 /// What the MainDevice's accesses mean to the device's application; taken after every frame.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Raised {
     pub al_control: Option<u16>,
     /// Bit per SyncManager: filled to its last byte by the MainDevice.
     pub sm_written: u8,
-    /// Bit per SyncManager: mailbox emptied by the MainDevice.
+    /// Bit per SyncManager: read to its last byte by the MainDevice.
     pub sm_read: u8,
     /// The activation byte of the mailbox-in SyncManager asks to repeat.
     pub repeat_request: Option<bool>,
@@ -40,10 +71,12 @@ pub struct Raised {
     pub sm_configured: bool,
     /// 0x0981 changed.
     pub sync_changed: bool,
+    /// SYNC outputs that rose because a debug pulse was ordered.
+    pub ping: Edges,
+    /// The reset sequence is complete.
+    pub reset: bool,
 }
 
-/// Where process RAM starts.
-const PROCESS_RAM: usize = 0x1000;
 const MAX_RAM_KIB: u8 = 60;
 
 /// Fixed properties of an ESC.
@@ -56,6 +89,9 @@ pub struct EscConfig {
     pub with_dc: bool,
     pub clock_offset_ns: u64,
     pub clock_drift_ppm: f64,
+    /// Noise on time stamps, ± nanoseconds, and its seed.
+    pub clock_jitter_ns: u32,
+    pub jitter_seed: u64,
 }
 
 #[derive(Debug, Clone)]
@@ -63,15 +99,28 @@ pub struct Esc {
     config: EscConfig,
     mem: Vec<u8>,
     map: RegisterMap,
-    fmmus: [Option<Fmmu>; 8],
+    fmmus: Fmmus,
     pub(crate) sms: [SyncManager; 8],
     pub(crate) clock: Clock,
+    jitter: Jitter,
     pub(crate) dc: Option<Dc>,
     pub(crate) eeprom: Eeprom,
+    /// Valid until the next frame begins.
+    eeprom_write_enable: bool,
+    /// The configuration area has been taken from the EEPROM: there is an application and process RAM.
+    loaded: bool,
     pub(crate) watchdog: Watchdog,
+    pdi_watchdog: Watchdog,
+    guard: Guard,
+    frame: Frame,
+    shadow: Shadow,
+    scratch: Vec<u8>,
+    register_bytes: Vec<u8>,
     raised: Raised,
     station: u16,
     alias: Option<u16>,
+    /// AL control was written and the device has not read it yet.
+    al_locked: bool,
     latch: bool,
     ports: Ports,
 }
@@ -79,18 +128,29 @@ pub struct Esc {
 impl Esc {
     #[must_use]
     pub fn new(config: EscConfig, sii: Vec<u8>) -> Self {
+        let ram = usize::from(config.info.ram_kib.min(MAX_RAM_KIB)) * 1024;
         let mut esc = Self {
-            mem: vec![0; PROCESS_RAM + usize::from(config.info.ram_kib.min(MAX_RAM_KIB)) * 1024],
-            map: RegisterMap::new(&config.info, config.with_dc),
-            fmmus: [None; 8],
+            mem: vec![0; reg::PROCESS_RAM + ram],
+            map: RegisterMap::new(&config.info, clock_width(&config)),
+            fmmus: Fmmus::default(),
             sms: [SyncManager::default(); 8],
             clock: Clock::new(0, config.clock_offset_ns, config.clock_drift_ppm),
+            jitter: Jitter::new(config.clock_jitter_ns, config.jitter_seed),
             dc: None,
             eeprom: Eeprom::new(sii, &config.info),
+            eeprom_write_enable: false,
+            loaded: false,
             watchdog: Watchdog::default(),
+            pdi_watchdog: Watchdog::default(),
+            guard: Guard::default(),
+            frame: Frame::default(),
+            shadow: Shadow::with_capacity(),
+            scratch: Vec::with_capacity(1536),
+            register_bytes: Vec::with_capacity(16),
             raised: Raised::default(),
             station: 0,
             alias: None,
+            al_locked: false,
             latch: false,
             ports: Ports::new(config.info.ports.unwrap_or(config.ports)),
             config,
@@ -99,53 +159,74 @@ impl Esc {
         esc
     }
 
-    /// Everything volatile back to its reset value.
+    /// Everything volatile back to its reset value, then the EEPROM is read.
     pub fn power_on(&mut self, now: Nanos) {
+        let EscConfig { info, .. } = self.config;
         self.mem.fill(0);
-        self.fmmus = [None; 8];
+        self.fmmus = Fmmus::default();
         self.sms = [SyncManager::default(); 8];
         self.clock = Clock::new(
             now,
             self.config.clock_offset_ns,
             self.config.clock_drift_ppm,
         );
-        let EscConfig { info, with_dc, .. } = self.config;
-        self.dc = (with_dc && info.has(info::feature::DC)).then(Dc::default);
-        self.watchdog = Watchdog::default();
+        self.dc = clock_width(&self.config).map(|width| Dc::new(width, 0));
+        (self.watchdog, self.pdi_watchdog) = (Watchdog::default(), Watchdog::default());
+        self.guard = Guard::default();
+        self.frame = Frame::default();
+        self.shadow.clear();
         self.raised = Raised::default();
         (self.station, self.alias, self.latch) = (0, None, false);
+        (self.al_locked, self.eeprom_write_enable) = (false, false);
 
         let ([b0, b1], [f0, f1]) = (info.build.to_le_bytes(), info.features.to_le_bytes());
         let ports = info.ports.unwrap_or(self.config.ports);
         self.put(reg::TYPE, &[info.kind, info.revision, b0, b1]);
         self.put(reg::TYPE + 4, &[info.fmmus, info.sync_managers]);
         self.put(reg::TYPE + 6, &[info.ram_kib, ports, f0, f1]);
-        let alias = self.eeprom.word(4);
-        self.put(reg::STATION_ALIAS, &alias.to_le_bytes());
-        self.put(reg::PDI_CONTROL, &self.eeprom.word(0).to_le_bytes());
-        self.put(reg::PDI_CONFIG, &self.eeprom.word(1).to_le_bytes());
         self.put(reg::DL_CONTROL, &[0x01, 0, 0x07, 0]);
+        self.put(reg::AL_CONTROL, &[AlState::Init.code()]);
+        self.put(reg::AL_STATUS, &[AlState::Init.code()]);
+        self.put(reg::AL_EVENT_MASK, &[0x0f, 0xff, 0xff, 0x00]);
         self.put(reg::WD_DIVIDER, &watchdog::DEFAULT_DIVIDER.to_le_bytes());
         self.put(reg::WD_PDI, &watchdog::DEFAULT_COUNT.to_le_bytes());
         self.put(reg::WD_PROCESS_DATA, &watchdog::DEFAULT_COUNT.to_le_bytes());
-        self.put(reg::WD_STATUS, &[1]);
         if info.has(info::feature::DC) {
             self.put(reg::DC_RECEIVE_TIMES, info.receive_times.as_flattened());
         }
         if self.dc.is_some() {
-            self.put(reg::DC_SPEED_START, &[0x00, 0x10]);
-            self.put(reg::DC_FILTER, &[0x04, 0x0c]);
-            self.put(reg::DC_PULSE_LENGTH, &self.eeprom.word(2).to_le_bytes());
-            if let Some(dc) = &mut self.dc {
-                dc.reset_loop(&mut self.clock, now, 4);
-            }
+            let start = dc::DEFAULT_SPEED_START.to_le_bytes();
+            self.put(reg::DC_SPEED_START, &start);
+            self.put(reg::DC_FILTER, &dc::DEFAULT_FILTERS);
         }
+        for n in 0..self.sms.len() {
+            self.refresh_sm(n);
+        }
+        self.eeprom.power_on();
+        self.loaded = false;
+        self.load_configuration();
         self.refresh_eeprom();
-        self.set_al(AlState::Init, 0);
         self.ports = Ports::new(ports);
-        // EEPROM loaded, PDI watchdog not expired.
-        self.put(reg::DL_STATUS, &[0x03, 0]);
         self.show_ports();
+    }
+
+    /// Takes the configuration area over, if it is sound. The alias is taken once after power-on.
+    fn load_configuration(&mut self) {
+        let Some([a0, a1, a2, a3, a4, ..]) = self.eeprom.configuration() else {
+            return;
+        };
+        self.put(reg::PDI_CONTROL, &a0.to_le_bytes());
+        self.put(reg::PDI_CONFIG, &a1.to_le_bytes());
+        self.put(reg::PDI_CONFIG_EXTENDED, &a3.to_le_bytes());
+        if let Some(dc) = &mut self.dc {
+            dc.sync.pulse_length = a2;
+            self.put(reg::DC_PULSE_LENGTH, &a2.to_le_bytes());
+        }
+        if !self.loaded {
+            self.loaded = true;
+            self.put(reg::STATION_ALIAS, &a4.to_le_bytes());
+            self.take_alias();
+        }
     }
 
     /// End of process RAM.
@@ -154,61 +235,11 @@ impl Esc {
         self.mem.len()
     }
 
-    /// Register or RAM contents as the device's own side sees them.
-    #[must_use]
-    pub fn bytes(&self, start: u16, len: u16) -> &[u8] {
-        let start = usize::from(start);
-        self.mem
-            .get(start..start + usize::from(len))
-            .unwrap_or_default()
-    }
-
-    /// Writes from the device's own side.
-    pub(crate) fn put(&mut self, start: u16, bytes: &[u8]) {
-        let start = usize::from(start);
-        if let Some(to) = self.mem.get_mut(start..start + bytes.len()) {
-            to.copy_from_slice(bytes);
-        }
-    }
-
-    pub(crate) fn bytes_mut(&mut self, start: u16, len: u16) -> &mut [u8] {
-        let start = usize::from(start);
-        self.mem
-            .get_mut(start..start + usize::from(len))
-            .unwrap_or_default()
-    }
-
-    pub(crate) fn u16_at(&self, at: u16) -> u16 {
-        self.bytes(at, 2).try_into().map_or(0, u16::from_le_bytes)
-    }
-
-    pub(crate) fn u32_at(&self, at: u16) -> u32 {
-        self.bytes(at, 4).try_into().map_or(0, u32::from_le_bytes)
-    }
-
-    pub(crate) fn u64_at(&self, at: u16) -> u64 {
-        self.bytes(at, 8).try_into().map_or(0, u64::from_le_bytes)
-    }
-
-    /// AL status and its code, as the application sets them.
-    pub(crate) fn set_al(&mut self, state: AlState, code: u16) {
-        let error = if code == 0 { 0 } else { al::ERROR };
-        let status = u16::from(state.code()) | error;
-        self.put(reg::AL_STATUS, &status.to_le_bytes());
-        self.put(reg::AL_STATUS_CODE, &code.to_le_bytes());
-        self.ecat_event(0x08);
-    }
-
-    pub(crate) fn ecat_event(&mut self, bits: u16) {
-        let events = self.u16_at(reg::ECAT_EVENT) | bits;
-        self.put(reg::ECAT_EVENT, &events.to_le_bytes());
-    }
-
-    /// Device emulation (bit 0 of 0x0141): nobody stands behind the controller, and AL status follows AL
-    /// control by itself.
-    #[must_use]
-    pub fn emulates_device(&self) -> bool {
-        self.u16_at(reg::PDI_CONTROL) & 0x0100 != 0
+    /// DL status without the ports.
+    fn own_dl_status(&self) -> u16 {
+        u16::from(self.loaded)
+            | u16::from(self.pdi_runs()) << 1
+            | u16::from(self.enhanced_link_detection()) << 2
     }
 
     #[must_use]
@@ -224,46 +255,15 @@ impl Esc {
     pub(crate) fn take_raised(&mut self) -> Raised {
         std::mem::take(&mut self.raised)
     }
+}
 
-    pub(crate) fn refresh_eeprom(&mut self) {
-        let write_enable = self.u16_at(reg::EEPROM_CONTROL) & eeprom::WRITE_ENABLE;
-        let status = self.eeprom.status() | write_enable;
-        self.put(reg::EEPROM_CONTROL, &status.to_le_bytes());
-    }
-
-    pub(crate) fn finish_eeprom(&mut self) {
-        if let Some((data, len)) = self.eeprom.finish() {
-            self.put(reg::EEPROM_DATA, data.get(..len).unwrap_or(&data));
+/// How wide the clock is, if the chip has one and it is switched on.
+fn clock_width(config: &EscConfig) -> Option<Width> {
+    (config.with_dc && config.info.has(info::feature::DC)).then(|| {
+        if config.info.has(info::feature::DC_64_BIT) {
+            Width::Bits64
+        } else {
+            Width::Bits32
         }
-        self.refresh_eeprom();
-    }
-
-    pub(crate) fn refresh_sm(&mut self, n: usize) {
-        let Some(status) = self.sms.get(n).map(SyncManager::status) else {
-            return;
-        };
-        if let Some(byte) = self.mem.get_mut(usize::from(reg::SM) + n * 8 + 5) {
-            *byte = status;
-        }
-    }
-
-    pub(crate) fn expire_watchdog(&mut self) {
-        self.watchdog.expire();
-        self.put(reg::WD_STATUS, &[0]);
-        let count = self
-            .bytes(reg::WD_COUNTER, 1)
-            .first()
-            .map_or(0, |c| c.saturating_add(1));
-        self.put(reg::WD_COUNTER, &[count]);
-    }
-
-    /// SYNC0 fired: count on, show the next pulse in 0x0990.
-    pub(crate) fn fire_sync0(&mut self) {
-        if let Some(dc) = &mut self.dc {
-            dc.fire();
-            if let dc::Sync0::Armed { next, .. } = dc.sync0 {
-                self.put(reg::DC_START_TIME, &next.to_le_bytes());
-            }
-        }
-    }
+    })
 }

@@ -4,8 +4,8 @@
 //! Source: Beckhoff ESC hardware data sheet, section I chapters 3, 4 and 14, section II chapters
 //! 2.4 and 2.9.
 
-use super::Esc;
 use super::registers as reg;
+use super::{Esc, event};
 use crate::Nanos;
 
 pub const PORTS: usize = 4;
@@ -172,6 +172,10 @@ impl Esc {
         self.ports.media
     }
 
+    pub(crate) fn links(&self) -> [bool; PORTS] {
+        self.ports.link
+    }
+
     /// Frames are sent and received at the port. With every loop closed, port 0 stays open so that
     /// the device can still be reached; DL status does not show it.
     pub(crate) fn port_open(&self, port: u8) -> bool {
@@ -218,14 +222,14 @@ impl Esc {
             return;
         }
         if self.ports.set_link(usize::from(port), up) {
-            self.count(reg::LOST_LINK + u16::from(port));
+            self.count_up(reg::LOST_LINK + u16::from(port));
         }
         self.show_ports();
     }
 
     /// A frame that makes no sense passed the processing unit.
     pub(crate) fn count_processing_error(&mut self) {
-        self.count(reg::PROCESSING_UNIT_ERRORS);
+        self.count_up(reg::PROCESSING_UNIT_ERRORS);
     }
 
     /// A valid frame has arrived at a closed port.
@@ -283,9 +287,9 @@ impl Esc {
     /// A frame that latches receive times came in at the port.
     pub(crate) fn latch_port(&mut self, port: u8, now: Nanos) {
         if usize::from(port) < PORTS {
-            let local = self.clock.local(now) as u32;
+            let stamp = self.stamp(now) as u32;
             let at = reg::DC_RECEIVE_TIMES + 4 * u16::from(port);
-            self.put(at, &local.to_le_bytes());
+            self.put(at, &stamp.to_le_bytes());
         }
     }
 }
@@ -301,19 +305,13 @@ impl Esc {
         self.ports.written.is_some()
     }
 
-    /// Writes the ports' part of DL status; a change is an ECAT event.
+    /// Writes DL status; a change is an ECAT event.
     pub(super) fn show_ports(&mut self) {
         let before = self.u16_at(reg::DL_STATUS);
-        let status = before & 0x000f | self.ports.status();
+        let status = self.own_dl_status() | self.ports.status();
         if status != before {
             self.put(reg::DL_STATUS, &status.to_le_bytes());
-            self.ecat_event(0x04);
-        }
-    }
-
-    fn count(&mut self, counter: u16) {
-        if let [value] = self.bytes_mut(counter, 1) {
-            *value = value.saturating_add(1);
+            self.ecat_event(event::DL_STATUS);
         }
     }
 

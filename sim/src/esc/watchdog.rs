@@ -1,5 +1,4 @@
-//! The process-data watchdog (0x0400–0x0443). The PDI watchdog never expires: the simulated
-//! application does not hang.
+//! The watchdogs for process data and for the process data interface (0x0400–0x0443).
 
 /// Reset values: 100 µs per unit, 1000 units.
 pub const DEFAULT_DIVIDER: u16 = 0x09c2;
@@ -7,33 +6,38 @@ pub const DEFAULT_COUNT: u16 = 0x03e8;
 
 #[derive(Debug, Clone, Default)]
 pub struct Watchdog {
-    /// Local time of expiry, `None` until first triggered.
+    /// Local time of expiry, `None` while it does not wait.
     deadline: Option<u64>,
-    pub expired: bool,
+    expired: bool,
 }
 
 impl Watchdog {
-    /// Process data arrived in a SyncManager that triggers the watchdog.
+    /// Starts waiting anew; a count of 0 switches it off. Not before `divider` and `count` are over it
+    /// expires; real ones take up to one unit longer.
     pub fn trigger(&mut self, local: u64, divider: u16, count: u16) {
         self.expired = false;
         let unit = (u64::from(divider) + 2) * 40;
         self.deadline = (count > 0).then(|| local.saturating_add(unit * u64::from(count)));
     }
 
-    /// Stops waiting, as leaving SafeOp and Op does.
+    /// Stops waiting, and is content.
     pub fn stop(&mut self) {
-        self.deadline = None;
-        self.expired = false;
+        (self.deadline, self.expired) = (None, false);
+    }
+
+    pub fn expire(&mut self) {
+        (self.deadline, self.expired) = (None, true);
+    }
+
+    /// Expired, and not triggered since.
+    #[must_use]
+    pub fn expired(&self) -> bool {
+        self.expired
     }
 
     #[must_use]
     pub fn due(&self) -> u64 {
         self.deadline.unwrap_or(u64::MAX)
-    }
-
-    pub fn expire(&mut self) {
-        self.deadline = None;
-        self.expired = true;
     }
 }
 
@@ -42,12 +46,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_are_100_ms() {
-        let mut watchdog = Watchdog::default();
-        assert_eq!(watchdog.due(), u64::MAX);
-        watchdog.trigger(5, DEFAULT_DIVIDER, DEFAULT_COUNT);
-        assert_eq!(watchdog.due(), 100_000_005);
-        watchdog.trigger(5, DEFAULT_DIVIDER, 0);
-        assert_eq!(watchdog.due(), u64::MAX);
+    fn divider_and_count_make_the_time() {
+        // (divider, count, nanoseconds)
+        let rows = [
+            (DEFAULT_DIVIDER, DEFAULT_COUNT, 100_000_000),
+            (0, 1, 80),
+            (0x09c2, 1, 100_000),
+            (0xffff, 0xffff, 65_537 * 40 * 65_535),
+        ];
+        for (divider, count, expected) in rows {
+            let mut watchdog = Watchdog::default();
+            assert_eq!(watchdog.due(), u64::MAX, "not before it is triggered");
+            watchdog.trigger(5, divider, count);
+            assert_eq!(watchdog.due(), expected + 5);
+            watchdog.trigger(5, divider, 0);
+            assert_eq!(watchdog.due(), u64::MAX, "0 switches it off");
+        }
     }
 }

@@ -17,7 +17,6 @@ mod outer;
 #[cfg(test)]
 mod tests;
 
-use super::objects::CurrentLimits;
 use super::plant::{Plant, PlantParams};
 
 use current::{CurrentLoop, Winding};
@@ -63,7 +62,8 @@ pub(super) struct Feed {
 /// What limits the loops.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bounds {
-    pub current: CurrentLimits,
+    /// A.
+    pub current: f64,
     /// Counts/s.
     pub speed: f64,
 }
@@ -175,10 +175,7 @@ impl Controller {
     /// from asking for what they should.
     pub(super) fn ask(&mut self, demand: Demand, bounds: &Bounds) -> bool {
         let bounds = Bounds {
-            current: CurrentLimits {
-                forward: self.winding.allow(bounds.current.forward),
-                backward: self.winding.allow(bounds.current.backward),
-            },
+            current: self.winding.allow(bounds.current),
             speed: bounds.speed / self.counts_per_rad,
         };
         let asked = self.outer.ask(demand, &self.estimator, &bounds);
