@@ -1,6 +1,7 @@
 //! CANopen over EtherCAT: the object dictionary and the servers that answer for it.
 //!
 //! * `store`: every object as a slot in one arena
+//! * `place`: where a value is in it
 //! * `datatype`: what values mean, their codes and ranges
 //! * `objects`: reading and writing with access rights and complete access
 //! * `pdo`: PDO assignment and mapping, modules
@@ -14,6 +15,7 @@ mod datatype;
 mod info;
 mod objects;
 pub mod pdo;
+mod place;
 mod sdo;
 pub mod store;
 

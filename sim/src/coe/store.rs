@@ -7,6 +7,7 @@ use std::ops::{Range, RangeInclusive};
 use ecaxis_esi::model::{Access, Dictionary, ObjectCode, PdoMapping, Writable};
 
 use super::datatype::{self, Kind};
+use super::place::{Place, TAIL};
 
 /// A subindex that exists, as a handle that stays valid for the store's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -58,7 +59,9 @@ struct Object {
 /// All objects of one device.
 #[derive(Debug, Clone, Default)]
 pub struct ObjectStore {
+    /// Ends with [`TAIL`] bytes of no item, so that every item can be read as a whole word.
     arena: Vec<u8>,
+    places: Vec<Place>,
     /// The arena as the device left its maker.
     defaults: Vec<u8>,
     /// Sorted by index; objects nobody described are not in it.
@@ -279,15 +282,19 @@ impl ObjectStore {
     fn insert(&mut self, mut item: Item, default: &[u8]) -> Slot {
         let key = key(item.index, item.sub);
         let len = usize::try_from(item.bit_len.div_ceil(8)).unwrap_or(0);
-        let start = self.arena.len();
+        let start = self.arena.len().saturating_sub(TAIL);
+        self.arena.truncate(start);
         self.arena.extend(
             default
                 .iter()
                 .copied()
                 .chain(std::iter::repeat(0))
-                .take(len),
+                .take(len)
+                .chain([0; TAIL]),
         );
         item.range = start..start + len;
+        self.places
+            .push(Place::new(start, item.bit_len, item.signed()));
         let slot = Slot(u32::try_from(self.items.len()).unwrap_or(u32::MAX));
         self.items.push(item);
         match self.order.binary_search_by_key(&key, |(k, _)| *k) {
@@ -355,32 +362,23 @@ impl ObjectStore {
     /// The value, sign-extended if the dictionary's type is signed; of long items the low 64 bits.
     #[must_use]
     pub fn get(&self, slot: Slot) -> i64 {
-        self.item(slot).map_or(0, |item| {
-            number(self.slice(item), item.bit_len, item.signed())
-        })
+        self.places
+            .get(slot.0 as usize)
+            .map_or(0, |place| place.get(&self.arena))
     }
 
     /// The value as two's complement of its length, whatever the dictionary says.
     #[must_use]
     pub fn get_signed(&self, slot: Slot) -> i64 {
-        self.item(slot)
-            .map_or(0, |item| number(self.slice(item), item.bit_len, true))
+        self.places
+            .get(slot.0 as usize)
+            .map_or(0, |place| place.get_signed(&self.arena))
     }
 
     /// Stores the low `bit_len` bits of the value, little-endian.
     pub fn set(&mut self, slot: Slot, value: i64) {
-        let Some(item) = self.items.get(slot.0 as usize) else {
-            return;
-        };
-        let value = if item.bit_len < 64 {
-            value & ((1 << item.bit_len) - 1)
-        } else {
-            value
-        };
-        if let Some(bytes) = self.arena.get_mut(item.range.clone()) {
-            for (to, from) in bytes.iter_mut().zip(value.to_le_bytes()) {
-                *to = from;
-            }
+        if let Some(place) = self.places.get(slot.0 as usize) {
+            place.set(&mut self.arena, value);
         }
     }
 
@@ -413,23 +411,6 @@ fn data_type(name: &str, bit_len: u32) -> u16 {
 fn overwrite(to: &mut [u8], from: &[u8]) {
     for (to, from) in to.iter_mut().zip(from) {
         *to = *from;
-    }
-}
-
-fn number(bytes: &[u8], bit_len: u32, signed: bool) -> i64 {
-    let mut raw = [0; 8];
-    for (to, from) in raw.iter_mut().zip(bytes) {
-        *to = *from;
-    }
-    let value = i64::from_le_bytes(raw);
-    let unused = 64u32.saturating_sub(bit_len.max(1));
-    if signed {
-        value << unused >> unused
-    } else {
-        (value << unused)
-            .cast_unsigned()
-            .wrapping_shr(unused)
-            .cast_signed()
     }
 }
 
@@ -478,6 +459,36 @@ mod tests {
         store.set(wide, -5);
         assert_eq!(store.get(wide), -5);
         assert_eq!(store.get(bit), 1);
+    }
+
+    #[test]
+    fn items_of_every_length_keep_to_themselves() {
+        let mut store = ObjectStore::default();
+        let lengths = [1, 7, 8, 12, 16, 0, 24, 32, 33, 48, 63, 64, 80, 8];
+        let slots: Vec<Slot> = (0..)
+            .zip(lengths)
+            .map(|(sub, bits)| store.ensure(0x2000, sub, "n", bits, Access::default(), &[]))
+            .collect();
+        for value in [-1, 0, 1, i64::MIN, 0x5a5a_a5a5_5a5a_a5a5] {
+            for slot in &slots {
+                store.set(*slot, value);
+            }
+            for (slot, bits) in slots.iter().zip(lengths) {
+                let bits = bits.min(64);
+                let (plain, signed) = (store.get(*slot), store.get_signed(*slot));
+                if bits == 0 {
+                    assert_eq!((plain, signed), (0, 0));
+                    continue;
+                }
+                let unused = 64 - bits;
+                let cut = value.cast_unsigned() << unused;
+                assert_eq!(plain.cast_unsigned(), cut >> unused, "{bits} bits");
+                assert_eq!(signed, cut.cast_signed() >> unused, "{bits} bits");
+                let len = usize::try_from(bits).unwrap().div_ceil(8);
+                let bytes = plain.to_le_bytes();
+                assert_eq!(store.bytes(*slot)[..len], bytes[..len], "{bits} bits");
+            }
+        }
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use super::objects::float;
 use super::track::Track;
 
 /// One step of the current loop, in seconds.
@@ -144,9 +145,10 @@ impl Plant {
 
     /// What the encoder counted since power-on, from the initial position.
     pub(super) fn counts(&self) -> i64 {
+        // Rounding down by hand: `floor` is a call on processors without an instruction for it.
         #[expect(clippy::cast_possible_truncation, reason = "saturates, centuries away")]
-        let counts = self.position.floor() as i64;
-        counts
+        let counts = self.position as i64;
+        counts - i64::from(self.position < float(counts))
     }
 
     /// Counts with fraction.
@@ -158,10 +160,11 @@ impl Plant {
     /// by the present speed; at most `within`.
     pub(super) fn edge(&self, within: f64) -> (f64, f64) {
         let speed = self.velocity * self.counts_per_rad;
-        let edge = if speed < 0.0 {
-            self.position.ceil()
+        let below = float(self.counts());
+        let edge = if speed < 0.0 && self.position > below {
+            below + 1.0
         } else {
-            self.position.floor()
+            below
         };
         let (way, speed) = ((self.position - edge).abs(), speed.abs());
         let age = if way < speed * within {
@@ -194,6 +197,7 @@ impl Plant {
     }
 
     /// One current-loop step at this voltage.
+    #[inline]
     pub(super) fn drive(&mut self, voltage: f64) {
         let before = self.current;
         let back_emf = self.torque_constant * self.velocity;
@@ -202,6 +206,7 @@ impl Plant {
     }
 
     /// One current-loop step with the winding open.
+    #[inline]
     pub(super) fn coast(&mut self) {
         self.current = 0.0;
         self.turn(0.0);
@@ -211,6 +216,7 @@ impl Plant {
         super::control::flush(&mut self.current);
     }
 
+    #[inline]
     fn turn(&mut self, current: f64) {
         if self.blocked {
             self.velocity = 0.0;

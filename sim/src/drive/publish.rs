@@ -74,7 +74,8 @@ impl Drive {
     }
 }
 
+/// `round` is a call on processors without an instruction for it.
 #[expect(clippy::cast_possible_truncation, reason = "saturates")]
 fn whole(value: f64) -> i64 {
-    value.round() as i64
+    (value + 0.5_f64.copysign(value)) as i64
 }
