@@ -6,6 +6,7 @@ use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 use super::esm::Al;
 use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
+use super::supervision::Supervision;
 use super::{Application, Delays, Fresh, MailboxLimits, SimDevice};
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
@@ -173,6 +174,7 @@ impl SimDevice {
                 application: application.clone(),
             }),
             esc,
+            supervision: Supervision::new(&store),
             store,
             pdo,
             process,

@@ -271,7 +271,7 @@ impl SimDevice {
     }
 
     /// An error takes the device down by itself.
-    fn fall_to(&mut self, state: AlState, code: u16, error: DeviceError) {
+    pub(super) fn fall_to(&mut self, state: AlState, code: u16, error: DeviceError) {
         self.drop_outputs();
         if state < AlState::SafeOp {
             self.close_process_data(true);

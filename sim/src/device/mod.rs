@@ -6,6 +6,7 @@
 //! * `mailbox`: requests and replies
 //! * `parameters`: what outlives a power cycle
 //! * `process`: process data and objects
+//! * `supervision`: whether they come in time
 //!
 //! Everything a device does by itself happens in [`SimDevice::advance`], in the order of its clock.
 
@@ -15,6 +16,7 @@ mod from_sii;
 pub(crate) mod mailbox;
 mod parameters;
 mod process;
+mod supervision;
 
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
@@ -30,6 +32,7 @@ use esm::Al;
 use mailbox::Mailbox;
 pub use mailbox::MailboxOptions;
 use process::{Mirror, ProcessData};
+use supervision::Supervision;
 
 /// Pulses remembered by [`SimDevice::sync0_log`].
 const SYNC_LOG: usize = 64;
@@ -120,6 +123,7 @@ pub struct SimDevice {
     store: ObjectStore,
     pdo: PdoRules,
     process: Vec<ProcessData>,
+    supervision: Supervision,
     application: Application,
     mailbox: Option<Mailbox>,
     mailbox_limits: [MailboxLimits; 8],
@@ -357,6 +361,7 @@ impl SimDevice {
         if edges.sync0 {
             self.esc.acknowledge_sync(0);
             self.first_sync_seen();
+            self.count_sync0();
             self.exchange();
         }
     }
@@ -376,6 +381,7 @@ impl SimDevice {
         if let Application::Drive(drive) = &mut self.application {
             drive.control(&mut self.store, in_op);
             self.send_emergencies();
+            self.watch_sync0();
         }
         if self.outputs_are_none() && !self.sync0_decides() {
             self.latch_inputs();
@@ -434,6 +440,9 @@ impl SimDevice {
         if raised.ping != Edges::default() {
             self.esc.note_sync(raised.ping);
             self.synchronized(raised.ping);
+        }
+        if raised.sm_written != 0 {
+            self.outputs_came(raised.sm_written);
         }
         if raised.sm_written != 0 && self.follows_sm(raised.sm_written) {
             self.exchange();

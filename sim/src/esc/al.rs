@@ -51,6 +51,7 @@ pub mod code {
     pub const BOOT_NOT_SUPPORTED: u16 = 0x0013;
     pub const INVALID_MAILBOX_BOOT: u16 = 0x0015;
     pub const INVALID_MAILBOX_PREOP: u16 = 0x0016;
+    pub const SYNC_ERROR: u16 = 0x001a;
     pub const SM_WATCHDOG: u16 = 0x001b;
     pub const INVALID_OUTPUTS: u16 = 0x001d;
     pub const INVALID_INPUTS: u16 = 0x001e;
