@@ -244,6 +244,18 @@ fn a_repeated_request_is_executed_once_and_answered_until_it_is_fetched() {
 }
 
 #[test]
+fn an_answer_read_after_the_repetition_was_written_does_not_come_twice() {
+    let mut bus = preop();
+    let request = first_segment(&mut bus);
+    bus.write(S, 0x1000, &request);
+    bus.wait(1_000_000);
+    bus.write(S, 0x1000, &request);
+    assert!(bus.fetch_raw(S).is_some());
+    bus.wait(1_000_000);
+    assert_eq!((bus.fetch_raw(S), bus.read(S, 0x805, 1)), (None, vec![0]));
+}
+
+#[test]
 fn another_request_under_the_last_counter_is_dropped() {
     let mut bus = preop();
     bus.write(S, 0x1000, &counted(5, &UPLOAD));

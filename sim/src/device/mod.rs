@@ -432,7 +432,12 @@ impl SimDevice {
             self.al_requested(control, local);
         }
         if raised.sm_written | raised.sm_read != 0 || raised.repeat_request.is_some() {
-            self.mailbox_events(raised.sm_read, raised.repeat_request, local);
+            self.mailbox_events(
+                raised.sm_written,
+                raised.sm_read,
+                raised.repeat_request,
+                local,
+            );
         }
         if raised.sm_configured || raised.sync_changed {
             self.configuration_changed(raised.sm_configured, raised.sync_changed);

@@ -110,8 +110,14 @@ impl Mailbox {
 }
 
 impl SimDevice {
-    /// The MainDevice emptied a mailbox, or asks for the last message again.
-    pub(super) fn mailbox_events(&mut self, read: u8, repeat: Option<bool>, local: u64) {
+    /// The MainDevice filled or emptied a mailbox, or asks for the last message again.
+    pub(super) fn mailbox_events(
+        &mut self,
+        written: u8,
+        read: u8,
+        repeat: Option<bool>,
+        local: u64,
+    ) {
         // In Init nobody looks after mailboxes.
         let Some(mailbox) = self
             .mailbox
@@ -120,6 +126,10 @@ impl SimDevice {
         else {
             return;
         };
+        if written >> mailbox.receive & 1 != 0 {
+            let is_working = mailbox.is_working();
+            mailbox.queue.written(is_working);
+        }
         let n = mailbox.send;
         if read >> n & 1 != 0 {
             mailbox.queue.fetched();

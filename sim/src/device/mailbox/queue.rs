@@ -51,6 +51,8 @@ pub(super) struct Queue {
     /// What the last request was answered with.
     last_answer: Vec<Message>,
     requests: u64,
+    /// Before the request was written that is fetched next.
+    answer_was_fetched: bool,
 }
 
 impl Queue {
@@ -117,9 +119,19 @@ impl Queue {
         self.unanswered() + 1 >= ANSWERS
     }
 
+    fn has_answer_on_the_way(&self) -> bool {
+        let mut messages = self.waiting.iter().chain(&self.current);
+        messages.any(|m| m.class.is_answer() && m.request == self.requests)
+    }
+
+    /// A request was written; whether its sender can have seen the last answer is known only now.
+    pub(super) fn written(&mut self, is_working: bool) {
+        self.answer_was_fetched = !is_working && !self.has_answer_on_the_way();
+    }
+
     /// Whether this is the last request once more, as a MainDevice sends it that did not see it arrive: same counter
-    /// (0: none, never a repetition). It must not be executed twice. If its answer has been fetched, that got lost too
-    /// and goes out again; an answer that still waits will do.
+    /// (0: none, never a repetition). It must not be executed twice. If it came after its answer had been fetched, that
+    /// got lost and goes out again; otherwise the answer on its way will do.
     pub(super) fn is_repeated(&mut self, counter: u8, message: &[u8]) -> bool {
         let before = self.last_request.get(HEADER - 1).map(|kind| kind >> 4 & 7);
         if counter == 0 || before != Some(counter) {
@@ -129,13 +141,7 @@ impl Queue {
             self.requests += 1;
             return false;
         }
-        let request = self.requests;
-        let on_the_way = self
-            .waiting
-            .iter()
-            .chain(&self.current)
-            .any(|m| m.class.is_answer() && m.request == request);
-        if !on_the_way && self.last_request == message {
+        if self.answer_was_fetched && self.last_request == message {
             self.waiting.extend(self.last_answer.iter().cloned());
         }
         true
