@@ -12,8 +12,8 @@ use ecaxis_esi::sii::{self, General, MailboxAreas, Protocols, Sii, SiiDc, SiiPdo
 use super::{DeviceOptions, SimDevice, SimError};
 
 impl SimDevice {
-    /// A device as its EEPROM image describes it, powered on and in Init. Serial number and alias come from the image,
-    /// what the chip is from `options.esc`.
+    /// A device as its EEPROM image describes it, powered on and in Init. Serial number and alias come from the image; the
+    /// chip is `options.esc`, or the smallest in which the device fits.
     ///
     /// With a mailbox that carries CoE it has the objects 0x1000, 0x1008, 0x1018, 0x1C00, PDO assignment and mapping;
     /// other mailboxes answer that the protocol is unknown. Without a mailbox it is a plain I/O terminal.
