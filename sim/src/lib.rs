@@ -35,7 +35,7 @@ pub use faults::{FaultScript, ScriptError};
 pub use foe::{FileStore, FoeOptions};
 pub use network::topology::{SecondPort, Topology, TopologyError, Uplink, Wish};
 pub use network::{Nic, Segment, SegmentOptions, Transit};
-pub use serve::{ServeError, ServeStats, serve};
+pub use serve::{ServeError, ServeStats, Server};
 
 /// True time of the simulated world, in nanoseconds. Every device's own clock drifts from it.
 pub type Nanos = u64;

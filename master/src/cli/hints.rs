@@ -326,13 +326,13 @@ fn trip(trip: &Trip) -> &'static str {
 pub(crate) fn serve(error: &ServeError) -> Failure {
     let failure = Failure::new(FAILED, error.to_string());
     match error {
-        ServeError::NoSuchInterface(_) => Failure {
+        ServeError::NoSuchInterface(_) | ServeError::NotEthernet(_) => Failure {
             code: WRONG,
             ..failure
         }
         .hint(interfaces()),
         ServeError::NotPermitted(_) => failure.hint(capabilities()),
-        ServeError::Io { .. } => failure,
+        ServeError::Gone(_) | ServeError::Io { .. } => failure,
     }
 }
 

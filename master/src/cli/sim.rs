@@ -8,7 +8,7 @@ use ecaxis::config;
 use ecaxis::link::packet::{OpenError, PacketLink};
 use ecaxis::rt::thread;
 use ecaxis::session;
-use ecaxis_sim::{Segment, ServeStats};
+use ecaxis_sim::{Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
 use super::{Failure, hints, note, result, run, signals};
@@ -74,6 +74,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             ));
         }
     }
+    let server = Server::open(&[nic]).map_err(|e| hints::serve(&e))?;
     note(&format!(
         "{devices} simulated SubDevice{} answer{} on `{nic}`; Ctrl-C ends it",
         if devices == 1 { "" } else { "s" },
@@ -83,7 +84,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     for denied in thread::prepare(PRIORITY, None) {
         note(&format!("warning: {denied}"));
     }
-    let stats = ecaxis_sim::serve(&mut segment, nic, &stop).map_err(|e| hints::serve(&e))?;
+    let stats = server
+        .serve(&mut segment, &stop)
+        .map_err(|e| hints::serve(&e))?;
     let report = report(&stats, &segment);
     result(&if args.json {
         format!("{report:#}\n")
@@ -127,7 +130,9 @@ fn report(stats: &ServeStats, segment: &Segment) -> Value {
     json!({
         "frames": stats.frames,
         "answered": stats.answered,
-        "lost_on_purpose": stats.lost,
+        "lost": stats.lost,
+        "duplicated": stats.duplicated,
+        "delayed": stats.delayed,
         "malformed": stats.malformed,
         "not_ethercat": stats.foreign,
         "not_sent": stats.send_errors,
@@ -138,9 +143,12 @@ fn report(stats: &ServeStats, segment: &Segment) -> Value {
 
 fn text(report: &Value) -> String {
     let mut text = format!(
-        "{} frames answered, {} lost on purpose, {} malformed, {} not EtherCAT, {} not sent\n",
+        "{} frames received, {} replies sent, {} lost, {} duplicated, {} delayed\n{} malformed, {} not EtherCAT, {} not sent\n",
+        report["frames"],
         report["answered"],
-        report["lost_on_purpose"],
+        report["lost"],
+        report["duplicated"],
+        report["delayed"],
         report["malformed"],
         report["not_ethercat"],
         report["not_sent"],

@@ -13,7 +13,11 @@ use crate::Nanos;
 type Control = [u64; 8];
 
 #[derive(Debug)]
-pub(super) struct RawSocket(OwnedFd);
+pub(super) struct RawSocket {
+    fd: OwnedFd,
+    nic: CString,
+    index: u32,
+}
 
 /// A frame that is in the caller's buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,13 +41,19 @@ impl RawSocket {
         let name = CString::new(nic).map_err(|_| ServeError::NoSuchInterface(nic.to_owned()))?;
         // SAFETY: `name` is NUL-terminated and lives through the call.
         let index = unsafe { libc::if_nametoindex(name.as_ptr()) };
-        let index = i32::try_from(index).unwrap_or(0);
-        if index == 0 {
+        let number = i32::try_from(index).unwrap_or(0);
+        if number == 0 {
             return Err(ServeError::NoSuchInterface(nic.to_owned()));
         }
         // Without a protocol it receives nothing until `bind` names one; other interfaces' frames stay out.
         // SAFETY: plain system call; the result is checked.
-        let fd = unsafe { libc::socket(libc::AF_PACKET, libc::SOCK_RAW | libc::SOCK_CLOEXEC, 0) };
+        let fd = unsafe {
+            libc::socket(
+                libc::AF_PACKET,
+                libc::SOCK_RAW | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK,
+                0,
+            )
+        };
         if fd < 0 {
             let source = io::Error::last_os_error();
             return Err(if source.kind() == io::ErrorKind::PermissionDenied {
@@ -53,15 +63,13 @@ impl RawSocket {
             });
         }
         // SAFETY: `fd` is a valid descriptor that nothing else owns.
-        let socket = Self(unsafe { OwnedFd::from_raw_fd(fd) });
-
-        let timeout = libc::timeval {
-            tv_sec: 0,
-            tv_usec: 1_000,
+        let fd = unsafe { OwnedFd::from_raw_fd(fd) };
+        let socket = Self {
+            fd,
+            nic: name,
+            index,
         };
-        socket
-            .set(libc::SOL_SOCKET, libc::SO_RCVTIMEO, &timeout)
-            .map_err(failed("setting the receive timeout"))?;
+
         // Without stamps the time of the receive call has to do.
         let _ = socket.set(libc::SOL_SOCKET, libc::SO_TIMESTAMPNS, &1_i32);
         // Our own replies would otherwise come back; older kernels are covered by the packet type.
@@ -70,7 +78,7 @@ impl RawSocket {
         let _ = socket.set(libc::SOL_PACKET, libc::PACKET_QDISC_BYPASS, &1_i32);
         // A MainDevice's destination address is the broadcast address, but need not be.
         let everything = libc::packet_mreq {
-            mr_ifindex: index,
+            mr_ifindex: number,
             mr_type: libc::PACKET_MR_PROMISC as libc::c_ushort,
             mr_alen: 0,
             mr_address: [0; 8],
@@ -83,11 +91,11 @@ impl RawSocket {
         let mut address: libc::sockaddr_ll = unsafe { mem::zeroed() };
         address.sll_family = libc::AF_PACKET as libc::c_ushort;
         address.sll_protocol = (libc::ETH_P_ALL as u16).to_be();
-        address.sll_ifindex = index;
+        address.sll_ifindex = number;
         // SAFETY: the address lives through the call and the length is its size.
         let bound = unsafe {
             libc::bind(
-                socket.0.as_raw_fd(),
+                socket.fd.as_raw_fd(),
                 (&raw const address).cast(),
                 size_of_val(&address) as libc::socklen_t,
             )
@@ -95,14 +103,37 @@ impl RawSocket {
         if bound < 0 {
             return Err(failed("binding the socket")(io::Error::last_os_error()));
         }
+        let mut len = size_of_val(&address) as libc::socklen_t;
+        // SAFETY: address and length are valid to write to.
+        let named = unsafe {
+            libc::getsockname(
+                socket.fd.as_raw_fd(),
+                (&raw mut address).cast(),
+                &raw mut len,
+            )
+        };
+        // On the loopback interface every reply would be a request again.
+        if named == 0 && address.sll_hatype != libc::ARPHRD_ETHER {
+            return Err(ServeError::NotEthernet(nic.to_owned()));
+        }
         Ok(socket)
+    }
+
+    /// An error once the interface has been removed, or another one has its name: its socket hears
+    /// nothing any more, and says nothing either.
+    pub(super) fn check(&self) -> Result<(), ServeError> {
+        // SAFETY: the name is NUL-terminated and lives through the call.
+        if unsafe { libc::if_nametoindex(self.nic.as_ptr()) } == self.index {
+            return Ok(());
+        }
+        Err(ServeError::Gone(self.nic.to_string_lossy().into_owned()))
     }
 
     fn set<T>(&self, level: i32, name: i32, value: &T) -> io::Result<()> {
         // SAFETY: the value lives through the call and the length is its size.
         let result = unsafe {
             libc::setsockopt(
-                self.0.as_raw_fd(),
+                self.fd.as_raw_fd(),
                 level,
                 name,
                 (&raw const *value).cast(),
@@ -116,8 +147,8 @@ impl RawSocket {
         }
     }
 
-    /// The next frame; `None` after a millisecond without one.
-    pub(super) fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
+    /// The next frame that has arrived.
+    pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<Option<Received>, ServeError> {
         // SAFETY: all-zero is a valid sockaddr_ll and a valid msghdr.
         let (mut from, mut message): (libc::sockaddr_ll, libc::msghdr) =
             unsafe { (mem::zeroed(), mem::zeroed()) };
@@ -133,13 +164,17 @@ impl RawSocket {
         message.msg_control = (&raw mut control).cast();
         message.msg_controllen = size_of_val(&control);
         // SAFETY: every pointer in `message` is valid for the length beside it.
-        let len = unsafe { libc::recvmsg(self.0.as_raw_fd(), &raw mut message, 0) };
+        let len = unsafe { libc::recvmsg(self.fd.as_raw_fd(), &raw mut message, 0) };
         let Ok(len) = usize::try_from(len) else {
-            let error = io::Error::last_os_error();
-            return match error.raw_os_error() {
+            let source = io::Error::last_os_error();
+            return match source.raw_os_error() {
                 // An interface that goes down and up again is a pulled cable, not the end.
                 Some(libc::EAGAIN | libc::EINTR | libc::ENETDOWN) => Ok(None),
-                _ => Err(error),
+                _ => Err(ServeError::Io {
+                    nic: self.nic.to_string_lossy().into_owned(),
+                    what: "receiving",
+                    source,
+                }),
             };
         };
         if from.sll_pkttype == libc::PACKET_OUTGOING {
@@ -159,9 +194,28 @@ impl RawSocket {
     /// False if the interface does not take it.
     pub(super) fn send(&self, bytes: &[u8]) -> bool {
         // SAFETY: the buffer is valid for its length.
-        let sent = unsafe { libc::send(self.0.as_raw_fd(), bytes.as_ptr().cast(), bytes.len(), 0) };
+        let sent =
+            unsafe { libc::send(self.fd.as_raw_fd(), bytes.as_ptr().cast(), bytes.len(), 0) };
         usize::try_from(sent) == Ok(bytes.len())
     }
+}
+
+/// Until a frame has arrived at one of them, or the time is over, which makes it false.
+pub(super) fn wait(sockets: &[RawSocket], patience: Nanos) -> bool {
+    let mut polled = [libc::pollfd {
+        fd: -1,
+        events: libc::POLLIN,
+        revents: 0,
+    }; 2];
+    for (slot, socket) in polled.iter_mut().zip(sockets) {
+        slot.fd = socket.fd.as_raw_fd();
+    }
+    let timeout = libc::timespec {
+        tv_sec: 0,
+        tv_nsec: patience.min(999_999_999).cast_signed(),
+    };
+    // SAFETY: descriptors and timeout are valid for the call.
+    unsafe { libc::ppoll(polled.as_mut_ptr(), 2, &raw const timeout, ptr::null()) > 0 }
 }
 
 /// The kernel's time of arrival among the control messages.

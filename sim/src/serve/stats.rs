@@ -12,14 +12,18 @@ pub struct ServeStats {
     pub frames: u64,
     /// Replies sent.
     pub answered: u64,
-    /// Lost on purpose, by the fault script.
+    /// Did not come back, as the fault script or an open ring has it.
     pub lost: u64,
+    /// Answered twice, by the fault script.
+    pub duplicated: u64,
+    /// Held back, as slow as the simulated wire.
+    pub delayed: u64,
     /// Went round unprocessed, as SubDevices pass on what they cannot read, or too long for that.
     pub malformed: u64,
-    /// Not EtherCAT: destroyed, as SubDevices do unless told otherwise.
+    /// Not EtherCAT; SubDevices destroy them unless told otherwise.
     pub foreign: u64,
     pub send_errors: u64,
-    /// From a frame's arrival at the interface until its reply is sent.
+    /// From a frame's arrival at the interface until its reply is sent, or held back.
     pub turnaround: Histogram,
 }
 

@@ -11,6 +11,7 @@ from .bringup import expected_wkc
 
 def faults(bench):
     watchdog(bench)
+    outage(bench, "a link breaks and heals", 'device = 2\nport = 0\nkind = "link-break"\n')
     outage(bench, "a device loses its power", 'device = 1\nkind = "absent"\n')
     outage(bench, "the cable at the MainDevice", 'kind = "silent"\n')
 
