@@ -120,7 +120,7 @@ proptest! {
         // Once all is fetched it still answers, in Bootstrap by a refusal.
         for _ in 0..10_000 {
             bus.wait(400_000);
-            if bus.fetch_raw(S).is_none() && bus.read(S, 0x805, 1) == [0] {
+            if bus.fetch_raw(S).is_none() && bus.read(S, 0x805, 1)[0] & 8 == 0 {
                 break;
             }
         }

@@ -252,7 +252,7 @@ fn an_answer_read_after_the_repetition_was_written_does_not_come_twice() {
     bus.write(S, 0x1000, &request);
     assert!(bus.fetch_raw(S).is_some());
     bus.wait(1_000_000);
-    assert_eq!((bus.fetch_raw(S), bus.read(S, 0x805, 1)), (None, vec![0]));
+    assert_eq!((bus.fetch_raw(S), bus.read(S, 0x805, 1)), (None, vec![2]));
 }
 
 #[test]
