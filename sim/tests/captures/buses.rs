@@ -12,8 +12,8 @@ pub struct Device {
     /// device emulation (0x0100) where AL status copies the acknowledge bit, SYNC unit (0x0400) where 0x0910 answers.
     pub pdi_control: u16,
     pub esc: EscInfo,
-    /// What the firmware needs for a state change and for an answer in the mailbox: the longest time after which the
-    /// capture still shows it at work.
+    /// What the firmware needs for a state change and for an answer in the mailbox: between the last poll that found it
+    /// at work and the first that did not, and never more than any poll allows.
     pub firmware_ns: Firmware,
 }
 
