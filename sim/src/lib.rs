@@ -11,6 +11,7 @@
 //! * [`coe`]: object dictionary, SDO server, SDO Information
 //! * [`foe`]: a device's files
 //! * [`drive`]: a CiA 402 drive down to the motor shaft
+//! * [`gateway`]: a CANopen gateway and the network behind it
 //! * [`faults`]: what goes wrong on purpose
 //! * [`serve`]: the segment on a real network interface, for any MainDevice
 
@@ -22,6 +23,7 @@ pub mod esc;
 pub mod faults;
 pub mod foe;
 pub mod frame;
+pub mod gateway;
 pub mod network;
 mod random;
 pub mod serve;

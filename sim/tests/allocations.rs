@@ -1,14 +1,16 @@
 //! A cycle allocates nothing: frames, SYNC0, process data, drives.
 
 mod common;
+mod main_device;
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use common::*;
 use ecaxis_esi::model::Device;
-use ecaxis_sim::Transit;
 use ecaxis_sim::frame::FrameBuilder;
+use ecaxis_sim::gateway::{Epos, GatewayOptions, NodeOptions, PdoLink};
+use ecaxis_sim::{DeviceOptions, Transit};
 
 struct Counting;
 
@@ -80,4 +82,63 @@ fn cycling_does_not_allocate() {
     assert_eq!(allocations, Some(0));
     assert_eq!(bytes[bytes.len() - 2..], [2, 0], "both answered to the end");
     assert_eq!(bytes[bytes.len() - 4], 8, "both in Op");
+}
+
+#[test]
+fn forwarding_between_two_networks_does_not_allocate() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/esi/gateway.xml");
+    let file = ecaxis_esi::parse(&std::fs::read(path).unwrap()).unwrap();
+    let link = |at| PdoLink {
+        pdo: 2,
+        at,
+        contents: Vec::new(),
+        synchronous: true,
+    };
+    let nodes = [(1, 2), (2, 8)].map(|(id, at)| NodeOptions {
+        inputs: vec![link(at)],
+        outputs: vec![link(at)],
+        ..NodeOptions::new(id, Epos::E24_5)
+    });
+    let gateway = GatewayOptions {
+        nodes: nodes.into(),
+        heartbeat_ms: 20,
+        ..GatewayOptions::default()
+    };
+    let options = DeviceOptions {
+        gateway: Some(gateway),
+        ..DeviceOptions::default()
+    };
+    let mut bus = Bus::new(vec![sim_with(&file.devices[0], options)]);
+    bus.address_all();
+    let (_, mapped) = main_device::bring_up(&mut bus, 0x1001).unwrap();
+    let command = |n: u64| {
+        let mut outputs = [0; 16];
+        outputs[0] = 0x81;
+        outputs[1] = 0x80;
+        outputs[2] = if n < 10 { 6 } else { 15 };
+        outputs[8] = outputs[2];
+        FrameBuilder::default()
+            .logical(12, mapped.logical, &outputs)
+            .build()
+    };
+    for n in 0..300 {
+        bus.frame(command(n)).unwrap();
+        bus.wait(1_000_000);
+    }
+    let frames = |bus: &Bus| {
+        let gateway = bus.segment.device(0).unwrap().gateway().unwrap();
+        gateway.frames().last().unwrap()
+    };
+    let (before, template) = (frames(&bus), command(20));
+    let mut bytes = template.clone();
+    COUNT.with(|c| c.set(Some(0)));
+    for n in 1..2_000 {
+        bytes.copy_from_slice(&template);
+        bus.segment.transit(&mut bytes, bus.now + n * 1_000_000);
+    }
+    let allocations = COUNT.with(|c| c.replace(None));
+    assert_eq!(allocations, Some(0));
+    assert_eq!(bytes[bytes.len() - 2..], [3, 0]);
+    let ran = frames(&bus).0 - before.0;
+    assert!(ran > 1_990_000_000, "the network ran all the time: {ran}");
 }

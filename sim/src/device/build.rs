@@ -3,20 +3,22 @@
 use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse, SyncManager};
 use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 
+use super::application::{Application, Io};
 use super::esm::Al;
 use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
 use super::supervision::Supervision;
-use super::{Application, Delays, Fresh, MailboxLimits, SimDevice};
+use super::{Delays, Fresh, MailboxLimits, SimDevice};
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
-use crate::drive::{Drive, PlantParams};
+use crate::drive::PlantParams;
 use crate::esc::info::Needs;
 use crate::esc::ports::Medium;
 use crate::esc::registers::{ADDRESS_SPACE, PROCESS_RAM};
 use crate::esc::{Esc, EscConfig, EscInfo};
 use crate::foe::FileStore;
+use crate::gateway::{Gateway, GatewayError, GatewayOptions};
 
 /// CiA 402.
 const DRIVE_PROFILE: u32 = 402;
@@ -47,6 +49,8 @@ pub struct DeviceOptions {
     /// The chip; `None`: the smallest in which the device fits. Process RAM grows where SyncManagers need more.
     pub esc: Option<EscInfo>,
     pub mailbox: MailboxOptions,
+    /// Of a CANopen gateway and the nodes behind it; a gateway without options has no nodes.
+    pub gateway: Option<GatewayOptions>,
 }
 
 impl Default for DeviceOptions {
@@ -65,6 +69,7 @@ impl Default for DeviceOptions {
             state_change_ns: 200_000,
             esc: None,
             mailbox: MailboxOptions::default(),
+            gateway: None,
         }
     }
 }
@@ -80,8 +85,51 @@ pub enum SimError {
         start: u16,
         len: u16,
     },
+    #[error("device `{0}` is not a CANopen gateway, so it has no nodes")]
+    NoGateway(String),
+    #[error(transparent)]
+    Gateway(#[from] GatewayError),
     #[error("EEPROM image: {0}")]
     Image(#[from] SiiError),
+}
+
+/// The objects of a device, its PDOs and the SyncManagers that carry them.
+pub(super) struct Objects {
+    pub(super) store: ObjectStore,
+    pub(super) pdo: PdoRules,
+    pub(super) process: Vec<ProcessData>,
+}
+
+impl Objects {
+    /// `first` may add objects before PDOs do.
+    pub(super) fn new(
+        device: &Device,
+        modules: &[Module],
+        serial: u32,
+        first: impl FnOnce(&mut ObjectStore),
+    ) -> Self {
+        let mut store = ObjectStore::from_dictionary(&dictionaries(device, modules));
+        identify(&mut store, device, serial);
+        first(&mut store);
+        let pdo = PdoRules::new(&mut store, device, modules);
+        let process = pdo
+            .process_sms()
+            .iter()
+            .filter(|sm| !is_virtual(device, sm.sm))
+            .map(|sm| ProcessData {
+                sm: usize::from(sm.sm),
+                direction: sm.direction,
+                mode: sm.mode,
+                map: Vec::new(),
+                len: 0,
+            })
+            .collect();
+        Self {
+            store,
+            pdo,
+            process,
+        }
+    }
 }
 
 impl SimDevice {
@@ -103,30 +151,32 @@ impl SimDevice {
                 sii::emit(device, modules, &own)
             }
         };
-        let mut store = ObjectStore::from_dictionary(&dictionaries(device, modules));
-        identify(&mut store, device, options.serial);
-        let pdo = PdoRules::new(&mut store, device, modules);
-        let process = pdo
-            .process_sms()
-            .iter()
-            .filter(|sm| !is_virtual(device, sm.sm))
-            .map(|sm| ProcessData {
-                sm: usize::from(sm.sm),
-                direction: sm.direction,
-                mode: sm.mode,
-                map: Vec::new(),
-                len: 0,
-            })
-            .collect();
-        let is_drive = device.mailbox.is_some() && is_drive(device, &store);
-        let application = if is_drive {
-            Application::Drive(Box::new(Drive::new(&mut store, options.plant)))
-        } else {
-            Application::Io {
-                mirrors: Vec::new(),
-                held: Vec::new(),
+        let mut gateway = Application::gateway(device, options.serial, options.gateway)?;
+        let shaped = gateway.as_ref().map(Gateway::shaped);
+        let mut objects = Objects::new(
+            shaped.as_ref().unwrap_or(device),
+            modules,
+            options.serial,
+            |store| {
+                if let Some(gateway) = &gateway {
+                    gateway.prepare(store);
+                }
+            },
+        );
+        let is_drive = device.mailbox.is_some() && is_drive(device, &objects.store);
+        let application = match gateway.take() {
+            Some(mut gateway) => {
+                gateway.bind(&objects.store);
+                Application::Gateway(Box::new(gateway))
             }
+            None if is_drive => Application::drive(&mut objects.store, options.plant),
+            None => Application::Io(Io::default()),
         };
+        let Objects {
+            mut store,
+            pdo,
+            process,
+        } = objects;
         let ram_end = ram_end.max(mapped_end(device, &pdo, &store)).min(0x1_0000);
         let ram_kib = count((ram_end - PROCESS_RAM).div_ceil(1024));
         let needs = Needs {
@@ -190,6 +240,7 @@ impl SimDevice {
             mailbox_options: options.mailbox,
             files: FileStore::default(),
             al: Al::default(),
+            serial: options.serial,
             tick: 0,
             pulses: Default::default(),
             local: 0,

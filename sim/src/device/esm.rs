@@ -2,7 +2,7 @@
 
 use ecaxis_esi::model::Direction;
 
-use super::{Application, SimDevice};
+use super::SimDevice;
 use crate::drive::DeviceError;
 use crate::esc::al::{self, AlState, Request, code, judge};
 use crate::esc::registers as reg;
@@ -279,9 +279,7 @@ impl SimDevice {
         self.al.waits_for_sync = false;
         self.al.due = u64::MAX;
         self.settle(state, code);
-        if let Application::Drive(drive) = &mut self.application {
-            drive.error(error);
-        }
+        self.application.error(error);
     }
 
     pub(super) fn watchdog_expired(&mut self) {

@@ -1,5 +1,6 @@
 //! A SubDevice: an ESC, the application behind it and the device's own time.
 //!
+//! * `application`: what stands behind the controller
 //! * `build`: from an ESI device
 //! * `from_sii`: from an EEPROM image
 //! * `esm`: state changes and what they demand
@@ -10,6 +11,7 @@
 //!
 //! Everything a device does by itself happens in [`SimDevice::advance`], in the order of its clock.
 
+mod application;
 mod build;
 mod esm;
 mod from_sii;
@@ -20,18 +22,19 @@ mod supervision;
 
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
-use crate::coe::store::{ObjectStore, Slot};
-use crate::drive::{CONTROL_PERIOD_NS, Drive, Emergency, State};
+use crate::coe::store::ObjectStore;
+use crate::drive::{Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
 use crate::foe::FileStore;
 use crate::frame;
+use application::Application;
 pub use build::{DeviceOptions, SimError};
 use esm::Al;
 use mailbox::Mailbox;
 pub use mailbox::MailboxOptions;
-use process::{Mirror, ProcessData};
+use process::ProcessData;
 use supervision::Supervision;
 
 /// Pulses remembered by [`SimDevice::sync0_log`].
@@ -68,16 +71,6 @@ impl PulseLog {
             .filter_map(|n| self.times.get((n % SYNC_LOG as u64) as usize))
             .copied()
     }
-}
-
-/// What the device is for.
-#[derive(Debug, Clone)]
-enum Application {
-    Drive(Box<Drive>),
-    Io {
-        mirrors: Vec<Mirror>,
-        held: Vec<Slot>,
-    },
 }
 
 /// Where a mailbox SyncManager must lie.
@@ -136,7 +129,8 @@ pub struct SimDevice {
     mailbox_options: MailboxOptions,
     files: FileStore,
     al: Al,
-    /// Local time of the drive's next control cycle.
+    serial: u32,
+    /// Local time at which the application acts next.
     tick: u64,
     /// SYNC0 and SYNC1.
     pulses: [PulseLog; 2],
@@ -180,21 +174,6 @@ impl SimDevice {
     /// The controller as the device's own side has it.
     pub fn esc_mut(&mut self) -> &mut Esc {
         &mut self.esc
-    }
-
-    #[must_use]
-    pub fn drive(&self) -> Option<&Drive> {
-        match &self.application {
-            Application::Drive(drive) => Some(drive),
-            Application::Io { .. } => None,
-        }
-    }
-
-    pub fn drive_mut(&mut self) -> Option<&mut Drive> {
-        match &mut self.application {
-            Application::Drive(drive) => Some(drive),
-            Application::Io { .. } => None,
-        }
     }
 
     /// An object's value as an upload would carry it, access rights aside.
@@ -274,10 +253,8 @@ impl SimDevice {
     }
 
     fn start_ticking(&mut self, local: u64) {
-        self.tick = match self.application {
-            Application::Drive(_) => local + CONTROL_PERIOD_NS,
-            Application::Io { .. } => u64::MAX,
-        };
+        let period = self.application.period();
+        self.tick = period.map_or(u64::MAX, |period| local + period);
     }
 
     /// Without power nothing happens in it any more; it keeps what [`SimDevice::power_on`] clears.
@@ -289,8 +266,7 @@ impl SimDevice {
     pub(crate) fn power_on(&mut self, now: Nanos) {
         self.powered = true;
         self.esc.power_on(now);
-        self.store = self.fresh.store.clone();
-        self.application = self.fresh.application.clone();
+        self.restart_application(now);
         self.al = Al::default();
         if let Some(mailbox) = &mut self.mailbox {
             mailbox.reset();
@@ -376,14 +352,14 @@ impl SimDevice {
     }
 
     fn tick(&mut self) {
-        self.tick += CONTROL_PERIOD_NS;
+        let now = self.esc.clock.true_time(self.tick);
+        self.start_ticking(self.tick);
         let in_op = self.al.state == AlState::Op;
-        if let Application::Drive(drive) = &mut self.application {
-            drive.control(&mut self.store, in_op);
-            self.send_emergencies();
-            self.watch_sync0();
-        }
-        if self.outputs_are_none() && !self.sync0_decides() {
+        self.application.act(&mut self.store, in_op, now);
+        self.send_emergencies();
+        self.watch_sync0();
+        let alone = self.outputs_are_none() || self.application.samples_when_acting();
+        if alone && !self.sync0_decides() {
             self.latch_inputs();
         }
     }
@@ -406,7 +382,7 @@ impl SimDevice {
     pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> Seen {
         let local = self.esc.begin_frame(now);
         self.local = local;
-        if matches!(self.application, Application::Io { .. }) && !self.sync0_decides() {
+        if self.application.samples_at_frames() && !self.sync0_decides() {
             // As digital inputs do: sampled when a frame begins.
             self.latch_inputs();
         }

@@ -7,7 +7,6 @@ use super::{Application, SimDevice};
 use crate::Nanos;
 use crate::bits;
 use crate::coe::pdo::Mapped;
-use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::CONTROL_PERIOD_NS;
 use crate::esc::al::AlState;
 use crate::esc::registers::ADDRESS_SPACE;
@@ -25,13 +24,6 @@ pub(super) struct ProcessData {
     pub(super) len: usize,
 }
 
-/// An input that copies an output, as I/O devices without a process behind them do here.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Mirror {
-    from: Slot,
-    pub(super) to: Slot,
-}
-
 impl SimDevice {
     /// Makes the layouts anew from assignment and mapping.
     pub(super) fn lay_out(&mut self) {
@@ -39,27 +31,7 @@ impl SimDevice {
             let sm = u8::try_from(data.sm).unwrap_or(0);
             data.len = self.pdo.layout(&self.store, sm, &mut data.map);
         }
-        let of = |direction| {
-            self.process
-                .iter()
-                .filter(move |d| d.direction == direction)
-                .flat_map(|d| &d.map)
-        };
-        match &mut self.application {
-            Application::Drive(drive) => {
-                drive.set_mapped(|slot| of(Direction::Rx).any(|mapped| mapped.slot == slot));
-            }
-            Application::Io { mirrors, held } => {
-                *mirrors = of(Direction::Rx)
-                    .zip(of(Direction::Tx))
-                    .filter(|(_, to)| !held.contains(&to.slot))
-                    .map(|(from, to)| Mirror {
-                        from: from.slot,
-                        to: to.slot,
-                    })
-                    .collect();
-            }
-        }
+        self.application.laid_out(&self.process);
     }
 
     /// Takes outputs, if they count in this state, and latches inputs.
@@ -72,18 +44,11 @@ impl SimDevice {
         self.latch_inputs();
     }
 
-    /// Digital and analogue outputs go to their safe state, zero. A drive reacts by itself.
+    /// Nobody commands outputs any more.
     pub(super) fn drop_outputs(&mut self) {
-        let Application::Io { mirrors, .. } = &self.application else {
-            return;
-        };
-        for data in self.process.iter().filter(|d| d.direction == Direction::Rx) {
-            for m in &data.map {
-                self.store.bytes_mut(m.slot).fill(0);
-            }
+        if self.application.rest(&mut self.store, &self.process) {
+            self.latch_inputs();
         }
-        copy_mirrors(&mut self.store, mirrors);
-        self.latch_inputs();
     }
 
     /// An output area with one buffer only takes the next data once these have been fetched.
@@ -107,10 +72,7 @@ impl SimDevice {
                 bits::copy(self.store.bytes_mut(m.slot), 0, buffer, m.bit, m.bits);
             }
         }
-        match &mut self.application {
-            Application::Drive(drive) => drive.sync(&self.store),
-            Application::Io { mirrors, .. } => copy_mirrors(&mut self.store, mirrors),
-        }
+        self.application.sync(&mut self.store);
     }
 
     pub(super) fn latch_inputs(&mut self) {
@@ -179,10 +141,7 @@ impl SimDevice {
             return false;
         };
         self.store.set(slot, value);
-        if let Application::Io { mirrors, held } = &mut self.application {
-            mirrors.retain(|mirror| mirror.to != slot);
-            held.push(slot);
-        }
+        self.application.hold(slot);
         true
     }
 }
@@ -191,11 +150,4 @@ impl SimDevice {
 fn share(part: Nanos, whole: Nanos) -> f64 {
     let short = |ns: Nanos| f64::from(u32::try_from(ns).unwrap_or(u32::MAX));
     (short(part) / short(whole)).min(1.0)
-}
-
-fn copy_mirrors(store: &mut ObjectStore, mirrors: &[Mirror]) {
-    for mirror in mirrors {
-        let value = store.get(mirror.from);
-        store.set(mirror.to, value);
-    }
 }

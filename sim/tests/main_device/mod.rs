@@ -26,6 +26,8 @@ pub struct Learned {
     pub protocols: u16,
     /// Receive and send mailbox: start and length; zero without mailbox.
     pub mailbox: [(u16, u16); 2],
+    /// Of the last mailbox message sent.
+    counter: u8,
 }
 
 /// A SubDevice with FMMUs configured: outputs and inputs begin at the same logical address.
@@ -144,11 +146,11 @@ pub struct Mailbox {
 }
 
 impl Mailbox {
-    pub fn new(station: u16, areas: [(u16, u16); 2]) -> Self {
+    pub fn new(station: u16, learned: &Learned) -> Self {
         Self {
             station,
-            areas,
-            counter: 0,
+            areas: learned.mailbox,
+            counter: learned.counter,
         }
     }
 
@@ -256,7 +258,7 @@ pub fn to_preop(bus: &mut Bus, station: u16, learned: &Learned) -> Result<(), St
 
 /// Bits each process-data SyncManager carries, read from 0x1C10 + n and the PDOs assigned there.
 fn ask_assignment(bus: &mut Bus, station: u16, learned: &mut Learned) -> Result<(), String> {
-    let mut mailbox = Mailbox::new(station, learned.mailbox);
+    let mut mailbox = Mailbox::new(station, learned);
     for (n, sm) in (0..).zip(&mut learned.sms) {
         if sm.usage < 3 {
             continue;
@@ -271,6 +273,7 @@ fn ask_assignment(bus: &mut Bus, station: u16, learned: &mut Learned) -> Result<
             }
         }
     }
+    learned.counter = mailbox.counter;
     Ok(())
 }
 

@@ -1,0 +1,287 @@
+//! The gateway as NMT master of the secondary network (CiA 302-2): it boots its slaves (identity, configuration, error
+//! control), watches over them and does what the control word asks.
+//!
+//! * here: what is known of each node, NMT services, states
+//! * `boot`, `watch`: a slave's boot; error control
+//! * `requests`: SDO transfers
+
+mod boot;
+mod requests;
+mod watch;
+
+use std::collections::VecDeque;
+
+use super::can::CanFrame;
+use super::control::Target;
+use super::nmt::{NmtCommand, NmtState};
+use super::options::Setting;
+use super::sdo::Client;
+use super::{Abort, Gateway};
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+enum Boot {
+    #[default]
+    Waiting,
+    /// Looking at this line of the identity.
+    Identity(usize),
+    /// Writing this one of its settings.
+    Settings(usize),
+    Ready,
+    Refused,
+}
+
+#[derive(Debug, Clone)]
+struct Guard {
+    period: u64,
+    /// Questions without an answer before the node is given up.
+    patience: u8,
+    unanswered: u8,
+    next: u64,
+    /// Of the next answer; `None` takes either.
+    toggle: Option<bool>,
+}
+
+/// One node number.
+#[derive(Debug, Clone)]
+struct Slave {
+    boot: Boot,
+    settings: Vec<Setting>,
+    /// Heartbeats are expected within; 0: none are.
+    consumer: u64,
+    deadline: u64,
+    guard: Option<Guard>,
+    /// What it last said to be in.
+    state: Option<u8>,
+    error: bool,
+}
+
+impl Default for Slave {
+    fn default() -> Self {
+        Self {
+            boot: Boot::Waiting,
+            settings: Vec::new(),
+            consumer: 0,
+            deadline: u64::MAX,
+            guard: None,
+            state: None,
+            error: false,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Purpose {
+    Boot,
+    /// Asked for through [`Gateway::request_sdo`].
+    Tool,
+}
+
+#[derive(Debug, Clone)]
+struct Request {
+    node: u8,
+    index: u16,
+    sub: u8,
+    data: Option<Vec<u8>>,
+    purpose: Purpose,
+}
+
+/// An SDO transfer with a node that has ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SdoResult {
+    pub node: u8,
+    pub index: u16,
+    pub sub: u8,
+    /// Of an upload; empty after a download.
+    pub data: Result<Vec<u8>, Abort>,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Master {
+    slaves: Vec<Slave>,
+    queue: VecDeque<Request>,
+    active: Option<(Request, Client, u64)>,
+    pub(super) results: VecDeque<SdoResult>,
+}
+
+impl Default for Master {
+    fn default() -> Self {
+        Self {
+            slaves: vec![Slave::default(); 128],
+            queue: VecDeque::new(),
+            active: None,
+            results: VecDeque::new(),
+        }
+    }
+}
+
+impl Master {
+    /// The state that all assigned slaves are in, as 0x1F82 would show it: missing if one is, unknown if they differ.
+    fn common(states: impl Iterator<Item = u8>) -> u8 {
+        let mut common = None;
+        for state in states {
+            match (common, state) {
+                (_, 1) => return 1,
+                (None, _) => common = Some(state),
+                (Some(known), _) if known != state => common = Some(0),
+                _ => {}
+            }
+        }
+        common.unwrap_or(0)
+    }
+
+    pub(super) fn due(&self) -> u64 {
+        let sdo = self.active.as_ref().map_or(u64::MAX, |(.., at)| *at);
+        let slaves = self.slaves.iter().map(|slave| {
+            let guard = slave.guard.as_ref().map_or(u64::MAX, |guard| guard.next);
+            slave.deadline.min(guard)
+        });
+        slaves.fold(sdo, u64::min)
+    }
+
+    fn slave(&mut self, node: u8) -> Option<&mut Slave> {
+        self.slaves.get_mut(usize::from(node))
+    }
+
+    /// The lowest node in error, 0 if there is none.
+    pub(super) fn error_node(&self) -> u8 {
+        let first = self.slaves.iter().position(|slave| slave.error);
+        first.map_or(0, |node| node as u8)
+    }
+
+    /// A reset has been ordered: what was known no longer counts.
+    fn forget(&mut self, node: Option<u8>) {
+        for (n, slave) in self.slaves.iter_mut().enumerate() {
+            if node.is_none_or(|node| usize::from(node) == n) {
+                slave.boot = Boot::Waiting;
+                (slave.deadline, slave.state, slave.guard) = (u64::MAX, None, None);
+            }
+        }
+        let own = |request: &Request| node.is_none_or(|node| request.node == node);
+        self.queue
+            .retain(|request| request.purpose == Purpose::Tool || !own(request));
+        self.active
+            .take_if(|(request, ..)| request.purpose == Purpose::Boot && own(request));
+    }
+}
+
+impl Gateway {
+    fn assignment(&self, node: u8) -> u32 {
+        self.d.get(0x1f81, node) as u32
+    }
+
+    fn start_up(&self) -> u32 {
+        self.d.get(0x1f80, 0) as u32
+    }
+
+    pub(super) fn is_master(&self) -> bool {
+        self.start_up() & 1 != 0
+    }
+
+    fn nmt(&mut self, command: NmtCommand, node: u8, now: u64) {
+        let frame = CanFrame::new(0, &[command.specifier(), node]);
+        self.bus.send(self.options.node_id, frame, now);
+        if command.leads_to() == NmtState::Initialising {
+            self.master.forget(Some(node).filter(|node| *node != 0));
+        }
+    }
+
+    /// Initialised: all slaves begin anew.
+    pub(super) fn start_network(&mut self, now: u64) {
+        self.load_consumers();
+        if self.is_master() {
+            self.nmt(NmtCommand::ResetCommunication, 0, now);
+        }
+    }
+
+    /// Object 0x1F82: only nodes that are watched have a state.
+    pub(super) fn node_state(&self, node: u8) -> u8 {
+        if node == self.options.node_id {
+            return self.nmt.code();
+        }
+        match self.master.slaves.get(usize::from(node)) {
+            Some(slave) if slave.error => 1,
+            Some(slave) if slave.consumer > 0 || slave.guard.is_some() => slave.state.unwrap_or(0),
+            _ => 0,
+        }
+    }
+
+    /// The same of the whole network.
+    pub(super) fn network_state(&self) -> u8 {
+        let assigned = (1..=127).filter(|node| self.assignment(*node) & 1 != 0);
+        Master::common(assigned.map(|node| self.node_state(node)))
+    }
+
+    pub(super) fn is_guarded(&self, node: u8) -> bool {
+        let slave = self.master.slaves.get(usize::from(node));
+        slave.is_some_and(|slave| slave.guard.is_some())
+    }
+
+    /// A service for the module, one node or all of them; false if it must not be done now.
+    pub(super) fn set_state(&mut self, command: NmtCommand, target: Target, now: u64) -> bool {
+        if self.nmt == NmtState::Initialising {
+            return false;
+        }
+        match target {
+            Target::Module => self.change_own(command, now),
+            // As a slave the module can command nobody but itself.
+            _ if !self.is_master() => return false,
+            Target::Node(node) if node == self.options.node_id => self.change_own(command, now),
+            Target::Node(node) => self.nmt(command, node, now),
+            Target::Network => {
+                if command == NmtCommand::Start && !self.mandatory_ready() {
+                    return false;
+                }
+                self.nmt(command, 0, now);
+                self.change_own(command, now);
+            }
+        }
+        true
+    }
+
+    fn change_own(&mut self, command: NmtCommand, now: u64) {
+        match command {
+            NmtCommand::ResetNode | NmtCommand::ResetCommunication => {
+                self.restart(command == NmtCommand::ResetNode, now);
+            }
+            _ => {
+                let before = self.nmt;
+                self.nmt = command.leads_to();
+                if self.nmt == NmtState::Operational && before != self.nmt {
+                    self.start_pdos();
+                    self.start_slaves(now);
+                }
+            }
+        }
+    }
+
+    fn mandatory_ready(&self) -> bool {
+        (1..=127).all(|node| {
+            let ready = |slave: &Slave| slave.boot == Boot::Ready;
+            self.assignment(node) & 0b1001 != 0b1001
+                || self.master.slaves.get(usize::from(node)).is_some_and(ready)
+        })
+    }
+
+    /// Slaves that have booted become operational with the master, unless the MainDevice starts them.
+    fn start_slaves(&mut self, now: u64) {
+        let allowed = self.nmt == NmtState::Operational
+            && self.is_master()
+            && self.start_up() & 1 << 3 == 0
+            && self.mandatory_ready();
+        if !allowed {
+            return;
+        }
+        if self.start_up() & 1 << 1 != 0 {
+            return self.nmt(NmtCommand::Start, 0, now);
+        }
+        for node in 1..=127 {
+            let slave = self.master.slaves.get(usize::from(node));
+            let starts = slave.is_some_and(|slave| {
+                slave.boot == Boot::Ready && slave.state != Some(NmtState::Operational.code())
+            });
+            if starts {
+                self.nmt(NmtCommand::Start, node, now);
+            }
+        }
+    }
+}

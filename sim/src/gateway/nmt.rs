@@ -1,0 +1,69 @@
+//! Network management: states and services (CiA 301 §7.2.8, §7.3.2).
+
+/// What a CANopen device is in. The numbers are those of heartbeats and of object 0x1F82.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+pub enum NmtState {
+    #[default]
+    Initialising = 0,
+    Stopped = 4,
+    Operational = 5,
+    PreOperational = 127,
+}
+
+impl NmtState {
+    #[must_use]
+    pub fn from_code(code: u8) -> Option<Self> {
+        Some(match code {
+            0 => Self::Initialising,
+            4 => Self::Stopped,
+            5 => Self::Operational,
+            127 => Self::PreOperational,
+            _ => return None,
+        })
+    }
+
+    #[must_use]
+    pub fn code(self) -> u8 {
+        self as u8
+    }
+}
+
+/// Module control services; the numbers are the command specifiers on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum NmtCommand {
+    Start = 1,
+    Stop = 2,
+    EnterPreOperational = 0x80,
+    ResetNode = 0x81,
+    ResetCommunication = 0x82,
+}
+
+impl NmtCommand {
+    #[must_use]
+    pub fn from_specifier(specifier: u8) -> Option<Self> {
+        Some(match specifier {
+            1 => Self::Start,
+            2 => Self::Stop,
+            0x80 => Self::EnterPreOperational,
+            0x81 => Self::ResetNode,
+            0x82 => Self::ResetCommunication,
+            _ => return None,
+        })
+    }
+
+    #[must_use]
+    pub fn specifier(self) -> u8 {
+        self as u8
+    }
+
+    /// Where it leads to; resets lead to initialisation.
+    #[must_use]
+    pub fn leads_to(self) -> NmtState {
+        match self {
+            Self::Start => NmtState::Operational,
+            Self::Stop => NmtState::Stopped,
+            Self::EnterPreOperational => NmtState::PreOperational,
+            Self::ResetNode | Self::ResetCommunication => NmtState::Initialising,
+        }
+    }
+}

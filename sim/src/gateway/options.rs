@@ -1,0 +1,362 @@
+//! What a configuration tool would write into a gateway and its nodes: from a short description to objects.
+
+use super::anybus::{BYTES_AN_OBJECT, MAX_SIZE, MIN_SIZE};
+use super::node::{Epos, RECEIVABLE, RECEIVE_COBS, TRANSMIT_COBS, TRANSMITTABLE};
+use super::pdo::{INVALID, mapping};
+use crate::drive::PlantParams;
+
+/// A value for one subindex.
+pub(super) type Setting = (u16, u8, Vec<u8>);
+
+/// Bit rates of the gateway's rotary switch.
+pub const BIT_RATES: [u32; 7] = [
+    20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
+];
+
+/// A gateway as it leaves commissioning.
+#[derive(Debug, Clone)]
+pub struct GatewayOptions {
+    /// Its own node number on the secondary network.
+    pub node_id: u8,
+    /// Bits a second, one of [`BIT_RATES`].
+    pub bit_rate: u32,
+    /// Bytes to and from EtherCAT (0x3000, 0x3001), 2 to 512 each, control and status word included; `None`: as
+    /// much as the ESI maps by default.
+    pub input_size: Option<u16>,
+    pub output_size: Option<u16>,
+    /// 0x1006, microseconds; 0: no SYNC.
+    pub sync_period_us: u32,
+    /// 0x1017, milliseconds; 0: no heartbeat of its own.
+    pub heartbeat_ms: u16,
+    /// 0x1F80. Bit 0: NMT master; bit 3: the MainDevice starts the nodes one by one.
+    pub start_up: u32,
+    pub nodes: Vec<NodeOptions>,
+    /// Further objects of the gateway's CANopen dictionary, written last.
+    pub objects: Vec<(u16, u8, Vec<u8>)>,
+}
+
+impl Default for GatewayOptions {
+    fn default() -> Self {
+        Self {
+            node_id: 99,
+            bit_rate: 1_000_000,
+            input_size: None,
+            output_size: None,
+            sync_period_us: 4000,
+            heartbeat_ms: 0,
+            start_up: 1,
+            nodes: Vec::new(),
+            objects: Vec::new(),
+        }
+    }
+}
+
+/// How the gateway notices that a node is gone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Supervision {
+    None,
+    /// The node sends every so many milliseconds and may be half that late.
+    Heartbeat {
+        period_ms: u16,
+    },
+    /// The gateway asks every so many milliseconds and gives up after so many questions.
+    Guarding {
+        period_ms: u16,
+        retries: u8,
+    },
+}
+
+/// A drive behind the gateway.
+#[derive(Debug, Clone)]
+pub struct NodeOptions {
+    pub id: u8,
+    pub drive: Epos,
+    pub plant: PlantParams,
+    pub supervision: Supervision,
+    /// The network must not be started without it.
+    pub mandatory: bool,
+    /// It is configured and started again when it comes back.
+    pub restart: bool,
+    /// Its transmit PDOs into the input data.
+    pub inputs: Vec<PdoLink>,
+    /// Output data into its receive PDOs.
+    pub outputs: Vec<PdoLink>,
+    /// Further objects written at each boot.
+    pub objects: Vec<(u16, u8, Vec<u8>)>,
+}
+
+impl NodeOptions {
+    #[must_use]
+    pub fn new(id: u8, drive: Epos) -> Self {
+        Self {
+            id,
+            drive,
+            plant: drive.plant(),
+            supervision: Supervision::Heartbeat { period_ms: 100 },
+            mandatory: false,
+            restart: true,
+            inputs: Vec::new(),
+            outputs: Vec::new(),
+            objects: Vec::new(),
+        }
+    }
+}
+
+/// One PDO of a node and its place in the EtherCAT process data.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PdoLink {
+    /// 1 to 3.
+    pub pdo: u8,
+    /// Offset in the process data; bytes 0 and 1 are control and status word.
+    pub at: u16,
+    /// (index, subindex, bits) of what it carries; empty: what it carries by default.
+    pub contents: Vec<(u16, u8, u8)>,
+    /// With each SYNC. EPOS drives of this generation send asynchronous PDOs on request only.
+    pub synchronous: bool,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum GatewayError {
+    #[error("gateway: {what} {value} is not possible: {choices}")]
+    Setting {
+        what: &'static str,
+        value: u32,
+        choices: &'static str,
+    },
+    #[error("gateway: node {id} is there twice")]
+    Twice { id: u8 },
+    #[error("gateway: node {id}: a {drive} takes node numbers up to {most}")]
+    NodeId {
+        id: u8,
+        drive: &'static str,
+        most: u8,
+    },
+    #[error("gateway: object 0x{index:04x}:{sub:02x} is refused with 0x{code:08x}")]
+    Object { index: u16, sub: u8, code: u32 },
+    #[error("gateway: node {id}, PDO {pdo}: {problem}")]
+    Pdo { id: u8, pdo: u8, problem: String },
+}
+
+/// Objects for the gateway, and for each node what it gets at boot.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Configuration {
+    pub(super) gateway: Vec<Setting>,
+    pub(super) nodes: Vec<(u8, Vec<Setting>)>,
+}
+
+fn u8_(index: u16, sub: u8, value: u8) -> Setting {
+    (index, sub, vec![value])
+}
+
+fn u16_(index: u16, sub: u8, value: u16) -> Setting {
+    (index, sub, value.to_le_bytes().to_vec())
+}
+
+fn u32_(index: u16, sub: u8, value: u32) -> Setting {
+    (index, sub, value.to_le_bytes().to_vec())
+}
+
+/// A PDO's contents: emptied, filled, counted.
+fn contents(out: &mut Vec<Setting>, index: u16, entries: &[(u16, u8, u8)]) {
+    out.push(u8_(index, 0, 0));
+    for (sub, (object, object_sub, bits)) in (1..).zip(entries) {
+        out.push(u32_(
+            index,
+            sub,
+            mapping(*object, *object_sub, *bits) as u32,
+        ));
+    }
+    out.push(u8_(index, 0, entries.len() as u8));
+}
+
+/// Which way a link goes, seen from the gateway.
+#[derive(Clone, Copy)]
+struct Way {
+    /// Communication and mapping parameters at the gateway and at the node.
+    gateway: (u16, u16),
+    node: (u16, u16),
+    buffer: u16,
+    cobs: [i64; 3],
+    mappable: &'static [(u16, u8, u8)],
+    defaults: [u16; 3],
+}
+
+const INPUTS: Way = Way {
+    gateway: super::pdo::RECEIVE,
+    node: super::pdo::TRANSMIT,
+    buffer: super::anybus::RECEIVE_BUFFER,
+    cobs: TRANSMIT_COBS,
+    mappable: &TRANSMITTABLE,
+    defaults: [2, 6, 3],
+};
+const OUTPUTS: Way = Way {
+    gateway: super::pdo::TRANSMIT,
+    node: super::pdo::RECEIVE,
+    buffer: super::anybus::TRANSMIT_BUFFER,
+    cobs: RECEIVE_COBS,
+    mappable: &RECEIVABLE,
+    defaults: [2, 6, 3],
+};
+
+impl GatewayOptions {
+    pub(super) fn check(&self) -> Result<(), GatewayError> {
+        let setting = |what, value: u32, choices| GatewayError::Setting {
+            what,
+            value,
+            choices,
+        };
+        if !(1..=127).contains(&self.node_id) {
+            return Err(setting("node number", self.node_id.into(), "1 to 127"));
+        }
+        if !BIT_RATES.contains(&self.bit_rate) {
+            let choices = "20, 50, 125, 250, 500, 800 or 1000 kbit/s";
+            return Err(setting("bit rate", self.bit_rate, choices));
+        }
+        for size in [self.input_size, self.output_size].into_iter().flatten() {
+            if !(MIN_SIZE..=MAX_SIZE).contains(&size) {
+                return Err(setting("data size", size.into(), "2 to 512 bytes"));
+            }
+        }
+        for (n, node) in self.nodes.iter().enumerate() {
+            let ids = node.drive.node_ids();
+            if !ids.contains(&node.id) {
+                return Err(GatewayError::NodeId {
+                    id: node.id,
+                    drive: node.drive.name(),
+                    most: *ids.end(),
+                });
+            }
+            let others = self.nodes.iter().take(n).map(|other| other.id);
+            if others.chain([self.node_id]).any(|id| id == node.id) {
+                return Err(GatewayError::Twice { id: node.id });
+            }
+        }
+        Ok(())
+    }
+
+    /// Sizes are those of input and output data.
+    pub(super) fn configuration(
+        &self,
+        (input_size, output_size): (u16, u16),
+    ) -> Result<Configuration, GatewayError> {
+        let mut out = Configuration::default();
+        let gateway = &mut out.gateway;
+        gateway.push(u16_(0x3000, 0, input_size));
+        gateway.push(u16_(0x3001, 0, output_size));
+        gateway.push(u32_(0x1005, 0, 0x4000_0080));
+        gateway.push(u32_(0x1006, 0, self.sync_period_us));
+        gateway.push(u16_(0x1017, 0, self.heartbeat_ms));
+        gateway.push(u32_(0x1f80, 0, self.start_up));
+        for n in 0..4 {
+            for communication in [0x1400, 0x1800] {
+                gateway.push(u32_(communication + n, 1, INVALID));
+            }
+        }
+        let (mut inputs, mut outputs) = (0, 0);
+        for (n, node) in (1..).zip(&self.nodes) {
+            let mut dcf = Vec::new();
+            let mut assignment = 1 | u32::from(node.restart) << 2 | u32::from(node.mandatory) << 3;
+            match node.supervision {
+                Supervision::None => {}
+                Supervision::Heartbeat { period_ms } => {
+                    let patience = u32::from(period_ms) + u32::from(period_ms / 2).max(1);
+                    let consumer = u32::from(node.id) << 16 | patience.min(0xffff);
+                    gateway.push(u32_(0x1016, n, consumer));
+                    dcf.push(u16_(0x1017, 0, period_ms));
+                }
+                Supervision::Guarding { period_ms, retries } => {
+                    assignment |= u32::from(retries) << 8 | u32::from(period_ms) << 16;
+                }
+            }
+            gateway.push(u32_(0x1f81, node.id, assignment));
+            for (links, way, used, size) in [
+                (&node.inputs, &INPUTS, &mut inputs, input_size),
+                (&node.outputs, &OUTPUTS, &mut outputs, output_size),
+            ] {
+                for link in links {
+                    link.configure(node.id, way, *used, size, gateway, &mut dcf)?;
+                    *used += 1;
+                }
+            }
+            dcf.extend(node.objects.iter().cloned());
+            out.nodes.push((node.id, dcf));
+        }
+        out.gateway.extend(self.objects.iter().cloned());
+        Ok(out)
+    }
+}
+
+impl PdoLink {
+    /// `n`: number of the gateway's PDO.
+    fn configure(
+        &self,
+        id: u8,
+        way: &Way,
+        n: u16,
+        size: u16,
+        gateway: &mut Vec<Setting>,
+        dcf: &mut Vec<Setting>,
+    ) -> Result<(), GatewayError> {
+        let fail = |problem: String| GatewayError::Pdo {
+            id,
+            pdo: self.pdo,
+            problem,
+        };
+        let place = usize::from(self.pdo).wrapping_sub(1);
+        let (Some(cob), Some(default)) = (way.cobs.get(place), way.defaults.get(place)) else {
+            return Err(fail("there are PDOs 1 to 3".into()));
+        };
+        if n >= 128 {
+            return Err(fail("the gateway has 128 PDOs each way".into()));
+        }
+        if self.pdo == 3 && !self.contents.is_empty() {
+            return Err(fail("its contents are static".into()));
+        }
+        if self.contents.len() > 4 {
+            return Err(fail("it takes at most 4 objects".into()));
+        }
+        let unknown = self.contents.iter().find(|c| !way.mappable.contains(c));
+        if let Some((index, sub, bits)) = unknown {
+            let object = format!("0x{index:04x}:{sub:02x} with {bits} bits cannot be mapped");
+            return Err(fail(object));
+        }
+        let mapped: u16 = self.contents.iter().map(|c| u16::from(c.2) / 8).sum();
+        let len = if mapped > 0 { mapped } else { *default };
+        if len > 8 {
+            return Err(fail(format!("{len} bytes are more than 8")));
+        }
+        if self.at < 2 || self.at.checked_add(len).is_none_or(|end| end > size) {
+            let at = self.at;
+            return Err(fail(format!(
+                "{len} bytes at {at} do not lie between the first word and byte {size}"
+            )));
+        }
+        let kind = if self.synchronous { 1 } else { 255 };
+        let node = place as u16;
+        dcf.push(u8_(way.node.0 + node, 2, kind));
+        if !self.contents.is_empty() {
+            contents(dcf, way.node.1 + node, &self.contents);
+        }
+        let bytes: Vec<_> = (self.at - 2..self.at - 2 + len)
+            .map(|byte| {
+                let (object, sub) = (byte / BYTES_AN_OBJECT, byte % BYTES_AN_OBJECT);
+                (way.buffer + object, sub as u8 + 1, 8)
+            })
+            .collect();
+        let cob = u32::try_from(*cob).unwrap_or(0) + u32::from(id);
+        // What arrives is passed on at once, whenever it was sent.
+        let own = if way.gateway == super::pdo::RECEIVE {
+            255
+        } else {
+            kind
+        };
+        gateway.push(u8_(way.gateway.0 + n, 2, own));
+        contents(gateway, way.gateway.1 + n, &bytes);
+        gateway.push(u32_(way.gateway.0 + n, 1, cob));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[path = "options_tests.rs"]
+mod tests;

@@ -1,0 +1,164 @@
+//! Booting and watching over nodes (manual §6.4, §7.2.3).
+
+use super::*;
+
+#[test]
+fn a_silent_node_is_missed_after_its_heartbeat_time() {
+    let mut line = Line::new("GW16", three_drives());
+    line.command(0x01, 128);
+    line.cycles(200);
+    assert_eq!(line.status(), [0x81, 0]);
+    let position = line.inputs[12..18].to_vec();
+    line.gateway_mut().set_node_silent(2, true);
+    // 100 ms of heartbeat, half of it patience; the last one may just have come.
+    line.cycles(45);
+    assert_eq!(line.status()[1], 0);
+    line.cycles(110);
+    assert_eq!(line.status(), [0x81, 2], "error node");
+    assert_eq!(line.command(0x10, 2), Some(0x16), "missing");
+    assert_eq!(line.command(0x10, 128), Some(0x16));
+    assert_eq!(line.command(0x20, 0), Some(0x24), "heartbeat error");
+    assert_eq!(line.inputs[12..18], position, "frozen");
+    assert_eq!(line.gateway().configuration(0x1f82, 2), Ok(vec![1]));
+    // The emergency, on the bus and in the list.
+    let error = number(&line.gateway().configuration(0x1003, 1).unwrap());
+    assert_eq!(error, 0x0002_8130);
+    // The lowest of several.
+    line.gateway_mut().set_node_silent(1, true);
+    line.cycles(200);
+    assert_eq!(line.status()[1], 1);
+    // Back: it boots, is configured and started, and sends again.
+    line.gateway_mut().set_node_silent(1, false);
+    line.gateway_mut().set_node_silent(2, false);
+    line.cycles(400);
+    assert_eq!(line.status()[1], 0);
+    assert_eq!(line.command(0x10, 2), Some(0x11));
+    assert_eq!(line.command(0x20, 0), Some(0x20));
+    enable(&mut line, 12, 1);
+    assert_eq!(line.input(12, 2) & 0x6f, 0x27);
+}
+
+#[test]
+fn what_a_lost_mandatory_node_does_to_the_others() {
+    let run = |start_up: u32, mandatory: bool| {
+        let mut options = three_drives();
+        options.start_up = start_up;
+        options.nodes[1].mandatory = mandatory;
+        options.nodes[1].restart = false;
+        let mut line = Line::new("GW16", options);
+        line.command(0x01, 128);
+        line.gateway_mut().set_node_silent(2, true);
+        line.cycles(400);
+        (line.gateway().nmt_state(), line.node(1).nmt_state())
+    };
+    let (op, stopped) = (NmtState::Operational, NmtState::Stopped);
+    assert_eq!(run(1, true), (op, op));
+    assert_eq!(run(1 | 1 << 6, true), (stopped, stopped));
+    assert_eq!(run(1 | 1 << 6, false), (op, op), "only for mandatory nodes");
+    let pre = NmtState::PreOperational;
+    assert_eq!(run(1 | 1 << 4, true), (pre, pre), "everything was reset");
+}
+
+#[test]
+fn without_a_mandatory_node_the_network_is_not_started() {
+    let mut options = three_drives();
+    options.nodes[1].mandatory = true;
+    let mut line = Line::new("GW16", options);
+    line.gateway_mut().set_node_silent(2, true);
+    line.command(0x02, 0);
+    line.cycles(400);
+    assert_eq!(line.command(0x01, 128), None);
+    assert_eq!(line.gateway().nmt_state(), NmtState::PreOperational);
+    // The command stands; it is done as soon as it can be.
+    line.gateway_mut().set_node_silent(2, false);
+    line.cycles(400);
+    assert_eq!(line.gateway().nmt_state(), NmtState::Operational);
+    assert_eq!(line.node(2).nmt_state(), NmtState::Operational);
+}
+
+#[test]
+fn node_guarding_asks_and_gives_up() {
+    // No PDOs, so that the frames remembered reach further back.
+    let nodes = [1, 2].map(|id| NodeOptions::new(id, Epos::E24_1));
+    let mut options = GatewayOptions {
+        nodes: nodes.into(),
+        sync_period_us: 0,
+        ..GatewayOptions::default()
+    };
+    options.nodes[0].supervision = Supervision::Guarding {
+        period_ms: 50,
+        retries: 3,
+    };
+    options.nodes[1].supervision = Supervision::None;
+    let mut line = Line::new("GW16", options);
+    line.command(0x01, 128);
+    line.cycles(300);
+    assert_eq!(line.gateway().configuration(0x1f83, 1), Ok(vec![1]));
+    assert_eq!(line.command(0x10, 1), Some(0x11));
+    assert_eq!(line.command(0x10, 2), Some(0x15), "unknown: not watched");
+    // Answers alternate in their toggle bit.
+    let answers = sent(&line, 0x701);
+    let toggles: Vec<bool> = answers
+        .iter()
+        .filter(|frame| !frame.remote && frame.data() != [0])
+        .map(|frame| frame.data()[0] & 0x80 != 0)
+        .collect();
+    assert!(
+        toggles.len() >= 5 && toggles.windows(2).all(|pair| pair[0] != pair[1]),
+        "{toggles:?}"
+    );
+    line.gateway_mut().set_node_silent(1, true);
+    line.gateway_mut().set_node_silent(2, true);
+    line.cycles(120);
+    assert_eq!(line.status()[1], 0);
+    line.cycles(130);
+    assert_eq!(line.status()[1], 1, "node 2 is missed by nobody");
+    assert_eq!(line.command(0x10, 1), Some(0x16));
+}
+
+#[test]
+fn a_node_that_is_not_what_it_should_be_stays_in_pre_operational() {
+    let mut options = three_drives();
+    let revision = |minor: u32| (0x2033_0000 + minor).to_le_bytes().to_vec();
+    options.objects = vec![
+        (0x1f84, 1, 0x0002_0192_u32.to_le_bytes().to_vec()),
+        (0x1f85, 1, 0xfb_u32.to_le_bytes().to_vec()),
+        (0x1f87, 1, revision(0)),
+        (0x1f86, 2, 0x6410_0000_u32.to_le_bytes().to_vec()),
+        (0x1f87, 100, revision(1)),
+    ];
+    let mut line = Line::new("GW16", options);
+    line.command(0x01, 0);
+    let (pre, op) = (NmtState::PreOperational, NmtState::Operational);
+    let states = [1, 2, 100].map(|id| line.node(id).nmt_state());
+    assert_eq!(
+        states,
+        [op, pre, pre],
+        "product code; minor revision too low"
+    );
+}
+
+#[test]
+fn a_refused_configuration_is_a_software_error() {
+    let mut options = three_drives();
+    options.nodes[1].objects = vec![(0x6041, 0, vec![0, 0])];
+    let line = Line::new("GW16", options);
+    let error = number(&line.gateway().configuration(0x1003, 1).unwrap());
+    assert_eq!(error, 0x0802_6161, "SDO error, node 2");
+}
+
+#[test]
+fn a_gateway_alone_is_error_passive() {
+    let mut line = Line::new("GW16", GatewayOptions::default());
+    assert_eq!(line.command(0x20, 0), Some(0x22));
+    assert_eq!(line.command(0x10, 128), Some(0x15));
+    let mut line = Line::new("GW16", three_drives());
+    assert_eq!(line.command(0x20, 0), Some(0x20));
+    // A node at another bit rate neither hears nor acknowledges.
+    line.sdo(2, 0x2001, 0, Some(&[2, 0])).unwrap();
+    line.sdo(2, 0x1010, 1, Some(b"save")).unwrap();
+    line.command(0x02, 2);
+    line.cycles(300);
+    assert_eq!(line.sdo(2, 0x1000, 0, None), Err(0x0504_0000));
+    assert!(line.sdo(1, 0x1000, 0, None).is_ok());
+}
