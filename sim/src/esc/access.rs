@@ -98,6 +98,9 @@ impl Esc {
         if start >= usize::from(reg::DC_RECEIVE_TIMES) {
             return self.before_dc_read(start, end);
         }
+        if read(reg::ECAT_EVENT, 0x14) || read(reg::SM, 0x40) {
+            self.show_sms();
+        }
         for (register, event) in [
             (reg::AL_STATUS, super::event::AL_STATUS),
             (reg::DL_STATUS, super::event::DL_STATUS),
@@ -235,6 +238,9 @@ impl Esc {
     /// Puts what may be written now into the shadow; false where that is nothing.
     pub(super) fn write_registers(&mut self, start: usize, data: &[u8]) -> bool {
         self.guard.note(start, data);
+        if start == usize::from(reg::DC_SYSTEM_TIME) && self.dc.is_some() {
+            return self.write_system_time(data);
+        }
         if self.map.freely_writable(start, start + data.len()) {
             self.shadow.push(start, data);
             return !data.is_empty();
@@ -252,6 +258,20 @@ impl Esc {
             at += accepted + 1;
         }
         any
+    }
+
+    /// The control loop takes four bytes; those that were not written are taken as they are in the local copy.
+    fn write_system_time(&mut self, data: &[u8]) -> bool {
+        let Some(dc) = &self.dc else { return false };
+        let mut received = (dc.local_copy(self.frame.stamp) as u32).to_le_bytes();
+        for (to, from) in received.iter_mut().zip(data) {
+            *to = *from;
+        }
+        self.frame.received = Some(u32::from_le_bytes(received));
+        if let Some(rest) = data.get(8..).filter(|rest| !rest.is_empty()) {
+            self.write_registers(usize::from(reg::DC_RECEIVE_TIME_PU), rest);
+        }
+        !data.is_empty()
     }
 
     fn accepts(&self, at: usize) -> bool {

@@ -3,7 +3,7 @@
 use super::access::overlaps;
 use super::dc::sync::Edges;
 use super::registers as reg;
-use super::{Esc, Fmmus, al, event, fmmu};
+use super::{Esc, al, event, fmmu};
 use crate::Nanos;
 
 /// The frame under way.
@@ -21,6 +21,8 @@ pub(super) struct Frame {
     pub(super) latches_read: u8,
     /// Bit per SyncManager that let an access pass.
     pub(super) touched: u8,
+    /// Written to 0x0910, to be compared with the time at the frame's beginning.
+    pub(super) received: Option<u32>,
     /// 0x0900 was written by one of the two commands that take the time at every port.
     pub(super) latches_ports: bool,
 }
@@ -29,11 +31,15 @@ impl Esc {
     /// A frame's first byte arrives at `now`; all its datagrams see this time. Returns it as local time.
     pub fn begin_frame(&mut self, now: Nanos) -> u64 {
         let local = self.clock.local(now);
+        let mask = self.u16_at(reg::ECAT_EVENT_MASK);
+        if mask & event::SYNC_MANAGERS != 0 {
+            self.show_sms();
+        }
         self.frame = Frame {
             now,
             local,
             stamp: self.jitter.stamp(local),
-            irq: self.u16_at(reg::ECAT_EVENT) & self.u16_at(reg::ECAT_EVENT_MASK),
+            irq: self.u16_at(reg::ECAT_EVENT) & mask,
             ..Frame::default()
         };
         self.guard.begin_frame();
@@ -44,6 +50,9 @@ impl Esc {
     /// The frame has been received well.
     pub fn end_frame(&mut self) {
         let frame = self.frame;
+        if let (Some(received), Some(dc)) = (frame.received, &mut self.dc) {
+            dc.compare(&mut self.clock, frame.now, frame.stamp, received);
+        }
         if !self.shadow.is_empty() {
             let mut shadow = std::mem::take(&mut self.shadow);
             for (start, data) in shadow.writes() {
@@ -70,22 +79,21 @@ impl Esc {
 
     /// Buffers and mailboxes whose last byte was accessed.
     fn hand_over(&mut self, touched: u8) {
+        self.sms_stale = true;
         let mut timed = false;
-        for n in 0..self.sms.len() {
-            if touched >> n & 1 == 0 {
-                continue;
-            }
-            let Some(sm) = self.sms.get_mut(n) else {
+        let mut left = touched;
+        while left != 0 {
+            let n = left.trailing_zeros() as u8;
+            left &= left - 1;
+            let Some(sm) = self.sms.get_mut(usize::from(n)) else {
                 continue;
             };
-            let done = sm.end_frame();
-            let written = sm.filled == super::sm::Filled::ByMainDevice;
-            let triggers = done && written && sm.watchdog;
-            self.refresh_sm(n);
-            if !done {
+            if !sm.end_frame() {
                 continue;
             }
-            timed |= self.byte_at(reg::SM + n as u16 * 8 + 6) & 0x40 != 0;
+            let written = sm.filled == super::sm::Filled::ByMainDevice;
+            let triggers = written && sm.watchdog;
+            timed |= self.byte_at(reg::SM + u16::from(n) * 8 + 6) & 0x40 != 0;
             if written {
                 self.raised.sm_written |= 1 << n;
             } else {
@@ -149,8 +157,8 @@ impl Esc {
             0x0600..0x0800 => {
                 let all = 16 * fmmu::COUNT;
                 let from = usize::from(reg::FMMU);
-                self.fmmus =
-                    Fmmus::from_registers(self.mem.get(from..from + all).unwrap_or_default());
+                let registers = self.mem.get(from..from + all).unwrap_or_default();
+                self.fmmus.configure(registers);
             }
             _ => self.apply_sms(start, end),
         }
@@ -223,21 +231,9 @@ impl Esc {
     fn apply_dc(&mut self, start: usize, data: &[u8]) {
         let end = start + data.len();
         let touched = |first: u16, len: usize| overlaps(start, end, first, len);
-        let Frame {
-            now, local, stamp, ..
-        } = self.frame;
+        let Frame { now, local, .. } = self.frame;
         if touched(reg::DC_RECEIVE_TIMES, 4) {
             return self.latch_arrival();
-        }
-        let time = usize::from(reg::DC_SYSTEM_TIME);
-        if start == time {
-            // Bytes that were not written are taken as they are in the local copy.
-            let Some(dc) = &mut self.dc else { return };
-            let mut received = (dc.local_copy(stamp) as u32).to_le_bytes();
-            for (to, from) in received.iter_mut().zip(data) {
-                *to = *from;
-            }
-            return dc.compare(&mut self.clock, now, stamp, u32::from_le_bytes(received));
         }
         if let Some(to) = self.mem.get_mut(start..end) {
             to.copy_from_slice(data);

@@ -149,24 +149,34 @@ impl Esc {
 
     // SyncManagers
 
-    /// Shows a SyncManager's status, and what follows from it, in the registers.
+    /// A SyncManager was filled or emptied. Registers show it when they are read.
     pub(crate) fn refresh_sm(&mut self, n: usize) {
-        let Some(sm) = self.sms.get_mut(n) else {
+        if let Some(sm) = self.sms.get_mut(n) {
+            sm.note_full();
+            self.sms_stale = true;
+        }
+    }
+
+    /// Shows the SyncManagers' status, and the events that follow from it, in the registers.
+    pub(super) fn show_sms(&mut self) {
+        if !std::mem::take(&mut self.sms_stale) {
             return;
-        };
-        sm.note_full();
-        let sm = *sm;
-        let base = usize::from(reg::SM) + n * 8;
-        if let Some([status, _, control]) = self.mem.get_mut(base + 5..base + 8) {
-            *status = sm.status();
-            *control = *control & !1 | u8::from(sm.closed_by_device);
         }
-        if sm.control & 0x30 != 0 {
-            let events = self.u16_at(reg::ECAT_EVENT) & !(0x10 << n);
-            let events = events | u16::from(sm.main_device_event()) << (4 + n);
-            self.put(reg::ECAT_EVENT, &events.to_le_bytes());
-            self.al_event(0x100 << n, sm.device_event());
+        let (mut main_device, mut device) = (0_u16, 0_u32);
+        let base = usize::from(reg::SM);
+        for (n, sm) in self.sms.iter().enumerate() {
+            if let Some([status, _, control]) = self.mem.get_mut(base + n * 8 + 5..base + n * 8 + 8)
+            {
+                *status = sm.status();
+                *control = *control & !1 | u8::from(sm.closed_by_device);
+            }
+            main_device |= u16::from(sm.main_device_event()) << (4 + n);
+            device |= u32::from(sm.device_event()) << (8 + n);
         }
+        let events = self.u16_at(reg::ECAT_EVENT) & !event::SYNC_MANAGERS | main_device;
+        self.put(reg::ECAT_EVENT, &events.to_le_bytes());
+        let events = self.u32_at(reg::AL_EVENT) & !event::DEVICE_SYNC_MANAGERS | device;
+        self.put(reg::AL_EVENT, &events.to_le_bytes());
     }
 
     /// Opens or closes a SyncManager (0x0807 bit 0); either empties it.
@@ -190,7 +200,7 @@ impl Esc {
     pub(crate) fn filled_buffer(&mut self, n: usize, local: u64) {
         if let Some(sm) = self.sms.get_mut(n) {
             sm.device_wrote();
-            self.refresh_sm(n);
+            self.sms_stale = true;
             self.stamp_device_access(n, local);
         }
     }
@@ -201,7 +211,7 @@ impl Esc {
         let fetches = |sm: &&mut SyncManager| sm.filled == Filled::ByMainDevice && sm.has_data();
         let sm = self.sms.get_mut(n).filter(fetches)?;
         let (at, len) = (sm.device_reads_at(memory), usize::from(sm.len));
-        self.refresh_sm(n);
+        self.sms_stale = true;
         self.stamp_device_access(n, local);
         self.mem.get(at..at + len)
     }
@@ -287,6 +297,9 @@ impl Esc {
     /// Shows pulses in the device's events, where 0x0151 maps them.
     pub(crate) fn note_sync(&mut self, edges: Edges) {
         let mapped = self.byte_at(reg::SYNC_CONFIG);
+        if mapped & 0x88 == 0 {
+            return;
+        }
         for (n, rose) in [edges.sync0, edges.sync1].into_iter().enumerate() {
             if rose && mapped >> (3 + 4 * n) & 1 != 0 {
                 self.al_event(event::SYNC0 << n, true);

@@ -3,7 +3,7 @@
 
 use super::Esc;
 use super::access::Combine;
-use super::fmmu::{self, Overlap, Use};
+use super::fmmu::{Overlap, Use};
 use super::registers as reg;
 use super::sm::Filled;
 use crate::bits;
@@ -108,14 +108,16 @@ impl Esc {
 
     fn logical_write(&mut self, address: u32, data: &[u8]) -> bool {
         let mut any = false;
-        for n in 0..fmmu::COUNT {
-            let mut from = 0;
-            while let Some((overlap, next)) =
-                self.fmmus
-                    .next_overlap(n, Use::Write, address, data.len(), from)
-            {
-                any |= self.write_bits(&overlap, data);
-                from = next;
+        let mut n = 0;
+        let mut from = 0;
+        let len = data.len();
+        while let Ok(overlap) = self.fmmus.next_overlap(n, Use::Write, address, len, from) {
+            match overlap {
+                Some((overlap, next)) => {
+                    any |= self.write_bits(&overlap, data);
+                    from = next;
+                }
+                None => (n, from) = (n + 1, 0),
             }
         }
         any
@@ -123,14 +125,16 @@ impl Esc {
 
     fn logical_read(&mut self, address: u32, data: &mut [u8]) -> bool {
         let mut any = false;
-        for n in 0..fmmu::COUNT {
-            let mut from = 0;
-            while let Some((overlap, next)) =
-                self.fmmus
-                    .next_overlap(n, Use::Read, address, data.len(), from)
-            {
-                any |= self.read_bits(&overlap, data);
-                from = next;
+        let mut n = 0;
+        let mut from = 0;
+        let len = data.len();
+        while let Ok(overlap) = self.fmmus.next_overlap(n, Use::Read, address, len, from) {
+            match overlap {
+                Some((overlap, next)) => {
+                    any |= self.read_bits(&overlap, data);
+                    from = next;
+                }
+                None => (n, from) = (n + 1, 0),
             }
         }
         any

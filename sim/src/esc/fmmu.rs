@@ -97,13 +97,6 @@ pub enum Use {
 }
 
 impl Fmmu {
-    fn is_for(&self, way: Use) -> bool {
-        match way {
-            Use::Read => self.read,
-            Use::Write => self.write,
-        }
-    }
-
     fn logical_bytes(&self) -> std::ops::Range<u64> {
         let start = u64::from(self.logical);
         start..start + (u64::from(self.start_bit) + self.bits()).div_ceil(8)
@@ -119,10 +112,11 @@ fn meet(a: &std::ops::Range<u64>, b: &std::ops::Range<u64>) -> bool {
     a.start < b.end && b.start < a.end
 }
 
-/// Those of one controller.
+/// Those of one controller that map something.
 #[derive(Debug, Clone, Default)]
 pub struct Fmmus {
-    list: [Option<Fmmu>; COUNT],
+    reads: Vec<Fmmu>,
+    writes: Vec<Fmmu>,
     /// Two of the same use want one logical byte: the lower number gets it.
     contested: bool,
     /// Memory that is read is also written.
@@ -130,28 +124,45 @@ pub struct Fmmus {
 }
 
 impl Fmmus {
-    /// From the registers of all of them.
     #[must_use]
-    pub fn from_registers(registers: &[u8]) -> Self {
-        let mut list = [None; COUNT];
-        for (fmmu, r) in list.iter_mut().zip(registers.chunks_exact(16)) {
-            *fmmu = r.try_into().ok().and_then(Fmmu::from_registers);
-        }
-        let pairs = || {
-            let used = list.iter().flatten().enumerate();
-            used.flat_map(|(n, a)| list.iter().flatten().skip(n + 1).map(move |b| (a, b)))
-        };
-        let same_use = |a: &Fmmu, b: &Fmmu| a.read && b.read || a.write && b.write;
-        let other_use = |a: &Fmmu, b: &Fmmu| a.read && b.write || a.write && b.read;
+    pub fn with_capacity() -> Self {
         Self {
-            list,
-            contested: pairs()
-                .any(|(a, b)| same_use(a, b) && meet(&a.logical_bytes(), &b.logical_bytes())),
-            looped: list.iter().flatten().any(|f| f.read && f.write)
-                || pairs().any(|(a, b)| {
-                    other_use(a, b) && meet(&a.physical_bytes(), &b.physical_bytes())
-                }),
+            reads: Vec::with_capacity(COUNT),
+            writes: Vec::with_capacity(COUNT),
+            ..Self::default()
         }
+    }
+
+    pub fn clear(&mut self) {
+        self.configure(&[]);
+    }
+
+    /// From the registers of all of them.
+    pub fn configure(&mut self, registers: &[u8]) {
+        self.reads.clear();
+        self.writes.clear();
+        let all = registers.chunks_exact(16).take(COUNT);
+        for fmmu in all.filter_map(|r| Fmmu::from_registers(r.try_into().ok()?)) {
+            if fmmu.read {
+                self.reads.push(fmmu);
+            }
+            if fmmu.write {
+                self.writes.push(fmmu);
+            }
+        }
+        let contested = |list: &[Fmmu]| {
+            list.iter().enumerate().any(|(n, a)| {
+                let others = list.iter().skip(n + 1);
+                others
+                    .into_iter()
+                    .any(|b| meet(&a.logical_bytes(), &b.logical_bytes()))
+            })
+        };
+        self.contested = contested(&self.reads) || contested(&self.writes);
+        self.looped = self.reads.iter().any(|a| {
+            let mut writes = self.writes.iter();
+            writes.any(|b| meet(&a.physical_bytes(), &b.physical_bytes()))
+        });
     }
 
     /// Whether reading before writing makes a difference.
@@ -160,8 +171,8 @@ impl Fmmus {
         self.looped
     }
 
-    /// What FMMU `n` maps of a datagram, from byte `from` of its data on, and where to go on asking.
-    #[must_use]
+    /// What the `n`th FMMU of this use maps of a datagram, from byte `from` of its data on, and where to go on
+    /// asking; `Err` where there is no such FMMU.
     pub fn next_overlap(
         &self,
         n: usize,
@@ -169,25 +180,32 @@ impl Fmmus {
         address: u32,
         len: usize,
         from: usize,
-    ) -> Option<(Overlap, usize)> {
-        let is_for = |fmmu: &&Fmmu| fmmu.is_for(way);
-        let fmmu = self.list.get(n)?.as_ref().filter(is_for)?;
-        if !self.contested {
-            return (from == 0).then_some((fmmu.overlap(address, len)?, len));
+    ) -> Result<Option<(Overlap, usize)>, NoMore> {
+        let list = match way {
+            Use::Read => &self.reads,
+            Use::Write => &self.writes,
+        };
+        let fmmu = list.get(n).ok_or(NoMore)?;
+        if from >= len {
+            return Ok(None);
         }
-        let lower = self.list.get(..n)?;
-        (from..len).find_map(|at| {
+        if !self.contested {
+            return Ok(fmmu.overlap(address, len).map(|overlap| (overlap, len)));
+        }
+        let lower = list.get(..n).unwrap_or_default();
+        Ok((from..len).find_map(|at| {
             let byte = address.checked_add(u32::try_from(at).ok()?)?;
             let mut overlap = fmmu.overlap(byte, 1)?;
             overlap.data_bit += at * 8;
-            let taken = lower.iter().flatten().filter(is_for);
-            let free = !taken
-                .into_iter()
-                .any(|f| f.logical_bytes().contains(&u64::from(byte)));
-            free.then_some((overlap, at + 1))
-        })
+            let taken = |f: &Fmmu| f.logical_bytes().contains(&u64::from(byte));
+            (!lower.iter().any(taken)).then_some((overlap, at + 1))
+        }))
     }
 }
+
+/// There are not so many FMMUs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NoMore;
 
 #[cfg(test)]
 mod tests {
@@ -249,11 +267,12 @@ mod tests {
         all[16..32].copy_from_slice(&registers(0x1001, 2, (0, 7), 0x1200, 0));
         all[32..48].copy_from_slice(&registers(0x1001, 1, (0, 7), 0x1300, 0));
         all[32 + 11] = 2;
-        let fmmus = Fmmus::from_registers(&all);
+        let mut fmmus = Fmmus::default();
+        fmmus.configure(&all);
         let mapped = |n, way| {
             let mut from = 0;
             let mut seen = Vec::new();
-            while let Some((o, next)) = fmmus.next_overlap(n, way, 0x1000, 4, from) {
+            while let Ok(Some((o, next))) = fmmus.next_overlap(n, way, 0x1000, 4, from) {
                 seen.push((o.data_bit / 8, o.physical_bit / 8, o.bits));
                 from = next;
             }
@@ -261,9 +280,12 @@ mod tests {
         };
         assert_eq!(mapped(0, Use::Read), [(0, 0x1100, 8), (1, 0x1101, 8)]);
         assert_eq!(mapped(1, Use::Read), [(2, 0x1201, 8)]);
-        assert_eq!(mapped(2, Use::Write), [(1, 0x1300, 8)]);
-        assert_eq!(mapped(2, Use::Read), []);
-        assert_eq!(mapped(7, Use::Read), []);
+        assert_eq!(mapped(0, Use::Write), [(1, 0x1300, 8)]);
+        assert_eq!(
+            fmmus.next_overlap(2, Use::Read, 0x1000, 4, 0),
+            Err(NoMore),
+            "two that read"
+        );
     }
 
     #[test]
@@ -272,10 +294,14 @@ mod tests {
         all[..16].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
         all[16..32].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
         all[16 + 11] = 2;
-        let fmmus = Fmmus::from_registers(&all);
+        let mut fmmus = Fmmus::default();
+        fmmus.configure(&all);
         assert!(fmmus.looped());
-        let (overlap, next) = fmmus.next_overlap(0, Use::Read, 0x0fff, 8, 0).unwrap();
+        let next = |from| fmmus.next_overlap(0, Use::Read, 0x0fff, 8, from).unwrap();
+        let (overlap, then) = next(0).unwrap();
         assert_eq!((overlap.data_bit, overlap.bits), (8, 16));
-        assert_eq!(fmmus.next_overlap(0, Use::Read, 0x0fff, 8, next), None);
+        assert_eq!(next(then), None);
+        fmmus.clear();
+        assert!(!fmmus.looped());
     }
 }

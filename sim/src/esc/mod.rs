@@ -49,12 +49,14 @@ pub(crate) mod event {
     pub(crate) const DC_LATCH: u16 = 0x0001;
     pub(crate) const DL_STATUS: u16 = 0x0004;
     pub(crate) const AL_STATUS: u16 = 0x0008;
+    pub(crate) const SYNC_MANAGERS: u16 = 0x0ff0;
     /// Device's events, 0x0220; SyncManagers follow from bit 8 on.
     pub(crate) const AL_CONTROL: u32 = 0x0001;
     pub(crate) const DEVICE_DC_LATCH: u32 = 0x0002;
     pub(crate) const SYNC0: u32 = 0x0004;
     pub(crate) const SM_ACTIVATION: u32 = 0x0010;
     pub(crate) const WATCHDOG: u32 = 0x0040;
+    pub(crate) const DEVICE_SYNC_MANAGERS: u32 = 0xff00;
 }
 
 /// What the MainDevice's accesses mean to the device's application; taken after every frame.
@@ -112,6 +114,8 @@ pub struct Esc {
     pub(crate) watchdog: Watchdog,
     pdi_watchdog: Watchdog,
     guard: Guard,
+    /// SyncManagers have changed since their status was last shown in registers.
+    sms_stale: bool,
     frame: Frame,
     shadow: Shadow,
     scratch: Vec<u8>,
@@ -132,7 +136,7 @@ impl Esc {
         let mut esc = Self {
             mem: vec![0; reg::PROCESS_RAM + ram],
             map: RegisterMap::new(&config.info, clock_width(&config)),
-            fmmus: Fmmus::default(),
+            fmmus: Fmmus::with_capacity(),
             sms: [SyncManager::default(); 8],
             clock: Clock::new(0, config.clock_offset_ns, config.clock_drift_ppm),
             jitter: Jitter::new(config.clock_jitter_ns, config.jitter_seed),
@@ -143,6 +147,7 @@ impl Esc {
             watchdog: Watchdog::default(),
             pdi_watchdog: Watchdog::default(),
             guard: Guard::default(),
+            sms_stale: false,
             frame: Frame::default(),
             shadow: Shadow::with_capacity(),
             scratch: Vec::with_capacity(1536),
@@ -163,7 +168,7 @@ impl Esc {
     pub fn power_on(&mut self, now: Nanos) {
         let EscConfig { info, .. } = self.config;
         self.mem.fill(0);
-        self.fmmus = Fmmus::default();
+        self.fmmus.clear();
         self.sms = [SyncManager::default(); 8];
         self.clock = Clock::new(
             now,
@@ -199,9 +204,7 @@ impl Esc {
             self.put(reg::DC_SPEED_START, &start);
             self.put(reg::DC_FILTER, &dc::DEFAULT_FILTERS);
         }
-        for n in 0..self.sms.len() {
-            self.refresh_sm(n);
-        }
+        self.sms_stale = true;
         self.eeprom.power_on();
         self.loaded = false;
         self.load_configuration();
