@@ -175,7 +175,7 @@ impl Controller {
     /// from asking for what they should.
     pub(super) fn ask(&mut self, demand: Demand, bounds: &Bounds) -> bool {
         let bounds = Bounds {
-            current: self.winding.allow(bounds.current),
+            current: self.winding.allow(bounds.current).max(0.0),
             speed: bounds.speed / self.counts_per_rad,
         };
         let asked = self.outer.ask(demand, &self.estimator, &bounds);

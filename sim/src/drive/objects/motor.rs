@@ -1,4 +1,4 @@
-//! Motor and supply data that commissioning has entered: 0x3000–0x3002 and 0x2200 of a maxon drive.
+//! Motor and supply data that commissioning has entered: 0x3000–0x3002, 0x3010 and 0x2200 of a maxon drive.
 
 use super::binder::Binder;
 use super::whole;
@@ -7,7 +7,7 @@ use crate::drive::plant::PlantParams;
 /// Index, subindex, name, bits, and what it holds of this plant; `None`: not known here.
 type Row = (u16, u8, &'static str, u32, Option<fn(&PlantParams) -> f64>);
 
-const ROWS: [Row; 10] = [
+const ROWS: [Row; 12] = [
     (
         0x2200,
         1,
@@ -17,6 +17,20 @@ const ROWS: [Row; 10] = [
     ),
     (0x3000, 1, "Sensors configuration", 32, None),
     (0x3000, 2, "Control structure", 32, None),
+    (
+        0x3000,
+        5,
+        "Main sensor resolution",
+        32,
+        Some(|p| f64::from(p.counts_per_turn)),
+    ),
+    (
+        0x3010,
+        1,
+        "Digital incremental encoder 1 number of pulses",
+        32,
+        Some(|p| f64::from(p.counts_per_turn / 4)),
+    ),
     (
         0x3001,
         1,
@@ -62,10 +76,11 @@ const ROWS: [Row; 10] = [
     ),
 ];
 
-const OBJECTS: [(u16, &str); 4] = [
+const OBJECTS: [(u16, &str); 5] = [
     (0x2200, "Power supply"),
     (0x3000, "Axis configuration"),
     (0x3001, "Motor data"),
+    (0x3010, "Digital incremental encoder 1"),
     (0x3002, "Electrical system parameters"),
 ];
 

@@ -3,7 +3,7 @@
 use super::binder::{Binder, RW};
 use super::homing::{HomingParameters, HomingSlots};
 use super::options::OptionSlots;
-use super::units::{RPM, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
+use super::units::{RPM, RPM_AND_FINER, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
 use super::velocity::{VelocitySlots, VelocityWindows};
 use super::{cycles, float, whole};
 use crate::coe::store::{ObjectStore, Slot};
@@ -92,10 +92,14 @@ impl ParameterSlots {
                 of(b.0.get(slot), counts_per_turn)
             })
         };
+        let per_unit_velocity = unit(unit_velocity, RPM, velocity_unit);
+        let per_unit_acceleration = unit(unit_acceleration, RPM_PER_S, acceleration_unit);
+        if let Some(slot) = unit_velocity {
+            b.choose(slot, RPM_AND_FINER);
+        }
         // rpm and rpm/s in the drive's units.
-        let per_rpm = counts_per_turn / 60.0 / unit(unit_velocity, RPM, velocity_unit);
-        let per_rpm_s =
-            counts_per_turn / 60.0 / unit(unit_acceleration, RPM_PER_S, acceleration_unit);
+        let per_rpm = counts_per_turn / 60.0 / per_unit_velocity;
+        let per_rpm_s = counts_per_turn / 60.0 / per_unit_acceleration;
         let speed = |rpm: f64| whole(rpm * per_rpm).clamp(1, 0xffff_ffff);
         let acceleration = whole(10_000.0 * per_rpm_s).clamp(1, 0xffff_ffff);
         let limits = [

@@ -2,6 +2,22 @@
 
 /// rpm, the power-on value of 0x60A9.
 pub(super) const RPM: i64 = 0x00b4_4700;
+/// rpm and tenths to millionths of it: what a drive that starts with rpm takes.
+pub(super) const RPM_AND_FINER: &[i64] = &[
+    RPM,
+    rpm_by_ten_to(-1),
+    rpm_by_ten_to(-2),
+    rpm_by_ten_to(-3),
+    rpm_by_ten_to(-4),
+    rpm_by_ten_to(-5),
+    rpm_by_ten_to(-6),
+];
+
+/// As the 32-bit two's complement that the object holds.
+const fn rpm_by_ten_to(power: i64) -> i64 {
+    (power << 24) + RPM
+}
+
 /// rpm/s, of 0x60AA.
 pub(super) const RPM_PER_S: i64 = 0x00c0_0300;
 /// Encoder counts, the only value of 0x60A8.
@@ -57,6 +73,15 @@ mod tests {
         let rpm = 2000.0 / 60.0;
         assert_eq!(velocity_unit(0x00b4_4700, 2000.0), rpm);
         assert!((velocity_unit(0xfdb4_4700, 2000.0) - rpm * 1e-3).abs() < 1e-12);
+        for (power, code) in (0..).zip(RPM_AND_FINER) {
+            let unit = velocity_unit(code & 0xffff_ffff, 2000.0);
+            assert!(
+                (unit / rpm * 10f64.powi(power) - 1.0).abs() < 1e-12,
+                "{code:x}"
+            );
+        }
+        assert_eq!(RPM_AND_FINER[3] & 0xffff_ffff, 0xfdb4_4700);
+        assert_eq!(RPM_AND_FINER[6] & 0xffff_ffff, 0xfab4_4700);
         assert_eq!(velocity_unit(0x00b5_0300, 2000.0), 1.0);
         assert_eq!(velocity_unit(0x00b4_0300, 2000.0), 2000.0);
         assert_eq!(acceleration_unit(0x00c0_0300, 2000.0), rpm);

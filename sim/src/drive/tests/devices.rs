@@ -65,13 +65,25 @@ fn epos4_with_its_csp_module() {
         (0x6076, 0, 118_400),
         (0x3001, 1, 3200),
         (0x3001, 2, 9600),
+        (0x3000, 2, 0x0001_0111),
+        (0x3000, 5, 2000),
+        (0x3001, 4, 300),
         (0x3001, 5, 37_000),
+        (0x3010, 1, 500),
+        // 0.46 mH and 0.6 Ω at 2000 rad/s, µV/A and µV/(A·ms).
+        (0x30a0, 1, 920_000),
+        (0x30a0, 2, 1_200_000),
+        (0x30a1, 5, 973),
+        (0x30a2, 3, 541),
+        (0x30a3, 5, 360_000),
         (0x60c2, 1, 1),
     ] {
         assert_eq!(value(&rig, index, sub), expected, "0x{index:04x}:{sub}");
     }
     moves_a_turn(&mut rig);
     assert!(rig.drive.objects.velocity_averaged.is_some());
+    let choices = |index| rig.store.item(rig.slot(index, 0)).unwrap().choices;
+    assert_eq!(choices(0x60a9).map(<[_]>::len), Some(7));
 }
 
 #[test]
