@@ -21,7 +21,7 @@ import tempfile
 import rig
 from report import Report, Stop
 
-SECTIONS = ["bringup", "overlap", "mailbox", "faults", "recordings"]
+SECTIONS = ["bringup", "overlap", "mailbox", "operation", "faults", "recordings"]
 
 
 def main():

@@ -103,6 +103,9 @@ class Device:
         )
         if write and start > 0x500 and start < 0x510 and self.written[0x500] & 1:
             return NO
+        if write and self.asked and start <= 0x120 < start + length:
+            # Until the application has taken the last request it takes no other.
+            return MAYBE
         if hits(self.registers()):
             return YES
         if hits(CLOCK_REGISTERS):

@@ -13,6 +13,7 @@ from report import Report
 from .bringup import bringup, overlap
 from .faults import faults
 from .mailbox import mailbox
+from .operation import operation
 from .recordings import judge, recordings
 
 __all__ = ["Bench", "bringup", "faults", "mailbox", "overlap", "recordings"]
