@@ -241,3 +241,18 @@ fn three_hundred_of_everything() {
     let options = sii::SiiOptions::default();
     assert!(sii::parse(&sii::emit(&file.devices[0], &file.modules, &options)).is_ok());
 }
+
+#[test]
+fn what_is_kept_set_and_measured_is_told_of_every_object() {
+    let file = file("../../tests/judges/esi/mailbox.xml");
+    let dictionary = &file.devices[0].dictionary;
+    for (index, backup, setting, unit) in [
+        (0x2020, true, true, 0xfd01_0000),
+        (0x2002, true, false, 0),
+        (0x2025, false, false, 0),
+    ] {
+        let item = dictionary.item(index, 0).unwrap();
+        let told = (item.backup, item.setting, item.unit);
+        assert_eq!(told, (backup, setting, unit), "0x{index:04x}");
+    }
+}

@@ -158,6 +158,10 @@ fn object_types_are_those_of_the_standard() {
         let data = ask(&mut bus, 3, &index.to_le_bytes()).unwrap();
         assert_eq!(data[2..4], data_type.to_le_bytes(), "0x{index:04x}");
     }
+    let mut name = |index: u16| ask(&mut bus, 3, &index.to_le_bytes()).unwrap()[6..].to_vec();
+    assert_eq!(name(0x1c00), b"SyncManager types");
+    assert_eq!(name(0x1c12), b"SyncManager 2 PDO assignment");
+    assert_eq!(name(0x1600), b"Outputs", "the PDO's");
     for (sub, data_type) in [(1, 0x01), (2, 0x32), (3, 0x06), (5, 0x04), (6, 0x31)] {
         assert_eq!(
             entry(&mut bus, 0x2010, sub, 0).unwrap().data_type,
@@ -170,8 +174,8 @@ fn object_types_are_those_of_the_standard() {
 fn values_are_told_where_they_are_asked_for_and_known() {
     let mut bus = bus(48);
     let all = entry(&mut bus, 0x2020, 0, 0x7f).unwrap();
-    assert_eq!(all.info, 0x77, "there is no unit");
-    let mut expected = Vec::new();
+    assert_eq!(all.info, 0x7f);
+    let mut expected = 0xfd01_0000_u32.to_le_bytes().to_vec();
     for value in [0, -1000, 1000_i32] {
         expected.extend_from_slice(&value.to_le_bytes());
     }
@@ -190,20 +194,9 @@ fn values_are_told_where_they_are_asked_for_and_known() {
     // The default is the maker's, not the present value.
     bus.download(S, 0x2020, 0, &[7, 0, 0, 0]).unwrap();
     assert_eq!(entry(&mut bus, 0x2020, 0, 0x10).unwrap().rest[..4], [0; 4]);
-    let mut device = mailbox_device();
-    let objects = &mut device.dictionary.objects;
-    objects
-        .iter_mut()
-        .find(|o| o.index == 0x2020)
-        .unwrap()
-        .items[0]
-        .unit = 0xfd01_0000;
-    bus = Bus::new(vec![sim(&device)]);
-    bus.mailboxes = [(0x1000, 48), (0x1600, 48)];
-    bus.address_all();
-    bus.preop(S);
-    let unit = entry(&mut bus, 0x2020, 0, 0x08).unwrap();
-    assert_eq!((unit.info, &unit.rest[..4]), (0x08, &[0, 0, 1, 0xfd][..]));
+    let no_unit = entry(&mut bus, 0x2021, 0, 0x7f).unwrap();
+    assert_eq!(no_unit.info, 0x77);
+    assert_eq!(no_unit.rest[..4], 0.5_f32.to_le_bytes());
 }
 
 #[test]

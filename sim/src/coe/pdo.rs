@@ -100,10 +100,8 @@ impl PdoRules {
                 .map(|pdo| pdo.index)
                 .collect();
             let index = ASSIGNMENT + u16::from(n);
-            if !store.has_object(index) {
-                let name = format!("SyncManager {n} PDO assignment");
-                store.describe(index, ObjectCode::Array, &name);
-            }
+            let name = format!("SyncManager {n} PDO assignment");
+            store.describe(index, ObjectCode::Array, &name);
             rules.fill(store, index, 16, &assigned, MAX_ASSIGNED, assign);
         }
         rules.plug_defaults(store, device);
@@ -119,9 +117,7 @@ impl PdoRules {
                 exclude: pdo.exclude.clone(),
             });
             let entries: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
-            if !store.has_object(index) {
-                store.describe(index, ObjectCode::Record, &pdo.name);
-            }
+            store.describe(index, ObjectCode::Record, &pdo.name);
             self.fill(store, index, 32, &entries, MAX_MAPPED, config && !pdo.fixed);
         }
         for entry in pdo.entries.iter().filter(|entry| !entry.is_gap()) {
@@ -196,6 +192,8 @@ impl PdoRules {
             })
             .collect();
         let max = u8::try_from(defaults.len()).unwrap_or(u8::MAX);
+        store.describe(MODULE_LIST, ObjectCode::Array, "Configured modules");
+        store.describe(DETECTED_MODULES, ObjectCode::Array, "Detected modules");
         self.fill(store, MODULE_LIST, 32, &defaults, max, true);
         self.fill(store, DETECTED_MODULES, 32, &defaults, max, false);
         for (slot, ident) in defaults.iter().enumerate() {

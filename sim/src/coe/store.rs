@@ -125,16 +125,15 @@ impl ObjectStore {
         store
     }
 
-    /// Says what an object is called and made of; for objects that [`Self::ensure`] created.
+    /// Says what an object is called and made of that the dictionary does not describe.
     pub fn describe(&mut self, index: u16, code: ObjectCode, name: &str) {
-        let object = Object {
-            index,
-            name: name.to_owned(),
-            code,
-        };
-        match self.objects.binary_search_by_key(&index, |o| o.index) {
-            Ok(at) => self.objects[at] = object,
-            Err(at) => self.objects.insert(at, object),
+        if let Err(at) = self.objects.binary_search_by_key(&index, |o| o.index) {
+            let object = Object {
+                index,
+                name: name.to_owned(),
+                code,
+            };
+            self.objects.insert(at, object);
         }
     }
 

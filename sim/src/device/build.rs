@@ -1,6 +1,6 @@
 //! Devices from ESI files.
 
-use ecaxis_esi::model::{Access, Device, Dictionary, Module, SmUse, SyncManager};
+use ecaxis_esi::model::{Access, Device, Dictionary, Module, ObjectCode, SmUse, SyncManager};
 use ecaxis_esi::sii::{self, SiiError, SiiOptions};
 
 use super::application::{Application, Io};
@@ -309,6 +309,7 @@ fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
         ro,
         &device.profile.unwrap_or(0).to_le_bytes(),
     );
+    store.describe(0x1018, ObjectCode::Record, "Identity");
     store.ensure(0x1018, 0, "SubIndex 000", 8, ro, &[4]);
     for (sub, (name, value)) in (1..).zip(identity) {
         let slot = store.ensure(0x1018, sub, name, 32, ro, &[]);
@@ -316,6 +317,7 @@ fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
     }
     let types: Vec<u8> = device.sync_managers.iter().take(8).map(sm_type).collect();
     let count = u8::try_from(types.len()).unwrap_or(8);
+    store.describe(0x1c00, ObjectCode::Array, "SyncManager types");
     store.ensure(0x1c00, 0, "SubIndex 000", 8, ro, &[count]);
     for (sub, kind) in (1..).zip(types) {
         let name = format!("SyncManager {}", sub - 1);
