@@ -8,6 +8,9 @@ use super::track::Track;
 /// One step of the current loop, in seconds.
 pub(super) const CURRENT_STEP: f64 = 40e-6;
 
+/// Counts. Beyond this a double no longer knows every one.
+const FARTHEST: f64 = 9_007_199_254_740_992.0;
+
 /// Motor, load and supply, in SI units. The default is a 70 W brushless motor of 45 mm with a load of
 /// about its own inertia.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -129,7 +132,7 @@ impl Plant {
                 .track
                 .ends
                 .filter(|(low, high)| low <= high)
-                .map_or((f64::NEG_INFINITY, f64::INFINITY), |(low, high)| {
+                .map_or((-FARTHEST, FARTHEST), |(low, high)| {
                     (f64::from(low) + 0.5, f64::from(high) + 0.5)
                 }),
             coulomb: p.coulomb_friction,

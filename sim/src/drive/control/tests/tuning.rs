@@ -87,3 +87,54 @@ proptest! {
         survives(&values, mode, structure(observed))?;
     }
 }
+
+/// Numbers a plant may be described with, sensible or not.
+fn number() -> impl Strategy<Value = f64> {
+    prop_oneof![
+        Just(0.0),
+        Just(-1.0),
+        Just(f64::NAN),
+        Just(f64::INFINITY),
+        1e-9..1e-3,
+        1e-3..1e3,
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    /// Motors that cannot exist do not end the simulation.
+    #[test]
+    fn no_plant_panics(
+        n in proptest::collection::vec(number(), 10),
+        counts_per_turn in prop_oneof![Just(0), Just(1), Just(u32::MAX), 16..100_000_u32],
+        initial_position in any::<i32>(),
+        mode in prop_oneof![Just(1_i64), Just(3), Just(8), Just(9), Just(10)],
+        observed in any::<bool>(),
+    ) {
+        let mut rig = Rig::new(PlantParams {
+            counts_per_turn,
+            initial_position,
+            inertia: n[0],
+            viscous_friction: n[1],
+            coulomb_friction: n[2],
+            load_torque: n[3],
+            torque_constant: n[4],
+            resistance: n[5],
+            inductance: n[6],
+            supply_voltage: n[7],
+            nominal_current: n[8],
+            current_limit: n[9],
+            ..PlantParams::default()
+        });
+        rig.set(0x3000, 2, structure(observed));
+        rig.set(0x6060, 0, mode);
+        for word in [0x06, 0x0f, 0x1f] {
+            rig.set(0x6040, 0, word);
+            rig.set(0x607a, 0, 100_000);
+            rig.set(0x60ff, 0, 3000);
+            rig.set(0x6071, 0, 500);
+            rig.run_ms(20);
+        }
+    }
+}
