@@ -197,6 +197,7 @@ impl Running {
                 }
             }
             FaultKind::Emergency { code } => device.inject_emergency(code),
+            FaultKind::NodeSilent { node } => silence(device, node, true),
             FaultKind::Identity {
                 vendor,
                 product,
@@ -217,11 +218,21 @@ impl Running {
     }
 
     fn end(&self, device: &mut SimDevice) {
-        if let FaultKind::Identity { .. } = self.fault.kind {
-            for (n, value) in self.saved.into_iter().enumerate() {
-                patch(device, n, value);
+        match self.fault.kind {
+            FaultKind::Identity { .. } => {
+                for (n, value) in self.saved.into_iter().enumerate() {
+                    patch(device, n, value);
+                }
             }
+            FaultKind::NodeSilent { node } => silence(device, node, false),
+            _ => {}
         }
+    }
+}
+
+fn silence(device: &mut SimDevice, node: u8, silent: bool) {
+    if let Some(gateway) = device.gateway_mut() {
+        gateway.set_node_silent(node, silent);
     }
 }
 

@@ -65,6 +65,10 @@ pub enum FaultKind {
     LinkBreak {
         port: u8,
     },
+    /// A node behind a gateway has no power; it boots again when it has.
+    NodeSilent {
+        node: u8,
+    },
     Emergency {
         code: u16,
     },
@@ -104,6 +108,7 @@ struct RawFault {
     duration: Option<String>,
     device: Option<usize>,
     port: Option<u8>,
+    node: Option<u8>,
     kind: Spanned<String>,
     count: Option<u32>,
     probability: Option<f64>,
@@ -225,16 +230,25 @@ fn check(raw: RawFault, line: u32) -> Result<Fault, String> {
             }
             FaultKind::LinkBreak { port }
         }
+        "node-silent" => {
+            allowed.push("node");
+            let node = raw.node.ok_or("`node` is missing")?;
+            if !(1..=127).contains(&node) {
+                return Err(format!("`node` {node}: nodes are 1 to 127"));
+            }
+            FaultKind::NodeSilent { node }
+        }
         _ => {
             return Err(
                 "unknown; known are frame-loss, drive-fault, sdo-abort, refuse-state, stuck, \
-                        identity, absent, silent, emergency, link-break"
+                        identity, absent, silent, emergency, link-break, node-silent"
                     .into(),
             );
         }
     };
     let given = [
         ("port", raw.port.is_some()),
+        ("node", raw.node.is_some()),
         ("count", raw.count.is_some()),
         ("probability", raw.probability.is_some()),
         ("code", raw.code.is_some()),
@@ -356,12 +370,16 @@ mod tests {
             device = 3
             kind = "link-break"
             port = 1
+            [[fault]]
+            kind = "node-silent"
+            node = 5
             "#,
         )
         .unwrap();
         assert_eq!(script.seed, Some(9));
-        assert_eq!(script.faults.len(), 10);
+        assert_eq!(script.faults.len(), 11);
         assert_eq!(script.faults[9].kind, FaultKind::LinkBreak { port: 1 });
+        assert_eq!(script.faults[10].kind, FaultKind::NodeSilent { node: 5 });
         assert_eq!(script.faults[0].at, 1_500_000_000);
         assert_eq!(script.faults[0].duration, Some(20_000_000));
         assert_eq!(
@@ -379,6 +397,8 @@ mod tests {
         );
         assert!(error("[[fault]]\nkind = \"absent\"\ncode = 1\n").contains("`code` means nothing"));
         assert!(error("[[fault]]\nkind = \"link-break\"\nport = 4\n").contains("ports are 0 to 3"));
+        assert!(error("[[fault]]\nkind = \"node-silent\"\n").contains("`node` is missing"));
+        assert!(error("[[fault]]\nkind = \"node-silent\"\nnode = 0\n").contains("1 to 127"));
         assert!(error("[[fault]]\nkind = \"melt\"\n").contains("known are frame-loss"));
         assert!(error("[[fault]]\nat = \"soon\"\nkind = \"absent\"\n").contains("not a duration"));
         assert!(error("[[fault]]\nkind = \"silent\"\nwhen = 1\n").contains("when"));

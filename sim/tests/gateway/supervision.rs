@@ -39,6 +39,32 @@ fn a_silent_node_is_missed_after_its_heartbeat_time() {
 }
 
 #[test]
+fn a_fault_script_silences_nodes() {
+    let mut line = Line::new("GW16", three_drives());
+    line.command(0x01, 128);
+    let script = "[[fault]]\nkind = \"node-silent\"\nnode = 100\nfor = \"300ms\"\n";
+    let script = ecaxis_sim::FaultScript::parse(script).unwrap();
+    line.bus.segment.set_faults(script);
+    line.cycles(250);
+    assert_eq!(
+        line.status(),
+        [0x81, 0],
+        "times count from the segment's first frame: long over"
+    );
+    let at = line.bus.segment.world_time(line.bus.now) / MS + 10;
+    let script = format!(
+        "[[fault]]\nkind = \"node-silent\"\nnode = 100\nat = \"{at}ms\"\nfor = \"300ms\"\n"
+    );
+    let script = ecaxis_sim::FaultScript::parse(&script).unwrap();
+    line.bus.segment.set_faults(script);
+    line.cycles(200);
+    assert_eq!(line.status(), [0x81, 100]);
+    line.cycles(500);
+    assert_eq!(line.status(), [0x81, 0]);
+    assert_eq!(line.node(100).nmt_state(), NmtState::Operational);
+}
+
+#[test]
 fn what_a_lost_mandatory_node_does_to_the_others() {
     let run = |start_up: u32, mandatory: bool| {
         let mut options = three_drives();
