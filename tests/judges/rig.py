@@ -71,6 +71,11 @@ def veth_pair():
         subprocess.run(["ip", "link", "del", a], capture_output=True)
 
 
+def target():
+    """Where cargo builds."""
+    return (ROOT / pathlib.Path(os.environ.get("CARGO_TARGET_DIR") or "target")).resolve()
+
+
 def binary():
     """The program under test: ECAXIS, or what cargo builds."""
     given = os.environ.get("ECAXIS")
@@ -79,8 +84,7 @@ def binary():
     profile = os.environ.get("ECAXIS_PROFILE", "dev")
     build = ["cargo", "build", "--quiet", "--bin", "ecaxis", "--profile", profile]
     subprocess.run(build, cwd=ROOT, check=True)
-    target = pathlib.Path(os.environ.get("CARGO_TARGET_DIR") or ROOT / "target")
-    return (ROOT / target / ("debug" if profile == "dev" else profile) / "ecaxis").resolve()
+    return target() / ("debug" if profile == "dev" else profile) / "ecaxis"
 
 
 class Machine:

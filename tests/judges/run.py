@@ -2,7 +2,7 @@
 """Other people's tools judge the simulated bus.
 
 pysoem (SOEM's MainDevice) brings a bus up that `ecaxis sim` serves on one end of a veth pair, and
-works with it. Run in an environment with `requirements.txt` installed, as root:
+works with it; so does ethercrab, more briefly. Run in an environment with `requirements.txt` installed, as root:
 
     python tests/judges/run.py [SECTION …] [--keep FOLDER]
 
@@ -21,7 +21,7 @@ import tempfile
 import rig
 from report import Report, Stop
 
-SECTIONS = ["bringup", "overlap", "mailbox", "operation", "faults", "recordings"]
+SECTIONS = ["bringup", "overlap", "mailbox", "operation", "faults", "ethercrab", "recordings"]
 
 
 def main():

@@ -6,7 +6,7 @@ address, FMMUs, SyncManagers, AL control, EEPROM ownership), and compares the co
 with the one in the answer. Written from ETG.1000.4; shares nothing with simulator or master.
 
 Three things no request tells, so answers are read for them: the AL state reached (0x0130), whether
-a mailbox is full (SyncManager status) and which features the controller has (0x0008). Where such
+a mailbox is full (SyncManager status) and what the controller has (0x0004 to 0x0008). Where such
 knowledge is missing the prediction is a range; those are counted apart.
 """
 
@@ -69,8 +69,11 @@ class Device:
     position: int
     # None until 0x0008 has been read.
     clock: bool | None = None
-    fmmus: int = 8
-    sms: int = 8
+    # None until 0x0004 has been read.
+    fmmus: int | None = None
+    sms: int | None = None
+    # Until then: how many have answered an access of their own.
+    seen: list = field(default_factory=lambda: [0, 0])
     station: int = 0
     # 0x0000 to 0x0FFF as far as the MainDevice has written it.
     written: bytearray = field(default_factory=lambda: bytearray(0x1000))
@@ -84,16 +87,26 @@ class Device:
 
     def outbox(self, n):
         """A mailbox that the MainDevice writes."""
-        return n < self.sms and self.sm(n)[4] & 0x0F == 0x06
+        return n in self.sm_range and self.sm(n)[4] & 0x0F == 0x06
 
-    def registers(self):
-        yield from REGISTERS
-        for n in range(self.fmmus):
-            yield (0x600 + 16 * n, 0x60F + 16 * n, True)
-        for n in range(self.sms):
-            base = 0x800 + 8 * n
-            yield from ((base, base + 4, True), (base + 5, base + 5, False))
-            yield from ((base + 6, base + 6, True), (base + 7, base + 7, False))
+    @property
+    def fmmu_range(self):
+        return range(16 if self.fmmus is None else self.fmmus)
+
+    @property
+    def sm_range(self):
+        return range(16 if self.sms is None else self.sms)
+
+    def units(self):
+        """Registers of FMMUs and SyncManagers, and whether the device is known to have them."""
+        for n in self.fmmu_range:
+            yield (0x600 + 16 * n, 0x60F + 16 * n, True), self.fmmus is not None or n < self.seen[0]
+        for n in self.sm_range:
+            base, known = 0x800 + 8 * n, self.sms is not None or n < self.seen[1]
+            yield (base, base + 4, True), known
+            yield (base + 5, base + 5, False), known
+            yield (base + 6, base + 6, True), known
+            yield (base + 7, base + 7, False), known
 
     def register(self, start, length, write):
         """Whether any byte of a register access counts."""
@@ -106,15 +119,17 @@ class Device:
         if write and self.asked and start <= 0x120 < start + length:
             # Until the application has taken the last request it takes no other.
             return MAYBE
-        if hits(self.registers()):
+        if hits(REGISTERS) or hits(unit for unit, known in self.units() if known):
             return YES
+        if hits(unit for unit, _ in self.units()):
+            return MAYBE
         if hits(CLOCK_REGISTERS):
             return {True: YES, False: NO, None: MAYBE}[self.clock]
         return NO
 
     def memory(self, start, length, write):
         """Whether an access to process memory counts, as SyncManagers have it."""
-        for n in range(self.sms):
+        for n in self.sm_range:
             r = self.sm(n)
             first, size = int.from_bytes(r[0:2], "little"), int.from_bytes(r[2:4], "little")
             if not size or start + length <= first or start >= first + size:
@@ -142,7 +157,7 @@ class Device:
 
     def logical(self, start, length, write):
         best = NO
-        for n in range(self.fmmus):
+        for n in self.fmmu_range:
             f = self.written[0x600 + 16 * n : 0x610 + 16 * n]
             first, size = int.from_bytes(f[0:4], "little"), int.from_bytes(f[4:6], "little")
             if not f[12] & 1 or not f[11] & (2 if write else 1):
@@ -155,7 +170,7 @@ class Device:
 
     def touch(self, start, data, wkc):
         """The MainDevice has written; `wkc` tells whether it arrived."""
-        for n in range(self.sms):
+        for n in self.sm_range:
             r = self.sm(n)
             first, size = int.from_bytes(r[0:2], "little"), int.from_bytes(r[2:4], "little")
             if size and first <= start < first + size and start >= 0x1000:
@@ -166,7 +181,7 @@ class Device:
         for at, value in enumerate(data, start):
             if at >= 0x1000:
                 break
-            locked = 0x800 <= at < 0x800 + 8 * self.sms and at % 8 < 5 and self.written[at | 6] & 1
+            locked = 0x800 <= at < 0x800 + 8 * len(self.sm_range) and at % 8 < 5 and self.written[at | 6] & 1
             if not locked or start <= at | 6 < start + len(data) and not data[(at | 6) - start] & 1:
                 self.written[at] = value
         if start <= 0x11 and start + len(data) >= 0x12:
@@ -174,7 +189,7 @@ class Device:
         if start <= 0x120 < start + len(data):
             self.asked = self.written[0x120] & 0x0F
             self.states |= {self.asked}
-        for n in range(self.sms):
+        for n in self.sm_range:
             if start <= 0x806 + 8 * n < start + len(data):
                 # Enabling empties it; what the device then puts in is its own affair.
                 self.full[n] = False if self.outbox(n) else None
@@ -193,13 +208,13 @@ class Device:
             self.fmmus = fmmus
         if (sms := byte(0x005)) is not None:
             self.sms = sms
-        for n in range(self.sms):
+        for n in self.sm_range:
             if (status := byte(0x805 + 8 * n)) is None or self.sm(n)[4] & 3 != 2:
                 continue
             full = bool(status & 8)
             # Full to be written: the device may empty it. Empty to be read: it may fill it.
             self.full[n] = full if full != self.outbox(n) else None
-        for n in range(self.sms):
+        for n in self.sm_range:
             r = self.sm(n)
             first, size = int.from_bytes(r[0:2], "little"), int.from_bytes(r[2:4], "little")
             if not size or start != first or r[4] & 3 != 2:
@@ -214,6 +229,8 @@ class Walk:
     def __init__(self, count):
         self.devices = [Device(n) for n in range(count)]
         self.exact = Counter()
+        # The same one by one: (number of the frame, place of the datagram).
+        self.places = {}
         self.ranges = Counter()
         self.wrong = []
         self.unanswered = 0
@@ -256,6 +273,11 @@ class Walk:
                 v.touch(d.ado, d.data, wkc is None or wkc > 0)
         if answer is None or not wkc:
             return
+        if d.command in (APRD, FPRD, APWR, FPWR) and len(targets) == 1:
+            for kind, base, size in ((0, 0x600, 16), (1, 0x800, 8)):
+                unit = (d.ado - base) // size
+                if 0 <= unit < 16:
+                    targets[0].seen[kind] = max(targets[0].seen[kind], unit + 1)
         if d.command in (APRD, FPRD) and len(targets) == 1:
             targets[0].learn(d.ado, answer.data)
         all_alike = d.command == BRD and d.ado == 0x130 and wkc == len(self.devices)
@@ -273,7 +295,11 @@ class Walk:
                 low, high = self.predict(d)
                 got = (answer.wkc - d.wkc) & 0xFFFF
                 name = NAMES[d.command] if d.command < len(NAMES) else "?"
-                (self.exact if low == high else self.ranges)[name] += 1
+                if low == high:
+                    self.exact[name] += 1
+                    self.places.setdefault(name, []).append((exchange.number, n))
+                else:
+                    self.ranges[name] += 1
                 if not low <= got <= high:
                     where = f"{d.logical:#010x}" if name[0] == "L" else f"{d.adp:#06x}:{d.ado:#06x}"
                     expected = str(low) if low == high else f"{low} to {high}"
