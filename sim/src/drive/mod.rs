@@ -196,7 +196,7 @@ impl Drive {
             Demand::Off
         };
         let bounds = Bounds {
-            current: self.parameters.current_limit,
+            current: self.parameters.current,
             speed: self.parameters.max_speed,
         };
         let limited = self.controller.ask(demand, &bounds);

@@ -17,6 +17,7 @@ mod outer;
 #[cfg(test)]
 mod tests;
 
+use super::objects::CurrentLimits;
 use super::plant::{Plant, PlantParams};
 
 use current::{CurrentLoop, Winding};
@@ -62,8 +63,7 @@ pub(super) struct Feed {
 /// What limits the loops.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bounds {
-    /// A.
-    pub current: f64,
+    pub current: CurrentLimits,
     /// Counts/s.
     pub speed: f64,
 }
@@ -175,7 +175,10 @@ impl Controller {
     /// from asking for what they should.
     pub(super) fn ask(&mut self, demand: Demand, bounds: &Bounds) -> bool {
         let bounds = Bounds {
-            current: self.winding.allow(bounds.current).max(0.0),
+            current: CurrentLimits {
+                forward: self.winding.allow(bounds.current.forward).max(0.0),
+                backward: self.winding.allow(bounds.current.backward).max(0.0),
+            },
             speed: bounds.speed / self.counts_per_rad,
         };
         let asked = self.outer.ask(demand, &self.estimator, &bounds);

@@ -150,11 +150,10 @@ impl Outer {
             }
         };
         let total = wanted + self.integral;
-        let limit = bounds.current;
-        let cut = total.clamp(-limit, limit);
+        let cut = bounds.current.clamp(total);
         // Wind-up: while the output is cut, the integral may only come back.
         if total == cut || total * step < 0.0 {
-            self.integral = (self.integral + step).clamp(-limit, limit);
+            self.integral = bounds.current.clamp(self.integral + step);
         }
         Some((cut, cut != total))
     }
@@ -164,10 +163,8 @@ impl Outer {
         // Near the speed limit the current that would go on accelerating fades out.
         let upper = self.velocity.p * (bounds.speed - velocity);
         let lower = self.velocity.p * (-bounds.speed - velocity);
-        let allowed = wanted
-            .min(upper)
-            .max(lower)
-            .clamp(-bounds.current, bounds.current);
+        let allowed = wanted.min(upper).max(lower);
+        let allowed = bounds.current.clamp(allowed);
         (allowed, allowed != wanted)
     }
 }

@@ -9,6 +9,7 @@
 //! * `probe`: touch probes
 //! * `options`: option codes
 //! * `velocity`: when a speed is reached, zero or slipping
+//! * `torque`: what limits the current
 //! * `units`: SI unit codes, interpolation time
 
 mod binder;
@@ -19,6 +20,7 @@ mod motor;
 mod options;
 mod parameters;
 mod probe;
+mod torque;
 mod units;
 mod velocity;
 
@@ -37,6 +39,7 @@ use units::COUNTS;
 pub(super) use homing::HomingParameters;
 pub(super) use parameters::Parameters;
 pub(super) use probe::ProbeSlots;
+pub(super) use torque::CurrentLimits;
 
 /// PP, PV, HM, CSP, CSV, CST.
 const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;

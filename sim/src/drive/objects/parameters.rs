@@ -3,6 +3,7 @@
 use super::binder::{Binder, RW};
 use super::homing::{HomingParameters, HomingSlots};
 use super::options::OptionSlots;
+use super::torque::{CurrentLimits, TorqueSlots};
 use super::units::{RPM, RPM_AND_FINER, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
 use super::velocity::{VelocitySlots, VelocityWindows};
 use super::{cycles, float, whole};
@@ -10,13 +11,6 @@ use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::plant::PlantParams;
 use crate::drive::profile::Dynamics;
 use crate::drive::state::OptionCodes;
-
-/// Limits that come with the process data: then zero means zero, where an unset object means "no limit".
-#[derive(Debug, Clone, Copy, Default)]
-struct MappedLimits {
-    torque: bool,
-    speed: bool,
-}
 
 #[derive(Debug, Clone)]
 pub(super) struct ParameterSlots {
@@ -26,12 +20,13 @@ pub(super) struct ParameterSlots {
     following_timeout: Slot,
     position_window: Slot,
     position_window_time: Slot,
-    max_torque: Option<Slot>,
-    rated_torque: Slot,
+    torque: TorqueSlots,
     range: [Slot; 2],
     limits: [Slot; 2],
     max_profile_velocity: Slot,
     max_motor_speed: Slot,
+    /// 0x3003:03, rpm.
+    max_gear_speed: Option<Slot>,
     profile_velocity: Slot,
     profile_acceleration: Slot,
     profile_deceleration: Slot,
@@ -43,8 +38,10 @@ pub(super) struct ParameterSlots {
     unit_acceleration: Option<Slot>,
     period_value: Slot,
     period_index: Slot,
-    output_current_limit: Option<Slot>,
-    mapped: MappedLimits,
+    /// 0x6080 comes with the process data: then zero means zero, where an unset object means "no limit".
+    speed_is_mapped: bool,
+    /// It does, or a limit of the torque.
+    limits_are_mapped: bool,
 }
 
 /// The parameters in counts and seconds.
@@ -61,9 +58,9 @@ pub(in crate::drive) struct Parameters {
     pub range_min: i64,
     pub range_width: i64,
     pub software_limits: Option<(i64, i64)>,
-    /// 0x6080.
+    /// 0x6080, and 0x3003:03.
     pub max_speed: f64,
-    /// 0x607F, and 0x6080.
+    /// 0x607F, and [`Self::max_speed`].
     pub max_profile_speed: f64,
     pub velocity: VelocityWindows,
     pub profile: Dynamics,
@@ -72,16 +69,13 @@ pub(in crate::drive) struct Parameters {
     pub velocity_unit: f64,
     /// N·m that a thousandth of rated torque is.
     pub torque_unit: f64,
-    /// A.
-    pub current_limit: f64,
+    pub current: CurrentLimits,
     /// 0x60C2.
     pub period_ns: i64,
 }
 
 impl ParameterSlots {
     pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
-        let rated_torque = b.bind(0x6076, 0, "Motor rated torque", 32, RW);
-        b.motor_data(rated_torque, whole(plant.rated_torque() * 1e6));
         let max_motor_speed = b.bind(0x6080, 0, "Max motor speed", 32, RW);
         b.motor_data(max_motor_speed, i64::from(plant.max_motor_speed));
         let (unit_velocity, unit_acceleration) = (b.0.slot(0x60a9, 0), b.0.slot(0x60aa, 0));
@@ -114,8 +108,7 @@ impl ParameterSlots {
             following_timeout: b.bind(0x6066, 0, "Following error time out", 16, RW),
             position_window: b.with_default(0x6067, 0, "Position window", 32, 0xffff_ffff),
             position_window_time: b.bind(0x6068, 0, "Position window time", 16, RW),
-            max_torque: b.0.slot(0x6072, 0),
-            rated_torque,
+            torque: TorqueSlots::bind(b, plant),
             range: [
                 b.bind(0x607b, 1, "Min position range limit", 32, RW),
                 b.bind(0x607b, 2, "Max position range limit", 32, RW),
@@ -129,6 +122,7 @@ impl ParameterSlots {
                 speed(50_000.0),
             ),
             max_motor_speed,
+            max_gear_speed: b.own(0x3003, 3, "Max gear input speed"),
             profile_velocity: b.with_default(0x6081, 0, "Profile velocity", 32, speed(1000.0)),
             profile_acceleration: b.with_default(
                 0x6083,
@@ -157,22 +151,20 @@ impl ParameterSlots {
             unit_acceleration,
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
             period_index: b.with_default(0x60c2, 2, "Interpolation time index", 8, -3),
-            output_current_limit: b.own(0x3001, 2, "Output current limit"),
-            mapped: MappedLimits::default(),
+            speed_is_mapped: false,
+            limits_are_mapped: false,
         }
     }
 
     /// Which outputs the process data now carries.
     pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
-        self.mapped = MappedLimits {
-            torque: self.max_torque.is_some_and(&is_mapped),
-            speed: is_mapped(self.max_motor_speed),
-        };
+        self.speed_is_mapped = is_mapped(self.max_motor_speed);
+        self.limits_are_mapped = self.torque.set_mapped(is_mapped) || self.speed_is_mapped;
     }
 
     /// Parameters change with the process data.
     pub(super) fn limits_are_mapped(&self) -> bool {
-        self.mapped.torque || self.mapped.speed
+        self.limits_are_mapped
     }
 
     /// Counts/s and counts/s² that a unit of speed and of acceleration is.
@@ -213,24 +205,16 @@ impl ParameterSlots {
         };
         // 0x6080 is in rpm whatever 0x60A9 says.
         let max_speed = match store.get(p.max_motor_speed) {
-            0 if !self.mapped.speed => i64::from(plant.max_motor_speed),
+            0 if !self.speed_is_mapped => i64::from(plant.max_motor_speed),
             rpm => rpm.max(0),
+        };
+        let max_speed = match p.max_gear_speed.map(|slot| store.get(slot)) {
+            Some(gear) if gear > 0 => gear.min(max_speed),
+            _ => max_speed,
         };
         let max_speed = float(max_speed) * counts_per_turn / 60.0;
         let profile_limit = speed(p.max_profile_velocity).min(max_speed);
         let max_acceleration = acceleration(p.max_acceleration);
-        let rated_torque = float(store.get(p.rated_torque)) * 1e-6;
-        let current_limit = p
-            .output_current_limit
-            .map(|slot| float(store.get(slot)) * 1e-3)
-            .map_or(plant.current_limit, |limit| limit.min(plant.current_limit));
-        let current_limit = match p.max_torque.map(|slot| store.get(slot)) {
-            Some(limit) if (limit > 0 || self.mapped.torque) && plant.torque_constant > 0.0 => {
-                let torque = float(limit.max(0)) * 1e-3 * rated_torque;
-                current_limit.min(torque / plant.torque_constant)
-            }
-            _ => current_limit,
-        };
         Parameters {
             options: p.options.read(store),
             velocity: p.velocity.read(store, velocity_unit),
@@ -250,8 +234,8 @@ impl ParameterSlots {
             },
             quick_stop_deceleration: acceleration(p.quick_stop_deceleration),
             velocity_unit,
-            torque_unit: rated_torque * 1e-3,
-            current_limit,
+            torque_unit: p.torque.rated(store) * 1e-3,
+            current: p.torque.read(store, plant),
             period_ns: period_ns(store.get(p.period_value), store.get_signed(p.period_index)),
         }
     }

@@ -269,6 +269,50 @@ fn a_received_torque_limit_acts_in_the_next_control_cycle() {
         drive.sync(&store);
         drive.control(&mut store, true);
         let expected = 3.2e-3 * float(permille);
-        assert!((drive.parameters.current_limit - expected).abs() < 1e-3);
+        assert!((drive.parameters.current.forward - expected).abs() < 1e-3);
+    }
+}
+
+/// 0x6072, 0x6073, 0x60E0, 0x60E1: of the rated 118.4 mN·m and 3.2 A what a blocked shaft is given.
+#[test]
+fn torque_and_current_limits_act_in_their_direction() {
+    let objects = [
+        (0x6072, 0, 16, "Max torque"),
+        (0x6073, 0, 16, "Max current"),
+        (0x60e0, 0, 16, "Positive torque limit value"),
+        (0x60e1, 0, 16, "Negative torque limit value"),
+    ];
+    // Limits as written; torque upwards and downwards.
+    let rows = [
+        ([0, 0, 0, 0], 2000, -2000),
+        ([1500, 0, 0, 0], 1500, -1500),
+        ([0, 1200, 0, 0], 1200, -1200),
+        ([0, 0, 800, 0], 800, -2000),
+        ([0, 0, 0, 700], 2000, -700),
+        ([500, 1200, 800, 300], 500, -300),
+    ];
+    for (limits, up, down) in rows {
+        let mut rig = Rig::with(PlantParams::default(), &objects);
+        for ((index, ..), limit) in objects.iter().zip(limits) {
+            rig.set(*index, 0, limit);
+        }
+        for mode in [9, 10] {
+            rig.enable(mode);
+            rig.drive.set_blocked(true);
+            for (torque, expected) in [(2000, up), (-2000, down)] {
+                rig.set(0x6071, 0, torque);
+                rig.set(0x60ff, 0, 3 * torque);
+                rig.run_ms(40);
+                let actual = rig.get(0x6077);
+                let limited = rig.word() & 1 << 11 != 0;
+                if mode == 10 {
+                    assert!((actual - expected).abs() <= 5, "{limits:?}: {actual}");
+                    assert_eq!(limited, expected != torque, "{limits:?}");
+                } else if expected != torque {
+                    assert!((actual - expected).abs() <= 5, "{limits:?}: {actual}");
+                    assert!(limited, "{limits:?}");
+                }
+            }
+        }
     }
 }

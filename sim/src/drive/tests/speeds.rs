@@ -2,7 +2,8 @@
 
 use super::*;
 
-const WINDOWS: [Extra; 5] = [
+const WINDOWS: [Extra; 6] = [
+    (0x3003, 3, 32, "Max gear input speed"),
     (0x606d, 0, 16, "Velocity window"),
     (0x606e, 0, 16, "Velocity window time"),
     (0x606f, 0, 16, "Velocity threshold"),
@@ -83,9 +84,15 @@ fn slippage_shows_in_bit_13() {
 }
 
 #[test]
-fn profile_speeds_are_limited_by_0x607f_and_0x6080() {
-    for (max_profile, max_motor, rpm) in [(500, 6000, 500), (5000, 800, 800)] {
+fn profile_speeds_are_limited_by_0x607f_0x6080_and_the_gear() {
+    for (max_profile, max_motor, max_gear, rpm) in [
+        (500, 6000, 0, 500),
+        (5000, 800, 9000, 800),
+        (5000, 800, 700, 700),
+    ] {
         let mut rig = profile_velocity(&[(0x607f, max_profile), (0x6080, max_motor)]);
+        rig.set(0x3003, 3, max_gear);
+        rig.run_ms(5);
         for target in [2000, -2000] {
             rig.set(0x60ff, 0, target);
             rig.run_ms(400);

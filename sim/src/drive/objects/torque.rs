@@ -1,0 +1,124 @@
+//! What limits the current: 0x3001:02, 0x6072, 0x6073, 0x60E0 and 0x60E1.
+
+use super::binder::{Binder, RW};
+use super::{float, whole};
+use crate::coe::store::{ObjectStore, Slot};
+use crate::drive::plant::PlantParams;
+
+/// A limit that a drive may have. Zero means zero where it comes with the process data; an object that
+/// was never written means "no limit".
+#[derive(Debug, Clone, Copy)]
+struct Limit {
+    slot: Slot,
+    mapped: bool,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct TorqueSlots {
+    rated_torque: Slot,
+    output_current_limit: Option<Slot>,
+    max_torque: Option<Limit>,
+    max_current: Option<Limit>,
+    /// 0x60E0, 0x60E1.
+    directions: [Option<Limit>; 2],
+}
+
+/// A, either way; neither is negative.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::drive) struct CurrentLimits {
+    pub forward: f64,
+    pub backward: f64,
+}
+
+impl CurrentLimits {
+    pub(in crate::drive) fn clamp(self, current: f64) -> f64 {
+        current.clamp(-self.backward, self.forward)
+    }
+}
+
+impl Limit {
+    /// Thousandths, if it limits.
+    fn get(self, store: &ObjectStore) -> Option<f64> {
+        let value = store.get(self.slot).max(0);
+        (value > 0 || self.mapped).then(|| float(value))
+    }
+}
+
+impl TorqueSlots {
+    pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
+        let rated_torque = b.bind(0x6076, 0, "Motor rated torque", 32, RW);
+        b.motor_data(rated_torque, whole(plant.rated_torque() * 1e6));
+        if let Some(rated_current) = b.0.slot(0x6075, 0) {
+            b.motor_data(rated_current, whole(plant.nominal_current * 1e3));
+        }
+        let limit = |index| {
+            b.0.slot(index, 0).map(|slot| Limit {
+                slot,
+                mapped: false,
+            })
+        };
+        Self {
+            rated_torque,
+            output_current_limit: b.own(0x3001, 2, "Output current limit"),
+            max_torque: limit(0x6072),
+            max_current: limit(0x6073),
+            directions: [0x60e0, 0x60e1].map(limit),
+        }
+    }
+
+    fn limits(&mut self) -> impl Iterator<Item = &mut Limit> {
+        let [forward, backward] = &mut self.directions;
+        [
+            &mut self.max_torque,
+            &mut self.max_current,
+            forward,
+            backward,
+        ]
+        .into_iter()
+        .flatten()
+    }
+
+    /// True if a limit changes with the process data.
+    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) -> bool {
+        let mut any = false;
+        for limit in self.limits() {
+            limit.mapped = is_mapped(limit.slot);
+            any |= limit.mapped;
+        }
+        any
+    }
+
+    /// N·m.
+    pub(super) fn rated(&self, store: &ObjectStore) -> f64 {
+        float(store.get(self.rated_torque)) * 1e-6
+    }
+
+    pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> CurrentLimits {
+        let ampere = match plant.torque_constant {
+            k if k > 0.0 => 1e-3 * self.rated(store) / k,
+            _ => f64::INFINITY,
+        };
+        let torque = |limit: Option<Limit>| limit?.get(store).map(|value| value * ampere);
+        let current =
+            |limit: Option<Limit>| limit?.get(store).map(|v| v * 1e-3 * plant.nominal_current);
+        let least = |limits: &[Option<f64>]| {
+            limits
+                .iter()
+                .flatten()
+                .fold(plant.current_limit, |least, &limit| least.min(limit))
+        };
+        let both = least(&[
+            self.output_current_limit
+                .map(|slot| float(store.get(slot)) * 1e-3),
+            torque(self.max_torque),
+            current(self.max_current),
+        ]);
+        let [forward, backward] = self
+            .directions
+            .map(|limit| torque(limit).map_or(both, |limit| limit.min(both)));
+        CurrentLimits {
+            forward: forward.max(0.0),
+            backward: backward.max(0.0),
+        }
+    }
+}
