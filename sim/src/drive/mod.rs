@@ -151,12 +151,12 @@ impl Drive {
         let rose = controlword & !self.set_points.controlword;
         self.set_points = SetPoints {
             controlword,
-            position: store.get_signed(o.target_position),
-            velocity: store.get_signed(o.target_velocity),
-            torque: store.get_signed(o.target_torque),
-            position_offset: store.get_signed(o.position_offset),
-            velocity_offset: store.get_signed(o.velocity_offset),
-            torque_offset: store.get_signed(o.torque_offset),
+            position: objects::int(store, o.target_position),
+            velocity: objects::int(store, o.target_velocity),
+            torque: objects::int(store, o.target_torque),
+            position_offset: objects::int(store, o.position_offset),
+            velocity_offset: objects::int(store, o.velocity_offset),
+            torque_offset: objects::int(store, o.torque_offset),
         };
         if self.objects.limits_are_mapped() {
             self.parameters_age = PARAMETER_CYCLES;

@@ -52,7 +52,7 @@ impl Drive {
             .is_some_and(|window| error > window);
         self.following_error = outside;
         self.following_cycles = if outside {
-            self.following_cycles + 1
+            self.following_cycles.saturating_add(1)
         } else {
             0
         };

@@ -264,7 +264,7 @@ impl Motion {
         let p = cycle.parameters;
         let inside = p.position_window.is_none_or(|window| float(off) <= window);
         let cycles = &mut self.homing.settled_cycles;
-        *cycles = if inside { *cycles + 1 } else { 0 };
+        *cycles = if inside { cycles.saturating_add(1) } else { 0 };
         if *cycles > p.position_window_time {
             self.homing.phase = Phase::Attained;
         }

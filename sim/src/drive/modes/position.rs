@@ -78,7 +78,11 @@ impl Motion {
             None => true,
             Some(window) => {
                 let inside = (target - float(cycle.counts)).abs() <= window;
-                buffer.settled_cycles = if inside { buffer.settled_cycles + 1 } else { 0 };
+                buffer.settled_cycles = if inside {
+                    buffer.settled_cycles.saturating_add(1)
+                } else {
+                    0
+                };
                 inside && buffer.settled_cycles > p.position_window_time
             }
         };

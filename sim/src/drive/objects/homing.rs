@@ -1,7 +1,7 @@
 //! Homing: 0x6098–0x609A, the home position, and maxon's 0x30B0–0x30B2.
 
 use super::binder::Binder;
-use super::{float, whole};
+use super::{float, int, uint, whole};
 use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::modes::METHODS;
 
@@ -88,17 +88,17 @@ impl HomingSlots {
         velocity_unit: f64,
         acceleration_unit: f64,
     ) -> HomingParameters {
-        let signed = |slot: Option<Slot>| slot.map_or(0, |slot| store.get_signed(slot));
+        let signed = |slot: Option<Slot>| slot.map_or(0, |slot| int(store, slot));
         HomingParameters {
-            method: store.get_signed(self.method),
-            search_speed: float(store.get(self.search_speed)) * velocity_unit,
-            zero_speed: float(store.get(self.zero_speed)) * velocity_unit,
-            acceleration: float(store.get(self.acceleration).max(1)) * acceleration_unit,
+            method: int(store, self.method),
+            search_speed: float(uint(store, self.search_speed)) * velocity_unit,
+            zero_speed: float(uint(store, self.zero_speed)) * velocity_unit,
+            acceleration: float(uint(store, self.acceleration).max(1)) * acceleration_unit,
             home_position: signed(self.home_position),
             distance: signed(self.distance),
             current_threshold: self
                 .current_threshold
-                .map_or(0.5, |slot| float(store.get(slot)) * 1e-3),
+                .map_or(0.5, |slot| float(uint(store, slot)) * 1e-3),
         }
     }
 }

@@ -87,6 +87,17 @@ fn whole(value: f64) -> i64 {
     value.round() as i64
 }
 
+/// A signed object. The standard has none longer than 32 bits; a dictionary may.
+pub(super) fn int(store: &ObjectStore, slot: Slot) -> i64 {
+    let value = store.get_signed(slot);
+    value.clamp(i32::MIN.into(), i32::MAX.into())
+}
+
+/// An unsigned object.
+fn uint(store: &ObjectStore, slot: Slot) -> i64 {
+    store.get(slot).clamp(0, u32::MAX.into())
+}
+
 /// Milliseconds in control cycles of 0.4 ms.
 fn cycles(ms: i64) -> u32 {
     u32::try_from((ms * 5 + 1) / 2).unwrap_or(u32::MAX)

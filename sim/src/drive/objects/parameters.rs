@@ -6,7 +6,7 @@ use super::options::OptionSlots;
 use super::torque::{CurrentLimits, TorqueSlots};
 use super::units::{RPM, RPM_AND_FINER, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
 use super::velocity::{VelocitySlots, VelocityWindows};
-use super::{cycles, float, whole};
+use super::{cycles, float, int, uint, whole};
 use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::plant::PlantParams;
 use crate::drive::profile::Dynamics;
@@ -190,25 +190,25 @@ impl ParameterSlots {
         let p = self;
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
         let (velocity_unit, acceleration_unit) = self.units(store, counts_per_turn);
-        let speed = |slot| float(store.get(slot)) * velocity_unit;
-        let acceleration = |slot| float(store.get(slot).max(1)) * acceleration_unit;
+        let speed = |slot| float(uint(store, slot)) * velocity_unit;
+        let acceleration = |slot| float(uint(store, slot).max(1)) * acceleration_unit;
         let window = |slot| {
-            Some(store.get(slot))
+            Some(uint(store, slot))
                 .filter(|&w| w < 0xffff_ffff)
                 .map(float)
         };
-        let cycles = |slot| cycles(store.get(slot));
-        let pair = |[min, max]: [Slot; 2]| (store.get_signed(min), store.get_signed(max));
+        let cycles = |slot| cycles(uint(store, slot));
+        let pair = |[min, max]: [Slot; 2]| (int(store, min), int(store, max));
         let (range_min, range_max) = match pair(p.range) {
             (min, max) if min < max => (min, max),
             _ => (i64::from(i32::MIN), i64::from(i32::MAX)),
         };
         // 0x6080 is in rpm whatever 0x60A9 says.
-        let max_speed = match store.get(p.max_motor_speed) {
+        let max_speed = match uint(store, p.max_motor_speed) {
             0 if !self.speed_is_mapped => i64::from(plant.max_motor_speed),
-            rpm => rpm.max(0),
+            rpm => rpm,
         };
-        let max_speed = match p.max_gear_speed.map(|slot| store.get(slot)) {
+        let max_speed = match p.max_gear_speed.map(|slot| uint(store, slot)) {
             Some(gear) if gear > 0 => gear.min(max_speed),
             _ => max_speed,
         };
@@ -236,7 +236,7 @@ impl ParameterSlots {
             velocity_unit,
             torque_unit: p.torque.rated(store) * 1e-3,
             current: p.torque.read(store, plant),
-            period_ns: period_ns(store.get(p.period_value), store.get_signed(p.period_index)),
+            period_ns: period_ns(uint(store, p.period_value), int(store, p.period_index)),
         }
     }
 }

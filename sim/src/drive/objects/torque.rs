@@ -1,7 +1,7 @@
 //! What limits the current: 0x3001:02, 0x6072, 0x6073, 0x60E0 and 0x60E1.
 
 use super::binder::{Binder, RW};
-use super::{float, whole};
+use super::{float, uint, whole};
 use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::plant::PlantParams;
 
@@ -39,7 +39,7 @@ impl CurrentLimits {
 impl Limit {
     /// Thousandths, if it limits.
     fn get(self, store: &ObjectStore) -> Option<f64> {
-        let value = store.get(self.slot).max(0);
+        let value = uint(store, self.slot);
         (value > 0 || self.mapped).then(|| float(value))
     }
 }
@@ -90,7 +90,7 @@ impl TorqueSlots {
 
     /// N·m.
     pub(super) fn rated(&self, store: &ObjectStore) -> f64 {
-        float(store.get(self.rated_torque)) * 1e-6
+        float(uint(store, self.rated_torque)) * 1e-6
     }
 
     pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> CurrentLimits {
@@ -109,7 +109,7 @@ impl TorqueSlots {
         };
         let both = least(&[
             self.output_current_limit
-                .map(|slot| float(store.get(slot)) * 1e-3),
+                .map(|slot| float(uint(store, slot)) * 1e-3),
             torque(self.max_torque),
             current(self.max_current),
         ]);

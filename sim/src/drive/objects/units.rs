@@ -35,10 +35,10 @@ pub(super) fn period_ns(value: i64, index: i64) -> i64 {
         .unwrap_or(0)
 }
 
-/// SI unit codes: prefix (power of ten), numerator, denominator, reserved; high byte first.
+/// SI unit codes: prefix (power of ten, pico to tera), numerator, denominator, reserved; high byte first.
 pub(super) fn prefix(code: i64) -> f64 {
     let prefix = i32::from(((code >> 24) & 0xff) as u8 as i8);
-    10f64.powi(prefix)
+    10f64.powi(prefix.clamp(-12, 12))
 }
 
 /// Counts/s per unit of velocity.

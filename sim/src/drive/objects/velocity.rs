@@ -2,7 +2,7 @@
 //! them.
 
 use super::binder::Binder;
-use super::float;
+use super::{cycles, float, uint};
 use crate::coe::store::{ObjectStore, Slot};
 
 #[derive(Debug, Clone)]
@@ -37,10 +37,10 @@ impl VelocitySlots {
 
     pub(super) fn read(&self, store: &ObjectStore, velocity_unit: f64) -> VelocityWindows {
         let speed = |slot: Option<Slot>| {
-            let value = store.get(slot?);
+            let value = uint(store, slot?);
             (value > 0).then(|| float(value) * velocity_unit)
         };
-        let time = |slot: Option<Slot>| slot.map_or(0, |slot| super::cycles(store.get(slot)));
+        let time = |slot: Option<Slot>| slot.map_or(0, |slot| cycles(uint(store, slot)));
         VelocityWindows {
             window: speed(self.window),
             window_time: time(self.window_time),

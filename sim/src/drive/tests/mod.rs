@@ -1,5 +1,6 @@
 //! The drive on its own: a store without an ESI, process data written by hand.
 
+mod abuse;
 mod devices;
 mod faults;
 mod halts;

@@ -216,3 +216,69 @@ fn option_codes_matter_to_a_powered_axis_only() {
         }
     }
 }
+
+/// A stop under way gives way to a faster end, never to a slower one's state.
+#[test]
+fn stops_under_way_are_overtaken() {
+    let ramp_first = [(0x605a, 5), (0x605c, 1), (0x605e, 2)];
+    // A slow quick stop, then a fault: the fault's ramp, then Fault.
+    let mut rig = turning(&ramp_first);
+    rig.set(0x6040, 0, 0x0b);
+    rig.run_ms(20);
+    assert_eq!(rig.drive.state(), S::QuickStopActive);
+    rig.drive.inject_fault(0x2310);
+    rig.run_ms(1);
+    assert_eq!(rig.drive.state(), S::FaultReactionActive);
+    assert_eq!(way(&mut rig), Way::QuickStop);
+    rig.run_ms(100);
+    assert_eq!(rig.drive.state(), S::Fault);
+
+    // Disable operation on its ramp, then quick stop.
+    let mut rig = turning(&[(0x605a, 6), (0x605c, 1)]);
+    rig.set(0x6040, 0, 0x07);
+    rig.run_ms(20);
+    assert_eq!(rig.drive.state(), S::OperationEnabled);
+    rig.set(0x6040, 0, 0x03);
+    rig.run_ms(1);
+    assert_eq!(rig.drive.state(), S::QuickStopActive);
+    assert_eq!(way(&mut rig), Way::QuickStop);
+
+    // Disable voltage ends any of them at once.
+    for word in [0x07, 0x0b] {
+        let mut rig = turning(&ramp_first);
+        rig.set(0x6040, 0, word);
+        rig.run_ms(20);
+        assert!(rig.drive.power_on());
+        rig.set(0x6040, 0, 0x00);
+        rig.run_ms(1);
+        assert_eq!(rig.drive.state(), S::SwitchOnDisabled);
+        assert_eq!(way(&mut rig), Way::Coast);
+    }
+
+    // Enabled again in the middle of the ramp: it goes on from there.
+    let mut rig = turning(&ramp_first);
+    rig.set(0x6040, 0, 0x07);
+    rig.run_ms(100);
+    assert!(rig.drive.velocity_rev_s() < 45.0);
+    rig.set(0x6040, 0, 0x0f);
+    rig.run_ms(200);
+    assert_eq!(rig.drive.state(), S::OperationEnabled);
+    assert!((rig.drive.velocity_rev_s() - 50.0).abs() < 0.5);
+}
+
+/// 0x60C5 bounds the profile's ramps.
+#[test]
+fn no_profile_is_steeper_than_0x60c5() {
+    for (limit, ms) in [(0xffff_ffff_i64, 300), (5_000, 600)] {
+        let mut rig = rig();
+        rig.set(0x60c5, 0, limit);
+        rig.enable(3);
+        for (target, rpm) in [(3000, 50.0), (0, 0.0)] {
+            rig.set(0x60ff, 0, target);
+            rig.run_ms(ms - 40);
+            assert!((rig.drive.velocity_rev_s() - rpm).abs() > 2.0, "{limit}");
+            rig.run_ms(100);
+            assert!((rig.drive.velocity_rev_s() - rpm).abs() < 0.5, "{limit}");
+        }
+    }
+}

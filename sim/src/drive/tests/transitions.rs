@@ -144,6 +144,28 @@ fn statuswords_by_mask_and_value() {
     }
 }
 
+/// Bits 4 (voltage enabled), 7 (warning), 9 (remote) and 11 (internal limit).
+#[test]
+fn the_other_bits_by_state() {
+    let rows = [
+        (S::NotReadyToSwitchOn, 0),
+        (S::SwitchOnDisabled, 0),
+        (S::ReadyToSwitchOn, 0),
+        (S::SwitchedOn, 1 << 4),
+        (S::OperationEnabled, 1 << 4),
+        (S::QuickStopActive, 1 << 4),
+        (S::Fault, 0),
+    ];
+    for (state, voltage) in rows {
+        let mut rig = brought_to(state, &[]);
+        rig.drive.control(&mut rig.store, true);
+        assert_eq!(rig.drive.state(), state);
+        assert_eq!(rig.word() & 0x0a90, voltage | 1 << 9, "{state:?}");
+        rig.drive.control(&mut rig.store, false);
+        assert_eq!(rig.word() & 1 << 9, 0, "{state:?}: not remote");
+    }
+}
+
 #[test]
 fn quick_stop_options() {
     for (option, end) in [
