@@ -31,8 +31,22 @@ fn every_device_reaches_op() {
     if fixture("README.md").is_none() {
         return;
     }
+    let count = sweep(&fixtures().join("esi"));
+    eprintln!("{count} devices");
+    assert!(count > 370, "{count}");
+}
+
+#[test]
+fn so_does_every_device_of_our_own() {
+    let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi");
+    let count = sweep(&own);
+    assert!(count >= 12, "{count}");
+}
+
+/// Takes each device of all files of a folder to Op; how many they are.
+fn sweep(folder: &Path) -> usize {
     let mut paths = Vec::new();
-    files(&fixtures().join("esi"), &mut paths);
+    files(folder, &mut paths);
     paths.sort();
     let (mut count, mut problems) = (0, Vec::new());
     for path in paths {
@@ -48,18 +62,14 @@ fn every_device_reaches_op() {
             let result = SimDevice::from_esi(device, &file.modules, DeviceOptions::default())
                 .map_err(|error| error.to_string())
                 .and_then(|sim| climb(device, sim));
+            let (name, identity) = (&device.type_name, &device.identity);
             if let Err(problem) = result {
-                problems.push(format!(
-                    "{}: {} {}: {problem}",
-                    path.display(),
-                    device.type_name,
-                    device.identity,
-                ));
+                problems.push(format!("{}: {name} {identity}: {problem}", path.display()));
             }
         }
     }
-    eprintln!("{count} devices");
     assert!(problems.is_empty(), "{}", problems.join("\n"));
+    count
 }
 
 fn climb(device: &Device, sim: SimDevice) -> Result<(), String> {

@@ -64,6 +64,8 @@ const LOG: usize = 256;
 /// Transmit errors from which a CAN controller is error passive, and what one failure adds.
 const ERROR_PASSIVE: u16 = 128;
 const TRANSMIT_ERROR: u16 = 8;
+/// CAN in error passive mode.
+const PASSIVE_MODE: u16 = 0x8120;
 
 #[derive(Debug, Clone)]
 pub struct Gateway {
@@ -277,7 +279,7 @@ impl Gateway {
         });
         let Some(sent) = sent else { return };
         if sent.from == own {
-            self.count_errors(sent.failed);
+            self.count_errors(sent.failed, now);
         }
         if sent.failed {
             return;
@@ -298,12 +300,17 @@ impl Gateway {
         }
     }
 
-    fn count_errors(&mut self, failed: bool) {
+    fn count_errors(&mut self, failed: bool, now: u64) {
+        let before = self.transmit_errors;
         self.transmit_errors = if failed {
-            (self.transmit_errors + TRANSMIT_ERROR).min(ERROR_PASSIVE)
+            (before + TRANSMIT_ERROR).min(ERROR_PASSIVE)
         } else {
-            self.transmit_errors.saturating_sub(1)
+            before.saturating_sub(1)
         };
+        // One frame that gets through and one that does not are no news.
+        if self.transmit_errors == ERROR_PASSIVE && before + TRANSMIT_ERROR == ERROR_PASSIVE {
+            self.emergency(PASSIVE_MODE, 0, now);
+        }
     }
 
     /// A node's frame.

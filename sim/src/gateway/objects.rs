@@ -1,5 +1,7 @@
 //! The gateway's CANopen objects as a configuration tool on the secondary network reads and writes them (manual §7).
 
+use ecaxis_esi::model::SmUse;
+
 use super::Gateway;
 use super::anybus::{buffer_count, buffer_place};
 use super::control::Target;
@@ -10,6 +12,8 @@ use super::pdo;
 use super::sdo::Objects;
 use super::{Abort, anybus};
 
+/// Hardware error: the data sizes are more than the fieldbus side takes.
+const HARDWARE: u16 = 0x6600;
 /// "conf".
 const CONFIGURE: i64 = 0x666e_6f63;
 
@@ -43,6 +47,10 @@ impl Objects for Gateway {
             (0x1003, 0) => (1..=16).for_each(|sub| self.d.set(0x1003, sub, 0)),
             (0x1010, 1) => {
                 if value != SAVE {
+                    return Err(Abort::NOT_STORED);
+                }
+                if !self.sizes_fit() {
+                    self.emergency(HARDWARE, 0, self.now);
                     return Err(Abort::NOT_STORED);
                 }
                 self.stored = self.d.clone();
@@ -90,6 +98,19 @@ impl Gateway {
             identity.revision,
             self.serial,
         )
+    }
+
+    /// Whether the SyncManagers of the EtherCAT side can be as long as 0x3000 and 0x3001 say.
+    fn sizes_fit(&self) -> bool {
+        let most = |usage| {
+            let sms = self.esi.sync_managers.iter();
+            let limits = sms
+                .filter(|sm| sm.usage == usage)
+                .filter_map(|sm| sm.max_size);
+            i64::from(limits.min().unwrap_or(anybus::MAX_SIZE))
+        };
+        self.d.get(0x3000, 0) <= most(SmUse::Inputs)
+            && self.d.get(0x3001, 0) <= most(SmUse::Outputs)
     }
 
     fn write_buffer(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {

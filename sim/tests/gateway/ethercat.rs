@@ -170,3 +170,47 @@ fn sizes_written_by_a_configuration_tool_count_after_a_restart() {
     line.bus.sm(S, 3, 0x1800, 16, 0x20);
     assert_eq!(line.bus.request(S, 4), (0x12, 0x1e));
 }
+
+#[test]
+fn sizes_beyond_the_fieldbus_are_not_stored() {
+    let mut device = ours().devices[0].clone();
+    device.sync_managers[3].max_size = Some(64);
+    let sim = SimDevice::from_esi(&device, &[], DeviceOptions::default()).unwrap();
+    let mut bus = Bus::new(vec![sim]);
+    let gateway = bus.segment.device_mut(0).unwrap().gateway_mut().unwrap();
+    let save = |gateway: &mut Gateway, size: u16| {
+        gateway.configure(0x3000, 0, &size.to_le_bytes()).unwrap();
+        gateway
+            .configure(0x1010, 1, b"save")
+            .map_err(|abort| abort.0)
+    };
+    assert_eq!(save(gateway, 64), Ok(()));
+    assert_eq!(save(gateway, 65), Err(0x0800_0020));
+    assert_eq!(gateway.configuration(0x1003, 1), Ok(vec![0x00, 0x66, 0, 0]));
+    gateway.configure(0x1003, 0, &[0]).unwrap();
+    assert_eq!(gateway.configuration(0x1003, 0), Ok(vec![0]));
+}
+
+#[test]
+fn an_eeprom_image_is_enough_to_know_a_gateway_by() {
+    let image = build("GW512", GatewayOptions::default())
+        .unwrap()
+        .sii()
+        .to_vec();
+    let sim = SimDevice::from_sii(&image, DeviceOptions::default()).unwrap();
+    assert!(sim.gateway().is_some());
+    let mut bus = Bus::new(vec![sim]);
+    bus.address_all();
+    let (_, mapped) = bring_up(&mut bus, S).unwrap();
+    assert_eq!((mapped.outputs, mapped.inputs), (512, 512));
+    // Nodes need a gateway in front of them.
+    let options = DeviceOptions {
+        gateway: Some(GatewayOptions::default()),
+        ..DeviceOptions::default()
+    };
+    let error = SimDevice::from_esi(&coe_device(), &[], options).unwrap_err();
+    assert!(
+        error.to_string().contains("not a CANopen gateway"),
+        "{error}"
+    );
+}

@@ -177,6 +177,12 @@ fn a_refused_configuration_is_a_software_error() {
 fn a_gateway_alone_is_error_passive() {
     let mut line = Line::new("GW16", GatewayOptions::default());
     assert_eq!(line.command(0x20, 0), Some(0x22));
+    assert_eq!(line.gateway().configuration(0x1003, 0), Ok(vec![1]));
+    assert_eq!(
+        line.gateway().configuration(0x1003, 1),
+        Ok(vec![0x20, 0x81, 0, 0])
+    );
+    // A node appears: what has waited goes out, the emergency too.
     assert_eq!(line.command(0x10, 128), Some(0x15));
     let mut line = Line::new("GW16", three_drives());
     assert_eq!(line.command(0x20, 0), Some(0x20));
