@@ -5,7 +5,7 @@
 //! start, shift, cycle and AssignActivate are written here (ETG.1000.4, 6.4.2; ETG.2000, Dc).
 
 use super::device::{read, write};
-use super::{BringUpError, BusDevice, Step};
+use super::{BringUpError, BusDevice, DeviceRef, Step};
 use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::mailbox::Wire;
@@ -110,6 +110,22 @@ pub(super) async fn configure(
     Err(BringUpError::NoStart {
         device: reference.at.clone(),
     })
+}
+
+/// Some devices take receive times for others' sake and have no clock beyond that: what they say in 0x0008 is the
+/// same, but 0x0910 does not answer (Beckhoff ESC data sheet, section I, 9.1).
+pub(super) async fn has_system_time(
+    wire: &impl Wire,
+    at: &DeviceRef,
+) -> Result<bool, BringUpError> {
+    let counter = wire.read(at.station, SYSTEM_TIME, &mut [0; 8]).await;
+    counter
+        .map(|counter| counter > 0)
+        .map_err(|source| BringUpError::Wire {
+            device: at.clone(),
+            step: STEP,
+            source,
+        })
 }
 
 async fn system_time(wire: &impl Wire, reference: &BusDevice) -> Result<u64, BringUpError> {

@@ -63,6 +63,7 @@ pub struct BusDevice {
     pub at: DeviceRef,
     /// `None` where the device has no CoE mailbox.
     pub coe: Option<CoeClient>,
+    /// It has a system time: not every one that says so in 0x0008 has it switched on.
     pub dc: bool,
     /// Outputs that no axis drives and that must not be zero: index, subindex, value.
     pub held: Vec<(u16, u8, i64)>,
@@ -249,11 +250,13 @@ pub async fn bring_up(
             sub_device.dc_support(),
             sub_device.propagation_delay()
         );
+        let dc = !matches!(sub_device.dc_support(), DcSupport::None)
+            && clocks::has_system_time(&wire, &at).await?;
         devices.push(BusDevice {
             coe: mailbox::open(&wire, config, &at).await?.map(CoeClient::new),
             at,
             held: Vec::new(),
-            dc: !matches!(sub_device.dc_support(), DcSupport::None),
+            dc,
             propagation_delay: sub_device.propagation_delay(),
         });
     }
