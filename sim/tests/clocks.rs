@@ -363,15 +363,17 @@ impl Eight {
     }
 }
 
-/// Ten seconds of system times at 1 kHz: (milliseconds until 0x092C stays below 100, largest 0x092C afterwards,
-/// largest true difference, largest difference of pulses).
-fn ten_seconds(eight: &mut Eight) -> (u64, u32, i64, u64) {
+/// The clocks have this long to lock.
+const LOCK_MS: u64 = 1_000;
+
+/// Ten seconds of system times at 1 kHz; after the time to lock: (largest 0x092C, largest true difference, largest
+/// difference of pulses).
+fn ten_seconds(eight: &mut Eight) -> (u32, i64, u64) {
     const MS: u64 = 10_000;
-    let (mut locked, mut worst, mut apart, mut pulses) = (0, 0, 0, 0);
+    let (mut worst, mut apart, mut pulses) = (0, 0, 0);
     for ms in 0..MS {
         let largest = eight.cycle().into_iter().max().unwrap();
-        if largest >= 100 {
-            (locked, worst, apart) = (ms + 1, 0, 0);
+        if ms < LOCK_MS {
             continue;
         }
         worst = worst.max(largest);
@@ -384,14 +386,13 @@ fn ten_seconds(eight: &mut Eight) -> (u64, u32, i64, u64) {
             pulses = pulses.max(eight.pulses_apart());
         }
     }
-    (locked, worst, apart, pulses)
+    (worst, apart, pulses)
 }
 
 #[test]
 fn eight_clocks_lock_fire_together_and_part_at_their_crystals_rates() {
     let mut eight = Eight::new(0);
-    let (locked, worst, apart, pulses) = ten_seconds(&mut eight);
-    assert!(locked < 1_000, "locked after {locked} ms");
+    let (worst, apart, pulses) = ten_seconds(&mut eight);
     assert!(worst < 100, "0x092C: {worst} ns");
     assert!(apart < 100, "clocks: {apart} ns");
     assert!(pulses < 200, "SYNC0: {pulses} ns");
@@ -417,8 +418,7 @@ fn eight_clocks_lock_fire_together_and_part_at_their_crystals_rates() {
 #[test]
 fn eight_clocks_with_noisy_time_stamps_lock_as_well() {
     let mut eight = Eight::new(10);
-    let (locked, worst, apart, pulses) = ten_seconds(&mut eight);
-    assert!(locked < 1_000, "locked after {locked} ms");
+    let (worst, apart, pulses) = ten_seconds(&mut eight);
     assert!(worst < 100 && apart < 100, "{worst} ns, {apart} ns");
     assert!((1..200).contains(&pulses), "SYNC0: {pulses} ns");
 }

@@ -54,9 +54,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .unwrap_or(session::Options::default().seed);
     let mut segment = session::simulated_bus(&machine, seed, faults.as_ref())
         .map_err(|error| hints::run(&error, &machine.bus.nic))?;
-    if let Some(folder) = &args.sii {
-        write_images(&segment, folder)?;
-    }
 
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
@@ -75,6 +72,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
     }
     let server = Server::open(&[nic]).map_err(|e| hints::serve(&e))?;
+    if let Some(folder) = &args.sii {
+        write_images(&segment, folder)?;
+    }
     note(&format!(
         "{devices} simulated SubDevice{} answer{} on `{nic}`; Ctrl-C ends it",
         if devices == 1 { "" } else { "s" },

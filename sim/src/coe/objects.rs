@@ -35,6 +35,9 @@ pub(crate) struct Dictionary<'a> {
     pub(crate) command: Option<ParameterCommand>,
 }
 
+/// What complete access carries at most; no device has longer objects, and an ESI may place an item anywhere.
+const MAX_OBJECT_BITS: usize = 64 << 20;
+
 impl Dictionary<'_> {
     fn find(&self, index: u16, sub: u8) -> Result<(Slot, &Item), Abort> {
         let mut forced = self.forced.iter();
@@ -108,6 +111,9 @@ impl Dictionary<'_> {
         for (slot, item, at) in self.places(index, first, self.count(index)) {
             let bits = item.bit_len as usize;
             let padded = if item.sub == 0 { bits.max(16) } else { bits };
+            if at + padded > MAX_OBJECT_BITS {
+                continue;
+            }
             out.resize(out.len().max((at + padded).div_ceil(8)), 0);
             if item.access.read {
                 crate::bits::copy(&mut out, at, self.store.bytes(slot), 0, bits);

@@ -95,8 +95,8 @@ impl Esc {
     /// Registers that are made when they are read, and events that reading acknowledges.
     fn before_read(&mut self, start: usize, end: usize) {
         let read = |first: u16, len: usize| overlaps(start, end, first, len);
-        if start >= usize::from(reg::DC_RECEIVE_TIMES) {
-            return self.before_dc_read(start, end);
+        if end > usize::from(reg::DC_RECEIVE_TIMES) {
+            self.before_dc_read(start, end);
         }
         if read(reg::ECAT_EVENT, 0x14) || read(reg::SM, 0x40) {
             self.show_sms();
@@ -118,8 +118,9 @@ impl Esc {
         let read = |first: u16, len: usize| overlaps(start, end, first, len);
         if read(reg::DC_SYSTEM_TIME, 8) {
             let time = dc.local_copy(self.frame.stamp);
-            return self.put(reg::DC_SYSTEM_TIME, &time.to_le_bytes());
+            self.put(reg::DC_SYSTEM_TIME, &time.to_le_bytes());
         }
+        let Some(dc) = &self.dc else { return };
         if first(reg::DC_DIFFERENCE) {
             let difference = dc.difference_register();
             self.put(reg::DC_DIFFERENCE, &difference.to_le_bytes());

@@ -199,7 +199,7 @@ impl SyncManager {
         if !self.is_open() {
             return (len, None);
         }
-        let last = usize::from(self.len) - 1;
+        let last = usize::from(self.len).saturating_sub(1);
         if self.passes() {
             self.closing |= self.filled == filled;
             return (len, Some(self.buffer(0, memory)));

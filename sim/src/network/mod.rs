@@ -326,6 +326,7 @@ impl Segment {
                         device.esc.count_processing_error();
                     }
                 }
+                mark(route, bytes);
                 return true;
             }
         }
@@ -355,12 +356,7 @@ impl Segment {
                 }
             }
         }
-        // SubDevices mark what they pass on: the source address becomes a local one.
-        if route.ethercat_only
-            && let Some(source) = bytes.get_mut(6)
-        {
-            *source |= 0x02;
-        }
+        mark(route, bytes);
         true
     }
 
@@ -374,5 +370,14 @@ impl Segment {
         }
         self.reroute();
         self.schedule();
+    }
+}
+
+/// SubDevices mark what they pass on: the source address becomes a local one.
+fn mark(route: &Route, bytes: &mut [u8]) {
+    if route.ethercat_only
+        && let Some(source) = bytes.get_mut(6)
+    {
+        *source |= 0x02;
     }
 }
