@@ -62,6 +62,30 @@ fn a_coupler_and_terminals_in_front_of_an_axis() {
     assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
 }
 
+/// A gateway is bytes to the MainDevice; what stands behind it, only the simulated bus knows.
+#[test]
+fn a_gateway_with_nodes_beside_an_axis() {
+    let machine = load("gateway.toml");
+    let gateway = machine.devices[0]
+        .sim
+        .gateway
+        .as_ref()
+        .expect("[device.sim]");
+    let nodes: Vec<_> = gateway
+        .nodes
+        .iter()
+        .map(|node| (node.id, node.drive.name()))
+        .collect();
+    assert_eq!(
+        nodes,
+        [(1, "EPOS 24/1"), (2, "EPOS 24/5"), (100, "EPOS 70/10")]
+    );
+    assert!(machine.devices[1].sim.gateway.is_none());
+    let summary = run_well(machine, virtual_time());
+    assert_eq!(summary.counters.wkc_errors, 0);
+    assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
+}
+
 #[test]
 fn every_axis_of_the_modes_machine_moves() {
     let (outcome, heard) = run(load("modes.toml"), virtual_time());

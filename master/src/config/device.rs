@@ -9,7 +9,7 @@ use toml::Spanned;
 
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, axis, sdo};
+use super::{DeviceConfig, Locator, SimSetup, axis, sdo, sim};
 
 /// What all devices share: where ESI files are, those read so far, and the cycle.
 pub(crate) struct Library<'f> {
@@ -99,7 +99,7 @@ pub(crate) fn mode_name(mode: ecaxis_axis::Mode) -> String {
 }
 
 pub(crate) fn check(
-    raw: RawDevice,
+    mut raw: RawDevice,
     at: Option<Locator>,
     library: &mut Library<'_>,
     p: &mut Problems<'_>,
@@ -124,6 +124,8 @@ pub(crate) fn check(
         (Some(axis), Ok(Some(mode))) => Some(axis::setup(axis, &raw.sdo, mode, chosen.as_ref(), p)),
         _ => None,
     };
+    let has_sim = raw.sim.is_some();
+    let sim = raw.sim.take().and_then(|raw| sim::setup(raw, device, p));
     let device = device.map(|d| Arc::new(d.clone()));
     let (esi_path, file) = file?;
     Some(DeviceConfig {
@@ -137,6 +139,11 @@ pub(crate) fn check(
             Some(axis) => Some(axis?),
             None if raw.axis.is_some() => return None,
             None => None,
+        },
+        sim: match sim {
+            Some(sim) => sim,
+            None if has_sim => return None,
+            None => SimSetup::default(),
         },
         line: p.line(&raw.span),
     })

@@ -11,6 +11,7 @@
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `axis.rs` | units and limits |
 //! | `units.rs` | the names of units of positions |
+//! | `sim.rs` | what only the simulated bus needs to know |
 //! | `steps.rs` | the demonstration program |
 //!
 //! Every mistake is collected; a file with five of them is refused once, with five answers.
@@ -26,6 +27,7 @@ mod fields;
 mod problem;
 mod raw;
 mod sdo;
+mod sim;
 mod steps;
 #[cfg(test)]
 mod tests;
@@ -112,8 +114,16 @@ pub struct DeviceConfig {
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
     pub axis: Option<AxisSetup>,
+    pub sim: SimSetup,
     /// Of its `[[device]]` in the machine file.
     pub line: u32,
+}
+
+/// What the simulated bus makes of a device beyond its ESI; a real one does not care.
+#[derive(Debug, Clone, Default)]
+pub struct SimSetup {
+    /// The nodes behind a CANopen gateway.
+    pub gateway: Option<ecaxis_sim::gateway::GatewayOptions>,
 }
 
 /// How a device is found on the bus.

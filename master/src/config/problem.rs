@@ -151,6 +151,10 @@ impl<'s> Problems<'s> {
         &self.text[start..floor(self.text, span.end).max(start)]
     }
 
+    pub fn count(&self) -> usize {
+        self.found.len()
+    }
+
     pub fn is_empty(&self) -> bool {
         self.found.is_empty()
     }

@@ -5,6 +5,7 @@ use toml::de::{DeTable, DeValue};
 
 use super::fields::{self, Fields};
 use super::problem::{Problems, Span};
+use super::sim::{self, RawSim};
 
 #[derive(Debug, Default)]
 pub(crate) struct RawMachine {
@@ -47,6 +48,7 @@ pub(crate) struct RawDevice {
     pub tx: Option<Spanned<Vec<RawEntry>>>,
     pub sdo: Vec<RawSdo>,
     pub axis: Option<RawAxis>,
+    pub sim: Option<RawSim>,
 }
 
 #[derive(Debug)]
@@ -223,6 +225,7 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
         tx: None,
         sdo: Vec::new(),
         axis: None,
+        sim: None,
     };
     if let Some(mut pdo) = f.get("pdo").and_then(|v| fields::table(p, v, "`pdo`")) {
         device.rx = pdo.get("rx").and_then(|v| read_entries(v, p));
@@ -242,12 +245,19 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
         let fields = fields::table(p, value, "[device.axis]");
         device.axis = fields.map(|f| read_axis(f, value.span(), p));
     }
+    if let Some(value) = f.get("sim") {
+        let fields = fields::table(p, value, "[device.sim]");
+        device.sim = fields.map(|f| sim::read(f, value.span(), p));
+    }
     f.done(p);
     device
 }
 
 /// Objects as `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.
-fn read_entries(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<Vec<RawEntry>>> {
+pub(crate) fn read_entries(
+    value: Value<'_>,
+    p: &mut Problems<'_>,
+) -> Option<Spanned<Vec<RawEntry>>> {
     let all = value.span();
     let mut entries = Vec::new();
     for value in fields::array(p, value, "a list of objects")? {

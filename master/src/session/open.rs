@@ -90,6 +90,7 @@ fn sim_device(device: &DeviceConfig, position: usize) -> Result<SimDevice, RunEr
     let mut options = DeviceOptions {
         serial: 1000 + u32::try_from(position).unwrap_or(0),
         clock_drift_ppm: DRIFTS_PPM[position % DRIFTS_PPM.len()],
+        gateway: device.sim.gateway.clone(),
         ..DeviceOptions::default()
     };
     match device.at {

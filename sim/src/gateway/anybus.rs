@@ -21,7 +21,8 @@ pub(super) const TRANSMIT_BUFFER: u16 = 0x2000;
 pub(super) const RECEIVE_BUFFER: u16 = 0x2100;
 
 /// A gateway by its process data: bytes of 0x2100 out, bytes of 0x2000 in.
-pub(crate) fn is_gateway(device: &Device) -> bool {
+#[must_use]
+pub fn is_gateway(device: &Device) -> bool {
     let begins = |pdos: &[EsiPdo], index: u16, object: u16| {
         let pdo = pdos.iter().find(|pdo| pdo.index == index);
         let first = pdo.and_then(|pdo| pdo.entries.first());

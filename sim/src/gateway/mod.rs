@@ -40,7 +40,7 @@ pub use nmt::{NmtCommand, NmtState};
 pub use node::{Epos, Node};
 pub use options::{BIT_RATES, GatewayError, GatewayOptions, NodeOptions, PdoLink, Supervision};
 
-pub(crate) use anybus::is_gateway;
+pub use anybus::is_gateway;
 
 use ecaxis_esi::model::Device;
 
@@ -105,11 +105,7 @@ impl Gateway {
         options: GatewayOptions,
     ) -> Result<Self, GatewayError> {
         options.check()?;
-        let (inputs, outputs) = anybus::default_sizes(device);
-        let sizes = (
-            options.input_size.unwrap_or(inputs),
-            options.output_size.unwrap_or(outputs),
-        );
+        let sizes = options.sizes(device);
         let configuration = options.configuration(sizes)?;
         let nodes = (1..).zip(&options.nodes).map(|(n, node)| {
             Node::new(node::Settings {

@@ -1,5 +1,7 @@
 //! What a configuration tool would write into a gateway and its nodes: from a short description to objects.
 
+use ecaxis_esi::model::Device;
+
 use super::anybus::{BYTES_AN_OBJECT, MAX_SIZE, MIN_SIZE};
 use super::node::{Epos, RECEIVABLE, RECEIVE_COBS, TRANSMIT_COBS, TRANSMITTABLE};
 use super::pdo::{INVALID, mapping};
@@ -199,6 +201,19 @@ const OUTPUTS: Way = Way {
 };
 
 impl GatewayOptions {
+    /// Whether a device can be set up like this.
+    pub fn validate(&self, device: &Device) -> Result<(), GatewayError> {
+        self.check()?;
+        self.configuration(self.sizes(device)).map(drop)
+    }
+
+    /// Input and output size.
+    pub(super) fn sizes(&self, device: &Device) -> (u16, u16) {
+        let (inputs, outputs) = super::anybus::default_sizes(device);
+        let input_size = self.input_size.unwrap_or(inputs);
+        (input_size, self.output_size.unwrap_or(outputs))
+    }
+
     pub(super) fn check(&self) -> Result<(), GatewayError> {
         let setting = |what, value: u32, choices| GatewayError::Setting {
             what,

@@ -42,6 +42,14 @@ impl Epos {
         Self::ALL.into_iter().find(|model| model.name() == name)
     }
 
+    /// Bits of an object that PDO 1 and 2 can carry; `None` for all others.
+    #[must_use]
+    pub fn mappable_bits(index: u16, sub: u8) -> Option<u8> {
+        let mut all = RECEIVABLE.iter().chain(&TRANSMITTABLE);
+        all.find(|object| (object.0, object.1) == (index, sub))
+            .map(|object| object.2)
+    }
+
     /// Object 0x2003:02.
     pub(super) fn hardware(self) -> i64 {
         match self {
