@@ -454,3 +454,44 @@ fn the_application_takes_its_time_with_state_changes() {
     bus.wait(100_000);
     assert_eq!(bus.read_u16(0x1001, 0x130), u16::from(PREOP));
 }
+
+#[test]
+fn the_application_reads_al_control_sooner_than_it_follows_it() {
+    let options = DeviceOptions {
+        state_change_ns: 4_000_000,
+        ..DeviceOptions::default()
+    };
+    let mut bus = Bus::new(vec![sim_with(&coe_device(), options)]);
+    bus.address_all();
+    bus.start_mailboxes(0x1001);
+    // As SOEM reconfigures a device: Init, which it is in already, and at once PreOp.
+    bus.write(0x1001, 0x120, &[INIT, 0]);
+    bus.wait(500_000);
+    assert_eq!(bus.datagram(5, 0x1001, 0x120, &[PREOP, 0]).1, 0, "unread");
+    bus.wait(600_000);
+    bus.write(0x1001, 0x120, &[PREOP, 0]);
+    bus.wait(2_000_000);
+    assert_eq!(bus.datagram(5, 0x1001, 0x120, &[PREOP, 0]).1, 0, "busy");
+    bus.wait(8_000_000);
+    assert_eq!(bus.read_u16(0x1001, 0x130), u16::from(PREOP));
+}
+
+#[test]
+fn an_error_does_not_swallow_a_request() {
+    let mut bus = Bus::new(vec![sim(&coe_device())]);
+    bus.address_all();
+    bus.preop(0x1001);
+    bus.sm(0x1001, 2, 0x1100, 4, 0x64);
+    bus.sm(0x1001, 3, 0x1200, 4, 0x20);
+    bus.to(0x1001, SAFEOP);
+    bus.write(0x1001, 0x1100, &[0; 4]);
+    bus.to(0x1001, OP);
+    // The watchdog of 100 ms expires between a request and its reading.
+    let now = bus.now;
+    bus.write(0x1001, 0x1100, &[0; 4]);
+    bus.wait(99_980_000 - (bus.now - now));
+    bus.write(0x1001, 0x120, &[PREOP | 0x10, 0]);
+    bus.wait(20_000_000);
+    assert_eq!(bus.read_u16(0x1001, 0x130), u16::from(PREOP));
+    bus.to(0x1001, INIT);
+}

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Predicts every working counter in a recording: wkc.py RECORDING DEVICES
+"""Predicts every working counter in a recording: wkc.py RECORDING DEVICES, a letter each, `c` with a clock
 
 Walks over the requests alone, keeping of every device what the MainDevice has written (station
 address, FMMUs, SyncManagers, AL control, EEPROM ownership), and compares the counter that follows
 with the one in the answer. Written from ETG.1000.4; shares nothing with simulator or master.
 
 Three things no request tells, so answers are read for them: the AL state reached (0x0130), whether
-a mailbox is full (SyncManager status) and what the controller has (0x0004 to 0x0008). Where such
+a mailbox is full (SyncManager status) and what the controller has (0x0004 to 0x0008, clock). Where such
 knowledge is missing the prediction is a range; those are counted apart.
 """
 
@@ -46,9 +46,10 @@ REGISTERS = [
     (0x0501, 0x0501, False),
     (0x0502, 0x050F, True),
 ]
+# Of every controller that could have a clock.
+RECEIVE_TIMES = [(0x0900, 0x0903, True), (0x0904, 0x090F, False)]
+# Of those that do.
 CLOCK_REGISTERS = [
-    (0x0900, 0x0903, True),
-    (0x0904, 0x090F, False),
     (0x0910, 0x0917, True),
     (0x0918, 0x091F, False),
     (0x0920, 0x092B, True),
@@ -67,8 +68,10 @@ NO, YES, MAYBE = (0, 0), (1, 1), (0, 1)
 @dataclass
 class Device:
     position: int
+    # True as its ESI has it; otherwise None until it has answered or not: couplers have one, too.
+    clock: bool | None
     # None until 0x0008 has been read.
-    clock: bool | None = None
+    receive_times: bool | None = None
     # None until 0x0004 has been read.
     fmmus: int | None = None
     sms: int | None = None
@@ -79,6 +82,8 @@ class Device:
     written: bytearray = field(default_factory=lambda: bytearray(0x1000))
     states: set = field(default_factory=lambda: {INIT, PREOP, BOOT, SAFEOP, OP})
     asked: int | None = None
+    # The last request was for the state it was in: nothing shows when it has been taken.
+    silent: bool = False
     # By SyncManager: True full, False empty, None unknown.
     full: list = field(default_factory=lambda: [None] * 16)
 
@@ -116,16 +121,18 @@ class Device:
         )
         if write and start > 0x500 and start < 0x510 and self.written[0x500] & 1:
             return NO
-        if write and self.asked and start <= 0x120 < start + length:
+        if write and (self.asked or self.silent) and start <= 0x120 < start + length:
             # Until the application has taken the last request it takes no other.
             return MAYBE
         if hits(REGISTERS) or hits(unit for unit, known in self.units() if known):
             return YES
         if hits(unit for unit, _ in self.units()):
             return MAYBE
-        if hits(CLOCK_REGISTERS):
-            return {True: YES, False: NO, None: MAYBE}[self.clock]
-        return NO
+        known = {True: YES, False: NO, None: MAYBE}
+        return max(
+            known[self.clock] if hits(CLOCK_REGISTERS) else NO,
+            known[self.receive_times] if hits(RECEIVE_TIMES) else NO,
+        )
 
     def memory(self, start, length, write):
         """Whether an access to process memory counts, as SyncManagers have it."""
@@ -188,6 +195,7 @@ class Device:
             self.station = int.from_bytes(self.written[0x10:0x12], "little")
         if start <= 0x120 < start + len(data):
             self.asked = self.written[0x120] & 0x0F
+            self.silent = self.asked in self.states
             self.states |= {self.asked}
         for n in self.sm_range:
             if start <= 0x806 + 8 * n < start + len(data):
@@ -203,7 +211,9 @@ class Device:
                 self.asked = None
             self.states = {state} | ({self.asked} if self.asked else set())
         if (features := byte(0x008)) is not None:
-            self.clock = bool(features & 4)
+            self.receive_times = bool(features & 4)
+            if not self.receive_times:
+                self.clock = False
         if (fmmus := byte(0x004)) is not None:
             self.fmmus = fmmus
         if (sms := byte(0x005)) is not None:
@@ -226,8 +236,9 @@ class Device:
 
 
 class Walk:
-    def __init__(self, count):
-        self.devices = [Device(n) for n in range(count)]
+    def __init__(self, clocks):
+        """`clocks`: for every device, whether its ESI has distributed clocks."""
+        self.devices = [Device(n, clock or None) for n, clock in enumerate(clocks)]
         self.exact = Counter()
         # The same one by one: (number of the frame, place of the datagram).
         self.places = {}
@@ -271,6 +282,8 @@ class Walk:
         if d.command in (APWR, FPWR, BWR, APRW, FPRW, BRW):
             for v in targets:
                 v.touch(d.ado, d.data, wkc is None or wkc > 0)
+        if answer is not None and len(targets) == 1 and 0x0910 <= d.ado < 0x0A00 and targets[0].clock is None:
+            targets[0].clock = bool(wkc)
         if answer is None or not wkc:
             return
         if d.command in (APRD, FPRD, APWR, FPWR) and len(targets) == 1:
@@ -317,9 +330,9 @@ class Walk:
         )
 
 
-def walk(path, count):
+def walk(path, clocks):
     found, stray = pcapng.exchanges(path)
-    result = Walk(count)
+    result = Walk(clocks)
     for exchange in found:
         result.exchange(exchange)
     if stray:
@@ -328,7 +341,7 @@ def walk(path, count):
 
 
 if __name__ == "__main__":
-    done = walk(sys.argv[1], int(sys.argv[2]))
+    done = walk(sys.argv[1], [letter == "c" for letter in sys.argv[2]])
     print(done.summary)
     for line in done.wrong[:20]:
         print(f"  {line}")

@@ -15,7 +15,11 @@ const FIRST_SYNC_NS: u64 = 5_000_000_000;
 pub(super) struct Al {
     pub(super) state: AlState,
     pub(super) code: u16,
+    /// The request under way, or the last one.
     control: u16,
+    /// One that the application has not read yet, and one that it has read and follows.
+    unread: Option<u16>,
+    followed: Option<u16>,
     pub(super) due: u64,
     /// Op was requested; SYNC0 has been armed but not seen yet.
     pub(super) waits_for_sync: bool,
@@ -27,6 +31,8 @@ impl Default for Al {
             state: AlState::Init,
             code: 0,
             control: 1,
+            unread: None,
+            followed: None,
             due: u64::MAX,
             waits_for_sync: false,
         }
@@ -35,12 +41,20 @@ impl Default for Al {
 
 impl SimDevice {
     pub(super) fn al_requested(&mut self, control: u16, local: u64) {
-        self.al.control = control;
-        self.al.waits_for_sync = false;
         if self.esc.emulates_device() {
+            self.al.control = control;
             return self.emulate(control);
         }
-        self.al.due = local.saturating_add(self.state_change_ns);
+        self.al.unread = Some(control);
+        if self.al.followed.is_none() {
+            self.al.waits_for_sync = false;
+            self.al.due = local.saturating_add(self.notice_ns());
+        }
+    }
+
+    /// The application reads AL control sooner than it has followed: the MainDevice may write it again then.
+    fn notice_ns(&self) -> u64 {
+        self.state_change_ns / 4
     }
 
     /// The controller has answered already, and no application could refuse. It copies the acknowledge bit, too, which
@@ -58,13 +72,31 @@ impl SimDevice {
         self.esc.put(reg::AL_STATUS_CODE, &[0, 0]);
     }
 
-    /// The request's time has come, or the wait for SYNC0 is over.
+    /// The time has come to read a request, or to have followed it, or the wait for SYNC0 is over.
     pub(super) fn al_step(&mut self, local: u64) {
         self.al.due = u64::MAX;
         if std::mem::take(&mut self.al.waits_for_sync) {
             return self.finish_op();
         }
-        self.esc.read_al_control();
+        match self.al.followed.take() {
+            Some(control) => {
+                self.al.control = control;
+                self.follow(local);
+                if self.al.unread.is_some() {
+                    self.al.waits_for_sync = false;
+                    self.al.due = local.saturating_add(self.notice_ns());
+                }
+            }
+            None => {
+                self.esc.read_al_control();
+                self.al.followed = self.al.unread.take();
+                let rest = self.state_change_ns - self.notice_ns();
+                self.al.due = local.saturating_add(rest);
+            }
+        }
+    }
+
+    fn follow(&mut self, local: u64) {
         match judge(self.al.state, self.al.code != 0, self.al.control) {
             Request::Ignored => {}
             Request::Stay => self.settle(self.al.state, 0),
@@ -276,8 +308,10 @@ impl SimDevice {
         if state < AlState::SafeOp {
             self.close_process_data(true);
         }
-        self.al.waits_for_sync = false;
-        self.al.due = u64::MAX;
+        // A request that stands is followed all the same.
+        if std::mem::take(&mut self.al.waits_for_sync) {
+            self.al.due = u64::MAX;
+        }
         self.settle(state, code);
         self.application.error(error);
     }

@@ -62,7 +62,7 @@ class Bench:
             self.report.equal("the simulated bus ends in order on SIGINT", code, 0)
             for line in output.strip().splitlines():
                 self.report.note(line)
-        judge(self, recording, len(machine.devices), steady)
+        judge(self, recording, [device.dc for device in machine.devices], steady)
 
     @contextlib.contextmanager
     def master(self):
