@@ -106,11 +106,16 @@ impl Application {
         }
     }
 
-    /// Its period is over, at a true time.
-    pub(super) fn act(&mut self, store: &mut ObjectStore, in_op: bool, now: Nanos) {
+    /// Its period is over; `now` is the true time, which not everybody wants to know.
+    pub(super) fn act(
+        &mut self,
+        store: &mut ObjectStore,
+        in_op: bool,
+        now: impl FnOnce() -> Nanos,
+    ) {
         match self {
             Self::Drive(drive) => drive.control(store, in_op),
-            Self::Gateway(gateway) => gateway.forward(store, in_op, now),
+            Self::Gateway(gateway) => gateway.forward(store, in_op, now()),
             Self::Io(_) => {}
         }
     }

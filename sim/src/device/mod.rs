@@ -352,9 +352,10 @@ impl SimDevice {
     }
 
     fn tick(&mut self) {
-        let now = self.esc.clock.true_time(self.tick);
-        self.start_ticking(self.tick);
+        let at = self.tick;
+        self.start_ticking(at);
         let in_op = self.al.state == AlState::Op;
+        let now = || self.esc.clock.true_time(at);
         self.application.act(&mut self.store, in_op, now);
         self.send_emergencies();
         self.watch_sync0();
