@@ -21,7 +21,7 @@ fuzz_target!(|text: &str| {
         return;
     };
     BUS.with_borrow_mut(|hostile| {
-        if script.check(hostile.bus.segment.len()).is_ok() {
+        if script.check(hostile.bus.segment.topology()).is_ok() {
             hostile.rebuild_with(script);
             for _ in 0..50 {
                 hostile.attack();

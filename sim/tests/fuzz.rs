@@ -9,7 +9,7 @@ mod common;
 #[path = "common/hostile/mod.rs"]
 mod hostile;
 
-use ecaxis_sim::{DeviceOptions, FaultScript, SimDevice};
+use ecaxis_sim::{DeviceOptions, FaultScript, SimDevice, Topology};
 use hostile::{Dice, Hostile};
 use proptest::prelude::*;
 
@@ -55,9 +55,9 @@ const KEYS: &[&str] = &[
     "revision",
     "port",
     "delay",
+    "serial",
+    "alias",
     "with",
-    "ppm",
-    "every",
 ];
 const KINDS: &[&str] = &[
     "frame-loss",
@@ -72,10 +72,9 @@ const KINDS: &[&str] = &[
     "link-break",
     "power-off",
     "swap",
-    "duplicate",
-    "corrupt",
-    "delay",
-    "clock",
+    "frame-duplicate",
+    "frame-corrupt",
+    "frame-delay",
     "melt",
 ];
 const STATES: &[&str] = &[
@@ -137,10 +136,10 @@ fn script(dice: &mut Dice) -> String {
     text
 }
 
-/// What may be run on a bus of so many devices.
-fn runnable(text: &str, devices: usize) -> Option<FaultScript> {
+/// What may be run on the bus.
+fn runnable(text: &str, bus: &Topology) -> Option<FaultScript> {
     let script = FaultScript::parse(text).ok()?;
-    script.check(devices).ok()?;
+    script.check(bus).ok()?;
     Some(script)
 }
 
@@ -150,7 +149,7 @@ fn random_fault_scripts_are_refused_or_run() {
     let (mut ran, mut refused) = (0, 0);
     for _ in 0..3_000 {
         let text = script(&mut hostile.dice);
-        let Some(script) = runnable(&text, hostile.bus.segment.len()) else {
+        let Some(script) = runnable(&text, hostile.bus.segment.topology()) else {
             refused += 1;
             continue;
         };

@@ -447,7 +447,8 @@ fn a_ring_that_reflects_looks_like_a_line_to_one_port() {
     segment.plug(2, 1, false);
     let (transit, wkc, _) = send(&mut segment, Nic::Primary, 0);
     assert_eq!((back_at(transit), wkc), (Some(Nic::Primary), 3));
-    // Broken in front, everything is out of reach: nobody sends from the second port.
+    // Broken in front, everything is out of reach: nobody is there to send from the second port.
+    assert_eq!(send(&mut segment, Nic::Secondary, 0).0, Transit::Lost);
     segment.plug(2, 1, true);
     segment.plug(0, 0, false);
     assert_eq!(send(&mut segment, Nic::Primary, 0).0, Transit::Lost);

@@ -134,9 +134,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
     }
     let script = args.faults.as_deref();
-    let faults = script
-        .map(|path| faults(path, machine.devices.len()))
-        .transpose()?;
+    let faults = script.map(|path| faults(path, machine)).transpose()?;
     if let Some(path) = &args.record {
         record::check(path, machine, script)?;
     }
@@ -157,12 +155,13 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     })
 }
 
-/// A fault script from its file, for a bus of so many devices.
-pub(super) fn faults(path: &Path, devices: usize) -> Result<FaultScript, Failure> {
+/// A fault script from its file, for the machine's simulated bus.
+pub(super) fn faults(path: &Path, machine: &Machine) -> Result<FaultScript, Failure> {
     let text = std::fs::read_to_string(path)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
+    let bus = session::topology(machine).map_err(|e| hints::run(&e, &machine.bus.nic))?;
     let script = FaultScript::parse(&text).and_then(|script| {
-        script.check(devices)?;
+        script.check(&bus)?;
         Ok(script)
     });
     script.map_err(|e| Failure::new(hints::WRONG, format!("{}: {e}", path.display())))

@@ -47,7 +47,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let machine = config::load(&args.file).map_err(|e| hints::config(&args.file, &e))?;
     let devices = machine.devices.len();
     let faults = args.faults.as_deref();
-    let faults = faults.map(|f| run::faults(f, devices)).transpose()?;
+    let faults = faults.map(|f| run::faults(f, &machine)).transpose()?;
     let seed = faults
         .as_ref()
         .and_then(|f| f.seed)

@@ -7,6 +7,7 @@ use toml::Spanned;
 use super::device::{self, Library};
 use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
+use super::sim;
 use super::steps::{self, Known};
 use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, duration};
 
@@ -21,12 +22,18 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let mut library = Library::new(folder, bus.as_ref().map(|b| (b.cycle_ns, cycle_span)));
     let mut names = Vec::new();
     let mut devices: Vec<Option<DeviceConfig>> = Vec::new();
+    let all: Vec<String> = raw
+        .devices
+        .iter()
+        .filter_map(|d| Some(d.name.as_ref()?.get_ref().clone()))
+        .collect();
+    let connections = sim::Places::of(&raw.devices);
     for (raw, at) in raw.devices.into_iter().zip(places) {
         names.push((
             raw.name.as_ref().map(|n| n.get_ref().clone()),
             raw.axis.is_some(),
         ));
-        devices.push(device::check(raw, at, &mut library, p));
+        devices.push(device::check(raw, at, &mut library, &all, p));
     }
     // Indices in steps are those of the machine, so the order is settled first.
     if devices.iter().all(|d| {
@@ -58,10 +65,12 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         })
         .collect();
     let steps = steps::check(raw.steps, &known, p);
+    let devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
+    connections.check(&devices, p);
     Some(Machine {
         path: path.to_owned(),
         bus: bus?,
-        devices: devices.into_iter().collect::<Option<_>>()?,
+        devices,
         steps,
         repeat: raw.repeat.map_or(1, Spanned::into_inner),
     })

@@ -9,7 +9,7 @@ use toml::Spanned;
 
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, SimSetup, axis, sdo, sim};
+use super::{DeviceConfig, Locator, axis, sdo, sim};
 
 /// What all devices share: where ESI files are, those read so far, and the cycle.
 pub(crate) struct Library<'f> {
@@ -102,6 +102,7 @@ pub(crate) fn check(
     mut raw: RawDevice,
     at: Option<Locator>,
     library: &mut Library<'_>,
+    names: &[String],
     p: &mut Problems<'_>,
 ) -> Option<DeviceConfig> {
     let mode = mode(&raw, p);
@@ -124,8 +125,7 @@ pub(crate) fn check(
         (Some(axis), Ok(Some(mode))) => Some(axis::setup(axis, &raw.sdo, mode, chosen.as_ref(), p)),
         _ => None,
     };
-    let has_sim = raw.sim.is_some();
-    let sim = raw.sim.take().and_then(|raw| sim::setup(raw, device, p));
+    let sim = raw.sim.take().map(|raw| sim::check(raw, names, device, p));
     let device = device.map(|d| Arc::new(d.clone()));
     let (esi_path, file) = file?;
     Some(DeviceConfig {
@@ -140,11 +140,7 @@ pub(crate) fn check(
             None if raw.axis.is_some() => return None,
             None => None,
         },
-        sim: match sim {
-            Some(sim) => sim,
-            None if has_sim => return None,
-            None => SimSetup::default(),
-        },
+        sim: sim.unwrap_or_default(),
         line: p.line(&raw.span),
     })
 }

@@ -10,8 +10,9 @@
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
 //! | `axis.rs` | units and limits |
+//! | `sim.rs` | what only the simulated bus needs: connections, clocks |
 //! | `units.rs` | the names of units of positions |
-//! | `sim.rs` | what only the simulated bus needs to know |
+//! | `gateway.rs` | the network behind a simulated gateway |
 //! | `steps.rs` | the demonstration program |
 //!
 //! Every mistake is collected; a file with five of them is refused once, with five answers.
@@ -24,10 +25,11 @@ mod check;
 mod device;
 pub mod duration;
 mod fields;
+mod gateway;
 mod problem;
 mod raw;
 mod sdo;
-mod sim;
+pub mod sim;
 mod steps;
 #[cfg(test)]
 mod tests;
@@ -114,16 +116,9 @@ pub struct DeviceConfig {
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
     pub axis: Option<AxisSetup>,
-    pub sim: SimSetup,
+    pub sim: sim::SimSetup,
     /// Of its `[[device]]` in the machine file.
     pub line: u32,
-}
-
-/// What the simulated bus makes of a device beyond its ESI; a real one does not care.
-#[derive(Debug, Clone, Default)]
-pub struct SimSetup {
-    /// The nodes behind a CANopen gateway.
-    pub gateway: Option<ecaxis_sim::gateway::GatewayOptions>,
 }
 
 /// How a device is found on the bus.

@@ -1,215 +1,398 @@
-//! `[device.sim]`: what only the simulated bus needs to know of a device. A real one is what it is.
+//! `[device.sim]`: what only the simulated bus needs to know of a device.
 
 use ecaxis_esi as esi;
-use ecaxis_sim::gateway::{BIT_RATES, Epos, GatewayOptions, NodeOptions, PdoLink, Supervision};
+use ecaxis_sim::gateway::GatewayOptions;
+use ecaxis_sim::network::topology::Media;
+use ecaxis_sim::{Medium, Topology, TopologyError, Wish};
 use toml::Spanned;
-use toml::de::DeValue;
 
-use super::SimSetup;
 use super::fields::{self, Fields};
-use super::problem::{Problems, Span, list, suggestion};
-use super::raw;
+use super::gateway::{self, RawGateway};
+use super::problem::{Problems, Span, suggestion};
+use super::raw::RawDevice;
+use super::{DeviceConfig, Locator};
 
-type Value<'d> = &'d Spanned<DeValue<'d>>;
+/// A device of the simulated bus, as far as its ESI file does not describe it.
+#[derive(Debug, Clone, Default)]
+pub struct SimSetup {
+    /// The device that it is connected to, by name; `None`: as the order of devices suggests.
+    pub after: Option<String>,
+    /// At which port of that device.
+    pub port: Option<u8>,
+    /// Propagation on the cable to it, one way.
+    pub cable_ns: Option<u64>,
+    /// How much faster its clock is than true time.
+    pub drift_ppm: Option<f64>,
+    /// What its clock shows at power-on.
+    pub offset_ns: u64,
+    /// What frames read of its clock is off by up to so much either way.
+    pub jitter_ns: u32,
+    /// The network behind a gateway.
+    pub gateway: Option<GatewayOptions>,
+}
 
-const MS: u64 = 1_000_000;
-
-/// As written. Nodes stand with their place in the file.
+/// As written.
 #[derive(Debug)]
 pub(crate) struct RawSim {
-    span: Span,
-    options: GatewayOptions,
-    nodes: Vec<(NodeOptions, Span)>,
-    /// Something has been reported.
-    wrong: bool,
+    after: Option<Spanned<String>>,
+    port: Option<Spanned<u8>>,
+    cable: Option<Spanned<u64>>,
+    drift_ppm: Option<Spanned<f64>>,
+    offset: Option<Spanned<u64>>,
+    jitter: Option<Spanned<u64>>,
+    gateway: Option<RawGateway>,
 }
+
+/// Crystals are better than this by far.
+const MOST_DRIFT_PPM: f64 = 1000.0;
+/// 200 km of cable; no clock is read worse.
+const LONGEST_NS: u64 = 1_000_000;
 
 pub(crate) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawSim {
-    let before = p.count();
-    let mut options = GatewayOptions::default();
-    if let Some(rate) = f
-        .get("bit_rate")
-        .and_then(|v| fields::integer(p, v, 1, u32::MAX))
+    let raw = RawSim {
+        after: f.get("after").and_then(|v| fields::string(p, v)),
+        port: f.get("port").and_then(|v| fields::integer(p, v, 1, 3)),
+        cable: f.get("cable").and_then(|v| fields::duration(p, v)),
+        drift_ppm: f.get("drift_ppm").and_then(|v| fields::number(p, v)),
+        offset: f.get("offset").and_then(|v| fields::duration(p, v)),
+        jitter: f.get("jitter").and_then(|v| fields::duration(p, v)),
+        gateway: gateway::read(&mut f, span, p),
+    };
+    f.done(p);
+    raw
+}
+
+/// `names` are those of all devices.
+pub(crate) fn check(
+    raw: RawSim,
+    names: &[String],
+    device: Option<&esi::Device>,
+    p: &mut Problems<'_>,
+) -> SimSetup {
+    if let Some(after) = &raw.after
+        && !names.contains(after.get_ref())
     {
-        if !BIT_RATES.contains(rate.get_ref()) {
-            let rates = BIT_RATES.iter().map(ToString::to_string);
-            let hint = format!("bits a second: {}", rates.collect::<Vec<_>>().join(", "));
-            p.add_hint(rate.span(), "no such bit rate", hint);
-        }
-        options.bit_rate = rate.into_inner();
+        let known = names.iter().map(String::as_str);
+        let hint = suggestion(after.get_ref(), known, "devices");
+        let message = format!("there is no device \"{}\"", after.get_ref());
+        p.add_hint(after.span(), message, hint);
     }
-    if let Some(ns) = f.get("sync").and_then(|v| fields::duration(p, v)) {
-        options.sync_period_us = u32::try_from(ns.into_inner() / 1000).unwrap_or(u32::MAX);
+    if let (Some(port), None) = (&raw.port, &raw.after) {
+        let message = "it is not said which device's port this is";
+        p.add_hint(
+            port.span(),
+            message,
+            "add `after`, the name of the device it is connected to",
+        );
     }
-    let nodes = f.get("node");
-    let nodes = nodes.and_then(|v| fields::array(p, v, "[[device.sim.node]] with two brackets"));
-    let mut read = Vec::new();
-    for value in nodes.unwrap_or_default() {
-        let table = fields::table(p, value, "[[device.sim.node]]");
-        let node = table.and_then(|f| node(f, p));
-        read.extend(node.map(|node| (node, value.span())));
-    }
-    f.done(p);
-    RawSim {
-        span,
-        options,
-        nodes: read,
-        wrong: p.count() > before,
-    }
-}
-
-fn node(mut f: Fields<'_>, p: &mut Problems<'_>) -> Option<NodeOptions> {
-    let id = f.need("id", "id = 1");
-    let id = id.and_then(|v| fields::integer(p, v, 1u8, 127));
-    let drive = f.need("drive", "drive = \"EPOS 24/5\"");
-    let drive = drive.and_then(|v| {
-        let name = fields::string(p, v)?;
-        let found = Epos::from_name(name.get_ref());
-        if found.is_none() {
-            let names = || Epos::ALL.iter().map(|drive| drive.name());
-            let hint = suggestion(name.get_ref(), names(), "drives");
-            p.add_hint(
-                name.span(),
-                format!("unknown drive `{}`", name.get_ref()),
-                hint,
-            );
-        }
-        found
-    });
-    let heartbeat = f.get("heartbeat").and_then(|v| milliseconds(p, v));
-    let mandatory = f.get("mandatory").and_then(|v| fields::boolean(p, v));
-    let inputs = links(&mut f, "inputs", p);
-    let outputs = links(&mut f, "outputs", p);
-    f.done(p);
-    let mut node = NodeOptions::new(id?.into_inner(), drive?);
-    if let Some(period_ms) = heartbeat {
-        node.supervision = Supervision::Heartbeat { period_ms };
-    }
-    node.mandatory = mandatory.is_some_and(Spanned::into_inner);
-    (node.inputs, node.outputs) = (inputs, outputs);
-    Some(node)
-}
-
-fn milliseconds(p: &mut Problems<'_>, value: Value<'_>) -> Option<u16> {
-    let ns = fields::duration(p, value)?;
-    let ms = u16::try_from(ns.get_ref() / MS).ok().filter(|ms| *ms >= 10);
-    if ms.is_none() {
-        p.add(ns.span(), "a heartbeat takes 10 ms to 65 s");
-    }
-    ms
-}
-
-fn links(f: &mut Fields<'_>, key: &'static str, p: &mut Problems<'_>) -> Vec<PdoLink> {
-    let values = f.get(key);
-    let values = values.and_then(|v| fields::array(p, v, "a list of PDOs"));
-    let mut links = Vec::new();
-    for value in values.unwrap_or_default() {
-        if let Some(f) = fields::table(p, value, "a PDO of a node") {
-            links.extend(link(f, p));
+    for (value, what) in [(&raw.cable, "a cable"), (&raw.jitter, "a jitter")] {
+        if let Some(value) = value
+            && *value.get_ref() > LONGEST_NS
+        {
+            p.add(value.span(), format!("{what} of more than 1 ms is none"));
         }
     }
-    links
+    if let Some(drift) = &raw.drift_ppm
+        && drift.get_ref().abs() > MOST_DRIFT_PPM
+    {
+        p.add(
+            drift.span(),
+            "a clock that is off by more than 1000 ppm is broken",
+        );
+    }
+    let ns = |value: &Option<Spanned<u64>>| value.as_ref().map(|v| *v.get_ref());
+    SimSetup {
+        after: raw.after.as_ref().map(|a| a.get_ref().clone()),
+        port: raw.port.as_ref().map(|p| *p.get_ref()),
+        cable_ns: ns(&raw.cable),
+        drift_ppm: raw.drift_ppm.as_ref().map(|d| *d.get_ref()),
+        offset_ns: ns(&raw.offset).unwrap_or(0),
+        jitter_ns: ns(&raw.jitter)
+            .and_then(|ns| u32::try_from(ns).ok())
+            .unwrap_or(0),
+        gateway: raw.gateway.and_then(|raw| gateway::setup(raw, device, p)),
+    }
 }
 
-fn link(mut f: Fields<'_>, p: &mut Problems<'_>) -> Option<PdoLink> {
-    let pdo = f.need("pdo", "pdo = 1");
-    let pdo = pdo.and_then(|v| fields::integer(p, v, 1u8, 3));
-    let at = f.need("at", "at = 2");
-    let at = at.and_then(|v| fields::integer(p, v, 2u16, 511));
-    let mut contents = Vec::new();
-    if let Some(objects) = f.get("objects").and_then(|v| raw::read_entries(v, p)) {
-        for entry in objects.into_inner() {
-            match Epos::mappable_bits(entry.index, entry.sub) {
-                Some(bits) => contents.push((entry.index, entry.sub, bits)),
-                None => p.add(
-                    entry.span,
-                    format!("0x{:04x}:{:02x} cannot be mapped", entry.index, entry.sub),
-                ),
+/// Devices in the order in which frames pass them. Those found by alias or identification may stand
+/// anywhere: they fill the gaps in order.
+#[must_use]
+pub fn bus_order(devices: &[DeviceConfig]) -> Vec<&DeviceConfig> {
+    let mut placed: Vec<Option<&DeviceConfig>> = devices.iter().map(|_| None).collect();
+    for device in devices {
+        if let Locator::Position(position) = device.at
+            && let Some(place @ None) = placed.get_mut(usize::from(position))
+        {
+            *place = Some(device);
+        }
+    }
+    let is_elsewhere = |d: &&DeviceConfig| !matches!(d.at, Locator::Position(_));
+    let mut others = devices.iter().filter(is_elsewhere);
+    let filled = placed
+        .into_iter()
+        .map(|place| place.or_else(|| others.next()));
+    filled.flatten().collect()
+}
+
+/// How the simulated bus is cabled: the devices of [`bus_order`], with its indices.
+///
+/// # Errors
+/// Every device that cannot be where it is to be; [`told`] says it in words.
+pub fn topology(devices: &[DeviceConfig]) -> Result<Topology, Vec<TopologyError>> {
+    let order = bus_order(devices);
+    let wishes: Vec<Option<Wish>> = order
+        .iter()
+        .map(|device| {
+            let name = device.sim.after.as_ref()?;
+            Some(Wish {
+                after: order.iter().position(|d| d.name == *name)?,
+                port: device.sim.port,
+            })
+        })
+        .collect();
+    let mut topology = Topology::connect(&media(&order), &wishes)?;
+    for (n, device) in order.iter().enumerate() {
+        if let Some(ns) = device.sim.cable_ns {
+            topology = topology.with_cable(n, ns);
+        }
+    }
+    Ok(topology)
+}
+
+fn media(order: &[&DeviceConfig]) -> Vec<Media> {
+    let physics = order.iter().map(|d| d.device.physics.as_str());
+    physics.map(Medium::from_physics).collect()
+}
+
+/// What is wrong with a device's place, and what would help.
+#[must_use]
+pub fn told(error: &TopologyError, devices: &[DeviceConfig]) -> (String, String) {
+    use TopologyError as E;
+    let order = bus_order(devices);
+    let media = media(&order);
+    let name = |n: usize| order.get(n).map_or("?", |d| d.name.as_str());
+    let medium = |n: usize, port: u8| {
+        let medium = media.get(n).and_then(|ports| ports.get(usize::from(port)));
+        medium_name(medium.copied().unwrap_or_default())
+    };
+    let ports = |n: usize| {
+        let own = media.get(n).copied().unwrap_or_default();
+        let there = (0..).zip(own).filter(|(_, m)| *m != Medium::None);
+        let listed: Vec<String> = there
+            .map(|(port, m)| format!("{port} ({})", medium_name(m)))
+            .collect();
+        format!("by its ESI file it has ports {}", listed.join(", "))
+    };
+    match *error {
+        E::NotBefore { device, after } => (
+            format!(
+                "frames do not reach \"{}\" before \"{}\", so it cannot be connected to it",
+                name(after),
+                name(device)
+            ),
+            "positions count in the order in which frames pass the devices".to_owned(),
+        ),
+        E::Upstream { after, .. } => (
+            format!("port 0 of \"{}\" leads to the MainDevice", name(after)),
+            ports(after),
+        ),
+        E::NoSuchPort { after, port, .. } => (
+            format!("\"{}\" has no port {port}", name(after)),
+            ports(after),
+        ),
+        E::Taken {
+            after, port, by, ..
+        } => (
+            format!(
+                "port {port} of \"{}\" leads to \"{}\"",
+                name(after),
+                name(by)
+            ),
+            ports(after),
+        ),
+        E::OutOfOrder {
+            device,
+            after,
+            port,
+            by,
+        } => (
+            format!(
+                "frames pass port {port} of \"{}\" before they reach \"{}\", so \"{}\" comes before it on the bus",
+                name(after),
+                name(by),
+                name(device)
+            ),
+            "frames leave a device at port 3 first, then 1, then 2; each branch is passed whole"
+                .to_owned(),
+        ),
+        E::OtherMedium {
+            device,
+            after,
+            port,
+        } => (
+            format!(
+                "port {port} of \"{}\" is {}, \"{}\" needs {}",
+                name(after),
+                medium(after, port),
+                name(device),
+                medium(device, 0)
+            ),
+            ports(after),
+        ),
+        E::NoPortAt { device, after } => (
+            format!(
+                "\"{}\" has no port left for \"{}\", which needs {}",
+                name(after),
+                name(device),
+                medium(device, 0)
+            ),
+            ports(after),
+        ),
+        E::NoPort { device } => (
+            format!("no device before \"{}\" has a port left", name(device)),
+            "devices are connected in the order of their positions".to_owned(),
+        ),
+        E::NoPortForRing => (error.to_string(), String::new()),
+    }
+}
+
+fn medium_name(medium: Medium) -> &'static str {
+    match medium {
+        Medium::Mii => "Ethernet",
+        Medium::Ebus => "E-bus",
+        Medium::None => "a port",
+    }
+}
+
+/// Where the places that were asked for are written, with the devices' names.
+pub(crate) struct Places(Vec<(String, Span)>);
+
+impl Places {
+    pub(crate) fn of(devices: &[RawDevice]) -> Self {
+        let place = |device: &RawDevice| {
+            let sim = device.sim.as_ref()?;
+            let port = sim.port.as_ref().map(Spanned::span);
+            let span = port.or(sim.after.as_ref().map(Spanned::span))?;
+            Some((device.name.as_ref()?.get_ref().clone(), span))
+        };
+        Self(devices.iter().filter_map(place).collect())
+    }
+
+    /// Reports the places that cannot be had. One that nobody asked for is no mistake of the file: the
+    /// real bus is what it is.
+    pub(crate) fn check(&self, devices: &[DeviceConfig], p: &mut Problems<'_>) {
+        let order = bus_order(devices);
+        for error in topology(devices).err().unwrap_or_default() {
+            let device = error.device().and_then(|n| order.get(n));
+            let asked = self
+                .0
+                .iter()
+                .find(|(name, _)| device.is_some_and(|d| d.name == *name));
+            if let Some((_, span)) = asked {
+                let (message, hint) = told(&error, devices);
+                p.add_hint(span.clone(), message, hint);
             }
         }
     }
-    let synchronous = f.get("synchronous").and_then(|v| fields::boolean(p, v));
-    f.done(p);
-    Some(PdoLink {
-        pdo: pdo?.into_inner(),
-        at: at?.into_inner(),
-        contents,
-        synchronous: synchronous.is_none_or(Spanned::into_inner),
-    })
-}
-
-/// What the device, if it is known, makes of it.
-pub(crate) fn setup(
-    raw: RawSim,
-    device: Option<&esi::Device>,
-    p: &mut Problems<'_>,
-) -> Option<SimSetup> {
-    let mut options = raw.options;
-    let mut wrong = raw.wrong;
-    let device = device?;
-    for (node, span) in raw.nodes {
-        options.nodes.push(node);
-        // One after the other, so that the blame falls on the right one.
-        if !wrong && let Err(error) = options.validate(device) {
-            p.add(span, error.to_string());
-            wrong = true;
-        }
-    }
-    if !ecaxis_sim::gateway::is_gateway(device) {
-        let message = format!("`{}` is not a CANopen gateway", device.type_name);
-        let hint = format!("a gateway carries bytes of {}", list(["0x2100", "0x2000"]));
-        p.add_hint(raw.span, message, hint);
-        return None;
-    }
-    (!wrong).then_some(SimSetup {
-        gateway: Some(options),
-    })
 }
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
+    use ecaxis_sim::Uplink;
 
-    use super::super::{ConfigError, parse};
+    use super::super::{ConfigError, Machine, Problem, parse};
+    use super::*;
 
-    /// Problems of the project's own gateway machine with one text replaced by another.
-    fn broken(from: &str, to: &str) -> Vec<(String, String)> {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/gateway.toml");
-        let text = std::fs::read_to_string(&path).unwrap();
-        assert!(text.contains(from), "{from}");
-        match parse(&path, &text.replacen(from, to, 1)) {
-            Err(ConfigError::Problems(problems)) => problems
-                .into_iter()
-                .map(|problem| (problem.message, problem.hint.unwrap_or_default()))
-                .collect(),
-            other => panic!("{from} → {to}: {other:?}"),
+    const ESI: &str = r##"<?xml version="1.0"?>
+<EtherCATInfo><Vendor><Id>#x1</Id><Name>Test</Name></Vendor><Descriptions><Devices>
+<Device Physics="YKY"><Type ProductCode="#x1" RevisionNo="#x1">C</Type><Name>Coupler</Name></Device>
+<Device Physics="KK"><Type ProductCode="#x2" RevisionNo="#x1">T</Type><Name>Terminal</Name></Device>
+<Device Physics="YY"><Type ProductCode="#x3" RevisionNo="#x1">B</Type><Name>Box</Name></Device>
+</Devices></Descriptions></EtherCATInfo>
+"##;
+
+    /// A bus of devices: name, type, position and the lines of their `[device.sim]`.
+    fn load(devices: &[(&str, &str, usize, &str)]) -> Result<Machine, ConfigError> {
+        let folder = tempfile::tempdir().expect("folder");
+        std::fs::write(folder.path().join("bus.xml"), ESI).expect("file");
+        let mut text = "[bus]\ncycle = \"1ms\"\n".to_owned();
+        for (name, kind, position, sim) in devices {
+            text += &format!("[[device]]\nname = \"{name}\"\nesi = \"bus.xml\"\n");
+            text += &format!("type = \"{kind}\"\nposition = {position}\n[device.sim]\n{sim}\n");
+        }
+        parse(&folder.path().join("m.toml"), &text)
+    }
+
+    fn problems(devices: &[(&str, &str, usize, &str)]) -> Vec<Problem> {
+        match load(devices) {
+            Err(ConfigError::Problems(problems)) => problems,
+            other => panic!("expected problems: {other:?}"),
         }
     }
 
     #[test]
+    fn what_is_asked_for_is_what_the_simulated_bus_gets() {
+        let machine = load(&[
+            (
+                "c",
+                "C",
+                0,
+                "drift_ppm = -20\noffset = \"3s\"\njitter = \"15ns\"",
+            ),
+            ("x", "B", 2, "after = \"c\"\nport = 2\ncable = \"150ns\""),
+            ("t", "T", 1, "after = \"c\""),
+        ]);
+        let machine = machine.expect("good");
+        let order: Vec<&str> = bus_order(&machine.devices)
+            .iter()
+            .map(|d| d.name.as_str())
+            .collect();
+        assert_eq!(order, ["c", "t", "x"]);
+        let coupler = &machine.devices[0].sim;
+        assert_eq!(coupler.drift_ppm, Some(-20.0));
+        assert_eq!((coupler.offset_ns, coupler.jitter_ns), (3_000_000_000, 15));
+        let bus = topology(&machine.devices).expect("good");
+        let at = |device, port| Some(Uplink { device, port });
+        assert_eq!([bus.uplink(1), bus.uplink(2)], [at(0, 1), at(0, 2)]);
+    }
+
+    #[test]
     #[rustfmt::skip] // one row a mistake
-    fn every_way_to_be_wrong() {
-        for (from, to, message, hint) in [
-            ("\"EPOS 24/1\"", "\"EPOS 24/2\"", "unknown drive `EPOS 24/2`", "did you mean `EPOS 24/1`?"),
-            ("id      = 1", "id = 16", "takes node numbers up to 15", ""),
-            ("id      = 1", "id = 128", "a whole number from 1 to 127", ""),
-            ("id        = 2", "id = 1", "node 1 is there twice", ""),
-            ("drive   = \"EPOS 24/1\"\n", "", "`drive` is missing in [[device.sim.node]]", "EPOS 24/5"),
-            ("at = 8", "at = 600", "a whole number from 2 to 511", ""),
-            ("pdo = 2, at = 24", "pdo = 2, at = 60", "6 bytes at 60 do not lie", ""),
-            ("pdo = 3, at = 18", "pdo = 4, at = 18", "a whole number from 1 to 3", ""),
-            ("\"0x6041\", \"0x6064\"", "\"0x6042\"", "0x6042:00 cannot be mapped", ""),
-            ("\"0x6041\", \"0x6064\"", "\"0x6040\"", "0x6040:00 with 16 bits cannot be mapped", ""),
-            ("bit_rate = 1_000_000", "bit_rate = 9600", "no such bit rate", "500000"),
-            ("heartbeat = \"50ms\"", "heartbeat = \"1ms\"", "10 ms to 65 s", ""),
-            ("mandatory =", "mandatry =", "unknown key `mandatry`", "did you mean `mandatory`?"),
-            ("[device.axis]", "[device.sim]\n[device.axis]", "`EPOS4` is not a CANopen gateway", "0x2100"),
+    fn every_way_to_be_connected_wrongly() {
+        let c = ("c", "C", 0, "");
+        for (rest, message, hint) in [
+            (&[("t", "T", 1, "after = \"d\"")][..], "no device \"d\"", "devices"),
+            (&[("t", "T", 1, "port = 1")], "not said which device's port", "add `after`"),
+            (&[("t", "T", 1, "after = \"c\"\nport = 0")], "from 1 to 3, found 0", ""),
+            (&[("t", "T", 1, "after = \"c\"\nport = 3")], "\"c\" has no port 3", "0 (Ethernet), 1 (E-bus), 2 (Ethernet)"),
+            (&[("t", "T", 1, "after = \"c\"\nport = 2")], "port 2 of \"c\" is Ethernet, \"t\" needs E-bus", ""),
+            (&[("t", "T", 1, "after = \"t\"")], "frames do not reach \"t\" before \"t\"", "positions count"),
+            (&[("t", "T", 1, ""), ("u", "T", 2, "after = \"c\"\nport = 1")], "port 1 of \"c\" leads to \"t\"", ""),
+            (&[("x", "B", 1, ""), ("y", "B", 2, "after = \"c\"")], "\"c\" has no port left for \"y\", which needs Ethernet", ""),
+            // The terminals of a coupler come before what is connected to its second socket.
+            (&[("x", "B", 1, ""), ("t", "T", 2, "after = \"c\"")], "frames pass port 1 of \"c\" before they reach \"x\", so \"t\" comes before it", "port 3 first"),
+            (&[("x", "B", 1, "drift_ppm = 2000")], "more than 1000 ppm", ""),
+            (&[("x", "B", 1, "jitter = \"2ms\"")], "a jitter of more than 1 ms", ""),
+            (&[("x", "B", 1, "cable = \"2ms\"")], "a cable of more than 1 ms", ""),
+            (&[("x", "B", 1, "drift = 1.0")], "unknown key `drift` in [device.sim]", "`drift_ppm`"),
         ] {
-            let found = broken(from, to);
-            let [(said, hinted)] = found.as_slice() else {
-                panic!("{from} → {to}: {found:?}")
-            };
-            assert!(said.contains(message) && hinted.contains(hint), "{said}: {hinted}");
+            let mut bus = vec![c];
+            bus.extend_from_slice(rest);
+            let found = problems(&bus);
+            let [problem] = found.as_slice() else { panic!("{rest:?}: {found:#?}") };
+            assert!(problem.message.contains(message), "{problem}");
+            assert!(problem.hint.as_deref().unwrap_or_default().contains(hint), "{problem}");
         }
+    }
+
+    #[test]
+    fn every_wrong_connection_is_reported_with_its_line() {
+        let found = problems(&[
+            ("c", "C", 0, ""),
+            ("t", "T", 1, "after = \"c\"\nport = 3"),
+            ("u", "T", 2, "after = \"c\"\nport = 2"),
+        ]);
+        let lines: Vec<u32> = found.iter().map(|p| p.line).collect();
+        assert_eq!(lines, [17, 25]);
     }
 }

@@ -8,48 +8,52 @@ use crate::clock;
 /// Frames that may be under way at once.
 const IN_FLIGHT: usize = 64;
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Slot {
-    at: Nanos,
     len: usize,
     frame: [u8; MAX_FRAME],
 }
 
-/// Carries frames through a [`Segment`] and hands them back when they would have arrived.
+/// Carries frames through a [`Segment`] and hands them back when they would have arrived: late, in
+/// another order or twice where the fault script says so.
 #[derive(Debug)]
 pub struct SimLink {
     segment: Segment,
     /// The clock's time at the segment's time zero.
     start: Nanos,
-    /// Ring of frames on their way back, in order of arrival.
-    ring: Vec<Slot>,
-    head: usize,
-    count: usize,
+    slots: Vec<Slot>,
+    free: Vec<usize>,
+    /// Arrival and slot of frames on their way back, the next one last.
+    under_way: Vec<(Nanos, usize)>,
 }
 
 impl SimLink {
     /// The segment's time starts now.
     #[must_use]
     pub fn new(segment: Segment) -> Self {
-        let ring = (0..IN_FLIGHT)
-            .map(|_| Slot {
-                at: 0,
-                len: 0,
-                frame: [0; MAX_FRAME],
-            })
-            .collect();
+        let empty = Slot {
+            len: 0,
+            frame: [0; MAX_FRAME],
+        };
         Self {
             segment,
             start: clock::now(),
-            ring,
-            head: 0,
-            count: 0,
+            slots: vec![empty; IN_FLIGHT],
+            free: (0..IN_FLIGHT).collect(),
+            under_way: Vec::with_capacity(IN_FLIGHT),
         }
     }
 
     #[must_use]
     pub fn segment(&self) -> &Segment {
         &self.segment
+    }
+
+    /// Every slot is free or under way, so that neither list ever grows beyond its capacity.
+    fn arrives(&mut self, at: Nanos, slot: usize) {
+        let at = at.saturating_add(self.start);
+        let place = self.under_way.partition_point(|(other, _)| *other > at);
+        self.under_way.insert(place, (at, slot));
     }
 }
 
@@ -58,37 +62,110 @@ impl Link for SimLink {
         if frame.len() > MAX_FRAME {
             return Err(LinkError::TooLong(frame.len()));
         }
-        if self.count == IN_FLIGHT {
+        let Some(n) = self.free.pop() else {
             return Err(LinkError::Send(rustix::io::Errno::NOBUFS));
-        }
+        };
         let now = clock::now().saturating_sub(self.start);
-        let slot = &mut self.ring[(self.head + self.count) % IN_FLIGHT];
+        let slot = &mut self.slots[n];
+        slot.len = frame.len();
         slot.frame[..frame.len()].copy_from_slice(frame);
-        if let Transit::Back { at, .. } = self.segment.transit(&mut slot.frame[..frame.len()], now)
-        {
-            slot.at = at + self.start;
-            slot.len = frame.len();
-            self.count += 1;
+        match self.segment.transit(&mut slot.frame[..frame.len()], now) {
+            Transit::Lost => self.free.push(n),
+            Transit::Back { at, again, .. } => {
+                self.arrives(at, n);
+                // A copy that finds no place is lost.
+                if let Some(at) = again
+                    && let Some(copy) = self.free.pop()
+                {
+                    self.slots[copy] = self.slots[n].clone();
+                    self.arrives(at, copy);
+                }
+            }
         }
         Ok(())
     }
 
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
-        if self.count == 0 {
+        if self.next_arrival().is_none_or(|at| at > clock::now()) {
             return Ok(None);
         }
-        let slot = &self.ring[self.head];
-        if slot.at > clock::now() {
+        let Some((_, n)) = self.under_way.pop() else {
             return Ok(None);
-        }
+        };
+        self.free.push(n);
+        let slot = &self.slots[n];
         buf[..slot.len].copy_from_slice(&slot.frame[..slot.len]);
-        let len = slot.len;
-        self.head = (self.head + 1) % IN_FLIGHT;
-        self.count -= 1;
-        Ok(Some(len))
+        Ok(Some(slot.len))
     }
 
     fn next_arrival(&self) -> Option<Nanos> {
-        (self.count > 0).then(|| self.ring[self.head].at)
+        self.under_way.last().map(|(at, _)| *at)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecaxis_sim::frame::FrameBuilder;
+    use ecaxis_sim::{DeviceOptions, FaultScript, SegmentOptions, SimDevice};
+
+    use super::*;
+    use crate::clock::Clock;
+
+    /// Sends so many frames, 10 µs apart, and tells in which order they come back.
+    fn order(script: &str, frames: u8) -> Vec<u8> {
+        let script = FaultScript::parse(script).expect("script");
+        std::thread::spawn(move || {
+            Clock::Virtual.enter();
+            let device = ecaxis_esi::model::Device::default();
+            let device = SimDevice::from_esi(&device, &[], DeviceOptions::default());
+            let devices = vec![device.expect("device")];
+            let mut segment = Segment::new(devices, SegmentOptions::default());
+            segment.set_faults(script);
+            let mut link = SimLink::new(segment);
+            let mut buf = [0; MAX_FRAME];
+            let mut seen = Vec::new();
+            for n in 0..frames {
+                let frame = FrameBuilder::default().datagram(7, 0, 0, &[0]);
+                let mut frame = frame.build();
+                frame[17] = n;
+                link.send(&frame).expect("room");
+                Clock::Virtual.sleep_until(clock::now() + 10_000, 0);
+                while link.recv(&mut buf).expect("simulated").is_some() {
+                    seen.push(buf[17]);
+                }
+            }
+            while let Some(at) = link.next_arrival() {
+                assert_eq!(link.recv(&mut buf), Ok(None), "not before its time");
+                Clock::Virtual.sleep_until(at, 0);
+                link.recv(&mut buf).expect("simulated").expect("a frame");
+                seen.push(buf[17]);
+            }
+            seen
+        })
+        .join()
+        .expect("thread")
+    }
+
+    #[test]
+    fn frames_come_back_in_the_order_of_their_arrival() {
+        assert_eq!(order("", 4), [0, 1, 2, 3]);
+        let late = "[[fault]]\nkind = \"frame-delay\"\ncount = 1\ndelay = \"25us\"\n";
+        assert_eq!(order(late, 5), [1, 2, 0, 3, 4]);
+    }
+
+    #[test]
+    fn a_frame_comes_back_twice() {
+        let twice = "[[fault]]\nkind = \"frame-duplicate\"\ncount = 1\n";
+        assert_eq!(order(twice, 3), [0, 0, 1, 2]);
+    }
+
+    #[test]
+    fn every_place_can_be_taken_by_frames_and_copies() {
+        let script = "[[fault]]\nkind = \"frame-delay\"\nprobability = 1.0\ndelay = \"1s\"\n\
+                      [[fault]]\nkind = \"frame-duplicate\"\nprobability = 1.0\n";
+        let seen = order(script, 32);
+        // 32 frames and their copies fill 64 places.
+        assert_eq!(seen.len(), IN_FLIGHT);
+        assert_eq!(seen[..4], [0, 0, 1, 1]);
     }
 }

@@ -39,7 +39,7 @@ mod progress;
 mod summary;
 
 pub use error::RunError;
-pub use open::simulated_bus;
+pub use open::{simulated_bus, topology};
 pub use progress::{AxisLine, Observer, Progress, Status};
 pub use summary::{AxisSummary, Summary};
 

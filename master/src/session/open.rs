@@ -2,10 +2,11 @@
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use ecaxis_sim::{DeviceOptions, FaultScript, Segment, SegmentOptions, SimDevice};
+use ecaxis_sim::{DeviceOptions, FaultScript, Segment, SegmentOptions, SimDevice, Topology};
 
 use super::{Options, RunError};
 use crate::clock::{self, Clock};
+use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
 use crate::link::Link;
 use crate::link::capture::{Mode, Recorder};
@@ -49,47 +50,50 @@ pub fn simulated_bus(
     seed: u64,
     faults: Option<&FaultScript>,
 ) -> Result<Segment, RunError> {
-    let mut placed: Vec<Option<&DeviceConfig>> = machine.devices.iter().map(|_| None).collect();
-    for device in &machine.devices {
-        if let Locator::Position(position) = device.at
-            && let Some(place @ None) = placed.get_mut(usize::from(position))
-        {
-            *place = Some(device);
-        }
+    let topology = topology(machine)?;
+    let mut devices = Vec::with_capacity(machine.devices.len());
+    for device in bus_order(&machine.devices) {
+        devices.push(sim_device(device, devices.len(), seed)?);
     }
-    // Devices found by alias or identification may stand anywhere: they fill the gaps in order.
-    let mut others = machine
-        .devices
-        .iter()
-        .filter(|d| !matches!(d.at, Locator::Position(_)));
-    let mut devices = Vec::with_capacity(placed.len());
-    for place in placed {
-        let Some(device) = place.or_else(|| others.next()) else {
-            continue;
-        };
-        devices.push(sim_device(device, devices.len())?);
-    }
-    let mut segment = Segment::new(
-        devices,
-        SegmentOptions {
-            seed,
-            ..SegmentOptions::default()
-        },
-    );
+    let options = SegmentOptions {
+        seed,
+        ..SegmentOptions::default()
+    };
+    let mut segment = Segment::with_topology(devices, topology, options);
     if let Some(faults) = faults {
         segment.set_faults(faults.clone());
     }
     Ok(segment)
 }
 
+/// How the simulated bus is cabled.
+///
+/// # Errors
+/// [`RunError::Sim`] where a device finds no port.
+pub fn topology(machine: &Machine) -> Result<Topology, RunError> {
+    sim::topology(&machine.devices).map_err(|errors| {
+        let told = errors
+            .iter()
+            .map(|error| sim::told(error, &machine.devices).0);
+        RunError::Sim(told.collect::<Vec<_>>().join("; "))
+    })
+}
+
 /// Clocks of real devices differ by some tens of ppm; a simulated bus without drift would hide a
 /// clock control that does nothing.
 const DRIFTS_PPM: [f64; 4] = [18.0, -23.0, 7.0, -11.0];
 
-fn sim_device(device: &DeviceConfig, position: usize) -> Result<SimDevice, RunError> {
+fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDevice, RunError> {
+    let place = u32::try_from(position).unwrap_or(0);
     let mut options = DeviceOptions {
-        serial: 1000 + u32::try_from(position).unwrap_or(0),
-        clock_drift_ppm: DRIFTS_PPM[position % DRIFTS_PPM.len()],
+        serial: 1000 + place,
+        clock_drift_ppm: device
+            .sim
+            .drift_ppm
+            .unwrap_or(DRIFTS_PPM[position % DRIFTS_PPM.len()]),
+        clock_offset_ns: device.sim.offset_ns,
+        clock_jitter_ns: device.sim.jitter_ns,
+        jitter_seed: seed.wrapping_add(u64::from(place)),
         gateway: device.sim.gateway.clone(),
         ..DeviceOptions::default()
     };

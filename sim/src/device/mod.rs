@@ -97,6 +97,15 @@ pub(crate) struct Delays {
     pub(crate) processing_ns: u64,
 }
 
+/// What a device is known by, as far as it is known or to be changed.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Identification {
+    /// Vendor, product, revision and serial number: SII words 8, 10, 12 and 14, 0x1018:01 to 04.
+    pub(crate) numbers: [Option<u32>; 4],
+    /// SII word 4.
+    pub(crate) alias: Option<u16>,
+}
+
 /// What a frame has done to a device that concerns the network.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Seen {
@@ -451,13 +460,31 @@ impl SimDevice {
         self.esc.dc.as_ref().map_or(0, |dc| dc.sync.pulses)
     }
 
-    /// Fault injection: identity in EEPROM and object 0x1018.
-    pub(crate) fn patch_identity(&mut self, word: usize, sub: u8, value: u32) {
-        self.esc.eeprom.patch(word, value);
-        for store in [&mut self.store, &mut self.fresh.store] {
-            if let Some(slot) = store.slot(0x1018, sub) {
-                store.set(slot, i64::from(value));
+    /// Fault injection: what EEPROM and object 0x1018 say.
+    pub(crate) fn identification(&self) -> Identification {
+        let rom = &self.esc.eeprom;
+        let number = |word| u32::from(rom.word(word)) | u32::from(rom.word(word + 1)) << 16;
+        Identification {
+            numbers: [8, 10, 12, 14].map(|word| Some(number(word))),
+            alias: Some(rom.word(4)),
+        }
+    }
+
+    pub(crate) fn identify(&mut self, new: &Identification) {
+        for ((word, sub), value) in [(8, 1), (10, 2), (12, 3), (14, 4)]
+            .into_iter()
+            .zip(new.numbers)
+        {
+            let Some(value) = value else { continue };
+            self.esc.eeprom.patch(word, value);
+            for store in [&mut self.store, &mut self.fresh.store] {
+                if let Some(slot) = store.slot(0x1018, sub) {
+                    store.set(slot, i64::from(value));
+                }
             }
+        }
+        if let Some(alias) = new.alias {
+            self.esc.eeprom.patch_alias(alias);
         }
     }
 

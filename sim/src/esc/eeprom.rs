@@ -76,16 +76,8 @@ impl Eeprom {
     /// Words 0 to 6, if the checksum in word 7 fits (ETG.2010: x^8 + x^2 + x + 1, start value 0xff).
     /// Otherwise the error shows from now on.
     pub fn configuration(&mut self) -> Option<[u16; 7]> {
-        let crc = self.image.get(..14).map(|head| {
-            head.iter().fold(0xff_u8, |crc, byte| {
-                (0..8).fold(crc ^ byte, |crc, _| {
-                    crc << 1 ^ if crc & 0x80 != 0 { 0x07 } else { 0 }
-                })
-            })
-        });
-        let sound = crc.is_some() && crc == self.image.get(14).copied()
-            || self.image.len() > 15 && self.word(7) == ANY_CHECKSUM;
-        if !sound {
+        let any = self.image.len() > 15 && self.word(7) == ANY_CHECKSUM;
+        if !self.checksum_fits() && !any {
             self.error |= CHECKSUM_ERROR;
             return None;
         }
@@ -95,6 +87,21 @@ impl Eeprom {
             *word = self.word(n);
         }
         Some(words)
+    }
+
+    /// Of the configuration area.
+    fn checksum(&self) -> Option<u8> {
+        let head = self.image.get(..14)?;
+        Some(head.iter().fold(0xff_u8, |crc, byte| {
+            (0..8).fold(crc ^ byte, |crc, _| {
+                crc << 1 ^ if crc & 0x80 != 0 { 0x07 } else { 0 }
+            })
+        }))
+    }
+
+    fn checksum_fits(&self) -> bool {
+        let crc = self.checksum();
+        crc.is_some() && crc == self.image.get(14).copied()
     }
 
     #[must_use]
@@ -110,6 +117,19 @@ impl Eeprom {
         match self.image.get(at..at.saturating_add(2)) {
             Some([low, high]) => u16::from_le_bytes([*low, *high]),
             _ => 0xffff,
+        }
+    }
+
+    /// Overwrites the station alias, and renews a checksum that was right; for fault injection.
+    pub fn patch_alias(&mut self, alias: u16) {
+        let fits = self.checksum_fits();
+        if let Some(word) = self.image.get_mut(8..10) {
+            word.copy_from_slice(&alias.to_le_bytes());
+        }
+        if let (true, Some(crc)) = (fits, self.checksum())
+            && let Some(byte) = self.image.get_mut(14)
+        {
+            *byte = crc;
         }
     }
 

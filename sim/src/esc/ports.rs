@@ -232,6 +232,17 @@ impl Esc {
         self.count_up(reg::PROCESSING_UNIT_ERRORS);
     }
 
+    /// A frame with a bit error came in at the port, as the first to see it.
+    pub(crate) fn count_rx_error(&mut self, port: u8) {
+        self.count_up(reg::RX_ERRORS + 2 * u16::from(port));
+        self.count_up(reg::RX_ERRORS + 2 * u16::from(port) + 1);
+    }
+
+    /// A frame came in at the port that another device has found to be wrong and marked.
+    pub(crate) fn count_forwarded_error(&mut self, port: u8) {
+        self.count_up(reg::FORWARDED_ERRORS + u16::from(port));
+    }
+
     /// A valid frame has arrived at a closed port.
     pub(crate) fn frame_at_closed_port(&mut self, port: u8) {
         let n = usize::from(port);
@@ -284,13 +295,19 @@ impl Esc {
         }
     }
 
-    /// A frame that latches receive times came in at the port.
-    pub(crate) fn latch_port(&mut self, port: u8, now: Nanos) {
-        if usize::from(port) < PORTS {
-            let stamp = self.stamp(now) as u32;
-            let at = reg::DC_RECEIVE_TIMES + 4 * u16::from(port);
-            self.put(at, &stamp.to_le_bytes());
+    /// A frame that latches receive times came in at the port, perhaps on its way into the processing
+    /// unit, which has noted the time itself.
+    pub(crate) fn latch_port(&mut self, port: u8, now: Nanos, processed: bool) {
+        if usize::from(port) >= PORTS {
+            return;
         }
+        let stamp = if processed && port == 0 {
+            self.frame.stamp
+        } else {
+            self.stamp(now)
+        };
+        let at = reg::DC_RECEIVE_TIMES + 4 * u16::from(port);
+        self.put(at, &(stamp as u32).to_le_bytes());
     }
 }
 

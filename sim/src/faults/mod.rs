@@ -12,13 +12,35 @@
 //! state = "safeop"
 //! code = 0x001e
 //! ```
+//!
+//! | kind | keys | what happens |
+//! |---|---|---|
+//! | `frame-loss` | `count` or `probability` | frames vanish, half of them before any device has seen them |
+//! | `frame-corrupt` | `count` or `probability`; `device`, `port` | a bit turns over in front of the device's port (0), or anywhere; error counters |
+//! | `frame-delay` | `count` or `probability`; `delay` | frames come back late, and others before them |
+//! | `frame-duplicate` | `count` or `probability` | frames come back twice |
+//! | `link-break` | `device`, `port` | the cable at the port (0) is broken |
+//! | `silent` | | the MainDevice's cable is broken |
+//! | `power-off`, `absent` | `device` | no power; back in Init |
+//! | `swap` | `device`; `vendor`, `product`, `revision`, `serial`, `alias` | another device in its place, in Init, without alias |
+//! | `identity` | `device`; `vendor`, `product`, `revision` | EEPROM and 0x1018 say something else |
+//! | `refuse-state` | `device`, `state`, `code` | the state is refused with this AL status code |
+//! | `sdo-abort` | `device`, `index`, `sub`, `code` | the SDO is aborted |
+//! | `drive-fault` | `device`, `code` | the drive detects this error |
+//! | `stuck` | `device`, `state` | the drive does not leave this CiA 402 state |
+//! | `emergency` | `device`, `code` | an emergency message, nothing else |
 
+mod frames;
+mod kinds;
 mod script;
+#[cfg(test)]
+mod tests;
 
 use crate::Nanos;
-use crate::device::SimDevice;
+use crate::device::{Identification, SimDevice};
 use crate::random::Random;
-pub use script::{Fault, FaultKind, FaultScript, ScriptError};
+pub(crate) use frames::Corrupted;
+pub use script::{Fault, FaultKind, FaultScript, Hits, NewIdentity, ScriptError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
@@ -31,17 +53,10 @@ enum Phase {
 struct Running {
     fault: Fault,
     phase: Phase,
-    /// Frames still to lose.
+    /// Frames still to strike.
     left: u32,
-    /// EEPROM words 8–13 before an identity fault.
-    saved: [u32; 3],
-}
-
-/// What happens to one frame.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Loss {
-    pub(crate) on_the_way_out: bool,
-    pub(crate) on_the_way_back: bool,
+    /// What the device was known by before.
+    saved: Identification,
 }
 
 /// The script while it runs.
@@ -49,6 +64,10 @@ pub(crate) struct Loss {
 pub(crate) struct Faults {
     running: Vec<Running>,
     random: Random,
+    /// One that is active may strike frames.
+    concerns_frames: bool,
+    /// Devices that have been replaced since somebody asked.
+    replaced: Vec<usize>,
 }
 
 impl Faults {
@@ -56,6 +75,8 @@ impl Faults {
         Self {
             running: Vec::new(),
             random: Random::new(seed),
+            concerns_frames: false,
+            replaced: Vec::new(),
         }
     }
 
@@ -64,15 +85,13 @@ impl Faults {
             self.random = Random::new(seed);
         }
         let running = script.faults.into_iter().map(|fault| Running {
-            left: match fault.kind {
-                FaultKind::FrameLoss {
-                    count: Some(count), ..
-                } => count,
+            left: match fault.kind.hits() {
+                Some(Hits::Next(count)) => count,
                 _ => 0,
             },
             fault,
             phase: Phase::Pending,
-            saved: [0; 3],
+            saved: Identification::default(),
         });
         // Those that still act must be ended first; they end now.
         for old in &mut self.running {
@@ -106,12 +125,14 @@ impl Faults {
                     running.phase = Phase::Active;
                     if let Some(device) = device {
                         running.start(device);
+                        self.replaced.extend(running.replaces());
                     }
                 }
                 (Phase::Active, device) if end.is_some_and(|end| end <= now) => {
                     running.phase = Phase::Over;
                     if let Some(device) = device {
                         running.end(device);
+                        self.replaced.extend(running.replaces());
                     }
                 }
                 _ => {}
@@ -133,6 +154,13 @@ impl Faults {
             }
             device.hold_drive_in(held);
         }
+        let concerns_frames = self.active().any(|fault| fault.kind.hits().is_some());
+        self.concerns_frames = concerns_frames;
+    }
+
+    /// Devices that have become others since the last call.
+    pub(crate) fn take_replaced(&mut self) -> Vec<usize> {
+        std::mem::take(&mut self.replaced)
     }
 
     fn active(&self) -> impl Iterator<Item = &Fault> {
@@ -145,7 +173,7 @@ impl Faults {
     /// The device has no power.
     pub(crate) fn is_off(&self, device: usize) -> bool {
         self.active()
-            .any(|fault| fault.device == device && fault.kind == FaultKind::Absent)
+            .any(|fault| fault.device == device && fault.kind == FaultKind::PowerOff)
     }
 
     /// The cable at the port is broken.
@@ -157,34 +185,6 @@ impl Faults {
     /// The cable at the MainDevice is unplugged.
     pub(crate) fn is_silent(&self) -> bool {
         self.active().any(|fault| fault.kind == FaultKind::Silent)
-    }
-
-    /// Decides about the frame that is sent now.
-    pub(crate) fn lose(&mut self) -> Loss {
-        let mut loss = Loss::default();
-        for n in 0..self.running.len() {
-            let Some(running) = self.running.get_mut(n).filter(|r| r.phase == Phase::Active) else {
-                continue;
-            };
-            let lost = match running.fault.kind {
-                FaultKind::FrameLoss { count: Some(_), .. } => {
-                    let lost = running.left > 0;
-                    running.left = running.left.saturating_sub(1);
-                    lost
-                }
-                FaultKind::FrameLoss {
-                    probability: Some(p),
-                    ..
-                } => self.random.chance(p),
-                _ => false,
-            };
-            if lost {
-                let out = self.random.next() & 1 == 0;
-                loss.on_the_way_out |= out;
-                loss.on_the_way_back |= !out;
-            }
-        }
-        loss
     }
 }
 
@@ -198,20 +198,12 @@ impl Running {
             }
             FaultKind::Emergency { code } => device.inject_emergency(code),
             FaultKind::NodeSilent { node } => silence(device, node, true),
-            FaultKind::Identity {
-                vendor,
-                product,
-                revision,
-            } => {
-                for (n, value) in [vendor, product, revision].into_iter().enumerate() {
-                    let word = 8 + n as u32 * 2;
-                    let rom = &device.esc.eeprom;
-                    let old = u32::from(rom.word(word)) | u32::from(rom.word(word + 1)) << 16;
-                    if let Some(saved) = self.saved.get_mut(n) {
-                        *saved = old;
-                    }
-                    patch(device, n, value.unwrap_or(old));
-                }
+            FaultKind::Identity(new) | FaultKind::Swap(new) => {
+                self.saved = device.identification();
+                device.identify(&Identification {
+                    numbers: [new.vendor, new.product, new.revision, new.serial],
+                    alias: new.alias,
+                });
             }
             _ => {}
         }
@@ -219,14 +211,14 @@ impl Running {
 
     fn end(&self, device: &mut SimDevice) {
         match self.fault.kind {
-            FaultKind::Identity { .. } => {
-                for (n, value) in self.saved.into_iter().enumerate() {
-                    patch(device, n, value);
-                }
-            }
+            FaultKind::Identity(_) | FaultKind::Swap(_) => device.identify(&self.saved),
             FaultKind::NodeSilent { node } => silence(device, node, false),
             _ => {}
         }
+    }
+
+    fn replaces(&self) -> Option<usize> {
+        matches!(self.fault.kind, FaultKind::Swap(_)).then_some(self.fault.device)
     }
 }
 
@@ -234,9 +226,4 @@ fn silence(device: &mut SimDevice, node: u8, silent: bool) {
     if let Some(gateway) = device.gateway_mut() {
         gateway.set_node_silent(node, silent);
     }
-}
-
-/// Vendor, product and revision are SII words 8, 10 and 12 and 0x1018:01 to 03.
-fn patch(device: &mut SimDevice, n: usize, value: u32) {
-    device.patch_identity(8 + n * 2, n as u8 + 1, value);
 }

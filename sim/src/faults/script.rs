@@ -1,11 +1,13 @@
-//! The fault script as written and as checked.
+//! The fault script as written and as checked against the bus.
 
 use serde::Deserialize;
 use toml::Spanned;
 
+use super::kinds;
 use crate::Nanos;
 use crate::drive::State;
 use crate::esc::al::AlState;
+use crate::network::topology::Topology;
 
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FaultScript {
@@ -18,18 +20,52 @@ pub struct Fault {
     pub at: Nanos,
     /// `None`: for good.
     pub duration: Option<Nanos>,
+    /// 0 where the kind concerns no device.
     pub device: usize,
     pub kind: FaultKind,
     /// Line of the script.
     pub line: u32,
 }
 
+/// Which of the frames sent while a fault lasts it strikes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Hits {
+    /// The next so many.
+    Next(u32),
+    /// Each with this probability.
+    Each(f64),
+}
+
+/// What a device is known by; `None`: as before.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct NewIdentity {
+    pub vendor: Option<u32>,
+    pub product: Option<u32>,
+    pub revision: Option<u32>,
+    pub serial: Option<u32>,
+    pub alias: Option<u16>,
+}
+
 #[derive(Debug, Clone, PartialEq)]
 pub enum FaultKind {
     /// Frames vanish, on the way out or on the way back.
     FrameLoss {
-        count: Option<u32>,
-        probability: Option<f64>,
+        hits: Hits,
+    },
+    /// Frames arrive at the MainDevice twice.
+    FrameDuplicate {
+        hits: Hits,
+    },
+    /// Frames come back later than they should; others overtake them.
+    FrameDelay {
+        hits: Hits,
+        delay: Nanos,
+    },
+    /// A bit of the frame is turned over on its way to the port of the device named, or to any. From
+    /// there on devices ignore and count it; the MainDevice never sees it.
+    FrameCorrupt {
+        hits: Hits,
+        at: Option<(usize, u8)>,
     },
     /// The drive detects this error itself.
     DriveFault {
@@ -51,14 +87,13 @@ pub enum FaultKind {
         state: State,
     },
     /// EEPROM and 0x1018 name another device.
-    Identity {
-        vendor: Option<u32>,
-        product: Option<u32>,
-        revision: Option<u32>,
-    },
+    Identity(NewIdentity),
     /// Without power: its neighbours lose their link, what is behind it or fed by it through the
-    /// E-bus is out of reach; it comes back in Init.
-    Absent,
+    /// E-bus is out of reach; it comes back in Init. `absent` is another name for it: nobody on
+    /// the bus can tell the two apart.
+    PowerOff,
+    /// Another device takes its place and starts in Init; when the fault ends, the old one is back.
+    Swap(NewIdentity),
     /// The cable at the MainDevice is unplugged.
     Silent,
     /// The cable at the device's port carries nothing; both ends lose their link.
@@ -72,6 +107,21 @@ pub enum FaultKind {
     Emergency {
         code: u16,
     },
+}
+
+impl Fault {
+    /// The device and port that must be there.
+    fn place(&self) -> Option<(usize, Option<u8>)> {
+        match self.kind {
+            FaultKind::FrameLoss { .. }
+            | FaultKind::FrameDuplicate { .. }
+            | FaultKind::FrameDelay { .. }
+            | FaultKind::Silent => None,
+            FaultKind::FrameCorrupt { at, .. } => at.map(|(device, port)| (device, Some(port))),
+            FaultKind::LinkBreak { port } => Some((self.device, Some(port))),
+            _ => Some((self.device, None)),
+        }
+    }
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -90,6 +140,8 @@ pub enum ScriptError {
         device: usize,
         devices: usize,
     },
+    #[error("line {line}: nothing is connected to port {port} of device {device}")]
+    NoCable { line: u32, device: usize, port: u8 },
 }
 
 #[derive(Debug, Deserialize)]
@@ -102,23 +154,26 @@ struct RawScript {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct RawFault {
-    at: Option<String>,
+pub(super) struct RawFault {
+    pub at: Option<String>,
     #[serde(rename = "for")]
-    duration: Option<String>,
-    device: Option<usize>,
-    port: Option<u8>,
-    node: Option<u8>,
-    kind: Spanned<String>,
-    count: Option<u32>,
-    probability: Option<f64>,
-    code: Option<u32>,
-    index: Option<u16>,
-    sub: Option<u8>,
-    state: Option<String>,
-    vendor: Option<u32>,
-    product: Option<u32>,
-    revision: Option<u32>,
+    pub duration: Option<String>,
+    pub device: Option<usize>,
+    pub port: Option<u8>,
+    pub node: Option<u8>,
+    pub kind: Spanned<String>,
+    pub count: Option<u32>,
+    pub probability: Option<f64>,
+    pub delay: Option<String>,
+    pub code: Option<u32>,
+    pub index: Option<u16>,
+    pub sub: Option<u8>,
+    pub state: Option<String>,
+    pub vendor: Option<u32>,
+    pub product: Option<u32>,
+    pub revision: Option<u32>,
+    pub serial: Option<u32>,
+    pub alias: Option<u16>,
 }
 
 impl FaultScript {
@@ -130,7 +185,7 @@ impl FaultScript {
             let line = text.bytes().take(at).filter(|b| *b == b'\n').count() + 1;
             let kind = fault.kind.get_ref().clone();
             let number = u32::try_from(line).unwrap_or(u32::MAX);
-            check(fault, number).map_err(|problem| ScriptError::Fault {
+            kinds::check(&fault, number).map_err(|problem| ScriptError::Fault {
                 line,
                 kind,
                 problem,
@@ -142,301 +197,24 @@ impl FaultScript {
         })
     }
 
-    /// Whether a bus of so many devices has every device that the script names.
-    pub fn check(&self, devices: usize) -> Result<(), ScriptError> {
-        match self.faults.iter().find(|fault| {
-            let whole_bus = matches!(fault.kind, FaultKind::FrameLoss { .. } | FaultKind::Silent);
-            fault.device >= devices && !(whole_bus && fault.device == 0)
-        }) {
-            Some(fault) => Err(ScriptError::NoSuchDevice {
-                line: fault.line,
-                device: fault.device,
-                devices,
-            }),
-            None => Ok(()),
-        }
-    }
-}
-
-fn check(raw: RawFault, line: u32) -> Result<Fault, String> {
-    let name = raw.kind.get_ref().as_str();
-    let code16 = || {
-        let code = raw.code.ok_or("`code` is missing")?;
-        u16::try_from(code).map_err(|_| format!("`code` 0x{code:x} does not fit 16 bits"))
-    };
-    let state = || raw.state.as_deref().ok_or("`state` is missing");
-    let mut allowed: Vec<&str> = Vec::new();
-    let kind = match name {
-        "frame-loss" => {
-            allowed.extend(["count", "probability"]);
-            if raw.count.is_some() == raw.probability.is_some() {
-                return Err("needs either `count` or `probability`".into());
-            }
-            if raw.probability.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
-                return Err("`probability` must lie between 0 and 1".into());
-            }
-            FaultKind::FrameLoss {
-                count: raw.count,
-                probability: raw.probability,
+    /// Whether the bus has every device and every cable that the script names.
+    pub fn check(&self, bus: &Topology) -> Result<(), ScriptError> {
+        for fault in &self.faults {
+            let (line, devices) = (fault.line, bus.len());
+            match fault.place() {
+                Some((device, _)) if device >= devices => {
+                    return Err(ScriptError::NoSuchDevice {
+                        line,
+                        device,
+                        devices,
+                    });
+                }
+                Some((device, Some(port))) if !bus.has_cable(device, port) => {
+                    return Err(ScriptError::NoCable { line, device, port });
+                }
+                _ => {}
             }
         }
-        "drive-fault" => {
-            allowed.push("code");
-            FaultKind::DriveFault { code: code16()? }
-        }
-        "emergency" => {
-            allowed.push("code");
-            FaultKind::Emergency { code: code16()? }
-        }
-        "sdo-abort" => {
-            allowed.extend(["index", "sub", "code"]);
-            FaultKind::SdoAbort {
-                index: raw.index.ok_or("`index` is missing")?,
-                sub: raw.sub.unwrap_or(0),
-                code: raw.code.ok_or("`code` is missing")?,
-            }
-        }
-        "refuse-state" => {
-            allowed.extend(["state", "code"]);
-            FaultKind::RefuseState {
-                state: al_state(state()?)?,
-                code: code16()?,
-            }
-        }
-        "stuck" => {
-            allowed.push("state");
-            FaultKind::Stuck {
-                state: drive_state(state()?)?,
-            }
-        }
-        "identity" => {
-            allowed.extend(["vendor", "product", "revision"]);
-            if raw.vendor.or(raw.product).or(raw.revision).is_none() {
-                return Err("needs `vendor`, `product` or `revision`".into());
-            }
-            FaultKind::Identity {
-                vendor: raw.vendor,
-                product: raw.product,
-                revision: raw.revision,
-            }
-        }
-        "absent" => FaultKind::Absent,
-        "silent" => FaultKind::Silent,
-        "link-break" => {
-            allowed.push("port");
-            let port = raw.port.unwrap_or(0);
-            if port > 3 {
-                return Err(format!("`port` {port}: ports are 0 to 3"));
-            }
-            FaultKind::LinkBreak { port }
-        }
-        "node-silent" => {
-            allowed.push("node");
-            let node = raw.node.ok_or("`node` is missing")?;
-            if !(1..=127).contains(&node) {
-                return Err(format!("`node` {node}: nodes are 1 to 127"));
-            }
-            FaultKind::NodeSilent { node }
-        }
-        _ => {
-            return Err(
-                "unknown; known are frame-loss, drive-fault, sdo-abort, refuse-state, stuck, \
-                        identity, absent, silent, emergency, link-break, node-silent"
-                    .into(),
-            );
-        }
-    };
-    let given = [
-        ("port", raw.port.is_some()),
-        ("node", raw.node.is_some()),
-        ("count", raw.count.is_some()),
-        ("probability", raw.probability.is_some()),
-        ("code", raw.code.is_some()),
-        ("index", raw.index.is_some()),
-        ("sub", raw.sub.is_some()),
-        ("state", raw.state.is_some()),
-        ("vendor", raw.vendor.is_some()),
-        ("product", raw.product.is_some()),
-        ("revision", raw.revision.is_some()),
-    ];
-    if let Some((key, _)) = given
-        .iter()
-        .find(|(key, given)| *given && !allowed.contains(key))
-    {
-        return Err(format!("`{key}` means nothing here"));
-    }
-    Ok(Fault {
-        at: raw.at.as_deref().map_or(Ok(0), duration)?,
-        duration: raw.duration.as_deref().map(duration).transpose()?,
-        device: raw.device.unwrap_or(0),
-        kind,
-        line,
-    })
-}
-
-fn duration(text: &str) -> Result<Nanos, String> {
-    let bad = || format!("`{text}` is not a duration such as \"1.5s\", \"250ms\" or \"10us\"");
-    let split = text
-        .find(|c: char| c.is_ascii_alphabetic())
-        .ok_or_else(bad)?;
-    let (number, unit) = text.split_at(split);
-    let factor = match unit {
-        "ns" => 1.0,
-        "us" => 1e3,
-        "ms" => 1e6,
-        "s" => 1e9,
-        "min" => 60e9,
-        _ => return Err(bad()),
-    };
-    let value: f64 = number.trim().parse().map_err(|_| bad())?;
-    let ns = value * factor;
-    if (0.0..1e18).contains(&ns) {
-        Ok(ns.round() as Nanos)
-    } else {
-        Err(bad())
-    }
-}
-
-/// However people write it: `SafeOp`, `safe-op`, `safeop`.
-fn al_state(name: &str) -> Result<AlState, String> {
-    Ok(match name.to_ascii_lowercase().replace('-', "").as_str() {
-        "init" => AlState::Init,
-        "preop" => AlState::PreOp,
-        "boot" => AlState::Boot,
-        "safeop" => AlState::SafeOp,
-        "op" => AlState::Op,
-        _ => return Err(format!("`{name}` is not init, preop, boot, safeop or op")),
-    })
-}
-
-fn drive_state(name: &str) -> Result<State, String> {
-    Ok(match name {
-        "not-ready-to-switch-on" => State::NotReadyToSwitchOn,
-        "switch-on-disabled" => State::SwitchOnDisabled,
-        "ready-to-switch-on" => State::ReadyToSwitchOn,
-        "switched-on" => State::SwitchedOn,
-        "operation-enabled" => State::OperationEnabled,
-        "quick-stop-active" => State::QuickStopActive,
-        "fault-reaction-active" => State::FaultReactionActive,
-        "fault" => State::Fault,
-        _ => {
-            return Err(format!(
-                "`{name}` is not a CiA 402 state such as switch-on-disabled"
-            ));
-        }
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_kind_parses() {
-        let script = FaultScript::parse(
-            r#"
-            seed = 9
-            [[fault]]
-            at = "1.5s"
-            for = "20ms"
-            kind = "frame-loss"
-            count = 3
-            [[fault]]
-            device = 1
-            kind = "drive-fault"
-            code = 0x8611
-            [[fault]]
-            kind = "sdo-abort"
-            index = 0x6065
-            code = 0x06010002
-            [[fault]]
-            kind = "refuse-state"
-            state = "safeop"
-            code = 0x001e
-            [[fault]]
-            kind = "stuck"
-            state = "switch-on-disabled"
-            [[fault]]
-            kind = "identity"
-            product = 5
-            [[fault]]
-            kind = "absent"
-            [[fault]]
-            kind = "silent"
-            [[fault]]
-            kind = "emergency"
-            code = 0x2310
-            [[fault]]
-            device = 3
-            kind = "link-break"
-            port = 1
-            [[fault]]
-            kind = "node-silent"
-            node = 5
-            "#,
-        )
-        .unwrap();
-        assert_eq!(script.seed, Some(9));
-        assert_eq!(script.faults.len(), 11);
-        assert_eq!(script.faults[9].kind, FaultKind::LinkBreak { port: 1 });
-        assert_eq!(script.faults[10].kind, FaultKind::NodeSilent { node: 5 });
-        assert_eq!(script.faults[0].at, 1_500_000_000);
-        assert_eq!(script.faults[0].duration, Some(20_000_000));
-        assert_eq!(
-            script.faults[1].kind,
-            FaultKind::DriveFault { code: 0x8611 }
-        );
-    }
-
-    #[test]
-    fn errors_name_line_and_field() {
-        let error = |text: &str| FaultScript::parse(text).unwrap_err().to_string();
-        assert_eq!(
-            error("[[fault]]\nkind = \"sdo-abort\"\ncode = 1\n"),
-            "line 2: fault of kind `sdo-abort`: `index` is missing"
-        );
-        assert!(error("[[fault]]\nkind = \"absent\"\ncode = 1\n").contains("`code` means nothing"));
-        assert!(error("[[fault]]\nkind = \"link-break\"\nport = 4\n").contains("ports are 0 to 3"));
-        assert!(error("[[fault]]\nkind = \"node-silent\"\n").contains("`node` is missing"));
-        assert!(error("[[fault]]\nkind = \"node-silent\"\nnode = 0\n").contains("1 to 127"));
-        assert!(error("[[fault]]\nkind = \"melt\"\n").contains("known are frame-loss"));
-        assert!(error("[[fault]]\nat = \"soon\"\nkind = \"absent\"\n").contains("not a duration"));
-        assert!(error("[[fault]]\nkind = \"silent\"\nwhen = 1\n").contains("when"));
-    }
-
-    #[test]
-    fn states_as_people_write_them() {
-        for (state, spellings) in [
-            (AlState::Init, &["init", "Init", "INIT"][..]),
-            (AlState::PreOp, &["PreOp", "pre-op", "preop", "PRE-OP"]),
-            (AlState::SafeOp, &["SafeOp", "safe-op", "safeop", "Safe-Op"]),
-            (AlState::Op, &["Op", "op", "OP"]),
-            (AlState::Boot, &["boot", "Boot"]),
-        ] {
-            for spelling in spellings {
-                assert_eq!(al_state(spelling), Ok(state), "{spelling}");
-            }
-        }
-        assert_eq!(
-            al_state("Running").unwrap_err(),
-            "`Running` is not init, preop, boot, safeop or op"
-        );
-    }
-
-    #[test]
-    fn a_device_that_is_not_there_is_named_with_its_line() {
-        let script = FaultScript::parse(
-            "[[fault]]\nkind = \"silent\"\n\n[[fault]]\ndevice = 2\nkind = \"absent\"\n",
-        )
-        .unwrap();
-        let lines: Vec<u32> = script.faults.iter().map(|fault| fault.line).collect();
-        assert_eq!(lines, [2, 6]);
-        assert_eq!(script.check(3), Ok(()));
-        assert_eq!(
-            script.check(2).unwrap_err().to_string(),
-            "line 6: there is no device 2; the bus has 2, counted from 0"
-        );
-        let silent = FaultScript::parse("[[fault]]\nkind = \"silent\"\n").unwrap();
-        assert_eq!(silent.check(0), Ok(()));
+        Ok(())
     }
 }

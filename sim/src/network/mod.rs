@@ -11,12 +11,14 @@ mod route;
 pub mod topology;
 mod wiring;
 
+use std::cmp::Ordering;
+
 use crate::Nanos;
-use crate::device::SimDevice;
+use crate::device::{Seen, SimDevice};
 use crate::esc::ports::Medium;
-use crate::faults::{FaultScript, Faults};
+use crate::faults::{Corrupted, FaultScript, Faults};
 use crate::frame::{self, Kind};
-use route::{Goal, Route};
+use route::{Goal, Pass, Route};
 use topology::Topology;
 pub use wiring::Nic;
 use wiring::{End, Wiring};
@@ -150,12 +152,6 @@ impl Segment {
         visit.map(|visit| visit.after)
     }
 
-    /// Whether there is a cable at the port.
-    #[must_use]
-    pub fn has_cable(&self, device: usize, port: u8) -> bool {
-        self.wiring.cable(End::Port { device, port }).is_some()
-    }
-
     /// Pulls the cable at a port, or plugs it in again; false where there is none.
     pub fn plug(&mut self, device: usize, port: u8, plugged: bool) -> bool {
         let cable = self.wiring.cable(End::Port { device, port });
@@ -217,11 +213,20 @@ impl Segment {
     /// Faults begin or end, temporary settings run out.
     fn change(&mut self, at: Nanos) {
         self.faults.apply(at, &mut self.devices);
+        for device in self.faults.take_replaced() {
+            self.power_cycle(device);
+        }
         for device in &mut self.devices {
             device.esc.revert_ports(at);
         }
         self.relink();
         self.schedule();
+    }
+
+    fn power_cycle(&mut self, device: usize) {
+        let was_off = self.off.get(device).copied().unwrap_or(true);
+        self.power(device, false);
+        self.power(device, !was_off);
     }
 
     fn schedule(&mut self) {
@@ -281,7 +286,8 @@ impl Segment {
         self.transit_from(Nic::Primary, bytes, now)
     }
 
-    /// As [`Segment::transit`], sent from either port of the MainDevice.
+    /// As [`Segment::transit`], sent from either port of the MainDevice; from the second it is lost where
+    /// there is none or nobody listens.
     pub fn transit_from(&mut self, nic: Nic, bytes: &mut [u8], now: Nanos) -> Transit {
         self.advance(now);
         let epoch = self.epoch.unwrap_or(now);
@@ -289,11 +295,17 @@ impl Segment {
         let start = now.saturating_sub(epoch).max(*free);
         let wire = frame::wire_time(bytes.len());
         *free = start + wire;
-        let loss = self.faults.lose();
-        if loss.on_the_way_out {
+        let fate = self.faults.fate();
+        if fate.lost_on_the_way_out {
             return Transit::Lost;
         }
-        let came_through = self.walk(nic, bytes, start);
+        let came_through = match fate.corrupted.and_then(|at| self.corrupted_pass(nic, at)) {
+            Some(pass) => {
+                self.walk_corrupted(nic, bytes, start, pass);
+                false
+            }
+            None => self.walk(nic, bytes, start),
+        };
         let route = &self.routes[nic as usize];
         let (goal, back) = (route.goal, start + route.time + wire);
         if came_through
@@ -305,11 +317,14 @@ impl Segment {
         }
         self.settle(back);
         match goal {
-            Goal::Back(nic) if came_through && !loss.on_the_way_back => Transit::Back {
-                at: epoch + back,
-                nic,
-                again: None,
-            },
+            Goal::Back(nic) if came_through && !fate.lost_on_the_way_back => {
+                let at = (epoch + back).saturating_add(fate.delay);
+                Transit::Back {
+                    at,
+                    nic,
+                    again: fate.twice.then(|| at.saturating_add(wire)),
+                }
+            }
             _ => Transit::Lost,
         }
     }
@@ -333,6 +348,7 @@ impl Segment {
         let mut latches = false;
         for visit in &route.visits {
             if visit.marks_circulating && !frame::circulate(bytes) {
+                self.latches.fill(false);
                 return false;
             }
             let Some(device) = self.devices.get_mut(visit.device) else {
@@ -341,23 +357,66 @@ impl Segment {
             let at = start + visit.after;
             device.advance(at);
             let seen = device.process(bytes, at);
-            latches |= seen.latches;
             self.settles |= seen.dl_control;
-            if let Some(latch) = self.latches.get_mut(visit.device) {
-                *latch = seen.latches;
+            if seen.latches
+                && let Some(latch) = self.latches.get_mut(visit.device)
+            {
+                (*latch, latches) = (true, true);
             }
         }
         if latches {
-            for pass in &route.passes {
-                if self.latches.get(pass.device) == Some(&true)
-                    && let Some(device) = self.devices.get_mut(pass.device)
-                {
-                    device.esc.latch_port(pass.port, start + pass.after);
-                }
-            }
+            latch(&route.passes, &self.latches, &mut self.devices, start);
+            self.latches.fill(false);
         }
         mark(route, bytes);
         true
+    }
+
+    /// How manieth port the frame arrives at is the first to see the error; one more than there are
+    /// for the MainDevice itself. `None` where the frame does not come by.
+    fn corrupted_pass(&self, nic: Nic, at: Corrupted) -> Option<usize> {
+        let passes = &self.routes[nic as usize].passes;
+        match at {
+            Corrupted::At { device, port } => passes
+                .iter()
+                .position(|pass| pass.device == device && pass.port == port),
+            Corrupted::Somewhere(lot) => usize::try_from(lot % (passes.len() as u64 + 1)).ok(),
+        }
+    }
+
+    /// As [`Segment::walk`] up to a port; from there on the frame is only counted. The first port
+    /// marks it, so that those behind it know that the error is not theirs.
+    fn walk_corrupted(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos, first: usize) {
+        let route = &self.routes[nic as usize];
+        let valid = frame::kind(bytes) == Kind::EtherCat;
+        for (n, pass) in route.passes.iter().enumerate() {
+            let Some(device) = self.devices.get_mut(pass.device) else {
+                continue;
+            };
+            let at = start + pass.after;
+            device.advance(at);
+            match n.cmp(&first) {
+                Ordering::Less => {}
+                Ordering::Equal => device.esc.count_rx_error(pass.port),
+                Ordering::Greater => device.esc.count_forwarded_error(pass.port),
+            }
+            let processed = pass.processed && valid && n < first;
+            let seen = if processed {
+                device.process(bytes, at)
+            } else {
+                Seen::default()
+            };
+            if pass.processed && !processed {
+                device.esc.count_processing_error();
+            }
+            self.settles |= seen.dl_control;
+            if let Some(latch) = self.latches.get_mut(pass.device) {
+                *latch |= seen.latches;
+            }
+        }
+        let before = route.passes.get(..first).unwrap_or_default();
+        latch(before, &self.latches, &mut self.devices, start);
+        self.latches.fill(false);
     }
 
     /// DL control that the frame wrote takes effect when it is over.
@@ -379,5 +438,17 @@ fn mark(route: &Route, bytes: &mut [u8]) {
         && let Some(source) = bytes.get_mut(6)
     {
         *source |= 0x02;
+    }
+}
+
+/// Notes when a frame arrived at the ports of the devices that it told to.
+fn latch(passes: &[Pass], latches: &[bool], devices: &mut [SimDevice], start: Nanos) {
+    for pass in passes {
+        if latches.get(pass.device) == Some(&true)
+            && let Some(device) = devices.get_mut(pass.device)
+        {
+            let at = start + pass.after;
+            device.esc.latch_port(pass.port, at, pass.processed);
+        }
     }
 }

@@ -28,8 +28,8 @@ pub(super) struct Pass {
     pub(super) device: usize,
     pub(super) port: u8,
     pub(super) after: Nanos,
-    /// Number of the visit that follows, where one does.
-    pub(super) visit: Option<usize>,
+    /// It goes on through the processing unit.
+    pub(super) processed: bool,
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -73,9 +73,13 @@ impl Route {
         self.ethercat_only = false;
         self.time = 0;
         self.goal = Goal::Nowhere;
+        if from == Nic::Secondary && wiring.second == SecondPort::Reflects {
+            // Nobody is there to send.
+            return;
+        }
         let mut leaves = End::MainDevice(from);
-        // Every port is arrived at once in each direction of the ring.
-        for _ in 0..=2 * PORTS * devices.len() + 2 {
+        // No port is arrived at twice: every one has one cable, and every loop one way through.
+        for _ in 0..=PORTS * devices.len() + 2 {
             let Some((arrives, ns)) = wiring.other_end(leaves) else {
                 return;
             };
@@ -108,7 +112,7 @@ impl Route {
             device,
             port: arrived,
             after: self.time,
-            visit: None,
+            processed: false,
         });
         let Some(sim) = devices.get(device) else {
             return End::Port {
@@ -121,7 +125,7 @@ impl Route {
         loop {
             if port == 0 {
                 if let Some(pass) = self.passes.get_mut(pass) {
-                    pass.visit = Some(self.visits.len());
+                    pass.processed = true;
                 }
                 self.visits.push(Visit {
                     device,

@@ -86,6 +86,24 @@ pub enum TopologyError {
     NoPortForRing,
 }
 
+impl TopologyError {
+    /// The device that cannot be where it is to be.
+    #[must_use]
+    pub fn device(&self) -> Option<usize> {
+        match *self {
+            Self::NotBefore { device, .. }
+            | Self::Upstream { device, .. }
+            | Self::NoSuchPort { device, .. }
+            | Self::Taken { device, .. }
+            | Self::OutOfOrder { device, .. }
+            | Self::OtherMedium { device, .. }
+            | Self::NoPortAt { device, .. }
+            | Self::NoPort { device } => Some(device),
+            Self::NoPortForRing => None,
+        }
+    }
+}
+
 /// The devices whose downstream ports are still to be passed: the way to the latest device.
 #[derive(Debug, Default)]
 struct Open {
@@ -227,6 +245,27 @@ impl Topology {
             *cable = Some(ns);
         }
         self
+    }
+
+    /// Number of devices.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.uplinks.len()
+    }
+
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.uplinks.is_empty()
+    }
+
+    /// Whether something is connected to the port.
+    #[must_use]
+    pub fn has_cable(&self, device: usize, port: u8) -> bool {
+        if port == 0 {
+            return device == 0 && !self.is_empty() || self.uplink(device).is_some();
+        }
+        let end = Uplink { device, port };
+        self.uplinks.contains(&Some(end)) || self.ring.is_some_and(|(last, _)| last == end)
     }
 
     /// Where a device's port 0 leads; `None` for the one at the MainDevice.

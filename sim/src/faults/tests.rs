@@ -1,0 +1,212 @@
+//! What scripts are understood, and what is said of the others.
+
+use super::kinds::al_state;
+use super::script::*;
+use crate::drive::State;
+use crate::esc::al::AlState;
+use crate::esc::ports::Medium;
+use crate::network::topology::Topology;
+
+#[test]
+fn every_kind_parses() {
+    let script = FaultScript::parse(
+        r#"
+        seed = 9
+        [[fault]]
+        at = "1.5s"
+        for = "20ms"
+        kind = "frame-loss"
+        count = 3
+        [[fault]]
+        device = 1
+        kind = "drive-fault"
+        code = 0x8611
+        [[fault]]
+        kind = "sdo-abort"
+        index = 0x6065
+        code = 0x06010002
+        [[fault]]
+        kind = "refuse-state"
+        state = "safeop"
+        code = 0x001e
+        [[fault]]
+        kind = "stuck"
+        state = "switch-on-disabled"
+        [[fault]]
+        kind = "identity"
+        product = 5
+        [[fault]]
+        kind = "absent"
+        [[fault]]
+        kind = "silent"
+        [[fault]]
+        kind = "emergency"
+        code = 0x2310
+        [[fault]]
+        device = 3
+        kind = "link-break"
+        port = 1
+        [[fault]]
+        kind = "node-silent"
+        node = 5
+        [[fault]]
+        kind = "power-off"
+        [[fault]]
+        kind = "frame-duplicate"
+        probability = 0.25
+        [[fault]]
+        kind = "frame-delay"
+        count = 2
+        delay = "1.5ms"
+        [[fault]]
+        kind = "frame-corrupt"
+        count = 1
+        [[fault]]
+        kind = "frame-corrupt"
+        count = 1
+        device = 2
+        port = 3
+        [[fault]]
+        kind = "swap"
+        serial = 9
+        "#,
+    )
+    .unwrap();
+    assert_eq!(script.seed, Some(9));
+    let kinds: Vec<FaultKind> = script.faults.iter().map(|f| f.kind.clone()).collect();
+    let one = Hits::Next(1);
+    let expected = [
+        FaultKind::FrameLoss {
+            hits: Hits::Next(3),
+        },
+        FaultKind::DriveFault { code: 0x8611 },
+        FaultKind::SdoAbort {
+            index: 0x6065,
+            sub: 0,
+            code: 0x0601_0002,
+        },
+        FaultKind::RefuseState {
+            state: AlState::SafeOp,
+            code: 0x1e,
+        },
+        FaultKind::Stuck {
+            state: State::SwitchOnDisabled,
+        },
+        FaultKind::Identity(NewIdentity {
+            product: Some(5),
+            ..NewIdentity::default()
+        }),
+        FaultKind::PowerOff,
+        FaultKind::Silent,
+        FaultKind::Emergency { code: 0x2310 },
+        FaultKind::LinkBreak { port: 1 },
+        FaultKind::NodeSilent { node: 5 },
+        FaultKind::PowerOff,
+        FaultKind::FrameDuplicate {
+            hits: Hits::Each(0.25),
+        },
+        FaultKind::FrameDelay {
+            hits: Hits::Next(2),
+            delay: 1_500_000,
+        },
+        FaultKind::FrameCorrupt {
+            hits: one,
+            at: None,
+        },
+        FaultKind::FrameCorrupt {
+            hits: one,
+            at: Some((2, 3)),
+        },
+        FaultKind::Swap(NewIdentity {
+            serial: Some(9),
+            alias: Some(0),
+            ..NewIdentity::default()
+        }),
+    ];
+    assert_eq!(kinds, expected);
+    assert_eq!(script.faults[0].at, 1_500_000_000);
+    assert_eq!(script.faults[0].duration, Some(20_000_000));
+    assert_eq!(script.faults[9].device, 3);
+}
+
+#[test]
+fn errors_name_line_and_field() {
+    let error = |text: &str| FaultScript::parse(text).unwrap_err().to_string();
+    assert_eq!(
+        error("[[fault]]\nkind = \"sdo-abort\"\ncode = 1\n"),
+        "line 2: fault of kind `sdo-abort`: `index` is missing"
+    );
+    #[rustfmt::skip] // one row a mistake
+    let rows = [
+        ("kind = \"absent\"\ncode = 1\n", "`code` means nothing here; what it knows is `device`"),
+        ("kind = \"silent\"\ndevice = 1\n", "`device` means nothing here; it has no keys of its own"),
+        ("kind = \"frame-loss\"\ndevice = 1\ncount = 1\n", "`device` means nothing here"),
+        ("kind = \"link-break\"\nport = 4\n", "ports are 0 to 3"),
+        ("kind = \"melt\"\n", "known are frame-loss, frame-duplicate, frame-delay, frame-corrupt, drive-fault"),
+        ("kind = \"frame-duplicate\"\n", "needs either `count` or `probability`"),
+        ("kind = \"frame-corrupt\"\ncount = 1\nprobability = 0.5\n", "needs either"),
+        ("kind = \"frame-corrupt\"\ncount = 1\nport = 1\n", "`port` needs the `device`"),
+        ("kind = \"frame-corrupt\"\nprobability = 1.5\n", "between 0 and 1"),
+        ("kind = \"frame-delay\"\ncount = 1\n", "`delay` is missing"),
+        ("kind = \"frame-delay\"\ncount = 1\ndelay = \"1\"\n", "not a duration"),
+        ("kind = \"swap\"\nstate = \"op\"\n", "`state` means nothing here; what it knows is `device`, `vendor`"),
+        ("at = \"soon\"\nkind = \"absent\"\n", "not a duration"),
+        ("kind = \"silent\"\nwhen = 1\n", "when"),
+    ];
+    for (lines, expected) in rows {
+        let told = error(&format!("[[fault]]\n{lines}"));
+        assert!(told.contains(expected), "{lines}: {told}");
+    }
+}
+
+#[test]
+fn states_as_people_write_them() {
+    for (state, spellings) in [
+        (AlState::Init, &["init", "Init", "INIT"][..]),
+        (AlState::PreOp, &["PreOp", "pre-op", "preop", "PRE-OP"]),
+        (AlState::SafeOp, &["SafeOp", "safe-op", "safeop", "Safe-Op"]),
+        (AlState::Op, &["Op", "op", "OP"]),
+        (AlState::Boot, &["boot", "Boot"]),
+    ] {
+        for spelling in spellings {
+            assert_eq!(al_state(spelling), Ok(state), "{spelling}");
+        }
+    }
+    assert_eq!(
+        al_state("Running").unwrap_err(),
+        "`Running` is not init, preop, boot, safeop or op"
+    );
+}
+
+#[test]
+fn a_device_that_is_not_there_is_named_with_its_line() {
+    let script = FaultScript::parse(
+        "[[fault]]\nkind = \"silent\"\n\n[[fault]]\ndevice = 2\nkind = \"absent\"\n",
+    )
+    .unwrap();
+    let lines: Vec<u32> = script.faults.iter().map(|fault| fault.line).collect();
+    assert_eq!(lines, [2, 6]);
+    let line = |n: usize| Topology::by_order(&vec![Medium::from_physics("YY"); n]).unwrap();
+    assert_eq!(script.check(&line(3)), Ok(()));
+    assert_eq!(
+        script.check(&line(2)).unwrap_err().to_string(),
+        "line 6: there is no device 2; the bus has 2, counted from 0"
+    );
+    let silent = FaultScript::parse("[[fault]]\nkind = \"silent\"\n").unwrap();
+    assert_eq!(silent.check(&line(0)), Ok(()));
+    for (device, port, cable) in [(0, 0, true), (1, 1, true), (2, 0, true), (2, 1, false)] {
+        let script =
+            format!("[[fault]]\nkind = \"link-break\"\ndevice = {device}\nport = {port}\n");
+        let told = FaultScript::parse(&script).unwrap().check(&line(3));
+        assert_eq!(told.is_ok(), cable, "device {device} port {port}");
+    }
+    let nowhere = "[[fault]]\nkind = \"frame-corrupt\"\ncount = 1\ndevice = 1\nport = 2\n";
+    assert_eq!(
+        FaultScript::parse(nowhere)
+            .unwrap()
+            .check(&line(3))
+            .unwrap_err()
+            .to_string(),
+        "line 2: nothing is connected to port 2 of device 1"
+    );
+}
