@@ -174,6 +174,23 @@ fn a_refused_configuration_is_a_software_error() {
 }
 
 #[test]
+fn a_node_that_dies_while_it_boots_is_a_timeout() {
+    let mut line = Line::at_once("GW16", three_drives());
+    // The gateway resets the communication of all nodes when it starts; they boot a second time.
+    while sent(&line, 0x764).len() < 2 {
+        line.cycle();
+    }
+    line.gateway_mut().set_node_silent(100, true);
+    line.cycles(700);
+    let error = number(&line.gateway().configuration(0x1003, 1).unwrap());
+    assert_eq!(error, 0x0764_6161, "SDO timeout, node 100");
+    // The others are not held up for good.
+    assert_eq!(line.command(0x01, 0), Some(0x01));
+    let states = [1, 2].map(|id| line.node(id).nmt_state());
+    assert_eq!(states, [NmtState::Operational; 2]);
+}
+
+#[test]
 fn a_gateway_alone_is_error_passive() {
     let mut line = Line::new("GW16", GatewayOptions::default());
     assert_eq!(line.command(0x20, 0), Some(0x22));

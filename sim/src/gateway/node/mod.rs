@@ -50,6 +50,8 @@ pub struct Node {
     nmt: NmtState,
     /// It has power and is plugged in.
     alive: bool,
+    /// Its CAN controller runs: it acknowledges, also while the communication is reset.
+    online: bool,
     /// End of the initialisation.
     ready: u64,
     d: Dictionary,
@@ -86,6 +88,7 @@ impl Node {
         let mut node = Self {
             nmt: NmtState::Initialising,
             alive: true,
+            online: false,
             ready: 0,
             d: factory.clone(),
             stored: factory,
@@ -145,12 +148,12 @@ impl Node {
 
     /// Its controller takes part in the traffic.
     pub(super) fn is_on_bus(&self, bit_rate: u32) -> bool {
-        self.alive && self.nmt != NmtState::Initialising && self.bit_rate == bit_rate
+        self.alive && self.online && self.bit_rate == bit_rate
     }
 
     /// Power comes: everything volatile is what it was when parameters were stored.
     pub(super) fn power_on(&mut self, now: u64) {
-        self.alive = true;
+        (self.alive, self.online) = (true, false);
         self.d = self.stored.clone();
         self.store = epos::store();
         self.drive = Drive::new(&mut self.store, self.settings.plant);
@@ -210,6 +213,7 @@ impl Node {
         if self.nmt == NmtState::Initialising {
             if self.ready <= now {
                 self.nmt = NmtState::PreOperational;
+                self.online = true;
                 self.send(bus, 0x700, &[0], now);
                 self.start_heartbeat(now);
             }
@@ -269,6 +273,9 @@ impl Node {
 
     /// A frame of somebody else's.
     pub(super) fn receive(&mut self, frame: &CanFrame, now: u64, bus: &mut CanBus) {
+        if self.nmt == NmtState::Initialising {
+            return;
+        }
         let own = u16::from(self.settings.id);
         let operational = self.nmt == NmtState::Operational;
         match (frame.id, frame.remote) {
@@ -298,18 +305,18 @@ impl Node {
                 self.d.restore(&self.stored.clone(), 0x1000..=0x1fff);
                 self.initialise(now + COMMUNICATION_BOOT_NS);
             }
-            Some(command) if self.nmt != NmtState::Initialising => {
+            Some(command) => {
                 self.nmt = command.leads_to();
                 self.waiting = [None; 3];
             }
-            _ => {}
+            None => {}
         }
     }
 
     /// The master asks whether it lives.
     fn guarded(&mut self, now: u64, bus: &mut CanBus) {
         // With a heartbeat there is no guarding.
-        if self.d.get(0x1017, 0) > 0 || self.nmt == NmtState::Initialising {
+        if self.d.get(0x1017, 0) > 0 {
             return;
         }
         let state = self.nmt.code() | u8::from(self.guard_toggle) << 7;
