@@ -13,11 +13,12 @@ from report import Report
 from .bringup import bringup, overlap
 from .ethercrab import ethercrab
 from .faults import faults
+from .gateway import gateway
 from .mailbox import mailbox
 from .operation import operation
 from .recordings import judge, recordings
 
-__all__ = ["Bench", "bringup", "ethercrab", "faults", "mailbox", "operation", "overlap", "recordings"]
+__all__ = ["Bench", "bringup", "ethercrab", "faults", "gateway", "mailbox", "operation", "overlap", "recordings"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
