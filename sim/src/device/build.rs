@@ -46,6 +46,9 @@ pub struct DeviceOptions {
     pub sii: Option<Vec<u8>>,
     /// What the application needs to see a request in AL control and to answer it in AL status.
     pub state_change_ns: Nanos,
+    /// How long until the application has read AL control, which may be written again then; at most the time above.
+    /// `None`: a quarter of it.
+    pub state_notice_ns: Option<Nanos>,
     /// The chip; `None`: the smallest in which the device fits. Process RAM grows where SyncManagers need more.
     pub esc: Option<EscInfo>,
     pub mailbox: MailboxOptions,
@@ -67,6 +70,7 @@ impl Default for DeviceOptions {
             processing_ns: 0,
             sii: None,
             state_change_ns: 200_000,
+            state_notice_ns: None,
             esc: None,
             mailbox: MailboxOptions::default(),
             gateway: None,
@@ -219,6 +223,10 @@ impl SimDevice {
             },
             powered: true,
             state_change_ns: options.state_change_ns,
+            state_notice_ns: options
+                .state_notice_ns
+                .unwrap_or(options.state_change_ns / 4)
+                .min(options.state_change_ns),
             fresh: Box::new(Fresh {
                 store: store.clone(),
                 application: application.clone(),

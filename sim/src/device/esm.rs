@@ -48,13 +48,8 @@ impl SimDevice {
         self.al.unread = Some(control);
         if self.al.followed.is_none() {
             self.al.waits_for_sync = false;
-            self.al.due = local.saturating_add(self.notice_ns());
+            self.al.due = local.saturating_add(self.state_notice_ns);
         }
-    }
-
-    /// The application reads AL control sooner than it has followed: the MainDevice may write it again then.
-    fn notice_ns(&self) -> u64 {
-        self.state_change_ns / 4
     }
 
     /// The controller has answered already, and no application could refuse. It copies the acknowledge bit, too, which
@@ -84,13 +79,13 @@ impl SimDevice {
                 self.follow(local);
                 if self.al.unread.is_some() {
                     self.al.waits_for_sync = false;
-                    self.al.due = local.saturating_add(self.notice_ns());
+                    self.al.due = local.saturating_add(self.state_notice_ns);
                 }
             }
             None => {
                 self.esc.read_al_control();
                 self.al.followed = self.al.unread.take();
-                let rest = self.state_change_ns - self.notice_ns();
+                let rest = self.state_change_ns - self.state_notice_ns;
                 self.al.due = local.saturating_add(rest);
             }
         }

@@ -121,6 +121,7 @@ pub struct SimDevice {
     pub(crate) delays: Delays,
     pub(crate) powered: bool,
     state_change_ns: Nanos,
+    state_notice_ns: Nanos,
     pub(crate) esc: Esc,
     store: ObjectStore,
     pdo: PdoRules,

@@ -75,6 +75,8 @@ fn build(device: &Device, recording: &Recording) -> Option<SimDevice> {
         esc: Some(device.esc),
         clock_offset_ns: clock_offset(recording, device.station),
         state_change_ns: device.firmware_ns.state_change,
+        // The recorded firmware looks at AL control when it is about to follow it.
+        state_notice_ns: Some(device.firmware_ns.state_change),
         mailbox: MailboxOptions {
             processing_ns: device.firmware_ns.mailbox.saturating_sub(FETCH_NS),
             ..MailboxOptions::default()
