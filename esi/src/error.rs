@@ -44,7 +44,9 @@ pub enum EsiProblem {
     Syntax(String),
     #[error("the file ends inside <{0}>")]
     Truncated(String),
-    #[error("the root element is <{0}>, an ESI file starts with <EtherCATInfo>")]
+    #[error(
+        "the root element is <{0}>, an ESI file starts with <EtherCATInfo>, a file of modules with <EtherCATModule>"
+    )]
     NotEsi(String),
     #[error("there is no XML element in the file")]
     Empty,

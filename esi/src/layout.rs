@@ -162,7 +162,7 @@ fn direction(
     numbers.dedup();
     let fmmus: Vec<u8> = (0..=u8::MAX)
         .zip(&device.fmmus)
-        .filter(|(_, u)| **u == usage)
+        .filter(|(_, fmmu)| fmmu.usage == usage)
         .map(|(number, _)| number)
         .collect();
     let (mut sms, mut fields) = (Vec::new(), Vec::new());

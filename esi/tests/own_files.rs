@@ -51,7 +51,7 @@ fn epos4_modes_are_modules() {
     );
     for mode in MODES {
         let selection = choose(&file, Some(mode));
-        let ident = selection.module.as_ref().unwrap().ident;
+        let ident = selection.modules[0].ident;
         assert_eq!(
             value(&selection, 0xf030, 1),
             Some(ident.to_le_bytes().to_vec())
@@ -82,7 +82,7 @@ fn epos4_modes_are_modules() {
         (Some(vec![1]), Some(vec![0xfd]))
     );
     // Without a wish the slot's default module is taken.
-    assert_eq!(choose(&file, None).module.unwrap().type_name, "CSP");
+    assert_eq!(choose(&file, None).modules[0].type_name, "CSP");
 }
 
 #[test]

@@ -154,7 +154,8 @@ fn every_device_of_every_vendor_gets_an_image() {
             );
             assert_eq!(sii.identity, device.identity);
             assert_eq!(sii.sync_managers.len(), device.sync_managers.len());
-            assert_eq!(sii.fmmus, device.fmmus, "{}", device.name);
+            let usages: Vec<_> = device.fmmus.iter().map(|fmmu| fmmu.usage).collect();
+            assert_eq!(sii.fmmus, usages, "{}", device.name);
             assert_eq!(sii, sii::parse(&sii.to_bytes()).unwrap(), "{}", device.name);
         }
     }

@@ -87,7 +87,11 @@ fn the_epos4_file_exactly() {
     );
     assert_eq!((device.physics.as_str(), device.profile), ("YY", Some(402)));
     assert_eq!(
-        device.fmmus,
+        device
+            .fmmus
+            .iter()
+            .map(|fmmu| fmmu.usage)
+            .collect::<Vec<_>>(),
         [FmmuUse::Outputs, FmmuUse::Inputs, FmmuUse::MBoxState]
     );
     let sms: Vec<_> = device

@@ -19,23 +19,23 @@ pub struct DcSettings {
 const SYNC0: u16 = 0x0200;
 const SYNC1: u16 = 0x0400;
 
-/// `None`: no distributed clock (an OpMode whose AssignActivate is 0, or none at all).
+/// The OpMode that applies; `None`: the ESI has none, or the user wants none. One whose AssignActivate is 0 means no
+/// distributed clock.
 ///
 /// Without a wish a module's `DcOpModeName` decides; a synchronous drive takes the first OpMode that activates
 /// the clock, wherever it stands in the list; other devices take the first.
-pub(super) fn choose(
-    device: &Device,
+pub(super) fn choose<'a>(
+    device: &'a Device,
     wanted: Option<&str>,
     by_module: Option<&str>,
     synchronous: bool,
-    cycle_ns: u64,
-) -> Result<Option<DcSettings>, SelectError> {
+) -> Result<Option<&'a DcMode>, SelectError> {
     let named = |name: &str| {
         device.dc_modes.iter().find(|mode| {
             mode.name.eq_ignore_ascii_case(name) || mode.description.eq_ignore_ascii_case(name)
         })
     };
-    let mode = match wanted {
+    Ok(match wanted {
         Some(name) => match named(name) {
             Some(mode) => Some(mode),
             None if name.eq_ignore_ascii_case("off") || name.eq_ignore_ascii_case("none") => None,
@@ -67,14 +67,10 @@ pub(super) fn choose(
                     .find(|mode| synchronous && mode.assign_activate != 0)
             })
             .or(device.dc_modes.first()),
-    };
-    match mode {
-        Some(mode) if mode.assign_activate != 0 => settings(mode, cycle_ns).map(Some),
-        _ => Ok(None),
-    }
+    })
 }
 
-fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, SelectError> {
+pub(super) fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, SelectError> {
     let error = |what| SelectError::DcOutOfRange {
         mode: mode.name.clone(),
         cycle_ns,

@@ -25,11 +25,40 @@ pub enum SelectError {
         slot: String,
         offered: String,
     },
+    #[error("{device}, slot {slot:?} takes no module {wanted:?}; the ESI offers {offered}")]
+    NoSuchModule {
+        device: String,
+        slot: String,
+        wanted: String,
+        offered: String,
+    },
+    #[error("{device}: {given} modules are listed, there are {places} places for modules")]
+    TooManyModules {
+        device: String,
+        given: usize,
+        places: usize,
+    },
+    #[error("{device} has no PDO assignment {wanted:?}; the ESI offers {offered}")]
+    NoSuchAssignment {
+        device: String,
+        wanted: String,
+        offered: String,
+    },
     #[error(
-        "{device} has {count} slots that need a module; one is supported, further slots must be optional"
+        "assignment {name:?} of {device} names PDO 0x{pdo:04x}, which the ESI does not describe"
     )]
-    SeveralSlots { device: String, count: usize },
-    #[error("slot {slot:?} names module 0x{ident:08x}, which the ESI file does not describe")]
+    UnknownPdo {
+        device: String,
+        name: String,
+        pdo: u16,
+    },
+    #[error(
+        "PDO 0x{pdo:04x} of {device} would be assigned to SyncManager {sm}, which its ESI excludes"
+    )]
+    ExcludedSyncManager { device: String, pdo: u16, sm: u8 },
+    #[error(
+        "slot {slot:?} names module 0x{ident:08x}, which neither the ESI file nor a file that it refers to describes"
+    )]
     UnknownModule { slot: String, ident: u32 },
     #[error("{device} has no DC mode {wanted:?}; the ESI offers {offered}")]
     NoSuchDcMode {

@@ -44,6 +44,11 @@ pub struct Choice<'a> {
     pub rx: Option<&'a [EntryRef]>,
     /// The user's own contents of the input PDO.
     pub tx: Option<&'a [EntryRef]>,
+    /// Modules slot by slot (type, name or identity; `-` for none); slots that are not named follow mode and
+    /// default.
+    pub modules: &'a [&'a str],
+    /// Name of an `AlternativeSmMapping`.
+    pub assignment: Option<&'a str>,
     /// Name or description of a `Dc/OpMode`, or `off`.
     pub dc_mode: Option<&'a str>,
     pub cycle_ns: u64,
@@ -55,8 +60,11 @@ pub struct Choice<'a> {
 pub struct Selection {
     pub identity: Identity,
     pub device_name: String,
-    pub module: Option<SelectedModule>,
+    /// In the order of their slots.
+    pub modules: Vec<SelectedModule>,
     pub mode: Option<Mode>,
+    /// The assignment by name that applies, the user's or the DC mode's.
+    pub assignment: Option<String>,
     /// As they will be on the wire, in the order of assignment; `sm` is always set.
     pub rx: Vec<Pdo>,
     pub tx: Vec<Pdo>,
@@ -72,12 +80,16 @@ pub struct Selection {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SelectedModule {
+    /// Counted from 0 over all slots and their instances; 0xF030 has it at subindex `place + 1`.
+    pub place: usize,
     pub ident: u32,
     pub type_name: String,
     pub name: String,
     pub slot_name: String,
     pub position: Position,
     pub init_cmds: Vec<InitCmd>,
+    /// Its PDOs' indices, as they are in this slot.
+    pub pdos: Vec<u16>,
 }
 
 /// Decides everything about one device.
@@ -87,37 +99,64 @@ pub fn select(
     choice: &Choice<'_>,
 ) -> Result<Selection, SelectError> {
     let mut notes = Vec::new();
-    let placed = module::choose(&file.modules, device, choice.mode)?;
-    let dictionary = merged(device, placed);
+    let placed = module::choose(&file.modules, device, choice.mode, choice.modules)?;
+    let dictionary = merged(device, &placed);
+    let dc_mode = dc::choose(
+        device,
+        choice.dc_mode,
+        placed.iter().find_map(|p| p.module.dc_mode.as_deref()),
+        choice.mode.is_some_and(Mode::is_cyclic),
+    )?;
+    let by_name = choice
+        .assignment
+        .map(|name| pdo::assignment(device, name))
+        .transpose()?;
+    let by_dc_mode = dc_mode
+        .filter(|mode| !mode.sync_managers.is_empty())
+        .map(|mode| pdo::Assignment {
+            name: &mode.name,
+            sync_managers: &mode.sync_managers,
+        });
+    let assignment = by_name.or(by_dc_mode);
     let chooser = |direction| pdo::Chooser {
         device,
-        placed,
+        placed: &placed,
         dictionary: &dictionary,
         direction,
+        assignment,
     };
     let rx = chooser(Direction::Rx).choose(choice.mode, choice.rx, &mut notes)?;
     let tx = chooser(Direction::Tx).choose(choice.mode, choice.tx, &mut notes)?;
     let layout = Layout::new(device, &rx, &tx)?;
-    let dc = dc::choose(
-        device,
-        choice.dc_mode,
-        placed.and_then(|p| p.module.dc_mode.as_deref()),
-        choice.mode.is_some_and(Mode::is_cyclic),
-        choice.cycle_ns,
-    )?;
-    let module = placed.map(|p| SelectedModule {
-        ident: p.module.ident,
-        type_name: p.module.type_name.clone(),
-        name: p.module.name.clone(),
-        slot_name: p.slot.name.clone(),
-        position: p.module.position,
-        init_cmds: p.module.init_cmds.clone(),
-    });
+    let dc = dc_mode
+        .filter(|mode| mode.assign_activate != 0)
+        .map(|mode| dc::settings(mode, choice.cycle_ns))
+        .transpose()?;
+    let modules = placed
+        .into_iter()
+        .map(|p| SelectedModule {
+            pdos: p
+                .module
+                .rx_pdos
+                .iter()
+                .chain(&p.module.tx_pdos)
+                .map(|pdo| pdo.index)
+                .collect(),
+            place: p.place,
+            slot_name: p.slot_name,
+            ident: p.module.ident,
+            type_name: p.module.type_name,
+            name: p.module.name,
+            position: p.module.position,
+            init_cmds: p.module.init_cmds,
+        })
+        .collect();
     let mut selection = Selection {
         identity: device.identity,
         device_name: device.name.clone(),
-        module,
+        modules,
         mode: choice.mode,
+        assignment: assignment.map(|assignment| assignment.name.to_owned()),
         rx,
         tx,
         dictionary,
@@ -130,12 +169,9 @@ pub fn select(
     Ok(selection)
 }
 
-fn merged(device: &Device, placed: Option<module::Placed<'_>>) -> Dictionary {
+fn merged(device: &Device, placed: &[module::Placed]) -> Dictionary {
     let mut dictionary = device.dictionary.clone();
-    for object in placed
-        .into_iter()
-        .flat_map(|p| &p.module.dictionary.objects)
-    {
+    for object in placed.iter().flat_map(|p| &p.module.dictionary.objects) {
         match dictionary
             .objects
             .iter_mut()
@@ -159,8 +195,9 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
         .into_iter()
         .filter(|&mode| {
             if has_slots {
-                return module::choose(&file.modules, device, Some(mode))
-                    .is_ok_and(|placed| placed.is_some());
+                return module::choose(&file.modules, device, Some(mode), &[]).is_ok_and(
+                    |placed| placed.iter().any(|p| module::mode_of(&p.module).is_some()),
+                );
             }
             let control = |pdo: &Pdo, index| pdo.entries.iter().any(|entry| entry.index == index);
             mode.target_object()
@@ -171,12 +208,13 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
 
 /// Every PDO of one direction, those of the default module in place; for images that know no choice.
 pub(crate) fn default_pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
-    let placed = module::choose(modules, device, None).unwrap_or(None);
+    let placed = module::choose(modules, device, None, &[]).unwrap_or_default();
     pdo::Chooser {
         device,
-        placed,
+        placed: &placed,
         dictionary: &device.dictionary,
         direction,
+        assignment: None,
     }
     .available()
 }

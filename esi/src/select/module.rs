@@ -1,113 +1,245 @@
-//! Which module goes into the slot.
+//! Which modules go into which slots, and what a module's indices become there.
 
 use super::SelectError;
 use crate::mode::Mode;
-use crate::model::{Device, Module, Slot};
+use crate::model::{Device, Increments, Module, Slot, SlotDependence, Slots};
 
 const MODES_OF_OPERATION: u16 = 0x6060;
+/// 0xF030 has so many subindices.
+const MAX_PLACES: usize = 254;
 
-/// A module in its slot.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Placed<'a> {
-    pub module: &'a Module,
-    pub slot: &'a Slot,
+/// A module in its slot; its indices are those that it has there.
+#[derive(Debug, Clone)]
+pub(super) struct Placed {
+    /// Counted from 0 over all slots and their instances, empty ones included.
+    pub place: usize,
+    pub slot_name: String,
+    pub module: Module,
 }
 
-/// `None`: the device has no slots, or an optional slot stays empty.
-pub(super) fn choose<'a>(
-    modules: &'a [Module],
-    device: &'a Device,
+/// One instance of a slot.
+struct Place<'a> {
+    slot: &'a Slot,
+    name: String,
+    required: bool,
+}
+
+/// Empty where the device has no slots, or its optional slots stay empty.
+///
+/// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills every required
+/// place that offers drive modes and is not named, or the first place where none is required.
+pub(super) fn choose(
+    modules: &[Module],
+    device: &Device,
     mode: Option<Mode>,
-) -> Result<Option<Placed<'a>>, SelectError> {
-    let Some(slots) = &device.slots else {
-        return Ok(None);
-    };
-    let required = slots
-        .slots
-        .iter()
-        .filter(|slot| slot.min_instances > 0)
-        .count();
-    if required > 1 {
-        return Err(SelectError::SeveralSlots {
+    wanted: &[&str],
+) -> Result<Vec<Placed>, SelectError> {
+    let no_slots = Slots::default();
+    let slots = device.slots.as_ref().unwrap_or(&no_slots);
+    let places = places(slots);
+    if wanted.len() > places.len() {
+        return Err(SelectError::TooManyModules {
             device: device.name.clone(),
-            count: required,
+            given: wanted.len(),
+            places: places.len(),
         });
     }
-    let Some(slot) = slots
-        .slots
-        .iter()
-        .find(|slot| slot.min_instances > 0)
-        .or(slots.slots.first())
-    else {
-        return Ok(None);
-    };
-    let offered = modules_of(modules, slot)?;
-    let found = match mode {
-        Some(mode) => {
-            let by_command = offered
-                .iter()
-                .find(|module| commanded_mode(module) == Some(mode.code()));
-            let by_name = || {
-                offered.iter().find(|module| {
-                    commanded_mode(module).is_none()
-                        && (mode.is_named_in(&module.type_name) || mode.is_named_in(&module.name))
-                })
-            };
-            match by_command.or_else(by_name) {
-                Some(module) => Some(*module),
-                None => {
-                    let offered = describe(&offered);
-                    return Err(SelectError::ModeNotOffered {
-                        device: device.name.clone(),
-                        mode,
-                        offered,
-                    });
-                }
+    let any_required = places.iter().any(|place| place.required);
+    let mut chosen = Vec::new();
+    for (number, place) in places.iter().enumerate() {
+        let by_name = wanted.get(number).map(|name| name.trim());
+        let takes_mode = place.required || (!any_required && number == 0);
+        let module = match (by_name, mode) {
+            (Some(name), _) => named(modules, device, place, name)?,
+            (None, Some(mode)) if takes_mode => for_mode(modules, device, place, mode)?,
+            _ => default_module(modules, place)?,
+        };
+        let Some(module) = module else {
+            if place.required {
+                return Err(SelectError::ModuleNeeded {
+                    device: device.name.clone(),
+                    slot: place.name.clone(),
+                    offered: describe(&offered(modules, place.slot)?),
+                });
             }
+            continue;
+        };
+        chosen.push(Placed {
+            place: number,
+            slot_name: place.name.clone(),
+            module: instance(module, place.slot, &slots.increments, number),
+        });
+    }
+    Ok(chosen)
+}
+
+fn places(slots: &Slots) -> Vec<Place<'_>> {
+    let most = slots
+        .max_count
+        .and_then(|count| usize::try_from(count).ok())
+        .filter(|count| *count > 0)
+        .map_or(MAX_PLACES, |count| count.min(MAX_PLACES));
+    let mut places = Vec::new();
+    for slot in &slots.slots {
+        let instances = slot.max_instances.max(slot.min_instances).max(1);
+        for instance in 0..instances {
+            if places.len() >= most {
+                return places;
+            }
+            let name = if instances > 1 {
+                format!("{} {}", slot.name, instance + 1)
+            } else {
+                slot.name.clone()
+            };
+            places.push(Place {
+                slot,
+                name,
+                required: instance < slot.min_instances,
+            });
         }
-        None => default_module(&slot.module_idents, &offered),
-    };
+    }
+    places
+}
+
+fn named<'a>(
+    modules: &'a [Module],
+    device: &Device,
+    place: &Place<'_>,
+    name: &str,
+) -> Result<Option<&'a Module>, SelectError> {
+    if name.is_empty() || name == "-" {
+        return Ok(None);
+    }
+    let ident = name
+        .strip_prefix("0x")
+        .or(name.strip_prefix("0X"))
+        .map_or_else(
+            || name.parse().ok(),
+            |hex| u32::from_str_radix(hex, 16).ok(),
+        );
+    let all = offered(modules, place.slot)?;
+    let found = all.iter().copied().find(|module| {
+        module.type_name.eq_ignore_ascii_case(name)
+            || module.name.eq_ignore_ascii_case(name)
+            || ident == Some(module.ident)
+    });
     match found {
-        Some(module) => Ok(Some(Placed { module, slot })),
-        None if slot.min_instances == 0 => Ok(None),
-        None => Err(SelectError::ModuleNeeded {
+        Some(module) => Ok(Some(module)),
+        None => Err(SelectError::NoSuchModule {
             device: device.name.clone(),
-            slot: slot.name.clone(),
-            offered: describe(&offered),
+            slot: place.name.clone(),
+            wanted: name.to_owned(),
+            offered: describe(&all),
         }),
     }
 }
 
-/// The modules that one slot takes.
-fn modules_of<'a>(modules: &'a [Module], slot: &Slot) -> Result<Vec<&'a Module>, SelectError> {
-    slot.module_idents
+/// The module of this mode; a slot without drive modules gets its default.
+fn for_mode<'a>(
+    modules: &'a [Module],
+    device: &Device,
+    place: &Place<'_>,
+    mode: Mode,
+) -> Result<Option<&'a Module>, SelectError> {
+    let all = offered(modules, place.slot)?;
+    let by_command = |module: &&&Module| commanded_mode(module) == Some(mode.code());
+    let by_name = |module: &&&Module| {
+        commanded_mode(module).is_none()
+            && (mode.is_named_in(&module.type_name) || mode.is_named_in(&module.name))
+    };
+    let found = all
         .iter()
-        .map(|&(ident, _)| {
-            modules
-                .iter()
-                .find(|module| module.ident == ident)
-                .ok_or_else(|| SelectError::UnknownModule {
-                    slot: slot.name.clone(),
-                    ident,
-                })
-        })
-        .collect()
-}
-
-fn default_module<'a>(idents: &[(u32, bool)], offered: &[&'a Module]) -> Option<&'a Module> {
-    let marked = idents
-        .iter()
-        .find(|(_, default)| *default)
-        .map(|(ident, _)| *ident);
-    match (marked, offered) {
-        (Some(ident), _) => offered.iter().copied().find(|module| module.ident == ident),
-        (None, [only]) => Some(only),
-        _ => None,
+        .find(by_command)
+        .or_else(|| all.iter().find(by_name));
+    match found {
+        Some(module) => Ok(Some(module)),
+        None if all.iter().any(|module| mode_of(module).is_some()) => {
+            Err(SelectError::ModeNotOffered {
+                device: device.name.clone(),
+                mode,
+                offered: describe(&all),
+            })
+        }
+        None => default_module(modules, place),
     }
 }
 
+/// The modules that one slot takes.
+fn offered<'a>(modules: &'a [Module], slot: &Slot) -> Result<Vec<&'a Module>, SelectError> {
+    let mut all = Vec::new();
+    for &(ident, _) in &slot.module_idents {
+        let found = modules.iter().find(|module| module.ident == ident);
+        all.push(found.ok_or_else(|| SelectError::UnknownModule {
+            slot: slot.name.clone(),
+            ident,
+        })?);
+    }
+    let of_class = |module: &&Module| {
+        let class = module.class.as_ref();
+        class.is_some_and(|class| slot.module_classes.contains(class))
+    };
+    all.extend(modules.iter().filter(of_class));
+    Ok(all)
+}
+
+fn default_module<'a>(
+    modules: &'a [Module],
+    place: &Place<'_>,
+) -> Result<Option<&'a Module>, SelectError> {
+    let all = offered(modules, place.slot)?;
+    let marked = place
+        .slot
+        .module_idents
+        .iter()
+        .find(|(_, default)| *default);
+    Ok(match (marked, all.as_slice()) {
+        (Some((ident, _)), _) => all.iter().copied().find(|module| module.ident == *ident),
+        (None, [only]) if place.required => Some(only),
+        _ => None,
+    })
+}
+
+/// The module as it is at a place: indices that depend on the slot count on.
+fn instance(module: &Module, slot: &Slot, increments: &Increments, place: usize) -> Module {
+    let place = u16::try_from(place).unwrap_or(u16::MAX);
+    let group = slot
+        .group
+        .and_then(|group| u16::try_from(group).ok())
+        .unwrap_or(0);
+    let pdo_step = slot.pdo_increment.unwrap_or(increments.pdo);
+    let index_step = slot.index_increment.unwrap_or(increments.index);
+    let shifted = |index: u16, on: SlotDependence, step: u16, group_step: u16| {
+        let by_slot = if on.slot { place.wrapping_mul(step) } else { 0 };
+        let by_group = if on.group {
+            group.wrapping_mul(group_step)
+        } else {
+            0
+        };
+        index.wrapping_add(by_slot).wrapping_add(by_group)
+    };
+    let pdo_index = |index, on| shifted(index, on, pdo_step, increments.group_pdo);
+    let object_index = |index, on| shifted(index, on, index_step, increments.group_index);
+    let mut module = module.clone();
+    for pdo in module.rx_pdos.iter_mut().chain(&mut module.tx_pdos) {
+        pdo.index = pdo_index(pdo.index, pdo.depends_on);
+        for excluded in &mut pdo.exclude {
+            excluded.index = pdo_index(excluded.index, excluded.depends_on);
+        }
+        for entry in pdo.entries.iter_mut().filter(|entry| !entry.is_gap()) {
+            entry.index = object_index(entry.index, entry.depends_on);
+        }
+    }
+    for command in &mut module.init_cmds {
+        command.index = object_index(command.index, command.depends_on);
+    }
+    for object in &mut module.dictionary.objects {
+        object.index = object_index(object.index, object.depends_on);
+    }
+    module
+}
+
 /// The mode that a module's own InitCmd writes.
-pub(super) fn commanded_mode(module: &Module) -> Option<i8> {
+fn commanded_mode(module: &Module) -> Option<i8> {
     let command = module
         .init_cmds
         .iter()

@@ -3,30 +3,73 @@
 use super::module::Placed;
 use super::{EntryRef, SelectError};
 use crate::mode::Mode;
-use crate::model::{Coe, Device, Dictionary, Direction, Entry, Pdo, PdoMapping, Position, SmUse};
+use crate::model::{
+    Coe, Device, Dictionary, Direction, Entry, Pdo, PdoMapping, Position, SlotDependence, SmUse,
+};
+
+/// PDOs by SyncManager under a name: an `AlternativeSmMapping`, or what a DC mode assigns.
+#[derive(Clone, Copy)]
+pub(super) struct Assignment<'a> {
+    pub name: &'a str,
+    pub sync_managers: &'a [(u8, Vec<u16>)],
+}
+
+/// The assignment that is asked for by name.
+pub(super) fn assignment<'a>(
+    device: &'a Device,
+    wanted: &str,
+) -> Result<Assignment<'a>, SelectError> {
+    let wanted = wanted.trim();
+    let mapping = device
+        .sm_mappings
+        .iter()
+        .find(|mapping| mapping.name.trim().eq_ignore_ascii_case(wanted));
+    let Some(mapping) = mapping else {
+        let names: Vec<String> = device
+            .sm_mappings
+            .iter()
+            .map(|mapping| format!("{:?}", mapping.name))
+            .collect();
+        return Err(SelectError::NoSuchAssignment {
+            device: device.name.clone(),
+            wanted: wanted.to_owned(),
+            offered: if names.is_empty() {
+                "none by name".to_owned()
+            } else {
+                names.join(", ")
+            },
+        });
+    };
+    Ok(Assignment {
+        name: &mapping.name,
+        sync_managers: &mapping.sync_managers,
+    })
+}
 
 /// One direction of one device.
 pub(super) struct Chooser<'a> {
     pub device: &'a Device,
-    pub placed: Option<Placed<'a>>,
+    pub placed: &'a [Placed],
     pub dictionary: &'a Dictionary,
     pub direction: Direction,
+    pub assignment: Option<Assignment<'a>>,
 }
 
 impl Chooser<'_> {
-    /// Every PDO that could be assigned: the device's, with those of the module in their place.
+    /// Every PDO that could be assigned: the device's, with those of the modules in their place.
     pub fn available(&self) -> Vec<Pdo> {
-        let (device, module) = match (self.direction, self.placed) {
-            (Direction::Rx, placed) => (&self.device.rx_pdos, placed.map(|p| &p.module.rx_pdos)),
-            (Direction::Tx, placed) => (&self.device.tx_pdos, placed.map(|p| &p.module.tx_pdos)),
-        };
+        let device = self.of_device();
+        let modules = self.placed.iter().flat_map(|p| match self.direction {
+            Direction::Rx => &p.module.rx_pdos,
+            Direction::Tx => &p.module.tx_pdos,
+        });
         let mut pdos: Vec<Pdo> = device.iter().filter(|pdo| !pdo.virtual_).cloned().collect();
-        for new in module.into_iter().flatten().filter(|pdo| !pdo.virtual_) {
+        for new in modules.filter(|pdo| !pdo.virtual_) {
             let mut new = new.clone();
             new.sm = new.sm.or(self.primary_sm());
             match pdos.iter_mut().find(|old| old.index == new.index) {
                 Some(old) => {
-                    let excluded: Vec<u16> = old
+                    let excluded: Vec<_> = old
                         .exclude
                         .iter()
                         .filter(|i| !new.exclude.contains(i))
@@ -41,6 +84,13 @@ impl Chooser<'_> {
         pdos
     }
 
+    fn of_device(&self) -> &[Pdo] {
+        match self.direction {
+            Direction::Rx => &self.device.rx_pdos,
+            Direction::Tx => &self.device.tx_pdos,
+        }
+    }
+
     /// The PDOs as they will be assigned, in order, each with its SyncManager.
     pub fn choose(
         &self,
@@ -48,7 +98,7 @@ impl Chooser<'_> {
         own: Option<&[EntryRef]>,
         notes: &mut Vec<String>,
     ) -> Result<Vec<Pdo>, SelectError> {
-        let available = self.available();
+        let available = self.assigned(self.available())?;
         let default = self.default_set(&available, notes);
         let mut chosen = match (own, mode) {
             (Some(list), _) => self.with_own_entries(&available, &default, list, mode)?,
@@ -56,9 +106,61 @@ impl Chooser<'_> {
             (None, None) => default,
         };
         for pdo in &mut chosen {
-            pdo.sm = Some(self.sm_of(pdo)?);
+            let sm = self.sm_of(pdo)?;
+            if pdo.excluded_sm.contains(&sm) {
+                return Err(SelectError::ExcludedSyncManager {
+                    device: self.device.name.clone(),
+                    pdo: pdo.index,
+                    sm,
+                });
+            }
+            pdo.sm = Some(sm);
         }
         Ok(chosen)
+    }
+
+    /// Applies the assignment by name, if there is one: the SyncManagers that it names carry its PDOs in its
+    /// order, before those of the others.
+    fn assigned(&self, mut available: Vec<Pdo>) -> Result<Vec<Pdo>, SelectError> {
+        let Some(assignment) = self.assignment else {
+            return Ok(available);
+        };
+        for pdo in &mut available {
+            let named = |sm| {
+                assignment
+                    .sync_managers
+                    .iter()
+                    .any(|(number, _)| *number == sm)
+            };
+            if pdo.sm.is_some_and(named) {
+                pdo.sm = None;
+            }
+        }
+        let of_direction = |sm: &&(u8, Vec<u16>)| {
+            let usage = self.device.sync_managers.get(usize::from(sm.0));
+            usage.is_some_and(|sm| sm.usage == self.usage())
+        };
+        let mut first = Vec::new();
+        for (sm, pdos) in assignment.sync_managers.iter().filter(of_direction) {
+            for index in pdos {
+                let Some(at) = available.iter().position(|pdo| pdo.index == *index) else {
+                    // Virtual PDOs are listed, and reached without an assignment.
+                    if self.of_device().iter().any(|pdo| pdo.index == *index) {
+                        continue;
+                    }
+                    return Err(SelectError::UnknownPdo {
+                        device: self.device.name.clone(),
+                        name: assignment.name.to_owned(),
+                        pdo: *index,
+                    });
+                };
+                let mut pdo = available.remove(at);
+                pdo.sm = Some(*sm);
+                first.push(pdo);
+            }
+        }
+        first.append(&mut available);
+        Ok(first)
     }
 
     /// What the device assigns when nobody says anything; mutual exclusions are resolved in file order.
@@ -94,6 +196,9 @@ impl Chooser<'_> {
         };
         if let Some(pdo) = available.iter().find(one) {
             return Ok(self.alongside(pdo.clone(), &default));
+        }
+        if let Some(set) = cover(available, &default, &needed) {
+            return Ok(set);
         }
         match self.direction {
             Direction::Rx => Err(SelectError::ModeNotOffered {
@@ -183,6 +288,9 @@ impl Chooser<'_> {
             .find(|pdo| !pdo.fixed)
             .filter(|_| configurable);
         let Some(carrier) = carrier else {
+            if let Some(set) = self.composed(available, default, list) {
+                return Ok(set);
+            }
             return Err(SelectError::NotConfigurable {
                 list: label,
                 device: self.device.name.clone(),
@@ -223,6 +331,37 @@ impl Chooser<'_> {
         }
         let mandatory: Vec<Pdo> = default.iter().filter(|p| p.mandatory).cloned().collect();
         Ok(self.alongside(pdo, &mandatory))
+    }
+
+    /// The user's list as a sequence of the device's own PDOs, where these cannot be changed.
+    fn composed(&self, available: &[Pdo], default: &[Pdo], list: &[EntryRef]) -> Option<Vec<Pdo>> {
+        let mut set: Vec<Pdo> = default.iter().filter(|p| p.mandatory).cloned().collect();
+        let mut rest = list;
+        while !rest.is_empty() {
+            let begins_with = |pdo: &&Pdo| {
+                let mapped = || pdo.entries.iter().filter(|entry| !entry.is_gap());
+                let same = mapped()
+                    .zip(rest)
+                    .all(|(entry, wanted)| (entry.index, entry.sub) == (wanted.index, wanted.sub));
+                let count = mapped().count();
+                let free = set
+                    .iter()
+                    .all(|other| other.index != pdo.index && !conflict(other, pdo));
+                count > 0 && count <= rest.len() && same && free
+            };
+            let longest = available
+                .iter()
+                .filter(begins_with)
+                .max_by_key(|pdo| pdo.entries.len())?;
+            let count = longest
+                .entries
+                .iter()
+                .filter(|entry| !entry.is_gap())
+                .count();
+            rest = rest.get(count..)?;
+            set.push(longest.clone());
+        }
+        Some(set)
     }
 
     fn max_entries(&self, pdo: u16) -> Option<usize> {
@@ -272,6 +411,7 @@ impl Chooser<'_> {
                     bit_len,
                     name: item.name.clone(),
                     data_type: item.type_name.clone(),
+                    depends_on: SlotDependence::default(),
                 });
             }
         }
@@ -302,7 +442,7 @@ impl Chooser<'_> {
         let device = self.device.rx_pdos.iter().chain(&self.device.tx_pdos);
         let module = self
             .placed
-            .into_iter()
+            .iter()
             .flat_map(|p| p.module.rx_pdos.iter().chain(&p.module.tx_pdos));
         device.chain(module).flat_map(|pdo| &pdo.entries)
     }
@@ -316,16 +456,19 @@ impl Chooser<'_> {
 
     /// The SyncManager that carries this direction unless a PDO says otherwise.
     fn primary_sm(&self) -> Option<u8> {
-        let usage = match self.direction {
-            Direction::Rx => SmUse::Outputs,
-            Direction::Tx => SmUse::Inputs,
-        };
         let place = self
             .device
             .sync_managers
             .iter()
-            .position(|sm| sm.usage == usage)?;
+            .position(|sm| sm.usage == self.usage() && !sm.virtual_)?;
         u8::try_from(place).ok()
+    }
+
+    fn usage(&self) -> SmUse {
+        match self.direction {
+            Direction::Rx => SmUse::Outputs,
+            Direction::Tx => SmUse::Inputs,
+        }
     }
 
     fn sm_of(&self, pdo: &Pdo) -> Result<u8, SelectError> {
@@ -348,7 +491,28 @@ fn direction_name(direction: Direction) -> &'static str {
 }
 
 fn conflict(a: &Pdo, b: &Pdo) -> bool {
-    a.exclude.contains(&b.index) || b.exclude.contains(&a.index)
+    let excludes = |a: &Pdo, b: &Pdo| a.exclude.iter().any(|other| other.index == b.index);
+    a.index != b.index && (excludes(a, b) || excludes(b, a))
+}
+
+/// Several PDOs that together bring what a mode needs, for devices whose PDOs hold one object each: the default
+/// ones first, then for every object that is missing the shortest PDO that has it.
+fn cover(available: &[Pdo], default: &[Pdo], needed: &[u16]) -> Option<Vec<Pdo>> {
+    let mut set: Vec<Pdo> = Vec::new();
+    for &index in needed {
+        if contains(&set, index) {
+            continue;
+        }
+        let fits = |pdo: &&Pdo| {
+            contains(std::slice::from_ref(*pdo), index)
+                && !set.iter().any(|other| conflict(other, pdo))
+        };
+        let by_default = default.iter().find(fits);
+        let pdo =
+            by_default.or_else(|| available.iter().filter(fits).min_by_key(|p| p.bit_len()))?;
+        set.push(pdo.clone());
+    }
+    Some(set)
 }
 
 fn contains(set: &[Pdo], index: u16) -> bool {

@@ -35,7 +35,7 @@ impl Sii {
             protocols: device.mailbox.as_ref().map(protocols).unwrap_or_default(),
             byte_size: device.eeprom.byte_size,
             general: Some(general(device)),
-            fmmus: device.fmmus.clone(),
+            fmmus: device.fmmus.iter().map(|fmmu| fmmu.usage).collect(),
             sync_managers: sync_managers(device, &rx, &tx),
             tx_pdos: tx.iter().map(pdo).collect(),
             rx_pdos: rx.iter().map(pdo).collect(),

@@ -8,7 +8,7 @@ mod interpolation;
 mod pdo;
 
 use crate::model::{Device, InitCmd, Writable};
-use crate::select::{Choice, SelectError, Selection};
+use crate::select::{Choice, SelectError, SelectedModule, Selection};
 use crate::{Dictionary, Mode};
 
 /// One SDO download.
@@ -53,8 +53,19 @@ pub(crate) fn list(
     module_list(device, selection, &mut list);
     pdo::configure(device, coe, selection, choice, &mut list)?;
     interpolation_time(selection, choice, &mut list)?;
-    init_cmds(&coe.init_cmds, "device", selection, &mut list);
-    if let Some(module) = selection.module.clone() {
+    // A module's own command for the same object takes the place of one that says so.
+    let replaced = |cmd: &InitCmd| {
+        let mut own = selection.modules.iter().flat_map(|m| &m.init_cmds);
+        cmd.overwritten_by_module && own.any(|own| (own.index, own.sub) == (cmd.index, cmd.sub))
+    };
+    let of_device: Vec<InitCmd> = coe
+        .init_cmds
+        .iter()
+        .filter(|cmd| !replaced(cmd))
+        .cloned()
+        .collect();
+    init_cmds(&of_device, "device", selection, &mut list);
+    for module in selection.modules.clone() {
         let origin = format!("module {:?}", module.type_name);
         init_cmds(&module.init_cmds, &origin, selection, &mut list);
     }
@@ -91,6 +102,7 @@ fn without_coe(
 }
 
 /// The list under construction.
+#[derive(Default)]
 struct List {
     dictionary: Dictionary,
     sdos: Vec<StartupSdo>,
@@ -111,6 +123,14 @@ impl List {
         });
     }
 
+    /// The whole object by complete access, from subindex 0, which takes two bytes.
+    fn push_whole(&mut self, index: u16, data: Vec<u8>, origin: &str) {
+        self.push(index, 0, data, origin);
+        if let Some(sdo) = self.sdos.last_mut() {
+            sdo.complete_access = true;
+        }
+    }
+
     fn name(&self, index: u16, sub: u8) -> String {
         let Some(object) = self.dictionary.object(index) else {
             return String::new();
@@ -129,15 +149,40 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List) {
         .slots
         .as_ref()
         .is_some_and(|slots| slots.download_module_ident_list);
-    if let (true, Some(module)) = (wanted, &selection.module) {
-        let origin = format!(
+    let Some(last) = selection
+        .modules
+        .iter()
+        .map(|m| m.place)
+        .max()
+        .filter(|_| wanted)
+    else {
+        return;
+    };
+    let origin = |module: &SelectedModule| {
+        format!(
             "module {:?} (line {})",
             module.type_name, module.position.line
+        )
+    };
+    let count = u8::try_from(last + 1).unwrap_or(u8::MAX);
+    let whole = selection.modules.first().map(origin).unwrap_or_default();
+    list.push(MODULE_LIST, 0, vec![0], &whole);
+    for place in 0..count {
+        let module = selection
+            .modules
+            .iter()
+            .find(|m| m.place == usize::from(place));
+        // An empty place in between is told as identity 0.
+        let ident = module.map_or(0, |m| m.ident);
+        let origin = module.map_or_else(|| "empty slot".to_owned(), origin);
+        list.push(
+            MODULE_LIST,
+            place.saturating_add(1),
+            ident.to_le_bytes().to_vec(),
+            &origin,
         );
-        list.push(MODULE_LIST, 0, vec![0], &origin);
-        list.push(MODULE_LIST, 1, module.ident.to_le_bytes().to_vec(), &origin);
-        list.push(MODULE_LIST, 0, vec![1], &origin);
     }
+    list.push(MODULE_LIST, 0, vec![count], &whole);
 }
 
 /// Cyclic set-points are interpolated over the bus cycle (CSP, CSV). In CST the EPOS4 application notes set the

@@ -19,16 +19,31 @@ pub(super) fn configure(
     if !coe.pdo_config {
         check_contents(device, selection)?;
     }
-    if coe.pdo_assign {
+    let mut changes = List {
+        dictionary: list.dictionary.clone(),
+        ..List::default()
+    };
+    if coe.pdo_config {
+        contents(device, Direction::Tx, selection, choice, &mut changes);
+        contents(device, Direction::Rx, selection, choice, &mut changes);
+    }
+    // Contents can only change while nothing is assigned. Where they stay, complete access replaces the whole
+    // assignment at once.
+    let at_once = coe.complete_access && changes.sdos.is_empty();
+    if coe.pdo_assign && !at_once {
         for (sm, _) in &assignments {
             list.push(assign_object(*sm), 0, vec![0], &sm_origin(device, *sm));
         }
     }
-    if coe.pdo_config {
-        contents(device, Direction::Tx, selection, choice, list);
-        contents(device, Direction::Rx, selection, choice, list);
-    }
-    if coe.pdo_assign {
+    list.sdos.append(&mut changes.sdos);
+    if coe.pdo_assign && at_once {
+        for (sm, pdos) in &assignments {
+            let count = u8::try_from(pdos.len()).unwrap_or(u8::MAX);
+            let mut data = vec![count, 0];
+            data.extend(pdos.iter().flat_map(|pdo| pdo.index.to_le_bytes()));
+            list.push_whole(assign_object(*sm), data, &sm_origin(device, *sm));
+        }
+    } else if coe.pdo_assign {
         for (sm, pdos) in &assignments {
             let index = assign_object(*sm);
             for (sub, pdo) in (1..=u8::MAX).zip(pdos) {
@@ -46,9 +61,12 @@ pub(super) fn configure(
     Ok(())
 }
 
-/// For devices that nobody can write to.
+/// For devices that nobody can write to. One without a mailbox knows no assignment: its SyncManagers alone decide,
+/// so what the ESI itself lists under a name can be had.
 pub(super) fn check_unchanged(device: &Device, selection: &Selection) -> Result<(), SelectError> {
-    check_assignment(device, selection)?;
+    if selection.assignment.is_none() {
+        check_assignment(device, selection)?;
+    }
     check_contents(device, selection)
 }
 
@@ -144,7 +162,7 @@ fn check_assignment(device: &Device, selection: &Selection) -> Result<(), Select
     ] {
         // A module's PDOs are assigned by the device itself once it knows the module.
         let of_module = |index: u16| {
-            selection.module.is_some() && !offered.iter().any(|pdo| pdo.index == index)
+            !selection.modules.is_empty() && !offered.iter().any(|pdo| pdo.index == index)
         };
         let default: Vec<u16> = offered
             .iter()
@@ -174,7 +192,11 @@ fn has_excludes(offered: &[Pdo], default: &[u16], direction: Direction) -> bool 
     offered
         .iter()
         .filter(|pdo| pdo.direction == direction && default.contains(&pdo.index))
-        .any(|pdo| pdo.exclude.iter().any(|index| default.contains(index)))
+        .any(|pdo| {
+            pdo.exclude
+                .iter()
+                .any(|other| default.contains(&other.index))
+        })
 }
 
 fn check_contents(device: &Device, selection: &Selection) -> Result<(), SelectError> {
@@ -185,7 +207,7 @@ fn check_contents(device: &Device, selection: &Selection) -> Result<(), SelectEr
             .chain(&device.tx_pdos)
             .find(|known| known.index == pdo.index);
         if let Some(offered) = offered
-            && selection.module.is_none()
+            && selection.modules.is_empty()
             && offered.entries != pdo.entries
         {
             return Err(SelectError::ContentsFixed {
@@ -219,13 +241,12 @@ fn pdo_origin(device: &Device, selection: &Selection, pdo: &Pdo) -> String {
         Direction::Rx => ("RxPdo", &device.rx_pdos),
         Direction::Tx => ("TxPdo", &device.tx_pdos),
     };
-    let module = selection
-        .module
-        .as_ref()
-        .filter(|_| of_device.iter().all(|known| known.position != pdo.position))
-        .map_or_else(String::new, |module| {
-            format!("module {:?} ", module.type_name)
-        });
+    let of_device = of_device.iter().any(|known| known.position == pdo.position);
+    let mut modules = selection.modules.iter().filter(|_| !of_device);
+    let module = modules.find(|module| module.pdos.contains(&pdo.index));
+    let module = module.map_or_else(String::new, |module| {
+        format!("module {:?} ", module.type_name)
+    });
     format!(
         "{module}{kind} 0x{:04x} (line {})",
         pdo.index, pdo.position.line

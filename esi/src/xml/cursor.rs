@@ -7,7 +7,7 @@ use quick_xml::{Reader, XmlVersion};
 
 use super::number;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Position, Warning};
+use crate::model::{Position, SlotDependence, Warning};
 
 const MAX_DEPTH: usize = 64;
 const MAX_WARNINGS: usize = 500;
@@ -206,15 +206,46 @@ impl<'a> Cursor<'a> {
     }
 
     pub fn attribute_flag(&mut self, element: &Element<'a>, name: &str) -> Result<bool, EsiError> {
+        Ok(self.attribute_optional_flag(element, name)? == Some(true))
+    }
+
+    pub fn attribute_optional_flag(
+        &mut self,
+        element: &Element<'a>,
+        name: &str,
+    ) -> Result<Option<bool>, EsiError> {
         let Some(text) = self.attribute(element, name)? else {
-            return Ok(false);
+            return Ok(None);
         };
+        let flag = number::boolean(&text);
+        if flag.is_none() {
+            let text = shorten(&text);
+            self.warn(
+                element,
+                format!("{name}={text:?} is neither true nor false; taken as false"),
+            );
+        }
+        Ok(flag)
+    }
+
+    /// `DependOnSlot` and `DependOnSlotGroup` of an index.
+    pub fn slot_dependence(&mut self, element: &Element<'a>) -> Result<SlotDependence, EsiError> {
+        Ok(SlotDependence {
+            slot: self.attribute_flag(element, "DependOnSlot")?,
+            group: self.attribute_flag(element, "DependOnSlotGroup")?,
+        })
+    }
+
+    /// The element's text as true or false; anything else is false, with a warning.
+    pub fn flag(&mut self, element: &Element<'a>) -> Result<bool, EsiError> {
+        let text = self.text(element)?;
         if let Some(flag) = number::boolean(&text) {
             return Ok(flag);
         }
+        let (name, text) = (element.name, shorten(&text));
         self.warn(
             element,
-            format!("{name}={text:?} is neither true nor false; taken as false"),
+            format!("{name} {text:?} is neither true nor false; taken as false"),
         );
         Ok(false)
     }

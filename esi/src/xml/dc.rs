@@ -1,6 +1,7 @@
 //! `Dc/OpMode`.
 
 use super::cursor::{Cursor, Element};
+use super::sync;
 use super::text::Names;
 use crate::error::EsiError;
 use crate::model::{DcMode, SyncTime};
@@ -31,6 +32,7 @@ fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiE
             "ShiftTimeSync0" => shift(c, el, &mut mode.sync0)?,
             "CycleTimeSync1" => cycle(c, el, &mut mode.sync1)?,
             "ShiftTimeSync1" => shift(c, el, &mut mode.sync1)?,
+            "Sm" => mode.sync_managers.extend(sync::assignment(c, el)?),
             _ => {}
         }
         Ok(())

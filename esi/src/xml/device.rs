@@ -2,14 +2,15 @@
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
-use super::{datatype, dc, eeprom, mailbox, object, pdo, resolve, slots, sync};
+use super::{dc, device_info, eeprom, mailbox, pdo, profile, slots, sync};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Device, Dictionary, Direction};
+use crate::model::{Device, Direction, HiddenType, InitialRegisters, RevisionCheck};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Device, EsiError> {
     let mut device = Device {
         position: element.position,
         physics: c.attribute(element, "Physics")?.unwrap_or_default(),
+        invisible: c.attribute_flag(element, "Invisible")?,
         ..Device::default()
     };
     let mut names = Names::default();
@@ -17,37 +18,31 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
     c.children(element, |c, el| {
         match el.name {
             "Type" => {
-                let product = c.attribute_number(el, "ProductCode")?;
-                device.identity.product = match product {
-                    Some(code) => code,
-                    None => {
-                        return Err(c.error_at(
-                            el,
-                            EsiProblem::Missing {
-                                what: "ProductCode",
-                            },
-                        ));
-                    }
-                };
-                device.identity.revision =
-                    c.attribute_number(el, "RevisionNo")?.unwrap_or_default();
-                device.type_name = c.text(el)?;
+                type_element(c, el, &mut device)?;
                 has_type = true;
             }
+            "HideType" => device.hides.push(hidden_type(c, el)?),
             "Name" => names.add(c, el)?,
+            "Info" => device.info = device_info::read(c, el, &mut device.sm_mappings)?,
+            "GroupType" => device.group = c.text(el)?,
             "Profile" => {
-                let (number, dictionary) = profile(c, el)?;
-                device.profile = device.profile.or(number);
-                device.dictionary.objects.extend(dictionary.objects);
+                let profile = profile::read(c, el)?;
+                device.profile = device.profile.or(profile.number);
+                device.dictionary.objects.extend(profile.objects);
+                device.diag_messages.extend(profile.diag_messages);
             }
             "Fmmu" => device.fmmus.push(sync::fmmu(c, el)?),
             "Sm" => device.sync_managers.push(sync::sync_manager(c, el)?),
+            "Su" => device.sync_units.push(sync::sync_unit(c, el)?),
             "RxPdo" => device.rx_pdos.push(pdo::read(c, el, Direction::Rx)?),
             "TxPdo" => device.tx_pdos.push(pdo::read(c, el, Direction::Tx)?),
             "Mailbox" => device.mailbox = Some(mailbox::read(c, el)?),
             "Dc" => device.dc_modes = dc::read(c, el)?,
             "Slots" => device.slots = Some(slots::read(c, el)?),
             "Eeprom" => device.eeprom = eeprom::read(c, el)?,
+            "ESC" => device.registers = registers(c, el)?,
+            "AlternativeSmMapping" => device.sm_mappings.push(device_info::sm_mapping(c, el)?),
+            "VendorSpecific" => device_info::vendor_specific(c, el, &mut device.sm_mappings)?,
             _ => {}
         }
         Ok(())
@@ -60,52 +55,71 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
             },
         ));
     }
-    device.name = names.take();
+    (device.name, device.names) = names.take_all();
     if device.name.is_empty() {
         device.name = device.type_name.clone();
     }
     Ok(device)
 }
 
-/// `Profile`, of a device or of a module: the profile number and the resolved dictionary. The number stands in
-/// `Profile` itself or, newer, in one `ChannelInfo` per axis; then the first axis counts.
-pub(super) fn profile<'a>(
+/// Identity and what belongs to it.
+fn type_element<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
-) -> Result<(Option<u32>, Dictionary), EsiError> {
-    let (mut number, mut of_channel) = (None, None);
-    let mut dictionary = Dictionary::default();
-    c.children(element, |c, el| {
-        match el.name {
-            "ProfileNo" => number = number.or(Some(c.number(el, "ProfileNo")?)),
-            "ChannelInfo" => c.children(el, |c, el| {
-                if el.name == "ProfileNo" {
-                    of_channel = of_channel.or(Some(c.number(el, "ProfileNo")?));
-                }
-                Ok(())
-            })?,
-            "Dictionary" => {
-                let mut types = datatype::DataTypes::default();
-                let mut objects = Vec::new();
-                c.children(el, |c, el| match el.name {
-                    "DataTypes" => datatype::read(c, el, &mut types),
-                    "Objects" => object::read(c, el, &mut objects),
-                    _ => Ok(()),
-                })?;
-                // Objects may stand before the types they use, so they are joined at the end.
-                for raw in objects {
-                    dictionary
-                        .objects
-                        .push(resolve::object(c, el, &types, raw)?);
-                }
-            }
-            "DictionaryFile" => c.warn(
-                el,
-                "the dictionary is in another file, which is not read".to_owned(),
-            ),
-            _ => {}
+    device: &mut Device,
+) -> Result<(), EsiError> {
+    let Some(product) = c.attribute_number(element, "ProductCode")? else {
+        return Err(c.error_at(
+            element,
+            EsiProblem::Missing {
+                what: "ProductCode",
+            },
+        ));
+    };
+    device.identity.product = product;
+    device.identity.revision = c
+        .attribute_number(element, "RevisionNo")?
+        .unwrap_or_default();
+    device.use_lrd_lwr = c.attribute_flag(element, "UseLrdLwr")?;
+    device.revision_check = match c.attribute(element, "CheckRevisionNo")?.as_deref() {
+        None => RevisionCheck::Unstated,
+        Some("NONE") => RevisionCheck::None,
+        Some("EQ") => RevisionCheck::Equal,
+        Some("EQ_OR_G") => RevisionCheck::EqualOrGreater,
+        Some("LW_EQ") => RevisionCheck::LowEqual,
+        Some("LW_EQ_HW_EQ_OR_G") => RevisionCheck::LowEqualHighEqualOrGreater,
+        Some("HW_EQ") => RevisionCheck::HighEqual,
+        Some("HW_EQ_LW_EQ_OR_G") => RevisionCheck::HighEqualLowEqualOrGreater,
+        Some(_) => {
+            c.warn(element, "CheckRevisionNo is none of its values".to_owned());
+            RevisionCheck::Unstated
         }
+    };
+    device.type_name = c.text(element)?;
+    Ok(())
+}
+
+fn hidden_type<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<HiddenType, EsiError> {
+    Ok(HiddenType {
+        product: c.attribute_number(element, "ProductCode")?,
+        revision: c
+            .attribute_number(element, "RevisionNo")?
+            .unwrap_or_default(),
+    })
+}
+
+fn registers<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitialRegisters, EsiError> {
+    let mut registers = InitialRegisters::default();
+    c.children(element, |c, el| {
+        let register = match el.name {
+            "Reg0108" => &mut registers.reg0108,
+            "Reg0400" => &mut registers.reg0400,
+            "Reg0410" => &mut registers.reg0410,
+            "Reg0420" => &mut registers.reg0420,
+            _ => return Ok(()),
+        };
+        *register = c.optional_number(el, "register value")?;
         Ok(())
     })?;
-    Ok((number.or(of_channel), dictionary))
+    Ok(registers)
 }

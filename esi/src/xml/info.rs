@@ -4,12 +4,13 @@ use super::cursor::{Cursor, Element};
 use super::text::Names;
 use super::{device, module};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{EsiFile, Vendor};
+use crate::model::{EsiFile, Group, Vendor};
 
 pub(super) fn read(c: &mut Cursor<'_>, file: &mut EsiFile) -> Result<(), EsiError> {
     let root = c.root()?;
     match root.name {
         "EtherCATInfo" => info(c, &root, file),
+        "EtherCATModule" => modules_alone(c, &root, file),
         "EtherCATInfoList" => c.children(&root, |c, el| match el.name {
             "EtherCATInfo" => info(c, el, file),
             _ => Ok(()),
@@ -23,6 +24,7 @@ fn info<'a>(c: &mut Cursor<'a>, root: &Element<'a>, file: &mut EsiFile) -> Resul
     let mut vendor = None;
     c.children(root, |c, el| {
         match el.name {
+            "InfoReference" => file.references.push(c.text(el)?),
             "Vendor" => vendor = Some(read_vendor(c, el)?),
             "Descriptions" => descriptions(c, el, file)?,
             _ => {}
@@ -63,18 +65,65 @@ fn descriptions<'a>(
     file: &mut EsiFile,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| match el.name {
+        "Groups" => c.children(el, |c, el| {
+            if el.name == "Group" {
+                file.groups.push(group(c, el)?);
+            }
+            Ok(())
+        }),
         "Devices" => c.children(el, |c, el| {
             if el.name == "Device" {
                 file.devices.push(device::read(c, el)?);
             }
             Ok(())
         }),
-        "Modules" => c.children(el, |c, el| {
-            if el.name == "Module" {
-                file.modules.push(module::read(c, el)?);
-            }
-            Ok(())
-        }),
+        "Modules" => modules(c, el, file),
         _ => Ok(()),
+    })
+}
+
+fn group<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Group, EsiError> {
+    let mut group = Group::default();
+    let mut names = Names::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "Type" => group.type_name = c.text(el)?,
+            "Name" => names.add(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    group.name = names.take();
+    Ok(group)
+}
+
+fn modules<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    file: &mut EsiFile,
+) -> Result<(), EsiError> {
+    c.children(element, |c, el| {
+        if el.name == "Module" {
+            file.modules.push(module::read(c, el)?);
+        }
+        Ok(())
+    })
+}
+
+/// The modules stand directly below the root or inside `Modules`; some files have a `Vendor`, some have none.
+fn modules_alone<'a>(
+    c: &mut Cursor<'a>,
+    root: &Element<'a>,
+    file: &mut EsiFile,
+) -> Result<(), EsiError> {
+    c.children(root, |c, el| {
+        match el.name {
+            "Vendor" => file.vendor = read_vendor(c, el)?,
+            "Module" => file.modules.push(module::read(c, el)?),
+            "Modules" => modules(c, el, file)?,
+            "Descriptions" => descriptions(c, el, file)?,
+            _ => {}
+        }
+        Ok(())
     })
 }

@@ -4,7 +4,7 @@
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Coe, InitCmd, Mailbox};
+use crate::model::{Coe, InitCmd, Mailbox, SlotDependence};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Mailbox, EsiError> {
     let mut mailbox = Mailbox {
@@ -51,8 +51,11 @@ fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, Es
         position: element.position,
         transitions: Vec::new(),
         index: 0,
+        depends_on: SlotDependence::default(),
         sub: 0,
         complete_access: c.attribute_flag(element, "CompleteAccess")?,
+        fixed: c.attribute_flag(element, "Fixed")?,
+        overwritten_by_module: c.attribute_flag(element, "OverwrittenByModule")?,
         data: Vec::new(),
         comment: String::new(),
     };
@@ -61,7 +64,10 @@ fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, Es
     c.children(element, |c, el| {
         match el.name {
             "Transition" => cmd.transitions.push(c.text(el)?.to_ascii_uppercase()),
-            "Index" => index = Some(c.number(el, "InitCmd index")?),
+            "Index" => {
+                cmd.depends_on = c.slot_dependence(el)?;
+                index = Some(c.number(el, "InitCmd index")?);
+            }
             "SubIndex" => cmd.sub = c.number(el, "InitCmd subindex")?,
             "Data" => cmd.data = c.hex_bytes(el, "InitCmd data")?,
             "Comment" => comments.add(c, el)?,

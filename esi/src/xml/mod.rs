@@ -1,8 +1,9 @@
 //! The ESI file as a stream of XML events, one file per ETG.2000 element family.
 //!
 //! `decode` turns bytes into text, `cursor` walks elements with line, column and path, `number` reads literals.
-//! `info` is the root; below it `device`, `sync` (Fmmu, Sm), `pdo`, `mailbox`, `dc`, `slots`, `module`, `eeprom`
-//! and the dictionary: `datatype` and `object` read it as written, `resolve` joins the two.
+//! `info` is the root; below it `device`, `device_info`, `sync` (Fmmu, Sm, Su), `pdo`, `mailbox`, `dc`, `slots`,
+//! `module`, `eeprom` and `profile` with the dictionary: `datatype` and `object` read it as written, `resolve` joins
+//! the two.
 //!
 //! Rules here: unknown elements are skipped; what a layout or an address depends on is an error when it is
 //! wrong, everything else a warning; nothing in a file may make the reader panic, recurse without bound or
@@ -13,6 +14,7 @@ mod datatype;
 mod dc;
 mod decode;
 mod device;
+mod device_info;
 mod eeprom;
 mod info;
 mod literal;
@@ -21,6 +23,7 @@ mod module;
 mod number;
 mod object;
 mod pdo;
+mod profile;
 mod resolve;
 mod slots;
 mod sync;
@@ -29,7 +32,8 @@ mod text;
 use crate::error::EsiError;
 use crate::model::{EsiFile, Position, Warning};
 
-/// Reads an ESI file (`EtherCATInfo`), or what `ethercat xml` prints (`EtherCATInfoList`).
+/// Reads an ESI file (`EtherCATInfo`), a file of modules alone (`EtherCATModule`), or what `ethercat xml` prints
+/// (`EtherCATInfoList`).
 pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
     let decoded = decode::decode(bytes);
     let mut cursor = cursor::Cursor::new(&decoded.text);

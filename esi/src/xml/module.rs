@@ -2,7 +2,7 @@
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
-use super::{device, mailbox, pdo};
+use super::{mailbox, pdo, profile};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Direction, Module};
 
@@ -17,6 +17,8 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Modu
         match el.name {
             "Type" => {
                 ident = c.attribute_number(el, "ModuleIdent")?;
+                module.class = c.attribute(el, "ModuleClass")?;
+                module.pdo_group = c.attribute_number(el, "ModulePdoGroup")?;
                 module.type_name = c.text(el)?;
             }
             "Name" => names.add(c, el)?,
@@ -25,9 +27,9 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Modu
             "Mailbox" => module.init_cmds = mailbox::read(c, el)?.coe.unwrap_or_default().init_cmds,
             "DcOpModeName" => module.dc_mode = Some(c.text(el)?),
             "Profile" => {
-                let (number, dictionary) = device::profile(c, el)?;
-                module.profile = module.profile.or(number);
-                module.dictionary.objects.extend(dictionary.objects);
+                let profile = profile::read(c, el)?;
+                module.profile = module.profile.or(profile.number);
+                module.dictionary.objects.extend(profile.objects);
             }
             _ => {}
         }

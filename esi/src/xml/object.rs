@@ -4,11 +4,12 @@ use super::cursor::{Cursor, Element};
 use super::number::{boolean, number};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Access, PdoMapping, Position, Writable};
+use crate::model::{Access, PdoMapping, Position, SlotDependence, Writable};
 
 pub(super) struct RawObject {
     pub position: Position,
     pub index: u16,
+    pub depends_on: SlotDependence,
     pub name: String,
     pub type_name: String,
     pub bit_size: u32,
@@ -59,6 +60,7 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject, Es
     let mut object = RawObject {
         position: element.position,
         index: 0,
+        depends_on: SlotDependence::default(),
         name: String::new(),
         type_name: String::new(),
         bit_size: 0,
@@ -67,7 +69,10 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject, Es
     };
     c.children(element, |c, el| {
         match el.name {
-            "Index" => index = Some(c.number(el, "object index")?),
+            "Index" => {
+                object.depends_on = c.slot_dependence(el)?;
+                index = Some(c.number(el, "object index")?);
+            }
             "Name" => names.add(c, el)?,
             "Type" => object.type_name = c.text(el)?,
             "BitSize" => object.bit_size = c.number(el, "BitSize")?,

@@ -3,7 +3,7 @@
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Direction, Entry, Pdo};
+use crate::model::{Direction, Entry, Excluded, Pdo, SlotDependence};
 
 pub(super) fn read<'a>(
     c: &mut Cursor<'a>,
@@ -16,10 +16,13 @@ pub(super) fn read<'a>(
         index: 0,
         name: String::new(),
         sm: c.attribute_number(element, "Sm")?,
+        su: c.attribute_number(element, "Su")?,
+        excluded_sm: Vec::new(),
         fixed: c.attribute_flag(element, "Fixed")?,
         mandatory: c.attribute_flag(element, "Mandatory")?,
         virtual_: c.attribute_flag(element, "Virtual")?,
         overwritten_by_module: c.attribute_flag(element, "OverwrittenByModule")?,
+        depends_on: SlotDependence::default(),
         exclude: Vec::new(),
         entries: Vec::new(),
     };
@@ -27,9 +30,16 @@ pub(super) fn read<'a>(
     let mut index = None;
     c.children(element, |c, el| {
         match el.name {
-            "Index" => index = Some(c.number(el, "PDO index")?),
+            "Index" => {
+                pdo.depends_on = c.slot_dependence(el)?;
+                index = Some(c.number(el, "PDO index")?);
+            }
             "Name" => names.add(c, el)?,
-            "Exclude" => pdo.exclude.push(c.number(el, "excluded PDO index")?),
+            "Exclude" => pdo.exclude.push(Excluded {
+                depends_on: c.slot_dependence(el)?,
+                index: c.number(el, "excluded PDO index")?,
+            }),
+            "ExcludedSm" => pdo.excluded_sm.push(c.number(el, "excluded SyncManager")?),
             "Entry" => pdo.entries.push(entry(c, el)?),
             _ => {}
         }
@@ -49,12 +59,16 @@ fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiErro
         bit_len: 0,
         name: String::new(),
         data_type: String::new(),
+        depends_on: SlotDependence::default(),
     };
     let mut names = Names::default();
     let mut index = None;
     c.children(element, |c, el| {
         match el.name {
-            "Index" => index = Some(c.number(el, "entry index")?),
+            "Index" => {
+                entry.depends_on = c.slot_dependence(el)?;
+                index = Some(c.number(el, "entry index")?);
+            }
             "SubIndex" => entry.sub = c.number(el, "entry subindex")?,
             "BitLen" => entry.bit_len = c.number(el, "BitLen")?,
             "Name" => names.add(c, el)?,

@@ -114,6 +114,7 @@ pub(super) fn object<'a>(
     Ok(Object {
         position: raw.position,
         index: raw.index,
+        depends_on: raw.depends_on,
         name: raw.name,
         code,
         type_name: raw.type_name,

@@ -1,22 +1,23 @@
-//! `Slots`: where modules go. Slot groups are read as if their slots stood in the list.
+//! `Slots`: where modules go. Slots inside a `SlotGroup` element are read as if they stood in the list.
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::error::EsiError;
-use crate::model::{Slot, Slots};
+use crate::model::{Increments, ModulePdoGroup, Slot, Slots};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slots, EsiError> {
     let mut slots = Slots {
         position: element.position,
         max_count: c.attribute_number(element, "MaxSlotCount")?,
-        pdo_increment: c
-            .attribute_number(element, "SlotPdoIncrement")?
-            .unwrap_or_default(),
-        index_increment: c
-            .attribute_number(element, "SlotIndexIncrement")?
-            .unwrap_or_default(),
+        increments: Increments {
+            pdo: increment(c, element, "SlotPdoIncrement")?,
+            index: increment(c, element, "SlotIndexIncrement")?,
+            group_pdo: increment(c, element, "SlotGroupPdoIncrement")?,
+            group_index: increment(c, element, "SlotGroupIndexIncrement")?,
+        },
         download_module_ident_list: c.attribute_flag(element, "DownloadModuleIdentList")?,
         slots: Vec::new(),
+        pdo_groups: Vec::new(),
     };
     c.children(element, |c, el| match el.name {
         "Slot" => {
@@ -29,20 +30,37 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slot
             }
             Ok(())
         }),
+        "ModulePdoGroup" => {
+            slots.pdo_groups.push(ModulePdoGroup {
+                alignment: c.attribute_number(el, "Alignment")?.unwrap_or_default(),
+                rx_pdo: c.attribute_number(el, "RxPdo")?,
+                tx_pdo: c.attribute_number(el, "TxPdo")?,
+                name: c.text(el)?,
+            });
+            Ok(())
+        }
         _ => Ok(()),
     })?;
     Ok(slots)
+}
+
+fn increment(c: &Cursor<'_>, element: &Element<'_>, name: &'static str) -> Result<u16, EsiError> {
+    Ok(c.attribute_number(element, name)?.unwrap_or_default())
 }
 
 fn slot<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slot, EsiError> {
     let mut slot = Slot {
         position: element.position,
         name: String::new(),
+        group: c.attribute_number(element, "SlotGroup")?,
+        pdo_increment: c.attribute_number(element, "SlotPdoIncrement")?,
+        index_increment: c.attribute_number(element, "SlotIndexIncrement")?,
         min_instances: c
             .attribute_number(element, "MinInstances")?
             .unwrap_or_default(),
         max_instances: c.attribute_number(element, "MaxInstances")?.unwrap_or(1),
         module_idents: Vec::new(),
+        module_classes: Vec::new(),
     };
     let mut names = Names::default();
     c.children(element, |c, el| {
@@ -53,6 +71,12 @@ fn slot<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slot, EsiError>
                 slot.module_idents
                     .push((c.number(el, "ModuleIdent")?, default));
             }
+            "ModuleClass" => c.children(el, |c, el| {
+                if el.name == "Class" {
+                    slot.module_classes.push(c.text(el)?);
+                }
+                Ok(())
+            })?,
             _ => {}
         }
         Ok(())

@@ -2,15 +2,47 @@
 
 use super::cursor::{Cursor, Element};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{FmmuUse, SmUse, SyncManager};
+use crate::model::{Fmmu, FmmuUse, SmUse, SyncManager, SyncUnit};
 
-pub(super) fn fmmu<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<FmmuUse, EsiError> {
-    Ok(match c.text(element)?.to_ascii_lowercase().as_str() {
-        "outputs" => FmmuUse::Outputs,
-        "inputs" => FmmuUse::Inputs,
-        "mboxstate" => FmmuUse::MBoxState,
-        _ => FmmuUse::Other,
+pub(super) fn fmmu<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fmmu, EsiError> {
+    Ok(Fmmu {
+        sm: c.attribute_number(element, "Sm")?,
+        op_only: c.attribute_flag(element, "OpOnly")?,
+        usage: match c.text(element)?.to_ascii_lowercase().as_str() {
+            "outputs" => FmmuUse::Outputs,
+            "inputs" => FmmuUse::Inputs,
+            "mboxstate" => FmmuUse::MBoxState,
+            _ => FmmuUse::Other,
+        },
     })
+}
+
+pub(super) fn sync_unit<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<SyncUnit, EsiError> {
+    Ok(SyncUnit {
+        separate: c.attribute_flag(element, "SeparateSu")?,
+        separate_frame: c.attribute_flag(element, "SeparateFrame")?,
+        frame_repeat: c.attribute_flag(element, "FrameRepeatSupport")?,
+        name: c.text(element)?,
+    })
+}
+
+/// `Sm No="2"` with its `Pdo`s, in an OpMode or in an AlternativeSmMapping. One without a number says nothing.
+pub(super) fn assignment<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<Option<(u8, Vec<u16>)>, EsiError> {
+    let number = c.attribute_number(element, "No")?;
+    let mut pdos = Vec::new();
+    c.children(element, |c, el| {
+        if el.name == "Pdo" {
+            pdos.push(c.number(el, "PDO index")?);
+        }
+        Ok(())
+    })?;
+    Ok(number.map(|number| (number, pdos)))
 }
 
 pub(super) fn sync_manager<'a>(
@@ -45,6 +77,9 @@ pub(super) fn sync_manager<'a>(
             .attribute_number(element, "ControlByte")?
             .unwrap_or_default(),
         enable: enable.is_some_and(|bits| bits & 1 != 0),
+        virtual_: c.attribute_flag(element, "Virtual")?,
+        op_only: c.attribute_flag(element, "OpOnly")?,
+        watchdog: c.attribute_optional_flag(element, "Watchdog")?,
     };
     sm.usage = match c.text(element)?.to_ascii_lowercase().as_str() {
         "mboxout" => SmUse::MBoxOut,

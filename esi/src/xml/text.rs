@@ -2,14 +2,13 @@
 
 use super::cursor::{Cursor, Element};
 use crate::error::EsiError;
+use crate::model::LocalName;
 
 const ENGLISH: u32 = 1033;
 
-/// Collects sibling `Name` elements: English where it is marked, else the first.
+/// Collects sibling `Name` elements.
 #[derive(Default)]
-pub(super) struct Names {
-    best: Option<(bool, String)>,
-}
+pub(super) struct Names(Vec<LocalName>);
 
 impl Names {
     pub fn add<'a>(
@@ -17,22 +16,25 @@ impl Names {
         cursor: &mut Cursor<'a>,
         element: &Element<'a>,
     ) -> Result<(), EsiError> {
-        let english = cursor
+        let lcid = cursor
             .attribute(element, "LcId")?
-            .and_then(|id| id.trim().parse().ok())
-            == Some(ENGLISH);
+            .and_then(|id| id.trim().parse().ok());
         let text = cursor.text(element)?;
-        if self
-            .best
-            .as_ref()
-            .is_none_or(|(best_is_english, _)| english && !best_is_english)
-        {
-            self.best = Some((english, text));
-        }
+        self.0.push(LocalName { lcid, text });
         Ok(())
     }
 
+    /// English where it is marked, else the first.
     pub fn take(self) -> String {
-        self.best.map_or_else(String::new, |(_, text)| text)
+        self.take_all().0
+    }
+
+    /// The same, and all of them.
+    pub fn take_all(mut self) -> (String, Vec<LocalName>) {
+        let english = self.0.iter().find(|name| name.lcid == Some(ENGLISH));
+        let best = english.or(self.0.first());
+        let text = best.map_or_else(String::new, |name| name.text.clone());
+        self.0.shrink_to_fit();
+        (text, self.0)
     }
 }

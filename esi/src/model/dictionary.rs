@@ -1,0 +1,99 @@
+//! The object dictionary.
+
+use super::{Position, SlotDependence};
+
+/// Objects in file order, types resolved: every readable subindex is an item of its object.
+#[derive(Debug, Clone, Default)]
+pub struct Dictionary {
+    pub objects: Vec<Object>,
+}
+
+impl Dictionary {
+    #[must_use]
+    pub fn object(&self, index: u16) -> Option<&Object> {
+        self.objects.iter().find(|o| o.index == index)
+    }
+
+    #[must_use]
+    pub fn item(&self, index: u16, sub: u8) -> Option<&ObjectItem> {
+        self.object(index)?.items.iter().find(|i| i.sub == sub)
+    }
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum ObjectCode {
+    #[default]
+    Var,
+    Array,
+    Record,
+}
+
+#[derive(Debug, Clone, Default)]
+pub struct Object {
+    pub position: Position,
+    pub index: u16,
+    pub depends_on: SlotDependence,
+    pub name: String,
+    pub code: ObjectCode,
+    /// Name of the type as the file writes it.
+    pub type_name: String,
+    /// Subindex 0 first. A simple variable has exactly one item, with subindex 0.
+    pub items: Vec<ObjectItem>,
+}
+
+#[derive(Debug, Clone, Default)]
+pub struct ObjectItem {
+    pub sub: u8,
+    pub name: String,
+    /// Base type name (`USINT`, `DINT`, `STRING(5)`, `ARRAY [0..15] OF BYTE`).
+    pub type_name: String,
+    pub bit_len: u32,
+    /// Offset inside the object as complete access sees it, subindex 0 padded to 16 bits.
+    pub bit_offset: u32,
+    /// Little-endian, exactly `bit_len.div_ceil(8)` bytes; zero where the file gives no default.
+    pub default: Vec<u8>,
+    pub has_default: bool,
+    pub min: Option<Vec<u8>>,
+    pub max: Option<Vec<u8>>,
+    pub access: Access,
+    pub pdo_mapping: PdoMapping,
+    /// `Backup`: kept over a power cycle once parameters are stored.
+    pub backup: bool,
+    /// `Setting`: belongs to what a machine configures at start-up.
+    pub setting: bool,
+    /// `Unit`, coded as in ETG.1004; 0 where the file gives none.
+    pub unit: u32,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Access {
+    pub read: bool,
+    pub write: Writable,
+}
+
+impl Default for Access {
+    fn default() -> Self {
+        Self {
+            read: true,
+            write: Writable::Never,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Writable {
+    Never,
+    Always,
+    /// `WriteRestrictions` name the states in which it may be written.
+    Only {
+        pre_op: bool,
+        safe_op: bool,
+        op: bool,
+    },
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct PdoMapping {
+    pub rx: bool,
+    pub tx: bool,
+}

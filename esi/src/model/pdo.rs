@@ -1,0 +1,92 @@
+//! PDOs and their entries.
+
+use super::Position;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Direction {
+    /// MainDevice → SubDevice (outputs, 0x16xx, 0x1C12).
+    Rx,
+    /// SubDevice → MainDevice (inputs, 0x1Axx, 0x1C13).
+    Tx,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pdo {
+    pub position: Position,
+    pub direction: Direction,
+    pub index: u16,
+    pub name: String,
+    /// SyncManager it is assigned to by default; `None`: not in the default assignment.
+    pub sm: Option<u8>,
+    pub su: Option<u8>,
+    /// SyncManagers that it may not be assigned to.
+    pub excluded_sm: Vec<u8>,
+    /// The contents cannot be changed.
+    pub fixed: bool,
+    pub mandatory: bool,
+    pub virtual_: bool,
+    /// A slot's module replaces this PDO's contents.
+    pub overwritten_by_module: bool,
+    /// In a module: the index counts on by the slot's increment.
+    pub depends_on: SlotDependence,
+    pub exclude: Vec<Excluded>,
+    pub entries: Vec<Entry>,
+}
+
+/// A PDO that cannot be assigned beside this one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Excluded {
+    pub index: u16,
+    pub depends_on: SlotDependence,
+}
+
+/// Which of a slot's increments an index in a module counts on by.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+pub struct SlotDependence {
+    pub slot: bool,
+    pub group: bool,
+}
+
+impl Pdo {
+    #[must_use]
+    pub fn bit_len(&self) -> u32 {
+        self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
+    }
+}
+
+/// A mapped object, or a gap where `index` is 0.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Entry {
+    pub position: Position,
+    pub index: u16,
+    pub sub: u8,
+    pub bit_len: u16,
+    pub name: String,
+    /// ETG.2000 base type name (`UINT`, `DINT`, `BOOL` …), empty for a gap.
+    pub data_type: String,
+    pub depends_on: SlotDependence,
+}
+
+impl Entry {
+    #[must_use]
+    pub fn is_gap(&self) -> bool {
+        self.index == 0
+    }
+
+    /// The UDINT that stands in 0x16xx/0x1Axx for this entry: index, subindex, bit length.
+    /// Entries longer than 255 bits keep the low byte of their length.
+    #[must_use]
+    pub fn mapping(&self) -> u32 {
+        u32::from(self.index) << 16 | u32::from(self.sub) << 8 | u32::from(self.bit_len & 0xff)
+    }
+}
+
+/// `AlternativeSmMapping`: the PDOs of each SyncManager under a name.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SmMapping {
+    pub position: Position,
+    pub name: String,
+    pub default: bool,
+    /// (SyncManager, its PDOs in order). A SyncManager that is not named keeps its default.
+    pub sync_managers: Vec<(u8, Vec<u16>)>,
+}

@@ -1,0 +1,97 @@
+//! FMMUs, SyncManagers, sync units and DC operation modes.
+
+use super::Position;
+
+/// One `Fmmu` element; its place in `Device::fmmus` is its number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Fmmu {
+    pub usage: FmmuUse,
+    /// The SyncManager it is for, where the file says so.
+    pub sm: Option<u8>,
+    pub op_only: bool,
+}
+
+impl From<FmmuUse> for Fmmu {
+    fn from(usage: FmmuUse) -> Self {
+        Self {
+            usage,
+            sm: None,
+            op_only: false,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum FmmuUse {
+    Outputs,
+    Inputs,
+    MBoxState,
+    /// Empty or unknown text.
+    Other,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SmUse {
+    MBoxOut,
+    MBoxIn,
+    Outputs,
+    Inputs,
+    /// Empty or unknown text.
+    Other,
+}
+
+/// One `Sm` element; its place in `Device::sync_managers` is its number.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SyncManager {
+    pub position: Position,
+    pub usage: SmUse,
+    pub start_address: u16,
+    /// Bytes; 0 where the file gives none.
+    pub default_size: u16,
+    pub min_size: Option<u16>,
+    pub max_size: Option<u16>,
+    pub control_byte: u8,
+    pub enable: bool,
+    /// Not a SyncManager of the chip: process data at a register, reached by an FMMU alone.
+    pub virtual_: bool,
+    /// Enabled in Op only.
+    pub op_only: bool,
+    /// `Watchdog`: overrides control byte bit 6.
+    pub watchdog: Option<bool>,
+}
+
+/// `Dc/OpMode`. Times in nanoseconds.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct DcMode {
+    pub position: Position,
+    pub name: String,
+    pub description: String,
+    /// Low byte → 0x0980, high byte → 0x0981.
+    pub assign_activate: u16,
+    pub sync0: SyncTime,
+    pub sync1: SyncTime,
+    /// PDOs that the mode assigns: (SyncManager, PDOs in order), empty where it leaves them alone.
+    pub sync_managers: Vec<(u8, Vec<u16>)>,
+}
+
+/// Cycle and shift of one SYNC signal as written; `Factor` relates it to the bus cycle.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SyncTime {
+    /// Absolute cycle in nanoseconds; 0: derive from the factor.
+    pub cycle_ns: i64,
+    /// > 0: bus cycle × factor, < 0: bus cycle ÷ |factor|, 0: none.
+    pub factor: i32,
+    pub shift_ns: i64,
+    pub shift_factor: i32,
+    /// `Input="1"`: shift relative to the input event.
+    pub shift_input: bool,
+}
+
+/// `Su`.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SyncUnit {
+    pub name: String,
+    pub separate: bool,
+    pub separate_frame: bool,
+    pub frame_repeat: bool,
+}
