@@ -5,8 +5,8 @@
 mod common;
 
 use ecaxis_esi::sii::{
-    self, General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiOptions, SiiPdo,
-    SiiSyncManager,
+    self, General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiOptions,
+    SiiPdo, SiiSyncManager,
 };
 use ecaxis_esi::{FmmuUse, Identity, SmUse, parse};
 use proptest::prelude::*;
@@ -259,10 +259,16 @@ fn any_image() -> impl Strategy<Value = Sii> {
         text(),
         text(),
         text(),
-        any::<(u8, bool, bool, u8, i16, u16)>(),
+        any::<(u8, bool, bool, u8, i16, u16, u16)>(),
     )
         .prop_map(
-            |(group, image, order, name, (coe_details, foe, eoe, flags, ebus_ma, ports))| General {
+            |(
+                group,
+                image,
+                order,
+                name,
+                (coe_details, foe, eoe, flags, ebus_ma, ports, identification_address),
+            )| General {
                 group,
                 image,
                 order,
@@ -273,8 +279,26 @@ fn any_image() -> impl Strategy<Value = Sii> {
                 flags,
                 ebus_ma,
                 ports,
+                identification_address,
             },
         );
+    let detail = (
+        any::<bool>(),
+        proptest::option::of(any::<u8>()),
+        proptest::option::of(any::<u8>()),
+    )
+        .prop_map(|(op_only, sm, su)| SiiFmmuDetail { op_only, sm, su });
+    // An odd number of bytes is padded, so only even ones come back as they were.
+    let details = prop::collection::vec(detail, 0..4).prop_map(|details| {
+        if details.len() == 3 {
+            Vec::new()
+        } else {
+            details
+        }
+    });
+    let even_bytes =
+        || prop::collection::vec(any::<[u8; 2]>(), 0..5).prop_map(|pairs| pairs.concat());
+    let other = (0x0800..0x3000_u16, even_bytes());
     let areas = any::<[u16; 4]>().prop_map(|w| MailboxAreas {
         receive_offset: w[0],
         receive_size: w[1],
@@ -292,6 +316,7 @@ fn any_image() -> impl Strategy<Value = Sii> {
             prop::collection::vec(pdo(), 0..5),
         ],
         prop::collection::vec(dc(), 0..4),
+        (details, even_bytes(), prop::collection::vec(other, 0..4)),
     )
         .prop_map(
             |(
@@ -302,6 +327,7 @@ fn any_image() -> impl Strategy<Value = Sii> {
                 sync_managers,
                 [tx_pdos, rx_pdos],
                 dc,
+                (fmmu_details, sync_units, others),
             )| Sii {
                 config,
                 alias: u16::from_le_bytes([config[8], config[9]]),
@@ -322,7 +348,9 @@ fn any_image() -> impl Strategy<Value = Sii> {
                 tx_pdos,
                 rx_pdos,
                 dc,
-                others: Vec::new(),
+                fmmu_details,
+                sync_units,
+                others,
                 ended: true,
             },
         )

@@ -8,6 +8,8 @@ pub struct Fmmu {
     pub usage: FmmuUse,
     /// The SyncManager it is for, where the file says so.
     pub sm: Option<u8>,
+    /// Its sync unit, by number.
+    pub su: Option<u8>,
     pub op_only: bool,
 }
 
@@ -16,6 +18,7 @@ impl From<FmmuUse> for Fmmu {
         Self {
             usage,
             sm: None,
+            su: None,
             op_only: false,
         }
     }
@@ -93,5 +96,6 @@ pub struct SyncUnit {
     pub name: String,
     pub separate: bool,
     pub separate_frame: bool,
+    pub depends_on_input_state: bool,
     pub frame_repeat: bool,
 }

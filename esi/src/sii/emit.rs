@@ -74,6 +74,30 @@ impl Sii {
             }
             push(&mut rest, category::SYNC_MANAGER, &data, 0);
         }
+        if !self.fmmu_details.is_empty() {
+            let bytes = self.fmmu_details.iter().flat_map(|detail| {
+                let flags = [
+                    (detail.op_only, 1),
+                    (detail.sm.is_some(), 2),
+                    (detail.su.is_some(), 4),
+                ];
+                let flags = flags
+                    .into_iter()
+                    .filter(|(on, _)| *on)
+                    .map(|(_, bit)| bit)
+                    .sum();
+                [flags, detail.sm.unwrap_or(0), detail.su.unwrap_or(0)]
+            });
+            push(
+                &mut rest,
+                category::FMMU_DETAILS,
+                &bytes.collect::<Vec<u8>>(),
+                0,
+            );
+        }
+        if !self.sync_units.is_empty() {
+            push(&mut rest, category::SYNC_UNIT, &self.sync_units, 0);
+        }
         for (kind, pdos) in [
             (category::TX_PDO, &self.tx_pdos),
             (category::RX_PDO, &self.rx_pdos),
@@ -88,6 +112,9 @@ impl Sii {
         let mut out = Vec::new();
         push(&mut out, category::STRINGS, &strings.to_bytes(), 0);
         out.append(&mut rest);
+        for (kind, data) in &self.others {
+            push(&mut out, *kind, data, 0);
+        }
         out.extend_from_slice(&category::END.to_le_bytes());
         out
     }
@@ -110,6 +137,7 @@ impl Sii {
         data.extend_from_slice(&general.ebus_ma.to_le_bytes());
         data.extend_from_slice(&[group, 0]);
         data.extend_from_slice(&general.ports.to_le_bytes());
+        data.extend_from_slice(&general.identification_address.to_le_bytes());
         data.resize(32, 0);
         Some(data)
     }

@@ -1,8 +1,11 @@
 //! ESI device → EEPROM image contents.
 
 use super::datatype::type_code;
-use super::{General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiPdo, SiiSyncManager};
-use crate::model::{Device, Direction, Mailbox, Module, Pdo, SmUse};
+use super::{
+    General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo, SiiSyncManager,
+    category,
+};
+use crate::model::{Device, Direction, Identification, Mailbox, Module, Pdo, SmUse, SyncUnit};
 use crate::select::default_pdos;
 
 /// What differs from one piece of hardware to the next.
@@ -53,10 +56,68 @@ impl Sii {
                     sync1_factor: i16::try_from(mode.sync1.factor).unwrap_or(0),
                 })
                 .collect(),
-            others: Vec::new(),
+            fmmu_details: fmmu_details(device),
+            sync_units: device.sync_units.iter().map(sync_unit).collect(),
+            others: device
+                .eeprom
+                .categories
+                .iter()
+                .filter(|category| !GENERATED.contains(&category.number))
+                .map(|category| (category.number, even(&category.data)))
+                .collect(),
             ended: true,
         }
     }
+}
+
+/// Categories that follow from the rest of the ESI; a file that lists them as well means the same.
+const GENERATED: [u16; 9] = [
+    category::STRINGS,
+    category::GENERAL,
+    category::FMMU,
+    category::SYNC_MANAGER,
+    category::FMMU_DETAILS,
+    category::SYNC_UNIT,
+    category::TX_PDO,
+    category::RX_PDO,
+    category::DC,
+];
+
+/// Categories are made of words.
+fn even(data: &[u8]) -> Vec<u8> {
+    let mut data = data.to_vec();
+    data.resize(data.len().next_multiple_of(2), 0);
+    data
+}
+
+/// Only where the file tells more than the order of the FMMUs.
+fn fmmu_details(device: &Device) -> Vec<SiiFmmuDetail> {
+    let details = device.fmmus.iter().map(|fmmu| SiiFmmuDetail {
+        op_only: fmmu.op_only,
+        sm: fmmu.sm,
+        su: fmmu.su,
+    });
+    let told = |detail: &SiiFmmuDetail| *detail != SiiFmmuDetail::default();
+    let details: Vec<_> = details.collect();
+    if details.iter().any(told) {
+        details
+    } else {
+        Vec::new()
+    }
+}
+
+fn sync_unit(unit: &SyncUnit) -> u8 {
+    let flags = [
+        (unit.separate, 1),
+        (unit.separate_frame, 2),
+        (unit.depends_on_input_state, 4),
+        (unit.frame_repeat, 8),
+    ];
+    flags
+        .into_iter()
+        .filter(|(on, _)| *on)
+        .map(|(_, bit)| bit)
+        .sum()
 }
 
 fn bootstrap(bytes: &[u8]) -> MailboxAreas {
@@ -121,7 +182,21 @@ fn general(device: &Device) -> General {
             .rev()
             .fold(0, |byte, bit| byte << 1 | u8::from(bit))
     });
-    let link_layer = mailbox.is_some_and(|mailbox| mailbox.data_link_layer);
+    let flags = [
+        (device.use_lrd_lwr, General::NO_LRW),
+        (
+            mailbox.is_some_and(|mailbox| mailbox.data_link_layer),
+            General::DATA_LINK_LAYER,
+        ),
+        (
+            device.info.identification == Identification::Reg134,
+            General::IDENTIFICATION_AL_STATUS,
+        ),
+        (
+            matches!(device.info.identification, Identification::Ado(_)),
+            General::IDENTIFICATION_ADDRESS,
+        ),
+    ];
     General {
         group: device.type_name.clone(),
         image: String::new(),
@@ -130,9 +205,21 @@ fn general(device: &Device) -> General {
         coe_details,
         foe: mailbox.is_some_and(|mailbox| mailbox.foe),
         eoe: mailbox.is_some_and(|mailbox| mailbox.eoe),
-        flags: if link_layer { 0x04 } else { 0 },
-        ebus_ma: 0,
+        flags: flags
+            .into_iter()
+            .filter(|(on, _)| *on)
+            .map(|(_, bit)| bit)
+            .sum(),
+        ebus_ma: device
+            .info
+            .ebus_current_ma
+            .and_then(|current| i16::try_from(current).ok())
+            .unwrap_or(0),
         ports: ports(&device.physics),
+        identification_address: match device.info.identification {
+            Identification::Ado(address) => address,
+            _ => 0,
+        },
     }
 }
 
@@ -172,7 +259,9 @@ fn sync_managers(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Vec<SiiSyncManager>
                 start_address: sm.start_address,
                 len,
                 control: sm.control_byte,
-                enable: u8::from(sm.enable),
+                enable: u8::from(sm.enable)
+                    | u8::from(sm.virtual_) << 2
+                    | u8::from(sm.op_only) << 3,
                 usage: sm.usage,
             }
         })

@@ -1,9 +1,10 @@
 //! The EEPROM image (SII, ETG.2010): what a SubDevice tells about itself before anybody has its ESI.
 //!
 //! `image` derives it from an ESI device, `emit` writes the bytes, `parse` reads them, `strings` and `crc` are the
-//! two details both need. [`Sii`] is the meeting point: `parse(emit(sii))` gives the same value again as long
+//! two details both need; `compare` tells where two images differ. [`Sii`] is the meeting point: `parse(emit(sii))` gives the same value again as long
 //! as its texts are ASCII of at most 63 characters.
 
+mod compare;
 mod crc;
 mod datatype;
 mod emit;
@@ -11,6 +12,7 @@ mod image;
 mod parse;
 mod strings;
 
+pub use compare::{Aspect, Difference, compare};
 pub use crc::checksum;
 pub use image::SiiOptions;
 pub use parse::SiiError;
@@ -41,8 +43,13 @@ pub struct Sii {
     pub tx_pdos: Vec<SiiPdo>,
     pub rx_pdos: Vec<SiiPdo>,
     pub dc: Vec<SiiDc>,
-    /// Categories that are not interpreted: type and length in bytes.
-    pub others: Vec<(u16, usize)>,
+    /// Extended FMMU settings (category 42), one for each FMMU; empty where the image has none.
+    pub fmmu_details: Vec<SiiFmmuDetail>,
+    /// Flags of each sync unit (category 43): bit 0 separate, 1 separate frame, 2 depends on the input state,
+    /// 3 frames may be repeated.
+    pub sync_units: Vec<u8>,
+    /// Categories that are not interpreted, as they are: data types, dictionaries, makers' own.
+    pub others: Vec<(u16, Vec<u8>)>,
     /// The end mark was found.
     pub ended: bool,
 }
@@ -84,11 +91,28 @@ pub struct General {
     pub coe_details: u8,
     pub foe: bool,
     pub eoe: bool,
-    /// Bit 1: no LRW, bit 2: mailbox data link layer.
+    /// Bit 0: SafeOp is allowed, bit 1: no LRW, bit 2: mailbox data link layer, bit 3: identification in the AL status
+    /// code register, bit 4: identification at `identification_address`.
     pub flags: u8,
     pub ebus_ma: i16,
     /// Four bits a port: 0 none, 1 MII, 3 E-bus, 4 fast hot connect.
     pub ports: u16,
+    pub identification_address: u16,
+}
+
+impl General {
+    pub const NO_LRW: u8 = 0x02;
+    pub const DATA_LINK_LAYER: u8 = 0x04;
+    pub const IDENTIFICATION_AL_STATUS: u8 = 0x08;
+    pub const IDENTIFICATION_ADDRESS: u8 = 0x10;
+}
+
+/// Category 42.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SiiFmmuDetail {
+    pub op_only: bool,
+    pub sm: Option<u8>,
+    pub su: Option<u8>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -163,6 +187,8 @@ mod category {
     pub const GENERAL: u16 = 30;
     pub const FMMU: u16 = 40;
     pub const SYNC_MANAGER: u16 = 41;
+    pub const FMMU_DETAILS: u16 = 42;
+    pub const SYNC_UNIT: u16 = 43;
     pub const TX_PDO: u16 = 50;
     pub const RX_PDO: u16 = 51;
     pub const DC: u16 = 60;

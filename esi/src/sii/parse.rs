@@ -2,8 +2,8 @@
 
 use super::strings::Table;
 use super::{
-    General, HEADER_BYTES, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiPdo, SiiSyncManager,
-    category, checksum, fmmu_use, sm_use,
+    General, HEADER_BYTES, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo,
+    SiiSyncManager, category, checksum, fmmu_use, sm_use,
 };
 use crate::model::{FmmuUse, Identity};
 
@@ -55,7 +55,11 @@ pub(super) fn image(bytes: &[u8]) -> Result<Sii, SiiError> {
                     .map(|chunk| dc(chunk, &strings))
                     .collect()
             }
-            _ => sii.others.push((kind, data.len())),
+            category::FMMU_DETAILS => {
+                sii.fmmu_details = data.chunks_exact(3).map(fmmu_detail).collect()
+            }
+            category::SYNC_UNIT => sii.sync_units = data.to_vec(),
+            _ => sii.others.push((kind, data.to_vec())),
         }
     }
     Ok(sii)
@@ -134,6 +138,16 @@ fn general(data: &[u8], strings: &Table) -> General {
         flags: byte(data, 11),
         ebus_ma: i16::from_le_bytes(word(data, 12).to_le_bytes()),
         ports: word(data, 16),
+        identification_address: word(data, 18),
+    }
+}
+
+fn fmmu_detail(data: &[u8]) -> SiiFmmuDetail {
+    let flags = byte(data, 0);
+    SiiFmmuDetail {
+        op_only: flags & 1 != 0,
+        sm: Some(byte(data, 1)).filter(|_| flags & 2 != 0),
+        su: Some(byte(data, 2)).filter(|_| flags & 4 != 0),
     }
 }
 

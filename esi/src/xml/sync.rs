@@ -7,6 +7,7 @@ use crate::model::{Fmmu, FmmuUse, SmUse, SyncManager, SyncUnit};
 pub(super) fn fmmu<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fmmu, EsiError> {
     Ok(Fmmu {
         sm: c.attribute_number(element, "Sm")?,
+        su: c.attribute_number(element, "Su")?,
         op_only: c.attribute_flag(element, "OpOnly")?,
         usage: match c.text(element)?.to_ascii_lowercase().as_str() {
             "outputs" => FmmuUse::Outputs,
@@ -24,6 +25,7 @@ pub(super) fn sync_unit<'a>(
     Ok(SyncUnit {
         separate: c.attribute_flag(element, "SeparateSu")?,
         separate_frame: c.attribute_flag(element, "SeparateFrame")?,
+        depends_on_input_state: c.attribute_flag(element, "DependOnInputState")?,
         frame_repeat: c.attribute_flag(element, "FrameRepeatSupport")?,
         name: c.text(element)?,
     })
