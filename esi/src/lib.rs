@@ -6,11 +6,13 @@
 //! - [`layout`]: that choice → bit offsets
 //! - [`startup`]: that choice → the SDOs to send before SafeOp
 //! - [`sii`]: the EEPROM image, from an ESI device or from bytes
+//! - [`lint`](mod@lint): what is wrong with a file that can be read
 
 #![forbid(unsafe_code)]
 
 mod error;
 pub mod layout;
+pub mod lint;
 mod mode;
 pub mod model;
 pub mod select;
@@ -20,6 +22,7 @@ mod xml;
 
 pub use error::{EsiError, EsiProblem};
 pub use layout::{Field, Layout, SmLayout};
+pub use lint::{Finding, Severity, lint};
 pub use mode::{Mode, UnknownMode};
 pub use model::*;
 pub use select::{

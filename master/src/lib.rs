@@ -2,6 +2,7 @@
 //!
 //! The layers, from the file to the wire:
 //!
+//! - [`library`]: ESI files on disk, one or a folder of them;
 //! - [`config`]: the machine file as written, then validated;
 //! - [`session`]: one run of a machine, from the file to the summary;
 //! - [`supervise`]: everything beside the cycle while the machine runs;
@@ -15,6 +16,7 @@ pub mod al_status;
 pub mod bringup;
 pub mod clock;
 pub mod config;
+pub mod library;
 pub mod link;
 pub mod mailbox;
 pub mod rt;

@@ -7,8 +7,9 @@ use ecaxis::config::{
     self, AxisSetup, DeviceConfig, Machine, Nic, Step, VelocityUnitFrom, duration,
 };
 use ecaxis::rt::image::{self, ImagePlan};
-use ecaxis_esi::{Field, SmLayout};
+use ecaxis_esi::SmLayout;
 
+use super::tables::{fields, startup};
 use super::{Failure, hints, report::Table, result};
 
 /// Show what a machine file and its ESI files come to: PDOs, start-up SDOs, clocks, frames
@@ -112,12 +113,15 @@ fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
     if let Some(mode) = selection.mode {
         writeln!(out, "  mode {mode} (0x6060 = {})", mode.code())?;
     }
-    if let Some(module) = &selection.module {
+    for module in &selection.modules {
         writeln!(
             out,
             "  module {:?} (0x{:08x}) in slot {:?}, {esi}:{}",
             module.type_name, module.ident, module.slot_name, module.position,
         )?;
+    }
+    if let Some(assignment) = &selection.assignment {
+        writeln!(out, "  PDO assignment {assignment:?}")?;
     }
     for note in &selection.notes {
         writeln!(out, "  note: {note}")?;
@@ -130,7 +134,7 @@ fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
     fields("outputs", layout.rx_bytes(), &layout.rx, out)?;
     fields("inputs", layout.tx_bytes(), &layout.tx, out)?;
     clock(device, out)?;
-    startup(device, out)
+    startup(&device.selection.startup, out)
 }
 
 fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
@@ -234,25 +238,6 @@ fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
     writeln!(out, "\n{}", table.indented(2))
 }
 
-fn fields(what: &str, bytes: usize, fields: &[Field], out: &mut String) -> std::fmt::Result {
-    writeln!(out, "\n  {what}: {bytes} bytes")?;
-    if fields.is_empty() {
-        return Ok(());
-    }
-    let mut table = Table::new(&["offset", "bits", "object", "type", "name", "PDO"]);
-    for field in fields {
-        table.row([
-            &format!("{}.{}", field.bit_offset / 8, field.bit_offset % 8),
-            &field.bit_len.to_string(),
-            &format!("0x{:04x}:{:02x}", field.index, field.sub),
-            &field.data_type,
-            &field.name,
-            &format!("0x{:04x}", field.pdo),
-        ]);
-    }
-    writeln!(out, "{}", table.indented(2))
-}
-
 fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
     let Some(dc) = &device.selection.dc else {
         return writeln!(out, "\n  no distributed clock (0x0980 = 0x0000)");
@@ -291,54 +276,6 @@ fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
         "    SYNC1 {}",
         sync(dc.sync1_cycle_ns, dc.sync1_shift_ns)
     )
-}
-
-fn startup(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
-    let startup = &device.selection.startup;
-    if startup.is_empty() {
-        return writeln!(out, "\n  no start-up SDOs");
-    }
-    let mut table = Table::new(&["at", "object", "value", "name", "from"]);
-    for sdo in startup {
-        let object = match sdo.complete_access {
-            true => format!("0x{:04x} CA", sdo.index),
-            false => format!("0x{:04x}:{:02x}", sdo.index, sdo.sub),
-        };
-        table.row([
-            sdo.transition,
-            &object,
-            &value(&sdo.data),
-            short_name(&sdo.name),
-            &sdo.origin,
-        ]);
-    }
-    writeln!(
-        out,
-        "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}",
-        table.indented(2)
-    )
-}
-
-/// The object's index stands beside it, so the entry's own name is enough where it has one.
-fn short_name(name: &str) -> &str {
-    match name.split_once(" / ") {
-        Some((_, entry)) if !entry.starts_with("SubIndex") => entry,
-        _ => name,
-    }
-}
-
-/// Up to eight bytes as one number, more as bytes in the order of the wire.
-fn value(data: &[u8]) -> String {
-    let hex = |bytes: &mut dyn Iterator<Item = &u8>, gap: &str| {
-        let bytes: Vec<String> = bytes.map(|b| format!("{b:02x}")).collect();
-        bytes.join(gap)
-    };
-    match data.len() {
-        0 => String::new(),
-        1..=8 => format!("0x{}", hex(&mut data.iter().rev(), "")),
-        9..=24 => hex(&mut data.iter(), " "),
-        n => format!("{} … ({n} bytes)", hex(&mut data.iter().take(16), " ")),
-    }
 }
 
 /// Preamble, Ethernet header, FCS, gap.

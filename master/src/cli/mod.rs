@@ -11,6 +11,7 @@ use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
 mod check;
+mod esi;
 mod explain;
 mod hints;
 mod progress;
@@ -19,6 +20,7 @@ mod report;
 mod run;
 mod signals;
 mod sim;
+mod tables;
 
 pub(crate) use hints::Failure;
 
@@ -35,6 +37,7 @@ enum Verb {
     Run(run::Args),
     Check(check::Args),
     Explain(explain::Args),
+    Esi(esi::Args),
     Sim(sim::Args),
 }
 
@@ -75,12 +78,13 @@ pub fn main() -> ExitCode {
         Verb::Run(run::Args { verbosity, .. }) | Verb::Sim(sim::Args { verbosity, .. }) => {
             verbosity.start_logging();
         }
-        Verb::Check(_) | Verb::Explain(_) => {}
+        Verb::Check(_) | Verb::Explain(_) | Verb::Esi(_) => {}
     }
     let done = match cli.verb {
         Verb::Run(args) => run::run(&args),
         Verb::Check(args) => check::run(&args),
         Verb::Explain(args) => explain::run(&args),
+        Verb::Esi(args) => esi::run(&args),
         Verb::Sim(args) => sim::run(&args),
     };
     match done {
@@ -146,6 +150,17 @@ mod tests {
             ("ecaxis run --for 10", false),
             ("ecaxis run --repeat 0", false),
             ("ecaxis check", false),
+            (
+                "ecaxis esi show f.xml --device EPOS4 --mode csp --cycle 2ms",
+                true,
+            ),
+            ("ecaxis esi sii f.xml", false),
+            (
+                "ecaxis esi list d --vendor 0xfb --product 1 --revision 2 --match high-word",
+                true,
+            ),
+            ("ecaxis esi list d --revision 2", false),
+            ("ecaxis esi list d --match roughly", false),
             ("ecaxis sim m.toml --nic veth0", true),
         ] {
             assert_eq!(Cli::try_parse_from(line.split(' ')).is_ok(), good, "{line}");

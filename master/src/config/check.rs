@@ -4,7 +4,7 @@ use std::path::Path;
 
 use toml::Spanned;
 
-use super::device::{self, Library};
+use super::device::{self, EsiFiles};
 use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
@@ -19,7 +19,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let places = places(&raw.devices, p);
 
     let folder = path.parent().unwrap_or(Path::new(""));
-    let mut library = Library::new(folder, bus.as_ref().map(|b| (b.cycle_ns, cycle_span)));
+    let mut files = EsiFiles::new(folder, bus.as_ref().map(|b| (b.cycle_ns, cycle_span)));
     let mut names = Vec::new();
     let mut devices: Vec<Option<DeviceConfig>> = Vec::new();
     let all: Vec<String> = raw
@@ -33,7 +33,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
             raw.name.as_ref().map(|n| n.get_ref().clone()),
             raw.axis.is_some(),
         ));
-        devices.push(device::check(raw, at, &mut library, &all, p));
+        devices.push(device::check(raw, at, &mut files, &all, p));
     }
     // Indices in steps are those of the machine, so the order is settled first.
     if devices.iter().all(|d| {

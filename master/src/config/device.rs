@@ -10,50 +10,55 @@ use toml::Spanned;
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, axis, sdo, sim};
+use crate::library::{self, Library, LoadError};
 
 /// What all devices share: where ESI files are, those read so far, and the cycle.
-pub(crate) struct Library<'f> {
+pub(crate) struct EsiFiles<'f> {
     folder: &'f Path,
     /// Nanoseconds and where they are written; `None` where the cycle itself is wrong.
     cycle: Option<(u64, Span)>,
     /// `None`: could not be read, which has been reported.
     files: BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>,
+    folders: BTreeMap<PathBuf, Option<Library>>,
 }
 
-impl<'f> Library<'f> {
+impl<'f> EsiFiles<'f> {
     pub fn new(folder: &'f Path, cycle: Option<(u64, Span)>) -> Self {
         Self {
             folder,
             cycle,
             files: BTreeMap::new(),
+            folders: BTreeMap::new(),
         }
     }
 
+    /// The file that `esi` names, or the one of the folder that it names which describes the device.
     fn file(
         &mut self,
-        name: &Spanned<String>,
+        raw: &RawDevice,
         p: &mut Problems<'_>,
     ) -> Option<(PathBuf, Arc<esi::EsiFile>)> {
-        let path = self.folder.join(name.get_ref());
+        let name = raw.esi.as_ref()?;
+        let mut path = self.folder.join(name.get_ref());
+        if path.is_dir() {
+            path = self.in_folder(&path, raw, name, p)?;
+        }
         if let Some(known) = self.files.get(&path) {
             return known.clone().map(|file| (path, file));
         }
-        let read = match std::fs::read(&path) {
-            Ok(bytes) => esi::parse(&bytes).map_err(|e| {
-                (
-                    format!("{}:{e}", path.display()),
-                    "the file is damaged or is not an ESI file".to_owned(),
-                )
-            }),
-            Err(e) => {
-                let hint = match e.kind() {
+        let read = library::load(&path).map_err(|e| match e {
+            LoadError::Read { path, source } => {
+                let hint = match source.kind() {
                     std::io::ErrorKind::NotFound => neighbours(&path),
-                    std::io::ErrorKind::IsADirectory => neighbours(&path.join("-")),
                     _ => "look at the file's permissions".to_owned(),
                 };
-                Err((unreadable(&path, &e), hint))
+                (unreadable(&path, &source), hint)
             }
-        };
+            LoadError::Esi { .. } | LoadError::TooLong { .. } => (
+                e.to_string(),
+                "the file is damaged or is not an ESI file".to_owned(),
+            ),
+        });
         let file = match read {
             Ok(file) => Some(Arc::new(file)),
             Err((message, hint)) => {
@@ -63,6 +68,76 @@ impl<'f> Library<'f> {
         };
         self.files.insert(path.clone(), file.clone());
         file.map(|file| (path, file))
+    }
+
+    /// The one file of a folder that describes what `type`, `vendor`, `product` and `revision` say.
+    fn in_folder(
+        &mut self,
+        folder: &Path,
+        raw: &RawDevice,
+        name: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<PathBuf> {
+        if !self.folders.contains_key(folder) {
+            let cache = library::cache_file(folder);
+            let opened = Library::open(folder, cache.as_deref());
+            let opened = opened.map_err(|e| p.add(name.span(), e.to_string())).ok();
+            self.folders.insert(folder.to_owned(), opened);
+        }
+        let known = self.folders.get(folder)?.as_ref()?;
+        let of = |number: &Option<Spanned<u32>>| number.as_ref().map(|n| *n.get_ref());
+        let type_name = raw.type_name.as_ref().map(|t| t.get_ref().trim());
+        let fits = |e: &&library::Entry| {
+            of(&raw.vendor).is_none_or(|vendor| vendor == e.vendor)
+                && of(&raw.product).is_none_or(|product| product == e.product)
+                && of(&raw.revision).is_none_or(|revision| revision == e.revision)
+                && type_name.is_none_or(|name| {
+                    e.type_name.eq_ignore_ascii_case(name) || e.name.eq_ignore_ascii_case(name)
+                })
+        };
+        // Of several revisions in several files, the newest.
+        let newest = known
+            .entries()
+            .iter()
+            .filter(fits)
+            .max_by_key(|e| e.revision);
+        let Some(newest) = newest else {
+            let message = format!(
+                "none of the {} devices described in {} fits `type`, `vendor`, `product` and `revision`",
+                known.entries().len(),
+                folder.display()
+            );
+            let names = known.entries().iter().map(|e| e.type_name.as_str());
+            let hint = match type_name {
+                Some(name) => suggestion(name, names, "devices described there"),
+                None => format!("`ecaxis esi list {}` shows them", folder.display()),
+            };
+            p.add_hint(name.span(), message, hint);
+            return None;
+        };
+        let product = (newest.vendor, newest.product);
+        let other = known
+            .entries()
+            .iter()
+            .filter(fits)
+            .find(|e| (e.vendor, e.product) != product);
+        if let Some(other) = other {
+            let message = format!(
+                "{} describes several devices that fit: {} in {}, {} in {}, perhaps more",
+                folder.display(),
+                newest.type_name,
+                newest.file.display(),
+                other.type_name,
+                other.file.display()
+            );
+            p.add_hint(
+                name.span(),
+                message,
+                "say which with `type`, or with `vendor` and `product`",
+            );
+            return None;
+        }
+        Some(folder.join(&newest.file))
     }
 }
 
@@ -101,14 +176,14 @@ pub(crate) fn mode_name(mode: ecaxis_axis::Mode) -> String {
 pub(crate) fn check(
     mut raw: RawDevice,
     at: Option<Locator>,
-    library: &mut Library<'_>,
+    files: &mut EsiFiles<'_>,
     names: &[String],
     p: &mut Problems<'_>,
 ) -> Option<DeviceConfig> {
     let mode = mode(&raw, p);
-    let file = raw.esi.as_ref().and_then(|name| library.file(name, p));
+    let file = files.file(&raw, p);
     let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
-    let chosen = match (&file, device, mode, &library.cycle) {
+    let chosen = match (&file, device, mode, &files.cycle) {
         (Some((_, file)), Some(device), Ok(mode), Some((cycle_ns, cycle))) => {
             let wanted = Wanted {
                 raw: &raw,
@@ -254,10 +329,18 @@ impl Wanted<'_> {
             )
         };
         let (rx, tx) = (entries(&self.raw.rx), entries(&self.raw.tx));
+        let modules = self.raw.modules.as_ref().map(|m| m.get_ref().as_slice());
+        let modules: Vec<&str> = modules
+            .unwrap_or_default()
+            .iter()
+            .map(String::as_str)
+            .collect();
         let mut choice = esi::Choice {
             mode: self.mode,
             rx: rx.as_deref(),
             tx: tx.as_deref(),
+            modules: &modules,
+            assignment: self.raw.assignment.as_ref().map(|a| a.get_ref().as_str()),
             dc_mode: self.raw.dc.as_ref().map(|d| d.get_ref().as_str()),
             cycle_ns: self.cycle_ns,
             sdo: &[],
@@ -330,6 +413,10 @@ impl Wanted<'_> {
         let at = match e {
             E::ModeNotOffered { .. } => of(raw.mode.as_ref().map(Spanned::span)),
             E::NoSuchDcMode { .. } => of(raw.dc.as_ref().map(Spanned::span)),
+            E::NoSuchModule { .. } | E::TooManyModules { .. } => {
+                of(raw.modules.as_ref().map(Spanned::span))
+            }
+            E::NoSuchAssignment { .. } => of(raw.assignment.as_ref().map(Spanned::span)),
             E::CycleNotExpressible { .. } | E::DcOutOfRange { .. } => self.cycle.clone(),
             E::UnknownEntry { list, index, sub }
             | E::NotMappable {
@@ -342,9 +429,11 @@ impl Wanted<'_> {
             _ => device.clone(),
         };
         match e {
-            E::ModuleNeeded { .. } => {
-                p.add_hint(at, e.to_string(), "pick one by its mode: `mode = \"csp\"`")
-            }
+            E::ModuleNeeded { .. } => p.add_hint(
+                at,
+                e.to_string(),
+                "pick one by its mode (`mode = \"csp\"`), or name the modules slot by slot (`modules = [\"CSP\"]`)",
+            ),
             _ => p.add(at, e.to_string()),
         }
     }

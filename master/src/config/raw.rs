@@ -40,10 +40,13 @@ pub(crate) struct RawDevice {
     pub alias: Option<Spanned<u16>>,
     pub id: Option<Spanned<u16>>,
     pub type_name: Option<Spanned<String>>,
+    pub vendor: Option<Spanned<u32>>,
     pub product: Option<Spanned<u32>>,
     pub revision: Option<Spanned<u32>>,
     pub mode: Option<Spanned<String>>,
     pub dc: Option<Spanned<String>>,
+    pub modules: Option<Spanned<Vec<String>>>,
+    pub assignment: Option<Spanned<String>>,
     pub rx: Option<Spanned<Vec<RawEntry>>>,
     pub tx: Option<Spanned<Vec<RawEntry>>>,
     pub sdo: Vec<RawSdo>,
@@ -217,10 +220,13 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
         alias: optional!(p, f, "alias", integer(1, u16::MAX)),
         id: optional!(p, f, "id", integer(1, u16::MAX)),
         type_name: optional!(p, f, "type", string),
+        vendor: optional!(p, f, "vendor", integer(0, u32::MAX)),
         product: optional!(p, f, "product", integer(0, u32::MAX)),
         revision: optional!(p, f, "revision", integer(0, u32::MAX)),
         mode: optional!(p, f, "mode", string),
         dc: optional!(p, f, "dc", string),
+        modules: f.get("modules").and_then(|v| read_modules(v, p)),
+        assignment: optional!(p, f, "assignment", string),
         rx: None,
         tx: None,
         sdo: Vec::new(),
@@ -251,6 +257,14 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
     }
     f.done(p);
     device
+}
+
+/// One name a slot.
+fn read_modules(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<Vec<String>>> {
+    let names = fields::array(p, value, "a list of modules, one a slot, \"-\" for none")?;
+    let names = names.into_iter().map(|v| fields::string(p, v));
+    let names: Option<Vec<_>> = names.map(|name| name.map(Spanned::into_inner)).collect();
+    Some(Spanned::new(value.span(), names?))
 }
 
 /// Objects as `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.

@@ -1,0 +1,323 @@
+//! What is wrong with a file that can be read: contradictions between its elements, and devices that nobody could
+//! configure from it.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use crate::model::{Device, Direction, EsiFile, InitCmd, Module, ObjectItem, Pdo, Position, SmUse};
+use crate::select::{Choice, offered_modes, select};
+
+/// A usual bus cycle, for what depends on one.
+const CYCLE_NS: u64 = 1_000_000;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Severity {
+    /// A device, or a mode of it, cannot be used.
+    Error,
+    /// Something contradicts something else, and one of the two was taken.
+    Warning,
+}
+
+impl fmt::Display for Severity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Error => "error",
+            Self::Warning => "warning",
+        })
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    pub severity: Severity,
+    pub position: Position,
+    /// Element path, `Device[1]/RxPdo[2]`.
+    pub path: String,
+    pub message: String,
+}
+
+/// Everything that is odd about a file, the reader's warnings included, in file order.
+#[must_use]
+pub fn lint(file: &EsiFile) -> Vec<Finding> {
+    let mut found = Found(Vec::new());
+    for warning in &file.warnings {
+        found.0.push(Finding {
+            severity: Severity::Warning,
+            position: warning.position,
+            path: warning.path.clone(),
+            message: warning.message.clone(),
+        });
+    }
+    for (n, device) in file.devices.iter().enumerate() {
+        let path = format!("Device[{}]", n + 1);
+        self::device(&mut found, &path, device);
+        usable(&mut found, &path, file, device);
+    }
+    for (n, module) in file.modules.iter().enumerate() {
+        self::module(&mut found, &format!("Module[{}]", n + 1), file, module);
+    }
+    doubled_devices(&mut found, file);
+    found
+        .0
+        .sort_by_key(|finding| (finding.position.line, finding.position.column));
+    found.0
+}
+
+struct Found(Vec<Finding>);
+
+impl Found {
+    fn add(&mut self, severity: Severity, position: Position, path: &str, message: String) {
+        self.0.push(Finding {
+            severity,
+            position,
+            path: path.to_owned(),
+            message,
+        });
+    }
+
+    fn warn(&mut self, position: Position, path: &str, message: String) {
+        self.add(Severity::Warning, position, path, message);
+    }
+}
+
+fn device(found: &mut Found, path: &str, device: &Device) {
+    pdos(found, path, device, &device.rx_pdos, "RxPdo");
+    pdos(found, path, device, &device.tx_pdos, "TxPdo");
+    if let Some(coe) = device.mailbox.as_ref().and_then(|m| m.coe.as_ref()) {
+        commands(found, path, device, &coe.init_cmds);
+    }
+    let areas = |usage| device.sync_managers.iter().any(|sm| sm.usage == usage);
+    if device.mailbox.is_some() && !(areas(SmUse::MBoxOut) && areas(SmUse::MBoxIn)) {
+        let message = "the device has a Mailbox, but no Sm for both of its directions".to_owned();
+        found.warn(device.position, path, message);
+    }
+    for (n, fmmu) in device.fmmus.iter().enumerate() {
+        if let Some(sm) = fmmu
+            .sm
+            .filter(|sm| usize::from(*sm) >= device.sync_managers.len())
+        {
+            let path = format!("{path}/Fmmu[{}]", n + 1);
+            found.warn(
+                device.position,
+                &path,
+                format!("it is for Sm {sm}, which does not exist"),
+            );
+        }
+    }
+    for mapping in &device.sm_mappings {
+        for index in mapping.sync_managers.iter().flat_map(|(_, pdos)| pdos) {
+            let mut all = device.rx_pdos.iter().chain(&device.tx_pdos);
+            if !all.any(|pdo| pdo.index == *index) {
+                let message = format!(
+                    "assignment {:?} names PDO 0x{index:04x}, which does not exist",
+                    mapping.name
+                );
+                let path = format!("{path}/AlternativeSmMapping");
+                found.warn(mapping.position, &path, message);
+            }
+        }
+    }
+    objects(found, path, device);
+}
+
+fn module(found: &mut Found, path: &str, file: &EsiFile, module: &Module) {
+    let first = file
+        .modules
+        .iter()
+        .find(|other| other.ident == module.ident);
+    if let Some(first) = first.filter(|first| first.position != module.position) {
+        let message = format!(
+            "module 0x{:08x} is described twice; the one on line {} is taken",
+            module.ident, first.position.line
+        );
+        found.warn(module.position, path, message);
+    }
+    for (list, kind) in [(&module.rx_pdos, "RxPdo"), (&module.tx_pdos, "TxPdo")] {
+        for (n, pdo) in list.iter().enumerate() {
+            self::pdo(found, &format!("{path}/{kind}[{}]", n + 1), pdo, list);
+        }
+    }
+}
+
+fn pdos(found: &mut Found, path: &str, device: &Device, list: &[Pdo], kind: &str) {
+    for (n, pdo) in list.iter().enumerate() {
+        let path = format!("{path}/{kind}[{}]", n + 1);
+        self::pdo(found, &path, pdo, list);
+        let Some(sm) = pdo.sm else { continue };
+        let (wanted, other) = match pdo.direction {
+            Direction::Rx => (SmUse::Outputs, SmUse::Inputs),
+            Direction::Tx => (SmUse::Inputs, SmUse::Outputs),
+        };
+        match device.sync_managers.get(usize::from(sm)) {
+            None => {
+                let message = format!(
+                    "PDO 0x{:04x} is assigned to Sm {sm}, and the device has {}",
+                    pdo.index,
+                    device.sync_managers.len()
+                );
+                found.warn(pdo.position, &path, message);
+            }
+            Some(sync)
+                if sync.usage == other || !matches!(sync.usage, SmUse::Outputs | SmUse::Inputs) =>
+            {
+                let message = format!(
+                    "PDO 0x{:04x} is assigned to Sm {sm}, which is for {:?} and not for {wanted:?}",
+                    pdo.index, sync.usage
+                );
+                found.warn(pdo.position, &path, message);
+            }
+            Some(_) => {}
+        }
+    }
+}
+
+fn pdo(found: &mut Found, path: &str, pdo: &Pdo, list: &[Pdo]) {
+    let first = list.iter().find(|other| other.index == pdo.index);
+    if let Some(first) = first.filter(|first| first.position != pdo.position) {
+        let message = format!(
+            "PDO 0x{:04x} is described twice, first on line {}",
+            pdo.index, first.position.line
+        );
+        found.warn(pdo.position, path, message);
+    }
+    if pdo.exclude.iter().any(|other| other.index == pdo.index) {
+        let message = format!("PDO 0x{:04x} excludes itself; that is ignored", pdo.index);
+        found.warn(pdo.position, path, message);
+    }
+    if pdo.entries.len() > 255 {
+        let message = format!(
+            "PDO 0x{:04x} has {} entries; a mapping object holds 255",
+            pdo.index,
+            pdo.entries.len()
+        );
+        found.warn(pdo.position, path, message);
+    }
+    for (n, entry) in pdo.entries.iter().enumerate() {
+        let unread = |bits: u16| !entry.is_gap() && usize::from(bits) > 8 * 1486;
+        if unread(entry.bit_len) {
+            let message = format!(
+                "0x{:04x}:{:02x} has {} bits, more than a frame carries",
+                entry.index, entry.sub, entry.bit_len
+            );
+            found.warn(entry.position, &format!("{path}/Entry[{}]", n + 1), message);
+        }
+    }
+}
+
+fn commands(found: &mut Found, path: &str, device: &Device, commands: &[InitCmd]) {
+    for (n, command) in commands.iter().enumerate() {
+        let path = format!("{path}/Mailbox/CoE/InitCmd[{}]", n + 1);
+        let what = format!("0x{:04x}:{:02x}", command.index, command.sub);
+        if command.transitions.is_empty() {
+            found.warn(
+                command.position,
+                &path,
+                format!("{what} names no Transition and is never sent"),
+            );
+        }
+        let dictionary = &device.dictionary;
+        let item = dictionary.item(command.index, command.sub);
+        if let Some(item) = item.filter(|_| !command.complete_access) {
+            let bytes = item.default.len();
+            if bytes > 0 && bytes != command.data.len() && !is_text(item) {
+                let message = format!(
+                    "{what} is written with {} bytes, the object has {bytes}",
+                    command.data.len()
+                );
+                found.warn(command.position, &path, message);
+            }
+        } else if item.is_none()
+            && dictionary.object(command.index).is_none()
+            && !dictionary.objects.is_empty()
+        {
+            found.warn(
+                command.position,
+                &path,
+                format!("{what} is not in the dictionary"),
+            );
+        }
+    }
+}
+
+fn is_text(item: &ObjectItem) -> bool {
+    item.type_name.contains("STRING") || item.type_name.contains("ARRAY")
+}
+
+fn objects(found: &mut Found, path: &str, device: &Device) {
+    let mut first: BTreeMap<u16, Position> = BTreeMap::new();
+    for (n, object) in device.dictionary.objects.iter().enumerate() {
+        let path = format!("{path}/Object[{}]", n + 1);
+        match first.get(&object.index) {
+            Some(position) => {
+                let message = format!(
+                    "object 0x{:04x} is described twice; the one on line {} is taken",
+                    object.index, position.line
+                );
+                found.warn(object.position, &path, message);
+            }
+            None => {
+                first.insert(object.index, object.position);
+            }
+        }
+    }
+}
+
+/// The default and every mode that is offered come to a layout.
+fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
+    let has_pdos = !device.rx_pdos.is_empty() || !device.tx_pdos.is_empty();
+    let soe_only = device
+        .mailbox
+        .as_ref()
+        .is_some_and(|m| m.soe && m.coe.is_none());
+    if soe_only {
+        let message = format!(
+            "{} speaks SoE and not CoE: its process data is laid out, but nothing can be set up at start",
+            device.name
+        );
+        found.warn(device.position, path, message);
+    }
+    let choice = Choice {
+        cycle_ns: CYCLE_NS,
+        ..Choice::default()
+    };
+    let default = select(file, device, &choice);
+    if let (Err(error), true) = (&default, has_pdos || device.slots.is_some()) {
+        found.add(
+            Severity::Error,
+            device.position,
+            path,
+            format!("its default configuration: {error}"),
+        );
+        return;
+    }
+    for mode in offered_modes(file, device) {
+        let choice = Choice {
+            mode: Some(mode),
+            ..choice
+        };
+        if let Err(error) = select(file, device, &choice) {
+            found.add(
+                Severity::Error,
+                device.position,
+                path,
+                format!("mode {mode}: {error}"),
+            );
+        }
+    }
+}
+
+fn doubled_devices(found: &mut Found, file: &EsiFile) {
+    let mut first: BTreeMap<(u32, u32, u32), Position> = BTreeMap::new();
+    for (n, device) in file.devices.iter().enumerate() {
+        let id = device.identity;
+        match first.get(&(id.vendor, id.product, id.revision)) {
+            Some(position) => {
+                let message = format!("{id} is described twice, first on line {}", position.line);
+                found.warn(device.position, &format!("Device[{}]", n + 1), message);
+            }
+            None => {
+                first.insert((id.vendor, id.product, id.revision), device.position);
+            }
+        }
+    }
+}

@@ -1,0 +1,71 @@
+//! `ecaxis esi check`: every mistake in a file, with its place.
+
+use std::fmt::Write;
+use std::path::PathBuf;
+
+use ecaxis_esi::{Finding, Severity, lint};
+use serde_json::json;
+
+use super::super::{Failure, hints, note, result};
+
+/// Tell every mistake in an ESI file, with its line, element and weight
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// ESI file
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Print the findings as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let file = super::load(&args.file)?;
+    let findings = lint(&file);
+    let errors = findings
+        .iter()
+        .filter(|f| f.severity == Severity::Error)
+        .count();
+    let text = if args.json {
+        let findings: Vec<_> = findings.iter().map(as_json).collect();
+        format!("{:#}\n", json!({ "ok": errors == 0, "findings": findings }))
+    } else {
+        let mut text = String::new();
+        for f in &findings {
+            // Writing into a String cannot fail.
+            let _ = writeln!(
+                text,
+                "{}:{}: {}: {}: {}",
+                args.file.display(),
+                f.position,
+                f.severity,
+                f.path,
+                f.message
+            );
+        }
+        text
+    };
+    result(&text)?;
+    let devices = super::plural(file.devices.len(), "device");
+    let warnings = super::plural(findings.len() - errors, "warning");
+    if errors > 0 {
+        let errors = super::plural(errors, "error");
+        let message = format!("{}: {devices}, {errors}, {warnings}", args.file.display());
+        return Err(Failure::new(hints::WRONG, message));
+    }
+    note(&format!(
+        "{}: {devices}, no error, {warnings}",
+        args.file.display()
+    ));
+    Ok(())
+}
+
+fn as_json(finding: &Finding) -> serde_json::Value {
+    json!({
+        "severity": finding.severity.to_string(),
+        "line": finding.position.line,
+        "column": finding.position.column,
+        "path": finding.path,
+        "message": finding.message,
+    })
+}

@@ -1,0 +1,102 @@
+//! `ecaxis esi diff`: an EEPROM image against the ESI of its device.
+
+use std::path::PathBuf;
+
+use ecaxis_esi::sii::{self, Aspect, Difference, Sii, SiiOptions};
+use serde_json::json;
+
+use super::super::report::Table;
+use super::super::{Failure, hints, note, result};
+use super::Which;
+
+/// Compare an EEPROM image with what the ESI file says; exit code 1 if the device would behave differently
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    which: Which,
+    /// EEPROM image
+    #[arg(value_name = "IMAGE")]
+    image: PathBuf,
+    /// Print the differences as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let file = args.which.load()?;
+    let name = args.image.display();
+    let wrong = |message: String| Failure::new(hints::WRONG, message);
+    let bytes =
+        std::fs::read(&args.image).map_err(|e| wrong(format!("cannot read {name}: {e}")))?;
+    let found = sii::parse(&bytes).map_err(|e| {
+        wrong(format!("{name}: {e}")).hint("an image is the EEPROM's bytes, without any header")
+    })?;
+    let device = device(args, &file, &found)?;
+    let expected = sii::emit(device, &file.modules, &SiiOptions::default());
+    let expected = sii::parse(&expected).map_err(|e| wrong(format!("the ESI's own image: {e}")))?;
+    let differences = sii::compare(&expected, &found);
+    let text = if args.json {
+        let all: Vec<_> = differences.iter().map(as_json).collect();
+        format!(
+            "{:#}\n",
+            json!({ "device": device.name, "differences": all })
+        )
+    } else {
+        table(&differences)
+    };
+    result(&text)?;
+    let count = |aspect| differences.iter().filter(|d| d.aspect == aspect).count();
+    let (identity, behaviour) = (count(Aspect::Identity), count(Aspect::Behaviour));
+    let told = format!(
+        "{name} against {}: {} of identity, {behaviour} of behaviour, {} of description",
+        device.name,
+        super::plural(identity, "difference"),
+        count(Aspect::Description),
+    );
+    if identity + behaviour > 0 {
+        return Err(Failure::new(hints::FAILED, told));
+    }
+    note(&told);
+    Ok(())
+}
+
+/// The device that the image names, unless the user says which.
+fn device<'e>(
+    args: &Args,
+    file: &'e ecaxis_esi::EsiFile,
+    found: &Sii,
+) -> Result<&'e ecaxis_esi::Device, Failure> {
+    let which = &args.which;
+    if which.device.is_some() || which.product.is_some() || which.revision.is_some() {
+        return which.device(file);
+    }
+    let same = |d: &&ecaxis_esi::Device| d.identity == found.identity;
+    match file.devices.iter().find(same) {
+        Some(device) => Ok(device),
+        None => which.device(file),
+    }
+}
+
+fn table(differences: &[Difference]) -> String {
+    if differences.is_empty() {
+        return String::new();
+    }
+    let mut table = Table::new(&["of", "field", "ESI", "image"]);
+    for d in differences {
+        table.row([aspect(d.aspect), &d.field, &d.expected, &d.found]);
+    }
+    table.indented(0) + "\n"
+}
+
+fn aspect(aspect: Aspect) -> &'static str {
+    match aspect {
+        Aspect::Identity => "identity",
+        Aspect::Behaviour => "behaviour",
+        Aspect::Description => "description",
+        Aspect::Instance => "this piece",
+    }
+}
+
+fn as_json(d: &Difference) -> serde_json::Value {
+    json!({ "of": aspect(d.aspect), "field": d.field, "esi": d.expected, "image": d.found })
+}

@@ -1,0 +1,107 @@
+//! `ecaxis esi list`: the devices of a file or of a folder of files, and which of them fits a device best.
+
+use std::path::PathBuf;
+
+use ecaxis::library::{self, Library, LoadError, Match};
+use ecaxis_esi::Identity;
+use serde_json::json;
+
+use super::super::report::Table;
+use super::super::{Failure, hints, note, result};
+
+/// List the devices in a file or in a folder of ESI files; with an identity, the description that fits it best
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// ESI file, or a folder of them
+    #[arg(value_name = "PATH")]
+    path: PathBuf,
+    /// Vendor id, decimal or 0x…
+    #[arg(long, value_parser = super::number)]
+    vendor: Option<u32>,
+    /// Product code, decimal or 0x…
+    #[arg(long, value_parser = super::number)]
+    product: Option<u32>,
+    /// Revision of the device at hand, decimal or 0x…; needs `--vendor` and `--product`
+    #[arg(long, value_parser = super::number, requires = "vendor", requires = "product")]
+    revision: Option<u32>,
+    /// Which described revisions fit it: equal, newer (the device may be newer than its description), high-word, low-word
+    #[arg(long = "match", default_value = "newer")]
+    rule: Match,
+    /// Read every file, and leave the index of the last time alone
+    #[arg(long)]
+    no_cache: bool,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let library = open(args).map_err(|error| Failure::new(hints::WRONG, error.to_string()))?;
+    for (file, problem) in library.unusable() {
+        note(&format!(
+            "warning: {}: {problem}",
+            library.folder().join(file).display()
+        ));
+    }
+    let entries: Vec<&library::Entry> = match (args.vendor, args.product, args.revision) {
+        (Some(vendor), Some(product), Some(revision)) => {
+            let device = Identity {
+                vendor,
+                product,
+                revision,
+            };
+            let found = library.find(device, args.rule);
+            vec![found.ok_or_else(|| missing(&library, device, args.rule))?]
+        }
+        (vendor, product, _) => {
+            let fits = |e: &&library::Entry| {
+                vendor.is_none_or(|vendor| e.vendor == vendor)
+                    && product.is_none_or(|product| e.product == product)
+            };
+            library.entries().iter().filter(fits).collect()
+        }
+    };
+    if args.json {
+        return result(&format!("{:#}\n", json!(entries)));
+    }
+    let mut table = Table::new(&["vendor", "product", "revision", "type", "name", "file"]);
+    for e in &entries {
+        table.row([
+            &format!("0x{:08x} {}", e.vendor, e.vendor_name),
+            &format!("0x{:08x}", e.product),
+            &format!("0x{:08x}", e.revision),
+            &e.type_name,
+            &e.name,
+            &e.file.display().to_string(),
+        ]);
+    }
+    result(&(table.indented(0) + "\n"))
+}
+
+fn open(args: &Args) -> Result<Library, LoadError> {
+    if args.path.is_file() {
+        return Library::of_file(&args.path);
+    }
+    let cache = library::cache_file(&args.path).filter(|_| !args.no_cache);
+    Library::open(&args.path, cache.as_deref())
+}
+
+fn missing(library: &Library, device: Identity, rule: Match) -> Failure {
+    let same = |e: &&library::Entry| (e.vendor, e.product) == (device.vendor, device.product);
+    let described: Vec<String> = library
+        .entries()
+        .iter()
+        .filter(same)
+        .map(|e| format!("0x{:08x} in {}", e.revision, e.file.display()))
+        .collect();
+    let message = format!(
+        "{} describes no device that fits {device} by the rule `{rule}`",
+        library.folder().display()
+    );
+    let failure = Failure::new(hints::WRONG, message);
+    if described.is_empty() {
+        failure.hint("nothing of that vendor and product is there; the maker's site has the file")
+    } else {
+        failure.hint(format!("there are revisions {}", described.join(", ")))
+    }
+}

@@ -1,0 +1,53 @@
+//! `ecaxis esi sii`: the EEPROM image of a device.
+
+use std::path::PathBuf;
+
+use ecaxis_esi::sii::{self, SiiOptions};
+
+use super::super::{Failure, hints, note};
+use super::Which;
+
+/// Write the EEPROM image (SII) that follows from an ESI file
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    which: Which,
+    /// Image file; it must not exist yet
+    #[arg(short, long, value_name = "IMAGE")]
+    output: PathBuf,
+    /// Serial number
+    #[arg(long, default_value = "0", value_parser = super::number)]
+    serial: u32,
+    /// Station alias
+    #[arg(long, default_value_t = 0)]
+    alias: u16,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let file = args.which.load()?;
+    let device = args.which.device(&file)?;
+    let options = SiiOptions {
+        alias: args.alias,
+        serial: args.serial,
+    };
+    let image = sii::emit(device, &file.modules, &options);
+    let output = args.output.display();
+    std::fs::File::create_new(&args.output)
+        .and_then(|mut out| std::io::Write::write_all(&mut out, &image))
+        .map_err(|error| {
+            let failure = Failure::new(hints::WRONG, format!("cannot write {output}: {error}"));
+            match error.kind() {
+                std::io::ErrorKind::AlreadyExists => failure.hint(
+                    "images are never written over others; name another file or remove that one",
+                ),
+                _ => failure,
+            }
+        })?;
+    note(&format!(
+        "{output}: {} bytes for {} ({})",
+        image.len(),
+        device.name,
+        device.identity
+    ));
+    Ok(())
+}

@@ -1,0 +1,80 @@
+//! Tables that several verbs show.
+
+use std::fmt::Write;
+
+use ecaxis_esi::{Field, StartupSdo};
+
+use super::report::Table;
+
+/// Where each object of one direction lies.
+pub(super) fn fields(
+    what: &str,
+    bytes: usize,
+    fields: &[Field],
+    out: &mut String,
+) -> std::fmt::Result {
+    writeln!(out, "\n  {what}: {bytes} bytes")?;
+    if fields.is_empty() {
+        return Ok(());
+    }
+    let mut table = Table::new(&["offset", "bits", "object", "type", "name", "PDO"]);
+    for field in fields {
+        table.row([
+            &format!("{}.{}", field.bit_offset / 8, field.bit_offset % 8),
+            &field.bit_len.to_string(),
+            &format!("0x{:04x}:{:02x}", field.index, field.sub),
+            &field.data_type,
+            &field.name,
+            &format!("0x{:04x}", field.pdo),
+        ]);
+    }
+    writeln!(out, "{}", table.indented(2))
+}
+
+/// The start-up list with the origin of each command.
+pub(super) fn startup(startup: &[StartupSdo], out: &mut String) -> std::fmt::Result {
+    if startup.is_empty() {
+        return writeln!(out, "\n  no start-up SDOs");
+    }
+    let mut table = Table::new(&["at", "object", "value", "name", "from"]);
+    for sdo in startup {
+        let object = match sdo.complete_access {
+            true => format!("0x{:04x} CA", sdo.index),
+            false => format!("0x{:04x}:{:02x}", sdo.index, sdo.sub),
+        };
+        table.row([
+            sdo.transition,
+            &object,
+            &value(&sdo.data),
+            short_name(&sdo.name),
+            &sdo.origin,
+        ]);
+    }
+    writeln!(
+        out,
+        "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}",
+        table.indented(2)
+    )
+}
+
+/// The object's index stands beside it, so the entry's own name is enough where it has one.
+fn short_name(name: &str) -> &str {
+    match name.split_once(" / ") {
+        Some((_, entry)) if !entry.starts_with("SubIndex") => entry,
+        _ => name,
+    }
+}
+
+/// Up to eight bytes as one number, more as bytes in the order of the wire.
+fn value(data: &[u8]) -> String {
+    let hex = |bytes: &mut dyn Iterator<Item = &u8>, gap: &str| {
+        let bytes: Vec<String> = bytes.map(|b| format!("{b:02x}")).collect();
+        bytes.join(gap)
+    };
+    match data.len() {
+        0 => String::new(),
+        1..=8 => format!("0x{}", hex(&mut data.iter().rev(), "")),
+        9..=24 => hex(&mut data.iter(), " "),
+        n => format!("{} … ({n} bytes)", hex(&mut data.iter().take(16), " ")),
+    }
+}
