@@ -288,14 +288,8 @@ fn any_image() -> impl Strategy<Value = Sii> {
         proptest::option::of(any::<u8>()),
     )
         .prop_map(|(op_only, sm, su)| SiiFmmuDetail { op_only, sm, su });
-    // An odd number of bytes is padded, so only even ones come back as they were.
-    let details = prop::collection::vec(detail, 0..4).prop_map(|details| {
-        if details.len() == 3 {
-            Vec::new()
-        } else {
-            details
-        }
-    });
+    let details = prop::collection::vec(detail, 0..9);
+    let units = prop::collection::vec(0..16_u8, 0..4);
     let even_bytes =
         || prop::collection::vec(any::<[u8; 2]>(), 0..5).prop_map(|pairs| pairs.concat());
     let other = (0x0800..0x3000_u16, even_bytes());
@@ -316,7 +310,7 @@ fn any_image() -> impl Strategy<Value = Sii> {
             prop::collection::vec(pdo(), 0..5),
         ],
         prop::collection::vec(dc(), 0..4),
-        (details, even_bytes(), prop::collection::vec(other, 0..4)),
+        (details, units, prop::collection::vec(other, 0..4)),
     )
         .prop_map(
             |(

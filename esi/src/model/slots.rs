@@ -1,6 +1,6 @@
 //! Slots, and the modules that go there.
 
-use super::{Dictionary, InitCmd, Pdo, Position};
+use super::{Dictionary, InitCmd, Pdo, Position, SlotDependence};
 
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Slots {
@@ -67,4 +67,46 @@ pub struct Module {
     /// `DcOpModeName`: which OpMode of the device the module wants.
     pub dc_mode: Option<String>,
     pub dictionary: Dictionary,
+}
+
+impl Module {
+    /// The module as it is at a place: indices that depend on the slot count on. Places are counted from 0 over all
+    /// slots and their instances.
+    #[must_use]
+    pub fn at(&self, slots: &Slots, slot: &Slot, place: usize) -> Self {
+        let place = u16::try_from(place).unwrap_or(u16::MAX);
+        let group = slot.group.and_then(|group| u16::try_from(group).ok());
+        let group = group.unwrap_or(0);
+        let increments = &slots.increments;
+        let shifted = |index: u16, on: SlotDependence, step: u16, group_step: u16| {
+            let by_slot = if on.slot { place.wrapping_mul(step) } else { 0 };
+            let by_group = if on.group {
+                group.wrapping_mul(group_step)
+            } else {
+                0
+            };
+            index.wrapping_add(by_slot).wrapping_add(by_group)
+        };
+        let pdo_step = slot.pdo_increment.unwrap_or(increments.pdo);
+        let pdo_index = |index, on| shifted(index, on, pdo_step, increments.group_pdo);
+        let step = slot.index_increment.unwrap_or(increments.index);
+        let object_index = |index, on| shifted(index, on, step, increments.group_index);
+        let mut module = self.clone();
+        for pdo in module.rx_pdos.iter_mut().chain(&mut module.tx_pdos) {
+            pdo.index = pdo_index(pdo.index, pdo.depends_on);
+            for excluded in &mut pdo.exclude {
+                excluded.index = pdo_index(excluded.index, excluded.depends_on);
+            }
+            for entry in pdo.entries.iter_mut().filter(|entry| !entry.is_gap()) {
+                entry.index = object_index(entry.index, entry.depends_on);
+            }
+        }
+        for command in &mut module.init_cmds {
+            command.index = object_index(command.index, command.depends_on);
+        }
+        for object in &mut module.dictionary.objects {
+            object.index = object_index(object.index, object.depends_on);
+        }
+        module
+    }
 }

@@ -2,7 +2,7 @@
 
 use super::SelectError;
 use crate::mode::Mode;
-use crate::model::{Device, Increments, Module, Slot, SlotDependence, Slots};
+use crate::model::{Device, Module, Slot, Slots};
 
 const MODES_OF_OPERATION: u16 = 0x6060;
 /// 0xF030 has so many subindices.
@@ -67,7 +67,7 @@ pub(super) fn choose(
         chosen.push(Placed {
             place: number,
             slot_name: place.name.clone(),
-            module: instance(module, place.slot, &slots.increments, number),
+            module: module.at(slots, place.slot, number),
         });
     }
     Ok(chosen)
@@ -197,45 +197,6 @@ fn default_module<'a>(
         (None, [only]) if place.required => Some(only),
         _ => None,
     })
-}
-
-/// The module as it is at a place: indices that depend on the slot count on.
-fn instance(module: &Module, slot: &Slot, increments: &Increments, place: usize) -> Module {
-    let place = u16::try_from(place).unwrap_or(u16::MAX);
-    let group = slot
-        .group
-        .and_then(|group| u16::try_from(group).ok())
-        .unwrap_or(0);
-    let pdo_step = slot.pdo_increment.unwrap_or(increments.pdo);
-    let index_step = slot.index_increment.unwrap_or(increments.index);
-    let shifted = |index: u16, on: SlotDependence, step: u16, group_step: u16| {
-        let by_slot = if on.slot { place.wrapping_mul(step) } else { 0 };
-        let by_group = if on.group {
-            group.wrapping_mul(group_step)
-        } else {
-            0
-        };
-        index.wrapping_add(by_slot).wrapping_add(by_group)
-    };
-    let pdo_index = |index, on| shifted(index, on, pdo_step, increments.group_pdo);
-    let object_index = |index, on| shifted(index, on, index_step, increments.group_index);
-    let mut module = module.clone();
-    for pdo in module.rx_pdos.iter_mut().chain(&mut module.tx_pdos) {
-        pdo.index = pdo_index(pdo.index, pdo.depends_on);
-        for excluded in &mut pdo.exclude {
-            excluded.index = pdo_index(excluded.index, excluded.depends_on);
-        }
-        for entry in pdo.entries.iter_mut().filter(|entry| !entry.is_gap()) {
-            entry.index = object_index(entry.index, entry.depends_on);
-        }
-    }
-    for command in &mut module.init_cmds {
-        command.index = object_index(command.index, command.depends_on);
-    }
-    for object in &mut module.dictionary.objects {
-        object.index = object_index(object.index, object.depends_on);
-    }
-    module
 }
 
 /// The mode that a module's own InitCmd writes.

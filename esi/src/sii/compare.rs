@@ -2,6 +2,8 @@
 
 use std::fmt::Display;
 
+use crate::model::FmmuUse;
+
 use super::{General, MailboxAreas, Protocols, Sii, SiiDc, SiiPdo};
 
 /// What a difference touches.
@@ -33,7 +35,15 @@ pub fn compare(expected: &Sii, found: &Sii) -> Vec<Difference> {
     let mut list = List(Vec::new());
     header(&mut list, expected, found);
     general(&mut list, expected.general.as_ref(), found.general.as_ref());
-    let usages = |sii: &Sii| sii.fmmus.clone();
+    // An odd number of FMMUs is filled up, by some with an unused one.
+    let usages = |sii: &Sii| {
+        let used = sii.fmmus.iter().rposition(|usage| *usage != FmmuUse::Other);
+        sii.fmmus
+            .iter()
+            .take(used.map_or(0, |last| last + 1))
+            .copied()
+            .collect::<Vec<_>>()
+    };
     list.items(
         Aspect::Behaviour,
         "FMMU",

@@ -3,6 +3,10 @@
 use super::strings::Table;
 use super::{HEADER_BYTES, Sii, SiiPdo, category, checksum, fmmu_code, sm_code};
 
+/// Makers' images have ones in the bits that nothing uses.
+const UNUSED_FMMU_FLAGS: u8 = 0xf8;
+const UNUSED_UNIT_FLAGS: u8 = 0xf0;
+
 impl Sii {
     /// Padded with 0xff to `byte_size`; longer, in steps of 128 bytes, where the contents need it.
     #[must_use]
@@ -75,28 +79,34 @@ impl Sii {
             push(&mut rest, category::SYNC_MANAGER, &data, 0);
         }
         if !self.fmmu_details.is_empty() {
-            let bytes = self.fmmu_details.iter().flat_map(|detail| {
+            let data = self.fmmu_details.iter().flat_map(|detail| {
                 let flags = [
                     (detail.op_only, 1),
                     (detail.sm.is_some(), 2),
                     (detail.su.is_some(), 4),
                 ];
-                let flags = flags
-                    .into_iter()
-                    .filter(|(on, _)| *on)
-                    .map(|(_, bit)| bit)
-                    .sum();
-                [flags, detail.sm.unwrap_or(0), detail.su.unwrap_or(0)]
+                let flags: u8 = flags.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum();
+                let (sm, su) = (detail.sm.unwrap_or(0), detail.su.unwrap_or(0));
+                [UNUSED_FMMU_FLAGS | flags, 0xff, sm, su]
             });
             push(
                 &mut rest,
                 category::FMMU_DETAILS,
-                &bytes.collect::<Vec<u8>>(),
+                &data.collect::<Vec<u8>>(),
                 0,
             );
         }
         if !self.sync_units.is_empty() {
-            push(&mut rest, category::SYNC_UNIT, &self.sync_units, 0);
+            let data = self
+                .sync_units
+                .iter()
+                .flat_map(|flags| [UNUSED_UNIT_FLAGS | flags, 0xff]);
+            push(
+                &mut rest,
+                category::SYNC_UNIT,
+                &data.collect::<Vec<u8>>(),
+                0,
+            );
         }
         for (kind, pdos) in [
             (category::TX_PDO, &self.tx_pdos),

@@ -5,7 +5,9 @@ use super::{
     General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo, SiiSyncManager,
     category,
 };
-use crate::model::{Device, Direction, Identification, Mailbox, Module, Pdo, SmUse, SyncUnit};
+use crate::model::{
+    Device, Direction, Identification, Mailbox, Module, Pdo, SmUse, SyncTime, SyncUnit,
+};
 use crate::select::default_pdos;
 
 /// What differs from one piece of hardware to the next.
@@ -52,7 +54,15 @@ impl Sii {
                     cycle0_ns: u32::try_from(mode.sync0.cycle_ns).unwrap_or(0),
                     shift0_ns: i32::try_from(mode.sync0.shift_ns).unwrap_or(0),
                     shift1_ns: i32::try_from(mode.sync1.shift_ns).unwrap_or(0),
-                    sync0_factor: i16::try_from(mode.sync0.factor).unwrap_or(0),
+                    sync0_factor: match mode.sync0 {
+                        // Without a cycle and a factor it follows the bus, which makers write as 1.
+                        SyncTime {
+                            cycle_ns: 0,
+                            factor: 0,
+                            ..
+                        } => 1,
+                        SyncTime { factor, .. } => i16::try_from(factor).unwrap_or(0),
+                    },
                     sync1_factor: i16::try_from(mode.sync1.factor).unwrap_or(0),
                 })
                 .collect(),
@@ -198,7 +208,10 @@ fn general(device: &Device) -> General {
         ),
     ];
     General {
-        group: device.type_name.clone(),
+        group: match device.group.as_str() {
+            "" => device.type_name.clone(),
+            group => group.to_owned(),
+        },
         image: String::new(),
         order: device.type_name.clone(),
         name: device.name.clone(),

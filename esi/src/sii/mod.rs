@@ -45,7 +45,7 @@ pub struct Sii {
     pub dc: Vec<SiiDc>,
     /// Extended FMMU settings (category 42), one for each FMMU; empty where the image has none.
     pub fmmu_details: Vec<SiiFmmuDetail>,
-    /// Flags of each sync unit (category 43): bit 0 separate, 1 separate frame, 2 depends on the input state,
+    /// Four flags of each sync unit (category 43): bit 0 separate, 1 separate frame, 2 depends on the input state,
     /// 3 frames may be repeated.
     pub sync_units: Vec<u8>,
     /// Categories that are not interpreted, as they are: data types, dictionaries, makers' own.
@@ -107,7 +107,7 @@ impl General {
     pub const IDENTIFICATION_ADDRESS: u8 = 0x10;
 }
 
-/// Category 42.
+/// Category 42: four bytes each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SiiFmmuDetail {
     pub op_only: bool,

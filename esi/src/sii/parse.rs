@@ -56,9 +56,15 @@ pub(super) fn image(bytes: &[u8]) -> Result<Sii, SiiError> {
                     .collect()
             }
             category::FMMU_DETAILS => {
-                sii.fmmu_details = data.chunks_exact(3).map(fmmu_detail).collect()
+                sii.fmmu_details = data.chunks_exact(4).map(fmmu_detail).collect();
             }
-            category::SYNC_UNIT => sii.sync_units = data.to_vec(),
+
+            category::SYNC_UNIT => {
+                sii.sync_units = data
+                    .chunks_exact(2)
+                    .map(|unit| byte(unit, 0) & 0x0f)
+                    .collect();
+            }
             _ => sii.others.push((kind, data.to_vec())),
         }
     }
@@ -146,8 +152,8 @@ fn fmmu_detail(data: &[u8]) -> SiiFmmuDetail {
     let flags = byte(data, 0);
     SiiFmmuDetail {
         op_only: flags & 1 != 0,
-        sm: Some(byte(data, 1)).filter(|_| flags & 2 != 0),
-        su: Some(byte(data, 2)).filter(|_| flags & 4 != 0),
+        sm: Some(byte(data, 2)).filter(|_| flags & 2 != 0),
+        su: Some(byte(data, 3)).filter(|_| flags & 4 != 0),
     }
 }
 

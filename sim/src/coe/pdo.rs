@@ -73,7 +73,7 @@ impl PdoRules {
             .and_then(|mailbox| mailbox.coe.as_ref());
         let (assign, config) = coe.map_or((false, false), |coe| (coe.pdo_assign, coe.pdo_config));
         for pdo in device.rx_pdos.iter().chain(&device.tx_pdos) {
-            rules.learn(store, pdo, pdo.index, config);
+            rules.learn(store, pdo, config);
         }
         rules.learn_modules(store, device, modules, config);
         for (n, sm) in device.sync_managers.iter().enumerate().take(8) {
@@ -108,13 +108,14 @@ impl PdoRules {
         rules
     }
 
-    fn learn(&mut self, store: &mut ObjectStore, pdo: &Pdo, index: u16, config: bool) {
+    fn learn(&mut self, store: &mut ObjectStore, pdo: &Pdo, config: bool) {
+        let index = pdo.index;
         if !self.pdos.iter().any(|known| known.index == index) {
             self.pdos.push(KnownPdo {
                 index,
                 direction: pdo.direction,
                 fixed: pdo.fixed,
-                exclude: pdo.exclude.clone(),
+                exclude: pdo.exclude.iter().map(|other| other.index).collect(),
             });
             let entries: Vec<u32> = pdo.entries.iter().map(|entry| entry.mapping()).collect();
             store.describe(index, ObjectCode::Record, &pdo.name);
@@ -153,9 +154,6 @@ impl PdoRules {
         for (position, slot) in expand(slots).enumerate() {
             self.slots
                 .push(slot.module_idents.iter().map(|(ident, _)| *ident).collect());
-            let shift = slots
-                .pdo_increment
-                .wrapping_mul(u16::try_from(position).unwrap_or(0));
             for module in modules {
                 if !slot
                     .module_idents
@@ -164,12 +162,12 @@ impl PdoRules {
                 {
                     continue;
                 }
+                let module = module.at(slots, slot, position);
                 let mut contents = Vec::new();
                 for pdo in module.rx_pdos.iter().chain(&module.tx_pdos) {
-                    let index = pdo.index.wrapping_add(shift);
-                    self.learn(store, pdo, index, config);
+                    self.learn(store, pdo, config);
                     contents.push((
-                        index,
+                        pdo.index,
                         pdo.entries.iter().map(|entry| entry.mapping()).collect(),
                     ));
                 }
@@ -478,7 +476,9 @@ impl PdoRules {
 }
 
 /// The slots of a modular device one by one; a slot with several instances counts several times.
-fn expand(slots: &ecaxis_esi::model::Slots) -> impl Iterator<Item = &ecaxis_esi::model::Slot> + '_ {
+pub(crate) fn expand(
+    slots: &ecaxis_esi::model::Slots,
+) -> impl Iterator<Item = &ecaxis_esi::model::Slot> + '_ {
     slots.slots.iter().flat_map(|slot| {
         let n = usize::try_from(slot.max_instances.clamp(1, 254)).unwrap_or(1);
         std::iter::repeat_n(slot, n)

@@ -10,7 +10,7 @@ use super::process::ProcessData;
 use super::supervision::Supervision;
 use super::{Delays, Fresh, MailboxLimits, SimDevice};
 use crate::Nanos;
-use crate::coe::pdo::PdoRules;
+use crate::coe::pdo::{PdoRules, expand};
 use crate::coe::store::ObjectStore;
 use crate::drive::PlantParams;
 use crate::esc::info::Needs;
@@ -112,7 +112,7 @@ impl Objects {
         serial: u32,
         first: impl FnOnce(&mut ObjectStore),
     ) -> Self {
-        let mut store = ObjectStore::from_dictionary(&dictionaries(device, modules));
+        let mut store = ObjectStore::from_dictionary(&dictionaries(device, &modules_at_places(device, modules)));
         identify(&mut store, device, serial);
         first(&mut store);
         let pdo = PdoRules::new(&mut store, device, modules);
@@ -273,24 +273,37 @@ fn uses_dc(device: &Device) -> bool {
     units != 0 || !device.dc_modes.is_empty()
 }
 
-/// Modules that may be plugged, the device, its default modules: the later wins.
-fn dictionaries<'a>(device: &'a Device, modules: &'a [Module]) -> Vec<&'a Dictionary> {
+/// Modules of further places than these bring no objects of their own.
+const MAX_PLACES: usize = 32;
+
+/// Every module as it would be in every slot that takes it; whether it is the slot's default.
+fn modules_at_places(device: &Device, modules: &[Module]) -> Vec<(Module, bool)> {
+    let mut all = Vec::new();
     let Some(slots) = &device.slots else {
-        return vec![&device.dictionary];
+        return all;
     };
-    let idents = || slots.slots.iter().flat_map(|slot| &slot.module_idents);
-    let is = |module: &Module, default: bool| {
-        idents().any(|(ident, is_default)| *ident == module.ident && *is_default == default)
+    for (place, slot) in expand(slots).enumerate().take(MAX_PLACES) {
+        for (ident, default) in &slot.module_idents {
+            if let Some(module) = modules.iter().find(|module| module.ident == *ident) {
+                all.push((module.at(slots, slot, place), *default));
+            }
+        }
+    }
+    all
+}
+
+/// Modules that may be plugged, the device, its default modules: the later wins.
+fn dictionaries<'a>(device: &'a Device, plugged: &'a [(Module, bool)]) -> Vec<&'a Dictionary> {
+    let of = |wanted: bool| {
+        let fitting = plugged
+            .iter()
+            .filter(move |(_, default)| *default == wanted);
+        fitting.map(|(module, _)| &module.dictionary)
     };
-    let others = modules
-        .iter()
-        .filter(|module| is(module, false))
-        .map(|m| &m.dictionary);
-    let defaults = modules
-        .iter()
-        .filter(|module| is(module, true))
-        .map(|m| &m.dictionary);
-    others.chain([&device.dictionary]).chain(defaults).collect()
+    of(false)
+        .chain([&device.dictionary])
+        .chain(of(true))
+        .collect()
 }
 
 /// Object 0x1018 says what the EEPROM says, 0x1C00 what the SyncManagers are for; every device with CoE has them.

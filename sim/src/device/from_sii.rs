@@ -42,7 +42,7 @@ fn device(sii: &Sii) -> Device {
         type_name: type_name(sii, &general),
         name: general.name.clone(),
         physics: physics(general.ports),
-        fmmus: sii.fmmus.clone(),
+        fmmus: sii.fmmus.iter().map(|usage| (*usage).into()).collect(),
         rx_pdos: pdos(&sii.rx_pdos, Direction::Rx),
         tx_pdos: pdos(&sii.tx_pdos, Direction::Tx),
         mailbox: mailbox(sii, &general),
@@ -53,6 +53,7 @@ fn device(sii: &Sii) -> Device {
             byte_size: sii.byte_size,
             config_data: sii.config.to_vec(),
             bootstrap: bootstrap(sii.bootstrap),
+            ..Eeprom::default()
         },
         ..Device::default()
     }
@@ -113,6 +114,9 @@ fn sync_manager(sm: &SiiSyncManager) -> SyncManager {
         max_size: None,
         control_byte: sm.control,
         enable: sm.enable & 1 != 0,
+        virtual_: sm.enable & 4 != 0,
+        op_only: sm.enable & 8 != 0,
+        watchdog: None,
     }
 }
 
@@ -137,10 +141,13 @@ fn pdo(pdo: &SiiPdo, direction: Direction) -> Pdo {
         index: pdo.index,
         name: pdo.name.clone(),
         sm: pdo.sm,
+        su: None,
+        excluded_sm: Vec::new(),
         fixed: pdo.flags & 0x10 != 0,
         mandatory: pdo.flags & 0x01 != 0,
         virtual_: pdo.flags & 0x20 != 0,
         overwritten_by_module: false,
+        depends_on: Default::default(),
         exclude: Vec::new(),
         entries: pdo
             .entries
@@ -152,6 +159,7 @@ fn pdo(pdo: &SiiPdo, direction: Direction) -> Pdo {
                 bit_len: u16::from(entry.bit_len),
                 name: entry.name.clone(),
                 data_type: String::new(),
+                depends_on: Default::default(),
             })
             .collect(),
     }

@@ -6,7 +6,7 @@ use clap::Subcommand;
 use ecaxis::library::{self, LoadError};
 use ecaxis_esi::{self as esi, Device, DeviceQuery, EsiFile, Mode};
 
-use super::{Failure, hints, result};
+use super::{Failure, hints};
 
 mod check;
 mod diff;
