@@ -1,3 +1,4 @@
+use super::super::tables::{short_name, value};
 use super::*;
 
 #[test]

@@ -58,7 +58,7 @@ pub(super) fn startup(startup: &[StartupSdo], out: &mut String) -> std::fmt::Res
 }
 
 /// The object's index stands beside it, so the entry's own name is enough where it has one.
-fn short_name(name: &str) -> &str {
+pub(super) fn short_name(name: &str) -> &str {
     match name.split_once(" / ") {
         Some((_, entry)) if !entry.starts_with("SubIndex") => entry,
         _ => name,
@@ -66,7 +66,7 @@ fn short_name(name: &str) -> &str {
 }
 
 /// Up to eight bytes as one number, more as bytes in the order of the wire.
-fn value(data: &[u8]) -> String {
+pub(super) fn value(data: &[u8]) -> String {
     let hex = |bytes: &mut dyn Iterator<Item = &u8>, gap: &str| {
         let bytes: Vec<String> = bytes.map(|b| format!("{b:02x}")).collect();
         bytes.join(gap)

@@ -112,7 +112,10 @@ impl Objects {
         serial: u32,
         first: impl FnOnce(&mut ObjectStore),
     ) -> Self {
-        let mut store = ObjectStore::from_dictionary(&dictionaries(device, &modules_at_places(device, modules)));
+        let mut store = ObjectStore::from_dictionary(&dictionaries(
+            device,
+            &modules_at_places(device, modules),
+        ));
         identify(&mut store, device, serial);
         first(&mut store);
         let pdo = PdoRules::new(&mut store, device, modules);

@@ -75,6 +75,7 @@ fn pdos(templates: &[EsiPdo], direction: Direction, size: u16) -> Vec<EsiPdo> {
                 bit_len: 8,
                 name: format!("{word} byte {:04}", first + byte),
                 data_type: "USINT".into(),
+                depends_on: Default::default(),
             });
             EsiPdo {
                 position: position.unwrap_or_default(),
@@ -87,6 +88,9 @@ fn pdos(templates: &[EsiPdo], direction: Direction, size: u16) -> Vec<EsiPdo> {
                 virtual_: false,
                 overwritten_by_module: false,
                 exclude: Vec::new(),
+                su: None,
+                excluded_sm: Vec::new(),
+                depends_on: Default::default(),
                 entries: entries.collect(),
             }
         })

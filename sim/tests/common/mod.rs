@@ -306,6 +306,9 @@ fn sm(usage: SmUse, start_address: u16, default_size: u16, control_byte: u8) -> 
         max_size: None,
         control_byte,
         enable: true,
+        virtual_: false,
+        op_only: false,
+        watchdog: None,
     }
 }
 
@@ -330,8 +333,12 @@ fn pdo(direction: Direction, index: u16, sm: u8, entries: &[(u16, u8, u16)]) -> 
                 bit_len: *bit_len,
                 name: "entry".into(),
                 data_type: "UINT".into(),
+                depends_on: Default::default(),
             })
             .collect(),
+        su: None,
+        excluded_sm: Vec::new(),
+        depends_on: Default::default(),
     }
 }
 
@@ -345,7 +352,7 @@ pub fn io_device() -> Device {
         },
         type_name: "IO16".into(),
         physics: "KK".into(),
-        fmmus: vec![FmmuUse::Outputs, FmmuUse::Inputs],
+        fmmus: [FmmuUse::Outputs, FmmuUse::Inputs].map(Into::into).to_vec(),
         sync_managers: vec![
             sm(SmUse::Outputs, 0x1000, 2, 0x44),
             sm(SmUse::Inputs, 0x1100, 2, 0x00),
@@ -366,6 +373,7 @@ pub fn io_device() -> Device {
             byte_size: 2048,
             config_data: vec![4, 0, 0, 0x44],
             bootstrap: Vec::new(),
+            ..Eeprom::default()
         },
         ..Device::default()
     }
@@ -421,7 +429,9 @@ pub fn coe_device() -> Device {
         },
         type_name: "COE".into(),
         physics: "YY".into(),
-        fmmus: vec![FmmuUse::Outputs, FmmuUse::Inputs, FmmuUse::MBoxState],
+        fmmus: [FmmuUse::Outputs, FmmuUse::Inputs, FmmuUse::MBoxState]
+            .map(Into::into)
+            .to_vec(),
         sync_managers: vec![
             sm(SmUse::MBoxOut, 0x1000, 48, 0x26),
             sm(SmUse::MBoxIn, 0x1030, 48, 0x22),
