@@ -192,7 +192,7 @@ const ROWS: [Row; 27] = [
     (0x0604_0043, "PDOs that exclude each other", || {
         let mut device = mailbox_device();
         let mut other = device.rx_pdos[0].clone();
-        (other.index, other.sm, other.exclude) = (0x1601, None, vec![0x1600]);
+        (other.index, other.sm, other.exclude) = (0x1601, None, vec![0x1600.into()]);
         device.rx_pdos.push(other);
         let mut bus = bus_of(&device);
         bus.download(S, 0x1c12, 0, &[0])?;

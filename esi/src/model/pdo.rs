@@ -40,6 +40,15 @@ pub struct Excluded {
     pub depends_on: SlotDependence,
 }
 
+impl From<u16> for Excluded {
+    fn from(index: u16) -> Self {
+        Self {
+            index,
+            depends_on: SlotDependence::default(),
+        }
+    }
+}
+
 /// Which of a slot's increments an index in a module counts on by.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct SlotDependence {

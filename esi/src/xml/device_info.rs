@@ -45,11 +45,10 @@ pub(super) fn read<'a>(
                 Ok(())
             })?,
             "Port" => info.ports.push(port(c, el)?),
-            "IdentificationReg134" => {
-                if c.flag(el)? {
-                    info.identification = Identification::Reg134;
-                }
+            "IdentificationReg134" if c.flag(el)? => {
+                info.identification = Identification::Reg134;
             }
+            "IdentificationReg134" => {}
             "IdentificationAdo" => {
                 info.identification = Identification::Ado(c.number(el, "IdentificationAdo")?);
             }

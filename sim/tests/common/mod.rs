@@ -485,7 +485,7 @@ pub fn coe_device() -> Device {
         eeprom: Eeprom {
             byte_size: 2048,
             config_data: vec![8, 0, 0, 0x44],
-            bootstrap: Vec::new(),
+            ..Eeprom::default()
         },
         ..Device::default()
     }
