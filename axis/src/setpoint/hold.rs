@@ -1,6 +1,6 @@
 //! Stand still; brake first if moving.
 
-use super::{Motion, Ramp};
+use super::{Motion, Ramp, Setpoint};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hold {
@@ -16,10 +16,22 @@ impl Hold {
             slope: self.acceleration,
         }
         .advance(motion.velocity, dt_s);
-        Motion {
-            position: motion.position + velocity * dt_s,
-            velocity,
-        }
+        motion.then(motion.position + velocity * dt_s, velocity, dt_s)
+    }
+
+    #[must_use]
+    pub fn finished(self, motion: Motion) -> bool {
+        motion.velocity == 0.0
+    }
+}
+
+impl Setpoint for Hold {
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+        Self::advance(*self, motion, dt_s)
+    }
+
+    fn finished(&self, motion: Motion) -> bool {
+        Self::finished(*self, motion)
     }
 }
 
@@ -35,10 +47,13 @@ mod tests {
         let mut motion = Motion {
             position: 1.0,
             velocity: -10.0,
+            acceleration: 0.0,
         };
         for _ in 0..1000 {
             let next = hold.advance(motion, 0.001);
             assert!((next.velocity - motion.velocity).abs() <= 0.1 + 1e-12);
+            let change = next.velocity - motion.velocity;
+            assert!((next.acceleration * 0.001 - change).abs() <= 1e-12);
             motion = next;
         }
         assert_eq!(motion.velocity, 0.0);

@@ -15,11 +15,14 @@ pub use ramp::Ramp;
 pub use trapezoid::Trapezoid;
 pub(crate) use trapezoid::braking_velocity;
 
-/// A set-point: position and the velocity at which it was reached.
+/// A set-point: position, the velocity at which it was reached, and how that changed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
     pub position: f64,
+    /// The last cycle's step divided by its length.
     pub velocity: f64,
+    /// The last cycle's change of velocity divided by its length.
+    pub acceleration: f64,
 }
 
 impl Motion {
@@ -29,6 +32,38 @@ impl Motion {
         Self {
             position,
             velocity: 0.0,
+            acceleration: 0.0,
         }
     }
+
+    /// There and not moving.
+    #[must_use]
+    pub fn stands_at(self, position: f64) -> bool {
+        self.position == position && self.velocity == 0.0
+    }
+
+    /// One cycle later: `position` was reached at `velocity`. The acceleration follows.
+    #[must_use]
+    pub fn then(self, position: f64, velocity: f64, dt_s: f64) -> Self {
+        let acceleration = (velocity - self.velocity) / dt_s;
+        Self {
+            position,
+            velocity,
+            acceleration: if acceleration.is_finite() {
+                acceleration
+            } else {
+                0.0
+            },
+        }
+    }
+}
+
+/// Where the set-point goes next.
+pub trait Setpoint {
+    /// One cycle of `dt_s` seconds on from `motion`, which is what the cycle before returned or what the caller has made of
+    /// it: a source that finds another motion than its own goes on from there. RT: O(1).
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion;
+
+    /// Nothing is left to do: further cycles would neither move nor change the velocity.
+    fn finished(&self, motion: Motion) -> bool;
 }

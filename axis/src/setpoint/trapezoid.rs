@@ -3,7 +3,7 @@
 //! Each cycle asks one question: how fast may this cycle be, so that braking by the same amount in every following cycle ends
 //! exactly on the target? The continuous rule √(2·a·d) overshoots by up to a cycle, so the sum over cycles is inverted instead.
 
-use super::Motion;
+use super::{Motion, Setpoint};
 
 /// Braking is planned with this part of the acceleration. Rounding makes some cycles a hair too fast; with nothing in reserve
 /// that could only add up, and end beyond the target.
@@ -66,13 +66,23 @@ impl Trapezoid {
         } else {
             motion.position + step
         };
-        Motion { position, velocity }
+        motion.then(position, velocity, dt_s)
     }
 
     /// On the target and standing.
     #[must_use]
     pub fn finished(&self, motion: Motion) -> bool {
-        motion.position == self.target && motion.velocity == 0.0
+        motion.stands_at(self.target)
+    }
+}
+
+impl Setpoint for Trapezoid {
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+        Self::advance(*self, motion, dt_s)
+    }
+
+    fn finished(&self, motion: Motion) -> bool {
+        Self::finished(self, motion)
     }
 }
 
