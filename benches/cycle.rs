@@ -56,6 +56,7 @@ fn step_axes(c: &mut Criterion) {
         position: None,
         velocity: 50.0,
         acceleration: 500.0,
+        jerk: None,
         torque: 100.0,
         following_error: None,
     };

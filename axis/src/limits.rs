@@ -11,6 +11,8 @@ pub struct Limits {
     pub velocity: f64,
     /// User units per second².
     pub acceleration: f64,
+    /// User units per second³, for jerk-limited moves. `None`: full acceleration within [`Limits::JERK_TIME_S`].
+    pub jerk: Option<f64>,
     /// Percent of rated torque.
     pub torque: f64,
     /// Largest difference between commanded and reported position, user units. The reported position is a few cycles old, so
@@ -39,10 +41,20 @@ pub enum LimitError {
 }
 
 impl Limits {
+    /// How long a jerk-limited move takes to reach full acceleration where no jerk is given, seconds.
+    pub const JERK_TIME_S: f64 = 0.05;
+
+    /// The jerk limit in force, user units per second³.
+    #[must_use]
+    pub fn jerk(&self) -> f64 {
+        self.jerk.unwrap_or(self.acceleration / Self::JERK_TIME_S)
+    }
+
     pub fn check(&self, scale: &Scale) -> Result<(), LimitError> {
         let positive = [
             ("velocity", Some(self.velocity)),
             ("acceleration", Some(self.acceleration)),
+            ("jerk", self.jerk),
             ("torque", Some(self.torque)),
             ("following_error", self.following_error),
         ];
@@ -101,6 +113,7 @@ mod tests {
         position: Some([-50.0, 50.0]),
         velocity: 200.0,
         acceleration: 2000.0,
+        jerk: None,
         torque: 100.0,
         following_error: Some(1.0),
     };
@@ -128,6 +141,10 @@ mod tests {
             },
             Limits {
                 acceleration: f64::INFINITY,
+                ..GOOD
+            },
+            Limits {
+                jerk: Some(0.0),
                 ..GOOD
             },
             Limits {

@@ -13,6 +13,7 @@ pub const LIMITS: Limits = Limits {
     position: Some([-50.0, 50.0]),
     velocity: 200.0,
     acceleration: 2000.0,
+    jerk: None,
     torque: 100.0,
     following_error: Some(1.0),
 };

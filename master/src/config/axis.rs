@@ -193,6 +193,7 @@ fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
         position: raw.position.as_ref().map(|r| *r.get_ref()),
         velocity: velocity?,
         acceleration: acceleration?,
+        jerk: None,
         torque: torque.unwrap_or(100.0),
         following_error,
     };
