@@ -33,7 +33,7 @@ pub use drive::{PlantParams, Track};
 pub use esc::al::AlState;
 pub use esc::info::EscInfo;
 pub use esc::ports::Medium;
-pub use faults::{FaultScript, ScriptError};
+pub use faults::{FaultReport, FaultScript, ScriptError};
 pub use foe::{FileStore, FoeOptions};
 pub use network::topology::{SecondPort, Topology, TopologyError, Uplink, Wish};
 pub use network::{Nic, Segment, SegmentOptions, Transit};

@@ -40,16 +40,16 @@ def ip(*arguments):
 
 
 @contextlib.contextmanager
-def veth_pair():
+def veth_pair(letters="ab"):
     """Names of two connected interfaces, removed afterwards, however this ends."""
     if os.geteuid() != 0:
         raise Skip("a veth pair needs root")
     # What a killed run left behind.
     for name in os.listdir("/sys/class/net"):
-        left = re.fullmatch(rf"{PREFIX}(\d+)a", name)
+        left = re.fullmatch(rf"{PREFIX}(\d+)[a-z]", name)
         if left and not os.path.exists(f"/proc/{left[1]}"):
             subprocess.run(["ip", "link", "del", name], capture_output=True)
-    a, b = f"{PREFIX}{os.getpid()}a", f"{PREFIX}{os.getpid()}b"
+    a, b = (f"{PREFIX}{os.getpid()}{letter}" for letter in letters)
     try:
         ip("link", "add", a, "type", "veth", "peer", "name", b)
     except (RuntimeError, FileNotFoundError) as error:

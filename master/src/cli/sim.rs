@@ -8,7 +8,7 @@ use ecaxis::config;
 use ecaxis::link::packet::{OpenError, PacketLink};
 use ecaxis::rt::thread;
 use ecaxis::session;
-use ecaxis_sim::{Segment, ServeStats, Server};
+use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
 use super::{Failure, hints, note, result, run, signals};
@@ -25,6 +25,9 @@ pub(crate) struct Args {
     /// Network interface to answer on
     #[arg(long, value_name = "IF")]
     nic: String,
+    /// The other interface of a MainDevice with cable redundancy: closes the bus into a ring
+    #[arg(long, value_name = "IF")]
+    nic2: Option<String>,
     /// Fault script
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
@@ -39,7 +42,12 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    if args.nic == "sim" {
+    let nics: Vec<&str> = [Some(&args.nic), args.nic2.as_ref()]
+        .into_iter()
+        .flatten()
+        .map(String::as_str)
+        .collect();
+    if nics.contains(&"sim") {
         let message = "`sim` is this bus itself; it needs a network interface to answer on";
         return Err(Failure::new(hints::WRONG, message)
             .hint("`ecaxis run FILE --sim` needs no interface; `ip link add veth0 type veth peer name veth1` makes two that are connected"));
@@ -52,33 +60,36 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .as_ref()
         .and_then(|f| f.seed)
         .unwrap_or(session::Options::default().seed);
-    let mut segment = session::simulated_bus(&machine, seed, faults.as_ref())
+    let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
+    let mut segment = session::simulated_bus(&machine, seed, faults.as_ref(), ring)
         .map_err(|error| hints::run(&error, &machine.bus.nic))?;
 
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
-    let nic = &args.nic;
     // What cannot be opened is told before anything is said to answer.
-    match PacketLink::open(nic) {
-        Ok(_) => {}
-        Err(e @ (OpenError::Down { .. } | OpenError::NoCarrier { .. } | OpenError::Mtu { .. })) => {
-            note(&format!("warning: {e}"));
-        }
-        Err(e) => {
-            return Err(hints::interface(
-                Failure::new(hints::FAILED, e.to_string()),
-                &e,
-            ));
+    for nic in &nics {
+        match PacketLink::open(nic) {
+            Ok(_) => {}
+            Err(
+                e @ (OpenError::Down { .. } | OpenError::NoCarrier { .. } | OpenError::Mtu { .. }),
+            ) => note(&format!("warning: {e}")),
+            Err(e) => {
+                return Err(hints::interface(
+                    Failure::new(hints::FAILED, e.to_string()),
+                    &e,
+                ));
+            }
         }
     }
-    let server = Server::open(&[nic]).map_err(|e| hints::serve(&e))?;
+    let server = Server::open(&nics).map_err(|e| hints::serve(&e))?;
     if let Some(folder) = &args.sii {
         write_images(&segment, folder)?;
     }
     note(&format!(
-        "{devices} simulated SubDevice{} answer{} on `{nic}`; Ctrl-C ends it",
+        "{devices} simulated SubDevice{} answer{} on `{}`; Ctrl-C ends it",
         if devices == 1 { "" } else { "s" },
         if devices == 1 { "s" } else { "" },
+        nics.join("` and `"),
     ));
     // Devices of silicon answer whatever else the computer does.
     for denied in thread::prepare(PRIORITY, None) {
@@ -127,6 +138,18 @@ fn report(stats: &ServeStats, segment: &Segment) -> Value {
             })
         })
         .collect();
+    let faults: Vec<Value> = segment
+        .fault_reports()
+        .map(|fault| {
+            json!({
+                "line": fault.line,
+                "kind": fault.name,
+                "began": fault.began,
+                "ended": fault.ended,
+                "frames": fault.frames,
+            })
+        })
+        .collect();
     json!({
         "frames": stats.frames,
         "answered": stats.answered,
@@ -138,6 +161,7 @@ fn report(stats: &ServeStats, segment: &Segment) -> Value {
         "not_sent": stats.send_errors,
         "turnaround_us": { "p50": us(0.5), "p99": us(0.99), "max": us(1.0) },
         "devices": devices,
+        "faults": faults,
     })
 }
 
@@ -170,6 +194,19 @@ fn text(report: &Value) -> String {
         match device["al_status_code"].as_u64() {
             None | Some(0) => {}
             Some(code) => text += &format!(", error {code:#06x}"),
+        }
+        text.push('\n');
+    }
+    for fault in report["faults"].as_array().into_iter().flatten() {
+        let name = fault["kind"].as_str().unwrap_or_default();
+        text += &format!("  fault of line {}, {name}: ", fault["line"]);
+        text += match (fault["began"].as_bool(), fault["ended"].as_bool()) {
+            (Some(false), _) => "did not begin",
+            (_, Some(false)) => "lasts",
+            _ => "over",
+        };
+        if let Some(frames) = fault["frames"].as_u64() {
+            text += &format!(", {frames} frames");
         }
         text.push('\n');
     }

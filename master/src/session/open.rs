@@ -2,7 +2,10 @@
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use ecaxis_sim::{DeviceOptions, FaultScript, Segment, SegmentOptions, SimDevice, Topology};
+use ecaxis_sim::network::topology::media;
+use ecaxis_sim::{
+    DeviceOptions, FaultScript, SecondPort, Segment, SegmentOptions, SimDevice, Topology,
+};
 
 use super::{Options, RunError};
 use crate::clock::{self, Clock};
@@ -20,6 +23,7 @@ pub(super) fn link(machine: &Machine, options: &Options) -> Result<Box<dyn Link>
             machine,
             options.seed,
             options.faults.as_ref(),
+            None,
         )?)),
         Nic::Interface(nic) => Box::new(PacketLink::open(nic)?),
     };
@@ -44,16 +48,22 @@ fn since_1970() -> u64 {
         .unwrap_or(0)
 }
 
-/// The simulated bus that the machine file describes: every device from its own ESI.
+/// The simulated bus that the machine file describes: every device from its own ESI. With `ring`, the last open port
+/// leads back to a second port of the MainDevice.
 pub fn simulated_bus(
     machine: &Machine,
     seed: u64,
     faults: Option<&FaultScript>,
+    ring: Option<SecondPort>,
 ) -> Result<Segment, RunError> {
-    let topology = topology(machine)?;
+    let mut topology = topology(machine)?;
     let mut devices = Vec::with_capacity(machine.devices.len());
     for device in bus_order(&machine.devices) {
         devices.push(sim_device(device, devices.len(), seed)?);
+    }
+    if let Some(second) = ring {
+        let closed = topology.closed(&media(&devices), second);
+        topology = closed.map_err(|error| RunError::Sim(error.to_string()))?;
     }
     let options = SegmentOptions {
         seed,

@@ -67,6 +67,7 @@ impl Faults {
             if !fault.strikes(random) {
                 continue;
             }
+            fault.struck += 1;
             match fault.fault.kind {
                 FaultKind::FrameLoss { .. } => {
                     let out = random.next() & 1 == 0;

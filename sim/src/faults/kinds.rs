@@ -31,7 +31,7 @@ const KINDS: &[(&str, &[&str])] = &[
 
 pub(super) fn check(raw: &RawFault, line: u32) -> Result<Fault, String> {
     let name = raw.kind.get_ref().as_str();
-    let Some((_, allowed)) = KINDS.iter().find(|(kind, _)| *kind == name) else {
+    let Some((known, allowed)) = KINDS.iter().find(|(kind, _)| *kind == name) else {
         let known: Vec<&str> = KINDS.iter().map(|(kind, _)| *kind).collect();
         return Err(format!("unknown; known are {}", known.join(", ")));
     };
@@ -53,6 +53,7 @@ pub(super) fn check(raw: &RawFault, line: u32) -> Result<Fault, String> {
         device: raw.device.unwrap_or(0),
         kind: kind(name, raw)?,
         line,
+        name: known,
     })
 }
 

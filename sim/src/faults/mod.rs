@@ -55,8 +55,23 @@ struct Running {
     phase: Phase,
     /// Frames still to strike.
     left: u32,
+    /// Frames it has struck.
+    struck: u64,
     /// What the device was known by before.
     saved: Identification,
+}
+
+/// What has become of a fault of the script.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FaultReport {
+    /// Line of the script.
+    pub line: u32,
+    /// The kind as the script names it.
+    pub name: &'static str,
+    pub began: bool,
+    pub ended: bool,
+    /// How many frames it has struck; `None` where it does not concern single frames.
+    pub frames: Option<u64>,
 }
 
 /// The script while it runs.
@@ -91,6 +106,7 @@ impl Faults {
             },
             fault,
             phase: Phase::Pending,
+            struck: 0,
             saved: Identification::default(),
         });
         // Those that still act must be ended first; they end now.
@@ -156,6 +172,16 @@ impl Faults {
         }
         let concerns_frames = self.active().any(|fault| fault.kind.hits().is_some());
         self.concerns_frames = concerns_frames;
+    }
+
+    pub(crate) fn reports(&self) -> impl Iterator<Item = FaultReport> + '_ {
+        self.running.iter().map(|running| FaultReport {
+            line: running.fault.line,
+            name: running.fault.name,
+            began: running.phase != Phase::Pending,
+            ended: running.phase == Phase::Over,
+            frames: running.fault.kind.hits().map(|_| running.struck),
+        })
     }
 
     /// Devices that have become others since the last call.

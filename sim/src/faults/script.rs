@@ -25,6 +25,8 @@ pub struct Fault {
     pub kind: FaultKind,
     /// Line of the script.
     pub line: u32,
+    /// The kind as the script names it.
+    pub name: &'static str,
 }
 
 /// Which of the frames sent while a fault lasts it strikes.

@@ -16,7 +16,7 @@ use std::cmp::Ordering;
 use crate::Nanos;
 use crate::device::{Seen, SimDevice};
 use crate::esc::ports::Medium;
-use crate::faults::{Corrupted, FaultScript, Faults};
+use crate::faults::{Corrupted, FaultReport, FaultScript, Faults};
 use crate::frame::{self, Kind};
 use route::{Goal, Pass, Route};
 use topology::Topology;
@@ -117,6 +117,11 @@ impl Segment {
     pub fn set_faults(&mut self, script: FaultScript) {
         self.faults.set(script);
         self.schedule();
+    }
+
+    /// What has become of every fault of the script.
+    pub fn fault_reports(&self) -> impl Iterator<Item = FaultReport> + '_ {
+        self.faults.reports()
     }
 
     #[must_use]

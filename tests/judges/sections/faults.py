@@ -1,5 +1,6 @@
 """What goes wrong, and the way back to Op with `recover` and `reconfig`."""
 
+import json
 import time
 
 import pysoem
@@ -11,6 +12,7 @@ from .bringup import expected_wkc
 
 def faults(bench):
     watchdog(bench)
+    noise(bench)
     outage(bench, "a link breaks and heals", 'device = 2\nport = 0\nkind = "link-break"\n')
     outage(bench, "a device loses its power", 'device = 1\nkind = "absent"\n')
     outage(bench, "the cable at the MainDevice", 'kind = "silent"\n')
@@ -42,6 +44,33 @@ def watchdog(bench):
         codes = {s.al_status for s, d in zip(master.slaves, machine.devices) if d.rx_bits and d.mailbox}
         report.equal("AL status code of those", codes, {0x001B})
         back(bench, cycle, master)
+
+
+def noise(bench):
+    """Frames that are lost, late, doubled or broken: cycles are missed, but none is answered wrongly."""
+    report = bench.report
+    report.section("a noisy line")
+    machine = bench.machine()
+    kinds = ("frame-loss", "frame-duplicate", "frame-corrupt", "frame-delay")
+    faults = [f'[[fault]]\nat = "3s"\nkind = "{kind}"\nprobability = 0.01\n' for kind in kinds]
+    script = "".join(faults) + 'delay = "3ms"\n'
+    with bench.serve(machine, "noise", script, ["--json"], steady=False) as bus, bench.master() as master:
+        cycle = prepared(bench, master, machine, 300)
+        cycle.until(lambda: False, 3)
+        cycle.forget()
+        cycle.run(3_000)
+        report.check("no working counter is wrong", not cycle.wrong, cycle)
+        # Lost, broken and late ones; twice as many come for what the computer adds.
+        report.check("about 3 % of the cycles are missed", 30 < cycle.missed < 270, cycle.missed)
+        report.equal("nobody left Op", set(cyclic.states(master)), {"Op"})
+        broken = [slave._fprd(0x0300, 8) for slave in master.slaves]
+        counted = sum(sum(counters[0::2]) for counters in broken)
+        report.check("invalid frames are counted", counted > 0, counted)
+    statistics = json.loads(bus.output)
+    for fault in statistics["faults"]:
+        report.check(f"{fault['kind']} struck", fault["frames"] > 0, fault["frames"])
+    for count in ("lost", "duplicated", "delayed"):
+        report.check(f"frames {count} are counted", statistics[count] > 0, statistics[count])
 
 
 def outage(bench, what, fault):
