@@ -174,7 +174,7 @@ proptest! {
     /// The image of one of our devices with some bytes changed, cut or lengthened.
     #[test]
     fn any_eeprom_image_is_a_device_or_an_error(
-        of in 0_usize..7,
+        of in 0_usize..8,
         seed in any::<u64>(),
         changes in prop::collection::vec((0_usize..600, any::<u8>()), 0..20),
         len in prop_oneof![Just(None), (0_usize..3000).prop_map(Some)],

@@ -58,7 +58,7 @@ fn own(path: &str, type_name: &str) -> EsiFile {
 }
 
 impl Hostile {
-    /// Two drives, a device that is mailbox above all, a coupler and digital terminals.
+    /// Two drives, a device that is mailbox above all, a coupler, digital terminals and a gateway.
     pub fn new(seed: u64) -> Self {
         let terminals = "configs/esi/terminals.xml";
         let files = vec![
@@ -69,6 +69,7 @@ impl Hostile {
             own(terminals, "DI8"),
             own(terminals, "DO8"),
             own("configs/esi/IO8.xml", "IO8"),
+            own("configs/esi/gateway.xml", "GW16"),
         ];
         let fresh: Vec<SimDevice> = files
             .iter()
