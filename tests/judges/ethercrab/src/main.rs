@@ -21,7 +21,10 @@ static STORAGE: PduStorage<16, { PduStorage::element_size(1100) }> = PduStorage:
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = env::args().skip(1);
     let nic = arguments.next().ok_or("judge-ethercrab IF CYCLES")?;
-    let cycles: u32 = arguments.next().ok_or("judge-ethercrab IF CYCLES")?.parse()?;
+    let cycles: u32 = arguments
+        .next()
+        .ok_or("judge-ethercrab IF CYCLES")?
+        .parse()?;
     let (tx, rx, pdu_loop) = STORAGE.try_split().map_err(|()| "split twice")?;
     // Longer than this computer may stall.
     let timeouts = Timeouts {
@@ -56,7 +59,6 @@ async fn work(maindevice: &MainDevice<'_>, cycles: u32) -> Result<(), Box<dyn Er
     println!("vendor {:#010x}", first.sdo_read::<u32>(0x1018, 1).await?);
     first.sdo_write(0x6065, 0, 4321_u32).await?;
     println!("written {}", first.sdo_read::<u32>(0x6065, 0).await?);
-    drop(first);
 
     let group = group.into_safe_op(maindevice).await?;
     println!("SafeOp");
@@ -74,7 +76,10 @@ async fn work(maindevice: &MainDevice<'_>, cycles: u32) -> Result<(), Box<dyn Er
     println!("{}", if in_op { "Op" } else { "no Op" });
 
     let last = group.len() - 1;
-    group.subdevice(maindevice, last)?.outputs_raw_mut().fill(PATTERN);
+    group
+        .subdevice(maindevice, last)?
+        .outputs_raw_mut()
+        .fill(PATTERN);
     let mut counters = std::collections::BTreeMap::new();
     let mut next = Instant::now();
     for _ in 0..cycles {
@@ -88,7 +93,11 @@ async fn work(maindevice: &MainDevice<'_>, cycles: u32) -> Result<(), Box<dyn Er
     }
     let inputs = group.subdevice(maindevice, last)?.inputs_raw().to_vec();
     println!("inputs {inputs:02x?} for outputs {PATTERN:02x}");
-    group.into_safe_op(maindevice).await?.into_pre_op(maindevice).await?;
+    group
+        .into_safe_op(maindevice)
+        .await?
+        .into_pre_op(maindevice)
+        .await?;
     println!("PreOp");
     Ok(())
 }
