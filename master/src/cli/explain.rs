@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 
 use ecaxis::config::{
-    self, AxisSetup, DeviceConfig, Machine, Nic, Step, VelocityUnitFrom, duration,
+    self, Action, AxisSetup, DeviceConfig, Machine, Nic, Step, VelocityUnitFrom, duration,
 };
 use ecaxis::rt::image::{self, ImagePlan};
 use ecaxis_esi::SmLayout;
@@ -364,53 +364,23 @@ fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {
         );
     }
     writeln!(out, "\nprogram, {}", times(machine.repeat))?;
-    let axis = |index: usize| {
-        machine
-            .devices
-            .get(index)
-            .and_then(|d| Some((d, d.axis.as_ref()?)))
-    };
-    let targets = |targets: &[(usize, f64)], suffix: &str| {
-        let each = targets.iter().filter_map(|&(index, target)| {
-            let (device, axis) = axis(index)?;
-            let unit = if suffix == "%" { "" } else { &axis.unit };
-            Some(format!("{} → {target} {unit}{suffix}", device.name))
-        });
-        each.collect::<Vec<_>>().join(", ")
-    };
-    let percent = |fraction: f64| rounded(fraction * 100.0);
-    for (number, step) in machine.steps.iter().enumerate() {
-        let text = match step {
-            Step::Move {
-                targets: t,
-                speed,
-                ramp,
-            } => format!(
-                "move {} at {} % of the velocity and {} % of the acceleration limit",
-                targets(t, ""),
-                percent(*speed),
-                percent(*ramp),
-            ),
-            Step::Velocity { targets: t, ramp } => {
-                format!(
-                    "turn {} at {} % of the acceleration limit",
-                    targets(t, "/s"),
-                    percent(*ramp)
-                )
-            }
-            Step::Torque {
-                targets: t,
-                ramp_ns,
-            } => {
-                format!(
-                    "torque {} within {}",
-                    targets(t, "%"),
-                    duration::show(*ramp_ns)
-                )
-            }
-            Step::Dwell { ns } => format!("wait {}", duration::show(*ns)),
-        };
-        writeln!(out, "  {}. {text}", number + 1)?;
+    steps(machine, &machine.steps, out)
+}
+
+fn steps(machine: &Machine, each: &[Step], out: &mut String) -> std::fmt::Result {
+    for step in each {
+        let depth = step.number.matches('.').count();
+        let text = machine.describe(&step.action);
+        writeln!(
+            out,
+            "{:indent$}{}. {text}",
+            "",
+            step.number,
+            indent = 2 + 3 * depth
+        )?;
+        if let Action::Repeat { steps: inner, .. } = &step.action {
+            steps(machine, inner, out)?;
+        }
     }
     Ok(())
 }

@@ -91,8 +91,8 @@ impl Observer for Teller {
             Progress::PhaseLocked => self.line("frames leave in phase with SYNC0"),
             Progress::Enabled { axes: 1 } => self.line("1 axis in Operation enabled"),
             Progress::Enabled { axes } => self.line(&format!("{axes} axes in Operation enabled")),
-            Progress::Program { run, step, of } => {
-                let text = format!("run {run}, step {step}/{of}");
+            Progress::Program { run, step, what } => {
+                let text = format!("run {run}, step {}: {what}", step.number);
                 if *run == 1 && self.bar.is_none() {
                     self.line(&text);
                 } else {

@@ -61,17 +61,20 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
             None => name.as_deref().map(|name| Known {
                 name,
                 axis: Err(*has_axis),
+                device: None,
             }),
         })
         .collect();
-    let steps = steps::check(raw.steps, &known, p);
+    let program = steps::check(raw.steps, &known, p);
     let devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
     connections.check(&devices, p);
     Some(Machine {
         path: path.to_owned(),
         bus: bus?,
         devices,
-        steps,
+        steps: program.steps,
+        inputs: program.inputs,
+        outputs: program.outputs,
         repeat: raw.repeat.map_or(1, Spanned::into_inner),
     })
 }

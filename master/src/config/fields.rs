@@ -47,6 +47,10 @@ impl<'d> Fields<'d> {
         value
     }
 
+    pub fn asked(&self, key: &str) -> bool {
+        self.asked.contains(&key)
+    }
+
     /// Whether the table has keys nobody has asked for so far.
     pub fn unknown(&self) -> bool {
         self.table

@@ -22,6 +22,7 @@ use std::sync::Arc;
 
 mod axis;
 mod check;
+mod describe;
 mod device;
 pub mod duration;
 mod fields;
@@ -29,6 +30,7 @@ mod gateway;
 mod problem;
 mod raw;
 mod sdo;
+mod signal;
 pub mod sim;
 mod steps;
 #[cfg(test)]
@@ -47,6 +49,9 @@ pub struct Machine {
     /// In the order of the bus where every device is found by position, else as in the file.
     pub devices: Vec<DeviceConfig>,
     pub steps: Vec<Step>,
+    /// What the steps read, and set.
+    pub inputs: Vec<Signal>,
+    pub outputs: Vec<Signal>,
     /// How often the steps are run, at least 1.
     pub repeat: u32,
 }
@@ -164,12 +169,39 @@ pub enum VelocityUnitFrom {
     Nothing,
 }
 
-/// One step of the demonstration program. Targets are pairs of (index into [`Machine::devices`],
-/// value in user units).
+/// One step of the program.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Step {
+pub struct Step {
+    /// As people count: `2`, or `2.1` for the first step inside the second.
+    pub number: String,
+    /// Of the machine file.
+    pub line: u32,
+    pub action: Action,
+}
+
+/// What a step does. Axes are indices into [`Machine::devices`], targets pairs of such an index and a value in
+/// user units.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Action {
+    Enable {
+        axes: Vec<usize>,
+    },
+    /// Decelerate, then take the power away.
+    Disable {
+        axes: Vec<usize>,
+    },
+    /// Acknowledge trips and reset drive faults.
+    Reset {
+        axes: Vec<usize>,
+    },
+    /// Decelerate and hold.
+    Stop {
+        axes: Vec<usize>,
+    },
     /// Move and wait until every axis is in its target.
     Move {
+        /// From where the axes are when the step begins.
+        relative: bool,
         targets: Vec<(usize, f64)>,
         /// Fraction of each axis' velocity limit.
         speed: f64,
@@ -191,6 +223,79 @@ pub enum Step {
     Dwell {
         ns: u64,
     },
+    /// Until all conditions hold in the same cycle.
+    Wait {
+        conditions: Vec<Condition>,
+        timeout_ns: u64,
+    },
+    /// Indices into [`Machine::outputs`], and values.
+    Set {
+        values: Vec<(usize, f64)>,
+    },
+    Repeat {
+        times: u32,
+        steps: Vec<Step>,
+    },
+}
+
+/// An input and what it must be; every bound that is given holds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Condition {
+    /// Index into [`Machine::inputs`].
+    pub input: usize,
+    pub equal: Option<f64>,
+    pub above: Option<f64>,
+    pub below: Option<f64>,
+}
+
+impl Condition {
+    #[must_use]
+    pub fn holds(&self, value: f64) -> bool {
+        self.equal.is_none_or(|n| value == n)
+            && self.above.is_none_or(|n| value > n)
+            && self.below.is_none_or(|n| value < n)
+    }
+}
+
+/// A piece of process data that the program reads or sets.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signal {
+    /// Index into [`Machine::devices`].
+    pub device: usize,
+    /// With its device's: `io.Input 3`.
+    pub name: String,
+    pub field: esi::layout::Field,
+}
+
+/// How a signal's bits are a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    Unsigned,
+    Signed,
+    /// IEEE 754, 32 bits.
+    Real,
+}
+
+impl Signal {
+    #[must_use]
+    pub fn kind(&self) -> Kind {
+        match self.field.data_type.as_str() {
+            "REAL" if self.field.bit_len == 32 => Kind::Real,
+            "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
+            | "INTEGER8" | "INTEGER16" | "INTEGER32" | "INTEGER64" => Kind::Signed,
+            _ => Kind::Unsigned,
+        }
+    }
+
+    /// Lowest and highest value, and whether only whole ones.
+    fn range(&self) -> (f64, f64, bool) {
+        let steps = f64::from(self.field.bit_len).exp2();
+        match self.kind() {
+            Kind::Real => (f64::from(f32::MIN), f64::from(f32::MAX), false),
+            Kind::Signed => (-steps / 2.0, steps / 2.0 - 1.0, true),
+            Kind::Unsigned => (0.0, steps - 1.0, true),
+        }
+    }
 }
 
 /// Reads and checks a machine file and the ESI files it names.

@@ -1,21 +1,29 @@
-//! The demonstration program: axes by name, targets within limits.
+//! The program: axes and signals by name, targets within limits.
 
 use toml::Spanned;
 
 use super::axis::too_long;
-use super::problem::{Problems, suggestion};
-use super::raw::{RawStep, RawTarget, Verb};
-use super::{AxisSetup, DeviceConfig, Step};
+use super::problem::{Problems, Span, suggestion};
+use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
+use super::{Action, AxisSetup, Condition, DeviceConfig, Signal, Step, duration, signal};
 use crate::config::device::mode_name;
 use ecaxis_axis::Mode;
 
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
+/// How long an input is waited for where the step does not say.
+const WAIT_NS: u64 = 10_000_000_000;
+/// Half an hour more than a week.
+const LONGEST_WAIT_NS: u64 = 606_600_000_000_000;
+/// Steps of a program, those inside repeated ones included.
+const MOST_STEPS: usize = 10_000;
 
 /// What steps know about a device, which may itself be wrong.
+#[derive(Clone, Copy)]
 pub(crate) struct Known<'c> {
     pub name: &'c str,
     /// `Err(false)`: it has no axis; `Err(true)`: its axis is wrong, and that has been said.
     pub axis: Result<&'c AxisSetup, bool>,
+    pub device: Option<&'c DeviceConfig>,
 }
 
 impl<'c> From<&'c DeviceConfig> for Known<'c> {
@@ -23,89 +31,320 @@ impl<'c> From<&'c DeviceConfig> for Known<'c> {
         Self {
             name: &device.name,
             axis: device.axis.as_ref().ok_or(false),
+            device: Some(device),
         }
     }
 }
 
-pub(crate) fn check(steps: Vec<RawStep>, devices: &[Known<'_>], p: &mut Problems<'_>) -> Vec<Step> {
-    steps
-        .into_iter()
-        .filter_map(|step| one(step, devices, p))
-        .collect()
+/// Steps with the signals that they use.
+#[derive(Debug, Default)]
+pub(crate) struct Program {
+    pub steps: Vec<Step>,
+    pub inputs: Vec<Signal>,
+    pub outputs: Vec<Signal>,
 }
 
-fn one(step: RawStep, devices: &[Known<'_>], p: &mut Problems<'_>) -> Option<Step> {
-    match step {
-        RawStep::Dwell(ns) => Some(Step::Dwell {
-            ns: ns.into_inner(),
-        }),
-        RawStep::Torque { targets, ramp } => {
-            let targets = resolve(targets, "torque", Mode::Cst, devices, p);
-            let ramp_ns = ramp.map_or(WHOLE_TORQUE_RAMP_NS, Spanned::into_inner);
-            Some(Step::Torque {
-                targets: targets?,
-                ramp_ns,
-            })
+pub(crate) fn check(steps: Vec<RawStep>, devices: &[Known<'_>], p: &mut Problems<'_>) -> Program {
+    let mut checker = Checker {
+        devices,
+        inputs: Vec::new(),
+        outputs: Vec::new(),
+        count: 0,
+    };
+    let steps = checker.all(steps, "", p);
+    Program {
+        steps,
+        inputs: checker.inputs,
+        outputs: checker.outputs,
+    }
+}
+
+struct Checker<'c> {
+    devices: &'c [Known<'c>],
+    inputs: Vec<Signal>,
+    outputs: Vec<Signal>,
+    count: usize,
+}
+
+impl Checker<'_> {
+    fn all(&mut self, steps: Vec<RawStep>, prefix: &str, p: &mut Problems<'_>) -> Vec<Step> {
+        let mut checked = Vec::with_capacity(steps.len());
+        for (index, RawStep { span, action }) in steps.into_iter().enumerate() {
+            self.count += 1;
+            if self.count == MOST_STEPS + 1 {
+                p.add(span, format!("a program has {MOST_STEPS} steps at most"));
+                break;
+            }
+            let number = format!("{prefix}{}", index + 1);
+            let line = p.line(&span);
+            if let Some(action) = self.one(action, &number, p) {
+                checked.push(Step {
+                    number,
+                    line,
+                    action,
+                });
+            }
         }
-        RawStep::Motion {
-            verb,
-            targets,
-            speed,
-            ramp,
-        } => {
-            let ramp_at = ramp.as_ref().map(Spanned::span);
-            let speed = fraction(speed, "speed", p);
-            let ramp = fraction(ramp, "ramp", p);
-            let slow = |targets: &[(usize, f64)], p: &mut Problems<'_>| {
-                let at = ramp_at.clone()?;
-                ramps(targets, verb, speed?, ramp?, devices).map(|message| {
-                    p.add_hint(at, message, "a ramp may last an hour at most");
-                })
-            };
-            match verb {
-                Verb::Move => {
-                    let targets = resolve(targets, "move", Mode::Csp, devices, p)?;
-                    slow(&targets, p);
-                    Some(Step::Move {
-                        targets,
-                        speed: speed?,
-                        ramp: ramp?,
-                    })
+        checked
+    }
+
+    fn one(&mut self, action: RawAction, number: &str, p: &mut Problems<'_>) -> Option<Action> {
+        Some(match action {
+            RawAction::Enable(axes) => Action::Enable {
+                axes: self.axes(axes, p)?,
+            },
+            RawAction::Disable(axes) => Action::Disable {
+                axes: self.axes(axes, p)?,
+            },
+            RawAction::Reset(axes) => Action::Reset {
+                axes: self.axes(axes, p)?,
+            },
+            RawAction::Stop(axes) => Action::Stop {
+                axes: self.axes(axes, p)?,
+            },
+            RawAction::Move {
+                relative,
+                targets,
+                speed,
+                ramp,
+            } => {
+                let at = ramp.as_ref().map(Spanned::span);
+                let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
+                let what = if relative { What::Way } else { What::Position };
+                let targets = self.targets(targets, what, p)?;
+                let (speed, ramp) = (speed?, ramp?);
+                self.not_too_slow(&targets, ramp, at, p, |_, limit| limit * speed);
+                Action::Move {
+                    relative,
+                    targets,
+                    speed,
+                    ramp,
                 }
-                Verb::Velocity => {
-                    let targets = resolve(targets, "velocity", Mode::Csv, devices, p)?;
-                    slow(&targets, p);
-                    Some(Step::Velocity {
-                        targets,
-                        ramp: ramp?,
-                    })
+            }
+            RawAction::Velocity { targets, ramp } => {
+                let at = ramp.as_ref().map(Spanned::span);
+                let ramp = fraction(ramp, "ramp", p);
+                let targets = self.targets(targets, What::Velocity, p)?;
+                self.not_too_slow(&targets, ramp?, at, p, |target, _| target.abs());
+                Action::Velocity {
+                    targets,
+                    ramp: ramp?,
                 }
+            }
+            RawAction::Torque { targets, ramp } => Action::Torque {
+                targets: self.targets(targets, What::Torque, p)?,
+                ramp_ns: ramp.map_or(WHOLE_TORQUE_RAMP_NS, Spanned::into_inner),
+            },
+            RawAction::Dwell(ns) => Action::Dwell {
+                ns: ns.into_inner(),
+            },
+            RawAction::Wait {
+                conditions,
+                timeout,
+            } => {
+                let count = conditions.len();
+                let conditions: Vec<Condition> = conditions
+                    .into_iter()
+                    .filter_map(|condition| self.condition(&condition, p))
+                    .collect();
+                let timeout_ns = timeout.map_or(Some(WAIT_NS), |timeout| wait(&timeout, p))?;
+                (count > 0 && conditions.len() == count).then_some(Action::Wait {
+                    conditions,
+                    timeout_ns,
+                })?
+            }
+            RawAction::Set(values) => {
+                let count = values.len();
+                let values: Vec<(usize, f64)> = values
+                    .into_iter()
+                    .filter_map(|(signal, value)| self.output(&signal, &value, p))
+                    .collect();
+                (count > 0 && values.len() == count).then_some(Action::Set { values })?
+            }
+            RawAction::Repeat { times, steps } => Action::Repeat {
+                times: times.into_inner(),
+                steps: self.all(steps, &format!("{number}."), p),
+            },
+        })
+    }
+
+    /// Of the machine's axes, those that are named; `None`: all.
+    fn axes(
+        &self,
+        names: Option<Vec<Spanned<String>>>,
+        p: &mut Problems<'_>,
+    ) -> Option<Vec<usize>> {
+        let Some(names) = names else {
+            let axes = self.devices.iter().enumerate();
+            return Some(
+                axes.filter(|(_, d)| d.axis.is_ok())
+                    .map(|(index, _)| index)
+                    .collect(),
+            );
+        };
+        let count = names.len();
+        let axes: Vec<usize> = names
+            .iter()
+            .filter_map(|name| self.axis(name, p).map(|(index, _)| index))
+            .collect();
+        (axes.len() == count).then_some(axes)
+    }
+
+    fn axis(&self, name: &Spanned<String>, p: &mut Problems<'_>) -> Option<(usize, &AxisSetup)> {
+        let Some(index) = self.devices.iter().position(|d| d.name == name.get_ref()) else {
+            let axes = self.devices.iter().filter(|d| d.axis != Err(false));
+            let hint = suggestion(name.get_ref(), axes.map(|d| d.name), "axes");
+            let message = format!("no device is named `{}`", name.get_ref());
+            p.add_hint(name.span(), message, hint);
+            return None;
+        };
+        match self.devices[index].axis {
+            Ok(axis) => Some((index, axis)),
+            Err(true) => None,
+            Err(false) => {
+                let message = format!("`{}` has no axis to move", name.get_ref());
+                let hint = "give it a [device.axis], or leave it out here";
+                p.add_hint(name.span(), message, hint);
+                None
             }
         }
     }
+
+    fn targets(
+        &self,
+        targets: Vec<RawTarget>,
+        what: What,
+        p: &mut Problems<'_>,
+    ) -> Option<Vec<(usize, f64)>> {
+        let count = targets.len();
+        let mut resolved = Vec::with_capacity(count);
+        for RawTarget { axis: name, value } in targets {
+            let Some((index, axis)) = self.axis(&name, p) else {
+                continue;
+            };
+            let mode = what.mode();
+            if axis.config.mode != mode {
+                let message = format!(
+                    "`{}` needs an axis in mode \"{}\"; `{}` is in \"{}\"",
+                    what.verb(),
+                    mode_name(mode),
+                    name.get_ref(),
+                    axis.mode,
+                );
+                let hint = match axis.config.mode {
+                    Mode::Csv => "write `velocity = { … }` for it",
+                    Mode::Cst => "write `torque = { … }` for it",
+                    _ => "write `move = { … }` for it",
+                };
+                p.add_hint(name.span(), message, hint);
+            } else if within(&value, what, axis, p) {
+                resolved.push((index, value.into_inner()));
+            }
+        }
+        resolved.sort_by_key(|(index, _)| *index);
+        (count > 0 && resolved.len() == count).then_some(resolved)
+    }
+
+    /// Reports an axis that would take more than an hour to reach its velocity.
+    fn not_too_slow(
+        &self,
+        targets: &[(usize, f64)],
+        ramp: f64,
+        at: Option<Span>,
+        p: &mut Problems<'_>,
+        velocity: impl Fn(f64, f64) -> f64,
+    ) {
+        let Some(at) = at else { return };
+        let slow = targets.iter().find_map(|&(index, target)| {
+            let device = self.devices.get(index)?;
+            let limits = &device.axis.ok()?.config.limits;
+            let velocity = velocity(target, limits.velocity);
+            Some((device.name, too_long(velocity, limits.acceleration * ramp)?))
+        });
+        if let Some((name, time)) = slow {
+            let message =
+                format!("with a `ramp` of {ramp}, `{name}` takes {time} to reach its velocity");
+            p.add_hint(at, message, "a ramp may last an hour at most");
+        }
+    }
+
+    fn condition(&mut self, raw: &RawCondition, p: &mut Problems<'_>) -> Option<Condition> {
+        let input = signal::input(&raw.signal, self.devices, p)?;
+        let bounds = [&raw.equal, &raw.above, &raw.below].map(|bound| bound.as_ref());
+        if let Some(equal) = &raw.equal {
+            possible(&input, equal, p)?;
+        }
+        if let [_, Some(above), Some(below)] = bounds
+            && above.get_ref() >= below.get_ref()
+        {
+            let message = format!(
+                "no value is above {} and below {}",
+                above.get_ref(),
+                below.get_ref()
+            );
+            p.add(above.span(), message);
+            return None;
+        }
+        let [equal, above, below] = bounds.map(|bound| bound.map(|n| *n.get_ref()));
+        Some(Condition {
+            input: place(&mut self.inputs, input),
+            equal,
+            above,
+            below,
+        })
+    }
+
+    fn output(
+        &mut self,
+        raw: &RawSignal,
+        value: &Spanned<f64>,
+        p: &mut Problems<'_>,
+    ) -> Option<(usize, f64)> {
+        let output = signal::output(raw, self.devices, p)?;
+        possible(&output, value, p)?;
+        Some((place(&mut self.outputs, output), *value.get_ref()))
+    }
 }
 
-/// What is wrong where an axis would take more than an hour to reach its velocity.
-fn ramps(
-    targets: &[(usize, f64)],
-    verb: Verb,
-    speed: f64,
-    ramp: f64,
-    devices: &[Known<'_>],
-) -> Option<String> {
-    targets.iter().find_map(|&(index, target)| {
-        let device = devices.get(index)?;
-        let limits = &device.axis.ok()?.config.limits;
-        let velocity = match verb {
-            Verb::Move => limits.velocity * speed,
-            Verb::Velocity => target.abs(),
-        };
-        let time = too_long(velocity, limits.acceleration * ramp)?;
-        let name = device.name;
-        Some(format!(
-            "with a `ramp` of {ramp}, `{name}` takes {time} to reach its velocity"
-        ))
-    })
+/// The place of a signal among those in use.
+fn place(signals: &mut Vec<Signal>, signal: Signal) -> usize {
+    if let Some(known) = signals.iter().position(|s| *s == signal) {
+        return known;
+    }
+    signals.push(signal);
+    signals.len() - 1
+}
+
+/// A value that the signal's bits can hold.
+fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Option<()> {
+    let (low, high, whole) = signal.range();
+    let n = *value.get_ref();
+    if (low..=high).contains(&n) && (!whole || n.fract() == 0.0) {
+        return Some(());
+    }
+    let message = format!("{n} is not a value of `{}`", signal.name);
+    let hint = if high == 1.0 {
+        "it is one bit: true or false".to_owned()
+    } else if whole {
+        format!("it has {} bits: {low} to {high}", signal.field.bit_len)
+    } else {
+        "it is a floating-point number of 32 bits".to_owned()
+    };
+    p.add_hint(value.span(), message, hint);
+    None
+}
+
+fn wait(timeout: &Spanned<u64>, p: &mut Problems<'_>) -> Option<u64> {
+    let ns = *timeout.get_ref();
+    if (1_000_000..=LONGEST_WAIT_NS).contains(&ns) {
+        return Some(ns);
+    }
+    let message = format!(
+        "a timeout of {} is not possible; it must be from 1 ms to a week",
+        duration::show(ns)
+    );
+    p.add(timeout.span(), message);
+    None
 }
 
 fn fraction(value: Option<Spanned<f64>>, what: &str, p: &mut Problems<'_>) -> Option<f64> {
@@ -124,80 +363,56 @@ fn fraction(value: Option<Spanned<f64>>, what: &str, p: &mut Problems<'_>) -> Op
     None
 }
 
-fn resolve(
-    targets: Vec<RawTarget>,
-    verb: &str,
-    mode: Mode,
-    devices: &[Known<'_>],
-    p: &mut Problems<'_>,
-) -> Option<Vec<(usize, f64)>> {
-    let count = targets.len();
-    let mut resolved = Vec::with_capacity(count);
-    for RawTarget { axis: name, value } in targets {
-        let Some(index) = devices.iter().position(|d| d.name == name.get_ref()) else {
-            let names = devices
-                .iter()
-                .filter(|d| d.axis != Err(false))
-                .map(|d| d.name);
-            let hint = suggestion(name.get_ref(), names, "axes");
-            p.add_hint(
-                name.span(),
-                format!("no device is named `{}`", name.get_ref()),
-                hint,
-            );
-            continue;
-        };
-        let axis = match devices[index].axis {
-            Ok(axis) => axis,
-            Err(true) => continue,
-            Err(false) => {
-                let message = format!("`{}` has no axis to move", name.get_ref());
-                p.add_hint(
-                    name.span(),
-                    message,
-                    "give it a [device.axis], or leave it out here",
-                );
-                continue;
-            }
-        };
-        if axis.config.mode != mode {
-            let message = format!(
-                "`{verb}` needs an axis in mode \"{}\"; `{}` is in \"{}\"",
-                mode_name(mode),
-                name.get_ref(),
-                axis.mode,
-            );
-            let hint = match axis.config.mode {
-                Mode::Csv => "write `velocity = { … }` for it",
-                Mode::Cst => "write `torque = { … }` for it",
-                _ => "write `move = { … }` for it",
-            };
-            p.add_hint(name.span(), message, hint);
-            continue;
-        }
-        if within(*value.get_ref(), &value, verb, axis, p) {
-            resolved.push((index, value.into_inner()));
-        }
-    }
-    resolved.sort_by_key(|(index, _)| *index);
-    (resolved.len() == count).then_some(resolved)
+/// What a target is a target of.
+#[derive(Clone, Copy, PartialEq)]
+enum What {
+    Position,
+    /// Relative to where the axis is.
+    Way,
+    Velocity,
+    Torque,
 }
 
-fn within(n: f64, at: &Spanned<f64>, verb: &str, axis: &AxisSetup, p: &mut Problems<'_>) -> bool {
+impl What {
+    fn verb(self) -> &'static str {
+        match self {
+            Self::Position => "move",
+            Self::Way => "move_by",
+            Self::Velocity => "velocity",
+            Self::Torque => "torque",
+        }
+    }
+
+    fn mode(self) -> Mode {
+        match self {
+            Self::Position | Self::Way => Mode::Csp,
+            Self::Velocity => Mode::Csv,
+            Self::Torque => Mode::Cst,
+        }
+    }
+}
+
+fn within(value: &Spanned<f64>, what: What, axis: &AxisSetup, p: &mut Problems<'_>) -> bool {
     let limits = &axis.config.limits;
     let unit = &axis.unit;
-    let (low, high, unit) = match verb {
-        "move" => match limits.position {
+    let (low, high, unit) = match what {
+        What::Position => match limits.position {
             Some([low, high]) => (low, high, unit.clone()),
             None => return true,
         },
-        "velocity" => (-limits.velocity, limits.velocity, format!("{unit}/s")),
-        _ => (-limits.torque, limits.torque, "%".into()),
+        // Where it ends is known when it begins; it cannot be longer than the whole range.
+        What::Way => match limits.position {
+            Some([low, high]) => (low - high, high - low, unit.clone()),
+            None => return true,
+        },
+        What::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
+        What::Torque => (-limits.torque, limits.torque, "%".into()),
     };
+    let n = *value.get_ref();
     if (low..=high).contains(&n) {
         return true;
     }
     let message = format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}");
-    p.add(at.span(), message);
+    p.add(value.span(), message);
     false
 }

@@ -153,21 +153,25 @@ fn a_good_file_becomes_a_machine() {
             .torque,
         100.0
     );
+    let steps: Vec<_> = machine.steps.iter().map(|s| s.action.clone()).collect();
     assert_eq!(
-        machine.steps,
+        steps,
         [
-            Step::Move {
+            Action::Move {
+                relative: false,
                 targets: vec![(0, 50.0)],
                 speed: 0.5,
                 ramp: 0.3
             },
-            Step::Velocity {
+            Action::Velocity {
                 targets: vec![(1, 25.0)],
                 ramp: 1.0
             },
-            Step::Dwell { ns: 500_000_000 },
+            Action::Dwell { ns: 500_000_000 },
         ]
     );
+    let numbers: Vec<_> = machine.steps.iter().map(|s| s.number.as_str()).collect();
+    assert_eq!(numbers, ["1", "2", "3"]);
 }
 
 #[test]
@@ -206,8 +210,9 @@ fn devices_are_sorted_and_steps_follow() {
     let machine = with_esi(&swapped.replace("position = 9", "position = 0")).unwrap();
     assert_eq!(machine.devices[0].name, "v");
     assert_eq!(
-        machine.steps[0],
-        Step::Move {
+        machine.steps[0].action,
+        Action::Move {
+            relative: false,
             targets: vec![(1, 50.0)],
             speed: 0.5,
             ramp: 0.3
@@ -277,7 +282,16 @@ fn every_way_to_be_wrong() {
         ("{ x = 50.0 }", "{}", "no axis is named", "", "{}"),
         ("{ x = 50.0 }", "50.0", "expected axes and targets", "{ x = 50.0 }", "50.0"),
         ("speed = 0.5", "speed = 5", "fraction of the axis' velocity limit", "up to 1.0", "5"),
-        ("ramp = 0.3", "dwell = \"1s\"", "more than one thing", "", "[[step]]"),
+        ("ramp = 0.3", "dwell = \"1s\"", "`move` and `dwell`", "a [[step]] for each", "\"1s\""),
+        ("velocity = { v = 25.0 }", "velocity = { v = 25.0 }\nspeed = 0.5", "`speed` does not go with `velocity`", "", "0.5"),
+        ("dwell = \"500ms\"", "enable = [\"q\"]", "no device is named `q`", "axes: `x`, `v`", "\"q\""),
+        ("dwell = \"500ms\"", "disable = []", "no axis is named", "`true` for every axis", "[]"),
+        ("dwell = \"500ms\"", "move_by = { x = 101 }", "outside the axis' limits, -100 to 100 mm", "", "101"),
+        ("dwell = \"500ms\"", "repeat = 2", "nothing is repeated", "[[step.step]]", "2"),
+        ("dwell = \"500ms\"", "wait = { z.In = true }", "no device is named `z`", "devices: `x`, `v`", "z"),
+        ("dwell = \"500ms\"", "wait = { x.Nothing = true }", "no input \"Nothing\"", "its inputs: ", "Nothing"),
+        ("dwell = \"500ms\"", "wait = { x.\"0x6041\" = 65536 }", "is not a value of `x.", "16 bits: 0 to 65535", "65536"),
+        ("dwell = \"500ms\"", "set = { x.\"0x607A\" = 5 }", "written by the axis itself", "a command", "\"0x607A\""),
         ("dwell = \"500ms\"", "", "does nothing", "dwell", "[[step]]"),
         ("dwell = \"500ms\"", "dwel = \"500ms\"", "unknown key `dwel`", "`dwell`", "dwel"),
         ("dwell = \"500ms\"", "dwell = \"500 parsec\"", "unknown unit of time `parsec`", "units:", "parsec"),

@@ -4,8 +4,8 @@ use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, State};
 
 use super::exchange::{Answer, Exchange, Received};
 use super::guard::{Guard, StopCause};
-use super::handover::{Event, Order, PhaseStatus, RtEnd, Snapshot};
-use super::image::AxisBits;
+use super::handover::{Event, ORDERS_A_CYCLE, Order, PhaseStatus, RtEnd, Snapshot};
+use super::image::{AxisBits, SignalBits};
 use super::phase::Phase;
 use super::stats::Stats;
 use crate::clock::{self, Clock, Nanos};
@@ -75,6 +75,13 @@ impl AxisSlot {
     }
 }
 
+/// The process data that the program reads and sets.
+#[derive(Debug, Clone, Default)]
+pub struct Signals {
+    pub inputs: Vec<SignalBits>,
+    pub outputs: Vec<SignalBits>,
+}
+
 /// How the loop is timed.
 #[derive(Debug, Clone, Copy)]
 pub struct Timing {
@@ -95,6 +102,9 @@ pub struct Engine {
     port: Port,
     exchange: Exchange,
     axes: Vec<AxisSlot>,
+    signals: Signals,
+    /// Of the last cycle with fresh inputs.
+    inputs: Vec<f64>,
     phase: Option<Phase>,
     phase_error: i64,
     guard: Guard,
@@ -119,6 +129,7 @@ pub struct Parts {
     pub port: Port,
     pub exchange: Exchange,
     pub axes: Vec<AxisSlot>,
+    pub signals: Signals,
     pub phase: Option<Phase>,
     pub guard: Guard,
     pub end: RtEnd,
@@ -136,6 +147,7 @@ pub struct Remains {
 impl Engine {
     /// The first cycle is due one cycle from now.
     #[must_use]
+    #[allow(clippy::disallowed_macros, reason = "prepares")]
     pub fn new(parts: Parts) -> Self {
         Self {
             clock: parts.clock,
@@ -144,6 +156,8 @@ impl Engine {
             port: parts.port,
             exchange: parts.exchange,
             axes: parts.axes,
+            inputs: vec![0.0; parts.signals.inputs.len()],
+            signals: parts.signals,
             phase: parts.phase,
             phase_error: 0,
             guard: parts.guard,
@@ -195,7 +209,7 @@ impl Engine {
             self.stop(cause);
         }
 
-        self.take_order();
+        self.take_orders();
         self.step_axes();
         self.exchange.stage();
         self.publish(woke);
@@ -294,14 +308,21 @@ impl Engine {
         step.adjust
     }
 
-    fn take_order(&mut self) {
-        let Ok(order) = self.end.orders.pop() else {
-            if self.end.orders.is_abandoned() && !self.halted {
-                self.end_alone();
-            }
-            return;
-        };
-        self.orders_taken += 1;
+    /// Everything handed over so far, so that what belongs together begins in the same cycle.
+    fn take_orders(&mut self) {
+        for _ in 0..ORDERS_A_CYCLE {
+            let Ok(order) = self.end.orders.pop() else {
+                if self.end.orders.is_abandoned() && !self.halted {
+                    self.end_alone();
+                }
+                return;
+            };
+            self.orders_taken += 1;
+            self.take(order);
+        }
+    }
+
+    fn take(&mut self, order: Order) {
         match order {
             Order::Axis { axis, command } => {
                 // A stopping machine takes no new motion.
@@ -319,6 +340,11 @@ impl Engine {
                         axis,
                         reason,
                     });
+                }
+            }
+            Order::Output { output, value } => {
+                if let Some(signal) = self.signals.outputs.get(output) {
+                    signal.set(self.exchange.outputs_mut(), value);
                 }
             }
             Order::Guard => self.guarding = true,
@@ -427,6 +453,13 @@ impl Engine {
         for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
             *to = slot.axis.status();
         }
+        if self.answer.inputs_fresh {
+            let image = self.exchange.inputs();
+            for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
+                *to = signal.get(image);
+            }
+        }
+        snapshot.inputs.copy_from_slice(&self.inputs);
         for (to, diagnosis) in snapshot.diagnoses.iter_mut().zip(self.exchange.diagnoses()) {
             *to = *diagnosis;
         }
@@ -477,7 +510,7 @@ fn quick_stop(axis: &mut Axis) {
     clippy::disallowed_macros,
     reason = "prepares"
 )]
-pub fn first_snapshot(axes: &[AxisSlot], devices: usize) -> Snapshot {
+pub fn first_snapshot(axes: &[AxisSlot], signals: &Signals, devices: usize) -> Snapshot {
     Snapshot {
         time: clock::now(),
         counters: super::stats::Counters::default(),
@@ -485,6 +518,7 @@ pub fn first_snapshot(axes: &[AxisSlot], devices: usize) -> Snapshot {
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
+        inputs: vec![0.0; signals.inputs.len()],
         diagnoses: vec![super::exchange::Diagnosis::default(); devices],
         stopping: None,
         stopped: false,

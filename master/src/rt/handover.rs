@@ -7,8 +7,10 @@ use super::guard::StopCause;
 use super::stats::Counters;
 use crate::clock::Nanos;
 
-/// Orders that may wait; the cycle takes one a cycle.
-const ORDERS: usize = 64;
+/// Orders that may wait; a batch of them is one order an axis at most.
+const ORDERS: usize = 512;
+/// Orders taken in one cycle; what was handed over at once is within one batch.
+pub const ORDERS_A_CYCLE: usize = 256;
 /// Events that may wait; more are counted, not kept.
 const EVENTS: usize = 256;
 
@@ -18,6 +20,11 @@ pub enum Order {
     Axis {
         axis: usize,
         command: Command,
+    },
+    /// An output that no axis drives; an index into [`super::cycle::Signals::outputs`].
+    Output {
+        output: usize,
+        value: f64,
     },
     /// From now on bad cycles are counted, and too many stop the machine.
     Guard,
@@ -64,6 +71,8 @@ pub struct Snapshot {
     pub inputs_fresh: bool,
     pub al_status: Option<(u8, u16)>,
     pub axes: Vec<AxisStatus>,
+    /// What the program reads, in the order of [`super::cycle::Signals::inputs`]; of the last cycle with fresh inputs.
+    pub inputs: Vec<f64>,
     pub diagnoses: Vec<Diagnosis>,
     /// First cause, once the machine is stopping.
     pub stopping: Option<StopCause>,

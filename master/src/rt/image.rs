@@ -2,6 +2,8 @@
 
 use ecaxis_esi::layout::{Field, Layout};
 
+use crate::config::Kind;
+
 /// First logical address of the process image.
 pub const LOGICAL_BASE: u32 = 0x0001_0000;
 
@@ -151,6 +153,36 @@ impl Bits {
     }
 }
 
+/// Bits that are a number for the program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SignalBits {
+    pub bits: Bits,
+    pub kind: Kind,
+}
+
+impl SignalBits {
+    /// RT.
+    #[must_use]
+    pub fn get(self, image: &[u8]) -> f64 {
+        let raw = self.bits.get(image);
+        match self.kind {
+            Kind::Signed => raw as f64,
+            Kind::Unsigned => (raw as u64 & (u64::MAX >> (64 - u32::from(self.bits.len)))) as f64,
+            Kind::Real => f64::from(f32::from_bits(raw as u32)),
+        }
+    }
+
+    /// What does not fit is cut down to the nearest value that does. RT.
+    pub fn set(self, image: &mut [u8], value: f64) {
+        let raw = match self.kind {
+            Kind::Signed => value as i64,
+            Kind::Unsigned => value as u64 as i64,
+            Kind::Real => i64::from((value as f32).to_bits()),
+        };
+        self.bits.set(image, raw);
+    }
+}
+
 /// The objects of a cyclic synchronous axis in the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AxisBits {
@@ -241,6 +273,51 @@ mod tests {
                 device: 0,
                 len: 1500
             })
+        );
+    }
+
+    #[test]
+    fn signals_are_numbers_of_their_kind() {
+        let bits = Bits {
+            byte: 1,
+            shift: 3,
+            len: 1,
+        };
+        let mut image = [0_u8; 8];
+        let flag = SignalBits {
+            bits,
+            kind: Kind::Unsigned,
+        };
+        flag.set(&mut image, 1.0);
+        assert_eq!((image[1], flag.get(&image)), (0x08, 1.0));
+        let bits = Bits {
+            byte: 2,
+            shift: 0,
+            len: 16,
+        };
+        for (kind, value, raw) in [
+            (Kind::Signed, -2.0, 0xfffe_u16),
+            (Kind::Unsigned, 65_534.0, 0xfffe),
+            (Kind::Unsigned, -5.0, 0),
+            (Kind::Signed, f64::NAN, 0),
+        ] {
+            let signal = SignalBits { bits, kind };
+            signal.set(&mut image, value);
+            assert_eq!(image[2..4], raw.to_le_bytes(), "{kind:?} {value}");
+        }
+        let bits = Bits {
+            byte: 4,
+            shift: 0,
+            len: 32,
+        };
+        let real = SignalBits {
+            bits,
+            kind: Kind::Real,
+        };
+        real.set(&mut image, -0.5);
+        assert_eq!(
+            (&image[4..], real.get(&image)),
+            (&(-0.5_f32).to_le_bytes()[..], -0.5)
         );
     }
 

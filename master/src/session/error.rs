@@ -8,6 +8,7 @@ use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::link::LinkError;
 use crate::link::packet::OpenError;
 use crate::rt::image::{NotMapped, TooLarge};
+use crate::session::StepRef;
 
 /// A machine or a bus that failed.
 #[derive(Debug, thiserror::Error)]
@@ -88,20 +89,35 @@ pub enum RunError {
     Gone { device: DeviceRef },
     #[error("a SubDevice left Op (AL status 0x{al_status:02x}) and was back when it was asked")]
     LeftOpBriefly { al_status: u8 },
-    #[error("step {step}: {device}: command refused: {reason}")]
+    #[error("{step}: {device}: command refused: {reason}")]
     Refused {
         device: DeviceRef,
-        step: usize,
+        step: StepRef,
         reason: String,
     },
-    #[error(
-        "step {step}: {device}: the target {target} is not reached, the axis is at {actual:.4}"
-    )]
+    #[error("{step}: {device}: the target {target} is not reached, the axis is at {actual:.4}")]
     NotReached {
         device: DeviceRef,
-        step: usize,
+        step: StepRef,
         target: f64,
         actual: f64,
+    },
+    #[error(
+        "{step}: {device}: `{what}` is not done after {timeout_ms} ms: the drive is in {state}"
+    )]
+    StepTimeout {
+        device: DeviceRef,
+        step: StepRef,
+        what: String,
+        state: State,
+        timeout_ms: u64,
+    },
+    #[error("{step}: {condition} did not come within {timeout_ms} ms: it is {value}")]
+    WaitTimeout {
+        step: StepRef,
+        condition: String,
+        value: f64,
+        timeout_ms: u64,
     },
     #[error("{device}: the clock does not settle: {difference_ns} ns from the reference")]
     ClockNotSettled {

@@ -18,17 +18,17 @@ use ethercrab::{Command as Datagram, MainDevice};
 
 use crate::bringup::{Bus, bring_up};
 use crate::clock::{Clock, Nanos};
-use crate::config::{self, Machine};
+use crate::config::{self, Machine, Signal};
 use crate::link::Link;
 use crate::link::port::{Port, main_device, pump};
 use crate::rt::exchange::Exchange;
 use crate::rt::guard::Guard;
 use crate::rt::handover::ends;
-use crate::rt::image::{self, AxisBits, Bits, ImagePlan};
+use crate::rt::image::{self, AxisBits, Bits, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::rt::{
     self,
-    cycle::{AxisSlot, Engine, Parts, Remains, Timing, first_snapshot},
+    cycle::{AxisSlot, Engine, Parts, Remains, Signals, Timing, first_snapshot},
 };
 use crate::supervise::{Ended, Supervisor, executor, interruptible};
 use crate::wire::Datagrams;
@@ -40,7 +40,7 @@ mod summary;
 
 pub use error::RunError;
 pub use open::{simulated_bus, topology};
-pub use progress::{AxisLine, Observer, Progress, Status};
+pub use progress::{AxisLine, Observer, Progress, Status, StepRef};
 pub use summary::{AxisSummary, Summary};
 
 /// Stack of the thread that owns the link; ethercrab's futures hold its tables by value.
@@ -142,7 +142,7 @@ pub fn prepare(
     progress: Sender<Progress>,
 ) -> Result<Prepared, RunError> {
     // Whatever can be known to fail without a bus fails before there is one.
-    let (image, slots, axes) = plan(machine)?;
+    let (image, slots, axes, signals) = plan(machine)?;
     let mut link = open::link(machine, options)?;
     let (main_device, mut port) = main_device(machine.bus.cycle_ns);
     let carried = Carried {
@@ -161,7 +161,7 @@ pub fn prepare(
             };
             let clock = options.clock;
             let stations: Vec<u16> = bus.devices.iter().map(|d| d.at.station).collect();
-            let (rt_end, outer) = ends(&first_snapshot(&slots, stations.len()));
+            let (rt_end, outer) = ends(&first_snapshot(&slots, &signals, stations.len()));
             let mut exchange = Exchange::new(&bus.image, bus.dc.as_ref(), &stations);
             hold_outputs(machine, &bus, &mut exchange);
             exchange.stage();
@@ -172,6 +172,7 @@ pub fn prepare(
                 port,
                 exchange,
                 axes: slots,
+                signals,
                 phase: bus.dc.as_ref().map(Phase::new),
                 guard: Guard::new(
                     machine.bus.lost_frames,
@@ -207,7 +208,7 @@ pub fn prepare(
     }
 }
 
-type Plan = (ImagePlan, Vec<AxisSlot>, Vec<usize>);
+type Plan = (ImagePlan, Vec<AxisSlot>, Vec<usize>, Signals);
 
 /// The process image, and every axis with its place in it.
 fn plan(machine: &Machine) -> Result<Plan, RunError> {
@@ -237,7 +238,34 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
         slots.push(AxisSlot::new(axis, bits));
         axes.push(index);
     }
-    Ok((image, slots, axes))
+    let bits = |signal: &Signal, output: bool| {
+        let region = image.regions.get(signal.device)?.as_ref()?;
+        let len = if output {
+            region.out_len
+        } else {
+            region.in_len
+        };
+        let bits = Bits::new(&signal.field, region.offset, len)?;
+        let kind = signal.kind();
+        Some(SignalBits { bits, kind })
+    };
+    let all = |signals: &[Signal], output: bool| {
+        let each = signals.iter().map(|signal| {
+            bits(signal, output).ok_or_else(|| RunError::NotMapped {
+                name: signal.name.clone(),
+                source: NotMapped {
+                    index: signal.field.index,
+                    sub: signal.field.sub,
+                },
+            })
+        });
+        each.collect::<Result<Vec<_>, _>>()
+    };
+    let signals = Signals {
+        inputs: all(&machine.inputs, false)?,
+        outputs: all(&machine.outputs, true)?,
+    };
+    Ok((image, slots, axes, signals))
 }
 
 /// From full speed to rest within the limits of the slowest axis, and a second for the drive.

@@ -14,6 +14,20 @@ pub trait Observer {
     fn progress(&mut self, progress: &Progress);
 }
 
+/// A step of the machine file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StepRef {
+    /// `2`, or `2.1` for the first step inside the second.
+    pub number: String,
+    pub line: u32,
+}
+
+impl std::fmt::Display for StepRef {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "step {} (line {})", self.number, self.line)
+    }
+}
+
 /// One thing that happened.
 #[derive(Debug, Clone)]
 pub enum Progress {
@@ -26,11 +40,12 @@ pub enum Progress {
     Enabled {
         axes: usize,
     },
-    /// A step of the program begins; both count from 1.
+    /// A step of the program begins; runs count from 1.
     Program {
         run: u32,
-        step: usize,
-        of: usize,
+        step: StepRef,
+        /// In words.
+        what: String,
     },
     /// Once a second of the machine's time.
     Status(Status),

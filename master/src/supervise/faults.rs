@@ -144,8 +144,8 @@ impl Supervisor {
 
     /// Modes of operation display is in the process data of most drives, and is then checked every
     /// cycle; the others are asked here.
-    pub(super) async fn confirm_modes(&mut self) -> Result<(), RunError> {
-        for axis in 0..self.axes.len() {
+    pub(super) async fn confirm_modes(&mut self, axes: &[usize]) -> Result<(), RunError> {
+        for &axis in axes {
             let device = &self.machine.devices[self.axes[axis]];
             let Some(setup) = &device.axis else { continue };
             let expected = setup.config.mode.code();

@@ -17,7 +17,7 @@ use crate::clock::{self, Nanos};
 use crate::config::Machine;
 use crate::rt::cycle::has_power;
 use crate::rt::guard::StopCause;
-use crate::rt::handover::{Event, Order, OuterEnd, Snapshot};
+use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
 use crate::session::{Progress, RunError, Status};
 use crate::wire::Datagrams;
 
@@ -120,7 +120,10 @@ impl Supervisor {
         if !self.enable {
             return self.hold(clock::now()).await;
         }
-        self.enable_axes().await?;
+        if !program::enables(&self.machine.steps) {
+            let all: Vec<usize> = (0..self.axes.len()).collect();
+            self.enable_axes(&all).await?;
+        }
         self.run_program(ended).await
     }
 
@@ -170,34 +173,37 @@ impl Supervisor {
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
-    async fn enable_axes(&mut self) -> Result<(), RunError> {
+    async fn enable_axes(&mut self, axes: &[usize]) -> Result<(), RunError> {
         let snapshot = self.tick().await?;
-        for axis in 0..self.axes.len() {
+        let mut orders = Vec::with_capacity(2 * axes.len());
+        for &axis in axes {
             if snapshot.axes.get(axis).is_some_and(|s| s.fault.is_some()) {
                 self.tell_of_old_fault(axis).await;
                 let command = Command::ResetFault;
-                self.order(Order::Axis { axis, command }).await;
+                orders.push(Order::Axis { axis, command });
             }
             let command = Command::Enable;
-            self.order(Order::Axis { axis, command }).await;
+            orders.push(Order::Axis { axis, command });
         }
+        self.orders(&orders).await;
         let start = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns;
         loop {
             let snapshot = self.tick().await?;
-            let Some(waiting) = snapshot.axes.iter().position(|axis| !axis.ready) else {
+            let status = |axis: usize| snapshot.axes.get(axis).copied();
+            let late = axes
+                .iter()
+                .find_map(|&axis| Some((axis, status(axis)?)).filter(|(_, s)| !s.ready));
+            let Some((waiting, status)) = late else {
                 break;
             };
-            let status = snapshot.axes[waiting];
             let failed = status.reset_failed && snapshot.orders_taken >= self.orders_given;
             if failed || clock::now().saturating_sub(start) > timeout {
                 return Err(self.not_enabled(waiting, status, timeout).await);
             }
         }
-        self.confirm_modes().await?;
-        self.tell(Progress::Enabled {
-            axes: self.axes.len(),
-        });
+        self.confirm_modes(axes).await?;
+        self.tell(Progress::Enabled { axes: axes.len() });
         Ok(())
     }
 
@@ -311,12 +317,22 @@ impl Supervisor {
         }
     }
 
-    /// Hands an order over; the queue is longer than what one wait can fill.
     async fn order(&mut self, order: Order) {
-        while !self.outer.orders.is_abandoned() && self.outer.orders.push(order).is_err() {
-            clock::delay(TICK).await;
+        self.orders(&[order]).await;
+    }
+
+    /// Hands orders over, all at once as far as a batch holds them: the cycle takes them in one turn.
+    async fn orders(&mut self, orders: &[Order]) {
+        for batch in orders.chunks(ORDERS_A_CYCLE) {
+            while !self.outer.orders.is_abandoned() {
+                if let Ok(room) = self.outer.orders.write_chunk_uninit(batch.len()) {
+                    room.fill_from_iter(batch.iter().copied());
+                    break;
+                }
+                clock::delay(TICK).await;
+            }
+            self.orders_given += batch.len() as u64;
         }
-        self.orders_given += 1;
     }
 
     fn tell(&self, progress: Progress) {

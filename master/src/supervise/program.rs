@@ -1,15 +1,36 @@
 //! The steps of the machine file, one after the other.
 
+use std::future::Future;
+use std::pin::Pin;
+
 use ecaxis_axis::{AxisStatus, Command};
 
 use super::{Ended, Supervisor};
 use crate::clock::{self, Nanos};
-use crate::config::Step;
-use crate::rt::handover::Order;
-use crate::session::{Progress, RunError};
+use crate::config::{Action, Condition, Step};
+use crate::rt::handover::{Order, Snapshot};
+use crate::session::{Progress, RunError, StepRef};
 
 /// How long an axis may take to follow once its set-point has arrived.
 const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
+
+/// Whether the program itself says when axes are enabled.
+pub(super) fn enables(steps: &[Step]) -> bool {
+    steps.iter().any(|step| match &step.action {
+        Action::Enable { .. } => true,
+        Action::Repeat { steps, .. } => enables(steps),
+        _ => false,
+    })
+}
+
+impl From<&Step> for StepRef {
+    fn from(step: &Step) -> Self {
+        Self {
+            number: step.number.clone(),
+            line: step.line,
+        }
+    }
+}
 
 impl Supervisor {
     pub(super) async fn run_program(&mut self, ended: &mut Ended) -> Result<(), RunError> {
@@ -20,23 +41,18 @@ impl Supervisor {
             return self.hold(start).await;
         }
         loop {
-            for (index, step) in steps.iter().enumerate() {
-                if self.over(start) {
-                    return Ok(());
-                }
-                self.tell(Progress::Program {
-                    run: ended.runs + 1,
-                    step: index + 1,
-                    of: steps.len(),
-                });
-                self.run_step(index, step, start).await?;
-            }
+            let begun = clock::now();
+            self.run_steps(&steps, ended.runs + 1, start).await?;
             if self.over(start) {
                 return Ok(());
             }
             ended.runs += 1;
             if self.limit.is_none() && ended.runs >= self.repeat {
                 return Ok(());
+            }
+            // A program that takes no time must not keep the cycle from its turn.
+            if clock::now() == begun {
+                self.tick().await?;
             }
         }
     }
@@ -54,60 +70,249 @@ impl Supervisor {
         Ok(())
     }
 
-    async fn run_step(&mut self, index: usize, step: &Step, start: Nanos) -> Result<(), RunError> {
-        let command: &dyn Fn(f64) -> Command = match step {
-            Step::Move { speed, ramp, .. } => &|position| Command::MoveTo {
-                position,
-                speed: *speed,
-                ramp: *ramp,
-            },
-            Step::Velocity { ramp, .. } => &|velocity| Command::Velocity {
-                velocity,
-                ramp: *ramp,
-            },
-            Step::Torque { ramp_ns, .. } => &|percent| Command::Torque {
-                percent,
-                ramp_s: *ramp_ns as f64 * 1e-9,
-            },
-            Step::Dwell { ns } => {
-                let until = clock::now() + ns;
+    /// Boxed, because steps may hold steps.
+    fn run_steps<'s>(
+        &'s mut self,
+        steps: &'s [Step],
+        run: u32,
+        start: Nanos,
+    ) -> Pin<Box<dyn Future<Output = Result<(), RunError>> + Send + 's>> {
+        Box::pin(async move {
+            for step in steps {
+                if self.over(start) {
+                    return Ok(());
+                }
+                if let Action::Repeat { times, steps } = &step.action {
+                    for _ in 0..*times {
+                        let begun = clock::now();
+                        self.run_steps(steps, run, start).await?;
+                        if self.over(start) {
+                            return Ok(());
+                        }
+                        if clock::now() == begun {
+                            self.tick().await?;
+                        }
+                    }
+                    continue;
+                }
+                self.tell(Progress::Program {
+                    run,
+                    step: step.into(),
+                    what: self.machine.describe(&step.action),
+                });
+                self.run_step(step, start).await?;
+            }
+            Ok(())
+        })
+    }
+
+    async fn run_step(&mut self, step: &Step, start: Nanos) -> Result<(), RunError> {
+        match &step.action {
+            Action::Enable { axes } => {
+                let axes = self.places(axes);
+                self.enable_axes(&axes).await
+            }
+            Action::Disable { axes } => {
+                let axes = self.places(axes);
+                self.command(axes.iter().map(|&axis| (axis, Command::Disable)))
+                    .await;
+                self.until(step, start, |s, axis| !s.axes[axis].enabled, &axes)
+                    .await
+            }
+            Action::Reset { axes } => {
+                let axes = self.places(axes);
+                self.command(axes.iter().map(|&axis| (axis, Command::ResetFault)))
+                    .await;
+                self.until(step, start, |s, axis| !s.axes[axis].resetting, &axes)
+                    .await
+            }
+            Action::Stop { axes } => {
+                let axes = self.places(axes);
+                self.command(axes.iter().map(|&axis| (axis, Command::Stop)))
+                    .await;
+                self.until(step, start, |s, axis| !s.axes[axis].moving, &axes)
+                    .await
+            }
+            Action::Move {
+                relative,
+                targets,
+                speed,
+                ramp,
+            } => {
+                let origin = if *relative {
+                    self.tick().await?.axes
+                } else {
+                    Vec::new()
+                };
+                let targets: Vec<(usize, f64)> = self
+                    .targets(targets)
+                    .into_iter()
+                    .map(|(axis, target)| {
+                        let from = origin.get(axis).map_or(0.0, |s| s.target_position);
+                        (axis, from + target)
+                    })
+                    .collect();
+                self.reach(step, start, &targets, |position| Command::MoveTo {
+                    position,
+                    speed: *speed,
+                    ramp: *ramp,
+                })
+                .await
+            }
+            Action::Velocity { targets, ramp } => {
+                let targets = self.targets(targets);
+                self.reach(step, start, &targets, |velocity| Command::Velocity {
+                    velocity,
+                    ramp: *ramp,
+                })
+                .await
+            }
+            Action::Torque { targets, ramp_ns } => {
+                let targets = self.targets(targets);
+                self.reach(step, start, &targets, |percent| Command::Torque {
+                    percent,
+                    ramp_s: *ramp_ns as f64 * 1e-9,
+                })
+                .await
+            }
+            Action::Dwell { ns } => {
+                let until = clock::now().saturating_add(*ns);
                 while clock::now() < until && !self.over(start) {
                     self.tick().await?;
                 }
-                return Ok(());
+                Ok(())
             }
-        };
-        let (Step::Move { targets, .. }
-        | Step::Velocity { targets, .. }
-        | Step::Torque { targets, .. }) = step
-        else {
-            return Ok(());
-        };
-        let mut waiting = Vec::with_capacity(targets.len());
-        for &(device, target) in targets {
-            let Some(axis) = self.axes.iter().position(|&d| d == device) else {
-                continue;
-            };
-            self.order(Order::Axis {
-                axis,
-                command: command(target),
-            })
-            .await;
-            waiting.push((axis, target));
+            Action::Wait {
+                conditions,
+                timeout_ns,
+            } => self.wait(step, start, conditions, *timeout_ns).await,
+            Action::Set { values } => {
+                let orders = values
+                    .iter()
+                    .map(|&(output, value)| Order::Output { output, value });
+                self.orders(&orders.collect::<Vec<_>>()).await;
+                self.taken(start).await
+            }
+            // `run_steps` unfolds them.
+            Action::Repeat { .. } => Ok(()),
         }
-        self.await_targets(index, &waiting, start).await
     }
 
-    /// Until every axis has arrived; an axis whose set-point has arrived but which does not follow
-    /// fails the step.
-    async fn await_targets(
+    /// Places in the cycle of axes given as devices.
+    fn places(&self, devices: &[usize]) -> Vec<usize> {
+        let places = devices
+            .iter()
+            .filter_map(|device| self.axes.iter().position(|d| d == device));
+        places.collect()
+    }
+
+    fn targets(&self, targets: &[(usize, f64)]) -> Vec<(usize, f64)> {
+        let places = targets.iter().filter_map(|&(device, target)| {
+            Some((self.axes.iter().position(|&d| d == device)?, target))
+        });
+        places.collect()
+    }
+
+    /// All of them in the same cycle.
+    async fn command(&mut self, commands: impl Iterator<Item = (usize, Command)>) {
+        let orders = commands.map(|(axis, command)| Order::Axis { axis, command });
+        self.orders(&orders.collect::<Vec<_>>()).await;
+    }
+
+    /// Until the cycle has taken every order.
+    async fn taken(&mut self, start: Nanos) -> Result<(), RunError> {
+        while self.tick().await?.orders_taken < self.orders_given && !self.over(start) {}
+        Ok(())
+    }
+
+    fn refusal(&mut self, step: &Step) -> Result<(), RunError> {
+        match self.refused.take() {
+            Some((axis, reason)) => Err(RunError::Refused {
+                device: self.device_of(axis),
+                step: step.into(),
+                reason: reason.to_string(),
+            }),
+            None => Ok(()),
+        }
+    }
+
+    /// Until something holds of every axis, or the time an axis may take to be enabled is over.
+    async fn until(
         &mut self,
-        step: usize,
-        waiting: &[(usize, f64)],
+        step: &Step,
         start: Nanos,
+        holds: impl Fn(&Snapshot, usize) -> bool,
+        axes: &[usize],
     ) -> Result<(), RunError> {
-        // The orders are taken one a cycle; until then the status is that of the step before.
-        let ordered = self.orders_given;
+        let begun = clock::now();
+        let timeout = self.machine.bus.enable_timeout_ns.max(self.stop_patience);
+        loop {
+            let snapshot = self.tick().await?;
+            if self.over(start) {
+                return Ok(());
+            }
+            if snapshot.orders_taken < self.orders_given {
+                continue;
+            }
+            self.refusal(step)?;
+            let Some(&axis) = axes.iter().find(|&&axis| !holds(&snapshot, axis)) else {
+                return Ok(());
+            };
+            if clock::now().saturating_sub(begun) > timeout {
+                return Err(RunError::StepTimeout {
+                    device: self.device_of(axis),
+                    step: step.into(),
+                    what: self.machine.describe(&step.action),
+                    state: snapshot.axes[axis].state,
+                    timeout_ms: timeout / 1_000_000,
+                });
+            }
+        }
+    }
+
+    /// Until every condition holds in one and the same cycle.
+    async fn wait(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        conditions: &[Condition],
+        timeout: Nanos,
+    ) -> Result<(), RunError> {
+        let begun = clock::now();
+        loop {
+            let snapshot = self.tick().await?;
+            let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
+            let open = conditions.iter().find(|c| !c.holds(value(c.input)));
+            let Some(open) = open else { return Ok(()) };
+            if self.over(start) {
+                return Ok(());
+            }
+            if clock::now().saturating_sub(begun) > timeout {
+                return Err(RunError::WaitTimeout {
+                    step: step.into(),
+                    condition: self.machine.condition(open),
+                    value: value(open.input),
+                    timeout_ms: timeout / 1_000_000,
+                });
+            }
+        }
+    }
+
+    /// Orders every axis to its target and waits until all have arrived; an axis whose set-point has arrived but which
+    /// does not follow fails the step.
+    async fn reach(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        targets: &[(usize, f64)],
+        command: impl Fn(f64) -> Command,
+    ) -> Result<(), RunError> {
+        self.command(
+            targets
+                .iter()
+                .map(|&(axis, target)| (axis, command(target))),
+        )
+        .await;
         let mut settling_since = None;
         loop {
             let snapshot = self.tick().await?;
@@ -115,18 +320,13 @@ impl Supervisor {
                 // Winding down brings the axes to rest from wherever they are.
                 return Ok(());
             }
-            if snapshot.orders_taken < ordered {
+            // Until then the status is that of the step before.
+            if snapshot.orders_taken < self.orders_given {
                 continue;
             }
+            self.refusal(step)?;
             let status = |axis: usize| snapshot.axes.get(axis).copied();
-            if let Some((axis, reason)) = self.refused.take() {
-                return Err(RunError::Refused {
-                    device: self.device_of(axis),
-                    step: step + 1,
-                    reason: reason.to_string(),
-                });
-            }
-            let late = waiting.iter().find_map(|&(axis, target)| {
+            let late = targets.iter().find_map(|&(axis, target)| {
                 status(axis)
                     .filter(|s| !s.in_target)
                     .map(|s| (axis, target, s))
@@ -134,7 +334,7 @@ impl Supervisor {
             let Some((axis, target, last)) = late else {
                 return Ok(());
             };
-            if waiting
+            if targets
                 .iter()
                 .any(|&(axis, _)| status(axis).is_some_and(|s| s.moving))
             {
@@ -145,7 +345,7 @@ impl Supervisor {
             if clock::now().saturating_sub(since) > SETTLE_TIMEOUT {
                 return Err(RunError::NotReached {
                     device: self.device_of(axis),
-                    step: step + 1,
+                    step: step.into(),
                     target,
                     actual: reported(&last),
                 });

@@ -7,6 +7,10 @@ use super::fields::{self, Fields};
 use super::problem::{Problems, Span};
 use super::sim::{self, RawSim};
 
+mod step;
+
+pub(crate) use step::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
+
 #[derive(Debug, Default)]
 pub(crate) struct RawMachine {
     pub bus: RawBus,
@@ -102,33 +106,6 @@ pub(crate) struct RawLimits {
     pub following_error: Option<Spanned<f64>>,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Verb {
-    Move,
-    Velocity,
-}
-
-#[derive(Debug)]
-pub(crate) struct RawTarget {
-    pub axis: Spanned<String>,
-    pub value: Spanned<f64>,
-}
-
-#[derive(Debug)]
-pub(crate) enum RawStep {
-    Motion {
-        verb: Verb,
-        targets: Vec<RawTarget>,
-        speed: Option<Spanned<f64>>,
-        ramp: Option<Spanned<f64>>,
-    },
-    Torque {
-        targets: Vec<RawTarget>,
-        ramp: Option<Spanned<u64>>,
-    },
-    Dwell(Spanned<u64>),
-}
-
 type Value<'d> = &'d Spanned<DeValue<'d>>;
 
 /// Reads `$field`, where it stands, with one of the readers of [`fields`].
@@ -168,12 +145,13 @@ pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> Raw
         let Some(fields) = fields::table(p, value, "[[step]]") else {
             continue;
         };
-        machine.steps.extend(read_step(fields, span, p));
+        machine.steps.extend(step::read(fields, span, p));
     }
     f.done(p);
     machine
 }
 
+/// The tables of an array of tables.
 fn tables<'d>(
     p: &mut Problems<'_>,
     value: Option<Value<'d>>,
@@ -400,80 +378,4 @@ fn read_axis(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAxis {
     }
     f.done(p);
     axis
-}
-
-fn read_step(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawStep> {
-    let (travel, velocity, torque) = (f.get("move"), f.get("velocity"), f.get("torque"));
-    let (dwell, speed, ramp) = (f.get("dwell"), f.get("speed"), f.get("ramp"));
-    let unknown = f.unknown();
-    f.done(p);
-    let kinds = "a step has one of `move = { x = 50.0 }`, `velocity = { v = 100.0 }`, \
-                 `torque = { t = 10.0 }`, `dwell = \"500ms\"`";
-    let mut refuse = |value: Option<Value<'_>>, message: &str| {
-        if let Some(value) = value {
-            p.add(value.span(), message);
-        }
-    };
-    match (travel, velocity, torque, dwell) {
-        (Some(value), None, None, None) => Some(RawStep::Motion {
-            verb: Verb::Move,
-            targets: read_targets(value, p)?,
-            speed: speed.and_then(|v| fields::number(p, v)),
-            ramp: ramp.and_then(|v| fields::number(p, v)),
-        }),
-        (None, Some(value), None, None) => {
-            refuse(
-                speed,
-                "`speed` belongs to `move`; a velocity is its own speed",
-            );
-            Some(RawStep::Motion {
-                verb: Verb::Velocity,
-                targets: read_targets(value, p)?,
-                speed: None,
-                ramp: ramp.and_then(|v| fields::number(p, v)),
-            })
-        }
-        (None, None, Some(value), None) => {
-            refuse(speed, "`speed` belongs to `move`");
-            let targets = read_targets(value, p)?;
-            let ramp = ramp.and_then(|v| fields::duration(p, v));
-            Some(RawStep::Torque { targets, ramp })
-        }
-        (None, None, None, Some(value)) => {
-            refuse(speed, "`speed` belongs to `move`");
-            refuse(ramp, "a dwell has no `ramp`");
-            fields::duration(p, value).map(RawStep::Dwell)
-        }
-        (None, None, None, None) => {
-            // An unknown key has been reported and was probably meant to be one of them.
-            if !unknown {
-                p.add_hint(span, "this step does nothing", kinds);
-            }
-            None
-        }
-        _ => {
-            p.add_hint(span, "this step does more than one thing", kinds);
-            None
-        }
-    }
-}
-
-fn read_targets(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawTarget>> {
-    let DeValue::Table(table) = value.get_ref() else {
-        p.add_hint(
-            value.span(),
-            "expected axes and targets",
-            "write `{ x = 50.0 }`",
-        );
-        return None;
-    };
-    let mut targets = Vec::new();
-    for (key, value) in table {
-        let axis = Spanned::new(key.span(), key.get_ref().to_string());
-        targets.extend(fields::number(p, value).map(|value| RawTarget { axis, value }));
-    }
-    if table.is_empty() {
-        p.add_hint(value.span(), "no axis is named", "write `{ x = 50.0 }`");
-    }
-    Some(targets)
 }

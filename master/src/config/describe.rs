@@ -1,0 +1,99 @@
+//! A step in words, for `explain`, progress and errors.
+
+use super::{Action, Condition, Machine, duration};
+
+impl Machine {
+    /// What a step does, `move x → 50 mm at 50 % of the velocity …`.
+    #[must_use]
+    pub fn describe(&self, action: &Action) -> String {
+        match action {
+            Action::Enable { axes } => format!("enable {}", self.names(axes)),
+            Action::Disable { axes } => format!("disable {}", self.names(axes)),
+            Action::Reset { axes } => format!("reset the faults of {}", self.names(axes)),
+            Action::Stop { axes } => format!("stop {}", self.names(axes)),
+            Action::Move {
+                relative,
+                targets,
+                speed,
+                ramp,
+            } => format!(
+                "move {} at {} % of the velocity and {} % of the acceleration limit",
+                self.targets(targets, if *relative { "by" } else { "→" }, ""),
+                percent(*speed),
+                percent(*ramp),
+            ),
+            Action::Velocity { targets, ramp } => format!(
+                "turn {} at {} % of the acceleration limit",
+                self.targets(targets, "→", "/s"),
+                percent(*ramp),
+            ),
+            Action::Torque { targets, ramp_ns } => format!(
+                "torque {} within {}",
+                self.targets(targets, "→", "%"),
+                duration::show(*ramp_ns),
+            ),
+            Action::Dwell { ns } => format!("wait {}", duration::show(*ns)),
+            Action::Wait {
+                conditions,
+                timeout_ns,
+            } => {
+                let each = conditions.iter().map(|c| self.condition(c));
+                format!(
+                    "wait until {}, {} at most",
+                    each.collect::<Vec<_>>().join(" and "),
+                    duration::show(*timeout_ns),
+                )
+            }
+            Action::Set { values } => {
+                let each = values.iter().filter_map(|&(output, value)| {
+                    Some(format!("{} = {value}", self.outputs.get(output)?.name))
+                });
+                format!("set {}", each.collect::<Vec<_>>().join(", "))
+            }
+            Action::Repeat { times: 1, .. } => "once".to_owned(),
+            Action::Repeat { times, .. } => format!("{times} times"),
+        }
+    }
+
+    /// `io.Input 3 = 1`.
+    #[must_use]
+    pub fn condition(&self, condition: &Condition) -> String {
+        let name = self
+            .inputs
+            .get(condition.input)
+            .map_or("?", |input| input.name.as_str());
+        let bounds = [
+            ("=", condition.equal),
+            (">", condition.above),
+            ("<", condition.below),
+        ];
+        let bounds = bounds.into_iter();
+        let bounds = bounds.filter_map(|(sign, n)| Some(format!("{sign} {}", n?)));
+        format!("{name} {}", bounds.collect::<Vec<_>>().join(" and "))
+    }
+
+    fn names(&self, axes: &[usize]) -> String {
+        let names = axes.iter().filter_map(|&axis| self.devices.get(axis));
+        names
+            .map(|d| d.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    }
+
+    fn targets(&self, targets: &[(usize, f64)], arrow: &str, suffix: &str) -> String {
+        let each = targets.iter().filter_map(|&(index, target)| {
+            let device = self.devices.get(index)?;
+            let unit = match suffix {
+                "%" => "",
+                _ => &device.axis.as_ref()?.unit,
+            };
+            Some(format!("{} {arrow} {target} {unit}{suffix}", device.name))
+        });
+        each.collect::<Vec<_>>().join(", ")
+    }
+}
+
+/// Of a fraction, without the digits that are only rounding.
+fn percent(fraction: f64) -> f64 {
+    (fraction * 1e8).round() / 1e6
+}

@@ -1,0 +1,181 @@
+//! The program's steps on the simulated bus: power, inputs and outputs, repetition, and what is said when one fails.
+
+mod common;
+
+use common::{Heard, load, machine, run, virtual_time};
+use ecaxis::session::{Progress, RunError};
+
+const HEAD: &str = r#"
+[bus]
+nic = "sim"
+cycle = "1ms"
+
+[[device]]
+name = "x"
+esi = "esi/EPOS4.xml"
+position = 0
+mode = "csp"
+
+[device.axis]
+unit = "mm"
+per_turn = 5.0
+encoder = 2000
+limits = { position = [-60.0, 60.0], velocity = 250.0, acceleration = 2500.0, following_error = 2.0 }
+
+[[device]]
+name = "y"
+esi = "esi/EPOS4.xml"
+position = 1
+mode = "csp"
+
+[device.axis]
+unit = "mm"
+per_turn = 5.0
+encoder = 2000
+limits = { position = [-60.0, 60.0], velocity = 250.0, acceleration = 2500.0, following_error = 2.0 }
+
+[[device]]
+name = "io"
+esi = "esi/IO8.xml"
+position = 2
+"#;
+
+fn steps(heard: &Heard) -> Vec<String> {
+    let told = heard.0.iter();
+    told.filter_map(|progress| match progress {
+        Progress::Program { step, .. } => Some(step.number.clone()),
+        _ => None,
+    })
+    .collect()
+}
+
+/// Runs the steps, and gives the result with the numbers of the steps that began.
+fn program(text: &str) -> (Result<(), RunError>, Vec<String>, ecaxis::session::Summary) {
+    let (outcome, heard) = run(machine(&format!("{HEAD}{text}")), virtual_time());
+    let summary = outcome.summary.expect("the cycle has run");
+    (outcome.result, steps(&heard), summary)
+}
+
+#[test]
+fn the_example_does_everything_in_order() {
+    let (outcome, heard) = run(load("program.toml"), virtual_time());
+    outcome.result.expect("runs");
+    assert_eq!(
+        steps(&heard),
+        [
+            "1", "2", "3", "4", "5.1", "5.2", "5.1", "5.2", "5.1", "5.2", "6", "7", "8", "9"
+        ]
+    );
+    let enabled_at = heard
+        .0
+        .iter()
+        .position(|p| matches!(p, Progress::Enabled { axes: 1 }));
+    let third = heard
+        .0
+        .iter()
+        .position(|p| matches!(p, Progress::Program { step, .. } if step.number == "3"));
+    assert!(enabled_at > third, "not before the step that says so");
+    let summary = outcome.summary.expect("the cycle has run");
+    let moved = &summary.axes[0];
+    assert!(moved.final_position.abs() < 0.2, "{moved:?}");
+    assert!(
+        moved.largest_following_error > 0.1,
+        "it has moved: {moved:?}"
+    );
+}
+
+#[test]
+fn relative_moves_add_up_without_drift() {
+    let (result, ran, summary) = program(
+        r#"
+[[step]]
+repeat = 12
+[[step.step]]
+move_by = { x = 0.1, y = -0.1 }
+[[step]]
+dwell = "300ms"
+"#,
+    );
+    result.expect("runs");
+    assert_eq!(ran.len(), 13);
+    for (axis, expected) in summary.axes.iter().zip([1.2, -1.2]) {
+        assert!((axis.target_position - expected).abs() < 1e-9, "{axis:?}");
+        assert!(
+            axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+            "{axis:?}"
+        );
+    }
+}
+
+#[test]
+fn only_the_axes_that_are_named_get_power() {
+    let (result, _, summary) = program("[[step]]\nenable = \"y\"\n[[step]]\ndwell = \"20ms\"\n");
+    result.expect("runs");
+    let enabled: Vec<_> = summary.axes.iter().map(|a| a.was_enabled).collect();
+    assert_eq!(enabled, [false, true]);
+}
+
+#[test]
+fn a_move_of_an_axis_without_power_fails_its_step() {
+    let (result, ran, _) = program(
+        "[[step]]\nenable = [\"y\"]\n[[step]]\nrepeat = 2\n[[step.step]]\nmove = { x = 1.0 }\n",
+    );
+    let error = result.expect_err("x has no power").to_string();
+    assert_eq!(ran, ["1", "2.1"]);
+    assert!(error.starts_with("step 2.1 (line "), "{error}");
+    assert!(
+        error.contains("`x`") && error.contains("refused"),
+        "{error}"
+    );
+}
+
+#[test]
+fn an_input_that_does_not_come_ends_the_program_with_its_name() {
+    let (result, ran, _) = program(
+        r#"
+[[step]]
+set = { io."Output 3" = true }
+[[step]]
+wait = { io."Input 3" = true, io."Input 4" = true }
+timeout = "250ms"
+[[step]]
+dwell = "1s"
+"#,
+    );
+    let error = result.expect_err("input 4 stays off").to_string();
+    assert_eq!(ran, ["1", "2"]);
+    assert!(
+        error.contains("io.Input 4 = 1 did not come within 250 ms: it is 0"),
+        "{error}"
+    );
+}
+
+#[test]
+fn process_data_of_a_drive_can_be_waited_for() {
+    let (result, ran, _) = program(
+        r#"
+[[step]]
+wait = { x."0x6064" = { above = -5, below = 5 } }
+[[step]]
+disable = true
+"#,
+    );
+    result.expect("the shaft stands at zero");
+    assert_eq!(ran, ["1", "2"]);
+}
+
+/// An endless loop of steps that take no time would keep the machine from being stopped.
+#[test]
+fn steps_that_take_no_time_let_the_cycle_turn() {
+    let mut options = virtual_time();
+    options.limit = Some(50_000_000);
+    let text = format!("{HEAD}[[step]]\nset = {{ io.\"Output 1\" = true }}\n");
+    let (outcome, heard) = run(machine(&text), options);
+    outcome.result.expect("the time limit ends it");
+    assert!(steps(&heard).len() > 3);
+    let nothing = format!("repeat = 1000000\n{HEAD}[[step]]\nrepeat = 1000000\nstep = []\n");
+    let mut options = virtual_time();
+    options.limit = Some(50_000_000);
+    let (outcome, _) = run(machine(&nothing), options);
+    outcome.result.expect("the time limit ends it");
+}
