@@ -11,6 +11,7 @@
 //! | [`scale`] | counts ↔ user units, the drive's velocity unit (0x60A9), polarity, 32-bit wrap |
 //! | [`limits`] | what an axis may never exceed; checked once, enforced every cycle |
 //! | [`cia402`] | Statusword, Controlword, the power state machine, modes, error codes |
+//! | [`loops`] | the position loops that the master closes in CSV and CST, and the offsets in CSP |
 //! | [`setpoint`] | hold, trapezoidal moves, ramps; each advanced one cycle at a time |
 //! | [`axis`] | one axis: commands in, guarded set-points out, supervision in between |
 //! | [`status`] | what an axis reports, and the reasons for which it stops or refuses |
@@ -20,13 +21,15 @@
 pub mod axis;
 pub mod cia402;
 pub mod limits;
+pub mod loops;
 pub mod scale;
 pub mod setpoint;
 pub mod status;
 pub mod units;
 
 pub use axis::{Axis, AxisConfig, Command, ConfigError, Inputs, Outputs};
-pub use cia402::{Controlword, Mode, State, Statusword};
+pub use cia402::{Controlword, Mode, Modes, State, Statusword};
 pub use limits::{LimitError, Limits};
+pub use loops::{FeedForward, Loops, PositionPid, VelocityLoop};
 pub use scale::{Scale, ScaleError, VelocityBase, VelocityUnit};
 pub use status::{AxisStatus, DriveFault, Refused, Trip};

@@ -7,7 +7,12 @@ use crate::cia402::{Mode, State, describe};
 /// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisStatus {
+    /// The mode whose targets count.
     pub mode: Mode,
+    /// The mode on its way: 0x6060 is written, 0x6061 does not show it yet.
+    pub switching: Option<Mode>,
+    /// The last mode that was commanded did not show in time; the axis has stayed in `mode`.
+    pub switch_failed: Option<Mode>,
     /// From the last fresh Statusword.
     pub state: State,
     pub time_in_state_s: f64,
@@ -18,11 +23,12 @@ pub struct AxisStatus {
     pub enabled: bool,
     /// Motion commands are taken: `enabled`, and neither disabling nor stopping for good.
     pub ready: bool,
-    /// `mode_display` is the configured mode, or is not mapped.
+    /// 0x6061 shows `mode` or `switching`, or is not mapped.
     pub mode_confirmed: bool,
     /// The set-point is still changing, or waits for lost frames before it goes on.
     pub moving: bool,
-    /// The set-point has arrived, and so has the axis (CSP: within the target window; CSV: within the velocity window).
+    /// The set-point has arrived, and so has the axis (position: within the target window; velocity: within the velocity
+    /// window).
     pub in_target: bool,
     /// Commanded and reported velocity are near zero.
     pub at_rest: bool,
@@ -35,14 +41,15 @@ pub struct AxisStatus {
     /// As commanded in this cycle.
     pub target_position: f64,
     pub target_velocity: f64,
+    pub target_acceleration: f64,
     pub target_torque: f64,
-    /// Commanded (in the cycle before) minus reported position.
+    /// Commanded (in the cycle before, and by what of the dead time is longer) minus reported position.
     pub following_error: f64,
     /// Largest amount since enabling.
     pub max_following_error: f64,
     /// Target minus reported position once a position move's set-point has arrived.
     pub final_error_counts: Option<i64>,
-    /// A CSV velocity is held back so that the axis can stop before the end of its range.
+    /// A commanded velocity is held back so that the axis can stop before the end of its range.
     pub held_by_range: bool,
     /// Cycles in which the last guard had to change a set-point. Stays 0 unless something here is wrong.
     pub guarded_cycles: u32,
@@ -111,6 +118,22 @@ pub enum Refused {
         needs: Mode,
         mode: Mode,
     },
+    #[error("mode {mode} is not among those that were made ready for this axis")]
+    ModeNotOffered { mode: Mode },
+    #[error("the drive's mode is not visible: 0x6061 is not mapped")]
+    NoModeDisplay,
+    #[error("mode {mode} needs a reported position: 0x6064 is not mapped")]
+    NoPosition { mode: Mode },
+    #[error("the axis is just being switched to mode {to}")]
+    Switching { to: Mode },
+    #[error("a step of {step} in one cycle is more than the {most} of the velocity limit")]
+    Step { step: f64, most: f64 },
+    #[error(
+        "velocity changes by {change} in one cycle, more than the {most} of the acceleration limit"
+    )]
+    Jump { change: f64, most: f64 },
+    #[error("frames are being lost; the set-point waits")]
+    FramesLost,
     #[error("the axis is not enabled (drive: {state})")]
     NotEnabled { state: State },
     #[error("the drive has not confirmed mode {expected}, it shows {display}")]

@@ -276,11 +276,12 @@ fn refusals_say_why_and_change_nothing() {
         ),
         (
             Command::Velocity {
-                velocity: 1.0,
+                velocity: f64::NEG_INFINITY,
                 ramp: 1.0,
             },
-            "needs mode CSV, the axis is in CSP",
+            "not a finite number",
         ),
+        (Command::SetMode(Mode::Csv), "mode CSV is not among those"),
         (
             Command::Torque {
                 percent: 1.0,

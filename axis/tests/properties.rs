@@ -276,7 +276,7 @@ proptest! {
             if let Some(command) = command {
                 asked |= axis.command(command).is_ok() && command == Command::Enable;
             }
-            let inputs = Inputs { statusword, position, velocity, torque, mode_display, fresh };
+            let inputs = Inputs { statusword, position, velocity, torque, mode_display, fresh, ..Inputs::default() };
             let out = axis.step(&inputs, dt);
             let status = axis.status();
             prop_assert!(status.position.is_finite() && status.target_position.is_finite());

@@ -4,8 +4,9 @@
 //! [`RIDE_THROUGH_CYCLES`] are planned blind; then the set-point waits where it is, as the drive does with the last target it
 //! got.
 
-use super::Axis;
+use super::{Axis, Control, Plan};
 use crate::cia402::Mode;
+use crate::setpoint::Motion;
 
 /// The drive is never further behind than these and the cycle whose loss was not known yet.
 const RIDE_THROUGH_CYCLES: u32 = 2;
@@ -17,11 +18,29 @@ impl Axis {
     }
 
     /// Instead of an advance. The plan stays: in CSP it goes on from rest, for the drive stands at its last target; in CSV and
-    /// CST it goes on from the velocity or torque that the drive has kept.
+    /// CST it goes on from the velocity or torque that the drive has kept. What comes from outside does not go on.
     pub(super) fn freeze(&mut self) {
-        if self.config.mode == Mode::Csp {
+        if self.mode == Mode::Csp {
             self.cut_short |= self.motion.velocity != 0.0;
-            self.motion.velocity = 0.0;
+            self.motion = Motion::at(self.motion.position);
+        } else if self.grip() == Control::Position && self.motion.velocity != 0.0 {
+            self.regain = true;
         }
+        if self.plan == Plan::Fed {
+            self.brake();
+        }
+    }
+
+    /// The first advance after a freeze in which the drive moved on without a set-point.
+    pub(super) fn go_on(&mut self) {
+        if !core::mem::take(&mut self.regain) || self.grip() != Control::Position {
+            return;
+        }
+        let velocity = match self.mode {
+            Mode::Csv => self.motion.velocity,
+            _ => self.actual.velocity(),
+        };
+        self.motion = self.tracked(velocity);
+        self.given.restart();
     }
 }

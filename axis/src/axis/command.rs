@@ -1,12 +1,53 @@
 //! Commands: checked completely before anything changes.
 
-use super::{Axis, Command, Plan, Wish};
+use super::{Axis, Control, Plan, Wish};
 use crate::cia402::{Mode, State};
 use crate::setpoint::{Ramp, Trapezoid};
 use crate::status::Refused;
 
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Command {
+    /// Take the drive to Operation enabled. Does not reset a fault.
+    Enable,
+    /// Decelerate, then take the power away.
+    Disable,
+    /// Acknowledge a trip, and reset the drive's fault if it is in one.
+    ResetFault,
+    /// Decelerate with the limit acceleration and hold; stays enabled. In CST without a position loop: torque to zero.
+    Stop,
+    /// The drive's own quick stop; it then stays in Quick stop active if its option code says so.
+    QuickStop,
+    /// Switch the mode of operation, also in motion. Where the new mode can do what the set-point is about, it goes on
+    /// with it; otherwise it comes to rest.
+    SetMode(Mode),
+    /// In CSP, and where a position loop is configured in CSV and CST.
+    MoveTo {
+        position: f64,
+        /// Fraction of the velocity limit, above 0 and at most 1.
+        speed: f64,
+        /// Fraction of the acceleration limit, above 0 and at most 1.
+        ramp: f64,
+    },
+    /// In CSV, CSP, and CST with a position loop.
+    Velocity {
+        velocity: f64,
+        /// Fraction of the acceleration limit, above 0 and at most 1.
+        ramp: f64,
+    },
+    /// In CST.
+    Torque {
+        /// Of rated torque.
+        percent: f64,
+        /// Seconds from the present torque to the new one; never steeper than `torque_slope`.
+        ramp_s: f64,
+    },
+}
+
 /// Beyond this many counts f64 no longer tells two apart.
 const FARTHEST_COUNTS: f64 = 1e15;
+
+/// Quotients of differences of f64s that were within a limit may be a little beyond it.
+const SET_POINT_ROUNDING: f64 = 1.0 + 1e-6;
 
 impl Axis {
     pub(super) fn take(&mut self, command: Command) -> Result<(), Refused> {
@@ -21,9 +62,10 @@ impl Axis {
                 Ok(())
             }
             Command::Stop => {
-                self.plan = self.braking();
+                self.brake();
                 Ok(())
             }
+            Command::SetMode(mode) => self.set_mode(mode),
             Command::QuickStop => {
                 self.quick_stop(false);
                 Ok(())
@@ -66,7 +108,7 @@ impl Axis {
     }
 
     fn disable(&mut self) {
-        self.plan = self.braking();
+        self.brake();
         self.wish = match self.wish {
             Wish::QuickStop { elapsed_s, .. } => Wish::QuickStop {
                 then_disable: true,
@@ -81,7 +123,7 @@ impl Axis {
 
     /// Also how a trip stops the axis.
     pub(super) fn quick_stop(&mut self, then_disable: bool) {
-        self.plan = self.braking();
+        self.brake();
         self.wish = match self.wish {
             Wish::QuickStop {
                 then_disable: before,
@@ -117,12 +159,15 @@ impl Axis {
         if let Some(fault) = self.fault {
             return Err(Refused::Faulted(fault));
         }
+        if let Some(switch) = self.switch {
+            return Err(Refused::Switching { to: switch.to });
+        }
         if self.state == State::OperationEnabled
             && let Some(display) = self.mode_display
             && !self.mode_confirmed()
         {
             return Err(Refused::ModeNotConfirmed {
-                expected: self.config.mode,
+                expected: self.mode,
                 display: Mode::from_code(display),
             });
         }
@@ -135,19 +180,52 @@ impl Axis {
         Ok(())
     }
 
-    fn check_mode(&self, command: &'static str, needs: Mode) -> Result<(), Refused> {
-        if self.config.mode == needs {
+    /// Is the axis in a mode that takes this?
+    fn check_control(
+        &self,
+        command: &'static str,
+        needs: Mode,
+        possible: impl Fn(Control) -> bool,
+    ) -> Result<(), Refused> {
+        if self.mode == needs || possible(self.config.control(self.mode)) {
             return Ok(());
         }
         Err(Refused::WrongMode {
             command,
             needs,
-            mode: self.config.mode,
+            mode: self.mode,
         })
     }
 
+    fn set_mode(&mut self, to: Mode) -> Result<(), Refused> {
+        let known = matches!(to, Mode::Csp | Mode::Csv | Mode::Cst);
+        if !known || !(self.config.modes.contains(to) || to == self.config.mode) {
+            return Err(Refused::ModeNotOffered { mode: to });
+        }
+        if !self.active {
+            self.mode = to;
+            self.switch_failed = None;
+            return Ok(());
+        }
+        if self.switch.is_some_and(|switch| switch.to == to) {
+            return Ok(());
+        }
+        self.check_ready()?;
+        if to == self.mode {
+            return Ok(());
+        }
+        if self.mode_display.is_none() {
+            return Err(Refused::NoModeDisplay);
+        }
+        if self.config.control(to) == Control::Position && self.actual.counts().is_none() {
+            return Err(Refused::NoPosition { mode: to });
+        }
+        self.begin_switch(to);
+        Ok(())
+    }
+
     fn move_to(&mut self, position: f64, speed: f64, ramp: f64) -> Result<(), Refused> {
-        self.check_mode("a move", Mode::Csp)?;
+        self.check_control("a move", Mode::Csp, |c| c == Control::Position)?;
         finite("position", position)?;
         fraction("speed", speed)?;
         fraction("ramp", ramp)?;
@@ -165,10 +243,11 @@ impl Axis {
             });
         }
         self.check_ready()?;
+        self.engage();
         let earlier = match self.plan {
             Plan::Move(trapezoid) => trapezoid.braking,
             Plan::Hold(hold) => hold.acceleration,
-            Plan::Velocity(_) | Plan::Torque(_) => limits.acceleration,
+            _ => limits.acceleration,
         };
         let acceleration = limits.acceleration * ramp;
         let trapezoid = Trapezoid {
@@ -183,7 +262,7 @@ impl Axis {
     }
 
     fn run_at(&mut self, velocity: f64, ramp: f64) -> Result<(), Refused> {
-        self.check_mode("a velocity", Mode::Csv)?;
+        self.check_control("a velocity", Mode::Csv, |c| c != Control::Torque)?;
         finite("velocity", velocity)?;
         fraction("ramp", ramp)?;
         let limits = self.config.limits;
@@ -194,6 +273,7 @@ impl Axis {
             });
         }
         self.check_ready()?;
+        self.engage();
         self.plan = Plan::Velocity(Ramp {
             target: velocity,
             slope: limits.acceleration * ramp,
@@ -201,8 +281,47 @@ impl Axis {
         Ok(())
     }
 
+    /// The set-point of the next cycle, from outside.
+    pub(super) fn take_set_point(&mut self, position: f64) -> Result<(), Refused> {
+        self.check_control("a set-point", Mode::Csp, |c| c == Control::Position)?;
+        finite("position", position)?;
+        self.check_ready()?;
+        if self.frozen() {
+            return Err(Refused::FramesLost);
+        }
+        self.engage();
+        let limits = self.config.limits;
+        let before = self.motion;
+        let step = position - before.position;
+        let velocity = step / self.dt_s;
+        let most = limits.velocity * self.dt_s;
+        if step.abs() > most * SET_POINT_ROUNDING {
+            return Err(Refused::Step { step, most });
+        }
+        let change = velocity - before.velocity;
+        let most = limits.acceleration * self.dt_s;
+        // No cycle yet: not a number.
+        if change.is_nan() || change.abs() > most * SET_POINT_ROUNDING {
+            return Err(Refused::Jump { change, most });
+        }
+        if let Some([low, high]) = limits.position {
+            // From outside its range an axis may come back.
+            let [low, high] = [low.min(before.position), high.max(before.position)];
+            if !(low..=high).contains(&position) {
+                return Err(Refused::OutsideRange {
+                    position,
+                    low,
+                    high,
+                });
+            }
+        }
+        self.fed = Some(before.then(position, velocity, self.dt_s));
+        self.plan = Plan::Fed;
+        Ok(())
+    }
+
     fn push(&mut self, percent: f64, ramp_s: f64) -> Result<(), Refused> {
-        self.check_mode("a torque", Mode::Cst)?;
+        self.check_control("a torque", Mode::Cst, |_| false)?;
         finite("torque", percent)?;
         finite("ramp time", ramp_s)?;
         if ramp_s < 0.0 {
@@ -217,7 +336,7 @@ impl Axis {
         }
         self.check_ready()?;
         // Division by zero is infinitely steep, and then the configured slope is the smaller one.
-        let asked = (percent - self.torque).abs() / ramp_s;
+        let asked = (percent - self.given.torque).abs() / ramp_s;
         let slope = if asked > 0.0 {
             asked.min(self.config.torque_slope)
         } else {

@@ -1,9 +1,10 @@
 //! Judging what the drive reports, and the last guard before the outputs.
 
-use super::{Axis, Plan, Wish};
+use super::{Axis, Control, Plan, Wish};
 use crate::cia402::{Mode, State};
 use crate::limits::Limits;
-use crate::setpoint::braking_velocity;
+use crate::loops::bounded;
+use crate::setpoint::{Motion, braking_velocity};
 use crate::status::{DriveFault, Trip};
 use crate::units::Counts;
 
@@ -16,6 +17,9 @@ const CATCH_UP_CYCLES: u8 = 2;
 
 /// Rounding of a product of f64s.
 const ROUNDING: f64 = 1.0 + 1e-9;
+
+/// Braking for the end of the range is planned with this part of the acceleration, so that rounding cannot add up.
+const PLANNED: f64 = 1.0 - 1e-4;
 
 /// What supervision remembers while an axis is enabled.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -92,7 +96,7 @@ impl Axis {
             && !self.mode_confirmed()
         {
             self.trip(Trip::ModeLost {
-                expected: self.config.mode,
+                expected: self.mode,
                 display: Mode::from_code(display),
             });
             return;
@@ -114,9 +118,10 @@ impl Axis {
         let limits = self.config.limits;
         let position = self.actual.position();
         let mut cause = None;
-        if self.config.mode == Mode::Csp {
+        if self.grip() == Control::Position {
             let scale = &self.config.scale;
-            let commanded = scale.position_to_user(self.sent).0;
+            // The set-point here is a cycle old already.
+            let commanded = self.expected(self.config.dead_time_s - self.dt_s);
             self.watch.following_error = commanded - position;
             let known = self
                 .watch
@@ -172,7 +177,7 @@ impl Axis {
         self.actual.velocity().abs() <= slack.max(self.config.limits.velocity * 0.01)
     }
 
-    /// CSV: within 2 % of the target or 10 motor rpm of it, whichever is more; the latter never above a tenth of the limit.
+    /// Within 2 % of the target or 10 motor rpm of it, whichever is more; the latter never above a tenth of the limit.
     pub(super) fn velocity_reached(&self) -> bool {
         let Plan::Velocity(ramp) = self.plan else {
             return false;
@@ -184,7 +189,7 @@ impl Axis {
         (self.actual.velocity() - ramp.target).abs() <= window
     }
 
-    /// CSV: `target`, or the highest velocity from which the axis can still stop inside its range.
+    /// `target`, or the highest velocity from which the axis can still stop inside its range.
     pub(super) fn allowed_by_range(&self, target: f64) -> f64 {
         let Some([low, high]) = self.config.limits.position else {
             return target;
@@ -192,20 +197,27 @@ impl Axis {
         if self.actual.counts().is_none() {
             return target;
         }
-        let acceleration = self.config.limits.acceleration;
-        // The reported position is a cycle old, and the next set-point takes another one to act.
-        let ahead = self.actual.position() + self.motion.velocity * self.dt_s * 2.0;
+        let (acceleration, ahead) = if self.grip() == Control::Position {
+            (
+                self.config.limits.acceleration * PLANNED,
+                self.motion.position,
+            )
+        } else {
+            // The reported position is a cycle old, and the next set-point takes another one to act.
+            let ahead = self.actual.position() + self.motion.velocity * self.dt_s * 2.0;
+            (self.config.limits.acceleration, ahead)
+        };
         let up = braking_velocity((high - ahead).max(0.0), acceleration, self.dt_s);
         let down = braking_velocity((ahead - low).max(0.0), acceleration, self.dt_s);
         target.min(up).max(-down)
     }
 
     /// The last thing before the outputs: whatever was planned, nothing exceeds the limits.
-    pub(super) fn guard(&mut self, before: crate::setpoint::Motion, dt_s: f64) {
+    pub(super) fn guard(&mut self, grip: Control, before: Motion, dt_s: f64) {
         let limits = self.config.limits;
-        let planned = (self.motion, self.torque);
-        match self.config.mode {
-            Mode::Csp => {
+        let planned = (self.motion, self.given.torque);
+        match grip {
+            Control::Position => {
                 let most = limits.velocity * dt_s * ROUNDING;
                 // Not `clamp`: it panics on bounds that are not numbers.
                 let mut position = self
@@ -219,23 +231,21 @@ impl Axis {
                         .min(high.max(before.position));
                 }
                 if position != self.motion.position {
-                    self.motion.position = position;
-                    self.motion.velocity = if dt_s > 0.0 {
+                    let velocity = if dt_s > 0.0 {
                         (position - before.position) / dt_s
                     } else {
                         before.velocity
                     };
+                    self.motion = before.then(position, velocity, dt_s);
                 }
             }
-            Mode::Csv => {
-                self.motion.velocity = self
-                    .motion
-                    .velocity
-                    .clamp(-limits.velocity, limits.velocity);
+            Control::Velocity => {
+                let velocity = bounded(self.motion.velocity, limits.velocity);
+                self.motion.velocity = velocity;
             }
-            _ => self.torque = self.torque.max(-limits.torque).min(limits.torque),
+            Control::Torque => self.given.torque = bounded(self.given.torque, limits.torque),
         }
-        if planned != (self.motion, self.torque) {
+        if planned != (self.motion, self.given.torque) {
             self.guarded_cycles = self.guarded_cycles.saturating_add(1);
         }
     }

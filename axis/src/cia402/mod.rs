@@ -9,7 +9,7 @@ pub mod step;
 pub mod words;
 
 pub use fault::{Description, describe};
-pub use mode::Mode;
+pub use mode::{Mode, Modes};
 pub use state::State;
 pub use step::{Memory, Power, Progress, Request, Step, step};
 pub use words::{Controlword, Statusword};

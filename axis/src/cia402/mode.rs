@@ -63,9 +63,56 @@ impl fmt::Display for Mode {
     }
 }
 
+/// A set of the modes that have a name here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct Modes(u8);
+
+impl Modes {
+    pub const NONE: Self = Self(0);
+
+    /// [`Mode::Unknown`] is in no set.
+    #[must_use]
+    pub const fn only(mode: Mode) -> Self {
+        Self::NONE.with(mode)
+    }
+
+    #[must_use]
+    pub const fn with(self, mode: Mode) -> Self {
+        Self(self.0 | Self::bit(mode))
+    }
+
+    #[must_use]
+    pub const fn contains(self, mode: Mode) -> bool {
+        self.0 & Self::bit(mode) != 0
+    }
+
+    const fn bit(mode: Mode) -> u8 {
+        match mode {
+            Mode::Pp => 1,
+            Mode::Pv => 2,
+            Mode::Hm => 4,
+            Mode::Csp => 8,
+            Mode::Csv => 16,
+            Mode::Cst => 32,
+            Mode::Unknown(_) => 0,
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sets() {
+        let set = Modes::only(Mode::Csp).with(Mode::Hm);
+        for code in i8::MIN..=i8::MAX {
+            let mode = Mode::from_code(code);
+            assert_eq!(set.contains(mode), matches!(code, 6 | 8), "{mode}");
+            let alone = Modes::only(mode);
+            assert_eq!(alone.contains(mode), alone != Modes::NONE);
+        }
+    }
 
     #[test]
     fn every_code_survives() {

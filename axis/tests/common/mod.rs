@@ -3,8 +3,8 @@
 #![allow(dead_code)]
 
 use ecaxis_axis::{
-    Axis, AxisConfig, AxisStatus, Command, Inputs, Limits, Mode, Outputs, Scale, State,
-    VelocityUnit,
+    Axis, AxisConfig, AxisStatus, Command, FeedForward, Inputs, Limits, Loops, Mode, Modes,
+    Outputs, PositionPid, Scale, State, VelocityLoop, VelocityUnit,
 };
 
 pub const DT: f64 = 0.001;
@@ -43,6 +43,11 @@ pub struct Drive {
     /// Faults that come back at once after a reset.
     pub stubborn: bool,
     pub resets: u32,
+    /// Cycles from a mode on the wire to the mode in force and displayed. `None`: it never changes again.
+    pub mode_delay: Option<u32>,
+    mode_waits: u32,
+    /// What the load pushes with in torque mode, per mille.
+    pub load: f64,
     controlword: u16,
 }
 
@@ -58,6 +63,9 @@ impl Drive {
             blocked: false,
             stubborn: false,
             resets: 0,
+            mode_delay: Some(0),
+            mode_waits: 0,
+            load: 0.0,
             controlword: 0,
         }
     }
@@ -88,6 +96,7 @@ impl Drive {
             torque: Some(self.torque),
             mode_display: Some(self.mode),
             fresh: true,
+            ..Inputs::default()
         }
     }
 
@@ -99,7 +108,15 @@ impl Drive {
     pub fn cycle(&mut self, out: &Outputs, dt: f64) {
         let edge = out.controlword & !self.controlword & 0x80 != 0;
         self.controlword = out.controlword;
-        self.mode = out.mode;
+        self.mode_waits = if out.mode == self.mode {
+            0
+        } else {
+            self.mode_waits + 1
+        };
+        if self.mode_delay.is_some_and(|delay| self.mode_waits > delay) {
+            self.mode = out.mode;
+            self.mode_waits = 0;
+        }
         let w = out.controlword & 0x0F;
         self.state = match self.state {
             State::NotReadyToSwitchOn => State::SwitchOnDisabled,
@@ -133,7 +150,7 @@ impl Drive {
         self.torque = 0;
         match self.state {
             _ if self.blocked => self.velocity = 0.0,
-            State::OperationEnabled => match out.mode {
+            State::OperationEnabled => match self.mode {
                 8 => {
                     let step = out.target_position.wrapping_sub(self.raw_position());
                     self.position += f64::from(step);
@@ -146,7 +163,7 @@ impl Drive {
                 }
                 _ => {
                     self.torque = out.target_torque;
-                    self.velocity += f64::from(out.target_torque) * 100.0 * dt;
+                    self.velocity += (f64::from(out.target_torque) + self.load) * 100.0 * dt;
                     self.position += self.velocity * dt;
                 }
             },
@@ -157,6 +174,32 @@ impl Drive {
                 self.position += self.velocity * dt;
             }
         }
+    }
+}
+
+/// From the axis's step to the inputs that show it, in this rig.
+pub const DEAD_TIME_S: f64 = 2.0 * DT;
+
+/// All cyclic modes, with loops that fit [`Drive`].
+pub fn looped(mode: Mode, limits: Limits) -> AxisConfig {
+    AxisConfig {
+        modes: Modes::only(Mode::Csp).with(Mode::Csv).with(Mode::Cst),
+        loops: Loops {
+            csp: FeedForward::default(),
+            csv: Some(VelocityLoop {
+                kv: 20.0,
+                feed_forward: 1.0,
+            }),
+            // A torque of 1 % accelerates by 2.5 mm/s².
+            cst: Some(PositionPid {
+                kp: 1000.0,
+                tn_s: Some(0.1),
+                tv_s: 0.04,
+                acceleration: 0.4,
+            }),
+        },
+        dead_time_s: DEAD_TIME_S,
+        ..AxisConfig::new(mode, scale(), limits)
     }
 }
 
@@ -173,13 +216,7 @@ impl Rig {
         let mut rig = Self {
             axis,
             drive,
-            out: Outputs {
-                controlword: 0,
-                mode: 0,
-                target_position: 0,
-                target_velocity: 0,
-                target_torque: 0,
-            },
+            out: Outputs::default(),
         };
         let inputs = rig.drive.inputs();
         rig.out = rig.axis.step(&inputs, DT);

@@ -96,9 +96,9 @@ fn refused(error: &ConfigError, raw: &RawAxis, unit: &str) -> (Span, String) {
             of(raw.target_window.as_ref().map(Spanned::span)),
             error.to_string(),
         ),
-        ConfigError::Limit(LimitError::NotPositive { .. }) | ConfigError::Mode(_) => {
-            (limits.span.clone(), error.to_string())
-        }
+        ConfigError::Limit(LimitError::NotPositive { .. })
+        | ConfigError::Mode(_)
+        | ConfigError::Outside { .. } => (limits.span.clone(), error.to_string()),
     }
 }
 

@@ -56,6 +56,7 @@ impl AxisSlot {
             torque: bits.torque.map(|b| b.get(image) as i16),
             mode_display: bits.mode_display.map(|b| b.get(image) as i8),
             fresh,
+            ..Inputs::default()
         }
     }
 

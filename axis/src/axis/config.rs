@@ -1,0 +1,135 @@
+//! What an axis is made with, and what of that cannot work.
+
+use crate::cia402::{Mode, Modes};
+use crate::limits::{LimitError, Limits};
+use crate::loops::Loops;
+use crate::scale::Scale;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AxisConfig {
+    /// Until another one is commanded: CSP, CSV or CST.
+    pub mode: Mode,
+    /// What may be switched to besides `mode`: the modes whose targets are mapped.
+    pub modes: Modes,
+    pub scale: Scale,
+    pub limits: Limits,
+    /// A move is in target when the reported position is this near, user units.
+    pub target_window: f64,
+    /// Steepest change of a commanded torque, percent per second; also how a stop takes torque away.
+    pub torque_slope: f64,
+    pub loops: Loops,
+    /// From a set-point's leaving here until a reported position can show it, seconds: the wire both ways, the drive's
+    /// interpolation and its lag. Set-point and reported position are compared over this time, in every mode.
+    pub dead_time_s: f64,
+    /// How long 0x6061 may take to show the mode that was commanded, seconds.
+    pub mode_time_s: f64,
+}
+
+impl AxisConfig {
+    /// With a target window of a tenth of the following error limit (ten counts where there is none, never below two), full
+    /// torque in 0.1 s, no other mode, no loops, no dead time, and a second to switch modes.
+    #[must_use]
+    pub fn new(mode: Mode, scale: Scale, limits: Limits) -> Self {
+        let window = limits
+            .following_error
+            .map_or(scale.units_of_counts(10.0), |error| error * 0.1);
+        Self {
+            mode,
+            modes: Modes::only(mode),
+            scale,
+            limits,
+            target_window: window.max(scale.units_of_counts(2.0)),
+            torque_slope: limits.torque * 10.0,
+            loops: Loops::default(),
+            dead_time_s: 0.0,
+            mode_time_s: 1.0,
+        }
+    }
+
+    pub(super) fn check(&self) -> Result<(), ConfigError> {
+        if !matches!(self.mode, Mode::Csp | Mode::Csv | Mode::Cst) {
+            return Err(ConfigError::Mode(self.mode));
+        }
+        self.limits.check(&self.scale)?;
+        let csv = self.loops.csv;
+        let cst = self.loops.cst;
+        for (what, value) in [
+            ("target_window", Some(self.target_window)),
+            ("torque_slope", Some(self.torque_slope)),
+            ("mode_time_s", Some(self.mode_time_s)),
+            ("kv", csv.map(|l| l.kv)),
+            ("kp", cst.map(|l| l.kp)),
+            ("tn_s", cst.and_then(|l| l.tn_s)),
+        ] {
+            if let Some(value) = value
+                && !(value.is_finite() && value > 0.0)
+            {
+                return Err(ConfigError::NotPositive { what, value });
+            }
+        }
+        for (what, value, most) in [
+            ("dead_time_s", self.dead_time_s, LONGEST_DEAD_TIME_S),
+            ("velocity feed-forward", self.loops.csp.velocity, 1.0),
+            (
+                "velocity feed-forward",
+                csv.map_or(0.0, |l| l.feed_forward),
+                1.0,
+            ),
+            ("tv_s", cst.map_or(0.0, |l| l.tv_s), f64::MAX),
+            (
+                "acceleration feed-forward",
+                self.loops.csp.acceleration,
+                f64::MAX,
+            ),
+            (
+                "acceleration feed-forward",
+                cst.map_or(0.0, |l| l.acceleration),
+                f64::MAX,
+            ),
+        ] {
+            if !(0.0..=most).contains(&value) {
+                return Err(ConfigError::Outside { what, value, most });
+            }
+        }
+        Ok(())
+    }
+
+    /// What can be commanded in a mode.
+    pub(super) const fn control(&self, mode: Mode) -> Control {
+        match mode {
+            Mode::Csv if self.loops.csv.is_none() => Control::Velocity,
+            Mode::Cst if self.loops.cst.is_none() => Control::Torque,
+            _ => Control::Position,
+        }
+    }
+}
+
+/// Longer is no dead time.
+const LONGEST_DEAD_TIME_S: f64 = 0.1;
+
+/// What of the set-point counts in a mode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Control {
+    /// Position, and so velocity.
+    Position,
+    /// Velocity; the position is what it turns out to be.
+    Velocity,
+    /// Torque; the motion is what it turns out to be.
+    Torque,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    #[error("mode {0} is not one of CSP, CSV, CST")]
+    Mode(Mode),
+    #[error(transparent)]
+    Limit(#[from] LimitError),
+    #[error("{what} is {value}: it must be a finite number above zero")]
+    NotPositive { what: &'static str, value: f64 },
+    #[error("{what} is {value}: it must be between 0 and {most}")]
+    Outside {
+        what: &'static str,
+        value: f64,
+        most: f64,
+    },
+}

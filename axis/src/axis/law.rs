@@ -1,0 +1,139 @@
+//! From the set-point to the drive's targets, by the law of each mode.
+
+use super::{Axis, Control, Outputs, Plan};
+use crate::cia402::Mode;
+use crate::loops::{Deviation, Integral, bounded};
+use crate::setpoint::Ramp;
+use crate::units::{PerMille, Percent, RawVelocity, UserVelocity};
+
+/// What the loops gave last, user units and percent.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Given {
+    velocity: f64,
+    /// Of `velocity`, what the position loop added. Changes by no more than the acceleration limit allows, apart from what
+    /// the set-point does: were the sum limited, a set-point at the limit would leave nothing to correct with.
+    correction: f64,
+    pub(super) torque: f64,
+    integral: Integral,
+    /// The PID loop is to go on from `torque`.
+    takes_over: bool,
+    velocity_offset: f64,
+}
+
+impl Given {
+    /// The loops start from what was given last.
+    pub(super) fn restart(&mut self) {
+        self.correction = 0.0;
+        self.takes_over = true;
+    }
+}
+
+impl Axis {
+    /// The set-point as the position reported now would show it, had the drive no error. `late_s`: since the set-point left.
+    pub(super) fn expected(&self, late_s: f64) -> f64 {
+        let motion = &self.motion;
+        let position = self.config.scale.position_to_user(self.sent).0;
+        let late_s = late_s.max(0.0);
+        position - (motion.velocity - motion.acceleration * late_s * 0.5) * late_s
+    }
+
+    /// After the set-point has advanced. RT: O(1).
+    pub(super) fn close_loops(&mut self, fresh: bool, dt_s: f64) {
+        let limits = self.config.limits;
+        let loops = self.config.loops;
+        let switch = self.switch.map(|switch| switch.to);
+        let velocity = self.motion.velocity;
+        match self.mode {
+            Mode::Csp if switch.is_none() => {
+                let ramp = Ramp {
+                    target: loops.csp.velocity * velocity,
+                    slope: limits.acceleration,
+                };
+                self.given.velocity_offset = ramp.advance(self.given.velocity_offset, dt_s);
+            }
+            Mode::Csv => match loops.csv {
+                None => self.given.velocity = velocity,
+                Some(law) => {
+                    if fresh {
+                        let error = self.expected(self.config.dead_time_s) - self.actual.position();
+                        let ramp = Ramp {
+                            target: bounded(law.correction(error), limits.velocity),
+                            slope: limits.acceleration,
+                        };
+                        self.given.correction = ramp.advance(self.given.correction, dt_s);
+                    }
+                    let wanted = law.feed_forward * velocity + self.given.correction;
+                    self.given.velocity = bounded(wanted, limits.velocity);
+                }
+            },
+            Mode::Cst if fresh && !matches!(self.plan, Plan::Torque(_)) => self.close_torque(dt_s),
+            _ => {}
+        }
+        if self.mode != Mode::Csp || switch.is_some() {
+            self.given.velocity_offset = 0.0;
+        }
+        match switch {
+            Some(Mode::Csv) => self.given.velocity = bounded(velocity, limits.velocity),
+            Some(Mode::Cst) => self.given.torque = bounded(self.actual.torque(), limits.torque),
+            _ => {}
+        }
+    }
+
+    fn close_torque(&mut self, dt_s: f64) {
+        let Some(pid) = self.config.loops.cst else {
+            return;
+        };
+        let limit = self.config.limits.torque;
+        let seen = Deviation {
+            position: self.expected(self.config.dead_time_s) - self.actual.position(),
+            velocity: self.motion.velocity - self.actual.velocity(),
+            acceleration: self.motion.acceleration,
+        };
+        if core::mem::take(&mut self.given.takes_over) {
+            self.given.integral = pid.starting_with(self.given.torque, seen);
+        }
+        let slope = self.config.torque_slope;
+        (self.given.integral, self.given.torque) =
+            pid.advance(self.given.integral, seen, limit, slope, dt_s);
+    }
+
+    pub(super) fn outputs(&self) -> Outputs {
+        let scale = &self.config.scale;
+        let limits = &self.config.limits;
+        let mode = self.switch.map_or(self.mode, |switch| switch.to);
+        let actual = self.actual.counts().unwrap_or_default();
+        let mut out = Outputs {
+            controlword: self.controlword.bits(),
+            mode: mode.code(),
+            target_position: actual.wrapped(),
+            ..Outputs::default()
+        };
+        if !self.active {
+            return out;
+        }
+        let counts = |wanted: Mode| self.mode == wanted || mode == wanted;
+        if counts(Mode::Csp) && self.grip() == Control::Position {
+            out.target_position = self.sent.wrapped();
+        } else if mode == Mode::Csp {
+            out.target_position = scale
+                .position_to_counts(crate::units::UserUnits(self.motion.position))
+                .wrapped();
+        }
+        if counts(Mode::Csv) {
+            let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(self.given.velocity));
+            out.target_velocity = raw;
+        }
+        if counts(Mode::Cst) {
+            let PerMille(raw) = scale.torque_to_raw(Percent(self.given.torque));
+            out.target_torque = raw;
+        }
+        if self.mode == Mode::Csp && self.switch.is_none() {
+            let offset = UserVelocity(self.given.velocity_offset);
+            out.velocity_offset = scale.velocity_to_raw(offset).0;
+            let torque = self.config.loops.csp.acceleration * self.motion.acceleration;
+            let torque = Percent(bounded(torque, limits.torque));
+            out.torque_offset = scale.torque_to_raw(torque).0;
+        }
+        out
+    }
+}

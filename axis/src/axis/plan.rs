@@ -1,0 +1,164 @@
+//! Where the set-point goes.
+
+use super::{Axis, AxisConfig, Control};
+use crate::cia402::Mode;
+use crate::setpoint::{Hold, Motion, Ramp, Trapezoid};
+use crate::units::UserUnits;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Plan {
+    Hold(Hold),
+    Move(Trapezoid),
+    Velocity(Ramp),
+    Torque(Ramp),
+    /// From outside, anew in every cycle; a cycle without one ends it.
+    Fed,
+}
+
+impl Plan {
+    /// To rest, in the way of a mode.
+    pub(super) fn braking(config: &AxisConfig, mode: Mode) -> Self {
+        let slope = config.limits.acceleration;
+        match config.control(mode) {
+            Control::Position => Self::Hold(Hold {
+                acceleration: slope,
+            }),
+            Control::Velocity => Self::Velocity(Ramp { target: 0.0, slope }),
+            Control::Torque => Self::Torque(Ramp {
+                target: 0.0,
+                slope: config.torque_slope,
+            }),
+        }
+    }
+
+    /// Can a mode of this kind carry it out?
+    pub(super) fn fits(&self, control: Control) -> bool {
+        match self {
+            Self::Hold(_) | Self::Move(_) | Self::Fed => control == Control::Position,
+            Self::Velocity(_) => control != Control::Torque,
+            Self::Torque(_) => false,
+        }
+    }
+}
+
+impl Axis {
+    /// What is commanded now: a mode with a position loop takes a torque, too, and while modes are switched the position is
+    /// commanded already if the new one needs it.
+    pub(super) fn grip(&self) -> Control {
+        if matches!(self.plan, Plan::Torque(_)) {
+            return Control::Torque;
+        }
+        let now = self.config.control(self.mode);
+        let next = self.switch.map(|switch| self.config.control(switch.to));
+        if next == Some(Control::Position) {
+            Control::Position
+        } else {
+            now
+        }
+    }
+
+    /// Where the axis is now, by what it reports and the dead time, moving at `velocity`.
+    pub(super) fn tracked(&self, velocity: f64) -> Motion {
+        let limit = self.config.limits.velocity;
+        let velocity = if self.standing() { 0.0 } else { velocity };
+        let velocity = velocity.max(-limit).min(limit);
+        Motion {
+            position: self.actual.position() + velocity * self.config.dead_time_s,
+            velocity,
+            acceleration: 0.0,
+        }
+    }
+
+    /// Before a position or velocity is commanded where a torque was: from what the axis does, with the torque it has.
+    pub(super) fn engage(&mut self) {
+        if self.active && self.grip() == Control::Torque {
+            self.motion = self.tracked(self.actual.velocity());
+            self.given.restart();
+        }
+    }
+
+    /// To rest, from whatever is going on.
+    pub(super) fn brake(&mut self) {
+        let braking = Plan::braking(&self.config, self.mode);
+        if !matches!(braking, Plan::Torque(_)) {
+            self.engage();
+        }
+        self.plan = braking;
+    }
+
+    /// RT: O(1).
+    pub(super) fn advance(&mut self, dt_s: f64) {
+        self.go_on();
+        let before = self.motion;
+        let grip = self.grip();
+        match self.plan {
+            Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
+            Plan::Move(trapezoid) => self.motion = trapezoid.advance(before, dt_s),
+            Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
+            Plan::Torque(ramp) => {
+                self.given.torque = ramp.advance(self.given.torque, dt_s);
+                // A mode that is being switched to will take the motion over.
+                self.motion = if self.switch.is_some() {
+                    self.tracked(self.actual.velocity())
+                } else {
+                    Motion::at(self.actual.position())
+                };
+            }
+            Plan::Fed => match self.fed {
+                Some(motion) => self.motion = motion,
+                None => {
+                    let hold = Hold {
+                        acceleration: self.config.limits.acceleration,
+                    };
+                    self.plan = Plan::Hold(hold);
+                    self.motion = hold.advance(before, dt_s);
+                }
+            },
+        }
+        self.guard(grip, before, dt_s);
+        self.sent = if grip == Control::Position {
+            let position = UserUnits(self.motion.position);
+            self.config.scale.position_to_counts(position)
+        } else {
+            self.actual.counts().unwrap_or_default()
+        };
+        if grip == Control::Velocity {
+            self.motion.position = self.config.scale.position_to_user(self.sent).0;
+        }
+    }
+
+    fn run(&mut self, ramp: Ramp, before: Motion, dt_s: f64) -> Motion {
+        let allowed = self.allowed_by_range(ramp.target);
+        self.held_by_range = allowed != ramp.target;
+        // Braking for the end of the range may be steeper than the ramp that was asked for.
+        let slope = if self.held_by_range {
+            self.config.limits.acceleration
+        } else {
+            ramp.slope
+        };
+        let ramp = Ramp {
+            target: allowed,
+            slope,
+        };
+        let velocity = ramp.advance(before.velocity, dt_s);
+        before.then(before.position + velocity * dt_s, velocity, dt_s)
+    }
+
+    pub(super) fn setpoint_at_rest(&self) -> bool {
+        match self.plan {
+            Plan::Torque(_) => self.given.torque == 0.0,
+            _ => self.motion.velocity == 0.0,
+        }
+    }
+
+    /// The set-point has nowhere left to go.
+    pub(super) fn setpoint_arrived(&self) -> bool {
+        match self.plan {
+            Plan::Hold(hold) => hold.finished(self.motion),
+            Plan::Move(trapezoid) => trapezoid.finished(self.motion),
+            Plan::Velocity(ramp) => self.motion.velocity == ramp.target,
+            Plan::Torque(ramp) => self.given.torque == ramp.target,
+            Plan::Fed => self.motion.velocity == 0.0,
+        }
+    }
+}

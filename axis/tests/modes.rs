@@ -1,0 +1,545 @@
+//! Modes: the loops in the master, and switching between them in motion.
+
+mod common;
+
+use common::{DEAD_TIME_S, DT, Drive, LIMITS, Rig, looped, scale};
+use ecaxis_axis::{
+    Axis, AxisConfig, Command, ConfigError, FeedForward, Limits, Loops, Mode, Modes, PositionPid,
+    Refused, State, Trip, VelocityLoop,
+};
+
+const COUNTS_PER_UNIT: f64 = 400.0;
+
+/// This drive's torque at the limit of [`LIMITS`] would not do 2000 mm/s².
+const SLOW: Limits = Limits {
+    position: None,
+    velocity: 200.0,
+    acceleration: 100.0,
+    torque: 100.0,
+    following_error: Some(1.0),
+    ..LIMITS
+};
+
+fn enabled(config: AxisConfig) -> Rig {
+    let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(1000));
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 100);
+    rig
+}
+
+/// The same modes without loops.
+fn plain(mode: Mode, limits: Limits) -> AxisConfig {
+    AxisConfig {
+        loops: Loops::default(),
+        ..looped(mode, limits)
+    }
+}
+
+const fn to(position: f64) -> Command {
+    Command::MoveTo {
+        position,
+        speed: 1.0,
+        ramp: 1.0,
+    }
+}
+
+const fn run_at(velocity: f64) -> Command {
+    Command::Velocity {
+        velocity,
+        ramp: 1.0,
+    }
+}
+
+const CYCLIC: [Mode; 3] = [Mode::Csp, Mode::Csv, Mode::Cst];
+
+#[test]
+fn a_move_works_in_every_mode_with_a_position_loop() {
+    for mode in CYCLIC {
+        let mut rig = enabled(looped(mode, SLOW));
+        rig.axis.command(to(40.0)).unwrap();
+        let status = rig.until(|s| s.in_target && s.at_rest, 3000);
+        assert_eq!((status.trip, status.guarded_cycles), (None, 0), "{mode}");
+        let status = rig.run(1000);
+        assert!(status.in_target && !status.moving);
+        let off = status.final_error_counts.unwrap();
+        assert!(off.abs() <= 1, "{mode}: {off} counts");
+        assert!(
+            status.max_following_error < 0.1,
+            "{mode}: {}",
+            status.max_following_error
+        );
+    }
+}
+
+#[test]
+fn a_velocity_works_in_every_mode_with_a_position_loop() {
+    for mode in CYCLIC {
+        let limits = Limits {
+            position: Some([-50.0, 50.0]),
+            ..SLOW
+        };
+        let mut rig = enabled(looped(mode, limits));
+        rig.axis.command(run_at(20.0)).unwrap();
+        let status = rig.until(|s| s.in_target, 1000);
+        assert!((status.velocity - 20.0).abs() < 1.0, "{mode}");
+        // And it stops inside the range.
+        let status = rig.until(|s| s.held_by_range && s.at_rest, 5000);
+        assert_eq!((status.trip, status.guarded_cycles), (None, 0));
+        assert!((status.position - 50.0).abs() < 0.02, "{}", status.position);
+        rig.axis.command(run_at(-20.0)).unwrap();
+        rig.until(|s| s.in_target && s.position < 0.0, 5000);
+    }
+}
+
+#[test]
+fn the_torque_loop_holds_against_a_load() {
+    let mut rig = enabled(looped(Mode::Cst, SLOW));
+    let held = rig.axis.status().target_position;
+    rig.drive.load = -100.0;
+    let status = rig.run(3000);
+    assert_eq!(status.trip, None);
+    assert!((status.position - held).abs() * COUNTS_PER_UNIT <= 5.0);
+    assert!((status.target_torque - 10.0).abs() < 0.2);
+}
+
+#[test]
+fn the_velocity_loop_holds_against_a_drift() {
+    let mut rig = enabled(looped(Mode::Csv, SLOW));
+    let held = rig.axis.status().target_position;
+    for _ in 0..2000 {
+        rig.drive.position += 0.04;
+        rig.cycle();
+    }
+    let status = rig.axis.status();
+    assert!((status.position - held).abs() * COUNTS_PER_UNIT <= 5.0);
+}
+
+/// In motion, at constant velocity, once around: neither the set-point nor what the drive makes of it steps.
+#[test]
+fn once_around_in_motion() {
+    for delay in [0, 1, 7, 40] {
+        let mut rig = enabled(looped(Mode::Csp, SLOW));
+        rig.drive.mode_delay = Some(delay);
+        rig.axis.command(run_at(60.0)).unwrap();
+        rig.until(|s| s.in_target, 2000);
+        let (mut before, mut velocity) = (rig.axis.status(), 60.0);
+        let mut switches = 0;
+        for mode in [
+            Mode::Csv,
+            Mode::Cst,
+            Mode::Csp,
+            Mode::Cst,
+            Mode::Csv,
+            Mode::Csp,
+        ] {
+            rig.axis.command(Command::SetMode(mode)).unwrap();
+            assert_eq!(
+                rig.axis.command(to(0.0)),
+                Err(Refused::Switching { to: mode })
+            );
+            for _ in 0..300 {
+                let real = rig.drive.position;
+                let status = rig.cycle();
+                let step = status.target_position - before.target_position;
+                assert!(
+                    (step / DT - 60.0).abs() < 1e-6,
+                    "{mode}: set-point steps by {step}"
+                );
+                let moved = (rig.drive.position - real) / COUNTS_PER_UNIT / DT;
+                // One cycle of the acceleration limit, and rounding to counts.
+                let most = SLOW.acceleration * DT + 2.0 / COUNTS_PER_UNIT / DT;
+                assert!(
+                    (moved - velocity).abs() <= most,
+                    "{mode}: from {velocity} to {moved}"
+                );
+                velocity = moved;
+                switches += u32::from(status.mode != before.mode);
+                before = status;
+            }
+            let status = rig.axis.status();
+            assert_eq!(
+                (status.mode, status.switching, status.trip),
+                (mode, None, None)
+            );
+            assert!(status.in_target && status.guarded_cycles == 0);
+        }
+        assert_eq!(switches, 6);
+    }
+}
+
+#[test]
+fn a_move_goes_on_through_a_switch() {
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    rig.axis.command(to(80.0)).unwrap();
+    rig.run(700);
+    for mode in [Mode::Cst, Mode::Csv, Mode::Csp] {
+        rig.axis.command(Command::SetMode(mode)).unwrap();
+        rig.run(100);
+    }
+    let status = rig.until(|s| s.in_target && s.at_rest, 3000);
+    assert_eq!((status.mode, status.trip), (Mode::Csp, None));
+    assert_eq!(status.final_error_counts, Some(0));
+}
+
+/// A mode without a loop cannot carry out a move: it comes to rest, from the velocity or torque that there is.
+#[test]
+fn into_modes_without_loops() {
+    let mut rig = enabled(plain(Mode::Csp, SLOW));
+    rig.axis.command(to(80.0)).unwrap();
+    rig.run(500);
+    rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
+    let status = rig.until(|s| s.mode == Mode::Csv, 10);
+    assert!((status.target_velocity - 50.0).abs() < 1.0);
+    assert!(
+        rig.out.target_velocity > 49 * 12_000,
+        "the axis brakes from where it is"
+    );
+    assert!(matches!(
+        rig.axis.command(to(0.0)),
+        Err(Refused::WrongMode { .. })
+    ));
+    rig.axis.command(run_at(30.0)).unwrap();
+    rig.until(|s| s.in_target, 500);
+
+    // Torque starts with the torque that the drive has, and goes away.
+    let mut inputs = rig.drive.inputs();
+    rig.axis.command(Command::SetMode(Mode::Cst)).unwrap();
+    inputs.torque = Some(150);
+    rig.out = rig.axis.step(&inputs, DT);
+    assert_eq!(rig.out.target_torque, 150);
+    assert_eq!(rig.out.target_velocity, 30 * 12_000, "still in force");
+    inputs.mode_display = Some(Mode::Cst.code());
+    rig.out = rig.axis.step(&inputs, DT);
+    assert_eq!(rig.out.target_torque, 140);
+    assert_eq!(
+        (rig.out.target_velocity, rig.axis.status().mode),
+        (0, Mode::Cst)
+    );
+    rig.run(20);
+    assert_eq!(rig.out.target_torque, 0);
+
+    // Back to positions, still turning: from where the axis is, at its velocity, to rest.
+    rig.axis.command(Command::SetMode(Mode::Csp)).unwrap();
+    let mut last = rig.drive.position;
+    let mut velocity = rig.drive.velocity / COUNTS_PER_UNIT;
+    while rig.axis.status().moving || rig.axis.status().switching.is_some() {
+        let status = rig.cycle();
+        let moved = (rig.drive.position - last) / COUNTS_PER_UNIT / DT;
+        let most = SLOW.acceleration * DT + 2.0 / COUNTS_PER_UNIT / DT;
+        assert!(
+            (moved - velocity).abs() <= most,
+            "from {velocity} to {moved}"
+        );
+        (last, velocity) = (rig.drive.position, moved);
+        assert_eq!(status.trip, None);
+    }
+    assert!(rig.run(10).at_rest);
+}
+
+#[test]
+fn a_stop_ends_a_torque_at_the_position_it_led_to() {
+    let mut rig = enabled(looped(Mode::Cst, SLOW));
+    let torque = Command::Torque {
+        percent: 20.0,
+        ramp_s: 0.1,
+    };
+    rig.axis.command(torque).unwrap();
+    let status = rig.run(1000);
+    assert!(status.velocity > 30.0 && status.in_target);
+    let torque_before = status.target_torque;
+    rig.axis.command(Command::Stop).unwrap();
+    let status = rig.cycle();
+    assert!((status.target_velocity - status.velocity).abs() < 1.0);
+    // The acceleration changes sign, and the torque with it; the integral starts where it was.
+    assert!((status.target_torque - torque_before).abs() <= 0.4 * SLOW.acceleration + 1.0);
+    let status = rig.until(|s| s.in_target && s.at_rest, 2000);
+    assert_eq!(status.trip, None);
+    assert!(status.max_following_error < 0.2);
+}
+
+#[test]
+fn a_mode_that_does_not_show_leaves_the_old_one() {
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    rig.axis.command(to(80.0)).unwrap();
+    rig.run(100);
+    rig.drive.mode_delay = None;
+    rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
+    let status = rig.run(999);
+    assert_eq!(status.switching, Some(Mode::Csv));
+    assert_eq!(rig.out.mode, 9);
+    let status = rig.run(10);
+    assert_eq!(
+        (status.switching, status.switch_failed),
+        (None, Some(Mode::Csv))
+    );
+    assert_eq!((status.mode, rig.out.mode), (Mode::Csp, 8));
+    rig.until(|s| s.in_target, 3000);
+    // Another try may do better.
+    rig.drive.mode_delay = Some(3);
+    rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
+    let status = rig.until(|s| s.mode == Mode::Csv, 20);
+    assert_eq!((status.switch_failed, status.trip), (None, None));
+}
+
+#[test]
+fn a_third_mode_is_a_trip() {
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
+    let mut inputs = rig.drive.inputs();
+    inputs.mode_display = Some(1);
+    rig.axis.step(&inputs, DT);
+    assert!(matches!(
+        rig.axis.status().trip,
+        Some(Trip::ModeLost {
+            display: Mode::Pp,
+            ..
+        })
+    ));
+}
+
+#[test]
+fn modes_are_refused_with_a_reason() {
+    let mut rig = enabled(AxisConfig::new(Mode::Csp, scale(), SLOW));
+    for mode in [Mode::Csv, Mode::Unknown(-3), Mode::Unknown(0)] {
+        assert_eq!(
+            rig.axis.command(Command::SetMode(mode)),
+            Err(Refused::ModeNotOffered { mode })
+        );
+    }
+    assert_eq!(rig.axis.command(Command::SetMode(Mode::Csp)), Ok(()));
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    let mut inputs = rig.drive.inputs();
+    inputs.mode_display = None;
+    rig.axis.step(&inputs, DT);
+    assert_eq!(
+        rig.axis.command(Command::SetMode(Mode::Csv)),
+        Err(Refused::NoModeDisplay)
+    );
+    rig.axis.command(Command::QuickStop).unwrap();
+    assert_eq!(
+        rig.axis.command(Command::SetMode(Mode::Csv)),
+        Err(Refused::Stopping)
+    );
+}
+
+#[test]
+fn a_mode_may_be_chosen_before_enabling() {
+    let config = AxisConfig {
+        modes: Modes::only(Mode::Csp).with(Mode::Csv),
+        ..AxisConfig::new(Mode::Csp, scale(), LIMITS)
+    };
+    let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
+    rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
+    rig.axis.command(Command::Enable).unwrap();
+    let status = rig.until(|s| s.ready, 20);
+    assert_eq!((status.mode, rig.out.mode), (Mode::Csv, 9));
+}
+
+#[test]
+fn power_lost_during_a_switch() {
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    rig.axis.command(run_at(60.0)).unwrap();
+    rig.run(500);
+    rig.drive.mode_delay = Some(20);
+    rig.axis.command(Command::SetMode(Mode::Cst)).unwrap();
+    rig.run(5);
+    rig.drive.fault();
+    let status = rig.until(|s| s.state == State::Fault, 5);
+    assert_eq!((status.switching, status.enabled), (None, false));
+    assert_eq!((rig.out.target_velocity, rig.out.target_torque), (0, 0));
+    rig.axis.command(Command::ResetFault).unwrap();
+    rig.axis.command(Command::Enable).unwrap();
+    let status = rig.until(|s| s.ready, 400);
+    assert_eq!(status.mode, Mode::Cst);
+    assert_eq!(rig.run(100).trip, None);
+}
+
+#[test]
+fn offsets_feed_forward_in_csp_alone() {
+    let config = AxisConfig {
+        loops: Loops {
+            csp: FeedForward {
+                velocity: 0.5,
+                acceleration: 0.4,
+            },
+            ..looped(Mode::Csp, SLOW).loops
+        },
+        ..looped(Mode::Csp, SLOW)
+    };
+    let mut rig = enabled(config);
+    rig.axis.command(run_at(60.0)).unwrap();
+    rig.run(200);
+    assert_eq!(rig.out.torque_offset, 400, "100 mm/s² at 0.4 % each");
+    rig.until(|s| s.in_target && !s.moving, 1000);
+    rig.run(2);
+    assert_eq!(
+        (rig.out.velocity_offset, rig.out.torque_offset),
+        (30 * 12_000, 0)
+    );
+    rig.drive.mode_delay = Some(5);
+    rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
+    let mut before = rig.out.velocity_offset;
+    rig.cycle();
+    assert_eq!(
+        rig.out.velocity_offset, 0,
+        "it would be added to the target velocity"
+    );
+    rig.axis.command(Command::Stop).unwrap();
+    rig.until(|s| s.mode == Mode::Csv && !s.moving, 2000);
+    rig.axis.command(Command::SetMode(Mode::Csp)).unwrap();
+    rig.until(|s| s.mode == Mode::Csp, 100);
+    rig.axis.command(run_at(-60.0)).unwrap();
+    before -= before;
+    for _ in 0..1000 {
+        rig.cycle();
+        let change = rig.out.velocity_offset.abs_diff(before);
+        assert!(f64::from(change) <= SLOW.acceleration * DT * 12_000.0 + 1.0);
+        before = rig.out.velocity_offset;
+    }
+    assert_eq!(before, -30 * 12_000);
+}
+
+/// Set-points from outside: as they are, or not at all.
+#[test]
+fn set_points_from_outside() {
+    for mode in CYCLIC {
+        let mut rig = enabled(looped(mode, SLOW));
+        let start = rig.axis.status().target_position;
+        let wave = |k: i32| start + 5.0 * (1.0 - (f64::from(k) * DT * 4.0).cos());
+        for k in 1..3000 {
+            rig.axis.set_point(wave(k)).unwrap();
+            let status = rig.cycle();
+            assert_eq!(status.target_position, wave(k));
+            assert_eq!((status.trip, status.guarded_cycles), (None, 0));
+        }
+        // None: within limits to rest.
+        let velocity = rig.axis.status().target_velocity;
+        assert!(velocity.abs() > 5.0);
+        let after = rig.cycle().target_velocity;
+        assert!((after.abs() - (velocity.abs() - 0.1)).abs() < 1e-9);
+        rig.until(|s| s.in_target && s.at_rest, 2000);
+        // Too far, too sudden, no number.
+        let here = rig.axis.status().target_position;
+        assert!(matches!(
+            rig.axis.set_point(here + 0.201),
+            Err(Refused::Step { .. })
+        ));
+        assert!(matches!(
+            rig.axis.set_point(here + 0.001),
+            Err(Refused::Jump { .. })
+        ));
+        assert!(matches!(
+            rig.axis.set_point(f64::NAN),
+            Err(Refused::NotFinite { .. })
+        ));
+        assert_eq!(rig.cycle().target_position, here);
+    }
+}
+
+#[test]
+fn set_points_from_outside_stop_with_the_frames() {
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    for _ in 0..2 {
+        rig.cycle_with(false);
+        let here = rig.axis.status().target_position;
+        rig.axis.set_point(here).unwrap();
+    }
+    rig.cycle_with(false);
+    let here = rig.axis.status().target_position;
+    assert_eq!(rig.axis.set_point(here), Err(Refused::FramesLost));
+}
+
+#[test]
+fn the_dead_time_is_no_following_error() {
+    let config = AxisConfig {
+        dead_time_s: 0.0,
+        ..looped(Mode::Csp, SLOW)
+    };
+    for (config, low, high) in [
+        (config, 0.05, 0.07),
+        (looped(Mode::Csp, SLOW), 0.0, 1.5 / COUNTS_PER_UNIT),
+    ] {
+        let mut rig = enabled(config);
+        rig.axis.command(run_at(60.0)).unwrap();
+        let status = rig.until(|s| s.in_target, 2000);
+        let error = status.following_error.abs();
+        assert!((low..=high).contains(&error), "{error}");
+    }
+    assert_eq!(DEAD_TIME_S, 0.002);
+}
+
+/// A drive that kept its velocity over lost frames is not made to go back.
+#[test]
+fn lost_frames_in_a_velocity_loop() {
+    for mode in [Mode::Csv, Mode::Cst] {
+        let limits = Limits {
+            following_error: None,
+            ..SLOW
+        };
+        let mut rig = enabled(looped(mode, limits));
+        rig.axis.command(run_at(60.0)).unwrap();
+        rig.until(|s| s.in_target, 2000);
+        for lost in [1, 2, 3, 50] {
+            for _ in 0..lost {
+                let inputs = ecaxis_axis::Inputs {
+                    fresh: false,
+                    ..rig.drive.inputs()
+                };
+                // The frame out gets through to nobody, the motor turns on.
+                rig.drive.position += rig.drive.velocity * DT;
+                rig.out = rig.axis.step(&inputs, DT);
+            }
+            let mut slowest = f64::MAX;
+            for _ in 0..500 {
+                rig.cycle();
+                slowest = slowest.min(rig.drive.velocity / COUNTS_PER_UNIT);
+            }
+            assert!(slowest > 50.0, "{mode} after {lost}: {slowest}");
+        }
+    }
+}
+
+#[test]
+fn loops_that_cannot_work() {
+    let good = looped(Mode::Csp, SLOW);
+    let with = |loops| AxisConfig { loops, ..good };
+    let csv = |kv, feed_forward| {
+        with(Loops {
+            csv: Some(VelocityLoop { kv, feed_forward }),
+            ..Loops::default()
+        })
+    };
+    let cst = |kp, tn_s, tv_s| {
+        with(Loops {
+            cst: Some(PositionPid {
+                kp,
+                tn_s,
+                tv_s,
+                acceleration: 0.0,
+            }),
+            ..Loops::default()
+        })
+    };
+    for config in [
+        csv(0.0, 1.0),
+        csv(f64::NAN, 1.0),
+        csv(1.0, 1.1),
+        csv(1.0, -0.1),
+        cst(0.0, None, 0.0),
+        cst(1.0, Some(0.0), 0.0),
+        cst(1.0, None, -1.0),
+        AxisConfig {
+            dead_time_s: 1.0,
+            ..good
+        },
+        AxisConfig {
+            mode_time_s: 0.0,
+            ..good
+        },
+    ] {
+        assert!(matches!(
+            Axis::new(config).err(),
+            Some(ConfigError::NotPositive { .. } | ConfigError::Outside { .. })
+        ));
+    }
+}
