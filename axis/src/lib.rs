@@ -12,7 +12,8 @@
 //! | [`limits`] | what an axis may never exceed; checked once, enforced every cycle |
 //! | [`cia402`] | Statusword, Controlword, the power state machine, modes, error codes |
 //! | [`loops`] | the position loops that the master closes in CSV and CST, and the offsets in CSP |
-//! | [`setpoint`] | hold, trapezoidal moves, ramps; each advanced one cycle at a time |
+//! | [`setpoint`] | hold, trapezoidal and jerk-limited moves, ramps; each advanced one cycle at a time |
+//! | [`group`] | several axes: straight lines, arriving together, stopping together |
 //! | [`axis`] | one axis: commands in, guarded set-points out, supervision in between |
 //! | [`status`] | what an axis reports, and the reasons for which it stops or refuses |
 
@@ -20,6 +21,7 @@
 
 pub mod axis;
 pub mod cia402;
+pub mod group;
 pub mod limits;
 pub mod loops;
 pub mod scale;

@@ -1,6 +1,7 @@
 //! What an axis may never exceed. Checked once by [`Limits::check`]; afterwards the guard in [`crate::axis`] relies on it.
 
 use crate::scale::Scale;
+use crate::setpoint::MotionLimits;
 use crate::units::UserVelocity;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,6 +49,16 @@ impl Limits {
     #[must_use]
     pub fn jerk(&self) -> f64 {
         self.jerk.unwrap_or(self.acceleration / Self::JERK_TIME_S)
+    }
+
+    /// Velocity, acceleration and jerk.
+    #[must_use]
+    pub fn motion(&self) -> MotionLimits {
+        MotionLimits {
+            velocity: self.velocity,
+            acceleration: self.acceleration,
+            jerk: self.jerk(),
+        }
     }
 
     pub fn check(&self, scale: &Scale) -> Result<(), LimitError> {

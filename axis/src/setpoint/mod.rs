@@ -1,16 +1,30 @@
 //! Set-points, advanced one cycle at a time, in user units.
 //!
-//! A [`Motion`] is where the set-point is; [`Hold`], [`Trapezoid`] and [`Ramp`] say where it goes next. None of them remembers
-//! a start or a time, so a new one can take over in any cycle, at any velocity, without a jump.
+//! A [`Motion`] is where the set-point is; a [`Setpoint`] says where it goes next:
+//!
+//! | source | what it does |
+//! |---|---|
+//! | [`Hold`] | brakes, then stands |
+//! | [`Trapezoid`] | to a position, with bounded velocity and acceleration |
+//! | [`JerkLimited`] | to a position, or to a velocity, with bounded jerk as well |
+//! | [`crate::group::Along`] | to a position, on a straight line with other axes |
+//!
+//! [`Ramp`] is for a single value: velocity in CSV, torque in CST. [`Hold`], [`Trapezoid`] and [`Ramp`] remember neither a start nor a time;
+//! the others follow a plan, and make a new one when they find the axis elsewhere than they left it. So any of them can take over in any
+//! cycle, at any velocity, without a jump.
 //!
 //! The velocity of a cycle is the step the position makes in it, divided by its length. So velocity and acceleration, as seen
 //! in the sequence of positions that reaches the drive, are what the plans bound, exactly.
 
+mod error;
 mod hold;
+mod jerk;
 mod ramp;
 mod trapezoid;
 
+pub use error::SetpointError;
 pub use hold::Hold;
+pub use jerk::{Goal, JerkLimited, Order};
 pub use ramp::Ramp;
 pub use trapezoid::Trapezoid;
 pub(crate) use trapezoid::braking_velocity;
@@ -54,6 +68,26 @@ impl Motion {
             } else {
                 0.0
             },
+        }
+    }
+}
+
+/// What a jerk-limited motion may use, user units per second, second² and second³.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionLimits {
+    pub velocity: f64,
+    pub acceleration: f64,
+    pub jerk: f64,
+}
+
+impl MotionLimits {
+    /// Each multiplied by `factor`.
+    #[must_use]
+    pub fn scaled(self, factor: f64) -> Self {
+        Self {
+            velocity: self.velocity * factor,
+            acceleration: self.acceleration * factor,
+            jerk: self.jerk * factor,
         }
     }
 }

@@ -1,0 +1,217 @@
+//! A straight line through the positions of several axes.
+//!
+//! Synchronous arrival alone does not make a line: axes that reach their limits at different times leave it by millimetres. So there is
+//! one profile, of the way along the line from 0 to 1, under limits that leave every axis within its own.
+
+use crate::setpoint::{Goal, JerkLimited, Motion, MotionLimits, Order, Setpoint, SetpointError};
+
+/// One axis' part of a line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LineAxis {
+    /// The set-point now, at rest.
+    pub from: Motion,
+    pub target: f64,
+    /// What this axis may use for it.
+    pub limits: MotionLimits,
+    pub range: Option<[f64; 2]>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("axis {axis} of the line: {error}")]
+pub struct LineError {
+    /// Index in the slice given to [`Line::plan`].
+    pub axis: usize,
+    #[source]
+    pub error: SetpointError,
+}
+
+/// The profile that all axes of a line share.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Line {
+    path: JerkLimited,
+}
+
+impl Line {
+    /// All axes at rest; a line cannot begin anywhere else. O(axes), no allocation.
+    pub fn plan(axes: &[LineAxis]) -> Result<Self, LineError> {
+        let unbounded = MotionLimits {
+            velocity: f64::INFINITY,
+            acceleration: f64::INFINITY,
+            jerk: f64::INFINITY,
+        };
+        let mut limits = unbounded;
+        let mut slowest = 0;
+        for (index, axis) in axes.iter().enumerate() {
+            let way = axis
+                .check()
+                .map_err(|error| LineError { axis: index, error })?;
+            if way == 0.0 {
+                continue;
+            }
+            let own = axis.limits.scaled(1.0 / way);
+            if own.velocity < limits.velocity {
+                slowest = index;
+            }
+            limits = MotionLimits {
+                velocity: limits.velocity.min(own.velocity),
+                acceleration: limits.acceleration.min(own.acceleration),
+                jerk: limits.jerk.min(own.jerk),
+            };
+        }
+        let (start, limits) = if limits == unbounded {
+            (1.0, UNIT)
+        } else {
+            (0.0, limits)
+        };
+        let order = Order::within(Goal::Position(1.0), limits);
+        let path = JerkLimited::new(order, Motion::at(start), 0.0).map_err(|error| LineError {
+            axis: slowest,
+            error,
+        })?;
+        Ok(Self { path })
+    }
+
+    /// The source for one axis: the one that `axis` was in the plan.
+    #[must_use]
+    pub fn along(&self, axis: &LineAxis) -> Along {
+        Along {
+            path: self.path,
+            at: Motion::at(if self.path.duration_s() > 0.0 {
+                0.0
+            } else {
+                1.0
+            }),
+            start: axis.from.position,
+            target: axis.target,
+            last: axis.from,
+        }
+    }
+
+    #[must_use]
+    pub fn duration_s(&self) -> f64 {
+        self.path.duration_s()
+    }
+}
+
+/// For a line of no length.
+const UNIT: MotionLimits = MotionLimits {
+    velocity: 1.0,
+    acceleration: 1.0,
+    jerk: 1.0,
+};
+
+impl LineAxis {
+    /// The length of the way.
+    fn check(&self) -> Result<f64, SetpointError> {
+        self.limits.check()?;
+        let order = Order {
+            range: self.range,
+            ..Order::within(Goal::Position(self.target), self.limits)
+        };
+        let velocity = self.from.velocity;
+        if velocity != 0.0 {
+            return Err(SetpointError::NotAtRest { velocity });
+        }
+        // Finds what is not a number, and a target outside the range.
+        JerkLimited::new(order, Motion::at(self.from.position), 0.0)?;
+        Ok((self.target - self.from.position).abs())
+    }
+}
+
+/// One axis on a line. All axes of it advance in the same cycles by the same `dt_s`, and are stopped and sent on in the same cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Along {
+    path: JerkLimited,
+    /// On the path: 0 at the start, 1 at the target.
+    at: Motion,
+    start: f64,
+    target: f64,
+    last: Motion,
+}
+
+impl Along {
+    /// How far, from 0 to 1.
+    #[must_use]
+    pub const fn progress(&self) -> f64 {
+        self.at.position
+    }
+
+    #[must_use]
+    pub const fn target(&self) -> f64 {
+        self.target
+    }
+
+    /// Brakes on the line, with the limits the line was planned with.
+    pub fn stop(&mut self, dt_s: f64) {
+        self.redirect(Goal::Velocity(0.0), 1.0, dt_s);
+    }
+
+    /// On to the end after a stop, or at another speed: a fraction of the planned velocity, above 0 and at most 1; anything else changes
+    /// nothing.
+    pub fn go_on(&mut self, speed: f64, dt_s: f64) {
+        if speed > 0.0 && speed <= 1.0 {
+            self.redirect(Goal::Position(1.0), speed, dt_s);
+        }
+    }
+
+    fn redirect(&mut self, goal: Goal, speed: f64, dt_s: f64) {
+        let planned = self.path.order().ceiling;
+        let order = Order {
+            limits: MotionLimits {
+                velocity: planned.velocity * speed,
+                ..planned
+            },
+            ..Order {
+                ceiling: planned,
+                ..Order::within(goal, planned)
+            }
+        };
+        // Refused only where no number comes out; then the line goes on as it was.
+        if let Ok(path) = self.path.redirect(order, self.at, dt_s) {
+            self.path = path;
+        }
+    }
+
+    /// The axis was held up. The others of the line were too, and find the same.
+    fn take_up(&mut self, motion: Motion) {
+        let way = self.target - self.start;
+        if way == 0.0 {
+            return;
+        }
+        if motion.position != self.last.position {
+            self.at.position = (motion.position - self.start) / way;
+        }
+        self.at.velocity = motion.velocity / way;
+        self.at.acceleration = 0.0;
+    }
+}
+
+impl Setpoint for Along {
+    /// RT: O(1).
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
+            self.take_up(motion);
+        }
+        self.at = self.path.advance(self.at, dt_s);
+        let way = self.target - self.start;
+        let position = if self.at.position == 1.0 {
+            self.target
+        } else {
+            self.start + way * self.at.position
+        };
+        self.last = motion.then(position, way * self.at.velocity, dt_s);
+        self.last
+    }
+
+    /// Arrived, or stopped on the way.
+    fn finished(&self, _: Motion) -> bool {
+        self.path.finished(self.at)
+    }
+}
+
+#[cfg(test)]
+#[path = "line_tests.rs"]
+mod tests;

@@ -1,0 +1,71 @@
+//! Why a set-point is refused before its first cycle.
+
+use super::{Motion, MotionLimits};
+
+/// Beyond this, user units are no lengths any more, and products of them leave f64's range.
+const FARTHEST: f64 = 1e15;
+
+/// What limits may be, so that no quotient or product of them overflows.
+const USABLE: core::ops::RangeInclusive<f64> = 1e-12..=1e15;
+
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum SetpointError {
+    #[error("{what} is {value}: it must be a finite number")]
+    NotFinite { what: &'static str, value: f64 },
+    #[error("{what} is {value:e}: it must lie between 1e-12 and 1e15")]
+    NotUsable { what: &'static str, value: f64 },
+    #[error("{what} is {value:e}, farther than 1e15")]
+    TooFar { what: &'static str, value: f64 },
+    #[error("{reaches} would be reached on the way, outside the range [{low}, {high}]")]
+    LeavesRange { reaches: f64, low: f64, high: f64 },
+    #[error("a velocity of {velocity} would be reached, above the limit {limit}")]
+    TooFast { velocity: f64, limit: f64 },
+    #[error("an acceleration of {acceleration} would be reached, above the limit {limit}")]
+    TooSteep { acceleration: f64, limit: f64 },
+    #[error("there is no time between two points")]
+    NoTime,
+    #[error("the axis must stand still first; its set-point moves at {velocity}")]
+    NotAtRest { velocity: f64 },
+}
+
+pub(crate) fn finite(what: &'static str, value: f64) -> Result<(), SetpointError> {
+    if value.is_finite() {
+        Ok(())
+    } else {
+        Err(SetpointError::NotFinite { what, value })
+    }
+}
+
+pub(crate) fn position(what: &'static str, value: f64) -> Result<(), SetpointError> {
+    finite(what, value)?;
+    if value.abs() > FARTHEST {
+        return Err(SetpointError::TooFar { what, value });
+    }
+    Ok(())
+}
+
+pub(crate) fn usable(what: &'static str, value: f64) -> Result<(), SetpointError> {
+    finite(what, value)?;
+    if USABLE.contains(&value) {
+        Ok(())
+    } else {
+        Err(SetpointError::NotUsable { what, value })
+    }
+}
+
+impl MotionLimits {
+    /// Every one a number that can be reckoned with.
+    pub fn check(&self) -> Result<(), SetpointError> {
+        usable("velocity limit", self.velocity)?;
+        usable("acceleration limit", self.acceleration)?;
+        usable("jerk limit", self.jerk)
+    }
+}
+
+impl Motion {
+    pub fn check(&self) -> Result<(), SetpointError> {
+        position("position", self.position)?;
+        position("velocity", self.velocity)?;
+        position("acceleration", self.acceleration)
+    }
+}

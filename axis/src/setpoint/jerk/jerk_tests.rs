@@ -1,0 +1,312 @@
+use proptest::prelude::*;
+
+use super::*;
+
+const DT: f64 = 0.001;
+
+const LIMITS: MotionLimits = MotionLimits {
+    velocity: 200.0,
+    acceleration: 2000.0,
+    jerk: 40_000.0,
+};
+
+/// Checks the sequence of positions that reaches a drive, and nothing that the source says about itself.
+struct Watch {
+    limits: MotionLimits,
+    dt: f64,
+    motion: Motion,
+    /// Differences of the positions.
+    velocity: f64,
+    acceleration: f64,
+    /// Of the jerk promised.
+    check_jerk: bool,
+}
+
+impl Watch {
+    fn at(motion: Motion, limits: MotionLimits, dt: f64) -> Self {
+        Self {
+            limits,
+            dt,
+            motion,
+            velocity: motion.velocity,
+            acceleration: motion.acceleration,
+            check_jerk: true,
+        }
+    }
+
+    fn cycle(&mut self, source: &mut JerkLimited) -> Result<(), TestCaseError> {
+        let next = source.advance(self.motion, self.dt);
+        // Of a position whose parts are 1000 and 400 long.
+        let rounding = 1400.0 * 4.0 * f64::EPSILON;
+        let velocity = (next.position - self.motion.position) / self.dt;
+        let acceleration = (velocity - self.velocity) / self.dt;
+        let jerk = (acceleration - self.acceleration) / self.dt;
+        let rounding = rounding / self.dt;
+        prop_assert!((velocity - next.velocity).abs() <= rounding);
+        prop_assert!(
+            velocity.abs() <= self.limits.velocity + rounding,
+            "{velocity} {source:?}"
+        );
+        let rounding = 2.0 * rounding / self.dt;
+        prop_assert!(
+            acceleration.abs() <= self.limits.acceleration + rounding,
+            "{acceleration} {source:?}"
+        );
+        let rounding = 2.0 * rounding / self.dt;
+        if self.check_jerk {
+            prop_assert!(
+                jerk.abs() <= self.limits.jerk + rounding,
+                "{jerk} {source:?}"
+            );
+        }
+        self.velocity = velocity;
+        self.acceleration = acceleration;
+        self.motion = next;
+        Ok(())
+    }
+
+    fn finish(&mut self, source: &mut JerkLimited) -> Result<u32, TestCaseError> {
+        for cycle in 0..2_000_000 {
+            if source.finished(self.motion) {
+                return Ok(cycle);
+            }
+            self.cycle(source)?;
+        }
+        Err(TestCaseError::fail(format!("does not arrive: {source:?}")))
+    }
+}
+
+fn go(target: f64, limits: MotionLimits) -> Order {
+    Order {
+        ceiling: LIMITS,
+        ..Order::within(Goal::Position(target), limits)
+    }
+}
+
+fn part() -> impl Strategy<Value = MotionLimits> {
+    (0.01..=1.0f64, 0.02..=1.0f64, 0.02..=1.0f64).prop_map(|(v, a, j)| MotionLimits {
+        velocity: LIMITS.velocity * v,
+        acceleration: LIMITS.acceleration * a,
+        jerk: LIMITS.jerk * j,
+    })
+}
+
+#[test]
+fn takes_as_long_as_it_should() {
+    // Seven segments: v/a + a/j + s/v = 0.1 + 0.05 + 0.5 s.
+    let mut source = JerkLimited::new(go(100.0, LIMITS), Motion::at(0.0), DT).unwrap();
+    assert!((source.duration_s() - 0.65).abs() < 1e-4);
+    let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
+    let cycles = watch.finish(&mut source).unwrap();
+    assert!((651..=652).contains(&cycles), "{cycles}");
+    // Four: neither velocity nor acceleration is reached; s = 2·j·t³ with t a quarter of the time.
+    let source = JerkLimited::new(go(0.01, LIMITS), Motion::at(0.0), DT).unwrap();
+    let expected = 4.0 * (0.01f64 / (2.0 * 40_000.0)).cbrt();
+    assert!((source.duration_s() - expected).abs() < 1e-6);
+    assert!((source.span()[1] - 0.01).abs() < 1e-12);
+}
+
+#[test]
+fn stops_where_it_stands_already() {
+    let source = JerkLimited::new(go(3.0, LIMITS), Motion::at(3.0), DT).unwrap();
+    assert_eq!(source.duration_s(), 0.0);
+    assert!(source.finished(Motion::at(3.0)));
+}
+
+#[test]
+fn goes_on_from_rest_after_an_interruption() {
+    let mut source = JerkLimited::new(go(50.0, LIMITS), Motion::at(0.0), DT).unwrap();
+    let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
+    for _ in 0..200 {
+        watch.cycle(&mut source).unwrap();
+    }
+    assert!(watch.motion.velocity > 190.0);
+    // What an axis does while frames are lost.
+    watch.motion.velocity = 0.0;
+    watch.motion.acceleration = 0.0;
+    (watch.velocity, watch.acceleration) = (0.0, 0.0);
+    watch.finish(&mut source).unwrap();
+    assert!(watch.motion.stands_at(50.0));
+}
+
+#[test]
+fn a_gentler_successor_neither_overshoots_nor_speeds_up() {
+    let mut source = JerkLimited::new(go(50.0, LIMITS), Motion::at(0.0), DT).unwrap();
+    let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
+    // Accelerating, cruising, braking.
+    for cycles in [30, 100, 120, 130] {
+        for _ in 0..cycles {
+            watch.cycle(&mut source).unwrap();
+        }
+        let gentle = MotionLimits {
+            acceleration: 100.0,
+            jerk: 1000.0,
+            ..LIMITS
+        };
+        let mut next = source.redirect(go(50.0, gentle), watch.motion, DT).unwrap();
+        assert!(next.span()[1] <= 50.0 + 1e-9);
+        let mut watch = Watch::at(watch.motion, LIMITS, DT);
+        watch.check_jerk = false;
+        watch.finish(&mut next).unwrap();
+        assert!(watch.motion.stands_at(50.0));
+    }
+}
+
+#[test]
+fn the_range_is_kept_or_the_order_refused() {
+    // Full speed, 1 before the end of the range: it takes 15 to stop, a little less to turn round.
+    let motion = Motion {
+        position: 49.0,
+        velocity: 200.0,
+        acceleration: 0.0,
+    };
+    let order = Order {
+        range: Some([-50.0, 50.0]),
+        ..go(0.0, LIMITS)
+    };
+    let refused = JerkLimited::new(order, motion, DT);
+    assert!(
+        matches!(refused, Err(SetpointError::LeavesRange { reaches, .. }) if (reaches - 63.9).abs() < 0.15),
+        "{refused:?}"
+    );
+    // Outside already, and on the way back.
+    let outside = Motion::at(60.0);
+    assert!(JerkLimited::new(order, outside, DT).is_ok());
+}
+
+#[test]
+fn nonsense_is_refused() {
+    for value in [f64::NAN, f64::INFINITY, 1e300] {
+        for order in [
+            go(value, LIMITS),
+            Order::within(Goal::Velocity(value), LIMITS),
+        ] {
+            assert!(JerkLimited::new(order, Motion::at(0.0), DT).is_err());
+        }
+        assert!(JerkLimited::new(go(1.0, LIMITS), Motion::at(value), DT).is_err());
+    }
+    for value in [0.0, -1.0, 1e-300, f64::MIN_POSITIVE / 2.0, 1e300, f64::NAN] {
+        for limits in [
+            MotionLimits {
+                velocity: value,
+                ..LIMITS
+            },
+            MotionLimits {
+                acceleration: value,
+                ..LIMITS
+            },
+            MotionLimits {
+                jerk: value,
+                ..LIMITS
+            },
+        ] {
+            let refused = JerkLimited::new(go(1.0, limits), Motion::at(0.0), DT);
+            assert!(refused.is_err(), "{limits:?}");
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn from_rest(
+        start in -1e3..1e3f64, way in -200.0..200.0f64, limits in part(),
+        dt in prop::sample::select(vec![0.000_25, 0.001, 0.004]),
+    ) {
+        let mut source = JerkLimited::new(go(start + way, limits), Motion::at(start), dt).unwrap();
+        let mut watch = Watch::at(Motion::at(start), limits, dt);
+        let [low, high] = source.span();
+        prop_assert!(low >= start.min(start + way) - 1e-9 && high <= start.max(start + way) + 1e-9);
+        let cycles = watch.finish(&mut source)?;
+        prop_assert!(watch.motion.stands_at(start + way));
+        prop_assert!((f64::from(cycles) * dt - source.duration_s()).abs() <= 2.0 * dt);
+    }
+
+    /// A new order in any cycle of another, and another in any cycle of that: the axis' limits hold throughout, jerk included.
+    #[test]
+    fn redirected(
+        targets in prop::collection::vec((-50.0..50.0f64, part(), 0u32..400), 2..6),
+        stop in any::<bool>(),
+    ) {
+        let range = Some([-50.0, 50.0]);
+        let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
+        let mut source = JerkLimited::new(go(0.0, LIMITS), Motion::at(0.0), DT).unwrap();
+        for (target, limits, cycles) in targets {
+            let order = Order { range, ..go(target, limits) };
+            source = match source.redirect(order, watch.motion, DT) {
+                Ok(next) => next,
+                Err(error) => return Err(TestCaseError::fail(format!("{error}: {order:?} {source:?}"))),
+            };
+            for _ in 0..cycles {
+                watch.cycle(&mut source)?;
+                prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9);
+            }
+        }
+        if stop {
+            let order = Order { range, ..Order::within(Goal::Velocity(0.0), source.used) };
+            source = source.redirect(order, watch.motion, DT).unwrap();
+        }
+        let at = watch.motion;
+        watch.finish(&mut source)?;
+        prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9, "{at:?} {:?} {source:?}", watch.motion);
+        if !stop {
+            let Goal::Position(target) = source.order().goal else { unreachable!() };
+            prop_assert!(watch.motion.stands_at(target));
+        }
+    }
+
+    /// From any motion of any source: velocity and acceleration hold from the first cycle on.
+    #[test]
+    fn takes_over(
+        velocity in -200.0..200.0f64, acceleration in -2000.0..2000.0f64, target in -50.0..50.0f64, limits in part(),
+    ) {
+        let motion = Motion { position: 0.0, velocity, acceleration };
+        let mut source = JerkLimited::new(go(target, limits), motion, DT).unwrap();
+        let mut watch = Watch::at(motion, LIMITS, DT);
+        watch.check_jerk = false;
+        watch.cycle(&mut source)?;
+        watch.cycle(&mut source)?;
+        watch.check_jerk = true;
+        watch.finish(&mut source)?;
+        prop_assert!(watch.motion.stands_at(target));
+    }
+
+    #[test]
+    fn velocities(
+        changes in prop::collection::vec((-1.0..1.0f64, part(), 0u32..300), 1..6),
+    ) {
+        let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
+        let mut source = JerkLimited::new(Order::within(Goal::Velocity(0.0), LIMITS), Motion::at(0.0), DT).unwrap();
+        for (part, limits, cycles) in changes {
+            let goal = Goal::Velocity(limits.velocity * part);
+            let order = Order { ceiling: LIMITS, ..Order::within(goal, limits) };
+            source = source.redirect(order, watch.motion, DT).unwrap();
+            for _ in 0..cycles {
+                watch.cycle(&mut source)?;
+            }
+        }
+        watch.finish(&mut source)?;
+        let Goal::Velocity(velocity) = source.order().goal else { unreachable!() };
+        for _ in 0..10 {
+            watch.cycle(&mut source)?;
+            prop_assert_eq!(watch.motion.velocity, velocity);
+        }
+    }
+
+    /// Whatever the numbers, an accepted order gives finite motions.
+    #[test]
+    fn any_numbers(
+        numbers in prop::array::uniform9(any::<f64>()), dts in prop::collection::vec(any::<f64>(), 1..20), fast in any::<bool>(),
+    ) {
+        let [a, b, c, d, e, f, g, h, i] = numbers;
+        let limits = MotionLimits { velocity: a.abs(), acceleration: b.abs(), jerk: c.abs() };
+        let goal = if fast { Goal::Velocity(d) } else { Goal::Position(e) };
+        let motion = Motion { position: f, velocity: g, acceleration: h };
+        if let Ok(mut source) = JerkLimited::new(Order::within(goal, limits), motion, i) {
+            let mut motion = motion;
+            for dt in dts {
+                motion = source.advance(motion, dt.abs().min(0.1));
+                prop_assert!(motion.position.is_finite() && motion.velocity.is_finite(), "{motion:?} {source:?}");
+            }
+        }
+    }
+}

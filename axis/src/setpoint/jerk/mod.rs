@@ -1,0 +1,409 @@
+//! Moves and changes of velocity with bounded velocity, acceleration and jerk.
+//!
+//! `profile` is what there is to follow: segments of constant jerk, and the change from one velocity to another; `plan` finds the
+//! profile that ends at a position. Here a profile is followed, one cycle at a time.
+//!
+//! What reaches the drive is a continuous profile, seen once per cycle. Each difference of positions is then a mean over
+//! neighbouring cycles, so velocity, acceleration and jerk of the sequence keep the profile's limits, exactly, whatever the
+//! cycle. That holds across a change of plan as well, because the new profile starts from the old one's state within
+//! the cycle and not from the cycle's means.
+
+mod plan;
+mod profile;
+
+use super::{Motion, MotionLimits, Setpoint, SetpointError};
+use profile::{Profile, State, coasting, velocity_change};
+
+/// Rounding of positions shows in their differences; this much of every limit is left to it.
+const PLANNED: f64 = 1.0 - 1e-6;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Goal {
+    /// Rest at a position.
+    Position(f64),
+    /// A velocity that is kept; 0 is a stop.
+    Velocity(f64),
+}
+
+/// What is to be done, and what may be used for it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Order {
+    pub goal: Goal,
+    pub limits: MotionLimits,
+    /// The axis' own limits, none below `limits`. Its acceleration and jerk are used where the present motion would otherwise
+    /// carry the axis beyond the target or its velocity limit.
+    pub ceiling: MotionLimits,
+    /// Positions that may be reached on the way, or by a stop on it. A velocity other than 0 leads out of every range; there only
+    /// the way to the velocity counts.
+    pub range: Option<[f64; 2]>,
+}
+
+impl Order {
+    #[must_use]
+    pub const fn within(goal: Goal, limits: MotionLimits) -> Self {
+        Self {
+            goal,
+            limits,
+            ceiling: limits,
+            range: None,
+        }
+    }
+}
+
+/// Follows an [`Order`]. Copying it is cheap (some 400 bytes); nothing is allocated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JerkLimited {
+    order: Order,
+    /// The limits the profile was made with, apart from [`PLANNED`].
+    used: MotionLimits,
+    origin: f64,
+    profile: Profile,
+    index: usize,
+    /// Where the segment began, and how long ago.
+    base: State,
+    elapsed: f64,
+    now: State,
+    span: [f64; 2],
+    total: f64,
+    duration: f64,
+    last: Motion,
+}
+
+impl JerkLimited {
+    /// From `motion`, whatever source it comes from; `dt_s`: the cycle it was the result of. O(1): some microseconds, no
+    /// allocation.
+    ///
+    /// The acceleration is taken over as far as it leaves the velocity within its limit; from then on the jerk is bounded.
+    pub fn new(order: Order, motion: Motion, dt_s: f64) -> Result<Self, SetpointError> {
+        check(&order, motion)?;
+        let start = entry(motion, order.ceiling.scaled(PLANNED), dt_s);
+        Self::plan(order, start, motion, None)
+    }
+
+    /// From what this source is doing, with bounded jerk at the change as well; from `motion` if that is not this source's.
+    /// O(1), like [`JerkLimited::new`].
+    pub fn redirect(&self, order: Order, motion: Motion, dt_s: f64) -> Result<Self, SetpointError> {
+        if !self.continues(motion) {
+            return Self::new(order, motion, dt_s);
+        }
+        check(&order, motion)?;
+        Self::plan(order, self.now, motion, Some(self.used))
+    }
+
+    #[must_use]
+    pub const fn order(&self) -> &Order {
+        &self.order
+    }
+
+    /// Seconds from the start to the arrival.
+    #[must_use]
+    pub const fn duration_s(&self) -> f64 {
+        self.duration
+    }
+
+    #[must_use]
+    pub fn remaining_s(&self) -> f64 {
+        (self.duration - self.total).max(0.0)
+    }
+
+    /// Lowest and highest position from the start to the arrival.
+    #[must_use]
+    pub fn span(&self) -> [f64; 2] {
+        self.span.map(|position| self.origin + position)
+    }
+
+    /// The shortest time that can be met for sure, and with it every longer one. At least [`JerkLimited::duration_s`].
+    pub(crate) fn any_duration_from(&self) -> f64 {
+        match self.order.goal {
+            Goal::Position(target)
+                if self.base.velocity != 0.0 || self.base.acceleration != 0.0 =>
+            {
+                plan::stop_then_go_time(self.base, target - self.origin, self.used.scaled(PLANNED))
+            }
+            _ => self.duration,
+        }
+    }
+
+    /// The same move, taking `duration_s` from its start. `None` if it cannot be made to. Only before the first cycle.
+    pub(crate) fn lasting(&self, duration_s: f64) -> Option<Self> {
+        let Goal::Position(target) = self.order.goal else {
+            return None;
+        };
+        let distance = target - self.origin;
+        let (start, limits) = (self.base, self.used.scaled(PLANNED));
+        let at_rest = start.velocity == 0.0 && start.acceleration == 0.0;
+        let profile = if distance == 0.0 && at_rest {
+            Profile::default()
+        } else if at_rest {
+            self.profile.slowed((duration_s / self.duration).max(1.0))
+        } else if duration_s <= self.duration {
+            self.profile
+        } else {
+            slower(start, distance, limits, duration_s)
+                .or_else(|| plan::stop_then_go(start, distance, limits, duration_s))?
+        };
+        Some(Self {
+            span: profile.span(start),
+            profile,
+            duration: duration_s,
+            ..*self
+        })
+    }
+
+    fn plan(
+        order: Order,
+        start: State,
+        motion: Motion,
+        earlier: Option<MotionLimits>,
+    ) -> Result<Self, SetpointError> {
+        let start = State {
+            position: 0.0,
+            ..start
+        };
+        let origin = motion.position;
+        let harder = MotionLimits {
+            velocity: order.limits.velocity,
+            ..order.ceiling
+        };
+        let as_before = earlier.map_or(order.limits, |earlier| MotionLimits {
+            velocity: order.limits.velocity,
+            acceleration: order.limits.acceleration.max(earlier.acceleration),
+            jerk: order.limits.jerk.max(earlier.jerk),
+        });
+        let mut chosen = None;
+        for limits in [order.limits, as_before, harder] {
+            let planned = limits.scaled(PLANNED);
+            let profile = match order.goal {
+                Goal::Position(target) => plan::to_position(start, target - origin, planned),
+                Goal::Velocity(velocity) => Profile::of(&[&velocity_change(
+                    start,
+                    velocity,
+                    planned.acceleration,
+                    planned.jerk,
+                )]),
+            };
+            let span = profile.span(start);
+            let outside = leaves(&order, origin, [span, plan::stop_span(start, planned)]);
+            chosen = Some((limits, profile, span, outside));
+            if outside.is_none() && keeps_to(&order, origin, start, planned.jerk, span) {
+                break;
+            }
+        }
+        // The loop has three rounds.
+        let (used, profile, span, outside) = chosen.ok_or(SetpointError::NoTime)?;
+        outside.map_or(Ok(()), Err)?;
+        Ok(Self {
+            order,
+            used,
+            origin,
+            duration: profile.duration(),
+            profile,
+            index: 0,
+            base: start,
+            elapsed: 0.0,
+            now: start,
+            span,
+            total: 0.0,
+            last: motion,
+        })
+    }
+
+    /// `motion` is what the last cycle returned. A velocity has no position of its own: that may be the drive's.
+    fn continues(&self, motion: Motion) -> bool {
+        let same_place = match self.order.goal {
+            Goal::Position(_) => motion.position == self.last.position,
+            Goal::Velocity(_) => true,
+        };
+        same_place && motion.velocity == self.last.velocity
+    }
+
+    /// The plan was interrupted: the same goal from here, with everything the axis has.
+    fn resume(&mut self, motion: Motion, dt_s: f64) {
+        let order = Order {
+            range: None,
+            ..self.order
+        };
+        if let Ok(resumed) = Self::new(order, motion, dt_s) {
+            *self = Self {
+                order: self.order,
+                ..resumed
+            };
+        }
+    }
+
+    fn pass(&mut self, dt_s: f64) {
+        self.total += dt_s;
+        self.elapsed += dt_s;
+        while let Some(segment) = self.profile.get(self.index) {
+            if self.elapsed < segment.time {
+                self.now = self.base.after(segment.jerk, self.elapsed);
+                return;
+            }
+            self.base = self.base.after(segment.jerk, segment.time);
+            self.elapsed -= segment.time;
+            self.index += 1;
+            if let Some(next) = self.profile.get(self.index) {
+                self.base = next.enter(self.base);
+            }
+        }
+        self.now = match self.order.goal {
+            Goal::Position(_) => State {
+                velocity: 0.0,
+                acceleration: 0.0,
+                ..self.base
+            },
+            Goal::Velocity(velocity) => {
+                self.base.velocity = velocity;
+                self.base.acceleration = 0.0;
+                self.base.after(0.0, self.elapsed)
+            }
+        };
+    }
+
+    fn ended(&self) -> bool {
+        self.total >= self.duration && self.profile.get(self.index).is_none()
+    }
+}
+
+impl Setpoint for JerkLimited {
+    /// RT: O(1). Plans anew if `motion` is not what this source returned last.
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        if !self.continues(motion) {
+            self.resume(motion, dt_s);
+        }
+        let (before, had_ended) = (self.now.position, self.ended());
+        self.pass(dt_s);
+        let step = self.now.position - before;
+        self.last = match self.order.goal {
+            Goal::Position(target) if self.total >= self.duration => {
+                self.index = usize::MAX;
+                self.now = State {
+                    position: target - self.origin,
+                    ..State::default()
+                };
+                self.base = self.now;
+                let left = target - motion.position;
+                motion.then(target, left / dt_s, dt_s)
+            }
+            Goal::Position(_) => motion.then(self.origin + self.now.position, step / dt_s, dt_s),
+            Goal::Velocity(velocity) if had_ended => {
+                self.now = State {
+                    position: 0.0,
+                    ..self.now
+                };
+                self.base = self.now;
+                self.elapsed = 0.0;
+                motion.then(motion.position + velocity * dt_s, velocity, dt_s)
+            }
+            Goal::Velocity(_) => motion.then(motion.position + step, step / dt_s, dt_s),
+        };
+        self.last
+    }
+
+    /// A velocity is finished when it is reached.
+    fn finished(&self, motion: Motion) -> bool {
+        match self.order.goal {
+            Goal::Position(target) => motion.stands_at(target),
+            Goal::Velocity(velocity) => motion.velocity == velocity,
+        }
+    }
+}
+
+fn check(order: &Order, motion: Motion) -> Result<(), SetpointError> {
+    order.limits.check()?;
+    order.ceiling.check()?;
+    motion.check()?;
+    match order.goal {
+        Goal::Position(target) => super::error::position("target", target)?,
+        Goal::Velocity(velocity) => super::error::finite("velocity", velocity)?,
+    }
+    if let Goal::Velocity(velocity) = order.goal
+        && velocity.abs() > order.limits.velocity
+    {
+        return Err(SetpointError::TooFast {
+            velocity,
+            limit: order.limits.velocity,
+        });
+    }
+    Ok(())
+}
+
+/// Not faster than necessary, and not beyond a target that the axis is moving to.
+fn keeps_to(order: &Order, origin: f64, start: State, jerk: f64, span: [f64; 2]) -> bool {
+    let fastest = order.limits.velocity.max(start.velocity.abs());
+    if coasting(start, jerk).abs() > fastest {
+        return false;
+    }
+    let Goal::Position(target) = order.goal else {
+        return true;
+    };
+    let distance = target - origin;
+    let slack = distance.abs() * 1e-9;
+    let beyond = if distance > 0.0 {
+        start.velocity > 0.0 && span[1] > distance + slack
+    } else {
+        start.velocity < 0.0 && span[0] < distance - slack
+    };
+    !beyond
+}
+
+/// Where the way, or a stop on it, leads outside the range and farther out than where it begins.
+///
+/// The shortest way back turns round without standing still, and so before the place where a stop would end; it must be
+/// possible to stop all the same.
+fn leaves(order: &Order, origin: f64, spans: [[f64; 2]; 2]) -> Option<SetpointError> {
+    let [low, high] = order.range?;
+    let inside = low.min(origin)..=high.max(origin);
+    spans
+        .into_iter()
+        .flatten()
+        .map(|position| origin + position)
+        .find(|position| !inside.contains(position))
+        .map(|reaches| SetpointError::LeavesRange { reaches, low, high })
+}
+
+/// The state at the end of a cycle of which only the means are known. With a constant acceleration a cycle's mean velocity is
+/// that of its middle; so continued, the velocity stays within its limit.
+fn entry(motion: Motion, limits: MotionLimits, dt_s: f64) -> State {
+    let sign = 1f64.copysign(motion.acceleration);
+    let headroom = (limits.velocity - sign * motion.velocity).max(0.0);
+    let half = dt_s.max(0.0) / 2.0;
+    let most = limits.jerk * ((half * half + 2.0 * headroom / limits.jerk).sqrt() - half);
+    let acceleration = motion
+        .acceleration
+        .abs()
+        .min(most)
+        .min(limits.acceleration)
+        .copysign(sign);
+    State {
+        position: 0.0,
+        velocity: motion.velocity + acceleration * half,
+        acceleration,
+    }
+}
+
+/// A lower velocity limit that makes the way take `duration`.
+fn slower(start: State, distance: f64, limits: MotionLimits, duration: f64) -> Option<Profile> {
+    let (mut slow, mut fast) = (0.0, limits.velocity);
+    for _ in 0..64 {
+        let velocity = slow + (fast - slow) * 0.5;
+        let profile = plan::to_position(start, distance, MotionLimits { velocity, ..limits });
+        let time = profile.duration();
+        if (time - duration).abs() <= duration * 1e-12 {
+            return Some(profile);
+        }
+        if time > duration {
+            slow = velocity;
+        } else {
+            fast = velocity;
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+#[path = "jerk_tests.rs"]
+mod tests;
