@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use crate::model::{Device, Direction, EsiFile, InitCmd, Module, ObjectItem, Pdo, Position, SmUse};
-use crate::select::{Choice, offered_modes, select};
+use crate::select::{Choice, SelectError, offered_modes, select};
 
 /// A usual bus cycle, for what depends on one.
 const CYCLE_NS: u64 = 1_000_000;
@@ -265,30 +265,27 @@ fn objects(found: &mut Found, path: &str, device: &Device) {
 /// The default and every mode that is offered come to a layout.
 fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
     let has_pdos = !device.rx_pdos.is_empty() || !device.tx_pdos.is_empty();
-    let soe_only = device
-        .mailbox
-        .as_ref()
-        .is_some_and(|m| m.soe && m.coe.is_none());
-    if soe_only {
-        let message = format!(
-            "{} speaks SoE and not CoE: its process data is laid out, but nothing can be set up at start",
-            device.name
-        );
-        found.warn(device.position, path, message);
-    }
     let choice = Choice {
         cycle_ns: CYCLE_NS,
         ..Choice::default()
     };
     let default = select(file, device, &choice);
-    if let (Err(error), true) = (&default, has_pdos || device.slots.is_some()) {
-        found.add(
-            Severity::Error,
-            device.position,
-            path,
-            format!("its default configuration: {error}"),
-        );
-        return;
+    match default {
+        Err(error @ SelectError::SoeOnly { .. }) => {
+            found.add(Severity::Error, device.position, path, error.to_string());
+            return;
+        }
+        Err(error) if has_pdos || device.slots.is_some() => {
+            // Modules are the user's to name; nothing is wrong with the file.
+            let severity = match error {
+                SelectError::ModuleNeeded { .. } => Severity::Warning,
+                _ => Severity::Error,
+            };
+            let message = format!("its default configuration: {error}");
+            found.add(severity, device.position, path, message);
+            return;
+        }
+        _ => {}
     }
     for mode in offered_modes(file, device) {
         let choice = Choice {

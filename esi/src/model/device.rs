@@ -66,6 +66,15 @@ pub struct Device {
     pub registers: InitialRegisters,
 }
 
+impl Device {
+    /// SERCOS over EtherCAT without CoE: IDNs decide about its process data.
+    #[must_use]
+    pub fn speaks_soe_alone(&self) -> bool {
+        let mailbox = self.mailbox.as_ref();
+        mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none())
+    }
+}
+
 /// `HideType`. Where no product code is written, the device's own is meant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct HiddenType {

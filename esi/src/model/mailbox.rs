@@ -42,5 +42,7 @@ pub struct InitCmd {
     /// A device's command that a module's own for the same object replaces.
     pub overwritten_by_module: bool,
     pub data: Vec<u8>,
+    /// `AdaptAutomatically`: the data follow the configuration; what is written here is that of the maker's default.
+    pub adapts: bool,
     pub comment: String,
 }

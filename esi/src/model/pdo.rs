@@ -29,8 +29,20 @@ pub struct Pdo {
     pub overwritten_by_module: bool,
     /// In a module: the index counts on by the slot's increment.
     pub depends_on: SlotDependence,
+    pub oversampling: Option<Oversampling>,
     pub exclude: Vec<Excluded>,
     pub entries: Vec<Entry>,
+}
+
+/// `OSFac` …: one cycle brings several samples of the PDO.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Oversampling {
+    /// Samples where the OpMode does not say how many.
+    pub factor: u16,
+    pub max: Option<u16>,
+    /// By how much the entries' indices count on from one sample to the next, the PDO's own by 1. 0: the samples
+    /// stand in one PDO.
+    pub index_increment: u16,
 }
 
 /// A PDO that cannot be assigned beside this one.
@@ -98,4 +110,6 @@ pub struct SmMapping {
     pub default: bool,
     /// (SyncManager, its PDOs in order). A SyncManager that is not named keeps its default.
     pub sync_managers: Vec<(u8, Vec<u16>)>,
+    /// (PDO, samples in a cycle), for those that it assigns.
+    pub oversampling: Vec<(u16, u16)>,
 }

@@ -75,6 +75,8 @@ pub struct DcMode {
     pub sync1: SyncTime,
     /// PDOs that the mode assigns: (SyncManager, PDOs in order), empty where it leaves them alone.
     pub sync_managers: Vec<(u8, Vec<u16>)>,
+    /// (PDO, samples in a cycle), for those that it assigns.
+    pub oversampling: Vec<(u16, u16)>,
 }
 
 /// Cycle and shift of one SYNC signal as written; `Factor` relates it to the bus cycle.

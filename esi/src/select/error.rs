@@ -127,6 +127,17 @@ pub enum SelectError {
         "PDO 0x{pdo:04x} of {device} would need other contents, which CoE PdoConfig does not allow"
     )]
     ContentsFixed { device: String, pdo: u16 },
+    #[error(
+        "{factor} samples of PDO 0x{pdo:04x} (line {}) are more than {}",
+        position.line,
+        max.map_or("a cycle can carry".to_owned(), |max| format!("its OSMax of {max}"))
+    )]
+    TooManySamples {
+        pdo: u16,
+        position: Position,
+        factor: u16,
+        max: Option<u16>,
+    },
     #[error("SyncManager {sm} would carry {len} bytes of {direction}, it takes at most {max}")]
     SyncManagerFull {
         sm: u8,
@@ -173,6 +184,10 @@ pub enum SelectError {
         given: usize,
         expected: usize,
     },
+    #[error(
+        "{device} speaks SoE and not CoE: what its process data contains is set by SoE IDNs, which ecaxis does not speak"
+    )]
+    SoeOnly { device: String },
     #[error("{device} has no CoE mailbox, so {what} cannot be written")]
     NoCoe { device: String, what: &'static str },
 }

@@ -1,13 +1,16 @@
 //! The user's choice applied to what the ESI offers: device, module, PDOs and DC mode.
 //!
-//! `device` finds the device in the file, `module` fills the slot, `pdo` assigns and fills PDOs, `dc` picks the
-//! OpMode; [`select`] puts them together with layout and start-up list. Nothing here talks to a device.
+//! `device` finds the device in the file, `module` fills the slot, `pdo` assigns PDOs, `own` fills one as the user
+//! wants it, `samples` repeats
+//! what is oversampled, `dc` picks the OpMode; [`select`] puts them together with layout and start-up list. Nothing here talks to a device.
 
 mod dc;
 mod device;
 mod error;
 mod module;
+mod own;
 mod pdo;
+mod samples;
 
 pub use dc::DcSettings;
 pub use device::{DeviceQuery, find_device};
@@ -98,6 +101,11 @@ pub fn select(
     device: &Device,
     choice: &Choice<'_>,
 ) -> Result<Selection, SelectError> {
+    if device.speaks_soe_alone() {
+        return Err(SelectError::SoeOnly {
+            device: device.name.clone(),
+        });
+    }
     let mut notes = Vec::new();
     let placed = module::choose(&file.modules, device, choice.mode, choice.modules)?;
     let dictionary = merged(device, &placed);
@@ -116,6 +124,8 @@ pub fn select(
         .map(|mode| pdo::Assignment {
             name: &mode.name,
             sync_managers: &mode.sync_managers,
+            oversampling: &mode.oversampling,
+            whole_direction: true,
         });
     let assignment = by_name.or(by_dc_mode);
     let chooser = |direction| pdo::Chooser {

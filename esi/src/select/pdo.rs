@@ -1,17 +1,20 @@
 //! Which PDOs are assigned, and with what contents.
 
 use super::module::Placed;
-use super::{EntryRef, SelectError};
+use super::{EntryRef, SelectError, samples};
 use crate::mode::Mode;
-use crate::model::{
-    Coe, Device, Dictionary, Direction, Entry, Pdo, PdoMapping, Position, SlotDependence, SmUse,
-};
+use crate::model::{Device, Dictionary, Direction, Pdo, SmUse};
 
 /// PDOs by SyncManager under a name: an `AlternativeSmMapping`, or what a DC mode assigns.
 #[derive(Clone, Copy)]
 pub(super) struct Assignment<'a> {
     pub name: &'a str,
     pub sync_managers: &'a [(u8, Vec<u16>)],
+    /// (PDO, samples in a cycle).
+    pub oversampling: &'a [(u16, u16)],
+    /// Of a direction of which it names a SyncManager, the others carry nothing: channels that an OpMode leaves out
+    /// are off.
+    pub whole_direction: bool,
 }
 
 /// The assignment that is asked for by name.
@@ -43,6 +46,8 @@ pub(super) fn assignment<'a>(
     Ok(Assignment {
         name: &mapping.name,
         sync_managers: &mapping.sync_managers,
+        oversampling: &mapping.oversampling,
+        whole_direction: false,
     })
 }
 
@@ -116,7 +121,30 @@ impl Chooser<'_> {
             }
             pdo.sm = Some(sm);
         }
-        Ok(chosen)
+        if own.is_some() {
+            return Ok(chosen);
+        }
+        let mut sampled = Vec::with_capacity(chosen.len());
+        for pdo in chosen {
+            samples::append(&mut sampled, &pdo, self.samples(&pdo))?;
+        }
+        Ok(sampled)
+    }
+
+    /// How many samples of a PDO one cycle brings: what its assignment says, else what it says itself.
+    fn samples(&self, pdo: &Pdo) -> u16 {
+        let assigned = self.assignment.filter(|assignment| {
+            let mut all = assignment.sync_managers.iter().flat_map(|(_, pdos)| pdos);
+            all.any(|index| *index == pdo.index)
+        });
+        match assigned {
+            Some(assignment) => {
+                let mut all = assignment.oversampling.iter();
+                all.find(|(index, _)| *index == pdo.index)
+                    .map_or(1, |(_, factor)| *factor)
+            }
+            None => pdo.oversampling.map_or(1, |sampling| sampling.factor),
+        }
     }
 
     /// Applies the assignment by name, if there is one: the SyncManagers that it names carry its PDOs in its
@@ -125,21 +153,21 @@ impl Chooser<'_> {
         let Some(assignment) = self.assignment else {
             return Ok(available);
         };
-        for pdo in &mut available {
-            let named = |sm| {
-                assignment
-                    .sync_managers
-                    .iter()
-                    .any(|(number, _)| *number == sm)
-            };
-            if pdo.sm.is_some_and(named) {
-                pdo.sm = None;
-            }
-        }
         let of_direction = |sm: &&(u8, Vec<u16>)| {
             let usage = self.device.sync_managers.get(usize::from(sm.0));
             usage.is_some_and(|sm| sm.usage == self.usage())
         };
+        let named = |sm| {
+            let mut all = assignment.sync_managers.iter();
+            all.any(|(number, _)| *number == sm)
+        };
+        let whole = assignment.whole_direction
+            && assignment.sync_managers.iter().any(|sm| of_direction(&sm));
+        for pdo in &mut available {
+            if whole || pdo.sm.is_some_and(named) {
+                pdo.sm = None;
+            }
+        }
         let mut first = Vec::new();
         for (sm, pdos) in assignment.sync_managers.iter().filter(of_direction) {
             for index in pdos {
@@ -219,7 +247,7 @@ impl Chooser<'_> {
         }
     }
 
-    fn needed(&self, mode: Mode) -> Vec<u16> {
+    pub(super) fn needed(&self, mode: Mode) -> Vec<u16> {
         match self.direction {
             Direction::Rx => [Some(0x6040), mode.target_object()]
                 .into_iter()
@@ -230,7 +258,7 @@ impl Chooser<'_> {
     }
 
     /// `pdo` first; beside it the default PDOs that it does not exclude, as far as there is room.
-    fn alongside(&self, pdo: Pdo, default: &[Pdo]) -> Vec<Pdo> {
+    pub(super) fn alongside(&self, pdo: Pdo, default: &[Pdo]) -> Vec<Pdo> {
         let room = self.capacity(&pdo);
         let mut set = vec![pdo];
         // Mandatory ones first in line for the room, but assigned in file order.
@@ -268,186 +296,7 @@ impl Chooser<'_> {
         stated.map_or_else(|| object.items.len().saturating_sub(1).max(1), usize::from)
     }
 
-    fn with_own_entries(
-        &self,
-        available: &[Pdo],
-        default: &[Pdo],
-        list: &[EntryRef],
-        mode: Option<Mode>,
-    ) -> Result<Vec<Pdo>, SelectError> {
-        let label = self.label();
-        let coe = self
-            .device
-            .mailbox
-            .as_ref()
-            .and_then(|mailbox| mailbox.coe.as_ref());
-        let configurable = coe.is_some_and(|coe: &Coe| coe.pdo_config);
-        let carrier = default
-            .iter()
-            .chain(available)
-            .find(|pdo| !pdo.fixed)
-            .filter(|_| configurable);
-        let Some(carrier) = carrier else {
-            if let Some(set) = self.composed(available, default, list) {
-                return Ok(set);
-            }
-            return Err(SelectError::NotConfigurable {
-                list: label,
-                device: self.device.name.clone(),
-            });
-        };
-        if let Some(max) = self.max_entries(carrier.index)
-            && list.len() > max
-        {
-            return Err(SelectError::TooManyEntries {
-                list: label,
-                pdo: carrier.index,
-                count: list.len(),
-                max,
-            });
-        }
-        let mut pdo = carrier.clone();
-        pdo.entries = list
-            .iter()
-            .map(|entry| self.entry(*entry))
-            .collect::<Result<_, _>>()?;
-        if let Some(mode) = mode {
-            // The actual value is the user's business; without command and status words nothing moves.
-            let needed = self.needed(mode);
-            let strict = if self.direction == Direction::Rx {
-                needed.len()
-            } else {
-                1
-            };
-            for index in needed.into_iter().take(strict) {
-                if !contains(std::slice::from_ref(&pdo), index) {
-                    return Err(SelectError::MissingEntry {
-                        list: label,
-                        mode,
-                        index,
-                    });
-                }
-            }
-        }
-        let mandatory: Vec<Pdo> = default.iter().filter(|p| p.mandatory).cloned().collect();
-        Ok(self.alongside(pdo, &mandatory))
-    }
-
-    /// The user's list as a sequence of the device's own PDOs, where these cannot be changed.
-    fn composed(&self, available: &[Pdo], default: &[Pdo], list: &[EntryRef]) -> Option<Vec<Pdo>> {
-        let mut set: Vec<Pdo> = default.iter().filter(|p| p.mandatory).cloned().collect();
-        let mut rest = list;
-        while !rest.is_empty() {
-            let begins_with = |pdo: &&Pdo| {
-                let mapped = || pdo.entries.iter().filter(|entry| !entry.is_gap());
-                let same = mapped()
-                    .zip(rest)
-                    .all(|(entry, wanted)| (entry.index, entry.sub) == (wanted.index, wanted.sub));
-                let count = mapped().count();
-                let free = set
-                    .iter()
-                    .all(|other| other.index != pdo.index && !conflict(other, pdo));
-                count > 0 && count <= rest.len() && same && free
-            };
-            let longest = available
-                .iter()
-                .filter(begins_with)
-                .max_by_key(|pdo| pdo.entries.len())?;
-            let count = longest
-                .entries
-                .iter()
-                .filter(|entry| !entry.is_gap())
-                .count();
-            rest = rest.get(count..)?;
-            set.push(longest.clone());
-        }
-        Some(set)
-    }
-
-    fn max_entries(&self, pdo: u16) -> Option<usize> {
-        let max = self
-            .dictionary
-            .item(pdo, 0)?
-            .max
-            .as_ref()?
-            .first()
-            .copied()?;
-        (max > 0).then_some(usize::from(max))
-    }
-
-    /// Length and type of an object, from the dictionary or from any PDO that maps it.
-    fn entry(&self, wanted: EntryRef) -> Result<Entry, SelectError> {
-        let EntryRef { index, sub } = wanted;
-        if let Some((object, item)) = self
-            .dictionary
-            .object(index)
-            .zip(self.dictionary.item(index, sub))
-        {
-            let flag = |mapping: PdoMapping| match self.direction {
-                Direction::Rx => mapping.rx,
-                Direction::Tx => mapping.tx,
-            };
-            // Some files flag nothing at all; then nothing can be refused.
-            let flags_are_kept = self
-                .dictionary
-                .objects
-                .iter()
-                .flat_map(|o| &o.items)
-                .any(|i| flag(i.pdo_mapping));
-            if flags_are_kept && !flag(item.pdo_mapping) && !self.is_mapped_somewhere(wanted) {
-                return Err(SelectError::NotMappable {
-                    list: self.label(),
-                    index,
-                    sub,
-                    name: item.name.clone(),
-                    direction: direction_name(self.direction),
-                });
-            }
-            if let Some(bit_len) = u16::try_from(item.bit_len).ok().filter(|bits| *bits > 0) {
-                return Ok(Entry {
-                    position: object.position,
-                    index,
-                    sub,
-                    bit_len,
-                    name: item.name.clone(),
-                    data_type: item.type_name.clone(),
-                    depends_on: SlotDependence::default(),
-                });
-            }
-        }
-        let known = self
-            .all_entries()
-            .find(|entry| entry.index == index && entry.sub == sub && entry.bit_len > 0);
-        match known {
-            Some(entry) if !entry.is_gap() => Ok(Entry {
-                position: Position::default(),
-                ..entry.clone()
-            }),
-            _ => Err(SelectError::UnknownEntry {
-                list: self.label(),
-                index,
-                sub,
-            }),
-        }
-    }
-
-    fn is_mapped_somewhere(&self, wanted: EntryRef) -> bool {
-        self.available()
-            .iter()
-            .flat_map(|p| &p.entries)
-            .any(|e| e.index == wanted.index && e.sub == wanted.sub)
-    }
-
-    fn all_entries(&self) -> impl Iterator<Item = &Entry> {
-        let device = self.device.rx_pdos.iter().chain(&self.device.tx_pdos);
-        let module = self
-            .placed
-            .iter()
-            .flat_map(|p| p.module.rx_pdos.iter().chain(&p.module.tx_pdos));
-        device.chain(module).flat_map(|pdo| &pdo.entries)
-    }
-
-    fn label(&self) -> &'static str {
+    pub(super) fn label(&self) -> &'static str {
         match self.direction {
             Direction::Rx => "pdo.rx",
             Direction::Tx => "pdo.tx",
@@ -483,14 +332,14 @@ impl Chooser<'_> {
     }
 }
 
-fn direction_name(direction: Direction) -> &'static str {
+pub(super) fn direction_name(direction: Direction) -> &'static str {
     match direction {
         Direction::Rx => "RxPdo",
         Direction::Tx => "TxPdo",
     }
 }
 
-fn conflict(a: &Pdo, b: &Pdo) -> bool {
+pub(super) fn conflict(a: &Pdo, b: &Pdo) -> bool {
     let excludes = |a: &Pdo, b: &Pdo| a.exclude.iter().any(|other| other.index == b.index);
     a.index != b.index && (excludes(a, b) || excludes(b, a))
 }
@@ -515,7 +364,7 @@ fn cover(available: &[Pdo], default: &[Pdo], needed: &[u16]) -> Option<Vec<Pdo>>
     Some(set)
 }
 
-fn contains(set: &[Pdo], index: u16) -> bool {
+pub(super) fn contains(set: &[Pdo], index: u16) -> bool {
     set.iter()
         .flat_map(|pdo| &pdo.entries)
         .any(|entry| entry.index == index)

@@ -259,6 +259,15 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
             ));
             continue;
         }
+        let is_configured = matches!(cmd.index, 0x1600..=0x17ff | 0x1a00..=0x1bff | 0x1c10..=0x1c2f | MODULE_LIST)
+            && list.sdos.iter().any(|sdo| sdo.index == cmd.index);
+        if cmd.adapts && is_configured {
+            selection.notes.push(format!(
+                "InitCmd of {origin} (line {}) writes 0x{:04x} as it is by default; it follows from the choice and is left out",
+                cmd.position.line, cmd.index
+            ));
+            continue;
+        }
         if cmd.index == INTERPOLATION_TIME && list.knows_period {
             selection.notes.push(format!(
                 "InitCmd of {origin} (line {}) writes 0x60C2:{:02x}, which follows from cycle and mode; it is left out",

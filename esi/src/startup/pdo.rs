@@ -44,7 +44,7 @@ pub(super) fn configure(
             list.push_whole(assign_object(*sm), data, &sm_origin(device, *sm));
         }
     } else if coe.pdo_assign {
-        for (sm, pdos) in &assignments {
+        for (sm, pdos) in assignments.iter().filter(|(_, pdos)| !pdos.is_empty()) {
             let index = assign_object(*sm);
             for (sub, pdo) in (1..=u8::MAX).zip(pdos) {
                 list.push(
@@ -133,8 +133,11 @@ fn contents(
                 &origin,
             );
         }
-        let count = u8::try_from(pdo.entries.len()).unwrap_or(u8::MAX);
-        list.push(pdo.index, 0, vec![count], &origin);
+        // Without entries, the zero that opened it is the count.
+        if !pdo.entries.is_empty() {
+            let count = u8::try_from(pdo.entries.len()).unwrap_or(u8::MAX);
+            list.push(pdo.index, 0, vec![count], &origin);
+        }
     }
     // Some drives refuse an object that two mapping objects contain, assigned or not.
     let unused = offered.iter().filter(|pdo| {
@@ -164,6 +167,11 @@ fn check_assignment(device: &Device, selection: &Selection) -> Result<(), Select
         let of_module = |index: u16| {
             !selection.modules.is_empty() && !offered.iter().any(|pdo| pdo.index == index)
         };
+        // A further sample stands where its first one does, and comes with it.
+        let is_sample = |chosen: &Pdo| {
+            let mut all = offered.iter().filter(|pdo| pdo.oversampling.is_some());
+            all.any(|pdo| pdo.position == chosen.position && pdo.index != chosen.index)
+        };
         let default: Vec<u16> = offered
             .iter()
             .filter(|pdo| pdo.sm.is_some() && !pdo.virtual_)
@@ -171,6 +179,7 @@ fn check_assignment(device: &Device, selection: &Selection) -> Result<(), Select
             .collect();
         let wanted: Vec<u16> = chosen
             .iter()
+            .filter(|pdo| !is_sample(pdo))
             .map(|pdo| pdo.index)
             .filter(|index| !of_module(*index))
             .collect();
@@ -208,6 +217,7 @@ fn check_contents(device: &Device, selection: &Selection) -> Result<(), SelectEr
             .find(|known| known.index == pdo.index);
         if let Some(offered) = offered
             && selection.modules.is_empty()
+            && offered.oversampling.is_none()
             && offered.entries != pdo.entries
         {
             return Err(SelectError::ContentsFixed {

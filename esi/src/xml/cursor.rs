@@ -214,7 +214,11 @@ impl<'a> Cursor<'a> {
         element: &Element<'a>,
         name: &str,
     ) -> Result<Option<bool>, EsiError> {
-        let Some(text) = self.attribute(element, name)? else {
+        // Some makers write Default="".
+        let Some(text) = self
+            .attribute(element, name)?
+            .filter(|text| !text.trim().is_empty())
+        else {
             return Ok(None);
         };
         let flag = number::boolean(&text);

@@ -32,7 +32,10 @@ fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiE
             "ShiftTimeSync0" => shift(c, el, &mut mode.sync0)?,
             "CycleTimeSync1" => cycle(c, el, &mut mode.sync1)?,
             "ShiftTimeSync1" => shift(c, el, &mut mode.sync1)?,
-            "Sm" => mode.sync_managers.extend(sync::assignment(c, el)?),
+            "Sm" => {
+                let sm = sync::assignment(c, el, &mut mode.oversampling)?;
+                mode.sync_managers.extend(sm);
+            }
             _ => {}
         }
         Ok(())

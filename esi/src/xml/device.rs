@@ -2,7 +2,7 @@
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
-use super::{dc, device_info, eeprom, mailbox, pdo, profile, slots, sync};
+use super::{dc, device_info, eeprom, mailbox, mapping, pdo, profile, slots, sync};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Device, Direction, HiddenType, InitialRegisters, RevisionCheck};
 
@@ -56,6 +56,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
         ));
     }
     (device.name, device.names) = names.take_all();
+    mapping::complete(&mut device);
     if device.name.is_empty() {
         device.name = device.type_name.clone();
     }

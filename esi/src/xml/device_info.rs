@@ -135,7 +135,10 @@ pub(super) fn sm_mapping<'a>(
     c.children(element, |c, el| {
         match el.name {
             "Name" => mapping.name = c.text(el)?,
-            "Sm" => mapping.sync_managers.extend(sync::assignment(c, el)?),
+            "Sm" => {
+                let sm = sync::assignment(c, el, &mut mapping.oversampling)?;
+                mapping.sync_managers.extend(sm);
+            }
             _ => {}
         }
         Ok(())

@@ -57,6 +57,7 @@ fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, Es
         fixed: c.attribute_flag(element, "Fixed")?,
         overwritten_by_module: c.attribute_flag(element, "OverwrittenByModule")?,
         data: Vec::new(),
+        adapts: false,
         comment: String::new(),
     };
     let mut comments = Names::default();
@@ -69,7 +70,10 @@ fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, Es
                 index = Some(c.number(el, "InitCmd index")?);
             }
             "SubIndex" => cmd.sub = c.number(el, "InitCmd subindex")?,
-            "Data" => cmd.data = c.hex_bytes(el, "InitCmd data")?,
+            "Data" => {
+                cmd.adapts = c.attribute_flag(el, "AdaptAutomatically")?;
+                cmd.data = c.hex_bytes(el, "InitCmd data")?;
+            }
             "Comment" => comments.add(c, el)?,
             _ => {}
         }

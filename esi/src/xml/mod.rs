@@ -3,7 +3,7 @@
 //! `decode` turns bytes into text, `cursor` walks elements with line, column and path, `number` reads literals.
 //! `info` is the root; below it `device`, `device_info`, `sync` (Fmmu, Sm, Su), `pdo`, `mailbox`, `dc`, `slots`,
 //! `module`, `eeprom` and `profile` with the dictionary: `datatype` and `object` read it as written, `resolve` joins
-//! the two.
+//! the two, and `mapping` takes PDOs from there where a file has no other.
 //!
 //! Rules here: unknown elements are skipped; what a layout or an address depends on is an error when it is
 //! wrong, everything else a warning; nothing in a file may make the reader panic, recurse without bound or
@@ -19,6 +19,7 @@ mod eeprom;
 mod info;
 mod literal;
 mod mailbox;
+mod mapping;
 mod module;
 mod number;
 mod object;

@@ -3,7 +3,7 @@
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Direction, Entry, Excluded, Pdo, SlotDependence};
+use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, SlotDependence};
 
 pub(super) fn read<'a>(
     c: &mut Cursor<'a>,
@@ -23,6 +23,7 @@ pub(super) fn read<'a>(
         virtual_: c.attribute_flag(element, "Virtual")?,
         overwritten_by_module: c.attribute_flag(element, "OverwrittenByModule")?,
         depends_on: SlotDependence::default(),
+        oversampling: oversampling(c, element)?,
         exclude: Vec::new(),
         entries: Vec::new(),
     };
@@ -49,6 +50,20 @@ pub(super) fn read<'a>(
         index.ok_or_else(|| c.error_at(element, EsiProblem::Missing { what: "PDO Index" }))?;
     pdo.name = names.take();
     Ok(pdo)
+}
+
+fn oversampling<'a>(
+    c: &Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<Option<Oversampling>, EsiError> {
+    let Some(factor) = c.attribute_number(element, "OSFac")? else {
+        return Ok(None);
+    };
+    Ok(Some(Oversampling {
+        factor,
+        max: c.attribute_number(element, "OSMax")?,
+        index_increment: c.attribute_number(element, "OSIndexInc")?.unwrap_or(0),
+    }))
 }
 
 fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiError> {

@@ -32,15 +32,20 @@ pub(super) fn sync_unit<'a>(
 }
 
 /// `Sm No="2"` with its `Pdo`s, in an OpMode or in an AlternativeSmMapping. One without a number says nothing.
+/// `oversampling` gets the factors that stand there.
 pub(super) fn assignment<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
+    oversampling: &mut Vec<(u16, u16)>,
 ) -> Result<Option<(u8, Vec<u16>)>, EsiError> {
     let number = c.attribute_number(element, "No")?;
     let mut pdos = Vec::new();
     c.children(element, |c, el| {
         if el.name == "Pdo" {
-            pdos.push(c.number(el, "PDO index")?);
+            let factor = c.attribute_number(el, "OSFac")?;
+            let index = c.number(el, "PDO index")?;
+            oversampling.extend(factor.map(|factor| (index, factor)));
+            pdos.push(index);
         }
         Ok(())
     })?;

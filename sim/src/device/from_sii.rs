@@ -148,6 +148,7 @@ fn pdo(pdo: &SiiPdo, direction: Direction) -> Pdo {
         virtual_: pdo.flags & 0x20 != 0,
         overwritten_by_module: false,
         depends_on: Default::default(),
+        oversampling: None,
         exclude: Vec::new(),
         entries: pdo
             .entries

@@ -323,6 +323,7 @@ fn pdo(direction: Direction, index: u16, sm: u8, entries: &[(u16, u8, u16)]) -> 
         mandatory: false,
         virtual_: false,
         overwritten_by_module: false,
+        oversampling: None,
         exclude: Vec::new(),
         entries: entries
             .iter()

@@ -1,0 +1,126 @@
+//! Devices that describe their PDOs in the dictionary alone: mapping objects (0x1600 …, 0x1A00 …) and assignment
+//! objects (0x1C1x) by their defaults.
+
+use crate::model::{
+    Device, Dictionary, Direction, Entry, Object, Pdo, SlotDependence, SmUse, Writable,
+};
+
+/// Fills a direction that has no PDO elements. Where slots are, modules bring the PDOs.
+pub(super) fn complete(device: &mut Device) {
+    if device.slots.is_some() {
+        return;
+    }
+    if device.rx_pdos.is_empty() {
+        device.rx_pdos = pdos(device, Direction::Rx);
+    }
+    if device.tx_pdos.is_empty() {
+        device.tx_pdos = pdos(device, Direction::Tx);
+    }
+}
+
+fn pdos(device: &Device, direction: Direction) -> Vec<Pdo> {
+    let (range, usage) = match direction {
+        Direction::Rx => (0x1600..=0x17ff, SmUse::Outputs),
+        Direction::Tx => (0x1a00..=0x1bff, SmUse::Inputs),
+    };
+    let dictionary = &device.dictionary;
+    let mut mapped: Vec<&Object> = dictionary
+        .objects
+        .iter()
+        .filter(|object| range.contains(&object.index))
+        .collect();
+    mapped.sort_by_key(|object| object.index);
+    mapped.dedup_by_key(|object| object.index);
+    let mut pdos: Vec<Pdo> = mapped
+        .into_iter()
+        .filter_map(|object| pdo(dictionary, direction, object))
+        .collect();
+    let sync_managers: Vec<u8> = (0..=u8::MAX)
+        .zip(&device.sync_managers)
+        .filter(|(_, sm)| sm.usage == usage && !sm.virtual_)
+        .map(|(number, _)| number)
+        .collect();
+    let mut assigned = Vec::new();
+    let mut stated = false;
+    for &sm in &sync_managers {
+        let Some(object) = dictionary.object(0x1c10u16.saturating_add(u16::from(sm))) else {
+            continue;
+        };
+        stated = true;
+        for index in defaults(object) {
+            let at = pdos.iter().position(|pdo| u32::from(pdo.index) == index);
+            if let Some(at) = at {
+                let mut pdo = pdos.remove(at);
+                pdo.sm = Some(sm);
+                assigned.push(pdo);
+            }
+        }
+    }
+    // A device without assignment objects has one PDO in each direction.
+    if let (false, Some(first), Some(sm)) = (stated, pdos.first_mut(), sync_managers.first()) {
+        first.sm = Some(*sm);
+    }
+    assigned.append(&mut pdos);
+    assigned
+}
+
+fn pdo(dictionary: &Dictionary, direction: Direction, object: &Object) -> Option<Pdo> {
+    let entries: Vec<Entry> = defaults(object)
+        .map(|mapping| {
+            let [bits, sub, low, high] = mapping.to_le_bytes();
+            let index = u16::from_le_bytes([low, high]);
+            let item = dictionary.item(index, sub);
+            Entry {
+                position: object.position,
+                index,
+                sub,
+                bit_len: u16::from(bits),
+                name: item.map_or_else(String::new, |item| item.name.clone()),
+                data_type: item.map_or_else(String::new, |item| item.type_name.clone()),
+                depends_on: SlotDependence::default(),
+            }
+        })
+        .collect();
+    let writable = object
+        .items
+        .first()
+        .is_some_and(|count| count.access.write != Writable::Never);
+    (!entries.is_empty()).then(|| Pdo {
+        position: object.position,
+        direction,
+        index: object.index,
+        name: object.name.clone(),
+        sm: None,
+        su: None,
+        excluded_sm: Vec::new(),
+        fixed: !writable,
+        mandatory: false,
+        virtual_: false,
+        overwritten_by_module: false,
+        depends_on: SlotDependence::default(),
+        oversampling: None,
+        exclude: Vec::new(),
+        entries,
+    })
+}
+
+/// The values that subindex 0 counts.
+fn defaults(object: &Object) -> impl Iterator<Item = u32> {
+    let (count, rest) = match object.items.split_first() {
+        Some((count, rest)) => (value(&count.default), rest),
+        None => (0, &[][..]),
+    };
+    let count = usize::try_from(count).unwrap_or(usize::MAX);
+    rest.iter()
+        .take(count)
+        .filter(|item| item.has_default)
+        .map(|item| value(&item.default))
+}
+
+fn value(bytes: &[u8]) -> u32 {
+    let mut all = [0; 4];
+    for (to, from) in all.iter_mut().zip(bytes) {
+        *to = *from;
+    }
+    u32::from_le_bytes(all)
+}

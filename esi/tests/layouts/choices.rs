@@ -1,0 +1,187 @@
+//! Every choice that a device offers, one by one.
+
+use std::fmt::Write;
+
+use ecaxis_esi::{Choice, Device, EsiFile, Finding, lint, offered_modes, select};
+
+use super::text::{self, digest};
+
+/// A usual bus cycle.
+const CYCLE_NS: u64 = 1_000_000;
+const MANY_FINDINGS: usize = 24;
+
+pub fn of_file(file: &EsiFile, full: bool) -> String {
+    let mut out = format!(
+        "vendor {:08x}, {} devices, {} modules\n",
+        file.vendor.id,
+        file.devices.len(),
+        file.modules.len()
+    );
+    findings(&mut out, &lint(file));
+    for device in &file.devices {
+        out.push_str(&of_device(file, device, full));
+    }
+    out
+}
+
+fn findings(out: &mut String, all: &[Finding]) {
+    let lines: Vec<String> = all
+        .iter()
+        .map(|f| format!("{} {} {}", f.severity, f.position, f.path))
+        .collect();
+    if lines.len() > MANY_FINDINGS {
+        let errors = lines
+            .iter()
+            .filter(|line| line.starts_with("error"))
+            .count();
+        let _ = writeln!(
+            out,
+            "findings {}, errors {errors}, {}",
+            lines.len(),
+            digest(&lines)
+        );
+    } else {
+        for line in lines {
+            let _ = writeln!(out, "{line}");
+        }
+    }
+}
+
+/// What came of each choice so far; equal ones are named and not repeated.
+struct Choices<'a> {
+    file: &'a EsiFile,
+    device: &'a Device,
+    full: bool,
+    out: String,
+    seen: Vec<(String, Vec<String>)>,
+}
+
+fn of_device(file: &EsiFile, device: &Device, full: bool) -> String {
+    let mut choices = Choices {
+        file,
+        device,
+        full,
+        out: text::device(device),
+        seen: Vec::new(),
+    };
+    let plain = Choice {
+        cycle_ns: CYCLE_NS,
+        ..Choice::default()
+    };
+    choices.add("default", &plain, full);
+    if device.speaks_soe_alone() {
+        return choices.out;
+    }
+    for mode in offered_modes(file, device) {
+        choices.add(
+            &format!("mode {mode}"),
+            &Choice {
+                mode: Some(mode),
+                ..plain
+            },
+            full,
+        );
+    }
+    choices.modules(&plain);
+    for (n, mapping) in device.sm_mappings.iter().enumerate() {
+        let choice = Choice {
+            assignment: Some(&mapping.name),
+            ..plain
+        };
+        choices.add(&format!("assignment {}", n + 1), &choice, full);
+    }
+    for (n, mode) in device.dc_modes.iter().enumerate() {
+        // Some files give several OpModes one name and tell them apart by description.
+        let mut before = device.dc_modes.iter().take(n);
+        let name = match before.any(|other| other.name == mode.name) {
+            true => &mode.description,
+            false => &mode.name,
+        };
+        let choice = Choice {
+            dc_mode: Some(name),
+            ..plain
+        };
+        choices.add(&format!("opmode {}", n + 1), &choice, full);
+    }
+    choices.out
+}
+
+impl Choices<'_> {
+    /// Each module in each place that takes it, the other places as empty as they may be; then one choice that fills
+    /// every place with the first module that it takes.
+    fn modules(&mut self, plain: &Choice<'_>) {
+        let Some(slots) = &self.device.slots else {
+            return;
+        };
+        let mut places: Vec<(bool, Vec<String>)> = Vec::new();
+        for slot in &slots.slots {
+            let classed = self.file.modules.iter().filter(|module| {
+                let class = module.class.as_ref();
+                class.is_some_and(|class| slot.module_classes.contains(class))
+            });
+            let named = slot.module_idents.iter().map(|(ident, _)| *ident);
+            let idents: Vec<String> = named
+                .chain(classed.map(|module| module.ident))
+                .map(|ident| format!("0x{ident:08x}"))
+                .collect();
+            for instance in 0..slot.max_instances.max(slot.min_instances).clamp(1, 16) {
+                places.push((instance < slot.min_instances, idents.clone()));
+            }
+        }
+        let first = |place: &(bool, Vec<String>)| place.1.first().cloned().unwrap_or_default();
+        for (number, (_, idents)) in places.iter().enumerate() {
+            for ident in idents {
+                let modules: Vec<String> = places
+                    .iter()
+                    .enumerate()
+                    .map(|(other, place)| match place {
+                        _ if other == number => ident.clone(),
+                        (true, _) => first(place),
+                        (false, _) => "-".to_owned(),
+                    })
+                    .collect();
+                let name = format!("module {} place {number}", &ident[2..]);
+                self.add_modules(&name, &modules, plain, number == 0);
+            }
+        }
+        if places.len() > 1 {
+            let modules: Vec<String> = places.iter().map(first).collect();
+            self.add_modules("every place", &modules, plain, true);
+        }
+    }
+
+    fn add_modules(&mut self, name: &str, modules: &[String], plain: &Choice<'_>, full: bool) {
+        let modules: Vec<&str> = modules.iter().map(String::as_str).collect();
+        let choice = Choice {
+            modules: &modules,
+            ..*plain
+        };
+        self.add(name, &choice, full && self.full);
+    }
+
+    fn add(&mut self, name: &str, choice: &Choice<'_>, full: bool) {
+        let selection = match select(self.file, self.device, choice) {
+            Ok(selection) => selection,
+            Err(error) => {
+                let _ = writeln!(self.out, "  {name}: {}", text::error(&error));
+                return;
+            }
+        };
+        let dc = text::dc(&selection);
+        let lines = text::selection(&selection);
+        if let Some((same, _)) = self.seen.iter().find(|(_, known)| *known == lines) {
+            let _ = writeln!(self.out, "  {name}: as {same}{dc}");
+            return;
+        }
+        if full {
+            let _ = writeln!(self.out, "  {name}:{dc}");
+            for line in &lines {
+                let _ = writeln!(self.out, "    {line}");
+            }
+        } else {
+            let short = text::short(&selection);
+            let _ = writeln!(self.out, "  {name}:{dc} {short} {}", digest(&lines));
+        }
+        self.seen.push((name.to_owned(), lines));
+    }
+}
