@@ -9,6 +9,9 @@ use crate::select::{Choice, SelectError, offered_modes, select};
 
 /// A usual bus cycle, for what depends on one.
 const CYCLE_NS: u64 = 1_000_000;
+/// Places for modules, over all devices of a file; a device without slots is one.
+const MAX_EFFORT: usize = 20_000;
+const MAX_PLACES: u64 = 254;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Severity {
@@ -40,6 +43,7 @@ pub struct Finding {
 #[must_use]
 pub fn lint(file: &EsiFile) -> Vec<Finding> {
     let mut found = Found(Vec::new());
+    let mut effort = 0usize;
     for warning in &file.warnings {
         found.0.push(Finding {
             severity: Severity::Warning,
@@ -51,7 +55,21 @@ pub fn lint(file: &EsiFile) -> Vec<Finding> {
     for (n, device) in file.devices.iter().enumerate() {
         let path = format!("Device[{}]", n + 1);
         self::device(&mut found, &path, device);
-        usable(&mut found, &path, file, device);
+        effort = effort.saturating_add(places(device));
+        if effort <= MAX_EFFORT {
+            usable(&mut found, &path, file, device);
+        }
+    }
+    if effort > MAX_EFFORT {
+        let position = file
+            .devices
+            .last()
+            .map_or(Position::default(), |d| d.position);
+        let message = format!(
+            "{} devices with their slots have more than {MAX_EFFORT} places for modules; not all layouts were tried",
+            file.devices.len()
+        );
+        found.warn(position, "Devices", message);
     }
     for (n, module) in file.modules.iter().enumerate() {
         self::module(&mut found, &format!("Module[{}]", n + 1), file, module);
@@ -61,6 +79,16 @@ pub fn lint(file: &EsiFile) -> Vec<Finding> {
         .0
         .sort_by_key(|finding| (finding.position.line, finding.position.column));
     found.0
+}
+
+/// What a choice has to go through.
+fn places(device: &Device) -> usize {
+    let slots = device.slots.iter().flat_map(|slots| &slots.slots);
+    let instances = slots.map(|slot| slot.max_instances.max(slot.min_instances).clamp(1, 254));
+    instances
+        .map(|count| usize::try_from(count).unwrap_or(1))
+        .sum::<usize>()
+        .clamp(1, 254)
 }
 
 struct Found(Vec<Finding>);
@@ -115,6 +143,18 @@ fn device(found: &mut Found, path: &str, device: &Device) {
                 let path = format!("{path}/AlternativeSmMapping");
                 found.warn(mapping.position, &path, message);
             }
+        }
+    }
+    if let Some(slots) = &device.slots {
+        let each = slots.slots.iter();
+        let places: u64 = each
+            .map(|slot| u64::from(slot.max_instances.max(slot.min_instances).max(1)))
+            .sum();
+        if places > MAX_PLACES {
+            let message = format!(
+                "{places} places for modules; 0xF030 lists {MAX_PLACES}, and so many are used"
+            );
+            found.warn(slots.position, &format!("{path}/Slots"), message);
         }
     }
     objects(found, path, device);
@@ -269,20 +309,25 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
         cycle_ns: CYCLE_NS,
         ..Choice::default()
     };
-    let default = select(file, device, &choice);
-    match default {
+    let mut refuse = |severity, what: &str, error: &SelectError| {
+        let (position, path) = match error.element() {
+            Some((position, element)) => (position, format!("{path}/{element}")),
+            None => (device.position, path.to_owned()),
+        };
+        found.add(severity, position, &path, format!("{what}: {error}"));
+    };
+    match select(file, device, &choice) {
         Err(error @ SelectError::SoeOnly { .. }) => {
             found.add(Severity::Error, device.position, path, error.to_string());
             return;
         }
+        // Modules are the user's to name; nothing is wrong with the file.
+        Err(error @ SelectError::ModuleNeeded { .. }) => {
+            refuse(Severity::Warning, "its default configuration", &error);
+            return;
+        }
         Err(error) if has_pdos || device.slots.is_some() => {
-            // Modules are the user's to name; nothing is wrong with the file.
-            let severity = match error {
-                SelectError::ModuleNeeded { .. } => Severity::Warning,
-                _ => Severity::Error,
-            };
-            let message = format!("its default configuration: {error}");
-            found.add(severity, device.position, path, message);
+            refuse(Severity::Error, "its default configuration", &error);
             return;
         }
         _ => {}
@@ -293,12 +338,7 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
             ..choice
         };
         if let Err(error) = select(file, device, &choice) {
-            found.add(
-                Severity::Error,
-                device.position,
-                path,
-                format!("mode {mode}: {error}"),
-            );
+            refuse(Severity::Error, &format!("mode {mode}"), &error);
         }
     }
 }

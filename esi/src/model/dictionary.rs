@@ -41,6 +41,21 @@ pub struct Object {
     pub items: Vec<ObjectItem>,
 }
 
+impl Object {
+    /// Bytes in memory, nearly.
+    pub(crate) fn size(&self) -> usize {
+        let items = self.items.iter().map(|item| {
+            let range = [&item.min, &item.max].into_iter().flatten();
+            let data = range.map(Vec::len).sum::<usize>() + item.default.len();
+            size_of::<ObjectItem>() + data + item.name.len() + item.type_name.len()
+        });
+        items.fold(
+            size_of::<Self>() + self.name.len() + self.type_name.len(),
+            usize::saturating_add,
+        )
+    }
+}
+
 #[derive(Debug, Clone, Default)]
 pub struct ObjectItem {
     pub sub: u8,

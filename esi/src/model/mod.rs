@@ -21,6 +21,7 @@ pub use device::*;
 pub use dictionary::*;
 pub use mailbox::*;
 pub use pdo::*;
+pub(crate) use slots::Place;
 pub use slots::*;
 pub use sync::*;
 

@@ -73,6 +73,17 @@ impl Pdo {
     pub fn bit_len(&self) -> u32 {
         self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
     }
+
+    /// Bytes in memory, nearly.
+    pub(crate) fn size(&self) -> usize {
+        let entries = self.entries.iter();
+        let entries = entries.map(|e| size_of::<Entry>() + e.name.len() + e.data_type.len());
+        let lists = self.exclude.len().saturating_mul(size_of::<Excluded>());
+        entries.fold(
+            size_of::<Self>() + self.name.len() + lists,
+            usize::saturating_add,
+        )
+    }
 }
 
 /// A mapped object, or a gap where `index` is 0.

@@ -1,6 +1,6 @@
 //! Slots, and the modules that go there.
 
-use super::{Dictionary, InitCmd, Pdo, Position, SlotDependence};
+use super::{Dictionary, InitCmd, Object, Pdo, Position, SlotDependence};
 
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Slots {
@@ -74,39 +74,106 @@ impl Module {
     /// slots and their instances.
     #[must_use]
     pub fn at(&self, slots: &Slots, slot: &Slot, place: usize) -> Self {
-        let place = u16::try_from(place).unwrap_or(u16::MAX);
-        let group = slot.group.and_then(|group| u16::try_from(group).ok());
-        let group = group.unwrap_or(0);
-        let increments = &slots.increments;
-        let shifted = |index: u16, on: SlotDependence, step: u16, group_step: u16| {
-            let by_slot = if on.slot { place.wrapping_mul(step) } else { 0 };
-            let by_group = if on.group {
-                group.wrapping_mul(group_step)
-            } else {
-                0
-            };
-            index.wrapping_add(by_slot).wrapping_add(by_group)
+        let place = Place::new(slots, slot, place);
+        let mut module = self.without_objects_at(&place);
+        let objects = place.objects(self).map(|(index, object)| Object {
+            index,
+            ..object.clone()
+        });
+        module.dictionary.objects = objects.collect();
+        module
+    }
+
+    /// Bytes in memory, nearly.
+    pub(crate) fn size(&self) -> usize {
+        let pdos = self.rx_pdos.iter().chain(&self.tx_pdos).map(Pdo::size);
+        let commands = self.init_cmds.iter().map(|cmd| {
+            let transitions = cmd
+                .transitions
+                .len()
+                .saturating_mul(size_of::<String>() + 8);
+            size_of::<InitCmd>() + cmd.data.len() + cmd.comment.len() + transitions
+        });
+        let objects = self.dictionary.objects.iter().map(Object::size);
+        let names = self.name.len() + self.type_name.len();
+        pdos.chain(commands)
+            .chain(objects)
+            .fold(size_of::<Self>() + names, usize::saturating_add)
+    }
+
+    /// The same as [`Self::at`] without its dictionary, which [`Place::objects`] tells: it is long, and there are many places.
+    pub(crate) fn without_objects_at(&self, place: &Place) -> Self {
+        let mut module = Self {
+            rx_pdos: self.rx_pdos.clone(),
+            tx_pdos: self.tx_pdos.clone(),
+            init_cmds: self.init_cmds.clone(),
+            class: self.class.clone(),
+            type_name: self.type_name.clone(),
+            name: self.name.clone(),
+            dc_mode: self.dc_mode.clone(),
+            dictionary: Dictionary::default(),
+            ..*self
         };
-        let pdo_step = slot.pdo_increment.unwrap_or(increments.pdo);
-        let pdo_index = |index, on| shifted(index, on, pdo_step, increments.group_pdo);
-        let step = slot.index_increment.unwrap_or(increments.index);
-        let object_index = |index, on| shifted(index, on, step, increments.group_index);
-        let mut module = self.clone();
         for pdo in module.rx_pdos.iter_mut().chain(&mut module.tx_pdos) {
-            pdo.index = pdo_index(pdo.index, pdo.depends_on);
+            pdo.index = place.pdo_index(pdo.index, pdo.depends_on);
             for excluded in &mut pdo.exclude {
-                excluded.index = pdo_index(excluded.index, excluded.depends_on);
+                excluded.index = place.pdo_index(excluded.index, excluded.depends_on);
             }
             for entry in pdo.entries.iter_mut().filter(|entry| !entry.is_gap()) {
-                entry.index = object_index(entry.index, entry.depends_on);
+                entry.index = place.object_index(entry.index, entry.depends_on);
             }
         }
         for command in &mut module.init_cmds {
-            command.index = object_index(command.index, command.depends_on);
-        }
-        for object in &mut module.dictionary.objects {
-            object.index = object_index(object.index, object.depends_on);
+            command.index = place.object_index(command.index, command.depends_on);
         }
         module
+    }
+}
+
+/// Where a module goes, for the indices that it has there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Place {
+    number: u16,
+    group: u16,
+    steps: Increments,
+}
+
+impl Place {
+    pub fn new(slots: &Slots, slot: &Slot, number: usize) -> Self {
+        let group = slot.group.and_then(|group| u16::try_from(group).ok());
+        Self {
+            number: u16::try_from(number).unwrap_or(u16::MAX),
+            group: group.unwrap_or(0),
+            steps: Increments {
+                pdo: slot.pdo_increment.unwrap_or(slots.increments.pdo),
+                index: slot.index_increment.unwrap_or(slots.increments.index),
+                ..slots.increments
+            },
+        }
+    }
+
+    /// A module's objects as they are here.
+    pub fn objects<'m>(&self, module: &'m Module) -> impl Iterator<Item = (u16, &'m Object)> {
+        let place = *self;
+        let objects = module.dictionary.objects.iter();
+        objects.map(move |object| {
+            let index = place.object_index(object.index, object.depends_on);
+            (index, object)
+        })
+    }
+
+    fn pdo_index(&self, index: u16, on: SlotDependence) -> u16 {
+        self.shifted(index, on, self.steps.pdo, self.steps.group_pdo)
+    }
+
+    fn object_index(&self, index: u16, on: SlotDependence) -> u16 {
+        self.shifted(index, on, self.steps.index, self.steps.group_index)
+    }
+
+    fn shifted(&self, index: u16, on: SlotDependence, step: u16, group_step: u16) -> u16 {
+        let counted = |on, number: u16, step| if on { number.wrapping_mul(step) } else { 0 };
+        index
+            .wrapping_add(counted(on.slot, self.number, step))
+            .wrapping_add(counted(on.group, self.group, group_step))
     }
 }

@@ -57,9 +57,24 @@ pub enum SelectError {
     )]
     ExcludedSyncManager { device: String, pdo: u16, sm: u8 },
     #[error(
-        "slot {slot:?} names module 0x{ident:08x}, which neither the ESI file nor a file that it refers to describes"
+        "slot {slot:?} (line {}) names module 0x{ident:08x}, which neither the ESI file nor a file that it refers to describes",
+        position.line
     )]
-    UnknownModule { slot: String, ident: u32 },
+    UnknownModule {
+        slot: String,
+        position: Position,
+        ident: u32,
+    },
+    #[error(
+        "the modules in the {places} places of {device} (Slots on line {}) take more than {limit} bytes, which no device needs",
+        position.line
+    )]
+    ModulesTooLarge {
+        device: String,
+        position: Position,
+        places: usize,
+        limit: usize,
+    },
     #[error("{device} has no DC mode {wanted:?}; the ESI offers {offered}")]
     NoSuchDcMode {
         device: String,
@@ -190,4 +205,18 @@ pub enum SelectError {
     SoeOnly { device: String },
     #[error("{device} has no CoE mailbox, so {what} cannot be written")]
     NoCoe { device: String, what: &'static str },
+}
+
+impl SelectError {
+    /// The element at fault, where it is another than the device itself: its place and name.
+    #[must_use]
+    pub fn element(&self) -> Option<(Position, &'static str)> {
+        match self {
+            Self::UnknownModule { position, .. } => Some((*position, "Slot")),
+            Self::ModulesTooLarge { position, .. } => Some((*position, "Slots")),
+            Self::SyncManagerOutside { position, .. } => Some((*position, "Sm")),
+            Self::TooManySamples { position, .. } => Some((*position, "Pdo")),
+            _ => None,
+        }
+    }
 }

@@ -16,10 +16,12 @@ pub use dc::DcSettings;
 pub use device::{DeviceQuery, find_device};
 pub use error::SelectError;
 
+use std::collections::HashMap;
+
 use crate::layout::Layout;
 use crate::mode::Mode;
 use crate::model::{
-    Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Module, Pdo, Position,
+    Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Module, Object, Pdo, Position,
 };
 use crate::startup::{self, StartupSdo};
 
@@ -169,26 +171,37 @@ pub fn select(
         assignment: assignment.map(|assignment| assignment.name.to_owned()),
         rx,
         tx,
-        dictionary,
+        dictionary: Dictionary::default(),
         dc,
         layout,
         startup: Vec::new(),
         notes,
     };
-    selection.startup = startup::list(device, &mut selection, choice)?;
+    selection.startup = startup::list(device, &mut selection, &dictionary, choice)?;
+    selection.dictionary = dictionary;
     Ok(selection)
 }
 
-fn merged(device: &Device, placed: &[module::Placed]) -> Dictionary {
+fn merged(device: &Device, placed: &[module::Placed<'_>]) -> Dictionary {
     let mut dictionary = device.dictionary.clone();
-    for object in placed.iter().flat_map(|p| &p.module.dictionary.objects) {
-        match dictionary
-            .objects
-            .iter_mut()
-            .find(|known| known.index == object.index)
+    let mut known: HashMap<u16, usize> = HashMap::new();
+    for (at, object) in dictionary.objects.iter().enumerate() {
+        known.entry(object.index).or_insert(at);
+    }
+    for (index, object) in placed.iter().flat_map(|p| p.at.objects(p.source)) {
+        let object = Object {
+            index,
+            ..object.clone()
+        };
+        match known
+            .get(&index)
+            .and_then(|at| dictionary.objects.get_mut(*at))
         {
-            Some(known) => *known = object.clone(),
-            None => dictionary.objects.push(object.clone()),
+            Some(old) => *old = object,
+            None => {
+                known.insert(index, dictionary.objects.len());
+                dictionary.objects.push(object);
+            }
         }
     }
     dictionary

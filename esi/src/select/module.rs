@@ -1,25 +1,36 @@
 //! Which modules go into which slots, and what a module's indices become there.
 
+use std::collections::HashMap;
+use std::rc::Rc;
+
 use super::SelectError;
 use crate::mode::Mode;
-use crate::model::{Device, Module, Slot, Slots};
+use crate::model::{Device, Module, Place, Slot, Slots};
 
 const MODES_OF_OPERATION: u16 = 0x6060;
 /// 0xF030 has so many subindices.
 const MAX_PLACES: usize = 254;
+/// Bytes of the modules in all places together, with their objects. A choice copies them.
+const MAX_SIZE: usize = 24 << 20;
 
 /// A module in its slot; its indices are those that it has there.
 #[derive(Debug, Clone)]
-pub(super) struct Placed {
+pub(super) struct Placed<'m> {
     /// Counted from 0 over all slots and their instances, empty ones included.
     pub place: usize,
     pub slot_name: String,
+    /// Without its dictionary.
     pub module: Module,
+    pub at: Place,
+    /// The module as the file has it.
+    pub source: &'m Module,
 }
 
 /// One instance of a slot.
-struct Place<'a> {
+struct Instance<'a> {
     slot: &'a Slot,
+    /// Every module that the slot takes.
+    offered: Rc<[&'a Module]>,
     name: String,
     required: bool,
 }
@@ -28,15 +39,23 @@ struct Place<'a> {
 ///
 /// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills every required
 /// place that offers drive modes and is not named, or the first place where none is required.
-pub(super) fn choose(
-    modules: &[Module],
-    device: &Device,
+pub(super) fn choose<'m>(
+    modules: &'m [Module],
+    device: &'m Device,
     mode: Option<Mode>,
     wanted: &[&str],
-) -> Result<Vec<Placed>, SelectError> {
-    let no_slots = Slots::default();
-    let slots = device.slots.as_ref().unwrap_or(&no_slots);
-    let places = places(slots);
+) -> Result<Vec<Placed<'m>>, SelectError> {
+    let Some(slots) = device.slots.as_ref() else {
+        return match wanted.len() {
+            0 => Ok(Vec::new()),
+            given => Err(SelectError::TooManyModules {
+                device: device.name.clone(),
+                given,
+                places: 0,
+            }),
+        };
+    };
+    let places = places(modules, slots)?;
     if wanted.len() > places.len() {
         return Err(SelectError::TooManyModules {
             device: device.name.clone(),
@@ -45,66 +64,87 @@ pub(super) fn choose(
         });
     }
     let any_required = places.iter().any(|place| place.required);
-    let mut chosen = Vec::new();
+    let (mut chosen, mut size) = (Vec::new(), 0usize);
     for (number, place) in places.iter().enumerate() {
         let by_name = wanted.get(number).map(|name| name.trim());
         let takes_mode = place.required || (!any_required && number == 0);
         let module = match (by_name, mode) {
-            (Some(name), _) => named(modules, device, place, name)?,
-            (None, Some(mode)) if takes_mode => for_mode(modules, device, place, mode)?,
-            _ => default_module(modules, place)?,
+            (Some(name), _) => named(device, place, name)?,
+            (None, Some(mode)) if takes_mode => for_mode(device, place, mode)?,
+            _ => default_module(place),
         };
         let Some(module) = module else {
             if place.required {
                 return Err(SelectError::ModuleNeeded {
                     device: device.name.clone(),
                     slot: place.name.clone(),
-                    offered: describe(&offered(modules, place.slot)?),
+                    offered: describe(&place.offered),
                 });
             }
             continue;
         };
+        size = size.saturating_add(module.size());
+        if size > MAX_SIZE {
+            return Err(SelectError::ModulesTooLarge {
+                device: device.name.clone(),
+                position: slots.position,
+                places: places.len(),
+                limit: MAX_SIZE,
+            });
+        }
+        let at = Place::new(slots, place.slot, number);
         chosen.push(Placed {
             place: number,
             slot_name: place.name.clone(),
-            module: module.at(slots, place.slot, number),
+            module: module.without_objects_at(&at),
+            at,
+            source: module,
         });
     }
     Ok(chosen)
 }
 
-fn places(slots: &Slots) -> Vec<Place<'_>> {
+fn places<'a>(modules: &'a [Module], slots: &'a Slots) -> Result<Vec<Instance<'a>>, SelectError> {
     let most = slots
         .max_count
         .and_then(|count| usize::try_from(count).ok())
         .filter(|count| *count > 0)
         .map_or(MAX_PLACES, |count| count.min(MAX_PLACES));
+    // Of several descriptions of one module the first is taken.
+    let mut by_ident: HashMap<u32, &Module> = HashMap::new();
+    for module in modules {
+        by_ident.entry(module.ident).or_insert(module);
+    }
     let mut places = Vec::new();
     for slot in &slots.slots {
+        if places.len() >= most {
+            break;
+        }
+        let offered = offered(modules, &by_ident, slot)?;
         let instances = slot.max_instances.max(slot.min_instances).max(1);
         for instance in 0..instances {
             if places.len() >= most {
-                return places;
+                break;
             }
             let name = if instances > 1 {
                 format!("{} {}", slot.name, instance + 1)
             } else {
                 slot.name.clone()
             };
-            places.push(Place {
+            places.push(Instance {
                 slot,
+                offered: Rc::clone(&offered),
                 name,
                 required: instance < slot.min_instances,
             });
         }
     }
-    places
+    Ok(places)
 }
 
 fn named<'a>(
-    modules: &'a [Module],
     device: &Device,
-    place: &Place<'_>,
+    place: &Instance<'a>,
     name: &str,
 ) -> Result<Option<&'a Module>, SelectError> {
     if name.is_empty() || name == "-" {
@@ -117,7 +157,7 @@ fn named<'a>(
             || name.parse().ok(),
             |hex| u32::from_str_radix(hex, 16).ok(),
         );
-    let all = offered(modules, place.slot)?;
+    let all = &place.offered;
     let found = all.iter().copied().find(|module| {
         module.type_name.eq_ignore_ascii_case(name)
             || module.name.eq_ignore_ascii_case(name)
@@ -129,19 +169,18 @@ fn named<'a>(
             device: device.name.clone(),
             slot: place.name.clone(),
             wanted: name.to_owned(),
-            offered: describe(&all),
+            offered: describe(all),
         }),
     }
 }
 
 /// The module of this mode; a slot without drive modules gets its default.
 fn for_mode<'a>(
-    modules: &'a [Module],
     device: &Device,
-    place: &Place<'_>,
+    place: &Instance<'a>,
     mode: Mode,
 ) -> Result<Option<&'a Module>, SelectError> {
-    let all = offered(modules, place.slot)?;
+    let all = &place.offered;
     let by_command = |module: &&&Module| commanded_mode(module) == Some(mode.code());
     let by_name = |module: &&&Module| {
         commanded_mode(module).is_none()
@@ -157,20 +196,25 @@ fn for_mode<'a>(
             Err(SelectError::ModeNotOffered {
                 device: device.name.clone(),
                 mode,
-                offered: describe(&all),
+                offered: describe(all),
             })
         }
-        None => default_module(modules, place),
+        None => Ok(default_module(place)),
     }
 }
 
 /// The modules that one slot takes.
-fn offered<'a>(modules: &'a [Module], slot: &Slot) -> Result<Vec<&'a Module>, SelectError> {
+fn offered<'a>(
+    modules: &'a [Module],
+    by_ident: &HashMap<u32, &'a Module>,
+    slot: &Slot,
+) -> Result<Rc<[&'a Module]>, SelectError> {
     let mut all = Vec::new();
     for &(ident, _) in &slot.module_idents {
-        let found = modules.iter().find(|module| module.ident == ident);
+        let found = by_ident.get(&ident).copied();
         all.push(found.ok_or_else(|| SelectError::UnknownModule {
             slot: slot.name.clone(),
+            position: slot.position,
             ident,
         })?);
     }
@@ -179,24 +223,21 @@ fn offered<'a>(modules: &'a [Module], slot: &Slot) -> Result<Vec<&'a Module>, Se
         class.is_some_and(|class| slot.module_classes.contains(class))
     };
     all.extend(modules.iter().filter(of_class));
-    Ok(all)
+    Ok(all.into())
 }
 
-fn default_module<'a>(
-    modules: &'a [Module],
-    place: &Place<'_>,
-) -> Result<Option<&'a Module>, SelectError> {
-    let all = offered(modules, place.slot)?;
+fn default_module<'a>(place: &Instance<'a>) -> Option<&'a Module> {
+    let all = &place.offered;
     let marked = place
         .slot
         .module_idents
         .iter()
         .find(|(_, default)| *default);
-    Ok(match (marked, all.as_slice()) {
+    match (marked, &all[..]) {
         (Some((ident, _)), _) => all.iter().copied().find(|module| module.ident == *ident),
         (None, [only]) if place.required => Some(only),
         _ => None,
-    })
+    }
 }
 
 /// The mode that a module's own InitCmd writes.
@@ -219,12 +260,17 @@ pub(super) fn mode_of(module: &Module) -> Option<Mode> {
 }
 
 fn describe(modules: &[&Module]) -> String {
+    const SHOWN: usize = 12;
+    let more = modules.len().saturating_sub(SHOWN);
+    let more = (more > 0).then(|| format!("and {more} more"));
     let texts: Vec<String> = modules
         .iter()
+        .take(SHOWN)
         .map(|module| match mode_of(module) {
             Some(mode) => format!("{mode} (module {:?})", module.type_name),
             None => format!("module {:?}", module.type_name),
         })
+        .chain(more)
         .collect();
     if texts.is_empty() {
         "no module".to_owned()

@@ -54,7 +54,7 @@ pub(super) fn assignment<'a>(
 /// One direction of one device.
 pub(super) struct Chooser<'a> {
     pub device: &'a Device,
-    pub placed: &'a [Placed],
+    pub placed: &'a [Placed<'a>],
     pub dictionary: &'a Dictionary,
     pub direction: Direction,
     pub assignment: Option<Assignment<'a>>,

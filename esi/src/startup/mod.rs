@@ -7,7 +7,9 @@
 mod interpolation;
 mod pdo;
 
-use crate::model::{Device, InitCmd, Writable};
+use std::collections::HashMap;
+
+use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
 use crate::select::{Choice, SelectError, SelectedModule, Selection};
 use crate::{Dictionary, Mode};
 
@@ -33,9 +35,11 @@ const MODES_OF_OPERATION: u16 = 0x6060;
 const INTERPOLATION_TIME: u16 = 0x60c2;
 const MODULE_LIST: u16 = 0xf030;
 
+/// `selection` comes without its dictionary, which is `dictionary`.
 pub(crate) fn list(
     device: &Device,
     selection: &mut Selection,
+    dictionary: &Dictionary,
     choice: &Choice<'_>,
 ) -> Result<Vec<StartupSdo>, SelectError> {
     let Some(coe) = device
@@ -45,11 +49,8 @@ pub(crate) fn list(
     else {
         return without_coe(device, selection, choice);
     };
-    let mut list = List {
-        dictionary: selection.dictionary.clone(),
-        sdos: Vec::new(),
-        knows_period: false,
-    };
+    let objects = Objects::new(dictionary);
+    let mut list = List::new(&objects);
     module_list(device, selection, &mut list);
     pdo::configure(device, coe, selection, choice, &mut list)?;
     interpolation_time(selection, choice, &mut list)?;
@@ -101,16 +102,57 @@ fn without_coe(
     Ok(Vec::new())
 }
 
+/// The dictionary, for many questions about it.
+struct Objects<'d> {
+    dictionary: &'d Dictionary,
+    by_index: HashMap<u16, &'d Object>,
+}
+
+impl<'d> Objects<'d> {
+    fn new(dictionary: &'d Dictionary) -> Self {
+        let mut by_index = HashMap::with_capacity(dictionary.objects.len());
+        for object in &dictionary.objects {
+            by_index.entry(object.index).or_insert(object);
+        }
+        Self {
+            dictionary,
+            by_index,
+        }
+    }
+
+    fn is_empty(&self) -> bool {
+        self.by_index.is_empty()
+    }
+
+    fn object(&self, index: u16) -> Option<&'d Object> {
+        self.by_index.get(&index).copied()
+    }
+
+    fn item(&self, index: u16, sub: u8) -> Option<&'d ObjectItem> {
+        self.object(index)?
+            .items
+            .iter()
+            .find(|item| item.sub == sub)
+    }
+}
+
 /// The list under construction.
-#[derive(Default)]
-struct List {
-    dictionary: Dictionary,
+struct List<'d> {
+    objects: &'d Objects<'d>,
     sdos: Vec<StartupSdo>,
     /// 0x60C2 is written from cycle and mode.
     knows_period: bool,
 }
 
-impl List {
+impl<'d> List<'d> {
+    fn new(objects: &'d Objects<'d>) -> Self {
+        Self {
+            objects,
+            sdos: Vec::new(),
+            knows_period: false,
+        }
+    }
+
     fn push(&mut self, index: u16, sub: u8, data: Vec<u8>, origin: &str) {
         self.sdos.push(StartupSdo {
             transition: "PS",
@@ -132,7 +174,7 @@ impl List {
     }
 
     fn name(&self, index: u16, sub: u8) -> String {
-        let Some(object) = self.dictionary.object(index) else {
+        let Some(object) = self.objects.object(index) else {
             return String::new();
         };
         match object.items.iter().find(|item| item.sub == sub) {
@@ -144,7 +186,7 @@ impl List {
     }
 }
 
-fn module_list(device: &Device, selection: &Selection, list: &mut List) {
+fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
     let wanted = device
         .slots
         .as_ref()
@@ -191,16 +233,16 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List) {
 fn interpolation_time(
     selection: &mut Selection,
     choice: &Choice<'_>,
-    list: &mut List,
+    list: &mut List<'_>,
 ) -> Result<(), SelectError> {
     let Some(mode) = selection.mode.filter(|mode| mode.is_cyclic()) else {
         return Ok(());
     };
-    let dictionary = &selection.dictionary;
-    let item = dictionary.item(INTERPOLATION_TIME, 1);
+    let objects = list.objects;
+    let item = objects.item(INTERPOLATION_TIME, 1);
     let writable = match item {
         Some(item) => item.access.write != Writable::Never,
-        None => dictionary.objects.is_empty() && mode != Mode::Cst,
+        None => objects.is_empty() && mode != Mode::Cst,
     };
     if !writable {
         if mode != Mode::Cst {
@@ -225,7 +267,7 @@ fn interpolation_time(
         }
         return Ok(());
     }
-    let (value, exponent) = interpolation::interpolation_time(dictionary, choice.cycle_ns)?;
+    let (value, exponent) = interpolation::interpolation_time(objects.dictionary, choice.cycle_ns)?;
     list.push(INTERPOLATION_TIME, 1, vec![value], "bus.cycle");
     list.push(
         INTERPOLATION_TIME,
@@ -243,7 +285,7 @@ fn is_zero(bytes: &[u8]) -> bool {
 
 /// InitCmds for the way up to Op. One that sets another mode than the chosen one is left out, and so is one that
 /// writes the interpolation time of the maker's usual cycle over that of this bus.
-fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list: &mut List) {
+fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list: &mut List<'_>) {
     for cmd in commands {
         let upwards = UPWARDS
             .into_iter()
@@ -287,7 +329,7 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
     }
 }
 
-fn mode(selection: &mut Selection, list: &mut List) {
+fn mode(selection: &mut Selection, list: &mut List<'_>) {
     let Some(mode) = selection.mode else { return };
     if list
         .sdos
@@ -296,14 +338,14 @@ fn mode(selection: &mut Selection, list: &mut List) {
     {
         return;
     }
-    let dictionary = &selection.dictionary;
-    if !dictionary.objects.is_empty() && dictionary.object(MODES_OF_OPERATION).is_none() {
+    let objects = list.objects;
+    if !objects.is_empty() && objects.object(MODES_OF_OPERATION).is_none() {
         selection
             .notes
             .push("the dictionary has no 0x6060; the mode of operation is not written".to_owned());
         return;
     }
-    let read_only = dictionary
+    let read_only = objects
         .item(MODES_OF_OPERATION, 0)
         .is_some_and(|item| item.access.write == Writable::Never);
     if read_only {
@@ -324,10 +366,10 @@ fn mode(selection: &mut Selection, list: &mut List) {
 fn user(
     choice: &Choice<'_>,
     selection: &mut Selection,
-    list: &mut List,
+    list: &mut List<'_>,
 ) -> Result<(), SelectError> {
     for sdo in choice.sdo {
-        match selection.dictionary.item(sdo.index, sdo.sub) {
+        match list.objects.item(sdo.index, sdo.sub) {
             Some(item) => {
                 let expected = item.default.len();
                 let text = item.type_name.contains("STRING") || item.type_name.contains("ARRAY");
@@ -341,7 +383,7 @@ fn user(
                     });
                 }
             }
-            None if !selection.dictionary.objects.is_empty() => selection.notes.push(format!(
+            None if !list.objects.is_empty() => selection.notes.push(format!(
                 "start-up SDO 0x{:04x}:{:02x} is not in the ESI's dictionary",
                 sdo.index, sdo.sub
             )),

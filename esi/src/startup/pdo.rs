@@ -1,6 +1,6 @@
 //! 0x16xx, 0x1Axx, 0x1C12, 0x1C13: contents and assignment of PDOs.
 
-use super::List;
+use super::{List, Objects};
 use crate::model::{Coe, Device, Direction, Pdo, Writable};
 use crate::select::{Choice, SelectError, Selection};
 
@@ -10,19 +10,16 @@ pub(super) fn configure(
     coe: &Coe,
     selection: &Selection,
     choice: &Choice<'_>,
-    list: &mut List,
+    list: &mut List<'_>,
 ) -> Result<(), SelectError> {
-    let assignments = assignments(device, selection);
+    let assignments = assignments(device, selection, list.objects);
     if !coe.pdo_assign {
         check_assignment(device, selection)?;
     }
     if !coe.pdo_config {
         check_contents(device, selection)?;
     }
-    let mut changes = List {
-        dictionary: list.dictionary.clone(),
-        ..List::default()
-    };
+    let mut changes = List::new(list.objects);
     if coe.pdo_config {
         contents(device, Direction::Tx, selection, choice, &mut changes);
         contents(device, Direction::Rx, selection, choice, &mut changes);
@@ -75,7 +72,11 @@ fn assign_object(sm: u8) -> u16 {
 }
 
 /// Every process data SyncManager with its PDOs, outputs first; one that carries nothing is cleared as well.
-fn assignments<'s>(device: &Device, selection: &'s Selection) -> Vec<(u8, Vec<&'s Pdo>)> {
+fn assignments<'s>(
+    device: &Device,
+    selection: &'s Selection,
+    objects: &Objects<'_>,
+) -> Vec<(u8, Vec<&'s Pdo>)> {
     use crate::model::SmUse::{Inputs, Outputs};
     let mut numbers: Vec<u8> = (0..=u8::MAX)
         .zip(&device.sync_managers)
@@ -91,9 +92,7 @@ fn assignments<'s>(device: &Device, selection: &'s Selection) -> Vec<(u8, Vec<&'
         .collect();
     numbers.sort_unstable();
     numbers.dedup();
-    let known = |index| {
-        selection.dictionary.objects.is_empty() || selection.dictionary.object(index).is_some()
-    };
+    let known = |index| objects.is_empty() || objects.object(index).is_some();
     numbers
         .into_iter()
         .map(|number| {
@@ -112,7 +111,7 @@ fn contents(
     direction: Direction,
     selection: &Selection,
     choice: &Choice<'_>,
-    list: &mut List,
+    list: &mut List<'_>,
 ) {
     let (chosen, offered) = match direction {
         Direction::Rx => (&selection.rx, &device.rx_pdos),
@@ -142,8 +141,8 @@ fn contents(
     // Some drives refuse an object that two mapping objects contain, assigned or not.
     let unused = offered.iter().filter(|pdo| {
         let assigned = chosen.iter().any(|other| other.index == pdo.index);
-        let writable = selection
-            .dictionary
+        let writable = list
+            .objects
             .item(pdo.index, 0)
             .is_some_and(|i| i.access.write != Writable::Never);
         !assigned && !pdo.fixed && !pdo.mandatory && !pdo.virtual_ && writable

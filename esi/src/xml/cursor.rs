@@ -11,8 +11,9 @@ use crate::model::{Position, SlotDependence, Warning};
 
 const MAX_DEPTH: usize = 64;
 const MAX_WARNINGS: usize = 500;
-/// Bytes of data that one file may expand to; the largest known file needs about 2 MB.
-const MAX_EXPANSION: usize = 128 << 20;
+/// Bytes of data that one file's objects may expand to; the largest known file needs a tenth of it. A choice
+/// copies them.
+const MAX_EXPANSION: usize = 32 << 20;
 
 /// Elements that occur several times and therefore carry their number in a path.
 const NUMBERED: [&str; 16] = [
@@ -50,6 +51,7 @@ struct Level<'a> {
     name: &'a str,
     number: u32,
     position: Position,
+    /// Only what is numbered in paths.
     seen: Vec<(&'a str, u32)>,
 }
 
@@ -57,6 +59,7 @@ struct Level<'a> {
 pub(super) struct Element<'a> {
     pub name: &'a str,
     pub position: Position,
+    number: u32,
     start: BytesStart<'a>,
     depth: usize,
 }
@@ -261,7 +264,7 @@ impl<'a> Cursor<'a> {
     /// For oddities found after the element itself was left; `within` names the part of the file.
     pub fn warn_at(&mut self, position: Position, within: &Element<'a>, message: String) {
         if self.warnings.len() < MAX_WARNINGS {
-            let path = self.path(within.depth);
+            let path = self.path_of(within);
             self.warnings.push(Warning {
                 position,
                 path,
@@ -270,20 +273,32 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Accounts for `bytes` of data built from the file.
-    pub fn spend(&mut self, bytes: usize) -> Result<(), EsiError> {
+    /// Accounts for `bytes` of data built from what stands at `position`.
+    pub fn spend(
+        &mut self,
+        bytes: usize,
+        (position, within): (Position, &Element<'a>),
+    ) -> Result<(), EsiError> {
         self.spent = self.spent.saturating_add(bytes);
         if self.spent > MAX_EXPANSION {
-            return Err(self.error(EsiProblem::TooLarge {
-                what: "the objects' bytes",
-                limit: MAX_EXPANSION,
-            }));
+            let (what, limit) = ("the objects' bytes", MAX_EXPANSION);
+            return Err(self.error_within(position, within, EsiProblem::TooLarge { what, limit }));
         }
         Ok(())
     }
 
+    /// For what is found after the element itself was left; `within` names the part of the file.
+    pub fn error_within(
+        &self,
+        position: Position,
+        within: &Element<'a>,
+        problem: EsiProblem,
+    ) -> EsiError {
+        EsiError::new(position, self.path_of(within), problem)
+    }
+
     pub fn error_at(&self, element: &Element<'a>, problem: EsiProblem) -> EsiError {
-        EsiError::new(element.position, self.path(element.depth), problem)
+        EsiError::new(element.position, self.path_of(element), problem)
     }
 
     fn error(&self, problem: EsiProblem) -> EsiError {
@@ -293,7 +308,7 @@ impl<'a> Cursor<'a> {
 
     fn truncated(&self) -> EsiError {
         let name = self.stack.last().map_or("", |level| level.name);
-        self.error(EsiProblem::Truncated(name.to_owned()))
+        self.error(EsiProblem::Truncated(shorten(name)))
     }
 
     fn to_number<T>(
@@ -377,6 +392,7 @@ impl<'a> Cursor<'a> {
             .last_mut()
             .map_or(&mut self.top, |level| &mut level.seen);
         let number = match seen.iter_mut().find(|(known, _)| *known == name) {
+            _ if !NUMBERED.contains(&name) => 1,
             Some((_, count)) => {
                 *count = count.saturating_add(1);
                 *count
@@ -398,6 +414,7 @@ impl<'a> Cursor<'a> {
         Ok(Element {
             name,
             position: self.at,
+            number,
             start,
             depth: self.stack.len(),
         })
@@ -429,29 +446,52 @@ impl<'a> Cursor<'a> {
             return;
         };
         for character in passed.chars() {
-            if character == '\n' {
-                self.at.line = self.at.line.saturating_add(1);
-                self.at.column = 1;
-            } else {
-                self.at.column = self.at.column.saturating_add(1);
-            }
+            step(&mut self.at, character);
         }
         self.at_offset = offset;
+    }
+
+    /// Also of an element that was left already; what is around it is still open.
+    fn path_of(&self, element: &Element<'a>) -> String {
+        let mut path = self.path(element.depth.saturating_sub(1));
+        append(&mut path, element.name, element.number);
+        path
     }
 
     fn path(&self, depth: usize) -> String {
         let mut path = String::new();
         for level in self.stack.iter().take(depth) {
-            if !path.is_empty() {
-                path.push('/');
-            }
-            path.push_str(level.name);
-            if NUMBERED.contains(&level.name) && (level.number > 1 || level.name != "EtherCATInfo")
-            {
-                path.push_str(&format!("[{}]", level.number));
-            }
+            append(&mut path, level.name, level.number);
         }
         path
+    }
+}
+
+fn append(path: &mut String, name: &str, number: u32) {
+    if !path.is_empty() {
+        path.push('/');
+    }
+    path.push_str(&shorten(name));
+    if NUMBERED.contains(&name) && (number > 1 || name != "EtherCATInfo") {
+        path.push_str(&format!("[{number}]"));
+    }
+}
+
+/// Line and column of a byte of `text`.
+pub(super) fn position(text: &str, offset: usize) -> Position {
+    let mut position = Position { line: 1, column: 1 };
+    for character in text.get(..offset).unwrap_or_default().chars() {
+        step(&mut position, character);
+    }
+    position
+}
+
+fn step(position: &mut Position, character: char) {
+    if character == '\n' {
+        position.line = position.line.saturating_add(1);
+        position.column = 1;
+    } else {
+        position.column = position.column.saturating_add(1);
     }
 }
 

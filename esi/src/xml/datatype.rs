@@ -6,6 +6,7 @@ use super::cursor::{Cursor, Element};
 use super::object::{self, Flags};
 use super::text::Names;
 use crate::error::EsiError;
+use crate::model::Position;
 
 #[derive(Default)]
 pub(super) struct DataTypes {
@@ -14,6 +15,7 @@ pub(super) struct DataTypes {
 
 #[derive(Default)]
 pub(super) struct DataType {
+    pub position: Position,
     pub base: Option<String>,
     pub bit_size: u32,
     pub arrays: Vec<ArrayInfo>,
@@ -42,6 +44,28 @@ const MAX_ALIASES: usize = 8;
 impl DataTypes {
     pub fn get(&self, name: &str) -> Option<&DataType> {
         self.by_name.get(name)
+    }
+
+    /// Types whose aliases lead nowhere, in file order.
+    fn circular(&self) -> Vec<(Position, String)> {
+        let is_alias =
+            |of: &DataType| of.base.is_some() && of.arrays.is_empty() && of.sub_items.is_empty();
+        let mut found: Vec<_> = self
+            .by_name
+            .iter()
+            .filter(|(name, of)| {
+                // A base type may name itself: BOOL is a BOOL.
+                let base = self.base(name);
+                is_alias(of)
+                    && of.base.as_ref() != Some(*name)
+                    && self
+                        .get(base)
+                        .is_some_and(|of| is_alias(of) && of.base.as_deref() != Some(base))
+            })
+            .map(|(name, of)| (of.position, name.clone()))
+            .collect();
+        found.sort_by_key(|(position, _)| (position.line, position.column));
+        found
     }
 
     /// Follows enumerations and aliases to the type they are made of; arrays and records stand for themselves.
@@ -75,7 +99,13 @@ pub(super) fn read<'a>(
             types.by_name.entry(name).or_insert(data_type);
         }
         Ok(())
-    })
+    })?;
+    for (position, name) in types.circular() {
+        let name: String = name.chars().take(40).collect();
+        let message = format!("type {name:?} is made of itself; it counts as unknown");
+        c.warn_at(position, element, message);
+    }
+    Ok(())
 }
 
 fn data_type<'a>(
@@ -83,7 +113,10 @@ fn data_type<'a>(
     element: &Element<'a>,
 ) -> Result<(String, DataType), EsiError> {
     let mut name = String::new();
-    let mut data_type = DataType::default();
+    let mut data_type = DataType {
+        position: element.position,
+        ..DataType::default()
+    };
     c.children(element, |c, el| {
         match el.name {
             "Name" => name = c.text(el)?,

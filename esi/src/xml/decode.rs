@@ -13,11 +13,21 @@ const HIGH_CONTROLS: [char; 32] = [
 
 pub(super) struct Decoded {
     pub text: String,
-    /// What to tell the user about the encoding, if anything.
-    pub remark: Option<String>,
+    /// What to tell the user about the encoding, if anything, and where in `text` (bytes).
+    pub remark: Option<(usize, String)>,
 }
 
 pub(super) fn decode(bytes: &[u8]) -> Decoded {
+    let mut decoded = by_encoding(bytes);
+    // XML has no NUL; what is around it is still worth reading.
+    if let (None, Some(at)) = (&decoded.remark, decoded.text.find('\0')) {
+        let message = "a NUL character; the file may be damaged".to_owned();
+        decoded.remark = Some((at, message));
+    }
+    decoded
+}
+
+fn by_encoding(bytes: &[u8]) -> Decoded {
     if let Some(rest) = bytes.strip_prefix(&[0xef, 0xbb, 0xbf]) {
         return utf8(rest);
     }
@@ -39,9 +49,9 @@ pub(super) fn decode(bytes: &[u8]) -> Decoded {
         },
         Some(other) => {
             let mut decoded = utf8(bytes);
-            decoded.remark = Some(format!(
-                "encoding {other:?} is not supported; names may be unreadable"
-            ));
+            let other: String = other.chars().take(40).collect();
+            let message = format!("encoding {other:?} is not supported; names may be unreadable");
+            decoded.remark = Some((0, message));
             decoded
         }
     }
@@ -53,13 +63,18 @@ fn utf8(bytes: &[u8]) -> Decoded {
             text: text.to_owned(),
             remark: None,
         },
-        Err(error) => Decoded {
-            text: windows_1252(bytes),
-            remark: Some(format!(
+        Err(error) => {
+            let (valid, _) = bytes.split_at(error.valid_up_to());
+            let at = windows_1252(valid).len();
+            let message = format!(
                 "byte {} is not UTF-8; the file is read as windows-1252",
                 error.valid_up_to()
-            )),
-        },
+            );
+            Decoded {
+                text: windows_1252(bytes),
+                remark: Some((at, message)),
+            }
+        }
     }
 }
 
@@ -135,6 +150,6 @@ mod tests {
     fn broken_utf_8_is_remarked_and_read() {
         let decoded = decode(b"<a>\xfc</a>");
         assert_eq!(decoded.text, "<a>\u{fc}</a>");
-        assert!(decoded.remark.is_some());
+        assert!(decoded.remark.is_some_and(|(at, _)| at == 3));
     }
 }

@@ -27,9 +27,8 @@ pub(super) fn bytes(
     }
 }
 
-/// `bit_len` bits of a hexadecimal block from `bit_offset` on.
-pub(super) fn slice(block: &str, bit_offset: u32, bit_len: u32) -> Option<Vec<u8>> {
-    let block = hex_bytes(block)?;
+/// `bit_len` bits of a block from `bit_offset` on.
+pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Vec<u8>> {
     let (offset, length) = (
         usize::try_from(bit_offset).ok()?,
         usize::try_from(bit_len).ok()?,
@@ -179,8 +178,11 @@ mod tests {
 
     #[test]
     fn a_block_is_cut_at_bit_offsets() {
-        assert_eq!(slice("0200341278", 16, 16), Some(vec![0x34, 0x12]));
-        assert_eq!(slice("f0", 4, 4), Some(vec![0x0f]));
-        assert_eq!(slice("f0", 4, 8), None);
+        assert_eq!(
+            slice(&[2, 0, 0x34, 0x12, 0x78], 16, 16),
+            Some(vec![0x34, 0x12])
+        );
+        assert_eq!(slice(&[0xf0], 4, 4), Some(vec![0x0f]));
+        assert_eq!(slice(&[0xf0], 4, 8), None);
     }
 }

@@ -31,7 +31,7 @@ mod sync;
 mod text;
 
 use crate::error::EsiError;
-use crate::model::{EsiFile, Position, Warning};
+use crate::model::{EsiFile, Warning};
 
 /// Reads an ESI file (`EtherCATInfo`), a file of modules alone (`EtherCATModule`), or what `ethercat xml` prints
 /// (`EtherCATInfoList`).
@@ -40,8 +40,8 @@ pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
     let mut cursor = cursor::Cursor::new(&decoded.text);
     let mut file = EsiFile::default();
     info::read(&mut cursor, &mut file)?;
-    if let Some(message) = decoded.remark {
-        let position = Position { line: 1, column: 1 };
+    if let Some((at, message)) = decoded.remark {
+        let position = cursor::position(&decoded.text, at);
         file.warnings.push(Warning {
             position,
             path: "EtherCATInfo".to_owned(),

@@ -22,8 +22,8 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Modu
                 module.type_name = c.text(el)?;
             }
             "Name" => names.add(c, el)?,
-            "RxPdo" => module.rx_pdos.push(pdo::read(c, el, Direction::Rx)?),
-            "TxPdo" => module.tx_pdos.push(pdo::read(c, el, Direction::Tx)?),
+            "RxPdo" => pdo::append(c, el, Direction::Rx, &mut module.rx_pdos)?,
+            "TxPdo" => pdo::append(c, el, Direction::Tx, &mut module.tx_pdos)?,
             "Mailbox" => module.init_cmds = mailbox::read(c, el)?.coe.unwrap_or_default().init_cmds,
             "DcOpModeName" => module.dc_mode = Some(c.text(el)?),
             "Profile" => {

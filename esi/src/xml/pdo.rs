@@ -5,7 +5,32 @@ use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, SlotDependence};
 
-pub(super) fn read<'a>(
+/// A frame carries 11888 bits.
+const MAX_ENTRIES: usize = 12_000;
+/// There are 512 mapping objects for each direction.
+const MAX_PDOS: usize = 2048;
+
+/// Reads one more PDO of a device or module.
+pub(super) fn append<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    direction: Direction,
+    to: &mut Vec<Pdo>,
+) -> Result<(), EsiError> {
+    if to.len() >= MAX_PDOS {
+        return Err(c.error_at(
+            element,
+            EsiProblem::TooLarge {
+                what: "the PDOs of one direction",
+                limit: MAX_PDOS,
+            },
+        ));
+    }
+    to.push(read(c, element, direction)?);
+    Ok(())
+}
+
+fn read<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
     direction: Direction,
@@ -41,7 +66,18 @@ pub(super) fn read<'a>(
                 index: c.number(el, "excluded PDO index")?,
             }),
             "ExcludedSm" => pdo.excluded_sm.push(c.number(el, "excluded SyncManager")?),
-            "Entry" => pdo.entries.push(entry(c, el)?),
+            "Entry" => {
+                if pdo.entries.len() >= MAX_ENTRIES {
+                    return Err(c.error_at(
+                        el,
+                        EsiProblem::TooLarge {
+                            what: "a PDO's entries",
+                            limit: MAX_ENTRIES,
+                        },
+                    ));
+                }
+                pdo.entries.push(entry(c, el)?);
+            }
             _ => {}
         }
         Ok(())

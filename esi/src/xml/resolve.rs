@@ -4,9 +4,10 @@
 use super::cursor::{Cursor, Element};
 use super::datatype::{DataType, DataTypes};
 use super::literal;
+use super::number;
 use super::object::{Flags, Info, Literal, RawObject};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Access, Object, ObjectCode, ObjectItem, Writable};
+use crate::model::{Access, Object, ObjectCode, ObjectItem, Position, Writable};
 
 /// One MiB; longer objects (files, domains) carry no default and are transferred by length.
 const MAX_ITEM_BITS: u32 = 8 << 20;
@@ -20,11 +21,14 @@ pub(super) fn object<'a>(
 ) -> Result<Object, EsiError> {
     let data_type = types.get(&raw.type_name);
     let (code, mut slots) = match data_type {
-        Some(record) if !record.sub_items.is_empty() => record_items(types, record),
+        Some(record) if !record.sub_items.is_empty() => {
+            record_items(c, types, record, (raw.position, dictionary))?
+        }
         _ => (ObjectCode::Var, vec![variable(types, data_type, &raw)]),
     };
     if slots.len() > MAX_ITEMS {
-        return Err(c.error_at(
+        return Err(c.error_within(
+            raw.position,
             dictionary,
             EsiProblem::TooLarge {
                 what: "an object's subindices",
@@ -34,10 +38,16 @@ pub(super) fn object<'a>(
     }
     let mut infos = assign_infos(&slots, code, std::mem::take(&mut raw.info.sub_items));
     let mut items = Vec::with_capacity(slots.len());
+    let place = (raw.position, dictionary);
+    let block = match &raw.info.default {
+        Some(Literal::Data(block)) => number::hex_bytes(block),
+        _ => None,
+    };
     for (slot, info) in slots.iter_mut().zip(infos.iter_mut()) {
         if slot.bit_len > MAX_ITEM_BITS {
             let what = "an object's bits";
-            return Err(c.error_at(
+            return Err(c.error_within(
+                raw.position,
                 dictionary,
                 EsiProblem::TooLarge {
                     what,
@@ -60,7 +70,12 @@ pub(super) fn object<'a>(
                 .min(MAX_ITEM_BITS);
         }
         let length = usize::try_from(slot.bit_len.div_ceil(8)).unwrap_or(0);
-        c.spend(length + size_of::<ObjectItem>() + name.len())?;
+        let range = [&own.min, &own.max].into_iter().flatten().count();
+        let names = name.len() + slot.name.len() + slot.type_name.len();
+        c.spend(
+            length.saturating_mul(1 + range) + size_of::<ObjectItem>() + names,
+            place,
+        )?;
         let mut read = |literal: &Option<Literal>, what: &str| -> Option<Vec<u8>> {
             match literal::bytes(literal.as_ref()?, &slot.type_name, slot.bit_len) {
                 Ok(bytes) => bytes,
@@ -77,9 +92,9 @@ pub(super) fn object<'a>(
                 }
             }
         };
-        let default = read(&own.default, "default").or_else(|| match (&raw.info.default, code) {
+        let default = read(&own.default, "default").or_else(|| match (&block, code) {
             // Older files give a record's default as one block, as complete access would carry it.
-            (Some(Literal::Data(block)), ObjectCode::Array | ObjectCode::Record) => {
+            (Some(block), ObjectCode::Array | ObjectCode::Record) => {
                 literal::slice(block, slot.bit_offset, slot.bit_len)
             }
             _ => None,
@@ -146,7 +161,12 @@ fn variable(types: &DataTypes, data_type: Option<&DataType>, raw: &RawObject) ->
     }
 }
 
-fn record_items(types: &DataTypes, record: &DataType) -> (ObjectCode, Vec<Slot>) {
+fn record_items<'a>(
+    c: &mut Cursor<'a>,
+    types: &DataTypes,
+    record: &DataType,
+    (position, dictionary): (Position, &Element<'a>),
+) -> Result<(ObjectCode, Vec<Slot>), EsiError> {
     let mut code = ObjectCode::Record;
     let mut slots: Vec<Slot> = Vec::new();
     let mut running = 0u32;
@@ -165,12 +185,20 @@ fn record_items(types: &DataTypes, record: &DataType) -> (ObjectCode, Vec<Slot>)
                 code = ObjectCode::Array;
                 let element = types.base(array_type.base.as_deref().unwrap_or_default());
                 let elements = array.elements.min(255);
+                if array.elements > 255 {
+                    let message = format!(
+                        "an array of {} elements; there are 255 subindices",
+                        array.elements
+                    );
+                    c.warn_at(position, dictionary, message);
+                }
                 let share = bits.checked_div(array.elements).unwrap_or(0);
                 let bits = first_non_zero([literal::base_bits(element), share, 0]);
                 for number in 0..elements {
                     let Ok(sub) = u8::try_from(array.lower_bound.saturating_add(number)) else {
                         break;
                     };
+                    c.spend(size_of::<Slot>() + element.len(), (position, dictionary))?;
                     slots.push(Slot {
                         sub,
                         name: format!("SubIndex {sub:03}"),
@@ -200,7 +228,7 @@ fn record_items(types: &DataTypes, record: &DataType) -> (ObjectCode, Vec<Slot>)
             break;
         }
     }
-    (code, slots)
+    Ok((code, slots))
 }
 
 /// `Info/SubItem`s name the subindices of a record; where they do not, they stand in subindex order.

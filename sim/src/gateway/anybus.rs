@@ -87,6 +87,7 @@ fn pdos(templates: &[EsiPdo], direction: Direction, size: u16) -> Vec<EsiPdo> {
                 mandatory: true,
                 virtual_: false,
                 overwritten_by_module: false,
+                oversampling: None,
                 exclude: Vec::new(),
                 su: None,
                 excluded_sm: Vec::new(),
