@@ -9,6 +9,12 @@
 mod common;
 #[path = "mutations/memory.rs"]
 mod memory;
+#[path = "mutations/modules.rs"]
+mod modules;
+#[path = "mutations/process_data.rs"]
+mod process_data;
+#[path = "mutations/structure.rs"]
+mod structure;
 #[path = "mutations/table.rs"]
 mod table;
 
@@ -137,7 +143,13 @@ fn each_damage_is_told_at_its_place() {
     assert!(said.is_empty(), "{said:#?}");
     let mut wrong = Vec::new();
     let (mut highest, mut longest) = (0, Duration::ZERO);
-    for mutation in table::MUTATIONS {
+    let tables = [
+        structure::MUTATIONS,
+        process_data::MUTATIONS,
+        modules::MUTATIONS,
+    ];
+    let mutations: Vec<&Mutation> = tables.into_iter().flatten().collect();
+    for &mutation in &mutations {
         match check(mutation, &original) {
             Ok((said, peak, took)) => {
                 println!(
@@ -157,13 +169,13 @@ fn each_damage_is_told_at_its_place() {
     }
     println!(
         "{} kinds of damage, at most {} MB and {} ms; undamaged {} ms",
-        table::MUTATIONS.len(),
+        mutations.len(),
         highest >> 20,
         longest.as_millis(),
         undamaged.as_millis()
     );
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
-    assert!(table::MUTATIONS.len() >= 30);
+    assert!(mutations.len() >= 30);
     // Damage must not make work out of proportion; absolute times depend on the machine.
     assert!(
         longest < 100 * undamaged,
