@@ -39,7 +39,8 @@ fn whole_cycle(c: &mut Criterion) {
         options.clock.enter();
         let (progress, _told) = channel();
         let stop = Arc::new(AtomicBool::new(false));
-        let prepared = prepare(&Arc::new(machine), &options, stop, progress).expect("comes up");
+        let prepared =
+            prepare(&Arc::new(machine), &options, stop, progress, None).expect("comes up");
         let mut engine = Engine::new(prepared.parts);
         group.throughput(Throughput::Elements(count as u64));
         group.bench_function(BenchmarkId::from_parameter(count), |b| {

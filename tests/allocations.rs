@@ -135,6 +135,7 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
         &options,
         Arc::new(AtomicBool::new(false)),
         progress,
+        None,
     )
     .expect("comes up");
     parts.link = Box::new(Unmetered(parts.link));

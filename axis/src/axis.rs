@@ -78,6 +78,8 @@ pub struct Axis {
     sent: Counts,
     sent_before: Counts,
     dt_s: f64,
+    /// Of the inputs of this cycle.
+    fresh: bool,
     watch: supervise::Watch,
     held_by_range: bool,
     guarded_cycles: u32,
@@ -115,6 +117,7 @@ impl Axis {
             sent: Counts::default(),
             sent_before: Counts::default(),
             dt_s: 0.0,
+            fresh: false,
             watch: supervise::Watch::default(),
             held_by_range: false,
             guarded_cycles: 0,
@@ -148,7 +151,7 @@ impl Axis {
     }
 
     /// The set-point's position in the coming cycle, from outside: for groups, streams and controllers of one's own. To be
-    /// called before every [`Axis::step`]; after a cycle without it the axis decelerates and holds. Refused, and so
+    /// called before every [`Axis::step`], or between its halves; after a cycle without it the axis decelerates and holds. Refused, and so
     /// decelerated, where it steps further than the velocity limit allows, changes the velocity by more than the acceleration
     /// limit allows, or leaves the range. RT: O(1), never blocks or allocates.
     pub fn set_point(&mut self, position: f64) -> Result<(), Refused> {
@@ -158,12 +161,20 @@ impl Axis {
     /// One cycle of `dt_s` seconds (the nominal cycle time, 1 µs to 0.1 s; what is not is cut down to it, or no time at all).
     /// RT: O(1), never blocks or allocates.
     pub fn step(&mut self, inputs: &Inputs, dt_s: f64) -> Outputs {
+        self.observe(inputs, dt_s);
+        self.act()
+    }
+
+    /// The first half of [`Axis::step`]: takes the inputs in and judges them, so that [`Axis::status`] is of this cycle and
+    /// commands can answer it. RT: O(1), never blocks or allocates.
+    pub fn observe(&mut self, inputs: &Inputs, dt_s: f64) {
         let dt_s = if dt_s >= SHORTEST_CYCLE_S {
             dt_s.min(LONGEST_CYCLE_S)
         } else {
             0.0
         };
         self.dt_s = dt_s;
+        self.fresh = inputs.fresh;
         if inputs.fresh {
             self.read(inputs);
             self.judge();
@@ -172,10 +183,15 @@ impl Axis {
             self.watch.lost(self.sent_before);
         }
         self.actual.pass(dt_s);
+    }
+
+    /// The second half: from the inputs and commands to the outputs. RT: O(1), never blocks or allocates.
+    pub fn act(&mut self) -> Outputs {
+        let (fresh, dt_s) = (self.fresh, self.dt_s);
         self.settle_wish(dt_s);
-        self.settle_mode(inputs.fresh, dt_s);
-        self.switch_power(inputs.fresh, dt_s);
-        if inputs.fresh {
+        self.settle_mode(fresh, dt_s);
+        self.switch_power(fresh, dt_s);
+        if fresh {
             self.update_active();
         }
         let sent = self.sent;
@@ -185,7 +201,7 @@ impl Axis {
             self.freeze();
         } else {
             self.advance(dt_s);
-            self.close_loops(inputs.fresh, dt_s);
+            self.close_loops(fresh, dt_s);
         }
         self.fed = None;
         self.sent_before = sent;

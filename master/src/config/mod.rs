@@ -38,6 +38,7 @@ mod tests;
 mod units;
 
 pub use problem::{ConfigError, Problem};
+pub use signal::{AxisRef, InputRef, NameError, OutputRef};
 
 use ecaxis_esi as esi;
 

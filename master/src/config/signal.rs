@@ -2,15 +2,40 @@
 
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
-use toml::Spanned;
 
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::Known;
-use super::{DeviceConfig, Signal};
+use super::{DeviceConfig, Machine, Signal};
 
 /// Axes write these themselves (CiA 402, ETG.6010).
 const AXIS_OUTPUTS: [u16; 7] = [0x6040, 0x6060, 0x6071, 0x607a, 0x60b1, 0x60b2, 0x60ff];
+
+/// Whether a signal comes in or goes out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    In,
+    Out,
+}
+
+impl Way {
+    fn noun(self) -> &'static str {
+        match self {
+            Self::In => "input",
+            Self::Out => "output",
+        }
+    }
+}
+
+/// A name that means no axis and no process data of the machine.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{message}; {hint}")]
+pub struct NameError {
+    pub message: String,
+    pub hint: String,
+    /// The device's name is wrong, not the signal's.
+    device: bool,
+}
 
 /// What can be read, or set, of one device.
 struct Candidates<'d> {
@@ -76,12 +101,7 @@ pub(crate) fn input(
     devices: &[Known<'_>],
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
-    let (index, device) = device(&raw.device, devices, p)?;
-    let candidates = Candidates {
-        fields: &device.selection.layout.tx,
-        pdos: &device.selection.tx,
-    };
-    one(&raw.name, "input", index, device, &candidates, p)
+    said(raw, devices, Way::In, p)
 }
 
 /// An output of the machine that no axis writes.
@@ -90,46 +110,59 @@ pub(crate) fn output(
     devices: &[Known<'_>],
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
-    let (index, device) = device(&raw.device, devices, p)?;
-    let candidates = Candidates {
-        fields: &device.selection.layout.rx,
-        pdos: &device.selection.rx,
-    };
-    let signal = one(&raw.name, "output", index, device, &candidates, p)?;
-    if device.axis.is_some() && AXIS_OUTPUTS.contains(&signal.field.index) {
-        let message = format!("`{}` is written by the axis itself", signal.name);
-        p.add_hint(raw.name.span(), message, "give the axis a command instead");
-        return None;
-    }
-    Some(signal)
+    said(raw, devices, Way::Out, p)
 }
 
-fn device<'d>(
-    name: &Spanned<String>,
-    devices: &[Known<'d>],
-    p: &mut Problems<'_>,
-) -> Option<(usize, &'d DeviceConfig)> {
-    let Some(index) = devices.iter().position(|d| d.name == name.get_ref()) else {
-        let message = format!("no device is named `{}`", name.get_ref());
-        let known = devices.iter().map(|d| d.name);
-        let hint = suggestion(name.get_ref(), known, "devices");
-        p.add_hint(name.span(), message, hint);
-        return None;
-    };
-    // Nothing can be said of a device that is wrong itself, and that has been said.
-    Some((index, devices[index].device?))
+fn said(raw: &RawSignal, devices: &[Known<'_>], way: Way, p: &mut Problems<'_>) -> Option<Signal> {
+    let names = devices.iter().map(|d| d.name);
+    let found = place(raw.device.get_ref(), names).and_then(|index| {
+        // Nothing can be said of a device that is wrong itself, and that has been said.
+        let device = devices[index].device;
+        device
+            .map(|device| one(raw.name.get_ref(), way, index, device))
+            .transpose()
+    });
+    found.unwrap_or_else(|error| {
+        let at = if error.device { &raw.device } else { &raw.name };
+        p.add_hint(at.span(), error.message, error.hint);
+        None
+    })
 }
 
-fn one(
-    name: &Spanned<String>,
-    what: &str,
-    index: usize,
-    device: &DeviceConfig,
-    candidates: &Candidates<'_>,
-    p: &mut Problems<'_>,
-) -> Option<Signal> {
-    let wanted = name.get_ref();
+fn place<'n>(
+    name: &str,
+    mut names: impl Iterator<Item = &'n str> + Clone,
+) -> Result<usize, NameError> {
+    let all = names.clone();
+    names.position(|n| n == name).ok_or_else(|| NameError {
+        message: format!("no device is named `{name}`"),
+        hint: suggestion(name, all, "devices"),
+        device: true,
+    })
+}
+
+fn one(wanted: &str, way: Way, index: usize, device: &DeviceConfig) -> Result<Signal, NameError> {
+    let what = way.noun();
+    let wrong = |message: String, hint: String| NameError {
+        message,
+        hint,
+        device: false,
+    };
+    let candidates = match way {
+        Way::In => Candidates {
+            fields: &device.selection.layout.tx,
+            pdos: &device.selection.tx,
+        },
+        Way::Out => Candidates {
+            fields: &device.selection.layout.rx,
+            pdos: &device.selection.rx,
+        },
+    };
     let found = candidates.find(wanted);
+    let names = |fields: &[&Field]| -> Vec<String> {
+        let names = fields.iter().map(|field| candidates.name(field));
+        names.collect()
+    };
     let field = match found.as_slice() {
         [field] => *field,
         [] => {
@@ -137,46 +170,100 @@ fn one(
                 "`{}` has no {what} \"{wanted}\" in its process data",
                 device.name
             );
-            let names: Vec<String> = candidates
-                .fields
-                .iter()
-                .map(|field| candidates.name(field))
-                .collect();
+            let names = names(&candidates.fields.iter().collect::<Vec<_>>());
             let hint = if names.is_empty() {
                 format!("it has no {what}s at all")
             } else {
                 let names = names.iter().map(String::as_str);
                 suggestion(wanted, names, &format!("its {what}s"))
             };
-            p.add_hint(name.span(), message, hint);
-            return None;
+            return Err(wrong(message, hint));
         }
         several => {
             let message = format!(
                 "\"{wanted}\" is the name of several {what}s of `{}`",
                 device.name
             );
-            let names: Vec<String> = several.iter().map(|f| candidates.name(f)).collect();
-            let names = names.iter().map(|n| format!("\"{n}\"")).collect::<Vec<_>>();
-            p.add_hint(
-                name.span(),
-                message,
-                format!("write one of {}", names.join(", ")),
-            );
-            return None;
+            let names = names(several).into_iter().map(|n| format!("\"{n}\""));
+            let names = names.collect::<Vec<_>>().join(", ");
+            return Err(wrong(message, format!("write one of {names}")));
         }
     };
-    if !(1..=64).contains(&field.bit_len) {
-        let message = format!(
-            "\"{wanted}\" has {} bits and is not a number",
-            field.bit_len
-        );
-        p.add(name.span(), message);
-        return None;
-    }
-    Some(Signal {
+    let signal = Signal {
         device: index,
         name: format!("{}.{}", device.name, candidates.name(field)),
         field: field.clone(),
-    })
+    };
+    if !(1..=64).contains(&field.bit_len) {
+        let message = format!("`{}` has {} bits", signal.name, field.bit_len);
+        return Err(wrong(message, "numbers have 64 bits at most".to_owned()));
+    }
+    if way == Way::Out && device.axis.is_some() && AXIS_OUTPUTS.contains(&field.index) {
+        let message = format!("`{}` is written by the axis itself", signal.name);
+        return Err(wrong(message, "give the axis a command instead".to_owned()));
+    }
+    Ok(signal)
+}
+
+/// An axis of a machine, by which a controller names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct AxisRef(pub(crate) usize);
+
+/// An input of a machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct InputRef(pub(crate) usize);
+
+/// An output of a machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct OutputRef(pub(crate) usize);
+
+/// What a controller needs to know before the machine runs.
+impl Machine {
+    /// The axis of the device of this name.
+    ///
+    /// # Errors
+    /// No device is named so, or it has no axis.
+    pub fn axis(&self, name: &str) -> Result<AxisRef, NameError> {
+        let axes = self.devices.iter().filter(|d| d.axis.is_some());
+        let names = axes.map(|d| d.name.as_str());
+        let at = place(name, names.clone()).map_err(|error| NameError {
+            message: format!("no axis is named `{name}`"),
+            hint: suggestion(name, names, "axes"),
+            ..error
+        })?;
+        Ok(AxisRef(at))
+    }
+
+    /// An input by its device's name and its own: that of its entry in the ESI, that of its PDO, both as `PDO/entry`,
+    /// or its address as `0x6000:01`.
+    ///
+    /// # Errors
+    /// Nothing has this name, or several have.
+    pub fn input(&mut self, device: &str, name: &str) -> Result<InputRef, NameError> {
+        let signal = self.signal(device, name, Way::In)?;
+        Ok(InputRef(known(&mut self.inputs, signal)))
+    }
+
+    /// An output that no axis writes; named as inputs are.
+    ///
+    /// # Errors
+    /// Nothing has this name, several have, or an axis writes it.
+    pub fn output(&mut self, device: &str, name: &str) -> Result<OutputRef, NameError> {
+        let signal = self.signal(device, name, Way::Out)?;
+        Ok(OutputRef(known(&mut self.outputs, signal)))
+    }
+
+    fn signal(&self, device: &str, name: &str, way: Way) -> Result<Signal, NameError> {
+        let index = place(device, self.devices.iter().map(|d| d.name.as_str()))?;
+        one(name, way, index, &self.devices[index])
+    }
+}
+
+/// The place of a signal among those in use.
+pub(crate) fn known(signals: &mut Vec<Signal>, signal: Signal) -> usize {
+    if let Some(known) = signals.iter().position(|s| *s == signal) {
+        return known;
+    }
+    signals.push(signal);
+    signals.len() - 1
 }

@@ -287,7 +287,7 @@ impl Checker<'_> {
         }
         let [equal, above, below] = bounds.map(|bound| bound.map(|n| *n.get_ref()));
         Some(Condition {
-            input: place(&mut self.inputs, input),
+            input: signal::known(&mut self.inputs, input),
             equal,
             above,
             below,
@@ -302,17 +302,8 @@ impl Checker<'_> {
     ) -> Option<(usize, f64)> {
         let output = signal::output(raw, self.devices, p)?;
         possible(&output, value, p)?;
-        Some((place(&mut self.outputs, output), *value.get_ref()))
+        Some((signal::known(&mut self.outputs, output), *value.get_ref()))
     }
-}
-
-/// The place of a signal among those in use.
-fn place(signals: &mut Vec<Signal>, signal: Signal) -> usize {
-    if let Some(known) = signals.iter().position(|s| *s == signal) {
-        return known;
-    }
-    signals.push(signal);
-    signals.len() - 1
 }
 
 /// A value that the signal's bits can hold.

@@ -1,7 +1,10 @@
 //! One turn of the loop: wake, send, receive, check, step, publish.
 
-use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, State};
+use std::panic::AssertUnwindSafe;
 
+use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, Refused, State};
+
+use super::controller::{self, Controller};
 use super::exchange::{Answer, Exchange, Received};
 use super::guard::{Guard, StopCause};
 use super::handover::{Event, ORDERS_A_CYCLE, Order, PhaseStatus, RtEnd, Snapshot};
@@ -45,6 +48,11 @@ impl AxisSlot {
             ordered: false,
             rested: 0,
         }
+    }
+
+    pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {
+        self.ordered |= command == Command::Enable;
+        self.axis.command(command)
     }
 
     fn read(&self, image: &[u8], fresh: bool) -> Inputs {
@@ -106,6 +114,8 @@ pub struct Engine {
     signals: Signals,
     /// Of the last cycle with fresh inputs.
     inputs: Vec<f64>,
+    controller: Option<Box<dyn Controller>>,
+    finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
     guard: Guard,
@@ -131,6 +141,7 @@ pub struct Parts {
     pub exchange: Exchange,
     pub axes: Vec<AxisSlot>,
     pub signals: Signals,
+    pub controller: Option<Box<dyn Controller>>,
     pub phase: Option<Phase>,
     pub guard: Guard,
     pub end: RtEnd,
@@ -159,6 +170,8 @@ impl Engine {
             axes: parts.axes,
             inputs: vec![0.0; parts.signals.inputs.len()],
             signals: parts.signals,
+            controller: parts.controller,
+            finished: false,
             phase: parts.phase,
             phase_error: 0,
             guard: parts.guard,
@@ -210,8 +223,10 @@ impl Engine {
             self.stop(cause);
         }
 
+        self.observe();
         self.take_orders();
-        self.step_axes();
+        self.call_controller();
+        self.act();
         self.exchange.stage();
         self.publish(woke);
         self.plan_next(adjust);
@@ -333,8 +348,7 @@ impl Engine {
                 let Some(slot) = self.axes.get_mut(axis) else {
                     return;
                 };
-                slot.ordered |= command == Command::Enable;
-                if let Err(reason) = slot.axis.command(command) {
+                if let Err(reason) = slot.command(command) {
                     let cycle = self.stats.counters.cycles;
                     self.report(Event::Refused {
                         cycle,
@@ -396,16 +410,52 @@ impl Engine {
         self.report(Event::Stopping { cycle, cause });
     }
 
-    fn step_axes(&mut self) {
+    fn observe(&mut self) {
         let dt = self.timing.cycle_ns as f64 * 1e-9;
         let fresh = self.answer.inputs_fresh && self.answer.complete;
+        let image = self.exchange.inputs();
+        for slot in &mut self.axes {
+            let inputs = slot.read(image, fresh);
+            slot.axis.observe(&inputs, dt);
+        }
+        if fresh {
+            for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
+                *to = signal.get(image);
+            }
+        }
+    }
+
+    /// The user's own code. What it has done when it panics is kept: the axes guard themselves.
+    fn call_controller(&mut self) {
+        let Some(controller) = &mut self.controller else {
+            return;
+        };
+        let mut view = controller::Cycle {
+            number: self.stats.counters.cycles,
+            dt_s: self.timing.cycle_ns as f64 * 1e-9,
+            fresh: self.answer.inputs_fresh && self.answer.complete,
+            stopping: self.stopping.is_some(),
+            guarded: self.guarding,
+            axes: &mut self.axes,
+            inputs: &self.inputs,
+            signals: &self.signals,
+            outputs: self.exchange.outputs_mut(),
+            finished: &mut self.finished,
+        };
+        let call = AssertUnwindSafe(|| controller.cycle(&mut view));
+        if std::panic::catch_unwind(call).is_err() {
+            self.controller = None;
+            self.stop(StopCause::Controller);
+        }
+    }
+
+    fn act(&mut self) {
         let out_of_patience = self.stopping.is_some_and(|(_, since)| {
             self.next.saturating_sub(since) > self.timing.stop_patience_ns
         });
         let mut cause = None;
         for (index, slot) in self.axes.iter_mut().enumerate() {
-            let inputs = slot.read(self.exchange.inputs(), fresh);
-            let outputs = slot.axis.step(&inputs, dt);
+            let outputs = slot.axis.act();
             slot.write(self.exchange.outputs_mut(), &outputs);
             let status = slot.axis.status();
             slot.armed |= slot.ordered && status.fault.is_none();
@@ -454,12 +504,7 @@ impl Engine {
         for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
             *to = slot.axis.status();
         }
-        if self.answer.inputs_fresh {
-            let image = self.exchange.inputs();
-            for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
-                *to = signal.get(image);
-            }
-        }
+        snapshot.finished = self.finished;
         snapshot.inputs.copy_from_slice(&self.inputs);
         for (to, diagnosis) in snapshot.diagnoses.iter_mut().zip(self.exchange.diagnoses()) {
             *to = *diagnosis;
@@ -520,6 +565,7 @@ pub fn first_snapshot(axes: &[AxisSlot], signals: &Signals, devices: usize) -> S
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
         inputs: vec![0.0; signals.inputs.len()],
+        finished: false,
         diagnoses: vec![super::exchange::Diagnosis::default(); devices],
         stopping: None,
         stopped: false,

@@ -73,6 +73,8 @@ pub struct Snapshot {
     pub axes: Vec<AxisStatus>,
     /// What the program reads, in the order of [`super::cycle::Signals::inputs`]; of the last cycle with fresh inputs.
     pub inputs: Vec<f64>,
+    /// The controller's work is done.
+    pub finished: bool,
     pub diagnoses: Vec<Diagnosis>,
     /// First cause, once the machine is stopping.
     pub stopping: Option<StopCause>,

@@ -7,6 +7,7 @@
 //! - [`guard`]: how many bad cycles the machine rides through;
 //! - [`stats`]: bounded histograms and counters;
 //! - [`handover`]: the queues to and from everybody else;
+//! - [`controller`]: a user's own code in the cycle;
 //! - [`cycle`]: one turn of the loop, from wake-up to publishing;
 //! - [`thread`]: scheduling class, affinity and memory of the thread that turns it.
 //!
@@ -21,6 +22,7 @@
     )
 )]
 
+pub mod controller;
 pub mod cycle;
 pub mod exchange;
 pub mod guard;

@@ -126,6 +126,8 @@ pub enum RunError {
     },
     #[error("{device}: could not be brought to rest and disabled: stays in {state}")]
     NotDisabled { device: DeviceRef, state: State },
+    #[error("the controller panicked")]
+    Controller,
     #[error("interrupted")]
     Interrupted,
     #[error("internal error: {0}")]

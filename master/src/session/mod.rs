@@ -21,6 +21,7 @@ use crate::clock::{Clock, Nanos};
 use crate::config::{self, Machine, Signal};
 use crate::link::Link;
 use crate::link::port::{Port, main_device, pump};
+use crate::rt::controller::Controller;
 use crate::rt::exchange::Exchange;
 use crate::rt::guard::Guard;
 use crate::rt::handover::ends;
@@ -101,11 +102,33 @@ pub fn run(
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
 ) -> Outcome {
+    start(machine, options, stop, observer, None)
+}
+
+/// Like [`run`], with a controller of one's own in the place of the file's program: all axes are enabled, then they are
+/// its until it calls [`rt::controller::Cycle::finish`], or something else ends the run.
+pub fn run_with(
+    machine: Machine,
+    options: Options,
+    stop: Arc<AtomicBool>,
+    observer: &mut dyn Observer,
+    controller: Box<dyn Controller>,
+) -> Outcome {
+    start(machine, options, stop, observer, Some(controller))
+}
+
+fn start(
+    machine: Machine,
+    options: Options,
+    stop: Arc<AtomicBool>,
+    observer: &mut dyn Observer,
+    controller: Option<Box<dyn Controller>>,
+) -> Outcome {
     let (progress, told) = channel();
     let owner = thread::Builder::new()
         .name("ecaxis-rt".to_owned())
         .stack_size(STACK)
-        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress));
+        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, controller));
     let owner = match owner {
         Ok(owner) => owner,
         Err(error) => return RunError::Thread(error.to_string()).into(),
@@ -140,6 +163,7 @@ pub fn prepare(
     options: &Options,
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
+    controller: Option<Box<dyn Controller>>,
 ) -> Result<Prepared, RunError> {
     // Whatever can be known to fail without a bus fails before there is one.
     let (image, slots, axes, signals) = plan(machine)?;
@@ -165,6 +189,7 @@ pub fn prepare(
             let mut exchange = Exchange::new(&bus.image, bus.dc.as_ref(), &stations);
             hold_outputs(machine, &bus, &mut exchange);
             exchange.stage();
+            let controlled = controller.is_some();
             let parts = Parts {
                 clock,
                 timing,
@@ -173,6 +198,7 @@ pub fn prepare(
                 exchange,
                 axes: slots,
                 signals,
+                controller,
                 phase: bus.dc.as_ref().map(Phase::new),
                 guard: Guard::new(
                     machine.bus.lost_frames,
@@ -190,6 +216,7 @@ pub fn prepare(
                 repeat: options.repeat.unwrap_or(machine.repeat),
                 limit: options.limit,
                 enable: options.enable,
+                controlled,
                 axes,
                 stop_patience: timing.stop_patience_ns,
                 orders_given: 0,
@@ -297,10 +324,12 @@ fn own_the_link(
     options: &Options,
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
+    controller: Option<Box<dyn Controller>>,
 ) -> Outcome {
     options.clock.enter();
     let told = progress.clone();
-    let Prepared { parts, supervisor } = match prepare(machine, options, stop, progress) {
+    let Prepared { parts, supervisor } = match prepare(machine, options, stop, progress, controller)
+    {
         Ok(prepared) => prepared,
         Err(error) => return error.into(),
     };

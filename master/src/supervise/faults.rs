@@ -17,6 +17,7 @@ impl Supervisor {
         match cause {
             // `tick` asks only for causes that are failures.
             StopCause::Requested => RunError::Interrupted,
+            StopCause::Controller => RunError::Controller,
             StopCause::DriveFault { axis } => {
                 let code = self.error_code(axis).await;
                 if let Some(code) = code {

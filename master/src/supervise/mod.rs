@@ -57,6 +57,8 @@ pub struct Supervisor {
     /// Time limit of the program; it is repeated until then.
     pub limit: Option<Nanos>,
     pub enable: bool,
+    /// A controller takes the program's place.
+    pub controlled: bool,
     /// Indices into the machine's devices, one an axis of the cycle.
     pub axes: Vec<usize>,
     /// How long the cycle waits for its slowest axis to come to rest.
@@ -119,6 +121,9 @@ impl Supervisor {
         self.order(Order::Guard).await;
         if !self.enable {
             return self.hold(clock::now()).await;
+        }
+        if self.controlled {
+            return self.follow_controller(ended).await;
         }
         if !program::enables(&self.machine.steps) {
             let all: Vec<usize> = (0..self.axes.len()).collect();

@@ -57,6 +57,20 @@ impl Supervisor {
         }
     }
 
+    /// Enables every axis and leaves them to the controller until it has finished.
+    pub(super) async fn follow_controller(&mut self, ended: &mut Ended) -> Result<(), RunError> {
+        let start = clock::now();
+        let all: Vec<usize> = (0..self.axes.len()).collect();
+        self.enable_axes(&all).await?;
+        while !self.over(start) {
+            if self.tick().await?.finished {
+                ended.runs += 1;
+                break;
+            }
+        }
+        Ok(())
+    }
+
     fn over(&self, start: Nanos) -> bool {
         self.limit
             .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)

@@ -1,0 +1,199 @@
+//! A user's own controller in the cycle, guarded like everything else.
+
+mod common;
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, atomic::AtomicBool};
+
+use common::{Heard, load, virtual_time};
+use ecaxis::config::{AxisRef, InputRef, Machine, OutputRef};
+use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::session::{Outcome, RunError, run_with};
+use ecaxis_axis::{Command, Refused};
+
+fn control(machine: Machine, controller: impl Controller + 'static) -> Outcome {
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut heard = Heard::default();
+    run_with(
+        machine,
+        virtual_time(),
+        stop,
+        &mut heard,
+        Box::new(controller),
+    )
+}
+
+struct Closure<F>(F);
+
+impl<F: FnMut(&mut Cycle<'_>) + Send> Controller for Closure<F> {
+    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+        (self.0)(machine);
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Names {
+    x: AxisRef,
+    y: AxisRef,
+    lamp: OutputRef,
+    seen: InputRef,
+}
+
+fn bench() -> (Machine, Names) {
+    let mut machine = load("controller.toml");
+    let names = Names {
+        x: machine.axis("x").expect("an axis"),
+        y: machine.axis("y").expect("an axis"),
+        lamp: machine.output("io", "Output 1").expect("an output"),
+        seen: machine.input("io", "0x6000:01").expect("an input"),
+    };
+    (machine, names)
+}
+
+#[test]
+fn names_that_mean_nothing_are_explained() {
+    let (mut machine, _) = bench();
+    let wrong = [
+        machine.axis("z").map(|_| ()),
+        machine.axis("io").map(|_| ()),
+        machine.input("oi", "Input 1").map(|_| ()),
+        machine.input("io", "Input 9").map(|_| ()),
+        machine.output("x", "0x6040").map(|_| ()),
+    ];
+    let said: Vec<String> = wrong
+        .into_iter()
+        .map(|r| r.expect_err("means nothing").to_string())
+        .collect();
+    let expected = [
+        "no axis is named `z`; axes: `x`, `y`",
+        "no axis is named `io`; axes: `x`, `y`",
+        "no device is named `oi`; devices: `x`, `y`, `io`",
+        "`io` has no input \"Input 9\" in its process data; did you mean `Input 1`?",
+        "`x.Controlword` is written by the axis itself; give the axis a command instead",
+    ];
+    assert_eq!(said, expected);
+}
+
+/// Set-points cycle by cycle, a command, an output, and the input that copies it.
+#[test]
+fn it_moves_axes_and_reads_and_sets_signals() {
+    let (machine, names) = bench();
+    let reached = Arc::new(AtomicU64::new(0));
+    let told = Arc::clone(&reached);
+    let mut elapsed = 0.0;
+    let outcome = control(
+        machine,
+        Closure(move |machine: &mut Cycle<'_>| {
+            if machine.stopping() || !machine.axis(names.x).ready || !machine.axis(names.y).ready {
+                return;
+            }
+            if elapsed == 0.0 {
+                let to = Command::MoveTo {
+                    position: -3.0,
+                    speed: 1.0,
+                    ramp: 1.0,
+                };
+                machine.command(names.y, to).expect("y is ready");
+                machine.set(names.lamp, 1.0);
+            }
+            elapsed += machine.dt_s();
+            let x = 5.0 - 5.0 * (elapsed * std::f64::consts::PI).cos();
+            machine.set_point(names.x, x).expect("within the limits");
+            if elapsed >= 1.0 && machine.axis(names.y).in_target {
+                told.store(machine.input(names.seen).to_bits(), Ordering::Relaxed);
+                machine.finish();
+            }
+        }),
+    );
+    outcome.result.expect("runs");
+    let axes = outcome.summary.expect("the cycle has run").axes;
+    assert!(
+        (axes[0].target_position - 10.0).abs() < 0.05,
+        "{:?}",
+        axes[0]
+    );
+    assert_eq!(axes[1].target_position, -3.0);
+    assert_eq!(f64::from_bits(reached.load(Ordering::Relaxed)), 1.0);
+}
+
+/// A set-point that jumps never reaches the wire.
+#[test]
+fn a_jump_is_refused_and_the_axis_brakes() {
+    let (machine, names) = bench();
+    let refused = Arc::new(AtomicU64::new(0));
+    let told = Arc::clone(&refused);
+    let mut cycles = 0;
+    let outcome = control(
+        machine,
+        Closure(move |machine: &mut Cycle<'_>| {
+            if machine.stopping() || !machine.axis(names.x).ready {
+                return;
+            }
+            cycles += 1;
+            for wrong in [30.0, f64::NAN, f64::INFINITY, -1e300] {
+                if machine.set_point(names.x, wrong).is_err() {
+                    told.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+            if cycles == 500 {
+                machine.finish();
+            }
+        }),
+    );
+    outcome.result.expect("runs");
+    let x = &outcome.summary.expect("the cycle has run").axes[0];
+    assert_eq!(refused.load(Ordering::Relaxed), 2000);
+    assert!(x.final_position.abs() < 0.01, "{x:?}");
+}
+
+#[test]
+fn a_panic_stops_the_machine_within_its_limits() {
+    let (machine, names) = bench();
+    let mut moving = 0;
+    let outcome = control(
+        machine,
+        Closure(move |machine: &mut Cycle<'_>| {
+            if !machine.axis(names.x).ready {
+                return;
+            }
+            if moving == 0 {
+                let to = Command::MoveTo {
+                    position: 50.0,
+                    speed: 1.0,
+                    ramp: 1.0,
+                };
+                machine.command(names.x, to).expect("x is ready");
+            }
+            moving += 1;
+            assert!(moving < 100, "on purpose");
+        }),
+    );
+    let error = outcome.result.expect_err("it panicked");
+    assert!(matches!(error, RunError::Controller), "{error:?}");
+    let x = &outcome.summary.expect("the cycle has run").axes[0];
+    // 0.1 s at 2500 mm/s² and as long to rest: 12.5 mm and as much again.
+    assert!((20.0..30.0).contains(&x.final_position), "{x:?}");
+    assert_eq!((&x.fault, &x.trip), (&None, &None));
+}
+
+#[test]
+fn a_stopping_machine_takes_no_orders() {
+    let (machine, names) = bench();
+    let answer = Arc::new(AtomicU64::new(0));
+    let told = Arc::clone(&answer);
+    let outcome = control(
+        machine,
+        Closure(move |machine: &mut Cycle<'_>| {
+            if machine.axis(names.x).ready {
+                machine.finish();
+            }
+            if machine.stopping() {
+                let refused = machine.command(names.x, Command::Enable) == Err(Refused::Stopping)
+                    && machine.set_point(names.x, 0.0) == Err(Refused::Stopping);
+                told.fetch_add(u64::from(refused), Ordering::Relaxed);
+            }
+        }),
+    );
+    outcome.result.expect("runs");
+    assert!(answer.load(Ordering::Relaxed) > 0);
+}
