@@ -14,12 +14,14 @@
 //! | `plan` | where the set-point goes |
 //! | `law` | from the set-point to the drive's targets |
 //! | `switch` | from one mode to another |
+//! | `home` | homing |
 //! | `wish` | where the power goes |
 //! | `actual`, `supervise` | what the drive reports, and what is made of it |
 //! | `blind` | lost frames |
 //! | `report` | the status |
 
 use crate::cia402::{self, Controlword, Memory, Mode, Power, Progress, Request, State, Statusword};
+use crate::profile::Profile;
 use crate::setpoint::Motion;
 use crate::status::{DriveFault, Refused, Trip};
 use crate::units::Counts;
@@ -28,6 +30,7 @@ mod actual;
 mod blind;
 mod command;
 mod config;
+mod home;
 mod io;
 mod law;
 mod plan;
@@ -42,6 +45,7 @@ pub use io::{Inputs, Outputs};
 
 use actual::Actual;
 use config::Control;
+use home::Home;
 use law::Given;
 use plan::Plan;
 use switch::Switch;
@@ -74,6 +78,8 @@ pub struct Axis {
     plan: Plan,
     motion: Motion,
     given: Given,
+    profile: Profile,
+    home: Home,
     /// The set-point's position as of the last cycle; the actual one where no position is commanded.
     sent: Counts,
     sent_before: Counts,
@@ -114,6 +120,8 @@ impl Axis {
             plan: Plan::braking(&config, config.mode),
             motion: Motion::default(),
             given: Given::default(),
+            profile: Profile::new(),
+            home: Home::default(),
             sent: Counts::default(),
             sent_before: Counts::default(),
             dt_s: 0.0,
@@ -190,6 +198,7 @@ impl Axis {
         let (fresh, dt_s) = (self.fresh, self.dt_s);
         self.settle_wish(dt_s);
         self.settle_mode(fresh, dt_s);
+        self.settle_homing(fresh, dt_s);
         self.switch_power(fresh, dt_s);
         if fresh {
             self.update_active();
@@ -200,7 +209,7 @@ impl Axis {
         } else if self.frozen() {
             self.freeze();
         } else {
-            self.advance(dt_s);
+            self.advance(fresh, dt_s);
             self.close_loops(fresh, dt_s);
         }
         self.fed = None;
@@ -213,7 +222,13 @@ impl Axis {
         self.cut_short = false;
         self.statusword = Statusword::from_bits_retain(inputs.statusword);
         self.mode_display = inputs.mode_display;
-        self.actual.read(inputs, &self.config.scale);
+        // Homing moves the origin.
+        let fastest = if self.mode == Mode::Hm {
+            self.config.limits.velocity * 2.0
+        } else {
+            f64::INFINITY
+        };
+        self.actual.read(inputs, &self.config.scale, fastest);
         if let Some(code) = inputs.error_code {
             self.note_error_code(code);
         }
@@ -230,6 +245,7 @@ impl Axis {
         let request = Request {
             power,
             reset_fault: self.reset,
+            no_return: self.config.quick_stop.is_some_and(|option| !option.stays()),
         };
         // While frames are lost, no time passes for the drive's state and the reset pulses.
         let dt_s = if fresh { dt_s } else { 0.0 };
@@ -266,6 +282,7 @@ impl Axis {
         self.sent = self.actual.counts().unwrap_or_default();
         self.motion = Motion::at(self.config.scale.position_to_user(self.sent).0);
         self.given = Given::default();
+        self.profile = Profile::new();
         self.plan = Plan::braking(&self.config, self.mode);
         self.held_by_range = false;
         self.regain = false;

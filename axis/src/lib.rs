@@ -12,6 +12,8 @@
 //! | [`limits`] | what an axis may never exceed; checked once, enforced every cycle |
 //! | [`cia402`] | Statusword, Controlword, the power state machine, modes, error codes |
 //! | [`loops`] | the position loops that the master closes in CSV and CST, and the offsets in CSP |
+//! | [`profile`] | the drive's own profiles (PP, PV): the handshake |
+//! | [`homing`] | homing through the drive: parameters, sequence |
 //! | [`setpoint`] | hold, trapezoidal and jerk-limited moves, ramps; each advanced one cycle at a time |
 //! | [`group`] | several axes: straight lines, arriving together, stopping together |
 //! | [`axis`] | one axis: commands in, guarded set-points out, supervision in between |
@@ -22,8 +24,10 @@
 pub mod axis;
 pub mod cia402;
 pub mod group;
+pub mod homing;
 pub mod limits;
 pub mod loops;
+pub mod profile;
 pub mod scale;
 pub mod setpoint;
 pub mod status;
@@ -31,7 +35,8 @@ pub mod units;
 
 pub use axis::{Axis, AxisConfig, Command, ConfigError, Inputs, Outputs};
 pub use cia402::{Controlword, Mode, Modes, State, Statusword};
+pub use homing::{Homing, HomingError};
 pub use limits::{LimitError, Limits};
 pub use loops::{FeedForward, Loops, PositionPid, VelocityLoop};
 pub use scale::{Scale, ScaleError, VelocityBase, VelocityUnit};
-pub use status::{AxisStatus, DriveFault, Refused, Trip};
+pub use status::{AxisStatus, DriveFault, HomingStatus, Refused, Trip};

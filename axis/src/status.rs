@@ -3,6 +3,7 @@
 use core::fmt;
 
 use crate::cia402::{Mode, State, describe};
+use crate::homing::HomingError;
 
 /// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,6 +56,9 @@ pub struct AxisStatus {
     pub guarded_cycles: u32,
     /// Cycles since the last fresh inputs.
     pub stale_cycles: u32,
+    pub homing: HomingStatus,
+    /// Home was found, and not searched anew since.
+    pub homed: bool,
     /// The drive's first fault since the last reset.
     pub fault: Option<DriveFault>,
     /// Why the axis stopped itself, first cause since the last reset.
@@ -63,6 +67,17 @@ pub struct AxisStatus {
     pub resetting: bool,
     /// The last reset did not help.
     pub reset_failed: bool,
+}
+
+/// The last homing.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum HomingStatus {
+    /// There was none.
+    #[default]
+    None,
+    Running,
+    Attained,
+    Failed(HomingError),
 }
 
 /// A fault the drive reported.
@@ -93,6 +108,8 @@ pub enum Trip {
     OverVelocity { velocity: f64, limit: f64 },
     #[error("the drive left Operation enabled for {state} without being told to")]
     PowerLost { state: State },
+    #[error("the drive did not acknowledge a set-point")]
+    SetPointNotTaken,
     #[error("the drive changed its mode of operation from {expected} to {display}")]
     ModeLost { expected: Mode, display: Mode },
 }
@@ -126,6 +143,8 @@ pub enum Refused {
     NoPosition { mode: Mode },
     #[error("the axis is just being switched to mode {to}")]
     Switching { to: Mode },
+    #[error("the axis is homing")]
+    Homing,
     #[error("a step of {step} in one cycle is more than the {most} of the velocity limit")]
     Step { step: f64, most: f64 },
     #[error(
@@ -144,6 +163,6 @@ pub enum Refused {
     Tripped(Trip),
     #[error("the axis is stopping or being disabled")]
     Stopping,
-    #[error("the axis still moves at {velocity} after a quick stop")]
+    #[error("the axis still moves at {velocity}")]
     StillMoving { velocity: f64 },
 }

@@ -288,7 +288,7 @@ fn stale_words_decide_nothing() {
 
 #[test]
 fn configurations_that_cannot_work() {
-    for mode in [Mode::Pp, Mode::Pv, Mode::Hm, Mode::Unknown(-1)] {
+    for mode in [Mode::Hm, Mode::Unknown(-1), Mode::Unknown(0)] {
         assert_eq!(
             Axis::new(AxisConfig::new(mode, scale(), LIMITS)).err(),
             Some(ConfigError::Mode(mode))

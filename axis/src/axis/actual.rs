@@ -19,13 +19,14 @@ pub(super) struct Actual {
 }
 
 impl Actual {
-    pub(super) fn read(&mut self, inputs: &Inputs, scale: &Scale) {
+    /// `fastest`: faster from one reading to the next is another origin, and no velocity.
+    pub(super) fn read(&mut self, inputs: &Inputs, scale: &Scale, fastest: f64) {
         if let Some(raw) = inputs.position {
             let before = self.counts;
             let counts = before.map_or(Counts(i64::from(raw)), |c| c.unwrap_next(raw));
             let position = scale.position_to_user(counts).0;
-            if before.is_some() && self.elapsed_s > 0.0 {
-                let velocity = (position - self.position) / self.elapsed_s;
+            let velocity = (position - self.position) / self.elapsed_s;
+            if before.is_some() && self.elapsed_s > 0.0 && velocity.abs() <= fastest {
                 let weight = self.elapsed_s / (self.elapsed_s + FILTER_S);
                 self.velocity += (velocity - self.velocity) * weight;
             }
@@ -40,6 +41,15 @@ impl Actual {
         }
         self.measured_velocity = inputs.velocity.is_some();
         self.elapsed_s = 0.0;
+    }
+
+    /// The drive counts from another origin: what it reports now is where the axis is.
+    pub(super) fn start_over(&mut self, scale: &Scale) {
+        if let Some(counts) = self.counts {
+            let counts = Counts(i64::from(counts.wrapped()));
+            self.counts = Some(counts);
+            self.position = scale.position_to_user(counts).0;
+        }
     }
 
     pub(super) fn pass(&mut self, dt_s: f64) {

@@ -2,6 +2,7 @@
 
 use super::{Axis, Control, Plan, Wish};
 use crate::cia402::{Mode, State};
+use crate::profile::Goal;
 use crate::setpoint::{Ramp, Trapezoid};
 use crate::status::Refused;
 
@@ -20,7 +21,13 @@ pub enum Command {
     /// Switch the mode of operation, also in motion. Where the new mode can do what the set-point is about, it goes on
     /// with it; otherwise it comes to rest.
     SetMode(Mode),
-    /// In CSP, and where a position loop is configured in CSV and CST.
+    /// Homing by the drive, with the method and parameters that it has. The axis must stand; afterwards it is back in its
+    /// mode. [`Command::Stop`] aborts it.
+    Home {
+        /// For the search, seconds.
+        timeout_s: f64,
+    },
+    /// In CSP and PP, and where a position loop is configured in CSV and CST.
     MoveTo {
         position: f64,
         /// Fraction of the velocity limit, above 0 and at most 1.
@@ -28,7 +35,15 @@ pub enum Command {
         /// Fraction of the acceleration limit, above 0 and at most 1.
         ramp: f64,
     },
-    /// In CSV, CSP, and CST with a position loop.
+    /// From where the set-point is; otherwise as [`Command::MoveTo`].
+    MoveBy {
+        distance: f64,
+        /// Fraction of the velocity limit, above 0 and at most 1.
+        speed: f64,
+        /// Fraction of the acceleration limit, above 0 and at most 1.
+        ramp: f64,
+    },
+    /// In CSV, CSP, PV, and CST with a position loop.
     Velocity {
         velocity: f64,
         /// Fraction of the acceleration limit, above 0 and at most 1.
@@ -66,6 +81,7 @@ impl Axis {
                 Ok(())
             }
             Command::SetMode(mode) => self.set_mode(mode),
+            Command::Home { timeout_s } => self.home(timeout_s),
             Command::QuickStop => {
                 self.quick_stop(false);
                 Ok(())
@@ -75,6 +91,14 @@ impl Axis {
                 speed,
                 ramp,
             } => self.move_to(position, speed, ramp),
+            Command::MoveBy {
+                distance,
+                speed,
+                ramp,
+            } => {
+                finite("distance", distance)?;
+                self.move_to(self.move_start() + distance, speed, ramp)
+            }
             Command::Velocity { velocity, ramp } => self.run_at(velocity, ramp),
             Command::Torque { percent, ramp_s } => self.push(percent, ramp_s),
         }
@@ -152,12 +176,15 @@ impl Axis {
     }
 
     /// Motion is taken only from an axis that is enabled and is to stay so.
-    fn check_ready(&self) -> Result<(), Refused> {
+    pub(super) fn check_ready(&self) -> Result<(), Refused> {
         if let Some(trip) = self.trip {
             return Err(Refused::Tripped(trip));
         }
         if let Some(fault) = self.fault {
             return Err(Refused::Faulted(fault));
+        }
+        if self.home.running() {
+            return Err(Refused::Homing);
         }
         if let Some(switch) = self.switch {
             return Err(Refused::Switching { to: switch.to });
@@ -185,9 +212,9 @@ impl Axis {
         &self,
         command: &'static str,
         needs: Mode,
-        possible: impl Fn(Control) -> bool,
+        possible: impl Fn(Control, Mode) -> bool,
     ) -> Result<(), Refused> {
-        if self.mode == needs || possible(self.config.control(self.mode)) {
+        if self.mode == needs || possible(self.config.control(self.mode), self.mode) {
             return Ok(());
         }
         Err(Refused::WrongMode {
@@ -198,8 +225,9 @@ impl Axis {
     }
 
     fn set_mode(&mut self, to: Mode) -> Result<(), Refused> {
-        let known = matches!(to, Mode::Csp | Mode::Csv | Mode::Cst);
-        if !known || !(self.config.modes.contains(to) || to == self.config.mode) {
+        // Homing is a sequence, not a mode to stay in.
+        let possible = matches!(to, Mode::Csp | Mode::Csv | Mode::Cst | Mode::Pp | Mode::Pv);
+        if !possible || !(self.config.modes.contains(to) || to == self.config.mode) {
             return Err(Refused::ModeNotOffered { mode: to });
         }
         if !self.active {
@@ -210,22 +238,26 @@ impl Axis {
         if self.switch.is_some_and(|switch| switch.to == to) {
             return Ok(());
         }
-        self.check_ready()?;
-        if to == self.mode {
-            return Ok(());
+        self.check_switch(to)?;
+        if to != self.mode {
+            self.begin_switch(to);
         }
-        if self.mode_display.is_none() {
-            return Err(Refused::NoModeDisplay);
-        }
-        if self.config.control(to) == Control::Position && self.actual.counts().is_none() {
-            return Err(Refused::NoPosition { mode: to });
-        }
-        self.begin_switch(to);
         Ok(())
     }
 
+    /// Where a relative move starts.
+    fn move_start(&self) -> f64 {
+        match self.profile.goal() {
+            Some(goal) if self.mode == Mode::Pp && self.profile.reached() => goal.target,
+            _ if self.grip() == Control::Position => self.motion.position,
+            _ => self.actual.position(),
+        }
+    }
+
     fn move_to(&mut self, position: f64, speed: f64, ramp: f64) -> Result<(), Refused> {
-        self.check_control("a move", Mode::Csp, |c| c == Control::Position)?;
+        self.check_control("a move", Mode::Csp, |c, mode| {
+            c == Control::Position || mode == Mode::Pp
+        })?;
         finite("position", position)?;
         fraction("speed", speed)?;
         fraction("ramp", ramp)?;
@@ -243,6 +275,14 @@ impl Axis {
             });
         }
         self.check_ready()?;
+        if self.mode == Mode::Pp {
+            self.profile.go_to(Goal {
+                target: position,
+                velocity: limits.velocity * speed,
+                acceleration: limits.acceleration * ramp,
+            });
+            return Ok(());
+        }
         self.engage();
         let earlier = match self.plan {
             Plan::Move(trapezoid) => trapezoid.braking,
@@ -262,7 +302,9 @@ impl Axis {
     }
 
     fn run_at(&mut self, velocity: f64, ramp: f64) -> Result<(), Refused> {
-        self.check_control("a velocity", Mode::Csv, |c| c != Control::Torque)?;
+        self.check_control("a velocity", Mode::Csv, |c, mode| {
+            matches!(c, Control::Position | Control::Velocity) || mode == Mode::Pv
+        })?;
         finite("velocity", velocity)?;
         fraction("ramp", ramp)?;
         let limits = self.config.limits;
@@ -273,6 +315,14 @@ impl Axis {
             });
         }
         self.check_ready()?;
+        if self.mode == Mode::Pv {
+            self.profile.run_at(Goal {
+                target: velocity,
+                velocity: limits.velocity,
+                acceleration: limits.acceleration * ramp,
+            });
+            return Ok(());
+        }
         self.engage();
         self.plan = Plan::Velocity(Ramp {
             target: velocity,
@@ -283,7 +333,7 @@ impl Axis {
 
     /// The set-point of the next cycle, from outside.
     pub(super) fn take_set_point(&mut self, position: f64) -> Result<(), Refused> {
-        self.check_control("a set-point", Mode::Csp, |c| c == Control::Position)?;
+        self.check_control("a set-point", Mode::Csp, |c, _| c == Control::Position)?;
         finite("position", position)?;
         self.check_ready()?;
         if self.frozen() {
@@ -321,7 +371,7 @@ impl Axis {
     }
 
     fn push(&mut self, percent: f64, ramp_s: f64) -> Result<(), Refused> {
-        self.check_control("a torque", Mode::Cst, |_| false)?;
+        self.check_control("a torque", Mode::Cst, |_, _| false)?;
         finite("torque", percent)?;
         finite("ramp time", ramp_s)?;
         if ramp_s < 0.0 {

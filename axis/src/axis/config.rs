@@ -1,13 +1,13 @@
 //! What an axis is made with, and what of that cannot work.
 
-use crate::cia402::{Mode, Modes};
+use crate::cia402::{Mode, Modes, QuickStopOption};
 use crate::limits::{LimitError, Limits};
 use crate::loops::Loops;
 use crate::scale::Scale;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisConfig {
-    /// Until another one is commanded: CSP, CSV or CST.
+    /// Until another one is commanded: any but homing.
     pub mode: Mode,
     /// What may be switched to besides `mode`: the modes whose targets are mapped.
     pub modes: Modes,
@@ -23,6 +23,8 @@ pub struct AxisConfig {
     pub dead_time_s: f64,
     /// How long 0x6061 may take to show the mode that was commanded, seconds.
     pub mode_time_s: f64,
+    /// 0x605A, where it is known: without transition 16 an axis is enabled again by way of Switch on disabled.
+    pub quick_stop: Option<QuickStopOption>,
 }
 
 impl AxisConfig {
@@ -43,11 +45,15 @@ impl AxisConfig {
             loops: Loops::default(),
             dead_time_s: 0.0,
             mode_time_s: 1.0,
+            quick_stop: None,
         }
     }
 
     pub(super) fn check(&self) -> Result<(), ConfigError> {
-        if !matches!(self.mode, Mode::Csp | Mode::Csv | Mode::Cst) {
+        if !matches!(
+            self.mode,
+            Mode::Csp | Mode::Csv | Mode::Cst | Mode::Pp | Mode::Pv
+        ) {
             return Err(ConfigError::Mode(self.mode));
         }
         self.limits.check(&self.scale)?;
@@ -99,6 +105,7 @@ impl AxisConfig {
         match mode {
             Mode::Csv if self.loops.csv.is_none() => Control::Velocity,
             Mode::Cst if self.loops.cst.is_none() => Control::Torque,
+            Mode::Pp | Mode::Pv | Mode::Hm => Control::Drive,
             _ => Control::Position,
         }
     }
@@ -116,11 +123,13 @@ pub(super) enum Control {
     Velocity,
     /// Torque; the motion is what it turns out to be.
     Torque,
+    /// Nothing: the drive makes its own.
+    Drive,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    #[error("mode {0} is not one of CSP, CSV, CST")]
+    #[error("mode {0} is not one of CSP, CSV, CST, PP, PV")]
     Mode(Mode),
     #[error(transparent)]
     Limit(#[from] LimitError),

@@ -34,6 +34,10 @@ pub struct Outputs {
     pub target_velocity: i32,
     /// 0x6071. 0 where it does not count.
     pub target_torque: i16,
+    /// 0x6081, in the unit of 0x60A9.
+    pub profile_velocity: u32,
+    /// 0x6083, in the unit of 0x60A9 per second; also for 0x6084.
+    pub profile_acceleration: u32,
     /// 0x60B1, added to the drive's own velocity demand. 0 outside CSP.
     pub velocity_offset: i32,
     /// 0x60B2, added to the drive's own torque demand. 0 outside CSP.

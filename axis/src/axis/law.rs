@@ -1,10 +1,13 @@
 //! From the set-point to the drive's targets, by the law of each mode.
 
 use super::{Axis, Control, Outputs, Plan};
-use crate::cia402::Mode;
+use crate::cia402::{Controlword, Mode, ModeCommand};
 use crate::loops::{Deviation, Integral, bounded};
+use crate::scale::Scale;
 use crate::setpoint::Ramp;
-use crate::units::{PerMille, Percent, RawVelocity, UserVelocity};
+use crate::units::{
+    PerMille, Percent, RawAcceleration, RawVelocity, UserAcceleration, UserUnits, UserVelocity,
+};
 
 /// What the loops gave last, user units and percent.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -73,7 +76,9 @@ impl Axis {
             self.given.velocity_offset = 0.0;
         }
         match switch {
-            Some(Mode::Csv) => self.given.velocity = bounded(velocity, limits.velocity),
+            Some(Mode::Csv | Mode::Pv) if self.mode != Mode::Csv => {
+                self.given.velocity = bounded(velocity, limits.velocity);
+            }
             Some(Mode::Cst) => self.given.torque = bounded(self.actual.torque(), limits.torque),
             _ => {}
         }
@@ -106,20 +111,25 @@ impl Axis {
             controlword: self.controlword.bits(),
             mode: mode.code(),
             target_position: actual.wrapped(),
+            profile_velocity: speed(scale, limits.velocity),
+            profile_acceleration: acceleration(scale, limits.acceleration),
             ..Outputs::default()
         };
         if !self.active {
             return out;
+        }
+        if self.mode_command_counts() {
+            self.profile_outputs(&mut out);
         }
         let counts = |wanted: Mode| self.mode == wanted || mode == wanted;
         if counts(Mode::Csp) && self.grip() == Control::Position {
             out.target_position = self.sent.wrapped();
         } else if mode == Mode::Csp {
             out.target_position = scale
-                .position_to_counts(crate::units::UserUnits(self.motion.position))
+                .position_to_counts(UserUnits(self.motion.position))
                 .wrapped();
         }
-        if counts(Mode::Csv) {
+        if counts(Mode::Csv) || (mode == Mode::Pv && self.mode != Mode::Pv) {
             let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(self.given.velocity));
             out.target_velocity = raw;
         }
@@ -136,4 +146,48 @@ impl Axis {
         }
         out
     }
+
+    /// The bits of a mode belong beside "enable operation" alone.
+    fn mode_command_counts(&self) -> bool {
+        self.controlword == Controlword::ENABLE_OPERATION_COMMAND
+    }
+
+    /// PP, PV and HM: bits and goals.
+    fn profile_outputs(&self, out: &mut Outputs) {
+        let scale = &self.config.scale;
+        let goal = self.profile.goal();
+        let command = match self.mode {
+            Mode::Pp => {
+                if let Some(goal) = goal {
+                    let target = scale.position_to_counts(UserUnits(goal.target));
+                    out.target_position = target.wrapped();
+                    out.profile_velocity = speed(scale, goal.velocity);
+                }
+                self.profile.position_bits()
+            }
+            Mode::Pv => {
+                if let Some(goal) = goal {
+                    out.target_velocity = scale.velocity_to_raw(UserVelocity(goal.target)).0;
+                }
+                self.profile.velocity_bits()
+            }
+            Mode::Hm => self.home.bits(),
+            _ => ModeCommand::Nothing,
+        };
+        if let (Mode::Pp | Mode::Pv, Some(goal)) = (self.mode, goal) {
+            out.profile_acceleration = acceleration(scale, goal.acceleration);
+        }
+        out.controlword = self.controlword.with(command).bits();
+    }
+}
+
+/// 0 would be no motion at all.
+fn speed(scale: &Scale, velocity: f64) -> u32 {
+    let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(velocity));
+    raw.unsigned_abs().max(1)
+}
+
+fn acceleration(scale: &Scale, acceleration: f64) -> u32 {
+    let RawAcceleration(raw) = scale.acceleration_to_raw(UserAcceleration(acceleration));
+    raw.max(1)
 }

@@ -1,7 +1,7 @@
 //! Where the set-point goes.
 
 use super::{Axis, AxisConfig, Control};
-use crate::cia402::Mode;
+use crate::cia402::{Mode, ModeStatus};
 use crate::setpoint::{Hold, Motion, Ramp, Trapezoid};
 use crate::units::UserUnits;
 
@@ -11,6 +11,8 @@ pub(super) enum Plan {
     Move(Trapezoid),
     Velocity(Ramp),
     Torque(Ramp),
+    /// The drive's own profile, or homing.
+    Drive,
     /// From outside, anew in every cycle; a cycle without one ends it.
     Fed,
 }
@@ -24,6 +26,7 @@ impl Plan {
                 acceleration: slope,
             }),
             Control::Velocity => Self::Velocity(Ramp { target: 0.0, slope }),
+            Control::Drive => Self::Drive,
             Control::Torque => Self::Torque(Ramp {
                 target: 0.0,
                 slope: config.torque_slope,
@@ -35,8 +38,8 @@ impl Plan {
     pub(super) fn fits(&self, control: Control) -> bool {
         match self {
             Self::Hold(_) | Self::Move(_) | Self::Fed => control == Control::Position,
-            Self::Velocity(_) => control != Control::Torque,
-            Self::Torque(_) => false,
+            Self::Velocity(_) => matches!(control, Control::Position | Control::Velocity),
+            Self::Torque(_) | Self::Drive => false,
         }
     }
 }
@@ -45,8 +48,10 @@ impl Axis {
     /// What is commanded now: a mode with a position loop takes a torque, too, and while modes are switched the position is
     /// commanded already if the new one needs it.
     pub(super) fn grip(&self) -> Control {
-        if matches!(self.plan, Plan::Torque(_)) {
-            return Control::Torque;
+        match self.plan {
+            Plan::Torque(_) => return Control::Torque,
+            Plan::Drive => return Control::Drive,
+            _ => {}
         }
         let now = self.config.control(self.mode);
         let next = self.switch.map(|switch| self.config.control(switch.to));
@@ -69,6 +74,15 @@ impl Axis {
         }
     }
 
+    /// The motion where none is commanded: as it turns out. A mode that is being switched to will take it over.
+    fn uncommanded(&self) -> Motion {
+        if self.switch.is_some() {
+            self.tracked(self.actual.velocity())
+        } else {
+            Motion::at(self.actual.position())
+        }
+    }
+
     /// Before a position or velocity is commanded where a torque was: from what the axis does, with the torque it has.
     pub(super) fn engage(&mut self) {
         if self.active && self.grip() == Control::Torque {
@@ -79,15 +93,19 @@ impl Axis {
 
     /// To rest, from whatever is going on.
     pub(super) fn brake(&mut self) {
+        self.home.abort();
         let braking = Plan::braking(&self.config, self.mode);
-        if !matches!(braking, Plan::Torque(_)) {
+        if braking == Plan::Drive {
+            self.profile.halt();
+        }
+        if !matches!(braking, Plan::Torque(_) | Plan::Drive) {
             self.engage();
         }
         self.plan = braking;
     }
 
     /// RT: O(1).
-    pub(super) fn advance(&mut self, dt_s: f64) {
+    pub(super) fn advance(&mut self, fresh: bool, dt_s: f64) {
         self.go_on();
         let before = self.motion;
         let grip = self.grip();
@@ -97,12 +115,19 @@ impl Axis {
             Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
             Plan::Torque(ramp) => {
                 self.given.torque = ramp.advance(self.given.torque, dt_s);
-                // A mode that is being switched to will take the motion over.
-                self.motion = if self.switch.is_some() {
-                    self.tracked(self.actual.velocity())
-                } else {
-                    Motion::at(self.actual.position())
-                };
+                self.motion = self.uncommanded();
+            }
+            Plan::Drive => {
+                if fresh
+                    && let ModeStatus::Pp {
+                        target_reached,
+                        acknowledged,
+                        ..
+                    } = self.statusword.in_mode(self.mode)
+                {
+                    self.profile.step(acknowledged, target_reached, dt_s);
+                }
+                self.motion = self.uncommanded();
             }
             Plan::Fed => match self.fed {
                 Some(motion) => self.motion = motion,
@@ -144,9 +169,20 @@ impl Axis {
         before.then(before.position + velocity * dt_s, velocity, dt_s)
     }
 
+    /// The drive's profile has come to its end, as far as it can be told.
+    fn profile_arrived(&self) -> bool {
+        match (self.mode, self.profile.goal()) {
+            (Mode::Pp, Some(_)) => !self.profile.pending(),
+            (Mode::Pp, None) if self.profile.pending() => false,
+            (Mode::Pv, Some(goal)) => self.velocity_reached(goal.target),
+            _ => !self.home.running() && self.standing(),
+        }
+    }
+
     pub(super) fn setpoint_at_rest(&self) -> bool {
         match self.plan {
             Plan::Torque(_) => self.given.torque == 0.0,
+            Plan::Drive => !self.home.running() && self.standing(),
             _ => self.motion.velocity == 0.0,
         }
     }
@@ -158,6 +194,7 @@ impl Axis {
             Plan::Move(trapezoid) => trapezoid.finished(self.motion),
             Plan::Velocity(ramp) => self.motion.velocity == ramp.target,
             Plan::Torque(ramp) => self.given.torque == ramp.target,
+            Plan::Drive => self.profile_arrived(),
             Plan::Fed => self.motion.velocity == 0.0,
         }
     }

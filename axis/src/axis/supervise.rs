@@ -1,6 +1,6 @@
 //! Judging what the drive reports, and the last guard before the outputs.
 
-use super::{Axis, Control, Plan, Wish};
+use super::{Axis, Control, Wish};
 use crate::cia402::{Mode, State};
 use crate::limits::Limits;
 use crate::loops::bounded;
@@ -140,8 +140,15 @@ impl Axis {
             {
                 cause = Some(Trip::FollowingError { error, limit });
             }
+        } else {
+            self.watch.following_error = 0.0;
         }
-        if self.actual.counts().is_some()
+        if self.mode == Mode::Pp && self.profile.not_taken() {
+            cause = Some(Trip::SetPointNotTaken);
+        }
+        // While homing, positions mean nothing yet.
+        if self.mode != Mode::Hm
+            && self.actual.counts().is_some()
             && let Some([low, high]) = self.watch.range
         {
             let margin = limits.position_margin();
@@ -178,15 +185,12 @@ impl Axis {
     }
 
     /// Within 2 % of the target or 10 motor rpm of it, whichever is more; the latter never above a tenth of the limit.
-    pub(super) fn velocity_reached(&self) -> bool {
-        let Plan::Velocity(ramp) = self.plan else {
-            return false;
-        };
+    pub(super) fn velocity_reached(&self, target: f64) -> bool {
         let ten_rpm = self.config.scale.units_per_turn() * 10.0 / 60.0;
         let floor = ten_rpm.min(self.config.limits.velocity * 0.1);
         let slack = self.actual.velocity_slack(&self.config.scale);
-        let window = (ramp.target.abs() * 0.02).max(floor).max(slack);
-        (self.actual.velocity() - ramp.target).abs() <= window
+        let window = (target.abs() * 0.02).max(floor).max(slack);
+        (self.actual.velocity() - target).abs() <= window
     }
 
     /// `target`, or the highest velocity from which the axis can still stop inside its range.
@@ -243,6 +247,7 @@ impl Axis {
                 let velocity = bounded(self.motion.velocity, limits.velocity);
                 self.motion.velocity = velocity;
             }
+            Control::Drive => {}
             Control::Torque => self.given.torque = bounded(self.given.torque, limits.torque),
         }
         if planned != (self.motion, self.given.torque) {

@@ -3,8 +3,11 @@
 //! The drive changes over somewhere between the frame that carries the new mode and the one that shows it. So from the first
 //! to the last of these cycles the targets of both modes are valid, made from the one set-point.
 
+use super::supervise::Watch;
 use super::{Axis, Control, Plan};
 use crate::cia402::{Mode, State};
+use crate::profile::{Goal, Profile};
+use crate::setpoint::Ramp;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Switch {
@@ -51,14 +54,45 @@ impl Axis {
 
     /// The drive is in the new mode: from now on its law counts alone.
     fn enter(&mut self, to: Mode) {
+        let from = self.mode;
         self.mode = to;
         self.switch = None;
         self.given.restart();
         if to != Mode::Cst {
             self.given.torque = 0.0;
         }
+        if from == Mode::Hm {
+            self.watch = Watch::starting_at(self.actual.position(), &self.config.limits);
+        }
+        self.hand_over(from);
         if !self.plan.fits(self.config.control(to)) {
             self.plan = Plan::braking(&self.config, to);
+        }
+    }
+
+    /// A velocity under way goes on, whether it is the drive's profile or ours.
+    fn hand_over(&mut self, from: Mode) {
+        let goal = match (from, self.profile.goal(), self.plan) {
+            (Mode::Pv, Some(&goal), _) => goal,
+            (_, _, Plan::Velocity(ramp)) => Goal {
+                target: ramp.target,
+                velocity: self.config.limits.velocity,
+                acceleration: ramp.slope,
+            },
+            _ => Goal {
+                target: 0.0,
+                velocity: self.config.limits.velocity,
+                acceleration: self.config.limits.acceleration,
+            },
+        };
+        self.profile = Profile::new();
+        if self.mode == Mode::Pv {
+            self.profile.run_at(goal);
+        } else if from == Mode::Pv && goal.target != 0.0 {
+            self.plan = Plan::Velocity(Ramp {
+                target: goal.target,
+                slope: goal.acceleration,
+            });
         }
     }
 

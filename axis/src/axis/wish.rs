@@ -1,6 +1,6 @@
 //! What the axis is to do with the power, and how one wish leads to the next.
 
-use super::Axis;
+use super::{Axis, Plan};
 use crate::cia402::State;
 
 /// A quick stop that was to end disabled ends so after this time even if the axis still turns; a deceleration that was to end
@@ -29,10 +29,18 @@ impl Axis {
         let at_rest = self.setpoint_at_rest() && !self.cut_short;
         self.wish = match self.wish {
             Wish::Disabling { frozen_s } => {
-                if !self.active || at_rest || frozen_s > QUICK_STOP_LIMIT_S {
+                let limits = self.config.limits;
+                // The drive's own ramps may be gentler than ours, but not for ever.
+                let drive = self.plan == Plan::Drive;
+                let patience = if drive {
+                    QUICK_STOP_LIMIT_S + 2.0 * limits.velocity / limits.acceleration
+                } else {
+                    QUICK_STOP_LIMIT_S
+                };
+                if !self.active || at_rest || frozen_s > patience {
                     Wish::Disabled
                 } else {
-                    let passed = if self.frozen() { dt_s } else { 0.0 };
+                    let passed = if drive || self.frozen() { dt_s } else { 0.0 };
                     Wish::Disabling {
                         frozen_s: frozen_s + passed,
                     }

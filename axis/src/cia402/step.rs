@@ -24,6 +24,8 @@ pub struct Request {
     pub power: Power,
     /// Send fault reset pulses while the drive is in Fault.
     pub reset_fault: bool,
+    /// The drive's quick stop option code has no transition 16.
+    pub no_return: bool,
 }
 
 /// What the state machine remembers between cycles.
@@ -172,7 +174,12 @@ pub fn step(memory: Memory, statusword: Statusword, request: Request, dt_s: f64)
         waited_s: since(same_wait, memory.waited_s),
         reset,
     };
-    let mut word = controlword(state, request.power, memory.waited_s);
+    let waited_s = if request.no_return {
+        QUICK_STOP_RETURN_S
+    } else {
+        memory.waited_s
+    };
+    let mut word = controlword(state, request.power, waited_s);
     if matches!(reset, Reset::High { .. }) {
         word |= Controlword::FAULT_RESET_COMMAND;
     }

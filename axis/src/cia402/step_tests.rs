@@ -49,7 +49,7 @@ const POWERS: [Power; 3] = [Power::Disabled, Power::Enabled, Power::QuickStop];
 fn request(power: Power) -> Request {
     Request {
         power,
-        reset_fault: false,
+        ..Request::default()
     }
 }
 
@@ -134,6 +134,19 @@ fn ladders() {
     );
 }
 
+#[test]
+fn an_option_code_without_return() {
+    let ask = Request {
+        power: Power::Enabled,
+        no_return: true,
+        ..Request::default()
+    };
+    let word = word_of(State::QuickStopActive);
+    let (_, out) = step(Memory::new(), word, ask, 0.001);
+    let way = drive(State::QuickStopActive, out.controlword, false);
+    assert_eq!(way, Some((12, State::SwitchOnDisabled)));
+}
+
 /// Runs a reset against a drive that stays in Fault until it has seen `edges` rising edges.
 fn reset_run(edges: u32, dt_s: f64) -> (u32, Progress, Controlword) {
     let mut memory = Memory::new();
@@ -145,6 +158,7 @@ fn reset_run(edges: u32, dt_s: f64) -> (u32, Progress, Controlword) {
         let ask = Request {
             power: Power::Disabled,
             reset_fault: true,
+            ..Request::default()
         };
         let (next, out) = step(memory, word_of(state), ask, dt_s);
         memory = next;
@@ -197,6 +211,7 @@ fn a_second_reset_request_starts_over() {
     let ask = |reset_fault| Request {
         power: Power::Disabled,
         reset_fault,
+        ..Request::default()
     };
     let fault = word_of(State::Fault);
     let mut memory = Memory::new();
@@ -243,7 +258,11 @@ fn exhaustive_sweep() {
         let word = Statusword::from_bits_retain(bits);
         for power in POWERS {
             for reset_fault in [false, true] {
-                let ask = Request { power, reset_fault };
+                let ask = Request {
+                    power,
+                    reset_fault,
+                    no_return: bits & 1 == 0,
+                };
                 let mut memory = Memory::new();
                 for dt_s in [0.001, 0.06, 0.6, f64::NAN, -1.0, f64::INFINITY] {
                     let (next, out) = step(memory, word, ask, dt_s);

@@ -18,9 +18,9 @@ bitflags! {
         const REMOTE = 1 << 9;
         const TARGET_REACHED = 1 << 10;
         const INTERNAL_LIMIT_ACTIVE = 1 << 11;
-        /// In the cyclic synchronous modes: the drive follows the command value.
+        /// In the cyclic synchronous modes: the drive follows the command value. See [`super::bits`] for other modes.
         const FOLLOWS_COMMAND = 1 << 12;
-        /// In CSP: the drive's own following error.
+        /// In CSP: the drive's own following error. See [`super::bits`] for other modes.
         const FOLLOWING_ERROR = 1 << 13;
         const _ = !0;
     }
@@ -37,6 +37,7 @@ bitflags! {
         const ENABLE_OPERATION = 1 << 3;
         /// Acts on its rising edge.
         const FAULT_RESET = 1 << 7;
+        /// In PP, PV and HM; elsewhere by 0x605D.
         const HALT = 1 << 8;
         const _ = !0;
     }

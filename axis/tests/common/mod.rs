@@ -2,6 +2,7 @@
 
 #![allow(dead_code)]
 
+use ecaxis_axis::setpoint::{Hold, Motion, Ramp, Trapezoid};
 use ecaxis_axis::{
     Axis, AxisConfig, AxisStatus, Command, FeedForward, Inputs, Limits, Loops, Mode, Modes,
     Outputs, PositionPid, Scale, State, VelocityLoop, VelocityUnit,
@@ -48,7 +49,26 @@ pub struct Drive {
     mode_waits: u32,
     /// What the load pushes with in torque mode, per mille.
     pub load: f64,
+    /// Where the home switch is, counts before homing. `None`: never found.
+    pub home_at: Option<f64>,
+    /// What the position becomes there.
+    pub home_is: f64,
+    pub homing_error: bool,
+    /// Never acknowledges a set-point.
+    pub deaf: bool,
+    pub homing: Homing,
+    set_point: Option<f64>,
+    acknowledged: bool,
+    reached: bool,
     controlword: u16,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Homing {
+    NotStarted,
+    Searching,
+    Done,
+    Error,
 }
 
 impl Drive {
@@ -66,6 +86,14 @@ impl Drive {
             mode_delay: Some(0),
             mode_waits: 0,
             load: 0.0,
+            home_at: Some(-2000.0),
+            home_is: 0.0,
+            homing_error: false,
+            deaf: false,
+            homing: Homing::NotStarted,
+            set_point: None,
+            acknowledged: false,
+            reached: true,
             controlword: 0,
         }
     }
@@ -76,12 +104,88 @@ impl Drive {
             State::SwitchOnDisabled => 0x0240,
             State::ReadyToSwitchOn => 0x0231,
             State::SwitchedOn => 0x0233,
-            State::OperationEnabled => 0x1237,
+            State::OperationEnabled => 0x0237 | self.mode_bits(),
             State::QuickStopActive => 0x0217,
             State::FaultReactionActive => 0x021F,
             State::Fault => 0x0218,
             State::Unknown(word) => word,
         }
+    }
+
+    fn mode_bits(&self) -> u16 {
+        let bit = |on: bool, n: u32| u16::from(on) << n;
+        match self.mode {
+            1 => bit(self.acknowledged, 12) | bit(self.reached, 10),
+            3 => bit(self.velocity == 0.0, 12) | bit(self.reached, 10),
+            6 => match self.homing {
+                Homing::NotStarted => 0x0400,
+                Homing::Searching => 0x0000,
+                Homing::Done => 0x1400,
+                Homing::Error => bit(true, 13) | bit(self.velocity == 0.0, 10),
+            },
+            _ => 0x1000,
+        }
+    }
+
+    /// PP, PV and HM. `rose`: bit 4 did.
+    fn profile(&mut self, out: &Outputs, rose: bool, dt: f64) {
+        let halt = out.controlword & 0x100 != 0;
+        let start = out.controlword & 0x10 != 0;
+        let mrpm = 2000.0 / 60_000.0;
+        let slope = f64::from(out.profile_acceleration) * mrpm;
+        let rest = Hold {
+            acceleration: slope,
+        };
+        if self.mode == 1 {
+            if rose && !self.deaf {
+                self.set_point = Some(f64::from(out.target_position));
+                (self.acknowledged, self.reached) = (true, false);
+            }
+            self.acknowledged &= start;
+        }
+        if self.mode == 6 {
+            self.homing = match self.homing {
+                _ if !start && self.homing != Homing::Done => Homing::NotStarted,
+                _ if rose => Homing::Searching,
+                Homing::Searching if self.homing_error => Homing::Error,
+                Homing::Searching if self.home_at.is_some_and(|at| self.position <= at) => {
+                    (self.position, self.velocity) = (self.home_is, 0.0);
+                    Homing::Done
+                }
+                same => same,
+            };
+        }
+        let here = Motion {
+            position: self.position,
+            velocity: self.velocity,
+            acceleration: 0.0,
+        };
+        let next = match (self.mode, self.set_point, self.homing) {
+            _ if halt => rest.advance(here, dt),
+            (1, Some(target), _) => Trapezoid {
+                target,
+                velocity: f64::from(out.profile_velocity) * mrpm,
+                acceleration: slope,
+                braking: slope,
+            }
+            .advance(here, dt),
+            (3, _, _) => {
+                let ramp = Ramp {
+                    target: f64::from(out.target_velocity) * mrpm,
+                    slope,
+                };
+                let velocity = ramp.advance(self.velocity, dt);
+                here.then(self.position + velocity * dt, velocity, dt)
+            }
+            (6, _, Homing::Searching) => here.then(self.position - 8.0, -8.0 / dt, dt),
+            _ => rest.advance(here, dt),
+        };
+        (self.position, self.velocity) = (next.position, next.velocity);
+        self.reached = match self.mode {
+            _ if halt => self.velocity == 0.0,
+            1 => self.set_point.is_none_or(|at| next.stands_at(at)),
+            _ => self.velocity == f64::from(out.target_velocity) * mrpm,
+        };
     }
 
     pub fn raw_position(&self) -> i32 {
@@ -106,6 +210,7 @@ impl Drive {
 
     /// Takes the outputs and moves for one cycle.
     pub fn cycle(&mut self, out: &Outputs, dt: f64) {
+        let rose = out.controlword & !self.controlword & 0x10 != 0;
         let edge = out.controlword & !self.controlword & 0x80 != 0;
         self.controlword = out.controlword;
         self.mode_waits = if out.mode == self.mode {
@@ -116,6 +221,7 @@ impl Drive {
         if self.mode_delay.is_some_and(|delay| self.mode_waits > delay) {
             self.mode = out.mode;
             self.mode_waits = 0;
+            (self.set_point, self.acknowledged, self.reached) = (None, false, true);
         }
         let w = out.controlword & 0x0F;
         self.state = match self.state {
@@ -161,6 +267,7 @@ impl Drive {
                     self.velocity = f64::from(out.target_velocity) / 60_000.0 * 2000.0;
                     self.position += self.velocity * dt;
                 }
+                1 | 3 | 6 => self.profile(out, rose, dt),
                 _ => {
                     self.torque = out.target_torque;
                     self.velocity += (f64::from(out.target_torque) + self.load) * 100.0 * dt;
@@ -200,6 +307,15 @@ pub fn looped(mode: Mode, limits: Limits) -> AxisConfig {
         },
         dead_time_s: DEAD_TIME_S,
         ..AxisConfig::new(mode, scale(), limits)
+    }
+}
+
+/// Every mode.
+pub fn all(mode: Mode, limits: Limits) -> AxisConfig {
+    let looped = looped(mode, limits);
+    AxisConfig {
+        modes: looped.modes.with(Mode::Pp).with(Mode::Pv).with(Mode::Hm),
+        ..looped
     }
 }
 

@@ -321,6 +321,7 @@ fn trip(trip: &Trip) -> &'static str {
         }
         Trip::OverVelocity { .. } => "check `encoder`, `per_turn` and the drive's tuning",
         Trip::PowerLost { .. } => "check STO, enable inputs and the supply of the power stage",
+        Trip::SetPointNotTaken => "the drive must be in profile position mode with 0x607A mapped",
         Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
     }
 }

@@ -1,0 +1,377 @@
+//! What a homing is to do: method, speeds and offsets, and the objects that they go into.
+
+use crate::limits::Limits;
+use crate::scale::Scale;
+use crate::units::{UserAcceleration, UserUnits, UserVelocity};
+
+/// What a method needs to be connected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Needs {
+    pub negative_limit: bool,
+    pub positive_limit: bool,
+    pub home_switch: bool,
+    pub index: bool,
+    /// A mechanical end to run into (0x30B2).
+    pub obstacle: bool,
+}
+
+/// One homing method (0x6098).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Method {
+    pub code: i8,
+    pub text: &'static str,
+    pub needs: Needs,
+}
+
+const NOTHING: Needs = Needs {
+    negative_limit: false,
+    positive_limit: false,
+    home_switch: false,
+    index: false,
+    obstacle: false,
+};
+const NEGATIVE: Needs = Needs {
+    negative_limit: true,
+    ..NOTHING
+};
+const POSITIVE: Needs = Needs {
+    positive_limit: true,
+    ..NOTHING
+};
+const HOME: Needs = Needs {
+    home_switch: true,
+    ..NOTHING
+};
+const HOME_AND_NEGATIVE: Needs = Needs {
+    negative_limit: true,
+    ..HOME
+};
+const HOME_AND_POSITIVE: Needs = Needs {
+    positive_limit: true,
+    ..HOME
+};
+const OBSTACLE: Needs = Needs {
+    obstacle: true,
+    ..NOTHING
+};
+
+const fn with_index(needs: Needs) -> Needs {
+    Needs {
+        index: true,
+        ..needs
+    }
+}
+
+const fn row(code: i8, text: &'static str, needs: Needs) -> Method {
+    Method { code, text, needs }
+}
+
+/// The methods of CiA 402-2 (0x6098; 15, 16, 31 and 32 are reserved) and maxon's (negative), by code.
+#[rustfmt::skip]
+pub const METHODS: &[Method] = &[
+    row(-4, "mechanical end in negative direction", OBSTACLE),
+    row(-3, "mechanical end in positive direction", OBSTACLE),
+    row(-2, "mechanical end in negative direction, then index", with_index(OBSTACLE)),
+    row(-1, "mechanical end in positive direction, then index", with_index(OBSTACLE)),
+    row(1, "negative limit switch, then index", with_index(NEGATIVE)),
+    row(2, "positive limit switch, then index", with_index(POSITIVE)),
+    row(3, "home switch on the positive side, index below it", with_index(HOME)),
+    row(4, "home switch on the positive side, index above its edge", with_index(HOME)),
+    row(5, "home switch on the negative side, index above it", with_index(HOME)),
+    row(6, "home switch on the negative side, index below its edge", with_index(HOME)),
+    row(7, "home switch upwards, index below its lower edge", with_index(HOME_AND_POSITIVE)),
+    row(8, "home switch upwards, index above its lower edge", with_index(HOME_AND_POSITIVE)),
+    row(9, "home switch upwards, index below its upper edge", with_index(HOME_AND_POSITIVE)),
+    row(10, "home switch upwards, index above its upper edge", with_index(HOME_AND_POSITIVE)),
+    row(11, "home switch downwards, index above its upper edge", with_index(HOME_AND_NEGATIVE)),
+    row(12, "home switch downwards, index below its upper edge", with_index(HOME_AND_NEGATIVE)),
+    row(13, "home switch downwards, index above its lower edge", with_index(HOME_AND_NEGATIVE)),
+    row(14, "home switch downwards, index below its lower edge", with_index(HOME_AND_NEGATIVE)),
+    row(17, "negative limit switch", NEGATIVE),
+    row(18, "positive limit switch", POSITIVE),
+    row(19, "home switch on the positive side, below it", HOME),
+    row(20, "home switch on the positive side, above its edge", HOME),
+    row(21, "home switch on the negative side, above it", HOME),
+    row(22, "home switch on the negative side, below its edge", HOME),
+    row(23, "home switch upwards, below its lower edge", HOME_AND_POSITIVE),
+    row(24, "home switch upwards, above its lower edge", HOME_AND_POSITIVE),
+    row(25, "home switch upwards, below its upper edge", HOME_AND_POSITIVE),
+    row(26, "home switch upwards, above its upper edge", HOME_AND_POSITIVE),
+    row(27, "home switch downwards, above its upper edge", HOME_AND_NEGATIVE),
+    row(28, "home switch downwards, below its upper edge", HOME_AND_NEGATIVE),
+    row(29, "home switch downwards, above its lower edge", HOME_AND_NEGATIVE),
+    row(30, "home switch downwards, below its lower edge", HOME_AND_NEGATIVE),
+    row(33, "index in negative direction", with_index(NOTHING)),
+    row(34, "index in positive direction", with_index(NOTHING)),
+    row(35, "where the axis is (older code)", NOTHING),
+    row(37, "where the axis is", NOTHING),
+];
+
+/// A method by its code. A drive may know fewer.
+#[must_use]
+pub fn method(code: i8) -> Option<&'static Method> {
+    let at = METHODS.binary_search_by_key(&code, |m| m.code).ok()?;
+    METHODS.get(at)
+}
+
+/// Parameters of a homing in user units. `None`: the drive's own setting stays.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Homing {
+    /// 0x6098.
+    pub method: i8,
+    /// Towards the switch or the mechanical end, 0x6099:01.
+    pub search_velocity: Option<f64>,
+    /// Off the switch and to the index, 0x6099:02.
+    pub zero_velocity: Option<f64>,
+    /// 0x609A.
+    pub acceleration: Option<f64>,
+    /// How far the axis goes on from the place found, maxon's 0x30B1.
+    pub distance: Option<f64>,
+    /// What the position is there. maxon: 0x30B0; others: 0x607C, whose sign is the vendor's choice.
+    pub position: Option<f64>,
+    /// Current that tells a mechanical end, milliamperes, maxon's 0x30B2.
+    pub threshold_ma: Option<u16>,
+}
+
+/// One start-up SDO.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HomingObject {
+    pub index: u16,
+    pub subindex: u8,
+    pub value: i64,
+    pub bytes: u8,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum ParameterError {
+    #[error("homing method {0} is not one of CiA 402 or maxon")]
+    Method(i8),
+    #[error("{what} is {value}: it must be above zero and within the limit of {limit}")]
+    Outside {
+        what: &'static str,
+        value: f64,
+        limit: f64,
+    },
+    #[error("{what} of {value} is no number of counts that 32 bits hold")]
+    Counts { what: &'static str, value: f64 },
+    #[error("{what} of {value} is less than the drive's smallest step")]
+    TooSmall { what: &'static str, value: f64 },
+    #[error("homing method {0} runs into a mechanical end and needs the current that tells it")]
+    NoThreshold(i8),
+}
+
+impl Homing {
+    /// The method, and the drive's own settings.
+    #[must_use]
+    pub const fn by(method: i8) -> Self {
+        Self {
+            method,
+            search_velocity: None,
+            zero_velocity: None,
+            acceleration: None,
+            distance: None,
+            position: None,
+            threshold_ma: None,
+        }
+    }
+
+    pub fn check(&self, scale: &Scale, limits: &Limits) -> Result<(), ParameterError> {
+        let method = method(self.method).ok_or(ParameterError::Method(self.method))?;
+        let resolution = scale.velocity_resolution();
+        for (what, value, limit) in [
+            ("search velocity", self.search_velocity, limits.velocity),
+            ("zero velocity", self.zero_velocity, limits.velocity),
+            (
+                "homing acceleration",
+                self.acceleration,
+                limits.acceleration,
+            ),
+        ] {
+            let Some(value) = value else { continue };
+            if !(value > 0.0 && value <= limit) {
+                return Err(ParameterError::Outside { what, value, limit });
+            }
+            // Rounded to nothing, it would never arrive.
+            if value < resolution * 0.5 {
+                return Err(ParameterError::TooSmall { what, value });
+            }
+        }
+        for (what, value) in [
+            ("distance", self.distance),
+            ("home position", self.position),
+        ] {
+            let Some(value) = value else { continue };
+            let counts = (value * scale.counts_per_unit()).abs();
+            if counts.is_nan() || counts >= f64::from(i32::MAX) {
+                return Err(ParameterError::Counts { what, value });
+            }
+        }
+        if method.needs.obstacle && self.threshold_ma.is_none() {
+            return Err(ParameterError::NoThreshold(self.method));
+        }
+        Ok(())
+    }
+
+    /// What to write before the first homing; `maxon`: 0x30B0 instead of 0x607C. Values are in the drive's units and
+    /// direction; of a checked set of parameters they fit.
+    pub fn objects(
+        &self,
+        scale: &Scale,
+        maxon: bool,
+    ) -> impl Iterator<Item = HomingObject> + use<> {
+        let home = if maxon { 0x30B0 } else { 0x607C };
+        let object = |index, subindex, bytes, value: Option<i64>| {
+            value.map(|value| HomingObject {
+                index,
+                subindex,
+                value,
+                bytes,
+            })
+        };
+        let velocity = |v: f64| i64::from(scale.velocity_to_raw(UserVelocity(v)).0).abs();
+        let acceleration = |a: f64| i64::from(scale.acceleration_to_raw(UserAcceleration(a)).0);
+        let position = |p: f64| scale.position_to_counts(UserUnits(p)).0;
+        // A length has the axis's direction, but not its offset.
+        let distance = |d: f64| scale.position_to_counts(UserUnits(d + scale.offset())).0;
+        [
+            object(0x6098, 0, 1, Some(i64::from(self.method))),
+            object(0x6099, 1, 4, self.search_velocity.map(velocity)),
+            object(0x6099, 2, 4, self.zero_velocity.map(velocity)),
+            object(0x609A, 0, 4, self.acceleration.map(acceleration)),
+            object(0x30B1, 0, 4, self.distance.map(distance)),
+            object(home, 0, 4, self.position.map(position)),
+            object(0x30B2, 0, 2, self.threshold_ma.map(i64::from)),
+        ]
+        .into_iter()
+        .flatten()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scale::VelocityUnit;
+
+    const LIMITS: Limits = Limits {
+        position: None,
+        velocity: 200.0,
+        acceleration: 2000.0,
+        jerk: None,
+        torque: 100.0,
+        following_error: None,
+    };
+
+    fn scale() -> Scale {
+        Scale::new(2000.0, 5.0)
+            .unwrap()
+            .with_velocity_unit(VelocityUnit::RPM)
+    }
+
+    #[test]
+    fn methods_are_sorted_and_those_of_the_standard() {
+        assert!(METHODS.windows(2).all(|m| m[0].code < m[1].code));
+        for code in i8::MIN..=i8::MAX {
+            let standard = matches!(code, 1..=14 | 17..=30 | 33..=35 | 37);
+            let maxon = matches!(code, -4..=-1);
+            assert_eq!(method(code).is_some(), standard || maxon, "{code}");
+            if let Some(method) = method(code) {
+                // 1 to 14 and 33, 34 look for the index; 17 to 30 are the same without.
+                let index = matches!(code, -2 | -1 | 1..=14 | 33 | 34);
+                assert_eq!(method.needs.index, index, "{code}");
+            }
+        }
+        for code in 1..=14 {
+            let (with, without) = (method(code).unwrap(), method(code + 16).unwrap());
+            assert_eq!(with.needs, with_index(without.needs));
+        }
+    }
+
+    #[test]
+    fn objects_are_in_the_drives_units() {
+        let homing = Homing {
+            search_velocity: Some(10.0),
+            zero_velocity: Some(1.0),
+            acceleration: Some(100.0),
+            distance: Some(-2.5),
+            position: Some(5.0),
+            ..Homing::by(7)
+        };
+        assert_eq!(homing.check(&scale(), &LIMITS), Ok(()));
+        let as_rows = |scale: &Scale, maxon| {
+            homing
+                .objects(scale, maxon)
+                .map(|o| (o.index, o.subindex, o.value, o.bytes))
+                .collect::<Vec<_>>()
+        };
+        let expected = vec![
+            (0x6098, 0, 7, 1),
+            (0x6099, 1, 120, 4),
+            (0x6099, 2, 12, 4),
+            (0x609A, 0, 1200, 4),
+            (0x30B1, 0, -1000, 4),
+            (0x30B0, 0, 2000, 4),
+        ];
+        assert_eq!(as_rows(&scale(), true), expected);
+        let inverted = scale().with_invert(true).with_offset(1.0).unwrap();
+        let mut rows = as_rows(&inverted, false);
+        assert_eq!(rows.pop(), Some((0x607C, 0, -1600, 4)));
+        assert_eq!(rows.pop(), Some((0x30B1, 0, 1000, 4)));
+        assert_eq!(
+            rows.get(1),
+            Some(&(0x6099, 1, 120, 4)),
+            "a speed has no sign"
+        );
+        let mut only = Homing::by(37).objects(&scale(), true);
+        assert_eq!(only.next().map(|o| o.value), Some(37));
+        assert_eq!(only.next(), None);
+    }
+
+    #[test]
+    fn parameters_that_cannot_work() {
+        let base = Homing::by(1);
+        for homing in [
+            Homing::by(0),
+            Homing::by(15),
+            Homing::by(36),
+            Homing::by(-3),
+            Homing {
+                search_velocity: Some(0.0),
+                ..base
+            },
+            Homing {
+                search_velocity: Some(201.0),
+                ..base
+            },
+            Homing {
+                zero_velocity: Some(f64::NAN),
+                ..base
+            },
+            Homing {
+                zero_velocity: Some(0.01),
+                ..base
+            },
+            Homing {
+                acceleration: Some(2001.0),
+                ..base
+            },
+            Homing {
+                distance: Some(f64::INFINITY),
+                ..base
+            },
+            Homing {
+                position: Some(1e9),
+                ..base
+            },
+        ] {
+            let error = homing
+                .check(&scale(), &LIMITS)
+                .expect_err("must be refused");
+            assert!(!error.to_string().is_empty());
+        }
+        let end = Homing {
+            threshold_ma: Some(500),
+            ..Homing::by(-3)
+        };
+        assert_eq!(end.check(&scale(), &LIMITS), Ok(()));
+    }
+}

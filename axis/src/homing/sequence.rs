@@ -1,0 +1,403 @@
+//! From a mode into homing and back: a pure state machine.
+//!
+//! Bit 4 acts on its rising edge, so it is low for a cycle first. What the drive says before it can have seen the edge is
+//! about the homing before. Whatever ends a homing, the axis stands before the mode changes back.
+
+use crate::cia402::{HomingState, Mode};
+
+/// Longest that the drive may go on saying "attained" or "error" of the homing before, seconds after the start.
+const STALE_S: f64 = 0.1;
+
+/// An axis that does not come to rest after a halt or an error is let go after so many seconds.
+const HALT_S: f64 = 2.0;
+
+/// Why the home position is not known.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum HomingError {
+    #[error("home was not found within {timeout_s} s")]
+    Timeout { timeout_s: f64 },
+    #[error("the drive reports a homing error")]
+    Drive,
+    #[error("homing was aborted")]
+    Aborted,
+    #[error("the drive did not change to homing mode")]
+    ModeRefused,
+    #[error("the axis lost its power while homing")]
+    PowerLost,
+}
+
+/// What the sequence looks at in a cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Seen {
+    /// In force, as 0x6061 shows it.
+    pub mode: Mode,
+    /// The last change of mode that was ordered has been given up.
+    pub mode_failed: bool,
+    /// Bits 13, 12 and 10; meaningless in other modes.
+    pub state: HomingState,
+    pub standing: bool,
+    /// `false`: a lost frame, nothing of this is new.
+    pub fresh: bool,
+}
+
+/// What the sequence wants in a cycle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Order {
+    pub mode: Mode,
+    /// Controlword bit 4.
+    pub start: bool,
+    /// Controlword bit 8.
+    pub halt: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Outcome {
+    Running,
+    /// Home is known, and the axis is back in its mode.
+    Attained,
+    /// The axis is back in its mode, or still in homing mode where [`Seen::mode_failed`] said so.
+    Failed(HomingError),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Phase {
+    Enter,
+    /// Bit 4 low, in homing mode.
+    Prepare,
+    Search {
+        /// The drive still says what it said before the start.
+        stale: bool,
+        elapsed_s: f64,
+    },
+    /// Halted, because of this.
+    Halt {
+        error: HomingError,
+        elapsed_s: f64,
+    },
+    Leave {
+        result: Result<(), HomingError>,
+    },
+    Done {
+        result: Result<(), HomingError>,
+    },
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sequence {
+    phase: Phase,
+    back: Mode,
+    timeout_s: f64,
+}
+
+impl Sequence {
+    /// From mode `back` into homing and to `back` again. The time limit is that of the search.
+    #[must_use]
+    pub const fn new(back: Mode, timeout_s: f64) -> Self {
+        Self {
+            phase: Phase::Enter,
+            back,
+            timeout_s,
+        }
+    }
+
+    /// The mode before and after.
+    #[must_use]
+    pub const fn back(&self) -> Mode {
+        self.back
+    }
+
+    /// Home has just been found: positions from now on count from it.
+    #[must_use]
+    pub const fn attained(&self) -> bool {
+        matches!(
+            self.phase,
+            Phase::Leave { result: Ok(()) } | Phase::Done { result: Ok(()) }
+        )
+    }
+
+    /// Halts the axis and goes back. Without effect once the search is over.
+    pub fn abort(&mut self) {
+        let error = HomingError::Aborted;
+        self.phase = match self.phase {
+            Phase::Enter | Phase::Prepare => Phase::Leave { result: Err(error) },
+            Phase::Search { .. } => Phase::Halt {
+                error,
+                elapsed_s: 0.0,
+            },
+            over => over,
+        };
+    }
+
+    /// One cycle. Pure.
+    #[must_use]
+    pub fn step(mut self, seen: &Seen, dt_s: f64) -> (Self, Order, Outcome) {
+        self.phase = self.phase.next(seen, self.back, self.timeout_s, dt_s);
+        let homing = |start, halt| Order {
+            mode: Mode::Hm,
+            start,
+            halt,
+        };
+        let back = Order {
+            mode: self.back,
+            start: false,
+            halt: false,
+        };
+        let (order, outcome) = match self.phase {
+            Phase::Enter | Phase::Prepare => (homing(false, false), Outcome::Running),
+            Phase::Search { .. } => (homing(true, false), Outcome::Running),
+            Phase::Halt { .. } => (homing(true, true), Outcome::Running),
+            Phase::Leave { .. } => (back, Outcome::Running),
+            Phase::Done { result: Ok(()) } => (back, Outcome::Attained),
+            Phase::Done { result: Err(error) } => (back, Outcome::Failed(error)),
+        };
+        (self, order, outcome)
+    }
+}
+
+impl Phase {
+    fn next(self, seen: &Seen, back: Mode, timeout_s: f64, dt_s: f64) -> Self {
+        match self {
+            Self::Enter if seen.mode_failed => Self::Done {
+                result: Err(HomingError::ModeRefused),
+            },
+            Self::Enter if seen.fresh && seen.mode == Mode::Hm => Self::Prepare,
+            Self::Prepare if seen.fresh => Self::Search {
+                stale: seen.state.is_attained() || seen.state.is_error(),
+                elapsed_s: 0.0,
+            },
+            Self::Search { stale, elapsed_s } => {
+                let elapsed_s = elapsed_s + dt_s;
+                let said = seen.state.is_attained() || seen.state.is_error();
+                let stale = stale && (!seen.fresh || said) && elapsed_s < STALE_S;
+                let news = seen.fresh && !stale;
+                if news && seen.state.is_error() {
+                    Self::halt(HomingError::Drive)
+                } else if news && seen.state.is_attained() && seen.standing {
+                    Self::Leave { result: Ok(()) }
+                } else if elapsed_s > timeout_s {
+                    Self::halt(HomingError::Timeout { timeout_s })
+                } else {
+                    Self::Search { stale, elapsed_s }
+                }
+            }
+            Self::Halt { error, elapsed_s } => {
+                let rests = seen.fresh && seen.standing && elapsed_s > 0.0;
+                if rests || elapsed_s > HALT_S {
+                    Self::Leave { result: Err(error) }
+                } else {
+                    Self::Halt {
+                        error,
+                        elapsed_s: elapsed_s + dt_s,
+                    }
+                }
+            }
+            Self::Leave { result } if seen.mode == back || seen.mode_failed => {
+                Self::Done { result }
+            }
+            same => same,
+        }
+    }
+
+    const fn halt(error: HomingError) -> Self {
+        Self::Halt {
+            error,
+            elapsed_s: 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DT: f64 = 0.001;
+
+    fn seen(mode: Mode, state: HomingState, standing: bool) -> Seen {
+        Seen {
+            mode,
+            mode_failed: false,
+            state,
+            standing,
+            fresh: true,
+        }
+    }
+
+    /// Steps over rows of (mode, state, standing) × cycles; returns the last order and outcome.
+    fn run(
+        mut sequence: Sequence,
+        rows: &[(Mode, HomingState, bool, u32)],
+    ) -> (Sequence, Order, Outcome) {
+        let mut last = None;
+        for &(mode, state, standing, cycles) in rows {
+            for _ in 0..cycles {
+                let (next, order, outcome) = sequence.step(&seen(mode, state, standing), DT);
+                sequence = next;
+                last = Some((order, outcome));
+            }
+        }
+        let (order, outcome) = last.unwrap();
+        (sequence, order, outcome)
+    }
+
+    fn new() -> Sequence {
+        Sequence::new(Mode::Csp, 5.0)
+    }
+
+    const HM: Mode = Mode::Hm;
+    const CSP: Mode = Mode::Csp;
+
+    #[test]
+    fn there_and_back() {
+        use HomingState::*;
+        let order = |mode, start, halt| Order { mode, start, halt };
+        let rows: &[(Mode, HomingState, bool, u32, Order, Outcome)] = &[
+            (
+                CSP,
+                NotStarted,
+                true,
+                10,
+                order(HM, false, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                NotStarted,
+                true,
+                1,
+                order(HM, false, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                NotStarted,
+                true,
+                1,
+                order(HM, true, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                InProgress,
+                false,
+                2000,
+                order(HM, true, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                AttainedNotReached,
+                false,
+                300,
+                order(HM, true, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                Completed,
+                true,
+                1,
+                order(CSP, false, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                NotStarted,
+                true,
+                5,
+                order(CSP, false, false),
+                Outcome::Running,
+            ),
+            (
+                CSP,
+                NotStarted,
+                true,
+                1,
+                order(CSP, false, false),
+                Outcome::Attained,
+            ),
+        ];
+        let mut sequence = new();
+        for &(mode, state, standing, cycles, expected, outcome) in rows {
+            let (next, order, now) = run(sequence, &[(mode, state, standing, cycles)]);
+            assert_eq!((order, now), (expected, outcome), "{state:?}");
+            sequence = next;
+        }
+        assert!(sequence.attained());
+    }
+
+    #[test]
+    fn what_was_said_of_the_homing_before_does_not_count() {
+        use HomingState::*;
+        for old in [Completed, ErrorStanding] {
+            let before = [(HM, old, true, 2), (HM, old, true, 50)];
+            let (sequence, order, outcome) = run(new(), &before);
+            assert_eq!((order.start, outcome), (true, Outcome::Running));
+            let (_, order, _) = run(
+                sequence,
+                &[(HM, InProgress, false, 10), (HM, Completed, true, 1)],
+            );
+            assert_eq!(order.mode, CSP);
+        }
+        // A method that is done at once may never say "in progress".
+        let (sequence, _, _) = run(new(), &[(HM, Completed, true, 150)]);
+        assert!(sequence.attained());
+    }
+
+    #[test]
+    fn ways_to_fail() {
+        use HomingState::*;
+        let start = (HM, NotStarted, true, 3);
+        let search = (HM, InProgress, false, 100);
+        // An error while moving: halt, stand, back.
+        let (sequence, order, _) = run(new(), &[start, search, (HM, ErrorMoving, false, 5)]);
+        assert!(order.halt && order.mode == HM);
+        let (sequence, order, _) = run(sequence, &[(HM, ErrorStanding, true, 2)]);
+        assert_eq!(order.mode, CSP);
+        let (_, _, outcome) = run(sequence, &[(CSP, NotStarted, true, 1)]);
+        assert_eq!(outcome, Outcome::Failed(HomingError::Drive));
+        // Never found, and never at rest.
+        let (sequence, order, _) = run(new(), &[start, (HM, InProgress, false, 5010)]);
+        assert!(order.halt);
+        let (_, _, outcome) = run(
+            sequence,
+            &[(HM, InProgress, false, 2100), (CSP, NotStarted, false, 1)],
+        );
+        let timeout = HomingError::Timeout { timeout_s: 5.0 };
+        assert_eq!(outcome, Outcome::Failed(timeout));
+        assert_eq!(timeout.to_string(), "home was not found within 5 s");
+        // Aborted in each phase.
+        for rows in [
+            &[(CSP, NotStarted, true, 3)][..],
+            &[start],
+            &[start, search],
+        ] {
+            let (mut sequence, _, _) = run(new(), rows);
+            sequence.abort();
+            let rest = [(HM, NotStarted, true, 3), (CSP, NotStarted, true, 1)];
+            let (_, order, outcome) = run(sequence, &rest);
+            assert_eq!(outcome, Outcome::Failed(HomingError::Aborted));
+            assert!(!order.start && !order.halt);
+        }
+        // No such mode.
+        let refused = Seen {
+            mode_failed: true,
+            ..seen(CSP, NotStarted, true)
+        };
+        let (_, _, outcome) = new().step(&refused, DT);
+        assert_eq!(outcome, Outcome::Failed(HomingError::ModeRefused));
+    }
+
+    #[test]
+    fn abort_after_the_end_changes_nothing() {
+        let (mut sequence, _, _) = run(
+            new(),
+            &[
+                (HM, HomingState::NotStarted, true, 3),
+                (HM, HomingState::Completed, true, 1),
+            ],
+        );
+        sequence.abort();
+        let (_, _, outcome) = run(sequence, &[(CSP, HomingState::NotStarted, true, 1)]);
+        assert_eq!(outcome, Outcome::Attained);
+    }
+}
