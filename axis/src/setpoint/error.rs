@@ -22,8 +22,18 @@ pub enum SetpointError {
     TooFast { velocity: f64, limit: f64 },
     #[error("an acceleration of {acceleration} would be reached, above the limit {limit}")]
     TooSteep { acceleration: f64, limit: f64 },
-    #[error("there is no time between two points")]
+    #[error("a jerk of {jerk} would be reached, above the limit {limit}")]
+    TooMuchJerk { jerk: f64, limit: f64 },
+    #[error("{frequency} Hz is more than the {highest} Hz that the cycle can show")]
+    TooOften { frequency: f64, highest: f64 },
+    #[error("there is no time, or too little, for the way")]
     NoTime,
+    #[error("the axis stands at {at} and must stand at {expected}")]
+    Elsewhere { at: f64, expected: f64 },
+    #[error("all {capacity} places are taken")]
+    Full { capacity: usize },
+    #[error("the points have ended")]
+    Ended,
     #[error("the axis must stand still first; its set-point moves at {velocity}")]
     NotAtRest { velocity: f64 },
 }

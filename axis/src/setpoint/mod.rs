@@ -8,6 +8,10 @@
 //! | [`Trapezoid`] | to a position, with bounded velocity and acceleration |
 //! | [`JerkLimited`] | to a position, or to a velocity, with bounded jerk as well |
 //! | [`crate::group::Along`] | to a position, on a straight line with other axes |
+//! | [`PositionWave`] | sine and square waves for commissioning |
+//! | [`Stream`] | through points that arrive while it moves |
+//! | [`Playback`] | through the points of a [`Table`] |
+//! | [`Gear`] | after another axis |
 //!
 //! [`Ramp`] is for a single value: velocity in CSV, torque in CST. [`Hold`], [`Trapezoid`] and [`Ramp`] remember neither a start nor a time;
 //! the others follow a plan, and make a new one when they find the axis elsewhere than they left it. So any of them can take over in any
@@ -17,17 +21,29 @@
 //! in the sequence of positions that reaches the drive, are what the plans bound, exactly.
 
 mod error;
+mod gear;
 mod hold;
 mod jerk;
 mod ramp;
+#[cfg(test)]
+mod sequence;
+mod spline;
+mod stream;
+mod table;
 mod trapezoid;
+mod wave;
 
 pub use error::SetpointError;
+pub use gear::{Engage, Gear, GearConfig};
 pub use hold::Hold;
 pub use jerk::{Goal, JerkLimited, Order};
 pub use ramp::Ramp;
+pub use spline::{Interpolation, Knot};
+pub use stream::{Stream, StreamConfig, StreamState};
+pub use table::{Playback, Table, TableError, TableProblem};
 pub use trapezoid::Trapezoid;
 pub(crate) use trapezoid::braking_velocity;
+pub use wave::{PositionWave, Shape, Wave};
 
 /// A set-point: position, the velocity at which it was reached, and how that changed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -1,0 +1,185 @@
+//! One axis after another: follower = ratio × master + offset.
+//!
+//! The master is what its axis commands or reports, as the caller likes. While engaged, the follower is where it is to be in every cycle,
+//! exactly, as long as its own limits allow it; where they do not, at first or because the master jumps, it catches up within them.
+
+use super::error::{position, usable};
+use super::{Motion, MotionLimits, SetpointError, braking_velocity};
+
+/// Braking is planned with this part of the acceleration; the rest is for rounding.
+const PLANNED: f64 = 1.0 - 1e-4;
+
+/// What of the acceleration limit is for catching up. The rest is for following meanwhile.
+const CATCHING_UP: f64 = 0.5;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Engage {
+    /// With the offset that both have now: only the velocity has to be caught up with.
+    Here,
+    /// With this offset, in the follower's units: the way there is caught up with, too.
+    At { offset: f64 },
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GearConfig {
+    /// Follower's units per master's unit; negative for opposite directions.
+    pub ratio: f64,
+    pub engage: Engage,
+    /// Time constant with which the master's velocity is smoothed, seconds; 0 for none. Reported positions come in whole counts, and their
+    /// differences would otherwise exceed the follower's acceleration. A master at rest or at constant velocity is followed without lag.
+    pub smoothing_s: f64,
+    pub limits: MotionLimits,
+    pub range: Option<[f64; 2]>,
+}
+
+/// The longest smoothing, seconds.
+const SMOOTHEST_S: f64 = 10.0;
+
+/// Takes over from any motion; any other source takes over from it. To disengage is to give the follower another source.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Gear {
+    ratio: f64,
+    offset: f64,
+    limits: MotionLimits,
+    range: Option<[f64; 2]>,
+    smoothing_s: f64,
+    /// The master, smoothed.
+    master: Motion,
+    /// Where the follower was to be in the last cycle.
+    ideal: f64,
+    engaged: bool,
+    slips: u32,
+}
+
+impl Gear {
+    /// `master` and `motion` (the follower's set-point) as they are now.
+    pub fn new(config: GearConfig, master: Motion, motion: Motion) -> Result<Self, SetpointError> {
+        usable("gear ratio", config.ratio.abs())?;
+        config.limits.check()?;
+        master.check()?;
+        motion.check()?;
+        if !(0.0..=SMOOTHEST_S).contains(&config.smoothing_s) {
+            return Err(SetpointError::NotUsable {
+                what: "smoothing time",
+                value: config.smoothing_s,
+            });
+        }
+        let offset = match config.engage {
+            Engage::Here => motion.position - config.ratio * master.position,
+            Engage::At { offset } => offset,
+        };
+        position("gear offset", offset)?;
+        let ideal = config.ratio * master.position + offset;
+        position("gear position", ideal)?;
+        Ok(Self {
+            ratio: config.ratio,
+            offset,
+            limits: config.limits,
+            range: config.range,
+            smoothing_s: config.smoothing_s,
+            master,
+            ideal,
+            engaged: false,
+            slips: 0,
+        })
+    }
+
+    /// The follower is where it is to be.
+    #[must_use]
+    pub const fn engaged(&self) -> bool {
+        self.engaged
+    }
+
+    #[must_use]
+    pub const fn offset(&self) -> f64 {
+        self.offset
+    }
+
+    /// How many times it was engaged and could not follow.
+    #[must_use]
+    pub const fn slips(&self) -> u32 {
+        self.slips
+    }
+
+    /// One cycle on from `motion`; `master` is where the master is at its end. What is not a number leaves the master where it was.
+    /// RT: O(1).
+    #[must_use]
+    pub fn advance(&mut self, master: Motion, motion: Motion, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        let before = self.ideal;
+        if master.check().is_ok() {
+            self.track(master, dt_s);
+        }
+        let ideal = self.ratio * self.master.position + self.offset;
+        if position("gear position", ideal).is_ok() {
+            self.ideal = ideal;
+        }
+        let velocity = (self.ideal - before) / dt_s;
+        let [slowest, fastest] = self.possible(motion, dt_s);
+        // Exactly there, at the velocity that keeps it there.
+        let needed = (self.ideal - motion.position) / dt_s;
+        let possible = (slowest..=fastest).contains(&needed);
+        let change = self.limits.acceleration * CATCHING_UP * dt_s;
+        let was_engaged = self.engaged;
+        self.engaged = possible && (was_engaged || (needed - velocity).abs() <= change);
+        if self.engaged {
+            return motion.then(self.ideal, needed, dt_s);
+        }
+        self.slips = self.slips.saturating_add(u32::from(was_engaged));
+        let left = before - motion.position;
+        let braking = self.limits.acceleration * CATCHING_UP * PLANNED;
+        let closing = braking_velocity(left.abs(), braking, dt_s).copysign(left);
+        let wanted = velocity + closing;
+        // Not `clamp`: it panics on bounds that are not numbers.
+        let velocity = wanted.max(slowest).min(fastest);
+        motion.then(motion.position + velocity * dt_s, velocity, dt_s)
+    }
+
+    /// An α-β filter, critically damped.
+    fn track(&mut self, master: Motion, dt_s: f64) {
+        if self.smoothing_s == 0.0 {
+            self.master = master;
+            return;
+        }
+        let kept = (-dt_s / self.smoothing_s).exp();
+        let expected = self.master.position + self.master.velocity * dt_s;
+        let error = master.position - expected;
+        let position = expected + error * (1.0 - kept * kept);
+        let velocity = self.master.velocity + error / dt_s * (1.0 - kept) * (1.0 - kept);
+        self.master = Motion {
+            position,
+            velocity,
+            acceleration: 0.0,
+        };
+    }
+
+    /// Lowest and highest velocity of this cycle: within the limits, and such that the follower can still stop in its range.
+    fn possible(&self, motion: Motion, dt_s: f64) -> [f64; 2] {
+        let limits = &self.limits;
+        let change = limits.acceleration * dt_s;
+        let mut slowest = (motion.velocity - change).max(-limits.velocity);
+        let mut fastest = (motion.velocity + change).min(limits.velocity);
+        if let Some([low, high]) = self.range {
+            let braking = limits.acceleration * PLANNED;
+            let up = braking_velocity((high - motion.position).max(0.0), braking, dt_s);
+            let down = braking_velocity((motion.position - low).max(0.0), braking, dt_s);
+            fastest = fastest.min(up.max(motion.velocity - change));
+            slowest = slowest.max((-down).min(motion.velocity + change));
+        }
+        // Faster than the limit when it took over: it can only brake.
+        if slowest > fastest {
+            if motion.velocity > 0.0 {
+                fastest = slowest;
+            } else {
+                slowest = fastest;
+            }
+        }
+        [slowest, fastest]
+    }
+}
+
+#[cfg(test)]
+#[path = "gear_tests.rs"]
+mod tests;

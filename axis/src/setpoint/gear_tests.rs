@@ -1,0 +1,186 @@
+use proptest::prelude::*;
+
+use super::super::sequence::Sequence;
+use super::super::{Goal, JerkLimited, Order, Setpoint};
+use super::*;
+
+const DT: f64 = 0.001;
+
+const LIMITS: MotionLimits = MotionLimits {
+    velocity: 200.0,
+    acceleration: 2000.0,
+    jerk: 40_000.0,
+};
+
+fn config(ratio: f64, engage: Engage) -> GearConfig {
+    GearConfig {
+        ratio,
+        engage,
+        smoothing_s: 0.0,
+        limits: LIMITS,
+        range: None,
+    }
+}
+
+/// A master at 50, a follower at rest: it accelerates, catches up with what it missed, and stays.
+#[test]
+fn engages_with_a_moving_master() {
+    for engage in [Engage::Here, Engage::At { offset: 100.0 }] {
+        let mut master = Motion {
+            velocity: 50.0,
+            ..Motion::at(10.0)
+        };
+        let start = Motion::at(3.0);
+        let mut gear = Gear::new(config(-2.0, engage), master, start).unwrap();
+        let mut sequence = Sequence::from(start, LIMITS, DT);
+        let mut engaged_at = None;
+        for cycle in 0..4000 {
+            master.position += master.velocity * DT;
+            let next = gear.advance(master, sequence.motion, DT);
+            sequence.then(next).unwrap();
+            if gear.engaged() {
+                engaged_at.get_or_insert(cycle);
+                assert_eq!(next.position, -2.0 * master.position + gear.offset());
+            } else {
+                assert_eq!(engaged_at, None);
+            }
+        }
+        // 100/1000 s to brake relatively, and the way, at 100 faster at most.
+        let most = if engage == Engage::Here { 250 } else { 1200 };
+        assert!(
+            engaged_at.is_some_and(|cycle| cycle < most),
+            "{engaged_at:?}"
+        );
+        assert_eq!(gear.slips(), 0);
+    }
+}
+
+#[test]
+fn a_jump_of_the_master_is_caught_up_with() {
+    let mut gear = Gear::new(config(1.0, Engage::Here), Motion::at(0.0), Motion::at(0.0)).unwrap();
+    let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
+    for cycle in 0..1000 {
+        let master = Motion::at(if cycle < 10 { 0.0 } else { 20.0 });
+        sequence
+            .then(gear.advance(master, sequence.motion, DT))
+            .unwrap();
+        assert!(sequence.motion.position <= 20.0 + 1e-9);
+    }
+    assert!(gear.engaged() && sequence.motion.stands_at(20.0));
+    assert_eq!(gear.slips(), 1);
+    // What is no number does not move it.
+    let next = gear.advance(Motion::at(f64::NAN), sequence.motion, DT);
+    assert!(next.stands_at(20.0));
+}
+
+#[test]
+fn a_reported_master_is_smoothed() {
+    // 0.0025 per count, in whole counts: 2.5 per second and cycle, an acceleration of 2500.
+    let mut gear = Gear::new(
+        GearConfig {
+            smoothing_s: 0.02,
+            ..config(1.0, Engage::Here)
+        },
+        Motion {
+            velocity: 33.3,
+            ..Motion::at(0.0)
+        },
+        Motion::at(0.0),
+    )
+    .unwrap();
+    let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
+    let mut worst = 0.0f64;
+    for cycle in 0..3000 {
+        let position = f64::from(cycle) * DT * 33.3;
+        let reported = Motion::at((position / 0.0025).round() * 0.0025);
+        sequence
+            .then(gear.advance(reported, sequence.motion, DT))
+            .unwrap();
+        if cycle > 500 {
+            worst = worst.max((sequence.motion.position - position).abs());
+        }
+    }
+    assert!(gear.engaged());
+    assert_eq!(gear.slips(), 0);
+    assert!(worst < 0.0025, "{worst}");
+}
+
+#[test]
+fn nonsense_is_refused() {
+    let at = Motion::at(0.0);
+    for ratio in [0.0, f64::NAN, f64::INFINITY, 1e-300] {
+        assert!(Gear::new(config(ratio, Engage::Here), at, at).is_err());
+    }
+    for value in [f64::NAN, 1e300] {
+        assert!(Gear::new(config(1.0, Engage::At { offset: value }), at, at).is_err());
+        assert!(Gear::new(config(1.0, Engage::Here), Motion::at(value), at).is_err());
+        assert!(Gear::new(config(1.0, Engage::Here), at, Motion::at(value)).is_err());
+        let smoothed = GearConfig {
+            smoothing_s: value,
+            ..config(1.0, Engage::Here)
+        };
+        assert!(Gear::new(smoothed, at, at).is_err());
+    }
+    assert!(
+        Gear::new(
+            config(1e12, Engage::At { offset: 0.0 }),
+            Motion::at(1e12),
+            at
+        )
+        .is_err()
+    );
+}
+
+proptest! {
+    /// A master that goes anywhere, jumps and stops; engaged and given up at any time. Never beyond a limit, never outside the range, and
+    /// exactly there once the master stands.
+    #[test]
+    fn keeps_the_limits(
+        ratio in prop_oneof![-3.0..-0.1f64, 0.1..3.0f64], absolute in prop::option::of(-30.0..30.0f64), ranged in any::<bool>(),
+        smoothing_s in prop::sample::select(vec![0.0, 0.01]),
+        moves in prop::collection::vec((-15.0..15.0f64, 0u32..400, prop::option::weighted(0.1, -5.0..5.0f64)), 1..8),
+        velocity in -150.0..150.0f64,
+    ) {
+        let range = ranged.then_some([-60.0, 60.0]);
+        let engage = absolute.map_or(Engage::Here, |offset| Engage::At { offset });
+        let mut master = Motion::at(0.0);
+        let mut source = JerkLimited::new(Order::within(Goal::Position(0.0), LIMITS), master, DT).unwrap();
+        let start = Motion { velocity, ..Motion::at(5.0) };
+        let mut gear = Gear::new(GearConfig { range, smoothing_s, ..config(ratio, engage) }, master, start).unwrap();
+        let mut sequence = Sequence::from(start, LIMITS, DT);
+        for (target, cycles, jump) in moves.into_iter().chain([(1.0, 6000, None)]) {
+            master.position += jump.unwrap_or(0.0);
+            source = source.redirect(Order::within(Goal::Position(target), LIMITS), master, DT).unwrap();
+            for _ in 0..cycles {
+                master = source.advance(master, DT);
+                sequence.then(gear.advance(master, sequence.motion, DT))?;
+                if ranged {
+                    prop_assert!(sequence.motion.position.abs() <= 60.0 + 1e-9, "{:?}", sequence.motion);
+                }
+            }
+        }
+        let ideal = ratio * master.position + gear.offset();
+        if !ranged || ideal.abs() < 59.9 {
+            prop_assert!((sequence.motion.position - ideal).abs() < 1e-9, "{} {:?} {:?}", ideal, sequence.motion, gear);
+            prop_assert!(gear.engaged());
+        } else {
+            prop_assert!(sequence.motion.velocity.abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn any_numbers(
+        ratio: f64, offset: f64, smoothing_s in 0.0..1.0f64,
+        cycles in prop::collection::vec((any::<f64>(), any::<f64>(), any::<f64>()), 1..20),
+    ) {
+        let config = GearConfig { smoothing_s, ..config(ratio, Engage::At { offset }) };
+        if let Ok(mut gear) = Gear::new(config, Motion::at(0.0), Motion::at(0.0)) {
+            let mut motion = Motion::at(0.0);
+            for (position, velocity, dt) in cycles {
+                let master = Motion { position, velocity, acceleration: 0.0 };
+                motion = gear.advance(master, motion, dt.abs().min(0.1));
+                prop_assert!(motion.position.is_finite() && motion.velocity.is_finite());
+            }
+        }
+    }
+}

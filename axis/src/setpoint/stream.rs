@@ -1,0 +1,209 @@
+//! Set-points through points that arrive while the axis moves.
+//!
+//! Points lie a fixed time apart; each is checked against the one before when it arrives, the way between them included, so that nothing
+//! in the buffer can exceed a limit later. When the points run out, the axis decelerates with its limit and stands, and says so: what comes
+//! next must start from there.
+
+use super::error::{finite, usable};
+use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
+use super::{Hold, Knot, Motion, MotionLimits, Setpoint, SetpointError};
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StreamConfig {
+    pub interpolation: Interpolation,
+    /// From one point to the next, seconds.
+    pub interval_s: f64,
+    /// Starts to move when so many points are there, or the last one is.
+    pub prefill: usize,
+    pub limits: MotionLimits,
+    pub range: Option<[f64; 2]>,
+    /// The cycle.
+    pub dt_s: f64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StreamState {
+    /// For the first points.
+    Waiting,
+    Moving,
+    /// The last point is passed.
+    Ended,
+    /// The points ran out before the last one was told, or the axis was held up: it brakes, then stands. Nothing more is accepted.
+    Underrun,
+}
+
+/// A buffer of `N` points and what is made of them. It lies where it is declared; nothing is allocated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stream<const N: usize> {
+    config: StreamConfig,
+    buffer: [Piece; N],
+    first: usize,
+    filled: usize,
+    /// The last point accepted, and how fast it is reached.
+    newest: Knot,
+    closed: bool,
+    state: StreamState,
+    elapsed: f64,
+    last: Motion,
+}
+
+impl<const N: usize> Stream<N> {
+    /// From where `motion` stands.
+    pub fn new(config: StreamConfig, motion: Motion) -> Result<Self, SetpointError> {
+        usable("interval", config.interval_s)?;
+        usable("cycle time", config.dt_s)?;
+        // With several points in a cycle, several changes of velocity would fall into it.
+        if config.interval_s < config.dt_s * (1.0 - 1e-9) {
+            return Err(SetpointError::NoTime);
+        }
+        config.limits.check()?;
+        motion.check()?;
+        let velocity = motion.velocity;
+        if velocity != 0.0 {
+            return Err(SetpointError::NotAtRest { velocity });
+        }
+        let at = Knot {
+            position: motion.position,
+            velocity: 0.0,
+        };
+        Ok(Self {
+            config,
+            buffer: [Piece::new(at, at, config.interval_s); N],
+            first: 0,
+            filled: 0,
+            newest: at,
+            closed: false,
+            state: StreamState::Waiting,
+            elapsed: 0.0,
+            last: motion,
+        })
+    }
+
+    /// Accepts the point `interval_s` after the one before, or refuses it and changes nothing. RT: O(1).
+    pub fn push(&mut self, point: Knot) -> Result<(), SetpointError> {
+        if self.closed || self.state == StreamState::Underrun {
+            return Err(SetpointError::Ended);
+        }
+        if self.filled >= N {
+            return Err(SetpointError::Full { capacity: N });
+        }
+        let piece = self.check(point)?;
+        if let Some(place) = self.buffer.get_mut((self.first + self.filled) % N) {
+            *place = piece;
+        }
+        self.filled += 1;
+        self.newest = piece.to();
+        Ok(())
+    }
+
+    /// No more points: at the last one the axis is to stand. Refused, and not closed, if it would arrive there too fast to; on a cubic,
+    /// with any velocity.
+    pub fn close(&mut self) -> Result<(), SetpointError> {
+        let config = &self.config;
+        check_end(
+            config.interpolation,
+            self.newest.velocity,
+            config.limits.acceleration,
+            config.dt_s,
+        )?;
+        self.closed = true;
+        Ok(())
+    }
+
+    #[must_use]
+    pub const fn state(&self) -> StreamState {
+        self.state
+    }
+
+    /// Places that are left.
+    #[must_use]
+    pub const fn free(&self) -> usize {
+        N.saturating_sub(self.filled)
+    }
+
+    fn check(&self, point: Knot) -> Result<Piece, SetpointError> {
+        let config = &self.config;
+        super::error::position("point", point.position)?;
+        finite("velocity", point.velocity)?;
+        let before = self.newest;
+        let piece = match config.interpolation {
+            Interpolation::Cubic => Piece::new(before, point, config.interval_s),
+            Interpolation::Linear => {
+                Piece::straight(before.position, point.position, config.interval_s)
+            }
+        };
+        let acceleration = config.limits.acceleration;
+        piece.check(config.limits, config.range)?;
+        check_corner(
+            before.velocity,
+            piece.from().velocity,
+            acceleration,
+            config.dt_s,
+        )?;
+        check_stop(piece.to(), acceleration, config.range, config.dt_s)?;
+        Ok(piece)
+    }
+
+    fn start(&mut self) {
+        let enough = self.config.prefill.clamp(1, N.max(1));
+        if self.state == StreamState::Waiting && (self.filled >= enough || self.closed) {
+            self.state = StreamState::Moving;
+        }
+    }
+
+    /// The position after `dt_s` more, or `None` when there is none.
+    fn pass(&mut self, dt_s: f64) -> Option<f64> {
+        self.elapsed += dt_s;
+        while self.filled > 0 {
+            let piece = self.buffer.get(self.first)?;
+            if self.elapsed < piece.time() {
+                return Some(piece.position(self.elapsed));
+            }
+            self.elapsed -= piece.time();
+            self.first = (self.first + 1) % N;
+            self.filled -= 1;
+        }
+        if !self.closed {
+            return None;
+        }
+        self.state = StreamState::Ended;
+        Some(self.newest.position)
+    }
+}
+
+impl<const N: usize> Setpoint for Stream<N> {
+    /// RT: O(points passed in one cycle).
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
+            self.state = StreamState::Underrun;
+        }
+        self.start();
+        let position = match self.state {
+            StreamState::Moving => self.pass(dt_s),
+            StreamState::Waiting => Some(motion.position),
+            StreamState::Ended => Some(self.newest.position),
+            StreamState::Underrun => None,
+        };
+        let next = match position {
+            Some(position) => motion.then(position, (position - motion.position) / dt_s, dt_s),
+            None => {
+                self.state = StreamState::Underrun;
+                let acceleration = self.config.limits.acceleration;
+                Hold { acceleration }.advance(motion, dt_s)
+            }
+        };
+        self.last = next;
+        next
+    }
+
+    fn finished(&self, motion: Motion) -> bool {
+        matches!(self.state, StreamState::Ended | StreamState::Underrun) && motion.velocity == 0.0
+    }
+}
+
+#[cfg(test)]
+#[path = "stream_tests.rs"]
+mod tests;

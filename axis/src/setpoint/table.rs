@@ -1,0 +1,368 @@
+//! Set-points from a table of times, positions and perhaps velocities.
+//!
+//! [`Table::parse`] turns text into a table and allocates; [`Table::check`] judges all of it against an axis before the first cycle; a
+//! [`Playback`] follows it and allocates nothing.
+
+use super::error::position;
+use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
+use super::{Hold, Knot, Motion, MotionLimits, SetpointError};
+
+/// What is wrong, and in which line of the text (from 1).
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("line {line}: {problem}")]
+pub struct TableError {
+    pub line: usize,
+    #[source]
+    pub problem: TableProblem,
+}
+
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum TableProblem {
+    #[error("`{field}` is no number")]
+    NotANumber { field: String },
+    #[error("{found} columns where there are to be {expected}")]
+    Columns {
+        found: usize,
+        expected: &'static str,
+    },
+    #[error("time {time} s does not come after {before} s")]
+    NotLater { time: f64, before: f64 },
+    #[error("a table needs two rows at least, and {most} at most")]
+    Rows { most: usize },
+    #[error("{within} s after the row before is less than a cycle")]
+    TooClose { within: f64 },
+    #[error(transparent)]
+    Motion(#[from] SetpointError),
+}
+
+/// Rows of a table; 60 MB of pieces.
+const MOST_ROWS: usize = 1_000_000;
+
+/// Fields quoted in errors are no longer than this.
+const QUOTED: usize = 40;
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    interpolation: Interpolation,
+    pieces: Box<[Piece]>,
+    /// Of each piece's end.
+    lines: Box<[usize]>,
+    first_line: usize,
+}
+
+#[derive(Clone, Copy)]
+struct Row {
+    line: usize,
+    time: f64,
+    position: f64,
+    velocity: Option<f64>,
+}
+
+impl Table {
+    /// Reads rows of time (seconds), position and perhaps velocity, in user units, separated by commas, semicolons or blanks; empty lines
+    /// and what follows `#` do not count, nor does a first row that begins with a word. Without velocities a cubic takes them from the
+    /// neighbouring rows, and zero at both ends.
+    pub fn parse(text: &str, interpolation: Interpolation) -> Result<Self, TableError> {
+        let rows = rows(text)?;
+        let [first, .., _] = rows.as_slice() else {
+            return Err(TableError {
+                line: text.lines().count().max(1),
+                problem: TableProblem::Rows { most: MOST_ROWS },
+            });
+        };
+        let first_line = first.line;
+        let velocities = velocities(&rows);
+        let knots = rows.iter().zip(velocities).map(|(row, velocity)| Knot {
+            position: row.position,
+            velocity,
+        });
+        let knots: Vec<Knot> = knots.collect();
+        let pieces = rows.windows(2).zip(knots.windows(2));
+        let pieces = pieces.filter_map(|(rows, knots)| match (rows, knots) {
+            (&[a, b], &[from, to]) => Some(match interpolation {
+                Interpolation::Linear => {
+                    Piece::straight(from.position, to.position, b.time - a.time)
+                }
+                Interpolation::Cubic => Piece::new(from, to, b.time - a.time),
+            }),
+            _ => None,
+        });
+        Ok(Self {
+            interpolation,
+            pieces: pieces.collect(),
+            lines: rows.iter().skip(1).map(|row| row.line).collect(),
+            first_line,
+        })
+    }
+
+    /// Where it begins and where it ends.
+    #[must_use]
+    pub fn ends(&self) -> [f64; 2] {
+        let first = self.pieces.first().map(|piece| piece.from().position);
+        let last = self.pieces.last().map(|piece| piece.to().position);
+        [first, last].map(Option::unwrap_or_default)
+    }
+
+    #[must_use]
+    pub fn duration_s(&self) -> f64 {
+        self.pieces.iter().map(Piece::time).sum()
+    }
+
+    /// Rows.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.pieces.len() + 1
+    }
+
+    /// A table has two rows at least.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        false
+    }
+
+    /// Every velocity, acceleration and position, and a stop at any time, against what the axis may do; `offset` is added to all
+    /// positions. A velocity step at a row must be possible within the cycle `dt_s`.
+    pub fn check(
+        &self,
+        limits: MotionLimits,
+        range: Option<[f64; 2]>,
+        offset: f64,
+        dt_s: f64,
+    ) -> Result<(), TableError> {
+        let at = |line: usize| {
+            move |problem: SetpointError| TableError {
+                line,
+                problem: problem.into(),
+            }
+        };
+        limits.check().map_err(at(self.first_line))?;
+        position("offset", offset).map_err(at(self.first_line))?;
+        let range = range.map(|range| range.map(|end| end - offset));
+        let acceleration = limits.acceleration;
+        let mut before = self
+            .pieces
+            .first()
+            .map_or(0.0, |piece| piece.from().velocity);
+        // A start is an end seen backwards.
+        check_end(self.interpolation, before, acceleration, dt_s).map_err(at(self.first_line))?;
+        for (piece, &line) in self.pieces.iter().zip(&self.lines) {
+            if piece.time() < dt_s * (1.0 - 1e-9) {
+                return Err(TableError {
+                    line,
+                    problem: TableProblem::TooClose {
+                        within: piece.time(),
+                    },
+                });
+            }
+            let start = piece.from().velocity;
+            check_corner(before, start, acceleration, dt_s).map_err(at(line))?;
+            piece.check(limits, range).map_err(at(line))?;
+            check_stop(piece.to(), acceleration, range, dt_s).map_err(at(line))?;
+            before = piece.to().velocity;
+        }
+        let last = self.lines.last().copied().unwrap_or(self.first_line);
+        check_end(self.interpolation, before, acceleration, dt_s).map_err(at(last))
+    }
+}
+
+fn rows(text: &str) -> Result<Vec<Row>, TableError> {
+    let mut rows: Vec<Row> = Vec::new();
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    let mut heading = true;
+    for (index, text) in text.lines().enumerate() {
+        let line = index + 1;
+        let wrong = |problem| TableError { line, problem };
+        let text = text.split('#').next().unwrap_or_default().trim();
+        if text.is_empty() {
+            continue;
+        }
+        let fields: Vec<&str> = fields(text).collect();
+        let is_heading = heading && fields.first().is_some_and(|f| number(f).is_none());
+        heading = false;
+        if is_heading {
+            continue;
+        }
+        let row = row(line, &fields).map_err(wrong)?;
+        if let Some(before) = rows.last() {
+            if row.time <= before.time {
+                return Err(wrong(TableProblem::NotLater {
+                    time: row.time,
+                    before: before.time,
+                }));
+            }
+            if row.velocity.is_some() != before.velocity.is_some() {
+                return Err(wrong(TableProblem::Columns {
+                    found: fields.len(),
+                    expected: "as many as in the row before",
+                }));
+            }
+        }
+        if rows.len() >= MOST_ROWS {
+            return Err(wrong(TableProblem::Rows { most: MOST_ROWS }));
+        }
+        rows.push(row);
+    }
+    Ok(rows)
+}
+
+/// Commas and semicolons separate, with blanks around them or not; where there are none, blanks do.
+fn fields(text: &str) -> impl Iterator<Item = &str> {
+    let marked = text.contains([',', ';']);
+    text.split(move |c: char| {
+        if marked {
+            c == ',' || c == ';'
+        } else {
+            c.is_whitespace()
+        }
+    })
+    .map(str::trim)
+    .filter(move |field| marked || !field.is_empty())
+}
+
+fn number(field: &str) -> Option<f64> {
+    field.parse().ok()
+}
+
+fn row(line: usize, fields: &[&str]) -> Result<Row, TableProblem> {
+    let value = |field: &str| {
+        number(field).ok_or_else(|| TableProblem::NotANumber {
+            field: field.chars().take(QUOTED).collect(),
+        })
+    };
+    let (time, at, velocity) = match *fields {
+        [time, at] => (value(time)?, value(at)?, None),
+        [time, at, velocity] => (value(time)?, value(at)?, Some(value(velocity)?)),
+        _ => {
+            return Err(TableProblem::Columns {
+                found: fields.len(),
+                expected: "2 or 3 (time, position, velocity)",
+            });
+        }
+    };
+    position("time", time)?;
+    position("position", at)?;
+    position("velocity", velocity.unwrap_or_default())?;
+    Ok(Row {
+        line,
+        time,
+        position: at,
+        velocity,
+    })
+}
+
+/// As given, or of the parabola through each row and its neighbours.
+fn velocities(rows: &[Row]) -> Vec<f64> {
+    let neighbours = rows.windows(3).map(|rows| match *rows {
+        [a, b, c] => {
+            let (before, after) = (b.time - a.time, c.time - b.time);
+            let slopes = [
+                (b.position - a.position) / before,
+                (c.position - b.position) / after,
+            ];
+            (slopes[0] * after + slopes[1] * before) / (before + after)
+        }
+        _ => 0.0,
+    });
+    let computed = [0.0].into_iter().chain(neighbours).chain([0.0]);
+    rows.iter()
+        .zip(computed)
+        .map(|(row, computed)| row.velocity.unwrap_or(computed))
+        .collect()
+}
+
+/// Follows a table that has been checked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Playback {
+    acceleration: f64,
+    offset: f64,
+    index: usize,
+    elapsed: f64,
+    state: State,
+    last: Motion,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    Playing,
+    Ended,
+    Interrupted,
+}
+
+impl Playback {
+    /// From where `motion` stands, which is the table's first position and `offset`. O(1); [`Table::check`] is the caller's, outside the
+    /// cycle.
+    pub fn new(
+        table: &Table,
+        motion: Motion,
+        limits: MotionLimits,
+        offset: f64,
+    ) -> Result<Self, SetpointError> {
+        limits.check()?;
+        position("offset", offset)?;
+        let expected = table.ends()[0] + offset;
+        let velocity = motion.velocity;
+        if velocity != 0.0 {
+            return Err(SetpointError::NotAtRest { velocity });
+        }
+        let at = motion.position;
+        let near = (at - expected).abs() <= expected.abs().max(1.0) * 1e-9;
+        if !near {
+            return Err(SetpointError::Elsewhere { at, expected });
+        }
+        Ok(Self {
+            acceleration: limits.acceleration,
+            offset,
+            index: 0,
+            elapsed: 0.0,
+            state: State::Playing,
+            last: motion,
+        })
+    }
+
+    /// The axis was held up on the way; since then it stands.
+    #[must_use]
+    pub fn interrupted(&self) -> bool {
+        self.state == State::Interrupted
+    }
+
+    /// One cycle on; `table` is the one this was made for. RT: O(rows passed in one cycle).
+    #[must_use]
+    pub fn advance(&mut self, table: &Table, motion: Motion, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
+            self.state = State::Interrupted;
+        }
+        self.last = if self.state == State::Interrupted {
+            let acceleration = self.acceleration;
+            Hold { acceleration }.advance(motion, dt_s)
+        } else {
+            let position = self.pass(table, dt_s) + self.offset;
+            motion.then(position, (position - motion.position) / dt_s, dt_s)
+        };
+        self.last
+    }
+
+    #[must_use]
+    pub fn finished(&self, motion: Motion) -> bool {
+        self.state != State::Playing && motion.velocity == 0.0
+    }
+
+    fn pass(&mut self, table: &Table, dt_s: f64) -> f64 {
+        self.elapsed += dt_s;
+        while let Some(piece) = table.pieces.get(self.index) {
+            if self.elapsed < piece.time() {
+                return piece.position(self.elapsed);
+            }
+            self.elapsed -= piece.time();
+            self.index += 1;
+        }
+        self.state = State::Ended;
+        table.ends()[1]
+    }
+}
+
+#[cfg(test)]
+#[path = "table_tests.rs"]
+mod tests;

@@ -1,0 +1,263 @@
+//! Sine and square waves for commissioning.
+//!
+//! A sine grows from nothing during one more period before those asked for, and fades during one after them; so it starts and
+//! ends at rest, without a step even of the acceleration. A square wave of positions goes from one to the other with
+//! jerk-limited moves, and back to the middle in the end.
+
+use core::f64::consts::TAU;
+
+use super::error::{position, usable};
+use super::spline::within;
+use super::{Goal, Hold, JerkLimited, Motion, MotionLimits, Order, Setpoint, SetpointError};
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shape {
+    Sine,
+    Square,
+}
+
+/// A value that swings about zero: a velocity, a torque, or what a [`PositionWave`] adds to a position.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wave {
+    shape: Shape,
+    amplitude: f64,
+    frequency: f64,
+    periods: f64,
+    /// Since the start, in periods.
+    phase: f64,
+}
+
+/// While it grows or fades, a sine's derivatives reach so many times those of the steady wave (2π, 4π², 8π³ per period).
+const FADING: [f64; 3] = [1.0, 1.1122, 1.3286];
+
+/// Fewer cycles in a period are no sine any more.
+const CYCLES_PER_PERIOD: f64 = 10.0;
+
+impl Wave {
+    /// `amplitude` either way from zero, `frequency` in Hz, whole `periods` (1 to 2³² − 1); `dt_s` is the cycle.
+    pub fn new(
+        shape: Shape,
+        amplitude: f64,
+        frequency: f64,
+        periods: u32,
+        dt_s: f64,
+    ) -> Result<Self, SetpointError> {
+        usable("amplitude", amplitude)?;
+        usable("frequency", frequency)?;
+        usable("cycle time", dt_s)?;
+        if periods == 0 {
+            return Err(SetpointError::NoTime);
+        }
+        let highest = 1.0 / (CYCLES_PER_PERIOD * dt_s);
+        if frequency > highest {
+            return Err(SetpointError::TooOften { frequency, highest });
+        }
+        Ok(Self {
+            shape,
+            amplitude,
+            frequency,
+            periods: f64::from(periods),
+            phase: 0.0,
+        })
+    }
+
+    /// The highest first, second and third derivative of a sine.
+    #[must_use]
+    pub fn slopes(&self) -> [f64; 3] {
+        let omega = TAU * self.frequency;
+        [1, 2, 3].map(|order: i32| {
+            let fading = match order {
+                1 => FADING[0],
+                2 => FADING[1],
+                _ => FADING[2],
+            };
+            self.amplitude * omega.powi(order) * fading
+        })
+    }
+
+    #[must_use]
+    pub fn duration_s(&self) -> f64 {
+        self.length() / self.frequency
+    }
+
+    #[must_use]
+    pub fn finished(&self) -> bool {
+        self.phase >= self.length()
+    }
+
+    /// One cycle on. RT: O(1). A square wave's value steps; what takes it must ramp.
+    pub fn advance(&mut self, dt_s: f64) -> f64 {
+        self.phase = (self.phase + self.frequency * dt_s.max(0.0)).min(self.length());
+        if self.finished() {
+            return 0.0;
+        }
+        match self.shape {
+            Shape::Sine => {
+                let weight = smooth(self.phase) * smooth(self.length() - self.phase);
+                self.amplitude * weight * (TAU * self.phase.fract()).sin()
+            }
+            Shape::Square if self.phase.fract() < 0.5 => self.amplitude,
+            Shape::Square => -self.amplitude,
+        }
+    }
+
+    fn length(&self) -> f64 {
+        match self.shape {
+            Shape::Sine => self.periods + 2.0,
+            Shape::Square => self.periods,
+        }
+    }
+}
+
+/// From 0 to 1, with velocity and acceleration zero at both ends.
+fn smooth(x: f64) -> f64 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * x * (10.0 + x * (6.0 * x - 15.0))
+}
+
+#[expect(
+    clippy::large_enum_variant,
+    reason = "nothing may be allocated in the cycle"
+)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum State {
+    Sine,
+    Square(JerkLimited),
+    Interrupted,
+}
+
+/// A [`Wave`] about a position.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PositionWave {
+    wave: Wave,
+    centre: f64,
+    limits: MotionLimits,
+    state: State,
+    last: Motion,
+}
+
+impl PositionWave {
+    /// About where `motion` stands. Refused where a limit would be exceeded, or the range left, at any time; a square wave also
+    /// where half a period is too short for the way.
+    pub fn new(
+        wave: Wave,
+        motion: Motion,
+        limits: MotionLimits,
+        range: Option<[f64; 2]>,
+        dt_s: f64,
+    ) -> Result<Self, SetpointError> {
+        limits.check()?;
+        motion.check()?;
+        position("amplitude", wave.amplitude)?;
+        let velocity = motion.velocity;
+        if velocity != 0.0 {
+            return Err(SetpointError::NotAtRest { velocity });
+        }
+        let centre = motion.position;
+        if let Some(range) = range {
+            within(centre + wave.amplitude, range)?;
+            within(centre - wave.amplitude, range)?;
+        }
+        let state = match wave.shape {
+            Shape::Sine => {
+                let [velocity, acceleration, jerk] = wave.slopes();
+                if velocity > limits.velocity {
+                    return Err(SetpointError::TooFast {
+                        velocity,
+                        limit: limits.velocity,
+                    });
+                }
+                if acceleration > limits.acceleration {
+                    return Err(SetpointError::TooSteep {
+                        acceleration,
+                        limit: limits.acceleration,
+                    });
+                }
+                if jerk > limits.jerk {
+                    return Err(SetpointError::TooMuchJerk {
+                        jerk,
+                        limit: limits.jerk,
+                    });
+                }
+                State::Sine
+            }
+            Shape::Square => {
+                let order = |target| Order::within(Goal::Position(target), limits);
+                let swing = JerkLimited::new(
+                    order(centre + wave.amplitude),
+                    Motion::at(centre - wave.amplitude),
+                    dt_s,
+                )?;
+                // The end of a move takes a cycle more, and half periods need not be whole cycles.
+                if swing.duration_s() + 2.0 * dt_s > 0.5 / wave.frequency {
+                    return Err(SetpointError::NoTime);
+                }
+                State::Square(JerkLimited::new(order(centre), motion, dt_s)?)
+            }
+        };
+        Ok(Self {
+            wave,
+            centre,
+            limits,
+            state,
+            last: motion,
+        })
+    }
+
+    /// The axis was held up on the way; since then it stands.
+    #[must_use]
+    pub fn interrupted(&self) -> bool {
+        self.state == State::Interrupted
+    }
+}
+
+impl Setpoint for PositionWave {
+    /// RT: O(1).
+    fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
+        if dt_s.is_nan() || dt_s <= 0.0 {
+            return motion;
+        }
+        if (motion.position, motion.velocity) != (self.last.position, self.last.velocity) {
+            self.state = State::Interrupted;
+        }
+        let next = match &mut self.state {
+            State::Sine => {
+                let value = self.wave.advance(dt_s);
+                let position = self.centre + value;
+                motion.then(position, (position - motion.position) / dt_s, dt_s)
+            }
+            State::Square(source) => {
+                let target = self.centre + self.wave.advance(dt_s);
+                let order = Order::within(Goal::Position(target), self.limits);
+                if source.order().goal != order.goal
+                    && let Ok(next) = source.redirect(order, motion, dt_s)
+                {
+                    *source = next;
+                }
+                source.advance(motion, dt_s)
+            }
+            State::Interrupted => Hold {
+                acceleration: self.limits.acceleration,
+            }
+            .advance(motion, dt_s),
+        };
+        self.last = next;
+        next
+    }
+
+    fn finished(&self, motion: Motion) -> bool {
+        match &self.state {
+            State::Sine => self.wave.finished() && motion.stands_at(self.centre),
+            State::Square(source) => {
+                self.wave.finished()
+                    && source.order().goal == Goal::Position(self.centre)
+                    && source.finished(motion)
+            }
+            State::Interrupted => motion.velocity == 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "wave_tests.rs"]
+mod tests;
