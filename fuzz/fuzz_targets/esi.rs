@@ -1,8 +1,10 @@
-//! An ESI file.
+//! An ESI file, and all that is made of it: choices, layouts, start-up lists, EEPROM images.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
+#[path = "../../esi/tests/fuzz/walk.rs"]
+mod walk;
 
-fuzz_target!(|xml: &[u8]| {
-    let _ = ecaxis_esi::parse(xml);
-});
+use libfuzzer_sys::fuzz_target;
+use walk::{Reached, walk};
+
+fuzz_target!(|xml: &[u8]| walk(xml, &mut Reached::default()));

@@ -303,7 +303,7 @@ impl<'a> Cursor<'a> {
 
     fn error(&self, problem: EsiProblem) -> EsiError {
         let position = self.stack.last().map_or(self.at, |level| level.position);
-        EsiError::new(position, self.path(self.stack.len()), problem)
+        EsiError::new(position, self.current_path(), problem)
     }
 
     fn truncated(&self) -> EsiError {
@@ -350,7 +350,7 @@ impl<'a> Cursor<'a> {
                 Ok(event) => event,
                 Err(error) => {
                     self.move_to(usize::try_from(self.reader.error_position()).unwrap_or(offset));
-                    let path = self.path(self.stack.len());
+                    let path = self.current_path();
                     return Err(EsiError::new(
                         self.at,
                         path,
@@ -434,7 +434,7 @@ impl<'a> Cursor<'a> {
             let message = format!("entity &{}; is not expanded", shorten(&name));
             self.warnings.push(Warning {
                 position,
-                path: self.path(self.stack.len()),
+                path: self.current_path(),
                 message,
             });
         }
@@ -464,6 +464,14 @@ impl<'a> Cursor<'a> {
             append(&mut path, level.name, level.number);
         }
         path
+    }
+
+    /// Of what is read right now; before and behind the root that is the file.
+    fn current_path(&self) -> String {
+        match self.stack.len() {
+            0 => "(file)".to_owned(),
+            depth => self.path(depth),
+        }
     }
 }
 

@@ -7,7 +7,7 @@ pub const MUTATIONS: &[Mutation] = &[
         "cut inside the XML declaration",
         |text| cut(text, r##" encoding="iso"##),
         ("refused", At::First("<?xml")),
-        "",
+        "(file)",
         "syntax",
     ),
     row(
@@ -59,7 +59,7 @@ pub const MUTATIONS: &[Mutation] = &[
         "nothing at all",
         |_| String::new(),
         ("refused", At::First("")),
-        "",
+        "(file)",
         "no XML element",
     ),
     row(
