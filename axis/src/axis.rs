@@ -21,6 +21,7 @@
 //! | `report` | the status |
 
 use crate::cia402::{self, Controlword, Memory, Mode, Power, Progress, Request, State, Statusword};
+use crate::probe::Probes;
 use crate::profile::Profile;
 use crate::setpoint::Motion;
 use crate::status::{DriveFault, Refused, Trip};
@@ -80,6 +81,15 @@ pub struct Axis {
     given: Given,
     profile: Profile,
     home: Home,
+    probes: Probes,
+    probe_mapped: bool,
+    /// Power is to go the shortest way.
+    cut: bool,
+    hold: wish::Hold,
+    resets: wish::Resets,
+    /// In target, and at rest, for so long.
+    settled_s: f64,
+    rested_s: f64,
     /// The set-point's position as of the last cycle; the actual one where no position is commanded.
     sent: Counts,
     sent_before: Counts,
@@ -122,6 +132,13 @@ impl Axis {
             given: Given::default(),
             profile: Profile::new(),
             home: Home::default(),
+            probes: Probes::new(),
+            probe_mapped: false,
+            cut: false,
+            hold: wish::Hold::default(),
+            resets: wish::Resets::default(),
+            settled_s: 0.0,
+            rested_s: 0.0,
             sent: Counts::default(),
             sent_before: Counts::default(),
             dt_s: 0.0,
@@ -197,6 +214,7 @@ impl Axis {
     pub fn act(&mut self) -> Outputs {
         let (fresh, dt_s) = (self.fresh, self.dt_s);
         self.settle_wish(dt_s);
+        self.settle_reset(dt_s);
         self.settle_mode(fresh, dt_s);
         self.settle_homing(fresh, dt_s);
         self.switch_power(fresh, dt_s);
@@ -212,8 +230,10 @@ impl Axis {
             self.advance(fresh, dt_s);
             self.close_loops(fresh, dt_s);
         }
+        self.settle_brake();
         self.fed = None;
         self.sent_before = sent;
+        self.dwell(dt_s);
         self.outputs()
     }
 
@@ -229,6 +249,15 @@ impl Axis {
             f64::INFINITY
         };
         self.actual.read(inputs, &self.config.scale, fastest);
+        self.probe_mapped = inputs.touch_probe_status.is_some();
+        if let Some(status) = inputs.touch_probe_status {
+            let (actual, scale) = (&self.actual, &self.config.scale);
+            self.probes.step(status, |slot| {
+                let raw = inputs.touch_probe_positions.get(slot).copied().flatten()?;
+                let near = actual.counts().unwrap_or_default();
+                Some(scale.position_to_user(near.unwrap_next(raw)).0)
+            });
+        }
         if let Some(code) = inputs.error_code {
             self.note_error_code(code);
         }
@@ -239,6 +268,7 @@ impl Axis {
         let power = match self.wish {
             Wish::Enabled | Wish::Disabling { .. } if blind => Power::Disabled,
             Wish::Enabled | Wish::Disabling { .. } => Power::Enabled,
+            Wish::Disabled if self.cut => Power::Off,
             Wish::Disabled => Power::Disabled,
             Wish::QuickStop { .. } => Power::QuickStop,
         };

@@ -12,6 +12,8 @@
 //! | [`limits`] | what an axis may never exceed; checked once, enforced every cycle |
 //! | [`cia402`] | Statusword, Controlword, the power state machine, modes, error codes |
 //! | [`loops`] | the position loops that the master closes in CSV and CST, and the offsets in CSP |
+//! | [`supervision`] | what is supervised besides, what a trip does, brake, fault reset |
+//! | [`probe`] | touch probes |
 //! | [`profile`] | the drive's own profiles (PP, PV): the handshake |
 //! | [`homing`] | homing through the drive: parameters, sequence |
 //! | [`setpoint`] | hold, trapezoidal and jerk-limited moves, ramps; each advanced one cycle at a time |
@@ -27,16 +29,22 @@ pub mod group;
 pub mod homing;
 pub mod limits;
 pub mod loops;
+pub mod probe;
 pub mod profile;
 pub mod scale;
 pub mod setpoint;
 pub mod status;
+pub mod supervision;
 pub mod units;
 
 pub use axis::{Axis, AxisConfig, Command, ConfigError, Inputs, Outputs};
-pub use cia402::{Controlword, Mode, Modes, State, Statusword};
+pub use cia402::{
+    Controlword, HaltOption, Mode, ModeStatus, Modes, QuickStopOption, State, Statusword,
+};
 pub use homing::{Homing, HomingError};
 pub use limits::{LimitError, Limits};
 pub use loops::{FeedForward, Loops, PositionPid, VelocityLoop};
+pub use probe::{Edge, Probe, ProbeStatus, Source};
 pub use scale::{Scale, ScaleError, VelocityBase, VelocityUnit};
-pub use status::{AxisStatus, DriveFault, HomingStatus, Refused, Trip};
+pub use status::{AxisStatus, DriveFault, HomingStatus, Refused, Trip, Waiting};
+pub use supervision::{Brake, Emergency, FaultReset, Reaction, Supervision, TorqueWatch};

@@ -2,8 +2,9 @@
 
 use core::fmt;
 
-use crate::cia402::{Mode, State, describe};
+use crate::cia402::{Mode, ModeStatus, State, Statusword, describe};
 use crate::homing::HomingError;
+use crate::probe::ProbeStatus;
 
 /// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,7 +23,7 @@ pub struct AxisStatus {
     pub controlword: u16,
     /// Operation enabled, mode confirmed, set-points come from here. Before that, targets follow actual values.
     pub enabled: bool,
-    /// Motion commands are taken: `enabled`, and neither disabling nor stopping for good.
+    /// Motion commands are taken: `enabled`, neither disabling nor stopping for good, and the brake is open.
     pub ready: bool,
     /// 0x6061 shows `mode` or `switching`, or is not mapped.
     pub mode_confirmed: bool,
@@ -56,6 +57,11 @@ pub struct AxisStatus {
     pub guarded_cycles: u32,
     /// Cycles since the last fresh inputs.
     pub stale_cycles: u32,
+    /// Why enabling does not go on.
+    pub waiting: Option<Waiting>,
+    pub probes: [ProbeStatus; 2],
+    /// Automatic fault resets since the last one by command.
+    pub resets_tried: u8,
     pub homing: HomingStatus,
     /// Home was found, and not searched anew since.
     pub homed: bool,
@@ -67,6 +73,38 @@ pub struct AxisStatus {
     pub resetting: bool,
     /// The last reset did not help.
     pub reset_failed: bool,
+}
+
+impl AxisStatus {
+    /// The Statusword's bits, remote and voltage enabled among them.
+    #[must_use]
+    pub const fn word(&self) -> Statusword {
+        Statusword::from_bits_retain(self.statusword)
+    }
+
+    /// What the Statusword says in the mode that counts.
+    #[must_use]
+    pub const fn mode_status(&self) -> ModeStatus {
+        self.word().in_mode(self.mode)
+    }
+}
+
+/// Why an axis that is to be enabled is not ready yet.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Waiting {
+    #[error("no position is reported (0x6064)")]
+    Position,
+    #[error("the drive is not controlled from here: Statusword bit 9 (remote) is not set")]
+    Remote,
+    #[error("the power stage has no voltage: Statusword bit 4 is not set")]
+    Voltage,
+    #[error("the drive shows mode {display} instead of {expected}")]
+    Mode { expected: Mode, display: Mode },
+    #[error("the brake is opening")]
+    Brake,
+    /// And says nothing about why.
+    #[error("the drive stays in {state}")]
+    Drive { state: State },
 }
 
 /// The last homing.
@@ -108,6 +146,16 @@ pub enum Trip {
     OverVelocity { velocity: f64, limit: f64 },
     #[error("the drive left Operation enabled for {state} without being told to")]
     PowerLost { state: State },
+    #[error("torque {torque:.1} % has been above {limit:.1} % for {time_s} s")]
+    OverTorque {
+        torque: f64,
+        limit: f64,
+        time_s: f64,
+    },
+    #[error("acceleration {acceleration:.4} exceeds {limit:.4}")]
+    OverAcceleration { acceleration: f64, limit: f64 },
+    #[error("emergency stop")]
+    EmergencyStop,
     #[error("the drive did not acknowledge a set-point")]
     SetPointNotTaken,
     #[error("the drive changed its mode of operation from {expected} to {display}")]
@@ -143,6 +191,10 @@ pub enum Refused {
     NoPosition { mode: Mode },
     #[error("the axis is just being switched to mode {to}")]
     Switching { to: Mode },
+    #[error("the brake is still opening")]
+    BrakeOpening,
+    #[error("no touch probe is mapped (0x60B9)")]
+    NoProbe,
     #[error("the axis is homing")]
     Homing,
     #[error("a step of {step} in one cycle is more than the {most} of the velocity limit")]

@@ -4,7 +4,7 @@ use super::Inputs;
 use crate::scale::Scale;
 use crate::units::{Counts, PerMille, RawVelocity};
 
-/// Time constant of the velocity that is made from positions.
+/// Time constant of what is made from differences.
 const FILTER_S: f64 = 0.01;
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -12,6 +12,7 @@ pub(super) struct Actual {
     counts: Option<Counts>,
     position: f64,
     velocity: f64,
+    acceleration: f64,
     torque: f64,
     /// Since the last reading.
     elapsed_s: f64,
@@ -21,6 +22,7 @@ pub(super) struct Actual {
 impl Actual {
     /// `fastest`: faster from one reading to the next is another origin, and no velocity.
     pub(super) fn read(&mut self, inputs: &Inputs, scale: &Scale, fastest: f64) {
+        let velocity_before = self.velocity;
         if let Some(raw) = inputs.position {
             let before = self.counts;
             let counts = before.map_or(Counts(i64::from(raw)), |c| c.unwrap_next(raw));
@@ -35,6 +37,11 @@ impl Actual {
         }
         if let Some(raw) = inputs.velocity {
             self.velocity = scale.velocity_to_user(RawVelocity(raw)).0;
+        }
+        if self.elapsed_s > 0.0 {
+            let acceleration = (self.velocity - velocity_before) / self.elapsed_s;
+            let weight = self.elapsed_s / (self.elapsed_s + FILTER_S);
+            self.acceleration += (acceleration - self.acceleration) * weight;
         }
         if let Some(raw) = inputs.torque {
             self.torque = scale.torque_to_user(PerMille(raw)).0;
@@ -66,6 +73,11 @@ impl Actual {
 
     pub(super) const fn velocity(&self) -> f64 {
         self.velocity
+    }
+
+    /// Filtered over 10 ms.
+    pub(super) const fn acceleration(&self) -> f64 {
+        self.acceleration
     }
 
     pub(super) const fn torque(&self) -> f64 {

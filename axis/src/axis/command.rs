@@ -1,7 +1,9 @@
 //! Commands: checked completely before anything changes.
 
+use super::wish::Resets;
 use super::{Axis, Control, Plan, Wish};
 use crate::cia402::{Mode, State};
+use crate::probe::{Edge, Probe, Source};
 use crate::profile::Goal;
 use crate::setpoint::{Ramp, Trapezoid};
 use crate::status::Refused;
@@ -18,6 +20,17 @@ pub enum Command {
     Stop,
     /// The drive's own quick stop; it then stays in Quick stop active if its option code says so.
     QuickStop,
+    /// The shortest way to no motion: quick stop or no voltage, as configured; no power until it is reset and enabled again.
+    EmergencyStop,
+    /// Capture the position of the next edge, once.
+    ArmProbe {
+        probe: Probe,
+        edge: Edge,
+        source: Source,
+    },
+    DisarmProbe {
+        probe: Probe,
+    },
     /// Switch the mode of operation, also in motion. Where the new mode can do what the set-point is about, it goes on
     /// with it; otherwise it comes to rest.
     SetMode(Mode),
@@ -80,6 +93,25 @@ impl Axis {
                 self.brake();
                 Ok(())
             }
+            Command::EmergencyStop => {
+                self.emergency_stop();
+                Ok(())
+            }
+            Command::ArmProbe {
+                probe,
+                edge,
+                source,
+            } => {
+                if !self.probe_mapped {
+                    return Err(Refused::NoProbe);
+                }
+                self.probes.arm(probe, edge, source);
+                Ok(())
+            }
+            Command::DisarmProbe { probe } => {
+                self.probes.disarm(probe);
+                Ok(())
+            }
             Command::SetMode(mode) => self.set_mode(mode),
             Command::Home { timeout_s } => self.home(timeout_s),
             Command::QuickStop => {
@@ -127,11 +159,12 @@ impl Axis {
         if self.active && self.wish == Wish::Disabled {
             return Err(Refused::Stopping);
         }
+        self.cut = false;
         self.wish = Wish::Enabled;
         Ok(())
     }
 
-    fn disable(&mut self) {
+    pub(super) fn disable(&mut self) {
         self.brake();
         self.wish = match self.wish {
             Wish::QuickStop { elapsed_s, .. } => Wish::QuickStop {
@@ -168,6 +201,7 @@ impl Axis {
     fn reset_fault(&mut self) {
         self.trip = None;
         self.reset_failed = false;
+        self.resets = Resets::default();
         if self.state.is_fault() {
             self.reset = true;
         } else {
@@ -203,6 +237,9 @@ impl Axis {
         }
         if self.wish != Wish::Enabled {
             return Err(Refused::Stopping);
+        }
+        if self.braked() {
+            return Err(Refused::BrakeOpening);
         }
         Ok(())
     }

@@ -4,6 +4,7 @@ use crate::cia402::{Mode, Modes, QuickStopOption};
 use crate::limits::{LimitError, Limits};
 use crate::loops::Loops;
 use crate::scale::Scale;
+use crate::supervision::{Brake, FaultReset, Supervision};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisConfig {
@@ -25,6 +26,9 @@ pub struct AxisConfig {
     pub mode_time_s: f64,
     /// 0x605A, where it is known: without transition 16 an axis is enabled again by way of Switch on disabled.
     pub quick_stop: Option<QuickStopOption>,
+    pub supervision: Supervision,
+    pub brake: Brake,
+    pub fault_reset: FaultReset,
 }
 
 impl AxisConfig {
@@ -46,6 +50,9 @@ impl AxisConfig {
             dead_time_s: 0.0,
             mode_time_s: 1.0,
             quick_stop: None,
+            supervision: Supervision::default(),
+            brake: Brake::default(),
+            fault_reset: FaultReset::default(),
         }
     }
 
@@ -57,12 +64,20 @@ impl AxisConfig {
             return Err(ConfigError::Mode(self.mode));
         }
         self.limits.check(&self.scale)?;
+        let watch = &self.supervision;
+        let reset_delay = match self.fault_reset {
+            FaultReset::Manual => 0.0,
+            FaultReset::Automatic { delay_s, .. } => delay_s,
+        };
         let csv = self.loops.csv;
         let cst = self.loops.cst;
         for (what, value) in [
             ("target_window", Some(self.target_window)),
             ("torque_slope", Some(self.torque_slope)),
             ("mode_time_s", Some(self.mode_time_s)),
+            ("supervised torque", watch.torque.map(|t| t.percent)),
+            ("supervised acceleration", watch.acceleration),
+            ("standstill window", watch.standstill),
             ("kv", csv.map(|l| l.kv)),
             ("kp", cst.map(|l| l.kp)),
             ("tn_s", cst.and_then(|l| l.tn_s)),
@@ -75,6 +90,16 @@ impl AxisConfig {
         }
         for (what, value, most) in [
             ("dead_time_s", self.dead_time_s, LONGEST_DEAD_TIME_S),
+            (
+                "supervised torque's time",
+                watch.torque.map_or(0.0, |t| t.time_s),
+                LONGEST_S,
+            ),
+            ("target dwell", watch.target_dwell_s, LONGEST_S),
+            ("standstill dwell", watch.standstill_dwell_s, LONGEST_S),
+            ("brake release", self.brake.release_s, LONGEST_S),
+            ("brake engage", self.brake.engage_s, LONGEST_S),
+            ("fault reset delay", reset_delay, LONGEST_S),
             ("velocity feed-forward", self.loops.csp.velocity, 1.0),
             (
                 "velocity feed-forward",
@@ -113,6 +138,9 @@ impl AxisConfig {
 
 /// Longer is no dead time.
 const LONGEST_DEAD_TIME_S: f64 = 0.1;
+
+/// An hour is longer than any dwell, delay or brake.
+const LONGEST_S: f64 = 3600.0;
 
 /// What of the set-point counts in a mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

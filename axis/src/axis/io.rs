@@ -15,6 +15,10 @@ pub struct Inputs {
     pub mode_display: Option<i8>,
     /// 0x603F.
     pub error_code: Option<u16>,
+    /// 0x60B9.
+    pub touch_probe_status: Option<u16>,
+    /// 0x60BA, 0x60BB, 0x60BC, 0x60BD: probe 1 positive and negative edge, probe 2 positive and negative edge.
+    pub touch_probe_positions: [Option<i32>; 4],
     /// `false`: this cycle's frame was lost; the values are old and no decision is made on them. The set-point runs on for two
     /// such cycles in a row, then it waits.
     pub fresh: bool,
@@ -40,6 +44,10 @@ pub struct Outputs {
     pub profile_acceleration: u32,
     /// 0x60B1, added to the drive's own velocity demand. 0 outside CSP.
     pub velocity_offset: i32,
+    /// 0x60B8.
+    pub touch_probe_function: u16,
+    /// For a brake that is switched from here: it is to be open.
+    pub brake_open: bool,
     /// 0x60B2, added to the drive's own torque demand. 0 outside CSP.
     pub torque_offset: i16,
 }

@@ -111,6 +111,8 @@ impl Axis {
             controlword: self.controlword.bits(),
             mode: mode.code(),
             target_position: actual.wrapped(),
+            touch_probe_function: self.probes.function(),
+            brake_open: self.hold.open,
             profile_velocity: speed(scale, limits.velocity),
             profile_acceleration: acceleration(scale, limits.acceleration),
             ..Outputs::default()

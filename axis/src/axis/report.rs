@@ -1,9 +1,12 @@
 //! The status: everything about the axis in one cycle.
 
 use super::{Axis, Plan, Wish};
-use crate::cia402::Mode;
-use crate::status::AxisStatus;
+use crate::cia402::{Mode, State, Statusword};
+use crate::status::{AxisStatus, Waiting};
 use crate::units::{Counts, UserUnits};
+
+/// A state that lasts longer on the way to Operation enabled is not passed through but stuck in.
+const PASSING_S: f64 = 0.1;
 
 impl Axis {
     /// RT: O(1).
@@ -23,7 +26,6 @@ impl Axis {
             .actual
             .counts()
             .map_or(0, |Counts(at)| sent.0.saturating_sub(at));
-        let standing_still = self.setpoint_at_rest() || matches!(self.plan, Plan::Torque(_));
         AxisStatus {
             mode: self.mode,
             switching: self.switch.map(|switch| switch.to),
@@ -33,11 +35,13 @@ impl Axis {
             statusword: self.statusword.bits(),
             controlword: self.controlword.bits(),
             enabled: self.active,
-            ready: self.active && self.wish == Wish::Enabled,
+            ready: self.active && self.wish == Wish::Enabled && !self.braked(),
             mode_confirmed: self.mode_confirmed(),
             moving: self.active && !arrived,
-            in_target: arrived && self.reached(),
-            at_rest: standing_still && self.standing(),
+            in_target: arrived
+                && self.reached()
+                && self.settled_s >= self.config.supervision.target_dwell_s,
+            at_rest: self.rests() && self.rested_s >= self.config.supervision.standstill_dwell_s,
             position: self.actual.position(),
             velocity: self.actual.velocity(),
             torque: self.actual.torque(),
@@ -53,6 +57,9 @@ impl Axis {
             held_by_range: self.held_by_range,
             guarded_cycles: self.guarded_cycles,
             stale_cycles: self.stale_cycles,
+            waiting: self.waiting(),
+            probes: self.probes.status(),
+            resets_tried: self.resets.tried,
             homing: self.home.status,
             homed: self.home.homed,
             fault: self.fault,
@@ -60,6 +67,48 @@ impl Axis {
             resetting: self.reset,
             reset_failed: self.reset_failed,
         }
+    }
+
+    fn rests(&self) -> bool {
+        let commanded = self.setpoint_at_rest() || matches!(self.plan, Plan::Torque(_));
+        commanded && self.standing()
+    }
+
+    /// At the end of a cycle: for how long the axis has been where it is to be.
+    pub(super) fn dwell(&mut self, dt_s: f64) {
+        let time = |so: bool, before: f64| if so { before + dt_s } else { 0.0 };
+        self.settled_s = time(
+            self.active && self.setpoint_arrived() && self.reached(),
+            self.settled_s,
+        );
+        self.rested_s = time(self.rests(), self.rested_s);
+    }
+
+    fn waiting(&self) -> Option<Waiting> {
+        if self.wish != Wish::Enabled {
+            return None;
+        }
+        if self.active {
+            return self.braked().then_some(Waiting::Brake);
+        }
+        if self.blind() {
+            return Some(Waiting::Position);
+        }
+        // On the way up each state lasts a few cycles.
+        if self.memory.in_state_s() < PASSING_S {
+            return None;
+        }
+        let word = self.statusword;
+        let state = self.state;
+        Some(match (state, self.mode_display) {
+            (State::OperationEnabled, Some(display)) => Waiting::Mode {
+                expected: self.mode,
+                display: Mode::from_code(display),
+            },
+            _ if !word.contains(Statusword::REMOTE) => Waiting::Remote,
+            _ if !word.contains(Statusword::VOLTAGE_ENABLED) => Waiting::Voltage,
+            _ => Waiting::Drive { state },
+        })
     }
 
     /// The axis is where the set-point has arrived.

@@ -6,6 +6,7 @@ use crate::limits::Limits;
 use crate::loops::bounded;
 use crate::setpoint::{Motion, braking_velocity};
 use crate::status::{DriveFault, Trip};
+use crate::supervision::{Emergency, Reaction};
 use crate::units::Counts;
 
 /// How much faster than the limit, and for how many fresh cycles in a row.
@@ -27,6 +28,9 @@ pub(super) struct Watch {
     pub(super) following_error: f64,
     pub(super) max_following_error: f64,
     fast_cycles: u8,
+    steep_cycles: u8,
+    /// For so long the torque has been above what is supervised.
+    strained_s: f64,
     /// The last target the drive surely has, and for how many fresh cycles in a row it has got newer ones.
     known: Option<Counts>,
     fresh_cycles: u8,
@@ -109,9 +113,29 @@ impl Axis {
     /// The first cause stays. An axis already being disabled is not made to wait for another quick stop.
     fn trip(&mut self, trip: Trip) {
         self.trip.get_or_insert(trip);
-        if self.wish != Wish::Disabled {
-            self.quick_stop(true);
+        if self.wish == Wish::Disabled {
+            return;
         }
+        // Without power or in a mode of its own the drive would not follow a ramp.
+        let follows = self.active && self.state == State::OperationEnabled && self.mode_confirmed();
+        match self.config.supervision.reaction {
+            Reaction::Ramp if follows => self.disable(),
+            Reaction::Ramp | Reaction::QuickStop => self.quick_stop(true),
+            Reaction::DisableVoltage => self.cut_power(),
+        }
+    }
+
+    pub(super) fn emergency_stop(&mut self) {
+        self.trip.get_or_insert(Trip::EmergencyStop);
+        match self.config.supervision.emergency {
+            Emergency::QuickStop => self.quick_stop(true),
+            Emergency::DisableVoltage => self.cut_power(),
+        }
+    }
+
+    fn cut_power(&mut self) {
+        self.wish = Wish::Disabled;
+        self.cut = true;
     }
 
     fn exceeded(&mut self) -> Option<Trip> {
@@ -164,6 +188,35 @@ impl Axis {
         let velocity = self.actual.velocity();
         let slack = self.actual.velocity_slack(&self.config.scale);
         let fast = velocity.abs() > limits.velocity * OVER_VELOCITY + slack;
+        if let Some(watch) = self.config.supervision.torque {
+            let torque = self.actual.torque();
+            self.watch.strained_s = if torque.abs() > watch.percent {
+                self.watch.strained_s + self.dt_s
+            } else {
+                0.0
+            };
+            if self.watch.strained_s > watch.time_s {
+                cause = cause.or(Some(Trip::OverTorque {
+                    torque,
+                    limit: watch.percent,
+                    time_s: watch.time_s,
+                }));
+            }
+        }
+        if let Some(limit) = self.config.supervision.acceleration {
+            let acceleration = self.actual.acceleration();
+            self.watch.steep_cycles = if acceleration.abs() > limit {
+                self.watch.steep_cycles.saturating_add(1)
+            } else {
+                0
+            };
+            if self.watch.steep_cycles >= OVER_VELOCITY_CYCLES {
+                cause = cause.or(Some(Trip::OverAcceleration {
+                    acceleration,
+                    limit,
+                }));
+            }
+        }
         self.watch.fast_cycles = if fast {
             self.watch.fast_cycles.saturating_add(1)
         } else {
@@ -181,7 +234,9 @@ impl Axis {
     /// The drive itself stands, as far as it can be told.
     pub(super) fn standing(&self) -> bool {
         let slack = self.actual.velocity_slack(&self.config.scale);
-        self.actual.velocity().abs() <= slack.max(self.config.limits.velocity * 0.01)
+        let window = self.config.supervision.standstill;
+        let window = window.unwrap_or(self.config.limits.velocity * 0.01);
+        self.actual.velocity().abs() <= slack.max(window)
     }
 
     /// Within 2 % of the target or 10 motor rpm of it, whichever is more; the latter never above a tenth of the limit.

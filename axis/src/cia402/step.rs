@@ -5,7 +5,7 @@
 //!
 //! Of the standard's transitions 0–16 the drive makes 0, 1, 13 and 14 on its own. Disabling uses 8 rather than 5 and 9:
 //! "disable operation" (5) is the same word as "switch on" (3), so a drive that has already fallen back to Ready to switch on
-//! would be switched on by it. So without [`Power::Enabled`] neither bit 0 nor bit 3 is ever sent.
+//! would be switched on by it; 9 is for [`Power::Off`] alone. So without [`Power::Enabled`] neither bit 0 nor bit 3 is ever sent.
 
 use super::state::State;
 use super::words::{Controlword, Statusword};
@@ -17,6 +17,8 @@ pub enum Power {
     Disabled,
     Enabled,
     QuickStop,
+    /// Disabled the shortest way: no voltage, whatever the axis is doing.
+    Off,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -113,6 +115,10 @@ const LONGEST_WAIT_S: f64 = 1e9;
 #[must_use]
 pub fn controlword(state: State, power: Power, waited_s: f64) -> Controlword {
     match (state, power) {
+        // 14 is the drive's own. Shutdown rather than disable voltage: nothing that could cut its braking ramp short.
+        (State::FaultReactionActive, _) => Controlword::SHUTDOWN_COMMAND,
+        (_, Power::Off) => Controlword::DISABLE_VOLTAGE_COMMAND, // 7, 9, 10, 12
+
         // 0, 1: the drive's own.
         (State::NotReadyToSwitchOn, _) => Controlword::DISABLE_VOLTAGE_COMMAND,
 
@@ -137,8 +143,6 @@ pub fn controlword(state: State, power: Power, waited_s: f64) -> Controlword {
         (State::QuickStopActive, Power::QuickStop) => Controlword::QUICK_STOP_COMMAND,
         (State::QuickStopActive, _) => Controlword::DISABLE_VOLTAGE_COMMAND, // 12
 
-        // 14 is the drive's own. Shutdown rather than disable voltage: nothing that could cut its braking ramp short.
-        (State::FaultReactionActive, _) => Controlword::SHUTDOWN_COMMAND,
         // 15 is a pulse train, see `step`.
         (State::Fault, _) => Controlword::DISABLE_VOLTAGE_COMMAND,
 
@@ -202,7 +206,7 @@ pub fn step(memory: Memory, statusword: Statusword, request: Request, dt_s: f64)
 
 const fn reached(state: State, power: Power) -> bool {
     match power {
-        Power::Disabled => matches!(state, State::SwitchOnDisabled),
+        Power::Disabled | Power::Off => matches!(state, State::SwitchOnDisabled),
         Power::Enabled => matches!(state, State::OperationEnabled),
         // A drive whose quick stop option code ends in transition 12 has done what was asked, too.
         Power::QuickStop => matches!(state, State::QuickStopActive | State::SwitchOnDisabled),

@@ -44,7 +44,12 @@ fn word_of(state: State) -> Statusword {
     })
 }
 
-const POWERS: [Power; 3] = [Power::Disabled, Power::Enabled, Power::QuickStop];
+const POWERS: [Power; 4] = [
+    Power::Disabled,
+    Power::Enabled,
+    Power::QuickStop,
+    Power::Off,
+];
 
 fn request(power: Power) -> Request {
     Request {
@@ -56,7 +61,7 @@ fn request(power: Power) -> Request {
 /// Every state × every request: the word, and the transition it causes.
 #[test]
 fn table_row_by_row() {
-    use Power::{Disabled, Enabled, QuickStop};
+    use Power::{Disabled, Enabled, Off, QuickStop};
     use State::*;
     let rows = [
         // 0 and 1 happen inside the drive.
@@ -85,6 +90,14 @@ fn table_row_by_row() {
         (Fault, Disabled, 0x0000, None),
         (Fault, Enabled, 0x0000, None),
         (Fault, QuickStop, 0x0000, None),
+        (NotReadyToSwitchOn, Off, 0x0000, None),
+        (SwitchOnDisabled, Off, 0x0000, None),
+        (ReadyToSwitchOn, Off, 0x0000, Some(7)),
+        (SwitchedOn, Off, 0x0000, Some(10)),
+        (OperationEnabled, Off, 0x0000, Some(9)),
+        (QuickStopActive, Off, 0x0000, Some(12)),
+        (FaultReactionActive, Off, 0x0006, Some(14)),
+        (Fault, Off, 0x0000, None),
     ];
     for (state, power, bits, transition) in rows {
         let (_, out) = step(Memory::new(), word_of(state), request(power), 0.001);

@@ -321,6 +321,9 @@ fn trip(trip: &Trip) -> &'static str {
         }
         Trip::OverVelocity { .. } => "check `encoder`, `per_turn` and the drive's tuning",
         Trip::PowerLost { .. } => "check STO, enable inputs and the supply of the power stage",
+        Trip::OverTorque { .. } => "check for a blocked load, or supervise a higher torque",
+        Trip::OverAcceleration { .. } => "check the load and the drive's tuning",
+        Trip::EmergencyStop => "find out why it was pressed, then reset and enable the axis again",
         Trip::SetPointNotTaken => "the drive must be in profile position mode with 0x607A mapped",
         Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
     }

@@ -1,0 +1,249 @@
+//! Touch probes: where the axis was at an edge (0x60B8–0x60BD, CiA 402-2 "touch probe functionality").
+//!
+//! Of one edge, once: the probe's byte of 0x60B8 is 0 until 0x60B9 shows the probe switched off, so that nothing stored before
+//! can be taken for new; then it is armed, and the first stored edge is the capture.
+
+/// Which of the drive's two probes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Probe {
+    First,
+    Second,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Edge {
+    Positive,
+    Negative,
+}
+
+/// What the edge is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Source {
+    /// The probe's own input.
+    Input,
+    /// The encoder's index.
+    ZeroImpulse,
+    /// What 0x60D0 says.
+    Selected,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum ProbeStatus {
+    #[default]
+    Off,
+    /// Asked for; the drive has not said yet that it is watching.
+    Arming,
+    Armed,
+    /// Position at the edge, user units.
+    Captured {
+        position: f64,
+    },
+}
+
+/// One byte of 0x60B8.
+mod function {
+    pub const ENABLE: u8 = 1;
+    pub const ZERO_IMPULSE: u8 = 1 << 2;
+    pub const SELECTED: u8 = 1 << 3;
+    pub const POSITIVE: u8 = 1 << 4;
+    pub const NEGATIVE: u8 = 1 << 5;
+}
+
+/// One byte of 0x60B9.
+mod status {
+    pub const ENABLED: u8 = 1;
+    pub const POSITIVE: u8 = 1 << 1;
+    pub const NEGATIVE: u8 = 1 << 2;
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Phase {
+    Off,
+    Clearing,
+    Arming,
+    Armed,
+    Captured(f64),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct One {
+    phase: Phase,
+    edge: Edge,
+    source: Source,
+}
+
+/// Both probes of a drive.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Probes([One; 2]);
+
+impl Default for Probes {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Probe {
+    const fn index(self) -> usize {
+        match self {
+            Self::First => 0,
+            Self::Second => 1,
+        }
+    }
+}
+
+impl Probes {
+    #[must_use]
+    pub const fn new() -> Self {
+        const OFF: One = One {
+            phase: Phase::Off,
+            edge: Edge::Positive,
+            source: Source::Input,
+        };
+        Self([OFF, OFF])
+    }
+
+    /// From now on the next edge is captured. What was captured before is forgotten.
+    pub fn arm(&mut self, probe: Probe, edge: Edge, source: Source) {
+        if let Some(one) = self.0.get_mut(probe.index()) {
+            *one = One {
+                phase: Phase::Clearing,
+                edge,
+                source,
+            };
+        }
+    }
+
+    pub fn disarm(&mut self, probe: Probe) {
+        if let Some(one) = self.0.get_mut(probe.index()) {
+            one.phase = Phase::Off;
+        }
+    }
+
+    /// One fresh cycle. `status`: 0x60B9. `position` gives what 0x60BA, 0x60BB, 0x60BC or 0x60BD (0 to 3) holds, in user units.
+    pub fn step(&mut self, status: u16, position: impl Fn(usize) -> Option<f64>) {
+        for (n, (one, byte)) in self.0.iter_mut().zip(status.to_le_bytes()).enumerate() {
+            let enabled = byte & status::ENABLED != 0;
+            let (stored, slot) = match one.edge {
+                Edge::Positive => (byte & status::POSITIVE != 0, 2 * n),
+                Edge::Negative => (byte & status::NEGATIVE != 0, 2 * n + 1),
+            };
+            one.phase = match one.phase {
+                Phase::Clearing if !enabled => Phase::Arming,
+                Phase::Arming | Phase::Armed if enabled && stored => match position(slot) {
+                    Some(position) => Phase::Captured(position),
+                    None => one.phase,
+                },
+                Phase::Arming if enabled => Phase::Armed,
+                same => same,
+            };
+        }
+    }
+
+    /// 0x60B8.
+    #[must_use]
+    pub fn function(&self) -> u16 {
+        u16::from_le_bytes(self.0.map(One::function))
+    }
+
+    #[must_use]
+    pub fn status(&self) -> [ProbeStatus; 2] {
+        self.0.map(|one| match one.phase {
+            Phase::Off => ProbeStatus::Off,
+            Phase::Clearing | Phase::Arming => ProbeStatus::Arming,
+            Phase::Armed => ProbeStatus::Armed,
+            Phase::Captured(position) => ProbeStatus::Captured { position },
+        })
+    }
+}
+
+impl One {
+    const fn function(self) -> u8 {
+        if !matches!(self.phase, Phase::Arming | Phase::Armed) {
+            return 0;
+        }
+        let source = match self.source {
+            Source::Input => 0,
+            Source::ZeroImpulse => function::ZERO_IMPULSE,
+            Source::Selected => function::SELECTED,
+        };
+        let edge = match self.edge {
+            Edge::Positive => function::POSITIVE,
+            Edge::Negative => function::NEGATIVE,
+        };
+        function::ENABLE | source | edge
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WHERE: [f64; 4] = [1.0, 2.0, 3.0, 4.0];
+
+    fn step(probes: &mut Probes, status: u16) -> [ProbeStatus; 2] {
+        probes.step(status, |slot| WHERE.get(slot).copied());
+        probes.status()
+    }
+
+    #[test]
+    fn function_words_row_by_row() {
+        for (probe, edge, source, word) in [
+            (Probe::First, Edge::Positive, Source::Input, 0x0011),
+            (Probe::First, Edge::Negative, Source::Input, 0x0021),
+            (Probe::First, Edge::Positive, Source::ZeroImpulse, 0x0015),
+            (Probe::First, Edge::Positive, Source::Selected, 0x0019),
+            (Probe::Second, Edge::Positive, Source::Input, 0x1100),
+            (Probe::Second, Edge::Negative, Source::ZeroImpulse, 0x2500),
+        ] {
+            let mut probes = Probes::new();
+            probes.arm(probe, edge, source);
+            assert_eq!(probes.function(), 0, "first it is switched off");
+            step(&mut probes, 0);
+            assert_eq!(probes.function(), word);
+            probes.disarm(probe);
+            assert_eq!(probes.function(), 0);
+        }
+    }
+
+    #[test]
+    fn each_edge_of_each_probe() {
+        use ProbeStatus::*;
+        for (probe, edge, enabled, stored, position) in [
+            (Probe::First, Edge::Positive, 0x0001, 0x0003, 1.0),
+            (Probe::First, Edge::Negative, 0x0001, 0x0005, 2.0),
+            (Probe::Second, Edge::Positive, 0x0100, 0x0300, 3.0),
+            (Probe::Second, Edge::Negative, 0x0100, 0x0500, 4.0),
+        ] {
+            let at = probe.index();
+            let mut probes = Probes::new();
+            probes.arm(probe, edge, Source::Input);
+            // What the drive still holds of the capture before.
+            assert_eq!(step(&mut probes, stored)[at], Arming);
+            assert_eq!(step(&mut probes, stored)[at], Arming);
+            assert_eq!(step(&mut probes, 0)[at], Arming);
+            assert_eq!(step(&mut probes, enabled)[at], Armed);
+            // The other edge is not asked for.
+            let other = (stored ^ enabled)
+                ^ if probe == Probe::First {
+                    0x0006
+                } else {
+                    0x0600
+                };
+            assert_eq!(step(&mut probes, enabled | other)[at], Armed);
+            assert_eq!(step(&mut probes, stored)[at], Captured { position });
+            // Once; and the probe is switched off.
+            assert_eq!(probes.function(), 0);
+            assert_eq!(step(&mut probes, stored)[at], Captured { position });
+            assert_eq!(step(&mut probes, 0)[1 - at], Off);
+        }
+    }
+
+    #[test]
+    fn a_position_that_is_not_mapped_is_no_capture() {
+        let mut probes = Probes::new();
+        probes.arm(Probe::First, Edge::Positive, Source::Input);
+        probes.step(0, |_| None);
+        probes.step(3, |_| None);
+        assert_eq!(probes.status()[0], ProbeStatus::Arming);
+    }
+}
