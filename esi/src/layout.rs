@@ -207,7 +207,12 @@ fn direction(
         )?;
         offset = start.saturating_add(bytes.saturating_mul(8));
         if len > 0 {
-            let fmmu = fmmus.get(sms.len()).or(fmmus.last()).copied();
+            let meant = fmmus.iter().find(|&&fmmu| {
+                let of_file = device.fmmus.get(usize::from(fmmu));
+                of_file.is_some_and(|fmmu| fmmu.sm == Some(number))
+            });
+            let next = || fmmus.get(sms.len()).or(fmmus.last());
+            let fmmu = meant.or_else(next).copied();
             sms.push(SmLayout {
                 sm: number,
                 start_address: sm.start_address,

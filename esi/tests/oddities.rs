@@ -92,6 +92,22 @@ fn an_op_mode_leaves_channels_out() {
     assert_eq!(choose(&file, None).unwrap().layout.rx_bytes(), 1);
 }
 
+/// Where the file says which FMMU a SyncManager has, it has that one, whatever others carry.
+#[test]
+fn an_fmmu_goes_to_the_sync_manager_that_it_names() {
+    let fmmus = "<Fmmu>Outputs</Fmmu><Fmmu Sm=\"3\">Inputs</Fmmu><Fmmu Sm=\"4\">Inputs</Fmmu>";
+    let dc = "<Dc><OpMode><Name>Second</Name><Sm No=\"4\"><Pdo>#x1b01</Pdo></Sm></OpMode></Dc>";
+    let fmmu = |fmmus: &str, dc: &str| {
+        let file = device("", &format!("{fmmus}{SAMPLED}{dc}"));
+        let inputs = choose(&file, None).unwrap().layout.inputs;
+        inputs.iter().map(|sm| (sm.sm, sm.fmmu)).collect::<Vec<_>>()
+    };
+    assert_eq!(fmmu(fmmus, ""), [(3, Some(1)), (4, Some(2))]);
+    assert_eq!(fmmu(fmmus, dc), [(4, Some(2))]);
+    let unnamed = fmmus.replace(" Sm=\"4\"", "").replace(" Sm=\"3\"", "");
+    assert_eq!(fmmu(&unnamed, dc), [(4, Some(1))]);
+}
+
 /// Without an index increment one entry grows, and its mapping says so.
 #[test]
 fn samples_without_an_index_increment_lengthen_the_entry() {
