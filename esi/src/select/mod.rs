@@ -184,24 +184,26 @@ pub fn select(
 
 fn merged(device: &Device, placed: &[module::Placed<'_>]) -> Dictionary {
     let mut dictionary = device.dictionary.clone();
-    let mut known: HashMap<u16, usize> = HashMap::new();
+    // Where an object stands, and which object of a module it is a copy of: the same module in many places brings
+    // what does not depend on the slot only once.
+    let mut known: HashMap<u16, (usize, Option<&Object>)> = HashMap::new();
     for (at, object) in dictionary.objects.iter().enumerate() {
-        known.entry(object.index).or_insert(at);
+        known.entry(object.index).or_insert((at, None));
     }
-    for (index, object) in placed.iter().flat_map(|p| p.at.objects(p.source)) {
+    for (index, source) in placed.iter().flat_map(|p| p.at.objects(p.source)) {
+        let next = (dictionary.objects.len(), None);
+        let (at, copied) = known.entry(index).or_insert(next);
+        if copied.is_some_and(|before| std::ptr::eq(before, source)) {
+            continue;
+        }
+        *copied = Some(source);
         let object = Object {
             index,
-            ..object.clone()
+            ..source.clone()
         };
-        match known
-            .get(&index)
-            .and_then(|at| dictionary.objects.get_mut(*at))
-        {
+        match dictionary.objects.get_mut(*at) {
             Some(old) => *old = object,
-            None => {
-                known.insert(index, dictionary.objects.len());
-                dictionary.objects.push(object);
-            }
+            None => dictionary.objects.push(object),
         }
     }
     dictionary

@@ -54,10 +54,17 @@ pub const MUTATIONS: &[Mutation] = &[
     ),
     row(
         "254 slots of large dictionaries",
-        |text| slots(&large_module(&text), 254),
+        |text| slots(&large_module(&text, 200), 254),
         ("error", At::First("<Slots ")),
         "Device[1]/Slots",
         "in the 254 places of",
+    ),
+    row(
+        "254 slots of dictionaries just below the bound",
+        |text| slots(&large_module(&text, 5), 254),
+        ("warning", At::First("<Slots ")),
+        "Device[1]/Slots",
+        "255 places for modules; 0xF030 lists 254",
     ),
     row(
         "100000 slots",
@@ -68,7 +75,7 @@ pub const MUTATIONS: &[Mutation] = &[
     ),
     row(
         "65535 instances of large dictionaries",
-        |text| instances(&large_module(&text), "65535"),
+        |text| instances(&large_module(&text, 200), "65535"),
         ("error", At::First("<Slots ")),
         "Device[1]/Slots",
         "in the 254 places of",

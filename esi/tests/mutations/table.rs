@@ -61,11 +61,21 @@ pub fn cut_first(mut text: String, at: &str) -> String {
     text
 }
 
-/// Two megabytes of objects in the default module.
-pub fn large_module(text: &str) -> String {
-    let object = "<Object><Index>#x4000</Index><Type>BIG</Type><BitSize>80000</BitSize></Object>";
-    let objects = format!("<Objects>{}", object.repeat(200));
-    replace_in(text, "ModuleIdent=\"#x6800000C\">", "<Objects>", &objects)
+/// So many objects of 10 kB in the default module, others in each slot.
+pub fn large_module(text: &str, count: usize) -> String {
+    let objects: String = (0..count)
+        .map(|n| {
+            let index = format!("<Index DependOnSlot=\"1\">#x{:x}</Index>", 0x8000 + n);
+            format!("<Object>{index}<Type>BIG</Type><BitSize>80000</BitSize></Object>")
+        })
+        .collect();
+    let text = replace(
+        text,
+        "SlotIndexIncrement=\"0\"",
+        "SlotIndexIncrement=\"16\"",
+    );
+    let all = format!("<Objects>{objects}");
+    replace_in(&text, "ModuleIdent=\"#x6800000C\">", "<Objects>", &all)
 }
 
 pub fn instances(text: &str, count: &str) -> String {
