@@ -8,7 +8,7 @@
 //! | module | what lives there |
 //! |---|---|
 //! | [`units`] | newtypes for drive-side and user-side quantities |
-//! | [`scale`] | counts ↔ user units, the drive's velocity unit (0x60A9), polarity, 32-bit wrap |
+//! | [`scale`] | counts ↔ user units, the drive's own units (0x60A9, 0x60AA), polarity, modulo, torque; what a drive says of them |
 //! | [`limits`] | what an axis may never exceed; checked once, enforced every cycle |
 //! | [`cia402`] | Statusword, Controlword, the power state machine, modes, error codes |
 //! | [`loops`] | the position loops that the master closes in CSV and CST, and the offsets in CSP |
@@ -45,6 +45,6 @@ pub use homing::{Homing, HomingError};
 pub use limits::{LimitError, Limits};
 pub use loops::{FeedForward, Loops, PositionPid, VelocityLoop};
 pub use probe::{Edge, Probe, ProbeStatus, Source};
-pub use scale::{Scale, ScaleError, VelocityBase, VelocityUnit};
+pub use scale::{AccelerationUnit, Scale, ScaleError, VelocityBase, VelocityUnit};
 pub use status::{AxisStatus, DriveFault, HomingStatus, Refused, Trip, Waiting};
 pub use supervision::{Brake, Emergency, FaultReset, Reaction, Supervision, TorqueWatch};

@@ -3,117 +3,20 @@
 //! A [`Scale`] is checked when it is built; afterwards no conversion fails: values outside the wire's range saturate, and
 //! everything is rounded to nearest.
 
-use core::fmt;
+mod drive_unit;
+mod modulo;
+mod offered;
+mod torque;
+
+pub use drive_unit::{AccelerationBase, AccelerationUnit, INCREMENTS, VelocityBase, VelocityUnit};
+pub use modulo::Way;
+pub use offered::{Contradiction, Offered};
+pub use torque::TorqueScale;
 
 use crate::units::{
     Counts, PerMille, Percent, RawAcceleration, RawVelocity, UserAcceleration, UserUnits,
     UserVelocity,
 };
-
-/// What a velocity counts: encoder increments or turns of the motor.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum VelocityBase {
-    CountsPerSecond,
-    TurnsPerSecond,
-    TurnsPerMinute,
-}
-
-/// The unit of the drive's velocity objects, as 0x60A9 tells it: `10^prefix × base`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct VelocityUnit {
-    base: VelocityBase,
-    prefix: i8,
-}
-
-impl VelocityUnit {
-    pub const COUNTS_PER_SECOND: Self = Self::of(VelocityBase::CountsPerSecond);
-    pub const TURNS_PER_SECOND: Self = Self::of(VelocityBase::TurnsPerSecond);
-    pub const RPM: Self = Self::of(VelocityBase::TurnsPerMinute);
-    pub const MILLI_RPM: Self = Self {
-        base: VelocityBase::TurnsPerMinute,
-        prefix: -3,
-    };
-
-    // CiA 303-2 notation indices: numerator in bits 16–23, denominator in bits 8–15, signed power of ten in bits 24–31.
-    const REVOLUTION: u8 = 0xB4;
-    const INCREMENT: u8 = 0xB5;
-    const PER_SECOND: u8 = 0x03;
-    const PER_MINUTE: u8 = 0x47;
-    const PREFIXES: core::ops::RangeInclusive<i8> = -9..=9;
-
-    const fn of(base: VelocityBase) -> Self {
-        Self { base, prefix: 0 }
-    }
-
-    /// Reads the value of 0x60A9. `None` for a unit that is not a velocity of counts or turns.
-    #[must_use]
-    pub fn from_si_code(code: u32) -> Option<Self> {
-        let [reserved, denominator, numerator, prefix] = code.to_le_bytes();
-        let prefix = i8::from_le_bytes([prefix]);
-        let base = match (numerator, denominator) {
-            (Self::INCREMENT, Self::PER_SECOND) => VelocityBase::CountsPerSecond,
-            (Self::REVOLUTION, Self::PER_SECOND) => VelocityBase::TurnsPerSecond,
-            (Self::REVOLUTION, Self::PER_MINUTE) => VelocityBase::TurnsPerMinute,
-            _ => return None,
-        };
-        (reserved == 0 && Self::PREFIXES.contains(&prefix)).then_some(Self { base, prefix })
-    }
-
-    /// The value of 0x60A9 that means this unit.
-    #[must_use]
-    pub const fn si_code(self) -> u32 {
-        let (numerator, denominator) = match self.base {
-            VelocityBase::CountsPerSecond => (Self::INCREMENT, Self::PER_SECOND),
-            VelocityBase::TurnsPerSecond => (Self::REVOLUTION, Self::PER_SECOND),
-            VelocityBase::TurnsPerMinute => (Self::REVOLUTION, Self::PER_MINUTE),
-        };
-        let [prefix] = self.prefix.to_le_bytes();
-        u32::from_le_bytes([0, denominator, numerator, prefix])
-    }
-
-    #[must_use]
-    pub const fn base(self) -> VelocityBase {
-        self.base
-    }
-
-    /// Power of ten.
-    #[must_use]
-    pub const fn prefix(self) -> i8 {
-        self.prefix
-    }
-
-    /// How many of this unit one turn per second is.
-    fn per_turn_per_second(self, counts_per_turn: f64) -> f64 {
-        let base = match self.base {
-            VelocityBase::CountsPerSecond => counts_per_turn,
-            VelocityBase::TurnsPerSecond => 1.0,
-            VelocityBase::TurnsPerMinute => 60.0,
-        };
-        base * 10f64.powi(-i32::from(self.prefix))
-    }
-}
-
-impl Default for VelocityUnit {
-    /// What a drive without 0x60A9 is taken to use.
-    fn default() -> Self {
-        Self::COUNTS_PER_SECOND
-    }
-}
-
-impl fmt::Display for VelocityUnit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let base = match self.base {
-            VelocityBase::CountsPerSecond => "counts/s",
-            VelocityBase::TurnsPerSecond => "turns/s",
-            VelocityBase::TurnsPerMinute => "rpm",
-        };
-        match (self.prefix, self.base) {
-            (0, _) => f.write_str(base),
-            (-3, VelocityBase::TurnsPerMinute) => f.write_str("mrpm"),
-            (prefix, _) => write!(f, "10^{prefix} {base}"),
-        }
-    }
-}
 
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum ScaleError {
@@ -121,6 +24,19 @@ pub enum ScaleError {
     NotPositive { what: &'static str, value: f64 },
     #[error("offset is {value}: it must be a finite number")]
     Offset { value: f64 },
+    #[error("{what} is {above}:{below}: neither may be zero")]
+    Ratio {
+        what: &'static str,
+        above: u32,
+        below: u32,
+    },
+    #[error("a modulo of {value} units is less than 2 counts, or more than 2^31")]
+    Modulo { value: f64 },
+    #[error("{what} is not known, which a torque in {unit} needs")]
+    Torque {
+        what: &'static str,
+        unit: &'static str,
+    },
     #[error("one user unit is {counts_per_unit:e} counts, outside 1e-6 … 1e15")]
     Unusable { counts_per_unit: f64 },
 }
@@ -131,11 +47,26 @@ pub struct Scale {
     counts_per_turn: f64,
     units_per_turn: f64,
     velocity_unit: VelocityUnit,
+    /// `None`: of the velocity unit, per second.
+    acceleration_unit: Option<AccelerationUnit>,
     invert: bool,
     offset: f64,
+    modulo: Option<f64>,
     // Derived; the sign of `invert` is in both.
     counts_per_unit: f64,
     raw_velocity_per_unit: f64,
+    raw_acceleration_per_unit: f64,
+}
+
+/// From the encoder to what the machine moves, as drives describe it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Drivetrain {
+    /// Encoder increments, after quadrature, and the motor turns they belong to (0x608F).
+    pub encoder: [u32; 2],
+    /// Motor turns and the turns of the driving shaft they make (0x6091).
+    pub gear: [u32; 2],
+    /// User units per turn of the driving shaft.
+    pub feed: f64,
 }
 
 impl Scale {
@@ -157,17 +88,40 @@ impl Scale {
             counts_per_turn,
             units_per_turn,
             velocity_unit: VelocityUnit::default(),
+            acceleration_unit: None,
             invert: false,
             offset: 0.0,
+            modulo: None,
             counts_per_unit: 0.0,
             raw_velocity_per_unit: 0.0,
+            raw_acceleration_per_unit: 0.0,
         }
         .derived())
+    }
+
+    pub fn of_drivetrain(drivetrain: &Drivetrain) -> Result<Self, ScaleError> {
+        let ratio = |what, [above, below]: [u32; 2]| {
+            if above == 0 || below == 0 {
+                Err(ScaleError::Ratio { what, above, below })
+            } else {
+                Ok((f64::from(above), f64::from(below)))
+            }
+        };
+        let (increments, turns) = ratio("encoder resolution", drivetrain.encoder)?;
+        let (motor, shaft) = ratio("gear ratio", drivetrain.gear)?;
+        Self::new(increments / turns, drivetrain.feed * shaft / motor)
     }
 
     #[must_use]
     pub fn with_velocity_unit(mut self, unit: VelocityUnit) -> Self {
         self.velocity_unit = unit;
+        self.derived()
+    }
+
+    /// Where 0x60AA is another unit than that of 0x60A9 per second.
+    #[must_use]
+    pub fn with_acceleration_unit(mut self, unit: AccelerationUnit) -> Self {
+        self.acceleration_unit = Some(unit);
         self.derived()
     }
 
@@ -187,11 +141,20 @@ impl Scale {
         Ok(self)
     }
 
+    /// With the offset that makes `counts` the position `position`: what homing finds.
+    pub fn homed(self, counts: Counts, position: UserUnits) -> Result<Self, ScaleError> {
+        self.with_offset(position.0 - counts.0 as f64 / self.counts_per_unit)
+    }
+
     fn derived(mut self) -> Self {
         let sign = self.sign();
         self.counts_per_unit = sign * self.counts_per_turn / self.units_per_turn;
         self.raw_velocity_per_unit = sign
             * self.velocity_unit.per_turn_per_second(self.counts_per_turn)
+            / self.units_per_turn;
+        self.raw_acceleration_per_unit = self
+            .acceleration_unit()
+            .per_turn_per_second_squared(self.counts_per_turn)
             / self.units_per_turn;
         self
     }
@@ -219,6 +182,12 @@ impl Scale {
     #[must_use]
     pub const fn velocity_unit(&self) -> VelocityUnit {
         self.velocity_unit
+    }
+
+    #[must_use]
+    pub fn acceleration_unit(&self) -> AccelerationUnit {
+        self.acceleration_unit
+            .unwrap_or_else(|| self.velocity_unit.into())
     }
 
     #[must_use]
@@ -263,15 +232,17 @@ impl Scale {
         RawVelocity(round_i32(velocity.0 * self.raw_velocity_per_unit))
     }
 
-    /// In the unit of 0x60A9 per second; direction does not matter to an acceleration.
+    /// In the unit of 0x60AA; direction does not matter to an acceleration.
     #[must_use]
     pub fn acceleration_to_user(&self, raw: RawAcceleration) -> UserAcceleration {
-        UserAcceleration(f64::from(raw.0) * self.velocity_resolution())
+        UserAcceleration(f64::from(raw.0) / self.raw_acceleration_per_unit)
     }
 
     #[must_use]
     pub fn acceleration_to_raw(&self, acceleration: UserAcceleration) -> RawAcceleration {
-        let raw = (acceleration.0 * self.raw_velocity_per_unit).abs().round();
+        let raw = (acceleration.0 * self.raw_acceleration_per_unit)
+            .abs()
+            .round();
         // `as` saturates floats, and maps NaN to 0.
         RawAcceleration(raw as u32)
     }
@@ -298,129 +269,4 @@ fn round_i32(value: f64) -> i32 {
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn epos(unit: VelocityUnit) -> Scale {
-        Scale::new(2000.0, 5.0).unwrap().with_velocity_unit(unit)
-    }
-
-    #[test]
-    fn si_codes() {
-        for (code, unit, text) in [
-            (0x00B4_4700, VelocityUnit::RPM, "rpm"),
-            (0xFDB4_4700, VelocityUnit::MILLI_RPM, "mrpm"),
-            (0x00B5_0300, VelocityUnit::COUNTS_PER_SECOND, "counts/s"),
-            (0x00B4_0300, VelocityUnit::TURNS_PER_SECOND, "turns/s"),
-        ] {
-            assert_eq!(VelocityUnit::from_si_code(code), Some(unit));
-            assert_eq!(unit.si_code(), code);
-            assert_eq!(unit.to_string(), text);
-        }
-        assert_eq!(
-            VelocityUnit::from_si_code(0xFEB4_4700).unwrap().to_string(),
-            "10^-2 rpm"
-        );
-        // An acceleration, a position, nonsense.
-        for code in [0x00C0_0300, 0x00B5_0000, 0, u32::MAX, 0x80B4_4700] {
-            assert_eq!(VelocityUnit::from_si_code(code), None, "{code:#010x}");
-        }
-    }
-
-    #[test]
-    fn velocity_in_each_unit() {
-        // 5 mm per turn: 200 mm/s is 40 turns/s.
-        for (unit, raw) in [
-            (VelocityUnit::RPM, 2400),
-            (VelocityUnit::MILLI_RPM, 2_400_000),
-            (VelocityUnit::COUNTS_PER_SECOND, 80_000),
-            (VelocityUnit::TURNS_PER_SECOND, 40),
-        ] {
-            let scale = epos(unit);
-            assert_eq!(
-                scale.velocity_to_raw(UserVelocity(200.0)),
-                RawVelocity(raw),
-                "{unit}"
-            );
-            assert_eq!(
-                scale.velocity_to_user(RawVelocity(raw)),
-                UserVelocity(200.0)
-            );
-            assert_eq!(
-                scale.acceleration_to_raw(UserAcceleration(200.0)).0,
-                raw.unsigned_abs()
-            );
-        }
-    }
-
-    #[test]
-    fn rounds_to_nearest() {
-        let scale = Scale::new(1.0, 1.0).unwrap();
-        for (user, counts) in [(0.4, 0), (0.6, 1), (-0.4, 0), (-0.6, -1), (2.5, 3)] {
-            assert_eq!(scale.position_to_counts(UserUnits(user)), Counts(counts));
-        }
-        assert_eq!(scale.torque_to_raw(Percent(12.36)), PerMille(124));
-    }
-
-    #[test]
-    fn inversion_and_offset() {
-        let scale = epos(VelocityUnit::RPM)
-            .with_invert(true)
-            .with_offset(10.0)
-            .unwrap();
-        assert_eq!(scale.position_to_counts(UserUnits(15.0)), Counts(-2000));
-        assert_eq!(scale.position_to_user(Counts(-2000)), UserUnits(15.0));
-        assert_eq!(scale.velocity_to_raw(UserVelocity(5.0)), RawVelocity(-60));
-        assert_eq!(scale.torque_to_raw(Percent(5.0)), PerMille(-50));
-        assert_eq!(scale.torque_to_user(PerMille(-50)), Percent(5.0));
-        assert!(scale.counts_per_unit() > 0.0);
-    }
-
-    #[test]
-    fn nonsense_is_refused() {
-        for (counts, units) in [
-            (0.0, 1.0),
-            (-1.0, 1.0),
-            (f64::NAN, 1.0),
-            (1.0, 0.0),
-            (1.0, f64::INFINITY),
-            (1e300, 1e-300),
-        ] {
-            assert!(Scale::new(counts, units).is_err(), "{counts} {units}");
-        }
-        assert!(Scale::new(1.0, 1.0).unwrap().with_offset(f64::NAN).is_err());
-    }
-
-    proptest! {
-        #[test]
-        fn counts_round_trip(
-            counts in -(1i64 << 40)..(1i64 << 40),
-            per_turn in 1.0..1e7f64,
-            units in 1e-3..1e3f64,
-            invert: bool,
-            offset in -1e3..1e3f64,
-        ) {
-            let scale = Scale::new(per_turn, units).unwrap().with_invert(invert).with_offset(offset).unwrap();
-            prop_assert_eq!(scale.position_to_counts(scale.position_to_user(Counts(counts))), Counts(counts));
-        }
-
-        #[test]
-        fn any_code_survives(code: u32) {
-            if let Some(unit) = VelocityUnit::from_si_code(code) {
-                prop_assert_eq!(unit.si_code(), code);
-            }
-        }
-
-        #[test]
-        fn any_value_converts(bits: u64) {
-            let value = f64::from_bits(bits);
-            let scale = epos(VelocityUnit::RPM);
-            let _ = scale.position_to_counts(UserUnits(value));
-            let _ = scale.velocity_to_raw(UserVelocity(value));
-            let _ = scale.acceleration_to_raw(UserAcceleration(value));
-            let _ = scale.torque_to_raw(Percent(value));
-        }
-    }
-}
+mod tests;

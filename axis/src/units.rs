@@ -1,7 +1,8 @@
 //! Quantities as types, where a mix-up would move a machine by the wrong amount.
 //!
 //! Two sides: what the drive counts ([`Counts`], [`RawVelocity`], [`RawAcceleration`], [`PerMille`]) and what the user
-//! thinks in ([`UserUnits`], [`UserVelocity`], [`UserAcceleration`], [`Percent`]). [`crate::Scale`] is the only way across.
+//! thinks in ([`UserUnits`], [`UserVelocity`], [`UserAcceleration`], [`Percent`]). [`crate::Scale`] is the only way across; a torque in
+//! [`NewtonMetres`] or [`Amperes`] goes through [`crate::scale::TorqueScale`] first.
 
 /// Position in encoder counts, unwrapped: it goes on where the drive's 32-bit value wraps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
@@ -28,7 +29,7 @@ impl Counts {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct RawVelocity(pub i32);
 
-/// Acceleration as it is on the wire: the unit of 0x60A9 per second.
+/// Acceleration as it is on the wire, in the unit of 0x60AA.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct RawAcceleration(pub u32);
 
@@ -51,6 +52,14 @@ pub struct UserAcceleration(pub f64);
 /// Torque in percent of the motor's rated torque.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
 pub struct Percent(pub f64);
+
+/// Torque of the motor, before any gear.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
+pub struct NewtonMetres(pub f64);
+
+/// Current that makes torque.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
+pub struct Amperes(pub f64);
 
 #[cfg(test)]
 mod tests {

@@ -1,0 +1,212 @@
+//! What the drive's integers count, as 0x60A9 and 0x60AA tell it in the codes of CiA 303-2.
+
+use core::fmt;
+
+// Notation indices.
+const REVOLUTION: u8 = 0xB4;
+const INCREMENT: u8 = 0xB5;
+/// Revolutions per minute in one.
+const RPM: u8 = 0xC0;
+const PER_SECOND: u8 = 0x03;
+const PER_MINUTE: u8 = 0x47;
+const PER_SECOND_SQUARED: u8 = 0x57;
+const PREFIXES: core::ops::RangeInclusive<i8> = -9..=9;
+
+/// Encoder increments, the value of 0x60A8 that [`crate::units::Counts`] needs.
+pub const INCREMENTS: u32 = write((INCREMENT, 0), 0);
+
+/// Numerator in bits 16–23, denominator in bits 8–15, signed power of ten in bits 24–31.
+fn read(code: u32) -> Option<((u8, u8), i8)> {
+    let [reserved, denominator, numerator, prefix] = code.to_le_bytes();
+    let prefix = i8::from_le_bytes([prefix]);
+    (reserved == 0 && PREFIXES.contains(&prefix)).then_some(((numerator, denominator), prefix))
+}
+
+const fn write((numerator, denominator): (u8, u8), prefix: i8) -> u32 {
+    let [prefix] = prefix.to_le_bytes();
+    u32::from_le_bytes([0, denominator, numerator, prefix])
+}
+
+/// What a velocity counts: encoder increments or turns of the motor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum VelocityBase {
+    CountsPerSecond,
+    TurnsPerSecond,
+    TurnsPerMinute,
+}
+
+/// The unit of the drive's velocity objects, as 0x60A9 tells it: `10^prefix × base`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct VelocityUnit {
+    base: VelocityBase,
+    prefix: i8,
+}
+
+impl VelocityUnit {
+    pub const COUNTS_PER_SECOND: Self = Self::of(VelocityBase::CountsPerSecond);
+    pub const TURNS_PER_SECOND: Self = Self::of(VelocityBase::TurnsPerSecond);
+    pub const RPM: Self = Self::of(VelocityBase::TurnsPerMinute);
+    pub const MILLI_RPM: Self = Self {
+        base: VelocityBase::TurnsPerMinute,
+        prefix: -3,
+    };
+
+    const fn of(base: VelocityBase) -> Self {
+        Self { base, prefix: 0 }
+    }
+
+    /// Reads the value of 0x60A9. `None` for a unit that is not a velocity of counts or turns.
+    #[must_use]
+    pub fn from_si_code(code: u32) -> Option<Self> {
+        let (fraction, prefix) = read(code)?;
+        let base = match fraction {
+            (INCREMENT, PER_SECOND) => VelocityBase::CountsPerSecond,
+            (REVOLUTION, PER_SECOND) => VelocityBase::TurnsPerSecond,
+            (REVOLUTION, PER_MINUTE) => VelocityBase::TurnsPerMinute,
+            _ => return None,
+        };
+        Some(Self { base, prefix })
+    }
+
+    /// The value of 0x60A9 that means this unit.
+    #[must_use]
+    pub const fn si_code(self) -> u32 {
+        let fraction = match self.base {
+            VelocityBase::CountsPerSecond => (INCREMENT, PER_SECOND),
+            VelocityBase::TurnsPerSecond => (REVOLUTION, PER_SECOND),
+            VelocityBase::TurnsPerMinute => (REVOLUTION, PER_MINUTE),
+        };
+        write(fraction, self.prefix)
+    }
+
+    #[must_use]
+    pub const fn base(self) -> VelocityBase {
+        self.base
+    }
+
+    /// Power of ten.
+    #[must_use]
+    pub const fn prefix(self) -> i8 {
+        self.prefix
+    }
+
+    /// How many of this unit one turn per second is.
+    pub(super) fn per_turn_per_second(self, counts_per_turn: f64) -> f64 {
+        let base = match self.base {
+            VelocityBase::CountsPerSecond => counts_per_turn,
+            VelocityBase::TurnsPerSecond => 1.0,
+            VelocityBase::TurnsPerMinute => 60.0,
+        };
+        base * 10f64.powi(-i32::from(self.prefix))
+    }
+}
+
+impl Default for VelocityUnit {
+    /// What a drive without 0x60A9 is taken to use.
+    fn default() -> Self {
+        Self::COUNTS_PER_SECOND
+    }
+}
+
+impl fmt::Display for VelocityUnit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let base = match self.base {
+            VelocityBase::CountsPerSecond => "counts/s",
+            VelocityBase::TurnsPerSecond => "turns/s",
+            VelocityBase::TurnsPerMinute => "rpm",
+        };
+        match (self.prefix, self.base) {
+            (0, _) => f.write_str(base),
+            (-3, VelocityBase::TurnsPerMinute) => f.write_str("mrpm"),
+            (prefix, _) => write!(f, "10^{prefix} {base}"),
+        }
+    }
+}
+
+/// What an acceleration counts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum AccelerationBase {
+    CountsPerSecondSquared,
+    TurnsPerSecondSquared,
+    TurnsPerMinutePerSecond,
+}
+
+/// The unit of the drive's acceleration objects, as 0x60AA tells it: `10^prefix × base`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct AccelerationUnit {
+    base: AccelerationBase,
+    prefix: i8,
+}
+
+impl AccelerationUnit {
+    pub const RPM_PER_SECOND: Self = Self {
+        base: AccelerationBase::TurnsPerMinutePerSecond,
+        prefix: 0,
+    };
+    pub const COUNTS_PER_SECOND_SQUARED: Self = Self {
+        base: AccelerationBase::CountsPerSecondSquared,
+        prefix: 0,
+    };
+
+    /// Reads the value of 0x60AA. `None` for a unit that is not an acceleration of counts or turns.
+    #[must_use]
+    pub fn from_si_code(code: u32) -> Option<Self> {
+        let (fraction, prefix) = read(code)?;
+        let base = match fraction {
+            (INCREMENT, PER_SECOND_SQUARED) => AccelerationBase::CountsPerSecondSquared,
+            (REVOLUTION, PER_SECOND_SQUARED) => AccelerationBase::TurnsPerSecondSquared,
+            (RPM, PER_SECOND) => AccelerationBase::TurnsPerMinutePerSecond,
+            _ => return None,
+        };
+        Some(Self { base, prefix })
+    }
+
+    /// The value of 0x60AA that means this unit.
+    #[must_use]
+    pub const fn si_code(self) -> u32 {
+        let fraction = match self.base {
+            AccelerationBase::CountsPerSecondSquared => (INCREMENT, PER_SECOND_SQUARED),
+            AccelerationBase::TurnsPerSecondSquared => (REVOLUTION, PER_SECOND_SQUARED),
+            AccelerationBase::TurnsPerMinutePerSecond => (RPM, PER_SECOND),
+        };
+        write(fraction, self.prefix)
+    }
+
+    /// How many of this unit one turn per second² is.
+    pub(super) fn per_turn_per_second_squared(self, counts_per_turn: f64) -> f64 {
+        let base = match self.base {
+            AccelerationBase::CountsPerSecondSquared => counts_per_turn,
+            AccelerationBase::TurnsPerSecondSquared => 1.0,
+            AccelerationBase::TurnsPerMinutePerSecond => 60.0,
+        };
+        base * 10f64.powi(-i32::from(self.prefix))
+    }
+}
+
+impl From<VelocityUnit> for AccelerationUnit {
+    /// That velocity per second.
+    fn from(unit: VelocityUnit) -> Self {
+        Self {
+            base: match unit.base {
+                VelocityBase::CountsPerSecond => AccelerationBase::CountsPerSecondSquared,
+                VelocityBase::TurnsPerSecond => AccelerationBase::TurnsPerSecondSquared,
+                VelocityBase::TurnsPerMinute => AccelerationBase::TurnsPerMinutePerSecond,
+            },
+            prefix: unit.prefix,
+        }
+    }
+}
+
+impl fmt::Display for AccelerationUnit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let base = match self.base {
+            AccelerationBase::CountsPerSecondSquared => "counts/s²",
+            AccelerationBase::TurnsPerSecondSquared => "turns/s²",
+            AccelerationBase::TurnsPerMinutePerSecond => "rpm/s",
+        };
+        match self.prefix {
+            0 => f.write_str(base),
+            prefix => write!(f, "10^{prefix} {base}"),
+        }
+    }
+}

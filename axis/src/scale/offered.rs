@@ -1,0 +1,239 @@
+//! What a drive says of its units, against what the axis was configured with.
+
+use core::fmt;
+
+use super::{AccelerationUnit, INCREMENTS, Scale, VelocityUnit};
+
+/// As read from the drive. `None`: the drive does not have the object, or it was not read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Offered {
+    /// 0x608F: encoder increments, motor turns.
+    pub encoder_resolution: Option<[u32; 2]>,
+    /// 0x6091: motor turns, driving shaft turns.
+    pub gear_ratio: Option<[u32; 2]>,
+    /// 0x6092: feed in position units, driving shaft turns.
+    pub feed_constant: Option<[u32; 2]>,
+    /// 0x60A8.
+    pub position_unit: Option<u32>,
+    /// 0x60A9.
+    pub velocity_unit: Option<u32>,
+    /// 0x60AA.
+    pub acceleration_unit: Option<u32>,
+    /// 0x6076, in the drive's unit (mNm by the standard; EPOS4 counts µNm).
+    pub rated_torque: Option<u32>,
+    /// 0x607E: bit 7 position, bit 6 velocity.
+    pub polarity: Option<u8>,
+}
+
+/// One thing about which the drive and the configuration disagree.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum Contradiction {
+    /// A ratio of nothing.
+    Ratio { index: u16, above: u32, below: u32 },
+    /// Position units per motor turn, as 0x608F, 0x6091 and 0x6092 together make them; `index` is the one that decides.
+    CountsPerTurn {
+        index: u16,
+        expected: f64,
+        found: f64,
+    },
+    /// 0x60A8.
+    PositionUnit { found: u32 },
+    /// 0x60A9.
+    VelocityUnit { expected: VelocityUnit, found: u32 },
+    /// 0x60AA.
+    AccelerationUnit {
+        expected: AccelerationUnit,
+        found: u32,
+    },
+    /// 0x6076 in the drive's unit; `expected` where it is configured.
+    RatedTorque { expected: Option<u32>, found: u32 },
+    /// 0x607E: the drive inverts, or only half of what it reports.
+    Polarity { found: u8 },
+}
+
+/// How far ratios may be apart, relatively. Larger is another gear.
+const SAME: f64 = 1e-9;
+
+/// Per thousand of the rated torque, which is how exactly a torque is commanded.
+const SAME_TORQUE: f64 = 1e-3;
+
+const POLARITIES: u8 = 0xC0;
+
+impl Offered {
+    /// Everything that contradicts `scale` and, where it is given, the rated torque (in the unit of 0x6076). Allocates: not for the cycle.
+    #[must_use]
+    pub fn contradictions(&self, scale: &Scale, rated_torque: Option<u32>) -> Vec<Contradiction> {
+        let mut found = Vec::new();
+        let ratio = |index: u16, ratio: Option<[u32; 2]>, found: &mut Vec<_>| match ratio? {
+            [above, below] if above == 0 || below == 0 => {
+                found.push(Contradiction::Ratio {
+                    index,
+                    above,
+                    below,
+                });
+                None
+            }
+            [above, below] => Some(f64::from(above) / f64::from(below)),
+        };
+        let encoder = ratio(0x608F, self.encoder_resolution, &mut found);
+        let gear = ratio(0x6091, self.gear_ratio, &mut found);
+        let feed = ratio(0x6092, self.feed_constant, &mut found);
+        found.extend(counts_per_turn(encoder, gear, feed, scale));
+        if let Some(code) = self.position_unit
+            && code != INCREMENTS
+        {
+            found.push(Contradiction::PositionUnit { found: code });
+        }
+        if let Some(code) = self.velocity_unit
+            && VelocityUnit::from_si_code(code) != Some(scale.velocity_unit())
+        {
+            found.push(Contradiction::VelocityUnit {
+                expected: scale.velocity_unit(),
+                found: code,
+            });
+        }
+        if let Some(code) = self.acceleration_unit
+            && AccelerationUnit::from_si_code(code) != Some(scale.acceleration_unit())
+        {
+            found.push(Contradiction::AccelerationUnit {
+                expected: scale.acceleration_unit(),
+                found: code,
+            });
+        }
+        if let Some(torque) = self.rated_torque {
+            let near = |expected: u32| {
+                let (expected, torque) = (f64::from(expected), f64::from(torque));
+                (expected - torque).abs() <= expected * SAME_TORQUE
+            };
+            if torque == 0 || rated_torque.is_some_and(|expected| !near(expected)) {
+                found.push(Contradiction::RatedTorque {
+                    expected: rated_torque,
+                    found: torque,
+                });
+            }
+        }
+        if let Some(polarity) = self.polarity
+            && polarity & POLARITIES != 0
+        {
+            found.push(Contradiction::Polarity { found: polarity });
+        }
+        found
+    }
+}
+
+/// A drive with a feed constant counts that much per turn of the driving shaft; one without counts its encoder. A feed of 1 is what drives
+/// have that do not use it: none could be positioned with one count per turn.
+fn counts_per_turn(
+    encoder: Option<f64>,
+    gear: Option<f64>,
+    feed: Option<f64>,
+    scale: &Scale,
+) -> Option<Contradiction> {
+    let feed = feed.filter(|&feed| feed != 1.0);
+    let gear_ratio = gear.unwrap_or(1.0);
+    let geared = gear_ratio != 1.0;
+    let per_shaft_turn = feed.or(encoder);
+    let expected = scale.counts_per_turn();
+    let (index, found) = match (feed, per_shaft_turn) {
+        (Some(_), Some(counts)) => (0x6092, counts / gear_ratio),
+        (None, Some(counts)) if geared => (0x6091, counts / gear_ratio),
+        (None, Some(counts)) => (0x608F, counts),
+        // Without either, a gear still stretches what the encoder is known to count.
+        (_, None) if geared => (0x6091, expected / gear_ratio),
+        (_, None) => return None,
+    };
+    let same = (found - expected).abs() <= expected * SAME;
+    (!same).then_some(Contradiction::CountsPerTurn {
+        index,
+        expected,
+        found,
+    })
+}
+
+impl Contradiction {
+    /// Index and subindex of the object that says otherwise.
+    #[must_use]
+    pub const fn object(&self) -> (u16, u8) {
+        match *self {
+            Self::Ratio { index, below, .. } => (index, if below == 0 { 2 } else { 1 }),
+            Self::CountsPerTurn { index, .. } => (index, 1),
+            Self::PositionUnit { .. } => (0x60A8, 0),
+            Self::VelocityUnit { .. } => (0x60A9, 0),
+            Self::AccelerationUnit { .. } => (0x60AA, 0),
+            Self::RatedTorque { .. } => (0x6076, 0),
+            Self::Polarity { .. } => (0x607E, 0),
+        }
+    }
+
+    /// What to do about it.
+    #[must_use]
+    pub const fn advice(&self) -> &'static str {
+        match self {
+            Self::Ratio { .. } => "write a ratio to the drive in which neither number is zero",
+            Self::CountsPerTurn { index: 0x608F, .. } => {
+                "correct the encoder's counts per turn in the machine file, or the drive's encoder resolution"
+            }
+            Self::CountsPerTurn { .. } => {
+                "set the drive's gear ratio to 1:1 and its feed constant to the encoder's counts per turn, and describe the gear in \
+                 the machine file; or give in the machine file what the drive counts per motor turn"
+            }
+            Self::PositionUnit { .. } => "set 0x60A8 to 0x00B50000, encoder increments",
+            Self::VelocityUnit { .. } => {
+                "write the expected unit to 0x60A9 at start-up, or name the drive's unit in the machine file"
+            }
+            Self::AccelerationUnit { .. } => {
+                "write the expected unit to 0x60AA at start-up, or name the drive's unit in the machine file"
+            }
+            Self::RatedTorque { found: 0, .. } => {
+                "tell the drive its motor: with a rated torque of zero a torque in thousandths of it means nothing"
+            }
+            Self::RatedTorque { .. } => {
+                "correct the motor's rated torque in the machine file, or the drive's motor data"
+            }
+            Self::Polarity { .. } => {
+                "set 0x607E to 0 and turn the axis round in the machine file, so that only one of them does"
+            }
+        }
+    }
+}
+
+impl fmt::Display for Contradiction {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (index, subindex) = self.object();
+        write!(f, "0x{index:04X}:{subindex:02} ")?;
+        let unit = |f: &mut fmt::Formatter<'_>, expected: &dyn fmt::Display, code: u32| {
+            write!(f, "is 0x{code:08X}")?;
+            if let Some(known) = VelocityUnit::from_si_code(code) {
+                write!(f, " ({known})")?;
+            } else if let Some(known) = AccelerationUnit::from_si_code(code) {
+                write!(f, " ({known})")?;
+            }
+            write!(f, ", expected {expected}")
+        };
+        match *self {
+            Self::Ratio { above, below, .. } => write!(f, "is {above}:{below}, expected a ratio"),
+            Self::CountsPerTurn {
+                expected, found, ..
+            } => write!(
+                f,
+                "makes {found} counts per motor turn, expected {expected}"
+            ),
+            Self::PositionUnit { found } => {
+                write!(f, "is 0x{found:08X}, expected encoder increments")
+            }
+            Self::VelocityUnit { expected, found } => unit(f, &expected, found),
+            Self::AccelerationUnit { expected, found } => unit(f, &expected, found),
+            Self::RatedTorque {
+                expected: Some(expected),
+                found,
+            } => write!(f, "is {found}, expected {expected}"),
+            Self::RatedTorque { found, .. } => write!(f, "is {found}, expected a rated torque"),
+            Self::Polarity { found } => write!(f, "is 0x{found:02X}, expected 0x00"),
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "offered_tests.rs"]
+mod tests;
