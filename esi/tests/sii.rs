@@ -161,6 +161,42 @@ fn every_device_of_every_vendor_gets_an_image() {
     }
 }
 
+/// As makers' images have it: registers that a SyncManager stands for have PDOs, but no length of their own.
+#[test]
+fn virtual_pdos_are_listed_in_their_places() {
+    let xml = br##"<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices><Device>
+        <Type ProductCode="#x1">Oversampler</Type><Name>Oversampler</Name>
+        <Sm StartAddress="#x1000" ControlByte="#x20" Enable="1">Inputs</Sm>
+        <Sm StartAddress="#x0990" Virtual="1">Inputs</Sm>
+        <TxPdo Sm="1" Virtual="1" Fixed="1"><Index>#x1A10</Index><Exclude>#x1A11</Exclude><Name>Start</Name>
+            <Entry><Index>#x990</Index><BitLen>64</BitLen></Entry></TxPdo>
+        <TxPdo Sm="1" Virtual="1" Fixed="1"><Index>#x1A11</Index><Exclude>#x1A10</Exclude><Name>Stop</Name>
+            <Entry><Index>#x998</Index><BitLen>64</BitLen></Entry></TxPdo>
+        <TxPdo Sm="0"><Index>#x1A00</Index><Name>Value</Name>
+            <Entry><Index>#x6000</Index><SubIndex>1</SubIndex><BitLen>16</BitLen></Entry></TxPdo>
+        </Device></Devices></Descriptions></EtherCATInfo>"##;
+    let file = parse(xml).unwrap();
+    let image = sii::emit(&file.devices[0], &[], &SiiOptions::default());
+    let sii = sii::parse(&image).unwrap();
+    let listed: Vec<_> = sii
+        .tx_pdos
+        .iter()
+        .map(|p| (p.index, p.sm, p.flags))
+        .collect();
+    let expected = [
+        (0x1a10, Some(1), 0x30),
+        (0x1a11, None, 0x30),
+        (0x1a00, Some(0), 0),
+    ];
+    assert_eq!(listed, expected);
+    let lengths: Vec<_> = sii
+        .sync_managers
+        .iter()
+        .map(|sm| (sm.len, sm.enable))
+        .collect();
+    assert_eq!(lengths, [(2, 1), (0, 4)]);
+}
+
 fn text() -> impl Strategy<Value = String> {
     "[ -~]{0,20}"
 }

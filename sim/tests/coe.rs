@@ -324,3 +324,18 @@ fn stored_parameters_outlive_a_power_cycle_until_defaults_are_restored() {
     );
     assert_eq!(cycle(&mut bus, Some((0x1011, b"load"))), (0, 2));
 }
+
+#[test]
+fn a_mapping_entry_is_32_bits_long_whatever_the_dictionary_says() {
+    let mut device = coe_device();
+    let entry = device.rx_pdos[0].entries[0].mapping();
+    let mut object = device.dictionary.objects[0].clone();
+    object.index = device.rx_pdos[0].index;
+    let write = ecaxis_esi::model::Writable::Never;
+    object.items = vec![item(0, 8, 0, write, &[1]), item(1, 16, 16, write, &[])];
+    device.dictionary.objects.push(object);
+    let mut bus = Bus::new(vec![sim(&device)]);
+    bus.address_all();
+    bus.preop(S);
+    assert_eq!(bus.upload(S, 0x1600, 1).unwrap(), entry.to_le_bytes());
+}

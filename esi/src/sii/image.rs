@@ -27,8 +27,8 @@ impl Sii {
         if let Some(field) = config.get_mut(8..10) {
             field.copy_from_slice(&options.alias.to_le_bytes());
         }
-        let rx = default_pdos(device, modules, Direction::Rx);
-        let tx = default_pdos(device, modules, Direction::Tx);
+        let rx = pdos(device, modules, Direction::Rx);
+        let tx = pdos(device, modules, Direction::Tx);
         Self {
             config,
             alias: options.alias,
@@ -78,6 +78,32 @@ impl Sii {
             ended: true,
         }
     }
+}
+
+/// Those that can be chosen, and in their places those that stand for registers: images list both.
+fn pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
+    let own = match direction {
+        Direction::Rx => &device.rx_pdos,
+        Direction::Tx => &device.tx_pdos,
+    };
+    let mut all = default_pdos(device, modules, direction);
+    for pdo in own.iter().filter(|pdo| pdo.virtual_) {
+        let mut pdo = pdo.clone();
+        let names = |a: &Pdo, b: &Pdo| a.exclude.iter().any(|excluded| excluded.index == b.index);
+        let shuts_out = |other: &&Pdo| names(other, &pdo) || names(&pdo, other);
+        if all
+            .iter()
+            .filter(|other| other.sm.is_some())
+            .any(|other| shuts_out(&other))
+        {
+            pdo.sm = None;
+        }
+        all.push(pdo);
+    }
+    let place = |pdo: &Pdo| own.iter().position(|other| other.index == pdo.index);
+    // Those of modules come last.
+    all.sort_by_key(|pdo| place(pdo).unwrap_or(usize::MAX));
+    all
 }
 
 /// Categories that follow from the rest of the ESI; a file that lists them as well means the same.
@@ -253,7 +279,7 @@ fn ports(physics: &str) -> u16 {
         })
 }
 
-/// A size that the ESI leaves open is what the default PDOs need.
+/// A size that the ESI leaves open is what the default PDOs need; registers need none.
 fn sync_managers(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Vec<SiiSyncManager> {
     (0..=u8::MAX)
         .zip(&device.sync_managers)
@@ -265,6 +291,7 @@ fn sync_managers(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Vec<SiiSyncManager>
                 .map(Pdo::bit_len)
                 .fold(0, u32::saturating_add);
             let len = match sm.default_size {
+                0 if sm.virtual_ => 0,
                 0 => u16::try_from(bits.div_ceil(8)).unwrap_or(u16::MAX),
                 size => size,
             };

@@ -232,6 +232,8 @@ impl PdoRules {
                 None if exists && sub > used => continue,
                 _ => store.ensure(index, sub, &format!("SubIndex {sub:03}"), bits, access, &[]),
             };
+            // Some files give the last entry the type of what it maps.
+            let slot = store.lengthen(slot, bits);
             if writable {
                 store.set_access(slot, write);
             }

@@ -304,6 +304,24 @@ impl ObjectStore {
         slot
     }
 
+    /// Gives an item that its dictionary makes too short the length that it has to have; the later one counts.
+    pub(super) fn lengthen(&mut self, slot: Slot, bits: u32) -> Slot {
+        let Some(short) = self.item(slot).filter(|item| item.bit_len < bits).cloned() else {
+            return slot;
+        };
+        let data_type = datatype::unsigned(bits);
+        let item = Item {
+            bit_len: bits,
+            bit_offset: 16 + u32::from(short.sub.saturating_sub(1)) * bits,
+            data_type,
+            kind: datatype::kind(data_type, bits),
+            min: None,
+            max: None,
+            ..short
+        };
+        self.insert(item, &[])
+    }
+
     /// The object's slots in subindex order; empty where there is no such object.
     pub fn object(&self, index: u16) -> impl Iterator<Item = Slot> + '_ {
         let start = self.order.partition_point(|(k, _)| *k < key(index, 0));
