@@ -2,9 +2,9 @@
 """Other people's tools judge the simulated bus.
 
 pysoem (SOEM's MainDevice) brings a bus up that `ecaxis sim` serves on one end of a veth pair, and
-works with it; so does ethercrab, more briefly. Run in an environment with `requirements.txt` installed, as root:
+works with it; so does ethercrab, more briefly. Emitted EEPROM images are read by both, and by SOEM's slaveinfo. Run in an environment with `requirements.txt` installed, as root:
 
-    python tests/judges/run.py [SECTION …] [--keep FOLDER]
+    python tests/judges/run.py [SECTION …] [--keep FOLDER] [--all]
 
 Without root the judges are skipped, which they say. Elsewhere what is missing is an error with CI
 set, otherwise also a reason to skip. ECAXIS names the program to judge; without it, cargo builds it
@@ -21,13 +21,14 @@ import tempfile
 import rig
 from report import Report, Stop
 
-SECTIONS = ["bringup", "overlap", "mailbox", "operation", "faults", "ring", "gateway", "ethercrab", "recordings"]
+SECTIONS = ["bringup", "overlap", "mailbox", "operation", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings"]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sections", nargs="*", choices=[[], *SECTIONS], metavar="SECTION")
     parser.add_argument("--keep", help="folder that keeps the recordings")
+    parser.add_argument("--all", action="store_true", help="every device of every ESI file, not samples")
     arguments = parser.parse_args()
     # `finally` blocks are to run, and the interfaces to go, however this ends.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
@@ -55,7 +56,7 @@ def run(arguments, report):
     with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as temporary, rig.veth_pair() as nics:
         folder = pathlib.Path(arguments.keep or temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        bench = sections.Bench(program, *nics, folder, report)
+        bench = sections.Bench(program, *nics, folder, report, arguments.all)
         for name in arguments.sections or SECTIONS:
             try:
                 getattr(sections, name)(bench)

@@ -11,6 +11,7 @@ import rig
 from report import Report
 
 from .bringup import bringup, overlap
+from .eeproms import eeproms
 from .ethercrab import ethercrab
 from .faults import faults
 from .gateway import gateway
@@ -19,7 +20,7 @@ from .operation import operation
 from .recordings import judge, recordings
 from .ring import ring
 
-__all__ = ["Bench", "bringup", "ethercrab", "faults", "gateway", "mailbox", "operation", "overlap", "recordings", "ring"]
+__all__ = ["Bench", "bringup", "eeproms", "ethercrab", "faults", "gateway", "mailbox", "operation", "overlap", "recordings", "ring"]
 
 MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
@@ -36,6 +37,8 @@ class Bench:
     nic: str
     folder: Path
     report: Report
+    # No samples where there is much of a kind.
+    everything: bool = False
     on_ci: bool = bool(os.environ.get("CI"))
 
     def machine(self):

@@ -1,7 +1,10 @@
-//! ethercrab's own MainDevice, with its own tasks, on an interface: judge-ethercrab IF CYCLES
+//! ethercrab's own MainDevice, with its own tasks, on an interface: judge-ethercrab IF CYCLES.
+//! Or `IF PreOp`, `IF SafeOp`: that far, and it tells what the EEPROMs said
 //!
 //! Brings every device to Op, exchanges process data, copies a pattern to the last device's outputs,
 //! and prints one line per finding for the judges to compare.
+
+mod eeprom;
 
 use std::env;
 use std::error::Error;
@@ -21,10 +24,7 @@ static STORAGE: PduStorage<16, { PduStorage::element_size(1100) }> = PduStorage:
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = env::args().skip(1);
     let nic = arguments.next().ok_or("judge-ethercrab IF CYCLES")?;
-    let cycles: u32 = arguments
-        .next()
-        .ok_or("judge-ethercrab IF CYCLES")?
-        .parse()?;
+    let how_far = arguments.next().ok_or("judge-ethercrab IF CYCLES")?;
     let (tx, rx, pdu_loop) = STORAGE.try_split().map_err(|()| "split twice")?;
     // Longer than this computer may stall.
     let timeouts = Timeouts {
@@ -41,7 +41,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let maindevice = MainDevice::new(pdu_loop, timeouts, config);
     smol::spawn(tx_rx_task(&nic, tx, rx)?).detach();
-    smol::block_on(work(&maindevice, cycles))
+    smol::block_on(async {
+        match how_far.as_str() {
+            "PreOp" => eeprom::read(&maindevice, false).await,
+            "SafeOp" => eeprom::read(&maindevice, true).await,
+            cycles => work(&maindevice, cycles.parse()?).await,
+        }
+    })
 }
 
 async fn work(maindevice: &MainDevice<'_>, cycles: u32) -> Result<(), Box<dyn Error>> {
