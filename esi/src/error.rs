@@ -4,8 +4,12 @@ use crate::model::Position;
 
 /// The file cannot be used. Displays as `line:column path: what`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{position} {path}: {problem}")]
-pub struct EsiError {
+#[error("{} {}: {}", .0.position, .0.path, .0.problem)]
+pub struct EsiError(Box<Fault>);
+
+/// In a box, because every step of the reader may return one and hardly any does.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Fault {
     position: Position,
     path: String,
     problem: EsiProblem,
@@ -13,28 +17,28 @@ pub struct EsiError {
 
 impl EsiError {
     pub(crate) fn new(position: Position, path: String, problem: EsiProblem) -> Self {
-        Self {
+        Self(Box::new(Fault {
             position,
             path,
             problem,
-        }
+        }))
     }
 
     /// Line and column of the element at fault.
     #[must_use]
     pub fn position(&self) -> Position {
-        self.position
+        self.0.position
     }
 
     /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
     #[must_use]
     pub fn path(&self) -> &str {
-        &self.path
+        &self.0.path
     }
 
     #[must_use]
     pub fn problem(&self) -> &EsiProblem {
-        &self.problem
+        &self.0.problem
     }
 }
 
@@ -44,6 +48,8 @@ pub enum EsiProblem {
     Syntax(String),
     #[error("the file ends inside <{0}>")]
     Truncated(String),
+    #[error("the file ends inside a tag or a comment")]
+    TruncatedTag,
     #[error(
         "the root element is <{0}>, an ESI file starts with <EtherCATInfo>, a file of modules with <EtherCATModule>"
     )]

@@ -70,9 +70,15 @@ impl DataTypes {
 
     /// Follows enumerations and aliases to the type they are made of; arrays and records stand for themselves.
     pub fn base<'s>(&'s self, name: &'s str) -> &'s str {
-        let mut name = name;
+        self.with_base(name).1
+    }
+
+    /// The type of that name, and what [`Self::base`] makes of it.
+    pub fn with_base<'s>(&'s self, name: &'s str) -> (Option<&'s DataType>, &'s str) {
+        let found = self.get(name);
+        let (mut name, mut next) = (name, found);
         for _ in 0..MAX_ALIASES {
-            match self.get(name) {
+            match next {
                 Some(DataType {
                     base: Some(base),
                     arrays,
@@ -80,11 +86,12 @@ impl DataTypes {
                     ..
                 }) if arrays.is_empty() && sub_items.is_empty() => {
                     name = base;
+                    next = self.get(name);
                 }
                 _ => break,
             }
         }
-        name
+        (found, name)
     }
 }
 
@@ -114,7 +121,7 @@ fn data_type<'a>(
 ) -> Result<(String, DataType), EsiError> {
     let mut name = String::new();
     let mut data_type = DataType {
-        position: element.position,
+        position: c.position(element),
         ..DataType::default()
     };
     c.children(element, |c, el| {

@@ -19,7 +19,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Vec<
 
 fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiError> {
     let mut mode = DcMode {
-        position: element.position,
+        position: c.position(element),
         ..DcMode::default()
     };
     let mut descriptions = Names::default();

@@ -3,6 +3,8 @@
 //! Windows tools write windows-1252 and call it ISO-8859-1, so both are read as windows-1252. A file that
 //! claims UTF-8 and is not falls back to the same table: what breaks is a letter in a name, not the layout.
 
+use std::borrow::Cow;
+
 /// windows-1252, 0x80 to 0x9f; the rest equals ISO-8859-1. The five holes stay C1 controls.
 const HIGH_CONTROLS: [char; 32] = [
     '\u{20ac}', '\u{81}', '\u{201a}', '\u{192}', '\u{201e}', '\u{2026}', '\u{2020}', '\u{2021}',
@@ -11,23 +13,23 @@ const HIGH_CONTROLS: [char; 32] = [
     '\u{2dc}', '\u{2122}', '\u{161}', '\u{203a}', '\u{153}', '\u{9d}', '\u{17e}', '\u{178}',
 ];
 
-pub(super) struct Decoded {
-    pub text: String,
+pub(super) struct Decoded<'a> {
+    pub text: Cow<'a, str>,
     /// What to tell the user about the encoding, if anything, and where in `text` (bytes).
     pub remark: Option<(usize, String)>,
 }
 
-pub(super) fn decode(bytes: &[u8]) -> Decoded {
+pub(super) fn decode(bytes: &[u8]) -> Decoded<'_> {
     let mut decoded = by_encoding(bytes);
     // XML has no NUL; what is around it is still worth reading.
-    if let (None, Some(at)) = (&decoded.remark, decoded.text.find('\0')) {
+    if let (None, Some(at)) = (&decoded.remark, memchr::memchr(0, decoded.text.as_bytes())) {
         let message = "a NUL character; the file may be damaged".to_owned();
         decoded.remark = Some((at, message));
     }
     decoded
 }
 
-fn by_encoding(bytes: &[u8]) -> Decoded {
+fn by_encoding(bytes: &[u8]) -> Decoded<'_> {
     if let Some(rest) = bytes.strip_prefix(&[0xef, 0xbb, 0xbf]) {
         return utf8(rest);
     }
@@ -57,10 +59,10 @@ fn by_encoding(bytes: &[u8]) -> Decoded {
     }
 }
 
-fn utf8(bytes: &[u8]) -> Decoded {
+fn utf8(bytes: &[u8]) -> Decoded<'_> {
     match std::str::from_utf8(bytes) {
         Ok(text) => Decoded {
-            text: text.to_owned(),
+            text: Cow::Borrowed(text),
             remark: None,
         },
         Err(error) => {
@@ -78,26 +80,39 @@ fn utf8(bytes: &[u8]) -> Decoded {
     }
 }
 
-fn windows_1252(bytes: &[u8]) -> String {
-    bytes
-        .iter()
-        .map(|&byte| match byte {
-            0x80..=0x9f => HIGH_CONTROLS
-                .get(usize::from(byte - 0x80))
-                .copied()
-                .unwrap_or('\u{fffd}'),
-            _ => char::from(byte),
-        })
-        .collect()
+fn windows_1252(bytes: &[u8]) -> Cow<'_, str> {
+    if bytes.is_ascii()
+        && let Ok(text) = std::str::from_utf8(bytes)
+    {
+        return Cow::Borrowed(text);
+    }
+    let mut text = String::with_capacity(bytes.len() + bytes.len() / 16);
+    for chunk in bytes.chunks(64) {
+        match std::str::from_utf8(chunk) {
+            Ok(plain) if chunk.is_ascii() => text.push_str(plain),
+            _ => text.extend(chunk.iter().map(|&byte| windows_1252_letter(byte))),
+        }
+    }
+    Cow::Owned(text)
 }
 
-fn utf16(bytes: &[u8], unit: fn([u8; 2]) -> u16) -> Decoded {
+fn windows_1252_letter(byte: u8) -> char {
+    match byte {
+        0x80..=0x9f => HIGH_CONTROLS
+            .get(usize::from(byte - 0x80))
+            .copied()
+            .unwrap_or('\u{fffd}'),
+        _ => char::from(byte),
+    }
+}
+
+fn utf16(bytes: &[u8], unit: fn([u8; 2]) -> u16) -> Decoded<'static> {
     let units = bytes.chunks_exact(2).map(|pair| unit([pair[0], pair[1]]));
     let text: String = char::decode_utf16(units)
         .map(|c| c.unwrap_or('\u{fffd}'))
         .collect();
     Decoded {
-        text: text.trim_start_matches('\u{feff}').to_owned(),
+        text: Cow::Owned(text.trim_start_matches('\u{feff}').to_owned()),
         remark: None,
     }
 }

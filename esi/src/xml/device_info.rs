@@ -128,7 +128,7 @@ pub(super) fn sm_mapping<'a>(
     element: &Element<'a>,
 ) -> Result<SmMapping, EsiError> {
     let mut mapping = SmMapping {
-        position: element.position,
+        position: c.position(element),
         default: c.attribute_flag(element, "Default")?,
         ..SmMapping::default()
     };

@@ -5,7 +5,7 @@ use super::object::Literal;
 
 /// `Ok(None)`: the element is empty. The error text completes "default …".
 pub(super) fn bytes(
-    literal: &Literal,
+    literal: &Literal<'_>,
     type_name: &str,
     bit_len: u32,
 ) -> Result<Option<Vec<u8>>, String> {
@@ -135,8 +135,8 @@ fn short(text: &str) -> String {
 mod tests {
     use super::*;
 
-    fn v(text: &str) -> Literal {
-        Literal::Value(text.to_owned())
+    fn v(text: &str) -> Literal<'_> {
+        Literal::Value(text.into())
     }
 
     #[test]

@@ -48,7 +48,7 @@ fn coe<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Coe, EsiError> {
 
 fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, EsiError> {
     let mut cmd = InitCmd {
-        position: element.position,
+        position: c.position(element),
         transitions: Vec::new(),
         index: 0,
         depends_on: SlotDependence::default(),

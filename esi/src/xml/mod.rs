@@ -1,6 +1,6 @@
-//! The ESI file as a stream of XML events, one file per ETG.2000 element family.
+//! The ESI file as a stream of XML tags, one file per ETG.2000 element family.
 //!
-//! `decode` turns bytes into text, `cursor` walks elements with line, column and path, `number` reads literals.
+//! `decode` turns bytes into text, `scan` finds tags in it, `cursor` walks elements with line, column and path, `number` reads literals.
 //! `info` is the root; below it `device`, `device_info`, `sync` (Fmmu, Sm, Su), `pdo`, `mailbox`, `dc`, `slots`,
 //! `module`, `eeprom` and `profile` with the dictionary: `datatype` and `object` read it as written, `resolve` joins
 //! the two, and `mapping` takes PDOs from there where a file has no other.
@@ -26,6 +26,9 @@ mod object;
 mod pdo;
 mod profile;
 mod resolve;
+mod scan;
+#[cfg(test)]
+mod scan_tests;
 mod slots;
 mod sync;
 mod text;
@@ -41,7 +44,7 @@ pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
     let mut file = EsiFile::default();
     info::read(&mut cursor, &mut file)?;
     if let Some((at, message)) = decoded.remark {
-        let position = cursor::position(&decoded.text, at);
+        let position = cursor.at(at);
         file.warnings.push(Warning {
             position,
             path: "EtherCATInfo".to_owned(),

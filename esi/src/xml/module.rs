@@ -8,7 +8,7 @@ use crate::model::{Direction, Module};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Module, EsiError> {
     let mut module = Module {
-        position: element.position,
+        position: c.position(element),
         ..Module::default()
     };
     let mut names = Names::default();

@@ -11,11 +11,20 @@ pub(super) fn number(text: &str) -> Option<i128> {
         .iter()
         .find_map(|prefix| digits.strip_prefix(prefix));
     let (digits, radix) = hex.map_or((digits, 10), |rest| (rest, 16));
-    // from_str_radix would take a second sign.
-    if digits.is_empty() || digits.len() > 30 || !digits.chars().all(|c| c.is_digit(radix)) {
+    if digits.is_empty() || digits.len() > 30 {
         return None;
     }
-    let magnitude = i128::from_str_radix(digits, radix).ok()?;
+    let mut magnitude = 0_i128;
+    // In steps that a machine word holds.
+    for step in digits.as_bytes().chunks(15) {
+        let (mut value, mut scale) = (0_u64, 1_u64);
+        for digit in step {
+            let digit = char::from(*digit).to_digit(radix)?;
+            value = value * u64::from(radix) + u64::from(digit);
+            scale *= u64::from(radix);
+        }
+        magnitude = magnitude * i128::from(scale) + i128::from(value);
+    }
     Some(if negative { -magnitude } else { magnitude })
 }
 
@@ -29,21 +38,16 @@ pub(super) fn boolean(text: &str) -> Option<bool> {
 
 /// Hexadecimal bytes in file order, white space between them allowed.
 pub(super) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
-    let digits: Option<Vec<u8>> = text
-        .chars()
-        .filter(|c| !c.is_whitespace())
-        .map(|c| c.to_digit(16).and_then(|d| u8::try_from(d).ok()))
-        .collect();
-    let digits = digits?;
-    if digits.len() % 2 != 0 {
-        return None;
+    let mut bytes = Vec::with_capacity(text.len() / 2);
+    let mut high = None;
+    for character in text.chars().filter(|c| !c.is_whitespace()) {
+        let digit = u8::try_from(character.to_digit(16)?).ok()?;
+        match high.take() {
+            None => high = Some(digit << 4),
+            Some(high) => bytes.push(high | digit),
+        }
     }
-    Some(
-        digits
-            .chunks_exact(2)
-            .map(|pair| pair[0] << 4 | pair[1])
-            .collect(),
-    )
+    high.is_none().then_some(bytes)
 }
 
 #[cfg(test)]

@@ -1,36 +1,38 @@
 //! `Dictionary/Objects`, as written.
 
+use std::borrow::Cow;
+
 use super::cursor::{Cursor, Element};
 use super::number::{boolean, number};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Access, PdoMapping, Position, SlotDependence, Writable};
 
-pub(super) struct RawObject {
+pub(super) struct RawObject<'a> {
     pub position: Position,
     pub index: u16,
     pub depends_on: SlotDependence,
     pub name: String,
     pub type_name: String,
     pub bit_size: u32,
-    pub info: Info,
+    pub info: Info<'a>,
     pub flags: Flags,
 }
 
 /// Default and range of an object or of one of its subindices; literals are read when the type is known.
 #[derive(Default)]
-pub(super) struct Info {
-    pub default: Option<Literal>,
-    pub min: Option<Literal>,
-    pub max: Option<Literal>,
+pub(super) struct Info<'a> {
+    pub default: Option<Literal<'a>>,
+    pub min: Option<Literal<'a>>,
+    pub max: Option<Literal<'a>>,
     pub unit: u32,
-    pub sub_items: Vec<(String, Info)>,
+    pub sub_items: Vec<(String, Info<'a>)>,
 }
 
-pub(super) enum Literal {
-    Value(String),
-    Data(String),
-    Text(String),
+pub(super) enum Literal<'a> {
+    Value(Cow<'a, str>),
+    Data(Cow<'a, str>),
+    Text(Cow<'a, str>),
 }
 
 #[derive(Default, Clone, Copy)]
@@ -44,7 +46,7 @@ pub(super) struct Flags {
 pub(super) fn read<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
-    objects: &mut Vec<RawObject>,
+    objects: &mut Vec<RawObject<'a>>,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| {
         if el.name == "Object" {
@@ -54,11 +56,11 @@ pub(super) fn read<'a>(
     })
 }
 
-fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject, EsiError> {
+fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject<'a>, EsiError> {
     let mut names = Names::default();
     let mut index = None;
     let mut object = RawObject {
-        position: element.position,
+        position: c.position(element),
         index: 0,
         depends_on: SlotDependence::default(),
         name: String::new(),
@@ -94,19 +96,19 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject, Es
     Ok(object)
 }
 
-fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info, EsiError> {
+fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info<'a>, EsiError> {
     let mut out = Info::default();
     c.children(element, |c, el| {
         match el.name {
-            "DefaultValue" => out.default = Some(Literal::Value(c.text(el)?)),
-            "DefaultData" => out.default = Some(Literal::Data(c.text(el)?)),
-            "DefaultString" => out.default = Some(Literal::Text(c.text(el)?)),
-            "MinValue" => out.min = Some(Literal::Value(c.text(el)?)),
-            "MinData" => out.min = Some(Literal::Data(c.text(el)?)),
-            "MaxValue" => out.max = Some(Literal::Value(c.text(el)?)),
-            "MaxData" => out.max = Some(Literal::Data(c.text(el)?)),
+            "DefaultValue" => out.default = Some(Literal::Value(c.content(el)?)),
+            "DefaultData" => out.default = Some(Literal::Data(c.content(el)?)),
+            "DefaultString" => out.default = Some(Literal::Text(c.content(el)?)),
+            "MinValue" => out.min = Some(Literal::Value(c.content(el)?)),
+            "MinData" => out.min = Some(Literal::Data(c.content(el)?)),
+            "MaxValue" => out.max = Some(Literal::Value(c.content(el)?)),
+            "MaxData" => out.max = Some(Literal::Data(c.content(el)?)),
             "Unit" => {
-                let unit = number(&c.text(el)?).and_then(|unit| u32::try_from(unit).ok());
+                let unit = number(&c.content(el)?).and_then(|unit| u32::try_from(unit).ok());
                 out.unit = unit.unwrap_or(0);
             }
             "SubItem" => {
@@ -135,10 +137,11 @@ pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fla
         match el.name {
             "Access" => {
                 let only = c
-                    .attribute(el, "WriteRestrictions")?
+                    .value(el, "WriteRestrictions")?
                     .and_then(|text| restriction(&text));
-                let text = c.text(el)?.to_ascii_lowercase();
-                let (read, write) = (text.contains('r'), text.contains('w'));
+                let text = c.content(el)?;
+                let has = |letter: [char; 2]| text.contains(letter);
+                let (read, write) = (has(['r', 'R']), has(['w', 'W']));
                 let write = match (write, only) {
                     (false, _) => Writable::Never,
                     (true, None) => Writable::Always,
@@ -147,14 +150,14 @@ pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fla
                 flags.access = (!text.is_empty()).then_some(Access { read, write });
             }
             "PdoMapping" => {
-                let text = c.text(el)?.to_ascii_lowercase();
+                let text = c.content(el)?;
                 flags.pdo_mapping = Some(PdoMapping {
-                    rx: text.contains('r'),
-                    tx: text.contains('t'),
+                    rx: text.contains(['r', 'R']),
+                    tx: text.contains(['t', 'T']),
                 });
             }
-            "Backup" => flags.backup = boolean(&c.text(el)?),
-            "Setting" => flags.setting = boolean(&c.text(el)?),
+            "Backup" => flags.backup = boolean(&c.content(el)?),
+            "Setting" => flags.setting = boolean(&c.content(el)?),
             _ => {}
         }
         Ok(())

@@ -36,7 +36,7 @@ fn read<'a>(
     direction: Direction,
 ) -> Result<Pdo, EsiError> {
     let mut pdo = Pdo {
-        position: element.position,
+        position: c.position(element),
         direction,
         index: 0,
         name: String::new(),
@@ -104,7 +104,7 @@ fn oversampling<'a>(
 
 fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiError> {
     let mut entry = Entry {
-        position: element.position,
+        position: c.position(element),
         index: 0,
         sub: 0,
         bit_len: 0,

@@ -1,6 +1,8 @@
 //! Objects and data types joined: every subindex becomes an item with its own length, offset, default, range
 //! and access.
 
+use std::borrow::Cow;
+
 use super::cursor::{Cursor, Element};
 use super::datatype::{DataType, DataTypes};
 use super::literal;
@@ -17,8 +19,9 @@ pub(super) fn object<'a>(
     c: &mut Cursor<'a>,
     dictionary: &Element<'a>,
     types: &DataTypes,
-    mut raw: RawObject,
+    mut raw: RawObject<'a>,
 ) -> Result<Object, EsiError> {
+    let sub_infos = std::mem::take(&mut raw.info.sub_items);
     let data_type = types.get(&raw.type_name);
     let (code, mut slots) = match data_type {
         Some(record) if !record.sub_items.is_empty() => {
@@ -36,7 +39,7 @@ pub(super) fn object<'a>(
             },
         ));
     }
-    let mut infos = assign_infos(&slots, code, std::mem::take(&mut raw.info.sub_items));
+    let mut infos = assign_infos(&slots, code, sub_infos);
     let mut items = Vec::with_capacity(slots.len());
     let place = (raw.position, dictionary);
     let block = match &raw.info.default {
@@ -76,8 +79,8 @@ pub(super) fn object<'a>(
             length.saturating_mul(1 + range) + size_of::<ObjectItem>() + names,
             place,
         )?;
-        let mut read = |literal: &Option<Literal>, what: &str| -> Option<Vec<u8>> {
-            match literal::bytes(literal.as_ref()?, &slot.type_name, slot.bit_len) {
+        let mut read = |literal: &Option<Literal<'a>>, what: &str| -> Option<Vec<u8>> {
+            match literal::bytes(literal.as_ref()?, slot.type_name, slot.bit_len) {
                 Ok(bytes) => bytes,
                 Err(problem) => {
                     c.warn_at(
@@ -107,7 +110,7 @@ pub(super) fn object<'a>(
             } else {
                 better_name(name, &slot.name)
             },
-            type_name: slot.type_name.clone(),
+            type_name: slot.type_name.to_owned(),
             bit_len: slot.bit_len,
             bit_offset: slot.bit_offset,
             has_default: default.is_some(),
@@ -138,41 +141,44 @@ pub(super) fn object<'a>(
 }
 
 /// An item before its default is known.
-struct Slot {
+struct Slot<'t> {
     sub: u8,
-    name: String,
-    type_name: String,
+    name: Cow<'t, str>,
+    type_name: &'t str,
     bit_len: u32,
     bit_offset: u32,
     flags: Flags,
 }
 
-fn variable(types: &DataTypes, data_type: Option<&DataType>, raw: &RawObject) -> Slot {
+fn variable<'t>(
+    types: &'t DataTypes,
+    data_type: Option<&DataType>,
+    raw: &'t RawObject<'_>,
+) -> Slot<'t> {
     let type_name = types.base(&raw.type_name);
     let typed = data_type.map_or(0, |t| t.bit_size);
     let bit_len = first_non_zero([raw.bit_size, typed, literal::base_bits(type_name)]);
     Slot {
         sub: 0,
-        name: raw.name.clone(),
-        type_name: type_name.to_owned(),
+        name: Cow::Borrowed(&raw.name),
+        type_name,
         bit_len,
         bit_offset: 0,
         flags: raw.flags,
     }
 }
 
-fn record_items<'a>(
+fn record_items<'t, 'a>(
     c: &mut Cursor<'a>,
-    types: &DataTypes,
-    record: &DataType,
+    types: &'t DataTypes,
+    record: &'t DataType,
     (position, dictionary): (Position, &Element<'a>),
-) -> Result<(ObjectCode, Vec<Slot>), EsiError> {
+) -> Result<(ObjectCode, Vec<Slot<'t>>), EsiError> {
     let mut code = ObjectCode::Record;
-    let mut slots: Vec<Slot> = Vec::new();
+    let mut slots: Vec<Slot<'t>> = Vec::with_capacity(record.sub_items.len());
     let mut running = 0u32;
     for item in &record.sub_items {
-        let sub_type = types.get(&item.type_name);
-        let base = types.base(&item.type_name);
+        let (sub_type, base) = types.with_base(&item.type_name);
         let typed = sub_type.map_or(0, |t| t.bit_size);
         let bits = first_non_zero([item.bit_size, typed, literal::base_bits(base)]);
         let offset = item.bit_offset.unwrap_or(running);
@@ -201,8 +207,8 @@ fn record_items<'a>(
                     c.spend(size_of::<Slot>() + element.len(), (position, dictionary))?;
                     slots.push(Slot {
                         sub,
-                        name: format!("SubIndex {sub:03}"),
-                        type_name: element.to_owned(),
+                        name: Cow::Owned(format!("SubIndex {sub:03}")),
+                        type_name: element,
                         bit_len: bits,
                         bit_offset: offset.saturating_add(bits.saturating_mul(number)),
                         flags: item.flags,
@@ -211,8 +217,8 @@ fn record_items<'a>(
             }
             (sub, _) => slots.push(Slot {
                 sub: sub.unwrap_or(next_sub),
-                name: item.name.clone(),
-                type_name: base.to_owned(),
+                name: Cow::Borrowed(&item.name),
+                type_name: base,
                 bit_len: bits,
                 bit_offset: offset,
                 flags: item.flags,
@@ -232,12 +238,12 @@ fn record_items<'a>(
 }
 
 /// `Info/SubItem`s name the subindices of a record; where they do not, they stand in subindex order.
-fn assign_infos(
-    slots: &[Slot],
+fn assign_infos<'a>(
+    slots: &[Slot<'_>],
     code: ObjectCode,
-    infos: Vec<(String, Info)>,
-) -> Vec<Option<(String, Info)>> {
-    let mut assigned: Vec<Option<(String, Info)>> = slots.iter().map(|_| None).collect();
+    infos: Vec<(String, Info<'a>)>,
+) -> Vec<Option<(String, Info<'a>)>> {
+    let mut assigned: Vec<Option<(String, Info<'a>)>> = slots.iter().map(|_| None).collect();
     if code == ObjectCode::Var {
         return assigned;
     }

@@ -7,7 +7,7 @@ use crate::model::{Increments, ModulePdoGroup, Slot, Slots};
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slots, EsiError> {
     let mut slots = Slots {
-        position: element.position,
+        position: c.position(element),
         max_count: c.attribute_number(element, "MaxSlotCount")?,
         increments: Increments {
             pdo: increment(c, element, "SlotPdoIncrement")?,
@@ -50,7 +50,7 @@ fn increment(c: &Cursor<'_>, element: &Element<'_>, name: &'static str) -> Resul
 
 fn slot<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slot, EsiError> {
     let mut slot = Slot {
-        position: element.position,
+        position: c.position(element),
         name: String::new(),
         group: c.attribute_number(element, "SlotGroup")?,
         pdo_increment: c.attribute_number(element, "SlotPdoIncrement")?,

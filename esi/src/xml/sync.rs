@@ -72,7 +72,7 @@ pub(super) fn sync_manager<'a>(
         _ => c.attribute_number(element, "Enable")?,
     };
     let mut sm = SyncManager {
-        position: element.position,
+        position: c.position(element),
         usage: SmUse::Other,
         start_address,
         default_size: c

@@ -8,7 +8,7 @@ pub const MUTATIONS: &[Mutation] = &[
         |text| cut(text, r##" encoding="iso"##),
         ("refused", At::First("<?xml")),
         "(file)",
-        "syntax",
+        "ends inside a tag",
     ),
     row(
         "cut inside the vendor's id",
@@ -22,7 +22,7 @@ pub const MUTATIONS: &[Mutation] = &[
         |text| cut(text, r##" DefaultSize="48" StartAddress="#x1000""##),
         ("refused", At::First("<Sm MinSize")),
         "EtherCATInfo/Descriptions/Devices/Device[1]",
-        "syntax",
+        "ends inside a tag",
     ),
     row(
         "cut inside the data types",
@@ -39,7 +39,7 @@ pub const MUTATIONS: &[Mutation] = &[
         |text| cut(text, r##"#x6A00000C">"##),
         ("refused", At::Last("<Type ModuleIdent")),
         "EtherCATInfo/Descriptions/Modules/Module[5]",
-        "syntax",
+        "ends inside a tag",
     ),
     row(
         "cut before the root ends",
@@ -67,7 +67,7 @@ pub const MUTATIONS: &[Mutation] = &[
         |text| replace(&text, "<Fmmu>Outputs", "<!- - <Fmmu>Outputs"),
         ("refused", At::First("<!- -")),
         "EtherCATInfo/Descriptions/Devices/Device[1]",
-        "syntax",
+        "not well-formed",
     ),
     row(
         "another root",

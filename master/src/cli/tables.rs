@@ -13,14 +13,31 @@ pub(super) fn fields(
     fields: &[Field],
     out: &mut String,
 ) -> std::fmt::Result {
-    writeln!(out, "\n  {what}: {bytes} bytes")?;
+    let unit = if bytes == 1 { "byte" } else { "bytes" };
+    writeln!(out, "\n  {what}: {bytes} {unit}")?;
     if fields.is_empty() {
         return Ok(());
     }
     let mut table = Table::new(&["offset", "bits", "object", "type", "name", "PDO"]);
+    let place = |bit: u32| format!("{}.{}", bit / 8, bit % 8);
+    let gap = |table: &mut Table, from: u32, to: u32| {
+        if to > from {
+            table.row([
+                &place(from),
+                &(to - from).to_string(),
+                "-",
+                "",
+                "padding",
+                "",
+            ]);
+        }
+    };
+    let mut end = 0;
     for field in fields {
+        gap(&mut table, end, field.bit_offset);
+        end = field.bit_offset + u32::from(field.bit_len);
         table.row([
-            &format!("{}.{}", field.bit_offset / 8, field.bit_offset % 8),
+            &place(field.bit_offset),
             &field.bit_len.to_string(),
             &format!("0x{:04x}:{:02x}", field.index, field.sub),
             &field.data_type,
@@ -28,7 +45,12 @@ pub(super) fn fields(
             &format!("0x{:04x}", field.pdo),
         ]);
     }
-    writeln!(out, "{}", table.indented(2))
+    // What only fills up the last byte goes without saying.
+    let whole = u32::try_from(8 * bytes).unwrap_or(end);
+    if whole.saturating_sub(end) >= 8 {
+        gap(&mut table, end, whole);
+    }
+    writeln!(out, "{}", table.shown(2))
 }
 
 /// The start-up list with the origin of each command.
@@ -53,7 +75,7 @@ pub(super) fn startup(startup: &[StartupSdo], out: &mut String) -> std::fmt::Res
     writeln!(
         out,
         "\n  start-up SDOs, in this order (PS: between PreOp and SafeOp)\n{}",
-        table.indented(2)
+        table.shown(2)
     )
 }
 

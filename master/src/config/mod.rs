@@ -37,7 +37,7 @@ mod steps;
 mod tests;
 mod units;
 
-pub use problem::{ConfigError, Problem};
+pub use problem::{ConfigError, Problem, nearest};
 pub use signal::{AxisRef, InputRef, NameError, OutputRef};
 
 use ecaxis_esi as esi;

@@ -67,7 +67,7 @@ fn device<'e>(
     found: &Sii,
 ) -> Result<&'e ecaxis_esi::Device, Failure> {
     let which = &args.which;
-    if which.device.is_some() || which.product.is_some() || which.revision.is_some() {
+    if which.says_which() {
         return which.device(file);
     }
     let same = |d: &&ecaxis_esi::Device| d.identity == found.identity;
@@ -85,7 +85,7 @@ fn table(differences: &[Difference]) -> String {
     for d in differences {
         table.row([aspect(d.aspect), &d.field, &d.expected, &d.found]);
     }
-    table.indented(0) + "\n"
+    table.shown(0) + "\n"
 }
 
 fn aspect(aspect: Aspect) -> &'static str {

@@ -75,7 +75,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             &e.file.display().to_string(),
         ]);
     }
-    result(&(table.indented(0) + "\n"))
+    result(&(table.shown(0) + "\n"))
 }
 
 fn open(args: &Args) -> Result<Library, LoadError> {

@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
+use ecaxis::config::nearest;
 use ecaxis::library::{self, LoadError};
-use ecaxis_esi::{self as esi, Device, DeviceQuery, EsiFile, Mode};
+use ecaxis_esi::{self as esi, Device, DeviceQuery, EsiFile, Mode, SelectError};
 
-use super::{Failure, hints};
+use super::{Failure, hints, note};
 
 mod check;
 mod diff;
@@ -49,8 +50,8 @@ struct Which {
     /// ESI file
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Device, by its type or name; needed where the file describes several
-    #[arg(long, value_name = "NAME")]
+    /// Device: its type or name, 0x… for its product code, or its number in the file; needed where there are several
+    #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
     /// Product code, decimal or 0x…
     #[arg(long, value_parser = number)]
@@ -65,20 +66,101 @@ impl Which {
         load(&self.file)
     }
 
-    fn query(&self) -> DeviceQuery<'_> {
-        DeviceQuery {
+    fn says_which(&self) -> bool {
+        self.device.is_some() || self.product.is_some() || self.revision.is_some()
+    }
+
+    /// Of several revisions the newest, which is told.
+    fn device<'e>(&self, file: &'e EsiFile) -> Result<&'e Device, Failure> {
+        let device = self
+            .find(file)
+            .map_err(|error| self.not_found(file, &error))?;
+        let older: Vec<String> = file
+            .devices
+            .iter()
+            .filter(|other| {
+                other.identity.product == device.identity.product
+                    && other.identity.revision != device.identity.revision
+            })
+            .map(|other| format!("0x{:08x}", other.identity.revision))
+            .collect();
+        let text = self.device.as_deref();
+        let counted = text.is_some_and(|text| self.number_of(file, text).is_some());
+        if self.revision.is_none() && !counted && !older.is_empty() {
+            note(&format!(
+                "{}: the newest revision, 0x{:08x}; `--revision` picks another of {}",
+                device.type_name,
+                device.identity.revision,
+                older.join(", ")
+            ));
+        }
+        Ok(device)
+    }
+
+    fn find<'e>(&self, file: &'e EsiFile) -> Result<&'e Device, SelectError> {
+        let query = DeviceQuery {
             name: self.device.as_deref(),
             product: self.product,
             revision: self.revision,
+        };
+        let named = esi::find_device(file, &query);
+        let (Err(SelectError::NoSuchDevice { .. }), Some(text)) = (&named, &self.device) else {
+            return named;
+        };
+        if let Some(device) = self.number_of(file, text) {
+            return Ok(device);
+        }
+        match number(text) {
+            Ok(product) if self.product.is_none() && text.starts_with("0x") => {
+                let query = DeviceQuery {
+                    name: None,
+                    product: Some(product),
+                    revision: self.revision,
+                };
+                esi::find_device(file, &query)
+            }
+            _ => named,
         }
     }
 
-    fn device<'e>(&self, file: &'e EsiFile) -> Result<&'e Device, Failure> {
-        esi::find_device(file, &self.query()).map_err(|error| {
-            let message = format!("{}: {error}", self.file.display());
-            Failure::new(hints::WRONG, message)
-                .hint("pick one with `--device TYPE`, `--product` or `--revision`; `ecaxis esi list FILE` shows them")
-        })
+    /// The device that a plain number counts to, from 1 as in element paths. What is called so goes first.
+    fn number_of<'e>(&self, file: &'e EsiFile, text: &str) -> Option<&'e Device> {
+        let at = text.parse::<usize>().ok()?.checked_sub(1)?;
+        let device = file.devices.get(at)?;
+        let called = |device: &Device| device.type_name == text || device.name == text;
+        let fits = self
+            .product
+            .is_none_or(|product| product == device.identity.product)
+            && self
+                .revision
+                .is_none_or(|revision| revision == device.identity.revision);
+        (fits && !file.devices.iter().any(called)).then_some(device)
+    }
+
+    fn not_found(&self, file: &EsiFile, error: &SelectError) -> Failure {
+        let failure = |message: String| {
+            Failure::new(hints::WRONG, format!("{}: {message}", self.file.display()))
+        };
+        let path = self.file.display();
+        match (error, &self.device) {
+            (SelectError::NoSuchDevice { query, .. }, Some(name)) => {
+                let mut types: Vec<&str> = file.devices.iter().map(|d| &*d.type_name).collect();
+                types.dedup();
+                let count = plural(file.devices.len(), "device");
+                let failure = failure(format!("none of its {count} matches {query}"));
+                match nearest(name, types.iter().copied()) {
+                    Some(known) => failure.hint(format!("did you mean `{known}`?")),
+                    None if types.len() <= 12 => failure.hint(format!("there are {}", types.join(", "))),
+                    None => failure.hint(format!("`ecaxis esi list {path}` shows what there is")),
+                }
+            }
+            (SelectError::NoSuchDevice { .. } | SelectError::Ambiguous { .. }, _) => {
+                failure(error.to_string()).hint(format!(
+                    "pick one with `--device`, `--product` or `--revision`; `ecaxis esi list {path}` shows them"
+                ))
+            }
+            _ => failure(error.to_string()),
+        }
     }
 }
 
@@ -88,7 +170,9 @@ fn load(path: &Path) -> Result<EsiFile, Failure> {
         match error {
             LoadError::Esi { source, .. } => failure.hint(match source.problem() {
                 esi::EsiProblem::NotEsi(_) => "this is some other XML file",
-                esi::EsiProblem::Truncated(_) => "the file is not complete; fetch it again",
+                esi::EsiProblem::Truncated(_) | esi::EsiProblem::TruncatedTag => {
+                    "the file is not complete; fetch it again"
+                }
                 _ => "the file is damaged or is not an ESI file; its maker has the right one",
             }),
             LoadError::Read { .. } | LoadError::TooLong { .. } => failure,

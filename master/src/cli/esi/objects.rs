@@ -80,7 +80,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         return result(&format!("{:#}\n", serde_json::Value::Array(all)));
     }
-    result(&(table.indented(0) + "\n"))
+    result(&(table.shown(0) + "\n"))
 }
 
 fn access(item: &ObjectItem) -> String {

@@ -1,0 +1,211 @@
+//! Reading ESI files against lxml building its tree of the same file, in turns in the same run; the peak of memory;
+//! and what a library of known files adds to the start of the program. Only the ratios mean anything on a machine
+//! that others use too.
+//!
+//! Files come from `ECAXIS_FIXTURES` or `../shared/fixtures`. lxml is asked through the Python named by
+//! `ECAXIS_PYTHON`, else `python3`; without it our own times stand alone.
+
+#![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use ecaxis::library;
+
+const ROUNDS: usize = 15;
+/// What the second argument asks a process of this benchmark for.
+const PEAK: &str = "--peak-of";
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().collect();
+    if let Some(at) = arguments.iter().position(|a| a == PEAK) {
+        return peak_of(Path::new(&arguments[at + 1]));
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let fixtures = std::env::var_os("ECAXIS_FIXTURES")
+        .map_or_else(|| root.join("../shared/fixtures"), PathBuf::from)
+        .join("esi");
+    let mut files = Vec::new();
+    collect(&fixtures, &mut files);
+    if files.is_empty() {
+        println!(
+            "skipped: no ESI files in {} (set ECAXIS_FIXTURES)",
+            fixtures.display()
+        );
+        return;
+    }
+    files.sort_by_key(|(bytes, _)| std::cmp::Reverse(*bytes));
+    let mut lxml = Lxml::start(&root.join("benches/esi_lxml.py"));
+    against_lxml(&files[..files.len().min(6)], lxml.as_mut());
+    memory(&files[..files.len().min(3)]);
+    library_start(&fixtures, files.len());
+}
+
+fn collect(folder: &Path, files: &mut Vec<(u64, PathBuf)>) {
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        let path = entry.path();
+        if path.is_dir() {
+            collect(&path, files);
+        } else if path.extension().is_some_and(|e| e == "xml") {
+            files.push((entry.metadata().map_or(0, |m| m.len()), path));
+        }
+    }
+}
+
+/// Both from the file's path to their result, the release of the result not counted.
+fn against_lxml(files: &[(u64, PathBuf)], mut lxml: Option<&mut Lxml>) {
+    println!("\nreading a file, median (least) of {ROUNDS} turns");
+    println!(
+        "{:<44} {:>9} {:>16} {:>16} {:>7} {:>9}",
+        "file", "bytes", "ecaxis", "lxml", "ratio", "MB/s"
+    );
+    for (bytes, path) in files {
+        let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+        for _ in 0..ROUNDS {
+            let start = Instant::now();
+            let file = library::load(path);
+            ours.push(start.elapsed());
+            drop(file);
+            if let Some(lxml) = &mut lxml {
+                theirs.push(lxml.parse(path));
+            }
+        }
+        let (own, least) = median(&mut ours);
+        let (their, ratio) = match theirs.is_empty() {
+            true => ("-".to_owned(), "-".to_owned()),
+            false => {
+                let (other, least) = median(&mut theirs);
+                let ratio = other.as_secs_f64() / own.as_secs_f64();
+                (shown(other, least), format!("{ratio:.2}"))
+            }
+        };
+        let speed = *bytes as f64 / own.as_secs_f64() / 1e6;
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let name: String = name.chars().take(44).collect();
+        println!(
+            "{name:<44} {bytes:>9} {:>16} {their:>16} {ratio:>7} {speed:>9.0}",
+            shown(own, least)
+        );
+    }
+    if lxml.is_none() {
+        println!("lxml is not here: set ECAXIS_PYTHON to a Python that has it (pip install lxml)");
+    }
+}
+
+fn shown(median: Duration, least: Duration) -> String {
+    let ms = |time: Duration| time.as_secs_f64() * 1e3;
+    format!("{:.2} ({:.2}) ms", ms(median), ms(least))
+}
+
+fn median(times: &mut [Duration]) -> (Duration, Duration) {
+    times.sort();
+    (times[times.len() / 2], times[0])
+}
+
+/// lxml in a process of its own, so that neither side pays for the other's interpreter or heap.
+struct Lxml {
+    _child: Child,
+    orders: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+impl Lxml {
+    fn start(script: &Path) -> Option<Self> {
+        let python = std::env::var_os("ECAXIS_PYTHON").unwrap_or_else(|| "python3".into());
+        let mut child = Command::new(python)
+            .arg(script)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .ok()?;
+        let orders = child.stdin.take()?;
+        let mut answers = BufReader::new(child.stdout.take()?);
+        let mut version = String::new();
+        answers.read_line(&mut version).ok()?;
+        if version.is_empty() {
+            return None;
+        }
+        println!("against {}", version.trim());
+        Some(Self {
+            _child: child,
+            orders,
+            answers,
+        })
+    }
+
+    fn parse(&mut self, path: &Path) -> Duration {
+        writeln!(self.orders, "{}", path.display()).expect("lxml still listens");
+        let mut nanoseconds = String::new();
+        self.answers
+            .read_line(&mut nanoseconds)
+            .expect("lxml answers");
+        Duration::from_nanos(nanoseconds.trim().parse().expect("nanoseconds"))
+    }
+}
+
+/// The most memory that a process has held which does nothing but load one file.
+fn memory(files: &[(u64, PathBuf)]) {
+    println!("\npeak of memory while a file is loaded, in a process of its own");
+    for (bytes, path) in files {
+        let output = Command::new(std::env::current_exe().expect("this program"))
+            .arg(PEAK)
+            .arg(path)
+            .output()
+            .expect("this program runs");
+        let text = String::from_utf8_lossy(&output.stdout);
+        let kib: u64 = text.trim().parse().expect("KiB");
+        println!(
+            "{:<44} {:>6.1} MB, {:.1} times the file",
+            path.file_name().unwrap_or_default().to_string_lossy(),
+            kib as f64 * 1024.0 / 1e6,
+            kib as f64 * 1024.0 / *bytes as f64
+        );
+    }
+}
+
+fn peak_of(path: &Path) {
+    let file = library::load(path).expect("a fixture");
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kib = peak.map_or("", |rest| rest.trim().trim_end_matches(" kB"));
+    println!("{kib}");
+    drop(file);
+}
+
+/// The whole program with every file known against the same with an empty folder.
+fn library_start(fixtures: &Path, count: usize) {
+    let cache = tempfile::tempdir().expect("a temporary folder");
+    let empty = tempfile::tempdir().expect("a temporary folder");
+    let list = |folder: &Path| {
+        let start = Instant::now();
+        let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+            .args(["esi", "list", "--json"])
+            .arg(folder)
+            .env("XDG_CACHE_HOME", cache.path())
+            .output()
+            .expect("the program runs");
+        assert!(output.status.success(), "{output:?}");
+        start.elapsed()
+    };
+    let first = list(fixtures);
+    list(empty.path());
+    let (mut known, mut none) = (Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        known.push(list(fixtures));
+        none.push(list(empty.path()));
+    }
+    let (known, _) = median(&mut known);
+    let (none, _) = median(&mut none);
+    let ms = |time: Duration| time.as_secs_f64() * 1e3;
+    println!(
+        "\n`ecaxis esi list` of {count} files: {:.1} ms the first time, {:.1} ms once they are known, \
+         {:.1} ms with an empty folder: {:.1} ms more",
+        ms(first),
+        ms(known),
+        ms(none),
+        ms(known) - ms(none)
+    );
+}

@@ -1,0 +1,163 @@
+//! `ecaxis esi show`: a device as an engineer wants to see it.
+//!
+//! `head` says who the device is, `offers` what there is to choose from, `chosen` what one choice comes to; `as_json`
+//! says the same to programs.
+
+use std::fmt::Write;
+
+use ecaxis::config::duration;
+use ecaxis_esi::{Choice, EsiFile, Mode, SelectError, offered_modes, select};
+
+use super::super::report::Table;
+use super::super::{Failure, hints, note, result};
+use super::{Which, plural};
+
+mod as_json;
+mod chosen;
+mod head;
+mod offers;
+
+/// Show a device: identity, modes, PDOs, SyncManagers, clocks, start-up commands
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    which: Which,
+    /// In this mode: pp, pv, hm, csp, csv, cst; otherwise its default
+    #[arg(long, value_parser = super::mode)]
+    mode: Option<Mode>,
+    /// Modules slot by slot, `-` for none
+    #[arg(long, value_delimiter = ',', value_name = "MODULE,…")]
+    modules: Vec<String>,
+    /// PDO assignment by its name
+    #[arg(long, value_name = "NAME")]
+    assignment: Option<String>,
+    /// Clock mode by its name, or `off`
+    #[arg(long, value_name = "NAME")]
+    dc: Option<String>,
+    /// Bus cycle
+    #[arg(long, default_value = "1ms", value_parser = duration::parse)]
+    cycle: u64,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let file = args.which.load()?;
+    // Without a word on which, a file of several devices is shown as what it is.
+    let one_product = file
+        .devices
+        .windows(2)
+        .all(|pair| pair[0].identity.product == pair[1].identity.product);
+    if !args.which.says_which() && (file.devices.is_empty() || !one_product) {
+        if args.json {
+            return result(&as_json::devices(&file));
+        }
+        let mut out = String::new();
+        // Writing into a String cannot fail.
+        let _ = devices(&file, &mut out);
+        return result(&out);
+    }
+    let device = args.which.device(&file)?;
+    let modules: Vec<&str> = args.modules.iter().map(String::as_str).collect();
+    let choice = Choice {
+        mode: args.mode,
+        modules: &modules,
+        assignment: args.assignment.as_deref(),
+        dc_mode: args.dc.as_deref(),
+        cycle_ns: args.cycle,
+        ..Choice::default()
+    };
+    let chosen = args.mode.is_some()
+        || !modules.is_empty()
+        || args.assignment.is_some()
+        || args.dc.is_some();
+    let selection = match select(&file, device, &choice) {
+        Err(error) if chosen => {
+            let failure = Failure::new(hints::WRONG, error.to_string());
+            return Err(
+                failure.hint("`ecaxis esi show` without the choice lists what there is to choose")
+            );
+        }
+        other => other,
+    };
+    if args.json {
+        return result(&as_json::device(&file, device, &choice, &selection));
+    }
+    let mut out = String::new();
+    let _ = head::write(&file, device, &mut out);
+    let mailbox = device.mailbox.as_ref();
+    let soe_alone = mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none());
+    if soe_alone {
+        let _ = writeln!(
+            out,
+            "\nnot usable: it speaks SoE and not CoE; IDNs set what its process data contains, and ecaxis does not \
+             speak SoE"
+        );
+    }
+    let _ = offers::write(&file, device, &choice, &mut out);
+    match &selection {
+        Ok(selection) if !soe_alone => {
+            let _ = chosen::write(device, selection, &choice, &mut out);
+        }
+        Err(error) if !soe_alone => {
+            let _ = writeln!(out, "\nno default configuration: {error}");
+            if matches!(error, SelectError::ModuleNeeded { .. }) {
+                note("help: `--modules` takes one module for each slot, `-` for none");
+            }
+        }
+        _ => {}
+    }
+    result(&out)
+}
+
+fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
+    writeln!(
+        out,
+        "{} (0x{:08x}): {}, {}\n",
+        file.vendor.name,
+        file.vendor.id,
+        plural(file.devices.len(), "device"),
+        plural(file.modules.len(), "module"),
+    )?;
+    if file.devices.is_empty() {
+        return modules(file, out);
+    }
+    let head = ["type", "product", "revision", "modes", "mailbox", "name"];
+    let mut table = Table::new(&head);
+    for device in &file.devices {
+        let modes: Vec<String> = offered_modes(file, device)
+            .iter()
+            .map(Mode::to_string)
+            .collect();
+        table.row([
+            &device.type_name,
+            &format!("0x{:08x}", device.identity.product),
+            &format!("0x{:08x}", device.identity.revision),
+            &modes.join(" "),
+            &device
+                .mailbox
+                .as_ref()
+                .map_or_else(String::new, head::protocols),
+            &device.name,
+        ]);
+    }
+    writeln!(out, "{}", table.shown(0))?;
+    writeln!(out, "\n`--device TYPE` shows one of them.")
+}
+
+/// A file of modules alone, which another file's devices take.
+fn modules(file: &EsiFile, out: &mut String) -> std::fmt::Result {
+    let mut table = Table::new(&["module", "identity", "PDOs", "name"]);
+    for module in &file.modules {
+        let pdos = module.rx_pdos.iter().chain(&module.tx_pdos);
+        let pdos: Vec<String> = pdos.map(|pdo| format!("0x{:04x}", pdo.index)).collect();
+        table.row([
+            &module.type_name,
+            &format!("0x{:08x}", module.ident),
+            &pdos.join(" "),
+            &module.name,
+        ]);
+    }
+    writeln!(out, "{}", table.shown(0))
+}
