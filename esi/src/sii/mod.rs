@@ -1,7 +1,7 @@
 //! The EEPROM image (SII, ETG.2010): what a SubDevice tells about itself before anybody has its ESI.
 //!
 //! `image` derives it from an ESI device, `emit` writes the bytes, `parse` reads them, `strings` and `crc` are the
-//! two details both need; `compare` tells where two images differ. [`Sii`] is the meeting point: `parse(emit(sii))` gives the same value again as long
+//! two details both need; `warnings` tells what is odd in one image, `compare` where two images differ. [`Sii`] is the meeting point: `parse(emit(sii))` gives the same value again as long
 //! as its texts are ASCII of at most 63 characters.
 
 mod compare;
@@ -11,11 +11,13 @@ mod emit;
 mod image;
 mod parse;
 mod strings;
+mod warnings;
 
 pub use compare::{Aspect, Difference, compare};
 pub use crc::checksum;
 pub use image::SiiOptions;
 pub use parse::SiiError;
+pub use warnings::{Remark, SiiWarning};
 
 use crate::model::{Device, FmmuUse, Identity, Module, SmUse};
 
@@ -178,6 +180,11 @@ pub fn emit(device: &Device, modules: &[Module], options: &SiiOptions) -> Vec<u8
 
 /// Reads an EEPROM image.
 pub fn parse(bytes: &[u8]) -> Result<Sii, SiiError> {
+    parse::image(bytes).map(|(sii, _)| sii)
+}
+
+/// Reads an EEPROM image, and tells what is wrong with it that does not keep it from being read.
+pub fn inspect(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
     parse::image(bytes)
 }
 

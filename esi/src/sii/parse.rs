@@ -1,6 +1,6 @@
 //! Bytes → image contents. Every offset comes from outside and may point anywhere.
 
-use super::strings::Table;
+use super::warnings::{Notes, Remark, SiiWarning, Texts, left_over, repeated, strings_of};
 use super::{
     General, HEADER_BYTES, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo,
     SiiSyncManager, category, checksum, fmmu_use, sm_use,
@@ -19,46 +19,70 @@ pub enum SiiError {
         left: usize,
     },
     #[error(
-        "PDO category {category}: PDO 0x{pdo:04x} claims {entries} entries, more than the category holds"
+        "category {category} at byte 0x{offset:x}: PDO 0x{pdo:04x} claims {entries} entries, more than the category holds"
     )]
     Pdo {
         category: u16,
+        offset: usize,
         pdo: u16,
         entries: u8,
     },
 }
 
-pub(super) fn image(bytes: &[u8]) -> Result<Sii, SiiError> {
+/// Byte 14.
+const CHECKSUM: usize = 14;
+
+pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
     let Some((header, body)) = bytes.split_at_checked(HEADER_BYTES) else {
         return Err(SiiError::TooShort { len: bytes.len() });
     };
     let mut sii = read_header(header);
+    let mut notes = Notes::default();
+    let right = checksum(&sii.config);
+    let found = byte(header, CHECKSUM);
+    if right != found {
+        notes.add(CHECKSUM, None, Remark::Checksum { found, right });
+    }
     let (found, ended) = categories(body)?;
     sii.ended = ended;
-    let strings = found.iter().find(|(kind, _)| *kind == category::STRINGS);
+    if !ended {
+        notes.add(bytes.len(), None, Remark::NoEnd);
+    }
+    if ended && found.is_empty() {
+        notes.add(HEADER_BYTES, None, Remark::NoCategories);
+    }
+    repeated(&found, &mut notes);
+    let strings = found.iter().find(|c| c.kind == category::STRINGS);
     let strings = strings
-        .map(|(_, data)| Table::parse(data))
+        .map(|c| strings_of(c, &mut notes))
         .unwrap_or_default();
-    for (kind, data) in found {
+    for here in &found {
+        let (kind, data) = (here.kind, here.data);
+        left_over(here, &mut notes);
+        let mut strings = Texts {
+            table: &strings,
+            here: *here,
+            notes: &mut notes,
+        };
         match kind {
             category::STRINGS => {}
-            category::GENERAL => sii.general = Some(general(data, &strings)),
+            category::GENERAL => sii.general = Some(general(data, &mut strings)),
             category::FMMU => sii.fmmus = fmmus(data),
             category::SYNC_MANAGER => {
                 sii.sync_managers = data.chunks_exact(8).map(sync_manager).collect()
             }
-            category::TX_PDO => sii.tx_pdos.extend(pdos(kind, data, &strings)?),
-            category::RX_PDO => sii.rx_pdos.extend(pdos(kind, data, &strings)?),
+            category::TX_PDO => sii.tx_pdos.extend(pdos(data, &mut strings)?),
+            category::RX_PDO => sii.rx_pdos.extend(pdos(data, &mut strings)?),
             category::DC => {
                 sii.dc = data
                     .chunks_exact(24)
-                    .map(|chunk| dc(chunk, &strings))
-                    .collect()
+                    .enumerate()
+                    .map(|(n, chunk)| dc(chunk, n * 24, &mut strings))
+                    .collect();
             }
             category::FMMU_DETAILS => {
                 sii.fmmu_details = data.chunks_exact(4).map(fmmu_detail).collect();
             }
-
             category::SYNC_UNIT => {
                 sii.sync_units = data
                     .chunks_exact(2)
@@ -68,7 +92,7 @@ pub(super) fn image(bytes: &[u8]) -> Result<Sii, SiiError> {
             _ => sii.others.push((kind, data.to_vec())),
         }
     }
-    Ok(sii)
+    Ok((sii, notes.0))
 }
 
 fn read_header(header: &[u8]) -> Sii {
@@ -100,7 +124,13 @@ fn read_header(header: &[u8]) -> Sii {
     }
 }
 
-type Category<'a> = (u16, &'a [u8]);
+#[derive(Clone, Copy)]
+pub(super) struct Category<'a> {
+    pub kind: u16,
+    /// Of the data, from the beginning of the image.
+    pub offset: usize,
+    pub data: &'a [u8],
+}
 
 /// All categories up to the end mark; an image that just stops is accepted and said to be so.
 fn categories(body: &[u8]) -> Result<(Vec<Category<'_>>, bool), SiiError> {
@@ -127,17 +157,18 @@ fn categories(body: &[u8]) -> Result<(Vec<Category<'_>>, bool), SiiError> {
                 left: after.len(),
             });
         };
-        found.push((kind, data));
+        let offset = HEADER_BYTES + body.len() - after.len() - claimed;
+        found.push(Category { kind, offset, data });
         rest = after;
     }
 }
 
-fn general(data: &[u8], strings: &Table) -> General {
+fn general(data: &[u8], strings: &mut Texts<'_>) -> General {
     General {
-        group: strings.text(byte(data, 0)),
-        image: strings.text(byte(data, 1)),
-        order: strings.text(byte(data, 2)),
-        name: strings.text(byte(data, 3)),
+        group: strings.text(0),
+        image: strings.text(1),
+        order: strings.text(2),
+        name: strings.text(3),
         coe_details: byte(data, 5),
         foe: byte(data, 6) != 0,
         eoe: byte(data, 7) != 0,
@@ -176,41 +207,47 @@ fn sync_manager(data: &[u8]) -> SiiSyncManager {
     }
 }
 
-fn pdos(kind: u16, mut data: &[u8], strings: &Table) -> Result<Vec<SiiPdo>, SiiError> {
+fn pdos(data: &[u8], strings: &mut Texts<'_>) -> Result<Vec<SiiPdo>, SiiError> {
     let mut found = Vec::new();
-    while let Some((head, after)) = data.split_at_checked(8) {
+    let mut at = 0;
+    while let Some(head) = data.get(at..at + 8) {
         let (index, count) = (word(head, 0), byte(head, 2));
-        let Some((entries, after)) = after.split_at_checked(usize::from(count) * 8) else {
+        let first = at + 8;
+        let end = first + usize::from(count) * 8;
+        let Some(entries) = data.get(first..end) else {
             return Err(SiiError::Pdo {
-                category: kind,
+                category: strings.here.kind,
+                offset: strings.here.offset + at,
                 pdo: index,
                 entries: count,
             });
         };
         found.push(SiiPdo {
             index,
-            name: strings.text(byte(head, 5)),
+            name: strings.text(at + 5),
             sm: Some(byte(head, 3)).filter(|sm| *sm != 0xff),
             synchronization: byte(head, 4),
             flags: word(head, 6),
             entries: entries
                 .chunks_exact(8)
-                .map(|entry| SiiEntry {
+                .enumerate()
+                .map(|(n, entry)| SiiEntry {
                     index: word(entry, 0),
                     sub: byte(entry, 2),
-                    name: strings.text(byte(entry, 3)),
+                    name: strings.text(first + n * 8 + 3),
                     data_type: byte(entry, 4),
                     bit_len: byte(entry, 5),
                     flags: word(entry, 6),
                 })
                 .collect(),
         });
-        data = after;
+        at = end;
     }
     Ok(found)
 }
 
-fn dc(data: &[u8], strings: &Table) -> SiiDc {
+/// `at`: where the mode begins in its category.
+fn dc(data: &[u8], at: usize, strings: &mut Texts<'_>) -> SiiDc {
     let signed = |at| i32::from_le_bytes(double_word(data, at).to_le_bytes());
     let factor = |at| i16::from_le_bytes(word(data, at).to_le_bytes());
     SiiDc {
@@ -220,13 +257,13 @@ fn dc(data: &[u8], strings: &Table) -> SiiDc {
         sync1_factor: factor(12),
         assign_activate: word(data, 14),
         sync0_factor: factor(16),
-        name: strings.text(byte(data, 18)),
-        description: strings.text(byte(data, 19)),
+        name: strings.text(at + 18),
+        description: strings.text(at + 19),
     }
 }
 
 /// Little-endian reads; what lies outside reads as 0, as in a shorter, older category.
-fn byte(data: &[u8], at: usize) -> u8 {
+pub(super) fn byte(data: &[u8], at: usize) -> u8 {
     data.get(at).copied().unwrap_or(0)
 }
 

@@ -54,6 +54,10 @@ impl Table {
         table
     }
 
+    pub fn len(&self) -> usize {
+        self.texts.len()
+    }
+
     pub fn text(&self, number: u8) -> String {
         let text = usize::from(number)
             .checked_sub(1)

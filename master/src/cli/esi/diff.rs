@@ -28,18 +28,22 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let wrong = |message: String| Failure::new(hints::WRONG, message);
     let bytes =
         std::fs::read(&args.image).map_err(|e| wrong(format!("cannot read {name}: {e}")))?;
-    let found = sii::parse(&bytes).map_err(|e| {
+    let (found, warnings) = sii::inspect(&bytes).map_err(|e| {
         wrong(format!("{name}: {e}")).hint("an image is the EEPROM's bytes, without any header")
     })?;
     let device = device(args, &file, &found)?;
     let expected = sii::emit(device, &file.modules, &SiiOptions::default());
     let expected = sii::parse(&expected).map_err(|e| wrong(format!("the ESI's own image: {e}")))?;
     let differences = sii::compare(&expected, &found);
+    let warnings: Vec<String> = warnings.iter().map(ToString::to_string).collect();
+    for warning in warnings.iter().filter(|_| !args.json) {
+        note(&format!("warning: {name}: {warning}"));
+    }
     let text = if args.json {
         let all: Vec<_> = differences.iter().map(as_json).collect();
         format!(
             "{:#}\n",
-            json!({ "device": device.name, "differences": all })
+            json!({ "device": device.name, "differences": all, "warnings": warnings })
         )
     } else {
         table(&differences)

@@ -1,0 +1,353 @@
+//! Damaged EEPROM images: an error or a warning tells the byte and the category, and nothing panics.
+
+#![allow(clippy::print_stdout)]
+
+mod common;
+
+use ecaxis_esi::parse;
+use ecaxis_esi::sii::{self, SiiOptions};
+
+const STRINGS: u16 = 10;
+const GENERAL: u16 = 30;
+const FMMU: u16 = 40;
+const SYNC_MANAGER: u16 = 41;
+const TX_PDO: u16 = 50;
+const RX_PDO: u16 = 51;
+const DC: u16 = 60;
+
+/// A drive's.
+fn whole() -> Vec<u8> {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/esi/EPOS4.xml");
+    let file = parse(&std::fs::read(path).unwrap()).unwrap();
+    sii::emit(&file.devices[0], &file.modules, &SiiOptions::default())
+}
+
+fn word(image: &[u8], at: usize) -> u16 {
+    u16::from_le_bytes([image[at], image[at + 1]])
+}
+
+fn put(image: &mut [u8], at: usize, value: u16) {
+    image[at..at + 2].copy_from_slice(&value.to_le_bytes());
+}
+
+/// Where the head of a category stands; 0xffff is the end mark.
+fn head(image: &[u8], kind: u16) -> usize {
+    let mut at = 0x80;
+    while word(image, at) != kind {
+        at += 4 + 2 * usize::from(word(image, at + 2));
+    }
+    at
+}
+
+/// Where its data stand.
+fn data(image: &[u8], kind: u16) -> usize {
+    head(image, kind) + 4
+}
+
+fn insert(image: &mut Vec<u8>, at: usize, bytes: &[u8]) {
+    image.splice(at..at, bytes.iter().copied());
+}
+
+/// What was done, and a part of what is said.
+type Case = (&'static str, fn(&mut Vec<u8>), &'static str);
+
+const CASES: &[Case] = &[
+    ("nothing left", |i| i.clear(), "the image has 0 bytes"),
+    (
+        "half a header",
+        |i| i.truncate(64),
+        "the image has 64 bytes",
+    ),
+    (
+        "one byte short of a header",
+        |i| i.truncate(127),
+        "the image has 127 bytes",
+    ),
+    (
+        "header only",
+        |i| i.truncate(128),
+        "byte 0x80: the image stops without an end mark",
+    ),
+    (
+        "half a category type",
+        |i| i.truncate(129),
+        "byte 0x81: the image stops",
+    ),
+    (
+        "category type without length",
+        |i| i.truncate(130),
+        "byte 0x82: the image stops",
+    ),
+    (
+        "cut in the texts",
+        |i| i.truncate(0x90),
+        "category 10 at byte 0x80 claims",
+    ),
+    (
+        "cut in the PDOs",
+        |i| i.truncate(data(i, RX_PDO) + 9),
+        "category 51 at byte",
+    ),
+    (
+        "cut before the end mark",
+        |i| i.truncate(head(i, 0xffff)),
+        "the image stops without an end mark",
+    ),
+    ("checksum", |i| i[14] ^= 0x55, "byte 0xe: the checksum is"),
+    ("configuration", |i| i[2] ^= 1, "byte 0xe: the checksum is"),
+    (
+        "nothing but ones",
+        |i| i.fill(0xff),
+        "byte 0xe: the checksum is 0xff",
+    ),
+    (
+        "nothing but zeros",
+        |i| i.fill(0),
+        "the image stops without an end mark",
+    ),
+    (
+        "ones behind the header",
+        |i| i[0x80..0x100].fill(0xff),
+        "byte 0x80: there are no categories",
+    ),
+    (
+        "a category to the end of the world",
+        |i| {
+            let at = head(i, GENERAL);
+            put(i, at + 2, 0xffff);
+        },
+        "category 30 at byte",
+    ),
+    (
+        "a category one word beyond the end",
+        |i| {
+            let at = head(i, DC);
+            let left = (i.len() - at - 4) / 2;
+            put(i, at + 2, u16::try_from(left + 1).unwrap());
+        },
+        "category 60 at byte",
+    ),
+    (
+        "an empty category that never ends",
+        |i| {
+            let at = head(i, STRINGS);
+            i.truncate(at);
+            i.extend([0, 0, 0, 0].repeat(16_000));
+        },
+        "the image stops without an end mark",
+    ),
+    (
+        "the texts again and again",
+        |i| {
+            let texts = i[head(i, STRINGS)..head(i, GENERAL)].to_vec();
+            for _ in 0..300 {
+                insert(i, 0x80, &texts);
+            }
+        },
+        "category 10: the category is there a second time",
+    ),
+    (
+        "general twice",
+        |i| {
+            let at = head(i, GENERAL);
+            let again = i[at..at + 36].to_vec();
+            insert(i, at, &again);
+        },
+        "category 30: the category is there a second time",
+    ),
+    (
+        "name that does not exist",
+        |i| {
+            let at = data(i, GENERAL);
+            i[at + 3] = 0xfe;
+        },
+        "category 30: text 254 is named",
+    ),
+    (
+        "PDO name that does not exist",
+        |i| {
+            let at = data(i, TX_PDO);
+            i[at + 5] = 0xfd;
+        },
+        "category 50: text 253 is named",
+    ),
+    (
+        "entry name that does not exist",
+        |i| {
+            let at = data(i, RX_PDO);
+            i[at + 8 + 3] = 0xfc;
+        },
+        "category 51: text 252 is named",
+    ),
+    (
+        "DC name that does not exist",
+        |i| {
+            let at = data(i, DC);
+            i[at + 18] = 0xfb;
+        },
+        "category 60: text 251 is named",
+    ),
+    (
+        "no texts, all named",
+        |i| {
+            let at = data(i, STRINGS);
+            i[at] = 0;
+        },
+        "is named, there are 0",
+    ),
+    (
+        "more texts than there are",
+        |i| {
+            let at = data(i, STRINGS);
+            i[at] = 0xff;
+        },
+        "category 10: the category claims 255 texts and holds",
+    ),
+    (
+        "a text longer than the category",
+        |i| {
+            let at = data(i, STRINGS);
+            i[at + 1] = 0xff;
+        },
+        "category 10: the category claims",
+    ),
+    (
+        "more entries than there are",
+        |i| {
+            let at = data(i, RX_PDO);
+            i[at + 2] = 0xff;
+        },
+        "claims 255 entries, more than the category holds",
+    ),
+    (
+        "half a PDO",
+        |i| {
+            let at = head(i, TX_PDO);
+            let n = word(i, at + 2);
+            put(i, at + 2, n + 2);
+            insert(i, at + 4 + 2 * usize::from(n), &[1, 0x1a, 0, 3]);
+        },
+        "category 50: 4 bytes are left over, records have 8",
+    ),
+    (
+        "half a SyncManager",
+        |i| {
+            let at = head(i, SYNC_MANAGER);
+            let n = word(i, at + 2);
+            put(i, at + 2, n + 1);
+            insert(i, at + 4 + 2 * usize::from(n), &[0, 0x10]);
+        },
+        "category 41: 2 bytes are left over, records have 8",
+    ),
+    (
+        "half a DC mode",
+        |i| {
+            let at = head(i, DC);
+            let n = word(i, at + 2);
+            put(i, at + 2, n + 1);
+            insert(i, at + 4 + 2 * usize::from(n), &[0, 0]);
+        },
+        "category 60: 2 bytes are left over, records have 24",
+    ),
+    (
+        "a SyncManager of no type",
+        |i| {
+            let at = data(i, SYNC_MANAGER);
+            i[at + 7] = 9;
+        },
+        "category 41: 9 is no type of a SyncManager",
+    ),
+    (
+        "an FMMU of no use",
+        |i| {
+            let at = data(i, FMMU);
+            i[at] = 0x42;
+        },
+        "category 40: 66 is no use of an FMMU",
+    ),
+    (
+        "every PDO byte ones",
+        |i| {
+            let at = head(i, RX_PDO);
+            let n = usize::from(word(i, at + 2));
+            i[at + 4..at + 4 + 2 * n].fill(0xff);
+        },
+        "PDO 0xffff claims 255 entries",
+    ),
+];
+
+fn said(image: &[u8]) -> Vec<String> {
+    match sii::inspect(image) {
+        Ok((_, warnings)) => warnings.iter().map(ToString::to_string).collect(),
+        Err(error) => vec![error.to_string()],
+    }
+}
+
+#[test]
+fn damage_is_told_with_its_place() {
+    assert_eq!(said(&whole()), Vec::<String>::new());
+    for (what, damage, expected) in CASES {
+        let mut image = whole();
+        damage(&mut image);
+        let said = said(&image);
+        println!("{what}: {}", said.first().map_or("", String::as_str));
+        assert!(said.len() <= 100, "{what}");
+        assert!(
+            said.iter().any(|line| line.contains(expected)),
+            "{what}: {said:?} lacks {expected:?}"
+        );
+        assert_eq!(
+            sii::parse(&image).ok(),
+            sii::inspect(&image).ok().map(|(sii, _)| sii)
+        );
+    }
+    assert!(CASES.len() >= 30);
+}
+
+/// Wherever an image is cut, and whatever byte of it is wrong.
+#[test]
+fn no_cut_and_no_byte_makes_it_panic() {
+    let image = whole();
+    let used = head(&image, 0xffff) + 2;
+    for end in 0..used {
+        let cut = said(&image[..end]);
+        assert!(!cut.is_empty(), "cut at {end}");
+    }
+    for at in 0..used {
+        for value in [0, 1, 0x7f, 0x80, 0xff] {
+            let mut image = image.clone();
+            image[at] = value;
+            let _ = said(&image);
+        }
+    }
+}
+
+#[test]
+fn no_emitted_image_has_anything_odd() {
+    for path in common::files("esi", &["xml"]) {
+        let file = parse(&std::fs::read(&path).unwrap()).unwrap();
+        for device in &file.devices {
+            let image = sii::emit(device, &file.modules, &SiiOptions::default());
+            assert_eq!(said(&image), Vec::<String>::new(), "{}", device.name);
+        }
+    }
+}
+
+/// A false alarm on what devices really have would be ours.
+#[test]
+fn recorded_images_have_one_oddity() {
+    let mut odd = Vec::new();
+    for path in common::files("sii", &["bin", "hex", "sii"]) {
+        let bytes = std::fs::read(&path).unwrap();
+        if bytes.first() == Some(&b':') {
+            continue; // Intel HEX, the same bytes stand beside it.
+        }
+        let name = path.file_name().unwrap().to_string_lossy();
+        odd.extend(said(&bytes).iter().map(|line| format!("{name}: {line}")));
+    }
+    if common::fixtures().is_some() {
+        let expected =
+            "xmc4300_sii_eeprom.bin: byte 0x11c, category 60: text 6 is named, there are 2";
+        assert_eq!(odd, [expected]);
+    }
+}
