@@ -1,36 +1,11 @@
 //! Nothing an axis does in a cycle allocates: commands, refusals, faults and trips included.
 
 mod common;
-
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
+mod counting;
 
 use common::{DT, Rig};
+use counting::allocations;
 use ecaxis_axis::{Command, Mode};
-
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is passed on unchanged to the system's allocator; counting touches only a const-initialised
-// thread-local without a destructor, which does not allocate.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|n| n.set(n.get() + 1));
-        // SAFETY: the caller keeps the contract of `alloc`.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        // SAFETY: `at` came from `alloc` above, that is, from the system's allocator, with this layout.
-        unsafe { System.dealloc(at, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
 
 #[test]
 fn a_cycle_does_not_allocate() {
@@ -40,7 +15,7 @@ fn a_cycle_does_not_allocate() {
         ramp: 1.0,
     };
     let mut rig = Rig::of(Mode::Csp);
-    let before = ALLOCATIONS.with(Cell::get);
+    let before = allocations();
     let mut refused = 0;
     for round in 0..5000u32 {
         let command = match round % 1000 {
@@ -69,7 +44,7 @@ fn a_cycle_does_not_allocate() {
         rig.out = rig.axis.step(&inputs, DT);
         let _ = rig.axis.status();
     }
-    let allocations = ALLOCATIONS.with(Cell::get) - before;
+    let allocations = allocations() - before;
     assert!(refused >= 5);
     assert_eq!(allocations, 0);
 }

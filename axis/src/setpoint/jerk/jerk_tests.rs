@@ -309,4 +309,29 @@ proptest! {
             }
         }
     }
+
+    /// Limits and states decades apart: planned in any case, finite, and at the target at the end.
+    #[test]
+    fn anything_that_can_be_reckoned_with(
+        exponents in prop::array::uniform4(-9.0..12.0f64), fractions in (-1.0..1.0f64, -1.0..1.0f64), back in any::<bool>(), cycles in 1u32..50,
+    ) {
+        let [v, a, j, d] = exponents.map(|exponent| 10f64.powf(exponent));
+        let limits = MotionLimits { velocity: v, acceleration: a, jerk: j };
+        let target = if back { -d } else { d };
+        let motion = Motion { position: 0.0, velocity: v * fractions.0, acceleration: a * fractions.1 };
+        let mut source = JerkLimited::new(Order::within(Goal::Position(target), limits), motion, 0.0).unwrap();
+        prop_assert!(source.duration_s().is_finite());
+        let farthest = source.span().iter().fold(d, |far, end| far.max(end.abs()));
+        let slack = farthest * 1e-9;
+        let mut motion = motion;
+        let dt = source.duration_s() / f64::from(cycles);
+        for _ in 0..cycles {
+            motion = source.advance(motion, dt);
+            prop_assert!(motion.velocity.abs() <= v * (1.0 + 1e-6), "{motion:?}");
+            prop_assert!(motion.position >= source.span()[0] - slack && motion.position <= source.span()[1] + slack);
+        }
+        prop_assert!((motion.position - target).abs() <= slack, "{motion:?} {source:?}");
+        motion = source.advance(motion, dt);
+        prop_assert_eq!(motion.position, target);
+    }
 }
