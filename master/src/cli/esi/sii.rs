@@ -49,5 +49,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         device.name,
         device.identity
     ));
+    let room = device.eeprom.byte_size;
+    if room > 0 && image.len() > usize::try_from(room).unwrap_or(usize::MAX) {
+        note(&format!(
+            "warning: the ESI gives the EEPROM {room} bytes, this image does not fit"
+        ));
+    }
     Ok(())
 }
