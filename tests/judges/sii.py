@@ -52,6 +52,8 @@ class Device:
     ebus: int = 0
     # PDOs that exist only once its modules are configured over CoE.
     of_modules: bool = False
+    # PDOs that only the dictionary tells: not read here.
+    in_dictionary: bool = False
     # What a machine file has to name because no module is the default.
     modules: list = field(default_factory=list)
 
@@ -207,6 +209,8 @@ def read(root, element):
         kept = [p for p in own if not (p[2] and p[0].index in replaced)]
         device.of_modules |= not replaced <= {pdo.index for pdo, *_ in own}
         setattr(device, direction.lower(), unassign(kept + placed))
+    indices = [number(o.findtext("Index")) for o in element.iter("Object")]
+    device.in_dictionary = not device.rx + device.tx and any(0x1600 <= n < 0x1C00 for n in indices)
     return device
 
 
