@@ -79,6 +79,7 @@ pub struct Axis {
     plan: Plan,
     motion: Motion,
     given: Given,
+    fixed: law::Fixed,
     profile: Profile,
     home: Home,
     probes: Probes,
@@ -122,7 +123,7 @@ impl Axis {
             wish: Wish::Disabled,
             reset: false,
             reset_failed: false,
-            actual: Actual::default(),
+            actual: Actual::new(config.supervision.acceleration.is_some()),
             active: false,
             mode: config.mode,
             switch: None,
@@ -130,6 +131,7 @@ impl Axis {
             plan: Plan::braking(&config, config.mode),
             motion: Motion::default(),
             given: Given::default(),
+            fixed: law::Fixed::new(&config),
             profile: Profile::new(),
             home: Home::default(),
             probes: Probes::new(),
@@ -279,7 +281,7 @@ impl Axis {
         };
         // While frames are lost, no time passes for the drive's state and the reset pulses.
         let dt_s = if fresh { dt_s } else { 0.0 };
-        let (memory, step) = cia402::step(self.memory, self.statusword, request, dt_s);
+        let (memory, step) = cia402::step_in(self.memory, self.state, request, dt_s);
         self.memory = memory;
         self.controlword = step.controlword;
         if step.progress == Progress::ResetFailed {

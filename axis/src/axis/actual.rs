@@ -5,7 +5,7 @@ use crate::scale::Scale;
 use crate::units::{Counts, PerMille, RawVelocity};
 
 /// Time constant of what is made from differences.
-const FILTER_S: f64 = 0.01;
+pub(super) const FILTER_S: f64 = 0.01;
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Actual {
@@ -17,37 +17,49 @@ pub(super) struct Actual {
     /// Since the last reading.
     elapsed_s: f64,
     measured_velocity: bool,
+    wants_acceleration: bool,
 }
 
 impl Actual {
+    pub(super) fn new(wants_acceleration: bool) -> Self {
+        Self {
+            wants_acceleration,
+            ..Self::default()
+        }
+    }
+
     /// `fastest`: faster from one reading to the next is another origin, and no velocity.
     pub(super) fn read(&mut self, inputs: &Inputs, scale: &Scale, fastest: f64) {
-        let velocity_before = self.velocity;
+        let before = *self;
         if let Some(raw) = inputs.position {
-            let before = self.counts;
-            let counts = before.map_or(Counts(i64::from(raw)), |c| c.unwrap_next(raw));
-            let position = scale.position_to_user(counts).0;
-            let velocity = (position - self.position) / self.elapsed_s;
-            if before.is_some() && self.elapsed_s > 0.0 && velocity.abs() <= fastest {
-                let weight = self.elapsed_s / (self.elapsed_s + FILTER_S);
-                self.velocity += (velocity - self.velocity) * weight;
-            }
+            let counts = self
+                .counts
+                .map_or(Counts(i64::from(raw)), |c| c.unwrap_next(raw));
             self.counts = Some(counts);
-            self.position = position;
+            self.position = scale.position_to_user(counts).0;
         }
         if let Some(raw) = inputs.velocity {
             self.velocity = scale.velocity_to_user(RawVelocity(raw)).0;
+        } else if before.counts.is_some() && self.elapsed_s > 0.0 {
+            let velocity = (self.position - before.position) / self.elapsed_s;
+            if velocity.abs() <= fastest {
+                self.velocity += (velocity - self.velocity) * self.weight();
+            }
         }
-        if self.elapsed_s > 0.0 {
-            let acceleration = (self.velocity - velocity_before) / self.elapsed_s;
-            let weight = self.elapsed_s / (self.elapsed_s + FILTER_S);
-            self.acceleration += (acceleration - self.acceleration) * weight;
+        if self.wants_acceleration && self.elapsed_s > 0.0 {
+            let acceleration = (self.velocity - before.velocity) / self.elapsed_s;
+            self.acceleration += (acceleration - self.acceleration) * self.weight();
         }
         if let Some(raw) = inputs.torque {
             self.torque = scale.torque_to_user(PerMille(raw)).0;
         }
         self.measured_velocity = inputs.velocity.is_some();
         self.elapsed_s = 0.0;
+    }
+
+    /// Of a new reading, in a filtered value.
+    fn weight(&self) -> f64 {
+        self.elapsed_s / (self.elapsed_s + FILTER_S)
     }
 
     /// The drive counts from another origin: what it reports now is where the axis is.
@@ -84,12 +96,8 @@ impl Actual {
         self.torque
     }
 
-    /// What the last digit of the velocity may be wrong by, user units per second.
-    pub(super) fn velocity_slack(&self, scale: &Scale) -> f64 {
-        if self.measured_velocity {
-            2.0 * scale.velocity_resolution()
-        } else {
-            scale.units_of_counts(2.0) / FILTER_S
-        }
+    /// The velocity is reported, not made from positions.
+    pub(super) const fn velocity_is_measured(&self) -> bool {
+        self.measured_velocity
     }
 }

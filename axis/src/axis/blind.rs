@@ -29,6 +29,7 @@ impl Axis {
         if self.plan == Plan::Fed {
             self.brake();
         }
+        self.shadow();
     }
 
     /// The first advance after a freeze in which the drive moved on without a set-point.
@@ -38,9 +39,14 @@ impl Axis {
         }
         let velocity = match self.mode {
             Mode::Csv => self.motion.velocity,
-            _ => self.actual.velocity(),
+            _ => self.drift(),
         };
         self.motion = self.tracked(velocity);
-        self.given.restart();
+        self.given.take_over();
+        if let Plan::Move(trapezoid) = self.plan {
+            // It may be nearer to its target now than it could brake gently.
+            let limit = self.config.limits.acceleration;
+            self.plan = Plan::Move(trapezoid.taking_over(self.motion, limit, limit, self.dt_s));
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! From the set-point to the drive's targets, by the law of each mode.
 
-use super::{Axis, Control, Outputs, Plan};
+use super::actual::FILTER_S;
+use super::{Axis, AxisConfig, Control, Outputs, Plan};
 use crate::cia402::{Controlword, Mode, ModeCommand};
 use crate::loops::{Deviation, Integral, bounded};
 use crate::scale::Scale;
@@ -23,9 +24,38 @@ pub(super) struct Given {
     velocity_offset: f64,
 }
 
+/// What follows from the configuration and is needed in every cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Fixed {
+    /// 0x6081 and 0x6083 where no goal says more.
+    speed: u32,
+    acceleration: u32,
+    /// What the last digit of a velocity may be wrong by, user units per second: as reported, and as made from positions.
+    pub(super) slack: [f64; 2],
+}
+
+impl Fixed {
+    pub(super) fn new(config: &AxisConfig) -> Self {
+        let scale = &config.scale;
+        Self {
+            speed: speed(scale, config.limits.velocity),
+            acceleration: acceleration(scale, config.limits.acceleration),
+            slack: [
+                2.0 * scale.velocity_resolution(),
+                scale.units_of_counts(2.0) / FILTER_S,
+            ],
+        }
+    }
+}
+
 impl Given {
-    /// The loops start from what was given last.
-    pub(super) fn restart(&mut self) {
+    /// The loops go on from what was given last.
+    pub(super) const fn take_over(&mut self) {
+        self.takes_over = true;
+    }
+
+    /// Into a mode: of the shadow's velocity nothing is a correction.
+    pub(super) const fn enter(&mut self) {
         self.correction = 0.0;
         self.takes_over = true;
     }
@@ -35,9 +65,8 @@ impl Axis {
     /// The set-point as the position reported now would show it, had the drive no error. `late_s`: since the set-point left.
     pub(super) fn expected(&self, late_s: f64) -> f64 {
         let motion = &self.motion;
-        let position = self.config.scale.position_to_user(self.sent).0;
         let late_s = late_s.max(0.0);
-        position - (motion.velocity - motion.acceleration * late_s * 0.5) * late_s
+        motion.position - (motion.velocity - motion.acceleration * late_s * 0.5) * late_s
     }
 
     /// After the set-point has advanced. RT: O(1).
@@ -75,9 +104,15 @@ impl Axis {
         if self.mode != Mode::Csp || switch.is_some() {
             self.given.velocity_offset = 0.0;
         }
-        match switch {
+        self.shadow();
+    }
+
+    /// The targets of the mode that is being switched to. Also while frames are lost: the drive may have got the new mode.
+    pub(super) fn shadow(&mut self) {
+        let limits = self.config.limits;
+        match self.switch.map(|switch| switch.to) {
             Some(Mode::Csv | Mode::Pv) if self.mode != Mode::Csv => {
-                self.given.velocity = bounded(velocity, limits.velocity);
+                self.given.velocity = bounded(self.motion.velocity, limits.velocity);
             }
             Some(Mode::Cst) => self.given.torque = bounded(self.actual.torque(), limits.torque),
             _ => {}
@@ -104,17 +139,20 @@ impl Axis {
 
     pub(super) fn outputs(&self) -> Outputs {
         let scale = &self.config.scale;
-        let limits = &self.config.limits;
         let mode = self.switch.map_or(self.mode, |switch| switch.to);
         let actual = self.actual.counts().unwrap_or_default();
         let mut out = Outputs {
             controlword: self.controlword.bits(),
             mode: mode.code(),
             target_position: actual.wrapped(),
-            touch_probe_function: self.probes.function(),
+            touch_probe_function: if self.probe_mapped {
+                self.probes.function()
+            } else {
+                0
+            },
             brake_open: self.hold.open,
-            profile_velocity: speed(scale, limits.velocity),
-            profile_acceleration: acceleration(scale, limits.acceleration),
+            profile_velocity: self.fixed.speed,
+            profile_acceleration: self.fixed.acceleration,
             ..Outputs::default()
         };
         if !self.active {
@@ -140,11 +178,16 @@ impl Axis {
             out.target_torque = raw;
         }
         if self.mode == Mode::Csp && self.switch.is_none() {
-            let offset = UserVelocity(self.given.velocity_offset);
-            out.velocity_offset = scale.velocity_to_raw(offset).0;
-            let torque = self.config.loops.csp.acceleration * self.motion.acceleration;
-            let torque = Percent(bounded(torque, limits.torque));
-            out.torque_offset = scale.torque_to_raw(torque).0;
+            let loops = self.config.loops.csp;
+            if loops.velocity != 0.0 {
+                let offset = UserVelocity(self.given.velocity_offset);
+                out.velocity_offset = scale.velocity_to_raw(offset).0;
+            }
+            if loops.acceleration != 0.0 {
+                let torque = loops.acceleration * self.motion.acceleration;
+                let torque = Percent(bounded(torque, self.config.limits.torque));
+                out.torque_offset = scale.torque_to_raw(torque).0;
+            }
         }
         out
     }

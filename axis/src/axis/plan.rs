@@ -62,10 +62,18 @@ impl Axis {
         }
     }
 
+    /// The velocity that the axis turns out to have; noise is none.
+    pub(super) fn drift(&self) -> f64 {
+        if self.standing() {
+            0.0
+        } else {
+            self.actual.velocity()
+        }
+    }
+
     /// Where the axis is now, by what it reports and the dead time, moving at `velocity`.
     pub(super) fn tracked(&self, velocity: f64) -> Motion {
         let limit = self.config.limits.velocity;
-        let velocity = if self.standing() { 0.0 } else { velocity };
         let velocity = velocity.max(-limit).min(limit);
         Motion {
             position: self.actual.position() + velocity * self.config.dead_time_s,
@@ -77,7 +85,7 @@ impl Axis {
     /// The motion where none is commanded: as it turns out. A mode that is being switched to will take it over.
     fn uncommanded(&self) -> Motion {
         if self.switch.is_some() {
-            self.tracked(self.actual.velocity())
+            self.tracked(self.drift())
         } else {
             Motion::at(self.actual.position())
         }
@@ -86,8 +94,8 @@ impl Axis {
     /// Before a position or velocity is commanded where a torque was: from what the axis does, with the torque it has.
     pub(super) fn engage(&mut self) {
         if self.active && self.grip() == Control::Torque {
-            self.motion = self.tracked(self.actual.velocity());
-            self.given.restart();
+            self.motion = self.tracked(self.drift());
+            self.given.take_over();
         }
     }
 
@@ -153,19 +161,16 @@ impl Axis {
     }
 
     fn run(&mut self, ramp: Ramp, before: Motion, dt_s: f64) -> Motion {
-        let allowed = self.allowed_by_range(ramp.target);
-        self.held_by_range = allowed != ramp.target;
+        let [lowest, highest] = self.allowed_by_range();
+        let asked = ramp.advance(before.velocity, dt_s);
         // Braking for the end of the range may be steeper than the ramp that was asked for.
-        let slope = if self.held_by_range {
-            self.config.limits.acceleration
-        } else {
-            ramp.slope
+        let wanted = asked.min(highest).max(lowest);
+        self.held_by_range = wanted != asked || ramp.target > highest || ramp.target < lowest;
+        let steepest = Ramp {
+            target: wanted,
+            slope: self.config.limits.acceleration,
         };
-        let ramp = Ramp {
-            target: allowed,
-            slope,
-        };
-        let velocity = ramp.advance(before.velocity, dt_s);
+        let velocity = steepest.advance(before.velocity, dt_s);
         before.then(before.position + velocity * dt_s, velocity, dt_s)
     }
 

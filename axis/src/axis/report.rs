@@ -76,6 +76,10 @@ impl Axis {
 
     /// At the end of a cycle: for how long the axis has been where it is to be.
     pub(super) fn dwell(&mut self, dt_s: f64) {
+        let watch = &self.config.supervision;
+        if watch.target_dwell_s == 0.0 && watch.standstill_dwell_s == 0.0 {
+            return;
+        }
         let time = |so: bool, before: f64| if so { before + dt_s } else { 0.0 };
         self.settled_s = time(
             self.active && self.setpoint_arrived() && self.reached(),

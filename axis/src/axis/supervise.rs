@@ -19,8 +19,15 @@ const CATCH_UP_CYCLES: u8 = 2;
 /// Rounding of a product of f64s.
 const ROUNDING: f64 = 1.0 + 1e-9;
 
+/// Rounding of a second difference of positions: of the difference, and of the positions.
+const LOOSE: f64 = 2e-6;
+const ROUNDED: f64 = 4.0 * f64::EPSILON;
+
 /// Braking for the end of the range is planned with this part of the acceleration, so that rounding cannot add up.
 const PLANNED: f64 = 1.0 - 1e-4;
+
+/// Where there is no range.
+const EVERYWHERE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
 
 /// What supervision remembers while an axis is enabled.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -147,13 +154,15 @@ impl Axis {
             // The set-point here is a cycle old already.
             let commanded = self.expected(self.config.dead_time_s - self.dt_s);
             self.watch.following_error = commanded - position;
-            let known = self
-                .watch
-                .known
-                .map_or(commanded, |known| scale.position_to_user(known).0);
             // Frames that were lost took targets with them: then the axis may be anywhere on the way between.
-            let nearest = position.max(commanded.min(known)).min(commanded.max(known));
-            let error = nearest - position;
+            let error = match self.watch.known {
+                None => commanded - position,
+                Some(known) => {
+                    let known = scale.position_to_user(known).0;
+                    let nearest = position.max(commanded.min(known)).min(commanded.max(known));
+                    nearest - position
+                }
+            };
             self.watch.max_following_error = self.watch.max_following_error.max(error.abs());
             self.watch.fresh_cycles = self.watch.fresh_cycles.saturating_add(1);
             if self.watch.fresh_cycles >= CATCH_UP_CYCLES {
@@ -186,7 +195,7 @@ impl Axis {
             self.watch.narrow(position, &limits);
         }
         let velocity = self.actual.velocity();
-        let slack = self.actual.velocity_slack(&self.config.scale);
+        let slack = self.velocity_slack();
         let fast = velocity.abs() > limits.velocity * OVER_VELOCITY + slack;
         if let Some(watch) = self.config.supervision.torque {
             let torque = self.actual.torque();
@@ -231,9 +240,19 @@ impl Axis {
         cause
     }
 
+    /// What the last digit of the velocity may be wrong by, user units per second.
+    fn velocity_slack(&self) -> f64 {
+        let [measured, derived] = self.fixed.slack;
+        if self.actual.velocity_is_measured() {
+            measured
+        } else {
+            derived
+        }
+    }
+
     /// The drive itself stands, as far as it can be told.
     pub(super) fn standing(&self) -> bool {
-        let slack = self.actual.velocity_slack(&self.config.scale);
+        let slack = self.velocity_slack();
         let window = self.config.supervision.standstill;
         let window = window.unwrap_or(self.config.limits.velocity * 0.01);
         self.actual.velocity().abs() <= slack.max(window)
@@ -243,18 +262,18 @@ impl Axis {
     pub(super) fn velocity_reached(&self, target: f64) -> bool {
         let ten_rpm = self.config.scale.units_per_turn() * 10.0 / 60.0;
         let floor = ten_rpm.min(self.config.limits.velocity * 0.1);
-        let slack = self.actual.velocity_slack(&self.config.scale);
+        let slack = self.velocity_slack();
         let window = (target.abs() * 0.02).max(floor).max(slack);
         (self.actual.velocity() - target).abs() <= window
     }
 
-    /// `target`, or the highest velocity from which the axis can still stop inside its range.
-    pub(super) fn allowed_by_range(&self, target: f64) -> f64 {
+    /// Lowest and highest velocity of the coming cycle from which the axis can still stop inside its range.
+    pub(super) fn allowed_by_range(&self) -> [f64; 2] {
         let Some([low, high]) = self.config.limits.position else {
-            return target;
+            return [f64::NEG_INFINITY, f64::INFINITY];
         };
         if self.actual.counts().is_none() {
-            return target;
+            return [f64::NEG_INFINITY, f64::INFINITY];
         }
         let (acceleration, ahead) = if self.grip() == Control::Position {
             (
@@ -268,7 +287,7 @@ impl Axis {
         };
         let up = braking_velocity((high - ahead).max(0.0), acceleration, self.dt_s);
         let down = braking_velocity((ahead - low).max(0.0), acceleration, self.dt_s);
-        target.min(up).max(-down)
+        [-down, up]
     }
 
     /// The last thing before the outputs: whatever was planned, nothing exceeds the limits.
@@ -278,17 +297,28 @@ impl Axis {
         match grip {
             Control::Position => {
                 let most = limits.velocity * dt_s * ROUNDING;
-                // Not `clamp`: it panics on bounds that are not numbers.
-                let mut position = self
-                    .motion
-                    .position
-                    .max(before.position - most)
-                    .min(before.position + most);
-                if let Some([low, high]) = limits.position {
-                    position = position
-                        .max(low.min(before.position))
-                        .min(high.max(before.position));
+                let coasting = before.position + before.velocity * dt_s;
+                let change = limits.acceleration * dt_s * dt_s;
+                let rounded = change * LOOSE + (coasting.abs() + before.position.abs()) * ROUNDED;
+                // A motion that was taken over too near to an end of the range passes it braking.
+                let [low, high] = limits.position.map_or(EVERYWHERE, |[low, high]| {
+                    [
+                        low.min(before.position).min(coasting + change - rounded),
+                        high.max(before.position).max(coasting - change + rounded),
+                    ]
+                });
+                let position = self.motion.position;
+                if (position - before.position).abs() <= most
+                    && (position - coasting).abs() <= change + rounded
+                    && position >= low
+                    && position <= high
+                {
+                    return;
                 }
+                // Not `clamp`: it panics on bounds that are not numbers.
+                let least = (coasting - change - rounded).max(before.position - most);
+                let most = (coasting + change + rounded).min(before.position + most);
+                let position = position.max(low).min(high).max(least).min(most);
                 if position != self.motion.position {
                     let velocity = if dt_s > 0.0 {
                         (position - before.position) / dt_s

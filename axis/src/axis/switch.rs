@@ -18,12 +18,13 @@ pub(super) struct Switch {
 impl Axis {
     /// 0x6061 shows the mode that counts or the one on its way, or is not mapped.
     pub(super) fn mode_confirmed(&self) -> bool {
-        self.mode_display.is_none_or(|display| {
-            display == self.mode.code()
-                || self
-                    .switch
-                    .is_some_and(|switch| display == switch.to.code())
-        })
+        match self.mode_display {
+            None => true,
+            Some(display) if display == self.mode.code() => true,
+            Some(display) => self
+                .switch
+                .is_some_and(|switch| display == switch.to.code()),
+        }
     }
 
     pub(super) fn begin_switch(&mut self, to: Mode) {
@@ -57,7 +58,7 @@ impl Axis {
         let from = self.mode;
         self.mode = to;
         self.switch = None;
-        self.given.restart();
+        self.given.enter();
         if to != Mode::Cst {
             self.given.torque = 0.0;
         }

@@ -46,9 +46,12 @@ impl Axis {
     /// Where a wish has been fulfilled, the next one follows from it. Time passes here whether frames are lost or not: power
     /// is taken away in bounded time even if none ever comes back.
     pub(super) fn settle_wish(&mut self, dt_s: f64) {
+        self.hold.since_s = (self.hold.since_s + dt_s).min(FORGET_S * FORGET_S);
+        if matches!(self.wish, Wish::Enabled | Wish::Disabled) {
+            return;
+        }
         let stopping = matches!(self.state, State::OperationEnabled | State::QuickStopActive);
         let at_rest = self.setpoint_at_rest() && !self.cut_short;
-        self.hold.since_s = (self.hold.since_s + dt_s).min(FORGET_S * FORGET_S);
         self.wish = match self.wish {
             Wish::Disabling { .. } if !self.active => Wish::Disabled,
             Wish::Disabling { .. } if at_rest => self.once_held(self.wish),

@@ -15,5 +15,5 @@ pub use fault::{Description, describe};
 pub use mode::{Mode, Modes};
 pub use option::{Deceleration, HaltOption, QuickStopOption};
 pub use state::State;
-pub use step::{Memory, Power, Progress, Request, Step, step};
+pub use step::{Memory, Power, Progress, Request, Step, step, step_in};
 pub use words::{Controlword, Statusword};

@@ -19,26 +19,22 @@ pub enum State {
     Unknown(u16),
 }
 
-/// Mask, value, state. The rows exclude each other, so their order does not matter.
-const TABLE: [(u16, u16, State); 8] = [
-    (0x4F, 0x00, State::NotReadyToSwitchOn),
-    (0x4F, 0x40, State::SwitchOnDisabled),
-    (0x6F, 0x21, State::ReadyToSwitchOn),
-    (0x6F, 0x23, State::SwitchedOn),
-    (0x6F, 0x27, State::OperationEnabled),
-    (0x6F, 0x07, State::QuickStopActive),
-    (0x4F, 0x0F, State::FaultReactionActive),
-    (0x4F, 0x08, State::Fault),
-];
-
 impl State {
     #[must_use]
-    pub fn from_statusword(word: Statusword) -> Self {
+    pub const fn from_statusword(word: Statusword) -> Self {
         let bits = word.bits();
-        TABLE
-            .iter()
-            .find(|(mask, value, _)| bits & mask == *value)
-            .map_or(Self::Unknown(bits), |(_, _, state)| *state)
+        // Bits 0–3, 5 and 6; bit 5 (quick stop) matters in half of the states.
+        match bits & 0x6F {
+            0x00 | 0x20 => Self::NotReadyToSwitchOn,
+            0x40 | 0x60 => Self::SwitchOnDisabled,
+            0x21 => Self::ReadyToSwitchOn,
+            0x23 => Self::SwitchedOn,
+            0x27 => Self::OperationEnabled,
+            0x07 => Self::QuickStopActive,
+            0x0F | 0x2F => Self::FaultReactionActive,
+            0x08 | 0x28 => Self::Fault,
+            _ => Self::Unknown(bits),
+        }
     }
 
     /// Fault or on the way into it.
@@ -67,6 +63,27 @@ impl fmt::Display for State {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The standard's table: mask, value, state. The rows exclude each other, so their order does not matter.
+    const TABLE: [(u16, u16, State); 8] = [
+        (0x4F, 0x00, State::NotReadyToSwitchOn),
+        (0x4F, 0x40, State::SwitchOnDisabled),
+        (0x6F, 0x21, State::ReadyToSwitchOn),
+        (0x6F, 0x23, State::SwitchedOn),
+        (0x6F, 0x27, State::OperationEnabled),
+        (0x6F, 0x07, State::QuickStopActive),
+        (0x4F, 0x0F, State::FaultReactionActive),
+        (0x4F, 0x08, State::Fault),
+    ];
+
+    #[test]
+    fn every_word_by_the_table() {
+        for bits in 0..=u16::MAX {
+            let row = TABLE.iter().find(|(mask, value, _)| bits & mask == *value);
+            let expected = row.map_or(State::Unknown(bits), |row| row.2);
+            assert_eq!(state(bits), expected, "{bits:#06x}");
+        }
+    }
 
     fn state(bits: u16) -> State {
         State::from_statusword(Statusword::from_bits_retain(bits))

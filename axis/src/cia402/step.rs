@@ -155,8 +155,34 @@ pub fn controlword(state: State, power: Power, waited_s: f64) -> Controlword {
 /// One cycle. Pure: the same arguments give the same answer. Any `dt_s` is accepted; what is not a positive number is no time.
 #[must_use]
 pub fn step(memory: Memory, statusword: Statusword, request: Request, dt_s: f64) -> (Memory, Step) {
+    step_in(memory, State::from_statusword(statusword), request, dt_s)
+}
+
+/// [`step`] for a state that has been read already.
+#[must_use]
+pub fn step_in(mut memory: Memory, state: State, request: Request, dt_s: f64) -> (Memory, Step) {
     let dt_s = if dt_s > 0.0 { dt_s } else { 0.0 };
-    let state = State::from_statusword(statusword);
+    // Nearly every cycle of a machine's life.
+    let running = matches!(
+        (state, memory.state, request.power, memory.power),
+        (
+            State::OperationEnabled,
+            State::OperationEnabled,
+            Power::Enabled,
+            Power::Enabled
+        )
+    );
+    if running {
+        memory.in_state_s = (memory.in_state_s + dt_s).min(LONGEST_WAIT_S);
+        memory.waited_s = (memory.waited_s + dt_s).min(LONGEST_WAIT_S);
+        memory.reset = Reset::Idle;
+        let step = Step {
+            state,
+            controlword: Controlword::ENABLE_OPERATION_COMMAND,
+            progress: Progress::Reached,
+        };
+        return (memory, step);
+    }
     let same_state = state == memory.state;
     let same_wait = same_state && request.power == memory.power;
     let since = |same: bool, before: f64| {
