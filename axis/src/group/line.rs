@@ -141,6 +141,21 @@ impl Along {
         self.target
     }
 
+    /// The target, unless it is to stop before.
+    #[must_use]
+    pub const fn destination(&self) -> Option<f64> {
+        match self.path.order().goal {
+            Goal::Position(_) => Some(self.target),
+            Goal::Velocity(_) => None,
+        }
+    }
+
+    /// This axis' part of the acceleration that the line may brake with.
+    #[must_use]
+    pub const fn braking(&self) -> f64 {
+        self.path.used().acceleration * (self.target - self.start).abs()
+    }
+
     /// Brakes on the line, with the limits the line was planned with.
     pub fn stop(&mut self, dt_s: f64) {
         self.redirect(Goal::Velocity(0.0), 1.0, dt_s);

@@ -13,7 +13,7 @@
 //! | [`Playback`] | through the points of a [`Table`] |
 //! | [`Gear`] | after another axis |
 //!
-//! [`Ramp`] is for a single value: velocity in CSV, torque in CST. [`Hold`], [`Trapezoid`] and [`Ramp`] remember neither a start nor a time;
+//! [`Source`] is any of those that need nothing but the motion. [`Ramp`] is for a single value: velocity in CSV, torque in CST. [`Hold`], [`Trapezoid`] and [`Ramp`] remember neither a start nor a time;
 //! the others follow a plan, and make a new one when they find the axis elsewhere than they left it. So any of them can take over in any
 //! cycle, at any velocity, without a jump.
 //!
@@ -27,6 +27,7 @@ mod jerk;
 mod ramp;
 #[cfg(test)]
 mod sequence;
+mod source;
 mod spline;
 mod stream;
 mod table;
@@ -38,6 +39,7 @@ pub use gear::{Engage, Gear, GearConfig};
 pub use hold::Hold;
 pub use jerk::{Goal, JerkLimited, Order};
 pub use ramp::Ramp;
+pub use source::Source;
 pub use spline::{Interpolation, Knot};
 pub use stream::{Stream, StreamConfig, StreamState};
 pub use table::{Playback, Table, TableError, TableProblem};

@@ -204,6 +204,11 @@ impl PositionWave {
         })
     }
 
+    #[must_use]
+    pub const fn limits(&self) -> &MotionLimits {
+        &self.limits
+    }
+
     /// The axis was held up on the way; since then it stands.
     #[must_use]
     pub fn interrupted(&self) -> bool {

@@ -95,6 +95,12 @@ impl JerkLimited {
         &self.order
     }
 
+    /// The limits it moves with: of the order, or more where those would not have done.
+    #[must_use]
+    pub const fn used(&self) -> &MotionLimits {
+        &self.used
+    }
+
     /// Seconds from the start to the arrival.
     #[must_use]
     pub const fn duration_s(&self) -> f64 {
@@ -368,6 +374,10 @@ fn leaves(order: &Order, origin: f64, spans: [[f64; 2]; 2]) -> Option<SetpointEr
 /// The state at the end of a cycle of which only the means are known. With a constant acceleration a cycle's mean velocity is
 /// that of its middle; so continued, the velocity stays within its limit.
 fn entry(motion: Motion, limits: MotionLimits, dt_s: f64) -> State {
+    // Held where it is, or turning: then as well from rest.
+    if motion.velocity == 0.0 {
+        return State::default();
+    }
     let sign = 1f64.copysign(motion.acceleration);
     let headroom = (limits.velocity - sign * motion.velocity).max(0.0);
     let half = dt_s.max(0.0) / 2.0;
