@@ -1,13 +1,14 @@
 //! One axis: units, limits, and the unit of the drive's velocities.
 
 use ecaxis_axis::{
-    Axis, AxisConfig, ConfigError, LimitError, Limits, Scale, ScaleError, VelocityUnit,
+    Axis, AxisConfig, ConfigError, FeedForward, LimitError, Limits, Loops, Mode, Modes,
+    PositionPid, Scale, ScaleError, VelocityLoop, VelocityUnit,
 };
 use ecaxis_esi as esi;
 use toml::Spanned;
 
 use super::problem::{Problems, Span, suggestion};
-use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
+use super::raw::{RawAxis, RawLimits, RawLoops, RawSdo, SdoValue};
 use super::units::unit;
 use super::{AxisSetup, VelocityUnitFrom};
 
@@ -26,9 +27,14 @@ pub(crate) fn setup(
     let limits = limits(&raw.limits, shown, p);
     let ((velocity_unit, velocity_unit_from), limits) = (velocity?, limits?);
     let scale = scale?.with_velocity_unit(velocity_unit);
-    let mut config = AxisConfig::new(ecaxis_axis::Mode::from_code(mode.code()), scale, limits);
+    let mut config = AxisConfig::new(Mode::from_code(mode.code()), scale, limits);
     if let Some(window) = &raw.target_window {
         config.target_window = *positive(window, "target_window", shown, p)?;
+    }
+    config.modes = modes(config.mode, selection);
+    config.loops = loops(&raw.loops, shown, selection, p)?;
+    if let Some(dead_time) = &raw.dead_time {
+        config.dead_time_s = *dead_time.get_ref() as f64 * 1e-9;
     }
     if let Err(e) = Axis::new(config) {
         let (at, message) = refused(&e, raw, shown);
@@ -41,6 +47,88 @@ pub(crate) fn setup(
         mode,
         velocity_unit_from,
     })
+}
+
+/// Those that can be switched to: 0x6060 and its display are in the process data, and the mode's target is.
+fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
+    let mut modes = Modes::only(own);
+    let Some(layout) = selection.map(|s| &s.layout) else {
+        return modes;
+    };
+    if layout.rx_field(0x6060, 0).is_none() || layout.tx_field(0x6061, 0).is_none() {
+        return modes;
+    }
+    for (mode, target) in [
+        (Mode::Csp, 0x607a),
+        (Mode::Csv, 0x60ff),
+        (Mode::Cst, 0x6071),
+    ] {
+        if layout.rx_field(target, 0).is_some() {
+            modes = modes.with(mode);
+        }
+    }
+    modes
+}
+
+fn loops(
+    raw: &RawLoops,
+    unit: &str,
+    selection: Option<&esi::Selection>,
+    p: &mut Problems<'_>,
+) -> Option<Loops> {
+    let mut offset = |value: &Option<Spanned<f64>>, index: u16| {
+        let Some(value) = value else { return Some(0.0) };
+        let mapped = selection.is_none_or(|s| s.layout.rx_field(index, 0).is_some());
+        if !mapped {
+            let message =
+                format!("an offset goes into 0x{index:04X}, which is not in the process data");
+            p.add_hint(value.span(), message, "map it with `pdo.rx`");
+        }
+        mapped.then_some(*value.get_ref())
+    };
+    let csp = FeedForward {
+        velocity: offset(&raw.velocity_offset, 0x60b1)?,
+        acceleration: offset(&raw.torque_offset, 0x60b2)?,
+    };
+    let csv = match &raw.csv {
+        Some(csv) => Some(VelocityLoop {
+            kv: *positive(csv.kv.as_ref()?, "csv.kv", "1/s", p)?,
+            feed_forward: part(csv.feed_forward.as_ref(), 1.0, "csv.feed_forward", p)?,
+        }),
+        None => None,
+    };
+    let seconds = |time: &Option<Spanned<u64>>| time.as_ref().map(|t| *t.get_ref() as f64 * 1e-9);
+    let cst = match &raw.cst {
+        Some(cst) => Some(PositionPid {
+            kp: *positive(cst.kp.as_ref()?, "cst.kp", &format!("% per {unit}"), p)?,
+            tn_s: seconds(&cst.tn),
+            tv_s: seconds(&cst.tv).unwrap_or(0.0),
+            acceleration: cst.acceleration.as_ref().map_or(0.0, |a| *a.get_ref()),
+        }),
+        None => None,
+    };
+    Some(Loops { csp, csv, cst })
+}
+
+/// A weight from 0 to 1.
+fn part(
+    value: Option<&Spanned<f64>>,
+    default: f64,
+    what: &str,
+    p: &mut Problems<'_>,
+) -> Option<f64> {
+    let Some(value) = value else {
+        return Some(default);
+    };
+    let n = *value.get_ref();
+    if (0.0..=1.0).contains(&n) {
+        return Some(n);
+    }
+    p.add(
+        value.span(),
+        format!("`{what}` is {n}, but it is a weight from 0 to 1"),
+    );
+    None
 }
 
 /// `unit` may be empty.
@@ -96,9 +184,14 @@ fn refused(error: &ConfigError, raw: &RawAxis, unit: &str) -> (Span, String) {
             of(raw.target_window.as_ref().map(Spanned::span)),
             error.to_string(),
         ),
-        ConfigError::Limit(LimitError::NotPositive { .. })
-        | ConfigError::Mode(_)
-        | ConfigError::Outside { .. } => (limits.span.clone(), error.to_string()),
+        ConfigError::Limit(LimitError::NotPositive { .. }) | ConfigError::Mode(_) => {
+            (limits.span.clone(), error.to_string())
+        }
+        ConfigError::Outside { .. } => {
+            let at = raw.dead_time.as_ref().map(Spanned::span);
+            let at = at.or(raw.loops.cst.as_ref().map(|cst| cst.span.clone()));
+            (at.unwrap_or(raw.span.clone()), error.to_string())
+        }
     }
 }
 
@@ -167,6 +260,7 @@ fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
         &format!("{unit}/s²"),
     );
     let torque = read(&raw.torque, "limits.torque", "%");
+    let jerk = read(&raw.jerk, "limits.jerk", &format!("{unit}/s³"));
     let following_error = read(&raw.following_error, "limits.following_error", unit);
     if let (Some(velocity), Some(acceleration), Some(at)) =
         (velocity, acceleration, &raw.acceleration)
@@ -193,7 +287,7 @@ fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
         position: raw.position.as_ref().map(|r| *r.get_ref()),
         velocity: velocity?,
         acceleration: acceleration?,
-        jerk: None,
+        jerk,
         torque: torque.unwrap_or(100.0),
         following_error,
     };

@@ -32,6 +32,12 @@ impl Machine {
                 self.targets(targets, "→", "%"),
                 duration::show(*ramp_ns),
             ),
+            Action::Mode { targets } => {
+                let each = targets.iter().filter_map(|(axis, mode)| {
+                    Some(format!("{} to {mode}", self.devices.get(*axis)?.name))
+                });
+                format!("switch {}", each.collect::<Vec<_>>().join(", "))
+            }
             Action::Dwell { ns } => format!("wait {}", duration::show(*ns)),
             Action::Wait {
                 conditions,

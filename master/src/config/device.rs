@@ -168,11 +168,6 @@ fn neighbours(path: &Path) -> String {
     suggestion(&word, names.iter().map(String::as_str), &what)
 }
 
-/// The name that the machine file uses for a mode of the axis.
-pub(crate) fn mode_name(mode: ecaxis_axis::Mode) -> String {
-    esi::Mode::from_code(mode.code()).map_or_else(|| mode.to_string(), |m| m.to_string())
-}
-
 pub(crate) fn check(
     mut raw: RawDevice,
     at: Option<Locator>,

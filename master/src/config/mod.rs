@@ -221,6 +221,10 @@ pub enum Action {
         /// From the present torque to the new one.
         ramp_ns: u64,
     },
+    /// Switch modes of operation, also in motion.
+    Mode {
+        targets: Vec<(usize, ecaxis_axis::Mode)>,
+    },
     Dwell {
         ns: u64,
     },

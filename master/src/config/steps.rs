@@ -3,11 +3,11 @@
 use toml::Spanned;
 
 use super::axis::too_long;
-use super::problem::{Problems, Span, suggestion};
+use super::problem::{Problems, Span, list, suggestion};
 use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
 use super::{Action, AxisSetup, Condition, DeviceConfig, Signal, Step, duration, signal};
-use crate::config::device::mode_name;
 use ecaxis_axis::Mode;
+use ecaxis_esi as esi;
 
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
 /// How long an input is waited for where the step does not say.
@@ -50,6 +50,7 @@ pub(crate) fn check(steps: Vec<RawStep>, devices: &[Known<'_>], p: &mut Problems
         inputs: Vec::new(),
         outputs: Vec::new(),
         count: 0,
+        switched: Vec::new(),
     };
     let steps = checker.all(steps, "", p);
     Program {
@@ -64,6 +65,8 @@ struct Checker<'c> {
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
     count: usize,
+    /// Modes that steps so far have switched to.
+    switched: Vec<(usize, Mode)>,
 }
 
 impl Checker<'_> {
@@ -135,6 +138,15 @@ impl Checker<'_> {
                 targets: self.targets(targets, What::Torque, p)?,
                 ramp_ns: ramp.map_or(WHOLE_TORQUE_RAMP_NS, Spanned::into_inner),
             },
+            RawAction::Mode(named) => {
+                let count = named.len();
+                let mut targets: Vec<(usize, Mode)> = named
+                    .into_iter()
+                    .filter_map(|(name, mode)| self.mode(&name, &mode, p))
+                    .collect();
+                targets.sort_by_key(|(index, _)| *index);
+                (count > 0 && targets.len() == count).then_some(Action::Mode { targets })?
+            }
             RawAction::Dwell(ns) => Action::Dwell {
                 ns: ns.into_inner(),
             },
@@ -166,6 +178,44 @@ impl Checker<'_> {
                 steps: self.all(steps, &format!("{number}."), p),
             },
         })
+    }
+
+    fn mode(
+        &mut self,
+        name: &Spanned<String>,
+        mode: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<(usize, Mode)> {
+        let (index, axis) = self.axis(name, p)?;
+        let offered: Vec<esi::Mode> = [esi::Mode::Csp, esi::Mode::Csv, esi::Mode::Cst]
+            .into_iter()
+            .filter(|m| axis.config.modes.contains(Mode::from_code(m.code())))
+            .collect();
+        let wanted = offered.iter().find(|m| m.name() == mode.get_ref());
+        let Some(wanted) = wanted else {
+            let message = format!(
+                "`{}` cannot switch to \"{}\"",
+                name.get_ref(),
+                mode.get_ref()
+            );
+            let names = offered.iter().map(|m| m.name());
+            let hint = format!(
+                "it can: {}; for more, map 0x6060, 0x6061 and the mode's target with `pdo.rx` and `pdo.tx`",
+                list(names)
+            );
+            p.add_hint(mode.span(), message, hint);
+            return None;
+        };
+        let wanted = Mode::from_code(wanted.code());
+        self.switched.push((index, wanted));
+        Some((index, wanted))
+    }
+
+    /// Whether something is so in a mode that the axis is in at some time.
+    fn ever(&self, index: usize, so: impl Fn(Mode) -> bool) -> bool {
+        let own = self.devices[index].axis.ok().map(|axis| axis.config.mode);
+        let switched = self.switched.iter().filter(|(axis, _)| *axis == index);
+        switched.map(|(_, mode)| *mode).chain(own).any(so)
     }
 
     /// Of the machine's axes, those that are named; `None`: all.
@@ -222,20 +272,8 @@ impl Checker<'_> {
             let Some((index, axis)) = self.axis(&name, p) else {
                 continue;
             };
-            let mode = what.mode();
-            if axis.config.mode != mode {
-                let message = format!(
-                    "`{}` needs an axis in mode \"{}\"; `{}` is in \"{}\"",
-                    what.verb(),
-                    mode_name(mode),
-                    name.get_ref(),
-                    axis.mode,
-                );
-                let hint = match axis.config.mode {
-                    Mode::Csv => "write `velocity = { … }` for it",
-                    Mode::Cst => "write `torque = { … }` for it",
-                    _ => "write `move = { … }` for it",
-                };
+            if !self.ever(index, |mode| what.possible(mode, axis)) {
+                let (message, hint) = what.impossible(name.get_ref(), axis);
                 p.add_hint(name.span(), message, hint);
             } else if within(&value, what, axis, p) {
                 resolved.push((index, value.into_inner()));
@@ -374,12 +412,37 @@ impl What {
         }
     }
 
-    fn mode(self) -> Mode {
+    /// Whether an axis takes it in this mode.
+    fn possible(self, mode: Mode, axis: &AxisSetup) -> bool {
+        let loops = &axis.config.loops;
+        let position = match mode {
+            Mode::Csv => loops.csv.is_some(),
+            Mode::Cst => loops.cst.is_some(),
+            _ => true,
+        };
         match self {
-            Self::Position | Self::Way => Mode::Csp,
-            Self::Velocity => Mode::Csv,
-            Self::Torque => Mode::Cst,
+            Self::Position | Self::Way => position,
+            Self::Velocity => position || mode == Mode::Csv,
+            Self::Torque => mode == Mode::Cst,
         }
+    }
+
+    fn impossible(self, name: &str, axis: &AxisSetup) -> (String, String) {
+        let message = format!(
+            "`{}` is nothing that `{name}` does in mode \"{}\"",
+            self.verb(),
+            axis.mode
+        );
+        let instead = match axis.config.mode {
+            Mode::Csv => {
+                "write `velocity = { … }`, or give the axis a position loop: `csv = { kv = 20.0 }`"
+            }
+            Mode::Cst => {
+                "write `torque = { … }`, or give the axis a position loop: `cst = { kp = 10.0 }`"
+            }
+            _ => "write `move = { … }`, or switch it before: `mode = { … = \"cst\" }`",
+        };
+        (message, instead.to_owned())
     }
 }
 

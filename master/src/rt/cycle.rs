@@ -63,8 +63,8 @@ impl AxisSlot {
             velocity: bits.velocity.map(|b| b.get(image) as i32),
             torque: bits.torque.map(|b| b.get(image) as i16),
             mode_display: bits.mode_display.map(|b| b.get(image) as i8),
+            error_code: bits.error_code.map(|b| b.get(image) as u16),
             fresh,
-            ..Inputs::default()
         }
     }
 
@@ -76,6 +76,8 @@ impl AxisSlot {
             (bits.target_position, i64::from(outputs.target_position)),
             (bits.target_velocity, i64::from(outputs.target_velocity)),
             (bits.target_torque, i64::from(outputs.target_torque)),
+            (bits.velocity_offset, i64::from(outputs.velocity_offset)),
+            (bits.torque_offset, i64::from(outputs.torque_offset)),
         ] {
             if let Some(to) = to {
                 to.set(image, value);

@@ -112,6 +112,12 @@ pub enum RunError {
         state: State,
         timeout_ms: u64,
     },
+    #[error("{step}: {device}: modes of operation display (0x6061) does not become {mode}")]
+    NotSwitched {
+        device: DeviceRef,
+        step: StepRef,
+        mode: Mode,
+    },
     #[error("{step}: {condition} did not come within {timeout_ms} ms: it is {value}")]
     WaitTimeout {
         step: StepRef,

@@ -189,6 +189,28 @@ impl Supervisor {
                 })
                 .await
             }
+            Action::Mode { targets } => {
+                let axes = targets.iter().filter_map(|&(device, mode)| {
+                    Some((self.axes.iter().position(|&d| d == device)?, mode))
+                });
+                let targets: Vec<_> = axes.collect();
+                self.command(
+                    targets
+                        .iter()
+                        .map(|&(axis, mode)| (axis, Command::SetMode(mode))),
+                )
+                .await;
+                let axes: Vec<usize> = targets.iter().map(|&(axis, _)| axis).collect();
+                let there = |s: &Snapshot, axis: usize| {
+                    let mode = targets
+                        .iter()
+                        .find(|(a, _)| *a == axis)
+                        .map(|(_, mode)| *mode);
+                    let status = &s.axes[axis];
+                    Some(status.mode) == mode && status.switching.is_none()
+                };
+                self.until(step, start, there, &axes).await
+            }
             Action::Dwell { ns } => {
                 let until = clock::now().saturating_add(*ns);
                 while clock::now() < until && !self.over(start) {
@@ -272,6 +294,15 @@ impl Supervisor {
             let Some(&axis) = axes.iter().find(|&&axis| !holds(&snapshot, axis)) else {
                 return Ok(());
             };
+            if let Some(mode) = snapshot.axes[axis].switch_failed
+                && matches!(step.action, Action::Mode { .. })
+            {
+                return Err(RunError::NotSwitched {
+                    device: self.device_of(axis),
+                    step: step.into(),
+                    mode,
+                });
+            }
             if clock::now().saturating_sub(begun) > timeout {
                 return Err(RunError::StepTimeout {
                     device: self.device_of(axis),

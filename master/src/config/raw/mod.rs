@@ -7,8 +7,22 @@ use super::fields::{self, Fields};
 use super::problem::{Problems, Span};
 use super::sim::{self, RawSim};
 
+/// Reads `$field`, where it stands, with one of the readers of [`fields`].
+macro_rules! optional {
+    ($p:expr, $f:expr, $key:literal, $($reader:tt)+) => {
+        match $f.get($key) {
+            Some(v) => optional!(@ $p, v, $($reader)+),
+            None => None,
+        }
+    };
+    (@ $p:expr, $v:expr, integer($min:expr, $max:expr)) => { fields::integer($p, $v, $min, $max) };
+    (@ $p:expr, $v:expr, $reader:ident) => { fields::$reader($p, $v) };
+}
+
+mod axis;
 mod step;
 
+pub(crate) use axis::{RawAxis, RawLimits, RawLoops};
 pub(crate) use step::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
 
 #[derive(Debug, Default)]
@@ -83,42 +97,7 @@ pub(crate) enum SdoValue {
     Bytes(Vec<u8>),
 }
 
-#[derive(Debug)]
-pub(crate) struct RawAxis {
-    pub span: Span,
-    pub unit: Option<Spanned<String>>,
-    pub per_turn: Option<Spanned<f64>>,
-    pub encoder: Option<Spanned<f64>>,
-    pub invert: Option<Spanned<bool>>,
-    pub offset: Option<Spanned<f64>>,
-    pub target_window: Option<Spanned<f64>>,
-    pub velocity_unit: Option<Spanned<String>>,
-    pub limits: RawLimits,
-}
-
-#[derive(Debug, Default)]
-pub(crate) struct RawLimits {
-    pub span: Span,
-    pub position: Option<Spanned<[f64; 2]>>,
-    pub velocity: Option<Spanned<f64>>,
-    pub acceleration: Option<Spanned<f64>>,
-    pub torque: Option<Spanned<f64>>,
-    pub following_error: Option<Spanned<f64>>,
-}
-
 type Value<'d> = &'d Spanned<DeValue<'d>>;
-
-/// Reads `$field`, where it stands, with one of the readers of [`fields`].
-macro_rules! optional {
-    ($p:expr, $f:expr, $key:literal, $($reader:tt)+) => {
-        match $f.get($key) {
-            Some(v) => optional!(@ $p, v, $($reader)+),
-            None => None,
-        }
-    };
-    (@ $p:expr, $v:expr, integer($min:expr, $max:expr)) => { fields::integer($p, $v, $min, $max) };
-    (@ $p:expr, $v:expr, $reader:ident) => { fields::$reader($p, $v) };
-}
 
 pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> RawMachine {
     let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
@@ -227,7 +206,7 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
     }
     if let Some(value) = f.get("axis") {
         let fields = fields::table(p, value, "[device.axis]");
-        device.axis = fields.map(|f| read_axis(f, value.span(), p));
+        device.axis = fields.map(|f| axis::read(f, value.span(), p));
     }
     if let Some(value) = f.get("sim") {
         let fields = fields::table(p, value, "[device.sim]");
@@ -323,59 +302,4 @@ fn read_sdo(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawSd
         value: value?,
         type_name,
     })
-}
-
-fn read_axis(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAxis {
-    let encoder = f.need("encoder", "encoder = 2000");
-    let limits = f.need(
-        "limits",
-        "limits = { velocity = 200.0, acceleration = 2000.0 }",
-    );
-    let mut axis = RawAxis {
-        span: span.clone(),
-        unit: optional!(p, f, "unit", string),
-        per_turn: optional!(p, f, "per_turn", number),
-        encoder: encoder.and_then(|v| fields::number(p, v)),
-        invert: optional!(p, f, "invert", boolean),
-        offset: optional!(p, f, "offset", number),
-        target_window: optional!(p, f, "target_window", number),
-        velocity_unit: optional!(p, f, "velocity_unit", string),
-        limits: RawLimits::default(),
-    };
-    if let Some(value) = limits
-        && let Some(mut f) = fields::table(p, value, "`limits`")
-    {
-        let position = f.get("position").and_then(|v| {
-            let ends = fields::array(p, v, "a list of two positions")?;
-            let [low, high] = ends.as_slice() else {
-                p.add_hint(
-                    v.span(),
-                    "a range has two ends",
-                    "write `position = [-50.0, 50.0]`",
-                );
-                return None;
-            };
-            let range = [fields::number(p, low), fields::number(p, high)];
-            let [Some(low), Some(high)] = range else {
-                return None;
-            };
-            Some(Spanned::new(
-                v.span(),
-                [low.into_inner(), high.into_inner()],
-            ))
-        });
-        let velocity = f.need("velocity", "velocity = 200.0");
-        let acceleration = f.need("acceleration", "acceleration = 2000.0");
-        axis.limits = RawLimits {
-            span: value.span(),
-            position,
-            velocity: velocity.and_then(|v| fields::number(p, v)),
-            acceleration: acceleration.and_then(|v| fields::number(p, v)),
-            torque: optional!(p, f, "torque", number),
-            following_error: optional!(p, f, "following_error", number),
-        };
-        f.done(p);
-    }
-    f.done(p);
-    axis
 }

@@ -55,6 +55,8 @@ pub(crate) enum RawAction {
         targets: Vec<RawTarget>,
         ramp: Option<Spanned<u64>>,
     },
+    /// Axes and modes by name.
+    Mode(Vec<(Spanned<String>, Spanned<String>)>),
     Dwell(Spanned<u64>),
     Wait {
         conditions: Vec<RawCondition>,
@@ -68,7 +70,7 @@ pub(crate) enum RawAction {
 }
 
 /// Each with an example; the first key of a step that is one of these says what the step is.
-const VERBS: [(&str, &str); 12] = [
+const VERBS: [(&str, &str); 13] = [
     ("enable", "enable = [\"x\"]"),
     ("disable", "disable = true"),
     ("reset", "reset = [\"x\"]"),
@@ -77,6 +79,7 @@ const VERBS: [(&str, &str); 12] = [
     ("move_by", "move_by = { x = -5.0 }"),
     ("velocity", "velocity = { v = 100.0 }"),
     ("torque", "torque = { t = 10.0 }"),
+    ("mode", "mode = { x = \"csv\" }"),
     ("dwell", "dwell = \"500ms\""),
     ("wait", "wait = { io.\"Input 1\" = true }"),
     ("set", "set = { io.\"Output 1\" = true }"),
@@ -168,6 +171,7 @@ fn action(
                 ramp,
             }
         }
+        "mode" => RawAction::Mode(named(value, "{ x = \"csv\" }", fields::string, p)?),
         "dwell" => RawAction::Dwell(fields::duration(p, value)?),
         "wait" => {
             let timeout = f.get("timeout").and_then(|v| fields::duration(p, v));
@@ -230,23 +234,37 @@ fn axes(value: Value<'_>, p: &mut Problems<'_>) -> Option<Option<Vec<Spanned<Str
 }
 
 fn targets(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawTarget>> {
+    let named = named(value, "{ x = 50.0 }", fields::number, p)?;
+    let targets = named.into_iter();
+    Some(
+        targets
+            .map(|(axis, value)| RawTarget { axis, value })
+            .collect(),
+    )
+}
+
+/// Axes, and something for each.
+fn named<T>(
+    value: Value<'_>,
+    example: &str,
+    read: impl Fn(&mut Problems<'_>, Value<'_>) -> Option<Spanned<T>>,
+    p: &mut Problems<'_>,
+) -> Option<Vec<(Spanned<String>, Spanned<T>)>> {
     let DeValue::Table(table) = value.get_ref() else {
-        p.add_hint(
-            value.span(),
-            "expected axes and targets",
-            "write `{ x = 50.0 }`",
-        );
+        let hint = format!("write `{example}`");
+        p.add_hint(value.span(), "expected axes and targets", hint);
         return None;
     };
-    let mut targets = Vec::new();
+    let mut all = Vec::new();
     for (key, value) in table {
         let axis = Spanned::new(key.span(), key.get_ref().to_string());
-        targets.extend(fields::number(p, value).map(|value| RawTarget { axis, value }));
+        all.extend(read(p, value).map(|value| (axis, value)));
     }
     if table.is_empty() {
-        p.add_hint(value.span(), "no axis is named", "write `{ x = 50.0 }`");
+        let hint = format!("write `{example}`");
+        p.add_hint(value.span(), "no axis is named", hint);
     }
-    Some(targets)
+    Some(all)
 }
 
 /// `{ io."Input 3" = … }`: by device, then by signal.

@@ -1,0 +1,151 @@
+//! `[device.axis]` as written.
+
+use toml::Spanned;
+
+use super::super::fields::{self, Fields};
+use super::super::problem::{Problems, Span};
+
+#[derive(Debug)]
+pub(crate) struct RawAxis {
+    pub span: Span,
+    pub unit: Option<Spanned<String>>,
+    pub per_turn: Option<Spanned<f64>>,
+    pub encoder: Option<Spanned<f64>>,
+    pub invert: Option<Spanned<bool>>,
+    pub offset: Option<Spanned<f64>>,
+    pub target_window: Option<Spanned<f64>>,
+    pub velocity_unit: Option<Spanned<String>>,
+    pub limits: RawLimits,
+    pub dead_time: Option<Spanned<u64>>,
+    pub loops: RawLoops,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct RawLimits {
+    pub span: Span,
+    pub position: Option<Spanned<[f64; 2]>>,
+    pub velocity: Option<Spanned<f64>>,
+    pub acceleration: Option<Spanned<f64>>,
+    pub jerk: Option<Spanned<f64>>,
+    pub torque: Option<Spanned<f64>>,
+    pub following_error: Option<Spanned<f64>>,
+}
+
+/// What an axis does with its set-point in each mode.
+#[derive(Debug, Default)]
+pub(crate) struct RawLoops {
+    /// Of CSP: to 0x60B1 and 0x60B2.
+    pub velocity_offset: Option<Spanned<f64>>,
+    pub torque_offset: Option<Spanned<f64>>,
+    pub csv: Option<RawVelocityLoop>,
+    pub cst: Option<RawPid>,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawVelocityLoop {
+    pub kv: Option<Spanned<f64>>,
+    pub feed_forward: Option<Spanned<f64>>,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawPid {
+    pub span: Span,
+    pub kp: Option<Spanned<f64>>,
+    pub tn: Option<Spanned<u64>>,
+    pub tv: Option<Spanned<u64>>,
+    pub acceleration: Option<Spanned<f64>>,
+}
+
+pub(super) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAxis {
+    let encoder = f.need("encoder", "encoder = 2000");
+    let limits = f.need(
+        "limits",
+        "limits = { velocity = 200.0, acceleration = 2000.0 }",
+    );
+    let mut axis = RawAxis {
+        span: span.clone(),
+        unit: optional!(p, f, "unit", string),
+        per_turn: optional!(p, f, "per_turn", number),
+        encoder: encoder.and_then(|v| fields::number(p, v)),
+        invert: optional!(p, f, "invert", boolean),
+        offset: optional!(p, f, "offset", number),
+        target_window: optional!(p, f, "target_window", number),
+        velocity_unit: optional!(p, f, "velocity_unit", string),
+        limits: RawLimits::default(),
+        dead_time: optional!(p, f, "dead_time", duration),
+        loops: RawLoops::default(),
+    };
+    if let Some(value) = limits
+        && let Some(mut f) = fields::table(p, value, "`limits`")
+    {
+        let position = f.get("position").and_then(|v| {
+            let ends = fields::array(p, v, "a list of two positions")?;
+            let [low, high] = ends.as_slice() else {
+                p.add_hint(
+                    v.span(),
+                    "a range has two ends",
+                    "write `position = [-50.0, 50.0]`",
+                );
+                return None;
+            };
+            let range = [fields::number(p, low), fields::number(p, high)];
+            let [Some(low), Some(high)] = range else {
+                return None;
+            };
+            Some(Spanned::new(
+                v.span(),
+                [low.into_inner(), high.into_inner()],
+            ))
+        });
+        let velocity = f.need("velocity", "velocity = 200.0");
+        let acceleration = f.need("acceleration", "acceleration = 2000.0");
+        axis.limits = RawLimits {
+            span: value.span(),
+            position,
+            velocity: velocity.and_then(|v| fields::number(p, v)),
+            acceleration: acceleration.and_then(|v| fields::number(p, v)),
+            jerk: optional!(p, f, "jerk", number),
+            torque: optional!(p, f, "torque", number),
+            following_error: optional!(p, f, "following_error", number),
+        };
+        f.done(p);
+    }
+    axis.loops = loops(&mut f, p);
+    f.done(p);
+    axis
+}
+
+fn loops(f: &mut Fields<'_>, p: &mut Problems<'_>) -> RawLoops {
+    let mut loops = RawLoops::default();
+    if let Some(value) = f.get("csp")
+        && let Some(mut f) = fields::table(p, value, "`csp`")
+    {
+        loops.velocity_offset = optional!(p, f, "velocity_offset", number);
+        loops.torque_offset = optional!(p, f, "torque_offset", number);
+        f.done(p);
+    }
+    if let Some(value) = f.get("csv")
+        && let Some(mut f) = fields::table(p, value, "`csv`")
+    {
+        let kv = f.need("kv", "kv = 20.0");
+        loops.csv = Some(RawVelocityLoop {
+            kv: kv.and_then(|v| fields::number(p, v)),
+            feed_forward: optional!(p, f, "feed_forward", number),
+        });
+        f.done(p);
+    }
+    if let Some(value) = f.get("cst")
+        && let Some(mut f) = fields::table(p, value, "`cst`")
+    {
+        let kp = f.need("kp", "kp = 10.0");
+        loops.cst = Some(RawPid {
+            span: value.span(),
+            kp: kp.and_then(|v| fields::number(p, v)),
+            tn: optional!(p, f, "tn", duration),
+            tv: optional!(p, f, "tv", duration),
+            acceleration: optional!(p, f, "acceleration", number),
+        });
+        f.done(p);
+    }
+    loops
+}
