@@ -94,6 +94,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         }
         RunError::StepTimeout { .. } => "look at the drive's state and fault; the step waits as long as `bus.enable_timeout`, or as the slowest axis may take to stop".to_owned(),
         RunError::NotSwitched { .. } => "look at 0x6502 (supported drive modes), and at the drive's manual for what the mode needs".to_owned(),
+        RunError::NotHomed { .. } => "check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`".to_owned(),
         RunError::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
         RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),

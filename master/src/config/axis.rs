@@ -1,14 +1,16 @@
 //! One axis: units, limits, and the unit of the drive's velocities.
 
+use ecaxis_axis::cia402::QuickStopOption;
 use ecaxis_axis::{
-    Axis, AxisConfig, ConfigError, FeedForward, LimitError, Limits, Loops, Mode, Modes,
-    PositionPid, Scale, ScaleError, VelocityLoop, VelocityUnit,
+    Axis, AxisConfig, ConfigError, LimitError, Limits, Mode, Modes, Scale, ScaleError, VelocityUnit,
 };
 use ecaxis_esi as esi;
 use toml::Spanned;
 
+mod control;
+
 use super::problem::{Problems, Span, suggestion};
-use super::raw::{RawAxis, RawLimits, RawLoops, RawSdo, SdoValue};
+use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
 use super::units::unit;
 use super::{AxisSetup, VelocityUnitFrom};
 
@@ -32,7 +34,13 @@ pub(crate) fn setup(
         config.target_window = *positive(window, "target_window", shown, p)?;
     }
     config.modes = modes(config.mode, selection);
-    config.loops = loops(&raw.loops, shown, selection, p)?;
+    config.loops = control::loops(&raw.loops, shown, selection, p)?;
+    control::guards(raw, &mut config, shown, p)?;
+    config.quick_stop = quick_stop(sdos, selection);
+    let homing = match &raw.homing {
+        Some(homing) => Some(control::homing(homing, &config, selection, p)?),
+        None => None,
+    };
     if let Some(dead_time) = &raw.dead_time {
         config.dead_time_s = *dead_time.get_ref() as f64 * 1e-9;
     }
@@ -46,7 +54,24 @@ pub(crate) fn setup(
         unit: name?,
         mode,
         velocity_unit_from,
+        homing,
     })
+}
+
+/// 0x605A, as it will be.
+fn quick_stop(sdos: &[RawSdo], selection: Option<&esi::Selection>) -> Option<QuickStopOption> {
+    const QUICK_STOP_OPTION: u16 = 0x605a;
+    let written = sdos.iter().find(|s| s.index == QUICK_STOP_OPTION);
+    if let Some(written) = written {
+        return match written.value.get_ref() {
+            SdoValue::Integer(n) => Some(QuickStopOption(i16::try_from(*n).ok()?)),
+            _ => None,
+        };
+    }
+    let item = selection?.dictionary.item(QUICK_STOP_OPTION, 0)?;
+    let bytes = <[u8; 2]>::try_from(item.default.as_slice()).ok()?;
+    item.has_default
+        .then(|| QuickStopOption(i16::from_le_bytes(bytes)))
 }
 
 /// Those that can be switched to: 0x6060 and its display are in the process data, and the mode's target is.
@@ -58,81 +83,25 @@ fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
     if layout.rx_field(0x6060, 0).is_none() || layout.tx_field(0x6061, 0).is_none() {
         return modes;
     }
-    for (mode, target) in [
-        (Mode::Csp, 0x607a),
-        (Mode::Csv, 0x60ff),
-        (Mode::Cst, 0x6071),
-    ] {
-        if layout.rx_field(target, 0).is_some() {
+    let targets: [(Mode, &[u16]); 5] = [
+        (Mode::Csp, &[0x607a]),
+        (Mode::Csv, &[0x60ff]),
+        (Mode::Cst, &[0x6071]),
+        // The speed of a move is a fraction of the axis' limit, so the drive has to be told.
+        (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084]),
+        (Mode::Pv, &[0x60ff, 0x6083, 0x6084]),
+    ];
+    for (mode, targets) in targets {
+        let mapped = |index: &u16| layout.rx_field(*index, 0).is_some();
+        if targets.iter().all(mapped) {
             modes = modes.with(mode);
         }
     }
-    modes
-}
-
-fn loops(
-    raw: &RawLoops,
-    unit: &str,
-    selection: Option<&esi::Selection>,
-    p: &mut Problems<'_>,
-) -> Option<Loops> {
-    let mut offset = |value: &Option<Spanned<f64>>, index: u16| {
-        let Some(value) = value else { return Some(0.0) };
-        let mapped = selection.is_none_or(|s| s.layout.rx_field(index, 0).is_some());
-        if !mapped {
-            let message =
-                format!("an offset goes into 0x{index:04X}, which is not in the process data");
-            p.add_hint(value.span(), message, "map it with `pdo.rx`");
-        }
-        mapped.then_some(*value.get_ref())
-    };
-    let csp = FeedForward {
-        velocity: offset(&raw.velocity_offset, 0x60b1)?,
-        acceleration: offset(&raw.torque_offset, 0x60b2)?,
-    };
-    let csv = match &raw.csv {
-        Some(csv) => Some(VelocityLoop {
-            kv: *positive(csv.kv.as_ref()?, "csv.kv", "1/s", p)?,
-            feed_forward: part(csv.feed_forward.as_ref(), 1.0, "csv.feed_forward", p)?,
-        }),
-        None => None,
-    };
-    let seconds = |time: &Option<Spanned<u64>>| time.as_ref().map(|t| *t.get_ref() as f64 * 1e-9);
-    let cst = match &raw.cst {
-        Some(cst) => Some(PositionPid {
-            kp: *positive(cst.kp.as_ref()?, "cst.kp", &format!("% per {unit}"), p)?,
-            tn_s: seconds(&cst.tn),
-            tv_s: seconds(&cst.tv).unwrap_or(0.0),
-            acceleration: cst.acceleration.as_ref().map_or(0.0, |a| *a.get_ref()),
-        }),
-        None => None,
-    };
-    Some(Loops { csp, csv, cst })
-}
-
-/// A weight from 0 to 1.
-fn part(
-    value: Option<&Spanned<f64>>,
-    default: f64,
-    what: &str,
-    p: &mut Problems<'_>,
-) -> Option<f64> {
-    let Some(value) = value else {
-        return Some(default);
-    };
-    let n = *value.get_ref();
-    if (0.0..=1.0).contains(&n) {
-        return Some(n);
-    }
-    p.add(
-        value.span(),
-        format!("`{what}` is {n}, but it is a weight from 0 to 1"),
-    );
-    None
+    modes.with(Mode::Hm)
 }
 
 /// `unit` may be empty.
-fn positive<'v>(
+pub(super) fn positive<'v>(
     value: &'v Spanned<f64>,
     what: &str,
     unit: &str,

@@ -10,6 +10,7 @@ impl Machine {
             Action::Enable { axes } => format!("enable {}", self.names(axes)),
             Action::Disable { axes } => format!("disable {}", self.names(axes)),
             Action::Reset { axes } => format!("reset the faults of {}", self.names(axes)),
+            Action::Home { axes } => format!("find home with {}", self.names(axes)),
             Action::Stop { axes } => format!("stop {}", self.names(axes)),
             Action::Move {
                 relative,

@@ -178,7 +178,7 @@ pub(crate) fn check(
     let mode = mode(&raw, p);
     let file = files.file(&raw, p);
     let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
-    let chosen = match (&file, device, mode, &files.cycle) {
+    let mut chosen = match (&file, device, mode, &files.cycle) {
         (Some((_, file)), Some(device), Ok(mode), Some((cycle_ns, cycle))) => {
             let wanted = Wanted {
                 raw: &raw,
@@ -195,6 +195,13 @@ pub(crate) fn check(
         (Some(axis), Ok(Some(mode))) => Some(axis::setup(axis, &raw.sdo, mode, chosen.as_ref(), p)),
         _ => None,
     };
+    if let (Some(chosen), Some(Some(homing))) = (
+        chosen.as_mut(),
+        axis.as_ref()
+            .map(|a| a.as_ref().and_then(|a| a.homing.as_ref())),
+    ) {
+        homing.add_to(&mut chosen.startup);
+    }
     let sim = raw.sim.take().map(|raw| sim::check(raw, names, device, p));
     let device = device.map(|d| Arc::new(d.clone()));
     let (esi_path, file) = file?;

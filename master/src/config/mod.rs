@@ -155,6 +155,28 @@ pub struct AxisSetup {
     pub unit: String,
     pub mode: esi::Mode,
     pub velocity_unit_from: VelocityUnitFrom,
+    pub homing: Option<HomingSetup>,
+}
+
+/// How an axis finds home.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HomingSetup {
+    pub homing: ecaxis_axis::homing::Homing,
+    /// The same as SDOs.
+    pub startup: Vec<esi::StartupSdo>,
+    /// For the whole search.
+    pub timeout_ns: u64,
+}
+
+impl HomingSetup {
+    /// With the others before SafeOp, after what the ESI asks for.
+    fn add_to(&self, startup: &mut Vec<esi::StartupSdo>) {
+        let at = startup
+            .iter()
+            .position(|sdo| sdo.transition == "SO")
+            .unwrap_or(startup.len());
+        startup.splice(at..at, self.startup.iter().cloned());
+    }
 }
 
 /// What says in which unit the drive has its velocities.
@@ -193,6 +215,10 @@ pub enum Action {
     },
     /// Acknowledge trips and reset drive faults.
     Reset {
+        axes: Vec<usize>,
+    },
+    /// Homing by the drive.
+    Home {
         axes: Vec<usize>,
     },
     /// Decelerate and hold.

@@ -102,6 +102,7 @@ impl Checker<'_> {
             RawAction::Reset(axes) => Action::Reset {
                 axes: self.axes(axes, p)?,
             },
+            RawAction::Home(axes) => self.home(axes, p)?,
             RawAction::Stop(axes) => Action::Stop {
                 axes: self.axes(axes, p)?,
             },
@@ -180,6 +181,33 @@ impl Checker<'_> {
         })
     }
 
+    fn home(&self, names: Option<Vec<Spanned<String>>>, p: &mut Problems<'_>) -> Option<Action> {
+        let homes = |index: &usize| {
+            let axis = self.devices[*index].axis.ok();
+            axis.is_some_and(|axis| axis.homing.is_some())
+        };
+        let Some(named) = &names else {
+            let all = self.axes(None, p)?;
+            return Some(Action::Home {
+                axes: all.into_iter().filter(homes).collect(),
+            });
+        };
+        let mut ok = true;
+        for name in named {
+            if let Some(index) = self.devices.iter().position(|d| d.name == name.get_ref())
+                && self.devices[index].axis.is_ok()
+                && !homes(&index)
+            {
+                let message = format!("`{}` does not say how it finds home", name.get_ref());
+                let hint = "add `homing = { method = 37 }` to its [device.axis]";
+                p.add_hint(name.span(), message, hint);
+                ok = false;
+            }
+        }
+        let axes = self.axes(names, p)?;
+        ok.then_some(Action::Home { axes })
+    }
+
     fn mode(
         &mut self,
         name: &Spanned<String>,
@@ -187,8 +215,9 @@ impl Checker<'_> {
         p: &mut Problems<'_>,
     ) -> Option<(usize, Mode)> {
         let (index, axis) = self.axis(name, p)?;
-        let offered: Vec<esi::Mode> = [esi::Mode::Csp, esi::Mode::Csv, esi::Mode::Cst]
+        let offered: Vec<esi::Mode> = esi::Mode::ALL
             .into_iter()
+            .filter(|m| *m != esi::Mode::Hm)
             .filter(|m| axis.config.modes.contains(Mode::from_code(m.code())))
             .collect();
         let wanted = offered.iter().find(|m| m.name() == mode.get_ref());
@@ -418,11 +447,12 @@ impl What {
         let position = match mode {
             Mode::Csv => loops.csv.is_some(),
             Mode::Cst => loops.cst.is_some(),
-            _ => true,
+            Mode::Csp | Mode::Pp => true,
+            _ => false,
         };
         match self {
             Self::Position | Self::Way => position,
-            Self::Velocity => position || mode == Mode::Csv,
+            Self::Velocity => position && mode != Mode::Pp || matches!(mode, Mode::Csv | Mode::Pv),
             Self::Torque => mode == Mode::Cst,
         }
     }

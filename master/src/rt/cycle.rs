@@ -64,6 +64,10 @@ impl AxisSlot {
             torque: bits.torque.map(|b| b.get(image) as i16),
             mode_display: bits.mode_display.map(|b| b.get(image) as i8),
             error_code: bits.error_code.map(|b| b.get(image) as u16),
+            touch_probe_status: bits.touch_probe_status.map(|b| b.get(image) as u16),
+            touch_probe_positions: bits
+                .touch_probe_positions
+                .map(|b| b.map(|b| b.get(image) as i32)),
             fresh,
         }
     }
@@ -78,6 +82,19 @@ impl AxisSlot {
             (bits.target_torque, i64::from(outputs.target_torque)),
             (bits.velocity_offset, i64::from(outputs.velocity_offset)),
             (bits.torque_offset, i64::from(outputs.torque_offset)),
+            (bits.profile_velocity, i64::from(outputs.profile_velocity)),
+            (
+                bits.profile_acceleration,
+                i64::from(outputs.profile_acceleration),
+            ),
+            (
+                bits.profile_deceleration,
+                i64::from(outputs.profile_acceleration),
+            ),
+            (
+                bits.touch_probe_function,
+                i64::from(outputs.touch_probe_function),
+            ),
         ] {
             if let Some(to) = to {
                 to.set(image, value);

@@ -118,6 +118,12 @@ pub enum RunError {
         step: StepRef,
         mode: Mode,
     },
+    #[error("{step}: {device}: {error}")]
+    NotHomed {
+        device: DeviceRef,
+        step: StepRef,
+        error: ecaxis_axis::homing::HomingError,
+    },
     #[error("{step}: {condition} did not come within {timeout_ms} ms: it is {value}")]
     WaitTimeout {
         step: StepRef,

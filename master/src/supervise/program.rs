@@ -3,6 +3,7 @@
 use std::future::Future;
 use std::pin::Pin;
 
+use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command};
 
 use super::{Ended, Supervisor};
@@ -140,6 +141,7 @@ impl Supervisor {
                 self.until(step, start, |s, axis| !s.axes[axis].resetting, &axes)
                     .await
             }
+            Action::Home { axes } => self.home(step, start, axes).await,
             Action::Stop { axes } => {
                 let axes = self.places(axes);
                 self.command(axes.iter().map(|&axis| (axis, Command::Stop)))
@@ -194,6 +196,11 @@ impl Supervisor {
                     Some((self.axes.iter().position(|&d| d == device)?, mode))
                 });
                 let targets: Vec<_> = axes.collect();
+                self.settle(
+                    &targets.iter().map(|&(axis, _)| axis).collect::<Vec<_>>(),
+                    start,
+                )
+                .await?;
                 self.command(
                     targets
                         .iter()
@@ -311,6 +318,67 @@ impl Supervisor {
                     state: snapshot.axes[axis].state,
                     timeout_ms: timeout / 1_000_000,
                 });
+            }
+        }
+    }
+
+    /// Until axes whose set-point has come to rest have come to rest themselves; some orders are for standing axes only.
+    async fn settle(&mut self, axes: &[usize], start: Nanos) -> Result<(), RunError> {
+        let begun = clock::now();
+        loop {
+            let snapshot = self.tick().await?;
+            let settling = |&axis: &usize| {
+                let status = &snapshot.axes[axis];
+                status.enabled && !status.moving && !status.at_rest
+            };
+            let waited = clock::now().saturating_sub(begun);
+            if !axes.iter().any(settling) || self.over(start) || waited > SETTLE_TIMEOUT {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Each by its own timeout, which the axis keeps.
+    async fn home(&mut self, step: &Step, start: Nanos, devices: &[usize]) -> Result<(), RunError> {
+        let timeout = |device: &usize| {
+            let axis = self.machine.devices[*device].axis.as_ref();
+            let ns = axis.and_then(|a| a.homing.as_ref()).map(|h| h.timeout_ns);
+            ns.unwrap_or_default() as f64 * 1e-9
+        };
+        let timeouts: Vec<f64> = devices.iter().map(timeout).collect();
+        let axes = self.places(devices);
+        self.settle(&axes, start).await?;
+        let commands = axes.iter().zip(&timeouts);
+        self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
+            .await;
+        loop {
+            let snapshot = self.tick().await?;
+            if self.over(start) {
+                return Ok(());
+            }
+            if snapshot.orders_taken < self.orders_given {
+                continue;
+            }
+            self.refusal(step)?;
+            let mut waiting = false;
+            for &axis in &axes {
+                let status = &snapshot.axes[axis];
+                match status.homing {
+                    HomingStatus::Failed(error) => {
+                        return Err(RunError::NotHomed {
+                            device: self.device_of(axis),
+                            step: step.into(),
+                            error,
+                        });
+                    }
+                    HomingStatus::Attained => {
+                        waiting |= status.switching.is_some() || !status.ready;
+                    }
+                    HomingStatus::None | HomingStatus::Running => waiting = true,
+                }
+            }
+            if !waiting {
+                return Ok(());
             }
         }
     }

@@ -17,6 +17,8 @@ const KINDS: &[(&str, &[&str])] = &[
     ("sdo-abort", &["device", "index", "sub", "code"]),
     ("refuse-state", &["device", "state", "code"]),
     ("stuck", &["device", "state"]),
+    ("load", &["device", "torque"]),
+    ("blocked", &["device"]),
     ("identity", &["device", "vendor", "product", "revision"]),
     (
         "swap",
@@ -57,7 +59,7 @@ pub(super) fn check(raw: &RawFault, line: u32) -> Result<Fault, String> {
     })
 }
 
-fn given(raw: &RawFault) -> [(&'static str, bool); 15] {
+fn given(raw: &RawFault) -> [(&'static str, bool); 16] {
     [
         ("device", raw.device.is_some()),
         ("port", raw.port.is_some()),
@@ -74,6 +76,7 @@ fn given(raw: &RawFault) -> [(&'static str, bool); 15] {
         ("revision", raw.revision.is_some()),
         ("serial", raw.serial.is_some()),
         ("alias", raw.alias.is_some()),
+        ("torque", raw.torque.is_some()),
     ]
 }
 
@@ -114,6 +117,14 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
         "stuck" => FaultKind::Stuck {
             state: drive_state(state()?)?,
         },
+        "load" => {
+            let torque = raw.torque.ok_or("`torque` (N·m) is missing")?;
+            if !torque.is_finite() {
+                return Err(format!("`torque` {torque} is not a number of N·m"));
+            }
+            FaultKind::Load { torque }
+        }
+        "blocked" => FaultKind::Blocked,
         "identity" => {
             if raw.vendor.or(raw.product).or(raw.revision).is_none() {
                 return Err("needs `vendor`, `product` or `revision`".into());

@@ -28,6 +28,8 @@
 //! | `sdo-abort` | `device`, `index`, `sub`, `code` | the SDO is aborted |
 //! | `drive-fault` | `device`, `code` | the drive detects this error |
 //! | `stuck` | `device`, `state` | the drive does not leave this CiA 402 state |
+//! | `load` | `device`, `torque` | a torque (N·m) pulls the shaft towards negative positions |
+//! | `blocked` | `device` | the shaft does not turn |
 //! | `emergency` | `device`, `code` | an emergency message, nothing else |
 
 mod frames;
@@ -222,6 +224,8 @@ impl Running {
                     drive.inject_fault(code);
                 }
             }
+            FaultKind::Load { torque } => load(device, torque),
+            FaultKind::Blocked => block(device, true),
             FaultKind::Emergency { code } => device.inject_emergency(code),
             FaultKind::NodeSilent { node } => silence(device, node, true),
             FaultKind::Identity(new) | FaultKind::Swap(new) => {
@@ -238,6 +242,8 @@ impl Running {
     fn end(&self, device: &mut SimDevice) {
         match self.fault.kind {
             FaultKind::Identity(_) | FaultKind::Swap(_) => device.identify(&self.saved),
+            FaultKind::Load { .. } => load(device, 0.0),
+            FaultKind::Blocked => block(device, false),
             FaultKind::NodeSilent { node } => silence(device, node, false),
             _ => {}
         }
@@ -245,6 +251,18 @@ impl Running {
 
     fn replaces(&self) -> Option<usize> {
         matches!(self.fault.kind, FaultKind::Swap(_)).then_some(self.fault.device)
+    }
+}
+
+fn load(device: &mut SimDevice, torque: f64) {
+    if let Some(drive) = device.drive_mut() {
+        drive.set_load_torque(torque);
+    }
+}
+
+fn block(device: &mut SimDevice, blocked: bool) {
+    if let Some(drive) = device.drive_mut() {
+        drive.set_blocked(blocked);
     }
 }
 

@@ -88,6 +88,12 @@ pub enum FaultKind {
     Stuck {
         state: State,
     },
+    /// Pulls the shaft towards negative positions, N·m.
+    Load {
+        torque: f64,
+    },
+    /// The shaft does not turn, whatever the motor does.
+    Blocked,
     /// EEPROM and 0x1018 name another device.
     Identity(NewIdentity),
     /// Without power: its neighbours lose their link, what is behind it or fed by it through the
@@ -166,6 +172,7 @@ pub(super) struct RawFault {
     pub kind: Spanned<String>,
     pub count: Option<u32>,
     pub probability: Option<f64>,
+    pub torque: Option<f64>,
     pub delay: Option<String>,
     pub code: Option<u32>,
     pub index: Option<u16>,

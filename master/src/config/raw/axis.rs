@@ -18,6 +18,47 @@ pub(crate) struct RawAxis {
     pub limits: RawLimits,
     pub dead_time: Option<Spanned<u64>>,
     pub loops: RawLoops,
+    pub brake: RawBrake,
+    pub fault_reset: RawFaultReset,
+    pub supervise: RawSupervision,
+    pub on_trip: Option<Spanned<String>>,
+    pub on_emergency: Option<Spanned<String>>,
+    pub homing: Option<RawHoming>,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct RawBrake {
+    pub release: Option<Spanned<u64>>,
+    pub engage: Option<Spanned<u64>>,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct RawFaultReset {
+    pub tries: Option<Spanned<u8>>,
+    pub delay: Option<Spanned<u64>>,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct RawSupervision {
+    pub torque: Option<Spanned<f64>>,
+    pub torque_time: Option<Spanned<u64>>,
+    pub acceleration: Option<Spanned<f64>>,
+    pub standstill: Option<Spanned<f64>>,
+    pub standstill_time: Option<Spanned<u64>>,
+    pub target_time: Option<Spanned<u64>>,
+}
+
+#[derive(Debug)]
+pub(crate) struct RawHoming {
+    pub span: Span,
+    pub method: Option<Spanned<i8>>,
+    pub search: Option<Spanned<f64>>,
+    pub zero: Option<Spanned<f64>>,
+    pub acceleration: Option<Spanned<f64>>,
+    pub distance: Option<Spanned<f64>>,
+    pub position: Option<Spanned<f64>>,
+    pub threshold: Option<Spanned<u16>>,
+    pub timeout: Option<Spanned<u64>>,
 }
 
 #[derive(Debug, Default)]
@@ -74,6 +115,12 @@ pub(super) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAx
         limits: RawLimits::default(),
         dead_time: optional!(p, f, "dead_time", duration),
         loops: RawLoops::default(),
+        brake: RawBrake::default(),
+        fault_reset: RawFaultReset::default(),
+        supervise: RawSupervision::default(),
+        on_trip: optional!(p, f, "on_trip", string),
+        on_emergency: optional!(p, f, "on_emergency", string),
+        homing: None,
     };
     if let Some(value) = limits
         && let Some(mut f) = fields::table(p, value, "`limits`")
@@ -111,8 +158,63 @@ pub(super) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAx
         f.done(p);
     }
     axis.loops = loops(&mut f, p);
+    guards(&mut f, &mut axis, p);
+    axis.homing = f.get("homing").and_then(|v| homing(v, p));
     f.done(p);
     axis
+}
+
+fn guards(f: &mut Fields<'_>, axis: &mut RawAxis, p: &mut Problems<'_>) {
+    if let Some(value) = f.get("brake")
+        && let Some(mut f) = fields::table(p, value, "`brake`")
+    {
+        axis.brake = RawBrake {
+            release: optional!(p, f, "release", duration),
+            engage: optional!(p, f, "engage", duration),
+        };
+        f.done(p);
+    }
+    if let Some(value) = f.get("fault_reset")
+        && let Some(mut f) = fields::table(p, value, "`fault_reset`")
+    {
+        let tries = f.need("tries", "tries = 3");
+        axis.fault_reset = RawFaultReset {
+            tries: tries.and_then(|v| fields::integer(p, v, 1, 100)),
+            delay: optional!(p, f, "delay", duration),
+        };
+        f.done(p);
+    }
+    if let Some(value) = f.get("supervise")
+        && let Some(mut f) = fields::table(p, value, "`supervise`")
+    {
+        axis.supervise = RawSupervision {
+            torque: optional!(p, f, "torque", number),
+            torque_time: optional!(p, f, "torque_time", duration),
+            acceleration: optional!(p, f, "acceleration", number),
+            standstill: optional!(p, f, "standstill", number),
+            standstill_time: optional!(p, f, "standstill_time", duration),
+            target_time: optional!(p, f, "target_time", duration),
+        };
+        f.done(p);
+    }
+}
+
+fn homing(value: super::Value<'_>, p: &mut Problems<'_>) -> Option<RawHoming> {
+    let mut f = fields::table(p, value, "`homing`")?;
+    let method = f.need("method", "method = 37");
+    let homing = RawHoming {
+        span: value.span(),
+        method: method.and_then(|v| fields::integer(p, v, i8::MIN, i8::MAX)),
+        search: optional!(p, f, "search", number),
+        zero: optional!(p, f, "zero", number),
+        acceleration: optional!(p, f, "acceleration", number),
+        distance: optional!(p, f, "distance", number),
+        position: optional!(p, f, "position", number),
+        threshold: optional!(p, f, "threshold", integer(1, u16::MAX)),
+        timeout: optional!(p, f, "timeout", duration),
+    };
+    f.done(p);
+    Some(homing)
 }
 
 fn loops(f: &mut Fields<'_>, p: &mut Problems<'_>) -> RawLoops {

@@ -22,7 +22,7 @@ macro_rules! optional {
 mod axis;
 mod step;
 
-pub(crate) use axis::{RawAxis, RawLimits, RawLoops};
+pub(crate) use axis::{RawAxis, RawHoming, RawLimits, RawLoops};
 pub(crate) use step::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
 
 #[derive(Debug, Default)]

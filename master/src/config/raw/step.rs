@@ -41,6 +41,7 @@ pub(crate) enum RawAction {
     Disable(Option<Vec<Spanned<String>>>),
     Reset(Option<Vec<Spanned<String>>>),
     Stop(Option<Vec<Spanned<String>>>),
+    Home(Option<Vec<Spanned<String>>>),
     Move {
         relative: bool,
         targets: Vec<RawTarget>,
@@ -70,11 +71,12 @@ pub(crate) enum RawAction {
 }
 
 /// Each with an example; the first key of a step that is one of these says what the step is.
-const VERBS: [(&str, &str); 13] = [
+const VERBS: [(&str, &str); 14] = [
     ("enable", "enable = [\"x\"]"),
     ("disable", "disable = true"),
     ("reset", "reset = [\"x\"]"),
     ("stop", "stop = [\"x\"]"),
+    ("home", "home = [\"x\"]"),
     ("move", "move = { x = 50.0 }"),
     ("move_by", "move_by = { x = -5.0 }"),
     ("velocity", "velocity = { v = 100.0 }"),
@@ -148,6 +150,7 @@ fn action(
         "disable" => RawAction::Disable(axes(value, p)?),
         "reset" => RawAction::Reset(axes(value, p)?),
         "stop" => RawAction::Stop(axes(value, p)?),
+        "home" => RawAction::Home(axes(value, p)?),
         "move" | "move_by" => {
             let (speed, ramp) = (number("speed"), number("ramp"));
             RawAction::Move {
