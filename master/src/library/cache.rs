@@ -1,17 +1,20 @@
 //! The index of a library from one start to the next. A file counts as unchanged while its length and its time of
-//! change are; the cache belongs to one version of this program.
+//! change are; the cache belongs to one version of this program, and a checksum keeps a damaged one from being believed.
 
 use std::collections::BTreeMap;
 use std::fs::Metadata;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::time::UNIX_EPOCH;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
 use super::Record;
 
-const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// The number counts on whenever a file may come to another record than before.
+const HEAD: &str = concat!("ecaxis-esi-index ", env!("CARGO_PKG_VERSION"), " 2 ");
+/// A file that was changed so lately may change again within the same tick of the file system's clock.
+const SETTLED: Duration = Duration::from_secs(2);
 
 /// A file as it was when it was read.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -34,35 +37,49 @@ impl Stamp {
     }
 }
 
-pub(super) type Index = BTreeMap<Stamp, Record>;
-
-#[derive(Serialize, Deserialize)]
-struct Stored {
-    version: String,
-    files: Vec<(Stamp, Record)>,
+impl Stamp {
+    /// Whether another change is sure to give another stamp.
+    pub fn is_settled(&self) -> bool {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH);
+        let now = now.map_or(0, |time| time.as_nanos());
+        self.changed != 0 && self.changed.saturating_add(SETTLED.as_nanos()) < now
+    }
 }
 
+/// FNV-1a.
+pub(super) fn hash(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}
+
+pub(super) type Index = BTreeMap<Stamp, Record>;
+
+/// Nothing, where there is no index or it is not to be believed.
 pub(super) fn read(path: &Path) -> Index {
-    let stored = std::fs::read(path).ok();
-    let stored = stored.and_then(|bytes| serde_json::from_slice::<Stored>(&bytes).ok());
-    stored
-        .filter(|stored| stored.version == VERSION)
-        .map(|stored| stored.files.into_iter().collect())
-        .unwrap_or_default()
+    let bytes = std::fs::read(path).unwrap_or_default();
+    checked(&bytes).unwrap_or_default()
+}
+
+fn checked(bytes: &[u8]) -> Option<Index> {
+    let rest = bytes.strip_prefix(HEAD.as_bytes())?;
+    let (sum, body) = rest.split_at_checked(16)?;
+    let body = body.strip_prefix(b"\n")?;
+    if sum != format!("{:016x}", hash(body)).as_bytes() {
+        return None;
+    }
+    let files: Vec<(Stamp, Record)> = serde_json::from_slice(body).ok()?;
+    Some(files.into_iter().collect())
 }
 
 /// Written beside and renamed, so that a reader never sees half of it.
 pub(super) fn write(path: &Path, index: &Index) {
-    let stored = Stored {
-        version: VERSION.to_owned(),
-        files: index
-            .iter()
-            .map(|(stamp, record)| (stamp.clone(), record.clone()))
-            .collect(),
-    };
-    let Ok(bytes) = serde_json::to_vec(&stored) else {
+    let files: Vec<(&Stamp, &Record)> = index.iter().collect();
+    let Ok(body) = serde_json::to_vec(&files) else {
         return;
     };
+    let mut bytes = format!("{HEAD}{:016x}\n", hash(&body)).into_bytes();
+    bytes.extend(body);
     let beside = path.with_extension(format!("{}.tmp", std::process::id()));
     let written = path
         .parent()

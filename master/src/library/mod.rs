@@ -5,6 +5,8 @@
 //! the next, so that only files that changed are read again.
 
 mod cache;
+#[cfg(test)]
+mod tests;
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -136,11 +138,8 @@ pub fn cache_file(folder: &Path) -> Option<PathBuf> {
             PathBuf::from(std::env::var_os("HOME").filter(|home| !home.is_empty())?).join(".cache")
         }
     };
-    // FNV-1a: the name only has to differ from folder to folder, and to stay the same for years.
-    let bytes = absolute.as_os_str().as_encoded_bytes().iter();
-    let hash = bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
-    });
+    // The name only has to differ from folder to folder, and to stay the same for years.
+    let hash = cache::hash(absolute.as_os_str().as_encoded_bytes());
     Some(base.join("ecaxis").join(format!("esi-{hash:016x}.json")))
 }
 
@@ -243,7 +242,9 @@ impl Library {
                 Ok(devices) => entries.extend(devices.iter().cloned()),
                 Err(problem) => unusable.push((file.path.clone(), problem.clone())),
             }
-            fresh.insert(file, record);
+            if file.is_settled() {
+                fresh.insert(file, record);
+            }
         }
         entries.sort_by_key(|e| (e.vendor, e.product, e.revision));
         if let Some(cache) = cache.filter(|_| read > 0 || known.len() != fresh.len()) {
