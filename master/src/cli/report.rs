@@ -374,8 +374,7 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
             "one module, another module, a third",
             "an_endless_name_without_a_space",
         ]);
-        let expected = "\
-  no  what it takes     name
+        let expected = "  no  what it takes     name
   1   one module,       an_endless_name_
       another module,   without_a_space
       a third";
