@@ -5,6 +5,7 @@ use core::fmt;
 use crate::cia402::{Mode, ModeStatus, State, Statusword, describe};
 use crate::homing::HomingError;
 use crate::probe::ProbeStatus;
+use crate::setpoint::SetpointError;
 
 /// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -191,6 +192,8 @@ pub enum Refused {
     NoPosition { mode: Mode },
     #[error("the axis is just being switched to mode {to}")]
     Switching { to: Mode },
+    #[error(transparent)]
+    Plan(#[from] SetpointError),
     #[error("the brake is still opening")]
     BrakeOpening,
     #[error("no touch probe is mapped (0x60B9)")]

@@ -72,6 +72,7 @@ fn config(dice: &mut Dice) -> AxisConfig {
     };
     AxisConfig {
         loops,
+        jerk_limited: dice.one_in(3),
         mode_time_s: 0.2,
         supervision: Supervision {
             reaction: dice.pick(&[
@@ -120,6 +121,7 @@ fn command(dice: &mut Dice, mode: Mode) -> Command {
         0 => Command::Stop,
         1 if dice.one_in(3) => Command::Disable,
         2 if dice.one_in(3) => Command::QuickStop,
+        2 if dice.one_in(3) => Command::DisableVoltage,
         3 if dice.one_in(4) => Command::EmergencyStop,
         4..=6 => Command::SetMode(dice.pick(&MODES)),
         7 | 8 => Command::Home {
@@ -182,7 +184,9 @@ impl Checker {
         match command {
             Command::Enable if taken => (self.asked, self.ending) = (true, false),
             Command::Disable => self.ending = true,
-            Command::QuickStop | Command::EmergencyStop => self.asked = false,
+            Command::QuickStop | Command::EmergencyStop | Command::DisableVoltage => {
+                self.asked = false;
+            }
             _ => {}
         }
     }

@@ -543,3 +543,80 @@ fn loops_that_cannot_work() {
         ));
     }
 }
+
+/// In every mode with a position loop, redirected and stopped under way: velocity, acceleration and jerk stay within limits.
+#[test]
+fn jerk_limited_moves() {
+    const JERK: f64 = 2000.0;
+    for mode in CYCLIC {
+        let limits = Limits {
+            jerk: Some(JERK),
+            position: Some([-50.0, 50.0]),
+            ..SLOW
+        };
+        let config = AxisConfig {
+            jerk_limited: true,
+            ..looped(mode, limits)
+        };
+        let mut rig = enabled(config);
+        let mut before = rig.axis.status();
+        let mut watch = |rig: &mut Rig, cycles: u32| {
+            let mut steepest = 0.0f64;
+            for _ in 0..cycles {
+                let status = rig.cycle();
+                let jerk = (status.target_acceleration - before.target_acceleration) / DT;
+                assert!(jerk.abs() <= JERK * (1.0 + 1e-5), "{mode}: {jerk}");
+                assert!(status.target_acceleration.abs() <= SLOW.acceleration * (1.0 + 1e-6));
+                assert_eq!((status.trip, status.guarded_cycles), (None, 0));
+                steepest = steepest.max(jerk.abs());
+                before = status;
+            }
+            (before, steepest)
+        };
+        rig.axis.command(to(50.0)).unwrap();
+        let (_, steepest) = watch(&mut rig, 800);
+        assert!(steepest > 0.9 * JERK, "uses what it may");
+        rig.axis.command(to(-50.0)).unwrap();
+        watch(&mut rig, 900);
+        rig.axis.command(Command::Stop).unwrap();
+        let (status, _) = watch(&mut rig, 1500);
+        assert!(status.at_rest && !status.moving, "{mode}");
+        rig.axis.command(to(12.5)).unwrap();
+        let (status, _) = watch(&mut rig, 3000);
+        assert!(status.in_target && status.at_rest);
+        assert!(status.final_error_counts.unwrap().abs() <= 1);
+    }
+}
+
+/// Frames that were lost leave it where the drive stands; it goes on from there.
+#[test]
+fn a_jerk_limited_move_with_lost_frames() {
+    let config = AxisConfig {
+        jerk_limited: true,
+        ..looped(Mode::Csp, LIMITS)
+    };
+    let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 100);
+    rig.axis.command(to(50.0)).unwrap();
+    for cycle in 0..3000 {
+        rig.cycle_with(cycle % 300 > 20);
+    }
+    let status = rig.axis.status();
+    assert!(status.in_target && status.trip.is_none());
+    assert_eq!(rig.out.target_position, 20_000);
+}
+
+#[test]
+fn no_voltage_at_once() {
+    let mut rig = enabled(looped(Mode::Csp, SLOW));
+    rig.axis.command(run_at(60.0)).unwrap();
+    rig.run(300);
+    rig.axis.command(Command::DisableVoltage).unwrap();
+    rig.cycle();
+    assert_eq!(rig.out.controlword, 0);
+    let status = rig.until(|s| s.state == State::SwitchOnDisabled, 5);
+    assert_eq!(status.trip, None);
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 20);
+}

@@ -7,7 +7,7 @@ use ecaxis_axis::{Axis, Command, Edge, Inputs, Mode, Probe, Source, State};
 
 const MODES: [Mode; 5] = [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv];
 
-const COMMANDS: [Option<Command>; 16] = [
+const COMMANDS: [Option<Command>; 17] = [
     None,
     Some(Command::Enable),
     Some(Command::Disable),
@@ -15,6 +15,7 @@ const COMMANDS: [Option<Command>; 16] = [
     Some(Command::Stop),
     Some(Command::QuickStop),
     Some(Command::EmergencyStop),
+    Some(Command::DisableVoltage),
     Some(Command::SetMode(Mode::Csp)),
     Some(Command::SetMode(Mode::Cst)),
     Some(Command::SetMode(Mode::Pv)),

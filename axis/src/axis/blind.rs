@@ -6,7 +6,7 @@
 
 use super::{Axis, Control, Plan};
 use crate::cia402::Mode;
-use crate::setpoint::Motion;
+use crate::setpoint::{Goal, Motion, Trapezoid};
 
 /// The drive is never further behind than these and the cycle whose loss was not known yet.
 const RIDE_THROUGH_CYCLES: u32 = 2;
@@ -43,10 +43,24 @@ impl Axis {
         };
         self.motion = self.tracked(velocity);
         self.given.take_over();
-        if let Plan::Move(trapezoid) = self.plan {
-            // It may be nearer to its target now than it could brake gently.
-            let limit = self.config.limits.acceleration;
-            self.plan = Plan::Move(trapezoid.taking_over(self.motion, limit, limit, self.dt_s));
-        }
+        // It may be nearer to its target now than it could brake gently.
+        let limit = self.config.limits.acceleration;
+        let trapezoid = match &self.plan {
+            Plan::Move(trapezoid) => *trapezoid,
+            Plan::Jerk(source) => match source.order().goal {
+                Goal::Position(target) => Trapezoid {
+                    target,
+                    velocity: source.order().limits.velocity,
+                    acceleration: source.order().limits.acceleration,
+                    braking: limit,
+                },
+                Goal::Velocity(_) => {
+                    self.plan = Plan::braking(&self.config, self.mode);
+                    return;
+                }
+            },
+            _ => return,
+        };
+        self.plan = Plan::Move(trapezoid.taking_over(self.motion, limit, limit, self.dt_s));
     }
 }

@@ -5,7 +5,7 @@ use super::{Axis, Control, Plan, Wish};
 use crate::cia402::{Mode, State};
 use crate::probe::{Edge, Probe, Source};
 use crate::profile::Goal;
-use crate::setpoint::{Ramp, Trapezoid};
+use crate::setpoint::{self, Ramp, Trapezoid};
 use crate::status::Refused;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,6 +20,8 @@ pub enum Command {
     Stop,
     /// The drive's own quick stop; it then stays in Quick stop active if its option code says so.
     QuickStop,
+    /// No power at once, without deceleration: the axis coasts, or its brake stops it.
+    DisableVoltage,
     /// The shortest way to no motion: quick stop or no voltage, as configured; no power until it is reset and enabled again.
     EmergencyStop,
     /// Capture the position of the next edge, once.
@@ -90,7 +92,11 @@ impl Axis {
                 Ok(())
             }
             Command::Stop => {
-                self.brake();
+                self.stop();
+                Ok(())
+            }
+            Command::DisableVoltage => {
+                self.cut_power();
                 Ok(())
             }
             Command::EmergencyStop => {
@@ -318,6 +324,13 @@ impl Axis {
                 velocity: limits.velocity * speed,
                 acceleration: limits.acceleration * ramp,
             });
+            return Ok(());
+        }
+        if self.config.jerk_limited {
+            let goal = setpoint::Goal::Position(position);
+            let plan = self.jerk_limited(goal, limits.velocity * speed, ramp)?;
+            self.engage();
+            self.plan = Plan::Jerk(plan);
             return Ok(());
         }
         self.engage();

@@ -18,6 +18,8 @@ pub struct AxisConfig {
     pub target_window: f64,
     /// Steepest change of a commanded torque, percent per second; also how a stop takes torque away.
     pub torque_slope: f64,
+    /// Moves keep the jerk limit, too ([`Limits::jerk`]), and [`super::Command::Stop`] ends them so. Otherwise they are trapezoids.
+    pub jerk_limited: bool,
     pub loops: Loops,
     /// From a set-point's leaving here until a reported position can show it, seconds: the wire both ways, the drive's
     /// interpolation and its lag. Set-point and reported position are compared over this time, in every mode.
@@ -46,6 +48,7 @@ impl AxisConfig {
             limits,
             target_window: window.max(scale.units_of_counts(2.0)),
             torque_slope: limits.torque * 10.0,
+            jerk_limited: false,
             loops: Loops::default(),
             dead_time_s: 0.0,
             mode_time_s: 1.0,

@@ -2,13 +2,20 @@
 
 use super::{Axis, AxisConfig, Control};
 use crate::cia402::{Mode, ModeStatus};
-use crate::setpoint::{Hold, Motion, Ramp, Trapezoid};
+use crate::setpoint::{
+    Goal, Hold, JerkLimited, Motion, MotionLimits, Order, Ramp, Setpoint, SetpointError, Trapezoid,
+};
 use crate::units::UserUnits;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "nothing is allocated in the cycle, and a plan is copied only where a command makes it"
+)]
 pub(super) enum Plan {
     Hold(Hold),
     Move(Trapezoid),
+    Jerk(JerkLimited),
     Velocity(Ramp),
     Torque(Ramp),
     /// The drive's own profile, or homing.
@@ -37,7 +44,9 @@ impl Plan {
     /// Can a mode of this kind carry it out?
     pub(super) fn fits(&self, control: Control) -> bool {
         match self {
-            Self::Hold(_) | Self::Move(_) | Self::Fed => control == Control::Position,
+            Self::Hold(_) | Self::Move(_) | Self::Jerk(_) | Self::Fed => {
+                control == Control::Position
+            }
             Self::Velocity(_) => matches!(control, Control::Position | Control::Velocity),
             Self::Torque(_) | Self::Drive => false,
         }
@@ -99,6 +108,55 @@ impl Axis {
         }
     }
 
+    /// A plan of bounded jerk from here; `part` of the acceleration and the jerk are used unless that would lead too far.
+    pub(super) fn jerk_limited(
+        &self,
+        goal: Goal,
+        velocity: f64,
+        part: f64,
+    ) -> Result<JerkLimited, SetpointError> {
+        let limits = &self.config.limits;
+        let motion = if self.grip() == Control::Torque {
+            self.tracked(self.drift())
+        } else {
+            self.motion
+        };
+        let ceiling = MotionLimits {
+            velocity: limits.velocity,
+            acceleration: limits.acceleration,
+            jerk: limits.jerk(),
+        };
+        let order = Order {
+            goal,
+            limits: MotionLimits {
+                velocity,
+                acceleration: ceiling.acceleration * part,
+                jerk: ceiling.jerk * part,
+            },
+            ceiling,
+            range: limits
+                .position
+                .map(|[low, high]| [low.min(motion.position), high.max(motion.position)]),
+        };
+        match self.plan {
+            Plan::Jerk(ref source) => source.redirect(order, motion, self.dt_s),
+            _ => JerkLimited::new(order, motion, self.dt_s),
+        }
+    }
+
+    /// [`super::Command::Stop`]: a move of bounded jerk ends with bounded jerk.
+    pub(super) fn stop(&mut self) {
+        if let Plan::Jerk(ref source) = self.plan {
+            let limits = source.order().limits;
+            let part = limits.acceleration / self.config.limits.acceleration;
+            if let Ok(stop) = self.jerk_limited(Goal::Velocity(0.0), limits.velocity, part) {
+                self.plan = Plan::Jerk(stop);
+                return;
+            }
+        }
+        self.brake();
+    }
+
     /// To rest, from whatever is going on.
     pub(super) fn brake(&mut self) {
         self.home.abort();
@@ -119,6 +177,7 @@ impl Axis {
         let grip = self.grip();
         match self.plan {
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
+            Plan::Jerk(ref mut source) => self.motion = source.advance(before, dt_s),
             Plan::Move(trapezoid) => self.motion = trapezoid.advance(before, dt_s),
             Plan::Velocity(ramp) => self.motion = self.run(ramp, before, dt_s),
             Plan::Torque(ramp) => {
@@ -197,6 +256,7 @@ impl Axis {
         match self.plan {
             Plan::Hold(hold) => hold.finished(self.motion),
             Plan::Move(trapezoid) => trapezoid.finished(self.motion),
+            Plan::Jerk(ref source) => source.finished(self.motion),
             Plan::Velocity(ramp) => self.motion.velocity == ramp.target,
             Plan::Torque(ramp) => self.given.torque == ramp.target,
             Plan::Drive => self.profile_arrived(),

@@ -52,7 +52,7 @@ impl Axis {
             following_error: self.watch.following_error,
             max_following_error: self.watch.max_following_error,
             final_error_counts: (arrived
-                && (matches!(self.plan, Plan::Move(_)) || goal_position.is_some()))
+                && (matches!(self.plan, Plan::Move(_) | Plan::Jerk(_)) || goal_position.is_some()))
             .then_some(error_counts),
             held_by_range: self.held_by_range,
             guarded_cycles: self.guarded_cycles,
@@ -127,7 +127,7 @@ impl Axis {
                 }
                 _ => true,
             },
-            Plan::Hold(_) | Plan::Move(_) | Plan::Fed => {
+            Plan::Hold(_) | Plan::Move(_) | Plan::Jerk(_) | Plan::Fed => {
                 let error = self.motion.position - self.actual.position();
                 error.abs() <= self.config.target_window
             }

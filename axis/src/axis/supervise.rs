@@ -140,7 +140,7 @@ impl Axis {
         }
     }
 
-    fn cut_power(&mut self) {
+    pub(super) fn cut_power(&mut self) {
         self.wish = Wish::Disabled;
         self.cut = true;
     }
