@@ -105,6 +105,33 @@ fn a_reported_master_is_smoothed() {
     assert!(worst < 0.0025, "{worst}");
 }
 
+/// A master far beyond the follower's range, either way, and back.
+#[test]
+fn stops_at_the_end_of_the_range() {
+    for sign in [1.0, -1.0] {
+        let config = GearConfig {
+            range: Some([-10.0, 10.0]),
+            ..config(sign, Engage::Here)
+        };
+        let mut gear = Gear::new(config, Motion::at(0.0), Motion::at(0.0)).unwrap();
+        let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
+        for cycle in 0..3000 {
+            // To 90 and back at once, with steps of the velocity to catch up with.
+            let master = f64::from((cycle - 1000i32).abs().min(900)) * -0.1 + 90.0;
+            sequence
+                .then(gear.advance(Motion::at(master), sequence.motion, DT))
+                .unwrap();
+            assert!(sequence.motion.position.abs() <= 10.0, "{cycle}");
+            if cycle == 1000 {
+                assert!((sequence.motion.position - 10.0 * sign).abs() < 1e-6);
+                assert!(!gear.engaged());
+            }
+        }
+        assert!(gear.engaged() && sequence.motion.stands_at(0.0));
+        assert!(gear.slips() >= 1);
+    }
+}
+
 #[test]
 fn nonsense_is_refused() {
     let at = Motion::at(0.0);

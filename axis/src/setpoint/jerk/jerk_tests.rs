@@ -174,6 +174,39 @@ fn the_range_is_kept_or_the_order_refused() {
     assert!(JerkLimited::new(order, outside, DT).is_ok());
 }
 
+/// Turning round without standing still takes less room than a gentle stop. The stop must be possible all the same.
+#[test]
+fn a_stop_on_the_way_back_stays_in_the_range() {
+    let motion = Motion {
+        position: 15.0,
+        velocity: 116.0,
+        acceleration: 0.0,
+    };
+    let gentle = MotionLimits {
+        velocity: 180.0,
+        acceleration: 680.0,
+        jerk: 1250.0,
+    };
+    let order = Order {
+        range: Some([-50.0, 50.0]),
+        ..go(0.0, gentle)
+    };
+    let mut source = JerkLimited::new(order, motion, DT).unwrap();
+    let stop = Order {
+        range: order.range,
+        ..Order::within(Goal::Velocity(0.0), *source.used())
+    };
+    let mut watch = Watch::at(motion, LIMITS, DT);
+    for _ in 0..50 {
+        let mut stopping = source.redirect(stop, watch.motion, DT).unwrap();
+        let mut stopped = Watch::at(watch.motion, LIMITS, DT);
+        stopped.check_jerk = false;
+        stopped.finish(&mut stopping).unwrap();
+        assert!(stopped.motion.position <= 50.0);
+        watch.cycle(&mut source).unwrap();
+    }
+}
+
 #[test]
 fn nonsense_is_refused() {
     for value in [f64::NAN, f64::INFINITY, 1e300] {
