@@ -303,6 +303,40 @@ proptest! {
         prop_assert!(watch.motion.stands_at(target));
     }
 
+    /// Sent on by velocities alone, an axis stays in its range, and stops at its end if it is not sent elsewhere.
+    #[test]
+    fn velocities_in_a_range(
+        changes in prop::collection::vec((-1.0..1.0f64, part(), 0u32..600), 1..6), start in -49.0..49.0f64,
+    ) {
+        let mut watch = Watch::at(Motion::at(start), LIMITS, DT);
+        let range = Some([-50.0, 50.0]);
+        let still = Order { range, ..Order::within(Goal::Velocity(0.0), LIMITS) };
+        let mut source = JerkLimited::new(still, Motion::at(start), DT).unwrap();
+        for (part, limits, cycles) in changes {
+            let goal = Goal::Velocity(limits.velocity * part);
+            let order = Order { ceiling: LIMITS, range, ..Order::within(goal, limits) };
+            source = source.redirect(order, watch.motion, DT).unwrap();
+            for _ in 0..cycles {
+                watch.cycle(&mut source)?;
+                prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9, "{source:?}");
+            }
+        }
+        let Goal::Velocity(velocity) = source.order().goal else { unreachable!() };
+        if velocity.abs() > 0.1 {
+            for _ in 0..1_100_000 {
+                watch.cycle(&mut source)?;
+                if source.stopped_by_range() && source.finished(watch.motion) {
+                    break;
+                }
+            }
+            prop_assert!(source.stopped_by_range() && watch.motion.velocity == 0.0, "{source:?}");
+            // Not long before the end of it: one cycle more adds its way, and the stop from what it gains in velocity and acceleration.
+            prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9);
+            let room = 50.0 - watch.motion.position.abs();
+            prop_assert!(room < LIMITS.velocity * 6.0 * DT, "{room} {velocity}");
+        }
+    }
+
     #[test]
     fn velocities(
         changes in prop::collection::vec((-1.0..1.0f64, part(), 0u32..300), 1..6),

@@ -33,8 +33,7 @@ pub struct Order {
     /// The axis' own limits, none below `limits`. Its acceleration and jerk are used where the present motion would otherwise
     /// carry the axis beyond the target or its velocity limit.
     pub ceiling: MotionLimits,
-    /// Positions that may be reached on the way, or by a stop on it. A velocity other than 0 leads out of every range; there only
-    /// the way to the velocity counts.
+    /// Positions that may be reached on the way, or by a stop on it. A velocity is given up for a stop in time to keep it.
     pub range: Option<[f64; 2]>,
 }
 
@@ -66,6 +65,7 @@ pub struct JerkLimited {
     span: [f64; 2],
     total: f64,
     duration: f64,
+    stopped_by_range: bool,
     last: Motion,
 }
 
@@ -99,6 +99,12 @@ impl JerkLimited {
     #[must_use]
     pub const fn used(&self) -> &MotionLimits {
         &self.used
+    }
+
+    /// A velocity was given up for a stop at the end of the range.
+    #[must_use]
+    pub const fn stopped_by_range(&self) -> bool {
+        self.stopped_by_range
     }
 
     /// Seconds from the start to the arrival.
@@ -189,7 +195,12 @@ impl JerkLimited {
                 )]),
             };
             let span = profile.span(start);
-            let outside = leaves(&order, origin, [span, plan::stop_span(start, planned)]);
+            let stop = plan::stop_span(start, planned);
+            let way = match order.goal {
+                Goal::Position(_) => span,
+                Goal::Velocity(_) => stop,
+            };
+            let outside = leaves(&order, origin, [way, stop]);
             chosen = Some((limits, profile, span, outside));
             if outside.is_none() && keeps_to(&order, origin, start, planned.jerk, span) {
                 break;
@@ -210,6 +221,7 @@ impl JerkLimited {
             now: start,
             span,
             total: 0.0,
+            stopped_by_range: false,
             last: motion,
         })
     }
@@ -233,6 +245,35 @@ impl JerkLimited {
             *self = Self {
                 order: self.order,
                 ..resumed
+            };
+        }
+    }
+
+    /// One more cycle at this velocity, and a stop would no longer end inside the range.
+    fn must_stop(&self, motion: Motion, dt_s: f64) -> bool {
+        if matches!(self.order.goal, Goal::Position(_) | Goal::Velocity(0.0)) {
+            return false;
+        }
+        let mut ahead = *self;
+        ahead.pass(dt_s);
+        let stop = plan::stop_span(ahead.now, self.used.scaled(PLANNED));
+        let origin = motion.position - self.now.position;
+        let stop = stop.map(|position| origin + position - motion.position);
+        leaves(&self.order, motion.position, [stop, [0.0, 0.0]]).is_some()
+    }
+
+    fn stop(&mut self, motion: Motion) {
+        let order = Order {
+            goal: Goal::Velocity(0.0),
+            limits: self.used,
+            // What this stop is for; nothing else could refuse it.
+            range: None,
+            ..self.order
+        };
+        if let Ok(stopping) = Self::plan(order, self.now, motion, None) {
+            *self = Self {
+                stopped_by_range: true,
+                ..stopping
             };
         }
     }
@@ -279,6 +320,9 @@ impl Setpoint for JerkLimited {
         }
         if !self.continues(motion) {
             self.resume(motion, dt_s);
+        }
+        if self.order.range.is_some() && self.must_stop(motion, dt_s) {
+            self.stop(motion);
         }
         let (before, had_ended) = (self.now.position, self.ended());
         self.pass(dt_s);
