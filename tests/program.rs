@@ -179,3 +179,73 @@ fn steps_that_take_no_time_let_the_cycle_turn() {
     let (outcome, _) = run(machine(&nothing), options);
     outcome.result.expect("the time limit ends it");
 }
+
+#[test]
+fn lines_gears_tables_and_waves() {
+    let (outcome, heard) = run(load("together.toml"), virtual_time());
+    outcome.result.expect("runs");
+    assert_eq!(steps(&heard).len(), 8);
+    let summary = outcome.summary.expect("the cycle has run");
+    for axis in &summary.axes {
+        assert!(
+            axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+            "{axis:?}"
+        );
+        assert!(axis.target_position.abs() < 1e-6, "{axis:?}");
+    }
+    assert!(
+        summary.machine_seconds < 10.0,
+        "{}",
+        summary.machine_seconds
+    );
+}
+
+/// A line goes on where lost frames have held it up.
+#[test]
+fn lost_frames_hold_a_line_up() {
+    let text =
+        format!("{HEAD}[[step]]\nline = {{ x = 50.0, y = 20.0 }}\n[[step]]\ndwell = \"200ms\"\n");
+    let mut machine = machine(&text);
+    machine.bus.lost_frames = 20;
+    let script: String = (10..20)
+        .map(|n| {
+            format!(
+                "[[fault]]\nkind = \"frame-loss\"\nat = \"{}ms\"\ncount = 4\n",
+                50 * n
+            )
+        })
+        .collect();
+    let (outcome, _) = run(machine, common::faults(&script));
+    outcome.result.expect("rides through");
+    let summary = outcome.summary.expect("the cycle has run");
+    assert!(summary.counters.lost_frames > 3, "{:?}", summary.counters);
+    assert_eq!(summary.axes[0].target_position, 50.0);
+    assert_eq!(summary.axes[1].target_position, 20.0);
+}
+
+#[test]
+fn a_gear_stays_engaged_until_the_follower_is_told_otherwise() {
+    let (result, _, summary) = program(
+        r#"
+[[step]]
+gear = { y = { to = "x", ratio = -0.5, actual = true } }
+[[step]]
+move = { x = 30.0 }
+[[step]]
+dwell = "300ms"
+[[step]]
+stop = ["y"]
+[[step]]
+move = { x = 0.0 }
+[[step]]
+dwell = "300ms"
+"#,
+    );
+    result.expect("runs");
+    assert_eq!(summary.axes[0].target_position, 0.0);
+    assert!(
+        (summary.axes[1].target_position + 15.0).abs() < 0.01,
+        "{:?}",
+        summary.axes[1]
+    );
+}

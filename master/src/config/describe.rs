@@ -23,6 +23,49 @@ impl Machine {
                 percent(*speed),
                 percent(*ramp),
             ),
+            Action::Line {
+                relative,
+                targets,
+                speed,
+                ramp,
+            } => format!(
+                "straight line {} at {} % of the velocity and {} % of the acceleration limits",
+                self.targets(targets, if *relative { "by" } else { "→" }, ""),
+                percent(*speed),
+                percent(*ramp),
+            ),
+            Action::Wave { axis, wave } => format!(
+                "swing {} for {} s",
+                self.names(&[*axis]),
+                rounded(wave.duration_s())
+            ),
+            Action::Table { axis, table } => {
+                let file = self
+                    .tables
+                    .get(*table)
+                    .map(|t| t.path.display().to_string());
+                format!(
+                    "move {} along {}",
+                    self.names(&[*axis]),
+                    file.unwrap_or_default()
+                )
+            }
+            Action::Gear {
+                axis,
+                master,
+                actual,
+                ratio,
+                ..
+            } => format!(
+                "gear {} to {}{} with a ratio of {ratio}",
+                self.names(&[*axis]),
+                if *actual {
+                    "the reported position of "
+                } else {
+                    ""
+                },
+                self.names(&[*master]),
+            ),
             Action::Velocity { targets, ramp } => format!(
                 "turn {} at {} % of the acceleration limit",
                 self.targets(targets, "→", "/s"),
@@ -98,6 +141,10 @@ impl Machine {
         });
         each.collect::<Vec<_>>().join(", ")
     }
+}
+
+fn rounded(x: f64) -> f64 {
+    (x * 1e6).round() / 1e6
 }
 
 /// Of a fraction, without the digits that are only rounding.

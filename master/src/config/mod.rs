@@ -53,6 +53,8 @@ pub struct Machine {
     /// What the steps read, and set.
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
+    /// Set-points by time that the steps play.
+    pub tables: Vec<TableFile>,
     /// How often the steps are run, at least 1.
     pub repeat: u32,
 }
@@ -235,6 +237,38 @@ pub enum Action {
         /// Fraction of each axis' acceleration limit.
         ramp: f64,
     },
+    /// A straight line through the positions of all its axes, jerk-limited; they arrive in the same cycle.
+    Line {
+        relative: bool,
+        targets: Vec<(usize, f64)>,
+        /// Fraction of each axis' velocity limit.
+        speed: f64,
+        /// Fraction of each axis' acceleration and jerk limits.
+        ramp: f64,
+    },
+    /// About where the axis stands.
+    Wave {
+        axis: usize,
+        wave: ecaxis_axis::setpoint::Wave,
+    },
+    /// To the table's first position, then along it.
+    Table {
+        axis: usize,
+        /// Index into [`Machine::tables`].
+        table: usize,
+    },
+    /// One axis follows another from now on; until it is told something else.
+    Gear {
+        axis: usize,
+        master: usize,
+        /// What the master reports instead of its set-point.
+        actual: bool,
+        /// The follower's units per master's unit.
+        ratio: f64,
+        /// The follower's position when the master's is 0; `None`: as it is when the step begins.
+        offset: Option<f64>,
+        smoothing_ns: u64,
+    },
     /// Reach the velocities and go on turning.
     Velocity {
         targets: Vec<(usize, f64)>,
@@ -267,6 +301,13 @@ pub enum Action {
         times: u32,
         steps: Vec<Step>,
     },
+}
+
+/// A table of set-points and the file it comes from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TableFile {
+    pub path: PathBuf,
+    pub table: ecaxis_axis::setpoint::Table,
 }
 
 /// An input and what it must be; every bound that is given holds.

@@ -1,14 +1,23 @@
 //! The program: axes and signals by name, targets within limits.
 
+use std::path::Path;
+
 use toml::Spanned;
 
 use super::axis::too_long;
-use super::problem::{Problems, Span, list, suggestion};
+use super::problem::{Problems, Span, list, suggestion, unreadable};
 use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
-use super::{Action, AxisSetup, Condition, DeviceConfig, Signal, Step, duration, signal};
+use super::{
+    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, TableFile, duration, signal,
+};
 use ecaxis_axis::Mode;
+use ecaxis_axis::setpoint::{
+    Interpolation, Motion, PositionWave, SetpointError, Shape, Table, Wave,
+};
 use ecaxis_esi as esi;
 
+/// How a gear smooths what its master reports, where the step does not say.
+const SMOOTHING_NS: u64 = 10_000_000;
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
 /// How long an input is waited for where the step does not say.
 const WAIT_NS: u64 = 10_000_000_000;
@@ -42,11 +51,22 @@ pub(crate) struct Program {
     pub steps: Vec<Step>,
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
+    pub tables: Vec<TableFile>,
 }
 
-pub(crate) fn check(steps: Vec<RawStep>, devices: &[Known<'_>], p: &mut Problems<'_>) -> Program {
+/// `folder` is what files are relative to.
+pub(crate) fn check(
+    steps: Vec<RawStep>,
+    devices: &[Known<'_>],
+    folder: &Path,
+    cycle_s: f64,
+    p: &mut Problems<'_>,
+) -> Program {
     let mut checker = Checker {
         devices,
+        folder,
+        cycle_s,
+        tables: Vec::new(),
         inputs: Vec::new(),
         outputs: Vec::new(),
         count: 0,
@@ -57,11 +77,15 @@ pub(crate) fn check(steps: Vec<RawStep>, devices: &[Known<'_>], p: &mut Problems
         steps,
         inputs: checker.inputs,
         outputs: checker.outputs,
+        tables: checker.tables,
     }
 }
 
 struct Checker<'c> {
     devices: &'c [Known<'c>],
+    folder: &'c Path,
+    cycle_s: f64,
+    tables: Vec<TableFile>,
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
     count: usize,
@@ -123,6 +147,77 @@ impl Checker<'_> {
                     targets,
                     speed,
                     ramp,
+                }
+            }
+            RawAction::Line {
+                relative,
+                targets,
+                speed,
+                ramp,
+            } => {
+                let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
+                let what = if relative { What::Way } else { What::Position };
+                Action::Line {
+                    relative,
+                    targets: self.targets(targets, what, p)?,
+                    speed: speed?,
+                    ramp: ramp?,
+                }
+            }
+            RawAction::Wave {
+                square,
+                axis,
+                amplitude,
+                frequency,
+                periods,
+            } => self.wave(
+                square,
+                &axis,
+                &amplitude?,
+                &frequency?,
+                *periods?.get_ref(),
+                p,
+            )?,
+            RawAction::Table { axis, file } => self.table(&axis, &file, p)?,
+            RawAction::Gear {
+                axis: name,
+                to,
+                ratio,
+                actual,
+                offset,
+                smoothing,
+            } => {
+                let axis = self.positioned(&name, "gear", p)?.0;
+                let to = to?;
+                let master = self.axis(&to, p)?.0;
+                if axis == master {
+                    p.add(
+                        to.span(),
+                        format!("`{}` cannot follow itself", name.get_ref()),
+                    );
+                    return None;
+                }
+                let ratio = match &ratio {
+                    Some(ratio) if *ratio.get_ref() == 0.0 => {
+                        p.add(ratio.span(), "with a `ratio` of 0 nothing is followed");
+                        return None;
+                    }
+                    Some(ratio) => *ratio.get_ref(),
+                    None => 1.0,
+                };
+                let actual = actual.is_some_and(Spanned::into_inner);
+                Action::Gear {
+                    axis,
+                    master,
+                    actual,
+                    ratio,
+                    offset: offset.map(Spanned::into_inner),
+                    smoothing_ns: match smoothing {
+                        Some(smoothing) => smoothing.into_inner(),
+                        // Reported positions come in whole counts.
+                        None if actual => SMOOTHING_NS,
+                        None => 0,
+                    },
                 }
             }
             RawAction::Velocity { targets, ramp } => {
@@ -238,6 +333,102 @@ impl Checker<'_> {
         let wanted = Mode::from_code(wanted.code());
         self.switched.push((index, wanted));
         Some((index, wanted))
+    }
+
+    /// An axis that follows positions at some time.
+    fn positioned(
+        &self,
+        name: &Spanned<String>,
+        verb: &str,
+        p: &mut Problems<'_>,
+    ) -> Option<(usize, &AxisSetup)> {
+        let (index, axis) = self.axis(name, p)?;
+        if self.ever(index, |mode| {
+            mode != Mode::Pp && What::Position.possible(mode, axis)
+        }) {
+            return Some((index, axis));
+        }
+        let message = format!(
+            "`{verb}` is nothing that `{}` does in mode \"{}\"",
+            name.get_ref(),
+            axis.mode
+        );
+        p.add_hint(name.span(), message, "it needs CSP, or a position loop");
+        None
+    }
+
+    fn wave(
+        &self,
+        square: bool,
+        name: &Spanned<String>,
+        amplitude: &Spanned<f64>,
+        frequency: &Spanned<f64>,
+        periods: u32,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let verb = if square { "square" } else { "sine" };
+        let (index, axis) = self.positioned(name, verb, p)?;
+        let shape = if square { Shape::Square } else { Shape::Sine };
+        let limits = axis.config.limits.motion();
+        let wave = Wave::new(
+            shape,
+            *amplitude.get_ref(),
+            *frequency.get_ref(),
+            periods,
+            self.cycle_s,
+        );
+        let checked = wave.and_then(|wave| {
+            PositionWave::new(wave, Motion::default(), limits, None, self.cycle_s)?;
+            Ok(wave)
+        });
+        match checked {
+            Ok(wave) => Some(Action::Wave { axis: index, wave }),
+            Err(error) => {
+                let at = match error {
+                    SetpointError::TooOften { .. } => frequency.span(),
+                    _ => amplitude.span(),
+                };
+                let hint = "take a smaller amplitude or a lower frequency";
+                p.add_hint(at, error.to_string(), hint);
+                None
+            }
+        }
+    }
+
+    fn table(
+        &mut self,
+        name: &Spanned<String>,
+        file: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let path = self.folder.join(file.get_ref());
+        let text = match std::fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) => {
+                let hint = "paths are relative to the machine file";
+                p.add_hint(file.span(), unreadable(&path, &error), hint);
+                return None;
+            }
+        };
+        let (index, axis) = self.positioned(name, "table", p)?;
+        let limits = &axis.config.limits;
+        let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {
+            table.check(limits.motion(), limits.position, 0.0, self.cycle_s)?;
+            Ok(table)
+        });
+        match table {
+            Ok(table) => {
+                self.tables.push(TableFile { path, table });
+                let table = self.tables.len() - 1;
+                Some(Action::Table { axis: index, table })
+            }
+            Err(error) => {
+                let message = format!("{}, {error}", path.display());
+                let hint = "a row is time in seconds, position, and if you like velocity";
+                p.add_hint(file.span(), message, hint);
+                None
+            }
+        }
     }
 
     /// Whether something is so in a mode that the axis is in at some time.

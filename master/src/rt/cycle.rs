@@ -2,10 +2,12 @@
 
 use std::panic::AssertUnwindSafe;
 
+use ecaxis_axis::setpoint::Table;
 use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, Refused, State};
 
 use super::controller::{self, Controller};
 use super::exchange::{Answer, Exchange, Received};
+use super::feed::{self, Feed, FeedState, Start};
 use super::guard::{Guard, StopCause};
 use super::handover::{Event, ORDERS_A_CYCLE, Order, PhaseStatus, RtEnd, Snapshot};
 use super::image::{AxisBits, SignalBits};
@@ -26,6 +28,7 @@ const SETTLE: Nanos = 100_000_000;
 pub struct AxisSlot {
     pub axis: Axis,
     pub bits: AxisBits,
+    pub feed: Feed,
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
     pub last_enabled: Option<AxisStatus>,
@@ -34,6 +37,8 @@ pub struct AxisSlot {
     ordered: bool,
     /// How long a stopping axis has been at rest.
     rested: Nanos,
+    /// In this cycle.
+    acted: bool,
 }
 
 impl AxisSlot {
@@ -42,17 +47,32 @@ impl AxisSlot {
         Self {
             axis,
             bits,
+            feed: Feed::default(),
             largest_following_error: 0.0,
             last_enabled: None,
             armed: false,
             ordered: false,
             rested: 0,
+            acted: false,
         }
     }
 
     pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {
         self.ordered |= command == Command::Enable;
-        self.axis.command(command)
+        self.axis.command(command)?;
+        // These leave the set-point alone.
+        let aside = matches!(
+            command,
+            Command::Enable
+                | Command::ResetFault
+                | Command::SetMode(_)
+                | Command::ArmProbe { .. }
+                | Command::DisarmProbe { .. }
+        );
+        if !aside {
+            self.feed.end();
+        }
+        Ok(())
     }
 
     fn read(&self, image: &[u8], fresh: bool) -> Inputs {
@@ -134,6 +154,7 @@ pub struct Engine {
     /// Of the last cycle with fresh inputs.
     inputs: Vec<f64>,
     controller: Option<Box<dyn Controller>>,
+    tables: Box<[Table]>,
     finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
@@ -161,6 +182,7 @@ pub struct Parts {
     pub axes: Vec<AxisSlot>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
+    pub tables: Box<[Table]>,
     pub phase: Option<Phase>,
     pub guard: Guard,
     pub end: RtEnd,
@@ -190,6 +212,7 @@ impl Engine {
             inputs: vec![0.0; parts.signals.inputs.len()],
             signals: parts.signals,
             controller: parts.controller,
+            tables: parts.tables,
             finished: false,
             phase: parts.phase,
             phase_error: 0,
@@ -376,6 +399,7 @@ impl Engine {
                     });
                 }
             }
+            Order::Feed { axis, start } => self.begin_feed(axis, start),
             Order::Output { output, value } => {
                 if let Some(signal) = self.signals.outputs.get(output) {
                     signal.set(self.exchange.outputs_mut(), value);
@@ -419,10 +443,11 @@ impl Engine {
             // An axis that does not take a command has no power, or is losing it already.
             if blind {
                 quick_stop(&mut slot.axis);
+                slot.feed.end();
             } else if slot.axis.status().enabled {
-                let _ = slot.axis.command(Command::Stop);
+                let _ = slot.command(Command::Stop);
             } else {
-                let _ = slot.axis.command(Command::Disable);
+                let _ = slot.command(Command::Disable);
             }
         }
         let cycle = self.stats.counters.cycles;
@@ -436,6 +461,7 @@ impl Engine {
         for slot in &mut self.axes {
             let inputs = slot.read(image, fresh);
             slot.axis.observe(&inputs, dt);
+            slot.acted = false;
         }
         if fresh {
             for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
@@ -468,12 +494,51 @@ impl Engine {
         }
     }
 
+    fn begin_feed(&mut self, axis: usize, start: Start) {
+        if self.stopping.is_some() {
+            return;
+        }
+        let master = match start {
+            Start::Gear { master, actual, .. } => self
+                .axes
+                .get(master)
+                .map(|slot| feed::master_motion(&slot.axis.status(), actual)),
+            _ => None,
+        };
+        if let Some(slot) = self.axes.get_mut(axis) {
+            let status = slot.axis.status();
+            slot.feed.begin(start, &status, master);
+        }
+    }
+
+    /// Masters before those that follow them, so that a follower's set-point is of the same cycle.
     fn act(&mut self) {
+        self.act_on(|feed| feed.master().is_none());
+        self.act_on(|feed| feed.master().is_some());
+    }
+
+    fn act_on(&mut self, whose: impl Fn(&Feed) -> bool) {
+        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
         let out_of_patience = self.stopping.is_some_and(|(_, since)| {
             self.next.saturating_sub(since) > self.timing.stop_patience_ns
         });
         let mut cause = None;
-        for (index, slot) in self.axes.iter_mut().enumerate() {
+        for index in 0..self.axes.len() {
+            let Some(slot) = self.axes.get(index) else {
+                continue;
+            };
+            if slot.acted || !whose(&slot.feed) {
+                continue;
+            }
+            let master = slot.feed.master().and_then(|(master, actual)| {
+                let status = self.axes.get(master)?.axis.status();
+                Some(feed::master_motion(&status, actual))
+            });
+            let Some(slot) = self.axes.get_mut(index) else {
+                continue;
+            };
+            slot.acted = true;
+            slot.feed.give(&mut slot.axis, &self.tables, master, dt_s);
             let outputs = slot.axis.act();
             slot.write(self.exchange.outputs_mut(), &outputs);
             let status = slot.axis.status();
@@ -522,6 +587,9 @@ impl Engine {
         snapshot.al_status = self.answer.al_status;
         for (to, slot) in snapshot.axes.iter_mut().zip(&self.axes) {
             *to = slot.axis.status();
+        }
+        for (to, slot) in snapshot.feeds.iter_mut().zip(&self.axes) {
+            *to = slot.feed.state();
         }
         snapshot.finished = self.finished;
         snapshot.inputs.copy_from_slice(&self.inputs);
@@ -583,6 +651,7 @@ pub fn first_snapshot(axes: &[AxisSlot], signals: &Signals, devices: usize) -> S
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
+        feeds: vec![FeedState::None; axes.len()],
         inputs: vec![0.0; signals.inputs.len()],
         finished: false,
         diagnoses: vec![super::exchange::Diagnosis::default(); devices],

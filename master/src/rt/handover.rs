@@ -3,6 +3,7 @@
 use ecaxis_axis::{AxisStatus, Command, Refused};
 
 use super::exchange::Diagnosis;
+use super::feed::{FeedState, Start};
 use super::guard::StopCause;
 use super::stats::Counters;
 use crate::clock::Nanos;
@@ -16,10 +17,19 @@ const EVENTS: usize = 256;
 
 /// To the cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a box would have to be freed in the cycle"
+)]
 pub enum Order {
     Axis {
         axis: usize,
         command: Command,
+    },
+    /// What an axis is to follow.
+    Feed {
+        axis: usize,
+        start: Start,
     },
     /// An output that no axis drives; an index into [`super::cycle::Signals::outputs`].
     Output {
@@ -71,6 +81,7 @@ pub struct Snapshot {
     pub inputs_fresh: bool,
     pub al_status: Option<(u8, u16)>,
     pub axes: Vec<AxisStatus>,
+    pub feeds: Vec<FeedState>,
     /// What the program reads, in the order of [`super::cycle::Signals::inputs`]; of the last cycle with fresh inputs.
     pub inputs: Vec<f64>,
     /// The controller's work is done.

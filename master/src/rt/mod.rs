@@ -5,6 +5,7 @@
 //! - [`exchange`]: the frames of a cycle, built once and refilled;
 //! - [`phase`]: keeps the release of frames in phase with SYNC0;
 //! - [`guard`]: how many bad cycles the machine rides through;
+//! - [`feed`]: set-points from lines, tables, other axes;
 //! - [`stats`]: bounded histograms and counters;
 //! - [`handover`]: the queues to and from everybody else;
 //! - [`controller`]: a user's own code in the cycle;
@@ -25,6 +26,7 @@
 pub mod controller;
 pub mod cycle;
 pub mod exchange;
+pub mod feed;
 pub mod guard;
 pub mod handover;
 pub mod image;

@@ -199,6 +199,7 @@ pub fn prepare(
                 axes: slots,
                 signals,
                 controller,
+                tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
                 phase: bus.dc.as_ref().map(Phase::new),
                 guard: Guard::new(
                     machine.bus.lost_frames,

@@ -23,6 +23,7 @@ use crate::wire::Datagrams;
 
 pub mod executor;
 mod faults;
+mod follow;
 mod program;
 
 /// Cycles are looked at this often.

@@ -3,17 +3,19 @@
 use std::future::Future;
 use std::pin::Pin;
 
+use ecaxis_axis::setpoint::{Engage, GearConfig};
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command};
 
 use super::{Ended, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, Condition, Step};
+use crate::rt::feed::{FeedState, Start};
 use crate::rt::handover::{Order, Snapshot};
 use crate::session::{Progress, RunError, StepRef};
 
 /// How long an axis may take to follow once its set-point has arrived.
-const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
+pub(super) const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
 
 /// Whether the program itself says when axes are enabled.
 pub(super) fn enables(steps: &[Step]) -> bool {
@@ -72,7 +74,7 @@ impl Supervisor {
         Ok(())
     }
 
-    fn over(&self, start: Nanos) -> bool {
+    pub(super) fn over(&self, start: Nanos) -> bool {
         self.limit
             .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
     }
@@ -175,6 +177,47 @@ impl Supervisor {
                 })
                 .await
             }
+            Action::Line {
+                relative,
+                targets,
+                speed,
+                ramp,
+            } => {
+                self.line(step, start, *relative, targets, [*speed, *ramp])
+                    .await
+            }
+            Action::Wave { axis, wave } => self.wave(step, start, *axis, *wave).await,
+            Action::Table { axis, table } => self.play(step, start, *axis, *table).await,
+            Action::Gear {
+                axis,
+                master,
+                actual,
+                ratio,
+                offset,
+                smoothing_ns,
+            } => {
+                let config = GearConfig {
+                    ratio: *ratio,
+                    engage: offset.map_or(Engage::Here, |offset| Engage::At { offset }),
+                    smoothing_s: *smoothing_ns as f64 * 1e-9,
+                    limits: self.limits(*axis).motion(),
+                    range: self.limits(*axis).position,
+                };
+                let start_with = |places: &[usize]| match *places {
+                    [axis, master] => Some((
+                        axis,
+                        Start::Gear {
+                            master,
+                            actual: *actual,
+                            config,
+                        },
+                    )),
+                    _ => None,
+                };
+                let feed = start_with(&self.places(&[*axis, *master]));
+                let feeds: Vec<_> = feed.into_iter().collect();
+                self.follow(step, start, &feeds, FeedState::Engaged).await
+            }
             Action::Velocity { targets, ramp } => {
                 let targets = self.targets(targets);
                 self.reach(step, start, &targets, |velocity| Command::Velocity {
@@ -242,14 +285,14 @@ impl Supervisor {
     }
 
     /// Places in the cycle of axes given as devices.
-    fn places(&self, devices: &[usize]) -> Vec<usize> {
+    pub(super) fn places(&self, devices: &[usize]) -> Vec<usize> {
         let places = devices
             .iter()
             .filter_map(|device| self.axes.iter().position(|d| d == device));
         places.collect()
     }
 
-    fn targets(&self, targets: &[(usize, f64)]) -> Vec<(usize, f64)> {
+    pub(super) fn targets(&self, targets: &[(usize, f64)]) -> Vec<(usize, f64)> {
         let places = targets.iter().filter_map(|&(device, target)| {
             Some((self.axes.iter().position(|&d| d == device)?, target))
         });
@@ -268,7 +311,7 @@ impl Supervisor {
         Ok(())
     }
 
-    fn refusal(&mut self, step: &Step) -> Result<(), RunError> {
+    pub(super) fn refusal(&mut self, step: &Step) -> Result<(), RunError> {
         match self.refused.take() {
             Some((axis, reason)) => Err(RunError::Refused {
                 device: self.device_of(axis),
@@ -323,7 +366,7 @@ impl Supervisor {
     }
 
     /// Until axes whose set-point has come to rest have come to rest themselves; some orders are for standing axes only.
-    async fn settle(&mut self, axes: &[usize], start: Nanos) -> Result<(), RunError> {
+    pub(super) async fn settle(&mut self, axes: &[usize], start: Nanos) -> Result<(), RunError> {
         let begun = clock::now();
         loop {
             let snapshot = self.tick().await?;
@@ -413,7 +456,7 @@ impl Supervisor {
 
     /// Orders every axis to its target and waits until all have arrived; an axis whose set-point has arrived but which
     /// does not follow fails the step.
-    async fn reach(
+    pub(super) async fn reach(
         &mut self,
         step: &Step,
         start: Nanos,

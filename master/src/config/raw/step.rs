@@ -48,6 +48,31 @@ pub(crate) enum RawAction {
         speed: Option<Spanned<f64>>,
         ramp: Option<Spanned<f64>>,
     },
+    Line {
+        relative: bool,
+        targets: Vec<RawTarget>,
+        speed: Option<Spanned<f64>>,
+        ramp: Option<Spanned<f64>>,
+    },
+    Wave {
+        square: bool,
+        axis: Spanned<String>,
+        amplitude: Option<Spanned<f64>>,
+        frequency: Option<Spanned<f64>>,
+        periods: Option<Spanned<u32>>,
+    },
+    Table {
+        axis: Spanned<String>,
+        file: Spanned<String>,
+    },
+    Gear {
+        axis: Spanned<String>,
+        to: Option<Spanned<String>>,
+        ratio: Option<Spanned<f64>>,
+        actual: Option<Spanned<bool>>,
+        offset: Option<Spanned<f64>>,
+        smoothing: Option<Spanned<u64>>,
+    },
     Velocity {
         targets: Vec<RawTarget>,
         ramp: Option<Spanned<f64>>,
@@ -71,7 +96,7 @@ pub(crate) enum RawAction {
 }
 
 /// Each with an example; the first key of a step that is one of these says what the step is.
-const VERBS: [(&str, &str); 14] = [
+const VERBS: [(&str, &str); 20] = [
     ("enable", "enable = [\"x\"]"),
     ("disable", "disable = true"),
     ("reset", "reset = [\"x\"]"),
@@ -79,6 +104,18 @@ const VERBS: [(&str, &str); 14] = [
     ("home", "home = [\"x\"]"),
     ("move", "move = { x = 50.0 }"),
     ("move_by", "move_by = { x = -5.0 }"),
+    ("line", "line = { x = 50.0, y = 20.0 }"),
+    ("line_by", "line_by = { x = 5.0, y = -2.0 }"),
+    (
+        "sine",
+        "sine = { x = { amplitude = 1.0, frequency = 2.0, periods = 5 } }",
+    ),
+    (
+        "square",
+        "square = { x = { amplitude = 1.0, frequency = 0.5, periods = 5 } }",
+    ),
+    ("table", "table = { x = \"points.csv\" }"),
+    ("gear", "gear = { y = { to = \"x\", ratio = 2.0 } }"),
     ("velocity", "velocity = { v = 100.0 }"),
     ("torque", "torque = { t = 10.0 }"),
     ("mode", "mode = { x = \"csv\" }"),
@@ -159,6 +196,57 @@ fn action(
                 speed,
                 ramp,
             }
+        }
+        "line" | "line_by" => {
+            let (speed, ramp) = (number("speed"), number("ramp"));
+            RawAction::Line {
+                relative: verb == "line_by",
+                targets: targets(value, p)?,
+                speed,
+                ramp,
+            }
+        }
+        "sine" | "square" => {
+            let (axis, value) = only(
+                value,
+                "{ x = { amplitude = 1.0, frequency = 2.0, periods = 5 } }",
+                p,
+            )?;
+            let mut f = fields::table(p, value, "a wave")?;
+            let amplitude = f.need("amplitude", "amplitude = 1.0");
+            let frequency = f.need("frequency", "frequency = 2.0");
+            let periods = f.need("periods", "periods = 5");
+            let wave = RawAction::Wave {
+                square: verb == "square",
+                axis,
+                amplitude: amplitude.and_then(|v| fields::number(p, v)),
+                frequency: frequency.and_then(|v| fields::number(p, v)),
+                periods: periods.and_then(|v| fields::integer(p, v, 1, 1_000_000)),
+            };
+            f.done(p);
+            wave
+        }
+        "table" => {
+            let (axis, value) = only(value, "{ x = \"points.csv\" }", p)?;
+            RawAction::Table {
+                axis,
+                file: fields::string(p, value)?,
+            }
+        }
+        "gear" => {
+            let (axis, value) = only(value, "{ y = { to = \"x\", ratio = 2.0 } }", p)?;
+            let mut f = fields::table(p, value, "a gear")?;
+            let to = f.need("to", "to = \"x\"");
+            let gear = RawAction::Gear {
+                axis,
+                to: to.and_then(|v| fields::string(p, v)),
+                ratio: f.get("ratio").and_then(|v| fields::number(p, v)),
+                actual: f.get("actual").and_then(|v| fields::boolean(p, v)),
+                offset: f.get("offset").and_then(|v| fields::number(p, v)),
+                smoothing: f.get("smoothing").and_then(|v| fields::duration(p, v)),
+            };
+            f.done(p);
+            gear
         }
         "velocity" => {
             let ramp = number("ramp");
@@ -244,6 +332,23 @@ fn targets(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawTarget>> {
             .map(|(axis, value)| RawTarget { axis, value })
             .collect(),
     )
+}
+
+/// One axis and something for it.
+fn only<'d>(
+    value: Value<'d>,
+    example: &str,
+    p: &mut Problems<'_>,
+) -> Option<(Spanned<String>, Value<'d>)> {
+    if let DeValue::Table(table) = value.get_ref()
+        && table.len() == 1
+        && let Some((key, inner)) = table.iter().next()
+    {
+        return Some((Spanned::new(key.span(), key.get_ref().to_string()), inner));
+    }
+    let hint = format!("write `{example}`");
+    p.add_hint(value.span(), "expected one axis", hint);
+    None
 }
 
 /// Axes, and something for each.

@@ -1,0 +1,209 @@
+//! Set-points that come from more than the axis itself: a line with other axes, a table, another axis' motion.
+//!
+//! A feed gives its axis one position a cycle, through the same door as a controller of one's own, so the axis' limits judge
+//! each of them. Whatever else an axis is told to do ends its feed.
+
+use ecaxis_axis::group::Along;
+use ecaxis_axis::setpoint::{
+    Gear, GearConfig, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
+};
+use ecaxis_axis::{Axis, AxisStatus, Refused};
+
+/// What an axis is to follow from now on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Start {
+    /// Its part of a straight line.
+    Line(Along),
+    Wave(PositionWave),
+    /// Index of the table among those of the machine.
+    Table {
+        table: usize,
+        playback: Playback,
+    },
+    /// Another axis.
+    Gear {
+        master: usize,
+        /// The master's reported position instead of its set-point.
+        actual: bool,
+        config: GearConfig,
+    },
+}
+
+/// What an axis follows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Source {
+    Line(Along),
+    Wave(PositionWave),
+    Table {
+        table: usize,
+        playback: Playback,
+    },
+    Gear {
+        master: usize,
+        actual: bool,
+        gear: Gear,
+    },
+}
+
+/// Less is no difference between two velocities; a stop by lost frames is more.
+const ROUNDING: f64 = 1e-6;
+
+/// How the last feed of an axis stands.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum FeedState {
+    #[default]
+    None,
+    Running,
+    /// A gear that is where it is to be.
+    Engaged,
+    /// The end is reached.
+    Finished,
+    /// It could not begin: the axis was elsewhere, or in motion.
+    NotBegun(SetpointError),
+    /// The axis did not take a set-point of it, and decelerates.
+    Refused(Refused),
+}
+
+/// The feed of one axis.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Feed {
+    source: Option<Source>,
+    state: FeedState,
+    /// What the source said last.
+    given: Option<Motion>,
+}
+
+/// An axis' set-point.
+#[must_use]
+pub fn commanded(status: &AxisStatus) -> Motion {
+    Motion {
+        position: status.target_position,
+        velocity: status.target_velocity,
+        acceleration: status.target_acceleration,
+    }
+}
+
+/// Where a master is: its set-point, or what it reports.
+#[must_use]
+pub fn master_motion(status: &AxisStatus, actual: bool) -> Motion {
+    if actual {
+        Motion {
+            position: status.position,
+            velocity: status.velocity,
+            acceleration: 0.0,
+        }
+    } else {
+        commanded(status)
+    }
+}
+
+impl Feed {
+    #[must_use]
+    pub fn state(&self) -> FeedState {
+        self.state
+    }
+
+    /// `master` is the motion of the gear's master. RT: O(1).
+    pub fn begin(&mut self, start: Start, axis: &AxisStatus, master: Option<Motion>) {
+        let source = match start {
+            Start::Line(along) => Ok(Source::Line(along)),
+            Start::Wave(wave) => Ok(Source::Wave(wave)),
+            Start::Table { table, playback } => Ok(Source::Table { table, playback }),
+            Start::Gear {
+                master: index,
+                actual,
+                config,
+            } => Gear::new(config, master.unwrap_or_default(), commanded(axis)).map(|gear| {
+                Source::Gear {
+                    master: index,
+                    actual,
+                    gear,
+                }
+            }),
+        };
+        self.given = None;
+        (self.source, self.state) = match source {
+            Ok(source) => (Some(source), FeedState::Running),
+            Err(error) => (None, FeedState::NotBegun(error)),
+        };
+    }
+
+    /// The axis was told to do something else.
+    pub fn end(&mut self) {
+        if self.source.take().is_some() {
+            self.state = FeedState::None;
+        }
+    }
+
+    /// Index of the axis that is followed, and whether what it reports is.
+    #[must_use]
+    pub fn master(&self) -> Option<(usize, bool)> {
+        match self.source {
+            Some(Source::Gear { master, actual, .. }) => Some((master, actual)),
+            _ => None,
+        }
+    }
+
+    /// Where the source left the axis, if it is still there: the axis works the velocity out from positions, which rounds, and the
+    /// source would take that for a disturbance.
+    fn taken(&self, axis: &Axis, dt_s: f64) -> Motion {
+        let now = commanded(&axis.status());
+        let Some(given) = self.given.filter(|given| given.position == now.position) else {
+            return now;
+        };
+        let smallest = axis.config().limits.acceleration * dt_s;
+        if (given.velocity - now.velocity).abs() <= ROUNDING * (given.velocity.abs() + smallest) {
+            given
+        } else {
+            now
+        }
+    }
+
+    /// Gives the axis this cycle's set-point; between its `observe` and `act`. RT: O(1), for a table O(rows in a cycle).
+    pub fn give(&mut self, axis: &mut Axis, tables: &[Table], master: Option<Motion>, dt_s: f64) {
+        let Some(mut source) = self.source else {
+            return;
+        };
+        let before = self.taken(axis, dt_s);
+        let (next, finished, state) = match &mut source {
+            Source::Line(along) => {
+                let next = along.advance(before, dt_s);
+                (next, along.finished(next), FeedState::Running)
+            }
+            Source::Wave(wave) => {
+                let next = wave.advance(before, dt_s);
+                (next, wave.finished(next), FeedState::Running)
+            }
+            Source::Table { table, playback } => match tables.get(*table) {
+                Some(table) => {
+                    let next = playback.advance(table, before, dt_s);
+                    (next, playback.finished(next), FeedState::Running)
+                }
+                None => (before, true, FeedState::Running),
+            },
+            Source::Gear { gear, .. } => {
+                let next = gear.advance(master.unwrap_or_default(), before, dt_s);
+                let state = if gear.engaged() {
+                    FeedState::Engaged
+                } else {
+                    FeedState::Running
+                };
+                (next, false, state)
+            }
+        };
+        match axis.set_point(next.position) {
+            Ok(()) if finished => (self.source, self.state) = (None, FeedState::Finished),
+            Ok(()) => {
+                (self.source, self.state) = (Some(source), state);
+                self.given = Some(next);
+            }
+            // The axis waits; so does what it follows.
+            Err(Refused::FramesLost) => {}
+            Err(reason) => (self.source, self.state) = (None, FeedState::Refused(reason)),
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "feed_tests.rs"]
+mod tests;

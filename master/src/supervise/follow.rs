@@ -1,0 +1,198 @@
+//! Steps in which axes follow more than a target of their own: lines, waves, tables, other axes.
+
+use ecaxis_axis::group::{Line, LineAxis};
+use ecaxis_axis::setpoint::{MotionLimits, Playback, PositionWave, SetpointError, Wave};
+use ecaxis_axis::{Command, Limits};
+
+use super::Supervisor;
+use super::program::SETTLE_TIMEOUT;
+use crate::clock::{self, Nanos};
+use crate::config::Step;
+use crate::rt::feed::{FeedState, Start, commanded};
+use crate::rt::handover::Order;
+use crate::session::RunError;
+
+/// No step is worth more than this part of an axis' limits: products of f64s are rounded.
+const WHOLE: f64 = 1.0 - 1e-9;
+
+impl Supervisor {
+    /// Of the axis of a device.
+    pub(super) fn limits(&self, device: usize) -> Limits {
+        let axis = self.machine.devices[device].axis.as_ref();
+        // Steps name only devices with an axis.
+        axis.map_or(
+            Limits {
+                position: None,
+                velocity: 0.0,
+                acceleration: 0.0,
+                jerk: None,
+                torque: 0.0,
+                following_error: None,
+            },
+            |axis| axis.config.limits,
+        )
+    }
+
+    fn cannot(&self, step: &Step, axis: usize, error: &SetpointError) -> RunError {
+        RunError::Refused {
+            device: self.device_of(axis),
+            step: step.into(),
+            reason: error.to_string(),
+        }
+    }
+
+    /// `part`: of the velocity, and of the acceleration and jerk limits.
+    pub(super) async fn line(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        relative: bool,
+        targets: &[(usize, f64)],
+        part: [f64; 2],
+    ) -> Result<(), RunError> {
+        let [speed, ramp] = part.map(|part| part * WHOLE);
+        let places = self.targets(targets);
+        let axes: Vec<usize> = places.iter().map(|&(axis, _)| axis).collect();
+        self.settle(&axes, start).await?;
+        let snapshot = self.tick().await?;
+        let mut line_axes = Vec::with_capacity(axes.len());
+        for (&(axis, target), &(device, _)) in places.iter().zip(targets) {
+            let from = commanded(&snapshot.axes[axis]);
+            let limits = self.limits(device);
+            line_axes.push(LineAxis {
+                from,
+                target: if relative {
+                    from.position + target
+                } else {
+                    target
+                },
+                limits: MotionLimits {
+                    velocity: limits.velocity * speed,
+                    acceleration: limits.acceleration * ramp,
+                    jerk: limits.jerk() * ramp,
+                },
+                range: limits.position,
+            });
+        }
+        let line = Line::plan(&line_axes)
+            .map_err(|error| self.cannot(step, axes[error.axis], &error.error))?;
+        let feeds = axes.iter().zip(&line_axes);
+        let feeds: Vec<_> = feeds
+            .map(|(&axis, part)| (axis, Start::Line(line.along(part))))
+            .collect();
+        self.follow(step, start, &feeds, FeedState::Finished).await
+    }
+
+    pub(super) async fn wave(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        device: usize,
+        wave: Wave,
+    ) -> Result<(), RunError> {
+        let axes = self.places(&[device]);
+        self.settle(&axes, start).await?;
+        let snapshot = self.tick().await?;
+        let limits = self.limits(device);
+        let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
+        let mut feeds = Vec::new();
+        for axis in axes {
+            let at = commanded(&snapshot.axes[axis]);
+            let wave = PositionWave::new(wave, at, limits.motion(), limits.position, dt_s)
+                .map_err(|error| self.cannot(step, axis, &error))?;
+            feeds.push((axis, Start::Wave(wave)));
+        }
+        self.follow(step, start, &feeds, FeedState::Finished).await
+    }
+
+    /// To the first row first.
+    pub(super) async fn play(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        device: usize,
+        table: usize,
+    ) -> Result<(), RunError> {
+        let axes = self.places(&[device]);
+        let [first, _] = self.machine.tables[table].table.ends();
+        let there: Vec<_> = axes.iter().map(|&axis| (axis, first)).collect();
+        self.reach(step, start, &there, |position| Command::MoveTo {
+            position,
+            speed: 1.0,
+            ramp: 1.0,
+        })
+        .await?;
+        if self.over(start) {
+            return Ok(());
+        }
+        let snapshot = self.tick().await?;
+        let limits = self.limits(device).motion();
+        let mut feeds = Vec::new();
+        for axis in axes {
+            let at = commanded(&snapshot.axes[axis]);
+            let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
+                .map_err(|error| self.cannot(step, axis, &error))?;
+            feeds.push((axis, Start::Table { table, playback }));
+        }
+        self.follow(step, start, &feeds, FeedState::Finished).await
+    }
+
+    /// Begins all feeds in one cycle and waits until each is in the state that ends the step, its axis with it.
+    pub(super) async fn follow(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        feeds: &[(usize, Start)],
+        until: FeedState,
+    ) -> Result<(), RunError> {
+        let orders = feeds
+            .iter()
+            .map(|&(axis, start)| Order::Feed { axis, start });
+        self.orders(&orders.collect::<Vec<_>>()).await;
+        let mut done_since = None;
+        loop {
+            let snapshot = self.tick().await?;
+            if self.over(start) {
+                return Ok(());
+            }
+            if snapshot.orders_taken < self.orders_given {
+                continue;
+            }
+            self.refusal(step)?;
+            let mut done = true;
+            let mut late = None;
+            for &(axis, _) in feeds {
+                match snapshot.feeds[axis] {
+                    FeedState::NotBegun(error) => return Err(self.cannot(step, axis, &error)),
+                    FeedState::Refused(reason) => {
+                        return Err(RunError::Refused {
+                            device: self.device_of(axis),
+                            step: step.into(),
+                            reason: reason.to_string(),
+                        });
+                    }
+                    // Something else has taken the axis over.
+                    FeedState::None => {}
+                    state => done &= state == until,
+                }
+                if until == FeedState::Finished && !snapshot.axes[axis].in_target {
+                    late = Some(axis);
+                }
+            }
+            if !done {
+                done_since = None;
+                continue;
+            }
+            let Some(axis) = late else { return Ok(()) };
+            let since = *done_since.get_or_insert_with(clock::now);
+            if clock::now().saturating_sub(since) > SETTLE_TIMEOUT {
+                return Err(RunError::NotReached {
+                    device: self.device_of(axis),
+                    step: step.into(),
+                    target: snapshot.axes[axis].target_position,
+                    actual: snapshot.axes[axis].position,
+                });
+            }
+        }
+    }
+}
