@@ -11,11 +11,13 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
-use common::{axes, faults, machine};
+use common::{axes, faults, load, machine, virtual_time};
 use ecaxis::clock::Nanos;
+use ecaxis::config::{AxisRef, Machine};
 use ecaxis::link::capture::{Dir, Mode, Recorder};
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
-use ecaxis::rt::cycle::Engine;
+use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::rt::cycle::{Engine, Remains};
 use ecaxis::session::{Options, Prepared, RunError, prepare};
 
 thread_local! {
@@ -115,29 +117,22 @@ fn recording_beside_the_cycle_allocates_nothing() {
     assert_eq!(counted, 0);
 }
 
-#[test]
-fn a_hundred_thousand_cycles_allocate_nothing() {
-    const CYCLES: u64 = 100_000;
-    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"20s\"\ncount = 2\n\
-                  [[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"60s\"\ncode = 0x8611\n";
-    let options = Options {
-        repeat: Some(1_000_000),
-        ..faults(script)
-    };
+type Ended = Option<Result<(), RunError>>;
+
+/// Turns the cycle with the supervisor beside it; what the cycles allocated, what remains, how the supervisor ended.
+fn metered(
+    machine: Machine,
+    options: &Options,
+    controller: Option<Box<dyn Controller>>,
+    cycles: u64,
+) -> (u64, Remains, Ended) {
     options.clock.enter();
     let (progress, _told) = channel();
-    let machine = Arc::new(machine(&axes(3)));
+    let stop = Arc::new(AtomicBool::new(false));
     let Prepared {
         mut parts,
         supervisor,
-    } = prepare(
-        &machine,
-        &options,
-        Arc::new(AtomicBool::new(false)),
-        progress,
-        None,
-    )
-    .expect("comes up");
+    } = prepare(&Arc::new(machine), options, stop, progress, controller).expect("comes up");
     parts.link = Box::new(Unmetered(parts.link));
     let mut engine = Engine::new(parts);
     let mut beside = pin!(supervisor.run());
@@ -145,7 +140,7 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
     let mut result = None;
 
     COUNT.set(0);
-    for _ in 0..CYCLES {
+    for _ in 0..cycles {
         METERED.set(true);
         engine.cycle();
         METERED.set(false);
@@ -155,8 +150,19 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
             result = Some(done);
         }
     }
-    let counted = COUNT.get();
-    let remains = engine.into_remains();
+    (COUNT.get(), engine.into_remains(), result)
+}
+
+#[test]
+fn a_hundred_thousand_cycles_allocate_nothing() {
+    const CYCLES: u64 = 100_000;
+    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"20s\"\ncount = 2\n\
+                  [[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"60s\"\ncode = 0x8611\n";
+    let options = Options {
+        repeat: Some(1_000_000),
+        ..faults(script)
+    };
+    let (counted, remains, result) = metered(machine(&axes(3)), &options, None, CYCLES);
     assert_eq!(remains.stats.counters.cycles, CYCLES);
     assert!(
         remains.stats.counters.lost_frames >= 1,
@@ -175,4 +181,40 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
     );
     assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
     assert_eq!(counted, 0, "allocations in {CYCLES} cycles");
+}
+
+/// Mode switches, homing, profiles, lines, gears, tables, waves, inputs and outputs.
+#[test]
+fn programs_of_every_kind_allocate_nothing() {
+    for file in [
+        "together.toml",
+        "profiles.toml",
+        "loops.toml",
+        "program.toml",
+    ] {
+        let (counted, _, result) = metered(load(file), &virtual_time(), None, 20_000);
+        assert!(matches!(result, Some(Ok(()))), "{file}: {result:?}");
+        assert_eq!(counted, 0, "allocations in {file}");
+    }
+}
+
+struct Swing(AxisRef, f64);
+
+impl Controller for Swing {
+    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+        if machine.axis(self.0).ready {
+            self.1 += machine.dt_s();
+            let _ = machine.set_point(self.0, 5.0 - 5.0 * self.1.cos());
+        }
+    }
+}
+
+#[test]
+fn a_controller_is_called_without_an_allocation() {
+    let machine = load("controller.toml");
+    let x = machine.axis("x").expect("an axis");
+    let controller = Box::new(Swing(x, 0.0));
+    let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
+    assert!(remains.axes[0].axis.status().enabled);
+    assert_eq!(counted, 0);
 }

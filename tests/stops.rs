@@ -323,3 +323,47 @@ fn a_bound_that_nobody_drives_keeps_the_drives_own_value() {
         );
     }
 }
+
+/// An input of the machine file stops everything by the shortest way.
+#[test]
+fn an_emergency_input_stops_all_axes() {
+    let text = axes(2)
+        + r#"
+[[device]]
+name = "io"
+esi = "esi/IO8.xml"
+position = 2
+[stop]
+emergency = { io."Input 2" = true }
+"#;
+    let text = text.replacen(
+        "[[step]]",
+        "[[step]]\nset = { io.\"Output 2\" = true }\n[[step]]\ndwell = \"1s\"\n[[step]]",
+        1,
+    );
+    let (error, summary) = run_badly(machine(&text), virtual_time());
+    assert!(error.contains("emergency stop: io.Input 2 = 1"), "{error}");
+    let summary = summary.expect("the cycle has run");
+    assert!(summary.machine_seconds < 1.0, "{}", summary.machine_seconds);
+    for axis in &summary.axes {
+        assert!(
+            axis.was_enabled && axis.final_state != "Operation enabled",
+            "{axis:?}"
+        );
+    }
+}
+
+#[test]
+fn the_other_axes_stop_as_the_file_says() {
+    let fault = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"1s\"\ncode = 0x2310\n";
+    let mut ways = Vec::new();
+    for way in ["ramp", "quick-stop", "no-power"] {
+        let text = format!("{}\n[stop]\nothers = \"{way}\"\n", axes(2));
+        let (_, summary) = run_badly(machine(&text), faults(fault));
+        let summary = summary.expect("the cycle has run");
+        ways.push(summary.axes[1].final_position);
+        assert_ne!(summary.axes[1].final_state, "Operation enabled");
+    }
+    // A ramp is followed to its end with power; the last position with power is then the farthest.
+    assert!(ways[0] > ways[2] && ways[1] > ways[2] - 1e-9, "{ways:?}");
+}

@@ -100,6 +100,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
         RunError::NotDisabled { .. } => "the drive does not obey its Controlword: take its power away by hand, then look at its fault".to_owned(),
         RunError::Refused { .. } | RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
+        RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
         RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
         RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,

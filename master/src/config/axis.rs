@@ -7,7 +7,7 @@ use ecaxis_axis::{
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-mod control;
+pub(crate) mod control;
 
 use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};

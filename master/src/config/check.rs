@@ -66,7 +66,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         })
         .collect();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
-    let program = steps::check(raw.steps, &known, folder, cycle_s, p);
+    let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, p);
     let devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
     connections.check(&devices, p);
     Some(Machine {
@@ -76,6 +76,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         steps: program.steps,
         inputs: program.inputs,
         outputs: program.outputs,
+        stop: program.stop,
         tables: program.tables,
         repeat: raw.repeat.map_or(1, Spanned::into_inner),
     })

@@ -53,6 +53,7 @@ pub struct Machine {
     /// What the steps read, and set.
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
+    pub stop: StopSetup,
     /// Set-points by time that the steps play.
     pub tables: Vec<TableFile>,
     /// How often the steps are run, at least 1.
@@ -301,6 +302,35 @@ pub enum Action {
         times: u32,
         steps: Vec<Step>,
     },
+}
+
+/// How the machine stops.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct StopSetup {
+    /// Of the other axes when one faults or trips.
+    pub others: StopBy,
+    /// Of all axes when the bus is lost or a SubDevice has left Op: no axis can be led to rest then.
+    pub bus_lost: StopByDrive,
+    /// One of them is enough for an emergency stop.
+    pub emergency: Vec<Condition>,
+}
+
+/// How an axis comes to rest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum StopBy {
+    /// Within its limits, then no power.
+    #[default]
+    Ramp,
+    QuickStop,
+    NoPower,
+}
+
+/// What a drive does by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum StopByDrive {
+    #[default]
+    QuickStop,
+    NoPower,
 }
 
 /// A table of set-points and the file it comes from.

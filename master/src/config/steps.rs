@@ -4,11 +4,13 @@ use std::path::Path;
 
 use toml::Spanned;
 
+use super::axis::control::one_of;
 use super::axis::too_long;
 use super::problem::{Problems, Span, list, suggestion, unreadable};
-use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
+use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawStop, RawTarget};
 use super::{
-    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, TableFile, duration, signal,
+    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopBy, StopByDrive, StopSetup,
+    TableFile, duration, signal,
 };
 use ecaxis_axis::Mode;
 use ecaxis_axis::setpoint::{
@@ -48,6 +50,7 @@ impl<'c> From<&'c DeviceConfig> for Known<'c> {
 /// Steps with the signals that they use.
 #[derive(Debug, Default)]
 pub(crate) struct Program {
+    pub stop: StopSetup,
     pub steps: Vec<Step>,
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
@@ -57,6 +60,7 @@ pub(crate) struct Program {
 /// `folder` is what files are relative to.
 pub(crate) fn check(
     steps: Vec<RawStep>,
+    stop: RawStop,
     devices: &[Known<'_>],
     folder: &Path,
     cycle_s: f64,
@@ -73,7 +77,9 @@ pub(crate) fn check(
         switched: Vec::new(),
     };
     let steps = checker.all(steps, "", p);
+    let stop = checker.stop(&stop, p);
     Program {
+        stop,
         steps,
         inputs: checker.inputs,
         outputs: checker.outputs,
@@ -333,6 +339,28 @@ impl Checker<'_> {
         let wanted = Mode::from_code(wanted.code());
         self.switched.push((index, wanted));
         Some((index, wanted))
+    }
+
+    /// What is wrong in it has been said, and the machine does not run.
+    fn stop(&mut self, raw: &RawStop, p: &mut Problems<'_>) -> StopSetup {
+        let ways = [
+            ("ramp", StopBy::Ramp),
+            ("quick-stop", StopBy::QuickStop),
+            ("no-power", StopBy::NoPower),
+        ];
+        let by_drive = [
+            ("quick-stop", StopByDrive::QuickStop),
+            ("no-power", StopByDrive::NoPower),
+        ];
+        StopSetup {
+            others: one_of(raw.others.as_ref(), &ways, "others", p).unwrap_or_default(),
+            bus_lost: one_of(raw.bus_lost.as_ref(), &by_drive, "bus_lost", p).unwrap_or_default(),
+            emergency: raw
+                .emergency
+                .iter()
+                .filter_map(|condition| self.condition(condition, p))
+                .collect(),
+        }
     }
 
     /// An axis that follows positions at some time.

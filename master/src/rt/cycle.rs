@@ -14,6 +14,7 @@ use super::image::{AxisBits, SignalBits};
 use super::phase::Phase;
 use super::stats::Stats;
 use crate::clock::{self, Clock, Nanos};
+use crate::config::{Condition, StopBy, StopByDrive, StopSetup};
 use crate::link::port::Port;
 use crate::link::{Link, LinkError, MAX_FRAME};
 
@@ -155,6 +156,7 @@ pub struct Engine {
     inputs: Vec<f64>,
     controller: Option<Box<dyn Controller>>,
     tables: Box<[Table]>,
+    stop_setup: StopSetup,
     finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
@@ -183,6 +185,7 @@ pub struct Parts {
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
     pub tables: Box<[Table]>,
+    pub stop: StopSetup,
     pub phase: Option<Phase>,
     pub guard: Guard,
     pub end: RtEnd,
@@ -213,6 +216,7 @@ impl Engine {
             signals: parts.signals,
             controller: parts.controller,
             tables: parts.tables,
+            stop_setup: parts.stop,
             finished: false,
             phase: parts.phase,
             phase_error: 0,
@@ -438,17 +442,34 @@ impl Engine {
             return;
         }
         self.stopping = Some((cause, self.next));
-        let blind = matches!(cause, StopCause::BusLost { .. } | StopCause::LeftOp { .. });
+        let way = match cause {
+            StopCause::BusLost { .. } | StopCause::LeftOp { .. } => {
+                match self.stop_setup.bus_lost {
+                    StopByDrive::QuickStop => StopBy::QuickStop,
+                    StopByDrive::NoPower => StopBy::NoPower,
+                }
+            }
+            StopCause::DriveFault { .. } | StopCause::Trip { .. } => self.stop_setup.others,
+            StopCause::Requested | StopCause::Controller | StopCause::EmergencyStop => StopBy::Ramp,
+        };
         for slot in &mut self.axes {
             // An axis that does not take a command has no power, or is losing it already.
-            if blind {
-                quick_stop(&mut slot.axis);
-                slot.feed.end();
-            } else if slot.axis.status().enabled {
-                let _ = slot.command(Command::Stop);
-            } else {
-                let _ = slot.command(Command::Disable);
+            match way {
+                StopBy::QuickStop => quick_stop(&mut slot.axis),
+                StopBy::NoPower => {
+                    let _ = slot.axis.command(Command::DisableVoltage);
+                }
+                StopBy::Ramp if cause == StopCause::EmergencyStop => {
+                    let _ = slot.axis.command(Command::EmergencyStop);
+                }
+                StopBy::Ramp if slot.axis.status().enabled => {
+                    let _ = slot.axis.command(Command::Stop);
+                }
+                StopBy::Ramp => {
+                    let _ = slot.axis.command(Command::Disable);
+                }
             }
+            slot.feed.end();
         }
         let cycle = self.stats.counters.cycles;
         self.report(Event::Stopping { cycle, cause });
@@ -466,6 +487,11 @@ impl Engine {
         if fresh {
             for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
                 *to = signal.get(image);
+            }
+            let inputs = &self.inputs;
+            let pressed = |c: &Condition| inputs.get(c.input).is_some_and(|n| c.holds(*n));
+            if self.guarding && self.stop_setup.emergency.iter().any(pressed) {
+                self.stop(StopCause::EmergencyStop);
             }
         }
     }

@@ -25,6 +25,8 @@ pub enum StopCause {
         last_wkc: (u16, u16),
         answered: bool,
     },
+    /// A condition of the machine file for it holds.
+    EmergencyStop,
     /// The user's controller panicked.
     Controller,
     /// At least one SubDevice is no longer in Op.

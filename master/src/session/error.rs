@@ -138,6 +138,8 @@ pub enum RunError {
     },
     #[error("{device}: could not be brought to rest and disabled: stays in {state}")]
     NotDisabled { device: DeviceRef, state: State },
+    #[error("emergency stop: {condition}")]
+    EmergencyStop { condition: String },
     #[error("the controller panicked")]
     Controller,
     #[error("interrupted")]

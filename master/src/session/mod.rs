@@ -200,6 +200,7 @@ pub fn prepare(
                 signals,
                 controller,
                 tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
+                stop: machine.stop.clone(),
                 phase: bus.dc.as_ref().map(Phase::new),
                 guard: Guard::new(
                     machine.bus.lost_frames,

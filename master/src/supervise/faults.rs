@@ -17,6 +17,14 @@ impl Supervisor {
         match cause {
             // `tick` asks only for causes that are failures.
             StopCause::Requested => RunError::Interrupted,
+            StopCause::EmergencyStop => {
+                let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
+                let all = &self.machine.stop.emergency;
+                let pressed = all.iter().find(|c| c.holds(value(c.input))).or(all.first());
+                RunError::EmergencyStop {
+                    condition: pressed.map_or(String::new(), |c| self.machine.condition(c)),
+                }
+            }
             StopCause::Controller => RunError::Controller,
             StopCause::DriveFault { axis } => {
                 let code = self.error_code(axis).await;

@@ -139,7 +139,7 @@ pub(super) fn guards(
 }
 
 /// A word of a few, or the default.
-fn one_of<T: Copy + Default>(
+pub(crate) fn one_of<T: Copy + Default>(
     word: Option<&Spanned<String>>,
     all: &[(&str, T)],
     key: &str,

@@ -29,8 +29,17 @@ pub(crate) use step::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
 pub(crate) struct RawMachine {
     pub bus: RawBus,
     pub devices: Vec<RawDevice>,
+    pub stop: RawStop,
     pub steps: Vec<RawStep>,
     pub repeat: Option<Spanned<u32>>,
+}
+
+/// `[stop]`.
+#[derive(Debug, Default)]
+pub(crate) struct RawStop {
+    pub others: Option<Spanned<String>>,
+    pub bus_lost: Option<Spanned<String>>,
+    pub emergency: Vec<RawCondition>,
 }
 
 #[derive(Debug, Default)]
@@ -118,6 +127,19 @@ pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> Raw
             continue;
         };
         machine.devices.push(read_device(fields, span, p));
+    }
+    if let Some(value) = f.get("stop")
+        && let Some(mut f) = fields::table(p, value, "[stop]")
+    {
+        let emergency = f.get("emergency");
+        machine.stop = RawStop {
+            others: optional!(p, f, "others", string),
+            bus_lost: optional!(p, f, "bus_lost", string),
+            emergency: emergency
+                .and_then(|v| step::conditions(v, p))
+                .unwrap_or_default(),
+        };
+        f.done(p);
     }
     let steps = f.get("step");
     for (value, span) in tables(p, steps, "[[step]]") {

@@ -411,7 +411,7 @@ fn level(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<f64>> {
     }
 }
 
-fn conditions(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawCondition>> {
+pub(super) fn conditions(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawCondition>> {
     let mut conditions = Vec::new();
     for (signal, value) in signals(value, p)? {
         let mut condition = RawCondition {
