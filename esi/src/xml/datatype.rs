@@ -6,7 +6,6 @@ use super::cursor::{Cursor, Element};
 use super::object::{self, Flags};
 use super::text::Names;
 use crate::error::EsiError;
-use crate::model::Position;
 
 #[derive(Default)]
 pub(super) struct DataTypes {
@@ -15,7 +14,8 @@ pub(super) struct DataTypes {
 
 #[derive(Default)]
 pub(super) struct DataType {
-    pub position: Position,
+    /// What `Cursor::at` makes a position of.
+    offset: usize,
     pub base: Option<String>,
     pub bit_size: u32,
     pub arrays: Vec<ArrayInfo>,
@@ -47,7 +47,7 @@ impl DataTypes {
     }
 
     /// Types whose aliases lead nowhere, in file order.
-    fn circular(&self) -> Vec<(Position, String)> {
+    fn circular(&self) -> Vec<(usize, String)> {
         let is_alias =
             |of: &DataType| of.base.is_some() && of.arrays.is_empty() && of.sub_items.is_empty();
         let mut found: Vec<_> = self
@@ -62,9 +62,9 @@ impl DataTypes {
                         .get(base)
                         .is_some_and(|of| is_alias(of) && of.base.as_deref() != Some(base))
             })
-            .map(|(name, of)| (of.position, name.clone()))
+            .map(|(name, of)| (of.offset, name.clone()))
             .collect();
-        found.sort_by_key(|(position, _)| (position.line, position.column));
+        found.sort();
         found
     }
 
@@ -107,10 +107,10 @@ pub(super) fn read<'a>(
         }
         Ok(())
     })?;
-    for (position, name) in types.circular() {
+    for (offset, name) in types.circular() {
         let name: String = name.chars().take(40).collect();
         let message = format!("type {name:?} is made of itself; it counts as unknown");
-        c.warn_at(position, element, message);
+        c.warn_at(c.at(offset), element, message);
     }
     Ok(())
 }
@@ -121,7 +121,7 @@ fn data_type<'a>(
 ) -> Result<(String, DataType), EsiError> {
     let mut name = String::new();
     let mut data_type = DataType {
-        position: c.position(element),
+        offset: element.offset(),
         ..DataType::default()
     };
     c.children(element, |c, el| {

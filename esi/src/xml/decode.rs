@@ -87,7 +87,7 @@ fn windows_1252(bytes: &[u8]) -> Cow<'_, str> {
         return Cow::Borrowed(text);
     }
     let mut text = String::with_capacity(bytes.len() + bytes.len() / 16);
-    for chunk in bytes.chunks(64) {
+    for chunk in bytes.chunks(256) {
         match std::str::from_utf8(chunk) {
             Ok(plain) if chunk.is_ascii() => text.push_str(plain),
             _ => text.extend(chunk.iter().map(|&byte| windows_1252_letter(byte))),

@@ -7,10 +7,10 @@ pub(super) fn number(text: &str) -> Option<i128> {
         Some(rest) => (true, rest.trim_start()),
         None => (false, text.strip_prefix('+').unwrap_or(text)),
     };
-    let hex = ["#x", "#X", "0x", "0X"]
-        .iter()
-        .find_map(|prefix| digits.strip_prefix(prefix));
-    let (digits, radix) = hex.map_or((digits, 10), |rest| (rest, 16));
+    let (digits, radix) = match digits.as_bytes() {
+        [b'#' | b'0', b'x' | b'X', ..] => (&digits[2..], 16),
+        _ => (digits, 10),
+    };
     if digits.is_empty() || digits.len() > 30 {
         return None;
     }

@@ -11,6 +11,8 @@ pub(super) enum Piece<'a> {
     /// `<name attributes>` or, with `empty`, `<name attributes/>`.
     Start {
         name: &'a str,
+        /// The name without the namespace's prefix.
+        local: &'a str,
         attributes: &'a str,
         offset: usize,
         empty: bool,
@@ -44,10 +46,10 @@ impl<'a> Scanner<'a> {
     }
 
     /// The next tag, whatever text stands before it.
+    #[inline]
     pub fn next_tag(&mut self) -> Result<Piece<'a>, Malformed> {
         loop {
-            let rest = &self.text.as_bytes()[self.at..];
-            self.at += memchr(b'<', rest).unwrap_or(rest.len());
+            self.at += before_tag(&self.text.as_bytes()[self.at..]);
             match self.next()? {
                 Piece::CData(_) => {}
                 piece => return Ok(piece),
@@ -56,28 +58,26 @@ impl<'a> Scanner<'a> {
     }
 
     /// Passes whatever text stands before the next tag, and that where it closes `name`.
+    #[inline]
     pub fn closes(&mut self, name: &str) -> bool {
-        let rest = &self.text.as_bytes()[self.at..];
-        let Some(tag) = memchr(b'<', rest) else {
-            return false;
-        };
-        let closed = is_end(&rest[tag..], name);
-        self.at += tag + if closed { name.len() + 3 } else { 0 };
+        self.at += before_tag(&self.text.as_bytes()[self.at..]);
+        let closed = is_end(&self.text.as_bytes()[self.at..], name);
+        self.at += if closed { name.len() + 3 } else { 0 };
         closed
     }
 
-    /// The text up to the next tag where that closes `name`; then both are passed.
-    pub fn text_to_end(&mut self, name: &str) -> Option<&'a str> {
+    /// The text up to the next tag where that closes `name`, trimmed; then both are passed. With it whether the text
+    /// says what is meant: without references and line ends of other systems.
+    #[inline]
+    pub fn text_to_end(&mut self, name: &str) -> Option<(&'a str, bool)> {
         let rest = &self.text.as_bytes()[self.at..];
-        // Most text is short.
-        let near = rest.iter().take(24).position(|byte| *byte == b'<');
-        let length = near.or_else(|| memchr(b'<', rest))?;
+        let length = before_tag(rest);
         if !is_end(&rest[length..], name) {
             return None;
         }
         let text = &self.text[self.at..self.at + length];
         self.at += length + 2 + name.len() + 1;
-        Some(text)
+        Some(trimmed(text))
     }
 
     pub fn next(&mut self) -> Result<Piece<'a>, Malformed> {
@@ -104,8 +104,7 @@ impl<'a> Scanner<'a> {
                 }
                 [b'<', ..] => return self.tag(start),
                 _ => {
-                    let length = memchr(b'<', rest).unwrap_or(rest.len());
-                    self.at = start + length;
+                    self.at = start + before_tag(rest);
                     return Ok(Piece::Text(&self.text[start..self.at]));
                 }
             }
@@ -127,12 +126,16 @@ impl<'a> Scanner<'a> {
         Ok(self.at)
     }
 
+    #[inline]
     fn tag(&mut self, start: usize) -> Result<Piece<'a>, Malformed> {
         let bytes = self.text.as_bytes();
-        let name_end = bytes[start + 1..]
-            .iter()
-            .position(|byte| ENDS_NAME[usize::from(*byte)]);
-        let name_end = start + 1 + name_end.unwrap_or(bytes.len() - start - 1);
+        let part = |from: usize| from + name_length(&bytes[from..]);
+        let mut local = start + 1;
+        let mut name_end = part(local);
+        while bytes.get(name_end) == Some(&b':') {
+            local = name_end + 1;
+            name_end = part(local);
+        }
         if name_end == start + 1 {
             let what = if name_end == bytes.len() {
                 None
@@ -163,6 +166,7 @@ impl<'a> Scanner<'a> {
         let attributes = &self.text[name_end..if empty { end - 1 } else { end }];
         Ok(Piece::Start {
             name: &self.text[start + 1..name_end],
+            local: &self.text[local..name_end],
             attributes,
             offset: start,
             empty,
@@ -226,29 +230,98 @@ impl<'a> Scanner<'a> {
     }
 }
 
+const ONES: u64 = u64::MAX / 255;
+const HIGHS: u64 = ONES << 7;
+
+/// How many bytes stand before the next tag.
+#[inline]
+fn before_tag(rest: &[u8]) -> usize {
+    // Mostly a few, for which a search by vectors costs more than it saves.
+    for (n, word) in rest.as_chunks::<8>().0.iter().take(4).enumerate() {
+        let differs = u64::from_le_bytes(*word) ^ (ONES * u64::from(b'<'));
+        // The lowest of these bits is that of the first byte which does not differ.
+        let found = differs.wrapping_sub(ONES) & !differs & HIGHS;
+        if found != 0 {
+            return n * 8 + first_byte(found);
+        }
+    }
+    memchr(b'<', rest).unwrap_or(rest.len())
+}
+
+/// How many bytes a name has, or its prefix.
+#[inline]
+fn name_length(rest: &[u8]) -> usize {
+    // Mostly it is made of letters; all that ends it stands before them.
+    let letters = rest.first_chunk::<8>().map_or(0, |word| {
+        let word = u64::from_le_bytes(*word);
+        let found = word.wrapping_sub(ONES * u64::from(b'A')) & !word & HIGHS;
+        first_byte(found)
+    });
+    let ends = |byte: &u8| KIND[usize::from(*byte)] & (ENDS_NAME | COLON) != 0;
+    let more = &rest[letters..];
+    letters + more.iter().position(ends).unwrap_or(more.len())
+}
+
+/// Of a word of which the found bytes have their highest bit set; 8 without any.
+#[inline]
+fn first_byte(found: u64) -> usize {
+    (found.trailing_zeros() / 8) as usize
+}
+
+/// Without white space around it, and whether it says what is meant: without references and line ends of other
+/// systems.
+#[inline]
+fn trimmed(text: &str) -> (&str, bool) {
+    let bytes = text.as_bytes();
+    let kinds = bytes.iter().fold(0, |all, b| all | KIND[usize::from(*b)]);
+    let space = |byte: Option<&u8>| byte.is_some_and(|byte| KIND[usize::from(*byte)] & SPACE != 0);
+    if kinds & ODD == 0 && !space(bytes.first()) && !space(bytes.last()) {
+        return (text, true);
+    }
+    let text = text.trim();
+    let plain = !text.bytes().any(|byte| matches!(byte, b'&' | b'\r'));
+    (text, plain)
+}
+
 /// Whether `</name>` stands there, without a space.
+#[inline]
 fn is_end(tag: &[u8], name: &str) -> bool {
     let name = name.as_bytes();
-    tag.get(name.len() + 2) == Some(&b'>')
-        && tag.starts_with(b"</")
+    tag.get(1) == Some(&b'/')
+        && tag.get(name.len() + 2) == Some(&b'>')
         && tag.get(2..name.len() + 2) == Some(name)
 }
 
-const ENDS_NAME: [bool; 256] = {
-    let mut table = [false; 256];
-    let ends = b">/ \t\r\n";
-    let mut n = 0;
-    while n < ends.len() {
-        table[ends[n] as usize] = true;
-        n += 1;
+/// Bits of [`KIND`].
+const ENDS_NAME: u8 = 1;
+const SPACE: u8 = 2;
+/// Text with such a byte needs a closer look.
+const ODD: u8 = 4;
+/// Ends the prefix of a name.
+const COLON: u8 = 8;
+
+const KIND: [u8; 256] = {
+    let mut table = [0; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        table[byte] = match byte as u8 {
+            b'>' | b'/' => ENDS_NAME,
+            b' ' | b'\t' | b'\n' => ENDS_NAME | SPACE,
+            b'\r' => ENDS_NAME | SPACE | ODD,
+            b':' => COLON,
+            // Some letters beyond ASCII are spaces, too.
+            b'&' | 0..0x20 | 0x80.. => ODD,
+            _ => 0,
+        };
+        byte += 1;
     }
     table
 };
 
 /// Without the namespace's prefix.
 pub(super) fn local_name(qualified: &str) -> &str {
-    let colon = qualified.bytes().rposition(|byte| byte == b':');
-    colon.map_or(qualified, |colon| &qualified[colon + 1..])
+    let local = qualified.rsplit_once(':');
+    local.map_or(qualified, |(_, local)| local)
 }
 
 /// The value of one attribute as written; `Err` where the tag is not made of `name="value"` before it.
@@ -258,73 +331,23 @@ pub(super) fn attribute<'a>(
 ) -> Result<Option<&'a str>, &'static str> {
     let mut rest = attributes.trim_ascii_start();
     while !rest.is_empty() {
-        let Some((key, after)) = rest.split_once('=') else {
+        let Some(equals) = rest.bytes().position(|byte| byte == b'=') else {
             return Err("an attribute has no value");
         };
+        let (key, after) = (rest[..equals].trim_ascii_end(), &rest[equals + 1..]);
         let after = after.trim_ascii_start();
         let quote = match after.as_bytes() {
             [quote @ (b'"' | b'\''), ..] => *quote,
             _ => return Err("an attribute's value has no quotes"),
         };
-        let Some(end) = memchr(quote, &after.as_bytes()[1..]) else {
+        let Some(length) = after.bytes().skip(1).position(|byte| byte == quote) else {
             return Err("an attribute's value is not closed");
         };
-        let key = key.trim_ascii_end();
-        let local = local_name(key);
-        if local == name {
-            return Ok(Some(&after[1..=end]));
+        let prefix = key.strip_suffix(name);
+        if prefix.is_some_and(|prefix| prefix.is_empty() || prefix.ends_with(':')) {
+            return Ok(Some(&after[1..=length]));
         }
-        rest = after[end + 2..].trim_ascii_start();
+        rest = after[length + 2..].trim_ascii_start();
     }
     Ok(None)
-}
-
-/// Line and column of byte offsets, without a table of all lines: a file may be nothing but line ends, or one line.
-pub(super) struct Lines<'a> {
-    text: &'a [u8],
-    /// Line ends before each block, and characters since the last of them.
-    before: Vec<(u32, u32)>,
-}
-
-const BLOCK: usize = 512;
-
-impl<'a> Lines<'a> {
-    pub fn new(text: &'a str) -> Self {
-        let text = text.as_bytes();
-        let mut at = (0, 0);
-        // One more than there are whole blocks, for what is behind the last of them.
-        let mut before = Vec::with_capacity(text.len() / BLOCK + 1);
-        before.push(at);
-        for block in text.chunks_exact(BLOCK) {
-            at = passed(at, block);
-            before.push(at);
-        }
-        Self { text, before }
-    }
-
-    /// Both from 1; columns count characters.
-    pub fn position(&self, offset: usize) -> (u32, u32) {
-        let offset = offset.min(self.text.len());
-        let block = offset / BLOCK;
-        let known = self.before.get(block).copied().unwrap_or_default();
-        let (lines, characters) = passed(known, &self.text[block * BLOCK..offset]);
-        (lines.saturating_add(1), characters.saturating_add(1))
-    }
-}
-
-/// Lines and characters behind `bytes`.
-fn passed((lines, characters): (u32, u32), bytes: &[u8]) -> (u32, u32) {
-    let small = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
-    // A character is counted by its first byte.
-    let count = |bytes: &[u8]| {
-        let first = |byte: &&u8| **byte & 0xc0 != 0x80;
-        small(bytes.iter().filter(first).count())
-    };
-    match memchr::memrchr(b'\n', bytes) {
-        None => (lines, characters.saturating_add(count(bytes))),
-        Some(last) => {
-            let ends = memchr::memchr_iter(b'\n', &bytes[..=last]).count();
-            (lines.saturating_add(small(ends)), count(&bytes[last + 1..]))
-        }
-    }
 }

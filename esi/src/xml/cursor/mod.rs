@@ -1,0 +1,246 @@
+//! A pull cursor over the scanner's pieces that knows line, column and element path, refuses to nest without
+//! bound and meters how much a file may make us allocate.
+//!
+//! Here: walking from element to element. `values` reads text, numbers and flags, `entities` expands references,
+//! `path` names elements in messages, `problems` are these messages.
+
+mod entities;
+mod path;
+mod problems;
+mod values;
+
+use super::lines::Lines;
+use super::scan::{Malformed, Piece, Scanner};
+use crate::error::{EsiError, EsiProblem};
+use crate::model::{Position, Warning};
+use path::{NUMBERED, shorten};
+
+const MAX_DEPTH: usize = 64;
+
+pub(super) struct Cursor<'a> {
+    scanner: Scanner<'a>,
+    lines: Lines<'a>,
+    /// Levels beyond `depth` are kept for their memory.
+    stack: Vec<Level<'a>>,
+    depth: usize,
+    /// The root's siblings, for numbering.
+    top: Level<'a>,
+    /// The element on top of the stack was written `<…/>`.
+    ends_at_once: bool,
+    spent: usize,
+    pub warnings: Vec<Warning>,
+}
+
+#[derive(Default)]
+struct Level<'a> {
+    /// With its prefix, as the end tag must have it.
+    qualified: &'a str,
+    number: u32,
+    offset: usize,
+    /// How many of each numbered element below have begun.
+    seen: [u32; NUMBERED],
+}
+
+/// A start tag. Whoever receives it reads its children or its text; what is left unread is skipped.
+#[derive(Clone, Copy)]
+pub(super) struct Element<'a> {
+    pub name: &'a str,
+    attributes: &'a str,
+    offset: usize,
+    number: u32,
+    depth: usize,
+}
+
+impl Element<'_> {
+    /// Where it starts, for [`Cursor::at`].
+    pub fn offset(&self) -> usize {
+        self.offset
+    }
+}
+
+enum Token<'a> {
+    Start(Element<'a>),
+    /// References as they are written.
+    Text(&'a str),
+    CData(&'a str),
+    End,
+    Eof,
+}
+
+impl<'a> Cursor<'a> {
+    pub fn new(text: &'a str) -> Self {
+        Self {
+            scanner: Scanner::new(text),
+            lines: Lines::new(text),
+            stack: Vec::new(),
+            depth: 0,
+            top: Level::default(),
+            ends_at_once: false,
+            spent: 0,
+            warnings: Vec::new(),
+        }
+    }
+
+    /// Where the element starts.
+    pub fn position(&self, element: &Element<'_>) -> Position {
+        self.at(element.offset)
+    }
+
+    /// Line and column of a byte of the text.
+    pub fn at(&self, offset: usize) -> Position {
+        let (line, column) = self.lines.position(offset);
+        Position { line, column }
+    }
+
+    /// The first element of the document.
+    pub fn root(&mut self) -> Result<Element<'a>, EsiError> {
+        loop {
+            match self.tag()? {
+                Token::Start(element) => return Ok(element),
+                Token::Text(_) | Token::CData(_) | Token::End => {}
+                Token::Eof => return Err(self.error(EsiProblem::Empty)),
+            }
+        }
+    }
+
+    /// Calls `visit` with every child element of `parent`.
+    pub fn children(
+        &mut self,
+        parent: &Element<'a>,
+        mut visit: impl FnMut(&mut Self, &Element<'a>) -> Result<(), EsiError>,
+    ) -> Result<(), EsiError> {
+        while self.depth >= parent.depth {
+            match self.tag()? {
+                Token::Start(child) => {
+                    visit(self, &child)?;
+                    self.finish(child.depth)?;
+                }
+                Token::Text(_) | Token::CData(_) | Token::End => {}
+                Token::Eof => return Err(self.truncated()),
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads on until the element at `depth` is closed.
+    fn finish(&mut self, depth: usize) -> Result<(), EsiError> {
+        while self.depth >= depth {
+            if let Token::Eof = self.tag()? {
+                return Err(self.truncated());
+            }
+        }
+        Ok(())
+    }
+
+    fn token(&mut self) -> Result<Token<'a>, EsiError> {
+        self.next(Scanner::next)
+    }
+
+    /// The next token that is not text.
+    fn tag(&mut self) -> Result<Token<'a>, EsiError> {
+        let open = self.depth.checked_sub(1).and_then(|at| self.stack.get(at));
+        if !self.ends_at_once
+            && let Some(level) = open
+            && self.scanner.closes(level.qualified)
+        {
+            self.depth -= 1;
+            return Ok(Token::End);
+        }
+        self.next(Scanner::next_tag)
+    }
+
+    #[inline]
+    fn next(
+        &mut self,
+        piece: impl Fn(&mut Scanner<'a>) -> Result<Piece<'a>, Malformed>,
+    ) -> Result<Token<'a>, EsiError> {
+        if std::mem::take(&mut self.ends_at_once) {
+            self.depth = self.depth.saturating_sub(1);
+            return Ok(Token::End);
+        }
+        match piece(&mut self.scanner) {
+            Ok(Piece::Start {
+                name,
+                local,
+                attributes,
+                offset,
+                empty,
+            }) => {
+                self.ends_at_once = empty;
+                let element = self.open((name, local), attributes, offset);
+                element.map(Token::Start)
+            }
+            Ok(Piece::End { name, offset }) => self.close(name, offset),
+            Ok(Piece::Text(text)) => Ok(Token::Text(text)),
+            Ok(Piece::CData(text)) => Ok(Token::CData(text)),
+            Ok(Piece::Eof) => Ok(Token::Eof),
+            Err(Malformed { offset, what }) => {
+                let problem = match what {
+                    Some(what) => EsiProblem::Syntax(what.to_owned()),
+                    None => EsiProblem::TruncatedTag,
+                };
+                Err(EsiError::new(self.at(offset), self.current_path(), problem))
+            }
+        }
+    }
+
+    fn open(
+        &mut self,
+        (qualified, name): (&'a str, &'a str),
+        attributes: &'a str,
+        offset: usize,
+    ) -> Result<Element<'a>, EsiError> {
+        let parent = match self.depth.checked_sub(1) {
+            Some(parent) => self.stack.get_mut(parent),
+            None => Some(&mut self.top),
+        };
+        let number = parent.map_or(1, |parent| parent.count(name));
+        if self.depth >= MAX_DEPTH {
+            return Err(self.error(EsiProblem::TooDeep { limit: MAX_DEPTH }));
+        }
+        if self.stack.len() == self.depth {
+            self.stack.push(Level::default());
+        }
+        if let Some(level) = self.stack.get_mut(self.depth) {
+            level.qualified = qualified;
+            level.number = number;
+            level.offset = offset;
+            level.seen = [0; NUMBERED];
+        }
+        self.depth += 1;
+        Ok(Element {
+            name,
+            attributes,
+            offset,
+            number,
+            depth: self.depth,
+        })
+    }
+
+    fn close(&mut self, name: &'a str, offset: usize) -> Result<Token<'a>, EsiError> {
+        let open = self.depth.checked_sub(1).and_then(|at| self.stack.get(at));
+        if open.is_some_and(|level| level.qualified == name) {
+            self.depth -= 1;
+            return Ok(Token::End);
+        }
+        let name = shorten(name);
+        let problem = match open {
+            Some(level) => format!(
+                "expected `</{}>`, but `</{name}>` was found",
+                shorten(level.qualified)
+            ),
+            None => format!("</{name}> closes nothing"),
+        };
+        Err(EsiError::new(
+            self.at(offset),
+            self.current_path(),
+            EsiProblem::Syntax(problem),
+        ))
+    }
+
+    /// The element that was begun last and not closed.
+    fn within(&self) -> &Level<'a> {
+        let last = self.depth.checked_sub(1).and_then(|at| self.stack.get(at));
+        last.unwrap_or(&self.top)
+    }
+}

@@ -1,0 +1,82 @@
+//! Element paths as warnings and errors tell them, `EtherCATInfo/Descriptions/Devices/Device[2]/Sm[3]`.
+
+use super::super::scan;
+use super::{Cursor, Element, Level};
+
+/// Elements that occur several times and therefore carry their number in a path.
+pub(super) const NUMBERED: usize = 16;
+
+/// Which of them.
+fn numbered(name: &str) -> Option<usize> {
+    Some(match name {
+        "Sm" => 0,
+        "Fmmu" => 1,
+        "Slot" => 2,
+        "Entry" => 3,
+        "TxPdo" => 4,
+        "RxPdo" => 5,
+        "Object" => 6,
+        "Device" => 7,
+        "Module" => 8,
+        "OpMode" => 9,
+        "SubItem" => 10,
+        "Exclude" => 11,
+        "InitCmd" => 12,
+        "DataType" => 13,
+        "ModuleIdent" => 14,
+        "EtherCATInfo" => 15,
+        _ => return None,
+    })
+}
+
+impl Level<'_> {
+    pub(super) fn count(&mut self, name: &str) -> u32 {
+        match numbered(name).and_then(|which| self.seen.get_mut(which)) {
+            Some(count) => {
+                *count = count.saturating_add(1);
+                *count
+            }
+            None => 1,
+        }
+    }
+}
+
+impl<'a> Cursor<'a> {
+    /// Also of an element that was left already; what is around it is still open.
+    pub(super) fn path_of(&self, element: &Element<'a>) -> String {
+        let mut path = self.path(element.depth.saturating_sub(1));
+        append(&mut path, element.name, element.number);
+        path
+    }
+
+    fn path(&self, depth: usize) -> String {
+        let mut path = String::new();
+        for level in self.stack.iter().take(depth.min(self.depth)) {
+            append(&mut path, scan::local_name(level.qualified), level.number);
+        }
+        path
+    }
+
+    /// Of what is read right now; before and behind the root that is the file.
+    pub(super) fn current_path(&self) -> String {
+        match self.depth {
+            0 => "(file)".to_owned(),
+            depth => self.path(depth),
+        }
+    }
+}
+
+fn append(path: &mut String, name: &str, number: u32) {
+    if !path.is_empty() {
+        path.push('/');
+    }
+    path.push_str(&shorten(name));
+    if numbered(name).is_some() && (number > 1 || name != "EtherCATInfo") {
+        path.push_str(&format!("[{number}]"));
+    }
+}
+
+/// Keeps what a damaged file may put into an error text short.
+pub(super) fn shorten(text: &str) -> String {
+    text.chars().take(40).collect()
+}
