@@ -19,6 +19,8 @@ pub enum Severity {
     Error,
     /// Something contradicts something else, and one of the two was taken.
     Warning,
+    /// Nothing is wrong, but a user should know.
+    Note,
 }
 
 impl fmt::Display for Severity {
@@ -26,6 +28,7 @@ impl fmt::Display for Severity {
         f.write_str(match self {
             Self::Error => "error",
             Self::Warning => "warning",
+            Self::Note => "note",
         })
     }
 }
@@ -33,8 +36,10 @@ impl fmt::Display for Severity {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     pub severity: Severity,
+    /// Name of the file, where it is one that the file at hand refers to.
+    pub file: Option<String>,
     pub position: Position,
-    /// Element path, `Device[1]/RxPdo[2]`.
+    /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[2]`.
     pub path: String,
     pub message: String,
 }
@@ -42,22 +47,22 @@ pub struct Finding {
 /// Everything that is odd about a file, the reader's warnings included, in file order.
 #[must_use]
 pub fn lint(file: &EsiFile) -> Vec<Finding> {
-    let mut found = Found(Vec::new());
+    let mut found = Found::default();
     let mut effort = 0usize;
     for warning in &file.warnings {
-        found.0.push(Finding {
+        found.all.push(Finding {
             severity: Severity::Warning,
+            file: warning.file.clone(),
             position: warning.position,
             path: warning.path.clone(),
             message: warning.message.clone(),
         });
     }
-    for (n, device) in file.devices.iter().enumerate() {
-        let path = format!("Device[{}]", n + 1);
-        self::device(&mut found, &path, device);
+    for device in &file.devices {
+        self::device(&mut found, &device.path, device);
         effort = effort.saturating_add(places(device));
         if effort <= MAX_EFFORT {
-            usable(&mut found, &path, file, device);
+            usable(&mut found, &device.path, file, device);
         }
     }
     if effort > MAX_EFFORT {
@@ -69,16 +74,16 @@ pub fn lint(file: &EsiFile) -> Vec<Finding> {
             "{} devices with their slots have more than {MAX_EFFORT} places for modules; not all layouts were tried",
             file.devices.len()
         );
-        found.warn(position, "Devices", message);
-    }
-    for (n, module) in file.modules.iter().enumerate() {
-        self::module(&mut found, &format!("Module[{}]", n + 1), file, module);
+        found.warn(position, "EtherCATInfo/Descriptions/Devices", message);
     }
     doubled_devices(&mut found, file);
-    found
-        .0
-        .sort_by_key(|finding| (finding.position.line, finding.position.column));
-    found.0
+    for module in &file.modules {
+        found.file.clone_from(&module.file);
+        self::module(&mut found, &module.path, file, module);
+    }
+    let place = |f: &Finding| (f.file.clone(), f.position.line, f.position.column);
+    found.all.sort_by_key(place);
+    found.all
 }
 
 /// What a choice has to go through.
@@ -91,12 +96,18 @@ fn places(device: &Device) -> usize {
         .clamp(1, 254)
 }
 
-struct Found(Vec<Finding>);
+#[derive(Default)]
+struct Found {
+    all: Vec<Finding>,
+    /// Of what is looked at.
+    file: Option<String>,
+}
 
 impl Found {
     fn add(&mut self, severity: Severity, position: Position, path: &str, message: String) {
-        self.0.push(Finding {
+        self.all.push(Finding {
             severity,
+            file: self.file.clone(),
             position,
             path: path.to_owned(),
             message,
@@ -140,8 +151,7 @@ fn device(found: &mut Found, path: &str, device: &Device) {
                     "assignment {:?} names PDO 0x{index:04x}, which does not exist",
                     mapping.name
                 );
-                let path = format!("{path}/AlternativeSmMapping");
-                found.warn(mapping.position, &path, message);
+                found.warn(mapping.position, &mapping.path, message);
             }
         }
     }
@@ -286,7 +296,7 @@ fn is_text(item: &ObjectItem) -> bool {
 fn objects(found: &mut Found, path: &str, device: &Device) {
     let mut first: BTreeMap<u16, Position> = BTreeMap::new();
     for (n, object) in device.dictionary.objects.iter().enumerate() {
-        let path = format!("{path}/Object[{}]", n + 1);
+        let path = format!("{path}/Profile/Dictionary/Objects/Object[{}]", n + 1);
         match first.get(&object.index) {
             Some(position) => {
                 let message = format!(
@@ -311,7 +321,10 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
     };
     let mut refuse = |severity, what: &str, error: &SelectError| {
         let (position, path) = match error.element() {
-            Some((position, element)) => (position, format!("{path}/{element}")),
+            Some((position, element)) => (
+                position,
+                format!("{path}/{}", within(device, position, element)),
+            ),
             None => (device.position, path.to_owned()),
         };
         found.add(severity, position, &path, format!("{what}: {error}"));
@@ -323,7 +336,7 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
         }
         // Modules are the user's to name; nothing is wrong with the file.
         Err(error @ SelectError::ModuleNeeded { .. }) => {
-            refuse(Severity::Warning, "its default configuration", &error);
+            refuse(Severity::Note, "its default configuration", &error);
             return;
         }
         Err(error) if has_pdos || device.slots.is_some() => {
@@ -343,14 +356,28 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
     }
 }
 
+/// The element's number among its like, as the reader's paths have it.
+fn within(device: &Device, position: Position, element: &str) -> String {
+    let numbered = |positions: Vec<Position>| {
+        let found = positions.iter().position(|other| *other == position);
+        found.map_or_else(|| element.to_owned(), |at| format!("{element}[{}]", at + 1))
+    };
+    let slots = device.slots.iter().flat_map(|slots| &slots.slots);
+    match element {
+        "Slot" => format!("Slots/{}", numbered(slots.map(|s| s.position).collect())),
+        "Sm" => numbered(device.sync_managers.iter().map(|s| s.position).collect()),
+        _ => element.to_owned(),
+    }
+}
+
 fn doubled_devices(found: &mut Found, file: &EsiFile) {
     let mut first: BTreeMap<(u32, u32, u32), Position> = BTreeMap::new();
-    for (n, device) in file.devices.iter().enumerate() {
+    for device in &file.devices {
         let id = device.identity;
         match first.get(&(id.vendor, id.product, id.revision)) {
             Some(position) => {
                 let message = format!("{id} is described twice, first on line {}", position.line);
-                found.warn(device.position, &format!("Device[{}]", n + 1), message);
+                found.warn(device.position, &device.path, message);
             }
             None => {
                 first.insert((id.vendor, id.product, id.revision), device.position);

@@ -80,6 +80,7 @@ fn all(bytes: &[u8]) -> Vec<Said> {
             kind: match finding.severity {
                 ecaxis_esi::Severity::Error => "error",
                 ecaxis_esi::Severity::Warning => "warning",
+                ecaxis_esi::Severity::Note => "note",
             },
             line: finding.position.line,
             column: finding.position.column,

@@ -28,6 +28,8 @@ impl fmt::Display for Identity {
 #[derive(Debug, Clone, Default)]
 pub struct Device {
     pub position: Position,
+    /// Element path, as in [`super::Warning`].
+    pub path: String,
     pub identity: Identity,
     /// Text of `Type`, e.g. `EPOS4`.
     pub type_name: String,

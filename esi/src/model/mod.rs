@@ -53,6 +53,8 @@ pub struct EsiFile {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Warning {
+    /// Name of the file, where it is one that the file at hand refers to.
+    pub file: Option<String>,
     pub position: Position,
     /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
     pub path: String,

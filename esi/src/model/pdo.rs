@@ -117,6 +117,8 @@ impl Entry {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SmMapping {
     pub position: Position,
+    /// Element path, as in [`super::Warning`].
+    pub path: String,
     pub name: String,
     pub default: bool,
     /// (SyncManager, its PDOs in order). A SyncManager that is not named keeps its default.

@@ -53,6 +53,10 @@ pub struct Slot {
 #[derive(Debug, Clone, Default)]
 pub struct Module {
     pub position: Position,
+    /// Element path, as in [`super::Warning`].
+    pub path: String,
+    /// Name of the file, where it is another than that of the devices.
+    pub file: Option<String>,
     pub ident: u32,
     pub class: Option<String>,
     /// Number of the [`ModulePdoGroup`].
@@ -107,6 +111,8 @@ impl Module {
             rx_pdos: self.rx_pdos.clone(),
             tx_pdos: self.tx_pdos.clone(),
             init_cmds: self.init_cmds.clone(),
+            path: self.path.clone(),
+            file: self.file.clone(),
             class: self.class.clone(),
             type_name: self.type_name.clone(),
             name: self.name.clone(),

@@ -9,6 +9,7 @@ use crate::model::{Device, Direction, HiddenType, InitialRegisters, RevisionChec
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Device, EsiError> {
     let mut device = Device {
         position: c.position(element),
+        path: c.path_of(element),
         physics: c.attribute(element, "Physics")?.unwrap_or_default(),
         invisible: c.attribute_flag(element, "Invisible")?,
         ..Device::default()

@@ -129,6 +129,7 @@ pub(super) fn sm_mapping<'a>(
 ) -> Result<SmMapping, EsiError> {
     let mut mapping = SmMapping {
         position: c.position(element),
+        path: c.path_of(element),
         default: c.attribute_flag(element, "Default")?,
         ..SmMapping::default()
     };

@@ -48,6 +48,7 @@ pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
     if let Some((at, message)) = decoded.remark {
         let position = cursor.at(at);
         file.warnings.push(Warning {
+            file: None,
             position,
             path: "EtherCATInfo".to_owned(),
             message,

@@ -9,6 +9,7 @@ use crate::model::{Direction, Module};
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Module, EsiError> {
     let mut module = Module {
         position: c.position(element),
+        path: c.path_of(element),
         ..Module::default()
     };
     let mut names = Names::default();

@@ -89,13 +89,20 @@ pub fn load(path: &Path) -> Result<esi::EsiFile, LoadError> {
         match added {
             Ok(other) => {
                 waiting.extend(other.references);
-                for module in other.modules {
+                for mut module in other.modules {
                     if file.modules.iter().all(|known| known.ident != module.ident) {
+                        module.file = Some(name.clone());
                         file.modules.push(module);
                     }
                 }
+                file.warnings
+                    .extend(other.warnings.into_iter().map(|warning| {
+                        let file = Some(name.clone());
+                        esi::Warning { file, ..warning }
+                    }));
             }
             Err(problem) => file.warnings.push(esi::Warning {
+                file: None,
                 position: esi::Position { line: 1, column: 1 },
                 path: "EtherCATInfo/InfoReference".to_owned(),
                 message: format!("{name:?}: {problem}"),

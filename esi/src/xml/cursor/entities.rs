@@ -28,6 +28,7 @@ impl<'a> Cursor<'a> {
                 name => format!("entity &{name}; is not expanded"),
             };
             self.warnings.push(Warning {
+                file: None,
                 position: self.at(self.within().offset),
                 path: self.current_path(),
                 message,

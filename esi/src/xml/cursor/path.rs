@@ -43,7 +43,7 @@ impl Level<'_> {
 
 impl<'a> Cursor<'a> {
     /// Also of an element that was left already; what is around it is still open.
-    pub(super) fn path_of(&self, element: &Element<'a>) -> String {
+    pub fn path_of(&self, element: &Element<'a>) -> String {
         let mut path = self.path(element.depth.saturating_sub(1));
         append(&mut path, element.name, element.number);
         path

@@ -21,6 +21,7 @@ impl<'a> Cursor<'a> {
         if self.warnings.len() < MAX_WARNINGS {
             let path = self.path_of(within);
             self.warnings.push(Warning {
+                file: None,
                 position,
                 path,
                 message,

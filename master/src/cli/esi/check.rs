@@ -1,7 +1,7 @@
 //! `ecaxis esi check`: every mistake in a file, with its place.
 
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use ecaxis_esi::{Finding, Severity, lint};
 use serde_json::json;
@@ -22,10 +22,8 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let file = super::load(&args.file)?;
     let findings = lint(&file);
-    let errors = findings
-        .iter()
-        .filter(|f| f.severity == Severity::Error)
-        .count();
+    let count = |severity| findings.iter().filter(|f| f.severity == severity).count();
+    let errors = count(Severity::Error);
     let text = if args.json {
         let findings: Vec<_> = findings.iter().map(as_json).collect();
         format!("{:#}\n", json!({ "ok": errors == 0, "findings": findings }))
@@ -36,7 +34,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             let _ = writeln!(
                 text,
                 "{}:{}: {}: {}: {}",
-                args.file.display(),
+                place(&args.file, f.file.as_deref()).display(),
                 f.position,
                 f.severity,
                 f.path,
@@ -47,7 +45,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     result(&text)?;
     let devices = super::plural(file.devices.len(), "device");
-    let warnings = super::plural(findings.len() - errors, "warning");
+    let mut warnings = super::plural(count(Severity::Warning), "warning");
+    match count(Severity::Note) {
+        0 => {}
+        notes => warnings = format!("{warnings}, {}", super::plural(notes, "note")),
+    }
     if errors > 0 {
         let errors = super::plural(errors, "error");
         let message = format!("{}: {devices}, {errors}, {warnings}", args.file.display());
@@ -60,9 +62,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Files that a file refers to lie beside it.
+fn place(file: &Path, other: Option<&str>) -> PathBuf {
+    other.map_or_else(|| file.to_owned(), |other| file.with_file_name(other))
+}
+
 fn as_json(finding: &Finding) -> serde_json::Value {
     json!({
         "severity": finding.severity.to_string(),
+        "file": finding.file,
         "line": finding.position.line,
         "column": finding.position.column,
         "path": finding.path,
