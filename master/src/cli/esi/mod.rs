@@ -150,12 +150,20 @@ impl Which {
                 let failure = failure(format!("none of its {count} matches {query}"));
                 match nearest(name, types.iter().copied()) {
                     Some(known) => failure.hint(format!("did you mean `{known}`?")),
-                    None if types.len() <= 12 => failure.hint(format!("there are {}", types.join(", "))),
+                    None if types.len() <= 12 => {
+                        failure.hint(format!("there are {}", types.join(", ")))
+                    }
                     None => failure.hint(format!("`ecaxis esi list {path}` shows what there is")),
                 }
             }
             (SelectError::NoSuchDevice { .. } | SelectError::Ambiguous { .. }, _) => {
-                failure(error.to_string()).hint(format!(
+                let message = match error {
+                    SelectError::Ambiguous { .. } if !self.says_which() => {
+                        format!("it describes {}", plural(file.devices.len(), "device"))
+                    }
+                    _ => error.to_string(),
+                };
+                failure(message).hint(format!(
                     "pick one with `--device`, `--product` or `--revision`; `ecaxis esi list {path}` shows them"
                 ))
             }

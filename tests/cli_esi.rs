@@ -1,0 +1,229 @@
+//! `ecaxis esi …` as a user meets it: what each verb prints of our own files, and how it refuses others.
+//!
+//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes what is kept in `tests/snapshots/esi` anew; the difference then wants reviewing.
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use common::{fixture, root};
+use serde_json::Value;
+
+fn esi(arguments: &[&str]) -> Output {
+    let cache = tempfile::tempdir().expect("a temporary folder");
+    Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+        .arg("esi")
+        .args(arguments)
+        .current_dir(root())
+        .env("XDG_CACHE_HOME", cache.path())
+        .output()
+        .expect("the binary runs")
+}
+
+/// Exit code, standard output and standard error.
+fn ran(arguments: &[&str]) -> (i32, String, String) {
+    let output = esi(arguments);
+    let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).expect("UTF-8");
+    let code = output.status.code().expect("an exit code");
+    (code, text(&output.stdout), text(&output.stderr))
+}
+
+#[track_caller]
+fn json(arguments: &[&str], expected: i32) -> Value {
+    let (code, out, err) = ran(arguments);
+    assert_eq!(code, expected, "{err}");
+    serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error} in {out}"))
+}
+
+#[track_caller]
+fn refused(arguments: &[&str], parts: &[&str]) {
+    let (code, out, err) = ran(arguments);
+    assert_eq!((code, out.as_str()), (2, ""), "{err}");
+    for part in parts {
+        assert!(err.contains(part), "`{part}` is not in:\n{err}");
+    }
+}
+
+const EPOS4: &str = "configs/esi/EPOS4.xml";
+const TERMINALS: &str = "configs/esi/terminals.xml";
+
+/// Everything that is printed, as it was reviewed.
+#[test]
+fn what_is_printed_of_our_own_files() {
+    let update = std::env::var_os("ECAXIS_UPDATE_SNAPSHOTS").is_some();
+    let mut differ = Vec::new();
+    for (name, arguments) in [
+        ("list", &["list", "configs/esi"][..]),
+        ("show-epos4", &["show", EPOS4]),
+        (
+            "show-epos4-cst",
+            &["show", EPOS4, "--mode", "cst", "--cycle", "2ms"],
+        ),
+        ("show-terminals", &["show", TERMINALS]),
+        ("show-di8", &["show", TERMINALS, "--device", "DI8"]),
+        ("show-io8", &["show", "configs/esi/IO8.xml"]),
+        ("objects-idx", &["objects", "configs/esi/IDX.xml"]),
+        ("check-gateway", &["check", "configs/esi/gateway.xml"]),
+    ] {
+        let (code, out, err) = ran(arguments);
+        assert_eq!(code, 0, "{arguments:?}: {err}");
+        let now = format!("$ ecaxis esi {}\n{out}{err}", arguments.join(" "));
+        let kept = root().join(format!("tests/snapshots/esi/{name}.txt"));
+        if update {
+            std::fs::create_dir_all(kept.parent().expect("a folder")).expect("written");
+            std::fs::write(&kept, &now).expect("written");
+        } else if std::fs::read_to_string(&kept).unwrap_or_default() != now {
+            differ.push(format!("{}, now:\n{now}", kept.display()));
+        }
+    }
+    assert!(differ.is_empty(), "{}", differ.join("\n"));
+}
+
+#[test]
+fn every_verb_of_every_own_file_for_programs() {
+    for file in ["EPOS4", "IDX", "IO8", "gateway", "terminals"] {
+        let path = format!("configs/esi/{file}.xml");
+        let shown = json(&["show", &path, "--json"], 0);
+        assert!(shown.is_object(), "{shown}");
+        let checked = json(&["check", &path, "--json"], 0);
+        assert_eq!(checked["ok"], true, "{checked}");
+        let listed = json(&["list", &path, "--json"], 0);
+        assert!(!listed.as_array().expect("a list").is_empty());
+    }
+    let objects = json(&["objects", EPOS4, "--json"], 0);
+    let objects = objects.as_array().expect("a list");
+    let known = |index: u64, sub: u64| {
+        let mut all = objects.iter();
+        all.any(|o| o["index"] == index && o["sub"] == sub)
+    };
+    assert!(known(0x6040, 0) && known(0x1018, 4) && !known(0x6040, 1));
+}
+
+#[test]
+fn an_image_and_what_is_changed_in_it() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let image = folder.path().join("an image.bin");
+    let path = image.to_str().expect("UTF-8");
+    let (code, _, err) = ran(&["sii", EPOS4, "-o", path]);
+    assert_eq!(code, 0, "{err}");
+    let (code, out, err) = ran(&["diff", EPOS4, path]);
+    assert_eq!((code, out.as_str()), (0, ""), "{err}");
+
+    let mut bytes = std::fs::read(&image).expect("written");
+    // Product code, word 0x000a of the header.
+    bytes[20] ^= 1;
+    std::fs::write(&image, &bytes).expect("written");
+    let (code, out, err) = ran(&["diff", EPOS4, path]);
+    assert_eq!(code, 1, "{err}");
+    assert!(out.contains("product") && out.contains("identity"), "{out}");
+    let found = json(&["diff", EPOS4, path, "--json"], 1);
+    assert_eq!(found["differences"].as_array().map(Vec::len), Some(1));
+
+    std::fs::write(&image, &bytes[..100]).expect("written");
+    refused(&["diff", EPOS4, path], &["100 bytes", "128"]);
+    refused(&["sii", EPOS4, "-o", "/nowhere/x.bin"], &["/nowhere/x.bin"]);
+}
+
+#[test]
+fn what_cannot_be_read() {
+    for verb in ["list", "show", "check", "objects"] {
+        refused(&[verb, "nothere.xml"], &["nothere.xml"]);
+        refused(&[verb], &["Usage"]);
+    }
+    for verb in ["show", "check", "objects"] {
+        refused(&[verb, "configs"], &["configs", "directory"]);
+        refused(&[verb, "Cargo.toml"], &["Cargo.toml:1:1", "help"]);
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let cut = folder.path().join("half a file.xml");
+    let whole = std::fs::read(root().join(EPOS4)).expect("our ESI");
+    std::fs::write(&cut, &whole[..whole.len() / 2]).expect("written");
+    let path = cut.to_str().expect("UTF-8");
+    refused(
+        &["check", path],
+        &["half a file.xml:", "not complete", "EtherCATInfo/"],
+    );
+}
+
+#[test]
+fn which_device() {
+    refused(
+        &["objects", TERMINALS],
+        &["describes 7 devices", "--device", "esi list"],
+    );
+    refused(&["show", TERMINALS, "--device", "DI9"], &["did you mean"]);
+    refused(&["show", EPOS4, "--mode", "hm"], &["hm", "csp"]);
+    refused(&["show", EPOS4, "--dc", "nope"], &["nope"]);
+    for which in [
+        ["--device", "2"],
+        ["--device", "0x44490008"],
+        ["--product", "0x44490008"],
+    ] {
+        let shown = json(&[&["show", TERMINALS, "--json"], &which[..]].concat(), 0);
+        assert!(shown.to_string().contains("DI8"), "{which:?}: {shown}");
+    }
+}
+
+/// A finding stands in the file that it is about, under the path that the reader gives it.
+#[test]
+fn findings_of_modules_in_another_file() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let write = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).expect("written");
+        path.to_str().expect("UTF-8").to_owned()
+    };
+    write(
+        "Modules.xml",
+        "<EtherCATModule><Modules>\n\
+         <Module><Type ModuleIdent='1'>A</Type><Name>A</Name>\n\
+         <RxPdo><Index>#x1600</Index><Exclude>#x1600</Exclude><Name>P</Name></RxPdo></Module>\n\
+         </Modules></EtherCATModule>",
+    );
+    let file = write(
+        "a device.xml",
+        "<EtherCATInfo><InfoReference>modules.XML</InfoReference><Vendor><Id>1</Id></Vendor>\n\
+         <Descriptions><Devices><Device><Type ProductCode='1'>D</Type>\n\
+         <Slots><Slot MinInstances='1' MaxInstances='1'><Name>S</Name>\n\
+         <ModuleIdent>1</ModuleIdent></Slot></Slots></Device></Devices></Descriptions></EtherCATInfo>",
+    );
+    let (code, out, err) = ran(&["check", &file]);
+    assert_eq!(code, 0, "{out}{err}");
+    let lines: Vec<&str> = out.lines().collect();
+    let device = "a device.xml:2:25: note: EtherCATInfo/Descriptions/Devices/Device[1]: ";
+    let module = "modules.XML:3:1: warning: EtherCATModule/Modules/Module[1]/RxPdo[1]: ";
+    assert_eq!(lines.len(), 2, "{out}");
+    assert!(lines[0].contains(device), "{out}");
+    assert!(lines[1].contains(module), "{out}");
+    assert!(err.contains("1 warning, 1 note"), "{err}");
+    let found = json(&["check", &file, "--json"], 0);
+    assert_eq!(found["findings"][1]["file"], "modules.XML");
+}
+
+/// Also on names with spaces; what their makers wrote is not kept here.
+#[test]
+fn files_of_makers() {
+    let Some(folder) = fixture("esi") else { return };
+    let one = |path: &str| folder.join(path).to_str().expect("UTF-8").to_owned();
+    let inputs = one("beckhoff/Beckhoff EL1xxx.xml");
+    let (code, out, err) = ran(&["show", &inputs]);
+    assert_eq!(code, 0, "{err}");
+    assert!(out.contains("155 devices"), "{out}");
+    refused(&["objects", &inputs], &["155 devices"]);
+
+    // Two of its clock modes have one name; what they are for tells them apart.
+    let device = ["--device", "EL1262", "--revision", "0x30000"];
+    let (_, out, _) = ran(&[&["show", &inputs], &device[..]].concat());
+    let named: Vec<&str> = out.lines().filter(|l| l.starts_with("  DcSync ")).collect();
+    assert!(named.len() == 2 && named[0] != named[1], "{out}");
+
+    let drives = one("beckhoff/Beckhoff AX5xxx.xml");
+    let (code, out, _) = ran(&["check", &drives]);
+    assert_eq!(code, 2);
+    assert!(out.contains("SoE"));
+    let listed = json(&["list", folder.to_str().expect("UTF-8"), "--json"], 0);
+    assert!(listed.as_array().expect("a list").len() > 300);
+    let name = |entry: &Value| Path::new(entry["file"].as_str().unwrap_or("")).is_relative();
+    assert!(listed.as_array().expect("a list").iter().all(name));
+}
