@@ -4,19 +4,19 @@ use std::path::Path;
 
 use toml::Spanned;
 
+mod follow;
+mod target;
+
 use super::axis::control::one_of;
-use super::axis::too_long;
-use super::problem::{Problems, Span, list, suggestion, unreadable};
-use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawStop, RawTarget};
+use super::problem::{Problems, list, suggestion};
+use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawStop};
 use super::{
     Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopBy, StopByDrive, StopSetup,
     TableFile, duration, signal,
 };
 use ecaxis_axis::Mode;
-use ecaxis_axis::setpoint::{
-    Interpolation, Motion, PositionWave, SetpointError, Shape, Table, Wave,
-};
 use ecaxis_esi as esi;
+use target::{What, fraction};
 
 /// How a gear smooths what its master reports, where the step does not say.
 const SMOOTHING_NS: u64 = 10_000_000;
@@ -363,102 +363,6 @@ impl Checker<'_> {
         }
     }
 
-    /// An axis that follows positions at some time.
-    fn positioned(
-        &self,
-        name: &Spanned<String>,
-        verb: &str,
-        p: &mut Problems<'_>,
-    ) -> Option<(usize, &AxisSetup)> {
-        let (index, axis) = self.axis(name, p)?;
-        if self.ever(index, |mode| {
-            mode != Mode::Pp && What::Position.possible(mode, axis)
-        }) {
-            return Some((index, axis));
-        }
-        let message = format!(
-            "`{verb}` is nothing that `{}` does in mode \"{}\"",
-            name.get_ref(),
-            axis.mode
-        );
-        p.add_hint(name.span(), message, "it needs CSP, or a position loop");
-        None
-    }
-
-    fn wave(
-        &self,
-        square: bool,
-        name: &Spanned<String>,
-        amplitude: &Spanned<f64>,
-        frequency: &Spanned<f64>,
-        periods: u32,
-        p: &mut Problems<'_>,
-    ) -> Option<Action> {
-        let verb = if square { "square" } else { "sine" };
-        let (index, axis) = self.positioned(name, verb, p)?;
-        let shape = if square { Shape::Square } else { Shape::Sine };
-        let limits = axis.config.limits.motion();
-        let wave = Wave::new(
-            shape,
-            *amplitude.get_ref(),
-            *frequency.get_ref(),
-            periods,
-            self.cycle_s,
-        );
-        let checked = wave.and_then(|wave| {
-            PositionWave::new(wave, Motion::default(), limits, None, self.cycle_s)?;
-            Ok(wave)
-        });
-        match checked {
-            Ok(wave) => Some(Action::Wave { axis: index, wave }),
-            Err(error) => {
-                let at = match error {
-                    SetpointError::TooOften { .. } => frequency.span(),
-                    _ => amplitude.span(),
-                };
-                let hint = "take a smaller amplitude or a lower frequency";
-                p.add_hint(at, error.to_string(), hint);
-                None
-            }
-        }
-    }
-
-    fn table(
-        &mut self,
-        name: &Spanned<String>,
-        file: &Spanned<String>,
-        p: &mut Problems<'_>,
-    ) -> Option<Action> {
-        let path = self.folder.join(file.get_ref());
-        let text = match std::fs::read_to_string(&path) {
-            Ok(text) => text,
-            Err(error) => {
-                let hint = "paths are relative to the machine file";
-                p.add_hint(file.span(), unreadable(&path, &error), hint);
-                return None;
-            }
-        };
-        let (index, axis) = self.positioned(name, "table", p)?;
-        let limits = &axis.config.limits;
-        let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {
-            table.check(limits.motion(), limits.position, 0.0, self.cycle_s)?;
-            Ok(table)
-        });
-        match table {
-            Ok(table) => {
-                self.tables.push(TableFile { path, table });
-                let table = self.tables.len() - 1;
-                Some(Action::Table { axis: index, table })
-            }
-            Err(error) => {
-                let message = format!("{}, {error}", path.display());
-                let hint = "a row is time in seconds, position, and if you like velocity";
-                p.add_hint(file.span(), message, hint);
-                None
-            }
-        }
-    }
-
     /// Whether something is so in a mode that the axis is in at some time.
     fn ever(&self, index: usize, so: impl Fn(Mode) -> bool) -> bool {
         let own = self.devices[index].axis.ok().map(|axis| axis.config.mode);
@@ -505,52 +409,6 @@ impl Checker<'_> {
                 p.add_hint(name.span(), message, hint);
                 None
             }
-        }
-    }
-
-    fn targets(
-        &self,
-        targets: Vec<RawTarget>,
-        what: What,
-        p: &mut Problems<'_>,
-    ) -> Option<Vec<(usize, f64)>> {
-        let count = targets.len();
-        let mut resolved = Vec::with_capacity(count);
-        for RawTarget { axis: name, value } in targets {
-            let Some((index, axis)) = self.axis(&name, p) else {
-                continue;
-            };
-            if !self.ever(index, |mode| what.possible(mode, axis)) {
-                let (message, hint) = what.impossible(name.get_ref(), axis);
-                p.add_hint(name.span(), message, hint);
-            } else if within(&value, what, axis, p) {
-                resolved.push((index, value.into_inner()));
-            }
-        }
-        resolved.sort_by_key(|(index, _)| *index);
-        (count > 0 && resolved.len() == count).then_some(resolved)
-    }
-
-    /// Reports an axis that would take more than an hour to reach its velocity.
-    fn not_too_slow(
-        &self,
-        targets: &[(usize, f64)],
-        ramp: f64,
-        at: Option<Span>,
-        p: &mut Problems<'_>,
-        velocity: impl Fn(f64, f64) -> f64,
-    ) {
-        let Some(at) = at else { return };
-        let slow = targets.iter().find_map(|&(index, target)| {
-            let device = self.devices.get(index)?;
-            let limits = &device.axis.ok()?.config.limits;
-            let velocity = velocity(target, limits.velocity);
-            Some((device.name, too_long(velocity, limits.acceleration * ramp)?))
-        });
-        if let Some((name, time)) = slow {
-            let message =
-                format!("with a `ramp` of {ramp}, `{name}` takes {time} to reach its velocity");
-            p.add_hint(at, message, "a ramp may last an hour at most");
         }
     }
 
@@ -622,100 +480,4 @@ fn wait(timeout: &Spanned<u64>, p: &mut Problems<'_>) -> Option<u64> {
     );
     p.add(timeout.span(), message);
     None
-}
-
-fn fraction(value: Option<Spanned<f64>>, what: &str, p: &mut Problems<'_>) -> Option<f64> {
-    let Some(value) = value else { return Some(1.0) };
-    let n = *value.get_ref();
-    if n > 0.0 && n <= 1.0 {
-        return Some(n);
-    }
-    let limit = if what == "speed" {
-        "velocity"
-    } else {
-        "acceleration"
-    };
-    let message = format!("`{what}` is {n}, but it is a fraction of the axis' {limit} limit");
-    p.add_hint(value.span(), message, "a number above 0.0 and up to 1.0");
-    None
-}
-
-/// What a target is a target of.
-#[derive(Clone, Copy, PartialEq)]
-enum What {
-    Position,
-    /// Relative to where the axis is.
-    Way,
-    Velocity,
-    Torque,
-}
-
-impl What {
-    fn verb(self) -> &'static str {
-        match self {
-            Self::Position => "move",
-            Self::Way => "move_by",
-            Self::Velocity => "velocity",
-            Self::Torque => "torque",
-        }
-    }
-
-    /// Whether an axis takes it in this mode.
-    fn possible(self, mode: Mode, axis: &AxisSetup) -> bool {
-        let loops = &axis.config.loops;
-        let position = match mode {
-            Mode::Csv => loops.csv.is_some(),
-            Mode::Cst => loops.cst.is_some(),
-            Mode::Csp | Mode::Pp => true,
-            _ => false,
-        };
-        match self {
-            Self::Position | Self::Way => position,
-            Self::Velocity => position && mode != Mode::Pp || matches!(mode, Mode::Csv | Mode::Pv),
-            Self::Torque => mode == Mode::Cst,
-        }
-    }
-
-    fn impossible(self, name: &str, axis: &AxisSetup) -> (String, String) {
-        let message = format!(
-            "`{}` is nothing that `{name}` does in mode \"{}\"",
-            self.verb(),
-            axis.mode
-        );
-        let instead = match axis.config.mode {
-            Mode::Csv => {
-                "write `velocity = { … }`, or give the axis a position loop: `csv = { kv = 20.0 }`"
-            }
-            Mode::Cst => {
-                "write `torque = { … }`, or give the axis a position loop: `cst = { kp = 10.0 }`"
-            }
-            _ => "write `move = { … }`, or switch it before: `mode = { … = \"cst\" }`",
-        };
-        (message, instead.to_owned())
-    }
-}
-
-fn within(value: &Spanned<f64>, what: What, axis: &AxisSetup, p: &mut Problems<'_>) -> bool {
-    let limits = &axis.config.limits;
-    let unit = &axis.unit;
-    let (low, high, unit) = match what {
-        What::Position => match limits.position {
-            Some([low, high]) => (low, high, unit.clone()),
-            None => return true,
-        },
-        // Where it ends is known when it begins; it cannot be longer than the whole range.
-        What::Way => match limits.position {
-            Some([low, high]) => (low - high, high - low, unit.clone()),
-            None => return true,
-        },
-        What::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
-        What::Torque => (-limits.torque, limits.torque, "%".into()),
-    };
-    let n = *value.get_ref();
-    if (low..=high).contains(&n) {
-        return true;
-    }
-    let message = format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}");
-    p.add(value.span(), message);
-    false
 }

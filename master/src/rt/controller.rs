@@ -2,7 +2,8 @@
 
 use ecaxis_axis::{AxisStatus, Command, Refused};
 
-use super::cycle::{AxisSlot, Signals};
+use super::cycle::Signals;
+use super::slot::AxisSlot;
 use crate::config::{AxisRef, InputRef, OutputRef};
 
 /// Called once a cycle in the real-time thread, after the inputs have arrived and before the outputs are made.

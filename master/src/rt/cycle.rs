@@ -3,18 +3,23 @@
 use std::panic::AssertUnwindSafe;
 
 use ecaxis_axis::setpoint::Table;
-use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, Refused, State};
+use ecaxis_axis::{Command, State};
 
 use super::controller::{self, Controller};
 use super::exchange::{Answer, Exchange, Received};
-use super::feed::{self, Feed, FeedState, Start};
+use super::feed::{self, Feed, FeedState};
 use super::guard::{Guard, StopCause};
-use super::handover::{Event, ORDERS_A_CYCLE, Order, PhaseStatus, RtEnd, Snapshot};
-use super::image::{AxisBits, SignalBits};
+use super::handover::{Event, PhaseStatus, RtEnd, Snapshot};
+use super::image::SignalBits;
 use super::phase::Phase;
+use super::slot::AxisSlot;
 use super::stats::Stats;
+mod orders;
+
+use orders::quick_stop;
+
 use crate::clock::{self, Clock, Nanos};
-use crate::config::{Condition, StopBy, StopByDrive, StopSetup};
+use crate::config::{Condition, StopSetup};
 use crate::link::port::Port;
 use crate::link::{Link, LinkError, MAX_FRAME};
 
@@ -23,106 +28,6 @@ const FRAMES_AT_ONCE: usize = 32;
 
 /// An axis at rest settles on its target this long before its power is taken away.
 const SETTLE: Nanos = 100_000_000;
-
-/// One axis and where its objects are.
-#[derive(Debug)]
-pub struct AxisSlot {
-    pub axis: Axis,
-    pub bits: AxisBits,
-    pub feed: Feed,
-    /// Largest following error while enabled, and the status of the last enabled cycle.
-    pub largest_following_error: f64,
-    pub last_enabled: Option<AxisStatus>,
-    /// Enabling was ordered and the drive had no fault since: from now on a fault stops the machine.
-    armed: bool,
-    ordered: bool,
-    /// How long a stopping axis has been at rest.
-    rested: Nanos,
-    /// In this cycle.
-    acted: bool,
-}
-
-impl AxisSlot {
-    #[must_use]
-    pub fn new(axis: Axis, bits: AxisBits) -> Self {
-        Self {
-            axis,
-            bits,
-            feed: Feed::default(),
-            largest_following_error: 0.0,
-            last_enabled: None,
-            armed: false,
-            ordered: false,
-            rested: 0,
-            acted: false,
-        }
-    }
-
-    pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {
-        self.ordered |= command == Command::Enable;
-        self.axis.command(command)?;
-        // These leave the set-point alone.
-        let aside = matches!(
-            command,
-            Command::Enable
-                | Command::ResetFault
-                | Command::SetMode(_)
-                | Command::ArmProbe { .. }
-                | Command::DisarmProbe { .. }
-        );
-        if !aside {
-            self.feed.end();
-        }
-        Ok(())
-    }
-
-    fn read(&self, image: &[u8], fresh: bool) -> Inputs {
-        let bits = &self.bits;
-        Inputs {
-            statusword: bits.statusword.get(image) as u16,
-            position: bits.position.map(|b| b.get(image) as i32),
-            velocity: bits.velocity.map(|b| b.get(image) as i32),
-            torque: bits.torque.map(|b| b.get(image) as i16),
-            mode_display: bits.mode_display.map(|b| b.get(image) as i8),
-            error_code: bits.error_code.map(|b| b.get(image) as u16),
-            touch_probe_status: bits.touch_probe_status.map(|b| b.get(image) as u16),
-            touch_probe_positions: bits
-                .touch_probe_positions
-                .map(|b| b.map(|b| b.get(image) as i32)),
-            fresh,
-        }
-    }
-
-    fn write(&self, image: &mut [u8], outputs: &Outputs) {
-        let bits = &self.bits;
-        bits.controlword.set(image, i64::from(outputs.controlword));
-        for (to, value) in [
-            (bits.mode, i64::from(outputs.mode)),
-            (bits.target_position, i64::from(outputs.target_position)),
-            (bits.target_velocity, i64::from(outputs.target_velocity)),
-            (bits.target_torque, i64::from(outputs.target_torque)),
-            (bits.velocity_offset, i64::from(outputs.velocity_offset)),
-            (bits.torque_offset, i64::from(outputs.torque_offset)),
-            (bits.profile_velocity, i64::from(outputs.profile_velocity)),
-            (
-                bits.profile_acceleration,
-                i64::from(outputs.profile_acceleration),
-            ),
-            (
-                bits.profile_deceleration,
-                i64::from(outputs.profile_acceleration),
-            ),
-            (
-                bits.touch_probe_function,
-                i64::from(outputs.touch_probe_function),
-            ),
-        ] {
-            if let Some(to) = to {
-                to.set(image, value);
-            }
-        }
-    }
-}
 
 /// The process data that the program reads and sets.
 #[derive(Debug, Clone, Default)]
@@ -370,109 +275,10 @@ impl Engine {
         step.adjust
     }
 
-    /// Everything handed over so far, so that what belongs together begins in the same cycle.
-    fn take_orders(&mut self) {
-        for _ in 0..ORDERS_A_CYCLE {
-            let Ok(order) = self.end.orders.pop() else {
-                if self.end.orders.is_abandoned() && !self.halted {
-                    self.end_alone();
-                }
-                return;
-            };
-            self.orders_taken += 1;
-            self.take(order);
-        }
-    }
-
-    fn take(&mut self, order: Order) {
-        match order {
-            Order::Axis { axis, command } => {
-                // A stopping machine takes no new motion.
-                if self.stopping.is_some() && command != Command::Disable {
-                    return;
-                }
-                let Some(slot) = self.axes.get_mut(axis) else {
-                    return;
-                };
-                if let Err(reason) = slot.command(command) {
-                    let cycle = self.stats.counters.cycles;
-                    self.report(Event::Refused {
-                        cycle,
-                        axis,
-                        reason,
-                    });
-                }
-            }
-            Order::Feed { axis, start } => self.begin_feed(axis, start),
-            Order::Output { output, value } => {
-                if let Some(signal) = self.signals.outputs.get(output) {
-                    signal.set(self.exchange.outputs_mut(), value);
-                }
-            }
-            Order::Guard => self.guarding = true,
-            Order::Unguard => self.guarding = false,
-            Order::Stop => self.stop(StopCause::Requested),
-            Order::ErrorCode { axis, code } => {
-                if let Some(slot) = self.axes.get_mut(axis) {
-                    slot.axis.note_error_code(code);
-                }
-            }
-            Order::Halt => self.halted = true,
-        }
-    }
-
-    /// The supervisor is gone without saying so: stop, then end the loop.
-    fn end_alone(&mut self) {
-        self.stop(StopCause::Requested);
-        let since = self.stopping.map_or(self.next, |(_, since)| since);
-        self.halted = self.without_power()
-            || self.next.saturating_sub(since) > 2 * self.timing.stop_patience_ns;
-    }
-
     fn without_power(&self) -> bool {
         self.axes
             .iter()
             .all(|slot| !has_power(slot.axis.status().state))
-    }
-
-    /// The first cause wins. All axes decelerate within their limits and are then disabled; where the
-    /// bus is not to be trusted, the drives do it by themselves, from the velocity that they know.
-    fn stop(&mut self, cause: StopCause) {
-        if self.stopping.is_some() {
-            return;
-        }
-        self.stopping = Some((cause, self.next));
-        let way = match cause {
-            StopCause::BusLost { .. } | StopCause::LeftOp { .. } => {
-                match self.stop_setup.bus_lost {
-                    StopByDrive::QuickStop => StopBy::QuickStop,
-                    StopByDrive::NoPower => StopBy::NoPower,
-                }
-            }
-            StopCause::DriveFault { .. } | StopCause::Trip { .. } => self.stop_setup.others,
-            StopCause::Requested | StopCause::Controller | StopCause::EmergencyStop => StopBy::Ramp,
-        };
-        for slot in &mut self.axes {
-            // An axis that does not take a command has no power, or is losing it already.
-            match way {
-                StopBy::QuickStop => quick_stop(&mut slot.axis),
-                StopBy::NoPower => {
-                    let _ = slot.axis.command(Command::DisableVoltage);
-                }
-                StopBy::Ramp if cause == StopCause::EmergencyStop => {
-                    let _ = slot.axis.command(Command::EmergencyStop);
-                }
-                StopBy::Ramp if slot.axis.status().enabled => {
-                    let _ = slot.axis.command(Command::Stop);
-                }
-                StopBy::Ramp => {
-                    let _ = slot.axis.command(Command::Disable);
-                }
-            }
-            slot.feed.end();
-        }
-        let cycle = self.stats.counters.cycles;
-        self.report(Event::Stopping { cycle, cause });
     }
 
     fn observe(&mut self) {
@@ -517,23 +323,6 @@ impl Engine {
         if std::panic::catch_unwind(call).is_err() {
             self.controller = None;
             self.stop(StopCause::Controller);
-        }
-    }
-
-    fn begin_feed(&mut self, axis: usize, start: Start) {
-        if self.stopping.is_some() {
-            return;
-        }
-        let master = match start {
-            Start::Gear { master, actual, .. } => self
-                .axes
-                .get(master)
-                .map(|slot| feed::master_motion(&slot.axis.status(), actual)),
-            _ => None,
-        };
-        if let Some(slot) = self.axes.get_mut(axis) {
-            let status = slot.axis.status();
-            slot.feed.begin(start, &status, master);
         }
     }
 
@@ -654,12 +443,6 @@ pub fn has_power(state: State) -> bool {
         state,
         State::OperationEnabled | State::QuickStopActive | State::FaultReactionActive
     )
-}
-
-/// The drive's own quick stop, then no power.
-fn quick_stop(axis: &mut Axis) {
-    let _ = axis.command(Command::QuickStop);
-    let _ = axis.command(Command::Disable);
 }
 
 /// The snapshot before the first cycle, with room for `axes` and `devices`.

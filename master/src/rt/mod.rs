@@ -6,6 +6,7 @@
 //! - [`phase`]: keeps the release of frames in phase with SYNC0;
 //! - [`guard`]: how many bad cycles the machine rides through;
 //! - [`feed`]: set-points from lines, tables, other axes;
+//! - [`slot`]: one axis in the cycle;
 //! - [`stats`]: bounded histograms and counters;
 //! - [`handover`]: the queues to and from everybody else;
 //! - [`controller`]: a user's own code in the cycle;
@@ -31,5 +32,6 @@ pub mod guard;
 pub mod handover;
 pub mod image;
 pub mod phase;
+pub mod slot;
 pub mod stats;
 pub mod thread;

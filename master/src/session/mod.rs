@@ -27,9 +27,10 @@ use crate::rt::guard::Guard;
 use crate::rt::handover::ends;
 use crate::rt::image::{self, AxisBits, Bits, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
+use crate::rt::slot::AxisSlot;
 use crate::rt::{
     self,
-    cycle::{AxisSlot, Engine, Parts, Remains, Signals, Timing, first_snapshot},
+    cycle::{Engine, Parts, Remains, Signals, Timing, first_snapshot},
 };
 use crate::supervise::{Ended, Supervisor, executor, interruptible};
 use crate::wire::Datagrams;

@@ -6,7 +6,7 @@ use serde::Serialize;
 use crate::clock::Clock;
 use crate::config::Machine;
 use crate::link::capture::RecordStats;
-use crate::rt::cycle::AxisSlot;
+use crate::rt::slot::AxisSlot;
 use crate::rt::stats::{Counters, Percentiles, Stats};
 use crate::supervise::Ended;
 

@@ -1,7 +1,7 @@
 //! Steps in which axes follow more than a target of their own: lines, waves, tables, other axes.
 
 use ecaxis_axis::group::{Line, LineAxis};
-use ecaxis_axis::setpoint::{MotionLimits, Playback, PositionWave, SetpointError, Wave};
+use ecaxis_axis::setpoint::{MotionLimits, Playback, PositionWave, Wave};
 use ecaxis_axis::{Command, Limits};
 
 use super::Supervisor;
@@ -31,14 +31,6 @@ impl Supervisor {
             },
             |axis| axis.config.limits,
         )
-    }
-
-    fn cannot(&self, step: &Step, axis: usize, error: &SetpointError) -> RunError {
-        RunError::Refused {
-            device: self.device_of(axis),
-            step: step.into(),
-            reason: error.to_string(),
-        }
     }
 
     /// `part`: of the velocity, and of the acceleration and jerk limits.
@@ -75,7 +67,7 @@ impl Supervisor {
             });
         }
         let line = Line::plan(&line_axes)
-            .map_err(|error| self.cannot(step, axes[error.axis], &error.error))?;
+            .map_err(|error| self.refusal(step, axes[error.axis], &error.error))?;
         let feeds = axes.iter().zip(&line_axes);
         let feeds: Vec<_> = feeds
             .map(|(&axis, part)| (axis, Start::Line(line.along(part))))
@@ -99,7 +91,7 @@ impl Supervisor {
         for axis in axes {
             let at = commanded(&snapshot.axes[axis]);
             let wave = PositionWave::new(wave, at, limits.motion(), limits.position, dt_s)
-                .map_err(|error| self.cannot(step, axis, &error))?;
+                .map_err(|error| self.refusal(step, axis, &error))?;
             feeds.push((axis, Start::Wave(wave)));
         }
         self.follow(step, start, &feeds, FeedState::Finished).await
@@ -131,7 +123,7 @@ impl Supervisor {
         for axis in axes {
             let at = commanded(&snapshot.axes[axis]);
             let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
-                .map_err(|error| self.cannot(step, axis, &error))?;
+                .map_err(|error| self.refusal(step, axis, &error))?;
             feeds.push((axis, Start::Table { table, playback }));
         }
         self.follow(step, start, &feeds, FeedState::Finished).await
@@ -150,27 +142,13 @@ impl Supervisor {
             .map(|&(axis, start)| Order::Feed { axis, start });
         self.orders(&orders.collect::<Vec<_>>()).await;
         let mut done_since = None;
-        loop {
-            let snapshot = self.tick().await?;
-            if self.over(start) {
-                return Ok(());
-            }
-            if snapshot.orders_taken < self.orders_given {
-                continue;
-            }
-            self.refusal(step)?;
+        self.watch(step, start, |this, snapshot| {
             let mut done = true;
             let mut late = None;
             for &(axis, _) in feeds {
                 match snapshot.feeds[axis] {
-                    FeedState::NotBegun(error) => return Err(self.cannot(step, axis, &error)),
-                    FeedState::Refused(reason) => {
-                        return Err(RunError::Refused {
-                            device: self.device_of(axis),
-                            step: step.into(),
-                            reason: reason.to_string(),
-                        });
-                    }
+                    FeedState::NotBegun(error) => return Err(this.refusal(step, axis, &error)),
+                    FeedState::Refused(reason) => return Err(this.refusal(step, axis, &reason)),
                     // Something else has taken the axis over.
                     FeedState::None => {}
                     state => done &= state == until,
@@ -181,18 +159,20 @@ impl Supervisor {
             }
             if !done {
                 done_since = None;
-                continue;
+                return Ok(false);
             }
-            let Some(axis) = late else { return Ok(()) };
+            let Some(axis) = late else { return Ok(true) };
             let since = *done_since.get_or_insert_with(clock::now);
             if clock::now().saturating_sub(since) > SETTLE_TIMEOUT {
                 return Err(RunError::NotReached {
-                    device: self.device_of(axis),
+                    device: this.device_of(axis),
                     step: step.into(),
                     target: snapshot.axes[axis].target_position,
                     actual: snapshot.axes[axis].position,
                 });
             }
-        }
+            Ok(false)
+        })
+        .await
     }
 }

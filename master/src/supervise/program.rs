@@ -1,5 +1,6 @@
 //! The steps of the machine file, one after the other.
 
+use std::fmt::Display;
 use std::future::Future;
 use std::pin::Pin;
 
@@ -311,14 +312,38 @@ impl Supervisor {
         Ok(())
     }
 
-    pub(super) fn refusal(&mut self, step: &Step) -> Result<(), RunError> {
-        match self.refused.take() {
-            Some((axis, reason)) => Err(RunError::Refused {
-                device: self.device_of(axis),
-                step: step.into(),
-                reason: reason.to_string(),
-            }),
-            None => Ok(()),
+    /// Looks at every cycle from the one on that has taken all orders, until `look` says that the step is done or the program's
+    /// time limit is over.
+    pub(super) async fn watch(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        mut look: impl FnMut(&Self, &Snapshot) -> Result<bool, RunError>,
+    ) -> Result<(), RunError> {
+        loop {
+            let snapshot = self.tick().await?;
+            if self.over(start) {
+                // Winding down brings the axes to rest from wherever they are.
+                return Ok(());
+            }
+            // Until then the status is that of the step before.
+            if snapshot.orders_taken < self.orders_given {
+                continue;
+            }
+            if let Some((axis, reason)) = self.refused.take() {
+                return Err(self.refusal(step, axis, &reason));
+            }
+            if look(self, &snapshot)? {
+                return Ok(());
+            }
+        }
+    }
+
+    pub(super) fn refusal(&self, step: &Step, axis: usize, reason: &dyn Display) -> RunError {
+        RunError::Refused {
+            device: self.device_of(axis),
+            step: step.into(),
+            reason: reason.to_string(),
         }
     }
 
@@ -332,37 +357,31 @@ impl Supervisor {
     ) -> Result<(), RunError> {
         let begun = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns.max(self.stop_patience);
-        loop {
-            let snapshot = self.tick().await?;
-            if self.over(start) {
-                return Ok(());
-            }
-            if snapshot.orders_taken < self.orders_given {
-                continue;
-            }
-            self.refusal(step)?;
-            let Some(&axis) = axes.iter().find(|&&axis| !holds(&snapshot, axis)) else {
-                return Ok(());
+        self.watch(step, start, |this, snapshot| {
+            let Some(&axis) = axes.iter().find(|&&axis| !holds(snapshot, axis)) else {
+                return Ok(true);
             };
             if let Some(mode) = snapshot.axes[axis].switch_failed
                 && matches!(step.action, Action::Mode { .. })
             {
                 return Err(RunError::NotSwitched {
-                    device: self.device_of(axis),
+                    device: this.device_of(axis),
                     step: step.into(),
                     mode,
                 });
             }
             if clock::now().saturating_sub(begun) > timeout {
                 return Err(RunError::StepTimeout {
-                    device: self.device_of(axis),
+                    device: this.device_of(axis),
                     step: step.into(),
-                    what: self.machine.describe(&step.action),
+                    what: this.machine.describe(&step.action),
                     state: snapshot.axes[axis].state,
                     timeout_ms: timeout / 1_000_000,
                 });
             }
-        }
+            Ok(false)
+        })
+        .await
     }
 
     /// Until axes whose set-point has come to rest have come to rest themselves; some orders are for standing axes only.
@@ -394,36 +413,25 @@ impl Supervisor {
         let commands = axes.iter().zip(&timeouts);
         self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
             .await;
-        loop {
-            let snapshot = self.tick().await?;
-            if self.over(start) {
-                return Ok(());
-            }
-            if snapshot.orders_taken < self.orders_given {
-                continue;
-            }
-            self.refusal(step)?;
-            let mut waiting = false;
+        self.watch(step, start, |this, snapshot| {
+            let mut homed = true;
             for &axis in &axes {
                 let status = &snapshot.axes[axis];
-                match status.homing {
+                homed &= match status.homing {
                     HomingStatus::Failed(error) => {
                         return Err(RunError::NotHomed {
-                            device: self.device_of(axis),
+                            device: this.device_of(axis),
                             step: step.into(),
                             error,
                         });
                     }
-                    HomingStatus::Attained => {
-                        waiting |= status.switching.is_some() || !status.ready;
-                    }
-                    HomingStatus::None | HomingStatus::Running => waiting = true,
-                }
+                    HomingStatus::Attained => status.switching.is_none() && status.ready,
+                    HomingStatus::None | HomingStatus::Running => false,
+                };
             }
-            if !waiting {
-                return Ok(());
-            }
-        }
+            Ok(homed)
+        })
+        .await
     }
 
     /// Until every condition holds in one and the same cycle.
@@ -470,43 +478,28 @@ impl Supervisor {
         )
         .await;
         let mut settling_since = None;
-        loop {
-            let snapshot = self.tick().await?;
-            if self.over(start) {
-                // Winding down brings the axes to rest from wherever they are.
-                return Ok(());
-            }
-            // Until then the status is that of the step before.
-            if snapshot.orders_taken < self.orders_given {
-                continue;
-            }
-            self.refusal(step)?;
-            let status = |axis: usize| snapshot.axes.get(axis).copied();
-            let late = targets.iter().find_map(|&(axis, target)| {
-                status(axis)
-                    .filter(|s| !s.in_target)
-                    .map(|s| (axis, target, s))
-            });
-            let Some((axis, target, last)) = late else {
-                return Ok(());
+        self.watch(step, start, |this, snapshot| {
+            let status = |axis: usize| &snapshot.axes[axis];
+            let late = targets.iter().find(|(axis, _)| !status(*axis).in_target);
+            let Some(&(axis, target)) = late else {
+                return Ok(true);
             };
-            if targets
-                .iter()
-                .any(|&(axis, _)| status(axis).is_some_and(|s| s.moving))
-            {
+            if targets.iter().any(|&(axis, _)| status(axis).moving) {
                 settling_since = None;
-                continue;
+                return Ok(false);
             }
             let since = *settling_since.get_or_insert_with(clock::now);
             if clock::now().saturating_sub(since) > SETTLE_TIMEOUT {
                 return Err(RunError::NotReached {
-                    device: self.device_of(axis),
+                    device: this.device_of(axis),
                     step: step.into(),
                     target,
-                    actual: reported(&last),
+                    actual: reported(status(axis)),
                 });
             }
-        }
+            Ok(false)
+        })
+        .await
     }
 }
 

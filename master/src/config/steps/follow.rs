@@ -1,0 +1,110 @@
+//! Steps in which axes follow more than a target: gears, waves, tables.
+
+use ecaxis_axis::setpoint::{
+    Interpolation, Motion, PositionWave, SetpointError, Shape, Table, Wave,
+};
+use toml::Spanned;
+
+use super::Checker;
+use super::target::What;
+use crate::config::problem::{Problems, unreadable};
+use crate::config::{Action, AxisSetup, TableFile};
+use ecaxis_axis::Mode;
+
+impl Checker<'_> {
+    /// An axis that follows positions at some time.
+    pub(super) fn positioned(
+        &self,
+        name: &Spanned<String>,
+        verb: &str,
+        p: &mut Problems<'_>,
+    ) -> Option<(usize, &AxisSetup)> {
+        let (index, axis) = self.axis(name, p)?;
+        if self.ever(index, |mode| {
+            mode != Mode::Pp && What::Position.possible(mode, axis)
+        }) {
+            return Some((index, axis));
+        }
+        let message = format!(
+            "`{verb}` is nothing that `{}` does in mode \"{}\"",
+            name.get_ref(),
+            axis.mode
+        );
+        p.add_hint(name.span(), message, "it needs CSP, or a position loop");
+        None
+    }
+
+    pub(super) fn wave(
+        &self,
+        square: bool,
+        name: &Spanned<String>,
+        amplitude: &Spanned<f64>,
+        frequency: &Spanned<f64>,
+        periods: u32,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let verb = if square { "square" } else { "sine" };
+        let (index, axis) = self.positioned(name, verb, p)?;
+        let shape = if square { Shape::Square } else { Shape::Sine };
+        let limits = axis.config.limits.motion();
+        let wave = Wave::new(
+            shape,
+            *amplitude.get_ref(),
+            *frequency.get_ref(),
+            periods,
+            self.cycle_s,
+        );
+        let checked = wave.and_then(|wave| {
+            PositionWave::new(wave, Motion::default(), limits, None, self.cycle_s)?;
+            Ok(wave)
+        });
+        match checked {
+            Ok(wave) => Some(Action::Wave { axis: index, wave }),
+            Err(error) => {
+                let at = match error {
+                    SetpointError::TooOften { .. } => frequency.span(),
+                    _ => amplitude.span(),
+                };
+                let hint = "take a smaller amplitude or a lower frequency";
+                p.add_hint(at, error.to_string(), hint);
+                None
+            }
+        }
+    }
+
+    pub(super) fn table(
+        &mut self,
+        name: &Spanned<String>,
+        file: &Spanned<String>,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
+        let path = self.folder.join(file.get_ref());
+        let text = match std::fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) => {
+                let hint = "paths are relative to the machine file";
+                p.add_hint(file.span(), unreadable(&path, &error), hint);
+                return None;
+            }
+        };
+        let (index, axis) = self.positioned(name, "table", p)?;
+        let limits = &axis.config.limits;
+        let table = Table::parse(&text, Interpolation::Cubic).and_then(|table| {
+            table.check(limits.motion(), limits.position, 0.0, self.cycle_s)?;
+            Ok(table)
+        });
+        match table {
+            Ok(table) => {
+                self.tables.push(TableFile { path, table });
+                let table = self.tables.len() - 1;
+                Some(Action::Table { axis: index, table })
+            }
+            Err(error) => {
+                let message = format!("{}, {error}", path.display());
+                let hint = "a row is time in seconds, position, and if you like velocity";
+                p.add_hint(file.span(), message, hint);
+                None
+            }
+        }
+    }
+}

@@ -1,0 +1,158 @@
+//! Targets: within the axis' limits, and something that it does in one of its modes.
+
+use toml::Spanned;
+
+use super::Checker;
+use crate::config::AxisSetup;
+use crate::config::axis::too_long;
+use crate::config::problem::{Problems, Span};
+use crate::config::raw::RawTarget;
+use ecaxis_axis::Mode;
+
+impl Checker<'_> {
+    pub(super) fn targets(
+        &self,
+        targets: Vec<RawTarget>,
+        what: What,
+        p: &mut Problems<'_>,
+    ) -> Option<Vec<(usize, f64)>> {
+        let count = targets.len();
+        let mut resolved = Vec::with_capacity(count);
+        for RawTarget { axis: name, value } in targets {
+            let Some((index, axis)) = self.axis(&name, p) else {
+                continue;
+            };
+            if !self.ever(index, |mode| what.possible(mode, axis)) {
+                let (message, hint) = what.impossible(name.get_ref(), axis);
+                p.add_hint(name.span(), message, hint);
+            } else if within(&value, what, axis, p) {
+                resolved.push((index, value.into_inner()));
+            }
+        }
+        resolved.sort_by_key(|(index, _)| *index);
+        (count > 0 && resolved.len() == count).then_some(resolved)
+    }
+
+    /// Reports an axis that would take more than an hour to reach its velocity.
+    pub(super) fn not_too_slow(
+        &self,
+        targets: &[(usize, f64)],
+        ramp: f64,
+        at: Option<Span>,
+        p: &mut Problems<'_>,
+        velocity: impl Fn(f64, f64) -> f64,
+    ) {
+        let Some(at) = at else { return };
+        let slow = targets.iter().find_map(|&(index, target)| {
+            let device = self.devices.get(index)?;
+            let limits = &device.axis.ok()?.config.limits;
+            let velocity = velocity(target, limits.velocity);
+            Some((device.name, too_long(velocity, limits.acceleration * ramp)?))
+        });
+        if let Some((name, time)) = slow {
+            let message =
+                format!("with a `ramp` of {ramp}, `{name}` takes {time} to reach its velocity");
+            p.add_hint(at, message, "a ramp may last an hour at most");
+        }
+    }
+}
+
+pub(super) fn fraction(
+    value: Option<Spanned<f64>>,
+    what: &str,
+    p: &mut Problems<'_>,
+) -> Option<f64> {
+    let Some(value) = value else { return Some(1.0) };
+    let n = *value.get_ref();
+    if n > 0.0 && n <= 1.0 {
+        return Some(n);
+    }
+    let limit = if what == "speed" {
+        "velocity"
+    } else {
+        "acceleration"
+    };
+    let message = format!("`{what}` is {n}, but it is a fraction of the axis' {limit} limit");
+    p.add_hint(value.span(), message, "a number above 0.0 and up to 1.0");
+    None
+}
+
+/// What a target is a target of.
+#[derive(Clone, Copy, PartialEq)]
+pub(super) enum What {
+    Position,
+    /// Relative to where the axis is.
+    Way,
+    Velocity,
+    Torque,
+}
+
+impl What {
+    fn verb(self) -> &'static str {
+        match self {
+            Self::Position => "move",
+            Self::Way => "move_by",
+            Self::Velocity => "velocity",
+            Self::Torque => "torque",
+        }
+    }
+
+    /// Whether an axis takes it in this mode.
+    pub(super) fn possible(self, mode: Mode, axis: &AxisSetup) -> bool {
+        let loops = &axis.config.loops;
+        let position = match mode {
+            Mode::Csv => loops.csv.is_some(),
+            Mode::Cst => loops.cst.is_some(),
+            Mode::Csp | Mode::Pp => true,
+            _ => false,
+        };
+        match self {
+            Self::Position | Self::Way => position,
+            Self::Velocity => position && mode != Mode::Pp || matches!(mode, Mode::Csv | Mode::Pv),
+            Self::Torque => mode == Mode::Cst,
+        }
+    }
+
+    fn impossible(self, name: &str, axis: &AxisSetup) -> (String, String) {
+        let message = format!(
+            "`{}` is nothing that `{name}` does in mode \"{}\"",
+            self.verb(),
+            axis.mode
+        );
+        let instead = match axis.config.mode {
+            Mode::Csv => {
+                "write `velocity = { … }`, or give the axis a position loop: `csv = { kv = 20.0 }`"
+            }
+            Mode::Cst => {
+                "write `torque = { … }`, or give the axis a position loop: `cst = { kp = 10.0 }`"
+            }
+            _ => "write `move = { … }`, or switch it before: `mode = { … = \"cst\" }`",
+        };
+        (message, instead.to_owned())
+    }
+}
+
+fn within(value: &Spanned<f64>, what: What, axis: &AxisSetup, p: &mut Problems<'_>) -> bool {
+    let limits = &axis.config.limits;
+    let unit = &axis.unit;
+    let (low, high, unit) = match what {
+        What::Position => match limits.position {
+            Some([low, high]) => (low, high, unit.clone()),
+            None => return true,
+        },
+        // Where it ends is known when it begins; it cannot be longer than the whole range.
+        What::Way => match limits.position {
+            Some([low, high]) => (low - high, high - low, unit.clone()),
+            None => return true,
+        },
+        What::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
+        What::Torque => (-limits.torque, limits.torque, "%".into()),
+    };
+    let n = *value.get_ref();
+    if (low..=high).contains(&n) {
+        return true;
+    }
+    let message = format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}");
+    p.add(value.span(), message);
+    false
+}

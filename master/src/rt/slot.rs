@@ -1,0 +1,107 @@
+//! One axis in the cycle: its process data on one side, its feed on the other.
+
+use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, Refused};
+
+use super::feed::Feed;
+use super::image::AxisBits;
+use crate::clock::Nanos;
+
+/// One axis and where its objects are.
+#[derive(Debug)]
+pub struct AxisSlot {
+    pub axis: Axis,
+    pub bits: AxisBits,
+    pub feed: Feed,
+    /// Largest following error while enabled, and the status of the last enabled cycle.
+    pub largest_following_error: f64,
+    pub last_enabled: Option<AxisStatus>,
+    /// Enabling was ordered and the drive had no fault since: from now on a fault stops the machine.
+    pub(super) armed: bool,
+    pub(super) ordered: bool,
+    /// How long a stopping axis has been at rest.
+    pub(super) rested: Nanos,
+    /// In this cycle.
+    pub(super) acted: bool,
+}
+
+impl AxisSlot {
+    #[must_use]
+    pub fn new(axis: Axis, bits: AxisBits) -> Self {
+        Self {
+            axis,
+            bits,
+            feed: Feed::default(),
+            largest_following_error: 0.0,
+            last_enabled: None,
+            armed: false,
+            ordered: false,
+            rested: 0,
+            acted: false,
+        }
+    }
+
+    pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {
+        self.ordered |= command == Command::Enable;
+        self.axis.command(command)?;
+        // These leave the set-point alone.
+        let aside = matches!(
+            command,
+            Command::Enable
+                | Command::ResetFault
+                | Command::SetMode(_)
+                | Command::ArmProbe { .. }
+                | Command::DisarmProbe { .. }
+        );
+        if !aside {
+            self.feed.end();
+        }
+        Ok(())
+    }
+
+    pub(super) fn read(&self, image: &[u8], fresh: bool) -> Inputs {
+        let bits = &self.bits;
+        Inputs {
+            statusword: bits.statusword.get(image) as u16,
+            position: bits.position.map(|b| b.get(image) as i32),
+            velocity: bits.velocity.map(|b| b.get(image) as i32),
+            torque: bits.torque.map(|b| b.get(image) as i16),
+            mode_display: bits.mode_display.map(|b| b.get(image) as i8),
+            error_code: bits.error_code.map(|b| b.get(image) as u16),
+            touch_probe_status: bits.touch_probe_status.map(|b| b.get(image) as u16),
+            touch_probe_positions: bits
+                .touch_probe_positions
+                .map(|b| b.map(|b| b.get(image) as i32)),
+            fresh,
+        }
+    }
+
+    pub(super) fn write(&self, image: &mut [u8], outputs: &Outputs) {
+        let bits = &self.bits;
+        bits.controlword.set(image, i64::from(outputs.controlword));
+        for (to, value) in [
+            (bits.mode, i64::from(outputs.mode)),
+            (bits.target_position, i64::from(outputs.target_position)),
+            (bits.target_velocity, i64::from(outputs.target_velocity)),
+            (bits.target_torque, i64::from(outputs.target_torque)),
+            (bits.velocity_offset, i64::from(outputs.velocity_offset)),
+            (bits.torque_offset, i64::from(outputs.torque_offset)),
+            (bits.profile_velocity, i64::from(outputs.profile_velocity)),
+            (
+                bits.profile_acceleration,
+                i64::from(outputs.profile_acceleration),
+            ),
+            (
+                bits.profile_deceleration,
+                i64::from(outputs.profile_acceleration),
+            ),
+            (
+                bits.touch_probe_function,
+                i64::from(outputs.touch_probe_function),
+            ),
+        ] {
+            if let Some(to) = to {
+                to.set(image, value);
+            }
+        }
+    }
+}
