@@ -34,6 +34,7 @@ pub(crate) fn setup(
         config.target_window = *positive(window, "target_window", shown, p)?;
     }
     config.modes = modes(config.mode, selection);
+    config.jerk_limited = raw.limits.jerk.is_some();
     config.loops = control::loops(&raw.loops, shown, selection, p)?;
     control::guards(raw, &mut config, shown, p)?;
     config.quick_stop = quick_stop(sdos, selection);
