@@ -179,6 +179,7 @@ fn findings_of_modules_in_another_file() {
         "<EtherCATModule><Modules>\n\
          <Module><Type ModuleIdent='1'>A</Type><Name>A</Name>\n\
          <RxPdo><Index>#x1600</Index><Exclude>#x1600</Exclude><Name>P</Name></RxPdo></Module>\n\
+         <Module><Type ModuleIdent='2'>B</Type><Name>B</Name></Module>\n\
          </Modules></EtherCATModule>",
     );
     let file = write(
@@ -186,12 +187,12 @@ fn findings_of_modules_in_another_file() {
         "<EtherCATInfo><InfoReference>modules.XML</InfoReference><Vendor><Id>1</Id></Vendor>\n\
          <Descriptions><Devices><Device><Type ProductCode='1'>D</Type>\n\
          <Slots><Slot MinInstances='1' MaxInstances='1'><Name>S</Name>\n\
-         <ModuleIdent>1</ModuleIdent></Slot></Slots></Device></Devices></Descriptions></EtherCATInfo>",
+         <ModuleIdent>1</ModuleIdent><ModuleIdent>2</ModuleIdent></Slot></Slots></Device></Devices></Descriptions></EtherCATInfo>",
     );
     let (code, out, err) = ran(&["check", &file]);
     assert_eq!(code, 0, "{out}{err}");
     let lines: Vec<&str> = out.lines().collect();
-    let device = "a device.xml:2:25: note: EtherCATInfo/Descriptions/Devices/Device[1]: ";
+    let device = "a device.xml:2:24: note: EtherCATInfo/Descriptions/Devices/Device[1]: ";
     let module = "modules.XML:3:1: warning: EtherCATModule/Modules/Module[1]/RxPdo[1]: ";
     assert_eq!(lines.len(), 2, "{out}");
     assert!(lines[0].contains(device), "{out}");
