@@ -11,6 +11,10 @@ const STALE_S: f64 = 0.1;
 /// An axis that does not come to rest after a halt or an error is let go after so many seconds.
 const HALT_S: f64 = 2.0;
 
+/// One that comes to rest has to stand so long. A mode that took it over earlier would end its deceleration where it is then,
+/// perhaps with a last step further onto a limit switch.
+const REST_S: f64 = 0.05;
+
 /// Why the home position is not known.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HomingError {
@@ -73,6 +77,7 @@ enum Phase {
     Halt {
         error: HomingError,
         elapsed_s: f64,
+        stood_s: f64,
     },
     Leave {
         result: Result<(), HomingError>,
@@ -120,10 +125,7 @@ impl Sequence {
         let error = HomingError::Aborted;
         self.phase = match self.phase {
             Phase::Enter | Phase::Prepare => Phase::Leave { result: Err(error) },
-            Phase::Search { .. } => Phase::Halt {
-                error,
-                elapsed_s: 0.0,
-            },
+            Phase::Search { .. } => Phase::halt(error),
             over => over,
         };
     }
@@ -180,14 +182,23 @@ impl Phase {
                     Self::Search { stale, elapsed_s }
                 }
             }
-            Self::Halt { error, elapsed_s } => {
-                let rests = seen.fresh && seen.standing && elapsed_s > 0.0;
-                if rests || elapsed_s > HALT_S {
+            Self::Halt {
+                error,
+                elapsed_s,
+                stood_s,
+            } => {
+                let stood_s = match (seen.fresh, seen.standing) {
+                    (false, _) => stood_s,
+                    (true, true) => stood_s + dt_s,
+                    (true, false) => 0.0,
+                };
+                if stood_s > REST_S || elapsed_s > HALT_S {
                     Self::Leave { result: Err(error) }
                 } else {
                     Self::Halt {
                         error,
                         elapsed_s: elapsed_s + dt_s,
+                        stood_s,
                     }
                 }
             }
@@ -202,6 +213,7 @@ impl Phase {
         Self::Halt {
             error,
             elapsed_s: 0.0,
+            stood_s: 0.0,
         }
     }
 }
@@ -351,7 +363,7 @@ mod tests {
         // An error while moving: halt, stand, back.
         let (sequence, order, _) = run(new(), &[start, search, (HM, ErrorMoving, false, 5)]);
         assert!(order.halt && order.mode == HM);
-        let (sequence, order, _) = run(sequence, &[(HM, ErrorStanding, true, 2)]);
+        let (sequence, order, _) = run(sequence, &[(HM, ErrorStanding, true, 60)]);
         assert_eq!(order.mode, CSP);
         let (_, _, outcome) = run(sequence, &[(CSP, NotStarted, true, 1)]);
         assert_eq!(outcome, Outcome::Failed(HomingError::Drive));
@@ -373,7 +385,7 @@ mod tests {
         ] {
             let (mut sequence, _, _) = run(new(), rows);
             sequence.abort();
-            let rest = [(HM, NotStarted, true, 3), (CSP, NotStarted, true, 1)];
+            let rest = [(HM, NotStarted, true, 60), (CSP, NotStarted, true, 1)];
             let (_, order, outcome) = run(sequence, &rest);
             assert_eq!(outcome, Outcome::Failed(HomingError::Aborted));
             assert!(!order.start && !order.halt);
