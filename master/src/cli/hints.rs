@@ -10,7 +10,7 @@ use ecaxis::link::packet::OpenError;
 use ecaxis::mailbox::{ObjectAddress, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
-use ecaxis_axis::{State, Trip};
+use ecaxis_axis::{HomingError, State, Trip};
 use ecaxis_sim::ServeError;
 
 use super::note;
@@ -94,7 +94,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         }
         RunError::StepTimeout { .. } => "look at the drive's state and fault; the step waits as long as `bus.enable_timeout`, or as the slowest axis may take to stop".to_owned(),
         RunError::NotSwitched { .. } => "look at 0x6502 (supported drive modes), and at the drive's manual for what the mode needs".to_owned(),
-        RunError::NotHomed { .. } => "check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`".to_owned(),
+        RunError::NotHomed { error, .. } => not_homed(*error).to_owned(),
         RunError::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
         RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
@@ -144,6 +144,22 @@ fn message(error: &RunError) -> String {
     match text.strip_suffix(&long) {
         Some(head) => head.to_owned() + short,
         None => text,
+    }
+}
+
+fn not_homed(error: HomingError) -> &'static str {
+    match error {
+        HomingError::Timeout { .. } => {
+            "check that what the method looks for is there, wired and on that side (0x60FD shows the drive's inputs); a long way needs a higher `homing.search` or a longer `homing.timeout`"
+        }
+        HomingError::Drive => {
+            "the search met the other limit switch or no index pulse: check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`"
+        }
+        HomingError::ModeRefused => {
+            "look at 0x6502 (supported drive modes): this drive may not know homing"
+        }
+        HomingError::PowerLost => "look at the drive's fault (0x603F) and its supply",
+        HomingError::Aborted => "home the axis again before it moves to positions",
     }
 }
 

@@ -202,7 +202,13 @@ pub(crate) fn check(
     ) {
         homing.add_to(&mut chosen.startup);
     }
-    let sim = raw.sim.take().map(|raw| sim::check(raw, names, device, p));
+    let sim = raw.sim.take().map(|sim| {
+        let axis = match (&raw.axis, &axis) {
+            (None, _) => Err(()),
+            (Some(_), axis) => Ok(axis.as_ref().and_then(Option::as_ref)),
+        };
+        sim::check(sim, names, device, axis, p)
+    });
     let device = device.map(|d| Arc::new(d.clone()));
     let (esi_path, file) = file?;
     Some(DeviceConfig {

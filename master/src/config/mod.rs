@@ -35,6 +35,7 @@ pub mod sim;
 mod steps;
 #[cfg(test)]
 mod tests;
+mod track;
 mod units;
 
 pub use problem::{ConfigError, Problem, nearest};

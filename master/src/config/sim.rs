@@ -10,7 +10,8 @@ use super::fields::{self, Fields};
 use super::gateway::{self, RawGateway};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::RawDevice;
-use super::{DeviceConfig, Locator};
+use super::track::{self, RawTrack, TrackSetup};
+use super::{AxisSetup, DeviceConfig, Locator};
 
 /// A device of the simulated bus, as far as its ESI file does not describe it.
 #[derive(Debug, Clone, Default)]
@@ -29,6 +30,8 @@ pub struct SimSetup {
     pub jitter_ns: u32,
     /// The network behind a gateway.
     pub gateway: Option<GatewayOptions>,
+    /// Of a drive.
+    pub track: TrackSetup,
 }
 
 /// As written.
@@ -41,6 +44,7 @@ pub(crate) struct RawSim {
     offset: Option<Spanned<u64>>,
     jitter: Option<Spanned<u64>>,
     gateway: Option<RawGateway>,
+    track: Option<RawTrack>,
 }
 
 /// Crystals are better than this by far.
@@ -57,16 +61,18 @@ pub(crate) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawSi
         offset: f.get("offset").and_then(|v| fields::duration(p, v)),
         jitter: f.get("jitter").and_then(|v| fields::duration(p, v)),
         gateway: gateway::read(&mut f, span, p),
+        track: f.get("track").and_then(|v| track::read(v, p)),
     };
     f.done(p);
     raw
 }
 
-/// `names` are those of all devices.
+/// `names` are those of all devices; for `axis` see [`track::check`].
 pub(crate) fn check(
     raw: RawSim,
     names: &[String],
     device: Option<&esi::Device>,
+    axis: Result<Option<&AxisSetup>, ()>,
     p: &mut Problems<'_>,
 ) -> SimSetup {
     if let Some(after) = &raw.after
@@ -111,6 +117,10 @@ pub(crate) fn check(
             .and_then(|ns| u32::try_from(ns).ok())
             .unwrap_or(0),
         gateway: raw.gateway.and_then(|raw| gateway::setup(raw, device, p)),
+        track: raw
+            .track
+            .and_then(|raw| track::check(&raw, axis, p))
+            .unwrap_or_default(),
     }
 }
 

@@ -118,10 +118,12 @@ pub enum RunError {
         step: StepRef,
         mode: Mode,
     },
-    #[error("{step}: {device}: {error}")]
+    #[error("{step}: {device}: {error}, by {}", by(*method))]
     NotHomed {
         device: DeviceRef,
         step: StepRef,
+        /// 0x6098.
+        method: i8,
         error: ecaxis_axis::homing::HomingError,
     },
     #[error("{step}: {condition} did not come within {timeout_ms} ms: it is {value}")]
@@ -182,5 +184,13 @@ fn lost_note(answered: bool, (seen, expected): (u16, u16)) -> String {
         format!("with working counter {seen} instead of {expected}")
     } else {
         "without an answer".to_owned()
+    }
+}
+
+/// A homing method in words.
+fn by(method: i8) -> String {
+    match ecaxis_axis::homing::method(method) {
+        Some(known) => format!("method {method} ({})", known.text),
+        None => format!("method {method}"),
     }
 }

@@ -114,6 +114,8 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
     if let Some(axis) = &device.axis {
         // Validated as a positive number that fits.
         options.plant.counts_per_turn = axis.config.scale.counts_per_turn().round() as u32;
+        options.plant.initial_position = device.sim.track.start;
+        options.plant.track = device.sim.track.track;
     }
     SimDevice::from_esi(&device.device, &device.esi.modules, options)
         .map_err(|error| RunError::Sim(format!("`{}`: {error}", device.name)))

@@ -422,6 +422,7 @@ impl Supervisor {
                         return Err(RunError::NotHomed {
                             device: this.device_of(axis),
                             step: step.into(),
+                            method: this.homing_method(axis),
                             error,
                         });
                     }
@@ -432,6 +433,15 @@ impl Supervisor {
             Ok(homed)
         })
         .await
+    }
+
+    fn homing_method(&self, axis: usize) -> i8 {
+        let device = self
+            .axes
+            .get(axis)
+            .and_then(|&d| self.machine.devices.get(d));
+        let setup = device.and_then(|d| d.axis.as_ref()?.homing.as_ref());
+        setup.map_or(0, |setup| setup.homing.method)
     }
 
     /// Until every condition holds in one and the same cycle.

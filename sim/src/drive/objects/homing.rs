@@ -1,6 +1,6 @@
 //! Homing: 0x6098–0x609A, the home position, and maxon's 0x30B0–0x30B2.
 
-use super::binder::Binder;
+use super::binder::{Binder, RW};
 use super::{float, int, uint, whole};
 use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::modes::METHODS;
@@ -45,6 +45,18 @@ fn list_methods(b: &mut Binder<'_>) {
     }
 }
 
+const DISTANCE: (u16, &str, u32) = (0x30b1, "Home offset move distance", 32);
+const THRESHOLD: (u16, &str, u32) = (0x30b2, "Current threshold for homing mode", 16);
+/// mA.
+const THRESHOLD_MA: i64 = 500;
+
+/// For a dictionary that says nothing about its maker's objects. Not 0x30B0: such a dictionary has 0x607C.
+pub(super) fn add(b: &mut Binder<'_>) {
+    for (index, name, bits) in [DISTANCE, THRESHOLD] {
+        b.bind(index, 0, name, bits, RW);
+    }
+}
+
 impl HomingSlots {
     /// `per_rpm`, `per_rpm_s`: the drive's units of speed and acceleration.
     pub(super) fn bind(b: &mut Binder<'_>, per_rpm: f64, per_rpm_s: f64) -> Self {
@@ -76,8 +88,10 @@ impl HomingSlots {
                 units(1000.0 * per_rpm_s),
             ),
             home_position: b.own(0x30b0, 0, "Home position").or(b.0.slot(0x607c, 0)),
-            distance: b.own(0x30b1, 0, "Home offset move distance"),
-            current_threshold: b.own(0x30b2, 0, "Current threshold for homing mode"),
+            distance: b.own(DISTANCE.0, 0, DISTANCE.1),
+            current_threshold: b
+                .own(THRESHOLD.0, 0, THRESHOLD.1)
+                .inspect(|&slot| b.fill(slot, THRESHOLD_MA)),
         }
     }
 
@@ -98,7 +112,8 @@ impl HomingSlots {
             distance: signed(self.distance),
             current_threshold: self
                 .current_threshold
-                .map_or(0.5, |slot| float(uint(store, slot)) * 1e-3),
+                .map_or_else(|| float(THRESHOLD_MA), |slot| float(uint(store, slot)))
+                * 1e-3,
         }
     }
 }

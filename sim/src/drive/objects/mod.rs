@@ -116,6 +116,7 @@ impl Objects {
         if !b.0.has_any(MAKERS_OWN) {
             motor::add(&mut b);
             TuningSlots::add(&mut b);
+            homing::add(&mut b);
         }
         motor::fill(&mut b, plant);
         let tuning = TuningSlots::bind(&mut b, plant);
