@@ -3,6 +3,8 @@
 #![allow(dead_code, reason = "every test binary uses a part")]
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
+pub mod script;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

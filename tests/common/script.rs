@@ -1,0 +1,203 @@
+//! Commands one after the other through a [`Controller`], with the axis' status of every cycle kept.
+
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
+
+use ecaxis::config::{AxisRef, Machine};
+use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::session::{Options, Outcome, run_with};
+use ecaxis_axis::cia402::Mode;
+use ecaxis_axis::status::HomingStatus;
+use ecaxis_axis::{AxisStatus, Command};
+
+use super::Heard;
+
+/// One thing after the other.
+#[derive(Debug, Clone, Copy)]
+pub enum Act {
+    /// And wait until it is done.
+    Do(Command),
+    /// The next one at once.
+    Begin(Command),
+    /// So many seconds.
+    Dwell(f64),
+    /// Until the reported position is beyond this one.
+    Above(f64),
+    Below(f64),
+}
+
+/// The status of every cycle since the axis was ready, and where in it each act began.
+#[derive(Debug, Default)]
+pub struct Trace {
+    pub cycles: Vec<AxisStatus>,
+    pub began: Vec<usize>,
+    pub dt_s: f64,
+}
+
+impl Trace {
+    /// The cycles of an act, from the one in which it began to the one in which it turned out to be over.
+    pub fn of(&self, act: usize) -> &[AxisStatus] {
+        let end = self.began.get(act + 1).map(|next| next + 1);
+        &self.cycles[self.began[act]..end.unwrap_or(self.cycles.len())]
+    }
+
+    pub fn at_end_of(&self, act: usize) -> &AxisStatus {
+        self.of(act).last().expect("it took a cycle")
+    }
+}
+
+pub fn move_to(position: f64, speed: f64) -> Act {
+    Act::Do(Command::MoveTo {
+        position,
+        speed,
+        ramp: 1.0,
+    })
+}
+
+pub fn velocity(velocity: f64) -> Act {
+    Act::Do(Command::Velocity {
+        velocity,
+        ramp: 1.0,
+    })
+}
+
+pub fn mode(mode: Mode) -> Act {
+    Act::Do(Command::SetMode(mode))
+}
+
+pub fn home(timeout_s: f64) -> Act {
+    Act::Do(Command::Home { timeout_s })
+}
+
+struct Script {
+    axis: AxisRef,
+    acts: Vec<Act>,
+    next: usize,
+    since: u64,
+    trace: Arc<Mutex<Trace>>,
+}
+
+impl Script {
+    fn over(&self, status: &AxisStatus, elapsed: u64, dt_s: f64) -> bool {
+        match self.acts[self.next - 1] {
+            Act::Begin(_) => true,
+            Act::Dwell(seconds) => elapsed as f64 * dt_s >= seconds,
+            Act::Above(position) => status.position > position,
+            Act::Below(position) => status.position < position,
+            // What the axis says in the cycle of the command is of the time before it.
+            Act::Do(_) if elapsed < 2 => false,
+            Act::Do(Command::SetMode(mode)) => status.mode == mode && status.switching.is_none(),
+            Act::Do(Command::Home { .. }) => {
+                matches!(
+                    status.homing,
+                    HomingStatus::Attained | HomingStatus::Failed(_)
+                ) && status.ready
+            }
+            Act::Do(_) => status.in_target,
+        }
+    }
+}
+
+impl Controller for Script {
+    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+        let status = machine.axis(self.axis);
+        if machine.stopping() || (!status.ready && self.next == 0) {
+            return;
+        }
+        let mut trace = self.trace.lock().expect("nobody panics with it");
+        trace.dt_s = machine.dt_s();
+        trace.cycles.push(status);
+        let elapsed = machine.number() - self.since;
+        if self.next > 0 && !self.over(&status, elapsed, machine.dt_s()) {
+            return;
+        }
+        while let Some(&act) = self.acts.get(self.next) {
+            let cycle = trace.cycles.len() - 1;
+            trace.began.push(cycle);
+            self.next += 1;
+            self.since = machine.number();
+            match act {
+                Act::Do(command) | Act::Begin(command) => {
+                    if let Err(refused) = machine.command(self.axis, command) {
+                        panic!("{command:?}: {refused}");
+                    }
+                    if matches!(act, Act::Do(_)) {
+                        return;
+                    }
+                }
+                _ => return,
+            }
+        }
+        machine.finish();
+    }
+}
+
+/// Runs the acts on the machine's axis of this name. A limit of time keeps what never ends from hanging.
+pub fn perform(machine: Machine, axis: &str, acts: &[Act], options: Options) -> (Outcome, Trace) {
+    let axis = machine.axis(axis).expect("an axis");
+    let trace = Arc::new(Mutex::new(Trace::default()));
+    let script = Script {
+        axis,
+        acts: acts.to_vec(),
+        next: 0,
+        since: 0,
+        trace: Arc::clone(&trace),
+    };
+    let options = Options {
+        limit: options.limit.or(Some(120_000_000_000)),
+        ..options
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut heard = Heard::default();
+    let outcome = run_with(machine, options, stop, &mut heard, Box::new(script));
+    let mut kept = trace.lock().expect("nobody panics with it");
+    (outcome, std::mem::take(&mut kept))
+}
+
+/// As [`perform`]; every act must come to its end.
+pub fn perform_well(machine: Machine, axis: &str, acts: &[Act], options: Options) -> Trace {
+    let (outcome, trace) = perform(machine, axis, acts, options);
+    if let Err(error) = outcome.result {
+        panic!("{error}; at {:?}", trace.cycles.last());
+    }
+    let last = trace.cycles.last();
+    assert_eq!(trace.began.len(), acts.len(), "{last:?}");
+    trace
+}
+
+/// What the cycle wrote and read on the wire, taken from a recording: the process image of each cycle, as it left and as
+/// it came back.
+pub fn process_images(recording: &std::path::Path) -> Vec<(Vec<u8>, Vec<u8>)> {
+    use pcap_file::pcapng::{Block, PcapNgReader};
+    const LRW: u8 = 12;
+    let bytes = std::fs::read(recording).expect("the recording");
+    let mut reader = PcapNgReader::new(bytes.as_slice()).expect("pcapng");
+    let mut images = Vec::new();
+    let mut sent: Option<Vec<u8>> = None;
+    while let Some(block) = reader.next_block() {
+        let Block::EnhancedPacket(packet) = block.expect("a block") else {
+            continue;
+        };
+        let frame = packet.data.as_ref();
+        let mut at = 16;
+        // Datagrams: command, index, address, length with "more" in bit 15, interrupt; data; working counter.
+        while let Some(header) = frame.get(at..at + 10) {
+            let length = u16::from_le_bytes([header[6], header[7]]);
+            let size = usize::from(length & 0x7ff);
+            if header[0] == LRW {
+                let data = frame[at + 10..at + 10 + size].to_vec();
+                // SubDevices set this bit of the source address.
+                if frame[6] & 0x02 == 0 {
+                    sent = Some(data);
+                } else if let Some(sent) = sent.take() {
+                    images.push((sent, data));
+                }
+            }
+            if length & 0x8000 == 0 {
+                break;
+            }
+            at += 12 + size;
+        }
+    }
+    images
+}
