@@ -321,10 +321,7 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
     };
     let mut refuse = |severity, what: &str, error: &SelectError| {
         let (position, path) = match error.element() {
-            Some((position, element)) => (
-                position,
-                format!("{path}/{}", within(device, position, element)),
-            ),
+            Some((position, element)) => (position, within(file, device, position, element)),
             None => (device.position, path.to_owned()),
         };
         found.add(severity, position, &path, format!("{what}: {error}"));
@@ -356,18 +353,37 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
     }
 }
 
-/// The element's number among its like, as the reader's paths have it.
-fn within(device: &Device, position: Position, element: &str) -> String {
-    let numbered = |positions: Vec<Position>| {
-        let found = positions.iter().position(|other| *other == position);
-        found.map_or_else(|| element.to_owned(), |at| format!("{element}[{}]", at + 1))
+/// The path of an element of the device or of a module, as the reader tells it.
+fn within(file: &EsiFile, device: &Device, position: Position, element: &str) -> String {
+    let path = &device.path;
+    let found = match element {
+        "Slot" => {
+            let mut all = device.slots.iter().flat_map(|slots| &slots.slots);
+            let at = all.position(|slot| slot.position == position);
+            at.map(|at| format!("{path}/Slots/Slot[{}]", at + 1))
+        }
+        "Sm" => {
+            let mut all = device.sync_managers.iter();
+            let at = all.position(|sm| sm.position == position);
+            at.map(|at| format!("{path}/Sm[{}]", at + 1))
+        }
+        "Pdo" => {
+            let of_device = [(path, &device.rx_pdos, &device.tx_pdos)];
+            let modules = file.modules.iter();
+            let of_modules = modules.map(|m| (&m.path, &m.rx_pdos, &m.tx_pdos));
+            let mut all = of_device.into_iter().chain(of_modules);
+            all.find_map(|(path, rx, tx)| {
+                [("RxPdo", rx), ("TxPdo", tx)]
+                    .iter()
+                    .find_map(|(name, pdos)| {
+                        let at = pdos.iter().position(|pdo| pdo.position == position)?;
+                        Some(format!("{path}/{name}[{}]", at + 1))
+                    })
+            })
+        }
+        _ => None,
     };
-    let slots = device.slots.iter().flat_map(|slots| &slots.slots);
-    match element {
-        "Slot" => format!("Slots/{}", numbered(slots.map(|s| s.position).collect())),
-        "Sm" => numbered(device.sync_managers.iter().map(|s| s.position).collect()),
-        _ => element.to_owned(),
-    }
+    found.unwrap_or_else(|| format!("{path}/{element}"))
 }
 
 fn doubled_devices(found: &mut Found, file: &EsiFile) {

@@ -246,7 +246,7 @@ fn an_empty_flag_counts_as_absent() {
 
 /// Modules are the user's to name: a slot that needs one is no fault of the file.
 #[test]
-fn a_slot_that_needs_a_module_is_a_warning() {
+fn a_slot_that_needs_a_module_is_a_note() {
     let slots = "<Slots><Slot MinInstances=\"1\"><Name>A</Name><ModuleIdent>1</ModuleIdent><ModuleIdent>2</ModuleIdent></Slot></Slots>";
     let module =
         |ident: u8| format!("<Module><Type ModuleIdent=\"{ident}\">M{ident}</Type></Module>");
@@ -258,7 +258,7 @@ fn a_slot_that_needs_a_module_is_a_warning() {
     );
     let findings = lint(&parse(text.as_bytes()).unwrap());
     assert_eq!(findings.len(), 1);
-    assert_eq!(findings[0].severity, Severity::Warning);
+    assert_eq!(findings[0].severity, Severity::Note);
     assert!(findings[0].message.contains("needs a module"));
 }
 

@@ -3,6 +3,10 @@
 #![allow(clippy::print_stdout)]
 
 mod common;
+#[path = "selection/eni.rs"]
+mod eni;
+#[path = "selection/modules.rs"]
+mod modules;
 
 use ecaxis_esi::{
     Choice, DeviceQuery, EntryRef, EsiFile, Mode, SelectError, Selection, StartupSdo, UserSdo,
@@ -436,141 +440,6 @@ fn a_coupler_terminal_has_bits_and_no_sdos() {
     );
     assert_eq!(selection.layout.tx.len(), 8);
     assert!(selection.startup.is_empty());
-}
-
-/// The configuration that another tool made of the same file with its default module: the same commands in the same
-/// order, whole assignments by complete access, no contents because PdoConfig is not set, 9 before Op.
-#[test]
-fn the_same_start_up_commands_as_a_recorded_eni() {
-    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
-        return;
-    };
-    let Some(eni) = common::read("eni/CherryECAT_CIA402_ENI.xml") else {
-        return;
-    };
-    let choice = Choice {
-        cycle_ns: MS,
-        ..Choice::default()
-    };
-    let selection = choose(&file, &choice).unwrap();
-    let ours: Vec<_> = selection
-        .startup
-        .iter()
-        .map(|sdo| InitCmd {
-            transitions: vec![sdo.transition.to_owned()],
-            index: sdo.index,
-            sub: sdo.sub,
-            complete_access: sdo.complete_access,
-            data: sdo.data.clone(),
-        })
-        .collect();
-    let recorded = coe_init_cmds(std::str::from_utf8(&eni).unwrap());
-    assert_eq!(recorded.len(), 3);
-    assert_eq!(ours, recorded);
-    assert_eq!(
-        (selection.layout.rx_bytes(), selection.layout.tx_bytes()),
-        (8, 8)
-    );
-}
-
-#[derive(Debug, Default, PartialEq, Eq)]
-struct InitCmd {
-    transitions: Vec<String>,
-    index: u16,
-    sub: u8,
-    complete_access: bool,
-    data: Vec<u8>,
-}
-
-/// The CoE commands of an ENI, read without our own reader.
-fn coe_init_cmds(eni: &str) -> Vec<InitCmd> {
-    let coe = eni.split("<CoE>").nth(1).unwrap();
-    let coe = coe.split("</CoE>").next().unwrap();
-    let text = |part: &str, tag: &str| {
-        let rest = part.split(&format!("<{tag}>")).nth(1)?;
-        Some(rest.split("</").next()?.trim().to_owned())
-    };
-    coe.split("<InitCmd")
-        .filter(|part| part.contains("</InitCmd>"))
-        .map(|part| {
-            let hex = text(part, "Data").unwrap();
-            let byte = |at: usize| u8::from_str_radix(&hex[at..at + 2], 16).unwrap();
-            InitCmd {
-                transitions: vec![text(part, "Transition").unwrap()],
-                index: text(part, "Index").unwrap().parse().unwrap(),
-                sub: text(part, "SubIndex").unwrap().parse().unwrap(),
-                complete_access: part
-                    .split('>')
-                    .next()
-                    .unwrap()
-                    .contains("CompleteAccess=\"true\""),
-                data: (0..hex.len()).step_by(2).map(byte).collect(),
-            }
-        })
-        .collect()
-}
-
-/// Two axes in one device: the second module's indices count on by the slot's increments.
-#[test]
-fn a_module_in_the_second_slot_counts_on() {
-    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
-        return;
-    };
-    let choice = Choice {
-        modules: &["0x319800", "0x219800"],
-        cycle_ns: MS,
-        ..Choice::default()
-    };
-    let selection = choose(&file, &choice).unwrap();
-    let places: Vec<_> = selection
-        .modules
-        .iter()
-        .map(|m| (m.place, m.slot_name.as_str()))
-        .collect();
-    assert_eq!(places, [(0, "Axis 0"), (1, "Axis 1")]);
-    let indices: Vec<u16> = selection.rx.iter().map(|pdo| pdo.index).collect();
-    assert_eq!(indices, [0x1602, 0x1601 + 16]);
-    let controlwords =
-        [0x6040, 0x6840].map(|index| selection.layout.rx_field(index, 0).unwrap().bit_offset);
-    assert_eq!(controlwords, [0, 64]);
-    assert!(
-        selection.dictionary.object(0x683f).is_some(),
-        "0x603F + 0x800"
-    );
-    let modes: Vec<_> = selection
-        .startup
-        .iter()
-        .filter(|sdo| sdo.transition == "SO")
-        .map(|sdo| (sdo.index, sdo.data[0]))
-        .collect();
-    assert_eq!(modes, [(0x6060, 9), (0x6860, 8)]);
-}
-
-#[test]
-fn a_module_that_does_not_fit_is_refused_by_name() {
-    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
-        return;
-    };
-    let refused = |modules: &[&str]| {
-        let choice = Choice {
-            modules,
-            cycle_ns: MS,
-            ..Choice::default()
-        };
-        choose(&file, &choice).unwrap_err().to_string()
-    };
-    let text = refused(&["-", "-"]);
-    assert!(text.contains("slot \"Axis 0\" needs a module"), "{text}");
-    let text = refused(&["0x319800", "valve"]);
-    assert!(
-        text.contains("takes no module \"valve\"; the ESI offers"),
-        "{text}"
-    );
-    let text = refused(&["0x319800", "-", "-"]);
-    assert!(
-        text.contains("3 modules are listed, there are 2 places"),
-        "{text}"
-    );
 }
 
 /// Elmo's InitCmd sets 2 for its own 2 ms; the drive must learn the cycle of this bus.

@@ -3,6 +3,8 @@
 #![allow(clippy::print_stdout)]
 
 mod common;
+#[path = "mutations/memory.rs"]
+mod memory;
 
 use ecaxis_esi::parse;
 use ecaxis_esi::sii::{self, SiiOptions};
@@ -320,6 +322,35 @@ fn no_cut_and_no_byte_makes_it_panic() {
             let _ = said(&image);
         }
     }
+}
+
+/// Whatever lengths and numbers an image claims, reading it takes no more than a few times its length.
+#[test]
+fn no_claim_takes_much_memory() {
+    const LIMIT: usize = 64 << 20;
+    let mut long = whole();
+    let end = head(&long, 0xffff);
+    long.truncate(end);
+    // As long as an EEPROM can be, full of categories that claim the most.
+    for kind in (1..=DC).cycle() {
+        if long.len() + 4 + 2 * 0xff > 512 << 10 {
+            break;
+        }
+        long.extend(kind.to_le_bytes());
+        long.extend(0xff_u16.to_le_bytes());
+        long.extend([0xff; 2 * 0xff]);
+    }
+    long.extend([0xff, 0xff]);
+    memory::reset();
+    let _ = said(&long);
+    let mut image = whole();
+    for at in (0x80..image.len() - 1).step_by(2) {
+        let before = word(&image, at);
+        put(&mut image, at, 0xfffe);
+        let _ = said(&image);
+        put(&mut image, at, before);
+    }
+    assert!(memory::peak() < LIMIT, "{} bytes", memory::peak());
 }
 
 #[test]

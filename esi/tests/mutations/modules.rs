@@ -15,7 +15,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("error", At::First("<Slot ")),
-        "Device[1]/Slot",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Slots/Slot[1]",
         "module 0xdeadbeef, which neither",
     ),
     row(
@@ -35,14 +35,14 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("warning", At::Nth(2, "<Module>")),
-        "Module[2]",
+        "EtherCATInfo/Descriptions/Modules/Module[2]",
         "described twice; the one on line 8271 is taken",
     ),
     row(
         "65535 instances of a slot",
         |text| instances(&text, "65535"),
         ("warning", At::First("<Slots ")),
-        "Device[1]/Slots",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Slots",
         "65535 places for modules; 0xF030 lists 254",
     ),
     row(
@@ -56,28 +56,28 @@ pub const MUTATIONS: &[Mutation] = &[
         "254 slots of large dictionaries",
         |text| slots(&large_module(&text, 200), 254),
         ("error", At::First("<Slots ")),
-        "Device[1]/Slots",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Slots",
         "in the 254 places of",
     ),
     row(
         "254 slots of dictionaries just below the bound",
         |text| slots(&large_module(&text, 5), 254),
         ("warning", At::First("<Slots ")),
-        "Device[1]/Slots",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Slots",
         "255 places for modules; 0xF030 lists 254",
     ),
     row(
         "100000 slots",
         |text| slots(&text, 100_000),
         ("warning", At::First("<Slots ")),
-        "Device[1]/Slots",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Slots",
         "100001 places for modules",
     ),
     row(
         "65535 instances of large dictionaries",
         |text| instances(&large_module(&text, 200), "65535"),
         ("error", At::First("<Slots ")),
-        "Device[1]/Slots",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Slots",
         "in the 254 places of",
     ),
     row(
@@ -132,7 +132,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("warning", At::Nth(2, "<Object>")),
-        "Device[1]/Object[2]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Profile/Dictionary/Objects/Object[2]",
         "object 0x1000 is described twice",
     ),
     row(

@@ -14,7 +14,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("warning", At::Nth(2, "<RxPdo ")),
-        "Device[1]/RxPdo[2]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[2]",
         "described twice, first on line 8074",
     ),
     row(
@@ -47,7 +47,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("warning", At::Nth(1, "<RxPdo ")),
-        "Device[1]/RxPdo[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]",
         "excludes itself",
     ),
     row(
@@ -75,7 +75,7 @@ pub const MUTATIONS: &[Mutation] = &[
         "a bit length beyond a frame",
         |text| replace(&text, "<BitLen>16</BitLen>", "<BitLen>65535</BitLen>"),
         ("warning", At::First("<Entry>")),
-        "Device[1]/RxPdo[1]/Entry[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]/Entry[1]",
         "more than a frame carries",
     ),
     row(
@@ -95,7 +95,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("warning", At::Nth(1, "<RxPdo ")),
-        "Device[1]/RxPdo[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]",
         "Sm 9, and the device has 4",
     ),
     row(
@@ -121,7 +121,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("warning", At::Nth(1, "<RxPdo ")),
-        "Device[1]/RxPdo[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]",
         "for Inputs and not for Outputs",
     ),
     row(
@@ -154,7 +154,7 @@ pub const MUTATIONS: &[Mutation] = &[
         "65535 samples of a PDO",
         |text| replace_in(&text, "#x6800000C\">", "<RxPdo ", "<RxPdo OSFac=\"65535\" "),
         ("error", At::First("<RxPdo OSFac")),
-        "Device[1]/Pdo",
+        "EtherCATInfo/Descriptions/Modules/Module[3]/RxPdo[1]",
         "65535 samples of PDO 0x1600",
     ),
     row(
@@ -174,7 +174,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("error", At::Nth(3, "<Sm ")),
-        "Device[1]/Sm",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]",
         "does not lie in a SubDevice's memory",
     ),
     row(
@@ -187,7 +187,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("error", At::Nth(3, "<Sm ")),
-        "Device[1]/Sm",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]",
         "does not lie in a SubDevice's memory",
     ),
     row(
@@ -200,21 +200,21 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("error", At::First("<Device ")),
-        "Device[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]",
         "reaches into SyncManager 3",
     ),
     row(
         "no mailbox SyncManager",
         |text| replace(&text, ">MBoxIn<", ">Inputs<"),
         ("warning", At::First("<Device ")),
-        "Device[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]",
         "no Sm for both of its directions",
     ),
     row(
         "an FMMU of a SyncManager that is not there",
         |text| replace(&text, "<Fmmu>Inputs", r##"<Fmmu Sm="200">Inputs"##),
         ("warning", At::First("<Device ")),
-        "Device[1]/Fmmu[2]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]/Fmmu[2]",
         "Sm 200, which does not exist",
     ),
 ];

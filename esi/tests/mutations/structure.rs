@@ -128,21 +128,21 @@ pub const MUTATIONS: &[Mutation] = &[
             )
         },
         ("error", At::First("<Device ")),
-        "Device[1]",
+        "EtherCATInfo/Descriptions/Devices/Device[1]",
         "a SYNC0 cycle that does not fit",
     ),
     row(
         "a doubled device",
         |text| doubled(&text, 1),
         ("warning", At::Nth(2, "<Device ")),
-        "Device[2]",
+        "EtherCATInfo/Descriptions/Devices/Device[2]",
         "described twice, first on line 18",
     ),
     row(
         "5000 doubled devices with 254 places each",
         |text| doubled(&text, 5000),
         ("warning", At::Last("<Device ")),
-        "Devices",
+        "EtherCATInfo/Descriptions/Devices",
         "not all layouts were tried",
     ),
     row(

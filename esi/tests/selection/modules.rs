@@ -1,0 +1,66 @@
+//! Modules in slots.
+
+use super::*;
+
+/// Two axes in one device: the second module's indices count on by the slot's increments.
+#[test]
+fn a_module_in_the_second_slot_counts_on() {
+    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
+        return;
+    };
+    let choice = Choice {
+        modules: &["0x319800", "0x219800"],
+        cycle_ns: MS,
+        ..Choice::default()
+    };
+    let selection = choose(&file, &choice).unwrap();
+    let places: Vec<_> = selection
+        .modules
+        .iter()
+        .map(|m| (m.place, m.slot_name.as_str()))
+        .collect();
+    assert_eq!(places, [(0, "Axis 0"), (1, "Axis 1")]);
+    let indices: Vec<u16> = selection.rx.iter().map(|pdo| pdo.index).collect();
+    assert_eq!(indices, [0x1602, 0x1601 + 16]);
+    let controlwords =
+        [0x6040, 0x6840].map(|index| selection.layout.rx_field(index, 0).unwrap().bit_offset);
+    assert_eq!(controlwords, [0, 64]);
+    assert!(
+        selection.dictionary.object(0x683f).is_some(),
+        "0x603F + 0x800"
+    );
+    let modes: Vec<_> = selection
+        .startup
+        .iter()
+        .filter(|sdo| sdo.transition == "SO")
+        .map(|sdo| (sdo.index, sdo.data[0]))
+        .collect();
+    assert_eq!(modes, [(0x6060, 9), (0x6860, 8)]);
+}
+
+#[test]
+fn a_module_that_does_not_fit_is_refused_by_name() {
+    let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
+        return;
+    };
+    let refused = |modules: &[&str]| {
+        let choice = Choice {
+            modules,
+            cycle_ns: MS,
+            ..Choice::default()
+        };
+        choose(&file, &choice).unwrap_err().to_string()
+    };
+    let text = refused(&["-", "-"]);
+    assert!(text.contains("slot \"Axis 0\" needs a module"), "{text}");
+    let text = refused(&["0x319800", "valve"]);
+    assert!(
+        text.contains("takes no module \"valve\"; the ESI offers"),
+        "{text}"
+    );
+    let text = refused(&["0x319800", "-", "-"]);
+    assert!(
+        text.contains("3 modules are listed, there are 2 places"),
+        "{text}"
+    );
+}
