@@ -293,3 +293,48 @@ fn the_example_homes_to_the_index() {
     let summary = common::run_well(load("profiles.toml"), virtual_time());
     assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
 }
+
+/// What can be known before the bus is touched is said then, at its place in the file.
+#[test]
+fn a_homing_that_cannot_be_is_refused_with_the_file() {
+    let mapped = "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\"]\npdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\"]";
+    let no_display =
+        "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\"]\npdo.tx = [\"0x6041\", \"0x6064\"]";
+    let no_position =
+        "pdo.rx = [\"0x6040\", \"0x6060\", \"0x60FF\"]\npdo.tx = [\"0x6041\", \"0x6061\"]";
+    let rows = [
+        (
+            mapped,
+            "homing = { method = 40 }",
+            "method 40 is not one of",
+        ),
+        (mapped, "homing = { method = -3 }", "needs the current"),
+        (
+            mapped,
+            "homing = { method = 37, timeout = \"0ms\" }",
+            "before it begins",
+        ),
+        (
+            no_display,
+            "homing = { method = 37 }",
+            "their display (0x6060, 0x6061)",
+        ),
+        (
+            no_position,
+            "csv = { kv = 20.0 }",
+            "needs the position (0x6064)",
+        ),
+    ];
+    for (pdo, axis, expected) in rows {
+        let text = format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"x\"\nesi = \"esi/EPOS4.xml\"\nposition = 0\nmode = \"{}\"\n{pdo}\n\
+             [device.axis]\nencoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\n{axis}\n",
+            if pdo == no_position { "csv" } else { "csp" },
+        );
+        let path = common::root().join("configs/test.toml");
+        let error = ecaxis::config::parse(&path, &text)
+            .expect_err(axis)
+            .to_string();
+        assert!(error.contains(expected), "{axis}: {error}");
+    }
+}

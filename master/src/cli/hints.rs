@@ -10,7 +10,7 @@ use ecaxis::link::packet::OpenError;
 use ecaxis::mailbox::{ObjectAddress, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
-use ecaxis_axis::{HomingError, State, Trip};
+use ecaxis_axis::{HomingError, Refused, State, Trip};
 use ecaxis_sim::ServeError;
 
 use super::note;
@@ -99,7 +99,8 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
         RunError::NotDisabled { .. } => "the drive does not obey its Controlword: take its power away by hand, then look at its fault".to_owned(),
-        RunError::Refused { .. } | RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
+        RunError::Refused { by_axis, .. } => refused(by_axis.as_deref()).to_owned(),
+        RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
         RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
         RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
@@ -144,6 +145,23 @@ fn message(error: &RunError) -> String {
     match text.strip_suffix(&long) {
         Some(head) => head.to_owned() + short,
         None => text,
+    }
+}
+
+fn refused(reason: Option<&Refused>) -> &'static str {
+    let Some(reason) = reason else {
+        return "check the step and the axis' limits in the machine file";
+    };
+    match reason {
+        Refused::NotEnabled { .. } => "let a step enable the axis before: `enable = [\"x\"]`",
+        Refused::StillMoving { .. } => {
+            "bring the axis to rest before: `velocity = { x = 0.0 }` or `stop = [\"x\"]`"
+        }
+        Refused::WrongMode { .. } => "let a step switch the axis before: `mode = { x = \"csp\" }`",
+        Refused::Faulted(_) | Refused::Tripped(_) => {
+            "let a step reset the axis before, once the cause is known: `reset = [\"x\"]`"
+        }
+        _ => "check the step and the axis' limits in the machine file",
     }
 }
 

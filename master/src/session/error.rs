@@ -1,7 +1,7 @@
 //! Why a run failed: what, where, which code. What to do about it is the command line's to say.
 
 use ecaxis_axis::cia402::describe;
-use ecaxis_axis::{Mode, State, Trip};
+use ecaxis_axis::{Mode, Refused, State, Trip};
 
 use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
@@ -94,6 +94,8 @@ pub enum RunError {
         device: DeviceRef,
         step: StepRef,
         reason: String,
+        /// Where it was the axis that refused.
+        by_axis: Option<Box<Refused>>,
     },
     #[error("{step}: {device}: the target {target} is not reached, the axis is at {actual:.4}")]
     NotReached {

@@ -331,7 +331,12 @@ impl Supervisor {
                 continue;
             }
             if let Some((axis, reason)) = self.refused.take() {
-                return Err(self.refusal(step, axis, &reason));
+                return Err(RunError::Refused {
+                    device: self.device_of(axis),
+                    step: step.into(),
+                    reason: reason.to_string(),
+                    by_axis: Some(Box::new(reason)),
+                });
             }
             if look(self, &snapshot)? {
                 return Ok(());
@@ -344,6 +349,7 @@ impl Supervisor {
             device: self.device_of(axis),
             step: step.into(),
             reason: reason.to_string(),
+            by_axis: None,
         }
     }
 

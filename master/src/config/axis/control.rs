@@ -41,6 +41,18 @@ pub(super) fn loops(
         velocity: offset(&raw.velocity_offset, 0x60b1)?,
         acceleration: offset(&raw.torque_offset, 0x60b2)?,
     };
+    let reported = selection.is_none_or(|s| s.layout.tx_field(0x6064, 0).is_some());
+    let needs_position = [
+        raw.csv.as_ref().and_then(|csv| csv.kv.as_ref()),
+        raw.cst.as_ref().and_then(|cst| cst.kp.as_ref()),
+    ];
+    for gain in needs_position.into_iter().flatten().filter(|_| !reported) {
+        let message = "a position loop needs the position (0x6064) in the process data";
+        p.add_hint(gain.span(), message, "map it with `pdo.tx`");
+    }
+    if !reported && (raw.csv.is_some() || raw.cst.is_some()) {
+        return None;
+    }
     let csv = match &raw.csv {
         Some(csv) => Some(VelocityLoop {
             kv: *positive(csv.kv.as_ref()?, "csv.kv", "1/s", p)?,
@@ -192,10 +204,19 @@ pub(super) fn homing(
         p.add_hint(raw.span.clone(), error.to_string(), hint);
         return None;
     }
+    if let Some(timeout) = raw.timeout.as_ref().filter(|t| *t.get_ref() == 0) {
+        p.add_hint(
+            timeout.span(),
+            "a `timeout` of nothing ends the search before it begins",
+            "write the time that the longest search may take, such as \"60s\"",
+        );
+        return None;
+    }
     let selection = selection?;
-    let mapped = selection.layout.rx_field(0x6060, 0).is_some();
+    let layout = &selection.layout;
+    let mapped = layout.rx_field(0x6060, 0).is_some() && layout.tx_field(0x6061, 0).is_some();
     if !mapped {
-        let message = "homing needs modes of operation (0x6060) in the process data";
+        let message = "homing needs modes of operation and their display (0x6060, 0x6061) in the process data";
         p.add_hint(
             raw.span.clone(),
             message,
