@@ -1,10 +1,11 @@
 //! The steps of one SubDevice on its way from PreOp to SafeOp.
 
+use ecaxis_esi::StartupSdo;
 use ecaxis_esi::layout::SmLayout;
 
-use super::{BringUpError, BusDevice, Step};
+use super::{BringUpError, BusDevice, DeviceRef, Step};
 use crate::config::{Bus, DeviceConfig};
-use crate::mailbox::Wire;
+use crate::mailbox::{CoeClient, Wire};
 use crate::rt::image::Region;
 
 /// FMMU registers (ETG.1000.4, Table 56): 16 bytes each.
@@ -56,28 +57,39 @@ pub(super) async fn start_up(
             source,
         })?;
     for (done, sdo) in list.iter().enumerate() {
-        coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data)
-            .await
-            .map_err(|source| BringUpError::StartUp {
-                device: device.at.clone(),
-                index: sdo.index,
-                sub: sdo.sub,
-                name: sdo.name.clone(),
-                value: format_value(&sdo.data),
-                origin: sdo.origin.clone(),
-                source,
-            })?;
-        tracing::debug!(
-            device = %device.at,
-            "SDO 0x{:04x}:{:02x} {} = {} ({})",
-            sdo.index, sdo.sub, sdo.name, format_value(&sdo.data), sdo.origin
-        );
+        download(wire, &device.at, coe, sdo).await?;
         progress(Step::StartUp {
             device: config.name.clone(),
             done: done + 1,
             of: list.len(),
         });
     }
+    Ok(())
+}
+
+/// Downloads one start-up SDO.
+pub(super) async fn download(
+    wire: &impl Wire,
+    at: &DeviceRef,
+    coe: &mut CoeClient,
+    sdo: &StartupSdo,
+) -> Result<(), BringUpError> {
+    coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data)
+        .await
+        .map_err(|source| BringUpError::StartUp {
+            device: at.clone(),
+            index: sdo.index,
+            sub: sdo.sub,
+            name: sdo.name.clone(),
+            value: format_value(&sdo.data),
+            origin: sdo.origin.clone(),
+            source,
+        })?;
+    tracing::debug!(
+        device = %at,
+        "SDO 0x{:04x}:{:02x} {} = {} ({})",
+        sdo.index, sdo.sub, sdo.name, format_value(&sdo.data), sdo.origin
+    );
     Ok(())
 }
 

@@ -15,7 +15,7 @@ use std::fmt;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use crate::clock;
-use crate::config::Machine;
+use crate::config::{Adopted, Machine, UnitProblem};
 use crate::mailbox::{CoeClient, SdoError, WireError};
 use crate::rt::image::ImagePlan;
 use crate::rt::phase::ClockPlan;
@@ -28,6 +28,7 @@ mod held;
 mod identify;
 mod mailbox;
 mod mapping;
+mod units;
 
 pub use al::{AlState, StateError};
 use device::Moment;
@@ -67,6 +68,8 @@ pub struct BusDevice {
     pub dc: bool,
     /// Outputs that no axis drives and that must not be zero: index, subindex, value.
     pub held: Vec<(u16, u8, i64)>,
+    /// Of a drive: its axis, as the drive's own units make it.
+    pub adopted: Option<Box<Adopted>>,
     /// From the reference clock, nanoseconds.
     pub propagation_delay: u32,
 }
@@ -101,6 +104,13 @@ pub enum Step {
         devices: usize,
     },
     State(AlState),
+    /// A unit that is the drive's own word.
+    Adopted {
+        device: String,
+        what: String,
+    },
+    /// The bus comes up all the same.
+    Warning(String),
 }
 
 impl fmt::Display for Step {
@@ -127,6 +137,8 @@ impl fmt::Display for Step {
                 )
             }
             Self::State(state) => write!(f, "all SubDevices in {state}"),
+            Self::Adopted { device, what } => write!(f, "`{device}`: {what}"),
+            Self::Warning(text) => f.write_str(text),
         }
     }
 }
@@ -180,6 +192,16 @@ pub enum BringUpError {
         expected: String,
         actual: String,
     },
+    #[error(
+        "{device}: the drive's units are not those of the machine file: {}",
+        list(problems)
+    )]
+    Units {
+        device: DeviceRef,
+        problems: Vec<UnitProblem>,
+    },
+    #[error("{device}: asking the drive for its units: {source}")]
+    ReadUnits { device: DeviceRef, source: SdoError },
     #[error("{device}: emptying the mailbox: {source}")]
     Mailbox { device: DeviceRef, source: SdoError },
     #[error("{device}: reading the PDO mapping back: {source}")]
@@ -208,6 +230,11 @@ pub enum BringUpError {
     },
     #[error(transparent)]
     State(#[from] StateError),
+}
+
+fn list(problems: &[UnitProblem]) -> String {
+    let each: Vec<String> = problems.iter().map(ToString::to_string).collect();
+    each.join("; ")
 }
 
 /// Brings the segment from whatever it is in to SafeOp.
@@ -256,6 +283,7 @@ pub async fn bring_up(
             coe: mailbox::open(&wire, config, &at).await?.map(CoeClient::new),
             at,
             held: Vec::new(),
+            adopted: None,
             dc,
             propagation_delay: sub_device.propagation_delay(),
         });
@@ -264,6 +292,7 @@ pub async fn bring_up(
     for (config, device) in machine.devices.iter().zip(&mut devices) {
         device::start_up(&wire, config, device, Moment::InPreOp, progress).await?;
         mapping::compare(&wire, config, device).await?;
+        units::compare(&wire, config, device, progress).await?;
         held::read(&wire, config, device).await?;
     }
 

@@ -3,11 +3,11 @@
 use std::fmt::Write;
 use std::path::PathBuf;
 
-use ecaxis::config::{
-    self, Action, AxisSetup, DeviceConfig, Machine, Nic, Step, VelocityUnitFrom, duration,
-};
+use ecaxis::config::{self, Action, DeviceConfig, Machine, Nic, Step, duration};
 use ecaxis::rt::image::{self, ImagePlan};
 use ecaxis_esi::SmLayout;
+
+mod axis;
 
 use super::tables::{fields, startup};
 use super::{Failure, hints, report::Table, result};
@@ -127,7 +127,7 @@ fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
         writeln!(out, "  note: {note}")?;
     }
     if let Some(axis) = &device.axis {
-        self::axis(axis, out)?;
+        axis::axis(axis, out)?;
     }
     sync_managers(device, out)?;
     let layout = &selection.layout;
@@ -135,58 +135,6 @@ fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
     fields("inputs", layout.tx_bytes(), &layout.tx, out)?;
     clock(device, out)?;
     startup(&device.selection.startup, out)
-}
-
-fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
-    let (config, unit) = (&axis.config, &axis.unit);
-    let (scale, limits) = (&config.scale, &config.limits);
-    writeln!(
-        out,
-        "  axis: 1 turn = {} counts = {} {unit}{}; 1 {unit} = {} counts",
-        scale.counts_per_turn(),
-        scale.units_per_turn(),
-        if scale.inverted() { ", inverted" } else { "" },
-        scale.counts_per_unit(),
-    )?;
-    writeln!(
-        out,
-        "  velocities in {} ({}), a resolution of {} {unit}/s",
-        scale.velocity_unit(),
-        match axis.velocity_unit_from {
-            VelocityUnitFrom::Esi => "0x60A9 in the ESI",
-            VelocityUnitFrom::Sdo => "0x60A9 from `sdo`",
-            VelocityUnitFrom::File => "assumed, as `velocity_unit` says",
-            VelocityUnitFrom::Nothing => "assumed: the ESI has no value for 0x60A9",
-        },
-        rounded(scale.velocity_resolution()),
-    )?;
-    let position = match limits.position {
-        Some([low, high]) => format!("{low} to {high} {unit}"),
-        None => "endless".to_owned(),
-    };
-    let rpm = limits.velocity / scale.units_per_turn() * 60.0;
-    let following = match limits.following_error {
-        Some(error) => format!("{error} {unit}"),
-        None => "not supervised".to_owned(),
-    };
-    writeln!(
-        out,
-        "  limits: position {position}, velocity {} {unit}/s ({} rpm), acceleration {} {unit}/s²,\n          torque {} % of rated, following error {following}",
-        limits.velocity,
-        rounded(rpm),
-        limits.acceleration,
-        limits.torque,
-    )?;
-    writeln!(
-        out,
-        "  target window {} {unit}",
-        rounded(config.target_window)
-    )
-}
-
-/// Six significant digits are enough to read.
-fn rounded(x: f64) -> f64 {
-    format!("{x:.5e}").parse().unwrap_or(x)
 }
 
 fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {

@@ -41,10 +41,41 @@ fn fits_a_terminal_and_tells_what_is_assumed() {
     let text = explained(&demo);
     let wide: Vec<&str> = text.lines().filter(|l| l.chars().count() > 100).collect();
     assert!(wide.is_empty(), "{wide:#?}");
-    assert!(text.contains("rpm (0x60A9 in the ESI)"));
+    assert!(text.contains("0x60A9 in the ESI, until the drive is asked"));
     assert!(!text.contains("assumed"));
-    let said = demo.replace("encoder ", "velocity_unit = \"rpm\"\nencoder ");
-    assert!(explained(&said).contains("rpm (assumed, as `velocity_unit` says)"));
+    let all = "velocity_unit = \"rpm\"\ntorque_unit = \"A\"\ntorque_constant = 0.0385\ninvert = true\noffset = 2.5\ndead_time = \"2ms\"\n\
+        csv = { kv = 30.0 }\ncst = { kp = 400.0, tn = \"40ms\" }\nsupervise = { torque = 0.5, acceleration = 9000.0 }\n\
+        brake = { release = \"80ms\", engage = \"120ms\" }\nfault_reset = { tries = 3 }\non_trip = \"ramp\"\n";
+    let (before, after) = demo.split_once("encoder ").unwrap();
+    let text = explained(&format!(
+        "{before}{all}encoder {}",
+        after.replacen("torque = 100.0", "torque = 2.0", 1)
+    ));
+    let wide: Vec<&str> = text.lines().filter(|l| l.chars().count() > 110).collect();
+    assert!(wide.is_empty(), "{wide:#?}");
+    for (value, origin) in [
+        ("2000 counts a motor turn", "`encoder`, held against 0x608F"),
+        ("inverted", "`invert`"),
+        ("in rpm, steps of", "`velocity_unit`; the drive is asked"),
+        ("in rpm/s", "0x60AA in the ESI, until the drive is asked"),
+        ("in A", "`torque_unit`"),
+        ("0.1 Nm", "0x6076 in the ESI, until the drive is asked"),
+        ("0.0385 Nm/A", "`torque_constant`"),
+        ("2 A (77 % of rated)", "`limits.torque`"),
+        ("Kv 30 1/s, feed-forward 1", "`csv`"),
+        ("Tn 40 ms", "`cst`"),
+        ("2 ms", "`dead_time`"),
+        ("above 0.5 A for 100 ms", "`supervise.torque`"),
+        ("above 9000", "`supervise.acceleration`"),
+        ("by the acceleration limit, then no power", "`on_trip`"),
+        ("by itself after 1 s, 3 times", "`fault_reset`"),
+        ("opens in 80 ms, closes in 120 ms", "`brake`"),
+    ] {
+        let line = text
+            .lines()
+            .find(|l| l.contains(value) && l.contains(origin));
+        assert!(line.is_some(), "{value}, {origin}: {text}");
+    }
 }
 
 #[test]

@@ -5,12 +5,13 @@ use std::path::Path;
 
 use ecaxis::al_status::al_status_hint;
 use ecaxis::bringup::{BringUpError, StateError};
-use ecaxis::config::{ConfigError, Nic};
+use ecaxis::config::{ConfigError, Nic, UnitProblem};
 use ecaxis::link::packet::OpenError;
 use ecaxis::mailbox::{ObjectAddress, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
-use ecaxis_axis::{HomingError, Refused, State, Trip};
+use ecaxis_axis::scale::Contradiction;
+use ecaxis_axis::{HomingError, Refused, State, Trip, VelocityUnit};
 use ecaxis_sim::ServeError;
 
 use super::note;
@@ -129,9 +130,9 @@ fn message(error: &RunError) -> String {
             };
             (device, source, Some(object.to_string()))
         }
-        BringUpError::Mailbox { device, source } | BringUpError::ReadBack { device, source } => {
-            (device, source, None)
-        }
+        BringUpError::Mailbox { device, source }
+        | BringUpError::ReadBack { device, source }
+        | BringUpError::ReadUnits { device, source } => (device, source, None),
         _ => return text,
     };
     let long = source.to_string();
@@ -250,8 +251,13 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }
         BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
-        BringUpError::Mailbox { source, .. } | BringUpError::ReadBack { source, .. } => {
+        BringUpError::Mailbox { source, .. }
+        | BringUpError::ReadBack { source, .. }
+        | BringUpError::ReadUnits { source, .. } => {
             sdo(source, "bring-up")
+        }
+        BringUpError::Units { problems, .. } => {
+            return problems.iter().map(units).fold(failure, Failure::hint);
         }
         BringUpError::Mapping { .. } => {
             "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
@@ -271,6 +277,47 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
         BringUpError::State(state) => self::state(state),
     };
     failure.hint(hint)
+}
+
+/// What to change in the machine file or in the drive.
+fn units(problem: &UnitProblem) -> String {
+    let found = match problem {
+        UnitProblem::Contradiction(found) => found,
+        UnitProblem::NoRatedTorque { .. } => {
+            return "add `rated_torque = 0.1` (Nm), or give torques in percent".to_owned();
+        }
+        UnitProblem::Config { .. } | UnitProblem::Homing { .. } => {
+            return "write a finer or coarser unit with `sdo = [{ index = 0x60A9, value = … }]`, or change the axis' limits".to_owned();
+        }
+    };
+    match *found {
+        Contradiction::VelocityUnit {
+            expected,
+            found: code,
+        } => {
+            let write = format!(
+                "write `sdo = [{{ index = 0x60A9, value = 0x{:08X} }}]`",
+                expected.si_code()
+            );
+            match VelocityUnit::from_si_code(code) {
+                Some(unit) => format!(
+                    "{write}, or `velocity_unit = \"{unit}\"`, or leave `velocity_unit` out"
+                ),
+                None => write,
+            }
+        }
+        Contradiction::CountsPerTurn {
+            index: 0x608F,
+            found: counts,
+            ..
+        } => format!(
+            "write `encoder = {counts}`, or correct the drive's encoder resolution (0x608F)"
+        ),
+        Contradiction::RatedTorque { found: 1.., .. } => {
+            "correct `sdo`, or the drive's motor data; `rated_torque` has the last word".to_owned()
+        }
+        ref other => other.advice().to_owned(),
+    }
 }
 
 /// `origin` is what asked for it; `OWN_SDO` for the user's own list.

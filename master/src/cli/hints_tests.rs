@@ -57,7 +57,45 @@ fn every_failure_says_what_next() {
         missing: "`y`".into(),
         list: "EPOS4".into(),
     };
+    let units = |problem| {
+        bring_up(BringUpError::Units {
+            device: device(),
+            problems: vec![problem],
+        })
+    };
+    let contradicts = |found| units(UnitProblem::Contradiction(found));
     for (error, code, hint) in [
+        (
+            contradicts(Contradiction::VelocityUnit {
+                expected: VelocityUnit::MILLI_RPM,
+                found: VelocityUnit::RPM.si_code(),
+            }),
+            FAILED,
+            "value = 0xFDB44700 }]`, or `velocity_unit = \"rpm\"`",
+        ),
+        (
+            contradicts(Contradiction::CountsPerTurn {
+                index: 0x608f,
+                expected: 2000.0,
+                found: 4096.0,
+            }),
+            FAILED,
+            "write `encoder = 4096`",
+        ),
+        (
+            contradicts(Contradiction::CountsPerTurn {
+                index: 0x6091,
+                expected: 2000.0,
+                found: 1000.0,
+            }),
+            FAILED,
+            "gear ratio to 1:1",
+        ),
+        (
+            units(UnitProblem::NoRatedTorque { unit: "Nm" }),
+            FAILED,
+            "rated_torque = 0.1",
+        ),
         (
             RunError::Open(OpenError::NoSuchInterface { nic: "x".into() }),
             WRONG,

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use ecaxis::bringup::Step;
 use ecaxis::clock::Clock;
+use ecaxis::config::TorqueUnit;
 use ecaxis::session::{AxisLine, Observer, Progress, Status};
 use ecaxis_axis::Mode;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -148,11 +149,13 @@ fn axis_text(axis: &AxisLine) -> String {
         position,
         velocity,
         torque,
+        torque_unit,
         ..
     } = axis;
     match axis.mode {
         Mode::Csv => format!("{name} {velocity:.2} {unit}/s"),
-        Mode::Cst => format!("{name} {torque:.1} %"),
+        Mode::Cst if *torque_unit == TorqueUnit::Percent => format!("{name} {torque:.1} %"),
+        Mode::Cst => format!("{name} {torque:.4} {torque_unit}"),
         _ => format!("{name} {position:.3} {unit}"),
     }
 }

@@ -1,18 +1,20 @@
 //! One axis: units, limits, and the unit of the drive's velocities.
 
 use ecaxis_axis::cia402::QuickStopOption;
-use ecaxis_axis::{
-    Axis, AxisConfig, ConfigError, LimitError, Limits, Mode, Modes, Scale, ScaleError, VelocityUnit,
-};
+use ecaxis_axis::{Axis, AxisConfig, ConfigError, LimitError, Limits, Mode, Modes};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
 pub(crate) mod control;
+mod scale;
 
-use super::problem::{Problems, Span, suggestion};
+use super::problem::{Problems, Span};
 use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
 use super::units::unit;
-use super::{AxisSetup, VelocityUnitFrom};
+use super::{AxisSetup, TorqueSetup, TorqueUnit};
+
+/// maxon's vendor id.
+const MAXON: u32 = 0xfb;
 
 pub(crate) fn setup(
     raw: &RawAxis,
@@ -21,14 +23,22 @@ pub(crate) fn setup(
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
 ) -> Option<AxisSetup> {
-    let velocity = velocity_unit(raw, sdos, selection, p);
+    let velocity = scale::velocity_unit(raw, sdos, selection, p);
     let name = unit(raw.unit.as_ref(), p);
     // A wrong name is no reason to leave the figures unread.
     let shown = name.as_deref().unwrap_or("units");
-    let scale = scale(raw, shown, p);
-    let limits = limits(&raw.limits, shown, p);
+    let scale = scale::scale(raw, shown, p);
+    let way = scale::way(raw, p);
+    let torque = scale::torque(raw, sdos, selection, p);
+    let limits = limits(&raw.limits, torque.as_ref(), shown, p);
     let ((velocity_unit, velocity_unit_from), limits) = (velocity?, limits?);
-    let scale = scale?.with_velocity_unit(velocity_unit);
+    let (torque, way) = (torque?, way?);
+    let (acceleration_unit, acceleration_unit_from) =
+        scale::acceleration_unit(velocity_unit, sdos, selection);
+    let mut scale = scale?.with_velocity_unit(velocity_unit);
+    if acceleration_unit != velocity_unit.into() {
+        scale = scale.with_acceleration_unit(acceleration_unit);
+    }
     let mut config = AxisConfig::new(Mode::from_code(mode.code()), scale, limits);
     if let Some(window) = &raw.target_window {
         config.target_window = *positive(window, "target_window", shown, p)?;
@@ -36,7 +46,7 @@ pub(crate) fn setup(
     config.modes = modes(config.mode, selection);
     config.jerk_limited = raw.limits.jerk.is_some();
     config.loops = control::loops(&raw.loops, shown, selection, p)?;
-    control::guards(raw, &mut config, shown, p)?;
+    control::guards(raw, &mut config, &torque, shown, p)?;
     config.quick_stop = quick_stop(sdos, selection);
     let homing = match &raw.homing {
         Some(homing) => Some(control::homing(homing, &config, selection, p)?),
@@ -46,7 +56,7 @@ pub(crate) fn setup(
         config.dead_time_s = *dead_time.get_ref() as f64 * 1e-9;
     }
     if let Err(e) = Axis::new(config) {
-        let (at, message) = refused(&e, raw, shown);
+        let (at, message) = refused(&e, raw, &torque, shown);
         p.add(at, message);
         return None;
     }
@@ -55,6 +65,9 @@ pub(crate) fn setup(
         unit: name?,
         mode,
         velocity_unit_from,
+        acceleration_unit_from,
+        torque,
+        way,
         homing,
     })
 }
@@ -121,7 +134,7 @@ pub(super) fn positive<'v>(
 }
 
 /// What the axis refuses, at the key that is to blame and in the user's unit.
-fn refused(error: &ConfigError, raw: &RawAxis, unit: &str) -> (Span, String) {
+fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) -> (Span, String) {
     let limits = &raw.limits;
     let of = |value: Option<Span>| value.unwrap_or(limits.span.clone());
     let velocity = of(limits.velocity.as_ref().map(Spanned::span));
@@ -147,7 +160,16 @@ fn refused(error: &ConfigError, raw: &RawAxis, unit: &str) -> (Span, String) {
         ),
         ConfigError::Limit(LimitError::TorqueNotRepresentable { torque: limit }) => (
             torque,
-            format!("`limits.torque` of {limit} % is more than the 3276.7 % that 16 bits hold"),
+            match known.unit {
+                TorqueUnit::Percent => format!(
+                    "`limits.torque` of {limit} % is more than the 3276.7 % that 16 bits hold"
+                ),
+                unit => format!(
+                    "`limits.torque` of {} {unit} is {limit:.1} % of the rated torque, more than the \
+                     3276.7 % that 16 bits hold",
+                    known.shown(*limit)
+                ),
+            },
         ),
         ConfigError::Limit(LimitError::EmptyRange { .. }) => (position, error.to_string()),
         ConfigError::NotPositive { .. } => (
@@ -165,58 +187,12 @@ fn refused(error: &ConfigError, raw: &RawAxis, unit: &str) -> (Span, String) {
     }
 }
 
-/// Counts of a motor turn.
-const MOST_COUNTS: f64 = 2_147_483_648.0;
-
-fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<Scale> {
-    let encoder = raw
-        .encoder
-        .as_ref()
-        .and_then(|v| positive(v, "encoder", "", p));
-    if let Some(at) = raw
-        .encoder
-        .as_ref()
-        .filter(|v| *v.get_ref() > 0.0 && *v.get_ref() < 1.0)
-    {
-        p.add_hint(
-            at.span(),
-            format!("`encoder` is {}, less than one count a turn", at.get_ref()),
-            "write the counts of one motor turn, four to a line of an incremental encoder; \
-             a gear belongs in `per_turn`",
-        );
-        return None;
-    }
-    if let Some(at) = raw.encoder.as_ref().filter(|v| *v.get_ref() > MOST_COUNTS) {
-        p.add(
-            at.span(),
-            format!("`encoder` is {}, more than 32 bits can count", at.get_ref()),
-        );
-        return None;
-    }
-    let per_turn = match &raw.per_turn {
-        Some(v) => positive(v, "per_turn", unit, p),
-        None => Some(&1.0),
-    };
-    let scale = match Scale::new(*encoder?, *per_turn?) {
-        Ok(scale) => scale,
-        Err(e) => {
-            let at = raw.per_turn.as_ref().or(raw.encoder.as_ref());
-            let message = match e {
-                ScaleError::Unusable { counts_per_unit } => {
-                    format!("1 {unit} is {counts_per_unit:.3e} counts, outside 1e-6 … 1e15")
-                }
-                _ => e.to_string(),
-            };
-            p.add(at.map_or(raw.span.clone(), Spanned::span), message);
-            return None;
-        }
-    };
-    let offset = raw.offset.as_ref().map_or(0.0, |o| *o.get_ref());
-    let invert = raw.invert.as_ref().is_some_and(|i| *i.get_ref());
-    scale.with_invert(invert).with_offset(offset).ok()
-}
-
-fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
+fn limits(
+    raw: &RawLimits,
+    known: Option<&TorqueSetup>,
+    unit: &str,
+    p: &mut Problems<'_>,
+) -> Option<Limits> {
     let mut ok = true;
     let mut read = |value: &Option<Spanned<f64>>, what: &str, unit: &str| {
         let value = value.as_ref().map(|v| positive(v, what, unit, p).copied());
@@ -229,7 +205,8 @@ fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
         "limits.acceleration",
         &format!("{unit}/s²"),
     );
-    let torque = read(&raw.torque, "limits.torque", "%");
+    let torque_unit = known.map_or(TorqueUnit::Percent, |torque| torque.unit);
+    let torque = read(&raw.torque, "limits.torque", torque_unit.sign());
     let jerk = read(&raw.jerk, "limits.jerk", &format!("{unit}/s³"));
     let following_error = read(&raw.following_error, "limits.following_error", unit);
     if let (Some(velocity), Some(acceleration), Some(at)) =
@@ -258,7 +235,7 @@ fn limits(raw: &RawLimits, unit: &str, p: &mut Problems<'_>) -> Option<Limits> {
         velocity: velocity?,
         acceleration: acceleration?,
         jerk,
-        torque: torque.unwrap_or(100.0),
+        torque: torque.map_or(100.0, |n| known.map_or(n, |known| known.percent(n))),
         following_error,
     };
     ok.then_some(limits)
@@ -277,60 +254,4 @@ pub(crate) fn too_long(velocity: f64, acceleration: f64) -> Option<String> {
     } else {
         format!("{:.3e} h", seconds / HOUR)
     })
-}
-
-const VELOCITY_UNITS: [(&str, VelocityUnit); 4] = [
-    ("rpm", VelocityUnit::RPM),
-    ("mrpm", VelocityUnit::MILLI_RPM),
-    ("counts/s", VelocityUnit::COUNTS_PER_SECOND),
-    ("turns/s", VelocityUnit::TURNS_PER_SECOND),
-];
-
-const SI_UNIT_VELOCITY: u16 = 0x60a9;
-
-/// What 0x60A9 will say: the file's word, the file's SDO, or the ESI's default.
-fn velocity_unit(
-    raw: &RawAxis,
-    sdos: &[RawSdo],
-    selection: Option<&esi::Selection>,
-    p: &mut Problems<'_>,
-) -> Option<(VelocityUnit, VelocityUnitFrom)> {
-    if let Some(text) = &raw.velocity_unit {
-        let known = VELOCITY_UNITS
-            .iter()
-            .find(|(name, _)| *name == text.get_ref());
-        if known.is_none() {
-            let message = format!("unknown unit of velocity \"{}\"", text.get_ref());
-            let names = VELOCITY_UNITS.iter().map(|(name, _)| *name);
-            p.add_hint(
-                text.span(),
-                message,
-                suggestion(text.get_ref(), names, "units"),
-            );
-        }
-        return known.map(|(_, unit)| (*unit, VelocityUnitFrom::File));
-    }
-    let written = sdos.iter().find(|s| s.index == SI_UNIT_VELOCITY);
-    let written = written.and_then(|s| match s.value.get_ref() {
-        SdoValue::Integer(n) => u32::try_from(*n).ok(),
-        _ => None,
-    });
-    let default = || {
-        let item = selection?.dictionary.item(SI_UNIT_VELOCITY, 0)?;
-        let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
-        item.has_default.then_some(u32::from_le_bytes(bytes))
-    };
-    let written = written.map(|code| (code, VelocityUnitFrom::Sdo));
-    let default = || default().map(|code| (code, VelocityUnitFrom::Esi));
-    let Some((code, from)) = written.or_else(default) else {
-        return Some((VelocityUnit::default(), VelocityUnitFrom::Nothing));
-    };
-    let unit = VelocityUnit::from_si_code(code);
-    if unit.is_none() {
-        let message =
-            format!("the drive's velocity unit (0x60A9) is 0x{code:08x}, which is not understood");
-        let hint = "say it with `velocity_unit = \"rpm\"`, \"mrpm\", \"counts/s\" or \"turns/s\"";
-        p.add_hint(raw.span.clone(), message, hint);
-    }
-    Some((unit?, from))
 }

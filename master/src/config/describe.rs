@@ -73,7 +73,7 @@ impl Machine {
             ),
             Action::Torque { targets, ramp_ns } => format!(
                 "torque {} within {}",
-                self.targets(targets, "→", "%"),
+                self.targets(targets, "→", TORQUE),
                 duration::show(*ramp_ns),
             ),
             Action::Mode { targets } => {
@@ -133,10 +133,12 @@ impl Machine {
     fn targets(&self, targets: &[(usize, f64)], arrow: &str, suffix: &str) -> String {
         let each = targets.iter().filter_map(|&(index, target)| {
             let device = self.devices.get(index)?;
-            let unit = match suffix {
-                "%" => "",
-                _ => &device.axis.as_ref()?.unit,
-            };
+            let axis = device.axis.as_ref()?;
+            if suffix == TORQUE {
+                let (torque, unit) = (short(axis.torque.shown(target)), axis.torque.unit);
+                return Some(format!("{} {arrow} {torque} {unit}", device.name));
+            }
+            let unit = &axis.unit;
             Some(format!("{} {arrow} {target} {unit}{suffix}", device.name))
         });
         each.collect::<Vec<_>>().join(", ")
@@ -145,6 +147,14 @@ impl Machine {
 
 fn rounded(x: f64) -> f64 {
     (x * 1e6).round() / 1e6
+}
+
+/// Stands for the axis' unit of torques.
+const TORQUE: &str = "torque";
+
+/// Six significant digits are enough to read.
+fn short(x: f64) -> f64 {
+    format!("{x:.5e}").parse().unwrap_or(x)
 }
 
 /// Of a fraction, without the digits that are only rounding.

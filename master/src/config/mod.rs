@@ -9,7 +9,8 @@
 //! | `check.rs` | raw → [`Machine`]: bus, names, places |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
-//! | `axis.rs` | units and limits |
+//! | `axis.rs` | limits; units in `axis/scale.rs`, loops, guards and homing in `axis/control.rs` |
+//! | `adopt.rs` | what the drive itself says of its units |
 //! | `sim.rs` | what only the simulated bus needs: connections, clocks |
 //! | `units.rs` | the names of units of positions |
 //! | `gateway.rs` | the network behind a simulated gateway |
@@ -20,10 +21,13 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod adopt;
 mod axis;
 mod check;
 mod describe;
 mod device;
+#[cfg(test)]
+mod documented;
 pub mod duration;
 mod fields;
 mod gateway;
@@ -38,6 +42,7 @@ mod tests;
 mod track;
 mod units;
 
+pub use adopt::{Adopted, UnitProblem};
 pub use problem::{ConfigError, Problem, nearest};
 pub use signal::{AxisRef, InputRef, NameError, OutputRef};
 
@@ -158,7 +163,11 @@ pub struct AxisSetup {
     /// The user's name for the unit of positions, `mm`.
     pub unit: String,
     pub mode: esi::Mode,
-    pub velocity_unit_from: VelocityUnitFrom,
+    pub velocity_unit_from: UnitFrom,
+    pub acceleration_unit_from: UnitFrom,
+    pub torque: TorqueSetup,
+    /// Which way a modulo axis moves.
+    pub way: ecaxis_axis::scale::Way,
     pub homing: Option<HomingSetup>,
 }
 
@@ -183,15 +192,62 @@ impl HomingSetup {
     }
 }
 
-/// What says in which unit the drive has its velocities.
+/// The unit of an axis' torques, and what is known of its motor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TorqueSetup {
+    pub unit: TorqueUnit,
+    /// Rated torque, Nm. `None`: only the drive knows it.
+    pub rated: Option<f64>,
+    pub rated_from: UnitFrom,
+    /// Torque constant, Nm/A.
+    pub constant: Option<f64>,
+    /// Of 0x6076.
+    pub counts_per_newton_metre: f64,
+    /// Percent of rated torque that one of the unit is. Where the rated torque is not known: percent of the limit.
+    percent_per_unit: f64,
+    /// Otherwise the limit is the rated torque, whatever that is.
+    limit_said: bool,
+}
+
+/// `torque_unit`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum TorqueUnit {
+    /// Of the motor's rated torque.
+    #[default]
+    Percent,
+    /// Of the motor, before any gear.
+    NewtonMetres,
+    Amperes,
+}
+
+impl TorqueUnit {
+    #[must_use]
+    pub const fn sign(self) -> &'static str {
+        match self {
+            Self::Percent => "%",
+            Self::NewtonMetres => "Nm",
+            Self::Amperes => "A",
+        }
+    }
+}
+
+impl std::fmt::Display for TorqueUnit {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.sign())
+    }
+}
+
+/// What says how the drive counts something.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum VelocityUnitFrom {
-    /// `velocity_unit`.
+pub enum UnitFrom {
+    /// A key of [device.axis].
     File,
-    /// A start-up SDO of the machine file that writes 0x60A9.
+    /// A start-up SDO of the machine file.
     Sdo,
-    /// The default of 0x60A9 in the ESI file.
+    /// The default in the ESI file.
     Esi,
+    /// The drive itself.
+    Drive,
     /// It is assumed.
     Nothing,
 }

@@ -37,7 +37,7 @@ const ESI: &str = r##"<?xml version="1.0" encoding="utf-8"?>
 </Device></Devices></Descriptions></EtherCATInfo>
 "##;
 
-const GOOD: &str = r#"repeat = 2
+pub(super) const GOOD: &str = r#"repeat = 2
 
 [bus]
 nic = "sim"
@@ -78,7 +78,7 @@ velocity = { v = 25.0 }
 dwell = "500ms"
 "#;
 
-fn with_esi(text: &str) -> Result<Machine, ConfigError> {
+pub(super) fn with_esi(text: &str) -> Result<Machine, ConfigError> {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("D1.xml"), ESI).unwrap();
     std::fs::write(folder.path().join("cut.xml"), &ESI[..2000]).unwrap();
@@ -184,14 +184,75 @@ fn units_of_ones_own_and_what_says_the_velocity_unit() {
         let axis = with_esi(text).unwrap().devices[0].axis.clone();
         axis.unwrap().velocity_unit_from
     };
-    assert_eq!(from(GOOD), VelocityUnitFrom::Esi);
+    assert_eq!(from(GOOD), UnitFrom::Esi);
     let said = GOOD.replace("unit = \"mm\"", "unit = \"mm\"\nvelocity_unit = \"rpm\"");
-    assert_eq!(from(&said), VelocityUnitFrom::File);
+    assert_eq!(from(&said), UnitFrom::File);
     let written = GOOD.replace(
         "{ index = 0x6065, value = 2500 }",
         "{ index = 0x60A9, value = 0x00B44700 }",
     );
-    assert_eq!(from(&written), VelocityUnitFrom::Sdo);
+    assert_eq!(from(&written), UnitFrom::Sdo);
+}
+
+#[test]
+fn gear_feed_and_modulo() {
+    let axis = |keys: &str| {
+        let text = GOOD.replace(
+            "[device.axis]\nencoder",
+            &format!("[device.axis]\n{keys}\nencoder"),
+        );
+        with_esi(&text).unwrap().devices[1].axis.clone().unwrap()
+    };
+    for (keys, per_turn) in [
+        ("gear = [3, 1]", 1.0 / 3.0),
+        ("feed = 10", 10.0),
+        ("gear = [676, 49]\nfeed = 360.0", 360.0 * 49.0 / 676.0),
+        ("per_turn = 2.5", 2.5),
+    ] {
+        let scale = axis(keys).config.scale;
+        assert_eq!(scale.units_per_turn(), per_turn, "{keys}");
+    }
+    let turntable = axis("unit = \"deg\"\nfeed = 360.0\nmodulo = 360.0\nway = \"positive\"");
+    assert_eq!(turntable.config.scale.modulo(), Some(360.0));
+    assert_eq!(turntable.way, ecaxis_axis::scale::Way::Positive);
+    assert_eq!(axis("").config.scale.modulo(), None);
+}
+
+#[test]
+fn torques_in_nm_and_a() {
+    let axis = |keys: &str| {
+        let text = GOOD.replace(
+            "unit = \"mm\"",
+            &format!("{keys}\nsupervise = {{ torque = 0.05 }}"),
+        );
+        let text = text.replace("torque = 100.0", "torque = 0.1");
+        with_esi(&text).unwrap().devices[0].axis.clone().unwrap()
+    };
+    for (keys, limit, supervised, from) in [
+        // A vendor whose 0x6076 counts mNm.
+        (
+            "torque_unit = \"Nm\"\nrated_torque = 0.2",
+            50.0,
+            25.0,
+            UnitFrom::File,
+        ),
+        (
+            "torque_unit = \"A\"\ntorque_constant = 0.5\nrated_torque = 0.2",
+            25.0,
+            12.5,
+            UnitFrom::File,
+        ),
+        // Not known before the drive tells: parts of the limit.
+        ("torque_unit = \"Nm\"", 100.0, 50.0, UnitFrom::Nothing),
+        ("torque_unit = \"percent\"", 0.1, 0.05, UnitFrom::Nothing),
+    ] {
+        let axis = axis(keys);
+        let watched = axis.config.supervision.torque.unwrap().percent;
+        assert!((axis.config.limits.torque - limit).abs() < 1e-9, "{keys}");
+        assert!((watched - supervised).abs() < 1e-9, "{keys}");
+        assert_eq!(axis.torque.rated_from, from, "{keys}");
+        assert!((axis.torque.shown(limit) - 0.1).abs() < 1e-12, "{keys}");
+    }
 }
 
 #[test]
@@ -282,6 +343,22 @@ fn every_way_to_be_wrong() {
         ("unit = \"mm\"", "csv = { kv = 5, feed_forward = 2 }", "a weight from 0 to 1", "", "2"),
         ("unit = \"mm\"", "csp = { velocity_offset = 1 }", "0x60B1, which is not in the process data", "pdo.rx", "1"),
         ("unit = \"mm\"", "dead_time = \"1s\"", "must be between 0 and 0.1", "", "\"1s\""),
+        ("per_turn = 5.0", "per_turn = 5.0\ngear = [3, 1]", "`per_turn` says already", "`feed`", "[3, 1]"),
+        ("per_turn = 5.0", "gear = [3, 0]", "a whole number from 1 to 4294967295, found 0", "", "0"),
+        ("per_turn = 5.0", "gear = [3]", "two numbers", "gear = [3, 1]", "[3]"),
+        ("per_turn = 5.0", "gear = 3", "expected motor turns and shaft turns", "", "3"),
+        ("per_turn = 5.0", "feed = -1", "`feed` is -1 mm", "", "-1"),
+        ("unit = \"mm\"", "modulo = 360", "has no range of positions", "`modulo` out", "[-50.0, 50.0]"),
+        ("unit = \"mm\"", "modulo = 0", "`modulo` is 0", "", "0"),
+        ("unit = \"mm\"", "way = \"shortest\"", "only a modulo axis", "modulo = 360.0", "\"shortest\""),
+        ("[device.axis]\nencoder = 2000", "[device.axis]\nmodulo = 1e-4\nencoder = 2000", "less than 2 counts", "2.000e-1", "1e-4"),
+        ("[device.axis]\nencoder = 2000", "[device.axis]\nmodulo = 1\nway = \"forwards\"\nencoder = 2000", "`way` cannot be \"forwards\"", "`positive`", "\"forwards\""),
+        ("unit = \"mm\"", "torque_unit = \"nm\"", "`torque_unit` cannot be \"nm\"", "`Nm`", "\"nm\""),
+        ("unit = \"mm\"", "torque_unit = \"A\"", "need the motor's torque constant", "torque_constant", "\"A\""),
+        ("unit = \"mm\"", "rated_torque = 0", "`rated_torque` is 0 Nm", "", "0"),
+        ("unit = \"mm\"", "torque_constant = -1", "`torque_constant` is -1 Nm/A", "", "-1"),
+        ("[device.axis]\nencoder = 2000", "[device.axis]\ntorque_unit = \"Nm\"\nencoder = 2000", "only the drive knows the motor's rated torque", "rated_torque", "\"Nm\""),
+        ("unit = \"mm\"", "torque_unit = \"Nm\"\nrated_torque = 0.1", "`limits.torque` of 100 Nm is 100000.0 % of the rated torque", "", "100.0"),
         ("x = 50.0", "x = 50.1", "outside the axis' limits, -50 to 50 mm", "", "50.1"),
         ("v = 25.0", "v = 51", "outside the axis' limits, -50 to 50 turn/s", "", "51"),
         ("{ x = 50.0 }", "{}", "no axis is named", "", "{}"),

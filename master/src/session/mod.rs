@@ -16,7 +16,7 @@ use ecaxis_axis::Axis;
 use ecaxis_sim::FaultScript;
 use ethercrab::{Command as Datagram, MainDevice};
 
-use crate::bringup::{Bus, bring_up};
+use crate::bringup::{Bus, Step, bring_up};
 use crate::clock::{Clock, Nanos};
 use crate::config::{self, Machine, Signal};
 use crate::link::Link;
@@ -167,7 +167,7 @@ pub fn prepare(
     controller: Option<Box<dyn Controller>>,
 ) -> Result<Prepared, RunError> {
     // Whatever can be known to fail without a bus fails before there is one.
-    let (image, slots, axes, signals) = plan(machine)?;
+    let (image, ..) = plan(machine)?;
     let mut link = open::link(machine, options)?;
     let (main_device, mut port) = main_device(machine.bus.cycle_ns);
     let carried = Carried {
@@ -178,6 +178,8 @@ pub fn prepare(
     };
     match come_up(machine, main_device, image, carried, &progress) {
         Ok(bus) => {
+            let machine = &as_the_drives_say(machine, &bus);
+            let (_, slots, axes, signals) = plan(machine)?;
             let wire = Datagrams::new(main_device);
             let timing = Timing {
                 cycle_ns: machine.bus.cycle_ns,
@@ -236,6 +238,17 @@ pub fn prepare(
             Err(error)
         }
     }
+}
+
+/// The machine with its axes in the drives' own units.
+fn as_the_drives_say(machine: &Machine, bus: &Bus) -> Arc<Machine> {
+    let mut machine = machine.clone();
+    for (device, found) in bus.devices.iter().enumerate() {
+        if let Some(adopted) = &found.adopted {
+            machine.adopt(device, adopted);
+        }
+    }
+    Arc::new(machine)
 }
 
 type Plan = (ImagePlan, Vec<AxisSlot>, Vec<usize>, Signals);
@@ -337,6 +350,7 @@ fn own_the_link(
         Err(error) => return error.into(),
     };
     let wire = supervisor.wire;
+    let machine = &Arc::clone(&supervisor.machine);
     let (remains, (ended, result)) = match options.clock {
         Clock::Virtual => turn_in_virtual_time(parts, supervisor),
         Clock::Real => match turn_in_real_time(parts, supervisor, &machine.bus, &told) {
@@ -380,7 +394,10 @@ fn come_up(
     progress: &Sender<Progress>,
 ) -> Result<Bus, RunError> {
     let mut tell = |step| {
-        let _ = progress.send(Progress::Step(step));
+        let _ = progress.send(match step {
+            Step::Warning(text) => Progress::Warning(text),
+            step => Progress::Step(step),
+        });
     };
     let Carried {
         clock,

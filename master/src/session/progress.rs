@@ -1,10 +1,11 @@
 //! What a run tells while it goes on.
 
+use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
 
 use crate::bringup::Step;
 use crate::clock::Nanos;
-use crate::config::Machine;
+use crate::config::{Machine, TorqueUnit};
 use crate::rt::handover::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
 use crate::rt::thread::Denied;
@@ -68,10 +69,13 @@ pub struct AxisLine {
     pub unit: String,
     pub mode: Mode,
     pub state: State,
-    /// User units, user units a second, percent of rated torque.
+    /// User units; on a modulo axis the place.
     pub position: f64,
+    /// User units a second.
     pub velocity: f64,
+    /// In `torque_unit`.
     pub torque: f64,
+    pub torque_unit: TorqueUnit,
 }
 
 impl Status {
@@ -82,14 +86,17 @@ impl Status {
             .zip(&snapshot.axes)
             .filter_map(|(&device, status)| {
                 let device = machine.devices.get(device)?;
+                let setup = device.axis.as_ref()?;
+                let place = setup.config.scale.place(UserUnits(status.position));
                 Some(AxisLine {
                     name: device.name.clone(),
-                    unit: device.axis.as_ref()?.unit.clone(),
+                    unit: setup.unit.clone(),
                     mode: status.mode,
                     state: status.state,
-                    position: status.position,
+                    position: place.0,
                     velocity: status.velocity,
-                    torque: status.torque,
+                    torque: setup.torque.shown(status.torque),
+                    torque_unit: setup.torque.unit,
                 })
             })
             .collect();

@@ -56,7 +56,7 @@ impl Supervisor {
                 target: if relative {
                     from.position + target
                 } else {
-                    target
+                    self.place_to_go(axis, from.position, target)
                 },
                 limits: MotionLimits {
                     velocity: limits.velocity * speed,

@@ -6,11 +6,12 @@ use std::pin::Pin;
 
 use ecaxis_axis::setpoint::{Engage, GearConfig};
 use ecaxis_axis::status::HomingStatus;
+use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command};
 
 use super::{Ended, Supervisor};
 use crate::clock::{self, Nanos};
-use crate::config::{Action, Condition, Step};
+use crate::config::{Action, AxisSetup, Condition, Step};
 use crate::rt::feed::{FeedState, Start};
 use crate::rt::handover::{Order, Snapshot};
 use crate::session::{Progress, RunError, StepRef};
@@ -158,7 +159,11 @@ impl Supervisor {
                 speed,
                 ramp,
             } => {
-                let origin = if *relative {
+                let turning = self
+                    .targets(targets)
+                    .iter()
+                    .any(|&(axis, _)| self.modulo(axis));
+                let origin = if *relative || turning {
                     self.tick().await?.axes
                 } else {
                     Vec::new()
@@ -168,7 +173,11 @@ impl Supervisor {
                     .into_iter()
                     .map(|(axis, target)| {
                         let from = origin.get(axis).map_or(0.0, |s| s.target_position);
-                        (axis, from + target)
+                        let target = match relative {
+                            true => from + target,
+                            false => self.place_to_go(axis, from, target),
+                        };
+                        (axis, target)
                     })
                     .collect();
                 self.reach(step, start, &targets, |position| Command::MoveTo {
@@ -298,6 +307,26 @@ impl Supervisor {
             Some((self.axes.iter().position(|&d| d == device)?, target))
         });
         places.collect()
+    }
+
+    fn setup(&self, axis: usize) -> Option<&AxisSetup> {
+        let device = self.machine.devices.get(*self.axes.get(axis)?)?;
+        device.axis.as_ref()
+    }
+
+    fn modulo(&self, axis: usize) -> bool {
+        let setup = self.setup(axis);
+        setup.is_some_and(|s| s.config.scale.modulo().is_some())
+    }
+
+    /// The position for a target; on a modulo axis the one that its way leads to.
+    pub(super) fn place_to_go(&self, axis: usize, from: f64, target: f64) -> f64 {
+        let Some(setup) = self.setup(axis) else {
+            return target;
+        };
+        let scale = &setup.config.scale;
+        let to = UserUnits(target);
+        scale.destination(UserUnits(from), to, setup.way).0
     }
 
     /// All of them in the same cycle.

@@ -6,16 +6,15 @@ use ecaxis_axis::{AxisConfig, FeedForward, Loops, PositionPid, VelocityLoop};
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-use super::super::HomingSetup;
 use super::super::problem::{Problems, suggestion};
 use super::super::raw::{RawAxis, RawHoming, RawLoops};
-use super::positive;
+use super::super::{HomingSetup, TorqueSetup};
+use super::{MAXON, positive};
 
 /// How long torque may be above its supervised limit where the file does not say.
 const TORQUE_TIME_S: f64 = 0.1;
 const RESET_DELAY_S: f64 = 1.0;
 const HOMING_TIMEOUT_NS: u64 = 60_000_000_000;
-const MAXON: u32 = 0xfb;
 
 fn seconds(time: Option<&Spanned<u64>>) -> Option<f64> {
     time.map(|t| *t.get_ref() as f64 * 1e-9)
@@ -97,6 +96,7 @@ fn part(
 pub(super) fn guards(
     raw: &RawAxis,
     config: &mut AxisConfig,
+    known: &TorqueSetup,
     unit: &str,
     p: &mut Problems<'_>,
 ) -> Option<()> {
@@ -115,7 +115,7 @@ pub(super) fn guards(
         Some(value) => positive(value, what, unit, p).map(|n| Some(*n)),
         None => Some(None),
     };
-    let torque = above_zero(&watch.torque, "supervise.torque", "%")?;
+    let torque = above_zero(&watch.torque, "supervise.torque", known.unit.sign())?;
     let acceleration = above_zero(
         &watch.acceleration,
         "supervise.acceleration",
@@ -138,8 +138,8 @@ pub(super) fn guards(
     config.supervision = Supervision {
         reaction: one_of(raw.on_trip.as_ref(), &reactions, "on_trip", p)?,
         emergency: one_of(raw.on_emergency.as_ref(), &emergencies, "on_emergency", p)?,
-        torque: torque.map(|percent| TorqueWatch {
-            percent,
+        torque: torque.map(|torque| TorqueWatch {
+            percent: known.percent(torque),
             time_s: seconds(watch.torque_time.as_ref()).unwrap_or(TORQUE_TIME_S),
         }),
         acceleration,

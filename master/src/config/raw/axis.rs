@@ -10,11 +10,20 @@ pub(crate) struct RawAxis {
     pub span: Span,
     pub unit: Option<Spanned<String>>,
     pub per_turn: Option<Spanned<f64>>,
+    /// Motor turns, and the turns of the shaft that they make.
+    pub gear: Option<Spanned<[u32; 2]>>,
+    /// User units per turn of that shaft.
+    pub feed: Option<Spanned<f64>>,
+    pub modulo: Option<Spanned<f64>>,
+    pub way: Option<Spanned<String>>,
     pub encoder: Option<Spanned<f64>>,
     pub invert: Option<Spanned<bool>>,
     pub offset: Option<Spanned<f64>>,
     pub target_window: Option<Spanned<f64>>,
     pub velocity_unit: Option<Spanned<String>>,
+    pub torque_unit: Option<Spanned<String>>,
+    pub torque_constant: Option<Spanned<f64>>,
+    pub rated_torque: Option<Spanned<f64>>,
     pub limits: RawLimits,
     pub dead_time: Option<Spanned<u64>>,
     pub loops: RawLoops,
@@ -107,11 +116,18 @@ pub(super) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAx
         span: span.clone(),
         unit: optional!(p, f, "unit", string),
         per_turn: optional!(p, f, "per_turn", number),
+        gear: f.get("gear").and_then(|v| gear(v, p)),
+        feed: optional!(p, f, "feed", number),
+        modulo: optional!(p, f, "modulo", number),
+        way: optional!(p, f, "way", string),
         encoder: encoder.and_then(|v| fields::number(p, v)),
         invert: optional!(p, f, "invert", boolean),
         offset: optional!(p, f, "offset", number),
         target_window: optional!(p, f, "target_window", number),
         velocity_unit: optional!(p, f, "velocity_unit", string),
+        torque_unit: optional!(p, f, "torque_unit", string),
+        torque_constant: optional!(p, f, "torque_constant", number),
+        rated_torque: optional!(p, f, "rated_torque", number),
         limits: RawLimits::default(),
         dead_time: optional!(p, f, "dead_time", duration),
         loops: RawLoops::default(),
@@ -162,6 +178,19 @@ pub(super) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAx
     axis.homing = f.get("homing").and_then(|v| homing(v, p));
     f.done(p);
     axis
+}
+
+fn gear(value: super::Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<[u32; 2]>> {
+    let turns = fields::array(p, value, "motor turns and shaft turns, `[3, 1]`")?;
+    let [motor, shaft] = turns.as_slice() else {
+        let hint = "write motor turns and the turns of the shaft that they make: `gear = [3, 1]`";
+        p.add_hint(value.span(), "a gear ratio has two numbers", hint);
+        return None;
+    };
+    let motor = fields::integer(p, motor, 1, u32::MAX);
+    let shaft = fields::integer(p, shaft, 1, u32::MAX);
+    let turns = [motor?.into_inner(), shaft?.into_inner()];
+    Some(Spanned::new(value.span(), turns))
 }
 
 fn guards(f: &mut Fields<'_>, axis: &mut RawAxis, p: &mut Problems<'_>) {

@@ -26,7 +26,16 @@ impl Checker<'_> {
                 let (message, hint) = what.impossible(name.get_ref(), axis);
                 p.add_hint(name.span(), message, hint);
             } else if within(&value, what, axis, p) {
-                resolved.push((index, value.into_inner()));
+                let value = value.into_inner();
+                let torque = what == What::Torque;
+                resolved.push((
+                    index,
+                    if torque {
+                        axis.torque.percent(value)
+                    } else {
+                        value
+                    },
+                ));
             }
         }
         resolved.sort_by_key(|(index, _)| *index);
@@ -146,10 +155,19 @@ fn within(value: &Spanned<f64>, what: What, axis: &AxisSetup, p: &mut Problems<'
             None => return true,
         },
         What::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
-        What::Torque => (-limits.torque, limits.torque, "%".into()),
+        What::Torque => {
+            let limit = axis.torque.shown(limits.torque);
+            (-limit, limit, axis.torque.unit.to_string())
+        }
     };
     let n = *value.get_ref();
-    if (low..=high).contains(&n) {
+    // A limit that was converted there and back may be off by a rounding.
+    let rounding = if what == What::Torque {
+        high * 1e-9
+    } else {
+        0.0
+    };
+    if (low - rounding..=high + rounding).contains(&n) {
         return true;
     }
     let message = format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}");

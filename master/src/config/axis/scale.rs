@@ -1,0 +1,321 @@
+//! What the axis counts in: encoder, gear and feed, modulo; the drive's velocities, accelerations and torques.
+
+use ecaxis_axis::scale::{TorqueScale, Way};
+use ecaxis_axis::units::{Amperes, NewtonMetres};
+use ecaxis_axis::{AccelerationUnit, Scale, ScaleError, VelocityUnit};
+use ecaxis_esi as esi;
+use toml::Spanned;
+
+use super::super::problem::{Problems, suggestion};
+use super::super::raw::{RawAxis, RawSdo, SdoValue};
+use super::super::{TorqueSetup, TorqueUnit, UnitFrom};
+use super::control::one_of;
+use super::{MAXON, positive};
+
+/// Counts of a motor turn.
+const MOST_COUNTS: f64 = 2_147_483_648.0;
+
+pub(super) fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<Scale> {
+    let encoder = raw
+        .encoder
+        .as_ref()
+        .and_then(|v| positive(v, "encoder", "", p));
+    if let Some(at) = raw
+        .encoder
+        .as_ref()
+        .filter(|v| *v.get_ref() > 0.0 && *v.get_ref() < 1.0)
+    {
+        p.add_hint(
+            at.span(),
+            format!("`encoder` is {}, less than one count a turn", at.get_ref()),
+            "write the counts of one motor turn, four to a line of an incremental encoder; \
+             a gear belongs in `gear` or `per_turn`",
+        );
+        return None;
+    }
+    if let Some(at) = raw.encoder.as_ref().filter(|v| *v.get_ref() > MOST_COUNTS) {
+        p.add(
+            at.span(),
+            format!("`encoder` is {}, more than 32 bits can count", at.get_ref()),
+        );
+        return None;
+    }
+    let per_turn = per_turn(raw, unit, p);
+    let scale = match Scale::new(*encoder?, per_turn?) {
+        Ok(scale) => scale,
+        Err(e) => {
+            let at = raw.per_turn.as_ref().or(raw.feed.as_ref());
+            let at = at.or(raw.encoder.as_ref());
+            let message = match e {
+                ScaleError::Unusable { counts_per_unit } => {
+                    format!("1 {unit} is {counts_per_unit:.3e} counts, outside 1e-6 … 1e15")
+                }
+                _ => e.to_string(),
+            };
+            p.add(at.map_or(raw.span.clone(), Spanned::span), message);
+            return None;
+        }
+    };
+    let offset = raw.offset.as_ref().map_or(0.0, |o| *o.get_ref());
+    let invert = raw.invert.as_ref().is_some_and(|i| *i.get_ref());
+    let scale = scale.with_invert(invert).with_offset(offset).ok()?;
+    modulo(raw, scale, unit, p)
+}
+
+/// User units per motor turn: as they are given, or through the gear.
+fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
+    let geared = raw.gear.as_ref().map(Spanned::span);
+    let geared = geared.or(raw.feed.as_ref().map(Spanned::span));
+    if let (Some(at), Some(_)) = (geared, &raw.per_turn) {
+        p.add_hint(
+            at,
+            "`per_turn` says already how far a turn of the motor goes, gear included",
+            "write `gear` and `feed`, which is per turn of the shaft behind the gear; or `per_turn` alone",
+        );
+        return None;
+    }
+    if let Some(per_turn) = &raw.per_turn {
+        return positive(per_turn, "per_turn", unit, p).copied();
+    }
+    let feed = match &raw.feed {
+        Some(feed) => *positive(feed, "feed", unit, p)?,
+        None => 1.0,
+    };
+    let [motor, shaft] = raw.gear.as_ref().map_or([1, 1], |gear| *gear.get_ref());
+    Some(feed * f64::from(shaft) / f64::from(motor))
+}
+
+fn modulo(raw: &RawAxis, scale: Scale, unit: &str, p: &mut Problems<'_>) -> Option<Scale> {
+    let Some(length) = &raw.modulo else {
+        if let Some(way) = &raw.way {
+            let hint = "add `modulo = 360.0`, or leave `way` out";
+            p.add_hint(way.span(), "only a modulo axis has a `way` to choose", hint);
+            return None;
+        }
+        return Some(scale);
+    };
+    positive(length, "modulo", unit, p)?;
+    if let Some(range) = &raw.limits.position {
+        let message = "an axis that goes round and round has no range of positions";
+        p.add_hint(
+            range.span(),
+            message,
+            "leave `limits.position` or `modulo` out",
+        );
+        return None;
+    }
+    match scale.with_modulo(*length.get_ref()) {
+        Ok(scale) => Some(scale),
+        Err(error) => {
+            let counts = length.get_ref() * scale.counts_per_unit();
+            let hint = format!("`modulo` is {counts:.3e} counts: check `encoder` and the gear");
+            p.add_hint(length.span(), error.to_string(), hint);
+            None
+        }
+    }
+}
+
+const WAYS: [(&str, Way); 3] = [
+    ("shortest", Way::Shortest),
+    ("positive", Way::Positive),
+    ("negative", Way::Negative),
+];
+
+pub(super) fn way(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Way> {
+    one_of(raw.way.as_ref(), &WAYS, "way", p)
+}
+
+const VELOCITY_UNITS: [(&str, VelocityUnit); 4] = [
+    ("rpm", VelocityUnit::RPM),
+    ("mrpm", VelocityUnit::MILLI_RPM),
+    ("counts/s", VelocityUnit::COUNTS_PER_SECOND),
+    ("turns/s", VelocityUnit::TURNS_PER_SECOND),
+];
+
+const SI_UNIT_VELOCITY: u16 = 0x60a9;
+const SI_UNIT_ACCELERATION: u16 = 0x60aa;
+const RATED_TORQUE: u16 = 0x6076;
+
+/// What 0x60A9 will say: the file's word, the file's SDO, or the ESI's default.
+pub(super) fn velocity_unit(
+    raw: &RawAxis,
+    sdos: &[RawSdo],
+    selection: Option<&esi::Selection>,
+    p: &mut Problems<'_>,
+) -> Option<(VelocityUnit, UnitFrom)> {
+    if let Some(text) = &raw.velocity_unit {
+        let known = VELOCITY_UNITS
+            .iter()
+            .find(|(name, _)| *name == text.get_ref());
+        if known.is_none() {
+            let message = format!("unknown unit of velocity \"{}\"", text.get_ref());
+            let names = VELOCITY_UNITS.iter().map(|(name, _)| *name);
+            p.add_hint(
+                text.span(),
+                message,
+                suggestion(text.get_ref(), names, "units"),
+            );
+        }
+        return known.map(|(_, unit)| (*unit, UnitFrom::File));
+    }
+    let Some((code, from)) = will_be(SI_UNIT_VELOCITY, sdos, selection) else {
+        return Some((VelocityUnit::default(), UnitFrom::Nothing));
+    };
+    let unit = VelocityUnit::from_si_code(code);
+    if unit.is_none() {
+        let message =
+            format!("the drive's velocity unit (0x60A9) is 0x{code:08x}, which is not understood");
+        let hint = "say it with `velocity_unit = \"rpm\"`, \"mrpm\", \"counts/s\" or \"turns/s\"";
+        p.add_hint(raw.span.clone(), message, hint);
+    }
+    Some((unit?, from))
+}
+
+/// What an object of 32 bits will hold: the file's SDO, or the ESI's default.
+fn will_be(
+    index: u16,
+    sdos: &[RawSdo],
+    selection: Option<&esi::Selection>,
+) -> Option<(u32, UnitFrom)> {
+    let written = sdos.iter().rev().find(|s| s.index == index && s.sub == 0);
+    let written = written.and_then(|s| match s.value.get_ref() {
+        SdoValue::Integer(n) => u32::try_from(*n).ok(),
+        _ => None,
+    });
+    if let Some(value) = written {
+        return Some((value, UnitFrom::Sdo));
+    }
+    let item = selection?.dictionary.item(index, 0)?;
+    let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
+    item.has_default
+        .then_some((u32::from_le_bytes(bytes), UnitFrom::Esi))
+}
+
+/// What 0x60AA will say, where that is known and understood; else that of 0x60A9 per second.
+pub(super) fn acceleration_unit(
+    velocity: VelocityUnit,
+    sdos: &[RawSdo],
+    selection: Option<&esi::Selection>,
+) -> (AccelerationUnit, UnitFrom) {
+    let known = will_be(SI_UNIT_ACCELERATION, sdos, selection)
+        .and_then(|(code, from)| Some((AccelerationUnit::from_si_code(code)?, from)));
+    known.unwrap_or((velocity.into(), UnitFrom::Nothing))
+}
+
+const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
+    ("percent", TorqueUnit::Percent),
+    ("Nm", TorqueUnit::NewtonMetres),
+    ("A", TorqueUnit::Amperes),
+];
+
+/// The unit of torques, and what is known of the motor.
+pub(super) fn torque(
+    raw: &RawAxis,
+    sdos: &[RawSdo],
+    selection: Option<&esi::Selection>,
+    p: &mut Problems<'_>,
+) -> Option<TorqueSetup> {
+    let unit = one_of(raw.torque_unit.as_ref(), &TORQUE_UNITS, "torque_unit", p)?;
+    let mut known = |value: &Option<Spanned<f64>>, what: &str, unit: &str| match value {
+        Some(value) => positive(value, what, unit, p).map(|n| Some(*n)),
+        None => Some(None),
+    };
+    let constant = known(&raw.torque_constant, "torque_constant", "Nm/A");
+    let said = known(&raw.rated_torque, "rated_torque", "Nm");
+    let (constant, said) = (constant?, said?);
+    let counts_per_newton_metre = counts_per_newton_metre(selection);
+    let (rated, rated_from) = match (said, will_be(RATED_TORQUE, sdos, selection)) {
+        (Some(rated), _) => (Some(rated), UnitFrom::File),
+        (None, Some((count, from))) if count > 0 => {
+            (Some(f64::from(count) / counts_per_newton_metre), from)
+        }
+        _ => (None, UnitFrom::Nothing),
+    };
+    let at = raw
+        .torque_unit
+        .as_ref()
+        .map_or(raw.span.clone(), Spanned::span);
+    if unit == TorqueUnit::Amperes && constant.is_none() {
+        let message = "torques in A need the motor's torque constant";
+        p.add_hint(at, message, "add `torque_constant = 0.0385` (Nm/A)");
+        return None;
+    }
+    let torque = TorqueSetup {
+        unit,
+        rated,
+        rated_from,
+        constant,
+        counts_per_newton_metre,
+        percent_per_unit: 1.0,
+        limit_said: raw.limits.torque.is_some(),
+    };
+    // The drive will tell; until then torques are known as parts of the limit.
+    let limit = raw.limits.torque.as_ref().map(|n| *n.get_ref());
+    match (unit, rated, limit) {
+        (TorqueUnit::Percent, ..) => Some(torque),
+        (_, Some(rated), _) => torque.with_rated(rated, rated_from),
+        (_, None, Some(limit)) => Some(TorqueSetup {
+            percent_per_unit: 100.0 / limit,
+            ..torque
+        }),
+        (_, None, None) => {
+            let message = format!(
+                "only the drive knows the motor's rated torque (0x6076), so torques in {unit} need a limit"
+            );
+            p.add_hint(
+                at,
+                message,
+                "add `torque` to `limits`, or `rated_torque = 0.1` (Nm)",
+            );
+            None
+        }
+    }
+}
+
+/// What 0x6076 counts in a Nm: as the ESI says in its `Unit`, else µNm of maxon's drives and mNm of all others.
+fn counts_per_newton_metre(selection: Option<&esi::Selection>) -> f64 {
+    const NEWTON_METRE: u8 = 0x56;
+    let Some(selection) = selection else {
+        return 1e3;
+    };
+    let unit = selection
+        .dictionary
+        .item(RATED_TORQUE, 0)
+        .map_or(0, |item| item.unit);
+    if let [0, 0, NEWTON_METRE, prefix] = unit.to_le_bytes() {
+        return 10f64.powi(-i32::from(i8::from_le_bytes([prefix])));
+    }
+    let maxon =
+        selection.dictionary.item(0x30b0, 0).is_some() || selection.identity.vendor == MAXON;
+    if maxon { 1e6 } else { 1e3 }
+}
+
+impl TorqueSetup {
+    /// With the motor's rated torque in Nm.
+    pub(crate) fn with_rated(self, rated: f64, from: UnitFrom) -> Option<Self> {
+        let scale = TorqueScale::new(Some(rated), self.constant).ok()?;
+        let percent_per_unit = match self.unit {
+            TorqueUnit::Percent => 1.0,
+            TorqueUnit::NewtonMetres => scale.of_newton_metres(NewtonMetres(1.0)).ok()?.0,
+            TorqueUnit::Amperes => scale.of_amperes(Amperes(1.0)).ok()?.0,
+        };
+        Some(Self {
+            rated: Some(rated),
+            rated_from: from,
+            percent_per_unit,
+            ..self
+        })
+    }
+
+    /// Percent of rated torque, from the file's unit.
+    #[must_use]
+    pub fn percent(&self, torque: f64) -> f64 {
+        torque * self.percent_per_unit
+    }
+
+    /// In the file's unit, from percent of rated torque.
+    #[must_use]
+    pub fn shown(&self, percent: f64) -> f64 {
+        percent / self.percent_per_unit
+    }
+}
