@@ -8,8 +8,8 @@ mod common;
 
 use common::{DT, Drive, LIMITS, Rig, all};
 use ecaxis_axis::{
-    Axis, AxisConfig, AxisStatus, Brake, Command, Edge, Emergency, FaultReset, Inputs, Limits,
-    Loops, Mode, Outputs, Probe, Reaction, Source, State, Supervision, TorqueWatch,
+    Axis, AxisConfig, AxisStatus, Brake, Command, Edge, Emergency, FaultReset, FeedForward, Inputs,
+    Limits, Loops, Mode, Outputs, Probe, Reaction, Source, State, Supervision, TorqueWatch,
 };
 
 const COUNTS_PER_UNIT: f64 = 400.0;
@@ -68,7 +68,10 @@ fn config(dice: &mut Dice) -> AxisConfig {
     let loops = Loops {
         csv: base.loops.csv.filter(|_| !dice.one_in(2)),
         cst: base.loops.cst.filter(|_| !dice.one_in(2)),
-        ..base.loops
+        csp: FeedForward {
+            velocity: dice.pick(&[0.0, 0.5]),
+            acceleration: dice.pick(&[0.0, 0.01]),
+        },
     };
     AxisConfig {
         loops,
@@ -291,7 +294,8 @@ impl Checker {
             ensure(change <= 11, "torque steps")?;
         }
         let offsets = (out.velocity_offset, out.torque_offset) == (0, 0);
-        ensure(offsets || steady(Mode::Csp), "offsets outside CSP")?;
+        let csp = status.enabled && status.mode == Mode::Csp && status.switching.is_none();
+        ensure(offsets || csp, "offsets outside CSP")?;
         let counts = |mode| live(mode) || in_force(&status).contains(&Some(mode));
         ensure(
             out.target_velocity == 0 || counts(Mode::Csv) || counts(Mode::Pv),
@@ -317,6 +321,10 @@ impl Checker {
                 "enabled with a step",
             )?;
         }
+        ensure(
+            out.controlword & 0x0F == 0x0F || out.controlword & 0x0170 == 0,
+            "bits of a mode beside another command",
+        )?;
         ensure(
             out.brake_open || !status.ready,
             "ready against a closed brake",

@@ -147,6 +147,21 @@ fn a_profile_velocity() {
     ));
 }
 
+#[test]
+fn a_profile_velocity_stops_inside_the_range() {
+    let mut rig = Rig::new(Axis::new(all(Mode::Pv, LIMITS)).unwrap(), Drive::at(0));
+    rig.axis.command(Command::Enable).unwrap();
+    rig.until(|s| s.ready, 100);
+    for (velocity, end) in [(150.0, 50.0), (-100.0, -50.0), (-20.0, -50.0)] {
+        rig.axis.command(run_at(velocity)).unwrap();
+        let status = rig.until(|s| s.held_by_range, 3000);
+        assert_eq!(status.trip, None);
+        let status = rig.until(|s| s.at_rest && !s.moving, 500);
+        assert!((status.position - end).abs() < 1.5, "{}", status.position);
+        assert!(status.position.abs() <= 50.0 && status.ready);
+    }
+}
+
 /// The velocity goes on through PV, CSP and CSV; nothing steps by more than a cycle's acceleration.
 #[test]
 fn a_velocity_goes_on_in_and_out_of_pv() {

@@ -175,6 +175,7 @@ impl Axis {
         self.go_on();
         let before = self.motion;
         let grip = self.grip();
+        self.held_by_range &= matches!(self.plan, Plan::Velocity(_) | Plan::Drive);
         match self.plan {
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
             Plan::Jerk(ref mut source) => self.motion = source.advance(before, dt_s),
@@ -193,6 +194,9 @@ impl Axis {
                     } = self.statusword.in_mode(self.mode)
                 {
                     self.profile.step(acknowledged, target_reached, dt_s);
+                }
+                if fresh {
+                    self.halt_inside_range();
                 }
                 self.motion = self.uncommanded();
             }
@@ -217,6 +221,26 @@ impl Axis {
         if grip == Control::Velocity {
             self.motion.position = self.config.scale.position_to_user(self.sent).0;
         }
+    }
+
+    /// PV: a velocity that leads out of the range is halted where the drive can still stop inside it.
+    fn halt_inside_range(&mut self) {
+        let (Mode::Pv, Some(goal), Some([low, high])) =
+            (self.mode, self.profile.goal(), self.config.limits.position)
+        else {
+            return;
+        };
+        let velocity = self.actual.velocity();
+        let late_s = self.config.dead_time_s + 2.0 * self.dt_s;
+        // A halt brakes with the limit, which is then in 0x6084.
+        let braking = 2.0 * self.config.limits.acceleration;
+        let way = velocity * (velocity.abs() / braking + late_s);
+        let end = self.actual.position() + way;
+        let outwards = goal.target > 0.0 && end >= high || goal.target < 0.0 && end <= low;
+        if outwards && self.actual.counts().is_some() {
+            self.profile.halt();
+        }
+        self.held_by_range = outwards;
     }
 
     fn run(&mut self, ramp: Ramp, before: Motion, dt_s: f64) -> Motion {
