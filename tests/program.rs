@@ -249,3 +249,57 @@ dwell = "300ms"
         summary.axes[1]
     );
 }
+
+/// A position that jumps, because home was found, must not take another axis along.
+#[test]
+fn what_is_followed_cannot_search_its_home_nor_lose_its_power() {
+    let text = HEAD.replacen(
+        "following_error = 2.0 }",
+        "following_error = 2.0 }\nhoming = { method = 37, position = 7.0 }",
+        1,
+    );
+    let text = text.replacen(
+        "mode = \"csp\"",
+        "mode = \"csp\"\npdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\"]\n\
+         pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\", \"0x606C\", \"0x6077\"]",
+        1,
+    );
+    for (order, part) in [
+        ("home = [\"x\"]", "searches"),
+        ("disable = [\"x\"]", "no power"),
+    ] {
+        let text = format!(
+            "{text}[[step]]\nmove = {{ x = 30.0 }}\n[[step]]\ngear = {{ y = {{ to = \"x\" }} }}\n\
+             [[step]]\n{order}\n[[step]]\ndwell = \"1s\"\n"
+        );
+        let (outcome, _) = run(machine(&text), virtual_time());
+        let error = outcome.result.expect_err("the gear is lost").to_string();
+        assert!(error.contains("`y`") && error.contains(part), "{error}");
+        let y = &outcome.summary.expect("the cycle has run").axes[1];
+        assert!(y.final_position.abs() < 0.01, "{y:?}");
+    }
+}
+
+#[test]
+fn axes_cannot_follow_each_other() {
+    let (result, ran, _) = program(
+        "[[step]]\ngear = { y = { to = \"x\" } }\n[[step]]\ngear = { x = { to = \"y\" } }\n",
+    );
+    let error = result.expect_err("a ring").to_string();
+    assert_eq!(ran, ["1", "2"]);
+    assert!(error.contains("would follow each other"), "{error}");
+}
+
+#[test]
+fn a_follower_that_cannot_follow_stops_the_machine() {
+    let (result, _, summary) = program(
+        "[[step]]\ngear = { y = { to = \"x\", ratio = 3.0 } }\n[[step]]\nmove = { x = 50.0 }\n",
+    );
+    let error = result.expect_err("y ends at 60").to_string();
+    assert!(
+        error.contains("`y`") && error.contains("cannot follow"),
+        "{error}"
+    );
+    let x = &summary.axes[0];
+    assert!(x.final_position < 49.0, "stopped on the way: {x:?}");
+}

@@ -367,3 +367,29 @@ fn the_other_axes_stop_as_the_file_says() {
     // A ramp is followed to its end with power; the last position with power is then the farthest.
     assert!(ways[0] > ways[2] && ways[1] > ways[2] - 1e-9, "{ways:?}");
 }
+
+/// The way to rest is shortened, whatever it began as.
+#[test]
+fn an_emergency_counts_while_the_machine_is_stopping_already() {
+    let slow = axes(1).replacen("acceleration = 500.0", "acceleration = 10.0", 1)
+        + "\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 1\n";
+    // At the time limit the axis moves fast; then the input is on since the first step, but only seen as an emergency late.
+    let stop = "\n[stop]\nemergency = { a0.\"0x6064\" = { above = 20000 } }\n";
+    let mut options = virtual_time();
+    options.limit = Some(1_900_000_000);
+    let (outcome, _) = common::run(machine(&slow), options.clone());
+    let without = outcome.summary.expect("the cycle has run");
+    let (outcome, _) = common::run(machine(&(slow + stop)), options);
+    let with = outcome.summary.expect("the cycle has run");
+    assert!(
+        without.axes[0].final_position > 12.0,
+        "{:?}",
+        without.axes[0]
+    );
+    assert!(
+        with.axes[0].final_position < without.axes[0].final_position - 5.0,
+        "{:?} {:?}",
+        with.axes[0],
+        without.axes[0]
+    );
+}

@@ -166,6 +166,10 @@ pub enum Trip {
 /// Why a command was not taken. Nothing has changed. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Refused {
+    #[error("the bus is not in Op yet")]
+    NotInOp,
+    #[error("the axis follows something else; stop it first")]
+    Following,
     #[error("{what} is {value}: not a finite number")]
     NotFinite { what: &'static str, value: f64 },
     #[error("{what} is {value}: it must be above 0 and at most 1")]

@@ -103,6 +103,8 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::Refused { by_axis, .. } => refused(by_axis.as_deref()).to_owned(),
         RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
         RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
+        RunError::FollowLost { .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
+        RunError::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
         RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
         RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,

@@ -105,9 +105,11 @@ fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
         (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084]),
         (Mode::Pv, &[0x60ff, 0x6083, 0x6084]),
     ];
+    // Without the reported torque a switch to CST would begin with none.
+    let torque = layout.tx_field(0x6077, 0).is_some();
     for (mode, targets) in targets {
         let mapped = |index: &u16| layout.rx_field(*index, 0).is_some();
-        if targets.iter().all(mapped) {
+        if targets.iter().all(mapped) && (mode != Mode::Cst || torque) {
             modes = modes.with(mode);
         }
     }

@@ -9,7 +9,9 @@ use super::steps::Known;
 use super::{DeviceConfig, Machine, Signal};
 
 /// Axes write these themselves (CiA 402, ETG.6010).
-const AXIS_OUTPUTS: [u16; 7] = [0x6040, 0x6060, 0x6071, 0x607a, 0x60b1, 0x60b2, 0x60ff];
+const AXIS_OUTPUTS: [u16; 11] = [
+    0x6040, 0x6060, 0x6071, 0x607a, 0x6081, 0x6083, 0x6084, 0x60b1, 0x60b2, 0x60b8, 0x60ff,
+];
 
 /// Whether a signal comes in or goes out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

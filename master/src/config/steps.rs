@@ -8,7 +8,7 @@ mod follow;
 mod target;
 
 use super::axis::control::one_of;
-use super::problem::{Problems, list, suggestion};
+use super::problem::{Problems, Span, list, suggestion};
 use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawStop};
 use super::{
     Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopBy, StopByDrive, StopSetup,
@@ -110,7 +110,7 @@ impl Checker<'_> {
             }
             let number = format!("{prefix}{}", index + 1);
             let line = p.line(&span);
-            if let Some(action) = self.one(action, &number, p) {
+            if let Some(action) = self.one(action, &number, span, p) {
                 checked.push(Step {
                     number,
                     line,
@@ -121,7 +121,13 @@ impl Checker<'_> {
         checked
     }
 
-    fn one(&mut self, action: RawAction, number: &str, p: &mut Problems<'_>) -> Option<Action> {
+    fn one(
+        &mut self,
+        action: RawAction,
+        number: &str,
+        at: Span,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
         Some(match action {
             RawAction::Enable(axes) => Action::Enable {
                 axes: self.axes(axes, p)?,
@@ -132,7 +138,7 @@ impl Checker<'_> {
             RawAction::Reset(axes) => Action::Reset {
                 axes: self.axes(axes, p)?,
             },
-            RawAction::Home(axes) => self.home(axes, p)?,
+            RawAction::Home(axes) => self.home(axes, &at, p)?,
             RawAction::Stop(axes) => Action::Stop {
                 axes: self.axes(axes, p)?,
             },
@@ -282,16 +288,25 @@ impl Checker<'_> {
         })
     }
 
-    fn home(&self, names: Option<Vec<Spanned<String>>>, p: &mut Problems<'_>) -> Option<Action> {
+    fn home(
+        &self,
+        names: Option<Vec<Spanned<String>>>,
+        at: &Span,
+        p: &mut Problems<'_>,
+    ) -> Option<Action> {
         let homes = |index: &usize| {
             let axis = self.devices[*index].axis.ok();
             axis.is_some_and(|axis| axis.homing.is_some())
         };
         let Some(named) = &names else {
             let all = self.axes(None, p)?;
-            return Some(Action::Home {
-                axes: all.into_iter().filter(homes).collect(),
-            });
+            let axes: Vec<usize> = all.into_iter().filter(homes).collect();
+            if axes.is_empty() {
+                let hint = "add `homing = { method = 37 }` to a [device.axis]";
+                p.add_hint(at.clone(), "no axis says how it finds home", hint);
+                return None;
+            }
+            return Some(Action::Home { axes });
         };
         let mut ok = true;
         for name in named {

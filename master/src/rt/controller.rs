@@ -3,6 +3,7 @@
 use ecaxis_axis::{AxisStatus, Command, Refused};
 
 use super::cycle::Signals;
+use super::cycle::orders::stops;
 use super::slot::AxisSlot;
 use crate::config::{AxisRef, InputRef, OutputRef};
 
@@ -79,8 +80,11 @@ impl Cycle<'_> {
     /// # Errors
     /// Why it does not; nothing has changed then.
     pub fn command(&mut self, axis: AxisRef, command: Command) -> Result<(), Refused> {
-        if self.stopping && command != Command::Disable {
+        if self.stopping && !stops(command) {
             return Err(Refused::Stopping);
+        }
+        if !self.guarded && command == Command::Enable {
+            return Err(Refused::NotInOp);
         }
         self.axes[axis.0].command(command)
     }

@@ -7,14 +7,14 @@ use ecaxis_axis::{Command, State};
 
 use super::controller::{self, Controller};
 use super::exchange::{Answer, Exchange, Received};
-use super::feed::{self, Feed, FeedState};
+use super::feed::{self, FeedState};
 use super::guard::{Guard, StopCause};
 use super::handover::{Event, PhaseStatus, RtEnd, Snapshot};
 use super::image::SignalBits;
 use super::phase::Phase;
 use super::slot::AxisSlot;
 use super::stats::Stats;
-mod orders;
+pub(in crate::rt) mod orders;
 
 use orders::quick_stop;
 
@@ -71,6 +71,7 @@ pub struct Engine {
     end: RtEnd,
     next: Nanos,
     stopping: Option<(StopCause, Nanos)>,
+    severity: u8,
     answer: Answer,
     events_lost: u64,
     orders_taken: u64,
@@ -131,6 +132,7 @@ impl Engine {
             end: parts.end,
             next: clock::now() + parts.timing.cycle_ns,
             stopping: None,
+            severity: 0,
             answer: Answer::default(),
             events_lost: 0,
             orders_taken: 0,
@@ -295,7 +297,12 @@ impl Engine {
                 *to = signal.get(image);
             }
             let inputs = &self.inputs;
-            let pressed = |c: &Condition| inputs.get(c.input).is_some_and(|n| c.holds(*n));
+            // What is no number says nothing about what it stands for.
+            let pressed = |c: &Condition| {
+                inputs
+                    .get(c.input)
+                    .is_none_or(|n| n.is_nan() || c.holds(*n))
+            };
             if self.guarding && self.stop_setup.emergency.iter().any(pressed) {
                 self.stop(StopCause::EmergencyStop);
             }
@@ -328,63 +335,75 @@ impl Engine {
 
     /// Masters before those that follow them, so that a follower's set-point is of the same cycle.
     fn act(&mut self) {
-        self.act_on(|feed| feed.master().is_none());
-        self.act_on(|feed| feed.master().is_some());
-    }
-
-    fn act_on(&mut self, whose: impl Fn(&Feed) -> bool) {
-        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
-        let out_of_patience = self.stopping.is_some_and(|(_, since)| {
-            self.next.saturating_sub(since) > self.timing.stop_patience_ns
-        });
         let mut cause = None;
-        for index in 0..self.axes.len() {
-            let Some(slot) = self.axes.get(index) else {
-                continue;
-            };
-            if slot.acted || !whose(&slot.feed) {
-                continue;
-            }
-            let master = slot.feed.master().and_then(|(master, actual)| {
-                let status = self.axes.get(master)?.axis.status();
-                Some(feed::master_motion(&status, actual))
-            });
-            let Some(slot) = self.axes.get_mut(index) else {
-                continue;
-            };
-            slot.acted = true;
-            slot.feed.give(&mut slot.axis, &self.tables, master, dt_s);
-            let outputs = slot.axis.act();
-            slot.write(self.exchange.outputs_mut(), &outputs);
-            let status = slot.axis.status();
-            slot.armed |= slot.ordered && status.fault.is_none();
-            if status.enabled {
-                slot.largest_following_error =
-                    slot.largest_following_error.max(status.max_following_error);
-                slot.last_enabled = Some(status);
-            }
-            if self.stopping.is_some() {
-                let at_rest = status.at_rest && !status.moving;
-                slot.rested = if at_rest {
-                    slot.rested + self.timing.cycle_ns
-                } else {
-                    0
+        // Gears form no rings, so every round acts on one axis at least.
+        for _ in 0..self.axes.len() {
+            let mut waiting = false;
+            for index in 0..self.axes.len() {
+                let Some(slot) = self.axes.get(index) else {
+                    continue;
                 };
-                if status.enabled && out_of_patience {
-                    quick_stop(&mut slot.axis);
-                } else if status.enabled && slot.rested >= SETTLE {
-                    let _ = slot.axis.command(Command::Disable);
+                if slot.acted {
+                    continue;
                 }
-            } else if cause.is_none() && slot.armed {
-                cause = match (status.fault, status.trip) {
-                    (Some(_), _) => Some(StopCause::DriveFault { axis: index }),
-                    (None, Some(trip)) => Some(StopCause::Trip { axis: index, trip }),
-                    (None, None) => None,
-                };
+                let followed = slot.feed.master().and_then(|(m, _)| self.axes.get(m));
+                if followed.is_some_and(|master| !master.acted) {
+                    waiting = true;
+                } else {
+                    let found = self.act_on(index);
+                    cause = cause.or(found);
+                }
+            }
+            if !waiting {
+                break;
             }
         }
         if let Some(cause) = cause {
             self.stop(cause);
+        }
+    }
+
+    /// One axis; what of it has to stop the machine.
+    fn act_on(&mut self, index: usize) -> Option<StopCause> {
+        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
+        let out_of_patience = self.stopping.is_some_and(|(_, since)| {
+            self.next.saturating_sub(since) > self.timing.stop_patience_ns
+        });
+        let followed = self.axes.get(index)?.feed.master();
+        let master = followed.and_then(|(master, actual)| {
+            let status = self.axes.get(master)?.axis.status();
+            feed::master_motion(&status, actual)
+        });
+        let slot = self.axes.get_mut(index)?;
+        slot.acted = true;
+        let lost = slot.feed.give(&mut slot.axis, &self.tables, master, dt_s);
+        let outputs = slot.axis.act();
+        slot.write(self.exchange.outputs_mut(), &outputs);
+        let status = slot.axis.status();
+        slot.armed |= slot.ordered && status.fault.is_none();
+        if status.enabled {
+            slot.largest_following_error =
+                slot.largest_following_error.max(status.max_following_error);
+            slot.last_enabled = Some(status);
+        }
+        if self.stopping.is_some() {
+            let at_rest = status.at_rest && !status.moving;
+            slot.rested = if at_rest {
+                slot.rested + self.timing.cycle_ns
+            } else {
+                0
+            };
+            if status.enabled && out_of_patience {
+                quick_stop(&mut slot.axis);
+            } else if status.enabled && slot.rested >= SETTLE {
+                let _ = slot.axis.command(Command::Disable);
+            }
+            return None;
+        }
+        match (status.fault, status.trip) {
+            (Some(_), _) if slot.armed => Some(StopCause::DriveFault { axis: index }),
+            (None, Some(trip)) if slot.armed => Some(StopCause::Trip { axis: index, trip }),
+            _ => lost.then_some(StopCause::FollowLost { axis: index }),
         }
     }
 

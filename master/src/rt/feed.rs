@@ -7,7 +7,7 @@ use ecaxis_axis::group::Along;
 use ecaxis_axis::setpoint::{
     Gear, GearConfig, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
 };
-use ecaxis_axis::{Axis, AxisStatus, Refused};
+use ecaxis_axis::{Axis, AxisStatus, HomingStatus, Refused};
 
 /// What an axis is to follow from now on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,6 +48,15 @@ enum Source {
 /// Less is no difference between two velocities; a stop by lost frames is more.
 const ROUNDING: f64 = 1e-6;
 
+const RING: &str = "the axes would follow each other";
+const NO_MASTER: &str = "the axis that is followed has no power, or searches its home";
+const SLIPS: &str = "the axis cannot follow within its limits";
+
+/// A gear that was engaged may be behind for so long.
+const SLIP_S: f64 = 0.02;
+/// Reported positions come in steps, and a drive that catches up accelerates harder than its set-point.
+const SLIP_ACTUAL_S: f64 = 0.5;
+
 /// How the last feed of an axis stands.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum FeedState {
@@ -62,6 +71,8 @@ pub enum FeedState {
     NotBegun(SetpointError),
     /// The axis did not take a set-point of it, and decelerates.
     Refused(Refused),
+    /// Why there is nothing to follow, or it cannot be followed.
+    Lost(&'static str),
 }
 
 /// The feed of one axis.
@@ -71,6 +82,8 @@ pub struct Feed {
     state: FeedState,
     /// What the source said last.
     given: Option<Motion>,
+    /// How long a gear that was engaged has been behind.
+    slipping_s: f64,
 }
 
 /// An axis' set-point.
@@ -83,10 +96,14 @@ pub fn commanded(status: &AxisStatus) -> Motion {
     }
 }
 
-/// Where a master is: its set-point, or what it reports.
+/// Where a master is: its set-point, or what it reports. `None`: it has no power or searches its home, and its position may
+/// jump.
 #[must_use]
-pub fn master_motion(status: &AxisStatus, actual: bool) -> Motion {
-    if actual {
+pub fn master_motion(status: &AxisStatus, actual: bool) -> Option<Motion> {
+    if !status.enabled || matches!(status.homing, HomingStatus::Running) {
+        return None;
+    }
+    Some(if actual {
         Motion {
             position: status.position,
             velocity: status.velocity,
@@ -94,7 +111,7 @@ pub fn master_motion(status: &AxisStatus, actual: bool) -> Motion {
         }
     } else {
         commanded(status)
-    }
+    })
 }
 
 impl Feed {
@@ -103,8 +120,20 @@ impl Feed {
         self.state
     }
 
-    /// `master` is the motion of the gear's master. RT: O(1).
-    pub fn begin(&mut self, start: Start, axis: &AxisStatus, master: Option<Motion>) {
+    /// Whether the axis is led.
+    #[must_use]
+    pub fn runs(&self) -> bool {
+        self.source.is_some()
+    }
+
+    /// `master` is the motion of the gear's master; `ring`: that one follows this axis. RT: O(1).
+    pub fn begin(&mut self, start: Start, axis: &AxisStatus, master: Option<Motion>, ring: bool) {
+        self.slipping_s = 0.0;
+        if ring || (matches!(start, Start::Gear { .. }) && master.is_none()) {
+            let why = if ring { RING } else { NO_MASTER };
+            (self.source, self.state) = (None, FeedState::Lost(why));
+            return;
+        }
         let source = match start {
             Start::Line(along) => Ok(Source::Line(along)),
             Start::Wave(wave) => Ok(Source::Wave(wave)),
@@ -160,10 +189,21 @@ impl Feed {
     }
 
     /// Gives the axis this cycle's set-point; between its `observe` and `act`. RT: O(1), for a table O(rows in a cycle).
-    pub fn give(&mut self, axis: &mut Axis, tables: &[Table], master: Option<Motion>, dt_s: f64) {
+    /// `true`: it has just ended without an order to.
+    pub fn give(
+        &mut self,
+        axis: &mut Axis,
+        tables: &[Table],
+        master: Option<Motion>,
+        dt_s: f64,
+    ) -> bool {
         let Some(mut source) = self.source else {
-            return;
+            return false;
         };
+        if self.master().is_some() && master.is_none() {
+            (self.source, self.state) = (None, FeedState::Lost(NO_MASTER));
+            return true;
+        }
         let before = self.taken(axis, dt_s);
         let (next, finished, state) = match &mut source {
             Source::Line(along) => {
@@ -188,9 +228,24 @@ impl Feed {
                 } else {
                     FeedState::Running
                 };
+                if self.state == FeedState::Engaged && state == FeedState::Running {
+                    self.slipping_s = dt_s;
+                } else if self.slipping_s > 0.0 && state == FeedState::Running {
+                    self.slipping_s += dt_s;
+                } else {
+                    self.slipping_s = 0.0;
+                }
                 (next, false, state)
             }
         };
+        let patience = match source {
+            Source::Gear { actual: true, .. } => SLIP_ACTUAL_S,
+            _ => SLIP_S,
+        };
+        if self.slipping_s > patience {
+            (self.source, self.state) = (None, FeedState::Lost(SLIPS));
+            return true;
+        }
         match axis.set_point(next.position) {
             Ok(()) if finished => (self.source, self.state) = (None, FeedState::Finished),
             Ok(()) => {
@@ -199,8 +254,12 @@ impl Feed {
             }
             // The axis waits; so does what it follows.
             Err(Refused::FramesLost) => {}
-            Err(reason) => (self.source, self.state) = (None, FeedState::Refused(reason)),
+            Err(reason) => {
+                (self.source, self.state) = (None, FeedState::Refused(reason));
+                return true;
+            }
         }
+        false
     }
 }
 

@@ -59,14 +59,14 @@ impl Rig {
         };
         self.axis.observe(&inputs, DT);
         self.before = self.axis.status().target_position;
-        self.feed.give(&mut self.axis, &[], master, DT);
+        let _ = self.feed.give(&mut self.axis, &[], master, DT);
         self.out = self.axis.act();
         self.axis.status().target_position
     }
 
     fn begin(&mut self, start: Start, master: Option<Motion>) {
         let status = self.axis.status();
-        self.feed.begin(start, &status, master);
+        self.feed.begin(start, &status, master, false);
     }
 
     fn part(&self, target: f64, speed: f64) -> LineAxis {

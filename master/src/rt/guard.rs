@@ -27,10 +27,25 @@ pub enum StopCause {
     },
     /// A condition of the machine file for it holds.
     EmergencyStop,
+    /// This axis can no longer follow what it was geared to, or led along.
+    FollowLost { axis: usize },
     /// The user's controller panicked.
     Controller,
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
+}
+
+impl StopCause {
+    /// A graver one stops a machine anew that is already stopping: by a shorter way.
+    #[must_use]
+    pub fn severity(&self) -> u8 {
+        match self {
+            Self::Requested | Self::Controller => 1,
+            Self::DriveFault { .. } | Self::Trip { .. } | Self::FollowLost { .. } => 2,
+            Self::BusLost { .. } | Self::LeftOp { .. } => 3,
+            Self::EmergencyStop => 4,
+        }
+    }
 }
 
 /// Counts bad cycles in a row.

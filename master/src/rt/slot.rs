@@ -41,6 +41,9 @@ impl AxisSlot {
     }
 
     pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {
+        if self.feed.runs() && matches!(command, Command::SetMode(_) | Command::Home { .. }) {
+            return Err(Refused::Following);
+        }
         self.ordered |= command == Command::Enable;
         self.axis.command(command)?;
         // These leave the set-point alone.

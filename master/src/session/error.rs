@@ -144,6 +144,10 @@ pub enum RunError {
     NotDisabled { device: DeviceRef, state: State },
     #[error("emergency stop: {condition}")]
     EmergencyStop { condition: String },
+    #[error("{device}: follows no longer: {reason}")]
+    FollowLost { device: DeviceRef, reason: String },
+    #[error("{device}: is not enabled: {reason}")]
+    EnableRefused { device: DeviceRef, reason: String },
     #[error("the controller panicked")]
     Controller,
     #[error("interrupted")]

@@ -5,6 +5,7 @@ use ecaxis_axis::AxisStatus;
 use super::Supervisor;
 use crate::bringup::al;
 use crate::clock::{self, Nanos};
+use crate::rt::feed::FeedState;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Order, Snapshot};
 use crate::session::{Progress, RunError};
@@ -25,6 +26,14 @@ impl Supervisor {
                     condition: pressed.map_or(String::new(), |c| self.machine.condition(c)),
                 }
             }
+            StopCause::FollowLost { axis } => RunError::FollowLost {
+                device: self.device_of(axis),
+                reason: match snapshot.feeds.get(axis) {
+                    Some(FeedState::Refused(reason)) => reason.to_string(),
+                    Some(FeedState::Lost(why)) => (*why).to_owned(),
+                    _ => "it was told otherwise".to_owned(),
+                },
+            },
             StopCause::Controller => RunError::Controller,
             StopCause::DriveFault { axis } => {
                 let code = self.error_code(axis).await;

@@ -12,6 +12,9 @@ use crate::rt::feed::{FeedState, Start, commanded};
 use crate::rt::handover::Order;
 use crate::session::RunError;
 
+/// How long a follower may take to catch up.
+const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;
+
 /// No step is worth more than this part of an axis' limits: products of f64s are rounded.
 const WHOLE: f64 = 1.0 - 1e-9;
 
@@ -141,6 +144,7 @@ impl Supervisor {
             .iter()
             .map(|&(axis, start)| Order::Feed { axis, start });
         self.orders(&orders.collect::<Vec<_>>()).await;
+        let begun = clock::now();
         let mut done_since = None;
         self.watch(step, start, |this, snapshot| {
             let mut done = true;
@@ -149,6 +153,7 @@ impl Supervisor {
                 match snapshot.feeds[axis] {
                     FeedState::NotBegun(error) => return Err(this.refusal(step, axis, &error)),
                     FeedState::Refused(reason) => return Err(this.refusal(step, axis, &reason)),
+                    FeedState::Lost(why) => return Err(this.refusal(step, axis, &why)),
                     // Something else has taken the axis over.
                     FeedState::None => {}
                     state => done &= state == until,
@@ -158,6 +163,11 @@ impl Supervisor {
                 }
             }
             if !done {
+                let waited = clock::now().saturating_sub(begun);
+                if until == FeedState::Engaged && waited > ENGAGE_TIMEOUT {
+                    let axis = feeds.first().map_or(0, |&(axis, _)| axis);
+                    return Err(this.refusal(step, axis, &"it does not catch up"));
+                }
                 done_since = None;
                 return Ok(false);
             }

@@ -196,6 +196,12 @@ impl Supervisor {
         let timeout = self.machine.bus.enable_timeout_ns;
         loop {
             let snapshot = self.tick().await?;
+            if let Some((axis, reason)) = self.refused.take() {
+                return Err(RunError::EnableRefused {
+                    device: self.device_of(axis),
+                    reason: reason.to_string(),
+                });
+            }
             let status = |axis: usize| snapshot.axes.get(axis).copied();
             let late = axes
                 .iter()

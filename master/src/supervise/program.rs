@@ -529,7 +529,8 @@ impl Supervisor {
             let Some(&(axis, target)) = late else {
                 return Ok(true);
             };
-            if targets.iter().any(|&(axis, _)| status(axis).moving) {
+            let on_its_way = |axis: usize| status(axis).moving && !status(axis).held_by_range;
+            if targets.iter().any(|&(axis, _)| on_its_way(axis)) {
                 settling_since = None;
                 return Ok(false);
             }

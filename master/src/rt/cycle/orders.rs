@@ -27,7 +27,7 @@ impl Engine {
         match order {
             Order::Axis { axis, command } => {
                 // A stopping machine takes no new motion.
-                if self.stopping.is_some() && command != Command::Disable {
+                if self.stopping.is_some() && !stops(command) {
                     return;
                 }
                 let Some(slot) = self.axes.get_mut(axis) else {
@@ -71,10 +71,12 @@ impl Engine {
     /// The first cause wins. All axes decelerate within their limits and are then disabled; where the
     /// bus is not to be trusted, the drives do it by themselves, from the velocity that they know.
     pub(super) fn stop(&mut self, cause: StopCause) {
-        if self.stopping.is_some() {
+        if cause.severity() <= self.severity {
             return;
         }
-        self.stopping = Some((cause, self.next));
+        self.severity = cause.severity();
+        // What comes later is a consequence, and only makes the stop shorter.
+        let first = *self.stopping.get_or_insert((cause, self.next));
         let way = match cause {
             StopCause::BusLost { .. } | StopCause::LeftOp { .. } => {
                 match self.stop_setup.bus_lost {
@@ -82,7 +84,9 @@ impl Engine {
                     StopByDrive::NoPower => StopBy::NoPower,
                 }
             }
-            StopCause::DriveFault { .. } | StopCause::Trip { .. } => self.stop_setup.others,
+            StopCause::DriveFault { .. }
+            | StopCause::Trip { .. }
+            | StopCause::FollowLost { .. } => self.stop_setup.others,
             StopCause::Requested | StopCause::Controller | StopCause::EmergencyStop => StopBy::Ramp,
         };
         for slot in &mut self.axes {
@@ -105,7 +109,9 @@ impl Engine {
             slot.feed.end();
         }
         let cycle = self.stats.counters.cycles;
-        self.report(Event::Stopping { cycle, cause });
+        if first.0 == cause {
+            self.report(Event::Stopping { cycle, cause });
+        }
     }
 
     fn begin_feed(&mut self, axis: usize, start: Start) {
@@ -116,14 +122,36 @@ impl Engine {
             Start::Gear { master, actual, .. } => self
                 .axes
                 .get(master)
-                .map(|slot| feed::master_motion(&slot.axis.status(), actual)),
+                .and_then(|slot| feed::master_motion(&slot.axis.status(), actual)),
             _ => None,
         };
+        let ring = matches!(start, Start::Gear { master, .. } if self.follows(master, axis));
         if let Some(slot) = self.axes.get_mut(axis) {
             let status = slot.axis.status();
-            slot.feed.begin(start, &status, master);
+            slot.feed.begin(start, &status, master, ring);
         }
     }
+
+    /// Whether an axis is led by another, over however many gears.
+    fn follows(&self, axis: usize, leader: usize) -> bool {
+        let mut at = Some(axis);
+        for _ in 0..=self.axes.len() {
+            match at {
+                Some(axis) if axis == leader => return true,
+                Some(axis) => at = self.axes.get(axis).and_then(|s| Some(s.feed.master()?.0)),
+                None => return false,
+            }
+        }
+        true
+    }
+}
+
+/// What a machine that is being stopped still takes.
+pub(in crate::rt) fn stops(command: Command) -> bool {
+    matches!(
+        command,
+        Command::Disable | Command::QuickStop | Command::EmergencyStop | Command::DisableVoltage
+    )
 }
 
 /// The drive's own quick stop, then no power.
