@@ -7,6 +7,7 @@ use crate::probe::{Edge, Probe, Source};
 use crate::profile::Goal;
 use crate::setpoint::{self, Ramp, Trapezoid};
 use crate::status::Refused;
+use crate::units::{Counts, UserUnits};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Command {
@@ -319,6 +320,17 @@ impl Axis {
         }
         self.check_ready()?;
         if self.mode == Mode::Pp {
+            // The drive goes there by itself, and it counts 32 bits.
+            let Counts(counts) = scale.position_to_counts(UserUnits(position));
+            if i32::try_from(counts).is_err() {
+                let [low, high] = [i32::MIN, i32::MAX]
+                    .map(|end| scale.position_to_user(Counts(i64::from(end))).0);
+                return Err(Refused::OutsideRange {
+                    position,
+                    low: low.min(high),
+                    high: high.max(low),
+                });
+            }
             self.profile.go_to(Goal {
                 target: position,
                 velocity: limits.velocity * speed,

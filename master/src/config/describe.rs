@@ -39,7 +39,7 @@ impl Machine {
                 self.names(&[*axis]),
                 rounded(wave.duration_s())
             ),
-            Action::Table { axis, table } => {
+            Action::Table { axis, table, .. } => {
                 let file = self
                     .tables
                     .get(*table)

@@ -314,6 +314,9 @@ pub enum Action {
         axis: usize,
         /// Index into [`Machine::tables`].
         table: usize,
+        /// On the way to the first position, as in a move.
+        speed: f64,
+        ramp: f64,
     },
     /// One axis follows another from now on; until it is told something else.
     Gear {

@@ -18,6 +18,8 @@ use ecaxis_axis::Mode;
 use ecaxis_esi as esi;
 use target::{What, fraction};
 
+/// Of the limits: how an axis goes to the beginning of a table where the step does not say.
+const GENTLE: f64 = 0.1;
 /// How a gear smooths what its master reports, where the step does not say.
 const SMOOTHING_NS: u64 = 10_000_000;
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
@@ -190,7 +192,16 @@ impl Checker<'_> {
                 *periods?.get_ref(),
                 p,
             )?,
-            RawAction::Table { axis, file } => self.table(&axis, &file, p)?,
+            RawAction::Table {
+                axis,
+                file,
+                speed,
+                ramp,
+            } => {
+                let speed = speed.map_or(Some(GENTLE), |s| fraction(Some(s), "speed", p));
+                let ramp = ramp.map_or(Some(GENTLE), |r| fraction(Some(r), "ramp", p));
+                self.table(&axis, &file, [speed?, ramp?], p)?
+            }
             RawAction::Gear {
                 axis: name,
                 to,

@@ -105,16 +105,16 @@ impl Supervisor {
         &mut self,
         step: &Step,
         start: Nanos,
-        device: usize,
-        table: usize,
+        [device, table]: [usize; 2],
+        [speed, ramp]: [f64; 2],
     ) -> Result<(), RunError> {
         let axes = self.places(&[device]);
         let [first, _] = self.machine.tables[table].table.ends();
         let there: Vec<_> = axes.iter().map(|&axis| (axis, first)).collect();
         self.reach(step, start, &there, |position| Command::MoveTo {
             position,
-            speed: 1.0,
-            ramp: 1.0,
+            speed,
+            ramp,
         })
         .await?;
         if self.over(start) {

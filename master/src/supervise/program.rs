@@ -197,7 +197,15 @@ impl Supervisor {
                     .await
             }
             Action::Wave { axis, wave } => self.wave(step, start, *axis, *wave).await,
-            Action::Table { axis, table } => self.play(step, start, *axis, *table).await,
+            Action::Table {
+                axis,
+                table,
+                speed,
+                ramp,
+            } => {
+                self.play(step, start, [*axis, *table], [*speed, *ramp])
+                    .await
+            }
             Action::Gear {
                 axis,
                 master,

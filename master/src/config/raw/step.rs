@@ -64,6 +64,8 @@ pub(crate) enum RawAction {
     Table {
         axis: Spanned<String>,
         file: Spanned<String>,
+        speed: Option<Spanned<f64>>,
+        ramp: Option<Spanned<f64>>,
     },
     Gear {
         axis: Spanned<String>,
@@ -227,8 +229,11 @@ fn action(
             wave
         }
         "table" => {
+            let (speed, ramp) = (number("speed"), number("ramp"));
             let (axis, value) = only(value, "{ x = \"points.csv\" }", p)?;
             RawAction::Table {
+                speed,
+                ramp,
                 axis,
                 file: fields::string(p, value)?,
             }

@@ -76,6 +76,7 @@ impl Checker<'_> {
         &mut self,
         name: &Spanned<String>,
         file: &Spanned<String>,
+        [speed, ramp]: [f64; 2],
         p: &mut Problems<'_>,
     ) -> Option<Action> {
         let path = self.folder.join(file.get_ref());
@@ -97,7 +98,12 @@ impl Checker<'_> {
             Ok(table) => {
                 self.tables.push(TableFile { path, table });
                 let table = self.tables.len() - 1;
-                Some(Action::Table { axis: index, table })
+                Some(Action::Table {
+                    axis: index,
+                    table,
+                    speed,
+                    ramp,
+                })
             }
             Err(error) => {
                 let message = format!("{}, {error}", path.display());
