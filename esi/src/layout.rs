@@ -181,8 +181,8 @@ fn direction(
                         sub: entry.sub,
                         bit_offset: offset,
                         bit_len: entry.bit_len,
-                        name: entry.name.clone(),
-                        data_type: entry.data_type.clone(),
+                        name: entry.name.to_string(),
+                        data_type: entry.data_type.to_string(),
                     });
                 }
                 offset = offset.saturating_add(u32::from(entry.bit_len));

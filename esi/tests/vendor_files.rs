@@ -169,7 +169,7 @@ fn the_epos4_file_exactly() {
 
     let assigned = device.dictionary.object(0x1c12).unwrap();
     assert_eq!(assigned.code, ObjectCode::Array);
-    assert_eq!(assigned.items[0].max, Some(vec![1]));
+    assert_eq!(assigned.items[0].max, Some([1].into()));
     assert_eq!(assigned.items[1].default, [0x00, 0x16]);
     assert_eq!(
         assigned.items[1].access.write,

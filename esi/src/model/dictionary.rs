@@ -1,6 +1,6 @@
 //! The object dictionary.
 
-use super::{Position, SlotDependence};
+use super::{Bytes, Position, SlotDependence, Text};
 
 /// Objects in file order, types resolved: every readable subindex is an item of its object.
 #[derive(Debug, Clone, Default)]
@@ -33,10 +33,10 @@ pub struct Object {
     pub position: Position,
     pub index: u16,
     pub depends_on: SlotDependence,
-    pub name: String,
+    pub name: Text,
     pub code: ObjectCode,
     /// Name of the type as the file writes it.
-    pub type_name: String,
+    pub type_name: Text,
     /// Subindex 0 first. A simple variable has exactly one item, with subindex 0.
     pub items: Vec<ObjectItem>,
 }
@@ -46,7 +46,7 @@ impl Object {
     pub(crate) fn size(&self) -> usize {
         let items = self.items.iter().map(|item| {
             let range = [&item.min, &item.max].into_iter().flatten();
-            let data = range.map(Vec::len).sum::<usize>() + item.default.len();
+            let data = range.map(|bytes| bytes.len()).sum::<usize>() + item.default.len();
             size_of::<ObjectItem>() + data + item.name.len() + item.type_name.len()
         });
         items.fold(
@@ -59,17 +59,17 @@ impl Object {
 #[derive(Debug, Clone, Default)]
 pub struct ObjectItem {
     pub sub: u8,
-    pub name: String,
+    pub name: Text,
     /// Base type name (`USINT`, `DINT`, `STRING(5)`, `ARRAY [0..15] OF BYTE`).
-    pub type_name: String,
+    pub type_name: Text,
     pub bit_len: u32,
     /// Offset inside the object as complete access sees it, subindex 0 padded to 16 bits.
     pub bit_offset: u32,
     /// Little-endian, exactly `bit_len.div_ceil(8)` bytes; zero where the file gives no default.
-    pub default: Vec<u8>,
+    pub default: Bytes,
     pub has_default: bool,
-    pub min: Option<Vec<u8>>,
-    pub max: Option<Vec<u8>>,
+    pub min: Option<Bytes>,
+    pub max: Option<Bytes>,
     pub access: Access,
     pub pdo_mapping: PdoMapping,
     /// `Backup`: kept over a power cycle once parameters are stored.

@@ -7,16 +7,20 @@
 //! * `mailbox`: protocols and InitCmds
 //! * `slots`: slots and the modules that go there
 //! * `dictionary`: objects, types resolved
+//! * `text`: names and types that many of them share; `bytes`: values of objects
 
+mod bytes;
 mod device;
 mod dictionary;
 mod mailbox;
 mod pdo;
 mod slots;
 mod sync;
+mod text;
 
 use std::fmt;
 
+pub use bytes::Bytes;
 pub use device::*;
 pub use dictionary::*;
 pub use mailbox::*;
@@ -24,12 +28,30 @@ pub use pdo::*;
 pub(crate) use slots::Place;
 pub use slots::*;
 pub use sync::*;
+pub use text::Text;
 
 /// Where in the file an element starts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Position {
     pub line: u32,
     pub column: u32,
+}
+
+impl Position {
+    /// What stands here in a text that began at `from`, where the same text begins at `to`.
+    pub(crate) fn moved(self, from: Self, to: Self) -> Self {
+        let line = self.line.saturating_sub(from.line);
+        let column = match line {
+            0 => to
+                .column
+                .saturating_add(self.column.saturating_sub(from.column)),
+            _ => self.column,
+        };
+        Self {
+            line: to.line.saturating_add(line),
+            column,
+        }
+    }
 }
 
 impl fmt::Display for Position {

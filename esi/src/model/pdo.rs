@@ -1,6 +1,6 @@
 //! PDOs and their entries.
 
-use super::Position;
+use super::{Position, Text};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Direction {
@@ -74,6 +74,16 @@ impl Pdo {
         self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
     }
 
+    /// As it is where the same text stands at another place.
+    pub(crate) fn move_to(&mut self, position: Position) {
+        let from = std::mem::replace(&mut self.position, position);
+        if from != position {
+            for entry in &mut self.entries {
+                entry.position = entry.position.moved(from, position);
+            }
+        }
+    }
+
     /// Bytes in memory, nearly.
     pub(crate) fn size(&self) -> usize {
         let entries = self.entries.iter();
@@ -93,9 +103,9 @@ pub struct Entry {
     pub index: u16,
     pub sub: u8,
     pub bit_len: u16,
-    pub name: String,
+    pub name: Text,
     /// ETG.2000 base type name (`UINT`, `DINT`, `BOOL` …), empty for a gap.
-    pub data_type: String,
+    pub data_type: Text,
     pub depends_on: SlotDependence,
 }
 

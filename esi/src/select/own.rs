@@ -137,7 +137,7 @@ impl Chooser<'_> {
                     list: self.label(),
                     index,
                     sub,
-                    name: item.name.clone(),
+                    name: item.name.to_string(),
                     direction: direction_name(self.direction),
                 });
             }

@@ -329,7 +329,7 @@ fn pdo(pdo: &Pdo) -> SiiPdo {
             .map(|entry| SiiEntry {
                 index: entry.index,
                 sub: entry.sub,
-                name: entry.name.clone(),
+                name: entry.name.to_string(),
                 data_type: type_code(&entry.data_type),
                 bit_len: u8::try_from(entry.bit_len).unwrap_or(u8::MAX),
                 flags: 0,

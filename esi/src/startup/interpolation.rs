@@ -1,6 +1,6 @@
 //! 0x60C2: the cycle as value × 10^index seconds.
 
-use crate::model::{Dictionary, ObjectItem};
+use crate::model::{Bytes, Dictionary, ObjectItem};
 use crate::select::SelectError;
 
 /// What the drive takes; without a dictionary entry, all that the types can hold.
@@ -64,7 +64,7 @@ pub(super) fn interpolation_time(
 
 fn range(dictionary: &Dictionary) -> Range {
     let (value, exponent) = (dictionary.item(0x60c2, 1), dictionary.item(0x60c2, 2));
-    let byte = |item: Option<&ObjectItem>, bound: fn(&ObjectItem) -> Option<&Vec<u8>>| {
+    let byte = |item: Option<&ObjectItem>, bound: fn(&ObjectItem) -> Option<&Bytes>| {
         item.and_then(bound)
             .and_then(|bytes| bytes.first().copied())
     };
@@ -110,11 +110,11 @@ mod tests {
         let item = |sub, max| ObjectItem {
             sub,
             bit_len: 8,
-            default: vec![0],
+            default: [0].into(),
             max,
             ..ObjectItem::default()
         };
-        let items = vec![item(0, None), item(1, Some(vec![max])), item(2, None)];
+        let items = vec![item(0, None), item(1, Some([max].into())), item(2, None)];
         Dictionary {
             objects: vec![Object {
                 index: 0x60c2,

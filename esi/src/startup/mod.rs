@@ -181,7 +181,7 @@ impl<'d> List<'d> {
             Some(item) if object.items.len() > 1 && item.name != object.name => {
                 format!("{} / {}", object.name, item.name)
             }
-            _ => object.name.clone(),
+            _ => object.name.to_string(),
         }
     }
 }

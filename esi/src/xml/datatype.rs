@@ -1,22 +1,27 @@
 //! `Dictionary/DataTypes`, as written.
 
 use std::collections::HashMap;
+use std::rc::Rc;
 
 use super::cursor::{Cursor, Element};
 use super::object::{self, Flags};
 use super::text::Names;
 use crate::error::EsiError;
+use crate::model::Text;
 
 #[derive(Default)]
 pub(super) struct DataTypes {
-    by_name: HashMap<String, DataType>,
+    /// With what `Cursor::at` makes a position of.
+    by_name: HashMap<Text, (usize, Rc<Named>)>,
 }
+
+/// A type and its name.
+pub(super) type Named = (Text, DataType);
 
 #[derive(Default)]
 pub(super) struct DataType {
-    /// What `Cursor::at` makes a position of.
-    offset: usize,
-    pub base: Option<String>,
+    /// Empty where it has none.
+    pub base: Text,
     pub bit_size: u32,
     pub arrays: Vec<ArrayInfo>,
     pub sub_items: Vec<SubItem>,
@@ -28,11 +33,11 @@ pub(super) struct ArrayInfo {
     pub elements: u32,
 }
 
-#[derive(Default)]
+#[derive(Default, Clone)]
 pub(super) struct SubItem {
     pub sub: Option<u8>,
-    pub name: String,
-    pub type_name: String,
+    pub name: Text,
+    pub type_name: Text,
     pub bit_size: u32,
     pub bit_offset: Option<u32>,
     pub flags: Flags,
@@ -41,51 +46,51 @@ pub(super) struct SubItem {
 /// Alias chains longer than this are cycles.
 const MAX_ALIASES: usize = 8;
 
+impl DataType {
+    fn is_alias(&self) -> bool {
+        !self.base.is_empty() && self.arrays.is_empty() && self.sub_items.is_empty()
+    }
+}
+
 impl DataTypes {
     pub fn get(&self, name: &str) -> Option<&DataType> {
-        self.by_name.get(name)
+        self.by_name.get(name).map(|(_, named)| &named.1)
     }
 
     /// Types whose aliases lead nowhere, in file order.
     fn circular(&self) -> Vec<(usize, String)> {
-        let is_alias =
-            |of: &DataType| of.base.is_some() && of.arrays.is_empty() && of.sub_items.is_empty();
         let mut found: Vec<_> = self
             .by_name
             .iter()
-            .filter(|(name, of)| {
+            .filter(|(name, (_, named))| {
+                let of = &named.1;
                 // A base type may name itself: BOOL is a BOOL.
                 let base = self.base(name);
-                is_alias(of)
-                    && of.base.as_ref() != Some(*name)
+                of.is_alias()
+                    && of.base != **name
                     && self
                         .get(base)
-                        .is_some_and(|of| is_alias(of) && of.base.as_deref() != Some(base))
+                        .is_some_and(|of| of.is_alias() && of.base != *base)
             })
-            .map(|(name, of)| (of.offset, name.clone()))
+            .map(|(name, (offset, _))| (*offset, name.to_string()))
             .collect();
         found.sort();
         found
     }
 
     /// Follows enumerations and aliases to the type they are made of; arrays and records stand for themselves.
-    pub fn base<'s>(&'s self, name: &'s str) -> &'s str {
+    pub fn base<'s>(&'s self, name: &'s Text) -> &'s Text {
         self.with_base(name).1
     }
 
     /// The type of that name, and what [`Self::base`] makes of it.
-    pub fn with_base<'s>(&'s self, name: &'s str) -> (Option<&'s DataType>, &'s str) {
+    pub fn with_base<'s>(&'s self, name: &'s Text) -> (Option<&'s DataType>, &'s Text) {
         let found = self.get(name);
         let (mut name, mut next) = (name, found);
         for _ in 0..MAX_ALIASES {
             match next {
-                Some(DataType {
-                    base: Some(base),
-                    arrays,
-                    sub_items,
-                    ..
-                }) if arrays.is_empty() && sub_items.is_empty() => {
-                    name = base;
+                Some(of) if of.is_alias() => {
+                    name = &of.base;
                     next = self.get(name);
                 }
                 _ => break,
@@ -102,8 +107,9 @@ pub(super) fn read<'a>(
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| {
         if el.name == "DataType" {
-            let (name, data_type) = data_type(c, el)?;
-            types.by_name.entry(name).or_insert(data_type);
+            let named = c.memoised(el, |memos| &mut memos.types, data_type)?;
+            let name = named.0.clone();
+            types.by_name.entry(name).or_insert((el.offset(), named));
         }
         Ok(())
     })?;
@@ -115,27 +121,27 @@ pub(super) fn read<'a>(
     Ok(())
 }
 
-fn data_type<'a>(
-    c: &mut Cursor<'a>,
-    element: &Element<'a>,
-) -> Result<(String, DataType), EsiError> {
-    let mut name = String::new();
-    let mut data_type = DataType {
-        offset: element.offset(),
-        ..DataType::default()
-    };
+fn data_type<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<Named>, EsiError> {
+    let mut name = Text::default();
+    let mut data_type = DataType::default();
     c.children(element, |c, el| {
         match el.name {
-            "Name" => name = c.text(el)?,
-            "BaseType" => data_type.base = Some(c.text(el)?).filter(|base| !base.is_empty()),
+            "Name" => name = c.content(el)?.into(),
+            "BaseType" => data_type.base = c.content(el)?.into(),
             "BitSize" => data_type.bit_size = c.number(el, "BitSize")?,
             "ArrayInfo" => data_type.arrays.push(array_info(c, el)?),
-            "SubItem" => data_type.sub_items.push(sub_item(c, el)?),
+            "SubItem" => {
+                let take = |_: &mut Cursor<'a>, _: &Element<'a>, item| {
+                    data_type.sub_items.push(item);
+                    Ok(())
+                };
+                c.memoised_all(el, |memos| &mut memos.type_items, sub_item, take)?;
+            }
             _ => {}
         }
         Ok(())
     })?;
-    Ok((name, data_type))
+    Ok(Rc::new((name, data_type)))
 }
 
 fn array_info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<ArrayInfo, EsiError> {
@@ -158,14 +164,14 @@ fn sub_item<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<SubItem, Es
         match el.name {
             "SubIdx" => item.sub = c.optional_number(el, "SubIdx")?,
             "Name" => names.add(c, el)?,
-            "Type" => item.type_name = c.text(el)?,
+            "Type" => item.type_name = c.content(el)?.into(),
             "BitSize" => item.bit_size = c.number(el, "BitSize")?,
             "BitOffs" => item.bit_offset = c.optional_number(el, "BitOffs")?,
-            "Flags" => item.flags = object::flags(c, el)?,
+            "Flags" => item.flags = c.memoised(el, |memos| &mut memos.flags, object::flags)?,
             _ => {}
         }
         Ok(())
     })?;
-    item.name = names.take();
+    item.name = names.take().into();
     Ok(item)
 }

@@ -10,18 +10,18 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Vec<
     let mut modes = Vec::new();
     c.children(element, |c, el| {
         if el.name == "OpMode" {
-            modes.push(op_mode(c, el)?);
+            let mut mode = c.memoised(el, |memos| &mut memos.dc_modes, op_mode)?;
+            mode.position = c.position(el);
+            modes.push(mode);
         }
         Ok(())
     })?;
     Ok(modes)
 }
 
+/// Its place aside.
 fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiError> {
-    let mut mode = DcMode {
-        position: c.position(element),
-        ..DcMode::default()
-    };
+    let mut mode = DcMode::default();
     let mut descriptions = Names::default();
     c.children(element, |c, el| {
         match el.name {
@@ -33,14 +33,15 @@ fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiE
             "CycleTimeSync1" => cycle(c, el, &mut mode.sync1)?,
             "ShiftTimeSync1" => shift(c, el, &mut mode.sync1)?,
             "Sm" => {
-                let sm = sync::assignment(c, el, &mut mode.oversampling)?;
+                let (sm, oversampling) = sync::assignment(c, el)?;
                 mode.sync_managers.extend(sm);
+                mode.oversampling.extend(oversampling);
             }
             _ => {}
         }
         Ok(())
     })?;
-    mode.description = descriptions.take();
+    mode.description = descriptions.take().into_owned();
     Ok(mode)
 }
 

@@ -87,13 +87,26 @@ fn windows_1252(bytes: &[u8]) -> Cow<'_, str> {
         return Cow::Borrowed(text);
     }
     let mut text = String::with_capacity(bytes.len() + bytes.len() / 16);
-    for chunk in bytes.chunks(256) {
-        match std::str::from_utf8(chunk) {
-            Ok(plain) if chunk.is_ascii() => text.push_str(plain),
-            _ => text.extend(chunk.iter().map(|&byte| windows_1252_letter(byte))),
+    // In large pieces as far as they are ASCII, in small ones around what is not.
+    for piece in bytes.chunks(1024) {
+        if !push_ascii(&mut text, piece) {
+            for piece in piece.chunks(64) {
+                if !push_ascii(&mut text, piece) {
+                    text.extend(piece.iter().map(|&byte| windows_1252_letter(byte)));
+                }
+            }
         }
     }
     Cow::Owned(text)
+}
+
+/// Whether it was ASCII.
+fn push_ascii(text: &mut String, bytes: &[u8]) -> bool {
+    let ascii = bytes.is_ascii();
+    if let (true, Ok(plain)) = (ascii, std::str::from_utf8(bytes)) {
+        text.push_str(plain);
+    }
+    ascii
 }
 
 fn windows_1252_letter(byte: u8) -> char {

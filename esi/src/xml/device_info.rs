@@ -137,8 +137,9 @@ pub(super) fn sm_mapping<'a>(
         match el.name {
             "Name" => mapping.name = c.text(el)?,
             "Sm" => {
-                let sm = sync::assignment(c, el, &mut mapping.oversampling)?;
+                let (sm, oversampling) = sync::assignment(c, el)?;
                 mapping.sync_managers.extend(sm);
+                mapping.oversampling.extend(oversampling);
             }
             _ => {}
         }

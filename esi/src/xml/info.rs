@@ -55,7 +55,7 @@ fn read_vendor<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Vendor, 
     let id = id.ok_or_else(|| c.error_at(element, EsiProblem::Missing { what: "Vendor/Id" }))?;
     Ok(Vendor {
         id,
-        name: names.take(),
+        name: names.take().into_owned(),
     })
 }
 
@@ -93,7 +93,7 @@ fn group<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Group, EsiErro
         }
         Ok(())
     })?;
-    group.name = names.take();
+    group.name = names.take().into_owned();
     Ok(group)
 }
 

@@ -11,7 +11,7 @@ pub(super) struct Lines<'a> {
     last: Cell<(usize, (u32, u32))>,
 }
 
-const BLOCK: usize = 512;
+const BLOCK: usize = 4096;
 
 impl<'a> Lines<'a> {
     pub fn new(text: &'a str) -> Self {
@@ -25,28 +25,27 @@ impl<'a> Lines<'a> {
     /// Both from 1; columns count characters.
     pub fn position(&self, offset: usize) -> (u32, u32) {
         let offset = offset.min(self.text.len());
-        let block = offset / BLOCK * BLOCK;
-        let (mut from, mut known) = self.last.get();
-        if !(block..=offset).contains(&from) {
-            (from, known) = (block, self.before(offset / BLOCK));
-        }
-        let (lines, characters) = passed(known, &self.text[from..offset]);
+        let (lines, characters) = self.before(offset);
         self.last.set((offset, (lines, characters)));
         (lines.saturating_add(1), characters.saturating_add(1))
     }
 
-    fn before(&self, block: usize) -> (u32, u32) {
+    fn before(&self, offset: usize) -> (u32, u32) {
         let mut before = self.before.borrow_mut();
-        if let Some(known) = before.get(block) {
-            return *known;
+        let (mut from, mut known) = self.last.get();
+        let block = (offset / BLOCK).min(before.len().saturating_sub(1));
+        if !(block * BLOCK..=offset).contains(&from)
+            && let Some(at_block) = before.get(block)
+        {
+            (from, known) = (block * BLOCK, *at_block);
         }
-        let mut known = before.last().copied().unwrap_or_default();
-        while before.len() <= block {
+        while before.len() * BLOCK <= offset {
             let end = before.len() * BLOCK;
-            known = passed(known, &self.text[end - BLOCK..end]);
+            known = passed(known, &self.text[from..end]);
             before.push(known);
+            from = end;
         }
-        known
+        passed(known, &self.text[from..offset])
     }
 }
 
@@ -61,8 +60,21 @@ fn passed((lines, characters): (u32, u32), bytes: &[u8]) -> (u32, u32) {
     match memchr::memrchr(b'\n', bytes) {
         None => (lines, characters.saturating_add(count(bytes))),
         Some(last) => {
-            let ends = memchr::memchr_iter(b'\n', &bytes[..=last]).count();
+            let ends = line_ends(&bytes[..=last]);
             (lines.saturating_add(small(ends)), count(&bytes[last + 1..]))
         }
     }
+}
+
+/// In pieces of a fixed length, of which the compiler counts many bytes at once.
+fn line_ends(bytes: &[u8]) -> usize {
+    const PIECE: usize = 192;
+    let count = |piece: &[u8; PIECE]| {
+        let ends = piece.iter().map(|byte| u8::from(*byte == b'\n'));
+        usize::from(ends.sum::<u8>())
+    };
+    let (pieces, rest) = bytes.as_chunks();
+    let mut last = [0; PIECE];
+    last[..rest.len()].copy_from_slice(rest);
+    pieces.iter().map(count).sum::<usize>() + count(&last)
 }

@@ -1,34 +1,35 @@
 //! Default, minimum and maximum literals → little-endian bytes of the object's length.
 
-use super::number::{boolean, hex_bytes, number};
+use super::number::{boolean, hex_bytes, hex_start, number};
 use super::object::Literal;
+use crate::model::Bytes;
 
 /// `Ok(None)`: the element is empty. The error text completes "default …".
 pub(super) fn bytes(
     literal: &Literal<'_>,
     type_name: &str,
     bit_len: u32,
-) -> Result<Option<Vec<u8>>, String> {
+) -> Result<Option<Bytes>, String> {
     let length = usize::try_from(bit_len.div_ceil(8)).unwrap_or(0);
     match literal {
         Literal::Value(text) | Literal::Data(text) if text.is_empty() => Ok(None),
         Literal::Value(text) if is_text(type_name) => {
-            Ok(Some(fit(text.as_bytes().to_vec(), length)))
+            Ok(Some(Bytes::fitted(text.as_bytes(), length)))
         }
         Literal::Value(text) => value(text, type_name, bit_len, length).map(Some),
-        Literal::Data(text) => match hex_bytes(text) {
-            Some(data) => Ok(Some(fit(data, length))),
+        Literal::Data(text) => match data(text, length) {
+            Some(data) => Ok(Some(data)),
             None => Err(format!(
                 "{:?} is not a sequence of hexadecimal bytes",
                 short(text)
             )),
         },
-        Literal::Text(text) => Ok(Some(fit(text.as_bytes().to_vec(), length))),
+        Literal::Text(text) => Ok(Some(Bytes::fitted(text.as_bytes(), length))),
     }
 }
 
 /// `bit_len` bits of a block from `bit_offset` on.
-pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Vec<u8>> {
+pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Bytes> {
     let (offset, length) = (
         usize::try_from(bit_offset).ok()?,
         usize::try_from(bit_len).ok()?,
@@ -42,7 +43,7 @@ pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Vec<u
         let set = block.get(from / 8)? >> (from % 8) & 1;
         *out.get_mut(bit / 8)? |= set << (bit % 8);
     }
-    Some(out)
+    Some(out.into())
 }
 
 /// Length of ETG.1020's base types; 0 where the name says nothing.
@@ -76,19 +77,19 @@ fn is_text(type_name: &str) -> bool {
     type_name.starts_with("STRING") || type_name.starts_with("VISIBLE_STRING")
 }
 
-fn value(text: &str, type_name: &str, bit_len: u32, length: usize) -> Result<Vec<u8>, String> {
+fn value(text: &str, type_name: &str, bit_len: u32, length: usize) -> Result<Bytes, String> {
     let decimal = !text.contains(['x', 'X']);
     match type_name {
         "REAL" if decimal => {
             return text
                 .parse::<f32>()
-                .map(|v| fit(v.to_le_bytes().to_vec(), length))
+                .map(|v| Bytes::fitted(&v.to_le_bytes(), length))
                 .map_err(|_| not_a_number(text));
         }
         "LREAL" if decimal => {
             return text
                 .parse::<f64>()
-                .map(|v| fit(v.to_le_bytes().to_vec(), length))
+                .map(|v| Bytes::fitted(&v.to_le_bytes(), length))
                 .map_err(|_| not_a_number(text));
         }
         _ => {}
@@ -104,27 +105,40 @@ fn value(text: &str, type_name: &str, bit_len: u32, length: usize) -> Result<Vec
     if !fits {
         return Err(format!("{:?} does not fit {bit_len} bits", short(text)));
     }
-    let mut out = value.to_le_bytes().to_vec();
-    if length > out.len() {
-        out.resize(length, if value < 0 { 0xff } else { 0 });
+    let mut short = value.to_le_bytes();
+    if length <= short.len() {
+        odd_length(short.get_mut(..length).unwrap_or_default(), bit_len);
+        return Ok(Bytes::fitted(&short, length));
     }
-    out.truncate(length);
-    // A negative number in an odd length must not carry its sign past the last bit.
-    if !bit_len.is_multiple_of(8)
-        && let Some(last) = out.last_mut()
-    {
-        *last &= (1u8 << (bit_len % 8)) - 1;
-    }
-    Ok(out)
+    let mut long = short.to_vec();
+    long.resize(length, if value < 0 { 0xff } else { 0 });
+    odd_length(&mut long, bit_len);
+    Ok(long.into())
 }
 
 fn not_a_number(text: &str) -> String {
     format!("{:?} is not a number", short(text))
 }
 
-fn fit(mut bytes: Vec<u8>, length: usize) -> Vec<u8> {
-    bytes.resize(length, 0);
-    bytes
+/// Hexadecimal bytes of any number, fitted to `length`.
+fn data(text: &str, length: usize) -> Option<Bytes> {
+    let mut short = [0; 16];
+    if text.len() <= 2 * short.len() {
+        let (pairs, rest) = hex_start(text.as_bytes(), &mut short);
+        if rest.is_empty() {
+            return Some(Bytes::fitted(short.get(..pairs)?, length));
+        }
+    }
+    Some(Bytes::fitted(&hex_bytes(text)?, length))
+}
+
+/// A negative number in an odd length must not carry its sign past the last bit.
+fn odd_length(bytes: &mut [u8], bit_len: u32) {
+    if !bit_len.is_multiple_of(8)
+        && let Some(last) = bytes.last_mut()
+    {
+        *last &= (1u8 << (bit_len % 8)) - 1;
+    }
 }
 
 fn short(text: &str) -> String {
@@ -153,7 +167,7 @@ mod tests {
         ] {
             assert_eq!(
                 bytes(&v(text), type_name, bits),
-                Ok(Some(expected)),
+                Ok(Some(expected.into())),
                 "{text} {type_name}"
             );
         }
@@ -168,11 +182,11 @@ mod tests {
     fn data_is_little_endian_already() {
         assert_eq!(
             bytes(&Literal::Data("0001".into()), "UINT", 16),
-            Ok(Some(vec![0, 1]))
+            Ok(Some([0, 1].into()))
         );
         assert_eq!(
             bytes(&Literal::Data("01".into()), "UDINT", 32),
-            Ok(Some(vec![1, 0, 0, 0]))
+            Ok(Some([1, 0, 0, 0].into()))
         );
     }
 
@@ -180,9 +194,9 @@ mod tests {
     fn a_block_is_cut_at_bit_offsets() {
         assert_eq!(
             slice(&[2, 0, 0x34, 0x12, 0x78], 16, 16),
-            Some(vec![0x34, 0x12])
+            Some([0x34, 0x12].into())
         );
-        assert_eq!(slice(&[0xf0], 4, 4), Some(vec![0x0f]));
+        assert_eq!(slice(&[0xf0], 4, 4), Some([0x0f].into()));
         assert_eq!(slice(&[0xf0], 4, 8), None);
     }
 }

@@ -87,6 +87,6 @@ fn init_cmd<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<InitCmd, Es
             },
         )
     })?;
-    cmd.comment = comments.take();
+    cmd.comment = comments.take().into_owned();
     Ok(cmd)
 }

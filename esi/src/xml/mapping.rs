@@ -75,8 +75,8 @@ fn pdo(dictionary: &Dictionary, direction: Direction, object: &Object) -> Option
                 index,
                 sub,
                 bit_len: u16::from(bits),
-                name: item.map_or_else(String::new, |item| item.name.clone()),
-                data_type: item.map_or_else(String::new, |item| item.type_name.clone()),
+                name: item.map(|item| item.name.clone()).unwrap_or_default(),
+                data_type: item.map(|item| item.type_name.clone()).unwrap_or_default(),
                 depends_on: SlotDependence::default(),
             }
         })
@@ -89,7 +89,7 @@ fn pdo(dictionary: &Dictionary, direction: Direction, object: &Object) -> Option
         position: object.position,
         direction,
         index: object.index,
-        name: object.name.clone(),
+        name: object.name.to_string(),
         sm: None,
         su: None,
         excluded_sm: Vec::new(),

@@ -1,7 +1,7 @@
 //! The ESI file as a stream of XML tags, one file per ETG.2000 element family.
 //!
 //! `decode` turns bytes into text, `scan` finds tags in it, `lines` their line and column, `cursor`
-//! walks elements with position and path, `number` reads literals.
+//! walks elements with position and path, `memo` remembers elements that repeat, `number` reads literals.
 //! `info` is the root; below it `device`, `device_info`, `sync` (Fmmu, Sm, Su), `pdo`, `mailbox`, `dc`, `slots`,
 //! `module`, `eeprom` and `profile` with the dictionary: `datatype` and `object` read it as written, `resolve` joins
 //! the two, and `mapping` takes PDOs from there where a file has no other.
@@ -22,6 +22,7 @@ mod lines;
 mod literal;
 mod mailbox;
 mod mapping;
+mod memo;
 mod module;
 mod number;
 mod object;

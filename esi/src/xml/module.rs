@@ -44,6 +44,6 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Modu
             },
         )
     })?;
-    module.name = names.take();
+    module.name = names.take().into_owned();
     Ok(module)
 }

@@ -2,30 +2,43 @@
 
 /// Wide enough for every value that an ESI can hold, unsigned or signed.
 pub(super) fn number(text: &str) -> Option<i128> {
-    let text = text.trim();
+    // Mostly nothing is around it.
+    let text = match text.as_bytes() {
+        [first, .., last] if first.is_ascii_graphic() && last.is_ascii_graphic() => text,
+        _ => text.trim(),
+    };
     let (negative, digits) = match text.strip_prefix('-') {
         Some(rest) => (true, rest.trim_start()),
         None => (false, text.strip_prefix('+').unwrap_or(text)),
     };
     let (digits, radix) = match digits.as_bytes() {
-        [b'#' | b'0', b'x' | b'X', ..] => (&digits[2..], 16),
-        _ => (digits, 10),
+        [b'#' | b'0', b'x' | b'X', digits @ ..] => (digits, 16),
+        digits => (digits, 10),
     };
     if digits.is_empty() || digits.len() > 30 {
         return None;
     }
-    let mut magnitude = 0_i128;
-    // In steps that a machine word holds.
-    for step in digits.as_bytes().chunks(15) {
-        let (mut value, mut scale) = (0_u64, 1_u64);
-        for digit in step {
-            let digit = char::from(*digit).to_digit(radix)?;
-            value = value * u64::from(radix) + u64::from(digit);
-            scale *= u64::from(radix);
-        }
-        magnitude = magnitude * i128::from(scale) + i128::from(value);
+    // In steps that a machine word holds; mostly it is one.
+    let (first, more) = digits.split_at(digits.len().min(15));
+    let mut magnitude = i128::from(word(first, radix)?);
+    for step in more.chunks(15) {
+        let scale = step.iter().fold(1, |scale, _| scale * i128::from(radix));
+        magnitude = magnitude * scale + i128::from(word(step, radix)?);
     }
     Some(if negative { -magnitude } else { magnitude })
+}
+
+/// At most 15 digits.
+fn word(digits: &[u8], radix: u8) -> Option<u64> {
+    let mut value = 0;
+    for digit in digits {
+        let digit = HEX[usize::from(*digit)];
+        if digit >= radix {
+            return None;
+        }
+        value = value * u64::from(radix) + u64::from(digit);
+    }
+    Some(value)
 }
 
 pub(super) fn boolean(text: &str) -> Option<bool> {
@@ -38,10 +51,15 @@ pub(super) fn boolean(text: &str) -> Option<bool> {
 
 /// Hexadecimal bytes in file order, white space between them allowed.
 pub(super) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
-    let mut bytes = Vec::with_capacity(text.len() / 2);
+    let mut bytes = vec![0; text.len() / 2];
+    // As nearly all are written: in pairs.
+    let (pairs, rest) = hex_start(text.as_bytes(), &mut bytes);
+    bytes.truncate(pairs);
     let mut high = None;
-    for character in text.chars().filter(|c| !c.is_whitespace()) {
-        let digit = u8::try_from(character.to_digit(16)?).ok()?;
+    // What is behind a pair of ASCII begins with a character.
+    let rest = &text[text.len() - rest.len()..];
+    for character in rest.chars().filter(|c| !c.is_whitespace()) {
+        let digit = hex_digit(u8::try_from(character).ok()?)?;
         match high.take() {
             None => high = Some(digit << 4),
             Some(high) => bytes.push(high | digit),
@@ -49,6 +67,41 @@ pub(super) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
     }
     high.is_none().then_some(bytes)
 }
+
+/// Pairs of digits from the beginning, as far as `bytes` holds them: how many, and what is behind them.
+pub(super) fn hex_start<'a>(mut rest: &'a [u8], bytes: &mut [u8]) -> (usize, &'a [u8]) {
+    let mut pairs = 0;
+    for byte in bytes {
+        let Some(([high, low], behind)) = rest.split_first_chunk() else {
+            break;
+        };
+        let (Some(high), Some(low)) = (hex_digit(*high), hex_digit(*low)) else {
+            break;
+        };
+        *byte = high << 4 | low;
+        pairs += 1;
+        rest = behind;
+    }
+    (pairs, rest)
+}
+
+fn hex_digit(letter: u8) -> Option<u8> {
+    let value = HEX[usize::from(letter)];
+    (value < 16).then_some(value)
+}
+
+/// 16 and more: not a digit.
+const HEX: [u8; 256] = {
+    let mut table = [0xff; 256];
+    let mut value = 0;
+    while value < 16 {
+        let digits = (b"0123456789abcdef", b"0123456789ABCDEF");
+        table[digits.0[value as usize] as usize] = value;
+        table[digits.1[value as usize] as usize] = value;
+        value += 1;
+    }
+    table
+};
 
 #[cfg(test)]
 mod tests {

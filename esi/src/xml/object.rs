@@ -1,23 +1,26 @@
 //! `Dictionary/Objects`, as written.
 
 use std::borrow::Cow;
+use std::rc::Rc;
 
 use super::cursor::{Cursor, Element};
 use super::number::{boolean, number};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Access, PdoMapping, Position, SlotDependence, Writable};
+use crate::model::{Access, PdoMapping, Position, SlotDependence, Text, Writable};
 
 pub(super) struct RawObject<'a> {
-    pub position: Position,
     pub index: u16,
     pub depends_on: SlotDependence,
-    pub name: String,
-    pub type_name: String,
+    pub name: Text,
+    pub type_name: Text,
     pub bit_size: u32,
     pub info: Info<'a>,
     pub flags: Flags,
 }
+
+/// Name and values of a subindex.
+pub(super) type SubItem<'a> = Rc<(Cow<'a, str>, Info<'a>)>;
 
 /// Default and range of an object or of one of its subindices; literals are read when the type is known.
 #[derive(Default)]
@@ -26,7 +29,7 @@ pub(super) struct Info<'a> {
     pub min: Option<Literal<'a>>,
     pub max: Option<Literal<'a>>,
     pub unit: u32,
-    pub sub_items: Vec<(String, Info<'a>)>,
+    pub sub_items: Vec<SubItem<'a>>,
 }
 
 pub(super) enum Literal<'a> {
@@ -46,25 +49,25 @@ pub(super) struct Flags {
 pub(super) fn read<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
-    objects: &mut Vec<RawObject<'a>>,
+    objects: &mut Vec<(Position, Rc<RawObject<'a>>)>,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| {
         if el.name == "Object" {
-            objects.push(object(c, el)?);
+            let object = c.memoised(el, |memos| &mut memos.objects, object)?;
+            objects.push((c.position(el), object));
         }
         Ok(())
     })
 }
 
-fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject<'a>, EsiError> {
+fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<RawObject<'a>>, EsiError> {
     let mut names = Names::default();
     let mut index = None;
     let mut object = RawObject {
-        position: c.position(element),
         index: 0,
         depends_on: SlotDependence::default(),
-        name: String::new(),
-        type_name: String::new(),
+        name: Text::default(),
+        type_name: Text::default(),
         bit_size: 0,
         info: Info::default(),
         flags: Flags::default(),
@@ -76,10 +79,10 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject<'a>
                 index = Some(c.number(el, "object index")?);
             }
             "Name" => names.add(c, el)?,
-            "Type" => object.type_name = c.text(el)?,
+            "Type" => object.type_name = c.content(el)?.into(),
             "BitSize" => object.bit_size = c.number(el, "BitSize")?,
             "Info" => object.info = info(c, el)?,
-            "Flags" => object.flags = flags(c, el)?,
+            "Flags" => object.flags = c.memoised(el, |memos| &mut memos.flags, flags)?,
             _ => {}
         }
         Ok(())
@@ -92,8 +95,8 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject<'a>
             },
         )
     })?;
-    object.name = names.take();
-    Ok(object)
+    object.name = names.take().into();
+    Ok(Rc::new(object))
 }
 
 fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info<'a>, EsiError> {
@@ -112,23 +115,33 @@ fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info<'a>, EsiEr
                 out.unit = unit.unwrap_or(0);
             }
             "SubItem" => {
-                let mut names = Names::default();
-                let mut inner = Info::default();
-                c.children(el, |c, el| {
-                    match el.name {
-                        "Name" => names.add(c, el)?,
-                        "Info" => inner = info(c, el)?,
-                        _ => {}
-                    }
+                // Most have that many.
+                out.sub_items.reserve(16);
+                let take = |_: &mut Cursor<'a>, _: &Element<'a>, item| {
+                    out.sub_items.push(item);
                     Ok(())
-                })?;
-                out.sub_items.push((names.take(), inner));
+                };
+                c.memoised_all(el, |memos| &mut memos.object_items, sub_item, take)?;
             }
             _ => {}
         }
         Ok(())
     })?;
     Ok(out)
+}
+
+fn sub_item<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<SubItem<'a>, EsiError> {
+    let mut names = Names::default();
+    let mut inner = Info::default();
+    c.children(element, |c, el| {
+        match el.name {
+            "Name" => names.add(c, el)?,
+            "Info" => inner = info(c, el)?,
+            _ => {}
+        }
+        Ok(())
+    })?;
+    Ok(Rc::new((names.take(), inner)))
 }
 
 pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Flags, EsiError> {

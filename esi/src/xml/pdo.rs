@@ -3,7 +3,7 @@
 use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, SlotDependence};
+use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, Position, SlotDependence, Text};
 
 /// A frame carries 11888 bits.
 const MAX_ENTRIES: usize = 12_000;
@@ -26,8 +26,23 @@ pub(super) fn append<'a>(
             },
         ));
     }
-    to.push(read(c, element, direction)?);
+    // Before those of its entries: lines are counted forward.
+    let position = c.position(element);
+    let mut pdo = match direction {
+        Direction::Rx => c.memoised(element, |memos| &mut memos.rx_pdos, rx)?,
+        Direction::Tx => c.memoised(element, |memos| &mut memos.tx_pdos, tx)?,
+    };
+    pdo.move_to(position);
+    to.push(pdo);
     Ok(())
+}
+
+fn rx<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Pdo, EsiError> {
+    read(c, element, Direction::Rx)
+}
+
+fn tx<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Pdo, EsiError> {
+    read(c, element, Direction::Tx)
 }
 
 fn read<'a>(
@@ -67,16 +82,18 @@ fn read<'a>(
             }),
             "ExcludedSm" => pdo.excluded_sm.push(c.number(el, "excluded SyncManager")?),
             "Entry" => {
-                if pdo.entries.len() >= MAX_ENTRIES {
-                    return Err(c.error_at(
-                        el,
-                        EsiProblem::TooLarge {
-                            what: "a PDO's entries",
-                            limit: MAX_ENTRIES,
-                        },
-                    ));
-                }
-                pdo.entries.push(entry(c, el)?);
+                room(c, el, &pdo.entries)?;
+                return c.memoised_all(
+                    el,
+                    |memos| &mut memos.entries,
+                    entry,
+                    |c, el, mut entry| {
+                        room(c, el, &pdo.entries)?;
+                        entry.position = c.position(el);
+                        pdo.entries.push(entry);
+                        Ok(())
+                    },
+                );
             }
             _ => {}
         }
@@ -84,8 +101,17 @@ fn read<'a>(
     })?;
     pdo.index =
         index.ok_or_else(|| c.error_at(element, EsiProblem::Missing { what: "PDO Index" }))?;
-    pdo.name = names.take();
+    pdo.name = names.take().into_owned();
     Ok(pdo)
+}
+
+/// For one more entry.
+fn room<'a>(c: &Cursor<'a>, element: &Element<'a>, entries: &[Entry]) -> Result<(), EsiError> {
+    let (what, limit) = ("a PDO's entries", MAX_ENTRIES);
+    match entries.len() < limit {
+        true => Ok(()),
+        false => Err(c.error_at(element, EsiProblem::TooLarge { what, limit })),
+    }
 }
 
 fn oversampling<'a>(
@@ -102,14 +128,15 @@ fn oversampling<'a>(
     }))
 }
 
+/// Its place aside.
 fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiError> {
     let mut entry = Entry {
-        position: c.position(element),
+        position: Position::default(),
         index: 0,
         sub: 0,
         bit_len: 0,
-        name: String::new(),
-        data_type: String::new(),
+        name: Text::default(),
+        data_type: Text::default(),
         depends_on: SlotDependence::default(),
     };
     let mut names = Names::default();
@@ -123,7 +150,7 @@ fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiErro
             "SubIndex" => entry.sub = c.number(el, "entry subindex")?,
             "BitLen" => entry.bit_len = c.number(el, "BitLen")?,
             "Name" => names.add(c, el)?,
-            "DataType" => entry.data_type = c.text(el)?,
+            "DataType" => entry.data_type = c.content(el)?.into(),
             _ => {}
         }
         Ok(())
@@ -136,7 +163,7 @@ fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiErro
             },
         )
     })?;
-    entry.name = names.take();
+    entry.name = names.take().into();
     if entry.bit_len == 0 && entry.index != 0 {
         c.warn(
             element,

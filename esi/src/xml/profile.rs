@@ -58,8 +58,11 @@ fn dictionary<'a>(
         _ => Ok(()),
     })?;
     // Objects may stand before the types they use, so they are joined at the end.
-    for raw in raw_objects {
-        objects.push(resolve::object(c, element, &types, raw)?);
+    let mut memory = resolve::Memory::default();
+    objects.reserve(raw_objects.len());
+    for (position, raw) in &raw_objects {
+        let place = (*position, element);
+        objects.push(resolve::object(c, place, &types, raw, &mut memory)?);
     }
     Ok(())
 }
@@ -85,6 +88,6 @@ fn diag_message<'a>(
     }
     Ok(text_id.map(|text_id| DiagMessage {
         text_id,
-        text: names.take(),
+        text: names.take().into_owned(),
     }))
 }

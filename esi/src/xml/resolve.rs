@@ -7,31 +7,36 @@ use super::cursor::{Cursor, Element};
 use super::datatype::{DataType, DataTypes};
 use super::literal;
 use super::number;
-use super::object::{Flags, Info, Literal, RawObject};
+use super::object::{Flags, Info, Literal, RawObject, SubItem};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Access, Object, ObjectCode, ObjectItem, Position, Writable};
+use crate::model::{Access, Bytes, Object, ObjectCode, ObjectItem, Position, Text, Writable};
 
 /// One MiB; longer objects (files, domains) carry no default and are transferred by length.
 const MAX_ITEM_BITS: u32 = 8 << 20;
 const MAX_ITEMS: usize = 256;
 
-pub(super) fn object<'a>(
+pub(super) fn object<'t, 'a>(
     c: &mut Cursor<'a>,
-    dictionary: &Element<'a>,
-    types: &DataTypes,
-    mut raw: RawObject<'a>,
+    place @ (position, dictionary): (Position, &Element<'a>),
+    types: &'t DataTypes,
+    raw: &'t RawObject<'a>,
+    memory: &mut Memory<'t, 'a>,
 ) -> Result<Object, EsiError> {
-    let sub_infos = std::mem::take(&mut raw.info.sub_items);
     let data_type = types.get(&raw.type_name);
-    let (code, mut slots) = match data_type {
+    memory.slots.clear();
+    let code = match data_type {
         Some(record) if !record.sub_items.is_empty() => {
-            record_items(c, types, record, (raw.position, dictionary))?
+            record_items(c, types, record, place, memory)?
         }
-        _ => (ObjectCode::Var, vec![variable(types, data_type, &raw)]),
+        _ => {
+            memory.slots.push(variable(types, data_type, raw));
+            ObjectCode::Var
+        }
     };
+    let slots = &mut memory.slots;
     if slots.len() > MAX_ITEMS {
         return Err(c.error_within(
-            raw.position,
+            position,
             dictionary,
             EsiProblem::TooLarge {
                 what: "an object's subindices",
@@ -39,18 +44,20 @@ pub(super) fn object<'a>(
             },
         ));
     }
-    let mut infos = assign_infos(&slots, code, sub_infos);
+    if code != ObjectCode::Var {
+        assign_infos(slots, &raw.info.sub_items);
+    }
+    let nothing = Info::default();
     let mut items = Vec::with_capacity(slots.len());
-    let place = (raw.position, dictionary);
     let block = match &raw.info.default {
         Some(Literal::Data(block)) => number::hex_bytes(block),
         _ => None,
     };
-    for (slot, info) in slots.iter_mut().zip(infos.iter_mut()) {
+    for slot in slots {
         if slot.bit_len > MAX_ITEM_BITS {
             let what = "an object's bits";
             return Err(c.error_within(
-                raw.position,
+                position,
                 dictionary,
                 EsiProblem::TooLarge {
                     what,
@@ -58,11 +65,10 @@ pub(super) fn object<'a>(
                 },
             ));
         }
-        let (name, info) = info.take().unwrap_or_default();
-        let own = if code == ObjectCode::Var {
-            &raw.info
-        } else {
-            &info
+        let (name, own) = match slot.info {
+            Some(item) => (&*item.0, &item.1),
+            None if code == ObjectCode::Var => ("", &raw.info),
+            None => ("", &nothing),
         };
         if slot.bit_len == 0
             && let Some(Literal::Text(text)) = &own.default
@@ -79,12 +85,12 @@ pub(super) fn object<'a>(
             length.saturating_mul(1 + range) + size_of::<ObjectItem>() + names,
             place,
         )?;
-        let mut read = |literal: &Option<Literal<'a>>, what: &str| -> Option<Vec<u8>> {
-            match literal::bytes(literal.as_ref()?, slot.type_name, slot.bit_len) {
+        let mut read = |literal: &Literal<'a>, what: &str| -> Option<Bytes> {
+            match literal::bytes(literal, slot.type_name, slot.bit_len) {
                 Ok(bytes) => bytes,
                 Err(problem) => {
                     c.warn_at(
-                        raw.position,
+                        position,
                         dictionary,
                         format!(
                             "object 0x{:04x}:{:02x}: {what} {problem}",
@@ -95,14 +101,17 @@ pub(super) fn object<'a>(
                 }
             }
         };
-        let default = read(&own.default, "default").or_else(|| match (&block, code) {
+        let default = own.default.as_ref();
+        let default = default.and_then(|default| read(default, "default"));
+        let default = default.or_else(|| match (&block, code) {
             // Older files give a record's default as one block, as complete access would carry it.
             (Some(block), ObjectCode::Array | ObjectCode::Record) => {
                 literal::slice(block, slot.bit_offset, slot.bit_len)
             }
             _ => None,
         });
-        let (min, max) = (read(&own.min, "minimum"), read(&own.max, "maximum"));
+        let min = own.min.as_ref().and_then(|min| read(min, "minimum"));
+        let max = own.max.as_ref().and_then(|max| read(max, "maximum"));
         items.push(ObjectItem {
             sub: slot.sub,
             name: if code == ObjectCode::Var {
@@ -110,11 +119,11 @@ pub(super) fn object<'a>(
             } else {
                 better_name(name, &slot.name)
             },
-            type_name: slot.type_name.to_owned(),
+            type_name: slot.type_name.clone(),
             bit_len: slot.bit_len,
             bit_offset: slot.bit_offset,
             has_default: default.is_some(),
-            default: default.unwrap_or_else(|| vec![0; length]),
+            default: default.unwrap_or_else(|| Bytes::zeroes(length)),
             min,
             max,
             access: access(slot.flags.access, raw.flags.access),
@@ -130,31 +139,51 @@ pub(super) fn object<'a>(
     }
     items.sort_by_key(|item| item.sub);
     Ok(Object {
-        position: raw.position,
+        position,
         index: raw.index,
         depends_on: raw.depends_on,
-        name: raw.name,
+        name: raw.name.clone(),
         code,
-        type_name: raw.type_name,
+        type_name: raw.type_name.clone(),
         items,
     })
 }
 
+/// Kept from object to object.
+#[derive(Default)]
+pub(super) struct Memory<'t, 'a> {
+    slots: Vec<Slot<'t, 'a>>,
+    /// Names of array elements, by subindex.
+    names: Vec<Option<Text>>,
+}
+
+impl Memory<'_, '_> {
+    fn name(&mut self, sub: u8) -> Text {
+        self.names.resize(256, None);
+        let name = || format!("SubIndex {sub:03}").into();
+        match self.names.get_mut(usize::from(sub)) {
+            Some(known) => known.get_or_insert_with(name).clone(),
+            None => name(),
+        }
+    }
+}
+
 /// An item before its default is known.
-struct Slot<'t> {
+struct Slot<'t, 'a> {
     sub: u8,
-    name: Cow<'t, str>,
-    type_name: &'t str,
+    name: Cow<'t, Text>,
+    type_name: &'t Text,
     bit_len: u32,
     bit_offset: u32,
     flags: Flags,
+    info: Option<&'t SubItem<'a>>,
 }
 
-fn variable<'t>(
+fn variable<'t, 'a>(
     types: &'t DataTypes,
     data_type: Option<&DataType>,
-    raw: &'t RawObject<'_>,
-) -> Slot<'t> {
+    raw: &'t RawObject<'a>,
+) -> Slot<'t, 'a> {
     let type_name = types.base(&raw.type_name);
     let typed = data_type.map_or(0, |t| t.bit_size);
     let bit_len = first_non_zero([raw.bit_size, typed, literal::base_bits(type_name)]);
@@ -165,6 +194,7 @@ fn variable<'t>(
         bit_len,
         bit_offset: 0,
         flags: raw.flags,
+        info: None,
     }
 }
 
@@ -173,23 +203,30 @@ fn record_items<'t, 'a>(
     types: &'t DataTypes,
     record: &'t DataType,
     (position, dictionary): (Position, &Element<'a>),
-) -> Result<(ObjectCode, Vec<Slot<'t>>), EsiError> {
+    memory: &mut Memory<'t, 'a>,
+) -> Result<ObjectCode, EsiError> {
     let mut code = ObjectCode::Record;
-    let mut slots: Vec<Slot<'t>> = Vec::with_capacity(record.sub_items.len());
     let mut running = 0u32;
+    // Neighbours are mostly of one type.
+    let mut last: Option<(&Text, _)> = None;
     for item in &record.sub_items {
-        let (sub_type, base) = types.with_base(&item.type_name);
+        let (sub_type, base) = match &last {
+            Some((name, known)) if **name == item.type_name => *known,
+            _ => types.with_base(&item.type_name),
+        };
+        last = Some((&item.type_name, (sub_type, base)));
         let typed = sub_type.map_or(0, |t| t.bit_size);
         let bits = first_non_zero([item.bit_size, typed, literal::base_bits(base)]);
         let offset = item.bit_offset.unwrap_or(running);
-        let next_sub = slots.last().map_or(0, |slot| slot.sub.saturating_add(1));
+        let last_slot = memory.slots.last();
+        let next_sub = last_slot.map_or(0, |slot| slot.sub.saturating_add(1));
         match (
             item.sub,
             sub_type.and_then(|t| t.arrays.first().map(|array| (t, array))),
         ) {
             (None, Some((array_type, array))) => {
                 code = ObjectCode::Array;
-                let element = types.base(array_type.base.as_deref().unwrap_or_default());
+                let element = types.base(&array_type.base);
                 let elements = array.elements.min(255);
                 if array.elements > 255 {
                     let message = format!(
@@ -205,69 +242,63 @@ fn record_items<'t, 'a>(
                         break;
                     };
                     c.spend(size_of::<Slot>() + element.len(), (position, dictionary))?;
-                    slots.push(Slot {
+                    let name = memory.name(sub);
+                    memory.slots.push(Slot {
                         sub,
-                        name: Cow::Owned(format!("SubIndex {sub:03}")),
+                        name: Cow::Owned(name),
                         type_name: element,
                         bit_len: bits,
                         bit_offset: offset.saturating_add(bits.saturating_mul(number)),
                         flags: item.flags,
+                        info: None,
                     });
                 }
             }
-            (sub, _) => slots.push(Slot {
+            (sub, _) => memory.slots.push(Slot {
                 sub: sub.unwrap_or(next_sub),
                 name: Cow::Borrowed(&item.name),
                 type_name: base,
                 bit_len: bits,
                 bit_offset: offset,
                 flags: item.flags,
+                info: None,
             }),
         }
         // Complete access pads subindex 0 to 16 bits.
-        running = if offset == 0 && slots.len() == 1 {
+        running = if offset == 0 && memory.slots.len() == 1 {
             16
         } else {
             offset.saturating_add(bits)
         };
-        if slots.len() > MAX_ITEMS {
+        if memory.slots.len() > MAX_ITEMS {
             break;
         }
     }
-    Ok((code, slots))
+    Ok(code)
 }
 
 /// `Info/SubItem`s name the subindices of a record; where they do not, they stand in subindex order.
-fn assign_infos<'a>(
-    slots: &[Slot<'_>],
-    code: ObjectCode,
-    infos: Vec<(String, Info<'a>)>,
-) -> Vec<Option<(String, Info<'a>)>> {
-    let mut assigned: Vec<Option<(String, Info<'a>)>> = slots.iter().map(|_| None).collect();
-    if code == ObjectCode::Var {
-        return assigned;
-    }
+fn assign_infos<'t, 'a>(slots: &mut [Slot<'t, 'a>], infos: &'t [SubItem<'a>]) {
     let mut next = 0;
-    for (name, info) in infos {
-        let named = slots
-            .iter()
-            .skip(next)
-            .position(|slot| !name.is_empty() && slot.name == name);
+    for info in infos {
+        let (name, _) = &**info;
+        let mut rest = slots.iter().skip(next);
+        let named = rest.position(|slot| !name.is_empty() && *slot.name == **name);
         let place = next.saturating_add(named.unwrap_or(0));
-        let Some(entry) = assigned.get_mut(place) else {
+        let Some(slot) = slots.get_mut(place) else {
             break;
         };
-        *entry = Some((name, info));
+        slot.info = Some(info);
         next = place.saturating_add(1);
     }
-    assigned
 }
 
-fn better_name(from_info: String, from_type: &str) -> String {
-    if from_info.is_empty() || (from_info.starts_with("SubIndex ") && !from_type.is_empty()) {
-        from_type.to_owned()
+fn better_name(from_info: &str, from_type: &Text) -> Text {
+    let generic = from_info.starts_with("SubIndex ") && !from_type.is_empty();
+    if from_info.is_empty() || generic || from_type == from_info {
+        from_type.clone()
     } else {
-        from_info
+        from_info.into()
     }
 }
 

@@ -45,25 +45,43 @@ impl<'a> Scanner<'a> {
         Self { text, at: 0 }
     }
 
-    /// The next tag, whatever text stands before it.
-    #[inline]
-    pub fn next_tag(&mut self) -> Result<Piece<'a>, Malformed> {
-        loop {
-            self.at += before_tag(&self.text.as_bytes()[self.at..]);
-            match self.next()? {
-                Piece::CData(_) => {}
-                piece => return Ok(piece),
-            }
-        }
+    pub fn offset(&self) -> usize {
+        self.at
     }
 
-    /// Passes whatever text stands before the next tag, and that where it closes `name`.
+    /// Where the next tag begins.
+    pub fn next_offset(&self) -> usize {
+        self.at + before_tag(self.rest(self.at))
+    }
+
+    /// All that stands from a byte on.
+    pub fn rest(&self, from: usize) -> &'a [u8] {
+        self.text.as_bytes().get(from..).unwrap_or_default()
+    }
+
+    /// Goes on behind an element that is known.
+    pub fn go_to(&mut self, offset: usize) {
+        self.at = offset;
+    }
+
+    /// The next tag, whatever text stands before it; `None` where that closes `open`.
     #[inline]
-    pub fn closes(&mut self, name: &str) -> bool {
-        self.at += before_tag(&self.text.as_bytes()[self.at..]);
-        let closed = is_end(&self.text.as_bytes()[self.at..], name);
-        self.at += if closed { name.len() + 3 } else { 0 };
-        closed
+    pub fn next_tag(&mut self, open: &str) -> Result<Option<Piece<'a>>, Malformed> {
+        loop {
+            self.at += before_tag(&self.text.as_bytes()[self.at..]);
+            let rest = &self.text.as_bytes()[self.at..];
+            let piece = match rest.get(1) {
+                Some(b'/') if is_end(rest, open) => {
+                    self.at += open.len() + 3;
+                    return Ok(None);
+                }
+                Some(b'A'..=b'Z') => self.tag(self.at)?,
+                _ => self.next()?,
+            };
+            if !matches!(piece, Piece::CData(_)) {
+                return Ok(Some(piece));
+            }
+        }
     }
 
     /// The text up to the next tag where that closes `name`, trimmed; then both are passed. With it whether the text
@@ -126,7 +144,7 @@ impl<'a> Scanner<'a> {
         Ok(self.at)
     }
 
-    #[inline]
+    #[inline(always)]
     fn tag(&mut self, start: usize) -> Result<Piece<'a>, Malformed> {
         let bytes = self.text.as_bytes();
         let part = |from: usize| from + name_length(&bytes[from..]);
@@ -287,7 +305,8 @@ fn trimmed(text: &str) -> (&str, bool) {
 #[inline]
 fn is_end(tag: &[u8], name: &str) -> bool {
     let name = name.as_bytes();
-    tag.get(1) == Some(&b'/')
+    !name.is_empty()
+        && tag.get(1) == Some(&b'/')
         && tag.get(name.len() + 2) == Some(&b'>')
         && tag.get(2..name.len() + 2) == Some(name)
 }

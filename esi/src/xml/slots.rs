@@ -81,6 +81,6 @@ fn slot<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Slot, EsiError>
         }
         Ok(())
     })?;
-    slot.name = names.take();
+    slot.name = names.take().into_owned();
     Ok(slot)
 }

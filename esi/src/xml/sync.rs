@@ -2,7 +2,7 @@
 
 use super::cursor::{Cursor, Element};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Fmmu, FmmuUse, SmUse, SyncManager, SyncUnit};
+use crate::model::{Fmmu, FmmuUse, Position, SmUse, SyncManager, SyncUnit};
 
 pub(super) fn fmmu<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fmmu, EsiError> {
     Ok(Fmmu {
@@ -31,13 +31,19 @@ pub(super) fn sync_unit<'a>(
     })
 }
 
+/// A SyncManager's number and its PDOs; the oversampling factors that stand there, by PDO.
+pub(super) type Assignment = (Option<(u8, Vec<u16>)>, Vec<(u16, u16)>);
+
 /// `Sm No="2"` with its `Pdo`s, in an OpMode or in an AlternativeSmMapping. One without a number says nothing.
-/// `oversampling` gets the factors that stand there.
 pub(super) fn assignment<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
-    oversampling: &mut Vec<(u16, u16)>,
-) -> Result<Option<(u8, Vec<u16>)>, EsiError> {
+) -> Result<Assignment, EsiError> {
+    c.memoised(element, |memos| &mut memos.assignments, read_assignment)
+}
+
+fn read_assignment<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Assignment, EsiError> {
+    let mut oversampling = Vec::new();
     let number = c.attribute_number(element, "No")?;
     let mut pdos = Vec::new();
     c.children(element, |c, el| {
@@ -49,10 +55,20 @@ pub(super) fn assignment<'a>(
         }
         Ok(())
     })?;
-    Ok(number.map(|number| (number, pdos)))
+    Ok((number.map(|number| (number, pdos)), oversampling))
 }
 
 pub(super) fn sync_manager<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+) -> Result<SyncManager, EsiError> {
+    let mut sm = c.memoised(element, |memos| &mut memos.sync_managers, read_sync_manager)?;
+    sm.position = c.position(element);
+    Ok(sm)
+}
+
+/// Its place aside.
+fn read_sync_manager<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
 ) -> Result<SyncManager, EsiError> {
@@ -72,7 +88,7 @@ pub(super) fn sync_manager<'a>(
         _ => c.attribute_number(element, "Enable")?,
     };
     let mut sm = SyncManager {
-        position: c.position(element),
+        position: Position::default(),
         usage: SmUse::Other,
         start_address,
         default_size: c

@@ -1,29 +1,32 @@
 //! Names in several languages.
 
+use std::borrow::Cow;
+
 use super::cursor::{Cursor, Element};
 use crate::error::EsiError;
 use crate::model::LocalName;
 
 const ENGLISH: u32 = 1033;
 
-/// Collects sibling `Name` elements.
+/// Collects sibling `Name` elements, borrowed where they stand in the file in one piece.
 #[derive(Default)]
-pub(super) struct Names {
-    first: Option<LocalName>,
+pub(super) struct Names<'a> {
+    first: Option<Name<'a>>,
     /// Few have more than one.
-    more: Vec<LocalName>,
+    more: Vec<Name<'a>>,
 }
 
-impl Names {
-    pub fn add<'a>(
-        &mut self,
-        cursor: &mut Cursor<'a>,
-        element: &Element<'a>,
-    ) -> Result<(), EsiError> {
+struct Name<'a> {
+    lcid: Option<u32>,
+    text: Cow<'a, str>,
+}
+
+impl<'a> Names<'a> {
+    pub fn add(&mut self, cursor: &mut Cursor<'a>, element: &Element<'a>) -> Result<(), EsiError> {
         let lcid = cursor.value(element, "LcId")?;
         let lcid = lcid.and_then(|id| id.trim().parse().ok());
-        let text = cursor.text(element)?;
-        let name = LocalName { lcid, text };
+        let text = cursor.content(element)?;
+        let name = Name { lcid, text };
         match &self.first {
             None => self.first = Some(name),
             Some(_) => self.more.push(name),
@@ -32,10 +35,10 @@ impl Names {
     }
 
     /// English where it is marked, else the first.
-    pub fn take(self) -> String {
-        let is_english = |name: &LocalName| name.lcid == Some(ENGLISH);
+    pub fn take(self) -> Cow<'a, str> {
+        let is_english = |name: &Name<'_>| name.lcid == Some(ENGLISH);
         let Some(first) = self.first else {
-            return String::new();
+            return Cow::default();
         };
         if is_english(&first) {
             return first.text;
@@ -46,7 +49,11 @@ impl Names {
 
     /// The same, and all of them.
     pub fn take_all(self) -> (String, Vec<LocalName>) {
-        let all = self.first.iter().chain(&self.more).cloned().collect();
-        (self.take(), all)
+        let all = self.first.iter().chain(&self.more).map(|name| LocalName {
+            lcid: name.lcid,
+            text: name.text.clone().into_owned(),
+        });
+        let all = all.collect();
+        (self.take().into_owned(), all)
     }
 }

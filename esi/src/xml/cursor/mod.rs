@@ -10,6 +10,7 @@ mod problems;
 mod values;
 
 use super::lines::Lines;
+use super::memo::{Memo, Memos};
 use super::scan::{Malformed, Piece, Scanner};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Position, Warning};
@@ -28,6 +29,7 @@ pub(super) struct Cursor<'a> {
     /// The element on top of the stack was written `<…/>`.
     ends_at_once: bool,
     spent: usize,
+    memos: Memos<'a>,
     pub warnings: Vec<Warning>,
 }
 
@@ -77,6 +79,7 @@ impl<'a> Cursor<'a> {
             top: Level::default(),
             ends_at_once: false,
             spent: 0,
+            memos: Memos::new(),
             warnings: Vec::new(),
         }
     }
@@ -122,6 +125,64 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
+    /// What `read` makes of the element, taken from the memo where the same text was read before. `read` must make the
+    /// same of the same text wherever it stands, so without positions; what it warns of is told each time.
+    pub fn memoised<T: Clone>(
+        &mut self,
+        element: &Element<'a>,
+        memo: for<'m> fn(&'m mut Memos<'a>) -> &'m mut Memo<'a, T>,
+        read: impl FnOnce(&mut Self, &Element<'a>) -> Result<T, EsiError>,
+    ) -> Result<T, EsiError> {
+        if self.ends_at_once {
+            return read(self, element);
+        }
+        let rest = self.scanner.rest(element.offset);
+        let Some((key, known)) = memo(&mut self.memos).find(rest, element.depth) else {
+            return read(self, element);
+        };
+        let end = element.offset + key.length();
+        if let Some(known) = known {
+            self.scanner.go_to(end);
+            self.depth -= 1;
+            return Ok(known.clone());
+        }
+        let warned = self.warnings.len();
+        let value = read(self, element)?;
+        // The end that was found may have stood in a comment.
+        if self.scanner.offset() == end && self.warnings.len() == warned {
+            memo(&mut self.memos).put(key, value.clone());
+        }
+        Ok(value)
+    }
+
+    /// Like [`Self::memoised`], for an element and those behind it as long as they follow each other as they did
+    /// before; each is taken with its place.
+    pub fn memoised_all<T: Clone>(
+        &mut self,
+        element: &Element<'a>,
+        memo: for<'m> fn(&'m mut Memos<'a>) -> &'m mut Memo<'a, T>,
+        read: impl FnOnce(&mut Self, &Element<'a>) -> Result<T, EsiError>,
+        mut take: impl FnMut(&mut Self, &Element<'a>, T) -> Result<(), EsiError>,
+    ) -> Result<(), EsiError> {
+        let value = self.memoised(element, memo, read)?;
+        take(self, element, value)?;
+        let mut next = *element;
+        next.attributes = "";
+        while self.depth + 1 == element.depth {
+            next.offset = self.scanner.next_offset();
+            let rest = self.scanner.rest(next.offset);
+            let Some((length, value)) = memo(&mut self.memos).find_expected(rest, next.depth)
+            else {
+                break;
+            };
+            let value = value.clone();
+            self.scanner.go_to(next.offset + length);
+            next.number = self.count(next.name);
+            take(self, &next, value)?;
+        }
+        Ok(())
+    }
+
     /// Reads on until the element at `depth` is closed.
     fn finish(&mut self, depth: usize) -> Result<(), EsiError> {
         while self.depth >= depth {
@@ -133,32 +194,33 @@ impl<'a> Cursor<'a> {
     }
 
     fn token(&mut self) -> Result<Token<'a>, EsiError> {
-        self.next(Scanner::next)
-    }
-
-    /// The next token that is not text.
-    fn tag(&mut self) -> Result<Token<'a>, EsiError> {
-        let open = self.depth.checked_sub(1).and_then(|at| self.stack.get(at));
-        if !self.ends_at_once
-            && let Some(level) = open
-            && self.scanner.closes(level.qualified)
-        {
-            self.depth -= 1;
-            return Ok(Token::End);
-        }
-        self.next(Scanner::next_tag)
-    }
-
-    #[inline]
-    fn next(
-        &mut self,
-        piece: impl Fn(&mut Scanner<'a>) -> Result<Piece<'a>, Malformed>,
-    ) -> Result<Token<'a>, EsiError> {
         if std::mem::take(&mut self.ends_at_once) {
             self.depth = self.depth.saturating_sub(1);
             return Ok(Token::End);
         }
-        match piece(&mut self.scanner) {
+        let piece = self.scanner.next();
+        self.take(piece)
+    }
+
+    /// The next token that is not text.
+    fn tag(&mut self) -> Result<Token<'a>, EsiError> {
+        if std::mem::take(&mut self.ends_at_once) {
+            self.depth = self.depth.saturating_sub(1);
+            return Ok(Token::End);
+        }
+        let open = self.within().qualified;
+        match self.scanner.next_tag(open).transpose() {
+            None => {
+                self.depth = self.depth.saturating_sub(1);
+                Ok(Token::End)
+            }
+            Some(piece) => self.take(piece),
+        }
+    }
+
+    #[inline(always)]
+    fn take(&mut self, piece: Result<Piece<'a>, Malformed>) -> Result<Token<'a>, EsiError> {
+        match piece {
             Ok(Piece::Start {
                 name,
                 local,
@@ -184,17 +246,14 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    #[inline]
     fn open(
         &mut self,
         (qualified, name): (&'a str, &'a str),
         attributes: &'a str,
         offset: usize,
     ) -> Result<Element<'a>, EsiError> {
-        let parent = match self.depth.checked_sub(1) {
-            Some(parent) => self.stack.get_mut(parent),
-            None => Some(&mut self.top),
-        };
-        let number = parent.map_or(1, |parent| parent.count(name));
+        let number = self.count(name);
         if self.depth >= MAX_DEPTH {
             return Err(self.error(EsiProblem::TooDeep { limit: MAX_DEPTH }));
         }
@@ -215,6 +274,16 @@ impl<'a> Cursor<'a> {
             number,
             depth: self.depth,
         })
+    }
+
+    /// The number of a child that begins in the element that was begun last.
+    #[inline]
+    fn count(&mut self, name: &str) -> u32 {
+        let parent = match self.depth.checked_sub(1) {
+            Some(parent) => self.stack.get_mut(parent),
+            None => Some(&mut self.top),
+        };
+        parent.map_or(1, |parent| parent.count(name))
     }
 
     fn close(&mut self, name: &'a str, offset: usize) -> Result<Token<'a>, EsiError> {

@@ -70,13 +70,24 @@ fn append(path: &mut String, name: &str, number: u32) {
     if !path.is_empty() {
         path.push('/');
     }
-    path.push_str(&shorten(name));
+    path.push_str(short(name));
     if numbered(name).is_some() && (number > 1 || name != "EtherCATInfo") {
-        path.push_str(&format!("[{number}]"));
+        path.push('[');
+        path.push_str(&number.to_string());
+        path.push(']');
     }
 }
 
 /// Keeps what a damaged file may put into an error text short.
 pub(super) fn shorten(text: &str) -> String {
-    text.chars().take(40).collect()
+    short(text).to_owned()
+}
+
+fn short(text: &str) -> &str {
+    const MAX: usize = 40;
+    if text.len() <= MAX {
+        return text;
+    }
+    let end = text.char_indices().nth(MAX);
+    end.map_or(text, |(end, _)| &text[..end])
 }

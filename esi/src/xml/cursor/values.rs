@@ -105,6 +105,9 @@ impl<'a> Cursor<'a> {
         element: &Element<'a>,
         name: &str,
     ) -> Result<Option<Cow<'a, str>>, EsiError> {
+        if element.attributes.is_empty() {
+            return Ok(None);
+        }
         let value = scan::attribute(element.attributes, name)
             .map_err(|problem| self.error_at(element, EsiProblem::Syntax(problem.to_owned())))?;
         let Some(raw) = value else {
