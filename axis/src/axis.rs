@@ -254,11 +254,15 @@ impl Axis {
         self.probe_mapped = inputs.touch_probe_status.is_some();
         if let Some(status) = inputs.touch_probe_status {
             let (actual, scale) = (&self.actual, &self.config.scale);
-            self.probes.step(status, |slot| {
+            let stop = self.probes.step(status, |slot| {
                 let raw = inputs.touch_probe_positions.get(slot).copied().flatten()?;
                 let near = actual.counts().unwrap_or_default();
                 Some(scale.position_to_user(near.unwrap_next(raw)).0)
             });
+            // Homing has a way of its own.
+            if stop && !self.home.running() {
+                self.stop();
+            }
         }
         if let Some(code) = inputs.error_code {
             self.note_error_code(code);

@@ -70,6 +70,7 @@ struct One {
     phase: Phase,
     edge: Edge,
     source: Source,
+    stop: bool,
 }
 
 /// Both probes of a drive.
@@ -83,7 +84,18 @@ impl Default for Probes {
 }
 
 impl Probe {
-    const fn index(self) -> usize {
+    /// 1 or 2.
+    #[must_use]
+    pub const fn number(self) -> u8 {
+        match self {
+            Self::First => 1,
+            Self::Second => 2,
+        }
+    }
+
+    /// Its place in [`crate::AxisStatus::probes`].
+    #[must_use]
+    pub const fn index(self) -> usize {
         match self {
             Self::First => 0,
             Self::Second => 1,
@@ -98,17 +110,19 @@ impl Probes {
             phase: Phase::Off,
             edge: Edge::Positive,
             source: Source::Input,
+            stop: false,
         };
         Self([OFF, OFF])
     }
 
-    /// From now on the next edge is captured. What was captured before is forgotten.
-    pub fn arm(&mut self, probe: Probe, edge: Edge, source: Source) {
+    /// From now on the next edge is captured. What was captured before is forgotten. `stop`: [`Probes::step`] is to tell of it.
+    pub fn arm(&mut self, probe: Probe, edge: Edge, source: Source, stop: bool) {
         if let Some(one) = self.0.get_mut(probe.index()) {
             *one = One {
                 phase: Phase::Clearing,
                 edge,
                 source,
+                stop,
             };
         }
     }
@@ -120,7 +134,9 @@ impl Probes {
     }
 
     /// One fresh cycle. `status`: 0x60B9. `position` gives what 0x60BA, 0x60BB, 0x60BC or 0x60BD (0 to 3) holds, in user units.
-    pub fn step(&mut self, status: u16, position: impl Fn(usize) -> Option<f64>) {
+    /// `true`: an edge has just come that is to stop the axis.
+    pub fn step(&mut self, status: u16, position: impl Fn(usize) -> Option<f64>) -> bool {
+        let mut stop = false;
         for (n, (one, byte)) in self.0.iter_mut().zip(status.to_le_bytes()).enumerate() {
             let enabled = byte & status::ENABLED != 0;
             let (stored, slot) = match one.edge {
@@ -130,13 +146,17 @@ impl Probes {
             one.phase = match one.phase {
                 Phase::Clearing if !enabled => Phase::Arming,
                 Phase::Arming | Phase::Armed if enabled && stored => match position(slot) {
-                    Some(position) => Phase::Captured(position),
+                    Some(position) => {
+                        stop |= one.stop;
+                        Phase::Captured(position)
+                    }
                     None => one.phase,
                 },
                 Phase::Arming if enabled => Phase::Armed,
                 same => same,
             };
         }
+        stop
     }
 
     /// 0x60B8.
@@ -181,7 +201,14 @@ mod tests {
     const WHERE: [f64; 4] = [1.0, 2.0, 3.0, 4.0];
 
     fn step(probes: &mut Probes, status: u16) -> [ProbeStatus; 2] {
-        probes.step(status, |slot| WHERE.get(slot).copied());
+        let captured = |of: [ProbeStatus; 2]| {
+            let one = |s: &&ProbeStatus| matches!(s, ProbeStatus::Captured { .. });
+            of.iter().filter(one).count()
+        };
+        let before = captured(probes.status());
+        let stop = probes.step(status, |slot| WHERE.get(slot).copied());
+        // In the cycle of the capture, and once.
+        assert_eq!(stop, captured(probes.status()) > before);
         probes.status()
     }
 
@@ -196,7 +223,7 @@ mod tests {
             (Probe::Second, Edge::Negative, Source::ZeroImpulse, 0x2500),
         ] {
             let mut probes = Probes::new();
-            probes.arm(probe, edge, source);
+            probes.arm(probe, edge, source, false);
             assert_eq!(probes.function(), 0, "first it is switched off");
             step(&mut probes, 0);
             assert_eq!(probes.function(), word);
@@ -216,7 +243,7 @@ mod tests {
         ] {
             let at = probe.index();
             let mut probes = Probes::new();
-            probes.arm(probe, edge, Source::Input);
+            probes.arm(probe, edge, Source::Input, true);
             // What the drive still holds of the capture before.
             assert_eq!(step(&mut probes, stored)[at], Arming);
             assert_eq!(step(&mut probes, stored)[at], Arming);
@@ -241,9 +268,9 @@ mod tests {
     #[test]
     fn a_position_that_is_not_mapped_is_no_capture() {
         let mut probes = Probes::new();
-        probes.arm(Probe::First, Edge::Positive, Source::Input);
-        probes.step(0, |_| None);
-        probes.step(3, |_| None);
+        probes.arm(Probe::First, Edge::Positive, Source::Input, true);
+        assert!(!probes.step(0, |_| None));
+        assert!(!probes.step(3, |_| None));
         assert_eq!(probes.status()[0], ProbeStatus::Arming);
     }
 }

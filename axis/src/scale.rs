@@ -10,7 +10,7 @@ mod torque;
 
 pub use drive_unit::{AccelerationBase, AccelerationUnit, INCREMENTS, VelocityBase, VelocityUnit};
 pub use modulo::Way;
-pub use offered::{Contradiction, Offered};
+pub use offered::{Contradiction, Offered, same_motor};
 pub use torque::TorqueScale;
 
 use crate::units::{

@@ -222,6 +222,8 @@ pub enum Refused {
     Tripped(Trip),
     #[error("the axis is stopping or being disabled")]
     Stopping,
+    #[error("the group of axes that it belongs to is stopped; reset it first")]
+    GroupStopped,
     #[error("the axis still moves at {velocity}")]
     StillMoving { velocity: f64 },
 }

@@ -471,3 +471,43 @@ fn a_standing_axis_is_disabled_at_once() {
     rig.cycle_with(false);
     assert_eq!(rig.out.controlword, 0x0006);
 }
+
+/// The drive got the new mode amid lost frames, and goes to the target that came with it: the set-point goes on from there, wherever the
+/// motor is by then.
+#[test]
+fn csp_that_is_entered_amid_lost_frames_goes_on_from_the_target_sent() {
+    let most = LIMITS.velocity * DT * COUNTS_PER_UNIT + 1.0;
+    for delivered in 1..4 {
+        for lost in 3..12 {
+            for knocked in [-1.0, 0.0, 1.0] {
+                let axis = Axis::new(common::all(Mode::Csv, ENDLESS)).unwrap();
+                let mut rig = Rig::new(axis, Drive::at(0));
+                rig.axis.command(Command::Enable).unwrap();
+                rig.until(|s| s.ready, 100);
+                rig.axis.command(run_at(100.0)).unwrap();
+                rig.run(500);
+                rig.axis.command(Command::SetMode(Mode::Csp)).unwrap();
+                rig.cycle_with(true);
+                for _ in 0..delivered {
+                    cycle(&mut rig, true);
+                }
+                let mut entered = rig.axis.status().mode == Mode::Csp;
+                for n in 0..lost + 50 {
+                    let before = rig.out;
+                    if n == lost {
+                        // Somebody pushes it.
+                        rig.drive.velocity = knocked * LIMITS.velocity * COUNTS_PER_UNIT;
+                    }
+                    let (status, _) = cycle(&mut rig, n >= lost);
+                    let step = rig.out.target_position.wrapping_sub(before.target_position);
+                    entered |= status.mode == Mode::Csp;
+                    assert!(
+                        f64::from(step.abs()) <= most,
+                        "{delivered} delivered, {lost} lost, knocked {knocked}: {step} counts in cycle {n}"
+                    );
+                }
+                assert!(entered, "{delivered} delivered, {lost} lost");
+            }
+        }
+    }
+}

@@ -134,6 +134,7 @@ fn command(dice: &mut Dice, mode: Mode) -> Command {
             probe: dice.pick(&[Probe::First, Probe::Second]),
             edge: Edge::Positive,
             source: Source::Input,
+            stop: dice.one_in(2),
         },
         10 => Command::MoveBy {
             distance: dice.number(30.0),

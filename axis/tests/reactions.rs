@@ -395,6 +395,7 @@ fn a_touch_probe_captures_once_in_user_units() {
         probe: Probe::First,
         edge: Edge::Negative,
         source: Source::Input,
+        stop: false,
     };
     assert_eq!(rig.axis.command(arm), Err(Refused::NoProbe));
     let step = |rig: &mut Rig, status: u16, latched: i32| {
@@ -420,6 +421,60 @@ fn a_touch_probe_captures_once_in_user_units() {
         })
         .unwrap();
     assert_eq!(step(&mut rig, 0, 4000), (0, ProbeStatus::Off));
+}
+
+#[test]
+fn an_edge_stops_the_axis_in_the_cycle_that_shows_it() {
+    for mode in [Mode::Csp, Mode::Csv] {
+        for stop in [true, false] {
+            let mut config = all(mode, ENDLESS);
+            config.jerk_limited = mode == Mode::Csp;
+            let mut rig = enabled(config);
+            let step = |rig: &mut Rig, status: u16| {
+                let inputs = Inputs {
+                    touch_probe_status: Some(status),
+                    touch_probe_positions: [Some(800), None, None, None],
+                    ..rig.drive.inputs()
+                };
+                rig.drive.cycle(&rig.out, DT);
+                rig.out = rig.axis.step(&inputs, DT);
+                rig.axis.status()
+            };
+            step(&mut rig, 0);
+            let arm = Command::ArmProbe {
+                probe: Probe::First,
+                edge: Edge::Positive,
+                source: Source::Input,
+                stop,
+            };
+            rig.axis.command(arm).unwrap();
+            let go = Command::MoveTo {
+                position: 100.0,
+                speed: 1.0,
+                ramp: 1.0,
+            };
+            rig.axis.command(go).unwrap();
+            step(&mut rig, 0);
+            for _ in 0..200 {
+                step(&mut rig, 1);
+            }
+            let before = step(&mut rig, 1);
+            assert!(before.target_velocity > 5.0, "{before:?}");
+            step(&mut rig, 3);
+            let after = step(&mut rig, 3);
+            assert_eq!(
+                after.target_acceleration < before.target_acceleration,
+                stop,
+                "{mode}: {after:?}"
+            );
+            let mut last = after;
+            for _ in 0..3000 {
+                last = step(&mut rig, 3);
+            }
+            assert!(last.at_rest, "{mode}: {last:?}");
+            assert_eq!(last.target_position < 90.0, stop, "{mode}: {last:?}");
+        }
+    }
 }
 
 #[test]

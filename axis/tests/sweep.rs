@@ -24,6 +24,7 @@ const COMMANDS: [Option<Command>; 17] = [
         probe: Probe::Second,
         edge: Edge::Negative,
         source: Source::ZeroImpulse,
+        stop: false,
     }),
     Some(Command::MoveTo {
         position: 10.0,

@@ -21,8 +21,7 @@ impl Axis {
     /// CST it goes on from the velocity or torque that the drive has kept. What comes from outside does not go on.
     pub(super) fn freeze(&mut self) {
         if self.mode == Mode::Csp {
-            self.cut_short |= self.motion.velocity != 0.0;
-            self.motion = Motion::at(self.motion.position);
+            self.come_to_rest();
         } else if self.grip() == Control::Position && self.motion.velocity != 0.0 {
             self.regain = true;
         }
@@ -32,9 +31,20 @@ impl Axis {
         self.shadow();
     }
 
+    /// The set-point, where it is.
+    fn come_to_rest(&mut self) {
+        self.cut_short |= self.motion.velocity != 0.0;
+        self.motion = Motion::at(self.motion.position);
+    }
+
     /// The first advance after a freeze in which the drive moved on without a set-point.
     pub(super) fn go_on(&mut self) {
         if !core::mem::take(&mut self.regain) || self.grip() != Control::Position {
+            return;
+        }
+        if self.mode == Mode::Csp {
+            // Entered while frames were lost: the drive has the target that came with the mode, and goes there.
+            self.come_to_rest();
             return;
         }
         let velocity = match self.mode {

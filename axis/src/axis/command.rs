@@ -30,6 +30,8 @@ pub enum Command {
         probe: Probe,
         edge: Edge,
         source: Source,
+        /// As by [`Command::Stop`], in the very cycle that shows the edge. An axis that is given set-points goes on with them.
+        stop: bool,
     },
     DisarmProbe {
         probe: Probe,
@@ -108,11 +110,12 @@ impl Axis {
                 probe,
                 edge,
                 source,
+                stop,
             } => {
                 if !self.probe_mapped {
                     return Err(Refused::NoProbe);
                 }
-                self.probes.arm(probe, edge, source);
+                self.probes.arm(probe, edge, source, stop);
                 Ok(())
             }
             Command::DisarmProbe { probe } => {

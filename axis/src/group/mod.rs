@@ -4,16 +4,12 @@
 //! |---|---|
 //! | `line` | [`Line`]: a straight line through all axes' positions, on one profile |
 //! | `together` | [`arrive_together`]: moves of their own that take the same time |
-//! | `reaction` | [`ReactionGroup`]: which axes stop how when one has to |
 //!
 //! Nothing here owns an axis. A line hands each axis a set-point source of its own ([`Along`]); all of them make the same
-//! calculation, to the last bit, so the axes stay together without speaking to each other in the cycle. A reaction group takes sets of
-//! axes ([`AxisSet`], up to [`MAX_AXES`]) and returns sets of axes. No allocation anywhere.
+//! calculation, to the last bit, so the axes stay together without speaking to each other in the cycle. No allocation anywhere.
 
 mod line;
-mod reaction;
 mod together;
 
 pub use line::{Along, Line, LineAxis, LineError};
-pub use reaction::{AxisSet, Cause, Events, MAX_AXES, Reaction, ReactionGroup, Reactions, Stops};
 pub use together::arrive_together;

@@ -21,6 +21,8 @@ pub struct Offered {
     pub acceleration_unit: Option<u32>,
     /// 0x6076, in the drive's unit (mNm by the standard; EPOS4 counts µNm).
     pub rated_torque: Option<u32>,
+    /// maxon's 0x3001:05, µNm/A.
+    pub torque_constant: Option<u32>,
     /// 0x607E: bit 7 position, bit 6 velocity.
     pub polarity: Option<u8>,
 }
@@ -48,6 +50,8 @@ pub enum Contradiction {
     },
     /// 0x6076 in the drive's unit; `expected` where it is configured.
     RatedTorque { expected: Option<u32>, found: u32 },
+    /// maxon's 0x3001:05, µNm/A; told by who has configured one.
+    TorqueConstant { expected: u32, found: u32 },
     /// 0x607E: the drive inverts, or only half of what it reports.
     Polarity { found: u8 },
 }
@@ -57,6 +61,13 @@ const SAME: f64 = 1e-9;
 
 /// Per thousand of the rated torque, which is how exactly a torque is commanded.
 const SAME_TORQUE: f64 = 1e-3;
+
+/// Whether a figure of the motor is the one that is expected, both in the drive's unit.
+#[must_use]
+pub fn same_motor(expected: u32, found: u32) -> bool {
+    let (expected, found) = (f64::from(expected), f64::from(found));
+    (expected - found).abs() <= expected * SAME_TORQUE
+}
 
 const POLARITIES: u8 = 0xC0;
 
@@ -102,11 +113,8 @@ impl Offered {
             });
         }
         if let Some(torque) = self.rated_torque {
-            let near = |expected: u32| {
-                let (expected, torque) = (f64::from(expected), f64::from(torque));
-                (expected - torque).abs() <= expected * SAME_TORQUE
-            };
-            if torque == 0 || rated_torque.is_some_and(|expected| !near(expected)) {
+            let other = |expected: u32| !same_motor(expected, torque);
+            if torque == 0 || rated_torque.is_some_and(other) {
                 found.push(Contradiction::RatedTorque {
                     expected: rated_torque,
                     found: torque,
@@ -162,6 +170,7 @@ impl Contradiction {
             Self::VelocityUnit { .. } => (0x60A9, 0),
             Self::AccelerationUnit { .. } => (0x60AA, 0),
             Self::RatedTorque { .. } => (0x6076, 0),
+            Self::TorqueConstant { .. } => (0x3001, 5),
             Self::Polarity { .. } => (0x607E, 0),
         }
     }
@@ -190,6 +199,9 @@ impl Contradiction {
             }
             Self::RatedTorque { .. } => {
                 "correct the motor's rated torque in the machine file, or the drive's motor data"
+            }
+            Self::TorqueConstant { .. } => {
+                "correct the motor's torque constant in the machine file, or the drive's motor data"
             }
             Self::Polarity { .. } => {
                 "set 0x607E to 0 and turn the axis round in the machine file, so that only one of them does"
@@ -229,6 +241,9 @@ impl fmt::Display for Contradiction {
                 found,
             } => write!(f, "is {found}, expected {expected}"),
             Self::RatedTorque { found, .. } => write!(f, "is {found}, expected a rated torque"),
+            Self::TorqueConstant { expected, found } => {
+                write!(f, "is {found} µNm/A, expected {expected}")
+            }
             Self::Polarity { found } => write!(f, "is 0x{found:02X}, expected 0x00"),
         }
     }

@@ -18,6 +18,7 @@ fn contradictions() {
         velocity_unit: Some(0x00B4_4700),
         acceleration_unit: Some(0x00C0_0300),
         rated_torque: Some(118_400),
+        torque_constant: None,
         polarity: Some(0),
     };
     let torque = Some(118_350);
@@ -184,6 +185,7 @@ fn contradictions() {
         velocity_unit: Some(0),
         acceleration_unit: Some(0),
         rated_torque: Some(1),
+        torque_constant: None,
         polarity: Some(0xFF),
     };
     assert_eq!(all.contradictions(&scale, torque).len(), 8);
