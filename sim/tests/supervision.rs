@@ -19,7 +19,7 @@ fn drive(limit: u8) -> SimDevice {
     let entry = |sub, bits, offset, value| item(sub, bits, offset, Writable::Always, &[value]);
     let object = |index, items| Object {
         index,
-        name: format!("object {index:04x}"),
+        name: format!("object {index:04x}").into(),
         items,
         ..Object::default()
     };

@@ -4,7 +4,7 @@
 
 use std::ops::{Range, RangeInclusive};
 
-use ecaxis_esi::model::{Access, Dictionary, ObjectCode, PdoMapping, Writable};
+use ecaxis_esi::model::{Access, Bytes, Dictionary, ObjectCode, PdoMapping, Writable};
 
 use super::datatype::{self, Kind};
 use super::place::{Place, TAIL};
@@ -33,8 +33,8 @@ pub struct Item {
     pub unit: u32,
     pub has_default: bool,
     /// Little-endian, of the item's length.
-    pub min: Option<Vec<u8>>,
-    pub max: Option<Vec<u8>>,
+    pub min: Option<Bytes>,
+    pub max: Option<Bytes>,
     /// The only values that a client may write.
     pub choices: Option<&'static [i64]>,
     range: Range<usize>,
@@ -97,9 +97,9 @@ impl ObjectStore {
                             index: object.index,
                             sub: item.sub,
                             name: if item.name.is_empty() {
-                                object.name.clone()
+                                object.name.to_string()
                             } else {
-                                item.name.clone()
+                                item.name.to_string()
                             },
                             bit_len: item.bit_len,
                             bit_offset: item.bit_offset,
@@ -441,7 +441,7 @@ mod tests {
             sub,
             type_name: type_name.into(),
             bit_len,
-            default,
+            default: default.into(),
             ..ObjectItem::default()
         };
         Dictionary {

@@ -193,6 +193,7 @@ impl SimDevice {
             ram_kib,
             clock: is_drive || uses_dc(device),
             sync: is_drive || !device.dc_modes.is_empty(),
+            no_lrw: device.use_lrd_lwr,
         };
         let info = options
             .esc
@@ -254,6 +255,7 @@ impl SimDevice {
             serial: options.serial,
             tick: 0,
             pulses: Default::default(),
+            arrivals: Default::default(),
             local: 0,
             hangs: false,
             refusals: Vec::new(),

@@ -5,7 +5,7 @@
 
 use ecaxis_esi::model::{
     Access, Coe, DcMode, Device, Dictionary, Direction, Eeprom, Entry, Mailbox, Object, ObjectItem,
-    Pdo, SmUse, SyncManager, SyncTime,
+    Pdo, SmUse, SyncManager, SyncTime, Text,
 };
 use ecaxis_esi::sii::{self, General, MailboxAreas, Protocols, Sii, SiiDc, SiiPdo, SiiSyncManager};
 
@@ -48,6 +48,7 @@ fn device(sii: &Sii) -> Device {
         mailbox: mailbox(sii, &general),
         dc_modes: sii.dc.iter().map(dc_mode).collect(),
         dictionary: dictionary(sii, &general),
+        use_lrd_lwr: general.flags & General::NO_LRW != 0,
         sync_managers,
         eeprom: Eeprom {
             byte_size: sii.byte_size,
@@ -158,8 +159,8 @@ fn pdo(pdo: &SiiPdo, direction: Direction) -> Pdo {
                 index: entry.index,
                 sub: entry.sub,
                 bit_len: u16::from(entry.bit_len),
-                name: entry.name.clone(),
-                data_type: String::new(),
+                name: entry.name.as_str().into(),
+                data_type: Text::default(),
                 depends_on: Default::default(),
             })
             .collect(),
@@ -225,7 +226,7 @@ fn dictionary(sii: &Sii, general: &General) -> Dictionary {
     Dictionary {
         objects: vec![Object {
             index: 0x1008,
-            name: "Device name".to_owned(),
+            name: "Device name".into(),
             items: vec![item(0, &text, 0, name)],
             ..Object::default()
         }],
@@ -235,11 +236,11 @@ fn dictionary(sii: &Sii, general: &General) -> Dictionary {
 fn item(sub: u8, type_name: &str, bit_offset: u32, default: Vec<u8>) -> ObjectItem {
     ObjectItem {
         sub,
-        name: format!("SubIndex {sub:03}"),
-        type_name: type_name.to_owned(),
+        name: format!("SubIndex {sub:03}").into(),
+        type_name: type_name.into(),
         bit_len: u32::try_from(default.len() * 8).unwrap_or(0),
         bit_offset,
-        default,
+        default: default.into(),
         has_default: true,
         access: Access::default(),
         ..ObjectItem::default()

@@ -37,28 +37,28 @@ pub use mailbox::MailboxOptions;
 use process::ProcessData;
 use supervision::Supervision;
 
-/// Pulses remembered by [`SimDevice::sync0_log`].
-const SYNC_LOG: usize = 64;
+/// Events remembered by [`SimDevice::sync0_log`] and its like.
+const LOG: usize = 64;
 
-/// True times of a SYNC output's pulses.
+/// True times of the last events of a kind.
 #[derive(Debug, Clone)]
-struct PulseLog {
+struct EventLog {
     count: u64,
-    times: [Nanos; SYNC_LOG],
+    times: [Nanos; LOG],
 }
 
-impl Default for PulseLog {
+impl Default for EventLog {
     fn default() -> Self {
         Self {
             count: 0,
-            times: [0; SYNC_LOG],
+            times: [0; LOG],
         }
     }
 }
 
-impl PulseLog {
+impl EventLog {
     fn push(&mut self, at: Nanos) {
-        if let Some(entry) = self.times.get_mut((self.count % SYNC_LOG as u64) as usize) {
+        if let Some(entry) = self.times.get_mut((self.count % LOG as u64) as usize) {
             *entry = at;
         }
         self.count += 1;
@@ -66,9 +66,9 @@ impl PulseLog {
 
     /// The last ones, oldest first.
     fn last(&self) -> impl Iterator<Item = Nanos> + '_ {
-        let kept = self.count.min(SYNC_LOG as u64);
+        let kept = self.count.min(LOG as u64);
         (self.count - kept..self.count)
-            .filter_map(|n| self.times.get((n % SYNC_LOG as u64) as usize))
+            .filter_map(|n| self.times.get((n % LOG as u64) as usize))
             .copied()
     }
 }
@@ -143,7 +143,9 @@ pub struct SimDevice {
     /// Local time at which the application acts next.
     tick: u64,
     /// SYNC0 and SYNC1.
-    pulses: [PulseLog; 2],
+    pulses: [EventLog; 2],
+    /// Outputs came.
+    arrivals: EventLog,
     /// Local time of what is going on.
     local: u64,
     /// The application hangs; its controller does not.
@@ -233,6 +235,11 @@ impl SimDevice {
         self.pulses[1].last()
     }
 
+    /// True times at which the last frames that brought outputs began, oldest first.
+    pub fn outputs_log(&self) -> impl Iterator<Item = Nanos> + '_ {
+        self.arrivals.last()
+    }
+
     /// An input wired to LATCH0 (0) or LATCH1 (1) has this level at this true time.
     pub fn set_latch(&mut self, n: usize, level: bool, now: Nanos) {
         let local = self.esc.clock.local(now);
@@ -287,6 +294,7 @@ impl SimDevice {
         self.local = self.esc.clock.local(now);
         self.start_ticking(self.local);
         self.pulses = Default::default();
+        self.arrivals = EventLog::default();
     }
 
     /// Lets the device live up to `now`. Allocates only for mailbox traffic and state changes.

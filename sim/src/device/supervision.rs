@@ -50,7 +50,10 @@ impl Supervision {
 impl SimDevice {
     /// SyncManagers were written to the last byte.
     pub(super) fn outputs_came(&mut self, written: u8) {
-        self.supervision.fresh |= self.process.iter().any(|d| written >> d.sm & 1 != 0);
+        if self.process.iter().any(|d| written >> d.sm & 1 != 0) {
+            self.supervision.fresh = true;
+            self.arrivals.push(self.esc.clock.true_time(self.local));
+        }
     }
 
     /// A SYNC0 pulse, before it takes effect.

@@ -104,6 +104,7 @@ impl Drive {
                 min: parameters.range_min,
                 width: parameters.range_width,
                 shift: 0,
+                polarity: parameters.polarity,
             },
             objects,
             parameters,
@@ -149,13 +150,14 @@ impl Drive {
         let word = store.get(o.controlword).to_le_bytes();
         let controlword = u16::from_le_bytes([word[0], word[1]]);
         let rose = controlword & !self.set_points.controlword;
+        let polarity = self.frame.polarity;
         self.set_points = SetPoints {
             controlword,
-            position: objects::int(store, o.target_position),
-            velocity: objects::int(store, o.target_velocity),
+            position: self.frame.turned(objects::int(store, o.target_position)),
+            velocity: polarity.velocity(objects::int(store, o.target_velocity)),
             torque: objects::int(store, o.target_torque),
-            position_offset: objects::int(store, o.position_offset),
-            velocity_offset: objects::int(store, o.velocity_offset),
+            position_offset: polarity.way(objects::int(store, o.position_offset)),
+            velocity_offset: polarity.velocity(objects::int(store, o.velocity_offset)),
             torque_offset: objects::int(store, o.torque_offset),
         };
         if self.objects.limits_are_mapped() {
@@ -300,6 +302,7 @@ impl Drive {
         }
         self.frame.min = self.parameters.range_min;
         self.frame.width = self.parameters.range_width;
+        self.frame.polarity = self.parameters.polarity;
         let (polarity, live) = self.objects.io.wiring(store);
         self.inputs.configure(polarity, live);
         self.tuning_age += 1;

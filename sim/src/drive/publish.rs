@@ -32,6 +32,7 @@ impl Drive {
 
     pub(super) fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
         let (o, p) = (&self.objects, &self.parameters);
+        let polarity = self.frame.polarity;
         let counts = self.controller.counts();
         let velocity = self.controller.velocity();
         let torque_per_ampere = self.tuning.torque_constant / p.torque_unit.max(1e-12);
@@ -40,20 +41,27 @@ impl Drive {
         store.set(o.error_code, i64::from(self.faults.code()));
         store.set(o.error_register, i64::from(self.faults.register()));
         store.set(o.mode_display, self.mode.map_or(0, Mode::code));
-        store.set(o.position, self.frame.show(counts));
-        store.set(o.velocity, whole(velocity / p.velocity_unit));
+        store.set(o.position, self.frame.turned(self.frame.show(counts)));
+        store.set(
+            o.velocity,
+            polarity.velocity(whole(velocity / p.velocity_unit)),
+        );
         store.set(o.torque, whole(current * torque_per_ampere));
         let error = self.motion.following_error(demand, counts);
-        store.set(o.following_error, whole(error));
+        store.set(o.following_error, polarity.way(whole(error)));
         let (position, speed) = match demand {
             Demand::Off => (float(counts), 0.0),
             _ => self.motion.demanded(),
         };
-        store.set(o.position_demand, self.frame.show(whole(position)));
-        store.set(o.velocity_demand, whole(speed / p.velocity_unit));
+        let shown = self.frame.show(whole(position));
+        store.set(o.position_demand, self.frame.turned(shown));
+        store.set(
+            o.velocity_demand,
+            polarity.velocity(whole(speed / p.velocity_unit)),
+        );
         if let Some(slot) = o.velocity_averaged {
             let averaged = self.controller.averaged_velocity();
-            store.set(slot, whole(averaged / p.velocity_unit));
+            store.set(slot, polarity.velocity(whole(averaged / p.velocity_unit)));
         }
         if let Some(slot) = o.torque_averaged {
             let averaged = self.controller.averaged_current();

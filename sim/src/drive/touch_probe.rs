@@ -66,7 +66,7 @@ impl TouchProbes {
             let mut take = |probe: &mut Probe, edge: Edge| {
                 let which = usize::from(!edge.on);
                 if probe.samples(which) {
-                    slots.latch(store, n, which, frame.show(edge.counts));
+                    slots.latch(store, n, which, frame.turned(frame.show(edge.counts)));
                 }
             };
             match source {

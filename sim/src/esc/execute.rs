@@ -4,6 +4,7 @@
 use super::Esc;
 use super::access::Combine;
 use super::fmmu::{Overlap, Use};
+use super::info::feature;
 use super::registers as reg;
 use super::sm::Filled;
 use crate::bits;
@@ -16,6 +17,7 @@ impl Esc {
         let adp = datagram.adp(frame);
         match datagram.command {
             C::Nop | C::Unknown(_) => {}
+            C::Lrw if self.config.info.has(feature::NO_LRW) => {}
             C::Lrd | C::Lwr | C::Lrw => self.logical(frame, datagram),
             C::Aprd | C::Apwr | C::Aprw | C::Armw => {
                 datagram.set_adp(frame, adp.wrapping_add(1));

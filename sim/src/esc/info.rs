@@ -8,6 +8,8 @@ pub mod feature {
     pub const DC: u16 = 0x0004;
     /// Distributed clocks count 64 bits.
     pub const DC_64_BIT: u16 = 0x0008;
+    /// LRW passes unprocessed.
+    pub const NO_LRW: u16 = 0x0200;
     /// Auto-activation and plausibility check of SYNC0 (0x0981 bits 3 to 7, 0x0984).
     pub const ENHANCED_SYNC: u16 = 0x0100;
 }
@@ -140,6 +142,9 @@ impl EscInfo {
         if needs.sync {
             info.features |= feature::ENHANCED_SYNC;
         }
+        if needs.no_lrw {
+            info.features |= feature::NO_LRW;
+        }
         if eeprom_bytes > 2048 {
             info.eeprom |= eeprom::TWO_BYTE_ADDRESS;
         }
@@ -169,6 +174,8 @@ pub struct Needs {
     pub clock: bool,
     /// SYNC0 for its application; that a newer chip has the enhanced activation is taken for granted.
     pub sync: bool,
+    /// It is known not to process LRW.
+    pub no_lrw: bool,
 }
 
 #[cfg(test)]
@@ -184,6 +191,7 @@ mod tests {
             ram_kib,
             clock,
             sync: false,
+            no_lrw: false,
         };
         // Needs, then 0x0000 and 0x0004–0x0009 of the chip (port descriptor 0: as the device has it).
         let rows = [

@@ -73,7 +73,7 @@ fn pdos(templates: &[EsiPdo], direction: Direction, size: u16) -> Vec<EsiPdo> {
                 index: object + n,
                 sub: byte as u8 + 1,
                 bit_len: 8,
-                name: format!("{word} byte {:04}", first + byte),
+                name: format!("{word} byte {:04}", first + byte).into(),
                 data_type: "USINT".into(),
                 depends_on: Default::default(),
             });

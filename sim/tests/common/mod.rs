@@ -383,7 +383,7 @@ pub fn io_device() -> Device {
 pub fn item(sub: u8, bit_len: u32, bit_offset: u32, write: Writable, default: &[u8]) -> ObjectItem {
     ObjectItem {
         sub,
-        name: format!("item {sub}"),
+        name: format!("item {sub}").into(),
         type_name: "UDINT".into(),
         bit_len,
         bit_offset,
@@ -405,7 +405,7 @@ pub fn item(sub: u8, bit_len: u32, bit_offset: u32, write: Writable, default: &[
 fn object(index: u16, items: Vec<ObjectItem>) -> Object {
     Object {
         index,
-        name: format!("object {index:04x}"),
+        name: format!("object {index:04x}").into(),
         items,
         ..Object::default()
     }
@@ -415,8 +415,8 @@ fn object(index: u16, items: Vec<ObjectItem>) -> Object {
 pub fn coe_device() -> Device {
     let rw = Writable::Always;
     let mut limited = item(0, 32, 0, rw, &[5]);
-    limited.min = Some(vec![2, 0, 0, 0]);
-    limited.max = Some(vec![10, 0, 0, 0]);
+    limited.min = Some([2, 0, 0, 0].into());
+    limited.max = Some([10, 0, 0, 0].into());
     let pre_op = Writable::Only {
         pre_op: true,
         safe_op: false,

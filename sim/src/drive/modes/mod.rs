@@ -108,9 +108,47 @@ pub(super) struct Frame {
     pub width: i64,
     /// What homing added.
     pub shift: i64,
+    /// 0x607E: what the bus sees of positions, and of velocities, has the other sign.
+    pub polarity: Polarity,
+}
+
+/// 0x607E, bits 7 and 6.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Polarity {
+    pub position: bool,
+    pub velocity: bool,
+}
+
+impl Polarity {
+    pub(super) fn of(object: i64) -> Self {
+        Self {
+            position: object & 1 << 7 != 0,
+            velocity: object & 1 << 6 != 0,
+        }
+    }
+
+    /// There and back.
+    pub(super) fn velocity(self, value: i64) -> i64 {
+        if self.velocity { -value } else { value }
+    }
+
+    pub(super) fn way(self, value: i64) -> i64 {
+        if self.position { -value } else { value }
+    }
 }
 
 impl Frame {
+    /// Between the bus and the drive, there and back.
+    pub(super) fn turned(&self, shown: i64) -> i64 {
+        if !self.polarity.position {
+            return shown;
+        }
+        if self.width == 1 << 32 {
+            return -shown << 32 >> 32;
+        }
+        self.min + (-shown - self.min).rem_euclid(self.width)
+    }
+
     pub(super) fn show(&self, counts: i64) -> i64 {
         if self.width == 1 << 32 {
             // The usual case, without a division.

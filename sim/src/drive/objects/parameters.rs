@@ -8,6 +8,7 @@ use super::units::{RPM, RPM_AND_FINER, RPM_PER_S, acceleration_unit, period_ns, 
 use super::velocity::{VelocitySlots, VelocityWindows};
 use super::{cycles, float, int, uint, whole};
 use crate::coe::store::{ObjectStore, Slot};
+use crate::drive::modes::Polarity;
 use crate::drive::plant::PlantParams;
 use crate::drive::profile::Dynamics;
 use crate::drive::state::OptionCodes;
@@ -36,6 +37,8 @@ pub(super) struct ParameterSlots {
     /// A drive without 0x60A9 and 0x60AA counts in encoder counts and seconds.
     unit_velocity: Option<Slot>,
     unit_acceleration: Option<Slot>,
+    /// 0x607E, where the ESI has it.
+    polarity: Option<Slot>,
     period_value: Slot,
     period_index: Slot,
     /// 0x6080 comes with the process data: then zero means zero, where an unset object means "no limit".
@@ -70,6 +73,8 @@ pub(in crate::drive) struct Parameters {
     /// N·m that a thousandth of rated torque is.
     pub torque_unit: f64,
     pub current: CurrentLimits,
+    /// 0x607E.
+    pub polarity: Polarity,
     /// 0x60C2.
     pub period_ns: i64,
 }
@@ -149,6 +154,7 @@ impl ParameterSlots {
             homing: HomingSlots::bind(b, per_rpm, per_rpm_s),
             unit_velocity,
             unit_acceleration,
+            polarity: b.0.slot(0x607e, 0),
             period_value: b.bind(0x60c2, 1, "Interpolation time period value", 8, RW),
             period_index: b.with_default(0x60c2, 2, "Interpolation time index", 8, -3),
             speed_is_mapped: false,
@@ -182,7 +188,12 @@ impl ParameterSlots {
     pub(super) fn read_homing(&self, store: &ObjectStore, plant: &PlantParams) -> HomingParameters {
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
         let (velocity_unit, acceleration_unit) = self.units(store, counts_per_turn);
-        self.homing.read(store, velocity_unit, acceleration_unit)
+        let read = self.homing.read(store, velocity_unit, acceleration_unit);
+        let polarity = Polarity::of(self.polarity.map_or(0, |slot| uint(store, slot)));
+        HomingParameters {
+            home_position: polarity.way(read.home_position),
+            ..read
+        }
     }
 
     /// What the objects say now.
@@ -197,6 +208,7 @@ impl ParameterSlots {
                 .filter(|&w| w < 0xffff_ffff)
                 .map(float)
         };
+        let polarity = Polarity::of(p.polarity.map_or(0, |slot| uint(store, slot)));
         let cycles = |slot| cycles(uint(store, slot));
         let pair = |[min, max]: [Slot; 2]| (int(store, min), int(store, max));
         let (range_min, range_max) = match pair(p.range) {
@@ -224,7 +236,16 @@ impl ParameterSlots {
             position_window_time: cycles(p.position_window_time),
             range_min,
             range_width: range_max - range_min + 1,
-            software_limits: Some(pair(p.limits)).filter(|(min, max)| min < max),
+            software_limits: Some(pair(p.limits)).filter(|(min, max)| min < max).map(
+                |(min, max)| {
+                    if polarity.position {
+                        (-max, -min)
+                    } else {
+                        (min, max)
+                    }
+                },
+            ),
+            polarity,
             max_speed,
             max_profile_speed: profile_limit,
             profile: Dynamics {

@@ -16,6 +16,8 @@ struct Limit {
 #[derive(Debug, Clone)]
 pub(super) struct TorqueSlots {
     rated_torque: Slot,
+    /// Of 0x6076.
+    counts_per_newton_metre: f64,
     output_current_limit: Option<Slot>,
     max_torque: Option<Limit>,
     max_current: Option<Limit>,
@@ -44,10 +46,27 @@ impl Limit {
     }
 }
 
+/// As the dictionary's unit says (ETG.1004: newton metre is 0x56, the highest byte a power of ten); else a maxon drive counts µNm, any
+/// other mNm. A dictionary that does not say whose it is counts as maxon's.
+fn counts_per_newton_metre(b: &Binder<'_>, rated_torque: Slot) -> f64 {
+    const NEWTON_METRE: u32 = 0x56;
+    const MAXON: i64 = 0xfb;
+    let unit = b.0.item(rated_torque).map_or(0, |item| item.unit);
+    if unit & 0x00ff_ffff == NEWTON_METRE << 16 {
+        let [.., power] = unit.to_le_bytes();
+        return 10f64.powi(-i32::from(i8::from_le_bytes([power])));
+    }
+    let vendor = b.0.slot(0x1018, 1).map(|slot| b.0.get(slot));
+    let maxon = b.0.slot(0x30b0, 0).is_some() || vendor.is_none_or(|vendor| vendor == MAXON);
+    if maxon { 1e6 } else { 1e3 }
+}
+
 impl TorqueSlots {
     pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
         let rated_torque = b.bind(0x6076, 0, "Motor rated torque", 32, RW);
-        b.motor_data(rated_torque, whole(plant.rated_torque() * 1e6));
+        let counts_per_newton_metre = counts_per_newton_metre(b, rated_torque);
+        let rated = whole(plant.rated_torque() * counts_per_newton_metre);
+        b.motor_data(rated_torque, rated);
         if let Some(rated_current) = b.0.slot(0x6075, 0) {
             b.motor_data(rated_current, whole(plant.nominal_current * 1e3));
         }
@@ -59,6 +78,7 @@ impl TorqueSlots {
         };
         Self {
             rated_torque,
+            counts_per_newton_metre,
             output_current_limit: b.own(0x3001, 2, "Output current limit"),
             max_torque: limit(0x6072),
             max_current: limit(0x6073),
@@ -90,7 +110,7 @@ impl TorqueSlots {
 
     /// N·m.
     pub(super) fn rated(&self, store: &ObjectStore) -> f64 {
-        float(uint(store, self.rated_torque)) * 1e-6
+        float(uint(store, self.rated_torque)) / self.counts_per_newton_metre
     }
 
     pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> CurrentLimits {

@@ -117,7 +117,7 @@ fn factory_limits_beside_the_axis_are_not_meant() {
         return;
     };
     let dictionary = &file.devices.first().unwrap().dictionary;
-    let limit = |sub| dictionary.item(0x607d, sub).unwrap().default.clone();
+    let limit = |sub| dictionary.item(0x607d, sub).unwrap().default.to_vec();
     assert_eq!(limit(1), 7_129_736_i32.to_le_bytes());
     assert_eq!(limit(2), 9_713_015_i32.to_le_bytes());
     moves_a_turn(&mut rig_of(&[dictionary]));

@@ -8,6 +8,7 @@ mod homing;
 mod inputs;
 mod motion;
 mod options;
+mod polarity;
 mod probes;
 mod profiles;
 mod speeds;
