@@ -55,23 +55,34 @@ impl Clock {
         });
     }
 
-    /// Sleeps until `spin` before `t`, then spins. RT: blocks on the clock only.
-    pub fn sleep_until(self, t: Nanos, spin: Nanos) {
+    /// Sleeps until `spin` before `t`, then spins. Returns how late the sleep itself ended, `None` where there was nothing
+    /// to sleep or time is virtual. RT: blocks on the clock only.
+    pub fn sleep_until(self, t: Nanos, spin: Nanos) -> Option<Nanos> {
         match self {
-            Self::Virtual => VIRTUAL.set(VIRTUAL.get().map(|now| now.max(t))),
+            Self::Virtual => {
+                VIRTUAL.set(VIRTUAL.get().map(|now| now.max(t)));
+                None
+            }
             Self::Real => {
                 let wake = t.saturating_sub(spin);
+                let mut late = None;
                 if monotonic() < wake {
                     let request = Timespec {
                         tv_sec: i64::try_from(wake / NANOS_PER_SECOND).unwrap_or(i64::MAX),
                         tv_nsec: i64::try_from(wake % NANOS_PER_SECOND).unwrap_or(0),
                     };
                     // A signal ends the sleep early; the loop below waits for the rest.
-                    let _ = clock_nanosleep_absolute(ClockId::Monotonic, &request);
+                    let slept = clock_nanosleep_absolute(ClockId::Monotonic, &request);
+                    let now = monotonic();
+                    late = slept.is_ok().then(|| now.saturating_sub(wake));
+                    if now >= t {
+                        return late;
+                    }
                 }
                 while monotonic() < t {
                     std::hint::spin_loop();
                 }
+                late
             }
         }
     }
@@ -115,6 +126,25 @@ embassy_time_driver::time_driver_impl!(static DRIVER: Driver = Driver);
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_sleep_tells_how_late_it_ended() {
+        let t = now() + 3_000_000;
+        assert!(Clock::Real.sleep_until(t, 1_000_000).is_some());
+        assert!(now() >= t);
+        assert_eq!(
+            Clock::Real.sleep_until(t, 1_000_000),
+            None,
+            "nothing to sleep"
+        );
+        let t = now() + 100_000;
+        assert_eq!(
+            Clock::Real.sleep_until(t, 1_000_000),
+            None,
+            "all of it is spun"
+        );
+        assert!(now() >= t);
+    }
 
     #[test]
     fn virtual_time_moves_by_waiting_alone() {

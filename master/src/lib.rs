@@ -10,15 +10,23 @@
 //! - [`rt`]: the cycle; must not block or allocate;
 //! - [`mailbox`]: CoE over raw datagrams, beside the cycle;
 //! - [`link`]: what carries Ethernet frames;
-//! - [`clock`]: monotonic or virtual time.
+//! - [`doctor`]: what in this computer keeps a cycle from being on time;
+//! - [`bench`]: what measuring needs;
+//! - [`clock`]: monotonic or virtual time;
+//! - [`os`]: system calls; all unsafe code.
+
+#![deny(unsafe_code)]
 
 pub mod al_status;
+pub mod bench;
 pub mod bringup;
 pub mod clock;
 pub mod config;
+pub mod doctor;
 pub mod library;
 pub mod link;
 pub mod mailbox;
+pub mod os;
 pub mod rt;
 pub mod session;
 pub mod supervise;

@@ -100,7 +100,6 @@ pub(super) async fn configure(
             });
             return Ok(Some(ClockPlan {
                 reference: reference.at.station,
-                clocks: u16::try_from(devices.iter().filter(|d| d.dc).count()).unwrap_or(u16::MAX),
                 cycle_ns: cycle,
                 release: start.wrapping_add(between_pulses(cycle, shifts())),
             }));

@@ -36,7 +36,7 @@ pub(super) async fn read(
                 .selection
                 .dictionary
                 .item(field.index, field.sub)
-                .map(|item| item.default.clone())
+                .map(|item| item.default.to_vec())
                 .unwrap_or_default(),
             Err(source) => {
                 return Err(BringUpError::ReadBack {

@@ -17,7 +17,7 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 use crate::clock;
 use crate::config::{Adopted, Machine, UnitProblem};
 use crate::mailbox::{CoeClient, SdoError, WireError};
-use crate::rt::image::ImagePlan;
+use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::wire::Datagrams;
 
@@ -241,7 +241,7 @@ fn list(problems: &[UnitProblem]) -> String {
 pub async fn bring_up(
     main_device: &'static MainDevice<'static>,
     machine: &Machine,
-    image: ImagePlan,
+    mut image: ImagePlan,
     progress: &mut dyn FnMut(Step),
 ) -> Result<Bus, BringUpError> {
     let wire = Datagrams::new(main_device);
@@ -299,13 +299,17 @@ pub async fn bring_up(
     // From here on ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
 
+    if let Some(without) = without_lrw(&wire, machine, &devices).await? {
+        image = without;
+    }
+
     for ((config, device), region) in machine.devices.iter().zip(&devices).zip(&image.regions) {
         device::map_process_data(&wire, config, device, *region).await?;
         device::set_watchdog(&wire, &machine.bus, device).await?;
     }
     progress(Step::ProcessData {
         bytes: image.len,
-        frames: image.datagrams.len().max(1),
+        frames: image.frames(),
     });
 
     let dc = clocks::configure(&wire, machine, &devices, progress).await?;
@@ -317,6 +321,30 @@ pub async fn bring_up(
         device::start_up(&wire, config, device, Moment::InSafeOp, progress).await?;
     }
     Ok(Bus { devices, image, dc })
+}
+
+/// The image with the devices whose controllers say that they know no LRW (0x0008 bit 9) beyond those of which the ESI says so;
+/// `None` if there are none. Everything lies where it lay.
+async fn without_lrw(
+    wire: &Datagrams,
+    machine: &Machine,
+    devices: &[BusDevice],
+) -> Result<Option<ImagePlan>, BringUpError> {
+    const FEATURES: u16 = 0x0008;
+    const NO_LRW: u16 = 1 << 9;
+    let mut process_data = image::process_data(machine);
+    let mut more = false;
+    for (device, data) in devices.iter().zip(&mut process_data) {
+        let mut features = [0; 2];
+        let step = "reading what its controller can do";
+        device::read(wire, device, step, FEATURES, &mut features).await?;
+        if data.lrw && u16::from_le_bytes(features) & NO_LRW != 0 {
+            data.lrw = false;
+            more = true;
+        }
+    }
+    // Each that is taken out of an LRW fits into a frame by itself.
+    Ok(more.then(|| image::plan(&process_data).ok()).flatten())
 }
 
 fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> BringUpError {

@@ -1,10 +1,10 @@
-//! What a drive says of its units (0x608F, 0x6091, 0x6092, 0x60A8–0x60AA, 0x6076, 0x607E), asked after its start-up SDOs and
+//! What a drive says of its units (0x608F, 0x6091, 0x6092, 0x60A8–0x60AA, 0x6076, 0x607E; maxon's 0x3001:05), asked after its start-up SDOs and
 //! before it is told where to go.
 
 use ecaxis_axis::scale::Offered;
 
 use super::{BringUpError, BusDevice, Step, device};
-use crate::config::DeviceConfig;
+use crate::config::{DeviceConfig, TorqueUnit, is_maxon};
 use crate::mailbox::{CoeClient, SdoError, Wire};
 
 /// Takes over what was only assumed, and refuses what would move the axis wrongly.
@@ -17,7 +17,10 @@ pub(super) async fn compare(
     let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
         return Ok(());
     };
-    let offered = ask(wire, coe)
+    let torque = &axis.torque;
+    let constant = torque.unit == TorqueUnit::Amperes || torque.constant.is_some();
+    let constant = constant && is_maxon(&config.selection);
+    let offered = ask(wire, coe, constant)
         .await
         .map_err(|source| BringUpError::ReadUnits {
             device: device.at.clone(),
@@ -51,7 +54,8 @@ pub(super) async fn compare(
     Ok(())
 }
 
-async fn ask(wire: &impl Wire, coe: &mut CoeClient) -> Result<Offered, SdoError> {
+/// `constant`: also for the motor's torque constant.
+async fn ask(wire: &impl Wire, coe: &mut CoeClient, constant: bool) -> Result<Offered, SdoError> {
     Ok(Offered {
         encoder_resolution: ratio(wire, coe, 0x608f).await?,
         gear_ratio: ratio(wire, coe, 0x6091).await?,
@@ -60,6 +64,10 @@ async fn ask(wire: &impl Wire, coe: &mut CoeClient) -> Result<Offered, SdoError>
         velocity_unit: value(wire, coe, 0x60a9, 0).await?,
         acceleration_unit: value(wire, coe, 0x60aa, 0).await?,
         rated_torque: value(wire, coe, 0x6076, 0).await?,
+        torque_constant: match constant {
+            true => value(wire, coe, 0x3001, 5).await?,
+            false => None,
+        },
         polarity: value(wire, coe, 0x607e, 0)
             .await?
             .map(|n| n.to_le_bytes()[0]),

@@ -2,11 +2,11 @@
 //! file says is held against it.
 
 use ecaxis_axis::homing::ParameterError;
-use ecaxis_axis::scale::{Contradiction, Offered};
+use ecaxis_axis::scale::{Contradiction, Offered, same_motor};
 use ecaxis_axis::{AccelerationUnit, Axis, ConfigError, Mode, Scale, VelocityUnit};
 use ecaxis_esi as esi;
 
-use super::{Action, AxisSetup, HomingSetup, Machine, Step, TorqueUnit, UnitFrom};
+use super::{Action, AxisSetup, HomingSetup, Machine, Step, TorqueSetup, TorqueUnit, UnitFrom};
 
 /// An axis after its drive has been asked.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,6 +29,8 @@ pub enum UnitProblem {
     Contradiction(Contradiction),
     #[error("0x6076:00 is not there, so torques in {unit} mean nothing")]
     NoRatedTorque { unit: &'static str },
+    #[error("0x3001:05 says no torque constant, so torques in A mean nothing")]
+    NoTorqueConstant,
     #[error("{source} (velocities in {unit} by 0x60A9, torques by 0x6076)")]
     Config {
         unit: VelocityUnit,
@@ -59,6 +61,7 @@ impl AxisSetup {
         };
         adopted.take_velocity_unit(offered);
         adopted.take_acceleration_unit(offered);
+        adopted.take_torque_constant(offered);
         adopted.take_rated_torque(offered);
         let setup = &mut adopted.setup;
         let unit = setup.config.scale.velocity_unit();
@@ -157,6 +160,55 @@ impl Adopted {
         setup.acceleration_unit_from = UnitFrom::Drive;
     }
 
+    fn take_torque_constant(&mut self, offered: &Offered) {
+        /// µNm/A.
+        const COUNTS: f64 = 1e6;
+        let before = self.setup.torque;
+        match (before.constant, offered.torque_constant) {
+            (None, Some(found @ 1..)) if before.unit == TorqueUnit::Amperes => {
+                let constant = f64::from(found) / COUNTS;
+                self.taken.push(format!(
+                    "a torque constant of {constant} Nm/A, as the drive says in 0x3001:05"
+                ));
+                let torque = &mut self.setup.torque;
+                torque.constant = Some(constant);
+                torque.constant_from = UnitFrom::Drive;
+                let known = torque.rated.map(|rated| (rated, torque.rated_from));
+                if let Some(torque) = known.and_then(|(rated, from)| torque.with_rated(rated, from))
+                {
+                    self.rescale(torque);
+                }
+            }
+            (None, _) if before.unit == TorqueUnit::Amperes => {
+                self.wrong.push(UnitProblem::NoTorqueConstant);
+            }
+            (Some(said), Some(found)) => {
+                // `as` saturates; the figure is above zero.
+                let expected = (said * COUNTS).round() as u32;
+                if !same_motor(expected, found) {
+                    let found = Contradiction::TorqueConstant { expected, found };
+                    self.doubtful.push(found);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// What is in the file's unit of torque stays what it is there.
+    fn rescale(&mut self, torque: TorqueSetup) {
+        let factor = torque.percent_per_unit / self.setup.torque.percent_per_unit;
+        let config = &mut self.setup.config;
+        if torque.limit_said {
+            config.limits.torque *= factor;
+            config.torque_slope *= factor;
+        }
+        if let Some(watch) = &mut config.supervision.torque {
+            watch.percent *= factor;
+        }
+        self.torque_factor *= factor;
+        self.setup.torque = torque;
+    }
+
     fn take_rated_torque(&mut self, offered: &Offered) {
         let before = self.setup.torque;
         if before.unit == TorqueUnit::Percent || !assumed(before.rated_from) {
@@ -174,17 +226,7 @@ impl Adopted {
         let Some(torque) = before.with_rated(rated, UnitFrom::Drive) else {
             return;
         };
-        let factor = torque.percent_per_unit / before.percent_per_unit;
-        let config = &mut self.setup.config;
-        if torque.limit_said {
-            config.limits.torque *= factor;
-            config.torque_slope *= factor;
-        }
-        if let Some(watch) = &mut config.supervision.torque {
-            watch.percent *= factor;
-        }
-        self.torque_factor = factor;
-        self.setup.torque = torque;
+        self.rescale(torque);
         if before.rated != Some(rated) {
             let was = before
                 .rated

@@ -8,6 +8,8 @@ use toml::Spanned;
 pub(crate) mod control;
 mod scale;
 
+pub(crate) use scale::is_maxon;
+
 use super::problem::{Problems, Span};
 use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
 use super::units::unit;

@@ -9,6 +9,9 @@ use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, Known};
+use crate::link::BackEnd;
+use crate::rt::margin::Spin;
+
 use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, duration};
 
 /// `None` only where something has been reported.
@@ -66,7 +69,8 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         })
         .collect();
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
-    let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, p);
+    let repeat = raw.repeat.map_or(1, Spanned::into_inner);
+    let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, repeat, p);
     let devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
     connections.check(&devices, p);
     Some(Machine {
@@ -78,7 +82,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         outputs: program.outputs,
         stop: program.stop,
         tables: program.tables,
-        repeat: raw.repeat.map_or(1, Spanned::into_inner),
+        repeat,
     })
 }
 
@@ -111,8 +115,13 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
     } else if let (Some(cycle), Some(watchdog)) = (cycle_ns, watchdog_ns) {
         ridden_through(&raw, cycle, watchdog, p);
     }
+    let clock_window = raw
+        .clock_window
+        .as_ref()
+        .map(|w| in_range(w, 100, 1_000_000_000, "a window for clocks", p));
+    let clock_window_ns = clock_window.unwrap_or(Some(defaults.clock_window_ns));
     if let (Some(spin), Some(cycle)) = (&raw.spin, cycle_ns)
-        && *spin.get_ref() > cycle
+        && spin.get_ref().is_some_and(|spin| spin > cycle)
     {
         p.add(
             spin.span(),
@@ -123,15 +132,21 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         .exchange
         .map_or(Some(Exchange::SameCycle), |e| match e.get_ref().as_str() {
             "same-cycle" => Some(Exchange::SameCycle),
+            "pipelined" => Some(Exchange::Pipelined),
             other => {
                 p.add_hint(
                     e.span(),
                     format!("unknown exchange `{other}`"),
-                    "there is \"same-cycle\"",
+                    "there are \"same-cycle\" and \"pipelined\"",
                 );
                 None
             }
         });
+    let awake = match &raw.idle {
+        Some(idle) => awake(idle, raw.cpu.is_some(), p),
+        None => Some(defaults.awake),
+    };
+    let link = raw.link.map_or(Some(defaults.link), |l| back_end(&l, p));
     let timeout = |value: Option<Spanned<u64>>, default: u64, p: &mut Problems<'_>| match value {
         Some(value) => in_range(&value, 1_000_000, 600_000_000_000, "a timeout", p),
         None => Some(default),
@@ -152,15 +167,60 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
             .cpu
             .and_then(|cpu| usize::try_from(cpu.into_inner()).ok()),
         priority: raw.priority.map_or(defaults.priority, Spanned::into_inner),
-        spin_ns: match raw.spin {
-            Some(spin) => spin.into_inner(),
-            None => defaults.spin_ns.min(cycle_ns? / 4),
+        spin: match raw.spin.and_then(Spanned::into_inner) {
+            Some(spin) => Spin::For(spin),
+            None => Spin::Auto,
         },
+        awake: awake?,
         op_timeout_ns: op_timeout_ns?,
         enable_timeout_ns: enable_timeout_ns?,
         watchdog_ns: watchdog_ns?,
+        clock_window_ns: clock_window_ns?,
         exchange: exchange?,
+        link: link?,
     })
+}
+
+/// Whether `cpu` is kept awake.
+fn awake(idle: &Spanned<String>, has_cpu: bool, p: &mut Problems<'_>) -> Option<bool> {
+    match idle.get_ref().as_str() {
+        "sleep" => Some(false),
+        "awake" if has_cpu => Some(true),
+        "awake" => {
+            p.add_hint(
+                idle.span(),
+                "it is not said which CPU to keep awake",
+                "say where the real-time thread runs: `cpu = 1`",
+            );
+            None
+        }
+        other => {
+            p.add_hint(
+                idle.span(),
+                format!("unknown idle `{other}`"),
+                "there are \"sleep\" and \"awake\"",
+            );
+            None
+        }
+    }
+}
+
+fn back_end(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<BackEnd> {
+    let found = BackEnd::ALL.iter().find(|b| b.name() == name.get_ref());
+    if found.is_none() {
+        let hint = if name.get_ref() == "xdp" {
+            "this build is without it: `cargo install ecaxis --features xdp`; "
+        } else {
+            ""
+        };
+        let names: Vec<_> = BackEnd::ALL.iter().map(|b| format!("\"{b}\"")).collect();
+        p.add_hint(
+            name.span(),
+            format!("unknown link `{}`", name.get_ref()),
+            format!("{hint}there are {}", names.join(" and ")),
+        );
+    }
+    found.copied()
 }
 
 /// The axes must be told to stop before the drives' watchdogs end it their way.

@@ -1,5 +1,7 @@
 //! A step in words, for `explain`, progress and errors.
 
+use ecaxis_axis::Edge;
+
 use super::{Action, Condition, Machine, duration};
 
 impl Machine {
@@ -17,9 +19,34 @@ impl Machine {
                 targets,
                 speed,
                 ramp,
+                together,
             } => format!(
-                "move {} at {} % of the velocity and {} % of the acceleration limit",
+                "move {} at {} % of the velocity and {} % of the acceleration limit{}",
                 self.targets(targets, if *relative { "by" } else { "→" }, ""),
+                percent(*speed),
+                percent(*ramp),
+                if *together {
+                    ", to arrive together"
+                } else {
+                    ""
+                },
+            ),
+            Action::Probe {
+                axis,
+                probe,
+                edge,
+                relative,
+                target,
+                speed,
+                ramp,
+            } => format!(
+                "probe {} until input {} {}, at {} % of the velocity and {} % of the acceleration limit",
+                self.targets(&[(*axis, *target)], if *relative { "by" } else { "→" }, ""),
+                probe.number(),
+                match edge {
+                    Edge::Positive => "rises",
+                    Edge::Negative => "falls",
+                },
                 percent(*speed),
                 percent(*ramp),
             ),

@@ -14,7 +14,7 @@
 //! | `sim.rs` | what only the simulated bus needs: connections, clocks |
 //! | `units.rs` | the names of units of positions |
 //! | `gateway.rs` | the network behind a simulated gateway |
-//! | `steps.rs` | the demonstration program |
+//! | `steps.rs` | the demonstration program; `[stop]` in `steps/stop.rs` |
 //!
 //! Every mistake is collected; a file with five of them is refused once, with five answers.
 
@@ -36,17 +36,23 @@ mod raw;
 mod sdo;
 mod signal;
 pub mod sim;
-mod steps;
+pub(crate) mod steps;
 #[cfg(test)]
 mod tests;
 mod track;
 mod units;
 
 pub use adopt::{Adopted, UnitProblem};
+pub(crate) use axis::is_maxon;
 pub use problem::{ConfigError, Problem, nearest};
 pub use signal::{AxisRef, InputRef, NameError, OutputRef};
 
+pub use crate::rt::exchange::Mode as Exchange;
+
 use ecaxis_esi as esi;
+
+use crate::link::BackEnd;
+use crate::rt::margin::Spin;
 
 /// A machine: what the file says, with everything derived from the ESI files beside it.
 #[derive(Debug, Clone)]
@@ -78,18 +84,21 @@ pub struct Bus {
     /// SCHED_FIFO priority of the real-time thread.
     pub priority: u8,
     /// How long before a cycle is due sleeping ends and spinning starts.
-    pub spin_ns: u64,
+    pub spin: Spin,
+    /// Whether `cpu` is kept from sleeping.
+    pub awake: bool,
     /// How long the bus may take from SafeOp to Op.
     pub op_timeout_ns: u64,
     /// How long a drive may take to Operation enabled.
     pub enable_timeout_ns: u64,
     /// SyncManager and PDI watchdog of every SubDevice.
     pub watchdog_ns: u64,
+    /// A SubDevice whose clock differs more from the reference (0x092C) is reported.
+    pub clock_window_ns: u64,
     pub exchange: Exchange,
+    /// How frames are taken from the network interface.
+    pub link: BackEnd,
 }
-
-/// What `spin` is where the file does not say, unless that were more than a quarter of the cycle.
-const LONGEST_SPIN_NS: u64 = 100_000;
 
 impl Default for Bus {
     fn default() -> Self {
@@ -99,11 +108,14 @@ impl Default for Bus {
             lost_frames: 3,
             cpu: None,
             priority: 80,
-            spin_ns: LONGEST_SPIN_NS,
+            spin: Spin::Auto,
+            awake: false,
             op_timeout_ns: 10_000_000_000,
             enable_timeout_ns: 5_000_000_000,
             watchdog_ns: 100_000_000,
+            clock_window_ns: 10_000,
             exchange: Exchange::SameCycle,
+            link: BackEnd::default(),
         }
     }
 }
@@ -114,12 +126,6 @@ pub enum Nic {
     Sim,
     /// A network interface by name.
     Interface(String),
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Exchange {
-    /// The answers of a cycle's frames are waited for within the cycle.
-    SameCycle,
 }
 
 #[derive(Debug, Clone)]
@@ -201,6 +207,7 @@ pub struct TorqueSetup {
     pub rated_from: UnitFrom,
     /// Torque constant, Nm/A.
     pub constant: Option<f64>,
+    pub constant_from: UnitFrom,
     /// Of 0x6076.
     pub counts_per_newton_metre: f64,
     /// Percent of rated torque that one of the unit is. Where the rated torque is not known: percent of the limit.
@@ -294,6 +301,20 @@ pub enum Action {
         speed: f64,
         /// Fraction of each axis' acceleration limit.
         ramp: f64,
+        /// Jerk-limited, from rest, and all arrive in the same cycle.
+        together: bool,
+    },
+    /// Move until an edge comes at the input of a touch probe; without one the step fails.
+    Probe {
+        axis: usize,
+        probe: ecaxis_axis::Probe,
+        edge: ecaxis_axis::Edge,
+        /// How far: a position, or a way from where the axis is.
+        relative: bool,
+        target: f64,
+        /// Fractions, as in a move.
+        speed: f64,
+        ramp: f64,
     },
     /// A straight line through the positions of all its axes, jerk-limited; they arrive in the same cycle.
     Line {
@@ -367,12 +388,53 @@ pub enum Action {
 /// How the machine stops.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct StopSetup {
-    /// Of the other axes when one faults or trips.
+    /// Of the other axes when one faults or trips, where its group does not say otherwise.
     pub others: StopBy,
     /// Of all axes when the bus is lost or a SubDevice has left Op: no axis can be led to rest then.
     pub bus_lost: StopByDrive,
     /// One of them is enough for an emergency stop.
     pub emergency: Vec<Condition>,
+    /// SubDevices that stop together; those in none are one more group.
+    pub groups: Vec<StopGroup>,
+}
+
+/// SubDevices that stop together.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StopGroup {
+    pub name: String,
+    /// Indices into [`Machine::devices`], with and without an axis; in no other group.
+    pub devices: Vec<usize>,
+    /// Of its other axes when one faults or trips.
+    pub others: StopBy,
+    pub outside: Outside,
+}
+
+/// What the machine does when a group stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Outside {
+    /// It stops, too: within the limits of its axes.
+    #[default]
+    Stop,
+    Continue,
+}
+
+impl Machine {
+    /// As the machine file names it; empty for the first, which it does not.
+    #[must_use]
+    pub fn group_name(&self, group: usize) -> &str {
+        let named = group
+            .checked_sub(1)
+            .and_then(|index| self.stop.groups.get(index));
+        named.map_or("", |group| &group.name)
+    }
+
+    /// The group of a device: 0 where none names it, else one more than the index into [`StopSetup::groups`].
+    #[must_use]
+    pub fn group_of(&self, device: usize) -> usize {
+        let mut groups = self.stop.groups.iter();
+        let named = groups.position(|group| group.devices.contains(&device));
+        named.map_or(0, |index| index + 1)
+    }
 }
 
 /// How an axis comes to rest.

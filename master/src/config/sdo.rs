@@ -238,7 +238,7 @@ mod tests {
             name: "Following error window".into(),
             type_name: "UDINT".into(),
             bit_len: 32,
-            max: Some(vec![0xff, 0, 0, 0]),
+            max: Some([0xff, 0, 0, 0].into()),
             ..ObjectItem::default()
         };
         let value = SdoValue::Integer(2000);

@@ -1,21 +1,27 @@
 //! The program: axes and signals by name, targets within limits.
 
+use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use toml::Spanned;
 
+mod flow;
 mod follow;
+mod modes;
+mod probe;
+mod stop;
 mod target;
 
 use super::axis::control::one_of;
-use super::problem::{Problems, Span, list, suggestion};
+use super::problem::{Problems, Span, suggestion};
 use super::raw::{RawAction, RawCondition, RawSignal, RawStep, RawStop};
 use super::{
-    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopBy, StopByDrive, StopSetup,
-    TableFile, duration, signal,
+    Action, AxisSetup, Condition, DeviceConfig, Signal, Step, StopSetup, TableFile, duration,
+    signal,
 };
 use ecaxis_axis::Mode;
-use ecaxis_esi as esi;
+pub(crate) use flow::enables;
 use target::{What, fraction};
 
 /// Of the limits: how an axis goes to the beginning of a table where the step does not say.
@@ -66,8 +72,10 @@ pub(crate) fn check(
     devices: &[Known<'_>],
     folder: &Path,
     cycle_s: f64,
+    repeat: u32,
     p: &mut Problems<'_>,
 ) -> Program {
+    let before = p.count();
     let mut checker = Checker {
         devices,
         folder,
@@ -77,8 +85,14 @@ pub(crate) fn check(
         outputs: Vec::new(),
         count: 0,
         switched: Vec::new(),
+        number: String::new(),
+        places: RefCell::default(),
     };
     let steps = checker.all(steps, "", p);
+    // With a step that is wrong in itself nothing is certain about those after it.
+    if p.count() == before {
+        checker.flow(&steps, repeat, p);
+    }
     let stop = checker.stop(&stop, p);
     Program {
         stop,
@@ -99,6 +113,10 @@ struct Checker<'c> {
     count: usize,
     /// Modes that steps so far have switched to.
     switched: Vec<(usize, Mode)>,
+    /// Of the step that is being checked.
+    number: String,
+    /// Where steps are, and where they name an axis.
+    places: RefCell<BTreeMap<(String, Option<usize>), Span>>,
 }
 
 impl Checker<'_> {
@@ -112,6 +130,9 @@ impl Checker<'_> {
             }
             let number = format!("{prefix}{}", index + 1);
             let line = p.line(&span);
+            self.number.clone_from(&number);
+            let place = (number.clone(), None);
+            self.places.borrow_mut().insert(place, span.clone());
             if let Some(action) = self.one(action, &number, span, p) {
                 checked.push(Step {
                     number,
@@ -149,7 +170,10 @@ impl Checker<'_> {
                 targets,
                 speed,
                 ramp,
+                arrive,
             } => {
+                let ways = [("each", false), ("together", true)];
+                let together = one_of(arrive.as_ref(), &ways, "arrive", p);
                 let at = ramp.as_ref().map(Spanned::span);
                 let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
                 let what = if relative { What::Way } else { What::Position };
@@ -161,8 +185,10 @@ impl Checker<'_> {
                     targets,
                     speed,
                     ramp,
+                    together: together?,
                 }
             }
+            RawAction::Probe(probe) => self.probe(&probe, p)?,
             RawAction::Line {
                 relative,
                 targets,
@@ -299,96 +325,6 @@ impl Checker<'_> {
         })
     }
 
-    fn home(
-        &self,
-        names: Option<Vec<Spanned<String>>>,
-        at: &Span,
-        p: &mut Problems<'_>,
-    ) -> Option<Action> {
-        let homes = |index: &usize| {
-            let axis = self.devices[*index].axis.ok();
-            axis.is_some_and(|axis| axis.homing.is_some())
-        };
-        let Some(named) = &names else {
-            let all = self.axes(None, p)?;
-            let axes: Vec<usize> = all.into_iter().filter(homes).collect();
-            if axes.is_empty() {
-                let hint = "add `homing = { method = 37 }` to a [device.axis]";
-                p.add_hint(at.clone(), "no axis says how it finds home", hint);
-                return None;
-            }
-            return Some(Action::Home { axes });
-        };
-        let mut ok = true;
-        for name in named {
-            if let Some(index) = self.devices.iter().position(|d| d.name == name.get_ref())
-                && self.devices[index].axis.is_ok()
-                && !homes(&index)
-            {
-                let message = format!("`{}` does not say how it finds home", name.get_ref());
-                let hint = "add `homing = { method = 37 }` to its [device.axis]";
-                p.add_hint(name.span(), message, hint);
-                ok = false;
-            }
-        }
-        let axes = self.axes(names, p)?;
-        ok.then_some(Action::Home { axes })
-    }
-
-    fn mode(
-        &mut self,
-        name: &Spanned<String>,
-        mode: &Spanned<String>,
-        p: &mut Problems<'_>,
-    ) -> Option<(usize, Mode)> {
-        let (index, axis) = self.axis(name, p)?;
-        let offered: Vec<esi::Mode> = esi::Mode::ALL
-            .into_iter()
-            .filter(|m| *m != esi::Mode::Hm)
-            .filter(|m| axis.config.modes.contains(Mode::from_code(m.code())))
-            .collect();
-        let wanted = offered.iter().find(|m| m.name() == mode.get_ref());
-        let Some(wanted) = wanted else {
-            let message = format!(
-                "`{}` cannot switch to \"{}\"",
-                name.get_ref(),
-                mode.get_ref()
-            );
-            let names = offered.iter().map(|m| m.name());
-            let hint = format!(
-                "it can: {}; for more, map 0x6060, 0x6061 and the mode's target with `pdo.rx` and `pdo.tx`",
-                list(names)
-            );
-            p.add_hint(mode.span(), message, hint);
-            return None;
-        };
-        let wanted = Mode::from_code(wanted.code());
-        self.switched.push((index, wanted));
-        Some((index, wanted))
-    }
-
-    /// What is wrong in it has been said, and the machine does not run.
-    fn stop(&mut self, raw: &RawStop, p: &mut Problems<'_>) -> StopSetup {
-        let ways = [
-            ("ramp", StopBy::Ramp),
-            ("quick-stop", StopBy::QuickStop),
-            ("no-power", StopBy::NoPower),
-        ];
-        let by_drive = [
-            ("quick-stop", StopByDrive::QuickStop),
-            ("no-power", StopByDrive::NoPower),
-        ];
-        StopSetup {
-            others: one_of(raw.others.as_ref(), &ways, "others", p).unwrap_or_default(),
-            bus_lost: one_of(raw.bus_lost.as_ref(), &by_drive, "bus_lost", p).unwrap_or_default(),
-            emergency: raw
-                .emergency
-                .iter()
-                .filter_map(|condition| self.condition(condition, p))
-                .collect(),
-        }
-    }
-
     /// Whether something is so in a mode that the axis is in at some time.
     fn ever(&self, index: usize, so: impl Fn(Mode) -> bool) -> bool {
         let own = self.devices[index].axis.ok().map(|axis| axis.config.mode);
@@ -426,6 +362,8 @@ impl Checker<'_> {
             p.add_hint(name.span(), message, hint);
             return None;
         };
+        let place = (self.number.clone(), Some(index));
+        self.places.borrow_mut().insert(place, name.span());
         match self.devices[index].axis {
             Ok(axis) => Some((index, axis)),
             Err(true) => None,

@@ -161,7 +161,8 @@ fn a_good_file_becomes_a_machine() {
                 relative: false,
                 targets: vec![(0, 50.0)],
                 speed: 0.5,
-                ramp: 0.3
+                ramp: 0.3,
+                together: false,
             },
             Action::Velocity {
                 targets: vec![(1, 25.0)],
@@ -256,11 +257,20 @@ fn torques_in_nm_and_a() {
 }
 
 #[test]
-fn spinning_takes_no_more_than_a_quarter_of_the_cycle() {
-    let short = GOOD.replace("\"1ms\"", "\"200us\"");
-    assert_eq!(with_esi(&short).unwrap().bus.spin_ns, 50_000);
-    let said = short.replace("nic = \"sim\"", "spin = \"100us\"");
-    assert_eq!(with_esi(&said).unwrap().bus.spin_ns, 100_000);
+fn spinning_is_automatic_or_so_long() {
+    use crate::rt::margin::Spin;
+    for (said, spin) in [
+        ("repeat = 2", Spin::Auto),
+        ("spin = \"auto\"", Spin::Auto),
+        ("spin = \"100us\"", Spin::For(100_000)),
+        ("spin = \"0us\"", Spin::For(0)),
+        ("spin = 0", Spin::For(0)),
+    ] {
+        let text = GOOD
+            .replace("nic = \"sim\"", said)
+            .replace("[bus]\nrepeat = 2", "[bus]");
+        assert_eq!(with_esi(&text).unwrap().bus.spin, spin, "{said}");
+    }
 }
 
 #[test]
@@ -276,7 +286,8 @@ fn devices_are_sorted_and_steps_follow() {
             relative: false,
             targets: vec![(1, 50.0)],
             speed: 0.5,
-            ramp: 0.3
+            ramp: 0.3,
+            together: false,
         }
     );
 }
@@ -293,12 +304,17 @@ fn every_way_to_be_wrong() {
         ("nic = \"sim\"", "nic = \"a b\"", "cannot be a network interface", "enp3s0", "\"a b\""),
         ("nic = \"sim\"", "lost_frames = 0", "a whole number from 1 to 1000, found 0", "", "0"),
         ("nic = \"sim\"", "priority = true", "expected a whole number, found true or false", "", "true"),
-        ("nic = \"sim\"", "exchange = \"pipelined\"", "unknown exchange", "same-cycle", "\"pipelined\""),
+        ("nic = \"sim\"", "exchange = \"piped\"", "unknown exchange", "\"pipelined\"", "\"piped\""),
         ("nic = \"sim\"", "lost_frames = 100", "are 100 ms, but the drives' `watchdog` stops them after 100 ms", "lost_frames = 99", "100"),
         ("nic = \"sim\"", "watchdog = \"2ms\"", "`lost_frames` = 3 cycles of 1 ms", "lost_frames = 1", "\"2ms\""),
         ("\"1ms\"", "\"40ms\"", "are 120 ms", "lost_frames = 2", "\"40ms\""),
         ("nic = \"sim\"", "watchdog = \"1ms\"", "expires between two cycles", "", "\"1ms\""),
         ("nic = \"sim\"", "spin = \"2ms\"", "never sleeps", "", "\"2ms\""),
+        ("nic = \"sim\"", "spin = \"later\"", "\"later\" is not a duration", "", "later"),
+        ("nic = \"sim\"", "spin = 5", "a duration needs a unit", "\"5us\"", "5"),
+        ("nic = \"sim\"", "idle = \"awake\"", "not said which CPU", "cpu = 1", "\"awake\""),
+        ("nic = \"sim\"", "idle = \"never\"", "unknown idle `never`", "\"sleep\" and \"awake\"", "\"never\""),
+        ("nic = \"sim\"", "link = \"xyz\"", "unknown link `xyz`", "\"ring\" and \"packet\"", "\"xyz\""),
         ("[bus]", "[buss]", "unknown key `buss`", "did you mean `bus`?", "buss"),
         ("[[step]]", "[[stpe]]", "unknown key `stpe`", "did you mean `step`?", "stpe"),
         ("repeat = 2", "repeat = 0", "a whole number from 1", "", "0"),

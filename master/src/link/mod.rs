@@ -1,14 +1,29 @@
-//! What carries Ethernet frames. Nothing here knows EtherCAT beyond its EtherType.
+//! What carries Ethernet frames. Nothing here knows EtherCAT beyond its frame header.
+//!
+//! - [`interface`]: what a network interface must be;
+//! - [`ring`], [`packet`]: a network interface, through mapped memory or a plain socket;
+//! - `xdp`: a network interface before the network stack (feature `xdp`);
+//! - [`sift`]: which of an interface's frames are ours;
+//! - [`sim`]: the simulated bus in this process;
+//! - [`recorded`], [`capture`]: a recording around any of them;
+//! - [`port`]: ethercrab's two ends.
 
 use std::fmt;
 
 pub mod capture;
+pub mod interface;
 pub mod packet;
 pub mod port;
 pub mod recorded;
+pub mod ring;
+pub mod sift;
 pub mod sim;
+#[cfg(feature = "xdp")]
+pub mod xdp;
 
 pub use crate::clock::Nanos;
+pub use interface::{Concern, OpenError};
+pub use sift::LinkStats;
 
 /// Largest frame without FCS.
 pub const MAX_FRAME: usize = 1514;
@@ -27,10 +42,80 @@ pub trait Link: fmt::Debug + Send {
         None
     }
 
+    /// What has been seen beside the frames that were handed on. Not for the cycle: may ask the kernel.
+    fn stats(&mut self) -> LinkStats {
+        LinkStats::default()
+    }
+
     /// Ends a recording that goes on in this link, if there is one. Blocks.
     fn finish(self: Box<Self>) -> std::io::Result<Option<capture::RecordStats>> {
         Ok(None)
     }
+}
+
+/// How frames are taken from a network interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum BackEnd {
+    /// From mapped memory: [`ring::RingLink`].
+    #[default]
+    Ring,
+    /// By system calls: [`packet::PacketLink`].
+    Packet,
+    /// Before the network stack: `xdp::XdpLink`.
+    #[cfg(feature = "xdp")]
+    Xdp,
+}
+
+impl BackEnd {
+    /// Every one that this build has.
+    pub const ALL: &[Self] = &[
+        Self::Ring,
+        Self::Packet,
+        #[cfg(feature = "xdp")]
+        Self::Xdp,
+    ];
+
+    /// As the machine file has it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Ring => "ring",
+            Self::Packet => "packet",
+            #[cfg(feature = "xdp")]
+            Self::Xdp => "xdp",
+        }
+    }
+}
+
+impl fmt::Display for BackEnd {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Opens a network interface, and tells what about it will disturb the cycle. Without a ring a plain socket takes its place,
+/// which is told. Blocks and allocates.
+///
+/// # Errors
+/// Why the interface cannot be used.
+pub fn open(nic: &str, back_end: BackEnd) -> Result<(Box<dyn Link>, Vec<Concern>), OpenError> {
+    let mut concerns = interface::concerns(nic);
+    let link: Box<dyn Link> = match back_end {
+        BackEnd::Ring => match ring::RingLink::open(nic) {
+            Ok(link) => Box::new(link),
+            Err(OpenError::NoRing { nic, source }) => {
+                let link = packet::PacketLink::open(&nic)?;
+                let reason = source.to_string();
+                concerns.push(Concern::NoRing { nic, reason });
+                Box::new(link)
+            }
+            Err(error) => return Err(error),
+        },
+        BackEnd::Packet => Box::new(packet::PacketLink::open(nic)?),
+        #[cfg(feature = "xdp")]
+        BackEnd::Xdp => Box::new(xdp::XdpLink::open(nic)?),
+    };
+    Ok((link, concerns))
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

@@ -3,7 +3,7 @@
 use std::io;
 
 use super::capture::{Dir, RecordStats, Recorder};
-use super::{Link, LinkError, MAX_FRAME, Nanos};
+use super::{Link, LinkError, LinkStats, MAX_FRAME, Nanos};
 use crate::clock;
 
 /// Records what passes through.
@@ -44,6 +44,10 @@ impl Link for Recorded {
 
     fn next_arrival(&self) -> Option<Nanos> {
         self.inner.next_arrival()
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        self.inner.stats()
     }
 
     fn finish(self: Box<Self>) -> io::Result<Option<RecordStats>> {

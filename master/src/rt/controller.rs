@@ -3,7 +3,8 @@
 use ecaxis_axis::{AxisStatus, Command, Refused};
 
 use super::cycle::Signals;
-use super::cycle::orders::stops;
+use super::groups::{Group, admit};
+use super::guard::StopCause;
 use super::slot::AxisSlot;
 use crate::config::{AxisRef, InputRef, OutputRef};
 
@@ -24,14 +25,18 @@ impl std::fmt::Debug for dyn Controller {
 }
 
 /// The machine in one cycle, as a [`Controller`] sees it.
+///
+/// # Panics
+/// With references of another machine: where this one has no such axis or signal. That stops the machine like any other panic
+/// of the controller.
 #[derive(Debug)]
 pub struct Cycle<'a> {
     pub(super) number: u64,
     pub(super) dt_s: f64,
     pub(super) fresh: bool,
-    pub(super) stopping: bool,
     pub(super) guarded: bool,
     pub(super) axes: &'a mut [AxisSlot],
+    pub(super) groups: &'a mut [Group],
     pub(super) inputs: &'a [f64],
     pub(super) signals: &'a Signals,
     pub(super) outputs: &'a mut [u8],
@@ -51,7 +56,8 @@ impl Cycle<'_> {
         self.dt_s
     }
 
-    /// `false`: this cycle's frame was lost, and inputs and actual values are those of the cycle before.
+    /// `false`: frames of this cycle were lost, or a SubDevice is missing, and its inputs and actual values are those of a cycle before;
+    /// of an axis, `stale_cycles` of its status tells how long ago that was.
     #[must_use]
     pub fn fresh(&self) -> bool {
         self.fresh
@@ -66,7 +72,17 @@ impl Cycle<'_> {
     /// The machine is being stopped and takes no more motion.
     #[must_use]
     pub fn stopping(&self) -> bool {
-        self.stopping
+        self.groups
+            .first()
+            .is_some_and(|rest| rest.stop().is_some())
+    }
+
+    /// Why the group of an axis is stopped. It takes no motion until one of its axes is reset ([`Command::ResetFault`]) and none of them
+    /// has a fault, a trip or power any more; then it can be enabled again, unless the machine stops, too.
+    #[must_use]
+    pub fn stopped(&self, axis: AxisRef) -> Option<StopCause> {
+        let group = self.groups.get(self.axes[axis.0].group)?;
+        group.stop().map(|stop| stop.cause)
     }
 
     /// An axis with this cycle's actual values.
@@ -80,13 +96,12 @@ impl Cycle<'_> {
     /// # Errors
     /// Why it does not; nothing has changed then.
     pub fn command(&mut self, axis: AxisRef, command: Command) -> Result<(), Refused> {
-        if self.stopping && !stops(command) {
-            return Err(Refused::Stopping);
-        }
+        let slot = &mut self.axes[axis.0];
+        admit(self.groups, slot.group, command)?;
         if !self.guarded && command == Command::Enable {
             return Err(Refused::NotInOp);
         }
-        self.axes[axis.0].command(command)
+        slot.command(command)
     }
 
     /// Gives the set-point's position for this cycle; to be called in every cycle, or the axis decelerates and holds.
@@ -94,8 +109,11 @@ impl Cycle<'_> {
     /// # Errors
     /// It would step further or harder than the limits allow, or leave the range: the axis decelerates instead.
     pub fn set_point(&mut self, axis: AxisRef, position: f64) -> Result<(), Refused> {
-        if self.stopping {
+        if self.stopping() {
             return Err(Refused::Stopping);
+        }
+        if self.stopped(axis).is_some() {
+            return Err(Refused::GroupStopped);
         }
         self.axes[axis.0].axis.set_point(position)
     }

@@ -2,32 +2,30 @@
 
 use std::panic::AssertUnwindSafe;
 
+use ecaxis_axis::State;
 use ecaxis_axis::setpoint::Table;
-use ecaxis_axis::{Command, State};
 
 use super::controller::{self, Controller};
-use super::exchange::{Answer, Exchange, Received};
-use super::feed::{self, FeedState};
+use super::exchange::{Answer, Diagnosis, Exchange};
+use super::feed::FeedState;
+use super::groups::{Group, GroupStatus};
 use super::guard::{Guard, StopCause};
 use super::handover::{Event, PhaseStatus, RtEnd, Snapshot};
 use super::image::SignalBits;
+use super::journal::Note;
+use super::margin::{Margin, Spin};
 use super::phase::Phase;
 use super::slot::AxisSlot;
 use super::stats::Stats;
-pub(in crate::rt) mod orders;
 
-use orders::quick_stop;
+mod act;
+mod orders;
+mod wire;
 
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Condition, StopSetup};
 use crate::link::port::Port;
-use crate::link::{Link, LinkError, MAX_FRAME};
-
-/// Frames taken in a row without looking at the clock; more than a cycle and a mailbox ever bring.
-const FRAMES_AT_ONCE: usize = 32;
-
-/// An axis at rest settles on its target this long before its power is taken away.
-const SETTLE: Nanos = 100_000_000;
+use crate::link::{Link, MAX_FRAME};
 
 /// The process data that the program reads and sets.
 #[derive(Debug, Clone, Default)]
@@ -40,11 +38,10 @@ pub struct Signals {
 #[derive(Debug, Clone, Copy)]
 pub struct Timing {
     pub cycle_ns: u64,
-    /// Spinning before the release; the rest is slept.
-    pub spin_ns: u64,
-    /// How long the slowest axis may take from full speed to rest. One that is not at rest this long
-    /// after the machine began to stop is left to its drive's own quick stop.
-    pub stop_patience_ns: u64,
+    /// A clock farther from the reference is told of.
+    pub clock_window_ns: u64,
+    /// Before the release; the rest is slept.
+    pub spin: Spin,
 }
 
 /// Everything that a cycle touches.
@@ -56,22 +53,30 @@ pub struct Engine {
     port: Port,
     exchange: Exchange,
     axes: Vec<AxisSlot>,
+    /// The first is the machine's: what no other holds.
+    groups: Vec<Group>,
     signals: Signals,
-    /// Of the last cycle with fresh inputs.
+    /// Each of the last cycle in which its group's were fresh.
     inputs: Vec<f64>,
     controller: Option<Box<dyn Controller>>,
+    /// The controller has; it is not called again.
+    panicked: bool,
     tables: Box<[Table]>,
     stop_setup: StopSetup,
     finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
+    /// As last noted.
+    al_status: Option<(u8, u16)>,
+    /// Of each SubDevice, whether its clock has been told of.
+    clocks_off: Vec<bool>,
     guard: Guard,
     guarding: bool,
     stats: Stats,
     end: RtEnd,
     next: Nanos,
-    stopping: Option<(StopCause, Nanos)>,
-    severity: u8,
+    started: Nanos,
+    margin: Margin,
     answer: Answer,
     events_lost: u64,
     orders_taken: u64,
@@ -88,6 +93,8 @@ pub struct Parts {
     pub port: Port,
     pub exchange: Exchange,
     pub axes: Vec<AxisSlot>,
+    /// At least one.
+    pub groups: Vec<Group>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
     pub tables: Box<[Table]>,
@@ -104,6 +111,12 @@ pub struct Remains {
     pub port: Port,
     pub axes: Vec<AxisSlot>,
     pub stats: Stats,
+    /// Spinning before a release, at the end.
+    pub spin_ns: Nanos,
+    /// What the diagnostic slot has found, in the order of the exchange's members.
+    pub diagnoses: Vec<Diagnosis>,
+    /// The first cycle was due then.
+    pub started: Nanos,
 }
 
 impl Engine {
@@ -111,6 +124,8 @@ impl Engine {
     #[must_use]
     #[allow(clippy::disallowed_macros, reason = "prepares")]
     pub fn new(parts: Parts) -> Self {
+        let started = clock::now() + parts.timing.cycle_ns;
+        let clocks_off = vec![false; parts.exchange.diagnoses().len()];
         Self {
             clock: parts.clock,
             timing: parts.timing,
@@ -118,21 +133,25 @@ impl Engine {
             port: parts.port,
             exchange: parts.exchange,
             axes: parts.axes,
+            groups: parts.groups,
             inputs: vec![0.0; parts.signals.inputs.len()],
             signals: parts.signals,
             controller: parts.controller,
+            panicked: false,
             tables: parts.tables,
             stop_setup: parts.stop,
             finished: false,
             phase: parts.phase,
             phase_error: 0,
+            al_status: None,
+            clocks_off,
             guard: parts.guard,
             guarding: false,
             stats: Stats::default(),
             end: parts.end,
-            next: clock::now() + parts.timing.cycle_ns,
-            stopping: None,
-            severity: 0,
+            next: started,
+            started,
+            margin: Margin::new(parts.timing.spin, parts.timing.cycle_ns),
             answer: Answer::default(),
             events_lost: 0,
             orders_taken: 0,
@@ -147,36 +166,55 @@ impl Engine {
         self.halted
     }
 
+    /// Measures from here on. The time that this takes is not counted as an overrun.
+    pub fn measure_anew(&mut self) {
+        self.stats.clear();
+        let now = clock::now();
+        while self.next <= now {
+            self.next += self.timing.cycle_ns;
+        }
+    }
+
     #[must_use]
+    #[allow(clippy::disallowed_methods, reason = "the loop has ended")]
     pub fn into_remains(self) -> Remains {
         Remains {
             link: self.link,
             port: self.port,
             axes: self.axes,
             stats: self.stats,
+            spin_ns: self.margin.get(),
+            diagnoses: self.exchange.diagnoses().to_vec(),
+            started: self.started,
         }
     }
 
     /// One cycle. RT: blocks on the clock and the wire only; O(image + axes).
     pub fn cycle(&mut self) {
-        self.clock.sleep_until(self.next, self.timing.spin_ns);
+        let slept = self.clock.sleep_until(self.next, self.margin.get());
         let woke = clock::now();
         let lateness = woke.saturating_sub(self.next);
         self.stats.lateness.record(lateness);
         self.stats.counters.cycles += 1;
+        if self.guarding && lateness > self.timing.cycle_ns / 4 {
+            self.jot(Note::WokeLate(lateness));
+        }
 
-        self.send();
+        self.send(lateness);
+        self.margin.slept(slept);
+        if let Some(late) = slept {
+            self.stats.slept.record(late);
+        }
         self.receive(woke);
         self.answer = self.exchange.answer();
         self.count();
-        let adjust = self.follow_clock(lateness);
-        if self.guarding
-            && let Some(cause) = self.guard.check(&self.answer)
-        {
-            self.stop(cause);
+        let adjust = self.follow_clock();
+        if self.guarding {
+            self.watch_bus();
         }
 
         self.observe();
+        self.release();
         self.take_orders();
         self.call_controller();
         self.act();
@@ -186,95 +224,16 @@ impl Engine {
         self.stats.work.record(clock::now().saturating_sub(woke));
     }
 
-    fn send(&mut self) {
-        let sent = self.exchange.send(self.link.as_mut());
-        self.note(sent);
-        // Mailbox frames follow the cyclic ones, one a cycle.
-        let sent = self.port.send(self.link.as_mut(), 1).map(|_| ());
-        self.note(sent);
-    }
-
-    fn note(&mut self, result: Result<(), LinkError>) {
-        if result.is_err() {
-            self.stats.counters.link_errors += 1;
-        }
-    }
-
-    /// Until the cyclic frames are back or three quarters of the cycle are over.
-    fn receive(&mut self, woke: Nanos) {
-        let released = self.next;
-        let quarter = self.timing.cycle_ns / 4;
-        // A thread that woke late still gives its frame time to come back.
-        let deadline = (released + 3 * quarter).max(woke + quarter);
-        loop {
-            for _ in 0..FRAMES_AT_ONCE {
-                match self.link.recv(&mut self.buf) {
-                    Ok(Some(len)) => self.sort(len),
-                    Ok(None) => break,
-                    Err(_) => {
-                        self.stats.counters.link_errors += 1;
-                        break;
-                    }
-                }
-            }
-            let now = clock::now();
-            if self.exchange.complete() {
-                self.stats.round_trip.record(now.saturating_sub(released));
-                return;
-            }
-            if now >= deadline {
-                return;
-            }
-            self.clock.relax(
-                self.link
-                    .next_arrival()
-                    .map_or(deadline, |at| at.min(deadline)),
-            );
-        }
-    }
-
-    fn sort(&mut self, len: usize) {
-        let frame = &self.buf[..len];
-        match self.exchange.receive(frame) {
-            Received::Current => {}
-            Received::Late => self.stats.counters.late_frames += 1,
-            Received::Foreign => self.port.receive(frame),
-        }
-    }
-
-    fn count(&mut self) {
-        if self.guarding {
-            if !self.answer.complete {
-                self.stats.counters.lost_frames += 1;
-            } else if !self.answer.inputs_fresh {
-                self.stats.counters.wkc_errors += 1;
+    fn watch_bus(&mut self) {
+        self.guard.look(&self.answer, self.exchange.shares());
+        for group in 0..self.groups.len() {
+            if let Some(cause) = self.guard.lost(group) {
+                self.stop(Some(group), cause);
             }
         }
-        self.stats.counters.refused_answers = self.port.refused;
-    }
-
-    /// Nanoseconds to add to the next cycle.
-    fn follow_clock(&mut self, lateness: Nanos) -> i64 {
-        let Some(phase) = &mut self.phase else {
-            return 0;
-        };
-        let Some(system_time) = self.answer.system_time else {
-            return phase.holdover();
-        };
-        let before = phase.locked();
-        let step = phase.update(system_time, lateness);
-        let now_locked = phase.locked();
-        self.phase_error = step.error;
-        if now_locked {
-            self.stats.phase.record(step.error.unsigned_abs());
+        if let Some(cause) = self.guard.left_op() {
+            self.stop(None, cause);
         }
-        let cycle = self.stats.counters.cycles;
-        match (before, now_locked) {
-            (false, true) => self.report(Event::PhaseLocked { cycle }),
-            (true, false) => self.report(Event::PhaseLost { cycle }),
-            _ => {}
-        }
-        step.adjust
     }
 
     fn without_power(&self) -> bool {
@@ -285,42 +244,40 @@ impl Engine {
 
     fn observe(&mut self) {
         let dt = self.timing.cycle_ns as f64 * 1e-9;
-        let fresh = self.answer.inputs_fresh && self.answer.complete;
-        let image = self.exchange.inputs();
+        let (image, shares) = (self.exchange.inputs(), self.exchange.shares());
         for slot in &mut self.axes {
+            let fresh = shares.get(slot.group).is_some_and(|share| share.fresh);
             let inputs = slot.read(image, fresh);
             slot.axis.observe(&inputs, dt);
             slot.acted = false;
         }
-        if fresh {
-            for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
-                *to = signal.get(image);
-            }
-            let inputs = &self.inputs;
-            // What is no number says nothing about what it stands for.
-            let pressed = |c: &Condition| {
-                inputs
-                    .get(c.input)
-                    .is_none_or(|n| n.is_nan() || c.holds(*n))
-            };
-            if self.guarding && self.stop_setup.emergency.iter().any(pressed) {
-                self.stop(StopCause::EmergencyStop);
-            }
+        for (to, signal) in self.inputs.iter_mut().zip(&self.signals.inputs) {
+            *to = signal.get(image);
+        }
+        let inputs = &self.inputs;
+        // What is no number says nothing about what it stands for.
+        let pressed = |c: &Condition| {
+            inputs
+                .get(c.input)
+                .is_none_or(|n| n.is_nan() || c.holds(*n))
+        };
+        if self.guarding && self.stop_setup.emergency.iter().any(pressed) {
+            self.stop(None, StopCause::EmergencyStop);
         }
     }
 
     /// The user's own code. What it has done when it panics is kept: the axes guard themselves.
     fn call_controller(&mut self) {
-        let Some(controller) = &mut self.controller else {
+        let Some(controller) = self.controller.as_mut().filter(|_| !self.panicked) else {
             return;
         };
         let mut view = controller::Cycle {
             number: self.stats.counters.cycles,
             dt_s: self.timing.cycle_ns as f64 * 1e-9,
-            fresh: self.answer.inputs_fresh && self.answer.complete,
-            stopping: self.stopping.is_some(),
+            fresh: self.answer.inputs_fresh,
             guarded: self.guarding,
             axes: &mut self.axes,
+            groups: &mut self.groups,
             inputs: &self.inputs,
             signals: &self.signals,
             outputs: self.exchange.outputs_mut(),
@@ -328,87 +285,14 @@ impl Engine {
         };
         let call = AssertUnwindSafe(|| controller.cycle(&mut view));
         if std::panic::catch_unwind(call).is_err() {
-            self.controller = None;
-            self.stop(StopCause::Controller);
-        }
-    }
-
-    /// Masters before those that follow them, so that a follower's set-point is of the same cycle.
-    fn act(&mut self) {
-        let mut cause = None;
-        // Gears form no rings, so every round acts on one axis at least.
-        for _ in 0..self.axes.len() {
-            let mut waiting = false;
-            for index in 0..self.axes.len() {
-                let Some(slot) = self.axes.get(index) else {
-                    continue;
-                };
-                if slot.acted {
-                    continue;
-                }
-                let followed = slot.feed.master().and_then(|(m, _)| self.axes.get(m));
-                if followed.is_some_and(|master| !master.acted) {
-                    waiting = true;
-                } else {
-                    let found = self.act_on(index);
-                    cause = cause.or(found);
-                }
-            }
-            if !waiting {
-                break;
-            }
-        }
-        if let Some(cause) = cause {
-            self.stop(cause);
-        }
-    }
-
-    /// One axis; what of it has to stop the machine.
-    fn act_on(&mut self, index: usize) -> Option<StopCause> {
-        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
-        let out_of_patience = self.stopping.is_some_and(|(_, since)| {
-            self.next.saturating_sub(since) > self.timing.stop_patience_ns
-        });
-        let followed = self.axes.get(index)?.feed.master();
-        let master = followed.and_then(|(master, actual)| {
-            let status = self.axes.get(master)?.axis.status();
-            feed::master_motion(&status, actual)
-        });
-        let slot = self.axes.get_mut(index)?;
-        slot.acted = true;
-        let lost = slot.feed.give(&mut slot.axis, &self.tables, master, dt_s);
-        let outputs = slot.axis.act();
-        slot.write(self.exchange.outputs_mut(), &outputs);
-        let status = slot.axis.status();
-        slot.armed |= slot.ordered && status.fault.is_none();
-        if status.enabled {
-            slot.largest_following_error =
-                slot.largest_following_error.max(status.max_following_error);
-            slot.last_enabled = Some(status);
-        }
-        if self.stopping.is_some() {
-            let at_rest = status.at_rest && !status.moving;
-            slot.rested = if at_rest {
-                slot.rested + self.timing.cycle_ns
-            } else {
-                0
-            };
-            if status.enabled && out_of_patience {
-                quick_stop(&mut slot.axis);
-            } else if status.enabled && slot.rested >= SETTLE {
-                let _ = slot.axis.command(Command::Disable);
-            }
-            return None;
-        }
-        match (status.fault, status.trip) {
-            (Some(_), _) if slot.armed => Some(StopCause::DriveFault { axis: index }),
-            (None, Some(trip)) if slot.armed => Some(StopCause::Trip { axis: index, trip }),
-            _ => lost.then_some(StopCause::FollowLost { axis: index }),
+            // Dropped when the loop has ended: that may free, and panic again.
+            self.panicked = true;
+            self.stop(None, StopCause::Controller);
         }
     }
 
     fn publish(&mut self, woke: Nanos) {
-        let stopped = self.stopping.is_some() && self.without_power();
+        let stopping = self.stopping();
         let snapshot = self.end.snapshots.input_buffer_mut();
         snapshot.time = woke;
         snapshot.counters = self.stats.counters;
@@ -430,8 +314,21 @@ impl Engine {
         for (to, diagnosis) in snapshot.diagnoses.iter_mut().zip(self.exchange.diagnoses()) {
             *to = *diagnosis;
         }
-        snapshot.stopping = self.stopping.map(|(cause, _)| cause);
-        snapshot.stopped = stopped;
+        snapshot.stopping = stopping.map(|stop| stop.cause);
+        let groups = self.groups.iter().zip(self.exchange.shares());
+        for (to, (group, share)) in snapshot.groups.iter_mut().zip(groups) {
+            *to = GroupStatus {
+                stopped: group.stop().map(|stop| stop.cause),
+                stops: group.stops,
+                fresh: share.fresh,
+                powered: false,
+            };
+        }
+        for slot in &self.axes {
+            if let Some(group) = snapshot.groups.get_mut(slot.group) {
+                group.powered |= has_power(slot.axis.status().state);
+            }
+        }
         snapshot.events_lost = self.events_lost;
         snapshot.orders_taken = self.orders_taken;
         self.end.snapshots.publish();
@@ -444,11 +341,18 @@ impl Engine {
         if now > self.next {
             let missed = (now - self.next) / self.timing.cycle_ns + 1;
             self.stats.counters.overruns += missed;
+            self.jot(Note::Overrun(missed));
             self.next += missed * self.timing.cycle_ns;
         }
     }
 
+    fn jot(&mut self, note: Note) {
+        let cycle = self.stats.counters.cycles;
+        self.stats.journal.note(cycle, self.next, note);
+    }
+
     fn report(&mut self, event: Event) {
+        self.jot(Note::Told(event));
         if self.end.events.push(event).is_err() {
             self.events_lost += 1;
         }
@@ -464,14 +368,19 @@ pub fn has_power(state: State) -> bool {
     )
 }
 
-/// The snapshot before the first cycle, with room for `axes` and `devices`.
+/// The snapshot before the first cycle, with room for all there is.
 #[must_use]
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
     reason = "prepares"
 )]
-pub fn first_snapshot(axes: &[AxisSlot], signals: &Signals, devices: usize) -> Snapshot {
+pub fn first_snapshot(
+    axes: &[AxisSlot],
+    groups: usize,
+    signals: &Signals,
+    devices: usize,
+) -> Snapshot {
     Snapshot {
         time: clock::now(),
         counters: super::stats::Counters::default(),
@@ -482,9 +391,9 @@ pub fn first_snapshot(axes: &[AxisSlot], signals: &Signals, devices: usize) -> S
         feeds: vec![FeedState::None; axes.len()],
         inputs: vec![0.0; signals.inputs.len()],
         finished: false,
-        diagnoses: vec![super::exchange::Diagnosis::default(); devices],
+        diagnoses: vec![Diagnosis::default(); devices],
         stopping: None,
-        stopped: false,
+        groups: vec![GroupStatus::default(); groups],
         events_lost: 0,
         orders_taken: 0,
     }

@@ -1,106 +1,75 @@
-//! The frames of a cycle: FRMW of the system time, LRW of the process data, one BRD of AL status
-//! and one diagnostic read; built once, refilled every cycle, sent back to back.
+//! The frames of a cycle: FRMW of the system time, an LRW of each group's process data (LWR and LRD where a SubDevice
+//! knows no LRW), one BRD of AL status and one diagnostic read; built once, refilled every cycle, sent back to back.
 //!
 //! Ours and ethercrab's frames are told apart by the last byte of the source MAC, because
 //! ethercrab uses all 256 datagram indices. The byte before it numbers the frames of a cycle, and
 //! the datagram index numbers the cycle, so that late and repeated frames are recognised.
 
-use super::image::ImagePlan;
+use super::image::{Access, ImagePlan};
 use super::phase::ClockPlan;
+use crate::clock::Nanos;
 use crate::link::port::ETHERCAT;
-use crate::link::{Link, LinkError};
+use crate::link::{Link, LinkError, MAX_FRAME};
 
-const MAC_TAIL: u8 = 0x20;
-const ETHERNET_HEADER: usize = 14;
-const FIRST_DATAGRAM: usize = 16;
-const DATAGRAM_HEADER: usize = 10;
-const WKC: usize = 2;
+mod flight;
+mod frame;
+mod probe;
+
+use flight::Flight;
+use frame::{DATAGRAM_HEADER, Frame, MAC_TAIL, Place, WKC, clear_wkc, push, write_header};
+pub use probe::{Diagnosis, ErrorCounters, Probe};
 
 const FPRD: u8 = 4;
 const BRD: u8 = 7;
+const LRD: u8 = 10;
+const LWR: u8 = 11;
 const LRW: u8 = 12;
 const FRMW: u8 = 14;
 
 const SYSTEM_TIME: u16 = 0x0910;
 const AL_STATUS: u16 = 0x0130;
 
-/// Where a datagram lies in its frame.
 #[derive(Debug, Clone, Copy)]
-struct Place {
-    frame: usize,
-    /// Offset of the datagram's header.
-    offset: usize,
-    len: usize,
-}
-
-impl Place {
-    fn data(self) -> std::ops::Range<usize> {
-        let start = self.offset + DATAGRAM_HEADER;
-        start..start + self.len
-    }
-
-    fn end(self) -> usize {
-        self.offset + DATAGRAM_HEADER + self.len + WKC
-    }
-
-    fn wkc(self, frame: &[u8]) -> u16 {
-        let at = self.offset + DATAGRAM_HEADER + self.len;
-        match frame.get(at..at + WKC) {
-            Some(&[low, high]) => u16::from_le_bytes([low, high]),
-            _ => 0,
-        }
-    }
-}
-
-#[derive(Debug)]
-struct Frame {
-    /// As it will be sent.
-    bytes: Vec<u8>,
-    answered: bool,
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Lrw {
+struct ProcessDatagram {
     place: Place,
+    access: Access,
+    group: usize,
     /// Offset in the image.
     image: usize,
     expected_wkc: u16,
-    /// Working counter of this cycle's answer.
-    wkc: Option<u16>,
 }
 
-/// What the diagnostic slot reads in turn of every SubDevice.
+/// A SubDevice as the exchange sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Probe {
-    /// AL status and AL status code, 0x0130–0x0135.
-    AlStatus,
-    /// System time difference, 0x092C.
-    ClockDifference,
-    /// Rx error counters of the four ports, 0x0300–0x0307.
-    RxErrors,
+pub struct Member {
+    pub station: u16,
+    /// It takes the system time.
+    pub clock: bool,
 }
 
-impl Probe {
-    const ALL: [Self; 3] = [Self::AlStatus, Self::ClockDifference, Self::RxErrors];
+/// What came back of one group's process data in a cycle.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Share {
+    /// Every frame with a part of it came back; for a group without process data, the first.
+    pub answered: bool,
+    /// And every working counter was as expected: its part of the input image is this cycle's.
+    pub fresh: bool,
+    /// Sum of the working counters seen, of those expected.
+    pub wkc: (u16, u16),
+    /// SubDevices that take the system time.
+    clocks: u16,
+}
 
-    fn register_and_len(self) -> (u16, usize) {
-        match self {
-            Self::AlStatus => (0x0130, 6),
-            Self::ClockDifference => (0x092c, 4),
-            Self::RxErrors => (0x0300, 8),
+#[cfg(test)]
+impl Share {
+    pub(super) const fn new(answered: bool, fresh: bool, wkc: (u16, u16)) -> Self {
+        Self {
+            answered,
+            fresh,
+            wkc,
+            clocks: 0,
         }
     }
-}
-
-/// The last that the diagnostic slot has read of one SubDevice.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Diagnosis {
-    pub al_status: u8,
-    pub al_code: u16,
-    /// Own clock minus reference, nanoseconds.
-    pub clock_difference: i32,
-    /// Invalid frames and physical errors per port, as the registers hold them.
-    pub rx_errors: [u8; 8],
 }
 
 /// What a received frame turned out to be.
@@ -119,7 +88,7 @@ pub enum Received {
 pub struct Answer {
     /// Every frame came back.
     pub complete: bool,
-    /// Every working counter was as expected; the input image is this cycle's.
+    /// Every working counter was as expected; the whole input image is this cycle's.
     pub inputs_fresh: bool,
     /// Sum of the working counters seen, of those expected.
     pub wkc: (u16, u16),
@@ -127,89 +96,125 @@ pub struct Answer {
     pub system_time: Option<u64>,
     /// AL status of all SubDevices or-ed together, and how many answered.
     pub al_status: Option<(u8, u16)>,
+    /// How long after their planned release these frames were sent.
+    pub sent_late: Nanos,
+}
+
+/// When answers are taken.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Mode {
+    /// In the cycle that asks; the thread waits for them.
+    #[default]
+    SameCycle,
+    /// In the next; they have long arrived, and nobody waits.
+    Pipelined,
+}
+
+impl Mode {
+    /// Cycles whose frames are under way at once.
+    #[must_use]
+    pub const fn flights(self) -> u8 {
+        match self {
+            Self::SameCycle => 1,
+            Self::Pipelined => 2,
+        }
+    }
 }
 
 /// The exchange of process data.
 #[derive(Debug)]
 pub struct Exchange {
-    frames: Vec<Frame>,
+    /// The one that is staged or was sent in this cycle, and those sent before.
+    flights: Vec<Flight>,
+    staged: usize,
     clock: Option<Place>,
-    /// Working counter of the FRMW if every clock is there.
-    clock_wkc: u16,
+    /// Index of the reference clock among the members.
+    reference: usize,
     /// What a clock is set to if the reference before it does not answer: its own time, nearly.
     expected_time: u64,
     cycle_ns: u64,
-    lrws: Vec<Lrw>,
+    process_data: Vec<ProcessDatagram>,
     al_status: Place,
     probe_at: usize,
-    stations: Vec<u16>,
+    members: Vec<Member>,
+    shares: Vec<Share>,
     diagnoses: Vec<Diagnosis>,
-    /// Which device and probe the staged diagnostic datagram reads.
+    /// Which device and probe the next diagnostic datagram reads.
     probe: (usize, usize),
     cycle: u8,
     outputs: Vec<u8>,
     inputs: Vec<u8>,
-    system_time: Option<u64>,
-    al: Option<(u8, u16)>,
 }
 
 impl Exchange {
-    /// Builds the frames. `stations` in the order in which devices are reported.
+    /// Builds the frames. `members` are the plan's devices, in the same order; they are reported in it.
     #[must_use]
     #[allow(
         clippy::disallowed_methods,
         clippy::disallowed_macros,
         reason = "prepares"
     )]
-    pub fn new(plan: &ImagePlan, clock: Option<&ClockPlan>, stations: &[u16]) -> Self {
-        let mut frames = vec![new_frame(0)];
-        let place = clock.map(|clock| {
-            push(
-                &mut frames[0],
-                0,
-                FRMW,
-                u32::from(SYSTEM_TIME) << 16 | u32::from(clock.reference),
-                8,
-            )
-        });
-        let mut lrws: Vec<Lrw> = Vec::with_capacity(plan.datagrams.len());
-        for (i, datagram) in plan.datagrams.iter().enumerate() {
-            if i > 0 {
-                frames.push(new_frame(u8::try_from(i).unwrap_or(u8::MAX)));
-            }
-            lrws.push(Lrw {
-                place: push(&mut frames[i], i, LRW, datagram.logical, datagram.len),
-                image: datagram.offset,
-                expected_wkc: datagram.expected_wkc,
-                wkc: None,
-            });
+    pub fn new(
+        plan: &ImagePlan,
+        clock: Option<&ClockPlan>,
+        members: &[Member],
+        mode: Mode,
+    ) -> Self {
+        let mut places = None;
+        let flights = (0..mode.flights())
+            .map(|_| {
+                let mut flight = Flight::new(plan.frames());
+                places = Some(Places::fill(&mut flight.frames, plan, clock));
+                flight
+            })
+            .collect();
+        let Some(places) = places else {
+            unreachable!("there is a flight in every mode");
+        };
+        // The first group is there without members, too.
+        let groups = plan.groups.iter().max().map_or(1, |last| last + 1);
+        let mut shares = vec![Share::default(); groups];
+        for (member, &group) in members.iter().zip(&plan.groups) {
+            shares[group].clocks += u16::from(member.clock);
         }
-        let al_status = push(&mut frames[0], 0, BRD, u32::from(AL_STATUS) << 16, 2);
-        let probe_at = frames[0].bytes.len();
+        for datagram in &places.process_data {
+            shares[datagram.group].wkc.1 += datagram.expected_wkc;
+        }
+        let reference = clock.and_then(|clock| {
+            members
+                .iter()
+                .position(|member| member.station == clock.reference)
+        });
         let mut exchange = Self {
-            frames,
-            clock: place,
-            clock_wkc: clock.map_or(0, |clock| clock.clocks),
+            flights,
+            staged: 0,
+            clock: places.clock,
+            reference: reference.unwrap_or(0),
             expected_time: 0,
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
-            lrws,
-            al_status,
-            probe_at,
-            stations: stations.to_vec(),
-            diagnoses: vec![Diagnosis::default(); stations.len()],
+            process_data: places.process_data,
+            al_status: places.al_status,
+            probe_at: places.probe_at,
+            members: members.to_vec(),
+            shares,
+            diagnoses: vec![Diagnosis::default(); members.len()],
             probe: (0, 0),
             cycle: 0,
             outputs: vec![0; plan.len],
             inputs: vec![0; plan.len],
-            system_time: None,
-            al: None,
         };
-        // Room for the longest probe, so that staging never grows the buffer.
-        exchange.frames[0]
-            .bytes
-            .reserve_exact(DATAGRAM_HEADER + 8 + WKC);
         exchange.stage();
         exchange
+    }
+
+    /// When answers are taken.
+    #[must_use]
+    pub fn mode(&self) -> Mode {
+        if self.flights.len() == 1 {
+            Mode::SameCycle
+        } else {
+            Mode::Pipelined
+        }
     }
 
     /// Outputs of the next cycle.
@@ -223,262 +228,245 @@ impl Exchange {
         &self.inputs
     }
 
-    /// What the diagnostic slot has found, in the order of `stations`.
+    /// What came back of each group's process data, as of the last [`Exchange::answer`].
+    #[must_use]
+    pub fn shares(&self) -> &[Share] {
+        &self.shares
+    }
+
+    /// What the diagnostic slot has found, in the order of the members.
     #[must_use]
     pub fn diagnoses(&self) -> &[Diagnosis] {
         &self.diagnoses
     }
 
+    /// Whose clock difference the answers of this cycle have brought.
+    #[must_use]
+    pub fn clock_read(&self) -> Option<(usize, i32)> {
+        let flight = self.flights.get(self.due())?;
+        let (device, probe) = flight.probe;
+        flight.answer(0)?;
+        let found = self.diagnoses.get(device)?;
+        let read = Probe::ALL.get(probe) == Some(&Probe::ClockDifference) && found.answers;
+        read.then_some((device, found.clock_difference))
+    }
+
+    /// The flight whose answers this cycle takes: the oldest.
+    fn due(&self) -> usize {
+        (self.staged + 1) % self.flights.len()
+    }
+
     /// Fills the frames of the next cycle. RT: O(image).
     pub fn stage(&mut self) {
         self.cycle = self.cycle.wrapping_add(1);
-        for lrw in &mut self.lrws {
-            lrw.wkc = None;
-            let frame = &mut self.frames[lrw.place.frame].bytes;
-            let data = &mut frame[lrw.place.data()];
-            data.copy_from_slice(&self.outputs[lrw.image..lrw.image + lrw.place.len]);
-            clear_wkc(frame, lrw.place);
+        self.staged = self.due();
+        let time = self.expected_time;
+        let Some(flight) = self.flights.get_mut(self.staged) else {
+            return;
+        };
+        for datagram in &self.process_data {
+            let place = datagram.place;
+            let frame = &mut flight.frames[place.frame].bytes;
+            if datagram.access != Access::Inputs {
+                let from = datagram.image..datagram.image + place.len;
+                frame[place.data()].copy_from_slice(&self.outputs[from]);
+            }
+            clear_wkc(frame, place);
         }
-        self.stage_probe();
-        self.expected_time = self
-            .system_time
-            .unwrap_or(self.expected_time)
-            .wrapping_add(self.cycle_ns);
-        let first = &mut self.frames[0].bytes;
+        let first = &mut flight.frames[0].bytes;
+        flight.probe = self.probe;
+        if let Some(member) = self.members.get(self.probe.0) {
+            // The last datagram of its frame, so its length may change; within the capacity of the frame.
+            let (register, len) = Probe::ALL[self.probe.1].register_and_len();
+            first.truncate(self.probe_at);
+            first.resize(self.probe_at + DATAGRAM_HEADER + len + WKC, 0);
+            let address = u32::from(register) << 16 | u32::from(member.station);
+            write_header(first, self.probe_at, FPRD, address, len);
+            let next = self.probe.0 + 1;
+            self.probe = if next < self.members.len() {
+                (next, self.probe.1)
+            } else {
+                (0, (self.probe.1 + 1) % Probe::ALL.len())
+            };
+        }
         if let Some(place) = self.clock {
-            first[place.data()].copy_from_slice(&self.expected_time.to_le_bytes());
+            first[place.data()].copy_from_slice(&time.to_le_bytes());
             clear_wkc(first, place);
         }
         first[self.al_status.data()].fill(0);
         clear_wkc(first, self.al_status);
-        self.system_time = None;
-        self.al = None;
-        for frame in &mut self.frames {
-            frame.answered = false;
-            number(&mut frame.bytes, self.cycle);
+        flight.stage(self.cycle);
+        self.expected_time = time.wrapping_add(self.cycle_ns);
+    }
+
+    /// Sends all frames of the cycle back to back, `late` after their planned release. RT: blocks on the wire only.
+    pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
+        match self.flights.get_mut(self.staged) {
+            Some(flight) => flight.send(link, late),
+            None => Ok(()),
         }
     }
 
-    /// The diagnostic datagram is the last of the first frame, so its length may change.
-    fn stage_probe(&mut self) {
-        let Some(&station) = self.stations.get(self.probe.0) else {
-            return;
-        };
-        let (register, len) = Probe::ALL[self.probe.1].register_and_len();
-        let frame = &mut self.frames[0].bytes;
-        frame.truncate(self.probe_at);
-        // Within the capacity that `new` has reserved.
-        frame.resize(self.probe_at + DATAGRAM_HEADER + len + WKC, 0);
-        let address = u32::from(register) << 16 | u32::from(station);
-        write_header(frame, self.probe_at, FPRD, address, len);
-    }
-
-    /// Sends all frames of the cycle back to back. RT: blocks on the wire only.
-    pub fn send(&self, link: &mut dyn Link) -> Result<(), LinkError> {
-        for frame in &self.frames {
-            link.send(&frame.bytes)?;
-        }
-        Ok(())
-    }
-
-    /// Takes an answer in. RT: O(frame).
+    /// Keeps an answer until its flight is due. RT: O(frame).
     pub fn receive(&mut self, frame: &[u8]) -> Received {
         if frame.get(12..14) != Some(&ETHERCAT[..]) || frame.get(11) != Some(&MAC_TAIL) {
             return Received::Foreign;
         }
         let number = frame.get(10).map_or(usize::MAX, |n| usize::from(*n));
-        let Some(sent) = self.frames.get_mut(number) else {
+        let frames = self.flights.first().map_or(0, |f| f.frames.len());
+        if number >= frames {
             return Received::Foreign;
-        };
-        if sent.answered
-            || frame.get(FIRST_DATAGRAM + 1) != Some(&self.cycle)
-            || !same_headers(&sent.bytes, frame)
-        {
-            return Received::Late;
         }
-        sent.answered = true;
-        for lrw in self.lrws.iter_mut().filter(|lrw| lrw.place.frame == number) {
-            let wkc = lrw.place.wkc(frame);
-            lrw.wkc = Some(wkc);
-            if wkc == lrw.expected_wkc
-                && let Some(data) = frame.get(lrw.place.data())
-            {
-                self.inputs[lrw.image..lrw.image + data.len()].copy_from_slice(data);
-            }
-        }
-        if number == 0 {
-            let clock = self.clock.filter(|p| p.wkc(frame) == self.clock_wkc);
-            self.system_time = clock.and_then(|place| {
-                Some(u64::from_le_bytes(
-                    frame.get(place.data())?.try_into().ok()?,
-                ))
-            });
-            self.al = frame
-                .get(self.al_status.data())
-                .and_then(|data| Some((*data.first()?, self.al_status.wkc(frame))));
-            self.take_probe(frame);
-        }
-        Received::Current
-    }
-
-    fn take_probe(&mut self, frame: &[u8]) {
-        let (device, probe) = self.probe;
-        if device >= self.stations.len() {
-            return;
-        }
-        let len = Probe::ALL[probe].register_and_len().1;
-        let place = Place {
-            frame: 0,
-            offset: self.probe_at,
-            len,
-        };
-        if let (1, Some(data), Some(to)) = (
-            place.wkc(frame),
-            frame.get(place.data()),
-            self.diagnoses.get_mut(device),
-        ) {
-            match (Probe::ALL[probe], data) {
-                (Probe::AlStatus, &[status, _, _, _, low, high]) => {
-                    to.al_status = status;
-                    to.al_code = u16::from_le_bytes([low, high]);
-                }
-                (Probe::ClockDifference, &[a, b, c, d]) => {
-                    to.clock_difference = sign_magnitude(u32::from_le_bytes([a, b, c, d]));
-                }
-                (Probe::RxErrors, errors) => {
-                    if let Ok(errors) = errors.try_into() {
-                        to.rx_errors = errors;
-                    }
-                }
-                _ => {}
-            }
-        }
-        let next = device + 1;
-        self.probe = if next < self.stations.len() {
-            (next, probe)
+        let mut flights = self.flights.iter_mut();
+        if flights.any(|flight| flight.receive(number, frame)) {
+            Received::Current
         } else {
-            (0, (probe + 1) % Probe::ALL.len())
-        };
+            Received::Late
+        }
     }
 
-    /// Whether every frame of the cycle has come back.
+    /// Whether every frame that this cycle judges has come back.
     #[must_use]
     pub fn complete(&self) -> bool {
-        self.frames.iter().all(|frame| frame.answered)
+        self.flights.get(self.due()).is_some_and(Flight::complete)
     }
 
-    /// Sums the cycle up. RT.
-    #[must_use]
-    pub fn answer(&self) -> Answer {
-        let complete = self.complete();
-        let seen = self
-            .lrws
-            .iter()
-            .filter_map(|lrw| lrw.wkc)
-            .fold(0, u16::saturating_add);
-        let expected = self.lrws.iter().map(|lrw| lrw.expected_wkc).sum();
-        Answer {
-            complete,
-            inputs_fresh: self
-                .lrws
-                .iter()
-                .all(|lrw| lrw.wkc == Some(lrw.expected_wkc)),
-            wkc: (seen, expected),
-            system_time: self.system_time,
-            al_status: self.al,
+    /// Judges the answers that are due, for all groups and for each, and takes their inputs. RT: O(image).
+    pub fn answer(&mut self) -> Answer {
+        let due = self.due();
+        let Some(flight) = self.flights.get(due) else {
+            return Answer::default();
+        };
+        let first = flight.answer(0);
+        for share in &mut self.shares {
+            let alive = share.wkc.1 > 0 || first.is_some();
+            (share.answered, share.fresh, share.wkc.0) = (alive, alive, 0);
         }
+        for datagram in &self.process_data {
+            let Some(share) = self.shares.get_mut(datagram.group) else {
+                continue;
+            };
+            let place = datagram.place;
+            let answer = flight.answer(place.frame);
+            let wkc = answer.map_or(0, |answer| place.wkc(answer));
+            let right = answer.is_some() && wkc == datagram.expected_wkc;
+            share.answered &= answer.is_some();
+            share.fresh &= right;
+            share.wkc.0 = share.wkc.0.saturating_add(wkc);
+            if let Some(data) = answer.and_then(|answer| answer.get(place.data()))
+                && right
+                && datagram.access != Access::Outputs
+            {
+                self.inputs[datagram.image..datagram.image + data.len()].copy_from_slice(data);
+            }
+        }
+        let mut answer = Answer {
+            complete: flight.complete(),
+            inputs_fresh: self.shares.iter().all(|share| share.fresh),
+            wkc: self.shares.iter().fold((0, 0), |sum, share| {
+                let (seen, expected) = share.wkc;
+                (sum.0.saturating_add(seen), sum.1.saturating_add(expected))
+            }),
+            system_time: None,
+            al_status: None,
+            sent_late: flight.sent_late.unwrap_or(0),
+        };
+        let Some(first) = first else {
+            return answer;
+        };
+        answer.al_status = first
+            .get(self.al_status.data())
+            .and_then(|data| Some((*data.first()?, self.al_status.wkc(first))));
+        let (device, probe) = flight.probe;
+        if let (Some(to), Some(probe)) = (self.diagnoses.get_mut(device), Probe::ALL.get(probe)) {
+            let place = Place {
+                frame: 0,
+                offset: self.probe_at,
+                len: probe.register_and_len().1,
+            };
+            to.answers = place.wkc(first) == 1;
+            if let (true, Some(data)) = (to.answers, first.get(place.data())) {
+                to.take(*probe, data);
+            }
+        }
+        answer.system_time = self.system_time(first);
+        if let Some(time) = answer.system_time {
+            // Of the flight that is staged next; those under way lie between.
+            let ahead = self.cycle_ns.saturating_mul(self.flights.len() as u64);
+            self.expected_time = time.wrapping_add(ahead);
+        }
+        answer
+    }
+
+    /// If the reference clock has given it: where clocks are missing, only those of groups that are, and it was seen lately.
+    fn system_time(&self, first: &[u8]) -> Option<u64> {
+        let place = self.clock?;
+        let time = u64::from_le_bytes(first.get(place.data())?.try_into().ok()?);
+        let wkc = place.wkc(first);
+        let clocks = |shares: &mut dyn Iterator<Item = &Share>| -> u16 {
+            shares
+                .map(|share| share.clocks)
+                .fold(0, u16::saturating_add)
+        };
+        let seen = self.diagnoses.get(self.reference);
+        let all = wkc == clocks(&mut self.shares.iter());
+        let others = seen.is_some_and(|seen| seen.answers)
+            && wkc >= clocks(&mut self.shares.iter().filter(|share| share.fresh));
+        (all || others).then_some(time)
     }
 
     /// Bytes of each frame as staged, without FCS.
     pub fn frame_lengths(&self) -> impl Iterator<Item = usize> + '_ {
-        self.frames.iter().map(|frame| frame.bytes.len())
+        let staged = self.flights.get(self.staged);
+        staged
+            .into_iter()
+            .flat_map(|flight| flight.frames.iter().map(|frame| frame.bytes.len()))
     }
 }
 
-/// 0x092C, received − own time: bit 31 is the sign (own clock ahead), the rest the amount.
-fn sign_magnitude(raw: u32) -> i32 {
-    let amount = i32::try_from(raw & 0x7fff_ffff).unwrap_or(i32::MAX);
-    if raw & 0x8000_0000 == 0 {
-        amount
-    } else {
-        -amount
-    }
+/// Where the datagrams of a cycle lie in its frames.
+struct Places {
+    clock: Option<Place>,
+    process_data: Vec<ProcessDatagram>,
+    al_status: Place,
+    probe_at: usize,
 }
 
-#[allow(clippy::disallowed_methods, reason = "prepares")]
-fn new_frame(number: u8) -> Frame {
-    let mut bytes = Vec::with_capacity(crate::link::MAX_FRAME);
-    bytes.extend_from_slice(&[0xff; 6]);
-    bytes.extend_from_slice(&[0x10, 0x10, 0x10, 0x10, number, MAC_TAIL]);
-    bytes.extend_from_slice(&ETHERCAT);
-    bytes.extend_from_slice(&[0, 0]);
-    Frame {
-        bytes,
-        answered: false,
-    }
-}
-
-/// Appends a datagram with room for `len` bytes.
-fn push(frame: &mut Frame, number: usize, command: u8, address: u32, len: usize) -> Place {
-    let place = Place {
-        frame: number,
-        offset: frame.bytes.len(),
-        len,
-    };
-    frame.bytes.resize(place.end(), 0);
-    write_header(&mut frame.bytes, place.offset, command, address, len);
-    place
-}
-
-fn write_header(frame: &mut [u8], offset: usize, command: u8, address: u32, len: usize) {
-    let [a0, a1, a2, a3] = address.to_le_bytes();
-    let [l0, l1] = u16::try_from(len).unwrap_or(0).to_le_bytes();
-    if let Some(header) = frame.get_mut(offset..offset + DATAGRAM_HEADER) {
-        header.copy_from_slice(&[command, 0, a0, a1, a2, a3, l0, l1, 0, 0]);
-    }
-}
-
-fn clear_wkc(frame: &mut [u8], place: Place) {
-    if let Some(wkc) = frame.get_mut(place.data().end..place.end()) {
-        wkc.fill(0);
-    }
-}
-
-/// Writes the EtherCAT header, the cycle's index and the "more follows" flags of all datagrams.
-fn number(frame: &mut [u8], cycle: u8) {
-    let [low, high] = u16::try_from(frame.len() - FIRST_DATAGRAM)
-        .unwrap_or(0)
-        .to_le_bytes();
-    frame[ETHERNET_HEADER] = low;
-    frame[ETHERNET_HEADER + 1] = high & 0x07 | 0x10;
-    let mut at = FIRST_DATAGRAM;
-    while at + DATAGRAM_HEADER <= frame.len() {
-        frame[at + 1] = cycle;
-        let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 0x07]));
-        let next = at + DATAGRAM_HEADER + len + WKC;
-        frame[at + 7] = frame[at + 7] & 0x07 | if next < frame.len() { 0x80 } else { 0 };
-        at = next;
-    }
-}
-
-/// Whether an answer has our datagrams in our places. SubDevices change addresses (APRD, BRD),
-/// data, working counters and the circulating bit, nothing else.
-fn same_headers(sent: &[u8], answer: &[u8]) -> bool {
-    if answer.len() < sent.len() {
-        return false;
-    }
-    let mut at = FIRST_DATAGRAM;
-    while at + DATAGRAM_HEADER <= sent.len() {
-        let same = sent[at..at + 2] == answer[at..at + 2]
-            && sent[at + 6] == answer[at + 6]
-            && (sent[at + 7] ^ answer[at + 7]) & 0x87 == 0;
-        if !same {
-            return false;
+impl Places {
+    /// Puts all datagrams but the diagnostic one into empty frames.
+    #[allow(clippy::disallowed_methods, reason = "prepares")]
+    fn fill(frames: &mut [Frame], plan: &ImagePlan, clock: Option<&ClockPlan>) -> Self {
+        let clock = clock.map(|clock| {
+            let address = u32::from(SYSTEM_TIME) << 16 | u32::from(clock.reference);
+            push(&mut frames[0], 0, FRMW, address, 8)
+        });
+        let process_data = plan.datagrams.iter().map(|datagram| {
+            let frame = datagram.frame;
+            let command = match datagram.access {
+                Access::Both => LRW,
+                Access::Inputs => LRD,
+                Access::Outputs => LWR,
+            };
+            let (logical, len) = (datagram.logical, datagram.len);
+            ProcessDatagram {
+                place: push(&mut frames[frame], frame, command, logical, len),
+                access: datagram.access,
+                group: datagram.group,
+                image: datagram.offset,
+                expected_wkc: datagram.expected_wkc,
+            }
+        });
+        let process_data = process_data.collect();
+        let al_status = push(&mut frames[0], 0, BRD, u32::from(AL_STATUS) << 16, 2);
+        let probe_at = frames[0].bytes.len();
+        debug_assert!(probe_at + DATAGRAM_HEADER + Probe::LONGEST + WKC <= MAX_FRAME);
+        Self {
+            clock,
+            process_data,
+            al_status,
+            probe_at,
         }
-        let len = usize::from(u16::from_le_bytes([sent[at + 6], sent[at + 7] & 0x07]));
-        at += DATAGRAM_HEADER + len + WKC;
     }
-    true
 }
 
 #[cfg(test)]

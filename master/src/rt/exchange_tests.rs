@@ -1,44 +1,82 @@
 use super::*;
-use crate::link::MAX_FRAME;
-use crate::rt::image::plan;
+use crate::rt::image::{ProcessData, plan};
 use proptest::prelude::*;
 
-/// Answers as `devices` SubDevices would that carry `expected` working counters.
-fn reflect(exchange: &Exchange, number: usize, input: u8) -> Vec<u8> {
-    let mut frame = exchange.frames[number].bytes.clone();
+use super::frame::FIRST_DATAGRAM;
+
+/// Swallows what it is given.
+#[derive(Debug)]
+struct Nowhere;
+
+impl Link for Nowhere {
+    fn send(&mut self, _: &[u8]) -> Result<(), LinkError> {
+        Ok(())
+    }
+
+    fn recv(&mut self, _: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        Ok(None)
+    }
+}
+
+/// Sends the cycle's frames; what comes back of the one of this number, as from SubDevices that are all there.
+fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
+    exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
+    let mut frame = exchange.flights[exchange.staged].frames[number]
+        .bytes
+        .clone();
     frame[6] |= 0x02;
     let mut at = FIRST_DATAGRAM;
     while at + DATAGRAM_HEADER <= frame.len() {
         let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 7]));
         let data = at + DATAGRAM_HEADER;
-        let wkc = match frame[at] {
-            LRW => {
-                exchange
-                    .lrws
-                    .iter()
-                    .find(|l| l.place.frame == number)
-                    .expect("lrw")
-                    .expected_wkc
-            }
-            _ => 1,
-        };
-        frame[data..data + len].fill(input);
+        let expected = exchange
+            .process_data
+            .iter()
+            .find(|d| (d.place.frame, d.place.offset) == (number, at));
+        let wkc = expected.map_or(1, |d| d.expected_wkc);
+        if frame[at] != LWR {
+            frame[data..data + len].fill(input);
+        }
         frame[data + len..data + len + 2].copy_from_slice(&wkc.to_le_bytes());
         at = data + len + WKC;
     }
     frame
 }
 
+fn axis(group: usize) -> ProcessData {
+    ProcessData {
+        out_len: 12,
+        in_len: 12,
+        group,
+        lrw: true,
+    }
+}
+
 fn axes(count: usize) -> Exchange {
-    let plan = plan(&vec![(12, 12); count]).expect("fits");
-    let stations: Vec<u16> = (0..count).map(|i| 0x1000 + i as u16).collect();
+    exchange(&vec![axis(0); count], Mode::SameCycle)
+}
+
+/// An axis in each of the groups.
+fn grouped(groups: &[usize]) -> Exchange {
+    let devices: Vec<_> = groups.iter().map(|&group| axis(group)).collect();
+    exchange(&devices, Mode::SameCycle)
+}
+
+/// The first with a clock.
+fn exchange(devices: &[ProcessData], mode: Mode) -> Exchange {
+    let plan = plan(devices).expect("fits");
+    let members: Vec<_> = (0..devices.len())
+        .map(|i| Member {
+            station: 0x1000 + i as u16,
+            clock: i == 0,
+        })
+        .collect();
     let clock = ClockPlan {
         reference: 0x1000,
-        clocks: 1,
         cycle_ns: 1_000_000,
         release: 0,
     };
-    Exchange::new(&plan, Some(&clock), &stations)
+    Exchange::new(&plan, Some(&clock), &members, mode)
 }
 
 #[test]
@@ -58,7 +96,7 @@ fn frame_bytes_for_8_32_and_100_axes() {
 #[test]
 fn an_answer_is_taken_once_and_only_in_its_cycle() {
     let mut exchange = axes(2);
-    let first = reflect(&exchange, 0, 0x5a);
+    let first = reflect(&mut exchange, 0, 0x5a);
     assert_eq!(exchange.receive(&first), Received::Current);
     assert!(exchange.complete());
     assert_eq!(exchange.receive(&first), Received::Late, "a duplicate");
@@ -79,10 +117,99 @@ fn an_answer_is_taken_once_and_only_in_its_cycle() {
 }
 
 #[test]
+fn pipelined_answers_count_in_the_next_cycle_whenever_they_come() {
+    let mut exchange = exchange(&[axis(0); 2], Mode::Pipelined);
+    let first = reflect(&mut exchange, 0, 1);
+    assert!(!exchange.complete(), "nothing was asked before");
+    // It comes back at once, but its turn is the next cycle.
+    assert_eq!(exchange.receive(&first), Received::Current);
+    assert!(!exchange.answer().complete);
+    assert_eq!(exchange.inputs(), [0; 24]);
+    exchange.stage();
+
+    let second = reflect(&mut exchange, 0, 2);
+    assert!(exchange.complete());
+    assert_eq!(exchange.receive(&first), Received::Late, "a duplicate");
+    let answer = exchange.answer();
+    assert!(answer.complete && answer.inputs_fresh);
+    assert_eq!(answer.system_time, Some(0x0101_0101_0101_0101));
+    assert_eq!(exchange.inputs(), [1; 24]);
+    exchange.stage();
+    // Two cycles after the one that was answered.
+    assert_eq!(exchange.expected_time, 0x0101_0101_0101_0101 + 3_000_000);
+
+    // The second comes after the third was sent.
+    let third = reflect(&mut exchange, 0, 3);
+    assert_eq!(exchange.receive(&second), Received::Current);
+    assert!(exchange.answer().complete);
+    assert_eq!(exchange.inputs(), [2; 24]);
+    exchange.stage();
+
+    // The third not within the fourth's cycle.
+    let fourth = reflect(&mut exchange, 0, 4);
+    let answer = exchange.answer();
+    assert!(!answer.complete && !answer.inputs_fresh);
+    assert_eq!(exchange.inputs(), [2; 24]);
+    exchange.stage();
+    reflect(&mut exchange, 0, 5);
+    assert_eq!(exchange.receive(&third), Received::Late);
+    assert_eq!(exchange.receive(&fourth), Received::Current);
+    assert!(exchange.answer().complete);
+    assert_eq!(exchange.inputs(), [4; 24]);
+}
+
+#[test]
+fn an_answer_tells_how_late_its_frames_were_sent() {
+    for (mode, expected) in [
+        (Mode::SameCycle, [10, 20, 30]),
+        (Mode::Pipelined, [0, 10, 20]),
+    ] {
+        let mut exchange = exchange(&[axis(0)], mode);
+        for (late, expected) in [10, 20, 30].into_iter().zip(expected) {
+            exchange
+                .send(&mut Nowhere, late)
+                .expect("nowhere takes all");
+            assert_eq!(exchange.answer().sent_late, expected, "{mode:?}");
+            exchange.stage();
+        }
+    }
+}
+
+#[test]
+fn a_device_without_lrw_gets_and_gives_its_data_by_two_datagrams() {
+    let without = ProcessData {
+        out_len: 4,
+        in_len: 6,
+        lrw: false,
+        ..axis(0)
+    };
+    let mut exchange = exchange(&[axis(0), without], Mode::SameCycle);
+    exchange.outputs_mut().fill(0x77);
+    exchange.stage();
+    let sent = exchange.flights[0].frames[0].bytes.clone();
+    let commands: Vec<(u8, bool)> = exchange
+        .process_data
+        .iter()
+        .map(|d| {
+            (
+                sent[d.place.offset],
+                sent[d.place.data()].iter().all(|b| *b == 0x77),
+            )
+        })
+        .collect();
+    assert_eq!(commands, [(LRW, true), (LWR, true), (LRD, false)]);
+    let answer = reflect(&mut exchange, 0, 0x11);
+    assert_eq!(exchange.receive(&answer), Received::Current);
+    let answer = exchange.answer();
+    assert_eq!((answer.wkc, answer.inputs_fresh), ((5, 5), true));
+    assert_eq!(exchange.inputs(), [0x11; 18]);
+}
+
+#[test]
 fn a_wrong_working_counter_leaves_the_inputs_alone() {
     let mut exchange = axes(1);
-    let mut frame = reflect(&exchange, 0, 0x11);
-    let wkc = exchange.lrws[0].place.data().end;
+    let mut frame = reflect(&mut exchange, 0, 0x11);
+    let wkc = exchange.process_data[0].place.data().end;
     frame[wkc] = 2;
     assert_eq!(exchange.receive(&frame), Received::Current);
     let answer = exchange.answer();
@@ -95,22 +222,30 @@ fn a_wrong_working_counter_leaves_the_inputs_alone() {
 fn the_diagnostic_slot_walks_through_devices_and_probes() {
     let mut exchange = axes(2);
     let mut seen = Vec::new();
-    for _ in 0..6 {
-        seen.push(exchange.probe);
-        let frame = reflect(&exchange, 0, 1);
+    for _ in 0..2 * Probe::ALL.len() {
+        seen.push(exchange.flights[0].probe);
+        let frame = reflect(&mut exchange, 0, 1);
         exchange.receive(&frame);
+        exchange.answer();
         exchange.stage();
     }
-    assert_eq!(seen, [(0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2)]);
-    assert_eq!(
-        exchange.diagnoses()[1],
-        Diagnosis {
-            al_status: 1,
-            al_code: 0x0101,
-            clock_difference: 0x0101_0101,
-            rx_errors: [1; 8],
-        }
-    );
+    let expected: Vec<_> = (0..Probe::ALL.len())
+        .flat_map(|p| [(0, p), (1, p)])
+        .collect();
+    assert_eq!(seen, expected);
+    let found = exchange.diagnoses()[1];
+    assert!(found.answers);
+    assert_eq!((found.al_status, found.al_code), (1, 0x0101));
+    assert_eq!(found.clock_difference, 0x0101_0101);
+    let errors = ErrorCounters {
+        invalid_frames: [1; 4],
+        rx_errors: [1; 4],
+        forwarded: [1; 4],
+        processing: 1,
+        pdi: 1,
+        lost_links: [1; 4],
+    };
+    assert_eq!(found.errors, errors);
 }
 
 #[test]
@@ -119,16 +254,10 @@ fn large_images_take_several_frames() {
     assert_eq!(exchange.frame_lengths().count(), 3);
     assert!(exchange.frame_lengths().all(|len| len <= MAX_FRAME));
     for number in [2, 0, 1] {
-        let frame = reflect(&exchange, number, 7);
+        let frame = reflect(&mut exchange, number, 7);
         assert_eq!(exchange.receive(&frame), Received::Current);
     }
     assert!(exchange.answer().inputs_fresh);
-}
-
-#[test]
-fn the_difference_register_is_sign_and_magnitude() {
-    assert_eq!(sign_magnitude(5), 5);
-    assert_eq!(sign_magnitude(0x8000_0005), -5);
 }
 
 proptest! {
@@ -136,11 +265,79 @@ proptest! {
     fn no_received_bytes_panic(mut frame in proptest::collection::vec(any::<u8>(), 0..1600), ours: bool) {
         let mut exchange = axes(3);
         if ours && frame.len() > 20 {
-            let template = reflect(&exchange, 0, 0);
+            let template = reflect(&mut exchange, 0, 0);
             let n = frame.len().min(30);
             frame[..n].copy_from_slice(&template[..n]);
         }
         exchange.receive(&frame);
         let _ = exchange.answer();
     }
+}
+
+/// 12 bytes a group; the rest of the machine is in none.
+#[test]
+fn each_group_has_a_working_counter_of_its_own() {
+    let mut exchange = grouped(&[1, 0, 2, 1]);
+    assert_eq!(exchange.probe_at, axes(4).probe_at + 2 * 12);
+    let mut frame = reflect(&mut exchange, 0, 0x11);
+    let of_first_group = exchange.process_data[1].place.data().end;
+    frame[of_first_group] = 4;
+    assert_eq!(exchange.receive(&frame), Received::Current);
+    let answer = exchange.answer();
+    assert!(answer.complete && !answer.inputs_fresh);
+    assert_eq!(answer.wkc, (10, 12));
+    let shares: Vec<_> = exchange
+        .shares()
+        .iter()
+        .map(|share| (share.answered, share.fresh, share.wkc))
+        .collect();
+    assert_eq!(
+        shares,
+        [
+            (true, true, (3, 3)),
+            (true, false, (4, 6)),
+            (true, true, (3, 3))
+        ]
+    );
+    let mut inputs = [0x11; 48];
+    inputs[12..36].fill(0);
+    assert_eq!(exchange.inputs(), inputs);
+}
+
+/// A clock that is missing with its group does not keep the others from their reference.
+#[test]
+fn the_system_time_is_the_reference_s_alone() {
+    let mut exchange = grouped(&[0, 1]);
+    exchange.members[1].clock = true;
+    exchange.shares[1].clocks = 1;
+    let mut answer = |wkc: u8, fresh: bool| {
+        exchange.stage();
+        let mut frame = reflect(&mut exchange, 0, 1);
+        let clock = exchange.clock.expect("a clock").data().end;
+        frame[clock] = wkc;
+        let second = exchange.process_data[1].place.data().end;
+        frame[second] = if fresh { 3 } else { 0 };
+        exchange.receive(&frame);
+        exchange.answer().system_time.is_some()
+    };
+    assert!(answer(2, true), "both are there");
+    assert!(!answer(1, true), "one is missing, and nobody knows which");
+    assert!(answer(1, false), "it is the one whose group is missing");
+    assert!(!answer(0, false));
+}
+
+/// Groups in frames of their own are lost with these alone.
+#[test]
+fn a_frame_that_is_lost_concerns_its_groups() {
+    let groups: Vec<usize> = (0..200).map(|i| usize::from(i >= 100)).collect();
+    let mut exchange = grouped(&groups);
+    assert_eq!(exchange.frame_lengths().count(), 2);
+    let frame = reflect(&mut exchange, 0, 7);
+    exchange.receive(&frame);
+    let answer = exchange.answer();
+    assert!(!answer.complete && !answer.inputs_fresh);
+    let [rest, second] = exchange.shares() else {
+        panic!("two groups")
+    };
+    assert!(rest.fresh && !second.answered && !second.fresh);
 }

@@ -5,7 +5,7 @@
 
 use ecaxis_axis::group::Along;
 use ecaxis_axis::setpoint::{
-    Gear, GearConfig, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
+    Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
 };
 use ecaxis_axis::{Axis, AxisStatus, HomingStatus, Refused};
 
@@ -14,6 +14,8 @@ use ecaxis_axis::{Axis, AxisStatus, HomingStatus, Refused};
 pub enum Start {
     /// Its part of a straight line.
     Line(Along),
+    /// On its own way, timed with others.
+    Move(JerkLimited),
     Wave(PositionWave),
     /// Index of the table among those of the machine.
     Table {
@@ -33,6 +35,7 @@ pub enum Start {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Source {
     Line(Along),
+    Move(JerkLimited),
     Wave(PositionWave),
     Table {
         table: usize,
@@ -50,6 +53,9 @@ const ROUNDING: f64 = 1e-6;
 
 const RING: &str = "the axes would follow each other";
 const NO_MASTER: &str = "the axis that is followed has no power, or searches its home";
+/// A line goes on from where it was held up; points by time are past.
+const HELD_UP: &str = "lost frames held the axis up, and its time is past";
+const NO_PARTNER: &str = "an axis of the same line has stopped";
 const SLIPS: &str = "the axis cannot follow within its limits";
 
 /// A gear that was engaged may be behind for so long.
@@ -136,6 +142,7 @@ impl Feed {
         }
         let source = match start {
             Start::Line(along) => Ok(Source::Line(along)),
+            Start::Move(planned) => Ok(Source::Move(planned)),
             Start::Wave(wave) => Ok(Source::Wave(wave)),
             Start::Table { table, playback } => Ok(Source::Table { table, playback }),
             Start::Gear {
@@ -155,6 +162,22 @@ impl Feed {
             Ok(source) => (Some(source), FeedState::Running),
             Err(error) => (None, FeedState::NotBegun(error)),
         };
+    }
+
+    /// Whether the axis is led along a line: those that are at the same time are on the same.
+    #[must_use]
+    pub fn on_line(&self) -> bool {
+        matches!(self.source, Some(Source::Line(_)))
+    }
+
+    /// Another axis of its line does not go on.
+    pub fn part(&mut self) {
+        (self.source, self.state) = (None, FeedState::Lost(NO_PARTNER));
+    }
+
+    /// It is not begun, because the axis may not move.
+    pub fn refuse(&mut self, reason: Refused) {
+        (self.source, self.state) = (None, FeedState::Refused(reason));
     }
 
     /// The axis was told to do something else.
@@ -205,18 +228,25 @@ impl Feed {
             return true;
         }
         let before = self.taken(axis, dt_s);
+        let mut interrupted = false;
         let (next, finished, state) = match &mut source {
             Source::Line(along) => {
                 let next = along.advance(before, dt_s);
                 (next, along.finished(next), FeedState::Running)
             }
+            Source::Move(planned) => {
+                let next = planned.advance(before, dt_s);
+                (next, planned.finished(next), FeedState::Running)
+            }
             Source::Wave(wave) => {
                 let next = wave.advance(before, dt_s);
+                interrupted = wave.interrupted();
                 (next, wave.finished(next), FeedState::Running)
             }
             Source::Table { table, playback } => match tables.get(*table) {
                 Some(table) => {
                     let next = playback.advance(table, before, dt_s);
+                    interrupted = playback.interrupted();
                     (next, playback.finished(next), FeedState::Running)
                 }
                 None => (before, true, FeedState::Running),
@@ -244,6 +274,10 @@ impl Feed {
         };
         if self.slipping_s > patience {
             (self.source, self.state) = (None, FeedState::Lost(SLIPS));
+            return true;
+        }
+        if interrupted {
+            (self.source, self.state) = (None, FeedState::Lost(HELD_UP));
             return true;
         }
         match axis.set_point(next.position) {

@@ -185,3 +185,46 @@ fn what_an_axis_does_not_take_ends_its_feed() {
         rig.feed.state()
     );
 }
+
+/// Ways of different length, with different limits: the set-points arrive in one cycle, each within its limits.
+#[test]
+fn moves_timed_together_arrive_in_the_same_cycle() {
+    use ecaxis_axis::group::arrive_together;
+    use ecaxis_axis::setpoint::{Goal, Order};
+    let axes = [(50.0, 250.0), (3.0, 40.0), (-20.0, 250.0)];
+    let mut rigs: Vec<Rig> = axes.iter().map(|&(_, limit)| Rig::new(limit)).collect();
+    let mut moves: Vec<JerkLimited> = axes
+        .iter()
+        .zip(&rigs)
+        .map(|(&(target, _), rig)| {
+            let status = rig.axis.status();
+            let limits = rig.axis.config().limits.motion();
+            let order = Order::within(Goal::Position(target), limits);
+            JerkLimited::new(order, commanded(&status), DT).expect("a way")
+        })
+        .collect();
+    let alone: Vec<f64> = moves.iter().map(JerkLimited::duration_s).collect();
+    let duration = arrive_together(&mut moves).expect("timed");
+    assert!(alone[0] > 2.0 * alone[1], "{alone:?}");
+    for (rig, planned) in rigs.iter_mut().zip(&moves) {
+        rig.begin(Start::Move(*planned), None);
+    }
+    let mut arrived = vec![None; axes.len()];
+    for cycle in 0..2000 {
+        for (index, rig) in rigs.iter_mut().enumerate() {
+            let before = commanded(&rig.axis.status()).velocity;
+            let position = rig.cycle(None);
+            let change = (commanded(&rig.axis.status()).velocity - before).abs();
+            assert!(change <= 2500.0 * DT * 1.000_001, "{change}");
+            if arrived[index].is_none() && rig.feed.state() == FeedState::Finished {
+                assert_eq!(position, axes[index].0);
+                arrived[index] = Some(cycle);
+            }
+        }
+    }
+    assert!(arrived[0].is_some(), "{duration} s");
+    assert!(
+        arrived.iter().all(|&cycle| cycle == arrived[0]),
+        "{arrived:?}"
+    );
+}

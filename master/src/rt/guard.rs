@@ -1,6 +1,6 @@
 //! How many bad cycles the machine rides through, and what stops it.
 
-use super::exchange::Answer;
+use super::exchange::{Answer, Share};
 
 /// AL status that every SubDevice must show while the machine runs.
 const OP: u8 = 0x08;
@@ -31,6 +31,8 @@ pub enum StopCause {
     FollowLost { axis: usize },
     /// The user's controller panicked.
     Controller,
+    /// The drive of this axis keeps its power, long after its group began to stop.
+    Powered { axis: usize },
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
 }
@@ -40,7 +42,7 @@ impl StopCause {
     #[must_use]
     pub fn severity(&self) -> u8 {
         match self {
-            Self::Requested | Self::Controller => 1,
+            Self::Requested | Self::Controller | Self::Powered { .. } => 1,
             Self::DriveFault { .. } | Self::Trip { .. } | Self::FollowLost { .. } => 2,
             Self::BusLost { .. } | Self::LeftOp { .. } => 3,
             Self::EmergencyStop => 4,
@@ -48,52 +50,103 @@ impl StopCause {
     }
 }
 
-/// Counts bad cycles in a row.
+/// Counts bad cycles in a row, of each group.
 #[derive(Debug, Clone)]
 pub struct Guard {
     lost_frames: u32,
-    devices: u16,
-    bad: u32,
+    groups: Vec<Watch>,
+    /// Cycles in which AL status was wrong and no group's working counter said whose.
     al: u32,
+    al_status: u8,
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Watch {
+    /// That must answer.
+    devices: u16,
+    /// Cycles without its process data.
+    bad: u32,
+    /// Cycles in which AL status was wrong, and its working counter, too.
+    al: u32,
+    last: Share,
 }
 
 impl Guard {
-    /// `lost_frames` bad cycles in a row stop the machine; `devices` SubDevices must answer.
+    /// `lost_frames` bad cycles in a row stop a group; `groups` are those of the SubDevices.
     #[must_use]
-    pub fn new(lost_frames: u32, devices: u16) -> Self {
+    #[allow(clippy::disallowed_macros, reason = "prepares")]
+    pub fn new(lost_frames: u32, groups: &[usize]) -> Self {
+        // The first group is there without SubDevices, too.
+        let count = groups.iter().max().map_or(1, |last| last + 1);
+        let mut watches = vec![Watch::default(); count];
+        for &group in groups {
+            watches[group].devices = watches[group].devices.saturating_add(1);
+        }
         Self {
             lost_frames: lost_frames.max(1),
-            devices,
-            bad: 0,
+            groups: watches,
             al: 0,
+            al_status: OP,
         }
     }
 
-    /// Looks at one cycle. RT.
-    pub fn check(&mut self, answer: &Answer) -> Option<StopCause> {
-        self.bad = if answer.inputs_fresh && answer.complete {
+    /// Looks at one cycle. RT: O(groups).
+    pub fn look(&mut self, answer: &Answer, shares: &[Share]) {
+        for (watch, share) in self.groups.iter_mut().zip(shares) {
+            watch.last = *share;
+            watch.bad = if share.fresh {
+                0
+            } else {
+                watch.bad.saturating_add(1)
+            };
+        }
+        let Some((status, answering)) = answer.al_status else {
+            return;
+        };
+        self.al_status = status;
+        let devices = |groups: &mut dyn Iterator<Item = &Watch>| -> u16 {
+            groups.map(|g| g.devices).fold(0, u16::saturating_add)
+        };
+        let expected = devices(&mut self.groups.iter());
+        let right = status == OP && answering == expected;
+        // Who is not in Op does not take outputs, and who is not there takes nothing. That accounts for no more than they are.
+        let bad = devices(&mut self.groups.iter().filter(|g| g.bad > 0));
+        let known = bad > 0 && answering >= expected.saturating_sub(bad);
+        for watch in &mut self.groups {
+            let guilty = !right && known && watch.bad > 0;
+            watch.al = if guilty {
+                watch.al.saturating_add(1)
+            } else {
+                0
+            };
+        }
+        self.al = if right || known {
             0
         } else {
-            self.bad + 1
+            self.al.saturating_add(1)
         };
-        if self.bad >= self.lost_frames {
+    }
+
+    /// Why the whole machine has to stop: SubDevices are not in Op, and nothing says which.
+    #[must_use]
+    pub fn left_op(&self) -> Option<StopCause> {
+        let al_status = self.al_status;
+        (self.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status })
+    }
+
+    /// Why a group has to stop.
+    #[must_use]
+    pub fn lost(&self, group: usize) -> Option<StopCause> {
+        let watch = self.groups.get(group)?;
+        if watch.bad >= self.lost_frames {
             return Some(StopCause::BusLost {
-                cycles: self.bad,
-                last_wkc: answer.wkc,
-                answered: answer.complete,
+                cycles: watch.bad,
+                last_wkc: watch.last.wkc,
+                answered: watch.last.answered,
             });
         }
-        match answer.al_status {
-            Some((status, wkc)) if status != OP || wkc != self.devices => {
-                self.al += 1;
-                (self.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status: status })
-            }
-            Some(_) => {
-                self.al = 0;
-                None
-            }
-            None => None,
-        }
+        let al_status = self.al_status;
+        (watch.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status })
     }
 }
 
@@ -101,58 +154,96 @@ impl Guard {
 mod tests {
     use super::*;
 
-    const GOOD: Answer = Answer {
-        complete: true,
-        inputs_fresh: true,
-        wkc: (3, 3),
-        system_time: None,
-        al_status: Some((OP, 2)),
-    };
-    const LOST: Answer = Answer {
-        complete: false,
-        inputs_fresh: false,
-        wkc: (0, 3),
-        system_time: None,
-        al_status: None,
-    };
+    const SHARE: Share = Share::new(true, true, (3, 3));
+    const BAD: Share = Share::new(true, false, (0, 3));
+    const GONE: Share = Share::new(false, false, (0, 3));
+
+    fn answer(al_status: Option<(u8, u16)>) -> Answer {
+        Answer {
+            al_status,
+            ..Answer::default()
+        }
+    }
+
+    fn good() -> Answer {
+        answer(Some((OP, 2)))
+    }
 
     #[test]
     fn rides_through_fewer_bad_cycles_than_the_limit() {
-        let mut guard = Guard::new(3, 2);
+        let mut guard = Guard::new(3, &[0, 0]);
         for _ in 0..10 {
-            assert_eq!(guard.check(&LOST), None);
-            assert_eq!(guard.check(&LOST), None);
-            assert_eq!(guard.check(&GOOD), None);
+            for share in [GONE, GONE, SHARE] {
+                let back = share.answered.then_some((OP, 2));
+                guard.look(&answer(back), &[share]);
+                assert_eq!((guard.lost(0), guard.left_op()), (None, None));
+            }
         }
-        guard.check(&LOST);
-        guard.check(&LOST);
-        assert!(matches!(
-            guard.check(&LOST),
-            Some(StopCause::BusLost { cycles: 3, .. })
-        ));
+        guard.look(&answer(None), &[GONE]);
+        guard.look(&answer(None), &[GONE]);
+        guard.look(&answer(None), &[GONE]);
+        let lost = StopCause::BusLost {
+            cycles: 3,
+            last_wkc: (0, 3),
+            answered: false,
+        };
+        assert_eq!((guard.lost(0), guard.left_op()), (Some(lost), None));
     }
 
     #[test]
     fn a_device_that_leaves_op_stops_the_machine() {
-        let mut guard = Guard::new(3, 2);
-        let left = Answer {
-            al_status: Some((0x1c, 2)),
-            ..GOOD
-        };
-        assert_eq!(guard.check(&left), None);
-        assert_eq!(
-            guard.check(&left),
-            Some(StopCause::LeftOp { al_status: 0x1c })
-        );
-        let mut guard = Guard::new(3, 2);
-        let gone = Answer {
-            al_status: Some((OP, 1)),
-            ..GOOD
-        };
-        guard.check(&gone);
-        assert_eq!(
-            guard.check(&gone),
-            Some(StopCause::LeftOp { al_status: OP })
-        );
+        for al in [(0x1c, 2), (OP, 1)] {
+            let mut guard = Guard::new(3, &[0, 0]);
+            guard.look(&answer(Some(al)), &[SHARE]);
+            assert_eq!(guard.left_op(), None);
+            guard.look(&answer(Some(al)), &[SHARE]);
+            let left = Some(StopCause::LeftOp { al_status: al.0 });
+            assert_eq!((guard.lost(0), guard.left_op()), (None, left));
+            guard.look(&good(), &[SHARE]);
+            assert_eq!(guard.left_op(), None);
+        }
+    }
+
+    /// Devices 0, 1 and 2 are in groups 0, 1 and 2; the wrong working counter says whose AL status it is.
+    #[test]
+    fn a_group_answers_for_its_own_devices() {
+        let left = |al_status| Some(StopCause::LeftOp { al_status });
+        for (al, shares, groups, machine) in [
+            (
+                (0x1c, 3),
+                [SHARE, BAD, SHARE],
+                [None, left(0x1c), None],
+                None,
+            ),
+            ((OP, 2), [SHARE, SHARE, BAD], [None, None, left(OP)], None),
+            ((OP, 1), [SHARE, BAD, BAD], [None, left(OP), left(OP)], None),
+            // One more is missing than the group has.
+            ((OP, 1), [SHARE, SHARE, BAD], [None, None, None], left(OP)),
+            ((OP, 3), [SHARE, BAD, SHARE], [None, None, None], None),
+        ] {
+            let mut guard = Guard::new(10, &[0, 1, 2]);
+            for _ in 0..AL_CYCLES {
+                guard.look(&answer(Some(al)), &shares);
+            }
+            let found = [0, 1, 2].map(|group| guard.lost(group));
+            assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
+        }
+    }
+
+    #[test]
+    fn a_group_without_its_process_data_is_lost_alone() {
+        let mut guard = Guard::new(2, &[1]);
+        for _ in 0..2 {
+            guard.look(&answer(Some((OP, 1))), &[SHARE, BAD]);
+        }
+        assert_eq!(guard.lost(0), None);
+        assert!(matches!(
+            guard.lost(1),
+            Some(StopCause::BusLost {
+                cycles: 2,
+                last_wkc: (0, 3),
+                answered: true
+            })
+        ));
     }
 }

@@ -4,6 +4,7 @@ use ecaxis_axis::{AxisStatus, Command, Refused};
 
 use super::exchange::Diagnosis;
 use super::feed::{FeedState, Start};
+use super::groups::GroupStatus;
 use super::guard::StopCause;
 use super::stats::Counters;
 use crate::clock::Nanos;
@@ -40,7 +41,7 @@ pub enum Order {
     Guard,
     /// The segment is about to leave Op: wrong working counters are expected.
     Unguard,
-    /// Bring every axis to rest within its limits, then disable it.
+    /// Bring every axis of the machine to rest within its limits, then disable it.
     Stop,
     /// A drive's error code, read beside the cycle.
     ErrorCode {
@@ -59,15 +60,34 @@ pub enum Event {
         axis: usize,
         reason: Refused,
     },
+    /// The machine begins to stop.
     Stopping {
         cycle: u64,
         cause: StopCause,
+    },
+    /// A group begins to stop, without the machine.
+    GroupStopping {
+        cycle: u64,
+        group: usize,
+        cause: StopCause,
+    },
+    /// A group that was stopped has been reset, and may be enabled again.
+    GroupReleased {
+        cycle: u64,
+        group: usize,
     },
     PhaseLocked {
         cycle: u64,
     },
     PhaseLost {
         cycle: u64,
+    },
+    /// The clock of a SubDevice is outside the window around the reference's.
+    ClockOff {
+        cycle: u64,
+        device: usize,
+        /// Own minus reference.
+        difference_ns: i32,
     },
 }
 
@@ -82,15 +102,15 @@ pub struct Snapshot {
     pub al_status: Option<(u8, u16)>,
     pub axes: Vec<AxisStatus>,
     pub feeds: Vec<FeedState>,
-    /// What the program reads, in the order of [`super::cycle::Signals::inputs`]; of the last cycle with fresh inputs.
+    /// What the program reads, in the order of [`super::cycle::Signals::inputs`]; each of the last cycle in which it was fresh.
     pub inputs: Vec<f64>,
     /// The controller's work is done.
     pub finished: bool,
     pub diagnoses: Vec<Diagnosis>,
     /// First cause, once the machine is stopping.
     pub stopping: Option<StopCause>,
-    /// Every axis is disabled after a stop.
-    pub stopped: bool,
+    /// The first is the rest of the machine.
+    pub groups: Vec<GroupStatus>,
     /// Events that did not fit into the queue.
     pub events_lost: u64,
     /// Orders taken so far.

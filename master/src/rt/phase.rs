@@ -4,25 +4,45 @@
 //! should. A PI controller turns it into the length of the next cycle; the integral is the drift
 //! between this machine's clock and the reference. The measured lateness of the wake-up is taken
 //! out first, so that a late thread does not make the clock wander.
+//!
+//! Before the first lock, no device is in Op and nobody minds one cycle of odd length: the phase is
+//! set at once, not approached.
 
 use crate::clock::Nanos;
 
-const PROPORTIONAL: f64 = 0.1;
-/// Critically damped: Kp² ∕ 4.
-const INTEGRAL: f64 = PROPORTIONAL * PROPORTIONAL / 4.0;
+/// Parts of the error that go into the next cycle and into the drift.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Gains {
+    pub proportional: f64,
+    pub integral: f64,
+}
+
+impl Gains {
+    /// A tenth of the error a cycle, critically damped: Ki = Kp² ∕ 4.
+    pub const DEFAULT: Self = Self {
+        proportional: 0.1,
+        integral: 0.0025,
+    };
+    /// The whole error into the next cycle, as a loop has it that sleeps what it measures; to compare with.
+    pub const RAW: Self = Self {
+        proportional: 1.0,
+        integral: 0.0,
+    };
+}
+
 /// Score at which the phase counts as locked; a measurement inside the window adds one, one outside
 /// takes one away, so that a single late answer on a busy host does not start the count anew.
 const LOCKED_SCORE: u32 = 50;
 /// Highest score: so many measurements outside, and the phase counts as lost.
 const BEST_SCORE: u32 = 70;
+/// Measurements after the phase was set that may still be of frames released before.
+const UNDER_WAY: u8 = 2;
 
 /// What the cyclic exchange needs to know to keep the clocks together and itself in phase.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClockPlan {
     /// Station address of the reference clock.
     pub reference: u16,
-    /// SubDevices with a distributed clock, the reference among them.
-    pub clocks: u16,
     pub cycle_ns: u64,
     /// A system time at which a frame should pass the reference clock, and every cycle from then.
     pub release: u64,
@@ -31,6 +51,7 @@ pub struct ClockPlan {
 /// The phase controller of one segment.
 #[derive(Debug, Clone)]
 pub struct Phase {
+    gains: Gains,
     cycle: i64,
     /// System time of the last measurement, extended to 64 bits.
     time: Option<u64>,
@@ -39,7 +60,11 @@ pub struct Phase {
     /// Nanoseconds a cycle.
     drift: f64,
     locked: bool,
+    /// It has been locked.
+    acquired: bool,
     score: u32,
+    /// Measurements to leave out.
+    under_way: u8,
 }
 
 /// What one measurement told.
@@ -54,15 +79,23 @@ pub struct PhaseStep {
 impl Phase {
     #[must_use]
     pub fn new(plan: &ClockPlan) -> Self {
+        Self::with_gains(plan, Gains::DEFAULT)
+    }
+
+    #[must_use]
+    pub fn with_gains(plan: &ClockPlan, gains: Gains) -> Self {
         let cycle = i64::try_from(plan.cycle_ns).unwrap_or(i64::MAX).max(1);
         let target = i64::try_from(plan.release % plan.cycle_ns.max(1)).unwrap_or(0);
         Self {
+            gains,
             cycle,
             time: None,
             target,
             drift: 0.0,
             locked: false,
+            acquired: false,
             score: 0,
+            under_way: 0,
         }
     }
 
@@ -87,19 +120,29 @@ impl Phase {
         let error = self.wrap(passed - self.target);
         let lateness = i64::try_from(lateness).unwrap_or(i64::MAX).min(self.cycle);
         let planned = self.wrap(error - lateness);
+        if self.under_way > 0 {
+            self.under_way -= 1;
+            let adjust = self.holdover();
+            return PhaseStep { error, adjust };
+        }
         self.judge(planned);
-
-        // A single wild measurement may move a locked phase by a 1000th of a cycle, an unlocked
-        // one by a 50th: faster would look like jitter to the drives.
+        let near = planned.abs() <= self.cycle / 50;
+        if !self.acquired && !near {
+            self.under_way = UNDER_WAY;
+            let adjust = self.holdover() - planned;
+            return PhaseStep { error, adjust };
+        }
+        // A single wild measurement may move a locked phase by a 1000th of a cycle, one that was lost
+        // by a 50th: faster would look like jitter to the drives.
         let bound = self.cycle as f64 / if self.locked { 100.0 } else { 5.0 };
         let bounded = (planned as f64).clamp(-bound, bound);
         // The way to the target says nothing about drift.
-        if planned.abs() <= self.cycle / 50 {
-            self.drift += INTEGRAL * bounded;
+        if near {
+            self.drift += self.gains.integral * bounded;
             let most = self.cycle as f64 * 1e-3;
             self.drift = self.drift.clamp(-most, most);
         }
-        let adjust = -(PROPORTIONAL * bounded + self.drift);
+        let adjust = -(self.gains.proportional * bounded + self.drift);
         PhaseStep {
             error,
             adjust: adjust.round() as i64,
@@ -124,6 +167,7 @@ impl Phase {
             self.score.saturating_sub(1)
         };
         self.locked = self.score >= LOCKED_SCORE;
+        self.acquired |= self.locked;
     }
 
     /// A clock of 32 bits wraps every 4.3 s, in the middle of a cycle; measurements are closer
@@ -153,7 +197,6 @@ mod tests {
     fn plan(cycle_ns: u64, release: u64) -> ClockPlan {
         ClockPlan {
             reference: 0x1000,
-            clocks: 1,
             cycle_ns,
             release,
         }
@@ -204,6 +247,25 @@ mod tests {
                     assert!(largest < 100, "{cycle} {offset} {ppm}: {largest} ns");
                 }
             }
+        }
+    }
+
+    /// Answers may be of frames that were released before the phase was set.
+    #[test]
+    fn before_the_first_lock_the_phase_is_set_at_once() {
+        for lag in [0_usize, 1] {
+            let mut phase = Phase::new(&plan(20_000_000, 0));
+            let mut releases = vec![7_300_000_u64];
+            for k in 0_usize..60 {
+                let last = releases[k];
+                let step = k
+                    .checked_sub(lag)
+                    .map(|k| phase.update(releases[k], 0).adjust);
+                releases.push(last.wrapping_add_signed(20_000_000 + step.unwrap_or(0)));
+            }
+            assert!(phase.locked(), "lag {lag}");
+            let error = (releases[5] % 20_000_000) as i64;
+            assert_eq!(error, 0, "lag {lag}");
         }
     }
 

@@ -11,11 +11,13 @@ use crate::clock::Nanos;
 pub struct AxisSlot {
     pub axis: Axis,
     pub bits: AxisBits,
+    /// The axes that it stops with.
+    pub group: usize,
     pub feed: Feed,
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
     pub last_enabled: Option<AxisStatus>,
-    /// Enabling was ordered and the drive had no fault since: from now on a fault stops the machine.
+    /// Enabling was ordered and the drive had no fault since: from now on a fault stops its group.
     pub(super) armed: bool,
     pub(super) ordered: bool,
     /// How long a stopping axis has been at rest.
@@ -26,10 +28,11 @@ pub struct AxisSlot {
 
 impl AxisSlot {
     #[must_use]
-    pub fn new(axis: Axis, bits: AxisBits) -> Self {
+    pub fn new(axis: Axis, bits: AxisBits, group: usize) -> Self {
         Self {
             axis,
             bits,
+            group,
             feed: Feed::default(),
             largest_following_error: 0.0,
             last_enabled: None,
@@ -38,6 +41,11 @@ impl AxisSlot {
             rested: 0,
             acted: false,
         }
+    }
+
+    /// It has been stopped and reset: what it reports concerns nobody until it is enabled again.
+    pub(super) fn disarm(&mut self) {
+        (self.armed, self.ordered, self.rested) = (false, false, 0);
     }
 
     pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {

@@ -3,6 +3,8 @@
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
+use super::journal::Journal;
+
 /// Longest time a histogram tells apart; longer ones count as this.
 const LONGEST_NS: u64 = 10_000_000_000;
 
@@ -13,15 +15,43 @@ pub struct Times(Histogram<u64>);
 impl Times {
     #[must_use]
     pub fn new() -> Self {
-        let Ok(histogram) = Histogram::new_with_bounds(1, LONGEST_NS, 3) else {
+        let Ok(mut histogram) = Histogram::new_with_bounds(1, LONGEST_NS, 3) else {
             unreachable!("constant bounds are valid");
         };
+        // Writes to every page of it, so that none is met for the first time in a cycle.
+        histogram.reset();
         Self(histogram)
     }
 
     /// RT.
     pub fn record(&mut self, nanos: u64) {
         self.0.saturating_record(nanos);
+    }
+
+    /// So many at once. RT.
+    pub fn record_n(&mut self, nanos: u64, count: u64) {
+        // None at all would still be the longest.
+        if count > 0 {
+            self.0.saturating_record_n(nanos, count);
+        }
+    }
+
+    /// Forgets everything, without giving memory back.
+    pub fn clear(&mut self) {
+        self.0.reset();
+    }
+
+    /// Adds what another has recorded.
+    pub fn add(&mut self, other: &Self) {
+        for (nanos, count) in other.recorded() {
+            self.record_n(nanos, count);
+        }
+    }
+
+    /// The shortest times first, as far as they are told apart, and how often each was recorded.
+    pub fn recorded(&self) -> impl Iterator<Item = (u64, u64)> + '_ {
+        let each = self.0.iter_recorded();
+        each.map(|step| (step.value_iterated_to(), step.count_at_value()))
     }
 
     #[must_use]
@@ -70,16 +100,62 @@ pub struct Counters {
     pub refused_answers: u64,
 }
 
+impl Counters {
+    /// Both together.
+    #[must_use]
+    pub fn plus(&self, other: &Self) -> Self {
+        Self {
+            cycles: self.cycles + other.cycles,
+            lost_frames: self.lost_frames + other.lost_frames,
+            late_frames: self.late_frames + other.late_frames,
+            wkc_errors: self.wkc_errors + other.wkc_errors,
+            overruns: self.overruns + other.overruns,
+            link_errors: self.link_errors + other.link_errors,
+            refused_answers: self.refused_answers + other.refused_answers,
+        }
+    }
+}
+
+impl Stats {
+    /// Forgets everything, without giving memory back.
+    pub fn clear(&mut self) {
+        self.counters = Counters::default();
+        for times in [
+            &mut self.lateness,
+            &mut self.slept,
+            &mut self.round_trip,
+            &mut self.phase,
+            &mut self.work,
+        ] {
+            times.clear();
+        }
+    }
+
+    /// Adds what another has recorded.
+    pub fn add(&mut self, other: &Self) {
+        self.counters = self.counters.plus(&other.counters);
+        self.lateness.add(&other.lateness);
+        self.slept.add(&other.slept);
+        self.round_trip.add(&other.round_trip);
+        self.phase.add(&other.phase);
+        self.work.add(&other.work);
+    }
+}
+
 /// Everything the cycle records.
 #[derive(Debug, Clone, Default)]
 pub struct Stats {
     pub counters: Counters,
     /// Wake-up after the planned release.
     pub lateness: Times,
+    /// How late sleeping ended, whatever was spun after it.
+    pub slept: Times,
     /// Release to the last answer.
     pub round_trip: Times,
     /// Amount of the phase error against SYNC0.
     pub phase: Times,
     /// Wake-up to going to sleep again.
     pub work: Times,
+    /// What led to it.
+    pub journal: Journal,
 }

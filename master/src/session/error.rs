@@ -1,12 +1,13 @@
 //! Why a run failed: what, where, which code. What to do about it is the command line's to say.
 
+use std::sync::Arc;
+
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::{Mode, Refused, State, Trip};
 
 use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
-use crate::link::LinkError;
-use crate::link::packet::OpenError;
+use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::session::StepRef;
 
@@ -70,8 +71,13 @@ pub enum RunError {
     },
     #[error("{device}: {trip}")]
     Trip { device: DeviceRef, trip: Trip },
-    #[error("the bus is lost: {cycles} cycles in a row {}", lost_note(*answered, *wkc))]
+    #[error(
+        "{}: {cycles} cycles in a row {}",
+        lost(group.as_deref()), lost_note(*answered, *wkc)
+    )]
     BusLost {
+        /// The one whose process data it is, where it is not the whole machine's.
+        group: Option<String>,
         cycles: u32,
         wkc: (u16, u16),
         answered: bool,
@@ -97,12 +103,38 @@ pub enum RunError {
         /// Where it was the axis that refused.
         by_axis: Option<Box<Refused>>,
     },
-    #[error("{step}: {device}: the target {target} is not reached, the axis is at {actual:.4}")]
+    #[error(
+        "{step}: {device}: the target of {} {unit} is not reached, the axis is at {actual:.4} {unit}",
+        rounded(*target)
+    )]
     NotReached {
         device: DeviceRef,
         step: StepRef,
+        /// Both in `unit`.
         target: f64,
         actual: f64,
+        unit: String,
+    },
+    #[error(
+        "{step}: {device}: touch probe {input} is not armed within {timeout_ms} ms (0x60B8, 0x60B9)"
+    )]
+    ProbeNotArmed {
+        device: DeviceRef,
+        step: StepRef,
+        input: u8,
+        timeout_ms: u64,
+    },
+    #[error(
+        "{step}: {device}: no {edge} edge came at the input of touch probe {input} on the way to {} {unit}",
+        rounded(*target)
+    )]
+    NotProbed {
+        device: DeviceRef,
+        step: StepRef,
+        input: u8,
+        edge: &'static str,
+        target: f64,
+        unit: String,
     },
     #[error(
         "{step}: {device}: `{what}` is not done after {timeout_ms} ms: the drive is in {state}"
@@ -148,6 +180,14 @@ pub enum RunError {
     FollowLost { device: DeviceRef, reason: String },
     #[error("{device}: is not enabled: {reason}")]
     EnableRefused { device: DeviceRef, reason: String },
+    #[error("{}{device}: stopped with its group `{group}`: {cause}", at(step.as_ref()))]
+    GroupStopped {
+        device: DeviceRef,
+        step: Option<StepRef>,
+        group: String,
+        /// What stopped the group.
+        cause: Arc<RunError>,
+    },
     #[error("the controller panicked")]
     Controller,
     #[error("interrupted")]
@@ -167,6 +207,12 @@ fn al_note(al_status: Option<(u8, u16)>) -> String {
     }
 }
 
+/// Without the digits that are only rounding.
+fn rounded(x: f64) -> f64 {
+    let short = (x * 1e6).round() / 1e6;
+    if short.is_finite() { short } else { x }
+}
+
 fn mode_note(confirmed: bool) -> &'static str {
     if confirmed {
         ""
@@ -182,6 +228,17 @@ fn code_note(code: Option<u16>) -> String {
             describe(code).text
         ),
         None => String::new(),
+    }
+}
+
+fn at(step: Option<&StepRef>) -> String {
+    step.map_or_else(String::new, |step| format!("{step}: "))
+}
+
+fn lost(group: Option<&str>) -> String {
+    match group {
+        Some(group) => format!("the process data of the group `{group}` is lost"),
+        None => "the bus is lost".to_owned(),
     }
 }
 

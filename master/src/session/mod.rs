@@ -3,13 +3,10 @@
 //! One thread owns the link. In real time it becomes the real-time thread and a second one runs
 //! the supervisor beside it; in virtual time it does both in turn, so that a run can be repeated.
 
-use std::future::Future;
 use std::path::PathBuf;
-use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Sender, channel};
-use std::task::{Context, Poll, Waker};
 use std::thread;
 
 use ecaxis_axis::Axis;
@@ -17,33 +14,38 @@ use ecaxis_sim::FaultScript;
 use ethercrab::{Command as Datagram, MainDevice};
 
 use crate::bringup::{Bus, Step, bring_up};
-use crate::clock::{Clock, Nanos};
-use crate::config::{self, Machine, Signal};
+use crate::clock::{self, Clock, Nanos};
+use crate::config::{Machine, Signal};
 use crate::link::Link;
 use crate::link::port::{Port, main_device, pump};
 use crate::rt::controller::Controller;
-use crate::rt::exchange::Exchange;
+use crate::rt::cycle::{Parts, Remains, Signals, Timing, first_snapshot};
+use crate::rt::exchange::{Exchange, Member};
+use crate::rt::groups::Group;
 use crate::rt::guard::Guard;
 use crate::rt::handover::ends;
 use crate::rt::image::{self, AxisBits, Bits, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::rt::slot::AxisSlot;
-use crate::rt::{
-    self,
-    cycle::{Engine, Parts, Remains, Signals, Timing, first_snapshot},
-};
-use crate::supervise::{Ended, Supervisor, executor, interruptible};
+use crate::rt::stats::Stats;
+use crate::supervise::{Supervisor, interruptible};
 use crate::wire::Datagrams;
 
 mod error;
+mod events;
 mod open;
 mod progress;
 mod summary;
+mod turn;
 
 pub use error::RunError;
+pub use events::EventLine;
+pub(crate) use events::clock_off;
 pub use open::{simulated_bus, topology};
-pub use progress::{AxisLine, Observer, Progress, Status, StepRef};
-pub use summary::{AxisSummary, Summary};
+pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
+use summary::Aside;
+pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
+use turn::Turned;
 
 /// Stack of the thread that owns the link; ethercrab's futures hold its tables by value.
 const STACK: usize = 16 * 1024 * 1024;
@@ -84,6 +86,8 @@ impl Default for Options {
 pub struct Outcome {
     pub summary: Option<Summary>,
     pub result: Result<(), RunError>,
+    /// What the summary is of.
+    pub stats: Option<Box<Stats>>,
 }
 
 impl From<RunError> for Outcome {
@@ -91,6 +95,7 @@ impl From<RunError> for Outcome {
         Self {
             summary: None,
             result: Err(error),
+            stats: None,
         }
     }
 }
@@ -167,8 +172,23 @@ pub fn prepare(
     controller: Option<Box<dyn Controller>>,
 ) -> Result<Prepared, RunError> {
     // Whatever can be known to fail without a bus fails before there is one.
+    plan(machine)?;
+    let link = open::link(machine, options, |concern| {
+        let _ = progress.send(Progress::Concern(concern));
+    })?;
+    prepare_on(link, machine, options, stop, progress, controller)
+}
+
+/// Likewise, on a link of one's own in the place of the file's `nic`.
+pub fn prepare_on(
+    mut link: Box<dyn Link>,
+    machine: &Arc<Machine>,
+    options: &Options,
+    stop: Arc<AtomicBool>,
+    progress: Sender<Progress>,
+    controller: Option<Box<dyn Controller>>,
+) -> Result<Prepared, RunError> {
     let (image, ..) = plan(machine)?;
-    let mut link = open::link(machine, options)?;
     let (main_device, mut port) = main_device(machine.bus.cycle_ns);
     let carried = Carried {
         clock: options.clock,
@@ -183,13 +203,25 @@ pub fn prepare(
             let wire = Datagrams::new(main_device);
             let timing = Timing {
                 cycle_ns: machine.bus.cycle_ns,
-                spin_ns: machine.bus.spin_ns,
-                stop_patience_ns: stop_patience(machine),
+                clock_window_ns: machine.bus.clock_window_ns,
+                spin: machine.bus.spin,
             };
+            let groups = Group::all(machine);
+            let patience = groups.iter().map(|group| group.patience).max();
             let clock = options.clock;
-            let stations: Vec<u16> = bus.devices.iter().map(|d| d.at.station).collect();
-            let (rt_end, outer) = ends(&first_snapshot(&slots, &signals, stations.len()));
-            let mut exchange = Exchange::new(&bus.image, bus.dc.as_ref(), &stations);
+            let members = bus.devices.iter().map(|device| Member {
+                station: device.at.station,
+                clock: device.dc,
+            });
+            let members: Vec<_> = members.collect();
+            let (rt_end, outer) = ends(&first_snapshot(
+                &slots,
+                groups.len(),
+                &signals,
+                members.len(),
+            ));
+            let mut exchange =
+                Exchange::new(&bus.image, bus.dc.as_ref(), &members, machine.bus.exchange);
             hold_outputs(machine, &bus, &mut exchange);
             exchange.stage();
             let controlled = controller.is_some();
@@ -200,15 +232,13 @@ pub fn prepare(
                 port,
                 exchange,
                 axes: slots,
+                groups,
                 signals,
                 controller,
                 tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
                 stop: machine.stop.clone(),
                 phase: bus.dc.as_ref().map(Phase::new),
-                guard: Guard::new(
-                    machine.bus.lost_frames,
-                    u16::try_from(stations.len()).unwrap_or(u16::MAX),
-                ),
+                guard: Guard::new(machine.bus.lost_frames, &bus.image.groups),
                 end: rt_end,
             };
             let supervisor = Supervisor {
@@ -223,11 +253,13 @@ pub fn prepare(
                 enable: options.enable,
                 controlled,
                 axes,
-                stop_patience: timing.stop_patience_ns,
+                stop_patience: patience.unwrap_or(0),
                 orders_given: 0,
                 refused: None,
-                last_status: crate::clock::now(),
-                listened: (crate::clock::now(), 0),
+                captures: Vec::new(),
+                stopped: Vec::new(),
+                last_status: clock::now(),
+                listened: (clock::now(), 0),
             };
             Ok(Prepared { parts, supervisor })
         }
@@ -255,10 +287,8 @@ type Plan = (ImagePlan, Vec<AxisSlot>, Vec<usize>, Signals);
 
 /// The process image, and every axis with its place in it.
 fn plan(machine: &Machine) -> Result<Plan, RunError> {
-    let layouts = machine.devices.iter().map(|d| &d.selection.layout);
-    let sizes: Vec<_> = layouts.map(|l| (l.rx_bytes(), l.tx_bytes())).collect();
     let name = |index: usize| machine.devices[index].name.clone();
-    let image = image::plan(&sizes).map_err(|source| RunError::TooLarge {
+    let image = image::of(machine).map_err(|source| RunError::TooLarge {
         name: name(source.device),
         source,
     })?;
@@ -274,11 +304,15 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
                 source,
             }
         })?;
-        let axis = Axis::new(setup.config).map_err(|source| RunError::Axis {
+        let mut config = setup.config;
+        // A report is of the set-point of a cycle earlier.
+        let later = machine.bus.exchange.flights() - 1;
+        config.dead_time_s += f64::from(later) * machine.bus.cycle_ns as f64 * 1e-9;
+        let axis = Axis::new(config).map_err(|source| RunError::Axis {
             name: name(index),
             source,
         })?;
-        slots.push(AxisSlot::new(axis, bits));
+        slots.push(AxisSlot::new(axis, bits, image.groups[index]));
         axes.push(index);
     }
     let bits = |signal: &Signal, output: bool| {
@@ -311,16 +345,6 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
     Ok((image, slots, axes, signals))
 }
 
-/// From full speed to rest within the limits of the slowest axis, and a second for the drive.
-fn stop_patience(machine: &Machine) -> Nanos {
-    let setups = machine.devices.iter().filter_map(|d| d.axis.as_ref());
-    let slowest = setups
-        .map(|setup| setup.config.limits.velocity / setup.config.limits.acceleration)
-        .fold(0.0, f64::max);
-    // Longer than an hour is as good as for ever; the cast saturates.
-    1_000_000_000 + (slowest.min(3600.0) * 1e9) as Nanos
-}
-
 /// Puts the outputs that no axis drives to the values that their drives hold.
 fn hold_outputs(machine: &Machine, bus: &Bus, exchange: &mut Exchange) {
     let devices = machine.devices.iter().zip(&bus.devices);
@@ -351,9 +375,13 @@ fn own_the_link(
     };
     let wire = supervisor.wire;
     let machine = &Arc::clone(&supervisor.machine);
-    let (remains, (ended, result)) = match options.clock {
-        Clock::Virtual => turn_in_virtual_time(parts, supervisor),
-        Clock::Real => match turn_in_real_time(parts, supervisor, &machine.bus, &told) {
+    let Turned {
+        remains,
+        result: (ended, result),
+        used,
+    } = match options.clock {
+        Clock::Virtual => turn::in_virtual_time(parts, supervisor),
+        Clock::Real => match turn::in_real_time(parts, supervisor, &machine.bus, &told) {
             Ok(done) => done,
             Err(error) => return error.into(),
         },
@@ -363,18 +391,31 @@ fn own_the_link(
         mut port,
         axes,
         stats,
+        spin_ns,
+        diagnoses,
+        started,
     } = remains;
     if result.is_err() {
         go_silent(options.clock, wire.main_device(), link.as_mut(), &mut port);
     }
+    let seen = link.stats();
     let (record, result) = match link.finish() {
         Ok(record) => (record, result),
         Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),
     };
-    let summary = Summary::new(machine, options.clock, &axes, &stats, ended, record);
+    let thread = used.map(|(used, wall_ns)| ThreadSummary::new(used, wall_ns, spin_ns, &stats));
+    let aside = Aside {
+        link: seen,
+        thread,
+        record,
+        errors: summary::device_errors(machine, &diagnoses),
+        events: events::lines(&stats.journal, started, machine),
+    };
+    let summary = Summary::new(machine, options.clock, &axes, &stats, ended, aside);
     Outcome {
         summary: Some(summary),
         result,
+        stats: Some(Box::new(stats)),
     }
 }
 
@@ -430,60 +471,4 @@ fn go_silent(
         .ignore_wkc()
         .send(main_device, 0x0011_u16);
     let _ = pump(port, link, clock, init);
-}
-
-type Turned = (Remains, (Ended, Result<(), RunError>));
-
-/// The supervisor gets its turn after every cycle.
-fn turn_in_virtual_time(parts: Parts, supervisor: Supervisor) -> Turned {
-    let mut engine = Engine::new(parts);
-    let mut beside = pin!(supervisor.run());
-    let mut context = Context::from_waker(Waker::noop());
-    let mut result = None;
-    while !engine.halted() {
-        engine.cycle();
-        if result.is_none()
-            && let Poll::Ready(done) = beside.as_mut().poll(&mut context)
-        {
-            result = Some(done);
-        }
-    }
-    (engine.into_remains(), result.unwrap_or_else(died))
-}
-
-fn turn_in_real_time(
-    parts: Parts,
-    supervisor: Supervisor,
-    config: &config::Bus,
-    told: &Sender<Progress>,
-) -> Result<Turned, RunError> {
-    // Started first, because a thread inherits the scheduling class and CPU of its parent.
-    let beside = thread::Builder::new()
-        .name("ecaxis-mailbox".to_owned())
-        .spawn(move || executor::block_on(supervisor.run()))
-        .map_err(|error| RunError::Thread(error.to_string()))?;
-    for denied in rt::thread::prepare(config.priority, config.cpu) {
-        let _ = told.send(Progress::Denied(denied));
-    }
-    // Locking the memory takes milliseconds; the first cycle is due one cycle from here.
-    let mut engine = Engine::new(parts);
-    while !engine.halted() {
-        engine.cycle();
-    }
-    let result = match beside.join() {
-        Ok(Ok(result)) => result,
-        Ok(Err(error)) => (Ended::default(), Err(RunError::Thread(error.to_string()))),
-        Err(panic) => (
-            Ended::default(),
-            Err(RunError::Panicked(panic_text(&*panic))),
-        ),
-    };
-    Ok((engine.into_remains(), result))
-}
-
-fn died() -> (Ended, Result<(), RunError>) {
-    (
-        Ended::default(),
-        Err(RunError::Panicked("the supervisor ended early".to_owned())),
-    )
 }

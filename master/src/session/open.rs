@@ -11,13 +11,16 @@ use super::{Options, RunError};
 use crate::clock::{self, Clock};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
-use crate::link::Link;
 use crate::link::capture::{Mode, Recorder};
-use crate::link::packet::PacketLink;
 use crate::link::recorded::Recorded;
 use crate::link::sim::SimLink;
+use crate::link::{self, Concern, Link};
 
-pub(super) fn link(machine: &Machine, options: &Options) -> Result<Box<dyn Link>, RunError> {
+pub(super) fn link(
+    machine: &Machine,
+    options: &Options,
+    mut tell: impl FnMut(Concern),
+) -> Result<Box<dyn Link>, RunError> {
     let link: Box<dyn Link> = match &machine.bus.nic {
         Nic::Sim => Box::new(SimLink::new(simulated_bus(
             machine,
@@ -25,7 +28,11 @@ pub(super) fn link(machine: &Machine, options: &Options) -> Result<Box<dyn Link>
             options.faults.as_ref(),
             None,
         )?)),
-        Nic::Interface(nic) => Box::new(PacketLink::open(nic)?),
+        Nic::Interface(nic) => {
+            let (link, concerns) = link::open(nic, machine.bus.link)?;
+            concerns.into_iter().for_each(&mut tell);
+            link
+        }
     };
     let Some(path) = &options.record else {
         return Ok(link);

@@ -1,14 +1,19 @@
 //! What a run tells while it goes on.
 
+use std::sync::Arc;
+
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
+use serde::Serialize;
 
 use crate::bringup::Step;
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
+use crate::link::Concern;
 use crate::rt::handover::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
-use crate::rt::thread::Denied;
+use crate::rt::thread::{Denied, Overload};
+use crate::session::RunError;
 
 /// Listens to a run.
 pub trait Observer {
@@ -35,7 +40,11 @@ pub enum Progress {
     Step(Step),
     /// Something the operating system did not permit; the run goes on.
     Denied(Denied),
+    /// The real-time thread took nearly all of its CPU.
+    Overload(Overload),
     Warning(String),
+    /// Something about the network interface.
+    Concern(Concern),
     /// Frames leave in phase with SYNC0.
     PhaseLocked,
     Enabled {
@@ -48,9 +57,62 @@ pub enum Progress {
         /// In words.
         what: String,
     },
+    /// A probing step has found its edge.
+    Captured {
+        run: u32,
+        capture: Capture,
+    },
+    /// A group of axes has begun to stop; the machine goes on without it.
+    GroupStopped {
+        group: String,
+        cause: Arc<RunError>,
+    },
+    /// A stopped group has been reset and can be enabled again.
+    GroupReleased {
+        group: String,
+    },
     /// Once a second of the machine's time.
     Status(Status),
     Stopping,
+}
+
+/// What a probing step has found.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Capture {
+    /// Number of the step.
+    pub step: String,
+    pub axis: String,
+    /// Touch probe 1 or 2.
+    pub input: u8,
+    /// `"rising"` or `"falling"`.
+    pub edge: &'static str,
+    /// How often the step has found one so far; the rest is of the last.
+    pub times: u32,
+    /// Where the drive was at the edge, user units; on a modulo axis counted on over its turns.
+    pub position: f64,
+    /// On a modulo axis.
+    pub place: Option<f64>,
+    pub unit: String,
+}
+
+impl std::fmt::Display for Capture {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let at = self.place.unwrap_or(self.position);
+        write!(
+            f,
+            "`{}`: {} edge of input {} at {:.4} {}",
+            self.axis,
+            self.edge,
+            self.input,
+            positive_zero(at),
+            self.unit
+        )
+    }
+}
+
+/// `-0.0000` reads like a mistake.
+pub(crate) fn positive_zero(x: f64) -> f64 {
+    if x.abs() < 0.000_05 { 0.0 } else { x }
 }
 
 /// The machine at one moment.

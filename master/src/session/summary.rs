@@ -1,14 +1,21 @@
 //! What a run comes to, in numbers.
 
+use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Mode, Scale};
 use serde::Serialize;
 
 use crate::clock::Clock;
 use crate::config::Machine;
+use crate::link::LinkStats;
 use crate::link::capture::RecordStats;
+use crate::os::process::ThreadUse;
+use crate::rt::exchange::{Diagnosis, ErrorCounters};
 use crate::rt::slot::AxisSlot;
 use crate::rt::stats::{Counters, Percentiles, Stats};
 use crate::supervise::Ended;
+
+use super::Capture;
+use super::events::EventLine;
 
 /// The result of a run. In virtual time every figure depends on the file and the seed alone.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -25,6 +32,8 @@ pub struct Summary {
     /// Ended by the user.
     pub interrupted: bool,
     pub counters: Counters,
+    /// What came over the network interface beside answers.
+    pub link: LinkStats,
     /// Wake-up after the planned release of a frame.
     pub wake_up_lateness: Percentiles,
     /// Planned release to the last answer.
@@ -33,9 +42,91 @@ pub struct Summary {
     pub dc_phase_error: Option<Percentiles>,
     /// Wake-up to the end of the cycle's work.
     pub work: Percentiles,
+    /// `None` in virtual time.
+    pub thread: Option<ThreadSummary>,
     pub axes: Vec<AxisSummary>,
+    /// What probing has found, one for each step.
+    pub probes: Vec<Capture>,
+    /// SubDevices whose error counters have grown.
+    pub errors: Vec<DeviceErrors>,
+    /// The last that the cycle has noticed, oldest first.
+    pub events: Vec<EventLine>,
+    /// Stops of groups that the machine went on through.
+    pub group_stops: Vec<GroupStop>,
     pub recorded_frames: Option<u64>,
     pub recorded_frames_dropped: Option<u64>,
+}
+
+/// What a SubDevice's error counters (0x0300–0x0313) have grown by since the cycle began; 255 stands for more. Four ports each.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct DeviceErrors {
+    pub name: String,
+    pub invalid_frames: [u8; 4],
+    pub rx_errors: [u8; 4],
+    pub forwarded: [u8; 4],
+    pub lost_links: [u8; 4],
+    pub processing_unit: u8,
+    pub pdi: u8,
+}
+
+/// Those with something to tell.
+pub(super) fn device_errors(machine: &Machine, diagnoses: &[Diagnosis]) -> Vec<DeviceErrors> {
+    let devices = machine.devices.iter().zip(diagnoses);
+    let grown = devices.map(|(device, found)| (device, found.grown()));
+    grown
+        .filter(|(_, grown)| *grown != ErrorCounters::default())
+        .map(|(device, grown)| DeviceErrors {
+            name: device.name.clone(),
+            invalid_frames: grown.invalid_frames,
+            rx_errors: grown.rx_errors,
+            forwarded: grown.forwarded,
+            lost_links: grown.lost_links,
+            processing_unit: grown.processing,
+            pdi: grown.pdi,
+        })
+        .collect()
+}
+
+/// The real-time thread, from the first cycle to the last.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ThreadSummary {
+    #[serde(flatten)]
+    pub used: ThreadUse,
+    /// Percent of its CPU.
+    pub load_percent: f64,
+    /// How late sleeping ended, whatever was spun after it; `count` is 0 where it never slept.
+    pub sleep_lateness: Percentiles,
+    /// Spinning before a release, at the end.
+    pub spin_ns: u64,
+}
+
+impl ThreadSummary {
+    pub(super) fn new(used: ThreadUse, wall_ns: u64, spin_ns: u64, stats: &Stats) -> Self {
+        Self {
+            used,
+            load_percent: used.load_percent(wall_ns),
+            sleep_lateness: stats.slept.summary(),
+            spin_ns,
+        }
+    }
+}
+
+/// What a run comes to beside its cycle.
+pub(super) struct Aside {
+    pub link: LinkStats,
+    pub thread: Option<ThreadSummary>,
+    pub record: Option<RecordStats>,
+    pub errors: Vec<DeviceErrors>,
+    pub events: Vec<EventLine>,
+}
+
+/// A group of axes that stopped while the machine went on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct GroupStop {
+    pub group: String,
+    pub cause: String,
+    /// It has been reset since.
+    pub released: bool,
 }
 
 /// One axis at the end, in user units. Positions are those of the last cycle in Operation enabled.
@@ -43,11 +134,15 @@ pub struct Summary {
 pub struct AxisSummary {
     pub name: String,
     pub unit: String,
+    /// The last one in which it had power, as the machine file writes it.
     pub mode: String,
     /// Whether it ever was in Operation enabled.
     pub was_enabled: bool,
     pub final_position: f64,
     pub target_position: f64,
+    /// On a modulo axis: where on the turn; positions count on.
+    pub final_place: Option<f64>,
+    pub target_place: Option<f64>,
     /// Target minus final position in the drive's counts; CSP only.
     pub final_error_counts: Option<i64>,
     pub largest_following_error: f64,
@@ -60,6 +155,15 @@ fn error_counts(scale: &Scale, status: &AxisStatus) -> i64 {
     ((status.target_position - status.position) * scale.counts_per_unit()).round() as i64
 }
 
+/// `csp`.
+fn name_of(mode: Mode) -> String {
+    let known = ecaxis_esi::Mode::ALL.into_iter();
+    let mut known = known.filter(|known| known.code() == mode.code());
+    known
+        .next()
+        .map_or_else(|| mode.to_string(), |known| known.name().to_owned())
+}
+
 impl Summary {
     pub(super) fn new(
         machine: &Machine,
@@ -67,7 +171,7 @@ impl Summary {
         axes: &[AxisSlot],
         stats: &Stats,
         ended: Ended,
-        record: Option<RecordStats>,
+        aside: Aside,
     ) -> Self {
         let setups = machine
             .devices
@@ -78,13 +182,18 @@ impl Summary {
             .map(|((device, setup), slot)| {
                 let now = slot.axis.status();
                 let last = slot.last_enabled.unwrap_or(now);
+                let scale = &setup.config.scale;
+                let turns = scale.modulo().is_some();
+                let place = |position| turns.then(|| scale.place(UserUnits(position)).0);
                 AxisSummary {
                     name: device.name.clone(),
                     unit: setup.unit.clone(),
-                    mode: setup.mode.to_string(),
+                    mode: name_of(last.mode),
                     was_enabled: slot.last_enabled.is_some(),
                     final_position: last.position,
                     target_position: last.target_position,
+                    final_place: place(last.position),
+                    target_place: place(last.target_position),
                     final_error_counts: (last.mode == Mode::Csp && slot.last_enabled.is_some())
                         .then(|| error_counts(&setup.config.scale, &last)),
                     largest_following_error: slot.largest_following_error,
@@ -109,13 +218,19 @@ impl Summary {
             program_runs: ended.runs,
             interrupted: ended.interrupted,
             counters: stats.counters,
+            link: aside.link,
             wake_up_lateness: stats.lateness.summary(),
             round_trip: stats.round_trip.summary(),
             dc_phase_error: (phase.count > 0).then_some(phase),
             work: stats.work.summary(),
+            thread: aside.thread,
             axes,
-            recorded_frames: record.map(|r| r.written),
-            recorded_frames_dropped: record.map(|r| r.dropped),
+            probes: ended.captures,
+            errors: aside.errors,
+            events: aside.events,
+            group_stops: ended.group_stops,
+            recorded_frames: aside.record.map(|r| r.written),
+            recorded_frames_dropped: aside.record.map(|r| r.dropped),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! What stopped the machine, in words: asks the devices while they still answer.
 
-use ecaxis_axis::AxisStatus;
+use ecaxis_axis::{AxisStatus, State};
 
 use super::Supervisor;
 use crate::bringup::al;
@@ -14,7 +14,13 @@ const ERROR_CODE: u16 = 0x603f;
 const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
 
 impl Supervisor {
-    pub(super) async fn explain_stop(&mut self, cause: StopCause, snapshot: &Snapshot) -> RunError {
+    /// `group`: the one that stops, where the machine does not.
+    pub(super) async fn explain_stop(
+        &mut self,
+        cause: StopCause,
+        group: Option<usize>,
+        snapshot: &Snapshot,
+    ) -> RunError {
         match cause {
             // `tick` asks only for causes that are failures.
             StopCause::Requested => RunError::Interrupted,
@@ -35,6 +41,13 @@ impl Supervisor {
                 },
             },
             StopCause::Controller => RunError::Controller,
+            StopCause::Powered { axis } => RunError::NotDisabled {
+                device: self.device_of(axis),
+                state: snapshot
+                    .axes
+                    .get(axis)
+                    .map_or(State::OperationEnabled, |s| s.state),
+            },
             StopCause::DriveFault { axis } => {
                 let code = self.error_code(axis).await;
                 if let Some(code) = code {
@@ -59,12 +72,18 @@ impl Supervisor {
                 last_wkc,
                 answered,
             } => RunError::BusLost {
+                group: group.map(|group| self.group_name(group)),
                 cycles,
                 wkc: last_wkc,
                 answered,
             },
             StopCause::LeftOp { al_status } => {
-                for device in self.bus.addresses() {
+                for (index, device) in self.bus.addresses().into_iter().enumerate() {
+                    let own = self.machine.group_of(index);
+                    // What is known of already is not the cause.
+                    if group.is_some_and(|group| group != own) || self.is_stopped(own) {
+                        continue;
+                    }
                     match al::read_status(&self.wire, device.station).await {
                         Ok(Some((status, code))) if status != 8 => {
                             let state = al::AlState::from_status(status);

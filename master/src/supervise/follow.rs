@@ -1,11 +1,14 @@
 //! Steps in which axes follow more than a target of their own: lines, waves, tables, other axes.
 
-use ecaxis_axis::group::{Line, LineAxis};
-use ecaxis_axis::setpoint::{MotionLimits, Playback, PositionWave, Wave};
+use ecaxis_axis::group::{Line, LineAxis, arrive_together};
+use ecaxis_axis::setpoint::{
+    GearConfig, Goal, JerkLimited, MotionLimits, Order as Way, Playback, PositionWave,
+    SetpointError, Wave,
+};
 use ecaxis_axis::{Command, Limits};
 
 use super::Supervisor;
-use super::program::SETTLE_TIMEOUT;
+use super::program::{Aim, Settling};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
 use crate::rt::feed::{FeedState, Start, commanded};
@@ -45,7 +48,6 @@ impl Supervisor {
         targets: &[(usize, f64)],
         part: [f64; 2],
     ) -> Result<(), RunError> {
-        let [speed, ramp] = part.map(|part| part * WHOLE);
         let places = self.targets(targets);
         let axes: Vec<usize> = places.iter().map(|&(axis, _)| axis).collect();
         self.settle(&axes, start).await?;
@@ -53,7 +55,6 @@ impl Supervisor {
         let mut line_axes = Vec::with_capacity(axes.len());
         for (&(axis, target), &(device, _)) in places.iter().zip(targets) {
             let from = commanded(&snapshot.axes[axis]);
-            let limits = self.limits(device);
             line_axes.push(LineAxis {
                 from,
                 target: if relative {
@@ -61,12 +62,8 @@ impl Supervisor {
                 } else {
                     self.place_to_go(axis, from.position, target)
                 },
-                limits: MotionLimits {
-                    velocity: limits.velocity * speed,
-                    acceleration: limits.acceleration * ramp,
-                    jerk: limits.jerk() * ramp,
-                },
-                range: limits.position,
+                limits: self.part_of(device, part),
+                range: self.limits(device).position,
             });
         }
         let line = Line::plan(&line_axes)
@@ -76,6 +73,84 @@ impl Supervisor {
             .map(|(&axis, part)| (axis, Start::Line(line.along(part))))
             .collect();
         self.follow(step, start, &feeds, FeedState::Finished).await
+    }
+
+    /// Every axis jerk-limited on its own way, all as slowly as the one that takes longest. `part` as of a line.
+    pub(super) async fn together(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        relative: bool,
+        targets: &[(usize, f64)],
+        part: [f64; 2],
+    ) -> Result<(), RunError> {
+        let axes = self.places(
+            &targets
+                .iter()
+                .map(|&(device, _)| device)
+                .collect::<Vec<_>>(),
+        );
+        self.settle(&axes, start).await?;
+        let there = self.destinations(relative, targets).await?;
+        let snapshot = self.tick().await?;
+        let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
+        let mut moves = Vec::with_capacity(axes.len());
+        for (&(axis, target), &(device, _)) in there.iter().zip(targets) {
+            let from = commanded(&snapshot.axes[axis]);
+            let order = Way {
+                range: self.limits(device).position,
+                ..Way::within(Goal::Position(target), self.part_of(device, part))
+            };
+            let planned = if from.velocity == 0.0 {
+                JerkLimited::new(order, from, dt_s)
+            } else {
+                let velocity = from.velocity;
+                Err(SetpointError::NotAtRest { velocity })
+            };
+            moves.push(planned.map_err(|error| self.refusal(step, axis, &error))?);
+        }
+        let first = axes.first().copied().unwrap_or_default();
+        arrive_together(&mut moves).map_err(|error| self.refusal(step, first, &error))?;
+        let feeds = axes.iter().zip(&moves);
+        let feeds: Vec<_> = feeds
+            .map(|(&axis, &planned)| (axis, Start::Move(planned)))
+            .collect();
+        self.follow(step, start, &feeds, FeedState::Finished).await
+    }
+
+    /// Fractions of the velocity, and of the acceleration and jerk limits of the axis of a device.
+    fn part_of(&self, device: usize, part: [f64; 2]) -> MotionLimits {
+        let [speed, ramp] = part.map(|part| part * WHOLE);
+        let limits = self.limits(device);
+        MotionLimits {
+            velocity: limits.velocity * speed,
+            acceleration: limits.acceleration * ramp,
+            jerk: limits.jerk() * ramp,
+        }
+    }
+
+    /// `devices`: the follower and the one that it follows.
+    pub(super) async fn gear(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        devices: [usize; 2],
+        actual: bool,
+        config: GearConfig,
+    ) -> Result<(), RunError> {
+        let feed = match *self.places(&devices) {
+            [axis, master] => Some((
+                axis,
+                Start::Gear {
+                    master,
+                    actual,
+                    config,
+                },
+            )),
+            _ => None,
+        };
+        let feeds: Vec<_> = feed.into_iter().collect();
+        self.follow(step, start, &feeds, FeedState::Engaged).await
     }
 
     pub(super) async fn wave(
@@ -111,10 +186,12 @@ impl Supervisor {
         let axes = self.places(&[device]);
         let [first, _] = self.machine.tables[table].table.ends();
         let there: Vec<_> = axes.iter().map(|&axis| (axis, first)).collect();
-        self.reach(step, start, &there, |position| Command::MoveTo {
-            position,
-            speed,
-            ramp,
+        self.reach(step, start, Aim::Position, &there, |position| {
+            Command::MoveTo {
+                position,
+                speed,
+                ramp,
+            }
         })
         .await?;
         if self.over(start) {
@@ -145,7 +222,7 @@ impl Supervisor {
             .map(|&(axis, start)| Order::Feed { axis, start });
         self.orders(&orders.collect::<Vec<_>>()).await;
         let begun = clock::now();
-        let mut done_since = None;
+        let mut settling = Settling::default();
         self.watch(step, start, |this, snapshot| {
             let mut done = true;
             let mut late = None;
@@ -168,18 +245,14 @@ impl Supervisor {
                     let axis = feeds.first().map_or(0, |&(axis, _)| axis);
                     return Err(this.refusal(step, axis, &"it does not catch up"));
                 }
-                done_since = None;
+                settling = Settling::default();
                 return Ok(false);
             }
             let Some(axis) = late else { return Ok(true) };
-            let since = *done_since.get_or_insert_with(clock::now);
-            if clock::now().saturating_sub(since) > SETTLE_TIMEOUT {
-                return Err(RunError::NotReached {
-                    device: this.device_of(axis),
-                    step: step.into(),
-                    target: snapshot.axes[axis].target_position,
-                    actual: snapshot.axes[axis].position,
-                });
+            let status = &snapshot.axes[axis];
+            let target = status.target_position;
+            if settling.over() {
+                return Err(this.not_reached(step, axis, Aim::Position, target, status));
             }
             Ok(false)
         })

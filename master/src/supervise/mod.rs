@@ -14,16 +14,20 @@ use ecaxis_axis::{Command, Refused};
 
 use crate::bringup::{AlState, Bus, DeviceRef, StateError, al};
 use crate::clock::{self, Nanos};
-use crate::config::Machine;
+use crate::config::steps::enables;
+use crate::config::{Machine, Step};
 use crate::rt::cycle::has_power;
+use crate::rt::exchange::Probe;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
-use crate::session::{Progress, RunError, Status};
+use crate::session::{Capture, GroupStop, Progress, RunError, Status, clock_off};
 use crate::wire::Datagrams;
+use groups::StoppedGroup;
 
 pub mod executor;
 mod faults;
 mod follow;
+mod groups;
 mod program;
 
 /// Cycles are looked at this often.
@@ -32,8 +36,8 @@ const TICK: Duration = Duration::from_millis(1);
 const LOCK_TIMEOUT: Nanos = 5_000_000_000;
 /// Cycles before Op is asked for, besides those in which the diagnostic slot visits every device.
 const FIRST_CYCLES: u64 = 20;
-/// Diagnostic reads per device.
-const PROBES: usize = 3;
+/// Diagnostic reads per device until its clock has been looked at.
+const PROBES: usize = Probe::ClockDifference as usize + 1;
 /// A clock closer to the reference than this has settled.
 const SETTLED_NS: u32 = 1_000;
 /// The drives' own quick stop may take so long after the cycle's patience is over.
@@ -68,6 +72,10 @@ pub struct Supervisor {
     pub orders_given: u64,
     /// The last command that an axis did not take.
     pub refused: Option<(usize, Refused)>,
+    /// What probing has found, one for each step.
+    pub captures: Vec<Capture>,
+    /// Stops of groups that the machine went on through, in the order in which they were told.
+    pub stopped: Vec<StoppedGroup>,
     /// When the last status was told.
     pub last_status: Nanos,
     /// When a mailbox was last listened to, and the device whose turn is next.
@@ -75,12 +83,16 @@ pub struct Supervisor {
 }
 
 /// How the machine's program ended.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Ended {
     /// Complete runs of the program.
     pub runs: u32,
     /// Stopped by the user before its end.
     pub interrupted: bool,
+    /// What probing has found, one for each step.
+    pub captures: Vec<Capture>,
+    /// Groups that stopped while the machine went on.
+    pub group_stops: Vec<GroupStop>,
 }
 
 /// Runs a future until it ends or the user wants everything to; `None` then.
@@ -102,12 +114,14 @@ impl Supervisor {
         let stop = Arc::clone(&self.stop);
         let worked = interruptible(&stop, self.work(&mut ended)).await;
         ended.interrupted = worked.is_none();
+        ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
         let back = self.wind_down().await;
         if result.is_ok() {
             result = back;
         }
         self.order(Order::Halt).await;
+        ended.captures = std::mem::take(&mut self.captures);
         (ended, result)
     }
 
@@ -126,9 +140,9 @@ impl Supervisor {
         if self.controlled {
             return self.follow_controller(ended).await;
         }
-        if !program::enables(&self.machine.steps) {
+        if !enables(&self.machine.steps) {
             let all: Vec<usize> = (0..self.axes.len()).collect();
-            self.enable_axes(&all).await?;
+            self.enable_axes(None, &all).await?;
         }
         self.run_program(ended).await
     }
@@ -179,9 +193,10 @@ impl Supervisor {
             .map(|(device, found)| (device.at.clone(), found.clock_difference))
     }
 
-    async fn enable_axes(&mut self, axes: &[usize]) -> Result<(), RunError> {
+    async fn enable_axes(&mut self, step: Option<&Step>, axes: &[usize]) -> Result<(), RunError> {
         let snapshot = self.tick().await?;
         let mut orders = Vec::with_capacity(2 * axes.len());
+        self.none_stopped(step, axes)?;
         for &axis in axes {
             if snapshot.axes.get(axis).is_some_and(|s| s.fault.is_some()) {
                 self.tell_of_old_fault(axis).await;
@@ -193,9 +208,10 @@ impl Supervisor {
         }
         self.orders(&orders).await;
         let start = clock::now();
-        let timeout = self.machine.bus.enable_timeout_ns;
+        let timeout = self.machine.bus.enable_timeout_ns + self.longest_release(axes);
         loop {
             let snapshot = self.tick().await?;
+            self.none_stopped(step, axes)?;
             if let Some((axis, reason)) = self.refused.take() {
                 return Err(RunError::EnableRefused {
                     device: self.device_of(axis),
@@ -219,6 +235,17 @@ impl Supervisor {
         Ok(())
     }
 
+    /// Of the brakes of axes: the drive is enabled meanwhile.
+    fn longest_release(&self, axes: &[usize]) -> Nanos {
+        let devices = axes.iter().filter_map(|&axis| self.axes.get(axis));
+        let brakes = devices.filter_map(|&device| {
+            let axis = self.machine.devices.get(device)?.axis.as_ref()?;
+            Some(axis.config.brake.release_s)
+        });
+        // Configured as whole nanoseconds; the cast saturates.
+        (brakes.fold(0.0, f64::max) * 1e9) as Nanos
+    }
+
     /// Waits for the next look at the cycle; fails if the cycle has stopped the machine.
     async fn tick(&mut self) -> Result<Snapshot, RunError> {
         clock::delay(TICK).await;
@@ -238,8 +265,9 @@ impl Supervisor {
         if let Some(cause) = snapshot.stopping
             && cause != StopCause::Requested
         {
-            return Err(self.explain_stop(cause, &snapshot).await);
+            return Err(self.explain_stop(cause, None, &snapshot).await);
         }
+        self.tell_of_groups(&snapshot).await;
         if clock::now().saturating_sub(self.listened.0) >= LISTEN_PERIOD {
             self.listen().await;
         }
@@ -253,8 +281,21 @@ impl Supervisor {
                 Event::PhaseLost { cycle } => self.tell(Progress::Warning(format!(
                     "cycle {cycle}: the release of frames has lost its phase to SYNC0"
                 ))),
+                Event::ClockOff {
+                    device,
+                    difference_ns,
+                    ..
+                } => {
+                    let devices = &self.machine.devices;
+                    let name = devices.get(device).map_or("?", |d| d.name.as_str());
+                    self.tell(Progress::Warning(clock_off(name, difference_ns)));
+                }
                 Event::Refused { axis, reason, .. } => self.refused = Some((axis, reason)),
-                Event::Stopping { .. } | Event::PhaseLocked { .. } => {}
+                // The snapshot tells of stops, and cannot be lost.
+                Event::Stopping { .. }
+                | Event::GroupStopping { .. }
+                | Event::GroupReleased { .. }
+                | Event::PhaseLocked { .. } => {}
             }
         }
     }
@@ -266,10 +307,16 @@ impl Supervisor {
         let result = self.await_rest().await;
         self.pass_events_on();
         self.order(Order::Unguard).await;
-        let devices = self.bus.addresses();
+        let stopped = |device: usize| self.is_stopped(self.machine.group_of(device));
+        let devices = self.bus.addresses().into_iter().enumerate();
+        let (stopped, others): (Vec<_>, Vec<_>) = devices.partition(|(device, _)| stopped(*device));
+        let addresses = |devices: Vec<(usize, DeviceRef)>| -> Vec<DeviceRef> {
+            devices.into_iter().map(|(_, at)| at).collect()
+        };
+        let (stopped, others) = (addresses(stopped), addresses(others));
         let mut lowered = Ok(());
         for state in [AlState::SafeOp, AlState::PreOp, AlState::Init] {
-            match al::lower_state(&self.wire, &devices, state, al::BACK_TIMEOUT).await {
+            match al::lower_state(&self.wire, &others, state, al::BACK_TIMEOUT).await {
                 Ok(()) => self.tell(Progress::Step(crate::bringup::Step::State(state))),
                 Err(error) => {
                     let silent = matches!(error, StateError::Wire { .. });
@@ -282,6 +329,11 @@ impl Supervisor {
                     }
                 }
             }
+            // The machine has gone on without them; they go along as far as they still can.
+            if let Err(error) = al::lower_state(&self.wire, &stopped, state, al::BACK_TIMEOUT).await
+            {
+                tracing::debug!("{error}");
+            }
         }
         result.and(lowered)
     }
@@ -289,19 +341,26 @@ impl Supervisor {
     /// Until every axis is without power, the patience is over, or nobody has answered for long.
     async fn await_rest(&mut self) -> Result<(), RunError> {
         let start = clock::now();
-        let mut last_answer = start;
+        let mut answered = vec![start; self.machine.stop.groups.len() + 1];
         loop {
             clock::delay(TICK).await;
             let snapshot = self.outer.snapshots.read().clone();
             let now = clock::now();
-            if snapshot.inputs_fresh {
-                last_answer = now;
+            for (last, group) in answered.iter_mut().zip(&snapshot.groups) {
+                if group.fresh {
+                    *last = now;
+                }
             }
-            let waited = now.saturating_sub(start);
-            let over = waited > self.stop_patience + STOP_MARGIN
-                || now.saturating_sub(last_answer) > LOST_BUS_TIMEOUT
+            let silent = |group: usize| {
+                let last = answered.get(group).copied().unwrap_or(start);
+                now.saturating_sub(last) > LOST_BUS_TIMEOUT
+            };
+            let mut groups = snapshot.groups.iter().enumerate();
+            let rests = snapshot.stopping.is_some()
+                && groups.all(|(index, group)| !group.powered || silent(index));
+            let over = now.saturating_sub(start) > self.stop_patience + STOP_MARGIN
                 || self.outer.orders.is_abandoned();
-            if !snapshot.stopped && !over {
+            if !rests && !over {
                 continue;
             }
             // A fault that came while the machine was stopping has not been told yet.
@@ -311,20 +370,23 @@ impl Supervisor {
                     (None, Some(trip)) => StopCause::Trip { axis, trip },
                     (None, None) => continue,
                 };
-                if self.enable {
-                    return Err(self.explain_stop(cause, &snapshot).await);
+                if self.enable && !self.is_stopped(self.group_of(axis)) {
+                    return Err(self.explain_stop(cause, None, &snapshot).await);
                 }
             }
-            let powered = snapshot
-                .axes
-                .iter()
-                .position(|status| has_power(status.state));
+            // What has not answered for long has been told of if its group was stopped.
+            let left = |axis: usize| {
+                let group = self.group_of(axis);
+                !(self.is_stopped(group) && silent(group))
+            };
+            let mut axes = snapshot.axes.iter().enumerate();
+            let powered = axes.find(|(axis, status)| has_power(status.state) && left(*axis));
             return match powered {
-                Some(axis) if !snapshot.stopped => Err(RunError::NotDisabled {
+                Some((axis, status)) => Err(RunError::NotDisabled {
                     device: self.device_of(axis),
-                    state: snapshot.axes[axis].state,
+                    state: status.state,
                 }),
-                _ => Ok(()),
+                None => Ok(()),
             };
         }
     }

@@ -233,7 +233,7 @@ pub(super) fn homing(
             let name = selection
                 .dictionary
                 .item(object.index, object.subindex)
-                .map_or(String::new(), |item| item.name.clone());
+                .map_or(String::new(), |item| item.name.to_string());
             esi::StartupSdo {
                 transition: "PS",
                 index: object.index,

@@ -235,7 +235,9 @@ pub(super) fn torque(
         .torque_unit
         .as_ref()
         .map_or(raw.span.clone(), Spanned::span);
-    if unit == TorqueUnit::Amperes && constant.is_none() {
+    let drive_knows = selection.is_some_and(is_maxon);
+    let unknown = unit == TorqueUnit::Amperes && constant.is_none();
+    if unknown && !drive_knows {
         let message = "torques in A need the motor's torque constant";
         p.add_hint(at, message, "add `torque_constant = 0.0385` (Nm/A)");
         return None;
@@ -245,6 +247,11 @@ pub(super) fn torque(
         rated,
         rated_from,
         constant,
+        constant_from: if constant.is_some() {
+            UnitFrom::File
+        } else {
+            UnitFrom::Nothing
+        },
         counts_per_newton_metre,
         percent_per_unit: 1.0,
         limit_said: raw.limits.torque.is_some(),
@@ -253,11 +260,17 @@ pub(super) fn torque(
     let limit = raw.limits.torque.as_ref().map(|n| *n.get_ref());
     match (unit, rated, limit) {
         (TorqueUnit::Percent, ..) => Some(torque),
-        (_, Some(rated), _) => torque.with_rated(rated, rated_from),
-        (_, None, Some(limit)) => Some(TorqueSetup {
+        (_, Some(rated), _) if !unknown => torque.with_rated(rated, rated_from),
+        (_, _, Some(limit)) => Some(TorqueSetup {
             percent_per_unit: 100.0 / limit,
             ..torque
         }),
+        (_, Some(_), None) => {
+            let message = "only the drive knows the motor's torque constant (0x3001:05), so torques in A need a limit";
+            let hint = "add `torque` to `limits`, or `torque_constant = 0.0385` (Nm/A)";
+            p.add_hint(at, message, hint);
+            None
+        }
         (_, None, None) => {
             let message = format!(
                 "only the drive knows the motor's rated torque (0x6076), so torques in {unit} need a limit"
@@ -285,9 +298,12 @@ fn counts_per_newton_metre(selection: Option<&esi::Selection>) -> f64 {
     if let [0, 0, NEWTON_METRE, prefix] = unit.to_le_bytes() {
         return 10f64.powi(-i32::from(i8::from_le_bytes([prefix])));
     }
-    let maxon =
-        selection.dictionary.item(0x30b0, 0).is_some() || selection.identity.vendor == MAXON;
-    if maxon { 1e6 } else { 1e3 }
+    if is_maxon(selection) { 1e6 } else { 1e3 }
+}
+
+/// Whether maxon's own objects mean what maxon's documents say.
+pub(crate) fn is_maxon(selection: &esi::Selection) -> bool {
+    selection.dictionary.item(0x30b0, 0).is_some() || selection.identity.vendor == MAXON
 }
 
 impl TorqueSetup {

@@ -20,10 +20,14 @@ macro_rules! optional {
 }
 
 mod axis;
+mod motion;
 mod step;
+mod stop;
 
 pub(crate) use axis::{RawAxis, RawHoming, RawLimits, RawLoops};
+pub(crate) use motion::RawProbe;
 pub(crate) use step::{RawAction, RawCondition, RawSignal, RawStep, RawTarget};
+pub(crate) use stop::{RawGroup, RawStop};
 
 #[derive(Debug, Default)]
 pub(crate) struct RawMachine {
@@ -34,14 +38,6 @@ pub(crate) struct RawMachine {
     pub repeat: Option<Spanned<u32>>,
 }
 
-/// `[stop]`.
-#[derive(Debug, Default)]
-pub(crate) struct RawStop {
-    pub others: Option<Spanned<String>>,
-    pub bus_lost: Option<Spanned<String>>,
-    pub emergency: Vec<RawCondition>,
-}
-
 #[derive(Debug, Default)]
 pub(crate) struct RawBus {
     pub nic: Option<Spanned<String>>,
@@ -49,11 +45,15 @@ pub(crate) struct RawBus {
     pub lost_frames: Option<Spanned<u32>>,
     pub cpu: Option<Spanned<u32>>,
     pub priority: Option<Spanned<u8>>,
-    pub spin: Option<Spanned<u64>>,
+    /// `None` inside: `"auto"`.
+    pub spin: Option<Spanned<Option<u64>>>,
+    pub idle: Option<Spanned<String>>,
     pub op_timeout: Option<Spanned<u64>>,
     pub enable_timeout: Option<Spanned<u64>>,
     pub watchdog: Option<Spanned<u64>>,
+    pub clock_window: Option<Spanned<u64>>,
     pub exchange: Option<Spanned<String>>,
+    pub link: Option<Spanned<String>>,
 }
 
 #[derive(Debug)]
@@ -129,17 +129,9 @@ pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> Raw
         machine.devices.push(read_device(fields, span, p));
     }
     if let Some(value) = f.get("stop")
-        && let Some(mut f) = fields::table(p, value, "[stop]")
+        && let Some(fields) = fields::table(p, value, "[stop]")
     {
-        let emergency = f.get("emergency");
-        machine.stop = RawStop {
-            others: optional!(p, f, "others", string),
-            bus_lost: optional!(p, f, "bus_lost", string),
-            emergency: emergency
-                .and_then(|v| step::conditions(v, p))
-                .unwrap_or_default(),
-        };
-        f.done(p);
+        machine.stop = stop::read(fields, p);
     }
     let steps = f.get("step");
     for (value, span) in tables(p, steps, "[[step]]") {
@@ -174,14 +166,29 @@ fn read_bus(mut f: Fields<'_>, p: &mut Problems<'_>) -> RawBus {
         lost_frames: optional!(p, f, "lost_frames", integer(1, 1000)),
         cpu: optional!(p, f, "cpu", integer(0, 1023)),
         priority: optional!(p, f, "priority", integer(1, 99)),
-        spin: optional!(p, f, "spin", duration),
+        spin: f.get("spin").and_then(|v| spin(p, v)),
+        idle: optional!(p, f, "idle", string),
         op_timeout: optional!(p, f, "op_timeout", duration),
         enable_timeout: optional!(p, f, "enable_timeout", duration),
         watchdog: optional!(p, f, "watchdog", duration),
+        clock_window: optional!(p, f, "clock_window", duration),
         exchange: optional!(p, f, "exchange", string),
+        link: optional!(p, f, "link", string),
     };
     f.done(p);
     bus
+}
+
+/// `"auto"`, a time, or a plain 0.
+fn spin(p: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<Option<u64>>> {
+    match value.get_ref() {
+        DeValue::String(s) if s == "auto" => Some(Spanned::new(value.span(), None)),
+        DeValue::Integer(i) if i.as_str() == "0" => Some(Spanned::new(value.span(), Some(0))),
+        _ => {
+            let time = fields::duration(p, value)?;
+            Some(Spanned::new(time.span(), Some(time.into_inner())))
+        }
+    }
 }
 
 fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice {

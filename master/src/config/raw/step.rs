@@ -5,6 +5,7 @@ use toml::de::DeValue;
 
 use super::super::fields::{self, Fields};
 use super::super::problem::{Problems, Span};
+use super::motion::{self, RawProbe};
 use super::{Value, tables};
 
 #[derive(Debug)]
@@ -47,7 +48,9 @@ pub(crate) enum RawAction {
         targets: Vec<RawTarget>,
         speed: Option<Spanned<f64>>,
         ramp: Option<Spanned<f64>>,
+        arrive: Option<Spanned<String>>,
     },
+    Probe(RawProbe),
     Line {
         relative: bool,
         targets: Vec<RawTarget>,
@@ -98,7 +101,7 @@ pub(crate) enum RawAction {
 }
 
 /// Each with an example; the first key of a step that is one of these says what the step is.
-const VERBS: [(&str, &str); 20] = [
+const VERBS: [(&str, &str); 21] = [
     ("enable", "enable = [\"x\"]"),
     ("disable", "disable = true"),
     ("reset", "reset = [\"x\"]"),
@@ -106,6 +109,7 @@ const VERBS: [(&str, &str); 20] = [
     ("home", "home = [\"x\"]"),
     ("move", "move = { x = 50.0 }"),
     ("move_by", "move_by = { x = -5.0 }"),
+    ("probe", "probe = { x = { to = 50.0, input = 1 } }"),
     ("line", "line = { x = 50.0, y = 20.0 }"),
     ("line_by", "line_by = { x = 5.0, y = -2.0 }"),
     (
@@ -128,7 +132,7 @@ const VERBS: [(&str, &str); 20] = [
 ];
 
 /// Keys that stand beside a verb.
-const COMPANIONS: [&str; 4] = ["speed", "ramp", "timeout", "step"];
+const COMPANIONS: [&str; 5] = ["speed", "ramp", "arrive", "timeout", "step"];
 
 /// Steps in steps, as deep as anybody can still read.
 const DEEPEST: usize = 8;
@@ -192,11 +196,13 @@ fn action(
         "home" => RawAction::Home(axes(value, p)?),
         "move" | "move_by" => {
             let (speed, ramp) = (number("speed"), number("ramp"));
+            let arrive = f.get("arrive").and_then(|v| fields::string(p, v));
             RawAction::Move {
                 relative: verb == "move_by",
                 targets: targets(value, p)?,
                 speed,
                 ramp,
+                arrive,
             }
         }
         "line" | "line_by" => {
@@ -208,26 +214,8 @@ fn action(
                 ramp,
             }
         }
-        "sine" | "square" => {
-            let (axis, value) = only(
-                value,
-                "{ x = { amplitude = 1.0, frequency = 2.0, periods = 5 } }",
-                p,
-            )?;
-            let mut f = fields::table(p, value, "a wave")?;
-            let amplitude = f.need("amplitude", "amplitude = 1.0");
-            let frequency = f.need("frequency", "frequency = 2.0");
-            let periods = f.need("periods", "periods = 5");
-            let wave = RawAction::Wave {
-                square: verb == "square",
-                axis,
-                amplitude: amplitude.and_then(|v| fields::number(p, v)),
-                frequency: frequency.and_then(|v| fields::number(p, v)),
-                periods: periods.and_then(|v| fields::integer(p, v, 1, 1_000_000)),
-            };
-            f.done(p);
-            wave
-        }
+        "sine" | "square" => motion::wave(verb == "square", value, p)?,
+        "probe" => motion::probe(value, f, p)?,
         "table" => {
             let (speed, ramp) = (number("speed"), number("ramp"));
             let (axis, value) = only(value, "{ x = \"points.csv\" }", p)?;
@@ -238,21 +226,7 @@ fn action(
                 file: fields::string(p, value)?,
             }
         }
-        "gear" => {
-            let (axis, value) = only(value, "{ y = { to = \"x\", ratio = 2.0 } }", p)?;
-            let mut f = fields::table(p, value, "a gear")?;
-            let to = f.need("to", "to = \"x\"");
-            let gear = RawAction::Gear {
-                axis,
-                to: to.and_then(|v| fields::string(p, v)),
-                ratio: f.get("ratio").and_then(|v| fields::number(p, v)),
-                actual: f.get("actual").and_then(|v| fields::boolean(p, v)),
-                offset: f.get("offset").and_then(|v| fields::number(p, v)),
-                smoothing: f.get("smoothing").and_then(|v| fields::duration(p, v)),
-            };
-            f.done(p);
-            gear
-        }
+        "gear" => motion::gear(value, p)?,
         "velocity" => {
             let ramp = number("ramp");
             RawAction::Velocity {
@@ -340,7 +314,7 @@ fn targets(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawTarget>> {
 }
 
 /// One axis and something for it.
-fn only<'d>(
+pub(super) fn only<'d>(
     value: Value<'d>,
     example: &str,
     p: &mut Problems<'_>,

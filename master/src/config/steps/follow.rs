@@ -9,7 +9,6 @@ use super::Checker;
 use super::target::What;
 use crate::config::problem::{Problems, unreadable};
 use crate::config::{Action, AxisSetup, TableFile};
-use ecaxis_axis::Mode;
 
 impl Checker<'_> {
     /// An axis that follows positions at some time.
@@ -20,9 +19,7 @@ impl Checker<'_> {
         p: &mut Problems<'_>,
     ) -> Option<(usize, &AxisSetup)> {
         let (index, axis) = self.axis(name, p)?;
-        if self.ever(index, |mode| {
-            mode != Mode::Pp && What::Position.possible(mode, axis)
-        }) {
+        if self.ever(index, |mode| What::SetPoint.possible(mode, axis)) {
             return Some((index, axis));
         }
         let message = format!(

@@ -87,9 +87,11 @@ pub(super) fn fraction(
 }
 
 /// What a target is a target of.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum What {
     Position,
+    /// A position that has to come from here in every cycle.
+    SetPoint,
     /// Relative to where the axis is.
     Way,
     Velocity,
@@ -99,7 +101,7 @@ pub(super) enum What {
 impl What {
     fn verb(self) -> &'static str {
         match self {
-            Self::Position => "move",
+            Self::Position | Self::SetPoint => "move",
             Self::Way => "move_by",
             Self::Velocity => "velocity",
             Self::Torque => "torque",
@@ -117,12 +119,13 @@ impl What {
         };
         match self {
             Self::Position | Self::Way => position,
+            Self::SetPoint => position && mode != Mode::Pp,
             Self::Velocity => position && mode != Mode::Pp || matches!(mode, Mode::Csv | Mode::Pv),
             Self::Torque => mode == Mode::Cst,
         }
     }
 
-    fn impossible(self, name: &str, axis: &AxisSetup) -> (String, String) {
+    pub(super) fn impossible(self, name: &str, axis: &AxisSetup) -> (String, String) {
         let message = format!(
             "`{}` is nothing that `{name}` does in mode \"{}\"",
             self.verb(),
@@ -141,11 +144,16 @@ impl What {
     }
 }
 
-fn within(value: &Spanned<f64>, what: What, axis: &AxisSetup, p: &mut Problems<'_>) -> bool {
+pub(super) fn within(
+    value: &Spanned<f64>,
+    what: What,
+    axis: &AxisSetup,
+    p: &mut Problems<'_>,
+) -> bool {
     let limits = &axis.config.limits;
     let unit = &axis.unit;
     let (low, high, unit) = match what {
-        What::Position => match limits.position {
+        What::Position | What::SetPoint => match limits.position {
             Some([low, high]) => (low, high, unit.clone()),
             None => return true,
         },

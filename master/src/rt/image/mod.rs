@@ -1,103 +1,14 @@
-//! Where each SubDevice's process data lies: logical addresses, datagrams, frames, bits.
+//! Where each SubDevice's process data lies: logical addresses, datagrams and frames ([`plan`]); the bits of objects.
 
 use ecaxis_esi::layout::{Field, Layout};
 
 use crate::config::Kind;
 
-/// First logical address of the process image.
-pub const LOGICAL_BASE: u32 = 0x0001_0000;
+pub mod plan;
 
-/// Room for LRW data in the first frame of a cycle, beside the clock, AL status and diagnostic
-/// datagrams: 1514 − 16 (headers) − 20 − 14 − 20 − 12.
-const FIRST_FRAME_DATA: usize = 1432;
-/// Room for LRW data in every further frame.
-const NEXT_FRAME_DATA: usize = 1486;
-
-/// The place of one SubDevice's outputs and inputs. Both start at the same logical address, so one
-/// byte of an LRW carries an output out and an input back.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Region {
-    pub logical: u32,
-    /// Index into [`ImagePlan::datagrams`].
-    pub datagram: usize,
-    /// Offset in the image, which is all datagrams' data one after the other.
-    pub offset: usize,
-    pub out_len: usize,
-    pub in_len: usize,
-}
-
-/// One LRW.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LrwPlan {
-    pub logical: u32,
-    /// Offset of its data in the image.
-    pub offset: usize,
-    pub len: usize,
-    /// Sum over its SubDevices: 1 for inputs, 2 for outputs (ETG.1000.4, LRW).
-    pub expected_wkc: u16,
-}
-
-/// The whole image.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct ImagePlan {
-    /// In the order of the devices given; `None` where a device has no process data.
-    pub regions: Vec<Option<Region>>,
-    pub datagrams: Vec<LrwPlan>,
-    pub len: usize,
-}
-
-/// A device whose process data does not fit into one frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("{len} bytes of process data do not fit into one frame of {NEXT_FRAME_DATA}")]
-pub struct TooLarge {
-    /// Index of the device.
-    pub device: usize,
-    pub len: usize,
-}
-
-/// Lays out devices of (output, input) bytes one after the other; none is split over two frames.
-#[allow(clippy::disallowed_methods, reason = "prepares")]
-pub fn plan(sizes: &[(usize, usize)]) -> Result<ImagePlan, TooLarge> {
-    let mut image = ImagePlan::default();
-    for (device, &(out_len, in_len)) in sizes.iter().enumerate() {
-        let len = out_len.max(in_len);
-        if len == 0 {
-            image.regions.push(None);
-            continue;
-        }
-        let room = if image.datagrams.len() <= 1 {
-            FIRST_FRAME_DATA
-        } else {
-            NEXT_FRAME_DATA
-        };
-        if len > NEXT_FRAME_DATA || (image.datagrams.is_empty() && len > FIRST_FRAME_DATA) {
-            return Err(TooLarge { device, len });
-        }
-        let logical = LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX));
-        let wkc = u16::from(in_len > 0) + 2 * u16::from(out_len > 0);
-        match image.datagrams.last_mut() {
-            Some(last) if last.len + len <= room => {
-                last.len += len;
-                last.expected_wkc += wkc;
-            }
-            _ => image.datagrams.push(LrwPlan {
-                logical,
-                offset: image.len,
-                len,
-                expected_wkc: wkc,
-            }),
-        }
-        image.regions.push(Some(Region {
-            logical,
-            datagram: image.datagrams.len() - 1,
-            offset: image.len,
-            out_len,
-            in_len,
-        }));
-        image.len += len;
-    }
-    Ok(image)
-}
+pub use plan::{
+    Access, DatagramPlan, ImagePlan, ProcessData, Region, TooLarge, of, plan, process_data,
+};
 
 /// Bits of one object in the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -261,38 +172,6 @@ impl AxisBits {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-
-    #[test]
-    fn working_counters_and_addresses_of_a_drive_an_input_and_an_output() {
-        let image = plan(&[(12, 14), (0, 1), (1, 0), (0, 0)]).expect("fits");
-        assert_eq!(
-            image.datagrams,
-            [LrwPlan {
-                logical: LOGICAL_BASE,
-                offset: 0,
-                len: 16,
-                expected_wkc: 3 + 1 + 2,
-            }]
-        );
-        assert_eq!(image.regions[1].map(|r| r.offset), Some(14));
-        assert_eq!(image.regions[2].map(|r| r.logical), Some(LOGICAL_BASE + 15));
-        assert_eq!(image.regions[3], None);
-    }
-
-    #[test]
-    fn a_hundred_axes_of_twelve_bytes_fit_into_one_frame() {
-        assert_eq!(plan(&[(12, 12); 100]).expect("fits").datagrams.len(), 1);
-        let many = plan(&[(12, 12); 300]).expect("fits");
-        assert_eq!(many.datagrams.len(), 3);
-        assert!(many.datagrams.iter().all(|d| d.len <= NEXT_FRAME_DATA));
-        assert_eq!(
-            plan(&[(1500, 0)]),
-            Err(TooLarge {
-                device: 0,
-                len: 1500
-            })
-        );
-    }
 
     #[test]
     fn signals_are_numbers_of_their_kind() {

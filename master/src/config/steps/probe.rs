@@ -1,0 +1,144 @@
+//! Probing: a target, an input, and the drive's objects for both in the process data.
+
+use ecaxis_axis::{Edge, Probe};
+use toml::Spanned;
+
+use super::Checker;
+use super::target::{What, fraction, within};
+use crate::config::axis::control::one_of;
+use crate::config::problem::Problems;
+use crate::config::raw::RawProbe;
+use crate::config::{Action, DeviceConfig};
+use ecaxis_esi::layout::Field;
+
+/// 0x60B8, 0x60B9.
+const FUNCTION: u16 = 0x60b8;
+const STATUS: u16 = 0x60b9;
+
+/// Where the drive puts the position of an edge: 0x60BA to 0x60BD.
+const fn position_object(probe: Probe, edge: Edge) -> u16 {
+    match (probe, edge) {
+        (Probe::First, Edge::Positive) => 0x60ba,
+        (Probe::First, Edge::Negative) => 0x60bb,
+        (Probe::Second, Edge::Positive) => 0x60bc,
+        (Probe::Second, Edge::Negative) => 0x60bd,
+    }
+}
+
+impl Checker<'_> {
+    pub(super) fn probe(&self, raw: &RawProbe, p: &mut Problems<'_>) -> Option<Action> {
+        let (speed, ramp) = (
+            fraction(raw.speed.clone(), "speed", p),
+            fraction(raw.ramp.clone(), "ramp", p),
+        );
+        let edges = [("rising", Edge::Positive), ("falling", Edge::Negative)];
+        let edge = match &raw.edge {
+            None => Some(Edge::Positive),
+            Some(word) => known(word, &edges, p),
+        };
+        let probe = match raw.input.as_ref().map(|n| *n.get_ref()) {
+            Some(2) => Probe::Second,
+            _ => Probe::First,
+        };
+        let (index, axis) = self.axis(&raw.axis, p)?;
+        let (what, value) = match (&raw.to, &raw.by) {
+            (Some(to), _) => (What::Position, to),
+            (None, Some(by)) => (What::Way, by),
+            // It was no number.
+            (None, None) => return None,
+        };
+        if !self.ever(index, |mode| What::Position.possible(mode, axis)) {
+            let (_, hint) = What::Position.impossible(raw.axis.get_ref(), axis);
+            let message = format!(
+                "`probe` is nothing that `{}` does in mode \"{}\"",
+                raw.axis.get_ref(),
+                axis.mode
+            );
+            p.add_hint(raw.axis.span(), message, hint);
+            return None;
+        }
+        let inside = within(value, what, axis, p);
+        let (speed, ramp, edge) = (speed?, ramp?, edge?);
+        if let Some(device) = self.devices[index].device {
+            mapped(device, &raw.axis, probe, edge, p)?;
+        }
+        inside.then(|| Action::Probe {
+            axis: index,
+            probe,
+            edge,
+            relative: what == What::Way,
+            target: *value.get_ref(),
+            speed,
+            ramp,
+        })
+    }
+}
+
+fn known(word: &Spanned<String>, edges: &[(&str, Edge)], p: &mut Problems<'_>) -> Option<Edge> {
+    let all: Vec<(&str, Option<Edge>)> = edges.iter().map(|(name, e)| (*name, Some(*e))).collect();
+    one_of(Some(word), &all, "edge", p).flatten()
+}
+
+/// Reports what of a probe's objects is not in the process data, or not in the drive.
+fn mapped(
+    device: &DeviceConfig,
+    name: &Spanned<String>,
+    probe: Probe,
+    edge: Edge,
+    p: &mut Problems<'_>,
+) -> Option<()> {
+    let layout = &device.selection.layout;
+    let inputs = [STATUS, position_object(probe, edge)];
+    let no_output = layout.rx_field(FUNCTION, 0).is_none();
+    let missing: Vec<u16> = inputs
+        .into_iter()
+        .filter(|index| layout.tx_field(*index, 0).is_none())
+        .collect();
+    if !no_output && missing.is_empty() {
+        return Some(());
+    }
+    let all = no_output.then_some(FUNCTION).into_iter();
+    let all: Vec<u16> = all.chain(missing.iter().copied()).collect();
+    // A file without a dictionary says nothing about it.
+    let dictionary = &device.selection.dictionary;
+    let told = dictionary.item(0x6041, 0).is_some();
+    let has = |index: &u16| !told || dictionary.item(*index, 0).is_some();
+    if let Some(unknown) = all.iter().find(|index| !has(index)) {
+        let message = format!(
+            "by its ESI file `{}` has no touch probe {} that captures such an edge: there is no 0x{unknown:04X}",
+            name.get_ref(),
+            probe.number()
+        );
+        let hint = "take the other `input` or `edge`, or the ESI file of the drive's firmware";
+        p.add_hint(name.span(), message, hint);
+        return None;
+    }
+    let objects: Vec<String> = all.iter().map(|index| format!("0x{index:04X}")).collect();
+    let message = format!(
+        "touch probe {} of `{}` needs {} in the process data",
+        probe.number(),
+        name.get_ref(),
+        objects.join(", ")
+    );
+    let mut lists = Vec::new();
+    if no_output {
+        lists.push(format!("`pdo.rx = {}`", with(&layout.rx, &[FUNCTION])));
+    }
+    if !missing.is_empty() {
+        lists.push(format!("`pdo.tx = {}`", with(&layout.tx, &missing)));
+    }
+    let hint = format!("write {} in its [[device]]", lists.join(" and "));
+    p.add_hint(name.span(), message, hint);
+    None
+}
+
+/// The list that there is, and more.
+fn with(fields: &[Field], more: &[u16]) -> String {
+    let there = fields.iter().filter(|field| field.index != 0);
+    let there = there.map(|field| match field.sub {
+        0 => format!("\"0x{:04X}\"", field.index),
+        sub => format!("\"0x{:04X}:{sub:02X}\"", field.index),
+    });
+    let more = more.iter().map(|index| format!("\"0x{index:04X}\""));
+    format!("[{}]", there.chain(more).collect::<Vec<_>>().join(", "))
+}

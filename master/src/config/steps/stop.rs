@@ -1,0 +1,148 @@
+//! `[stop]`: how the machine stops, and what stops together.
+
+use toml::Spanned;
+
+use super::Checker;
+use crate::config::axis::control::one_of;
+use crate::config::problem::{Problems, suggestion};
+use crate::config::raw::{RawGroup, RawStop};
+use crate::config::{Outside, StopBy, StopByDrive, StopGroup, StopSetup};
+
+const WAYS: [(&str, StopBy); 3] = [
+    ("ramp", StopBy::Ramp),
+    ("quick-stop", StopBy::QuickStop),
+    ("no-power", StopBy::NoPower),
+];
+const BY_DRIVE: [(&str, StopByDrive); 2] = [
+    ("quick-stop", StopByDrive::QuickStop),
+    ("no-power", StopByDrive::NoPower),
+];
+const OUTSIDE: [(&str, Outside); 2] = [("stop", Outside::Stop), ("continue", Outside::Continue)];
+
+impl Checker<'_> {
+    /// What is wrong in it has been said, and the machine does not run.
+    pub(super) fn stop(&mut self, raw: &RawStop, p: &mut Problems<'_>) -> StopSetup {
+        let others = one_of(raw.others.as_ref(), &WAYS, "others", p).unwrap_or_default();
+        let mut groups: Vec<StopGroup> = Vec::new();
+        for (index, group) in raw.groups.iter().enumerate() {
+            let group = self.group(group, &raw.groups[..index], &groups, others, p);
+            groups.push(group);
+        }
+        let mut emergency = Vec::new();
+        for raw in &raw.emergency {
+            let Some(condition) = self.condition(raw, p) else {
+                continue;
+            };
+            let device = self.inputs[condition.input].device;
+            let group = groups.iter().find(|g| g.devices.contains(&device));
+            if let Some(group) = group.filter(|g| g.outside == Outside::Continue) {
+                let message = format!(
+                    "`{}` is in the group `{}`, without which the machine goes on: an emergency would go unseen",
+                    raw.signal.device.get_ref(),
+                    group.name,
+                );
+                let hint = "leave its device out of the group, or write `outside = \"stop\"`";
+                p.add_hint(raw.signal.device.span(), message, hint);
+            }
+            emergency.push(condition);
+        }
+        StopSetup {
+            others,
+            bus_lost: one_of(raw.bus_lost.as_ref(), &BY_DRIVE, "bus_lost", p).unwrap_or_default(),
+            emergency,
+            groups,
+        }
+    }
+
+    fn group(
+        &self,
+        raw: &RawGroup,
+        before: &[RawGroup],
+        groups: &[StopGroup],
+        others: StopBy,
+        p: &mut Problems<'_>,
+    ) -> StopGroup {
+        if let Some(name) = &raw.name {
+            let same = |other: &&RawGroup| {
+                let other = other.name.as_ref();
+                other.is_some_and(|other| other.get_ref() == name.get_ref())
+            };
+            if name.get_ref().trim().is_empty() {
+                p.add(name.span(), "a group needs a name");
+            } else if let Some(twin) = before.iter().find(same) {
+                let message = format!("the group \"{}\" is there already", name.get_ref());
+                let hint = format!("in line {}", p.line(&twin.span));
+                p.add_hint(name.span(), message, hint);
+            }
+        }
+        let mut group = StopGroup {
+            name: raw
+                .name
+                .as_ref()
+                .map_or_else(String::new, |n| n.get_ref().clone()),
+            devices: Vec::new(),
+            others: match &raw.others {
+                Some(_) => one_of(raw.others.as_ref(), &WAYS, "others", p).unwrap_or_default(),
+                None => others,
+            },
+            outside: one_of(raw.outside.as_ref(), &OUTSIDE, "outside", p).unwrap_or_default(),
+        };
+        for name in &raw.axes {
+            if let Some((device, _)) = self.axis(name, p) {
+                self.join(&mut group, name, device, groups, p);
+            }
+        }
+        for name in &raw.devices {
+            let Some(device) = self.devices.iter().position(|d| d.name == name.get_ref()) else {
+                let hint = suggestion(
+                    name.get_ref(),
+                    self.devices.iter().map(|d| d.name),
+                    "devices",
+                );
+                p.add_hint(
+                    name.span(),
+                    format!("no device is named `{}`", name.get_ref()),
+                    hint,
+                );
+                continue;
+            };
+            if self.devices[device].axis == Err(false) {
+                self.join(&mut group, name, device, groups, p);
+            } else {
+                let message = format!("`{}` has an axis", name.get_ref());
+                p.add_hint(name.span(), message, "name it in `axes`");
+            }
+        }
+        group
+    }
+
+    /// A device is in one group at most.
+    fn join(
+        &self,
+        group: &mut StopGroup,
+        name: &Spanned<String>,
+        device: usize,
+        groups: &[StopGroup],
+        p: &mut Problems<'_>,
+    ) {
+        let other = groups.iter().find(|g| g.devices.contains(&device));
+        if let Some(other) = other {
+            let message = format!(
+                "`{}` is in the group `{}` already",
+                name.get_ref(),
+                other.name
+            );
+            let hint = "a device is in one group at most";
+            p.add_hint(name.span(), message, hint);
+        } else if group.devices.contains(&device) {
+            let message = format!("`{}` is named twice", name.get_ref());
+            p.add_hint(name.span(), message, "once is enough");
+        } else {
+            group.devices.push(device);
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "stop_tests.rs"]
+mod tests;

@@ -1,0 +1,62 @@
+use crate::config::tests::{GOOD, with_esi};
+use crate::config::{ConfigError, Outside, StopBy, StopGroup};
+
+#[test]
+fn groups_of_axes() {
+    let machine = with_esi(GOOD).unwrap();
+    assert!(machine.stop.groups.is_empty());
+    assert_eq!([0, 1].map(|device| machine.group_of(device)), [0, 0]);
+    let two = "\n[stop]\nothers = \"no-power\"\n[[stop.group]]\nname = \"g\"\naxes = [\"v\"]\noutside = \"continue\"\n\
+        [[stop.group]]\nname = \"h\"\naxes = [\"x\"]\nothers = \"quick-stop\"\n";
+    let machine = with_esi(&format!("{GOOD}{two}")).unwrap();
+    assert_eq!([0, 1].map(|device| machine.group_of(device)), [2, 1]);
+    let group = |name: &str, device, others, outside| StopGroup {
+        name: name.to_owned(),
+        devices: vec![device],
+        others,
+        outside,
+    };
+    assert_eq!(
+        machine.stop.groups,
+        [
+            group("g", 1, StopBy::NoPower, Outside::Continue),
+            group("h", 0, StopBy::QuickStop, Outside::Stop),
+        ]
+    );
+}
+
+#[test]
+#[rustfmt::skip] // one row a mistake
+fn every_wrong_group() {
+    let io = "\n[[device]]\nname = \"io\"\nesi = \"D1.xml\"\nposition = 2\n";
+    let group = "[[stop.group]]\nname = \"g\"\naxes = [\"x\"]\n";
+    for (text, message, hint, marked) in [
+        ("[[stop.group]]\naxes = [\"x\"]\n", "`name` is missing in [[stop.group]]", "name = \"gantry\"", ""),
+        ("[[stop.group]]\nname = \"g\"\n", "`axes` is missing in [[stop.group]]", "axes = [\"x\", \"y\"]", ""),
+        ("[[stop.group]]\nname = \"g\"\naxes = []\n", "nothing is named here", "a list such as", "[]"),
+        ("[[stop.group]]\nname = \" \"\naxes = [\"x\"]\n", "a group needs a name", "", "\" \""),
+        ("[[stop.group]]\nname = \"g\"\naxes = [\"q\"]\n", "no device is named `q`", "axes: `x`, `v`", "\"q\""),
+        ("[[stop.group]]\nname = \"g\"\naxes = [\"io\"]\n", "`io` has no axis", "give it a [device.axis]", "\"io\""),
+        ("[[stop.group]]\nname = \"g\"\naxes = [\"x\", \"x\"]\n", "`x` is named twice", "", "\"x\""),
+        ("[[stop.group]]\nname = \"h\"\naxes = [\"x\"]\n[[stop.group]]\nname = \"g\"\naxes = [\"v\", \"x\"]\n", "`x` is in the group `h` already", "one group", "\"x\""),
+        ("[[stop.group]]\nname = \"g\"\naxes = [\"x\"]\n[[stop.group]]\nname = \"g\"\naxes = [\"v\"]\n", "the group \"g\" is there already", "in line", "\"g\""),
+        ("GROUPothers = \"gently\"\n", "`others` cannot be \"gently\"", "`ramp`", "\"gently\""),
+        ("GROUPoutside = \"continues\"\n", "`outside` cannot be \"continues\"", "did you mean `continue`?", "\"continues\""),
+        ("GROUPoutsid = \"stop\"\n", "unknown key `outsid` in [[stop.group]]", "did you mean `outside`?", "outsid"),
+        ("GROUPdevices = [\"v\"]\n", "`v` has an axis", "name it in `axes`", "\"v\""),
+        ("GROUPdevices = [\"oi\"]\n", "no device is named `oi`", "devices", "\"oi\""),
+        ("[stop]\nemergency = { x.\"0x6041\" = 1 }\nGROUPoutside = \"continue\"\n", "an emergency would go unseen", "leave its device out", "x"),
+    ] {
+        let text = text.replace("GROUP", group);
+        let Err(ConfigError::Problems(found)) = with_esi(&format!("{GOOD}{io}{text}")) else {
+            panic!("{text}")
+        };
+        let [problem] = found.as_slice() else { panic!("{text}: {found:#?}") };
+        assert!(problem.message.contains(message), "{problem}");
+        assert!(problem.hint.as_deref().unwrap_or_default().contains(hint), "{problem}");
+        if !marked.is_empty() {
+            let at: String = problem.source_line.chars().skip(problem.column as usize - 1).take(problem.width as usize).collect();
+            assert_eq!(at, marked, "{problem}");
+        }
+    }
+}

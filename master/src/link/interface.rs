@@ -1,0 +1,298 @@
+//! What an interface must be for EtherCAT, and what makes it a bad one.
+
+use std::fmt;
+use std::io;
+use std::net::IpAddr;
+use std::path::{Path, PathBuf};
+
+use super::sift::LinkStats;
+use crate::os::packet::{self, PacketSocket};
+
+pub(super) const ETHERTYPE: u16 = 0x88a4;
+
+const SYS: &str = "/sys/class/net";
+
+/// `type` in sysfs: ARPHRD_… of linux/if_arp.h.
+const ARPHRD_ETHER: u32 = 1;
+const ARPHRD_LOOPBACK: u32 = 772;
+
+/// Why an interface cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    #[error("the interface `{nic}` does not exist")]
+    NoSuchInterface { nic: String },
+    #[error("opening a raw socket on `{nic}` is not permitted")]
+    NotPermitted { nic: String },
+    #[error("the interface `{nic}` is down")]
+    Down { nic: String },
+    #[error("the interface `{nic}` has no link: no cable, or nothing powered at its end")]
+    NoCarrier { nic: String },
+    #[error("the interface `{nic}` carries frames of at most {mtu} bytes, 1500 are needed")]
+    Mtu { nic: String, mtu: u32 },
+    #[error("the interface `{nic}` {what}")]
+    Unfit { nic: String, what: &'static str },
+    #[error("the kernel gives no receive ring on `{nic}`: {source}")]
+    NoRing { nic: String, source: io::Error },
+    #[error("the interface `{nic}`: {what}: {source}")]
+    Io {
+        nic: String,
+        what: &'static str,
+        source: io::Error,
+    },
+}
+
+/// Something about an interface that will disturb the cycle; it can be used all the same.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Concern {
+    /// The computer's own traffic goes out there, too.
+    Addresses { nic: String, addresses: Vec<IpAddr> },
+    /// Part of a bridge, bond or team.
+    Member { nic: String, of: String },
+    /// A plain socket takes the place of the ring.
+    NoRing { nic: String, reason: String },
+}
+
+impl fmt::Display for Concern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Addresses { nic, addresses } => {
+                write!(f, "the interface `{nic}` has ")?;
+                for (n, address) in addresses.iter().enumerate() {
+                    write!(f, "{}{address}", if n > 0 { ", " } else { "" })?;
+                }
+                f.write_str(
+                    ": the computer sends its own traffic among the frames, which delays them",
+                )
+            }
+            Self::Member { nic, of } => write!(
+                f,
+                "the interface `{nic}` is part of `{of}`: what that forwards comes among the frames"
+            ),
+            Self::NoRing { nic, reason } => write!(
+                f,
+                "no receive ring on `{nic}` ({reason}): a plain socket is used, which costs a system call a look"
+            ),
+        }
+    }
+}
+
+/// Up, with a carrier, Ethernet by cable, and of full frame size; returns the interface's number. Asks sysfs, which needs
+/// no privileges; where that is not mounted, only the name is checked.
+///
+/// # Errors
+/// What is missing.
+pub fn check(nic: &str) -> Result<i32, OpenError> {
+    let Some(index) = packet::interface_index(nic) else {
+        return Err(OpenError::NoSuchInterface {
+            nic: nic.to_owned(),
+        });
+    };
+    Attributes::of(Path::new(SYS), nic).check()?;
+    Ok(index)
+}
+
+/// What is wrong with an interface that can be used.
+#[must_use]
+pub fn concerns(nic: &str) -> Vec<Concern> {
+    let addresses = packet::ip_addresses(nic).unwrap_or_default();
+    let addresses = (!addresses.is_empty()).then(|| Concern::Addresses {
+        nic: nic.to_owned(),
+        addresses,
+    });
+    let member = Attributes::of(Path::new(SYS), nic).member();
+    addresses.into_iter().chain(member).collect()
+}
+
+/// The interfaces of this computer that could carry EtherCAT.
+#[must_use]
+pub fn interfaces() -> Vec<String> {
+    let Ok(entries) = std::fs::read_dir(SYS) else {
+        return Vec::new();
+    };
+    let mut names: Vec<String> = entries
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .filter(|name| {
+            let attributes = Attributes::of(Path::new(SYS), name);
+            attributes.kind().is_none()
+        })
+        .collect();
+    names.sort();
+    names
+}
+
+/// An interface's folder in sysfs.
+struct Attributes<'n> {
+    nic: &'n str,
+    folder: PathBuf,
+}
+
+impl<'n> Attributes<'n> {
+    fn of(sys: &Path, nic: &'n str) -> Self {
+        Self {
+            nic,
+            folder: sys.join(nic),
+        }
+    }
+
+    fn read(&self, attribute: &str) -> io::Result<String> {
+        std::fs::read_to_string(self.folder.join(attribute)).map(|text| text.trim().to_owned())
+    }
+
+    fn has(&self, attribute: &str) -> bool {
+        self.folder.join(attribute).exists()
+    }
+
+    /// Why it can never carry EtherCAT, whatever its state.
+    fn kind(&self) -> Option<&'static str> {
+        let number = self.read("type").ok().and_then(|text| text.parse().ok());
+        match number {
+            Some(ARPHRD_LOOPBACK) => return Some("is the loopback; no wire leads out of it"),
+            Some(other) if other != ARPHRD_ETHER => return Some("is no Ethernet"),
+            _ => {}
+        }
+        if self.has("wireless") || self.has("phy80211") {
+            return Some("is wireless; EtherCAT needs a cable");
+        }
+        let uevent = self.read("uevent").unwrap_or_default();
+        if uevent.lines().any(|line| line == "DEVTYPE=vlan") {
+            return Some("is a VLAN: its frames have a tag, by which SubDevices do not know them");
+        }
+        None
+    }
+
+    fn check(&self) -> Result<(), OpenError> {
+        let nic = self.nic.to_owned();
+        if let Some(what) = self.kind() {
+            return Err(OpenError::Unfit { nic, what });
+        }
+        // Reading `carrier` fails with EINVAL while the interface is down.
+        match self.read("carrier").as_deref() {
+            Ok("1") => {}
+            Ok(_) => return Err(OpenError::NoCarrier { nic }),
+            Err(error) if error.raw_os_error() == Some(libc::EINVAL) => {
+                return Err(OpenError::Down { nic });
+            }
+            // No sysfs: nothing to check against.
+            Err(_) => return Ok(()),
+        }
+        match self.read("mtu").ok().and_then(|text| text.parse().ok()) {
+            Some(mtu) if mtu < 1500 => Err(OpenError::Mtu { nic, mtu }),
+            _ => Ok(()),
+        }
+    }
+
+    /// Of a bridge, bond or team.
+    fn member(&self) -> Option<Concern> {
+        let master = std::fs::read_link(self.folder.join("master")).ok()?;
+        Some(Concern::Member {
+            nic: self.nic.to_owned(),
+            of: master.file_name()?.to_string_lossy().into_owned(),
+        })
+    }
+}
+
+pub(super) fn socket(nic: &str) -> Result<PacketSocket, OpenError> {
+    let nic = nic.to_owned();
+    PacketSocket::new().map_err(|source| match source.kind() {
+        io::ErrorKind::PermissionDenied => OpenError::NotPermitted { nic },
+        _ => OpenError::Io {
+            nic,
+            what: "opening a raw socket",
+            source,
+        },
+    })
+}
+
+pub(super) fn bind(nic: &str, socket: &PacketSocket, index: i32) -> Result<(), OpenError> {
+    // A kernel that does not know it shows our own frames to us, and says that they are.
+    let _ = socket.set(libc::PACKET_IGNORE_OUTGOING, 1);
+    // Cyclic frames must not wait behind a traffic shaper; a kernel that does not know it does without.
+    let _ = socket.set(libc::PACKET_QDISC_BYPASS, 1);
+    socket
+        .bind(index, ETHERTYPE)
+        .map_err(|source| OpenError::Io {
+            nic: nic.to_owned(),
+            what: "binding the socket",
+            source,
+        })
+}
+
+/// What the kernel has dropped since this was last asked.
+pub(super) fn add_drops(socket: &PacketSocket, stats: &mut LinkStats) {
+    if let Ok((_, dropped)) = socket.statistics() {
+        stats.dropped += u64::from(dropped);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder as sysfs has it for an interface that carries frames.
+    fn with(files: &[(&str, &str)]) -> (tempfile::TempDir, Result<(), String>) {
+        let sys = tempfile::tempdir().unwrap();
+        let folder = sys.path().join("eth9");
+        std::fs::create_dir(&folder).unwrap();
+        let fine = [
+            ("type", "1"),
+            ("carrier", "1"),
+            ("mtu", "1500"),
+            ("uevent", "INTERFACE=eth9"),
+        ];
+        for (name, text) in fine.iter().chain(files) {
+            std::fs::write(folder.join(name), format!("{text}\n")).unwrap();
+        }
+        let checked = Attributes::of(sys.path(), "eth9").check();
+        let result = checked.map_err(|error| error.to_string());
+        (sys, result)
+    }
+
+    #[test]
+    fn each_kind_of_interface() {
+        assert_eq!(with(&[]).1, Ok(()));
+        assert_eq!(with(&[("mtu", "9000")]).1, Ok(()));
+        for (file, text, said) in [
+            ("type", "772", "loopback"),
+            ("type", "280", "no Ethernet"),
+            ("phy80211", "", "wireless"),
+            ("wireless", "", "wireless"),
+            ("uevent", "DEVTYPE=vlan\nINTERFACE=eth9", "VLAN"),
+            ("carrier", "0", "no link"),
+            ("mtu", "1400", "1400"),
+        ] {
+            let error = with(&[(file, text)]).1.expect_err(file);
+            assert!(error.contains(said), "{file} {text}: {error}");
+        }
+    }
+
+    #[test]
+    fn no_sysfs_means_no_check() {
+        let nowhere = Attributes::of(Path::new("/nonexistent"), "eth9");
+        assert!(nowhere.check().is_ok());
+        assert_eq!(nowhere.member(), None);
+    }
+
+    #[test]
+    fn a_member_names_what_it_is_part_of() {
+        let (sys, _) = with(&[]);
+        let folder = sys.path().join("eth9");
+        std::os::unix::fs::symlink("../../devices/virtual/net/br0", folder.join("master")).unwrap();
+        let member = Attributes::of(sys.path(), "eth9").member();
+        let expected = Concern::Member {
+            nic: "eth9".into(),
+            of: "br0".into(),
+        };
+        assert_eq!(member, Some(expected));
+    }
+
+    #[test]
+    fn the_loopback_of_this_computer_is_refused_and_has_addresses() {
+        if packet::interface_index("lo").is_none() {
+            return;
+        }
+        assert!(matches!(check("lo"), Err(OpenError::Unfit { .. })));
+        let addresses = packet::ip_addresses("lo").unwrap();
+        assert!(addresses.iter().all(IpAddr::is_loopback), "{addresses:?}");
+        assert!(!interfaces().contains(&"lo".to_owned()));
+    }
+}

@@ -1,0 +1,198 @@
+//! An interface through an AF_PACKET socket whose received frames are put into mapped memory: looking whether one is there
+//! costs a read of that memory instead of a system call.
+//!
+//! The ring is of version 2 (TPACKET_V2). Version 3 hands over whole blocks of frames, when they are full or a
+//! timer of a millisecond at least has run out; version 2 hands over each frame as soon as it is there. Frames are sent
+//! one by one: a ring for sending would take a system call each, too.
+
+use super::interface::{self, OpenError};
+use super::sift::{LinkStats, sift};
+use super::{Link, LinkError, MAX_FRAME};
+use crate::os::packet::PacketSocket;
+use crate::os::ring::Ring;
+
+/// A slot holds header, address and a whole frame: 66 bytes before it, 1514 of it.
+const SLOT: usize = 2048;
+
+/// Frames between two looks; 8 kHz may be left alone for 16 ms with two frames a cycle.
+const SLOTS: usize = 256;
+
+/// Foreign frames passed over at once; the rest waits for the next look.
+const PASSED_OVER: usize = 32;
+
+/// One interface, taken for EtherCAT frames only.
+#[derive(Debug)]
+pub struct RingLink {
+    // Before the socket that it belongs to.
+    ring: Ring,
+    socket: PacketSocket,
+    stats: LinkStats,
+}
+
+impl RingLink {
+    /// Opens the interface. Blocks and allocates.
+    ///
+    /// # Errors
+    /// [`OpenError::NoRing`] where the kernel gives no ring; plain sockets may still do.
+    pub fn open(nic: &str) -> Result<Self, OpenError> {
+        let index = interface::check(nic)?;
+        let socket = interface::socket(nic)?;
+        let ring = socket
+            .receive_ring(SLOTS, SLOT)
+            .map_err(|source| OpenError::NoRing {
+                nic: nic.to_owned(),
+                source,
+            })?;
+        interface::bind(nic, &socket, index)?;
+        Ok(Self {
+            ring,
+            socket,
+            stats: LinkStats::default(),
+        })
+    }
+}
+
+impl Link for RingLink {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        if frame.len() > MAX_FRAME {
+            return Err(LinkError::TooLong(frame.len()));
+        }
+        self.socket.send(frame).map_err(LinkError::Send)
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        for _ in 0..PASSED_OVER {
+            let Some(slot) = self.ring.front() else {
+                return Ok(None);
+            };
+            let seen = header::parse(slot);
+            let judged = seen.and_then(|seen| sift(&seen).map(|()| seen.frame));
+            let taken = judged.map(|frame| {
+                // `sift` lets nothing longer pass.
+                let len = frame.len().min(buf.len());
+                buf[..len].copy_from_slice(&frame[..len]);
+                len
+            });
+            self.ring.release();
+            match taken {
+                Ok(len) => return Ok(Some(len)),
+                Err(refused) => self.stats.count(refused),
+            }
+        }
+        Ok(None)
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        interface::add_drops(&self.socket, &mut self.stats);
+        self.stats
+    }
+}
+
+/// A slot's head: `tpacket2_hdr` and behind it, aligned to 16 bytes, `sockaddr_ll` (linux/if_packet.h).
+mod header {
+    use std::mem::offset_of;
+
+    use libc::{sockaddr_ll, tpacket2_hdr};
+
+    use super::super::sift::{Refused, Seen};
+
+    const ADDRESS: usize = size_of::<tpacket2_hdr>().next_multiple_of(16);
+    pub(super) const STATUS: usize = offset_of!(tpacket2_hdr, tp_status);
+    pub(super) const LEN: usize = offset_of!(tpacket2_hdr, tp_len);
+    pub(super) const SNAPLEN: usize = offset_of!(tpacket2_hdr, tp_snaplen);
+    pub(super) const MAC: usize = offset_of!(tpacket2_hdr, tp_mac);
+    pub(super) const PACKET_TYPE: usize = ADDRESS + offset_of!(sockaddr_ll, sll_pkttype);
+    #[cfg(test)]
+    pub(super) const HEAD: usize = ADDRESS + size_of::<sockaddr_ll>();
+
+    /// The frame in a slot. RT.
+    ///
+    /// # Errors
+    /// [`Refused::Damaged`] where the frame would not lie in the slot.
+    pub(super) fn parse(slot: &[u8]) -> Result<Seen<'_>, Refused> {
+        let word = |at: usize| {
+            let bytes = slot.get(at..)?.first_chunk()?;
+            Some(u32::from_ne_bytes(*bytes))
+        };
+        let fields = || {
+            let mac = u16::from_ne_bytes(*slot.get(MAC..)?.first_chunk()?);
+            let start = usize::from(mac);
+            let end = start.checked_add(usize::try_from(word(SNAPLEN)?).ok()?)?;
+            Some(Seen {
+                frame: slot.get(start..end)?,
+                wire_len: usize::try_from(word(LEN)?).ok()?,
+                status: word(STATUS)?,
+                packet_type: *slot.get(PACKET_TYPE)?,
+            })
+        };
+        fields().ok_or(Refused::Damaged)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::super::sift::Refused;
+    use super::super::sift::tests::answer;
+    use super::*;
+
+    /// As the kernel fills a slot.
+    fn slot(frame: &[u8], status: u32, packet_type: u8) -> Vec<u8> {
+        let mac = header::HEAD.next_multiple_of(16) + 2;
+        let mut slot = vec![0xa5; SLOT];
+        let len = u32::try_from(frame.len()).unwrap();
+        slot[header::STATUS..][..4].copy_from_slice(&status.to_ne_bytes());
+        slot[header::LEN..][..4].copy_from_slice(&len.to_ne_bytes());
+        slot[header::SNAPLEN..][..4].copy_from_slice(&len.to_ne_bytes());
+        slot[header::MAC..][..2].copy_from_slice(&u16::try_from(mac).unwrap().to_ne_bytes());
+        slot[header::PACKET_TYPE] = packet_type;
+        slot[mac..mac + frame.len()].copy_from_slice(frame);
+        slot
+    }
+
+    #[test]
+    fn a_frame_is_found_where_the_header_says() {
+        let frame = answer(100);
+        let slot = slot(&frame, libc::TP_STATUS_USER, libc::PACKET_BROADCAST);
+        let seen = header::parse(&slot).unwrap();
+        assert_eq!(seen.frame, frame);
+        assert_eq!(seen.wire_len, frame.len());
+        assert_eq!(seen.packet_type, libc::PACKET_BROADCAST);
+        assert_eq!(sift(&seen), Ok(()));
+    }
+
+    #[test]
+    fn a_frame_that_would_reach_beyond_its_slot_is_damaged() {
+        let mut slot = slot(&answer(100), libc::TP_STATUS_USER, 1);
+        slot[header::SNAPLEN..][..4].copy_from_slice(&u32::MAX.to_ne_bytes());
+        assert_eq!(header::parse(&slot).err(), Some(Refused::Damaged));
+        slot[header::SNAPLEN..][..4].copy_from_slice(&100_u32.to_ne_bytes());
+        slot[header::MAC..][..2].copy_from_slice(&u16::MAX.to_ne_bytes());
+        assert_eq!(header::parse(&slot).err(), Some(Refused::Damaged));
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_put_in_comes_out(len in 0_u16..1499, status: u32, packet_type: u8) {
+            let frame = answer(len);
+            let slot = slot(&frame, status, packet_type);
+            let seen = header::parse(&slot).unwrap();
+            prop_assert_eq!(seen.frame, frame.as_slice());
+            prop_assert_eq!((seen.status, seen.packet_type), (status, packet_type));
+        }
+
+        #[test]
+        fn no_slot_is_too_strange(slot in prop::collection::vec(any::<u8>(), 0..300), head: [u8; 16]) {
+            let mut slot = slot;
+            // Small numbers in the header, so that frames do lie in the slot at times.
+            for (byte, from) in slot.iter_mut().zip(head) {
+                *byte = from & if from % 3 == 0 { 0xff } else { 0x01 };
+            }
+            if let Ok(seen) = header::parse(&slot) {
+                prop_assert!(seen.frame.len() <= slot.len());
+                let _ = sift(&seen);
+            }
+        }
+    }
+}

@@ -1,0 +1,96 @@
+//! A mapped receive ring (TPACKET_V2): the kernel fills slots in turn, each with a status word that says whose it is.
+
+use std::fmt;
+use std::io;
+use std::os::fd::AsFd;
+use std::ptr::{self, NonNull};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+
+/// The slots of a socket's ring, taken in the order in which the kernel fills them.
+pub struct Ring {
+    base: NonNull<u8>,
+    slots: usize,
+    slot_len: usize,
+    next: usize,
+}
+
+// SAFETY: the mapping belongs to this value alone and is not tied to a thread.
+unsafe impl Send for Ring {}
+
+impl Ring {
+    /// Maps the ring that `socket` has been given.
+    pub(super) fn map(socket: impl AsFd, slots: usize, slot_len: usize) -> io::Result<Self> {
+        // SAFETY: a new mapping where the kernel likes; nothing else refers to it. The kernel refuses a length that is
+        // not the ring's.
+        let base = unsafe {
+            mmap(
+                ptr::null_mut(),
+                slots * slot_len,
+                ProtFlags::READ | ProtFlags::WRITE,
+                MapFlags::SHARED,
+                socket,
+                0,
+            )?
+        };
+        let base = NonNull::new(base.cast::<u8>()).ok_or(io::ErrorKind::OutOfMemory)?;
+        Ok(Self {
+            base,
+            slots,
+            slot_len,
+            next: 0,
+        })
+    }
+
+    fn status(&self) -> &AtomicU32 {
+        // SAFETY: `next` is below `slots`, so the slot lies in the mapping, which lives as long as `self`. Slots begin at
+        // multiples of `slot_len`, a divisor of the page size, with the status word, aligned; the kernel writes the word
+        // whole, so that an atomic is what it is.
+        unsafe { self.base.add(self.next * self.slot_len).cast().as_ref() }
+    }
+
+    /// The next slot, header and frame, if the kernel has filled it. RT: no system call.
+    #[must_use]
+    pub fn front(&self) -> Option<&[u8]> {
+        // Pairs with the kernel's barrier between filling a slot and handing it over.
+        if self.status().load(Ordering::Acquire) & libc::TP_STATUS_USER == 0 {
+            return None;
+        }
+        // SAFETY: the slot lies in the mapping (see `status`). While the bit is set the kernel does not write to it, and
+        // clearing it takes `&mut self`, which ends this borrow.
+        Some(unsafe {
+            std::slice::from_raw_parts(
+                self.base.add(self.next * self.slot_len).as_ptr(),
+                self.slot_len,
+            )
+        })
+    }
+
+    /// Gives the slot of [`Ring::front`] back to the kernel and goes on to the next. Without such a slot, does nothing. RT.
+    pub fn release(&mut self) {
+        let status = self.status();
+        if status.load(Ordering::Relaxed) & libc::TP_STATUS_USER == 0 {
+            return;
+        }
+        status.store(libc::TP_STATUS_KERNEL, Ordering::Release);
+        self.next = (self.next + 1) % self.slots;
+    }
+}
+
+impl Drop for Ring {
+    fn drop(&mut self) {
+        // SAFETY: the mapping is this value's own, and no borrow of it outlives the value.
+        let _ = unsafe { munmap(self.base.as_ptr().cast(), self.slots * self.slot_len) };
+    }
+}
+
+impl fmt::Debug for Ring {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Ring")
+            .field("slots", &self.slots)
+            .field("slot_len", &self.slot_len)
+            .field("next", &self.next)
+            .finish()
+    }
+}

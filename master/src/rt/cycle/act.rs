@@ -1,0 +1,102 @@
+//! From the inputs to the outputs: every axis once a cycle.
+
+use ecaxis_axis::Command;
+
+use super::orders::quick_stop;
+use super::{Engine, Nanos, has_power};
+use crate::rt::feed;
+use crate::rt::guard::StopCause;
+
+/// An axis at rest settles on its target this long before its power is taken away.
+const SETTLE: Nanos = 100_000_000;
+/// A drive's own quick stop is given two seconds; one that has power so long after it was ordered does not obey.
+const STUCK: Nanos = 3_000_000_000;
+
+impl Engine {
+    /// Masters before those that follow them, so that a follower's set-point is of the same cycle.
+    pub(super) fn act(&mut self) {
+        // Gears form no rings, so every round acts on one axis at least.
+        for _ in 0..self.axes.len() {
+            let mut waiting = false;
+            for index in 0..self.axes.len() {
+                let Some(slot) = self.axes.get(index) else {
+                    continue;
+                };
+                if slot.acted {
+                    continue;
+                }
+                let followed = slot.feed.master().and_then(|(m, _)| self.axes.get(m));
+                if followed.is_some_and(|master| !master.acted) {
+                    waiting = true;
+                } else {
+                    self.act_on(index);
+                }
+            }
+            if !waiting {
+                break;
+            }
+        }
+        for group in 0..self.groups.len() {
+            if let Some(cause) = self.groups.get_mut(group).and_then(|g| g.found.take()) {
+                // A group that cannot be stopped is not one to go on without.
+                let own = !matches!(cause, StopCause::Powered { .. });
+                self.stop(own.then_some(group), cause);
+            }
+        }
+    }
+
+    /// One axis; what of it has to stop its group is noted there.
+    fn act_on(&mut self, index: usize) {
+        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
+        let master = self.axes.get(index).and_then(|slot| {
+            let (master, actual) = slot.feed.master()?;
+            let status = self.axes.get(master)?.axis.status();
+            feed::master_motion(&status, actual)
+        });
+        let Some(slot) = self.axes.get_mut(index) else {
+            return;
+        };
+        let Some(group) = self.groups.get_mut(slot.group) else {
+            return;
+        };
+        slot.acted = true;
+        let lost = slot.feed.give(&mut slot.axis, &self.tables, master, dt_s);
+        let outputs = slot.axis.act();
+        slot.write(self.exchange.outputs_mut(), &outputs);
+        let status = slot.axis.status();
+        slot.armed |= slot.ordered && status.fault.is_none();
+        if status.enabled {
+            slot.largest_following_error =
+                slot.largest_following_error.max(status.max_following_error);
+            slot.last_enabled = Some(status);
+        }
+        if let Some(stop) = group.stop() {
+            let at_rest = status.at_rest && !status.moving;
+            slot.rested = if at_rest {
+                slot.rested + self.timing.cycle_ns
+            } else {
+                0
+            };
+            let elapsed = self.next.saturating_sub(stop.since);
+            let known = status.stale_cycles == 0 && has_power(status.state);
+            if known && elapsed > group.patience + STUCK {
+                group.found = Some(StopCause::Powered { axis: index });
+            }
+            if status.enabled && elapsed > group.patience {
+                quick_stop(&mut slot.axis);
+            } else if status.enabled && slot.rested >= SETTLE {
+                let _ = slot.axis.command(Command::Disable);
+            }
+            // By command, or by itself where the machine file says so.
+            if status.resetting {
+                group.acknowledge();
+            }
+        }
+        let cause = match (status.fault, status.trip) {
+            (Some(_), _) if slot.armed => Some(StopCause::DriveFault { axis: index }),
+            (None, Some(trip)) if slot.armed => Some(StopCause::Trip { axis: index, trip }),
+            _ => lost.then_some(StopCause::FollowLost { axis: index }),
+        };
+        group.found = group.found.or(cause);
+    }
+}

@@ -1,0 +1,142 @@
+//! The cycle's dealings with the wire: its frames out and in, and the phase in which they go out.
+
+use super::Engine;
+use crate::clock::{self, Nanos};
+use crate::link::LinkError;
+use crate::rt::exchange::{Mode, Received};
+use crate::rt::handover::Event;
+use crate::rt::journal::Note;
+
+/// Frames taken in a row without looking at the clock; more than a cycle and a mailbox ever bring.
+const FRAMES_AT_ONCE: usize = 32;
+
+impl Engine {
+    pub(super) fn send(&mut self, lateness: Nanos) {
+        let sent = self.exchange.send(self.link.as_mut(), lateness);
+        self.note(sent);
+        // Mailbox frames follow the cyclic ones, one a cycle.
+        let sent = self.port.send(self.link.as_mut(), 1).map(|_| ());
+        self.note(sent);
+    }
+
+    fn note(&mut self, result: Result<(), LinkError>) {
+        if result.is_err() {
+            self.stats.counters.link_errors += 1;
+            self.jot(Note::LinkError);
+        }
+    }
+
+    /// Until the frames that are due are back or three quarters of the cycle are over; pipelined, what is there.
+    pub(super) fn receive(&mut self, woke: Nanos) {
+        let released = self.next;
+        let quarter = self.timing.cycle_ns / 4;
+        // A thread that woke late still gives its frame time to come back.
+        let deadline = (released + 3 * quarter).max(woke + quarter);
+        loop {
+            for _ in 0..FRAMES_AT_ONCE {
+                match self.link.recv(&mut self.buf) {
+                    Ok(Some(len)) => self.sort(len),
+                    Ok(None) => break,
+                    Err(error) => {
+                        self.note(Err(error));
+                        break;
+                    }
+                }
+            }
+            if self.exchange.mode() == Mode::Pipelined {
+                return;
+            }
+            let now = clock::now();
+            if self.exchange.complete() {
+                self.stats.round_trip.record(now.saturating_sub(released));
+                return;
+            }
+            if now >= deadline {
+                return;
+            }
+            self.clock.relax(
+                self.link
+                    .next_arrival()
+                    .map_or(deadline, |at| at.min(deadline)),
+            );
+        }
+    }
+
+    fn sort(&mut self, len: usize) {
+        let frame = &self.buf[..len];
+        match self.exchange.receive(frame) {
+            Received::Current => {}
+            Received::Late => {
+                self.stats.counters.late_frames += 1;
+                self.jot(Note::Late);
+            }
+            Received::Foreign => self.port.receive(frame),
+        }
+    }
+
+    pub(super) fn count(&mut self) {
+        if self.guarding {
+            if !self.answer.complete {
+                self.stats.counters.lost_frames += 1;
+                self.jot(Note::Lost);
+            } else if !self.answer.inputs_fresh {
+                self.stats.counters.wkc_errors += 1;
+                let (seen, expected) = self.answer.wkc;
+                self.jot(Note::WorkingCounter(seen, expected));
+            }
+            if let Some((status, answered)) = self.answer.al_status
+                && self.al_status.replace((status, answered)) != Some((status, answered))
+            {
+                self.jot(Note::AlStatus(status, answered));
+            }
+            self.watch_clock();
+        }
+        self.stats.counters.refused_answers = self.port.refused;
+    }
+
+    /// The difference of one clock a cycle. One that is outside the window is told of once, until it has come well inside.
+    fn watch_clock(&mut self) {
+        let Some((device, difference_ns)) = self.exchange.clock_read() else {
+            return;
+        };
+        let Some(off) = self.clocks_off.get_mut(device) else {
+            return;
+        };
+        let amount = u64::from(difference_ns.unsigned_abs());
+        if amount > self.timing.clock_window_ns && !*off {
+            *off = true;
+            let cycle = self.stats.counters.cycles;
+            self.report(Event::ClockOff {
+                cycle,
+                device,
+                difference_ns,
+            });
+        } else if amount <= self.timing.clock_window_ns / 2 {
+            *off = false;
+        }
+    }
+
+    /// Nanoseconds to add to the next cycle.
+    pub(super) fn follow_clock(&mut self) -> i64 {
+        let Some(phase) = &mut self.phase else {
+            return 0;
+        };
+        let Some(system_time) = self.answer.system_time else {
+            return phase.holdover();
+        };
+        let before = phase.locked();
+        let step = phase.update(system_time, self.answer.sent_late);
+        let now_locked = phase.locked();
+        self.phase_error = step.error;
+        if now_locked {
+            self.stats.phase.record(step.error.unsigned_abs());
+        }
+        let cycle = self.stats.counters.cycles;
+        match (before, now_locked) {
+            (false, true) => self.report(Event::PhaseLocked { cycle }),
+            (true, false) => self.report(Event::PhaseLost { cycle }),
+            _ => {}
+        }
+        step.adjust
+    }
+}

@@ -1,0 +1,133 @@
+//! The bytes of the cycle's frames: Ethernet header, datagrams one behind the other.
+
+use crate::link::port::ETHERCAT;
+
+pub(super) const MAC_TAIL: u8 = 0x20;
+const ETHERNET_HEADER: usize = 14;
+pub(super) const FIRST_DATAGRAM: usize = 16;
+pub(super) const DATAGRAM_HEADER: usize = 10;
+pub(super) const WKC: usize = 2;
+
+/// Where a datagram lies in its frame.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    pub frame: usize,
+    /// Offset of the datagram's header.
+    pub offset: usize,
+    pub len: usize,
+}
+
+impl Place {
+    pub fn data(self) -> std::ops::Range<usize> {
+        let start = self.offset + DATAGRAM_HEADER;
+        start..start + self.len
+    }
+
+    fn end(self) -> usize {
+        self.offset + DATAGRAM_HEADER + self.len + WKC
+    }
+
+    pub fn wkc(self, frame: &[u8]) -> u16 {
+        let at = self.offset + DATAGRAM_HEADER + self.len;
+        match frame.get(at..at + WKC) {
+            Some(&[low, high]) => u16::from_le_bytes([low, high]),
+            _ => 0,
+        }
+    }
+}
+
+#[derive(Debug)]
+pub(super) struct Frame {
+    /// As it will be sent.
+    pub bytes: Vec<u8>,
+    /// As it came back, if it is answered; as long as it was sent.
+    pub answer: Box<[u8]>,
+    pub answered: bool,
+}
+
+#[allow(
+    clippy::disallowed_methods,
+    clippy::disallowed_macros,
+    reason = "prepares"
+)]
+pub(super) fn new_frame(number: u8) -> Frame {
+    let mut bytes = Vec::with_capacity(crate::link::MAX_FRAME);
+    bytes.extend_from_slice(&[0xff; 6]);
+    bytes.extend_from_slice(&[0x10, 0x10, 0x10, 0x10, number, MAC_TAIL]);
+    bytes.extend_from_slice(&ETHERCAT);
+    bytes.extend_from_slice(&[0, 0]);
+    Frame {
+        bytes,
+        answer: vec![0; crate::link::MAX_FRAME].into_boxed_slice(),
+        answered: false,
+    }
+}
+
+/// Appends a datagram with room for `len` bytes.
+pub(super) fn push(
+    frame: &mut Frame,
+    number: usize,
+    command: u8,
+    address: u32,
+    len: usize,
+) -> Place {
+    let place = Place {
+        frame: number,
+        offset: frame.bytes.len(),
+        len,
+    };
+    frame.bytes.resize(place.end(), 0);
+    write_header(&mut frame.bytes, place.offset, command, address, len);
+    place
+}
+
+pub(super) fn write_header(frame: &mut [u8], offset: usize, command: u8, address: u32, len: usize) {
+    let [a0, a1, a2, a3] = address.to_le_bytes();
+    let [l0, l1] = u16::try_from(len).unwrap_or(0).to_le_bytes();
+    if let Some(header) = frame.get_mut(offset..offset + DATAGRAM_HEADER) {
+        header.copy_from_slice(&[command, 0, a0, a1, a2, a3, l0, l1, 0, 0]);
+    }
+}
+
+pub(super) fn clear_wkc(frame: &mut [u8], place: Place) {
+    if let Some(wkc) = frame.get_mut(place.data().end..place.end()) {
+        wkc.fill(0);
+    }
+}
+
+/// Writes the EtherCAT header, the cycle's index and the "more follows" flags of all datagrams.
+pub(super) fn number(frame: &mut [u8], cycle: u8) {
+    let [low, high] = u16::try_from(frame.len() - FIRST_DATAGRAM)
+        .unwrap_or(0)
+        .to_le_bytes();
+    frame[ETHERNET_HEADER] = low;
+    frame[ETHERNET_HEADER + 1] = high & 0x07 | 0x10;
+    let mut at = FIRST_DATAGRAM;
+    while at + DATAGRAM_HEADER <= frame.len() {
+        frame[at + 1] = cycle;
+        let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 0x07]));
+        let next = at + DATAGRAM_HEADER + len + WKC;
+        frame[at + 7] = frame[at + 7] & 0x07 | if next < frame.len() { 0x80 } else { 0 };
+        at = next;
+    }
+}
+
+/// Whether an answer has our datagrams in our places. SubDevices change addresses (APRD, BRD),
+/// data, working counters and the circulating bit, nothing else.
+pub(super) fn same_headers(sent: &[u8], answer: &[u8]) -> bool {
+    if answer.len() < sent.len() {
+        return false;
+    }
+    let mut at = FIRST_DATAGRAM;
+    while at + DATAGRAM_HEADER <= sent.len() {
+        let same = sent[at..at + 2] == answer[at..at + 2]
+            && sent[at + 6] == answer[at + 6]
+            && (sent[at + 7] ^ answer[at + 7]) & 0x87 == 0;
+        if !same {
+            return false;
+        }
+        let len = usize::from(u16::from_le_bytes([sent[at + 6], sent[at + 7] & 0x07]));
+        at += DATAGRAM_HEADER + len + WKC;
+    }
+    true
+}

@@ -1,0 +1,370 @@
+//! The layout of the process image: which SubDevice at which logical address, in which datagram of which frame.
+
+use crate::config::Machine;
+
+/// First logical address of the process image.
+pub const LOGICAL_BASE: u32 = 0x0001_0000;
+
+/// Room for process data in the first frame of a cycle, beside the clock, AL status and diagnostic
+/// datagrams: 1514 − 16 (headers) − 20 − 14 − 20.
+const FIRST_FRAME: usize = 1444;
+/// Room for process data in every further frame.
+const NEXT_FRAME: usize = 1498;
+/// Header and working counter.
+const DATAGRAM: usize = 12;
+
+/// What one SubDevice has to exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ProcessData {
+    pub out_len: usize,
+    pub in_len: usize,
+    /// The group whose working counters its own are among.
+    pub group: usize,
+    /// It processes LRW; otherwise it is reached by LWR and LRD of its own.
+    pub lrw: bool,
+}
+
+/// The place of one SubDevice's outputs and inputs. Both start at the same logical address, so one
+/// byte of an LRW carries an output out and an input back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Region {
+    pub logical: u32,
+    /// Frame of the cycle that carries it; where LWR and LRD do, the first of them.
+    pub frame: usize,
+    /// Offset in the image.
+    pub offset: usize,
+    pub out_len: usize,
+    pub in_len: usize,
+}
+
+/// How a datagram reaches the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// LRW: outputs out, inputs back.
+    Both,
+    /// LRD.
+    Inputs,
+    /// LWR.
+    Outputs,
+}
+
+/// One datagram of process data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DatagramPlan {
+    /// Frame of the cycle that carries it.
+    pub frame: usize,
+    /// The group whose SubDevices it reaches, and no others.
+    pub group: usize,
+    pub access: Access,
+    pub logical: u32,
+    /// Offset of its data in the image.
+    pub offset: usize,
+    pub len: usize,
+    /// Sum over its SubDevices: in an LRW, 1 for inputs and 2 for outputs; else 1 (ETG.1000.4).
+    pub expected_wkc: u16,
+}
+
+/// The whole image.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ImagePlan {
+    /// In the order of the devices given; `None` where a device has no process data.
+    pub regions: Vec<Option<Region>>,
+    /// The group of each device.
+    pub groups: Vec<usize>,
+    pub datagrams: Vec<DatagramPlan>,
+    pub len: usize,
+}
+
+/// A device whose process data does not fit into one frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("{len} bytes of process data do not fit into one frame of {}", NEXT_FRAME - DATAGRAM)]
+pub struct TooLarge {
+    /// Index of the device.
+    pub device: usize,
+    pub len: usize,
+}
+
+impl ImagePlan {
+    /// Frames of a cycle; the first is sent whatever it carries.
+    #[must_use]
+    pub fn frames(&self) -> usize {
+        self.datagrams.last().map_or(1, |last| last.frame + 1)
+    }
+}
+
+/// What the SubDevices of a machine exchange, as their ESIs say.
+#[allow(clippy::disallowed_methods, reason = "prepares")]
+#[must_use]
+pub fn process_data(machine: &Machine) -> Vec<ProcessData> {
+    let each = machine.devices.iter().enumerate().map(|(index, device)| {
+        let layout = &device.selection.layout;
+        ProcessData {
+            out_len: layout.rx_bytes(),
+            in_len: layout.tx_bytes(),
+            group: machine.group_of(index),
+            lrw: !device.device.use_lrd_lwr,
+        }
+    });
+    each.collect()
+}
+
+/// The image of a machine, as far as its ESIs know.
+pub fn of(machine: &Machine) -> Result<ImagePlan, TooLarge> {
+    plan(&process_data(machine))
+}
+
+/// Lays devices out group by group, so that each group's working counters are its own. No device is split over two frames, and where
+/// it lies does not depend on how it is reached.
+#[allow(
+    clippy::disallowed_methods,
+    clippy::disallowed_macros,
+    reason = "prepares"
+)]
+pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
+    let mut image = ImagePlan {
+        regions: vec![None; devices.len()],
+        groups: devices.iter().map(|device| device.group).collect(),
+        ..ImagePlan::default()
+    };
+    let mut order: Vec<(usize, &ProcessData)> = devices.iter().enumerate().collect();
+    order.sort_by_key(|(_, device)| device.group);
+    let mut frames = Frames {
+        last: 0,
+        room: FIRST_FRAME,
+    };
+    for (index, device) in order {
+        let (out, inp) = (device.out_len, device.in_len);
+        let len = out.max(inp);
+        if len == 0 {
+            continue;
+        }
+        if len + DATAGRAM > NEXT_FRAME {
+            return Err(TooLarge { device: index, len });
+        }
+        let (reads, writes) = (u16::from(inp > 0), u16::from(out > 0));
+        let mut datagram = DatagramPlan {
+            frame: 0,
+            group: device.group,
+            access: Access::Both,
+            logical: LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX)),
+            offset: image.len,
+            len,
+            expected_wkc: reads + 2 * writes,
+        };
+        let first = image.datagrams.len();
+        let frame = match image.datagrams.last_mut() {
+            Some(last)
+                if device.lrw
+                    && (last.access, last.group) == (Access::Both, device.group)
+                    && len <= frames.room =>
+            {
+                last.len += len;
+                last.expected_wkc += datagram.expected_wkc;
+                frames.room -= len;
+                last.frame
+            }
+            _ if device.lrw => {
+                datagram.frame = frames.place(len);
+                image.datagrams.push(datagram);
+                datagram.frame
+            }
+            _ => {
+                for (access, len) in [(Access::Outputs, out), (Access::Inputs, inp)] {
+                    if len > 0 {
+                        image.datagrams.push(DatagramPlan {
+                            frame: frames.place(len),
+                            access,
+                            len,
+                            expected_wkc: 1,
+                            ..datagram
+                        });
+                    }
+                }
+                image.datagrams[first].frame
+            }
+        };
+        image.regions[index] = Some(Region {
+            logical: datagram.logical,
+            frame,
+            offset: image.len,
+            out_len: out,
+            in_len: inp,
+        });
+        image.len += len;
+    }
+    Ok(image)
+}
+
+/// The frame that is being filled.
+struct Frames {
+    last: usize,
+    room: usize,
+}
+
+impl Frames {
+    /// Takes the room of a new datagram; its frame.
+    fn place(&mut self, len: usize) -> usize {
+        if len + DATAGRAM > self.room {
+            self.last += 1;
+            self.room = NEXT_FRAME;
+        }
+        self.room -= len + DATAGRAM;
+        self.last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn lrw(sizes: &[(usize, usize)]) -> Vec<ProcessData> {
+        let each = sizes.iter().map(|&(out_len, in_len)| ProcessData {
+            out_len,
+            in_len,
+            group: 0,
+            lrw: true,
+        });
+        each.collect()
+    }
+
+    fn grouped(mut devices: Vec<ProcessData>, groups: &[usize]) -> Vec<ProcessData> {
+        for (device, &group) in devices.iter_mut().zip(groups) {
+            device.group = group;
+        }
+        devices
+    }
+
+    #[test]
+    fn working_counters_and_addresses_of_a_drive_an_input_and_an_output() {
+        let image = plan(&lrw(&[(12, 14), (0, 1), (1, 0), (0, 0)])).expect("fits");
+        assert_eq!(
+            image.datagrams,
+            [DatagramPlan {
+                frame: 0,
+                group: 0,
+                access: Access::Both,
+                logical: LOGICAL_BASE,
+                offset: 0,
+                len: 16,
+                expected_wkc: 3 + 1 + 2,
+            }]
+        );
+        assert_eq!(image.regions[1].map(|r| r.offset), Some(14));
+        assert_eq!(image.regions[2].map(|r| r.logical), Some(LOGICAL_BASE + 15));
+        assert_eq!(image.regions[3], None);
+    }
+
+    #[test]
+    fn a_hundred_axes_of_twelve_bytes_fit_into_one_frame() {
+        let hundred = plan(&lrw(&[(12, 12); 100])).expect("fits");
+        assert_eq!((hundred.datagrams.len(), hundred.frames()), (1, 1));
+        let many = plan(&lrw(&[(12, 12); 300])).expect("fits");
+        assert_eq!((many.datagrams.len(), many.frames()), (3, 3));
+        assert_eq!(
+            plan(&lrw(&[(1500, 0)])),
+            Err(TooLarge {
+                device: 0,
+                len: 1500
+            })
+        );
+    }
+
+    #[test]
+    fn a_group_has_datagrams_of_its_own() {
+        let sizes = [(12, 13), (0, 1), (12, 13), (0, 0), (12, 13)];
+        let image = plan(&grouped(lrw(&sizes), &[1, 0, 2, 1, 1])).expect("fits");
+        let datagrams: Vec<_> = image
+            .datagrams
+            .iter()
+            .map(|d| (d.frame, d.group, d.offset, d.len, d.expected_wkc))
+            .collect();
+        assert_eq!(
+            datagrams,
+            [(0, 0, 0, 1, 1), (0, 1, 1, 26, 6), (0, 2, 27, 13, 3)]
+        );
+        let offsets: Vec<_> = image.regions.iter().map(|r| r.map(|r| r.offset)).collect();
+        assert_eq!(offsets, [Some(1), Some(0), Some(27), None, Some(14)]);
+        assert_eq!(image.groups, [1, 0, 2, 1, 1]);
+    }
+
+    #[test]
+    fn a_device_without_lrw_is_reached_by_two_datagrams_and_lies_where_it_would() {
+        let mut devices = lrw(&[(12, 13), (4, 6), (0, 2), (12, 13)]);
+        let places = |devices: &[ProcessData]| {
+            let image = plan(devices).expect("fits");
+            image
+                .regions
+                .iter()
+                .map(|r| r.map(|r| r.offset))
+                .collect::<Vec<_>>()
+        };
+        let before = places(&devices);
+        (devices[1].lrw, devices[2].lrw) = (false, false);
+        assert_eq!(places(&devices), before);
+        let image = plan(&devices).expect("fits");
+        let datagrams: Vec<_> = image
+            .datagrams
+            .iter()
+            .map(|d| (d.access, d.offset, d.len, d.expected_wkc))
+            .collect();
+        assert_eq!(
+            datagrams,
+            [
+                (Access::Both, 0, 13, 3),
+                (Access::Outputs, 13, 4, 1),
+                (Access::Inputs, 13, 6, 1),
+                (Access::Inputs, 19, 2, 1),
+                (Access::Both, 21, 13, 3),
+            ]
+        );
+    }
+
+    proptest! {
+        /// Every byte of every device in one datagram of its group each way, none over another, every frame within its room.
+        #[test]
+        fn whatever_is_laid_out_fits(
+            devices in proptest::collection::vec((0_usize..900, 0_usize..1486, 0_usize..4, any::<bool>()), 0..40),
+        ) {
+            let devices: Vec<ProcessData> = devices
+                .into_iter()
+                .map(|(out_len, in_len, group, lrw)| ProcessData { out_len, in_len, group, lrw })
+                .collect();
+            let image = plan(&devices).expect("none is too large");
+            for frame in 0..image.frames() {
+                let of_frame = image.datagrams.iter().filter(|d| d.frame == frame);
+                let bytes: usize = of_frame.map(|d| d.len + DATAGRAM).sum();
+                let room = if frame == 0 { FIRST_FRAME } else { NEXT_FRAME };
+                prop_assert!(bytes <= room);
+            }
+            for datagram in &image.datagrams {
+                prop_assert_eq!(datagram.logical, LOGICAL_BASE + datagram.offset as u32);
+                prop_assert!(datagram.offset + datagram.len <= image.len);
+            }
+            let carried = |access: Access, group: usize, from: usize, to: usize| {
+                let carries = image.datagrams.iter().filter(|d| {
+                    (d.access == access || d.access == Access::Both)
+                        && d.group == group && d.offset <= from && to <= d.offset + d.len
+                });
+                from == to || carries.count() == 1
+            };
+            let mut used = vec![false; image.len];
+            for (region, device) in image.regions.iter().zip(&devices) {
+                let len = device.out_len.max(device.in_len);
+                prop_assert_eq!(region.is_some(), len > 0);
+                let Some(region) = region else { continue };
+                let (at, group) = (region.offset, device.group);
+                prop_assert!(carried(Access::Outputs, group, at, at + device.out_len));
+                prop_assert!(carried(Access::Inputs, group, at, at + device.in_len));
+                for byte in &mut used[at..at + len] {
+                    prop_assert!(!std::mem::replace(byte, true));
+                }
+            }
+            let expected: u32 = devices
+                .iter()
+                .map(|d| u32::from(d.in_len > 0) + u32::from(d.out_len > 0) * if d.lrw { 2 } else { 1 })
+                .sum();
+            prop_assert_eq!(image.datagrams.iter().map(|d| u32::from(d.expected_wkc)).sum::<u32>(), expected);
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! Axes to targets of their own, and into other modes.
+
+use ecaxis_axis::units::UserUnits;
+use ecaxis_axis::{AxisStatus, Command, Mode};
+
+use super::{Aim, Settling, Supervisor};
+use crate::clock::Nanos;
+use crate::config::Step;
+use crate::rt::handover::Snapshot;
+use crate::session::RunError;
+
+impl Supervisor {
+    /// All begin in the same cycle and arrive when they arrive. `part`: of the velocity and acceleration limits.
+    pub(super) async fn move_each(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        relative: bool,
+        targets: &[(usize, f64)],
+        [speed, ramp]: [f64; 2],
+    ) -> Result<(), RunError> {
+        let targets = self.destinations(relative, targets).await?;
+        self.reach(step, start, Aim::Position, &targets, |position| {
+            Command::MoveTo {
+                position,
+                speed,
+                ramp,
+            }
+        })
+        .await
+    }
+
+    /// Positions of axes that are sent somewhere, from where their set-points are.
+    pub(in crate::supervise) async fn destinations(
+        &mut self,
+        relative: bool,
+        targets: &[(usize, f64)],
+    ) -> Result<Vec<(usize, f64)>, RunError> {
+        let targets = self.targets(targets);
+        let turning = targets.iter().any(|&(axis, _)| self.modulo(axis));
+        let origin = if relative || turning {
+            self.tick().await?.axes
+        } else {
+            Vec::new()
+        };
+        let there = targets.into_iter().map(|(axis, target)| {
+            let from = origin.get(axis).map_or(0.0, |s| s.target_position);
+            let target = if relative {
+                from + target
+            } else {
+                self.place_to_go(axis, from, target)
+            };
+            (axis, target)
+        });
+        Ok(there.collect())
+    }
+
+    fn modulo(&self, axis: usize) -> bool {
+        let setup = self.setup(axis);
+        setup.is_some_and(|s| s.config.scale.modulo().is_some())
+    }
+
+    pub(super) async fn switch(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        targets: &[(usize, Mode)],
+    ) -> Result<(), RunError> {
+        let targets = targets.iter().filter_map(|&(device, mode)| {
+            Some((self.axes.iter().position(|&d| d == device)?, mode))
+        });
+        let targets: Vec<(usize, Mode)> = targets.collect();
+        let axes: Vec<usize> = targets.iter().map(|&(axis, _)| axis).collect();
+        self.settle(&axes, start).await?;
+        let commands = targets.iter();
+        self.command(commands.map(|&(axis, mode)| (axis, Command::SetMode(mode))))
+            .await;
+        let there = |s: &Snapshot, axis: usize| {
+            let wanted = targets.iter().find(|(a, _)| *a == axis);
+            let status = &s.axes[axis];
+            Some(status.mode) == wanted.map(|(_, mode)| *mode) && status.switching.is_none()
+        };
+        self.until(step, start, there, &axes).await
+    }
+
+    /// Orders every axis to its target and waits until all have arrived; an axis whose set-point has arrived but which
+    /// does not follow fails the step.
+    pub(in crate::supervise) async fn reach(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        aim: Aim,
+        targets: &[(usize, f64)],
+        command: impl Fn(f64) -> Command,
+    ) -> Result<(), RunError> {
+        self.command(
+            targets
+                .iter()
+                .map(|&(axis, target)| (axis, command(target))),
+        )
+        .await;
+        let mut settling = Settling::default();
+        self.watch(step, start, |this, snapshot| {
+            let status = |axis: usize| &snapshot.axes[axis];
+            let late = targets.iter().find(|(axis, _)| !status(*axis).in_target);
+            let Some(&(axis, target)) = late else {
+                return Ok(true);
+            };
+            let on_its_way = |axis: usize| status(axis).moving && !status(axis).held_by_range;
+            if targets.iter().any(|&(axis, _)| on_its_way(axis)) {
+                settling = Settling::default();
+                return Ok(false);
+            }
+            if settling.over() {
+                return Err(this.not_reached(step, axis, aim, target, status(axis)));
+            }
+            Ok(false)
+        })
+        .await
+    }
+
+    /// `target`: as [`Command`]s have it.
+    pub(in crate::supervise) fn not_reached(
+        &self,
+        step: &Step,
+        axis: usize,
+        aim: Aim,
+        target: f64,
+        last: &AxisStatus,
+    ) -> RunError {
+        let (target, actual, unit) = self.in_users_terms(axis, aim, target, last);
+        RunError::NotReached {
+            device: self.device_of(axis),
+            step: step.into(),
+            target,
+            actual,
+            unit,
+        }
+    }
+
+    /// A target and what is reported of it, in the file's unit; positions of a modulo axis as places.
+    fn in_users_terms(
+        &self,
+        axis: usize,
+        aim: Aim,
+        target: f64,
+        last: &AxisStatus,
+    ) -> (f64, f64, String) {
+        let Some(setup) = self.setup(axis) else {
+            return (target, last.position, String::new());
+        };
+        match aim {
+            Aim::Velocity => (target, last.velocity, format!("{}/s", setup.unit)),
+            Aim::Torque => {
+                let torque = &setup.torque;
+                let unit = torque.unit.to_string();
+                (torque.shown(target), torque.shown(last.torque), unit)
+            }
+            Aim::Position => {
+                let scale = &setup.config.scale;
+                let place = |position| scale.place(UserUnits(position)).0;
+                (place(target), place(last.position), setup.unit.clone())
+            }
+        }
+    }
+}

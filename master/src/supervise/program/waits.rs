@@ -1,0 +1,150 @@
+//! Steps that are over when something holds: states, homing, inputs.
+
+use ecaxis_axis::Command;
+use ecaxis_axis::status::HomingStatus;
+
+use super::{SETTLE_TIMEOUT, STANDS, Supervisor};
+use crate::clock::{self, Nanos};
+use crate::config::{Action, Condition, Step};
+use crate::rt::handover::Snapshot;
+use crate::session::RunError;
+
+impl Supervisor {
+    /// Until something holds of every axis, or the time an axis may take to be enabled is over.
+    pub(super) async fn until(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        holds: impl Fn(&Snapshot, usize) -> bool,
+        axes: &[usize],
+    ) -> Result<(), RunError> {
+        let begun = clock::now();
+        let timeout = self.machine.bus.enable_timeout_ns.max(self.stop_patience);
+        self.watch(step, start, |this, snapshot| {
+            let Some(&axis) = axes.iter().find(|&&axis| !holds(snapshot, axis)) else {
+                return Ok(true);
+            };
+            if let Some(mode) = snapshot.axes[axis].switch_failed
+                && matches!(step.action, Action::Mode { .. })
+            {
+                return Err(RunError::NotSwitched {
+                    device: this.device_of(axis),
+                    step: step.into(),
+                    mode,
+                });
+            }
+            if clock::now().saturating_sub(begun) > timeout {
+                return Err(RunError::StepTimeout {
+                    device: this.device_of(axis),
+                    step: step.into(),
+                    what: this.machine.describe(&step.action),
+                    state: snapshot.axes[axis].state,
+                    timeout_ms: timeout / 1_000_000,
+                });
+            }
+            Ok(false)
+        })
+        .await
+    }
+
+    /// Until axes whose set-point has come to rest have come to rest themselves; some orders are for standing axes only. One that swings
+    /// around its target is slow at each turn, too: it stands when it stays slow.
+    pub(in crate::supervise) async fn settle(
+        &mut self,
+        axes: &[usize],
+        start: Nanos,
+    ) -> Result<(), RunError> {
+        let begun = clock::now();
+        let mut moved = begun;
+        loop {
+            let snapshot = self.tick().await?;
+            let status = axes.iter().filter_map(|&axis| snapshot.axes.get(axis));
+            let settling: Vec<_> = status.filter(|s| s.enabled && !s.moving).collect();
+            let now = clock::now();
+            if settling.iter().any(|status| !status.at_rest) {
+                moved = now;
+            }
+            let stand = settling.is_empty() || now.saturating_sub(moved) >= STANDS;
+            if stand || self.over(start) || now.saturating_sub(begun) > SETTLE_TIMEOUT {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Each by its own timeout, which the axis keeps.
+    pub(super) async fn home(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        devices: &[usize],
+    ) -> Result<(), RunError> {
+        let timeout = |device: &usize| {
+            let axis = self.machine.devices[*device].axis.as_ref();
+            let ns = axis.and_then(|a| a.homing.as_ref()).map(|h| h.timeout_ns);
+            ns.unwrap_or_default() as f64 * 1e-9
+        };
+        let timeouts: Vec<f64> = devices.iter().map(timeout).collect();
+        let axes = self.places(devices);
+        self.settle(&axes, start).await?;
+        let commands = axes.iter().zip(&timeouts);
+        self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
+            .await;
+        self.watch(step, start, |this, snapshot| {
+            let mut homed = true;
+            for &axis in &axes {
+                let status = &snapshot.axes[axis];
+                homed &= match status.homing {
+                    HomingStatus::Failed(error) => {
+                        return Err(RunError::NotHomed {
+                            device: this.device_of(axis),
+                            step: step.into(),
+                            method: this.homing_method(axis),
+                            error,
+                        });
+                    }
+                    HomingStatus::Attained => status.switching.is_none() && status.ready,
+                    HomingStatus::None | HomingStatus::Running => false,
+                };
+            }
+            Ok(homed)
+        })
+        .await
+    }
+
+    fn homing_method(&self, axis: usize) -> i8 {
+        let device = self
+            .axes
+            .get(axis)
+            .and_then(|&d| self.machine.devices.get(d));
+        let setup = device.and_then(|d| d.axis.as_ref()?.homing.as_ref());
+        setup.map_or(0, |setup| setup.homing.method)
+    }
+
+    /// Until every condition holds in one and the same cycle.
+    pub(super) async fn wait(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        conditions: &[Condition],
+        timeout: Nanos,
+    ) -> Result<(), RunError> {
+        let begun = clock::now();
+        loop {
+            let snapshot = self.tick().await?;
+            let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
+            let open = conditions.iter().find(|c| !c.holds(value(c.input)));
+            let Some(open) = open else { return Ok(()) };
+            if self.over(start) {
+                return Ok(());
+            }
+            if clock::now().saturating_sub(begun) > timeout {
+                return Err(RunError::WaitTimeout {
+                    step: step.into(),
+                    condition: self.machine.condition(open),
+                    value: value(open.input),
+                    timeout_ms: timeout / 1_000_000,
+                });
+            }
+        }
+    }
+}
