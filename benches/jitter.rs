@@ -1,56 +1,136 @@
-//! Wake-up lateness of the cycle's clock: sleeping to shortly before the release and spinning the
-//! rest, against plain sleeping, in turns in the same run. Only the ratio means anything on a
-//! machine that others use too.
+//! Wake-up lateness of the cycle's clock beside cyclictest, in turns in one run: spinning as long as it needs, plain
+//! sleeping, and both on a CPU that is kept awake. Same class, priority, CPU and interval for all. On a computer that others use,
+//! too, only the ratios mean anything.
+//!
+//! `cargo bench --bench jitter -- [CPU [SECONDS [hog]]]`: which CPU (default 1), seconds a round (default 2), and whether
+//! something keeps the other CPUs busy.
 
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
-use ecaxis::clock::{self, Clock};
-use ecaxis::rt::stats::Times;
-use ecaxis::rt::thread;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-const CYCLE: u64 = 1_000_000;
-const CYCLES_A_ROUND: u32 = 1_000;
-const ROUNDS: u32 = 5;
-const SPIN: u64 = 100_000;
+use ecaxis::bench::wakeup::{Cyclictest, Wakeups};
+use ecaxis::clock::Nanos;
+use ecaxis::rt::awake::Awake;
+use ecaxis::rt::margin::{Margin, Spin};
+use ecaxis::rt::stats::{Percentiles, Times};
+use ecaxis::rt::thread::{self, Held};
 
-fn round(spin: u64, lateness: &mut Times) {
-    let mut next = clock::now() + CYCLE;
-    for _ in 0..CYCLES_A_ROUND {
-        Clock::Real.sleep_until(next, spin);
-        let now = clock::now();
-        lateness.record(now.saturating_sub(next));
-        next += CYCLE;
-        // What has been missed is not made up for.
-        next = next.max(now);
+const PRIORITY: u8 = 80;
+const ROUNDS: u32 = 3;
+
+fn row(name: &str, p: &Percentiles, beside: &Percentiles, cpu: Option<f64>) {
+    let ratio = |a: u64, b: u64| a as f64 / b.max(1) as f64;
+    println!(
+        "{name:<22} {:>8.2} {:>8.2} {:>8.2} {:>9.2}   {:>6.3} {:>6.3} {:>6.3}   {}",
+        p.p50_ns as f64 / 1e3,
+        p.p99_ns as f64 / 1e3,
+        p.p99_9_ns as f64 / 1e3,
+        p.max_ns as f64 / 1e3,
+        ratio(p.p50_ns, beside.p50_ns),
+        ratio(p.p99_ns, beside.p99_ns),
+        ratio(p.p99_9_ns, beside.p99_9_ns),
+        cpu.map_or(String::new(), |cpu| format!("{cpu:.1} %")),
+    );
+}
+
+fn measure(cycle: Nanos, cpu: usize, seconds: u32, awake: bool) {
+    let cycles = seconds * u32::try_from(1_000_000_000 / cycle).unwrap_or(1_000);
+    let spinner = awake.then(|| Awake::start(cpu));
+    if let Some(Err(denied)) = &spinner {
+        println!("note: {denied}");
+        return;
     }
+    let reference = Cyclictest {
+        cycle,
+        priority: PRIORITY,
+        cpu: Some(cpu),
+    };
+    let (mut theirs, mut auto, mut plain) = (Times::new(), Wakeups::default(), Wakeups::default());
+    let mut margin = Margin::new(Spin::Auto, cycle);
+    let mut sleeping = Margin::new(Spin::For(0), cycle);
+    for _ in 0..ROUNDS {
+        if let Err(error) = reference.round(cycles, &mut theirs) {
+            println!("note: {error}");
+        }
+        auto.round(cycle, &mut margin, cycles).expect("getrusage");
+        plain
+            .round(cycle, &mut sleeping, cycles)
+            .expect("getrusage");
+    }
+    println!(
+        "\n{} Hz, {ROUNDS} rounds of {cycles} cycles each in turns{}; spun before a release at the end: {:.1} µs\n\
+         {:<22} {:>8} {:>8} {:>8} {:>9}   {:>6} {:>6} {:>6}   CPU",
+        1_000_000_000 / cycle,
+        if awake { ", CPU kept awake" } else { "" },
+        margin.get() as f64 / 1e3,
+        "lateness, µs",
+        "p50",
+        "p99",
+        "p99.9",
+        "max",
+        "p50",
+        "p99",
+        "p99.9",
+    );
+    let beside = theirs.summary();
+    let load = |w: &Wakeups| Some(w.used.load_percent(w.wall_ns));
+    row("cyclictest", &beside, &beside, None);
+    row(
+        "sleep, then spin",
+        &auto.lateness.summary(),
+        &beside,
+        load(&auto),
+    );
+    row(
+        "sleep alone",
+        &plain.lateness.summary(),
+        &beside,
+        load(&plain),
+    );
 }
 
 fn main() {
-    for denied in thread::prepare(80, None) {
+    let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench");
+    let mut number = |default: u32| {
+        let said = arguments.next().and_then(|a| a.parse().ok());
+        said.unwrap_or(default)
+    };
+    let cpu = usize::try_from(number(1)).unwrap_or(1);
+    let seconds = number(2);
+    let hog = std::env::args().any(|a| a == "hog");
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let cpus = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let others = (0..cpus).filter(|other| hog && *other != cpu);
+    let hogs: Vec<_> = others
+        .map(|other| {
+            let stop = Arc::clone(&stop);
+            std::thread::spawn(move || {
+                let _ = thread::pin(other);
+                while !stop.load(Ordering::Relaxed) {
+                    std::hint::spin_loop();
+                }
+            })
+        })
+        .collect();
+    let (_held, mut denied) = Held::take(None);
+    denied.extend(thread::prepare(PRIORITY, Some(cpu)));
+    for denied in denied {
         println!("note: {denied}");
     }
-    let (mut sleeping, mut spinning) = (Times::new(), Times::new());
-    for _ in 0..ROUNDS {
-        round(0, &mut sleeping);
-        round(SPIN, &mut spinning);
+    println!(
+        "CPU {cpu}, SCHED_FIFO {PRIORITY}{}; ratios are to cyclictest of the same rounds",
+        if hog { ", other CPUs busy" } else { "" }
+    );
+    for awake in [false, true] {
+        for cycle in [1_000_000, 250_000] {
+            measure(cycle, cpu, seconds, awake);
+        }
     }
-    let (sleeping, spinning) = (sleeping.summary(), spinning.summary());
-    println!(
-        "wake-up lateness at 1 kHz, {ROUNDS} rounds of {CYCLES_A_ROUND} cycles each, in turns"
-    );
-    println!(
-        "{:>8} {:>12} {:>12} {:>8}",
-        "", "sleep", "sleep+spin", "ratio"
-    );
-    for (name, a, b) in [
-        ("p50", sleeping.p50_ns, spinning.p50_ns),
-        ("p99", sleeping.p99_ns, spinning.p99_ns),
-        ("p99.9", sleeping.p99_9_ns, spinning.p99_9_ns),
-        ("max", sleeping.max_ns, spinning.max_ns),
-    ] {
-        println!(
-            "{name:>8} {a:>9} ns {b:>9} ns {:>8.3}",
-            b as f64 / a.max(1) as f64
-        );
+    stop.store(true, Ordering::Relaxed);
+    for hog in hogs {
+        let _ = hog.join();
     }
 }

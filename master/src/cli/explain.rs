@@ -3,11 +3,14 @@
 use std::fmt::Write;
 use std::path::PathBuf;
 
-use ecaxis::config::{self, Action, DeviceConfig, Machine, Nic, Step, duration};
-use ecaxis::rt::image::{self, ImagePlan};
+use ecaxis::config::{self, Action, DeviceConfig, Exchange, Machine, Nic, Step, duration};
+use ecaxis::link::BackEnd;
+use ecaxis::rt::image::{self, Access, ImagePlan};
+use ecaxis::rt::margin::Spin;
 use ecaxis_esi::SmLayout;
 
 mod axis;
+mod stop;
 
 use super::tables::{fields, startup};
 use super::{Failure, hints, report::Table, result};
@@ -35,6 +38,7 @@ fn explain(machine: &Machine, out: &mut String) -> std::fmt::Result {
         self::device(device, out)?;
     }
     wire(machine, out)?;
+    stop::stop(machine, out)?;
     program(machine, out)
 }
 
@@ -60,11 +64,27 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         &lost,
         "consecutive cycles without a valid answer stop the axes",
     ]);
-    table.row([
-        "exchange",
-        "same-cycle",
-        "answers are waited for within the cycle",
-    ]);
+    table.row(match bus.exchange {
+        Exchange::SameCycle => [
+            "exchange",
+            "same-cycle",
+            "answers are waited for within the cycle",
+        ],
+        Exchange::Pipelined => [
+            "exchange",
+            "pipelined",
+            "answers are taken in the next cycle, nobody waits",
+        ],
+    });
+    if matches!(bus.nic, Nic::Interface(_)) {
+        let meaning = match bus.link {
+            BackEnd::Ring => "frames are taken from memory that the kernel shares",
+            BackEnd::Packet => "frames are taken by system calls",
+            #[cfg(feature = "xdp")]
+            BackEnd::Xdp => "frames are taken before the network stack sees them",
+        };
+        table.row(["link", bus.link.name(), meaning]);
+    }
     table.row([
         "priority",
         &format!("SCHED_FIFO {}", bus.priority),
@@ -73,15 +93,34 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
     table.row(["cpu", &cpu, "where it runs"]);
     table.row([
         "spin",
-        &duration::show(bus.spin_ns),
+        &match bus.spin {
+            Spin::Auto => "auto".to_owned(),
+            Spin::For(ns) => duration::show(ns),
+        },
         "before a cycle is due, sleeping becomes spinning",
     ]);
+    table.row(if bus.awake {
+        [
+            "idle",
+            "awake",
+            "something of the lowest class keeps that CPU busy",
+        ]
+    } else {
+        ["idle", "sleep", "CPUs sleep between two cycles"]
+    });
     let watchdog = duration::show(bus.watchdog_ns);
     table.row([
         "watchdog",
         &watchdog,
         "SyncManager and PDI watchdog (0x0400, 0x0410, 0x0420)",
     ]);
+    if machine.devices.iter().any(|d| d.selection.dc.is_some()) {
+        table.row([
+            "clock_window",
+            &duration::show(bus.clock_window_ns),
+            "a clock farther from the reference is warned of (0x092C)",
+        ]);
+    }
     table.row([
         "op_timeout",
         &duration::show(bus.op_timeout_ns),
@@ -239,13 +278,10 @@ const FORWARDING_NS: usize = 1_000;
 
 /// Bytes on the wire of each frame of a cycle, gap included.
 fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
-    let mut frames = vec![AL_STATUS + if clock { CLOCK } else { 0 }];
-    for (i, datagram) in plan.datagrams.iter().enumerate() {
-        let len = DATAGRAM + datagram.len;
-        match i {
-            0 => frames[0] += len,
-            _ => frames.push(len),
-        }
+    let mut frames = vec![0; plan.frames()];
+    frames[0] = AL_STATUS + if clock { CLOCK } else { 0 };
+    for datagram in &plan.datagrams {
+        frames[datagram.frame] += DATAGRAM + datagram.len;
     }
     frames
         .into_iter()
@@ -254,9 +290,7 @@ fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
 }
 
 fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
-    let layouts = machine.devices.iter().map(|d| &d.selection.layout);
-    let sizes: Vec<(usize, usize)> = layouts.map(|l| (l.rx_bytes(), l.tx_bytes())).collect();
-    let plan = match image::plan(&sizes) {
+    let plan = match image::of(machine) {
         Ok(plan) => plan,
         Err(e) => return writeln!(out, "\nprocess image\n  {e}"),
     };
@@ -275,7 +309,7 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
             &at,
             &outputs,
             &inputs,
-            &(region.datagram + 1).to_string(),
+            &(region.frame + 1).to_string(),
         ]);
     }
     writeln!(out, "{}", table.indented(2))?;
@@ -289,10 +323,11 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
         .map(|d| u32::from(d.expected_wkc))
         .sum();
     let clock = if clock { "FRMW 0x0910, " } else { "" };
+    let process_data = commands(&plan);
     let ns = u64::try_from(ns).unwrap_or(u64::MAX);
     writeln!(
         out,
-        "\nframes a cycle: {} ({clock}LRW, BRD 0x0130), {total} bytes on the wire",
+        "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130), {total} bytes on the wire",
         frames.len()
     )?;
     writeln!(
@@ -302,6 +337,23 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
         (ns * 100).div_ceil(machine.bus.cycle_ns),
     )?;
     writeln!(out, "  expected working counter {wkc}")
+}
+
+/// `LRW, ` or `2 LRW, LWR, LRD, `.
+fn commands(plan: &ImagePlan) -> String {
+    let mut text = String::new();
+    for (access, name) in [
+        (Access::Both, "LRW"),
+        (Access::Outputs, "LWR"),
+        (Access::Inputs, "LRD"),
+    ] {
+        match plan.datagrams.iter().filter(|d| d.access == access).count() {
+            0 => {}
+            1 => text += &format!("{name}, "),
+            several => text += &format!("{several} {name}, "),
+        }
+    }
+    text
 }
 
 fn program(machine: &Machine, out: &mut String) -> std::fmt::Result {

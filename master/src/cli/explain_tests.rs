@@ -4,7 +4,13 @@ use super::*;
 #[test]
 fn bytes_on_the_wire_as_counted_by_hand() {
     for (axes, bytes) in [(8, 168), (32, 456), (100, 1272)] {
-        let plan = image::plan(&vec![(12, 12); axes]).unwrap();
+        let axis = image::ProcessData {
+            out_len: 12,
+            in_len: 12,
+            group: 0,
+            lrw: true,
+        };
+        let plan = image::plan(&vec![axis; axes]).unwrap();
         let frames = frame_bytes(&plan, true);
         assert_eq!(
             frames.iter().sum::<usize>(),
@@ -75,6 +81,44 @@ fn fits_a_terminal_and_tells_what_is_assumed() {
             .lines()
             .find(|l| l.contains(value) && l.contains(origin));
         assert!(line.is_some(), "{value}, {origin}: {text}");
+    }
+}
+
+#[test]
+fn stops_and_groups() {
+    let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+    let explained = |file: &str| {
+        let machine = config::load(&configs.join(file)).unwrap();
+        let mut out = String::new();
+        explain(&machine, &mut out).unwrap();
+        let (_, stop) = out.split_once("\nstop\n").unwrap();
+        let (stop, _) = stop.split_once("\nprogram").unwrap();
+        (out.contains("2 LRW"), stop.to_owned())
+    };
+    let (several, text) = explained("demo.toml");
+    assert!(
+        !several && text.contains("all axes stop together"),
+        "{text}"
+    );
+    let (several, text) = explained("groups.toml");
+    assert!(several, "a datagram for the gantry, one for the rest");
+    let wide: Vec<&str> = text.lines().filter(|l| l.chars().count() > 110).collect();
+    assert!(wide.is_empty(), "{wide:#?}");
+    for words in [
+        &[
+            "an axis faults or trips",
+            "the others: within their limits",
+            "`others`",
+        ][..],
+        &["3 cycles", "the drives' quick stop", "`bus_lost`"],
+        &["emergency stop", "no condition"],
+        &["gantry", "x y", "quick stop", "continues"],
+        &["(the rest)", "z", "within their limits", "stops"],
+    ] {
+        let line = text
+            .lines()
+            .find(|l| words.iter().all(|word| l.contains(word)));
+        assert!(line.is_some(), "{words:?}: {text}");
     }
 }
 

@@ -6,7 +6,6 @@ use std::path::Path;
 use ecaxis::al_status::al_status_hint;
 use ecaxis::bringup::{BringUpError, StateError};
 use ecaxis::config::{ConfigError, Nic, UnitProblem};
-use ecaxis::link::packet::OpenError;
 use ecaxis::mailbox::{ObjectAddress, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
@@ -15,6 +14,11 @@ use ecaxis_axis::{HomingError, Refused, State, Trip, VelocityUnit};
 use ecaxis_sim::ServeError;
 
 use super::note;
+
+mod host;
+
+use host::interfaces;
+pub(crate) use host::{capabilities, concern, denied, interface, overload};
 
 /// The machine or the bus failed.
 pub(crate) const FAILED: u8 = 1;
@@ -93,6 +97,13 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::NotReached { .. } => {
             "check load and tuning, or give the axis a wider `target_window`".to_owned()
         }
+        RunError::ProbeNotArmed { input, .. } => format!(
+            "look whether the drive has a digital input configured as touch probe {input} (0x60B8 and 0x60B9 in its manual)"
+        ),
+        RunError::NotProbed { input, edge, .. } => format!(
+            "check the sensor, its wiring, and that the drive's digital input is configured as touch probe {input}; an input that is {} when the search begins shows no such edge; search farther with `to` or `by`, or for the other `edge`",
+            if *edge == "rising" { "already on" } else { "off" }
+        ),
         RunError::StepTimeout { .. } => "look at the drive's state and fault; the step waits as long as `bus.enable_timeout`, or as the slowest axis may take to stop".to_owned(),
         RunError::NotSwitched { .. } => "look at 0x6502 (supported drive modes), and at the drive's manual for what the mode needs".to_owned(),
         RunError::NotHomed { error, .. } => not_homed(*error).to_owned(),
@@ -100,11 +111,16 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
         RunError::NotDisabled { .. } => "the drive does not obey its Controlword: take its power away by hand, then look at its fault".to_owned(),
-        RunError::Refused { by_axis, .. } => refused(by_axis.as_deref()).to_owned(),
+        RunError::Refused { by_axis, device, .. } => refused(by_axis.as_deref(), &device.name),
         RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
         RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
         RunError::FollowLost { .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
         RunError::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
+        RunError::GroupStopped { cause, .. } => {
+            let cause = run(cause, nic).hints.into_iter();
+            let back = "once the cause is known, let steps bring the group back: `reset`, then `enable`";
+            return cause.fold(failure, Failure::hint).hint(back);
+        }
         RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
         RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,
@@ -151,20 +167,32 @@ fn message(error: &RunError) -> String {
     }
 }
 
-fn refused(reason: Option<&Refused>) -> &'static str {
-    let Some(reason) = reason else {
-        return "check the step and the axis' limits in the machine file";
-    };
+/// `name`: of the device that refused.
+fn refused(reason: Option<&Refused>, name: &str) -> String {
     match reason {
-        Refused::NotEnabled { .. } => "let a step enable the axis before: `enable = [\"x\"]`",
-        Refused::StillMoving { .. } => {
-            "bring the axis to rest before: `velocity = { x = 0.0 }` or `stop = [\"x\"]`"
+        Some(Refused::NotEnabled { .. }) => {
+            format!("let a step enable the axis before: `enable = [\"{name}\"]`")
         }
-        Refused::WrongMode { .. } => "let a step switch the axis before: `mode = { x = \"csp\" }`",
-        Refused::Faulted(_) | Refused::Tripped(_) => {
-            "let a step reset the axis before, once the cause is known: `reset = [\"x\"]`"
+        Some(Refused::StillMoving { .. }) => format!(
+            "bring the axis to rest before: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
+        ),
+        Some(Refused::Following) => {
+            format!("let a step end what it follows before: `stop = [\"{name}\"]`")
         }
-        _ => "check the step and the axis' limits in the machine file",
+        Some(Refused::WrongMode { needs, .. }) => format!(
+            "let a step switch the axis before: `mode = {{ {name} = \"{}\" }}`",
+            needs.to_string().to_lowercase()
+        ),
+        Some(Refused::Faulted(_) | Refused::Tripped(_) | Refused::GroupStopped) => format!(
+            "let a step reset the axis before, once the cause is known: `reset = [\"{name}\"]`"
+        ),
+        Some(Refused::ModeNotOffered { .. } | Refused::NoModeDisplay) => {
+            "map 0x6060, 0x6061 and the mode's targets with `pdo.rx` and `pdo.tx`".to_owned()
+        }
+        Some(Refused::NoProbe) => {
+            "map 0x60B8, 0x60B9 and 0x60BA to 0x60BD with `pdo.rx` and `pdo.tx`".to_owned()
+        }
+        _ => "check the step and the axis' limits in the machine file".to_owned(),
     }
 }
 
@@ -182,51 +210,6 @@ fn not_homed(error: HomingError) -> &'static str {
         HomingError::PowerLost => "look at the drive's fault (0x603F) and its supply",
         HomingError::Aborted => "home the axis again before it moves to positions",
     }
-}
-
-pub(crate) fn interface(failure: Failure, error: &OpenError) -> Failure {
-    match error {
-        OpenError::NoSuchInterface { .. } => {
-            // The file or the command line names it.
-            Failure {
-                code: WRONG,
-                ..failure
-            }
-            .hint(interfaces())
-        }
-        OpenError::NotPermitted { .. } => failure.hint(capabilities()),
-        OpenError::Down { nic } => failure.hint(format!("sudo ip link set {nic} up")),
-        OpenError::NoCarrier { .. } => {
-            failure.hint("plug the cable into the first SubDevice's IN port and switch it on")
-        }
-        OpenError::Mtu { nic, .. } => failure.hint(format!("sudo ip link set {nic} mtu 1500")),
-        OpenError::Io { .. } => failure,
-    }
-}
-
-/// The interfaces of this computer.
-fn interfaces() -> String {
-    let mut names: Vec<String> = std::fs::read_dir("/sys/class/net")
-        .into_iter()
-        .flatten()
-        .flatten()
-        .filter_map(|entry| entry.file_name().into_string().ok())
-        .filter(|name| name != "lo")
-        .collect();
-    names.sort();
-    if names.is_empty() {
-        return "this computer has no network interface; `--sim` runs without one".to_owned();
-    }
-    format!("this computer has {}", names.join(", "))
-}
-
-/// How to permit raw sockets, real-time priority and locked memory without being root.
-pub(crate) fn capabilities() -> String {
-    let exe = std::env::current_exe().unwrap_or_else(|_| "ecaxis".into());
-    format!(
-        "sudo setcap cap_net_raw,cap_sys_nice,cap_ipc_lock+ep {}",
-        exe.display()
-    )
 }
 
 fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
@@ -287,6 +270,9 @@ fn units(problem: &UnitProblem) -> String {
         UnitProblem::Contradiction(found) => found,
         UnitProblem::NoRatedTorque { .. } => {
             return "add `rated_torque = 0.1` (Nm), or give torques in percent".to_owned();
+        }
+        UnitProblem::NoTorqueConstant => {
+            return "add `torque_constant = 0.0385` (Nm/A), or give torques in percent".to_owned();
         }
         UnitProblem::Config { .. } | UnitProblem::Homing { .. } => {
             return "write a finer or coarser unit with `sdo = [{ index = 0x60A9, value = … }]`, or change the axis' limits".to_owned();

@@ -1,4 +1,5 @@
 use ecaxis::bringup::{AlState, DeviceRef};
+use ecaxis::link::OpenError;
 
 use super::*;
 
@@ -112,6 +113,14 @@ fn every_failure_says_what_next() {
             "ip link set x up",
         ),
         (
+            RunError::Open(OpenError::Unfit {
+                nic: "lo".into(),
+                what: "is the loopback",
+            }),
+            WRONG,
+            "this computer has",
+        ),
+        (
             bring_up(BringUpError::NoAnswer),
             FAILED,
             "is `eth9` the right interface?",
@@ -161,6 +170,7 @@ fn every_failure_says_what_next() {
         ),
         (
             RunError::BusLost {
+                group: None,
                 cycles: 3,
                 wkc: (0, 6),
                 answered: false,

@@ -10,7 +10,9 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
+mod bench;
 mod check;
+mod doctor;
 mod esi;
 mod explain;
 mod hints;
@@ -39,6 +41,8 @@ enum Verb {
     Explain(explain::Args),
     Esi(esi::Args),
     Sim(sim::Args),
+    Doctor(doctor::Args),
+    Bench(bench::Args),
 }
 
 #[derive(Debug, clap::Args)]
@@ -75,10 +79,12 @@ impl Verbosity {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     match &cli.verb {
-        Verb::Run(run::Args { verbosity, .. }) | Verb::Sim(sim::Args { verbosity, .. }) => {
+        Verb::Run(run::Args { verbosity, .. })
+        | Verb::Sim(sim::Args { verbosity, .. })
+        | Verb::Bench(bench::Args { verbosity, .. }) => {
             verbosity.start_logging();
         }
-        Verb::Check(_) | Verb::Explain(_) | Verb::Esi(_) => {}
+        Verb::Check(_) | Verb::Explain(_) | Verb::Esi(_) | Verb::Doctor(_) => {}
     }
     let done = match cli.verb {
         Verb::Run(args) => run::run(&args),
@@ -86,6 +92,8 @@ pub fn main() -> ExitCode {
         Verb::Explain(args) => explain::run(&args),
         Verb::Esi(args) => esi::run(&args),
         Verb::Sim(args) => sim::run(&args),
+        Verb::Doctor(args) => doctor::run(&args),
+        Verb::Bench(args) => bench::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -162,6 +170,14 @@ mod tests {
             ("ecaxis esi list d --revision 2", false),
             ("ecaxis esi list d --match roughly", false),
             ("ecaxis sim m.toml --nic veth0", true),
+            ("ecaxis doctor", true),
+            (
+                "ecaxis doctor eth0 --machine m.toml --cpu 3 --cycle 250us --seconds 0 --json",
+                true,
+            ),
+            ("ecaxis doctor --priority 100", false),
+            ("ecaxis doctor --cycle 1us", false),
+            ("ecaxis doctor --seconds -1", false),
         ] {
             assert_eq!(Cli::try_parse_from(line.split(' ')).is_ok(), good, "{line}");
         }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use ecaxis::bringup::Step;
 use ecaxis::clock::Clock;
-use ecaxis::config::TorqueUnit;
+use ecaxis::config::{Bus, Nic, TorqueUnit};
 use ecaxis::session::{AxisLine, Observer, Progress, Status};
 use ecaxis_axis::Mode;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -20,13 +20,15 @@ pub(crate) struct Teller {
     bar: Option<ProgressBar>,
     clock: Clock,
     cycle_ns: u64,
+    /// Hints depend on it.
+    nic: Nic,
     last_passing: Option<Instant>,
-    advised: bool,
+    advised: Vec<String>,
 }
 
 impl Teller {
     /// `plain`: do not rewrite lines, log lines come in between.
-    pub fn new(clock: Clock, cycle_ns: u64, plain: bool) -> Self {
+    pub fn new(clock: Clock, bus: &Bus, plain: bool) -> Self {
         let bar = (stderr_is_terminal() && !plain).then(|| {
             let bar = ProgressBar::new_spinner();
             let style = ProgressStyle::with_template("{spinner} {wide_msg}");
@@ -35,9 +37,10 @@ impl Teller {
         Self {
             bar,
             clock,
-            cycle_ns,
+            cycle_ns: bus.cycle_ns,
+            nic: bus.nic.clone(),
             last_passing: None,
-            advised: false,
+            advised: Vec::new(),
         }
     }
 
@@ -83,12 +86,36 @@ impl Observer for Teller {
             Progress::Step(step) => self.line(&step.to_string()),
             Progress::Denied(denied) => {
                 self.line(&format!("warning: {denied}"));
-                if !self.advised {
-                    self.advised = true;
-                    self.line(&format!("  = help: {}", hints::capabilities()));
+                let help = hints::denied(denied);
+                if !self.advised.contains(&help) {
+                    self.line(&format!("  = help: {help}"));
+                    self.advised.push(help);
+                }
+            }
+            Progress::Overload(overload) => {
+                self.line(&format!("warning: {overload}"));
+                self.line(&format!("  = help: {}", hints::overload()));
+            }
+            Progress::Concern(concern) => {
+                self.line(&format!("warning: {concern}"));
+                if let Some(help) = hints::concern(concern) {
+                    self.line(&format!("  = help: {help}"));
                 }
             }
             Progress::Warning(text) => self.line(&format!("warning: {text}")),
+            Progress::GroupStopped { group, cause } => {
+                self.line(&format!(
+                    "warning: the group `{group}` stops, the rest goes on: {cause}"
+                ));
+                for hint in hints::run(cause, &self.nic).hints {
+                    self.line(&format!("  = help: {hint}"));
+                }
+            }
+            Progress::GroupReleased { group } => {
+                self.line(&format!(
+                    "the group `{group}` has been reset and can be enabled again"
+                ));
+            }
             Progress::PhaseLocked => self.line("frames leave in phase with SYNC0"),
             Progress::Enabled { axes: 1 } => self.line("1 axis in Operation enabled"),
             Progress::Enabled { axes } => self.line(&format!("{axes} axes in Operation enabled")),
@@ -99,6 +126,9 @@ impl Observer for Teller {
                 } else {
                     self.occasional(|| text);
                 }
+            }
+            Progress::Captured { run, capture } => {
+                self.line(&format!("run {run}, step {}: {capture}", capture.step));
             }
             Progress::Status(status) if self.clock == Clock::Virtual => {
                 let cycle_ns = self.cycle_ns;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use ecaxis::config::duration;
 use ecaxis::rt::stats::Percentiles;
-use ecaxis::session::{AxisSummary, Summary};
+use ecaxis::session::{AxisSummary, DeviceErrors, EventLine, Summary, ThreadSummary};
 
 /// The whole result of a run.
 pub(crate) fn summary(summary: &Summary) -> String {
@@ -14,6 +14,9 @@ pub(crate) fn summary(summary: &Summary) -> String {
     text += "\n\n";
     text += &times(summary).indented(2);
     text += "\n";
+    if let Some(thread) = &summary.thread {
+        text += &self::thread(thread, summary.counters.cycles);
+    }
     if !summary.axes.is_empty() {
         text += "\n";
         text += &axes(&summary.axes).indented(2);
@@ -23,6 +26,32 @@ pub(crate) fn summary(summary: &Summary) -> String {
         for what in [&axis.fault, &axis.trip].into_iter().flatten() {
             text += &format!("  {}: {what}\n", axis.name);
         }
+    }
+    for stop in &summary.group_stops {
+        let end = if stop.released {
+            "reset since"
+        } else {
+            "not reset"
+        };
+        text += &format!("  group `{}` stopped, {end}: {}\n", stop.group, stop.cause);
+    }
+    if !summary.probes.is_empty() {
+        text += "\n";
+    }
+    for found in &summary.probes {
+        let times = match found.times {
+            1 => String::new(),
+            n => format!(" (the last of {n})"),
+        };
+        text += &format!("  step {}: {found}{times}\n", found.step);
+    }
+    if !summary.errors.is_empty() {
+        text += "\n";
+        text += &errors(&summary.errors).indented(2);
+        text += "\n";
+    }
+    if summary.events.iter().any(|event| event.failure) {
+        text += &format!("\n{}\n", events(&summary.events));
     }
     if let Some(frames) = summary.recorded_frames {
         text += &format!("\n  {frames} frames recorded");
@@ -92,6 +121,26 @@ fn counters(summary: &Summary) -> Table {
             counters.refused_answers,
             "mailbox frames too late or damaged",
         ),
+        (
+            "foreign frames",
+            summary.link.foreign,
+            "of other protocols or MainDevices on this wire",
+        ),
+        (
+            "tagged frames",
+            summary.link.tagged,
+            "with a VLAN tag, which ours never have",
+        ),
+        (
+            "damaged frames",
+            summary.link.damaged,
+            "shorter than they say, or too long",
+        ),
+        (
+            "dropped frames",
+            summary.link.dropped,
+            "the kernel had no room: nobody looked for long",
+        ),
     ] {
         // The first three are always asked for; the others only matter when they happen.
         if count > 0
@@ -133,6 +182,90 @@ fn times(summary: &Summary) -> Table {
     table
 }
 
+/// What the real-time thread took.
+fn thread(thread: &ThreadSummary, cycles: u64) -> String {
+    let used = &thread.used;
+    let a_cycle = |n: u64| n as f64 / cycles.max(1) as f64;
+    let mut text = format!(
+        "\n  real-time thread: {:.1} % of its CPU, {} a cycle; {:.2} context switches a cycle, {} against its will; {} page faults{}\n",
+        thread.load_percent,
+        duration::show(a_cycle(used.cpu_ns).round() as u64),
+        a_cycle(used.voluntary_switches + used.involuntary_switches),
+        used.involuntary_switches,
+        used.minor_faults + used.major_faults,
+        match used.major_faults {
+            0 => String::new(),
+            n => format!(", {n} of them from disk"),
+        },
+    );
+    let slept = &thread.sleep_lateness;
+    if slept.count > 0 {
+        text += &format!(
+            "  sleeping ends late by {} (p50), {} (p99), {} (p99.9); {} are spun before a release\n",
+            duration::show(slept.p50_ns),
+            duration::show(slept.p99_ns),
+            duration::show(slept.p99_9_ns),
+            duration::show(thread.spin_ns),
+        );
+    }
+    text
+}
+
+/// A line for each port that has seen errors.
+fn errors(devices: &[DeviceErrors]) -> Table {
+    let mut table = Table::new(&[
+        "SubDevice",
+        "port",
+        "invalid frames",
+        "receive errors",
+        "found bad before",
+        "lost links",
+    ]);
+    for device in devices {
+        for port in 0..4 {
+            let of_port = [
+                device.invalid_frames,
+                device.rx_errors,
+                device.forwarded,
+                device.lost_links,
+            ]
+            .map(|counters| counters[port]);
+            if of_port != [0; 4] {
+                let [invalid, rx, forwarded, lost] = of_port.map(|n| n.to_string());
+                table.row([
+                    &device.name,
+                    &port.to_string(),
+                    &invalid,
+                    &rx,
+                    &forwarded,
+                    &lost,
+                ]);
+            }
+        }
+        for (what, count) in [("unit", device.processing_unit), ("PDI", device.pdi)] {
+            if count > 0 {
+                table.row([&device.name, what, &count.to_string(), "", "", ""]);
+            }
+        }
+    }
+    table
+}
+
+/// The last that led to the end, and when.
+fn events(events: &[EventLine]) -> String {
+    const SHOWN: usize = 12;
+    let mut table = Table::new(&["time", "cycle", "what the cycle noticed last"]);
+    for event in &events[events.len().saturating_sub(SHOWN)..] {
+        let cycles = if event.first_cycle == event.last_cycle {
+            event.first_cycle.to_string()
+        } else {
+            format!("{}-{}", event.first_cycle, event.last_cycle)
+        };
+        table.row([&format!("{:.3} s", event.at_s), &cycles, &event.what]);
+    }
+    table.shown(2)
+}
+
 fn axes(axes: &[AxisSummary]) -> Table {
     let mut table = Table::new(&[
         "axis",
@@ -156,8 +289,14 @@ fn axes(axes: &[AxisSummary]) -> Table {
         table.row([
             &axis.name,
             &axis.mode,
-            &only(cyclic_position, position(axis.target_position)),
-            &only(axis.was_enabled, position(axis.final_position)),
+            &only(
+                cyclic_position,
+                position(axis.target_place.unwrap_or(axis.target_position)),
+            ),
+            &only(
+                axis.was_enabled,
+                position(axis.final_place.unwrap_or(axis.final_position)),
+            ),
             &off,
             &only(cyclic_position, position(axis.largest_following_error)),
             &axis.final_state,
@@ -313,10 +452,12 @@ mod tests {
                 lost_frames: 1,
                 ..Default::default()
             },
+            link: ecaxis::link::LinkStats::default(),
             wake_up_lateness: times,
             round_trip: times,
             dc_phase_error: Some(times),
             work: Percentiles::default(),
+            thread: None,
             axes: vec![AxisSummary {
                 name: "x".into(),
                 unit: "mm".into(),
@@ -324,11 +465,53 @@ mod tests {
                 was_enabled: true,
                 final_position: -0.000_01,
                 target_position: 0.0,
+                final_place: None,
+                target_place: None,
                 final_error_counts: Some(0),
                 largest_following_error: 0.1234,
                 final_state: "Switch on disabled".into(),
                 fault: None,
                 trip: None,
+            }],
+            probes: vec![ecaxis::session::Capture {
+                step: "3".into(),
+                axis: "x".into(),
+                input: 2,
+                edge: "falling",
+                times: 3,
+                position: 725.0,
+                place: Some(5.0),
+                unit: "deg".into(),
+            }],
+            errors: vec![DeviceErrors {
+                name: "x".into(),
+                invalid_frames: [0, 3, 0, 0],
+                rx_errors: [0, 4, 0, 0],
+                forwarded: [0; 4],
+                lost_links: [0, 1, 0, 0],
+                processing_unit: 0,
+                pdi: 0,
+            }],
+            events: vec![
+                EventLine {
+                    at_s: 1.25,
+                    first_cycle: 1250,
+                    last_cycle: 1252,
+                    what: "frames were not back before the deadline".into(),
+                    failure: false,
+                },
+                EventLine {
+                    at_s: 1.252,
+                    first_cycle: 1252,
+                    last_cycle: 1252,
+                    what: "stop: 3 cycles in a row without a valid answer".into(),
+                    failure: true,
+                },
+            ],
+            group_stops: vec![ecaxis::session::GroupStop {
+                group: "gantry".into(),
+                cause: "`x`: drive fault".into(),
+                released: true,
             }],
             recorded_frames: Some(7),
             recorded_frames_dropped: Some(0),
@@ -353,10 +536,45 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
 
   axis  mode  target     final position  off by    largest following error  state
   x     csp   0.0000 mm  0.0000 mm       0 counts  0.1234 mm                Switch on disabled
+  group `gantry` stopped, reset since: `x`: drive fault
+
+  step 3: `x`: falling edge of input 2 at 5.0000 deg (the last of 3)
+
+  SubDevice  port  invalid frames  receive errors  found bad before  lost links
+  x          1     3               4               0                 1
+
+  time     cycle      what the cycle noticed last
+  1.250 s  1250-1252  frames were not back before the deadline
+  1.252 s  1252       stop: 3 cycles in a row without a valid answer
 
   7 frames recorded
 ";
         assert_eq!(summary(&sample()), expected);
+    }
+
+    #[test]
+    fn what_the_thread_took() {
+        let thread = ThreadSummary {
+            used: ecaxis::os::process::ThreadUse {
+                cpu_ns: 625_000_000,
+                minor_faults: 3,
+                major_faults: 1,
+                voluntary_switches: 12_500,
+                involuntary_switches: 125,
+            },
+            load_percent: 5.0,
+            sleep_lateness: sample().wake_up_lateness,
+            spin_ns: 34_000,
+        };
+        let summary = Summary {
+            thread: Some(thread),
+            ..sample()
+        };
+        let expected = "
+  real-time thread: 5.0 % of its CPU, 50 µs a cycle; 1.01 context switches a cycle, 125 against its will; 4 page faults, 1 of them from disk
+  sleeping ends late by 120 ns (p50), 1.5 µs (p99), 2 µs (p99.9); 34 µs are spun before a release
+";
+        assert!(self::summary(&summary).contains(expected));
     }
 
     #[test]

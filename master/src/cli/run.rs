@@ -65,10 +65,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let nic = machine.bus.nic.clone();
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
-    let mut teller = Teller::new(options.clock, machine.bus.cycle_ns, args.verbosity.plain());
+    let mut teller = Teller::new(options.clock, &machine.bus, args.verbosity.plain());
     let Outcome {
         summary,
         result: ended,
+        ..
     } = session::run(machine, options, stop, &mut teller);
     drop(teller);
 

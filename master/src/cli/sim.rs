@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use ecaxis::config;
-use ecaxis::link::packet::{OpenError, PacketLink};
+use ecaxis::link::OpenError;
+use ecaxis::link::packet::PacketLink;
 use ecaxis::rt::thread;
 use ecaxis::session;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};

@@ -1,6 +1,6 @@
 //! `ecaxis esi objects`: the object dictionary of a device.
 
-use ecaxis_esi::{Choice, Mode, ObjectItem, PdoMapping, Writable, select};
+use ecaxis_esi::{Bytes, Choice, Mode, ObjectItem, PdoMapping, Writable, select};
 use serde_json::json;
 
 use super::super::report::Table;
@@ -48,7 +48,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             let name = if object.items.len() > 1 && item.sub > 0 {
                 format!("  {}", item.name)
             } else {
-                object.name.clone()
+                object.name.to_string()
             };
             let index = format!("0x{:04x}:{:02x}", object.index, item.sub);
             let shown = |bytes: &[u8]| value(&item.type_name, bytes);
@@ -57,11 +57,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             } else {
                 String::new()
             };
-            let edge = |bytes: &Option<Vec<u8>>| bytes.as_deref().map_or_else(String::new, shown);
+            let edge = |bytes: &Option<Bytes>| bytes.as_deref().map_or_else(String::new, shown);
             let (min, max) = (edge(&item.min), edge(&item.max));
             all.push(json!({
-                "index": object.index, "sub": item.sub, "name": item.name, "object": object.name,
-                "type": item.type_name, "bits": item.bit_len, "access": access(item),
+                "index": object.index, "sub": item.sub, "name": &*item.name, "object": &*object.name,
+                "type": &*item.type_name, "bits": item.bit_len, "access": access(item),
                 "pdo": mapping(item.pdo_mapping), "default": default, "min": min, "max": max,
             }));
             table.row([

@@ -93,9 +93,12 @@ fn units(axis: &AxisSetup, table: &mut Table) {
             .map_or("not known yet".to_owned(), |n| format!("{} Nm", rounded(n)));
         let origin = from(torque.rated_from, "rated_torque", "0x6076");
         table.row(["rated torque", &rated, &origin]);
-        if let Some(constant) = torque.constant {
-            let constant = format!("{constant} Nm/A");
+        let constant = torque.constant.map(|n| format!("{n} Nm/A"));
+        if let Some(constant) = constant {
             table.row(["torque constant", &constant, "`torque_constant`"]);
+        } else if torque.unit == TorqueUnit::Amperes {
+            let origin = "0x3001:05, the drive is asked";
+            table.row(["torque constant", "not known yet", origin]);
         }
     }
 }

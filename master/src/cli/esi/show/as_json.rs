@@ -96,7 +96,7 @@ fn pdo(pdo: &Pdo) -> Value {
     let entries = pdo.entries.iter().map(|entry| {
         json!({
             "index": entry.index, "sub": entry.sub, "bits": entry.bit_len,
-            "type": entry.data_type, "name": entry.name,
+            "type": &*entry.data_type, "name": &*entry.name,
         })
     });
     json!({

@@ -1,0 +1,82 @@
+//! What a frame to and fro costs over each back-end, in turns in one run, on a veth pair whose other end answers after 30 µs.
+//! The software's share is the round trip less these 30 µs. Needs root and two CPUs.
+//!
+//! `cargo bench --bench wire -- [MILLISECONDS]`: of a round (default 1000).
+
+#![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
+
+use ecaxis::bench::exchange::Exchanges;
+use ecaxis::bench::reflector::{Pace, Reflector};
+use ecaxis::bench::veth::VethPair;
+use ecaxis::link::{self, BackEnd};
+use ecaxis::rt::margin::{Margin, Spin};
+use ecaxis::rt::thread::{self, Held};
+
+const PRIORITY: u8 = 80;
+const ROUNDS: usize = 6;
+const HOLD_NS: u64 = 30_000;
+/// Of datagrams: 192 bytes of process data and what is around them.
+const DATA: u16 = 230;
+
+fn main() {
+    let said = std::env::args().skip(1).find_map(|a| a.parse().ok());
+    let round_ms: u32 = said.unwrap_or(1_000);
+    let pair = match VethPair::new() {
+        Ok(pair) => pair,
+        Err(error) => {
+            println!("skipped: a veth pair needs root: {error}");
+            return;
+        }
+    };
+    let (_held, mut denied) = Held::take(None);
+    denied.extend(thread::prepare(PRIORITY, Some(1)));
+    for denied in denied {
+        println!("note: {denied}");
+    }
+    for cycle in [1_000_000_u64, 250_000, 125_000] {
+        let rate = 1_000_000_000 / cycle;
+        let pace = Pace {
+            hold: HOLD_NS,
+            // Up again well before the next frame.
+            rest: cycle / 3,
+        };
+        let reflector = Reflector::start(&pair.b, pace, Some(0)).expect("the other end answers");
+        let cycles = u32::try_from(u64::from(round_ms) * rate / 1_000).unwrap_or(1_000);
+        let mut results = vec![Exchanges::default(); BackEnd::ALL.len()];
+        for round in 0..ROUNDS {
+            // Another one begins each time.
+            for turn in 0..BackEnd::ALL.len() {
+                let which = (turn + round) % BackEnd::ALL.len();
+                let (back_end, result) = (&BackEnd::ALL[which], &mut results[which]);
+                // One at a time: the kernel copies every frame for each that is open.
+                let (mut link, concerns) =
+                    link::open(&pair.a, *back_end).expect("an interface of ours");
+                assert_eq!(concerns, [], "it is this back-end that is measured");
+                let mut margin = Margin::new(Spin::For(20_000), cycle);
+                let done = result.round(link.as_mut(), DATA, cycle, &mut margin, cycles);
+                done.expect("the link works");
+            }
+        }
+        println!(
+            "\n{rate} Hz, {ROUNDS} rounds of {cycles} cycles each in turns, {DATA} bytes of datagrams\n\
+             {:<8} {:>9} {:>9} {:>9} {:>12} {:>11} {:>12} {:>6}",
+            "link", "p50 µs", "p99", "p99.9", "software p50", "CPU µs/cycle", "switches", "lost"
+        );
+        for (back_end, result) in BackEnd::ALL.iter().zip(&results) {
+            let p = result.round_trip.summary();
+            let us = |ns: u64| ns as f64 / 1e3;
+            println!(
+                "{:<8} {:>9.2} {:>9.2} {:>9.2} {:>12.2} {:>11.2} {:>12.2} {:>6}",
+                back_end.name(),
+                us(p.p50_ns),
+                us(p.p99_ns),
+                us(p.p99_9_ns),
+                us(p.p50_ns.saturating_sub(HOLD_NS)),
+                result.cpu_ns_a_cycle() / 1e3,
+                result.used.voluntary_switches as f64 / result.cycles.max(1) as f64,
+                result.lost,
+            );
+        }
+        println!("{} frames answered", reflector.finish());
+    }
+}

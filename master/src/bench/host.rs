@@ -1,0 +1,165 @@
+//! The computer that a bench runs on.
+
+use std::fs;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+
+use rustix::thread::{CpuSet, sched_getaffinity};
+
+use super::plan::Plan;
+use super::report::Fact;
+use crate::doctor::{self, Host, Intent, Severity, Tried};
+use crate::rt::thread::pin;
+
+fn read(path: &str) -> Option<String> {
+    let text = fs::read_to_string(path).ok()?;
+    let text = text.trim();
+    (!text.is_empty()).then(|| text.to_owned())
+}
+
+/// Of the CPUs that this process may use: the one for the cycle, isolated from others if there is such a one, and the one for
+/// everything beside it.
+#[must_use]
+pub fn cpus() -> (usize, Option<usize>) {
+    let allowed: Vec<usize> = sched_getaffinity(None).map_or_else(
+        |_| vec![0],
+        |set| {
+            (0..CpuSet::MAX_CPU)
+                .filter(|cpu| set.is_set(*cpu))
+                .collect()
+        },
+    );
+    let isolated = read("/sys/devices/system/cpu/isolated").map_or_else(Vec::new, |l| list(&l));
+    let last = allowed.iter().rev();
+    let cycle = last
+        .clone()
+        .find(|cpu| isolated.contains(cpu))
+        .or(allowed.last())
+        .copied()
+        .unwrap_or(0);
+    let other = last.copied().find(|cpu| *cpu != cycle);
+    (cycle, other)
+}
+
+/// `0,2-4` as the kernel writes it.
+fn list(text: &str) -> Vec<usize> {
+    let mut cpus = Vec::new();
+    for part in text.split(',') {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        if let (Ok(first), Ok(last)) = (first.trim().parse(), last.trim().parse::<usize>()) {
+            cpus.extend(first..=last.min(CpuSet::MAX_CPU));
+        }
+    }
+    cpus
+}
+
+/// Whether a hypervisor decides when its CPUs run.
+#[must_use]
+pub fn is_virtual() -> bool {
+    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let flags = info.lines().find(|line| line.starts_with("flags"));
+    flags.is_some_and(|flags| flags.split_whitespace().any(|flag| flag == "hypervisor"))
+}
+
+/// What a reader has to know of it to make sense of the figures: facts, and what `ecaxis doctor` would have mended.
+#[must_use]
+pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
+    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = info.lines().find_map(|line| {
+        let (name, value) = line.split_once(':')?;
+        (name.trim() == "model name").then(|| value.trim().to_owned())
+    });
+    let mut facts = Vec::new();
+    let mut add = |name, value: Option<String>| {
+        if let Some(value) = value {
+            facts.push(Fact { name, value });
+        }
+    };
+    add("processor", model);
+    let intent = Intent {
+        nic: None,
+        cpu: Some(plan.cpu),
+        priority: plan.priority,
+        cycle_ns: plan.cycle_ns,
+        spin: plan.spin,
+        program: std::env::current_exe().unwrap_or_default(),
+    };
+    let report = doctor::examine(&Host::here(), &intent, Tried::default());
+    for fact in report.facts {
+        add(fact.name, Some(fact.value));
+    }
+    let load = read("/proc/loadavg");
+    add(
+        "load at the end",
+        load.and_then(|l| Some(l.split_whitespace().next()?.to_owned())),
+    );
+    let bad = |f: &doctor::Finding| f.severity != Severity::Note;
+    let findings = report.findings.into_iter().filter(bad);
+    (facts, findings.map(|finding| finding.found).collect())
+}
+
+/// A thread of the ordinary class that takes all of a CPU, and its memory's bandwidth, until this is dropped.
+#[derive(Debug)]
+pub struct Hog {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// More than most caches nearby hold.
+const HOG_WORDS: usize = 1 << 20;
+
+impl Hog {
+    /// Starts it.
+    ///
+    /// # Errors
+    /// Where no thread can be started.
+    pub fn start(cpu: usize) -> std::io::Result<Self> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let ended = Arc::clone(&stop);
+        let thread = thread::Builder::new()
+            .name("ecaxis-hog".to_owned())
+            .spawn(move || {
+                if pin(cpu).is_ok() {
+                    let mut words = vec![0_u64; HOG_WORDS];
+                    while !ended.load(Ordering::Relaxed) {
+                        for word in words.iter_mut().step_by(8) {
+                            *word = word.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                        }
+                        std::hint::black_box(&mut words);
+                    }
+                }
+            })?;
+        Ok(Self {
+            stop,
+            thread: Some(thread),
+        })
+    }
+}
+
+impl Drop for Hog {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_of_cpus() {
+        assert_eq!(list("0,2-4"), [0, 2, 3, 4]);
+        assert!(list("").is_empty());
+        assert!(list("x,3-1,5-").is_empty());
+    }
+
+    #[test]
+    fn this_computer_says_something_of_itself() {
+        let (cpu, other) = cpus();
+        assert_ne!(Some(cpu), other);
+    }
+}

@@ -1,0 +1,249 @@
+//! A report to send to somebody: one file of XHTML with its drawings in it, and nothing that is loaded from elsewhere.
+
+use std::fmt::Write;
+
+use super::report::{Dist, Fact, Ratio, Report, Variant, losses};
+use super::svg::{COLOURS, chart};
+use crate::config::duration::show as duration;
+
+const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;max-width:900px;margin:2em auto;padding:0 1em;color:#1a1a1a}\
+h1{font-size:1.5em}h2{font-size:1.15em;margin-top:2em}table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}\
+th,td{text-align:right;padding:.25em .6em;border-bottom:1px solid #ddd}th:first-child,td:first-child{text-align:left}\
+th{font-weight:600}tr.ratio td{color:#555}svg{width:100%;height:auto;margin:.5em 0}svg text{font-size:11px;fill:#444}\
+.grid{stroke:#e5e5e5}.key{display:inline-block;width:.8em;height:.8em;margin-right:.4em}.facts td{text-align:left}\
+.facts td:first-child{width:11em;color:#555}li{margin:.3em 0}footer{margin-top:2em;color:#777;font-size:.9em}";
+
+/// `&`, `<`, `>` and quotes as XML has them; what XML has no place for is left out.
+#[must_use]
+pub(super) fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out += "&amp;",
+            '<' => out += "&lt;",
+            '>' => out += "&gt;",
+            '"' => out += "&quot;",
+            '\'' => out += "&#39;",
+            '\u{fffe}' | '\u{ffff}' => {}
+            c if c.is_control() && !matches!(c, '\n' | '\t') => {}
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// The whole document.
+#[must_use]
+pub fn html(report: &Report) -> String {
+    let mut out = format!(
+        "<!DOCTYPE html>\n<html xmlns=\"http://www.w3.org/1999/xhtml\" lang=\"en\"><head><meta charset=\"utf-8\"/>\
+         <meta name=\"viewport\" content=\"width=device-width\"/><title>Timing of an EtherCAT cycle</title>\
+         <style>{STYLE}</style></head><body>\n<h1>Timing of an EtherCAT cycle</h1>\n"
+    );
+    // Writing to a string does not fail.
+    let _ = sections(&mut out, report);
+    out + "</body></html>\n"
+}
+
+fn sections(out: &mut String, report: &Report) -> std::fmt::Result {
+    writeln!(out, "<h2>What was measured</h2>")?;
+    facts(out, &report.settings)?;
+    writeln!(out, "<h2>On which computer</h2>")?;
+    facts(out, &report.facts)?;
+    if !report.findings.is_empty() {
+        writeln!(
+            out,
+            "<p>What of it disturbs a cycle (<code>ecaxis doctor</code> says what that costs and what mends it):</p><ul>"
+        )?;
+        for finding in &report.findings {
+            writeln!(out, "<li>{}</li>", escaped(finding))?;
+        }
+        writeln!(out, "</ul>")?;
+    }
+    if !report.remarks.is_empty() {
+        writeln!(out, "<h2>To be kept in mind</h2><ul>")?;
+        for remark in &report.remarks {
+            writeln!(out, "<li>{}</li>", escaped(remark))?;
+        }
+        writeln!(out, "</ul>")?;
+    }
+    for (title, what, get) in MEASURES {
+        measure(out, report, title, what, get)?;
+    }
+    counters(out, report)?;
+    writeln!(
+        out,
+        "<footer>ecaxis {}. Percentiles: p99 is what 99 of 100 cycles did not exceed. Both axes of the drawings are \
+         logarithmic; the marks below them are p50, p99 and p99.9.</footer>",
+        escaped(report.version)
+    )
+}
+
+type Get = fn(&Variant) -> Option<&Dist>;
+
+/// What there is a table and a drawing of.
+pub(super) const MEASURES: [(&str, &str, Get); 4] = [
+    (
+        "Wake-up lateness",
+        "How long after its planned time a cycle began. Its frames leave at once then, so this is the jitter of their release.",
+        |v| v.wake_up_lateness.as_ref(),
+    ),
+    (
+        "Release to input",
+        "From the planned release of the frames until their answers were there.",
+        |v| v.release_to_input.as_ref(),
+    ),
+    (
+        "Work",
+        "From the wake-up until the next cycle was ready to be sent; waiting for answers is part of it unless the exchange is pipelined.",
+        |v| v.work.as_ref(),
+    ),
+    (
+        "Phase error",
+        "How far from their place in the cycle of SYNC0 the frames passed the reference clock.",
+        |v| v.phase_error.as_ref(),
+    ),
+];
+
+fn facts(out: &mut String, facts: &[Fact]) -> std::fmt::Result {
+    writeln!(out, "<table class=\"facts\"><tbody>")?;
+    for fact in facts {
+        writeln!(
+            out,
+            "<tr><td>{}</td><td>{}</td></tr>",
+            escaped(fact.name),
+            escaped(&fact.value)
+        )?;
+    }
+    writeln!(out, "</tbody></table>")
+}
+
+fn key(place: usize, name: &str) -> String {
+    let colour = COLOURS[place % COLOURS.len()];
+    format!(
+        "<span class=\"key\" style=\"background:{colour}\"></span>{}",
+        escaped(name)
+    )
+}
+
+/// A time with three digits and its unit.
+#[must_use]
+pub(super) fn time(nanos: u64) -> String {
+    let digits = |value: f64| match value {
+        v if v >= 99.95 => 0,
+        v if v >= 9.995 => 1,
+        _ => 2,
+    };
+    let (value, unit) = match nanos {
+        0..1_000 => return duration(nanos),
+        1_000..1_000_000 => (nanos as f64 / 1e3, "µs"),
+        1_000_000..1_000_000_000 => (nanos as f64 / 1e6, "ms"),
+        _ => (nanos as f64 / 1e9, "s"),
+    };
+    format!("{value:.*} {unit}", digits(value))
+}
+
+/// A quotient with two digits that count.
+#[must_use]
+pub(super) fn times(value: Option<f64>) -> String {
+    match value {
+        None => "–".to_owned(),
+        Some(v) if v >= 10.0 => format!("{v:.0} ×"),
+        Some(v) if v >= 1.0 => format!("{v:.2} ×"),
+        Some(v) if v >= 0.1 => format!("{v:.2} ×"),
+        Some(v) => format!("{v:.3} ×"),
+    }
+}
+
+fn measure(
+    out: &mut String,
+    report: &Report,
+    title: &str,
+    what: &str,
+    get: Get,
+) -> std::fmt::Result {
+    let all: Vec<(usize, &Variant, &Dist)> = report
+        .variants
+        .iter()
+        .enumerate()
+        .filter_map(|(place, v)| Some((place, v, get(v)?)))
+        .collect();
+    if all.is_empty() {
+        return Ok(());
+    }
+    writeln!(out, "<h2>{title}</h2><p>{what}</p>")?;
+    let drawn: Vec<(usize, &Dist)> = all.iter().map(|(place, _, dist)| (*place, *dist)).collect();
+    out.push_str(&chart(title, &drawn));
+    writeln!(
+        out,
+        "<table><thead><tr><th></th><th>p50</th><th>p99</th><th>p99.9</th><th>longest</th><th>cycles</th></tr></thead><tbody>"
+    )?;
+    for (place, variant, dist) in &all {
+        writeln!(
+            out,
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
+            key(*place, &variant.name),
+            time(dist.p50_ns),
+            time(dist.p99_ns),
+            dist.p99_9_ns.map_or_else(|| "–".to_owned(), time),
+            time(dist.max_ns),
+            dist.count
+        )?;
+    }
+    let belongs = |ratio: &&Ratio| ratio.measure.title() == title && ratio.value.is_none();
+    for ratio in report.ratios.iter().filter(belongs) {
+        writeln!(
+            out,
+            "<tr class=\"ratio\"><td>{} ∕ {}{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td></td></tr>",
+            escaped(&ratio.of),
+            escaped(&ratio.to),
+            ratio.measure.note(),
+            times(ratio.p50),
+            times(ratio.p99),
+            times(ratio.p99_9),
+            times(ratio.max)
+        )?;
+    }
+    writeln!(out, "</tbody></table>")
+}
+
+fn counters(out: &mut String, report: &Report) -> std::fmt::Result {
+    writeln!(
+        out,
+        "<h2>Counted</h2><table><thead><tr><th></th><th>cycles</th><th>lost</th><th>not the bus's</th><th>late frames</th>\
+         <th>overruns</th><th>CPU a cycle</th><th>switches a cycle</th><th>page faults</th></tr></thead><tbody>"
+    )?;
+    let number = |n: Option<u64>| n.map_or_else(|| "–".to_owned(), |n| n.to_string());
+    for (place, variant) in report.variants.iter().enumerate() {
+        let counters = variant.counters;
+        writeln!(
+            out,
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
+            key(place, &variant.name),
+            variant.cycles,
+            number(counters.map(|c| c.lost_frames)),
+            number(losses(variant).map(|(_, ours)| ours)),
+            number(counters.map(|c| c.late_frames)),
+            number(counters.map(|c| c.overruns)),
+            variant
+                .cpu_ns_per_cycle
+                .map_or_else(|| "–".to_owned(), |ns| time(ns as u64)),
+            variant
+                .context_switches_per_cycle
+                .map_or_else(|| "–".to_owned(), |n| format!("{n:.2}")),
+            number(variant.used.map(|u| u.minor_faults + u.major_faults)),
+        )?;
+    }
+    writeln!(out, "</tbody></table>")?;
+    for ratio in report.ratios.iter().filter(|ratio| ratio.value.is_some()) {
+        writeln!(
+            out,
+            "<p>{}, {} ∕ {}: {}</p>",
+            ratio.measure.name(),
+            escaped(&ratio.of),
+            escaped(&ratio.to),
+            times(ratio.value)
+        )?;
+    }
+    Ok(())
+}

@@ -1,0 +1,63 @@
+//! The segment in the thread of the cycle itself, for want of an interface: shows the work of a cycle, but no exchange.
+
+use super::bus::Hold;
+use super::held::Held;
+use super::segment::{Seen, Segment};
+use crate::clock::{self, Nanos};
+use crate::link::{Link, LinkError, MAX_FRAME};
+
+/// A link to a [`Segment`].
+#[derive(Debug)]
+pub struct InProcess {
+    segment: Segment,
+    hold: Hold,
+    held: Held,
+}
+
+impl InProcess {
+    #[must_use]
+    pub fn new(segment: Segment, hold: Hold) -> Self {
+        Self {
+            segment,
+            hold,
+            held: Held::new(),
+        }
+    }
+}
+
+impl Link for InProcess {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        let now = clock::now();
+        let due = now
+            + match self.hold {
+                Hold::Fixed(hold) => hold,
+                Hold::Wire => self.segment.wire_ns(frame.len()),
+            };
+        let slot = self
+            .held
+            .place()
+            .ok_or(LinkError::Send(rustix::io::Errno::NOBUFS))?;
+        let to = slot
+            .bytes
+            .get_mut(..frame.len())
+            .ok_or(LinkError::TooLong(frame.len()))?;
+        to.copy_from_slice(frame);
+        slot.len = frame.len();
+        if self.segment.answer(to, now) == Seen::Answered {
+            self.held.hold(due);
+        }
+        Ok(())
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        let Some((_, slot)) = self.held.take_due(clock::now()) else {
+            return Ok(None);
+        };
+        buf[..slot.len].copy_from_slice(&slot.bytes[..slot.len]);
+        Ok(Some(slot.len))
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.held.next_due()
+    }
+}

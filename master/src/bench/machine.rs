@@ -1,0 +1,60 @@
+//! The machine of a file: its own bus, brought up and down again by the session that also runs it.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use super::plan::Plan;
+use super::turn::Measured;
+use crate::config::Machine;
+use crate::rt::margin::Spin;
+use crate::session::{self, Observer, Options, Outcome, RunError};
+
+/// Runs it for the plan's time; without `enable`, in Op and without power. `None` where it was interrupted before its first
+/// cycle.
+///
+/// # Errors
+/// What a run of this machine fails with.
+pub fn run(
+    machine: &Machine,
+    enable: bool,
+    plan: &Plan,
+    spin: Spin,
+    stop: &Arc<AtomicBool>,
+    observer: &mut dyn Observer,
+) -> Result<Option<Measured>, RunError> {
+    let mut machine = machine.clone();
+    machine.bus.spin = spin;
+    machine.bus.cpu = Some(plan.cpu);
+    machine.bus.priority = plan.priority;
+    let options = Options {
+        limit: u64::try_from(plan.time.as_nanos()).ok(),
+        enable,
+        ..Options::default()
+    };
+    let outcome = session::run(machine, options, Arc::clone(stop), observer);
+    let Outcome {
+        summary,
+        result,
+        stats,
+    } = outcome;
+    match result {
+        Ok(()) => {}
+        Err(RunError::Interrupted) if stats.is_none() => return Ok(None),
+        Err(RunError::Interrupted) => {}
+        Err(error) => return Err(error),
+    }
+    let (Some(stats), Some(summary)) = (stats, summary) else {
+        return Ok(None);
+    };
+    let mut measured = Measured {
+        stats: *stats,
+        ..Measured::default()
+    };
+    if let Some(thread) = summary.thread {
+        measured.used = thread.used;
+        measured.spin_ns = thread.spin_ns;
+    }
+    let turns = summary.counters.cycles + summary.counters.overruns;
+    measured.wall_ns = turns * summary.cycle_ns;
+    Ok(Some(measured))
+}

@@ -1,0 +1,105 @@
+//! Answers every EtherCAT frame unchanged after a fixed time, as a bus of that length would.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+
+use crate::clock::{self, Clock, Nanos};
+use crate::link::{self, BackEnd, Link, MAX_FRAME, OpenError};
+use crate::rt::thread as rt_thread;
+
+/// The first SubDevice sets it in the first byte of the source address.
+const PROCESSED: u8 = 0x02;
+
+/// SCHED_FIFO; below that of who measures.
+const PRIORITY: u8 = 60;
+
+/// How a reflector answers. Nanoseconds.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Pace {
+    /// From a frame to its answer.
+    pub hold: Nanos,
+    /// Sleep after an answer, while no frame is to be expected. A thread that never sleeps meets the kernel's limit for
+    /// real-time threads, and stands still for some time a second.
+    pub rest: Nanos,
+}
+
+/// A thread that answers; ends when this is dropped. It spins while it waits.
+#[derive(Debug)]
+pub struct Reflector {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<u64>>,
+}
+
+impl Reflector {
+    /// Answers on `nic`. With a CPU, the thread spins there at real-time priority, if permitted; without, it gives way to others
+    /// and answers when it can.
+    ///
+    /// # Errors
+    /// Where the interface cannot be used or the thread not be started.
+    pub fn start(nic: &str, pace: Pace, cpu: Option<usize>) -> Result<Self, OpenError> {
+        let (mut link, _) = link::open(nic, BackEnd::Ring)?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let ended = Arc::clone(&stop);
+        let thread = thread::Builder::new()
+            .name("reflector".to_owned())
+            .spawn(move || {
+                if let Some(cpu) = cpu {
+                    let _ = rt_thread::prepare(PRIORITY, Some(cpu));
+                }
+                reflect(link.as_mut(), pace, cpu.is_some(), &ended)
+            })
+            .map_err(|source: io::Error| OpenError::Io {
+                nic: nic.to_owned(),
+                what: "starting a thread",
+                source,
+            })?;
+        Ok(Self {
+            stop,
+            thread: Some(thread),
+        })
+    }
+
+    /// Ends it; frames answered.
+    #[must_use]
+    pub fn finish(mut self) -> u64 {
+        self.end()
+    }
+
+    fn end(&mut self) -> u64 {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().map_or(0, |t| t.join().unwrap_or(0))
+    }
+}
+
+impl Drop for Reflector {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+fn reflect(link: &mut dyn Link, pace: Pace, alone: bool, stop: &AtomicBool) -> u64 {
+    let mut buf = [0; MAX_FRAME];
+    let mut answered = 0;
+    while !stop.load(Ordering::Relaxed) {
+        let Ok(Some(len)) = link.recv(&mut buf) else {
+            if alone {
+                std::hint::spin_loop();
+            } else {
+                thread::yield_now();
+            }
+            continue;
+        };
+        let due = clock::now() + pace.hold;
+        buf[6] |= PROCESSED;
+        while clock::now() < due {
+            std::hint::spin_loop();
+        }
+        answered += u64::from(link.send(&buf[..len]).is_ok());
+        if pace.rest > 0 {
+            Clock::Real.sleep_until(clock::now() + pace.rest, 0);
+        }
+    }
+    answered
+}

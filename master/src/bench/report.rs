@@ -1,0 +1,302 @@
+//! What a bench came to, in numbers.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::bus::Counts;
+use super::kernel::CpuTaken;
+use crate::os::process::ThreadUse;
+use crate::rt::stats::{Counters, Times};
+
+/// Of a histogram, in a decade of times.
+const STEPS_PER_DECADE: f64 = 20.0;
+
+/// Everything that is told of a bench. Times are nanoseconds.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    pub version: &'static str,
+    /// The computer.
+    pub facts: Vec<Fact>,
+    /// What in it disturbs a cycle; `ecaxis doctor` tells what mends it.
+    pub findings: Vec<String>,
+    pub settings: Vec<Fact>,
+    /// The first is the cycle as asked for, what follows took turns with it.
+    pub variants: Vec<Variant>,
+    /// Of each variant to each that follows it.
+    pub ratios: Vec<Ratio>,
+    /// What makes a number say less than it seems to.
+    pub remarks: Vec<String>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Fact {
+    pub name: &'static str,
+    pub value: String,
+}
+
+/// One way of doing it.
+#[derive(Debug, Clone, Serialize)]
+pub struct Variant {
+    pub name: String,
+    pub rounds: u32,
+    pub cycles: u64,
+    /// Planned release to wake-up.
+    pub wake_up_lateness: Option<Dist>,
+    /// Planned release to the last answer.
+    pub release_to_input: Option<Dist>,
+    /// Wake-up to the end of the cycle's work, waiting for answers included.
+    pub work: Option<Dist>,
+    /// Amount, against SYNC0.
+    pub phase_error: Option<Dist>,
+    pub counters: Option<Counters>,
+    /// Cycles that began so late that their answers can hardly have been in time.
+    pub late_releases: Option<u64>,
+    /// Of the whole process where it is not ours.
+    pub used: Option<ThreadUse>,
+    pub cpu_ns_per_cycle: Option<f64>,
+    /// Of one CPU.
+    pub cpu_percent: Option<f64>,
+    pub context_switches_per_cycle: Option<f64>,
+    /// Before a release, at the end.
+    pub spin_ns: Option<u64>,
+    /// Of the cycle's CPU, by others.
+    pub taken: Option<CpuTaken>,
+    pub bus: Option<Counts>,
+}
+
+/// A distribution of times.
+#[derive(Debug, Clone, Serialize)]
+pub struct Dist {
+    pub count: u64,
+    pub p50_ns: u64,
+    pub p99_ns: u64,
+    /// `null`: fewer than ten times are longer.
+    pub p99_9_ns: Option<u64>,
+    pub max_ns: u64,
+    /// Upper end of each step, and how many times fell into it; twenty steps a decade.
+    pub histogram: Vec<(u64, u64)>,
+}
+
+impl Dist {
+    /// `None` where nothing was recorded.
+    #[must_use]
+    pub fn of(times: &Times) -> Option<Self> {
+        let summary = times.summary();
+        if summary.count == 0 {
+            return None;
+        }
+        let mut steps = BTreeMap::new();
+        for (nanos, count) in times.recorded() {
+            let step = ((nanos.max(1) as f64).log10() * STEPS_PER_DECADE).ceil();
+            *steps.entry(step as u64).or_insert(0) += count;
+        }
+        let end = |step: u64| 10_f64.powf(step as f64 / STEPS_PER_DECADE).round() as u64;
+        Some(Self {
+            count: summary.count,
+            p50_ns: summary.p50_ns,
+            p99_ns: summary.p99_ns,
+            p99_9_ns: (summary.count >= 10_000).then_some(summary.p99_9_ns),
+            max_ns: summary.max_ns,
+            histogram: steps.into_iter().map(|(step, n)| (end(step), n)).collect(),
+        })
+    }
+}
+
+/// One measure of one variant, divided by that of another.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Ratio {
+    pub measure: Measure,
+    pub of: String,
+    pub to: String,
+    pub p50: Option<f64>,
+    pub p99: Option<f64>,
+    pub p99_9: Option<f64>,
+    pub max: Option<f64>,
+    /// Where it is one number.
+    pub value: Option<f64>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Measure {
+    WakeUpLateness,
+    ReleaseToInput,
+    /// Release to input, less what the bus held the reply.
+    SoftwareShare,
+    CpuPerCycle,
+}
+
+impl Measure {
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::WakeUpLateness => "wake-up lateness",
+            Self::ReleaseToInput => "release to input",
+            Self::SoftwareShare => "release to input less the hold",
+            Self::CpuPerCycle => "CPU per cycle",
+        }
+    }
+
+    /// The heading that it belongs under.
+    pub(super) fn title(self) -> &'static str {
+        match self {
+            Self::WakeUpLateness => "Wake-up lateness",
+            Self::ReleaseToInput | Self::SoftwareShare => "Release to input",
+            Self::CpuPerCycle => "",
+        }
+    }
+
+    /// What a reader has to know beside its heading.
+    pub(super) fn note(self) -> &'static str {
+        match self {
+            Self::SoftwareShare => ", less hold",
+            _ => "",
+        }
+    }
+}
+
+fn quotient(a: u64, b: u64) -> Option<f64> {
+    (b > 0).then(|| a as f64 / b as f64)
+}
+
+/// Every variant by each that follows it; `hold` is what the bus held every reply.
+#[must_use]
+pub fn ratios(variants: &[Variant], hold: Option<u64>) -> Vec<Ratio> {
+    let mut ratios = Vec::new();
+    for (place, first) in variants.iter().enumerate() {
+        for other in &variants[place + 1..] {
+            of_two(first, other, hold, &mut ratios);
+        }
+    }
+    ratios
+}
+
+fn of_two(first: &Variant, other: &Variant, hold: Option<u64>, ratios: &mut Vec<Ratio>) {
+    let mut add = |measure, a: &Option<Dist>, b: &Option<Dist>, less: u64| {
+        let (Some(a), Some(b)) = (a, b) else { return };
+        let by = |a: u64, b: u64| quotient(a.saturating_sub(less), b.saturating_sub(less));
+        ratios.push(Ratio {
+            measure,
+            of: first.name.clone(),
+            to: other.name.clone(),
+            p50: by(a.p50_ns, b.p50_ns),
+            p99: by(a.p99_ns, b.p99_ns),
+            p99_9: a.p99_9_ns.zip(b.p99_9_ns).and_then(|(a, b)| by(a, b)),
+            max: by(a.max_ns, b.max_ns),
+            value: None,
+        });
+    };
+    add(
+        Measure::WakeUpLateness,
+        &first.wake_up_lateness,
+        &other.wake_up_lateness,
+        0,
+    );
+    let (a, b) = (&first.release_to_input, &other.release_to_input);
+    match hold {
+        Some(hold) => add(Measure::SoftwareShare, a, b, hold),
+        None => add(Measure::ReleaseToInput, a, b, 0),
+    }
+    if let (Some(a), Some(b)) = (first.cpu_ns_per_cycle, other.cpu_ns_per_cycle)
+        && b > 0.0
+    {
+        ratios.push(Ratio {
+            measure: Measure::CpuPerCycle,
+            of: first.name.clone(),
+            to: other.name.clone(),
+            p50: None,
+            p99: None,
+            p99_9: None,
+            max: None,
+            value: Some(a / b),
+        });
+    }
+}
+
+/// Lost cycles of a variant, and how many of them neither the bus nor this computer's other CPU can have lost.
+#[must_use]
+pub fn losses(variant: &Variant) -> Option<(u64, u64)> {
+    let counters = variant.counters?;
+    let elsewhere = variant.bus.map_or(0, |bus| {
+        bus.dropped + bus.delayed + bus.not_sent + bus.too_late
+    });
+    let lost = counters.lost_frames;
+    Some((lost, lost.saturating_sub(elsewhere)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn times(values: impl IntoIterator<Item = u64>) -> Times {
+        let mut times = Times::new();
+        values.into_iter().for_each(|n| times.record(n));
+        times
+    }
+
+    fn variant(name: &str, lateness: u64, round_trip: u64, cpu: f64) -> Variant {
+        Variant {
+            name: name.to_owned(),
+            rounds: 1,
+            cycles: 100,
+            wake_up_lateness: Dist::of(&times([lateness; 100])),
+            release_to_input: Dist::of(&times([round_trip; 100])),
+            work: None,
+            phase_error: None,
+            counters: None,
+            late_releases: None,
+            used: None,
+            cpu_ns_per_cycle: Some(cpu),
+            cpu_percent: None,
+            context_switches_per_cycle: None,
+            spin_ns: None,
+            taken: None,
+            bus: None,
+        }
+    }
+
+    #[test]
+    fn a_histogram_keeps_every_time() {
+        let dist = Dist::of(&times((1..=20_000).map(|n| n * 7))).expect("recorded");
+        assert_eq!(dist.histogram.iter().map(|(_, n)| n).sum::<u64>(), 20_000);
+        assert!(dist.histogram.is_sorted());
+        assert!(dist.p99_9_ns.is_some());
+        assert!(Dist::of(&times([])).is_none());
+        assert_eq!(Dist::of(&times([5; 9_999])).expect("some").p99_9_ns, None);
+    }
+
+    #[test]
+    fn ratios_are_of_the_first_to_the_others_and_leave_the_hold_out() {
+        let all = [
+            variant("a", 100, 36_000, 10.0),
+            variant("b", 1_000, 60_000, 40.0),
+        ];
+        let ratios = ratios(&all, Some(30_000));
+        let by = |measure| ratios.iter().find(|r| r.measure == measure).unwrap();
+        let lateness = by(Measure::WakeUpLateness);
+        assert_eq!((lateness.of.as_str(), lateness.to.as_str()), ("a", "b"));
+        assert!((lateness.p50.unwrap() - 0.1).abs() < 0.001);
+        assert_eq!(lateness.p99_9, None);
+        assert!((by(Measure::SoftwareShare).p50.unwrap() - 0.2).abs() < 0.002);
+        assert_eq!(by(Measure::CpuPerCycle).value, Some(0.25));
+    }
+
+    #[test]
+    fn what_the_bus_did_is_not_lost_by_us() {
+        let mut variant = variant("a", 1, 1, 1.0);
+        variant.counters = Some(Counters {
+            lost_frames: 5,
+            ..Counters::default()
+        });
+        assert_eq!(losses(&variant), Some((5, 5)));
+        variant.bus = Some(Counts {
+            dropped: 3,
+            too_late: 1,
+            ..Counts::default()
+        });
+        assert_eq!(losses(&variant), Some((5, 1)));
+        variant.bus.as_mut().unwrap().dropped = 30;
+        assert_eq!(losses(&variant), Some((5, 0)));
+    }
+}

@@ -1,0 +1,421 @@
+//! `ecaxis bench`: measures the cycle on this computer, and compares.
+
+use std::num::NonZeroU64;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use ecaxis::bench::bus::{Hold, Mischief};
+use ecaxis::bench::compare::{self, BenchError, Watcher};
+use ecaxis::bench::plan::{Against, Plan, Target, exchange_name};
+use ecaxis::bench::{host, html, rig, text, veth};
+use ecaxis::clock::Clock;
+use ecaxis::config::{self, Bus, Exchange, Nic, duration};
+use ecaxis::link::BackEnd;
+use ecaxis::rt::margin::Spin;
+use ecaxis::session::Observer;
+
+use super::progress::Teller;
+use super::{Failure, hints, note, result, signals};
+
+/// The shortest cycle that is measured; SYNC0 of most drives is no faster.
+const SHORTEST: u64 = 20_000;
+const LONGEST: u64 = 100_000_000;
+
+const EXAMPLES: &str = "Examples:
+  ecaxis bench                                  8 axes at 1 ms over a pair of virtual interfaces (root)
+  ecaxis bench --cycle 250us --against cyclictest --against sleep --html report.html
+  ecaxis bench --cycle 125us --exchange pipelined --hold wire --axes 16
+  ecaxis bench --sim --axes 100 --cycle 250us   the work of a cycle; no root, no exchange
+  ecaxis bench --machine m.toml                 the file's real bus, axes without power";
+
+/// Measure the cycle on this computer, and compare it
+///
+/// The real cycle, with axes that move, runs on a pair of virtual interfaces; drives answer at the other end from another CPU. It
+/// tells how late cycles begin, how long an exchange takes, what it costs, and what was lost, beside what takes turns with it.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Cycle time, such as 1ms or 62.5us [default: 1ms, or the machine file's]
+    #[arg(long, value_name = "DURATION", value_parser = cycle)]
+    cycle: Option<u64>,
+    /// Axes, 12 bytes each way
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..=rig::MOST_AXES as i64))]
+    axes: u16,
+    /// When a cycle takes its answers: same-cycle or pipelined (one cycle later)
+    #[arg(long, value_name = "HOW", value_parser = exchange)]
+    exchange: Option<Exchange>,
+    /// How frames are taken from the interface: ring, packet, or xdp where the build has it
+    #[arg(long, value_name = "HOW", value_parser = link)]
+    link: Option<BackEnd>,
+    /// Spin so long before each release; auto: as long as needed; 0us: sleep only
+    #[arg(long, value_name = "DURATION", value_parser = spin)]
+    spin: Option<Spin>,
+    /// How long the other end holds a reply: a duration, or wire for what 100 Mbit/s takes
+    #[arg(long, value_name = "DURATION", default_value = "30us", value_parser = hold)]
+    hold: Hold,
+    /// Measure in process, without an interface; with --machine: on its simulated bus
+    #[arg(long)]
+    sim: bool,
+    /// Measure on the bus of this machine file; axes are not enabled
+    #[arg(long, value_name = "FILE")]
+    machine: Option<PathBuf>,
+    /// Use this network interface instead of the file's
+    #[arg(long, value_name = "IF", requires = "machine", conflicts_with = "sim")]
+    nic: Option<String>,
+    /// Enable the axes and run the file's program: THE MACHINE MOVES
+    #[arg(long, requires = "machine")]
+    enable: bool,
+    /// Take turns with: cyclictest, sleep (no spinning), an exchange, a link, or the path of a program; may be repeated
+    #[arg(long, value_name = "WHAT", value_parser = against)]
+    against: Vec<Against>,
+    /// Length of a round of each
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=86_400))]
+    seconds: u32,
+    /// Rounds, in each of which everything has its turn [default: 1, or 3 with --against]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    rounds: Option<u32>,
+    /// Keep the other CPU busy with an ordinary program
+    #[arg(long)]
+    hog: bool,
+    /// Keep the CPU of the cycle from idling, whoever has its turn
+    #[arg(long)]
+    awake: bool,
+    /// CPU of the cycle [default: an isolated one, or the last]
+    #[arg(long, value_name = "N")]
+    cpu: Option<usize>,
+    /// SCHED_FIFO priority of the cycle
+    #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(u8).range(1..=98))]
+    priority: u8,
+    /// Hold every N-th reply for two cycles longer
+    #[arg(long, value_name = "N")]
+    late_every: Option<NonZeroU64>,
+    /// Do not send every N-th reply
+    #[arg(long, value_name = "N")]
+    drop_every: Option<NonZeroU64>,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+    /// Write the report, with histograms, to this file
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+    /// Write all figures, as JSON, to this file
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+    #[command(flatten)]
+    pub verbosity: super::Verbosity,
+}
+
+fn cycle(text: &str) -> Result<u64, String> {
+    let nanos = duration::parse(text).map_err(|e| e.to_string())?;
+    if (SHORTEST..=LONGEST).contains(&nanos) {
+        return Ok(nanos);
+    }
+    Err(format!(
+        "a cycle takes from {} to {}",
+        duration::show(SHORTEST),
+        duration::show(LONGEST)
+    ))
+}
+
+fn exchange(text: &str) -> Result<Exchange, String> {
+    exchange_named(text).ok_or_else(|| "there are same-cycle and pipelined".to_owned())
+}
+
+fn exchange_named(text: &str) -> Option<Exchange> {
+    [Exchange::SameCycle, Exchange::Pipelined]
+        .into_iter()
+        .find(|exchange| exchange_name(*exchange) == text)
+}
+
+fn link_named(text: &str) -> Option<BackEnd> {
+    BackEnd::ALL.iter().copied().find(|b| b.name() == text)
+}
+
+fn link(text: &str) -> Result<BackEnd, String> {
+    let names: Vec<&str> = BackEnd::ALL.iter().map(|b| b.name()).collect();
+    link_named(text).ok_or_else(|| format!("there are {}", names.join(" and ")))
+}
+
+fn spin(text: &str) -> Result<Spin, String> {
+    if text == "auto" {
+        return Ok(Spin::Auto);
+    }
+    duration::parse(text)
+        .map(Spin::For)
+        .map_err(|e| e.to_string())
+}
+
+fn hold(text: &str) -> Result<Hold, String> {
+    if text == "wire" {
+        return Ok(Hold::Wire);
+    }
+    match duration::parse(text) {
+        Ok(nanos) if nanos <= LONGEST => Ok(Hold::Fixed(nanos)),
+        Ok(_) => Err(format!(
+            "a reply is held for {} at most",
+            duration::show(LONGEST)
+        )),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+fn against(text: &str) -> Result<Against, String> {
+    let known = match text {
+        "cyclictest" => Some(Against::Cyclictest),
+        "sleep" => Some(Against::Sleep),
+        _ => exchange_named(text)
+            .map(Against::Exchange)
+            .or_else(|| link_named(text).map(Against::Link)),
+    };
+    match known {
+        Some(against) => Ok(against),
+        None if Path::new(text).is_file() => Ok(Against::Program(PathBuf::from(text))),
+        None => Err("not cyclictest, sleep, an exchange, a link, nor a program".to_owned()),
+    }
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let plan = plan(args)?;
+    for nic in veth::leftovers() {
+        note(&format!(
+            "note: `{nic}` was left by a program that was killed; `ip link del {nic}` removes it"
+        ));
+    }
+    let stop = Arc::new(AtomicBool::new(false));
+    signals::stop_on_interrupt(&stop);
+    let bus = Bus {
+        cycle_ns: plan.cycle_ns,
+        ..Bus::default()
+    };
+    let mut told = Told(Teller::new(Clock::Real, &bus, args.verbosity.plain()));
+    let report = compare::run(&plan, &stop, &mut told).map_err(|e| failure(&e, &plan))?;
+    drop(told);
+    let Some(report) = report else {
+        note("interrupted before anything was measured");
+        return Ok(());
+    };
+    // Text as keys and numbers that are finite always are JSON.
+    let json = serde_json::to_string_pretty(&report).unwrap_or_default() + "\n";
+    if let Some(path) = &args.html {
+        save(path, &html::html(&report))?;
+    }
+    if let Some(path) = &args.save {
+        save(path, &json)?;
+    }
+    result(&if args.json { json } else { text::text(&report) })?;
+    if stop.load(Ordering::Relaxed) {
+        note("interrupted: this is what was measured so far");
+    }
+    Ok(())
+}
+
+fn save(path: &Path, text: &str) -> Result<(), Failure> {
+    std::fs::write(path, text).map_err(|e| {
+        let message = format!("cannot write {}: {e}", path.display());
+        Failure::new(hints::FAILED, message)
+    })
+}
+
+fn plan(args: &Args) -> Result<Plan, Failure> {
+    let wrong = |message: String| Failure::new(hints::WRONG, message);
+    let target = match &args.machine {
+        Some(file) => {
+            let mut machine = config::load(file).map_err(|e| hints::config(file, &e))?;
+            if args.sim {
+                machine.bus.nic = Nic::Sim;
+            } else if let Some(nic) = &args.nic {
+                machine.bus.nic = Nic::Interface(nic.clone());
+            }
+            if let Some(cycle) = args.cycle
+                && cycle != machine.bus.cycle_ns
+            {
+                return Err(wrong(format!(
+                    "the machine's cycle is {}, and its drives are set to that",
+                    duration::show(machine.bus.cycle_ns)
+                ))
+                .hint("change `cycle` in the machine file"));
+            }
+            machine.bus.exchange = args.exchange.unwrap_or(machine.bus.exchange);
+            machine.bus.link = args.link.unwrap_or(machine.bus.link);
+            Target::Machine {
+                machine: Box::new(machine),
+                enable: args.enable,
+            }
+        }
+        None if args.sim => Target::InProcess,
+        None => Target::Veth,
+    };
+    let bus = match &target {
+        Target::Machine { machine, .. } => machine.bus.clone(),
+        _ => Bus::default(),
+    };
+    let cycle_ns = args.cycle.unwrap_or(bus.cycle_ns);
+    let spin = args.spin.unwrap_or(bus.spin);
+    if let Spin::For(nanos) = spin
+        && nanos > cycle_ns
+    {
+        return Err(wrong(
+            "spinning longer than a cycle never sleeps: --spin must not exceed --cycle".to_owned(),
+        ));
+    }
+    let veth = matches!(target, Target::Veth);
+    if !veth
+        && args
+            .against
+            .iter()
+            .any(|a| matches!(a, Against::Program(_)))
+    {
+        return Err(wrong(
+            "a program to compare with needs the pair of virtual interfaces".to_owned(),
+        )
+        .hint("leave --sim and --machine out"));
+    }
+    let first = host::cpus();
+    let cpu = args.cpu.unwrap_or(first.0);
+    let other_cpu = match first {
+        (best, _) if best != cpu => Some(best),
+        (_, other) => other,
+    };
+    let two_cycles = 2 * cycle_ns;
+    Ok(Plan {
+        target,
+        axes: usize::from(args.axes),
+        cycle_ns,
+        exchange: args.exchange.unwrap_or(bus.exchange),
+        link: args.link.unwrap_or(bus.link),
+        spin,
+        hold: args.hold,
+        mischief: Mischief {
+            drop_every: args.drop_every,
+            late_every: args.late_every.map(|every| (every, two_cycles)),
+        },
+        priority: args.priority,
+        cpu,
+        other_cpu,
+        time: Duration::from_secs(u64::from(args.seconds)),
+        rounds: args
+            .rounds
+            .unwrap_or(if args.against.is_empty() { 1 } else { 3 }),
+        hog: args.hog,
+        awake: args.awake,
+        against: args.against.clone(),
+    })
+}
+
+struct Told(Teller);
+
+impl Watcher for Told {
+    fn round(&mut self, round: u32, of: u32, variant: &str) {
+        note(&format!("round {round} of {of}: {variant}"));
+    }
+
+    fn machine(&mut self) -> &mut dyn Observer {
+        &mut self.0
+    }
+
+    fn warning(&mut self, text: &str) {
+        note(&format!("warning: {text}"));
+    }
+}
+
+fn failure(error: &BenchError, plan: &Plan) -> Failure {
+    let failed = Failure::new(hints::FAILED, error.to_string());
+    match error {
+        BenchError::Veth(_) => failed.hint(
+            "run it as root; `--sim` measures the work of a cycle without an interface and without root",
+        ),
+        BenchError::Cyclictest(_) => {
+            failed.hint("cyclictest comes with the package rt-tests")
+        }
+        BenchError::Program(_) => {
+            failed.hint("`benches/ethercrab` shows what such a program takes and prints")
+        }
+        BenchError::Open(open) => hints::interface(failed, open),
+        BenchError::Run(error) => match &plan.target {
+            Target::Machine { machine, .. } => hints::run(error, &machine.bus.nic),
+            _ => failed,
+        },
+        BenchError::Turn(_) | BenchError::Rig(_) => {
+            failed.hint("a longer --cycle, or fewer --axes, leaves more time")
+        }
+        BenchError::Bus(_) | BenchError::Thread(_) => failed,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    fn parsed(line: &str) -> Result<Args, clap::Error> {
+        let words = ["bench"].into_iter().chain(line.split_whitespace());
+        <Line as clap::Parser>::try_parse_from(words).map(|line| line.args)
+    }
+
+    #[test]
+    fn command_lines() {
+        for (line, good) in [
+            ("", true),
+            ("--cycle 62.5us --axes 100 --hold wire --spin auto", true),
+            (
+                "--against cyclictest --against sleep --against packet --rounds 2",
+                true,
+            ),
+            ("--cycle 1", false),
+            ("--cycle 1us", false),
+            ("--cycle 2s", false),
+            ("--axes 0", false),
+            ("--axes 1001", false),
+            ("--hold 1min", false),
+            ("--against nothing-of-the-kind", false),
+            ("--exchange sometimes", false),
+            ("--link carrier-pigeon", false),
+            ("--nic eth0", false),
+            ("--enable", false),
+            ("--machine m.toml --sim --nic eth0", false),
+            ("--priority 99", false),
+            ("--late-every 0", false),
+            ("--seconds 0", false),
+        ] {
+            assert_eq!(parsed(line).is_ok(), good, "{line}");
+        }
+    }
+
+    #[test]
+    fn a_plan_follows_the_command_line() {
+        let made = plan(&parsed("--cycle 250us --against sleep --cpu 7 --late-every 5").unwrap());
+        let made = made.unwrap();
+        assert_eq!((made.cycle_ns, made.rounds, made.cpu), (250_000, 3, 7));
+        assert_ne!(made.other_cpu, Some(7));
+        assert_eq!(made.mischief.late_every.unwrap().1, 500_000);
+        assert_eq!(plan(&parsed("").unwrap()).unwrap().rounds, 1);
+        let failure = plan(&parsed("--cycle 1ms --spin 2ms").unwrap()).unwrap_err();
+        assert_eq!(failure.code, hints::WRONG);
+        let failure = plan(&parsed("--machine nowhere.toml").unwrap()).unwrap_err();
+        assert_eq!(failure.code, hints::WRONG);
+    }
+
+    #[test]
+    fn a_machine_keeps_its_cycle() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+        let line = format!("--machine {} --sim", file.display());
+        let made = plan(&parsed(&line).unwrap()).unwrap();
+        let Target::Machine { machine, enable } = &made.target else {
+            panic!("{made:?}");
+        };
+        assert!(!enable);
+        assert_eq!(made.cycle_ns, machine.bus.cycle_ns);
+        let other = format!("{line} --cycle 123us");
+        assert_eq!(
+            plan(&parsed(&other).unwrap()).unwrap_err().code,
+            hints::WRONG
+        );
+    }
+}
