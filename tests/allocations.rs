@@ -188,6 +188,7 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
 fn programs_of_every_kind_allocate_nothing() {
     for file in [
         "together.toml",
+        "probe.toml",
         "profiles.toml",
         "loops.toml",
         "program.toml",
@@ -217,4 +218,34 @@ fn a_controller_is_called_without_an_allocation() {
     let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
     assert!(remains.axes[0].axis.status().enabled);
     assert_eq!(counted, 0);
+}
+
+/// What stops a machine stops it without an allocation, too: an emergency, a gear that is lost, the bus; and a group.
+#[test]
+fn stopping_allocates_nothing() {
+    let gear =
+        "[[step]]\ngear = { a1 = { to = \"a0\", ratio = 3.0 } }\n[[step]]\nmove = { a0 = 80.0 }\n";
+    let emergency = "[stop]\nemergency = { a0.\"0x6064\" = { above = 20000 } }\n";
+    let lost = "[[fault]]\nkind = \"silent\"\nat = \"1s\"\n";
+    let group = "[[stop.group]]\nname = \"g\"\naxes = [\"a0\"]\noutside = \"continue\"\n\
+                 [[step]]\nmove = { a1 = 0.0 }\n[[step]]\nreset = [\"a0\"]\n[[step]]\nmove = { a0 = 0.0 }\n";
+    let fault = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"1s\"\ncode = 0x8611\n";
+    let bus = axes(2);
+    let (devices, _) = bus.split_once("\n[[step]]").expect("steps");
+    for (text, options) in [
+        (format!("{devices}\n{gear}"), virtual_time()),
+        (format!("{bus}\n{emergency}"), virtual_time()),
+        (bus.clone(), faults(lost)),
+        (
+            format!(
+                "{devices}\n[[step]]\nvelocity = {{ a0 = 10.0 }}\n[[step]]\nmove = {{ a1 = 80.0 }}\n{group}"
+            ),
+            faults(fault),
+        ),
+    ] {
+        let (counted, remains, result) = metered(machine(&text), &options, None, 20_000);
+        assert!(matches!(result, Some(Err(_))), "{result:?}");
+        assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
+        assert_eq!(counted, 0, "{result:?}");
+    }
 }

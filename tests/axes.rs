@@ -9,6 +9,7 @@ use std::path::Path;
 
 use common::script::{self, Act, move_to, perform_well, process_images, velocity};
 use common::{faults, load, virtual_time};
+use ecaxis::config::Machine;
 use ecaxis::session::Options;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 
@@ -55,10 +56,25 @@ fn hundred_turns_end_within_a_count_in_each_mode_that_positions() {
     }
 }
 
+/// `tuned.toml` with a bring-up that is longer by a few SDOs. The drives' control cycle of 0.4 ms then begins elsewhere between two
+/// frames, so that a cycle of 1 ms shows two or three of them: what a position loop here sees, and what is reported, depends on it.
+fn tuned(later: usize) -> Machine {
+    let mut machine = load("tuned.toml");
+    for device in &mut machine.devices {
+        let last = device.selection.startup.last().cloned();
+        let more = std::iter::repeat_n(last, later).flatten();
+        device.selection.startup.extend(more);
+    }
+    machine
+}
+
+/// Both places of the control cycle are among these.
+const LATER: [usize; 3] = [0, 4, 7];
+
 /// Velocities have no target to end at: after 100 turns the axis is stopped, and a position is asked for then.
 #[test]
 fn hundred_turns_at_the_velocity_of_the_profile() {
-    for (axis, counts) in AXES {
+    for ((axis, counts), later) in AXES.into_iter().flat_map(|axis| LATER.map(|l| (axis, l))) {
         let acts = [
             script::mode(Mode::Pv),
             velocity(40.0),
@@ -69,15 +85,15 @@ fn hundred_turns_at_the_velocity_of_the_profile() {
             move_to(100.0, 0.2),
             Act::Dwell(0.3),
         ];
-        let trace = perform_well(load("tuned.toml"), axis, &acts, virtual_time());
+        let trace = perform_well(tuned(later), axis, &acts, virtual_time());
         let running = trace.of(2);
         let off = largest(running, |s| s.velocity - 40.0);
         let last = ((trace.at_end_of(7).position - 100.0) * counts).round();
         println!(
-            "{axis} PV: {off:.2} turns/s off 40, stopped at {:.2}, at the end {last:.1} counts",
+            "{axis}, {later} SDOs more, PV: {off:.2} turns/s off 40, stopped at {:.2}, at the end {last:.1} counts",
             trace.at_end_of(4).position
         );
-        // Where the drive's control cycle lies between two frames depends on how long the bring-up took.
+        // 0.40 and 0.57, by the place of the control cycle.
         assert!(off < 0.7, "{axis}: {off}");
         assert!(trace.at_end_of(4).velocity.abs() < 0.1, "{axis}");
         assert!(last.abs() <= 1.0, "{axis}: {last}");
@@ -197,8 +213,11 @@ fn on_the_wire(recording: &Path, place: usize) -> Wire {
 #[test]
 fn modes_are_switched_in_motion_without_a_step() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    for axis in ["x", "y"] {
-        let record = folder.path().join(axis);
+    for (axis, later) in ["x", "y"]
+        .into_iter()
+        .flat_map(|axis| LATER.map(|l| (axis, l)))
+    {
+        let record = folder.path().join(format!("{axis}{later}"));
         let options = Options {
             record: Some(record.clone()),
             ..virtual_time()
@@ -217,7 +236,7 @@ fn modes_are_switched_in_motion_without_a_step() {
             script::mode(Mode::Csp),
             Act::Dwell(4.0),
         ];
-        let trace = perform_well(load("tuned.toml"), axis, &acts, options);
+        let trace = perform_well(tuned(later), axis, &acts, options);
         let all = &trace.cycles[trace.began[0]..];
         let dt = trace.dt_s;
         let position = step(all, |s| s.target_position);
@@ -245,6 +264,7 @@ fn modes_are_switched_in_motion_without_a_step() {
                 largest(around, |s| s.following_error),
                 largest(&around[..20], |s| s.following_error)
             );
+            // Into CSP 0.9 to 1.0 or 1.4 to 1.5, by the place of the control cycle.
             assert!(off < 1.5, "{axis} to {name}: {off}");
         }
         let end = trace.at_end_of(7);
@@ -257,7 +277,7 @@ fn modes_are_switched_in_motion_without_a_step() {
         assert!(wire.position as f64 <= VELOCITY * dt * counts + 1.0);
         // The set-point's change and the position loop's, each within the limit; in rpm.
         assert!(wire.velocity as f64 <= 2.0 * ACCELERATION * dt * 60.0 + 2.0);
-        // The first torque is the one that was there, but for one cycle of the loop.
+        // The first torque is the one that was there, but for one cycle of the loop: 2 or 59 ‰, by the place of the control cycle.
         assert!(wire.first_torque <= 65, "{wire:?}");
     }
 }

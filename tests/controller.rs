@@ -126,7 +126,7 @@ fn a_jump_is_refused_and_the_axis_brakes() {
     let outcome = control(
         machine,
         Closure(move |machine: &mut Cycle<'_>| {
-            if machine.stopping() || !machine.axis(names.x).ready {
+            if cycles == 500 || !machine.axis(names.x).ready {
                 return;
             }
             cycles += 1;

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{axes, faults, machine, run_badly, run_well, virtual_time};
+use common::{axes, faults, machine, run, run_badly, run_well, virtual_time};
 use ecaxis::session::Options;
 
 /// The error must name every one of these.
@@ -153,5 +153,146 @@ fn a_move_that_the_machine_ends_early_is_still_a_controlled_stop() {
             .final_error_counts
             .is_none_or(|e| e.abs() <= 50),
         "{summary:?}"
+    );
+}
+
+/// One frame in twenty is lost, of any kind, all the time: nothing trips below `lost_frames`, and every loss is known.
+#[test]
+fn a_bus_that_loses_frames_all_the_time_still_moves_its_axes() {
+    for seed in 1..=8 {
+        let script =
+            format!("seed = {seed}\n[[fault]]\nkind = \"frame-loss\"\nprobability = 0.05\n");
+        let text = axes(3).replace("cycle =", "lost_frames = 8\ncycle =");
+        // At two fifths of the limit, as one that is to catch up needs room.
+        let text = text.replace("\nmove =", "\nspeed = 0.4\nmove =");
+        let options = Options {
+            repeat: Some(2),
+            ..faults(&script)
+        };
+        let (outcome, heard) = run(machine(&text), options);
+        if let Err(error) = outcome.result {
+            panic!("seed {seed}: {error}; {:?}", heard.warnings());
+        }
+        let summary = outcome.summary.expect("the cycle ran");
+        let counters = summary.counters;
+        let lost = counters.lost_frames as f64 / counters.cycles as f64;
+        assert!((0.03..0.07).contains(&lost), "seed {seed}: {lost}");
+        for axis in &summary.axes {
+            assert!(
+                axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+                "seed {seed}: {axis:?}"
+            );
+            assert!(
+                axis.trip.is_none() && axis.fault.is_none(),
+                "seed {seed}: {axis:?}"
+            );
+        }
+    }
+}
+
+/// A cycle later, and otherwise the same.
+#[test]
+fn a_pipelined_exchange_moves_axes_as_well() {
+    let text = axes(2).replace("cycle =", "exchange = \"pipelined\"\ncycle =");
+    let summary = run_well(machine(&text), virtual_time());
+    for axis in &summary.axes {
+        assert!(
+            axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+            "{axis:?}"
+        );
+    }
+    let counters = summary.counters;
+    assert_eq!((counters.lost_frames, counters.late_frames), (0, 0));
+    assert_eq!(summary.round_trip.count, 0, "nobody waits");
+
+    // A reply that takes longer than a cycle, but not two, is in time; longer ones are late, and stop nothing.
+    for (delay, late) in [("900us", false), ("2500us", true)] {
+        let script = format!(
+            "[[fault]]\nkind = \"frame-delay\"\nat = \"1.5s\"\ncount = 2\ndelay = \"{delay}\"\n"
+        );
+        let summary = run_well(machine(&text), faults(&script));
+        assert_eq!(
+            summary.counters.late_frames > 0,
+            late,
+            "{delay}: {:?}",
+            summary.counters
+        );
+        assert_eq!(
+            summary.counters.lost_frames > 0,
+            late,
+            "{delay}: {:?}",
+            summary.counters
+        );
+    }
+
+    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\nprobability = 1.0\n";
+    let (error, _) = run_badly(machine(&text), faults(script));
+    says(
+        &error,
+        &["the bus is lost", "3 cycles", "without an answer"],
+    );
+}
+
+/// What led to the end is told in order; a run of the same is one line.
+#[test]
+fn the_cycle_remembers_what_led_to_a_stop() {
+    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\nprobability = 1.0\n";
+    let (_, summary) = run_badly(machine(&axes(2)), faults(script));
+    let events = summary.expect("the cycle ran").events;
+    let at = |what: &str| {
+        let found = events.iter().position(|e| e.what.contains(what));
+        found.unwrap_or_else(|| panic!("{what}: {events:#?}"))
+    };
+    assert!(at("in phase with SYNC0") < at("AL status 0x08 of 2 SubDevices"));
+    let lost = at("not back before the deadline");
+    let stop = at("stop: 3 cycles in a row");
+    assert!(lost < stop && events[stop].failure && !events[lost].failure);
+    let (lost, stop) = (&events[lost], &events[stop]);
+    assert_eq!(stop.first_cycle, lost.first_cycle + 2);
+    assert!(lost.last_cycle > stop.first_cycle, "they go on being lost");
+    assert!((1.0..2.0).contains(&stop.at_s), "{stop:?}");
+}
+
+#[test]
+fn errors_are_counted_at_the_port_that_sees_them() {
+    let script =
+        "[[fault]]\nkind = \"frame-corrupt\"\nat = \"1.5s\"\ncount = 2\ndevice = 1\nport = 0\n";
+    let summary = run_well(machine(&axes(3)), faults(script));
+    let seen = summary.errors.iter().find(|found| found.name == "a1");
+    assert_eq!(seen.map(|found| found.invalid_frames), Some([2, 0, 0, 0]));
+    let others = summary.errors.iter().filter(|found| found.name != "a1");
+    assert!(others.clone().count() > 0);
+    for other in others {
+        assert_eq!(other.invalid_frames, [0; 4], "it was bad before: {other:?}");
+        assert!(other.forwarded != [0; 4], "{other:?}");
+    }
+    assert!(
+        run_well(machine(&axes(3)), virtual_time())
+            .errors
+            .is_empty()
+    );
+}
+
+#[test]
+fn a_clock_outside_its_window_is_warned_of() {
+    let text = axes(2).replace("\n[[step]]", "[device.sim]\njitter = \"400ns\"\n\n[[step]]");
+    let text = text.replacen("[device.sim]\njitter = \"400ns\"\n", "", 1);
+    let warned = |window: &str| {
+        let text = text.replace("cycle =", &format!("clock_window = \"{window}\"\ncycle ="));
+        let (outcome, heard) = run(machine(&text), virtual_time());
+        outcome.result.expect("a clock that is off stops nothing");
+        let of_clocks = heard
+            .warnings()
+            .into_iter()
+            .filter(|w| w.contains("the clock of"));
+        of_clocks.map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(warned("10us"), [""; 0]);
+    let warnings = warned("100ns");
+    assert!(
+        warnings
+            .first()
+            .is_some_and(|w| w.contains("`a1`") && w.contains("the reference clock")),
+        "{warnings:?}"
     );
 }

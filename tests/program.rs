@@ -115,14 +115,26 @@ fn only_the_axes_that_are_named_get_power() {
     assert_eq!(enabled, [false, true]);
 }
 
+/// What can be seen in the file is refused there; a program that is repeated from the command line is not.
 #[test]
 fn a_move_of_an_axis_without_power_fails_its_step() {
-    let (result, ran, _) = program(
-        "[[step]]\nenable = [\"y\"]\n[[step]]\nrepeat = 2\n[[step.step]]\nmove = { x = 1.0 }\n",
+    let text =
+        "[[step]]\nenable = [\"y\"]\n[[step]]\nrepeat = 2\n[[step.step]]\nmove = { x = 1.0 }\n";
+    let path = common::root().join("configs/test.toml");
+    let error = ecaxis::config::parse(&path, &format!("{HEAD}{text}")).expect_err("x has no power");
+    assert!(
+        error.to_string().contains("no step before has enabled it"),
+        "{error}"
     );
-    let error = result.expect_err("x has no power").to_string();
-    assert_eq!(ran, ["1", "2.1"]);
-    assert!(error.starts_with("step 2.1 (line "), "{error}");
+    let text =
+        "[[step]]\nenable = [\"x\"]\n[[step]]\nmove = { x = 1.0 }\n[[step]]\ndisable = [\"x\"]\n";
+    let text = format!("{HEAD}{text}").replace("enable = [\"x\"]\n[[step]]\nmove", "move");
+    let mut options = virtual_time();
+    options.repeat = Some(2);
+    let (outcome, heard) = run(machine(&text), options);
+    let error = outcome.result.expect_err("x has no power").to_string();
+    assert_eq!(steps(&heard), ["1", "2", "1"]);
+    assert!(error.starts_with("step 1 (line "), "{error}");
     assert!(
         error.contains("`x`") && error.contains("refused"),
         "{error}"
@@ -200,11 +212,13 @@ fn lines_gears_tables_and_waves() {
     );
 }
 
-/// A line goes on where lost frames have held it up.
+/// A line goes on where lost frames have held it up. At two fifths of the limit, as a drive that loses its targets at full speed overshoots
+/// farther than its supervision allows.
 #[test]
 fn lost_frames_hold_a_line_up() {
-    let text =
-        format!("{HEAD}[[step]]\nline = {{ x = 50.0, y = 20.0 }}\n[[step]]\ndwell = \"200ms\"\n");
+    let text = format!(
+        "{HEAD}[[step]]\nline = {{ x = 50.0, y = 20.0 }}\nspeed = 0.4\n[[step]]\ndwell = \"200ms\"\n"
+    );
     let mut machine = machine(&text);
     machine.bus.lost_frames = 20;
     let script: String = (10..20)
@@ -302,4 +316,102 @@ fn a_follower_that_cannot_follow_stops_the_machine() {
     );
     let x = &summary.axes[0];
     assert!(x.final_position < 49.0, "stopped on the way: {x:?}");
+}
+
+/// What goes by time cannot wait for lost frames: it must not count as done.
+#[test]
+fn lost_frames_in_a_table_or_a_wave_fail_the_step() {
+    for step in [
+        "table = { x = \"points.csv\" }",
+        "sine = { x = { amplitude = 2.0, frequency = 2.0, periods = 4 } }",
+    ] {
+        let mut machine = machine(&format!(
+            "{HEAD}[[step]]\n{step}\n[[step]]\ndwell = \"1s\"\n"
+        ));
+        machine.bus.lost_frames = 20;
+        let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1s\"\ncount = 12\n";
+        let (outcome, heard) = run(machine, common::faults(script));
+        let error = outcome.result.expect_err("held up").to_string();
+        assert!(
+            error.contains("`x`") && error.contains("lost frames held"),
+            "{step}: {error}"
+        );
+        assert_eq!(steps(&heard), ["1"], "{step}");
+    }
+}
+
+/// The cycles after which the targets of `x` and `y` stay as they are while they are enabled, on the wire.
+fn last_changes(step: &str) -> [usize; 2] {
+    let fine = HEAD.replace("encoder = 2000", "encoder = 1000000").replace(
+        "mode = \"csp\"\n",
+        "mode = \"csp\"\nsdo = [{ index = 0x6065, value = 2000000 }]\npdo.rx = [\"0x6040\", \"0x607A\"]\npdo.tx = [\"0x6041\", \"0x6064\"]\n",
+    );
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut options = virtual_time();
+    options.record = Some(folder.path().join("record"));
+    let record = folder.path().join("record");
+    let text = format!("{fine}{step}[[step]]\ndwell = \"50ms\"\n");
+    let summary = common::run_well(machine(&text), options);
+    for (axis, target) in summary.axes.iter().zip([50.0, -3.0]) {
+        assert_eq!(axis.target_position, target, "{axis:?}");
+    }
+    let images = common::script::process_images(&record);
+    [2, 8].map(|at| {
+        let target = |k: usize| &images[k].0[at..at + 4];
+        let moving: Vec<usize> = (1..images.len())
+            .filter(|&k| images[k].0[at - 2] & 0x0f == 0x0f && target(k) != target(k - 1))
+            .collect();
+        *moving.last().expect("it moves")
+    })
+}
+
+/// The last micrometres of a slow move are less than a count a cycle.
+#[test]
+fn axes_that_are_to_arrive_together_do() {
+    let step = "[[step]]\nmove = { x = 50.0, y = -3.0 }\n";
+    let [x, y] = last_changes(step);
+    assert!(x > y + 50, "each as fast as it can: {x}, {y}");
+    for step in [
+        step.to_owned(),
+        step.replace("move =", "move_by ="),
+        format!("{step}speed = 0.5\nramp = 0.5\n"),
+    ] {
+        let [x, y] = last_changes(&format!("{step}arrive = \"together\"\n"));
+        assert!(x.abs_diff(y) <= 3, "{step}: {x}, {y}");
+    }
+}
+
+/// In the file's units; a place on the turn where the axis comes round.
+#[test]
+fn a_target_that_is_not_reached_is_told_in_its_unit() {
+    // Between two counts, and the window is narrower than one.
+    let modulo = HEAD
+        .replacen("position = [-60.0, 60.0], ", "", 1)
+        .replacen("unit = \"mm\"", "unit = \"deg\"\nmodulo = 360.0", 1)
+        .replacen(
+            "encoder = 2000",
+            "encoder = 2000\ntarget_window = 0.0001",
+            1,
+        );
+    let text = format!("{modulo}[[step]]\nmove_by = {{ x = 725.0012 }}\n");
+    let (outcome, _) = run(machine(&text), virtual_time());
+    let error = outcome.result.expect_err("between two counts").to_string();
+    assert!(
+        error.contains("the target of 5.0012 deg is not reached, the axis is at 5.00"),
+        "{error}"
+    );
+    let axis = &outcome.summary.expect("the cycle has run").axes[0];
+    assert!((axis.target_position - 725.0012).abs() < 1e-9, "{axis:?}");
+    for place in [axis.target_place, axis.final_place] {
+        assert!(place.is_some_and(|p| (p - 5.0).abs() < 0.01), "{axis:?}");
+    }
+    let csv = HEAD.replacen("mode = \"csp\"", "mode = \"csv\"", 1);
+    let text = format!("{csv}[[step]]\nvelocity = {{ x = 20.0 }}\n");
+    let script = "[[fault]]\nkind = \"blocked\"\ndevice = 0\nat = \"0s\"\nfor = \"60s\"\n";
+    let (outcome, _) = run(machine(&text), common::faults(script));
+    let error = outcome.result.expect_err("it cannot turn").to_string();
+    assert!(
+        error.contains("the target of 20 mm/s is not reached, the axis is at 0.0"),
+        "{error}"
+    );
 }

@@ -22,25 +22,33 @@ const OPERATION_ENABLED: u16 = 0x0f;
 /// What reached the drives in one cycle: Controlword and target position of each axis.
 type Outputs = Vec<(u16, i32)>;
 
-/// The process data of the cyclic frames that came back, as it left: what the drives took.
-fn delivered_bytes(recording: &Path) -> Vec<Vec<u8>> {
+/// Process data of the cyclic frames on the wire, sent (`true`) and come back.
+fn cyclic_frames(recording: &Path) -> Vec<(bool, Vec<u8>)> {
     const FIRST_LRW_DATA: usize = 16 + 20 + 10;
     let file = std::fs::File::open(recording).expect("the recording");
     let mut reader = PcapNgReader::new(file).expect("pcapng");
-    let mut sent: Option<Vec<u8>> = None;
-    let mut cycles = Vec::new();
+    let mut frames = Vec::new();
     while let Some(block) = reader.next_block() {
         let Block::EnhancedPacket(packet) = block.expect("a block") else {
             continue;
         };
         let frame = packet.data;
-        if frame.get(11) != Some(&0x20) {
-            continue;
+        if frame.get(11) == Some(&0x20) {
+            frames.push((frame[6] & 0x02 == 0, frame[FIRST_LRW_DATA..].to_vec()));
         }
-        if frame[6] & 0x02 == 0 {
-            sent = Some(frame.to_vec());
-        } else if let Some(sent) = sent.take() {
-            cycles.push(sent[FIRST_LRW_DATA..].to_vec());
+    }
+    frames
+}
+
+/// The process data of the cyclic frames that came back, as it left: what the drives took.
+fn delivered_bytes(recording: &Path) -> Vec<Vec<u8>> {
+    let mut last_sent = None;
+    let mut cycles = Vec::new();
+    for (sent, data) in cyclic_frames(recording) {
+        if sent {
+            last_sent = Some(data);
+        } else {
+            cycles.extend(last_sent.take());
         }
     }
     cycles
@@ -392,4 +400,30 @@ fn an_emergency_counts_while_the_machine_is_stopping_already() {
         with.axes[0],
         without.axes[0]
     );
+}
+
+/// The way out is fine, the way back is not: the drives go on hearing. From the last answer to the frame that orders the quick stop there
+/// are `lost_frames` cycles and one more, in which that frame is sent.
+#[test]
+fn a_lost_bus_is_stopped_within_a_cycle_of_the_limit() {
+    const QUICK_STOP: u16 = 0x0004;
+    for limit in [1_usize, 2, 3, 7] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\nprobability = 1.0\n";
+        let (options, path) = record(faults(script), &folder);
+        let text = axes(2).replace("cycle =", &format!("lost_frames = {limit}\ncycle ="));
+        let (error, _) = run_badly(machine(&text), options);
+        assert!(error.contains("the bus is lost"), "{error}");
+        let frames = cyclic_frames(&path);
+        let last_answer = frames
+            .iter()
+            .rposition(|(sent, _)| !sent)
+            .expect("answers before");
+        let unanswered: Vec<bool> = frames[last_answer + 1..]
+            .iter()
+            .map(|(_, data)| u16::from_le_bytes([data[0], data[1]]) & QUICK_STOP == 0)
+            .collect();
+        let stop = unanswered.iter().position(|stops| *stops);
+        assert_eq!(stop, Some(limit), "of {}", unanswered.len());
+    }
 }

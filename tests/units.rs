@@ -221,3 +221,52 @@ fn a_modulo_axis_goes_its_way() {
         );
     }
 }
+
+const VENDOR: &str = "#x00000E0A";
+
+/// A maxon drive's 0x3001:05 is 37 mNm/A here, and its rated torque 0.1184 Nm.
+#[test]
+fn a_maxon_drive_knows_its_motors_torque_constant() {
+    let axis = AXIS
+        .replace("encoder", "torque_unit = \"A\"\nencoder")
+        .replace("following_error = 0.5", "torque = 3.0");
+    let text =
+        format!("{HEAD}{axis}\n[[step]]\ntorque = {{ x = 0.4 }}\n[[step]]\ndwell = \"1200ms\"\n")
+            .replace("\"csp\"", "\"cst\"");
+    let (outcome, heard) = run(with_esi(VENDOR, "#x000000FB", &text), virtual_time());
+    outcome.result.expect("runs");
+    let taken: Vec<&str> = heard
+        .0
+        .iter()
+        .filter_map(|progress| match progress {
+            Progress::Step(Step::Adopted { what, .. }) => Some(what.as_str()),
+            _ => None,
+        })
+        .collect();
+    assert!(
+        taken.contains(&"a torque constant of 0.037 Nm/A, as the drive says in 0x3001:05"),
+        "{taken:?}"
+    );
+    let torques: Vec<f64> = heard
+        .0
+        .iter()
+        .filter_map(|progress| match progress {
+            Progress::Status(status) => Some(status.axes[0].torque),
+            _ => None,
+        })
+        .collect();
+    assert!(
+        torques.iter().any(|t| (t - 0.4).abs() < 0.02),
+        "{torques:?}"
+    );
+    let said = text
+        .replace("x = 0.4", "x = 0.1")
+        .replace("encoder", "torque_constant = 0.05\nencoder");
+    let (_, warnings) = told(with_esi(VENDOR, "#x000000FB", &said));
+    assert!(
+        warnings
+            .iter()
+            .any(|w| w.contains("0x3001:05 is 37000 µNm/A, expected 50000")),
+        "{warnings:?}"
+    );
+}

@@ -4,66 +4,35 @@
 
 mod common;
 
-use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::sync::Mutex;
+use std::time::Duration;
 
 use common::root;
+use ecaxis::bench::veth::VethPair;
+use ecaxis::link::BackEnd;
 
-/// A veth pair that is removed when the test ends, however it ends.
-struct Pair {
-    a: String,
-    b: String,
-}
-
-impl Pair {
-    /// `None`, with the reason printed, where interfaces may not be created.
-    fn new() -> Option<Self> {
-        let id = std::process::id() % 100_000;
-        let pair = Self {
-            a: format!("ecx{id}a"),
-            b: format!("ecx{id}b"),
-        };
-        let made = ip(&[
-            "link", "add", &pair.a, "type", "veth", "peer", "name", &pair.b,
-        ]);
-        if let Err(error) = made {
+/// `None`, with the reason printed, where interfaces may not be created.
+fn pair() -> Option<VethPair> {
+    match VethPair::new() {
+        Ok(pair) => Some(pair),
+        Err(error) => {
             println!("skipped: a veth pair needs root: {error}");
-            return None;
+            None
         }
-        for nic in [&pair.a, &pair.b] {
-            // No address resolution or router solicitation of the host's on this wire.
-            let _ = std::fs::write(format!("/proc/sys/net/ipv6/conf/{nic}/disable_ipv6"), "1");
-            ip(&["link", "set", nic, "up"]).expect("an interface of ours goes up");
-        }
-        Some(pair)
     }
 }
 
-impl Drop for Pair {
-    fn drop(&mut self) {
-        let _ = ip(&["link", "del", &self.a]);
-    }
+/// The demo's bus on one end of the pair, and the machine file for the other.
+struct Served {
+    child: Child,
+    file: tempfile::NamedTempFile,
 }
-
-fn ip(arguments: &[&str]) -> Result<(), String> {
-    let output = Command::new("ip")
-        .args(arguments)
-        .output()
-        .map_err(|e| e.to_string())?;
-    if output.status.success() {
-        Ok(())
-    } else {
-        Err(String::from_utf8_lossy(&output.stderr).trim().to_owned())
-    }
-}
-
-struct Served(Child);
 
 impl Drop for Served {
     fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
+        let _ = self.child.kill();
+        let _ = self.child.wait();
     }
 }
 
@@ -88,23 +57,11 @@ fn can_be_kept_apart() -> bool {
         && taskset.is_ok_and(|output| output.status.success())
 }
 
-fn wait_until_up(nic: &str) {
-    let carrier = format!("/sys/class/net/{nic}/carrier");
-    let start = Instant::now();
-    while std::fs::read_to_string(Path::new(&carrier)).is_ok_and(|c| c.trim() != "1") {
-        assert!(
-            start.elapsed() < Duration::from_secs(5),
-            "{nic} has no carrier"
-        );
-        std::thread::sleep(Duration::from_millis(10));
-    }
-}
+/// The two tests would take each other's processors.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-#[test]
-fn the_demo_over_a_real_interface() {
-    let Some(pair) = Pair::new() else { return };
-    wait_until_up(&pair.a);
-    wait_until_up(&pair.b);
+/// With `more` in the file's [bus].
+fn serve(pair: &VethPair, more: &str) -> Served {
     let apart = can_be_kept_apart();
     // The demo, but patient: a busy test machine may hold either process up for longer than three
     // cycles, and both ends share its processors.
@@ -114,26 +71,26 @@ fn the_demo_over_a_real_interface() {
         .suffix(".toml")
         .tempfile_in(root().join("configs"))
         .expect("a temporary file");
-    std::fs::write(
-        file.path(),
-        demo.replace(
-            "lost_frames = 20",
-            &format!(
-                "lost_frames = 80\nwatchdog = \"500ms\"{}",
-                if apart { "\ncpu = 1" } else { "" }
-            ),
-        ),
-    )
-    .expect("written");
-    let file = file.path().to_str().expect("a path in UTF-8");
-    let served = if apart { on_cpu_0() } else { ecaxis() }
-        .args(["sim", file, "--nic", &pair.a])
+    let cpu = if apart { "cpu = 1" } else { "" };
+    let patient = format!("lost_frames = 900\nwatchdog = \"2s\"\n{cpu}\n{more}");
+    std::fs::write(file.path(), demo.replace("lost_frames = 20", &patient)).expect("written");
+    let path = file.path().to_str().expect("a path in UTF-8");
+    let child = if apart { on_cpu_0() } else { ecaxis() }
+        .args(["sim", path, "--nic", &pair.a])
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
         .expect("the binary starts");
-    let _served = Served(served);
     std::thread::sleep(Duration::from_millis(300));
+    Served { child, file }
+}
+
+#[test]
+fn the_demo_over_a_real_interface() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    let served = serve(&pair, "");
+    let file = served.file.path().to_str().expect("a path in UTF-8");
 
     let output = ecaxis()
         .args(["run", file, "--nic", &pair.b, "--json"])
@@ -151,4 +108,50 @@ fn the_demo_over_a_real_interface() {
         assert!(error.abs() <= 1, "{axis:#}");
     }
     assert_eq!(summary["program_runs"], 2);
+    let thread = &summary["thread"];
+    assert!(
+        thread["cpu_ns"].as_u64().is_some_and(|ns| ns > 0),
+        "{thread:#}"
+    );
+    if !errors.contains("memory cannot be locked") {
+        assert_eq!(thread["minor_faults"], 0, "{thread:#}");
+        assert_eq!(thread["major_faults"], 0, "{thread:#}");
+    }
+}
+
+/// The cable is pulled and put back while the axes move: lost cycles, link errors, and on it goes.
+#[test]
+fn an_interface_goes_down_and_up_again_while_the_machine_runs() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    for link in BackEnd::ALL {
+        let served = serve(&pair, &format!("link = \"{link}\""));
+        let file = served.file.path().to_str().expect("a path in UTF-8");
+        let run = ecaxis()
+            .args(["run", file, "--nic", &pair.b, "--json"])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("the binary runs");
+        // In the middle of the first moves.
+        std::thread::sleep(Duration::from_millis(3_000));
+        pair.set(&pair.b, false).expect("down");
+        std::thread::sleep(Duration::from_millis(100));
+        pair.set(&pair.b, true).expect("up");
+        let output = run.wait_with_output().expect("it ends");
+        let errors = String::from_utf8_lossy(&output.stderr);
+        let result: serde_json::Value =
+            serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {errors}"));
+        println!("{link}: {:#}\n{errors}", result["summary"]["counters"]);
+        let counters = &result["summary"]["counters"];
+        assert!(
+            counters["link_errors"].as_u64().is_some_and(|n| n > 0),
+            "{result:#}"
+        );
+        assert!(
+            counters["lost_frames"].as_u64().is_some_and(|n| n > 0),
+            "{result:#}"
+        );
+        assert!(output.status.success(), "{link}: {errors}\n{result:#}");
+    }
 }

@@ -1,0 +1,275 @@
+//! `ecaxis bench`: what it measures with, and what it says. Nothing here asserts a time: the machine that runs the tests is
+//! nobody's measure.
+
+#![allow(clippy::print_stdout, reason = "a skipped test says why")]
+
+use std::num::NonZeroU64;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use ecaxis::bench::bus::{Bus, Counts, Hold, Mischief, Options};
+use ecaxis::bench::in_process::InProcess;
+use ecaxis::bench::rig::{self, Setup};
+use ecaxis::bench::turn::{self, Measured, Thread};
+use ecaxis::bench::veth::{VethPair, leftovers};
+use ecaxis::config::Exchange;
+use ecaxis::link::capture::{Mode, Recorder};
+use ecaxis::link::recorded::Recorded;
+use ecaxis::link::{self, BackEnd, Link};
+use ecaxis::rt::margin::Spin;
+use ecaxis_sim::frame::{self, Command};
+
+/// Two real-time threads on two processors leave no room for another two.
+static ALONE: Mutex<()> = Mutex::new(());
+
+fn alone() -> MutexGuard<'static, ()> {
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn pair() -> Option<VethPair> {
+    match VethPair::new() {
+        Ok(pair) => Some(pair),
+        Err(error) => {
+            println!("skipped: a veth pair needs root: {error}");
+            None
+        }
+    }
+}
+
+fn exists(nic: &str) -> bool {
+    Path::new("/sys/class/net").join(nic).exists()
+}
+
+fn options(cycle_ns: u64, mischief: Mischief) -> Options {
+    Options {
+        hold: Hold::Fixed(30_000),
+        cycle_ns,
+        mischief,
+        priority: 40,
+        cpu: Some(0),
+        slack_ns: cycle_ns / 2,
+    }
+}
+
+fn setup(axes: usize, cycle_ns: u64) -> Setup {
+    Setup {
+        axes,
+        cycle_ns,
+        spin: Spin::For(0),
+        exchange: Exchange::SameCycle,
+    }
+}
+
+fn thread(time: Duration) -> Thread {
+    Thread {
+        priority: 41,
+        // With one processor there is no other for the bus; then its replies are late, which is counted, too.
+        cpu: Some(std::thread::available_parallelism().map_or(0, |n| n.get() - 1)),
+        time,
+    }
+}
+
+fn run(link: Box<dyn Link>, setup: Setup, bus: Option<&Bus>, time: Duration) -> Measured {
+    let _alone = alone();
+    let (parts, outer) = rig::parts(setup, link).expect("few axes");
+    turn::rig(
+        parts,
+        outer,
+        setup,
+        thread(time),
+        bus,
+        &AtomicBool::new(false),
+    )
+    .expect("runs")
+    .expect("not interrupted")
+}
+
+/// Axes over a pair of interfaces.
+fn over_veth(mischief: Mischief, link: BackEnd) -> Option<(Measured, Counts)> {
+    let pair = pair()?;
+    let setup = setup(3, 4_000_000);
+    let segment = rig::segment(setup.axes).expect("few axes");
+    let bus = Bus::on(&pair, segment, options(setup.cycle_ns, mischief)).expect("answers");
+    let (link, _) = link::open(&pair.a, link).expect("opens");
+    let measured = run(link, setup, Some(&bus), Duration::from_secs(2));
+    let counts = measured.bus.expect("a bus");
+    Some((measured, counts))
+}
+
+#[test]
+fn a_pair_is_out_of_sight_at_one_end_and_gone_in_the_end() {
+    let Some(pair) = pair() else { return };
+    let (near, far) = (pair.a.clone(), pair.b.clone());
+    assert!(exists(&near) && exists(&far));
+    let segment = rig::segment(1).expect("one axis");
+    let bus = Bus::on(&pair, segment, options(1_000_000, Mischief::default())).expect("answers");
+    assert!(exists(&near));
+    assert!(!exists(&far), "in the bus's own network namespace");
+    assert!(!leftovers().contains(&near), "its process lives");
+    drop(bus);
+    drop(pair);
+    let start = Instant::now();
+    while exists(&near) && start.elapsed() < Duration::from_secs(5) {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert!(!exists(&near));
+}
+
+#[test]
+fn axes_move_over_every_back_end() {
+    for back_end in BackEnd::ALL {
+        let Some((measured, bus)) = over_veth(Mischief::default(), *back_end) else {
+            return;
+        };
+        let counters = measured.stats.counters;
+        assert!(counters.cycles > 0, "{back_end}");
+        assert_eq!(counters.wkc_errors, 0, "{back_end} {counters:?}");
+        assert_eq!(measured.stats.lateness.summary().count, counters.cycles);
+        assert_eq!((bus.malformed, bus.foreign), (0, 0), "{bus:?}");
+        assert!(bus.frames > 0);
+        assert!(measured.used.voluntary_switches > 0);
+    }
+}
+
+/// A reply that comes after its deadline is counted, and never stops the loop.
+#[test]
+fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
+    let every = NonZeroU64::new(7).expect("not zero");
+    let late = Mischief {
+        late_every: Some((every, 6_000_000)),
+        ..Mischief::default()
+    };
+    let Some((measured, bus)) = over_veth(late, BackEnd::Ring) else {
+        return;
+    };
+    let counters = measured.stats.counters;
+    assert!(bus.delayed > 10, "{bus:?}");
+    assert!(counters.late_frames > 10, "{counters:?}");
+    assert!(counters.lost_frames >= counters.late_frames / 2);
+    // One in seven is late; most of the others are in time even on a busy machine.
+    assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
+
+    let dropped = Mischief {
+        drop_every: Some(every),
+        ..Mischief::default()
+    };
+    let Some((measured, bus)) = over_veth(dropped, BackEnd::Ring) else {
+        return;
+    };
+    let counters = measured.stats.counters;
+    assert!(bus.dropped > 10, "{bus:?}");
+    assert!(counters.lost_frames > 10, "{counters:?}");
+    assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
+}
+
+/// Bytes of every frame sent, by what a recording says of them.
+fn recorded_frames(axes: usize) -> Vec<Vec<u8>> {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("bench.pcapng");
+    let segment = rig::segment(axes).expect("fits");
+    let recorder = Recorder::create(&path, Mode::Inline).expect("a recording");
+    let link = InProcess::new(segment, Hold::Fixed(1_000));
+    let link = Box::new(Recorded::new(Box::new(link), recorder, 0));
+    let setup = setup(axes, 2_000_000);
+    let (parts, outer) = rig::parts(setup, link).expect("fits");
+    let _alone = alone();
+    let mut engine = ecaxis::rt::cycle::Engine::new(parts);
+    for _ in 0..700 {
+        engine.cycle();
+    }
+    drop(outer);
+    engine
+        .into_remains()
+        .link
+        .finish()
+        .expect("written")
+        .expect("a recording");
+    sent(&path)
+}
+
+fn sent(path: &Path) -> Vec<Vec<u8>> {
+    use pcap_file::pcapng::blocks::enhanced_packet::EnhancedPacketOption;
+    use pcap_file::pcapng::{Block, PcapNgReader};
+    let file = std::fs::File::open(path).expect("a recording");
+    let mut reader = PcapNgReader::new(file).expect("pcapng");
+    let mut frames = Vec::new();
+    while let Some(block) = reader.next_block() {
+        if let Block::EnhancedPacket(packet) = block.expect("a block") {
+            let out = packet
+                .options
+                .iter()
+                .any(|o| matches!(o, EnhancedPacketOption::Flags(flags) if flags & 3 == 2));
+            if out {
+                frames.push(packet.data.to_vec());
+            }
+        }
+    }
+    frames
+}
+
+/// Twelve bytes each way per axis, one frame a cycle: what the design allows, as captured.
+#[test]
+fn a_cycle_is_one_frame_of_no_more_bytes_than_it_needs() {
+    for (axes, most) in [(8, 158), (32, 446), (100, 1262)] {
+        let frames = recorded_frames(axes);
+        assert_eq!(frames.len(), 700, "one a cycle");
+        let mut diagnoses = 0;
+        for frame in &frames {
+            let mut commands = Vec::new();
+            let mut diagnosis = 0;
+            let mut next = frame::next(frame, None);
+            while let Some(datagram) = next {
+                commands.push(datagram.command);
+                if datagram.command == Command::Fprd {
+                    diagnosis += datagram.data.len() + 12;
+                } else if datagram.command == Command::Lrw {
+                    assert_eq!(datagram.data.len(), 12 * axes);
+                }
+                next = frame::next(frame, Some(&datagram));
+            }
+            assert_eq!(commands[..3], [Command::Frmw, Command::Lrw, Command::Brd]);
+            assert!(commands.len() <= 4, "{commands:?}");
+            assert!(diagnosis <= 20, "{diagnosis}");
+            assert!(frame.len() - diagnosis <= most, "{axes}: {}", frame.len());
+            diagnoses += usize::from(diagnosis > 0);
+        }
+        assert!(diagnoses > 0, "and the diagnostic datagram besides");
+    }
+}
+
+#[test]
+fn axes_move_in_process() {
+    let setup = setup(5, 1_000_000);
+    let segment = rig::segment(setup.axes).expect("few axes");
+    let link = Box::new(InProcess::new(segment, Hold::Wire));
+    let measured = run(link, setup, None, Duration::from_millis(300));
+    let counters = measured.stats.counters;
+    assert!(counters.cycles > 0);
+    assert_eq!(counters.wkc_errors, 0);
+    assert!(measured.stats.round_trip.summary().count > 0);
+}
+
+#[test]
+fn an_interrupt_ends_a_bench_before_anything_moves() {
+    let setup = setup(1, 1_000_000);
+    let segment = rig::segment(1).expect("one axis");
+    let link = Box::new(InProcess::new(segment, Hold::Wire));
+    let (parts, outer) = rig::parts(setup, link).expect("one axis");
+    let stop = Arc::new(AtomicBool::new(true));
+    let ended = turn::rig(
+        parts,
+        outer,
+        setup,
+        thread(Duration::from_secs(100)),
+        None,
+        &stop,
+    );
+    assert!(matches!(ended, Ok(None)));
+}
+
+#[test]
+fn too_many_axes_are_refused() {
+    assert!(rig::segment(rig::MOST_AXES).is_ok());
+}

@@ -1,0 +1,510 @@
+//! `ecaxis doctor` on computers that are known: fabricated ones, and this one.
+//!
+//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes what is kept in `tests/snapshots/doctor` anew; the difference then wants reviewing.
+
+#![allow(clippy::print_stdout, reason = "says why a test does not run")]
+
+#[path = "doctor/machines.rs"]
+mod machines;
+
+use std::path::Path;
+use std::process::Command;
+
+use ecaxis::doctor::wakeup::{WakeUp, Way};
+use ecaxis::doctor::{Report, Severity, examine};
+use ecaxis::rt::thread::Denied;
+use machines::Machine;
+
+fn ids(report: &Report) -> Vec<String> {
+    let all = report.findings.iter();
+    all.map(|f| format!("{} {}", f.severity, f.id)).collect()
+}
+
+/// Compares the whole text with the one that was reviewed.
+#[track_caller]
+fn reviewed(name: &str, report: &Report) {
+    let text = report.to_string();
+    for line in text.lines() {
+        assert!(line.chars().count() <= 80, "{name}: longer than 80: {line}");
+        assert!(!line.contains(|c: char| c.is_control()), "{name}: {line:?}");
+    }
+    let kept =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../tests/snapshots/doctor/{name}.txt"));
+    if std::env::var_os("ECAXIS_UPDATE_SNAPSHOTS").is_some() {
+        std::fs::write(&kept, &text).expect("the snapshot can be written");
+    }
+    let expected = std::fs::read_to_string(&kept).expect("a snapshot");
+    assert_eq!(text, expected, "{name}");
+}
+
+#[test]
+fn ten_computers() {
+    let table: &[(&str, Machine, &[&str])] = &[
+        ("ideal", machines::ideal(), &[]),
+        (
+            "desktop",
+            machines::desktop(),
+            &[
+                "bad rights",
+                "warning preemption",
+                "warning throttling",
+                "warning isolation",
+                "warning governor",
+                "warning idle-states",
+                "warning nic-speed",
+                "warning nic-coalescing",
+                "warning nic-eee",
+                "warning nic-managed",
+                "warning nic-address",
+                "note irqbalance",
+            ],
+        ),
+        (
+            "virtual_machine",
+            machines::virtual_machine(),
+            &[
+                "bad nic-mtu",
+                "warning preemption",
+                "warning throttling",
+                "warning isolation",
+            ],
+        ),
+        (
+            "container",
+            machines::container(),
+            &[
+                "bad rights",
+                "warning throttling",
+                "warning nic-address",
+                "note same-cpu",
+            ],
+        ),
+        (
+            "group_without_time",
+            machines::group_without_time(),
+            &["bad cgroup"],
+        ),
+        (
+            "group_with_little_time",
+            machines::group_with_little_time(),
+            &["warning cgroup"],
+        ),
+        (
+            "no_sys",
+            machines::no_sys(),
+            &[
+                "bad rights",
+                "warning preemption",
+                "warning throttling",
+                "warning isolation",
+                "note irqbalance",
+            ],
+        ),
+        (
+            "laptop",
+            machines::laptop(),
+            &[
+                "bad rights",
+                "bad nic-kind",
+                "warning preemption",
+                "warning throttling",
+                "warning isolation",
+                "warning governor",
+                "warning idle-states",
+                "note battery",
+                "note irqbalance",
+            ],
+        ),
+        (
+            "crowded",
+            machines::crowded(),
+            &[
+                "bad nic-interrupt",
+                "warning clock-source",
+                "warning priority",
+                "note kernel-work",
+                "note smt",
+                "note interrupts",
+            ],
+        ),
+        ("nothing", Machine::new(), &[]),
+    ];
+    for (name, machine, expected) in table {
+        let report = machine.examined();
+        assert_eq!(ids(&report), *expected, "{name}");
+        reviewed(name, &report);
+    }
+}
+
+#[test]
+fn nonsense_in_every_file_is_survived() {
+    let long = "9".repeat(3 << 20);
+    for nonsense in [
+        "".as_bytes(),
+        b"\xff\xfe\x00\x80garbage",
+        b"-1",
+        b"99999999999999999999999999",
+        b"0-4294967295",
+        b"0x",
+        b"\n\n\n:::\n)(\n",
+        b"cpu\ncpu0\ncpu99999\n",
+        long.as_bytes(),
+    ] {
+        let text = machines::malformed(nonsense).examined().to_string();
+        assert!(text.len() < 20_000, "{}", text.len());
+        assert!(
+            !text.contains(|c: char| c.is_control() && c != '\n'),
+            "{text:?}"
+        );
+    }
+}
+
+#[test]
+fn nonsense_in_one_file_changes_no_more_than_that_file_tells() {
+    let machine = machines::desktop();
+    let root = tempfile::tempdir().expect("a folder");
+    let host = machine.write(root.path());
+    let examined = || examine(&host, &machine.intent, machine.tried.clone());
+    let usual = examined().findings.len();
+    for path in machine.paths() {
+        let file = root.path().join(&path);
+        let kept = std::fs::read(&file).expect("a file");
+        for nonsense in [b"\xff\xfe\x80".as_slice(), b"-99999999999999999999", b""] {
+            std::fs::write(&file, nonsense).expect("written");
+            let found = examined().findings.len();
+            assert!(
+                (usual - 4..=usual + 1).contains(&found),
+                "{path}: {found} of {usual}"
+            );
+        }
+        std::fs::write(&file, kept).expect("written");
+    }
+    assert_eq!(examined().findings.len(), usual);
+}
+
+/// One thing about the ideal computer's card is changed.
+#[test]
+fn cards() {
+    type Change = fn(&mut Machine);
+    let table: &[(&str, Change)] = &[
+        ("bad nic-down", |m| {
+            _ = m.file("sys/class/net/enp3s0/flags", "0x1002")
+        }),
+        ("bad nic-carrier", |m| {
+            _ = m.file("sys/class/net/enp3s0/carrier", "0")
+        }),
+        ("bad nic-speed", |m| {
+            _ = m.file("sys/class/net/enp3s0/duplex", "half")
+        }),
+        ("bad nic-speed", |m| {
+            _ = m.file("sys/class/net/enp3s0/speed", "10")
+        }),
+        ("bad nic-mtu", |m| {
+            _ = m.file("sys/class/net/enp3s0/mtu", "1280")
+        }),
+        ("bad nic-kind", |m| {
+            _ = m.file("sys/class/net/enp3s0/type", "772")
+        }),
+        ("bad nic-kind", |m| {
+            _ = m.file("sys/class/net/enp3s0/wireless/x", "")
+        }),
+        ("bad nic-kind", |m| {
+            _ = m.file("sys/class/net/enp3s0/bridge/x", "")
+        }),
+        ("bad nic-kind", |m| {
+            _ = m.link("sys/class/net/enp3s0/master", "../br0")
+        }),
+        ("warning nic-usb", |m| {
+            _ = m.link("sys/class/net/enp3s0/device/subsystem", "../../bus/usb")
+        }),
+        ("warning nic-threaded", |m| {
+            _ = m.file("sys/class/net/enp3s0/threaded", "1")
+        }),
+        ("warning nic-deferred", |m| {
+            m.file("sys/class/net/enp3s0/gro_flush_timeout", "200000");
+            m.file("sys/class/net/enp3s0/napi_defer_hard_irqs", "2");
+        }),
+        ("note nic-eee", |m| {
+            let nic = m.tried.nic.as_mut().unwrap();
+            nic.energy_efficient.as_mut().unwrap().enabled = true;
+        }),
+        ("note nic-lro", |m| {
+            m.tried.nic.as_mut().unwrap().lro = Some(true)
+        }),
+        ("note nic-address", |m| {
+            m.tried.nic.as_mut().unwrap().addresses = vec!["fe80::2".to_owned()]
+        }),
+        ("warning nic-coalescing", |m| {
+            m.tried
+                .nic
+                .as_mut()
+                .unwrap()
+                .coalescing
+                .as_mut()
+                .unwrap()
+                .rx_us = 50;
+        }),
+        ("warning nic-managed", |m| {
+            m.file(
+                "run/systemd/netif/links/3",
+                "ADMIN_STATE=configured\nOPER_STATE=routable\n",
+            );
+            m.process(400, "systemd-network", false, 0, 0);
+        }),
+    ];
+    for (expected, change) in table {
+        let mut machine = machines::ideal();
+        change(&mut machine);
+        assert_eq!(ids(&machine.examined()), [*expected]);
+    }
+}
+
+/// One thing about the rest of the ideal computer is changed.
+#[test]
+fn settings() {
+    type Change = fn(&mut Machine);
+    let none: &[&str] = &[];
+    let table: &[(&[&str], Change)] = &[
+        (&["bad cpu"], |m| m.intent.cpu = Some(4)),
+        (&["warning isolation", "note smt"], |m| {
+            m.intent.cpu = Some(1);
+            m.file(
+                "sys/devices/system/cpu/cpu1/topology/thread_siblings_list",
+                "0-1",
+            );
+        }),
+        (none, |m| m.intent.cpu = None),
+        (&["warning isolation"], |m| {
+            m.intent.cpu = None;
+            m.file("sys/devices/system/cpu/online", "0");
+            m.file("sys/devices/system/cpu/isolated", "");
+        }),
+        (&["warning idle-states"], |m| {
+            m.idle(4, &[("C6", 85, false)])
+        }),
+        // Somebody holds the CPUs awake.
+        (none, |m| {
+            m.idle(4, &[("C6", 85, false)]);
+            m.file("dev/cpu_dma_latency", 0_i32.to_ne_bytes());
+        }),
+        // The program will.
+        (none, |m| {
+            m.idle(4, &[("C6", 85, false)]);
+            m.file("dev/cpu_dma_latency", 2_000_000_000_i32.to_ne_bytes());
+        }),
+        // It must not; but spinning covers it.
+        (none, |m| {
+            m.idle(4, &[("C6", 50, false)]);
+            m.file("dev/cpu_dma_latency/x", "");
+        }),
+        (&["warning idle-states"], |m| {
+            m.idle(4, &[("C6", 50, false)]);
+            m.intent.cycle_ns = 250_000;
+        }),
+        // The limits of the user do instead of capabilities.
+        (none, |m| {
+            m.rights(1000, machines::NET_RAW, "95", "unlimited")
+        }),
+        (&["bad rights"], |m| {
+            m.rights(1000, machines::NET_RAW, "50", "unlimited")
+        }),
+        (&["warning rights"], |m| {
+            m.rights(1000, machines::NET_RAW | machines::SYS_NICE, "0", "65536")
+        }),
+        // From Linux 6.12 on the setting throttles groups alone, and there are none.
+        (none, |m| {
+            m.file("proc/sys/kernel/sched_rt_runtime_us", "950000");
+            m.file(
+                "boot/config-6.12.9-rt-amd64",
+                "CONFIG_PREEMPT_RT=y\n# CONFIG_RT_GROUP_SCHED is not set\n",
+            );
+        }),
+        (&["warning throttling"], |m| {
+            m.file("proc/sys/kernel/sched_rt_runtime_us", "950000");
+            m.file("proc/sys/kernel/osrelease", "6.6.1");
+        }),
+        (&["note priority"], |m| {
+            m.process(55, "irq/9-acpi", true, 1, 80)
+        }),
+        (&["warning priority"], |m| {
+            m.process(55, "pulse", false, 6, 0)
+        }),
+        (none, |m| m.process(55, "jackd", false, 1, 79)),
+        (none, |m| m.process(55, "irqbalance", false, 0, 0)),
+        (none, |m| _ = m.file("proc/cpuinfo", "flags : hypervisor")),
+    ];
+    for (n, (expected, change)) in table.iter().enumerate() {
+        let mut machine = machines::ideal();
+        change(&mut machine);
+        assert_eq!(ids(&machine.examined()), *expected, "row {n}");
+    }
+}
+
+#[test]
+fn refused_although_the_rights_are_there() {
+    let mut machine = machines::ideal();
+    machine.file("boot/config-6.12.9-rt-amd64", "CONFIG_RT_GROUP_SCHED=y\n");
+    let refused = Denied::Priority {
+        priority: 80,
+        reason: "Operation not permitted".to_owned(),
+    };
+    machine.tried.wake_up = Some(WakeUp {
+        denied: vec![refused.clone()],
+        ..measured(0)
+    });
+    let report = machine.examined();
+    assert_eq!(ids(&report), ["bad rights"]);
+    let mend = format!("{:?}", report.findings[0].mend);
+    assert!(mend.contains("rt_group_sched=0"), "{mend}");
+    // Where a right is missing anyway, that alone is told.
+    machine.rights(1000, machines::NET_RAW | machines::IPC_LOCK, "0", "0");
+    assert_eq!(machine.examined().count(Severity::Bad), 1);
+}
+
+fn measured(too_late: u64) -> WakeUp {
+    let mut way = Way::default();
+    way.lateness.count = 1_500;
+    way.lateness.max_ns = 300_000;
+    way.too_late = too_late;
+    WakeUp {
+        cycle_ns: 1_000_000,
+        spin_ns: 100_000,
+        seconds: 3,
+        cpu: Some(3),
+        priority: 80,
+        sleep: way,
+        sleep_and_spin: way,
+        denied: Vec::new(),
+        denials: Vec::new(),
+    }
+}
+
+#[test]
+fn late_wake_ups() {
+    for (too_late, expected) in [
+        (0, &[][..]),
+        (1, &["note wake-up"]),
+        (2, &["warning wake-up"]),
+        (15, &["warning wake-up"]),
+        (16, &["bad wake-up"]),
+    ] {
+        let mut machine = machines::ideal();
+        machine.tried.wake_up = Some(measured(too_late));
+        let report = machine.examined();
+        assert_eq!(ids(&report), expected, "{too_late}");
+        assert!(report.to_string().contains("1500 wake-ups"), "{report}");
+    }
+}
+
+fn ecaxis(arguments: &[&str]) -> (Option<i32>, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+        .args(arguments)
+        .output()
+        .expect("the binary runs");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("UTF-8");
+    (
+        output.status.code(),
+        text(output.stdout),
+        text(output.stderr),
+    )
+}
+
+/// What is told of this computer against an own look at it.
+#[test]
+fn this_computer() {
+    let (code, text, stderr) = ecaxis(&["doctor", "--seconds", "0", "--json"]);
+    let report: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let found = |id: &str| {
+        let findings = report["findings"].as_array().expect("findings");
+        findings.iter().find(|f| f["id"] == id).cloned()
+    };
+    let bad = report["findings"]
+        .as_array()
+        .expect("findings")
+        .iter()
+        .any(|f| f["severity"] == "bad");
+    assert_eq!(code, Some(i32::from(bad)), "{stderr}");
+
+    let read = |path: &str| {
+        std::fs::read_to_string(path)
+            .map(|t| t.trim().to_owned())
+            .ok()
+    };
+    let shell = |command: &str| {
+        let output = Command::new("sh")
+            .args(["-c", command])
+            .output()
+            .expect("a shell");
+        String::from_utf8_lossy(&output.stdout).trim().to_owned()
+    };
+    let uname = shell("uname -v");
+    if !uname.is_empty() && (uname.contains("PREEMPT_RT") || uname.contains("PREEMPT_DYNAMIC")) {
+        assert_eq!(
+            found("preemption").is_some(),
+            !uname.contains("PREEMPT_RT"),
+            "{uname}"
+        );
+    }
+    let isolated = read("/sys/devices/system/cpu/isolated");
+    if let Some(isolated) = isolated {
+        let alone = shell("nproc --all") == "1";
+        let expected = isolated.is_empty() || alone;
+        assert_eq!(
+            found("isolation").is_some(),
+            expected,
+            "isolated: `{isolated}`"
+        );
+    }
+    let runtime = read("/proc/sys/kernel/sched_rt_runtime_us");
+    match runtime.as_deref() {
+        Some("-1") | None => assert_eq!(found("throttling"), None),
+        Some(runtime) => {
+            // A kernel since 6.12 without groups does not throttle.
+            if let Some(throttling) = found("throttling") {
+                let ms = runtime.parse::<f64>().expect("a number") / 1e3;
+                let told = throttling["found"].as_str().expect("text");
+                assert!(told.contains(&format!("{ms} ms")), "{told}");
+            }
+        }
+    }
+    let governors =
+        shell("cat /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor 2>/dev/null | sort -u");
+    let saves = !governors.is_empty() && governors != "performance";
+    assert_eq!(found("governor").is_some(), saves, "{governors}");
+    let source = read("/sys/devices/system/clocksource/clocksource0/current_clocksource");
+    let slow = matches!(
+        source.as_deref(),
+        Some("hpet" | "acpi_pm" | "jiffies" | "refined-jiffies")
+    );
+    assert_eq!(found("clock-source").is_some(), slow, "{source:?}");
+    assert!(found("nic-mtu").is_none(), "no interface was named");
+}
+
+#[test]
+fn an_interface_that_does_not_exist_and_one_that_does() {
+    let (code, text, stderr) = ecaxis(&["doctor", "nonet7", "--seconds", "0"]);
+    assert_eq!(code, Some(2));
+    assert_eq!(text, "");
+    assert!(stderr.contains("`nonet7` does not exist"), "{stderr}");
+    let Some(nic) = ecaxis::doctor::Host::here().interfaces().into_iter().next() else {
+        println!("skipped: this computer has no network interface");
+        return;
+    };
+    assert!(stderr.contains(&nic), "{stderr}");
+    let (_, text, _) = ecaxis(&["doctor", &nic, "--seconds", "0"]);
+    assert!(text.contains("NIC  ") && text.contains(&nic), "{text}");
+}
+
+#[test]
+fn a_machine_file_says_what_is_intended() {
+    let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+    let file = demo.to_str().expect("UTF-8");
+    let (_, text, _) = ecaxis(&["doctor", "--machine", file, "--seconds", "0", "--json"]);
+    let report: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let machine = ecaxis::config::load(&demo).expect("the demonstration");
+    assert_eq!(report["intent"]["cycle_ns"], machine.bus.cycle_ns);
+    assert_eq!(report["intent"]["priority"], machine.bus.priority);
+    assert_eq!(report["wake_up"], serde_json::Value::Null);
+    let (code, _, stderr) = ecaxis(&["doctor", "--machine", "no-such.toml"]);
+    assert_eq!(code, Some(2), "{stderr}");
+}
