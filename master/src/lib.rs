@@ -9,6 +9,7 @@
 //! - [`bringup`]: from a silent wire to SafeOp; may block and allocate;
 //! - [`rt`]: the cycle; must not block or allocate;
 //! - [`mailbox`]: CoE over raw datagrams, beside the cycle;
+//! - [`service`]: a bus without a cycle, taken as it is found;
 //! - [`link`]: what carries Ethernet frames;
 //! - [`doctor`]: what in this computer keeps a cycle from being on time;
 //! - [`bench`]: what measuring needs;
@@ -28,6 +29,7 @@ pub mod link;
 pub mod mailbox;
 pub mod os;
 pub mod rt;
+pub mod service;
 pub mod session;
 pub mod supervise;
 mod wire;

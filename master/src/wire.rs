@@ -35,40 +35,58 @@ impl Datagrams {
         working_counter(answer.map(|_| ()), 0, 0, 0)
     }
 
-    /// One word by position in the segment, before station addresses are known to be right.
-    pub async fn read_position(
+    /// By position in the segment (APRD), before station addresses are known to be right. Returns the working counter.
+    ///
+    /// # Errors
+    /// [`WireError`], with the position in the place of the station.
+    pub async fn read_at(
         &self,
         position: u16,
         register: u16,
-    ) -> Result<Option<u16>, WireError> {
-        match Command::aprd(position, register)
-            .receive_slice(self.device, 2)
-            .await
-        {
-            Ok(pdu) => Ok(<[u8; 2]>::try_from(&*pdu).ok().map(u16::from_le_bytes)),
-            Err(Error::WorkingCounter { .. }) => Ok(None),
-            Err(error) => Err(failed(error, position, register)),
-        }
+        buf: &mut [u8],
+    ) -> Result<u16, WireError> {
+        let len = length(buf)?;
+        let answer = Command::aprd(position, register)
+            .receive_slice(self.device, len)
+            .await;
+        working_counter(answer.map(|pdu| copy(&pdu, buf)), 1, position, register)
+    }
+
+    /// By position in the segment (APWR). Returns the working counter.
+    ///
+    /// # Errors
+    /// As [`Datagrams::read_at`].
+    pub async fn write_at(
+        &self,
+        position: u16,
+        register: u16,
+        data: &[u8],
+    ) -> Result<u16, WireError> {
+        let answer = Command::apwr(position, register)
+            .send_receive_slice(self.device, data)
+            .await;
+        working_counter(answer.map(|_| ()), 1, position, register)
+    }
+}
+
+fn length(buf: &[u8]) -> Result<u16, WireError> {
+    u16::try_from(buf.len())
+        .map_err(|_| WireError::Other(format!("a datagram cannot read {} bytes", buf.len())))
+}
+
+fn copy(from: &[u8], to: &mut [u8]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to = *from;
     }
 }
 
 impl Wire for Datagrams {
     async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
-        let len = u16::try_from(buf.len())
-            .map_err(|_| WireError::Other(format!("a datagram cannot read {} bytes", buf.len())))?;
+        let len = length(buf)?;
         let answer = Command::fprd(station, register)
             .receive_slice(self.device, len)
             .await;
-        working_counter(
-            answer.map(|pdu| {
-                for (to, from) in buf.iter_mut().zip(pdu.iter()) {
-                    *to = *from;
-                }
-            }),
-            1,
-            station,
-            register,
-        )
+        working_counter(answer.map(|pdu| copy(&pdu, buf)), 1, station, register)
     }
 
     async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {

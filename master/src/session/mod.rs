@@ -147,7 +147,7 @@ fn start(
         .unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into())
 }
 
-fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
+pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
     panic
         .downcast_ref::<String>()
         .cloned()
