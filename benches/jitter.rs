@@ -13,6 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use ecaxis::bench::wakeup::{Cyclictest, Wakeups};
 use ecaxis::clock::Nanos;
 use ecaxis::rt::awake::Awake;
+use ecaxis::rt::exchange::Mode;
 use ecaxis::rt::margin::{Margin, Spin};
 use ecaxis::rt::stats::{Percentiles, Times};
 use ecaxis::rt::thread::{self, Held};
@@ -48,8 +49,8 @@ fn measure(cycle: Nanos, cpu: usize, seconds: u32, awake: bool) {
         cpu: Some(cpu),
     };
     let (mut theirs, mut auto, mut plain) = (Times::new(), Wakeups::default(), Wakeups::default());
-    let mut margin = Margin::new(Spin::Auto, cycle);
-    let mut sleeping = Margin::new(Spin::For(0), cycle);
+    let mut margin = Margin::new(Spin::Auto, cycle, Mode::SameCycle);
+    let mut sleeping = Margin::new(Spin::For(0), cycle, Mode::SameCycle);
     for _ in 0..ROUNDS {
         if let Err(error) = reference.round(cycles, &mut theirs) {
             println!("note: {error}");

@@ -9,6 +9,7 @@ use ecaxis::bench::exchange::Exchanges;
 use ecaxis::bench::reflector::{Pace, Reflector};
 use ecaxis::bench::veth::VethPair;
 use ecaxis::link::{self, BackEnd};
+use ecaxis::rt::exchange::Mode;
 use ecaxis::rt::margin::{Margin, Spin};
 use ecaxis::rt::thread::{self, Held};
 
@@ -52,7 +53,7 @@ fn main() {
                 let (mut link, concerns) =
                     link::open(&pair.a, *back_end).expect("an interface of ours");
                 assert_eq!(concerns, [], "it is this back-end that is measured");
-                let mut margin = Margin::new(Spin::For(20_000), cycle);
+                let mut margin = Margin::new(Spin::For(20_000), cycle, Mode::SameCycle);
                 let done = result.round(link.as_mut(), DATA, cycle, &mut margin, cycles);
                 done.expect("the link works");
             }

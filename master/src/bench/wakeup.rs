@@ -131,13 +131,14 @@ fn histogram(text: &str, lateness: &mut Times) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rt::exchange::Mode;
     use crate::rt::margin::Spin;
 
     #[test]
     fn every_cycle_is_counted_once() {
         let mut wakeups = Wakeups::default();
         for spin in [Spin::Auto, Spin::For(0)] {
-            let mut margin = Margin::new(spin, 1_000_000);
+            let mut margin = Margin::new(spin, 1_000_000, Mode::SameCycle);
             wakeups.round(1_000_000, &mut margin, 20).unwrap();
         }
         assert_eq!(wakeups.lateness.summary().count, 40);

@@ -3,6 +3,7 @@
 use super::host::{Cpus, Host};
 use super::mend::{Mend, boot, file, write};
 use super::{Context, Notes, Severity};
+use crate::rt::exchange::Mode;
 
 const FOLDER: &str = "sys/devices/system/cpu";
 /// What /dev/cpu_dma_latency says when nobody asks for less.
@@ -240,7 +241,11 @@ fn idle(context: &Context<'_>, notes: &mut Notes) {
         let limited = format!("{told}; now limited to {limit} µs by a program");
         return notes.fact("deepest idle state", limited);
     }
-    let covered_us = context.intent.spin.longest(context.intent.cycle_ns) / 1_000;
+    let covered_us = context
+        .intent
+        .spin
+        .longest(context.intent.cycle_ns, Mode::SameCycle)
+        / 1_000;
     // What spinning covers has to be spun in every cycle.
     let hidden = (covered_us / 4).max(10);
     if state.latency_us <= hidden {

@@ -12,6 +12,7 @@ use super::{Notes, Severity, interrupts};
 use crate::clock::{self, Clock};
 use crate::config::duration;
 use crate::os::process::ThreadUse;
+use crate::rt::exchange::Mode;
 use crate::rt::margin::{Margin, Spin};
 use crate::rt::stats::{Percentiles, Times};
 use crate::rt::thread::{Denied, Held, prepare};
@@ -114,7 +115,7 @@ struct Taking {
 impl Taking {
     fn new(spin: Spin, cycle: u64) -> Self {
         Self {
-            margin: Margin::new(spin, cycle),
+            margin: Margin::new(spin, cycle, Mode::SameCycle),
             lateness: Times::new(),
             way: Way::default(),
         }

@@ -126,6 +126,7 @@ impl Engine {
     pub fn new(parts: Parts) -> Self {
         let started = clock::now() + parts.timing.cycle_ns;
         let clocks_off = vec![false; parts.exchange.diagnoses().len()];
+        let mode = parts.exchange.mode();
         Self {
             clock: parts.clock,
             timing: parts.timing,
@@ -151,7 +152,7 @@ impl Engine {
             end: parts.end,
             next: started,
             started,
-            margin: Margin::new(parts.timing.spin, parts.timing.cycle_ns),
+            margin: Margin::new(parts.timing.spin, parts.timing.cycle_ns, mode),
             answer: Answer::default(),
             events_lost: 0,
             orders_taken: 0,

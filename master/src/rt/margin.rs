@@ -1,12 +1,20 @@
 //! When sleeping ends and spinning begins.
 
+use super::exchange::Mode;
 use crate::clock::Nanos;
 
-/// Spinning never begins later than this before the release, nor earlier than `LONGEST` or `SHARE` of the cycle. A quarter of
-/// a cycle of 250 µs is less than busy computers need.
+/// Spinning never begins later than this before the release, nor earlier than `LONGEST` or a share of the cycle.
 const SHORTEST: Nanos = 20_000;
 const LONGEST: Nanos = 200_000;
-const SHARE: (Nanos, Nanos) = (2, 5);
+
+/// What may be spun of a cycle, in hundredths. A quarter of a cycle of 250 µs is less than busy computers need. Who takes answers a
+/// cycle later does so to save processor time, and a short cycle must not spend that again.
+const fn share(mode: Mode) -> Nanos {
+    match mode {
+        Mode::SameCycle => 40,
+        Mode::Pipelined => 16,
+    }
+}
 
 /// Where the margin begins before anything is known.
 const FIRST: Nanos = 100_000;
@@ -29,9 +37,9 @@ pub enum Spin {
 impl Spin {
     /// The longest that is ever spun.
     #[must_use]
-    pub fn longest(self, cycle: Nanos) -> Nanos {
+    pub fn longest(self, cycle: Nanos, mode: Mode) -> Nanos {
         match self {
-            Self::Auto => LONGEST.min(cycle / SHARE.1 * SHARE.0),
+            Self::Auto => LONGEST.min(cycle / 100 * share(mode)),
             Self::For(fixed) => fixed,
         }
     }
@@ -48,11 +56,11 @@ pub struct Margin {
 
 impl Margin {
     #[must_use]
-    pub fn new(spin: Spin, cycle: Nanos) -> Self {
+    pub fn new(spin: Spin, cycle: Nanos, mode: Mode) -> Self {
         match spin {
             Spin::For(now) => Self { now, bounds: None },
             Spin::Auto => {
-                let high = spin.longest(cycle);
+                let high = spin.longest(cycle, mode);
                 Self {
                     now: FIRST.min(high),
                     bounds: Some((SHORTEST.min(high), high)),
@@ -90,7 +98,7 @@ mod tests {
 
     /// The margin's course over a day like this.
     fn course(lates: impl Iterator<Item = Nanos>) -> Vec<Nanos> {
-        let mut margin = Margin::new(Spin::Auto, MS);
+        let mut margin = Margin::new(Spin::Auto, MS, Mode::SameCycle);
         lates
             .map(|late| {
                 margin.slept(Some(late));
@@ -131,7 +139,7 @@ mod tests {
 
     #[test]
     fn one_outlier_is_one_step_and_a_worse_machine_is_met_within_a_second() {
-        let mut margin = Margin::new(Spin::Auto, MS);
+        let mut margin = Margin::new(Spin::Auto, MS, Mode::SameCycle);
         (0..20_000).for_each(|_| margin.slept(Some(1_000)));
         assert_eq!(margin.get(), SHORTEST);
         margin.slept(Some(50 * MS));
@@ -144,22 +152,25 @@ mod tests {
 
     #[test]
     fn short_cycles_are_not_spent_on_spinning() {
-        for (cycle, longest) in [
-            (62_500, 25_000),
-            (125_000, 50_000),
-            (250_000, 100_000),
-            (MS, 200_000),
+        for (cycle, same_cycle, pipelined) in [
+            (62_500, 25_000, 10_000),
+            (125_000, 50_000, 20_000),
+            (250_000, 100_000, 40_000),
+            (MS, 200_000, 160_000),
+            (10 * MS, 200_000, 200_000),
         ] {
-            assert_eq!(Spin::Auto.longest(cycle), longest);
-            let mut margin = Margin::new(Spin::Auto, cycle);
-            (0..100).for_each(|_| margin.slept(Some(MS)));
-            assert_eq!(margin.get(), longest);
+            for (mode, longest) in [(Mode::SameCycle, same_cycle), (Mode::Pipelined, pipelined)] {
+                assert_eq!(Spin::Auto.longest(cycle, mode), longest);
+                let mut margin = Margin::new(Spin::Auto, cycle, mode);
+                (0..100).for_each(|_| margin.slept(Some(MS)));
+                assert_eq!(margin.get(), longest);
+            }
         }
     }
 
     #[test]
     fn a_fixed_margin_stays() {
-        let mut margin = Margin::new(Spin::For(0), MS);
+        let mut margin = Margin::new(Spin::For(0), MS, Mode::SameCycle);
         margin.slept(Some(MS));
         assert_eq!(margin.get(), 0);
     }
@@ -168,10 +179,11 @@ mod tests {
         #[test]
         fn never_out_of_bounds(
             cycle in 50_000_u64..100_000_000,
+            mode in prop::sample::select(vec![Mode::SameCycle, Mode::Pipelined]),
             lates in prop::collection::vec(prop::option::of(0_u64..1_000_000), 0..500),
         ) {
-            let mut margin = Margin::new(Spin::Auto, cycle);
-            let high = Spin::Auto.longest(cycle);
+            let mut margin = Margin::new(Spin::Auto, cycle, mode);
+            let high = Spin::Auto.longest(cycle, mode);
             let low = SHORTEST.min(high);
             prop_assert!((low..=high).contains(&margin.get()));
             for late in lates {

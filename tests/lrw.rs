@@ -1,0 +1,133 @@
+//! Devices that know no LRW, beside one that does, on the whole bus.
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use common::{root, run_badly, run_well, virtual_time};
+use ecaxis::config::{self, Machine};
+use ecaxis::session::Options;
+use ecaxis_sim::FaultScript;
+use pcap_file::pcapng::{Block, PcapNgReader};
+
+const LRD: u8 = 10;
+const LWR: u8 = 11;
+const LRW: u8 = 12;
+
+/// Three drives that move; those that are named know no LRW, as their own ESI file says.
+fn bus(folder: &Path, without: &[&str], exchange: &str) -> Machine {
+    let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("an ESI file");
+    let type_ = "<Type ProductCode=\"#x45500004\"";
+    assert!(esi.contains(type_));
+    std::fs::write(folder.join("lrw.xml"), &esi).expect("written");
+    let without_lrw = esi.replace(type_, &format!("{type_} UseLrdLwr=\"1\""));
+    std::fs::write(folder.join("no_lrw.xml"), without_lrw).expect("written");
+    let mut text = format!("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\nexchange = \"{exchange}\"\n");
+    for (position, name) in ["x", "y", "z"].into_iter().enumerate() {
+        let file = if without.contains(&name) {
+            "no_lrw.xml"
+        } else {
+            "lrw.xml"
+        };
+        text += &format!(
+            "[[device]]\nname = \"{name}\"\nesi = \"{file}\"\nposition = {position}\nmode = \"csp\"\n\
+             [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
+             limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }}\n"
+        );
+    }
+    text += "[[step]]\nmove = { x = 20.0, y = -10.0, z = 5.0 }\n[[step]]\ndwell = \"1s\"\n";
+    config::parse(&folder.join("m.toml"), &text).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// The working counters with which each logical command came back, of each cyclic frame; datagrams of one command added up.
+fn logical(recording: &Path) -> Vec<BTreeMap<u8, u16>> {
+    let bytes = std::fs::read(recording).expect("the recording");
+    let mut reader = PcapNgReader::new(bytes.as_slice()).expect("pcapng");
+    let mut frames = Vec::new();
+    while let Some(block) = reader.next_block() {
+        let Block::EnhancedPacket(packet) = block.expect("a block") else {
+            continue;
+        };
+        let frame = packet.data.as_ref();
+        let came_back = frame[6] & 0x02 != 0;
+        let mut seen = BTreeMap::new();
+        let mut at = 16;
+        while let Some(header) = frame.get(at..at + 10) {
+            let length = u16::from_le_bytes([header[6], header[7]]);
+            let end = at + 10 + usize::from(length & 0x7ff);
+            if came_back && (LRD..=LRW).contains(&header[0]) {
+                let counter = u16::from_le_bytes([frame[end], frame[end + 1]]);
+                *seen.entry(header[0]).or_default() += counter;
+            }
+            if length & 0x8000 == 0 {
+                break;
+            }
+            at = end + 2;
+        }
+        if !seen.is_empty() {
+            frames.push(seen);
+        }
+    }
+    frames
+}
+
+#[test]
+fn each_device_is_reached_as_it_can_be() {
+    // LRW counts 1 for reading and 2 for writing each device, LRD and LWR 1.
+    for (without, expected) in [
+        (&[][..], vec![(LRW, 9)]),
+        (&["y"], vec![(LRD, 1), (LWR, 1), (LRW, 6)]),
+        (&["x", "z"], vec![(LRD, 2), (LWR, 2), (LRW, 3)]),
+        (&["x", "y", "z"], vec![(LRD, 3), (LWR, 3)]),
+    ] {
+        for exchange in ["same-cycle", "pipelined"] {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let recording = folder.path().join("r.pcapng");
+            let options = Options {
+                record: Some(recording.clone()),
+                ..virtual_time()
+            };
+            let summary = run_well(bus(folder.path(), without, exchange), options);
+            let counters = summary.counters;
+            assert_eq!(
+                (counters.wkc_errors, counters.lost_frames),
+                (0, 0),
+                "{without:?}"
+            );
+            for (axis, target) in summary.axes.iter().zip([20.0, -10.0, 5.0]) {
+                assert_eq!(axis.target_position, target, "{without:?}");
+                assert!(
+                    axis.final_error_counts.is_some_and(|e| e.abs() <= 1),
+                    "{axis:?}"
+                );
+            }
+            // The half in the middle is in Op.
+            let frames = logical(&recording);
+            let middle = &frames[frames.len() / 4..frames.len() / 4 * 3];
+            assert!(middle.len() > 300, "{}", middle.len());
+            let expected: BTreeMap<u8, u16> = expected.iter().copied().collect();
+            for frame in middle {
+                assert_eq!(*frame, expected, "{without:?}, {exchange}");
+            }
+        }
+    }
+}
+
+/// Whoever leaves is missed by the working counter of its own datagrams, when that of the others is right.
+#[test]
+fn a_device_without_lrw_that_leaves_stops_the_machine() {
+    for without in ["x", "z"] {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let script = "[[fault]]\nkind = \"absent\"\ndevice = 2\nat = \"1200ms\"\n";
+        let options = Options {
+            faults: Some(FaultScript::parse(script).expect("a script")),
+            ..virtual_time()
+        };
+        let (error, _) = run_badly(bus(folder.path(), &[without], "same-cycle"), options);
+        assert!(
+            error.contains("`z`") && error.contains("no longer answers"),
+            "{error}"
+        );
+    }
+}
