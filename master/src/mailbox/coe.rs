@@ -20,6 +20,7 @@ const TYPE_COE: u8 = 3;
 const SERVICE_EMERGENCY: u16 = 1;
 const SERVICE_SDO_REQUEST: u16 = 2;
 const SERVICE_SDO_RESPONSE: u16 = 3;
+const SERVICE_SDO_INFORMATION: u16 = 8;
 
 const COMPLETE_ACCESS: u8 = 0x10;
 const TOGGLE: u8 = 0x10;
@@ -69,6 +70,11 @@ pub(super) enum Request<'a> {
         sub: u8,
         code: u32,
     },
+    /// SDO Information; requests fit into one fragment.
+    Information {
+        opcode: u8,
+        body: &'a [u8],
+    },
 }
 
 impl Request<'_> {
@@ -77,7 +83,11 @@ impl Request<'_> {
     pub(super) fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>) {
         out.clear();
         out.extend_from_slice(&[0, 0, 0, 0, 0, TYPE_COE | counter << 4]);
-        out.extend_from_slice(&(SERVICE_SDO_REQUEST << 12).to_le_bytes());
+        let service = match self {
+            Self::Information { .. } => SERVICE_SDO_INFORMATION,
+            _ => SERVICE_SDO_REQUEST,
+        };
+        out.extend_from_slice(&(service << 12).to_le_bytes());
         let initiate = |out: &mut Vec<u8>, command: u8, complete: bool, index: u16, sub: u8| {
             out.push(if complete {
                 command | COMPLETE_ACCESS
@@ -130,6 +140,10 @@ impl Request<'_> {
                 initiate(out, 0x80, false, index, sub);
                 out.extend_from_slice(&code.to_le_bytes());
             }
+            Self::Information { opcode, body } => {
+                out.extend_from_slice(&[opcode, 0, 0, 0]);
+                out.extend_from_slice(body);
+            }
         }
         let length = u16::try_from(out.len() - MAILBOX_HEADER).unwrap_or(u16::MAX);
         for (to, from) in out.iter_mut().zip(length.to_le_bytes()) {
@@ -149,6 +163,7 @@ fn unused(room: usize, used: usize) -> u8 {
 pub(super) enum Message<'a> {
     Emergency(Emergency),
     Sdo(Answer<'a>),
+    Information(Fragment<'a>),
     /// The SubDevice's mailbox refused a message, with this code.
     Refused(u16),
     /// Anything else: another protocol, another CoE service.
@@ -181,6 +196,15 @@ pub(super) enum Answer<'a> {
     DownloadSegment {
         toggle: bool,
     },
+}
+
+/// One message of an SDO Information answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Fragment<'a> {
+    pub(super) opcode: u8,
+    /// How many follow.
+    pub(super) left: u16,
+    pub(super) data: &'a [u8],
 }
 
 /// How a message contradicts itself.
@@ -241,6 +265,18 @@ fn parse_coe(body: &[u8]) -> Result<Message<'_>, Flaw> {
         SERVICE_SDO_REQUEST if content.first() == Some(&0x80) => {
             parse_sdo(content).map(Message::Sdo)
         }
+        SERVICE_SDO_INFORMATION => match content {
+            [opcode, _, low, high, data @ ..] => Ok(Message::Information(Fragment {
+                // The highest bit repeats that fragments follow.
+                opcode: opcode & 0x7f,
+                left: u16::from_le_bytes([*low, *high]),
+                data,
+            })),
+            _ => Err(Flaw::Short {
+                what: "an SDO Information answer",
+                length: content.len(),
+            }),
+        },
         _ => Ok(Message::Other),
     }
 }

@@ -4,6 +4,7 @@
 //! - `port`: the mailbox SyncManagers: taking turns, lost answers, emergencies in between.
 //! - `coe`: the bytes of mailbox, CoE and SDO headers (ETG.1000.4, ETG.1000.6).
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
+//! - `info`: what objects a device has, as it says itself (SDO Information).
 //! - `error`, `abort`, `emergency`, `objects`: what is said when something goes wrong.
 
 use std::time::Duration;
@@ -12,6 +13,7 @@ mod abort;
 mod coe;
 mod emergency;
 mod error;
+mod info;
 mod objects;
 mod port;
 mod sdo;
@@ -22,6 +24,7 @@ mod transfer;
 pub use abort::{abort_text, mailbox_error_text};
 pub use emergency::{EMERGENCY_QUEUE, Emergency};
 pub use error::{Phase, SdoError};
+pub use info::{Asked, EntryDescription, InfoError, ObjectDescription, ObjectList};
 pub use objects::{ObjectAddress, object_name};
 pub use sdo::{CoeClient, MAX_OBJECT};
 
@@ -73,6 +76,16 @@ pub struct Timeouts {
     pub answer: Duration,
     /// For one whole transfer with all its segments.
     pub transfer: Duration,
+}
+
+impl Timeouts {
+    fn of(&self, phase: Phase) -> Duration {
+        match phase {
+            Phase::Request | Phase::Repeat => self.request,
+            Phase::Answer => self.answer,
+            Phase::Transfer => self.transfer,
+        }
+    }
 }
 
 impl Default for Timeouts {

@@ -21,9 +21,9 @@ const ABORT_GENERAL: u32 = 0x0800_0000;
 /// nothing behind that the next one would take for its answer.
 #[derive(Debug)]
 pub struct CoeClient {
-    port: Port,
+    pub(super) port: Port,
     /// A transfer ended without its last answer; it may still come.
-    unsettled: bool,
+    pub(super) unsettled: bool,
 }
 
 impl CoeClient {
@@ -113,13 +113,19 @@ impl CoeClient {
             deadline: Deadline::after(w, self.port.timeouts.transfer),
             forgotten: self.port.forgotten,
         };
-        let ready = match self.port.check() {
-            Ok(()) if self.unsettled => self.port.drain(w, DRAIN).await.map(drop),
-            checked => checked,
-        };
+        let ready = self.settle(w).await;
         ready.map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
-        self.unsettled = true;
         Ok(transfer)
+    }
+
+    /// Makes sure that what arrives from now on belongs to what is sent from now on.
+    pub(super) async fn settle<W: Wire>(&mut self, w: &W) -> Result<(), Trouble> {
+        self.port.check()?;
+        if self.unsettled {
+            self.port.drain(w, DRAIN).await?;
+        }
+        self.unsettled = true;
+        Ok(())
     }
 
     async fn end<W: Wire, T>(

@@ -62,11 +62,7 @@ impl Transfer {
             index,
             sub,
             phase,
-            after: match phase {
-                Phase::Request | Phase::Repeat => port.timeouts.request,
-                Phase::Answer => port.timeouts.answer,
-                Phase::Transfer => port.timeouts.transfer,
-            },
+            after: port.timeouts.of(phase),
             set_aside: port.forgotten.saturating_sub(self.forgotten),
         }))
     }

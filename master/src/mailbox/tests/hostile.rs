@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use super::mischief::Mischief;
 use super::server::Server;
 use super::{block_on, client};
-use crate::mailbox::{EMERGENCY_QUEUE, Wire, WireError};
+use crate::mailbox::{EMERGENCY_QUEUE, ObjectList, Wire, WireError};
 
 /// Answers every datagram with anything. Time passes only where the client waits, so that a loop without a pause
 /// never ends, and runs into the limit.
@@ -110,7 +110,14 @@ fn mailbox() -> impl Strategy<Value = Vec<u8>> {
             bytes[..9].copy_from_slice(&[length, 0, 0, 0, 0, 0x13, 0, 0x30, u8::from(toggle) << 4]);
             bytes
         });
-    prop_oneof![noise, plausible, begun, segment]
+    // Fragments of descriptions, in whatever number.
+    let fragment =
+        (noise.clone(), 0u8..46, 0u8..8, 0u8..4).prop_map(|(mut bytes, length, opcode, left)| {
+            bytes[..12].copy_from_slice(&[length, 0, 0, 0, 0, 0x13, 0, 0x80, opcode, 0, left, 0]);
+            bytes[12..15].copy_from_slice(&[0x00, 0x20, 1]);
+            bytes
+        });
+    prop_oneof![noise, plausible, begun, segment, fragment]
 }
 
 proptest! {
@@ -141,6 +148,11 @@ proptest! {
             let _ = block_on(client.drain(&noise));
             // Two transfers of 10 s each at most, one last message of each, and what draining takes.
             prop_assert!(noise.now() - begin < 60_000_000_000);
+            let begin = noise.now();
+            let _ = block_on(client.object_list(&noise, ObjectList::All));
+            let _ = block_on(client.object_description(&noise, 0x2000));
+            let _ = block_on(client.entry_description(&noise, 0x2000, 1));
+            prop_assert!(noise.now() - begin < 90_000_000_000);
         }
         prop_assert!(client.take_emergencies().count() <= EMERGENCY_QUEUE);
     }

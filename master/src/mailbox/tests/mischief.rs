@@ -20,6 +20,8 @@ pub enum Mischief {
     Before(u32, Vec<u8>),
     /// Changes one byte of the n-th answer.
     Corrupt(u32, usize, u8),
+    /// Leaves the n-th answer out.
+    Skip(u32),
     /// Never acknowledges a repeat request.
     NoRepeat,
     /// Does not look at its mailbox.

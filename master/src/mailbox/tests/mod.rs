@@ -6,8 +6,10 @@ use std::time::Duration;
 
 use super::{CoeClient, MailboxLayout, Timeouts};
 
+mod describe;
 mod errors;
 mod hostile;
+mod info;
 mod mischief;
 mod recorded;
 mod server;

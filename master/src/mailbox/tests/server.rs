@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use super::STATION;
+use super::describe;
 use super::mischief::Mischief;
 use crate::mailbox::{Wire, WireError};
 
@@ -177,14 +178,22 @@ impl Inner {
         );
         let body = request[6..6 + length].to_vec();
         assert_eq!(request[5] & 0x0f, 3, "CoE");
-        assert_eq!(body[1] >> 4, 2, "SDO request");
         self.log.push(body.clone());
         if self.is(&Mischief::Mute) {
             return;
         }
-        let Some(answer) = self.answer(&body[2..], len) else {
-            return;
+        let service = body[1] >> 4;
+        let answers = match service {
+            2 => self.answer(&body[2..], len).into_iter().collect(),
+            8 => describe::answers(&self.objects, &body[2..], len),
+            _ => panic!("service {service} is none of a client's"),
         };
+        for answer in answers {
+            self.give(if service == 8 { 0x80 } else { 0x30 }, &answer, len);
+        }
+    }
+
+    fn give(&mut self, service: u8, answer: &[u8], len: usize) {
         self.answers_made += 1;
         let n = self.answers_made;
         self.own_counter = self.own_counter % 7 + 1;
@@ -192,7 +201,7 @@ impl Inner {
             .unwrap()
             .to_le_bytes()
             .to_vec();
-        message.extend([0, 0, 0, 0x03 | self.own_counter << 4, 0x00, 0x30]);
+        message.extend([0, 0, 0, 0x03 | self.own_counter << 4, 0x00, service]);
         message.extend(answer);
         for mischief in self.mischief.clone() {
             match mischief {
@@ -203,6 +212,7 @@ impl Inner {
                     let position = position % len;
                     message[position] = to;
                 }
+                Mischief::Skip(at) if at == n => return,
                 _ => {}
             }
         }

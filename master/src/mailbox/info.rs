@@ -1,0 +1,445 @@
+//! SDO Information (ETG.1000.6 §5.6.3): which objects a device has, what they are called and made of. An answer may come
+//! in as many fragments as it needs; what they carry is put together before anything is read of it.
+
+use std::fmt;
+use std::time::Duration;
+
+use super::abort::{abort_text, mailbox_error_text};
+use super::coe::{Answer, Fragment, Message, Request, parse};
+use super::error::{Phase, SdoError};
+use super::objects::ObjectAddress;
+use super::port::{Deadline, Trouble};
+use super::transfer::explain;
+use super::{CoeClient, Wire};
+
+const LIST: u8 = 1;
+const OBJECT: u8 = 3;
+const ENTRY: u8 = 5;
+const ERROR: u8 = 7;
+
+/// How often a question is asked whose answer comes with a gap.
+const TRIES: u32 = 3;
+
+/// The longest answer is a list of all 65,536 indices.
+const MAX_ANSWER: usize = 2 + 2 * 0x1_0000;
+
+/// Access rights, category and mapping: what entry descriptions are asked for, and always tell.
+const VALUE_INFO: u8 = 0x07;
+
+/// Which objects a list names (ETG.1000.6 Table 43).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u16)]
+pub enum ObjectList {
+    All = 1,
+    /// Objects that an RxPDO can carry.
+    RxMappable = 2,
+    TxMappable = 3,
+    /// What a replacement device has to be given: kept by "store parameters".
+    Backup = 4,
+    /// What is set at start-up.
+    Settings = 5,
+}
+
+impl ObjectList {
+    pub const EACH: [Self; 5] = [
+        Self::All,
+        Self::RxMappable,
+        Self::TxMappable,
+        Self::Backup,
+        Self::Settings,
+    ];
+}
+
+/// What was asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Asked {
+    Lengths,
+    List(ObjectList),
+    Object(u16),
+    Entry(u16, u8),
+}
+
+impl Asked {
+    fn opcode(self) -> u8 {
+        match self {
+            Self::Lengths | Self::List(_) => LIST,
+            Self::Object(_) => OBJECT,
+            Self::Entry(..) => ENTRY,
+        }
+    }
+
+    fn body(self) -> Vec<u8> {
+        match self {
+            Self::Lengths => vec![0, 0],
+            Self::List(list) => (list as u16).to_le_bytes().to_vec(),
+            Self::Object(index) => index.to_le_bytes().to_vec(),
+            Self::Entry(index, sub) => {
+                let [low, high] = index.to_le_bytes();
+                vec![low, high, sub, VALUE_INFO]
+            }
+        }
+    }
+
+    /// Answers begin with what was asked.
+    fn begins(self, data: &[u8]) -> bool {
+        let body = self.body();
+        let echoed = match self {
+            Self::Entry(..) => 3,
+            _ => 2,
+        };
+        data.get(..echoed).is_some() && data.get(..echoed) == body.get(..echoed)
+    }
+}
+
+impl fmt::Display for Asked {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Lengths => f.write_str("the lengths of the object lists"),
+            Self::List(ObjectList::All) => f.write_str("the list of all objects"),
+            Self::List(ObjectList::RxMappable) => f.write_str("the list of objects for RxPDOs"),
+            Self::List(ObjectList::TxMappable) => f.write_str("the list of objects for TxPDOs"),
+            Self::List(ObjectList::Backup) => f.write_str("the list of backup objects"),
+            Self::List(ObjectList::Settings) => f.write_str("the list of settings"),
+            Self::Object(index) => write!(f, "the description of object {index:#06x}"),
+            Self::Entry(index, sub) => {
+                write!(f, "the description of {}", ObjectAddress { index, sub })
+            }
+        }
+    }
+}
+
+/// `station` is the SubDevice's configured address. The next request starts clean in every case.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum InfoError {
+    /// The SubDevice refused, with the code of an SDO abort.
+    #[error("station {station:#06x}: {asked} was refused with {code:#010x}: {}", abort_text(*code))]
+    Abort {
+        station: u16,
+        asked: Asked,
+        code: u32,
+    },
+    /// The SubDevice's mailbox refused the request itself: most have no SDO Information then.
+    #[error("station {station:#06x}: {asked}: the mailbox refused the request with {code:#06x}: {}", mailbox_error_text(*code))]
+    Refused {
+        station: u16,
+        asked: Asked,
+        code: u16,
+    },
+    #[error("station {station:#06x}: {asked}: {phase} within {after:?}")]
+    Timeout {
+        station: u16,
+        asked: Asked,
+        phase: Phase,
+        after: Duration,
+    },
+    #[error("station {station:#06x}: {asked}: the answer makes no sense: {what}")]
+    Malformed {
+        station: u16,
+        asked: Asked,
+        what: String,
+    },
+    /// Whatever was asked: the SubDevice is gone, its mailboxes carry no CoE, or the wire failed.
+    #[error(transparent)]
+    Mailbox(SdoError),
+}
+
+impl InfoError {
+    /// The device's own refusal; it may still answer other questions.
+    pub fn is_refusal(&self) -> bool {
+        matches!(self, Self::Abort { .. } | Self::Refused { .. })
+    }
+}
+
+/// Why a question got no answer.
+#[derive(Debug)]
+enum Ended {
+    /// Some fragments came and others did not.
+    Gap(InfoError),
+    For(InfoError),
+}
+
+impl From<InfoError> for Ended {
+    fn from(error: InfoError) -> Self {
+        Self::For(error)
+    }
+}
+
+/// One object as its device describes it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ObjectDescription {
+    pub index: u16,
+    /// Index of the type in the object dictionary (ETG.1020, "Base Data Types").
+    pub data_type: u16,
+    /// The highest subindex.
+    pub max_sub: u8,
+    /// 7 variable, 8 array, 9 record.
+    pub code: u8,
+    pub name: String,
+}
+
+/// One subindex as its device describes it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EntryDescription {
+    pub index: u16,
+    pub sub: u8,
+    /// As [`ObjectDescription::data_type`].
+    pub data_type: u16,
+    pub bit_len: u16,
+    /// Bits 0 to 2: readable in PreOp, SafeOp, Op; 3 to 5: writable; 6 and 7: mappable into RxPDOs and TxPDOs; 8: backup;
+    /// 9: setting (ETG.1000.6 Table 46).
+    pub access: u16,
+    pub name: String,
+}
+
+impl CoeClient {
+    /// How many objects each list names, in the order of [`ObjectList::EACH`].
+    pub async fn list_lengths<W: Wire>(&mut self, w: &W) -> Result<[u16; 5], InfoError> {
+        let asked = Asked::Lengths;
+        let data = self.inquire(w, asked).await?;
+        let words: Vec<u16> = words(data.get(2..).unwrap_or_default()).collect();
+        words
+            .try_into()
+            .map_err(|_| self.malformed(asked, format!("{} bytes for 5 lengths", data.len())))
+    }
+
+    /// The indices in the order in which the device tells them.
+    pub async fn object_list<W: Wire>(
+        &mut self,
+        w: &W,
+        list: ObjectList,
+    ) -> Result<Vec<u16>, InfoError> {
+        let asked = Asked::List(list);
+        let data = self.inquire(w, asked).await?;
+        if data.len() % 2 != 0 {
+            return Err(self.malformed(asked, "half an index at its end"));
+        }
+        Ok(words(data.get(2..).unwrap_or_default()).collect())
+    }
+
+    pub async fn object_description<W: Wire>(
+        &mut self,
+        w: &W,
+        index: u16,
+    ) -> Result<ObjectDescription, InfoError> {
+        let asked = Asked::Object(index);
+        let data = self.inquire(w, asked).await?;
+        let [_, _, low, high, max_sub, code, name @ ..] = data.as_slice() else {
+            return Err(self.malformed(asked, format!("{} bytes are too few", data.len())));
+        };
+        Ok(ObjectDescription {
+            index,
+            data_type: u16::from_le_bytes([*low, *high]),
+            max_sub: *max_sub,
+            code: *code & 0x0f,
+            name: text(name),
+        })
+    }
+
+    pub async fn entry_description<W: Wire>(
+        &mut self,
+        w: &W,
+        index: u16,
+        sub: u8,
+    ) -> Result<EntryDescription, InfoError> {
+        let asked = Asked::Entry(index, sub);
+        let data = self.inquire(w, asked).await?;
+        let [_, _, _, told, t0, t1, b0, b1, a0, a1, rest @ ..] = data.as_slice() else {
+            return Err(self.malformed(asked, format!("{} bytes are too few", data.len())));
+        };
+        let bit_len = u16::from_le_bytes([*b0, *b1]);
+        let value = usize::from(bit_len.div_ceil(8));
+        // What was not asked for, and some devices tell all the same: unit, default, least and greatest value.
+        let before = [(0x08, 4), (0x10, value), (0x20, value), (0x40, value)]
+            .iter()
+            .filter(|(bit, _)| told & bit != 0)
+            .map(|(_, len)| len)
+            .sum::<usize>();
+        let Some(name) = rest.get(before..) else {
+            let what = format!("{} bytes, {before} of them announced as values", rest.len());
+            return Err(self.malformed(asked, what));
+        };
+        Ok(EntryDescription {
+            index,
+            sub,
+            data_type: u16::from_le_bytes([*t0, *t1]),
+            bit_len,
+            access: u16::from_le_bytes([*a0, *a1]),
+            name: text(name),
+        })
+    }
+
+    /// The whole answer, without the headers of its fragments. A device that has the next fragment ready at once fills its
+    /// mailbox before anybody can know that the frame with the one before was lost; asking again does no harm.
+    async fn inquire<W: Wire>(&mut self, w: &W, asked: Asked) -> Result<Vec<u8>, InfoError> {
+        let total = Deadline::after(w, self.port.timeouts.transfer);
+        let mut tries = 1;
+        loop {
+            match self.ask_once(w, asked, &total).await {
+                Err(Ended::Gap(_)) if tries < TRIES => tries += 1,
+                Err(Ended::Gap(error) | Ended::For(error)) => return Err(error),
+                Ok(data) => return Ok(data),
+            }
+        }
+    }
+
+    async fn ask_once<W: Wire>(
+        &mut self,
+        w: &W,
+        asked: Asked,
+        total: &Deadline,
+    ) -> Result<Vec<u8>, Ended> {
+        let body = asked.body();
+        let request = Request::Information {
+            opcode: asked.opcode(),
+            body: &body,
+        };
+        let ready = self.settle(w).await;
+        ready.map_err(|trouble| self.in_trouble(asked, trouble))?;
+        let sent = self.port.send(w, &request).await;
+        sent.map_err(|trouble| self.in_trouble(asked, trouble))?;
+
+        let mut data = Vec::new();
+        // How many fragments are still to come, once the first is here.
+        let mut expected: Option<u16> = None;
+        let mut answer = Deadline::after(w, self.port.timeouts.answer);
+        loop {
+            if total.passed(w) {
+                return Err(self
+                    .in_trouble(asked, Trouble::Timeout(Phase::Transfer))
+                    .into());
+            }
+            let received = self.port.receive(w, &mut answer).await;
+            if let Err(trouble) = received {
+                let silent = matches!(trouble, Trouble::Timeout(Phase::Answer));
+                let error = self.in_trouble(asked, trouble);
+                return Err(match expected {
+                    Some(_) if silent => Ended::Gap(error),
+                    _ => Ended::For(error),
+                });
+            }
+            let fragment = match parse(self.port.message()) {
+                Ok(Message::Information(fragment))
+                    if self.is_answer(asked, expected, &fragment) =>
+                {
+                    fragment
+                }
+                Ok(Message::Information(Fragment {
+                    opcode: ERROR,
+                    data,
+                    ..
+                })) => {
+                    let code = data.first_chunk().map(|code| u32::from_le_bytes(*code));
+                    return Err(match code {
+                        Some(code) => self.aborted(asked, code).into(),
+                        None => self.malformed(asked, "an error without its code").into(),
+                    });
+                }
+                // Some devices refuse what they do not know by the other service.
+                Ok(Message::Sdo(Answer::Abort { code, .. })) => {
+                    return Err(self.aborted(asked, code).into());
+                }
+                Ok(Message::Refused(code)) => {
+                    return Err(InfoError::Refused {
+                        station: self.port.layout.station,
+                        asked,
+                        code,
+                    }
+                    .into());
+                }
+                Ok(_) => {
+                    self.port.set_aside();
+                    if answer.passed(w) {
+                        return Err(self
+                            .in_trouble(asked, Trouble::Timeout(Phase::Answer))
+                            .into());
+                    }
+                    answer.pause(w).await;
+                    continue;
+                }
+                Err(flaw) => return Err(self.malformed(asked, flaw).into()),
+            };
+            let left = fragment.left;
+            if let Some(expected) = expected
+                && left != expected
+            {
+                let what = format!("{left} fragments to come where {expected} were");
+                let error = self.malformed(asked, what);
+                return Err(match left < expected {
+                    true => Ended::Gap(error),
+                    false => Ended::For(error),
+                });
+            }
+            if data.len() + fragment.data.len() > MAX_ANSWER {
+                let what = format!("more than {MAX_ANSWER} bytes");
+                return Err(self.malformed(asked, what).into());
+            }
+            if fragment.data.is_empty() && left > 0 {
+                return Err(self.malformed(asked, "a fragment without data").into());
+            }
+            data.extend_from_slice(fragment.data);
+            match left.checked_sub(1) {
+                Some(next) => expected = Some(next),
+                None => break,
+            }
+            answer = Deadline::after(w, self.port.timeouts.answer);
+        }
+        self.port.free = true;
+        self.unsettled = false;
+        Ok(data)
+    }
+
+    /// Later fragments do not say what they belong to; the mailbox was empty before the first.
+    fn is_answer(&self, asked: Asked, expected: Option<u16>, fragment: &Fragment<'_>) -> bool {
+        fragment.opcode == asked.opcode() + 1 && (expected.is_some() || asked.begins(fragment.data))
+    }
+
+    fn aborted(&mut self, asked: Asked, code: u32) -> InfoError {
+        self.port.free = true;
+        self.unsettled = false;
+        InfoError::Abort {
+            station: self.port.layout.station,
+            asked,
+            code,
+        }
+    }
+
+    fn malformed(&self, asked: Asked, what: impl ToString) -> InfoError {
+        InfoError::Malformed {
+            station: self.port.layout.station,
+            asked,
+            what: what.to_string(),
+        }
+    }
+
+    fn in_trouble(&self, asked: Asked, trouble: Trouble) -> InfoError {
+        let Trouble::Timeout(phase) = trouble else {
+            let station = self.port.layout.station;
+            return InfoError::Mailbox(explain(&self.port, trouble, |_| SdoError::Gone {
+                station,
+            }));
+        };
+        InfoError::Timeout {
+            station: self.port.layout.station,
+            asked,
+            phase,
+            after: self.port.timeouts.of(phase),
+        }
+    }
+}
+
+fn words(bytes: &[u8]) -> impl Iterator<Item = u16> + '_ {
+    bytes.chunks_exact(2).map(|word| match word {
+        [low, high] => u16::from_le_bytes([*low, *high]),
+        _ => 0,
+    })
+}
+
+/// Names are not terminated; some devices do it all the same. Of the Latin alphabet where they are no UTF-8.
+fn text(bytes: &[u8]) -> String {
+    let end = bytes.iter().rposition(|byte| *byte != 0);
+    let bytes = end.and_then(|end| bytes.get(..=end)).unwrap_or_default();
+    match std::str::from_utf8(bytes) {
+        Ok(text) => text.to_owned(),
+        Err(_) => bytes.iter().map(|byte| char::from(*byte)).collect(),
+    }
+}
