@@ -22,6 +22,7 @@ mod report;
 mod run;
 mod signals;
 mod sim;
+mod table;
 mod tables;
 
 pub(crate) use hints::Failure;

@@ -6,6 +6,8 @@ use ecaxis::config::duration;
 use ecaxis::rt::stats::Percentiles;
 use ecaxis::session::{AxisSummary, DeviceErrors, EventLine, Summary, ThreadSummary};
 
+pub(crate) use super::table::Table;
+
 /// The whole result of a run.
 pub(crate) fn summary(summary: &Summary) -> String {
     let mut text = head(summary);
@@ -310,123 +312,6 @@ fn positive_zero(x: f64) -> f64 {
     if x.abs() < 0.000_05 { 0.0 } else { x }
 }
 
-/// Columns as wide as their widest cell.
-#[derive(Debug)]
-pub(crate) struct Table {
-    rows: Vec<Vec<String>>,
-}
-
-impl Table {
-    pub fn new(head: &[&str]) -> Self {
-        Self {
-            rows: vec![head.iter().map(|cell| (*cell).to_owned()).collect()],
-        }
-    }
-
-    pub fn row<const N: usize>(&mut self, cells: [&str; N]) {
-        self.line(cells.map(ToOwned::to_owned).to_vec());
-    }
-
-    /// A row of as many cells as the head has.
-    pub fn line(&mut self, cells: Vec<String>) {
-        self.rows.push(cells);
-    }
-
-    /// Without a line end after the last row.
-    pub fn indented(&self, by: usize) -> String {
-        self.fitted(by, None)
-    }
-
-    /// For a result that may be read on a terminal: there, long cells are broken so that lines need not be.
-    pub fn shown(&self, by: usize) -> String {
-        self.fitted(by, terminal_width())
-    }
-
-    /// The widest columns give way until a line has no more than `limit` characters.
-    fn fitted(&self, by: usize, limit: Option<usize>) -> String {
-        let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
-        let width = |column: usize| {
-            let cells = self.rows.iter().filter_map(|row| row.get(column));
-            cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
-        };
-        let mut widths: Vec<usize> = (0..columns).map(width).collect();
-        let between = by + GAP * columns.saturating_sub(1);
-        let limit = limit.unwrap_or(usize::MAX);
-        while widths.iter().sum::<usize>() + between > limit {
-            let widest = widths
-                .iter_mut()
-                .filter(|width| **width > NARROWEST)
-                .max_by_key(|width| **width);
-            let Some(widest) = widest else { break };
-            *widest -= 1;
-        }
-        let mut lines = Vec::new();
-        for row in &self.rows {
-            let cells: Vec<Vec<String>> = row
-                .iter()
-                .zip(&widths)
-                .map(|(cell, width)| broken(cell, *width))
-                .collect();
-            let height = cells.iter().map(Vec::len).max().unwrap_or(0).max(1);
-            for n in 0..height {
-                let mut line = " ".repeat(by);
-                for (column, (cell, width)) in cells.iter().zip(&widths).enumerate() {
-                    let part = cell.get(n).map_or("", String::as_str);
-                    let gap = if column == 0 { 0 } else { GAP };
-                    line += &format!("{:gap$}{part:<width$}", "");
-                }
-                lines.push(line.trim_end().to_owned());
-            }
-        }
-        lines.join("\n")
-    }
-}
-
-/// Between columns.
-const GAP: usize = 2;
-/// No column is made narrower to fit a terminal.
-const NARROWEST: usize = 14;
-
-/// `None`: the result goes to a file or another program.
-fn terminal_width() -> Option<usize> {
-    let size = rustix::termios::tcgetwinsize(std::io::stdout()).ok()?;
-    Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
-}
-
-/// In lines of at most `width` characters, between words where there is a place.
-fn broken(cell: &str, width: usize) -> Vec<String> {
-    if cell.chars().count() <= width {
-        return vec![cell.to_owned()];
-    }
-    let mut lines = vec![String::new()];
-    for word in cell.split_inclusive(' ') {
-        let mut word: Vec<char> = word.chars().collect();
-        loop {
-            let used = lines.last().map_or(0, |line| line.chars().count());
-            let bare = word.iter().rposition(|c| *c != ' ').map_or(0, |at| at + 1);
-            if used + bare <= width {
-                break;
-            }
-            if used > 0 {
-                lines.push(String::new());
-                continue;
-            }
-            // A word longer than a line.
-            lines.pop();
-            lines.push(word.drain(..width.max(1)).collect());
-            lines.push(String::new());
-        }
-        if let Some(line) = lines.last_mut() {
-            line.extend(word);
-        }
-    }
-    lines.retain(|line| !line.trim().is_empty());
-    lines
-        .into_iter()
-        .map(|line| line.trim_end().to_owned())
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -575,42 +460,5 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
   sleeping ends late by 120 ns (p50), 1.5 µs (p99), 2 µs (p99.9); 34 µs are spun before a release
 ";
         assert!(self::summary(&summary).contains(expected));
-    }
-
-    #[test]
-    fn columns_align() {
-        let mut table = Table::new(&["a", "bé", "c"]);
-        table.row(["long", "x", ""]);
-        assert_eq!(table.indented(1), " a     bé  c\n long  x");
-    }
-
-    #[test]
-    fn a_terminal_too_narrow_breaks_cells_and_loses_nothing() {
-        let mut table = Table::new(&["no", "what it takes", "name"]);
-        table.row([
-            "1",
-            "one module, another module, a third",
-            "an_endless_name_without_a_space",
-        ]);
-        let expected = "  no  what it takes     name
-  1   one module,       an_endless_name_
-      another module,   without_a_space
-      a third";
-        assert_eq!(table.fitted(2, Some(40)), expected);
-        assert_eq!(table.fitted(2, Some(400)), table.indented(2));
-        for limit in 0..100 {
-            let text = table.fitted(0, Some(limit));
-            let letters = |text: &str| {
-                let mut all: Vec<char> = text.chars().filter(|c| !c.is_whitespace()).collect();
-                all.sort_unstable();
-                all
-            };
-            assert_eq!(letters(&text), letters(&table.indented(0)), "{limit}");
-            let widest = text.lines().map(|line| line.chars().count()).max();
-            assert!(
-                widest <= Some(limit.max(2 * NARROWEST + 2 + 2 * GAP)),
-                "{limit}: {text}"
-            );
-        }
     }
 }
