@@ -222,3 +222,111 @@ fn an_esi_file_of_another_device() {
         &["no mode csp", "mode", "^"],
     );
 }
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).expect("UTF-8")
+}
+
+#[test]
+fn help_of_every_verb_fits_80_columns_and_has_examples() {
+    let run = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+            .args(arguments)
+            .env("COLUMNS", "80")
+            .output()
+            .expect("the binary runs");
+        assert_eq!(output.status.code(), Some(0), "{arguments:?}");
+        text(&output.stdout)
+    };
+    let all = run(&["--help"]);
+    let verbs = all
+        .lines()
+        .skip_while(|line| *line != "Commands:")
+        .skip(1)
+        .take_while(|line| !line.is_empty())
+        .filter_map(|line| line.strip_prefix("  ")?.split(' ').next())
+        .filter(|verb| !verb.is_empty() && *verb != "help");
+    let verbs: Vec<&str> = verbs.collect();
+    assert!(verbs.len() >= 9, "{verbs:?}");
+    for verb in verbs {
+        let help = run(&[verb, "--help"]);
+        assert!(help.contains("Examples:\n  "), "{verb}: {help}");
+        assert!(!help.contains('\u{1b}'), "{verb} has colours: {help:?}");
+        for line in help.lines() {
+            assert!(line.chars().count() <= 80, "{verb}: `{line}`");
+        }
+    }
+}
+
+#[test]
+fn shells_get_their_completions() {
+    for (shell, parts) in [
+        ("bash", &["complete -F _ecaxis", "--faults"][..]),
+        ("zsh", &["#compdef ecaxis", "--faults"]),
+        ("fish", &["complete -c ecaxis", "faults"]),
+    ] {
+        let output = ecaxis(&["completions", shell]);
+        assert_eq!(output.status.code(), Some(0));
+        let script = text(&output.stdout);
+        for part in parts.iter().chain(&["doctor", "explain"]) {
+            assert!(script.contains(part), "`{part}` is not in that of {shell}");
+        }
+    }
+    assert_eq!(ecaxis(&["completions", "dos"]).status.code(), Some(2));
+}
+
+#[test]
+fn the_manual_has_a_page_for_every_verb() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let man = folder.path().join("man1");
+    let path = man.to_str().expect("UTF-8");
+    assert_eq!(ecaxis(&["man", "--out", path]).status.code(), Some(0));
+    for (page, parts) in [
+        ("ecaxis.1", &[".TH ecaxis 1", "ecaxis\\-run(1)"][..]),
+        (
+            "ecaxis-run.1",
+            &[".TH ecaxis-run 1", "\\-\\-faults", ".SH EXAMPLES\n.nf"],
+        ),
+        (
+            "ecaxis-esi-show.1",
+            &["ecaxis esi show", "\\-\\-assignment"],
+        ),
+    ] {
+        let text = std::fs::read_to_string(man.join(page)).expect(page);
+        for part in parts {
+            assert!(text.contains(part), "`{part}` is not in {page}:\n{text}");
+        }
+    }
+    let one = ecaxis(&["man"]);
+    let kept = std::fs::read(man.join("ecaxis.1")).expect("read above");
+    assert_eq!(
+        one.stdout, kept,
+        "the page on stdout is the one in the folder"
+    );
+    // A file stands in the way.
+    let refused = ecaxis(&["man", "--out", &format!("{path}/ecaxis.1")]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(text(&refused.stderr).contains("cannot write"));
+}
+
+#[test]
+fn colours_only_where_they_are_wanted() {
+    let stderr = |variables: &[(&str, &str)]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+            .args(["check", "configs/no-such.toml"])
+            .env_remove("NO_COLOR")
+            .env_remove("CLICOLOR_FORCE")
+            .envs(variables.iter().copied())
+            .current_dir(root())
+            .output()
+            .expect("the binary runs");
+        text(&output.stderr)
+    };
+    let plain = stderr(&[]);
+    assert!(plain.starts_with("error: "), "{plain:?}");
+    assert!(!plain.contains('\u{1b}'), "{plain:?}");
+    let coloured = stderr(&[("CLICOLOR_FORCE", "1")]);
+    assert!(coloured.contains("\u{1b}["), "{coloured:?}");
+    let both = [("CLICOLOR_FORCE", "1"), ("NO_COLOR", "1")];
+    assert_eq!(stderr(&both), plain, "NO_COLOR wins");
+}

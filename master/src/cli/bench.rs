@@ -23,12 +23,14 @@ use super::{Failure, hints, note, result, signals};
 const SHORTEST: u64 = 20_000;
 const LONGEST: u64 = 100_000_000;
 
-const EXAMPLES: &str = "Examples:
-  ecaxis bench                                  8 axes at 1 ms over a pair of virtual interfaces (root)
-  ecaxis bench --cycle 250us --against cyclictest --against sleep --html report.html
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis bench                      8 axes at 1 ms over a pair of virtual
+                                    interfaces; needs root
+  ecaxis bench --cycle 250us --against cyclictest --html report.html
   ecaxis bench --cycle 125us --exchange pipelined --hold wire --axes 16
-  ecaxis bench --sim --axes 100 --cycle 250us   the work of a cycle; no root, no exchange
-  ecaxis bench --machine m.toml                 the file's real bus, axes without power";
+  ecaxis bench --sim --axes 100     the work of a cycle; no root, no exchange
+  ecaxis bench --machine m.toml     the file's real bus, axes without power";
 
 /// Measure the cycle on this computer, and compare it
 ///

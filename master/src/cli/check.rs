@@ -7,8 +7,14 @@ use serde_json::json;
 
 use super::{Failure, hints, result};
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis check machine.toml
+  ecaxis check machine.toml --json          for an editor or a script";
+
 /// Check a machine file against its ESI files, without a bus
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]

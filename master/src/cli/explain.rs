@@ -15,8 +15,14 @@ mod stop;
 use super::tables::{fields, startup};
 use super::{Failure, hints, report::Table, result};
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis explain machine.toml
+  ecaxis explain machine.toml | less";
+
 /// Show what a machine file and its ESI files come to: PDOs, start-up SDOs, clocks, frames
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]

@@ -2,7 +2,7 @@
 //!
 //! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
 //! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile;
-//! [`record`] keeps a recording from destroying another file.
+//! [`record`] keeps a recording from destroying another file; [`style`] decides about colours.
 
 use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
@@ -12,24 +12,38 @@ use tracing_subscriber::EnvFilter;
 
 mod bench;
 mod check;
+mod completions;
 mod doctor;
 mod esi;
 mod explain;
 mod hints;
+mod man;
 mod progress;
 mod record;
 mod report;
 mod run;
 mod signals;
 mod sim;
+mod style;
 mod table;
 mod tables;
 
 pub(crate) use hints::Failure;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis check machine.toml          every mistake in the machine file at once
+  ecaxis explain machine.toml        what follows from it
+  ecaxis run machine.toml --sim      its program on the simulated bus
+  ecaxis run machine.toml            on the file's network interface
+  ecaxis help run                    the options of a verb, with examples
+
+Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
+line is wrong. NO_COLOR=1 switches colours off, CLICOLOR_FORCE=1 on.";
+
 /// An EtherCAT master for CiA 402 drives in the cyclic synchronous modes.
 #[derive(Debug, Parser)]
-#[command(version, propagate_version = true, max_term_width = 100)]
+#[command(version, propagate_version = true, max_term_width = 100, after_help = EXAMPLES)]
 struct Cli {
     #[command(subcommand)]
     verb: Verb,
@@ -44,6 +58,8 @@ enum Verb {
     Sim(sim::Args),
     Doctor(doctor::Args),
     Bench(bench::Args),
+    Completions(completions::Args),
+    Man(man::Args),
 }
 
 #[derive(Debug, clap::Args)]
@@ -70,7 +86,7 @@ impl Verbosity {
         tracing_subscriber::fmt()
             .with_env_filter(filter)
             .with_writer(io::stderr)
-            .with_ansi(stderr_is_terminal())
+            .with_ansi(style::on_stderr())
             .with_timer(tracing_subscriber::fmt::time::uptime())
             .init();
     }
@@ -85,7 +101,12 @@ pub fn main() -> ExitCode {
         | Verb::Bench(bench::Args { verbosity, .. }) => {
             verbosity.start_logging();
         }
-        Verb::Check(_) | Verb::Explain(_) | Verb::Esi(_) | Verb::Doctor(_) => {}
+        Verb::Check(_)
+        | Verb::Explain(_)
+        | Verb::Esi(_)
+        | Verb::Doctor(_)
+        | Verb::Completions(_)
+        | Verb::Man(_) => {}
     }
     let done = match cli.verb {
         Verb::Run(args) => run::run(&args),
@@ -95,6 +116,8 @@ pub fn main() -> ExitCode {
         Verb::Sim(args) => sim::run(&args),
         Verb::Doctor(args) => doctor::run(&args),
         Verb::Bench(args) => bench::run(&args),
+        Verb::Completions(args) => completions::run(&args),
+        Verb::Man(args) => man::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -124,8 +147,12 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
 
 /// A line on stderr.
 pub(crate) fn note(text: &str) {
-    let mut err = io::stderr().lock();
-    let _ = writeln!(err, "{text}");
+    let _ = style::complaint(&mut style::stderr(), text);
+}
+
+/// What the command line takes, without what is read from it.
+fn command() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
 }
 
 pub(crate) fn stderr_is_terminal() -> bool {
@@ -147,8 +174,40 @@ mod tests {
     }
 
     #[test]
+    fn every_verb_has_examples_that_fit_a_terminal_and_are_right() {
+        fn look(verb: &clap::Command, path: &str) {
+            let path = format!("{path} {}", verb.get_name());
+            if verb.get_name() == "help" {
+                return;
+            }
+            let help = verb.get_after_help().map(ToString::to_string);
+            let help = help.unwrap_or_default();
+            assert!(help.contains("Examples:\n"), "{path} has no examples");
+            for line in help.lines() {
+                assert!(line.chars().count() <= 80, "{path}: `{line}` is too wide");
+                let Some(example) = line.trim().strip_prefix("ecaxis ") else {
+                    continue;
+                };
+                // What the example is about stands behind a wide gap.
+                let words = example.split("   ").next().unwrap_or_default();
+                let words = words.split(['>', '|']).next().unwrap_or_default();
+                let line = std::iter::once("ecaxis").chain(words.split_whitespace());
+                match Cli::try_parse_from(line) {
+                    Ok(_) => {}
+                    Err(e) if e.kind() == clap::error::ErrorKind::DisplayHelp => {}
+                    Err(e) => panic!("{path}: `{words}`: {e}"),
+                }
+            }
+            for verb in verb.get_subcommands() {
+                look(verb, &path);
+            }
+        }
+        look(&command(), "");
+    }
+
+    #[test]
     fn arguments_are_consistent() {
-        <Cli as clap::CommandFactory>::command().debug_assert();
+        command().debug_assert();
         for (line, good) in [
             ("ecaxis run", true),
             (

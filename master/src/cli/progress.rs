@@ -10,7 +10,7 @@ use ecaxis::session::{AxisLine, Observer, Progress, Status};
 use ecaxis_axis::Mode;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{hints, note, stderr_is_terminal};
+use super::{hints, note, style};
 
 /// Virtual time makes an hour of status lines in seconds; people read one a second.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
@@ -29,7 +29,7 @@ pub(crate) struct Teller {
 impl Teller {
     /// `plain`: do not rewrite lines, log lines come in between.
     pub fn new(clock: Clock, bus: &Bus, plain: bool) -> Self {
-        let bar = (stderr_is_terminal() && !plain).then(|| {
+        let bar = (style::rewrites() && !plain).then(|| {
             let bar = ProgressBar::new_spinner();
             let style = ProgressStyle::with_template("{spinner} {wide_msg}");
             bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()))

@@ -13,8 +13,21 @@ use serde_json::{Value, json};
 use super::progress::Teller;
 use super::{Failure, check, hints, note, record, report, result, signals};
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis run                                the demonstration, simulated
+  ecaxis run m.toml --sim --virtual         as fast as the computer can
+  ecaxis run m.toml --nic enp3s0 --for 1h   for an hour on a real bus
+  ecaxis run m.toml --record bus.pcapng     every frame kept for Wireshark
+  ecaxis run m.toml --sim --faults f.toml   with things that go wrong
+  ecaxis run m.toml --json                  the result for a script
+
+Ctrl-C at any time: the axes decelerate within their limits, lose power, and
+the bus goes back to Init.";
+
 /// Bring a machine up, run its program, and show what the bus and the axes did
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE", default_value = "configs/demo.toml")]

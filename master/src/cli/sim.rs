@@ -17,8 +17,18 @@ use super::{Failure, hints, note, result, run, signals};
 /// SCHED_FIFO priority of the simulated bus; below that of a master on the same computer.
 const PRIORITY: u8 = 70;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis sim m.toml --nic veth0             for a MainDevice at the other end
+  ecaxis sim m.toml --nic veth0 --nic2 veth2
+  ecaxis sim m.toml --nic veth0 --faults f.toml --sii eeproms
+
+`ip link add veth0 type veth peer name veth1` makes two interfaces that are
+connected; needs root, or cap_net_raw.";
+
 /// Serve the machine's bus, simulated, on a network interface until Ctrl-C
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]

@@ -8,8 +8,14 @@ use serde_json::json;
 
 use super::super::{Failure, hints, note, result};
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi check f.xml
+  ecaxis esi check f.xml --json             for an editor or a script";
+
 /// Tell every mistake in an ESI file, with its line, element and weight
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// ESI file
     #[arg(value_name = "FILE")]

@@ -9,8 +9,14 @@ use super::super::report::Table;
 use super::super::{Failure, hints, note, result};
 use super::Which;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi diff f.xml eeprom.bin
+  ecaxis esi diff f.xml eeprom.bin --revision 0x1700000 --json";
+
 /// Compare an EEPROM image with what the ESI file says; exit code 1 if the device would behave differently
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
     which: Which,

@@ -9,8 +9,15 @@ use serde_json::json;
 use super::super::report::Table;
 use super::super::{Failure, hints, note, result};
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi list esi/
+  ecaxis esi list esi/ --vendor 0xfb        of one vendor
+  ecaxis esi list esi/ --vendor 0xfb --product 0x63500000 --revision 0x1700000";
+
 /// List the devices in a file or in a folder of ESI files; with an identity, the description that fits it best
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// ESI file, or a folder of them
     #[arg(value_name = "PATH")]

@@ -16,8 +16,16 @@ mod objects;
 mod show;
 mod sii;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi list esi/                      devices of a folder of files
+  ecaxis esi show f.xml --device EPOS4 --mode csp
+  ecaxis esi check f.xml                    mistakes, with line and column
+  ecaxis esi sii f.xml --device 0x63500000 -o eeprom.bin";
+
 /// Look into ESI files: devices, PDOs, modes, mistakes, EEPROM images
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(subcommand)]
     verb: Verb,

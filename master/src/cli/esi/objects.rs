@@ -7,8 +7,15 @@ use super::super::report::Table;
 use super::super::{Failure, hints, result};
 use super::Which;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi objects f.xml --device EPOS4
+  ecaxis esi objects f.xml --mode csp       with the objects of a module
+  ecaxis esi objects f.xml --json           for a script";
+
 /// Show the object dictionary: types, access, defaults, ranges, what can be mapped
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
     which: Which,

@@ -7,8 +7,14 @@ use ecaxis_esi::sii::{self, SiiOptions};
 use super::super::{Failure, hints, note};
 use super::Which;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi sii f.xml --output eeprom.bin
+  ecaxis esi sii f.xml --device EPOS4 --serial 7 --alias 1001 -o eeprom.bin";
+
 /// Write the EEPROM image (SII) that follows from an ESI file
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
     which: Which,

@@ -17,8 +17,16 @@ mod chosen;
 mod head;
 mod offers;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi show f.xml                     what devices there are
+  ecaxis esi show f.xml --device EPOS4      one of them, as it comes
+  ecaxis esi show f.xml --device EPOS4 --mode csp --cycle 2ms
+  ecaxis esi show f.xml --device 2 --modules CSP,- --json";
+
 /// Show a device: identity, modes, PDOs, SyncManagers, clocks, start-up commands
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
     which: Which,

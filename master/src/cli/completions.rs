@@ -1,0 +1,25 @@
+//! `ecaxis completions`: what a shell needs to complete verbs, options and files.
+
+use clap_complete::Shell;
+
+use super::{Failure, command, result};
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis completions bash > ~/.local/share/bash-completion/completions/ecaxis
+  ecaxis completions zsh > ~/.zfunc/_ecaxis        with ~/.zfunc in `fpath`
+  ecaxis completions fish > ~/.config/fish/completions/ecaxis.fish";
+
+/// Print the completions of a shell
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[arg(value_name = "SHELL")]
+    shell: Shell,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let mut out = Vec::new();
+    clap_complete::generate(args.shell, &mut command(), "ecaxis", &mut out);
+    result(&String::from_utf8_lossy(&out))
+}
