@@ -69,6 +69,35 @@ impl Datagrams {
     }
 }
 
+impl Datagrams {
+    /// To everybody (BWR); returns how many took it.
+    ///
+    /// # Errors
+    /// [`WireError`], without a station.
+    pub async fn write_all(&self, register: u16, data: &[u8]) -> Result<u16, WireError> {
+        let answer = Command::bwr(register)
+            .with_wkc(0)
+            .send_receive_slice(self.device, data)
+            .await;
+        working_counter(answer.map(|_| ()), 0, 0, register)
+    }
+}
+
+impl Datagrams {
+    /// The system time of one device to all behind it (FRMW 0x0910); returns the working counter.
+    ///
+    /// # Errors
+    /// [`WireError`].
+    pub async fn distribute_time(&self, station: u16) -> Result<u16, WireError> {
+        const SYSTEM_TIME: u16 = 0x0910;
+        let answer = Command::frmw(station, SYSTEM_TIME)
+            .with_wkc(1)
+            .receive_slice(self.device, 8)
+            .await;
+        working_counter(answer.map(|_| ()), 1, station, SYSTEM_TIME)
+    }
+}
+
 fn length(buf: &[u8]) -> Result<u16, WireError> {
     u16::try_from(buf.len())
         .map_err(|_| WireError::Other(format!("a datagram cannot read {} bytes", buf.len())))

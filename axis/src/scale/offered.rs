@@ -72,6 +72,21 @@ pub fn same_motor(expected: u32, found: u32) -> bool {
 const POLARITIES: u8 = 0xC0;
 
 impl Offered {
+    /// Position units per motor turn, as 0x608F, 0x6091 and 0x6092 together make them, and the index of the object that decides. `None`
+    /// where the drive does not say.
+    #[must_use]
+    pub fn counts_per_turn(&self) -> Option<(u16, f64)> {
+        let ratio = |ratio: Option<[u32; 2]>| {
+            let [above, below] = ratio.filter(|[above, below]| *above > 0 && *below > 0)?;
+            Some(f64::from(above) / f64::from(below))
+        };
+        said(
+            ratio(self.encoder_resolution),
+            ratio(self.gear_ratio),
+            ratio(self.feed_constant),
+        )
+    }
+
     /// Everything that contradicts `scale` and, where it is given, the rated torque (in the unit of 0x6076). Allocates: not for the cycle.
     #[must_use]
     pub fn contradictions(&self, scale: &Scale, rated_torque: Option<u32>) -> Vec<Contradiction> {
@@ -130,26 +145,33 @@ impl Offered {
     }
 }
 
+/// Position units per motor turn, and the object that decides.
+///
 /// A drive with a feed constant counts that much per turn of the driving shaft; one without counts its encoder. A feed of 1 is what drives
 /// have that do not use it: none could be positioned with one count per turn.
+fn said(encoder: Option<f64>, gear: Option<f64>, feed: Option<f64>) -> Option<(u16, f64)> {
+    let feed = feed.filter(|&feed| feed != 1.0);
+    let gear_ratio = gear.unwrap_or(1.0);
+    match (feed, encoder) {
+        (Some(counts), _) => Some((0x6092, counts / gear_ratio)),
+        (None, Some(counts)) if gear_ratio != 1.0 => Some((0x6091, counts / gear_ratio)),
+        (None, Some(counts)) => Some((0x608F, counts)),
+        (None, None) => None,
+    }
+}
+
 fn counts_per_turn(
     encoder: Option<f64>,
     gear: Option<f64>,
     feed: Option<f64>,
     scale: &Scale,
 ) -> Option<Contradiction> {
-    let feed = feed.filter(|&feed| feed != 1.0);
-    let gear_ratio = gear.unwrap_or(1.0);
-    let geared = gear_ratio != 1.0;
-    let per_shaft_turn = feed.or(encoder);
     let expected = scale.counts_per_turn();
-    let (index, found) = match (feed, per_shaft_turn) {
-        (Some(_), Some(counts)) => (0x6092, counts / gear_ratio),
-        (None, Some(counts)) if geared => (0x6091, counts / gear_ratio),
-        (None, Some(counts)) => (0x608F, counts),
+    let (index, found) = match (said(encoder, gear, feed), gear) {
+        (Some(said), _) => said,
         // Without either, a gear still stretches what the encoder is known to count.
-        (_, None) if geared => (0x6091, expected / gear_ratio),
-        (_, None) => return None,
+        (None, Some(gear)) if gear != 1.0 => (0x6091, expected / gear),
+        (None, _) => return None,
     };
     let same = (found - expected).abs() <= expected * SAME;
     (!same).then_some(Contradiction::CountsPerTurn {

@@ -10,6 +10,7 @@ use crate::clock::Nanos;
 use crate::config::Machine;
 use crate::mailbox::Wire;
 use crate::rt::phase::ClockPlan;
+use crate::wire::Datagrams;
 
 const STEP: &str = "starting SYNC0";
 const SYSTEM_TIME: u16 = 0x0910;
@@ -109,6 +110,61 @@ pub(super) async fn configure(
     Err(BringUpError::NoStart {
         device: reference.at.clone(),
     })
+}
+
+/// Sets the clocks anew, by the first device that has one. ethercrab takes the first that has receive times for the reference; where that one
+/// has no system time, everybody else has been told of a time of zero.
+pub(super) async fn set_anew(wire: &Datagrams, devices: &[BusDevice]) -> Result<(), BringUpError> {
+    const STEP: &str = "setting the clocks";
+    const RECEIVE_TIMES: u16 = 0x0900;
+    const RECEIVE_TIME: u16 = 0x0918;
+    const OFFSET: u16 = 0x0920;
+    const DELAY: u16 = 0x0928;
+    const SPEED_START: u16 = 0x0930;
+    /// As after reset; writing it starts the loop anew, from the bare crystal.
+    const DEFAULT_SPEED_START: u16 = 0x1000;
+    /// As many as ethercrab sends.
+    const STATIC_SYNC_CYCLES: u32 = 1_000;
+
+    let clocks = || devices.iter().filter(|device| device.dc);
+    let Some(reference) = clocks().min_by_key(|device| device.at.position) else {
+        return Ok(());
+    };
+    let delay = |device: &BusDevice| {
+        let behind = device.propagation_delay;
+        behind.saturating_sub(reference.propagation_delay)
+    };
+    for device in clocks() {
+        let start = DEFAULT_SPEED_START.to_le_bytes();
+        write(wire, device, STEP, SPEED_START, &start).await?;
+        write(wire, device, STEP, DELAY, &delay(device).to_le_bytes()).await?;
+    }
+    let failed = |source| BringUpError::Wire {
+        device: reference.at.clone(),
+        step: STEP,
+        source,
+    };
+    wire.write_all(RECEIVE_TIMES, &[0; 4])
+        .await
+        .map_err(failed)?;
+    let mut offset = [0; 8];
+    read(wire, reference, STEP, OFFSET, &mut offset).await?;
+    let mut local = [0; 8];
+    read(wire, reference, STEP, RECEIVE_TIME, &mut local).await?;
+    // The system time at which the frame was at the reference clock.
+    let then = u64::from_le_bytes(local).wrapping_add(u64::from_le_bytes(offset));
+    for device in clocks().filter(|device| device.at != reference.at) {
+        read(wire, device, STEP, RECEIVE_TIME, &mut local).await?;
+        let there = then.wrapping_add(u64::from(delay(device)));
+        let offset = there.wrapping_sub(u64::from_le_bytes(local));
+        write(wire, device, STEP, OFFSET, &offset.to_le_bytes()).await?;
+    }
+    for _ in 0..STATIC_SYNC_CYCLES {
+        wire.distribute_time(reference.at.station)
+            .await
+            .map_err(failed)?;
+    }
+    Ok(())
 }
 
 /// Some devices take receive times for others' sake and have no clock beyond that: what they say in 0x0008 is the

@@ -3,7 +3,7 @@
 use ecaxis_esi::model::Identity;
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
-use super::{BringUpError, DeviceRef, Group, al, scan_error};
+use super::{BringUpError, DeviceRef, Group, Step, al, scan_error};
 use crate::config::{Locator, Machine};
 use crate::mailbox::WireError;
 use crate::wire::Datagrams;
@@ -12,6 +12,14 @@ use crate::wire::Datagrams;
 const TRIES: u32 = 5;
 /// Station addresses as ethercrab gives them out.
 const FIRST_STATION: u16 = 0x1000;
+
+/// A SubDevice that was scanned.
+struct Present {
+    identity: Identity,
+    serial: u32,
+    alias: u16,
+    station: u16,
+}
 
 /// At least one SubDevice answers a broadcast.
 pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
@@ -71,14 +79,16 @@ pub(super) async fn assign(
     main_device: &MainDevice<'static>,
     group: &Group,
     machine: &Machine,
+    progress: &mut dyn FnMut(Step),
 ) -> Result<Vec<u16>, BringUpError> {
     let mut found = Vec::with_capacity(group.len());
     for sub_device in group.iter(main_device) {
-        found.push((
-            identity(sub_device.identity()),
-            sub_device.alias_address(),
-            sub_device.configured_address(),
-        ));
+        found.push(Present {
+            identity: identity(sub_device.identity()),
+            serial: sub_device.identity().serial,
+            alias: sub_device.alias_address(),
+            station: sub_device.configured_address(),
+        });
     }
 
     let mut order = Vec::with_capacity(machine.devices.len());
@@ -88,7 +98,7 @@ pub(super) async fn assign(
             Locator::Position(position) => {
                 (usize::from(position) < found.len()).then_some(usize::from(position))
             }
-            Locator::Alias(alias) => found.iter().position(|(_, a, _)| *a == alias),
+            Locator::Alias(alias) => found.iter().position(|f| f.alias == alias),
             Locator::Id(id) => find_id(wire, &found, id).await,
         };
         match position {
@@ -113,8 +123,8 @@ pub(super) async fn assign(
         let list: Vec<_> = found
             .iter()
             .enumerate()
-            .map(|(position, (identity, ..))| {
-                format!("position {position}: {}", known(machine, *identity))
+            .map(|(position, found)| {
+                format!("position {position}: {}", known(machine, found.identity))
             })
             .collect();
         return Err(BringUpError::Missing {
@@ -126,24 +136,44 @@ pub(super) async fn assign(
     }
 
     for (config, &position) in machine.devices.iter().zip(&order) {
-        let (identity, _, station) = found[usize::from(position)];
+        let &Present {
+            identity,
+            serial,
+            station,
+            ..
+        } = &found[usize::from(position)];
         let expected = config.selection.identity;
-        if (expected.vendor, expected.product, expected.revision)
-            != (identity.vendor, identity.product, identity.revision)
-        {
+        let device = || DeviceRef {
+            name: config.name.clone(),
+            position,
+            station,
+        };
+        let product = (expected.vendor, expected.product) == (identity.vendor, identity.product);
+        let rule = config.identity;
+        if !product || !rule.accepts(expected.revision, identity.revision) {
             return Err(BringUpError::Identity {
-                device: DeviceRef {
-                    name: config.name.clone(),
-                    position,
-                    station,
-                },
+                device: device(),
                 esi: config.esi_path.display().to_string(),
                 expected: format!("{} ({expected})", config.selection.device_name),
                 found: known(machine, identity),
             });
         }
+        if expected.revision != identity.revision {
+            let at = device();
+            let (found, described) = (identity.revision, expected.revision);
+            progress(Step::Warning(format!(
+                "{at}: revision 0x{found:08x} stands for 0x{described:08x} of its ESI (identity = \"{rule}\")"
+            )));
+        }
+        if let Some(expected) = config.serial.filter(|expected| *expected != serial) {
+            return Err(BringUpError::Serial {
+                device: device(),
+                expected,
+                found: serial,
+            });
+        }
     }
-    for (position, (identity, ..)) in found.iter().enumerate() {
+    for (position, Present { identity, .. }) in found.iter().enumerate() {
         let position = u16::try_from(position).unwrap_or(u16::MAX);
         if !order.contains(&position) {
             return Err(BringUpError::Unexpected {
@@ -162,8 +192,8 @@ fn not_located(name: &str, locator: String) -> BringUpError {
     }
 }
 
-async fn find_id(wire: &Datagrams, found: &[(Identity, u16, u16)], id: u16) -> Option<usize> {
-    for (position, &(_, _, station)) in found.iter().enumerate() {
+async fn find_id(wire: &Datagrams, found: &[Present], id: u16) -> Option<usize> {
+    for (position, &Present { station, .. }) in found.iter().enumerate() {
         if matches!(al::read_explicit_id(wire, station).await, Ok(Some(actual)) if actual == id) {
             return Some(position);
         }

@@ -28,7 +28,7 @@ mod held;
 mod identify;
 mod mailbox;
 mod mapping;
-mod units;
+pub(crate) mod units;
 
 pub use al::{AlState, StateError};
 use device::Moment;
@@ -168,6 +168,14 @@ pub enum BringUpError {
         expected: String,
         found: String,
     },
+    #[error(
+        "{device}: identify: the machine file names serial number {expected}, the device has {found}"
+    )]
+    Serial {
+        device: DeviceRef,
+        expected: u32,
+        found: u32,
+    },
     #[error("`{name}`: no SubDevice has {locator}")]
     NotLocated { name: String, locator: String },
     #[error(
@@ -255,12 +263,14 @@ pub async fn bring_up(
         Ok(group) => group,
         Err(error) => return Err(identify::explain_scan(&wire, machine, error).await),
     };
-    let order = identify::assign(&wire, main_device, &group, machine).await?;
+    let order = identify::assign(&wire, main_device, &group, machine, progress).await?;
     progress(Step::Found {
         devices: order.len(),
     });
 
     let mut devices = Vec::with_capacity(order.len());
+    // Everybody with receive times, and whether there is a clock behind them.
+    let mut timed = Vec::new();
     for (config, &position) in machine.devices.iter().zip(&order) {
         let sub_device = group
             .subdevice(main_device, usize::from(position))
@@ -277,8 +287,11 @@ pub async fn bring_up(
             sub_device.dc_support(),
             sub_device.propagation_delay()
         );
-        let dc = !matches!(sub_device.dc_support(), DcSupport::None)
-            && clocks::has_system_time(&wire, &at).await?;
+        let receive_times = !matches!(sub_device.dc_support(), DcSupport::None);
+        let dc = receive_times && clocks::has_system_time(&wire, &at).await?;
+        if receive_times {
+            timed.push((position, dc));
+        }
         devices.push(BusDevice {
             coe: mailbox::open(&wire, config, &at).await?.map(CoeClient::new),
             at,
@@ -287,6 +300,10 @@ pub async fn bring_up(
             dc,
             propagation_delay: sub_device.propagation_delay(),
         });
+    }
+
+    if timed.iter().min().is_some_and(|(_, clock)| !clock) {
+        clocks::set_anew(&wire, &devices).await?;
     }
 
     for (config, device) in machine.devices.iter().zip(&mut devices) {

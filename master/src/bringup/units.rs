@@ -55,7 +55,11 @@ pub(super) async fn compare(
 }
 
 /// `constant`: also for the motor's torque constant.
-async fn ask(wire: &impl Wire, coe: &mut CoeClient, constant: bool) -> Result<Offered, SdoError> {
+pub(crate) async fn ask(
+    wire: &impl Wire,
+    coe: &mut CoeClient,
+    constant: bool,
+) -> Result<Offered, SdoError> {
     Ok(Offered {
         encoder_resolution: ratio(wire, coe, 0x608f).await?,
         gear_ratio: ratio(wire, coe, 0x6091).await?,
@@ -87,7 +91,7 @@ async fn ratio(
 }
 
 /// `None` where the drive does not have it, or does not let it be read.
-async fn value(
+pub(crate) async fn value(
     wire: &impl Wire,
     coe: &mut CoeClient,
     index: u16,

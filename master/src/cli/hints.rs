@@ -16,9 +16,11 @@ use ecaxis_sim::ServeError;
 use super::note;
 
 mod host;
+mod service;
 
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
+pub(crate) use service::service;
 
 /// The machine or the bus failed.
 pub(crate) const FAILED: u8 = 1;
@@ -230,7 +232,10 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             format!("add a [[device]] with `position = {position}`, or disconnect it")
         }
         BringUpError::Identity { .. } => {
-            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`".to_owned()
+            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` takes newer revisions as well; `ecaxis compare` shows all that differs".to_owned()
+        }
+        BringUpError::Serial { found, .. } => {
+            format!("where the device was replaced on purpose, write `serial = {found}`, or leave `serial` out")
         }
         BringUpError::NotLocated { .. } => {
             "set the device's alias or ID switch, or find it by `position`".to_owned()

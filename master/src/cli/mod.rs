@@ -11,7 +11,9 @@ use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
 mod bench;
+mod bus;
 mod check;
+mod compare;
 mod completions;
 mod doctor;
 mod esi;
@@ -22,6 +24,7 @@ mod progress;
 mod record;
 mod report;
 mod run;
+mod scan;
 mod signals;
 mod sim;
 mod style;
@@ -32,6 +35,7 @@ pub(crate) use hints::Failure;
 
 const EXAMPLES: &str = "\
 Examples:
+  ecaxis scan enp3s0                 who is on the bus
   ecaxis check machine.toml          every mistake in the machine file at once
   ecaxis explain machine.toml        what follows from it
   ecaxis run machine.toml --sim      its program on the simulated bus
@@ -54,6 +58,8 @@ enum Verb {
     Run(run::Args),
     Check(check::Args),
     Explain(explain::Args),
+    Scan(scan::Args),
+    Compare(compare::Args),
     Esi(esi::Args),
     Sim(sim::Args),
     Doctor(doctor::Args),
@@ -97,6 +103,8 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     match &cli.verb {
         Verb::Run(run::Args { verbosity, .. })
+        | Verb::Scan(scan::Args { verbosity, .. })
+        | Verb::Compare(compare::Args { verbosity, .. })
         | Verb::Sim(sim::Args { verbosity, .. })
         | Verb::Bench(bench::Args { verbosity, .. }) => {
             verbosity.start_logging();
@@ -112,6 +120,8 @@ pub fn main() -> ExitCode {
         Verb::Run(args) => run::run(&args),
         Verb::Check(args) => check::run(&args),
         Verb::Explain(args) => explain::run(&args),
+        Verb::Scan(args) => scan::run(&args),
+        Verb::Compare(args) => compare::run(&args),
         Verb::Esi(args) => esi::run(&args),
         Verb::Sim(args) => sim::run(&args),
         Verb::Doctor(args) => doctor::run(&args),
@@ -218,6 +228,16 @@ mod tests {
             ("ecaxis run --for 10", false),
             ("ecaxis run --repeat 0", false),
             ("ecaxis check", false),
+            ("ecaxis compare", false),
+            ("ecaxis compare m.toml --sim o.toml --apply", true),
+            ("ecaxis compare m.toml --apply --json", false),
+            ("ecaxis scan", false),
+            ("ecaxis scan eth0 --tree", true),
+            ("ecaxis scan --sim m.toml --ask --json", true),
+            ("ecaxis scan eth0 --sim m.toml", false),
+            ("ecaxis scan eth0 --force", false),
+            ("ecaxis scan eth0 --tree --json", false),
+            ("ecaxis run m.toml --enable --no-enable", false),
             (
                 "ecaxis esi show f.xml --device EPOS4 --mode csp --cycle 2ms",
                 true,

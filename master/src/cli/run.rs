@@ -20,6 +20,7 @@ Examples:
   ecaxis run m.toml --nic enp3s0 --for 1h   for an hour on a real bus
   ecaxis run m.toml --record bus.pcapng     every frame kept for Wireshark
   ecaxis run m.toml --sim --faults f.toml   with things that go wrong
+  ecaxis run m.toml --no-enable             to Op, axes without power
   ecaxis run m.toml --json                  the result for a script
 
 Ctrl-C at any time: the axes decelerate within their limits, lose power, and
@@ -53,6 +54,12 @@ pub(crate) struct Args {
     /// Fault script for the simulated bus
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
+    /// Take the bus to Op and leave the axes without power, until Ctrl-C or `--for` is over
+    #[arg(long, conflicts_with = "enable")]
+    no_enable: bool,
+    /// Enable the axes although the file says `enable = false`
+    #[arg(long)]
+    enable: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
@@ -123,6 +130,7 @@ fn tell(args: &Args, error: &str, hints: &[String], problems: Value) {
 
 fn load(args: &Args) -> Result<Machine, ConfigError> {
     let mut machine = config::load(&args.file)?;
+    machine.enable = args.enable || machine.enable && !args.no_enable;
     if args.sim || args.nic.as_deref() == Some("sim") {
         machine.bus.nic = Nic::Sim;
     } else if let Some(nic) = &args.nic {
@@ -143,7 +151,8 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
             return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
         }
     }
-    if args.virtual_time && machine.steps.is_empty() && args.time.is_none() {
+    let ends = machine.enable && !machine.steps.is_empty();
+    if args.virtual_time && !ends && args.time.is_none() {
         let message = "--virtual without a program would never end";
         return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
     }
@@ -165,7 +174,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         seed: seed.unwrap_or(defaults.seed),
         faults,
         record: args.record.clone(),
-        ..defaults
+        enable: machine.enable,
     })
 }
 

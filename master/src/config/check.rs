@@ -83,6 +83,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         stop: program.stop,
         tables: program.tables,
         repeat,
+        enable: raw.enable.is_none_or(Spanned::into_inner),
     })
 }
 

@@ -10,7 +10,7 @@ use toml::Spanned;
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, axis, sdo, sim};
-use crate::library::{self, Library, LoadError};
+use crate::library::{self, Library, LoadError, Match};
 
 /// What all devices share: where ESI files are, those read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
@@ -210,6 +210,7 @@ pub(crate) fn check(
         sim::check(sim, names, device, axis, p)
     });
     let device = device.map(|d| Arc::new(d.clone()));
+    let identity = identity(raw.identity.as_ref(), p);
     let (esi_path, file) = file?;
     Some(DeviceConfig {
         name: raw.name?.into_inner(),
@@ -218,6 +219,8 @@ pub(crate) fn check(
         device: device?,
         esi: file,
         selection: chosen?,
+        identity: identity?,
+        serial: raw.serial.map(Spanned::into_inner),
         axis: match axis {
             Some(axis) => Some(axis?),
             None if raw.axis.is_some() => return None,
@@ -226,6 +229,21 @@ pub(crate) fn check(
         sim: sim.unwrap_or_default(),
         line: p.line(&raw.span),
     })
+}
+
+/// Which revisions may stand for the ESI's: its own alone, where nothing is said.
+fn identity(rule: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<Match> {
+    let Some(rule) = rule else {
+        return Some(Match::Equal);
+    };
+    let known = rule.get_ref().parse();
+    if known.is_err() {
+        let message = format!("unknown identity \"{}\"", rule.get_ref());
+        let names = ["equal", ">=", "high-word", "low-word", "ignore"];
+        let hint = suggestion(rule.get_ref(), names, "rules");
+        p.add_hint(rule.span(), message, hint);
+    }
+    known.ok()
 }
 
 /// `Err`: wrong, and reported.

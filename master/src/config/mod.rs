@@ -51,6 +51,7 @@ pub use crate::rt::exchange::Mode as Exchange;
 
 use ecaxis_esi as esi;
 
+use crate::library::Match;
 use crate::link::BackEnd;
 use crate::rt::margin::Spin;
 
@@ -70,6 +71,8 @@ pub struct Machine {
     pub tables: Vec<TableFile>,
     /// How often the steps are run, at least 1.
     pub repeat: u32,
+    /// Axes get power; otherwise the bus goes to Op and no further.
+    pub enable: bool,
 }
 
 /// Times in nanoseconds.
@@ -136,6 +139,10 @@ pub struct DeviceConfig {
     pub esi: Arc<esi::EsiFile>,
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
+    /// Which revisions may stand for the ESI's.
+    pub identity: Match,
+    /// The one device that it must be.
+    pub serial: Option<u32>,
     pub axis: Option<AxisSetup>,
     pub sim: sim::SimSetup,
     /// Of its `[[device]]` in the machine file.

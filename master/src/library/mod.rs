@@ -161,22 +161,28 @@ pub enum Match {
     HighWord,
     /// The low words are the same.
     LowWord,
+    /// Any revision of the product.
+    Ignore,
 }
 
 impl Match {
-    const ALL: [(Self, &'static str); 4] = [
+    const ALL: [(Self, &'static str); 5] = [
         (Self::Equal, "equal"),
         (Self::Newer, "newer"),
         (Self::HighWord, "high-word"),
         (Self::LowWord, "low-word"),
+        (Self::Ignore, "ignore"),
     ];
 
-    fn accepts(self, described: u32, found: u32) -> bool {
+    /// Whether a device of revision `found` may stand for one of revision `described`.
+    #[must_use]
+    pub fn accepts(self, described: u32, found: u32) -> bool {
         match self {
             Self::Equal => described == found,
             Self::Newer => found >= described,
             Self::HighWord => found >> 16 == described >> 16,
             Self::LowWord => found & 0xffff == described & 0xffff,
+            Self::Ignore => true,
         }
     }
 }
@@ -192,9 +198,12 @@ impl FromStr for Match {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
+        if text == ">=" {
+            return Ok(Self::Newer);
+        }
         let found = Self::ALL.iter().find(|(_, name)| *name == text);
         found.map(|(rule, _)| *rule).ok_or_else(|| {
-            format!("{text:?} is not a rule; there are equal, newer, high-word and low-word")
+            format!("{text:?} is not a rule; there are equal, newer (>=), high-word, low-word and ignore")
         })
     }
 }

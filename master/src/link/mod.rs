@@ -9,6 +9,7 @@
 //! - [`port`]: ethercrab's two ends.
 
 use std::fmt;
+use std::time::{Duration, Instant};
 
 pub mod capture;
 pub mod interface;
@@ -116,6 +117,23 @@ pub fn open(nic: &str, back_end: BackEnd) -> Result<(Box<dyn Link>, Vec<Concern>
         BackEnd::Xdp => Box::new(xdp::XdpLink::open(nic)?),
     };
     Ok((link, concerns))
+}
+
+/// Frames that come in within a time in which nothing is sent: another MainDevice's. Blocks, on the monotonic clock.
+///
+/// # Errors
+/// Of the link.
+pub fn heard(link: &mut dyn Link, time: Duration) -> Result<u64, LinkError> {
+    let mut buf = [0; MAX_FRAME];
+    let mut frames = 0;
+    let end = Instant::now() + time;
+    while Instant::now() < end {
+        while link.recv(&mut buf)?.is_some() {
+            frames += 1;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    Ok(frames + link.stats().foreign)
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

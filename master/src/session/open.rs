@@ -1,6 +1,9 @@
 //! Opens what the machine file's `nic` names, with a recording around it where one is asked for.
 
+use std::borrow::Cow;
 use std::time::{SystemTime, UNIX_EPOCH};
+
+use ecaxis_esi::{Device, Slots};
 
 use ecaxis_sim::network::topology::media;
 use ecaxis_sim::{
@@ -100,10 +103,46 @@ pub fn topology(machine: &Machine) -> Result<Topology, RunError> {
 /// clock control that does nothing.
 const DRIFTS_PPM: [f64; 4] = [18.0, -23.0, 7.0, -11.0];
 
+/// The device with the modules of the file in its slots. Where a mode picks the module it is no hardware: the device takes what it is told.
+fn plugged(device: &DeviceConfig) -> Cow<'_, Device> {
+    let selection = &device.selection;
+    let Some(slots) = &device.device.slots else {
+        return Cow::Borrowed(&device.device);
+    };
+    if selection.mode.is_some() {
+        return Cow::Borrowed(&device.device);
+    }
+    let mut hardware = Device::clone(&device.device);
+    let mut places = Vec::new();
+    for slot in &slots.slots {
+        let count = usize::try_from(slot.max_instances.clamp(1, 254)).unwrap_or(1);
+        for _ in 0..count {
+            let mut place = slot.clone();
+            place.max_instances = 1;
+            place.min_instances = place.min_instances.min(1);
+            let module = selection.modules.iter().find(|m| m.place == places.len());
+            place.module_idents.iter_mut().for_each(|(_, d)| *d = false);
+            if let Some(module) = module {
+                // It may fit by its class alone.
+                place
+                    .module_idents
+                    .retain(|(ident, _)| *ident != module.ident);
+                place.module_idents.push((module.ident, true));
+            }
+            places.push(place);
+        }
+    }
+    hardware.slots = Some(Slots {
+        slots: places,
+        ..slots.clone()
+    });
+    Cow::Owned(hardware)
+}
+
 fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDevice, RunError> {
     let place = u32::try_from(position).unwrap_or(0);
     let mut options = DeviceOptions {
-        serial: 1000 + place,
+        serial: device.serial.unwrap_or(1000 + place),
         clock_drift_ppm: device
             .sim
             .drift_ppm
@@ -124,6 +163,7 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
         options.plant.initial_position = device.sim.track.start;
         options.plant.track = device.sim.track.track;
     }
-    SimDevice::from_esi(&device.device, &device.esi.modules, options)
+    let hardware = plugged(device);
+    SimDevice::from_esi(&hardware, &device.esi.modules, options)
         .map_err(|error| RunError::Sim(format!("`{}`: {error}", device.name)))
 }

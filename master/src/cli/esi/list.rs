@@ -31,7 +31,7 @@ pub(crate) struct Args {
     /// Revision of the device at hand, decimal or 0x…; needs `--vendor` and `--product`
     #[arg(long, value_parser = super::number, requires = "vendor", requires = "product")]
     revision: Option<u32>,
-    /// Which described revisions fit it: equal, newer (the device may be newer than its description), high-word, low-word
+    /// Which described revisions fit it: equal, newer (the device may be newer than its description), high-word, low-word, ignore
     #[arg(long = "match", default_value = "newer")]
     rule: Match,
     /// Read every file, and leave the index of the last time alone

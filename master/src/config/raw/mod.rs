@@ -36,6 +36,7 @@ pub(crate) struct RawMachine {
     pub stop: RawStop,
     pub steps: Vec<RawStep>,
     pub repeat: Option<Spanned<u32>>,
+    pub enable: Option<Spanned<bool>>,
 }
 
 #[derive(Debug, Default)]
@@ -70,6 +71,8 @@ pub(crate) struct RawDevice {
     pub vendor: Option<Spanned<u32>>,
     pub product: Option<Spanned<u32>>,
     pub revision: Option<Spanned<u32>>,
+    pub identity: Option<Spanned<String>>,
+    pub serial: Option<Spanned<u32>>,
     pub mode: Option<Spanned<String>>,
     pub dc: Option<Spanned<String>>,
     pub modules: Option<Spanned<Vec<String>>>,
@@ -112,6 +115,7 @@ pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> Raw
     let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
     let mut machine = RawMachine {
         repeat: optional!(p, f, "repeat", integer(1, 1_000_000)),
+        enable: optional!(p, f, "enable", boolean),
         ..RawMachine::default()
     };
     let bus = f.need("bus", "[bus]\ncycle = \"1ms\"");
@@ -209,6 +213,8 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
         vendor: optional!(p, f, "vendor", integer(0, u32::MAX)),
         product: optional!(p, f, "product", integer(0, u32::MAX)),
         revision: optional!(p, f, "revision", integer(0, u32::MAX)),
+        identity: optional!(p, f, "identity", string),
+        serial: optional!(p, f, "serial", integer(0, u32::MAX)),
         mode: optional!(p, f, "mode", string),
         dc: optional!(p, f, "dc", string),
         modules: f.get("modules").and_then(|v| read_modules(v, p)),

@@ -1,0 +1,117 @@
+//! A bus for verbs that turn no cycle: a network interface, or the simulated bus of a machine file in virtual time.
+
+use std::io::Write;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use ecaxis::clock::Clock;
+use ecaxis::config::{Machine, Nic};
+use ecaxis::link::{self, BackEnd, Link};
+use ecaxis::service::{self, Datagrams};
+use ecaxis::session::{self, Options, RunError};
+
+use super::{Failure, hints, note, signals, style};
+
+/// Another MainDevice on the interface shows within this time.
+const LISTEN: Duration = Duration::from_millis(100);
+
+#[derive(Debug)]
+pub(crate) enum Bus {
+    Interface { nic: String, back_end: BackEnd },
+    Sim(Box<Machine>),
+}
+
+impl Bus {
+    /// What the machine's `nic` names.
+    pub fn of(machine: &Machine) -> Self {
+        match &machine.bus.nic {
+            Nic::Sim => Self::Sim(Box::new(machine.clone())),
+            Nic::Interface(nic) => Self::Interface {
+                nic: nic.clone(),
+                back_end: machine.bus.link,
+            },
+        }
+    }
+
+    pub fn interface(nic: &str) -> Self {
+        Self::Interface {
+            nic: nic.to_owned(),
+            back_end: BackEnd::default(),
+        }
+    }
+
+    /// Hints depend on it.
+    pub fn nic(&self) -> Nic {
+        match self {
+            Self::Interface { nic, .. } => Nic::Interface(nic.clone()),
+            Self::Sim(_) => Nic::Sim,
+        }
+    }
+
+    /// Does a piece of work on it; `work` is told how many frames of others came in before anything was sent. Ctrl-C ends it.
+    pub fn visit<T, W>(self, work: W) -> Result<T, Failure>
+    where
+        T: Send + 'static,
+        W: AsyncFnOnce(Datagrams, u64) -> T + Send + 'static,
+    {
+        let nic = self.nic();
+        let clock = match self {
+            Self::Interface { .. } => Clock::Real,
+            Self::Sim(_) => Clock::Virtual,
+        };
+        let stop = Arc::new(AtomicBool::new(false));
+        signals::stop_on_interrupt(&stop);
+        let heard = Arc::new(AtomicU64::new(0));
+        let others = Arc::clone(&heard);
+        let done = service::visit(
+            move || self.open(&others),
+            clock,
+            stop,
+            async move |wire: Datagrams| work(wire, heard.load(Ordering::Relaxed)).await,
+        );
+        done.map_err(|error| hints::run(&error, &nic))
+    }
+
+    fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, RunError> {
+        match self {
+            Self::Sim(machine) => {
+                let seed = Options::default().seed;
+                let segment = session::simulated_bus(&machine, seed, None, None)?;
+                Ok(Box::new(link::sim::SimLink::new(segment)))
+            }
+            Self::Interface { nic, back_end } => {
+                // What only disturbs a cycle is no concern of a bus without one.
+                let (mut link, _) = link::open(&nic, back_end)?;
+                let frames = link::heard(link.as_mut(), LISTEN).map_err(RunError::Link)?;
+                heard.store(frames, Ordering::Relaxed);
+                Ok(link)
+            }
+        }
+    }
+}
+
+/// What a piece of work on a bus ended with, as the user sees it.
+pub(crate) fn done<T>(result: Result<T, service::ServiceError>, nic: &Nic) -> Result<T, Failure> {
+    result.map_err(|error| hints::service(&error, nic))
+}
+
+/// A line on stderr where somebody watches.
+pub(crate) fn passing(text: &str) {
+    if style::rewrites() {
+        let mut err = std::io::stderr().lock();
+        // Over the last one, and gone with the next.
+        let _ = write!(err, "\r\x1b[K{text}");
+        let _ = err.flush();
+    }
+}
+
+/// The last of those lines goes.
+pub(crate) fn passed() {
+    passing("");
+}
+
+/// Warnings, one a line.
+pub(crate) fn warn(text: impl std::fmt::Display) {
+    note(&format!("warning: {text}"));
+}

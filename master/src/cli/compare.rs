@@ -1,0 +1,271 @@
+//! `ecaxis compare`: a machine file against a bus, and the file made to be as the bus.
+
+use std::path::{Path, PathBuf};
+
+use ecaxis::compare::apply::{self, Actual, ApplyError};
+use ecaxis::compare::{self, Comparison, Difference};
+use ecaxis::config::{self, Machine, Nic};
+use ecaxis::library::{self, Library};
+use ecaxis::scan::{self, Scan};
+use serde_json::{Value, json};
+
+use super::bus::{self, Bus};
+use super::scan::{Seen, open, save};
+use super::{Failure, hints, result};
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis compare machine.toml                   the bus at the file's interface
+  ecaxis compare machine.toml --nic enp3s0      at another
+  ecaxis compare machine.toml --sim other.toml  another file's simulated bus
+  ecaxis compare machine.toml --apply           make the file as the bus is";
+
+/// Compare a machine file with the bus: missing, added, swapped devices, revisions, aliases, serial numbers, modules
+///
+/// Nothing is changed on the bus; devices in Init are in PreOp while they are asked for modules and parameters. Where everything is as in the
+/// file, the exit code is 0, else 1.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Machine file
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Use this network interface instead of the file's
+    #[arg(long, value_name = "IF", conflicts_with = "sim")]
+    nic: Option<String>,
+    /// Compare with the simulated bus of this machine file
+    #[arg(long, value_name = "FILE")]
+    sim: Option<PathBuf>,
+    /// Compare what the devices hold of the start-up SDOs, too
+    #[arg(long)]
+    parameters: bool,
+    /// Ask the devices even where another master shows
+    #[arg(long)]
+    intrude: bool,
+    /// Rewrite the file so that it is as the bus; comments stay
+    #[arg(long, conflicts_with = "json")]
+    apply: bool,
+    /// ESI file or folder for devices that are not in the file; otherwise the folders of the file's own
+    #[arg(long, value_name = "PATH", requires = "apply")]
+    esi: Option<PathBuf>,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    pub verbosity: super::Verbosity,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let machine = load(&args.file)?;
+    let bus = match (&args.sim, &args.nic) {
+        (Some(file), _) => {
+            let mut other = load(file)?;
+            other.bus.nic = Nic::Sim;
+            Bus::of(&other)
+        }
+        (None, Some(nic)) => Bus::interface(nic),
+        (None, None) => Bus::of(&machine),
+    };
+    let nic = bus.nic();
+    let library = args.apply.then(|| library(args, &machine)).transpose()?;
+    let (scan, comparison) = look(bus, &machine, args)?;
+    let seen = Seen::new(&nic, scan, library.as_ref());
+    seen.warn(args.intrude);
+    for unknown in &comparison.unknown {
+        bus::warn(format_args!("not compared: {unknown}"));
+    }
+    let differences: Vec<String> = comparison
+        .differences
+        .iter()
+        .map(|difference| difference.told(&machine, &seen.scan).to_string())
+        .collect();
+    if args.json {
+        result(&format!(
+            "{:#}\n",
+            as_json(&machine, &comparison, &seen.scan)
+        ))?;
+    } else if differences.is_empty() {
+        result("as in the file\n")?;
+    } else {
+        result(&(differences.join("\n") + "\n"))?;
+    }
+    if differences.is_empty() {
+        return Ok(());
+    }
+    if args.apply {
+        return rewrite(args, &machine, &seen, &comparison);
+    }
+    Err(differs(&args.file, differences.len()))
+}
+
+fn load(file: &Path) -> Result<Machine, Failure> {
+    config::load(file).map_err(|e| hints::config(file, &e))
+}
+
+fn differs(file: &Path, count: usize) -> Failure {
+    let plural = if count == 1 { "" } else { "s" };
+    let message = format!(
+        "the bus is not as in {}: {count} difference{plural}",
+        file.display()
+    );
+    Failure::new(hints::FAILED, message).hint(
+        "correct the bus, or `--apply` makes the file as the bus is; what revisions may stand for others, `identity` says",
+    )
+}
+
+fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), Failure> {
+    let nic = bus.nic();
+    let machine = machine.clone();
+    let (parameters, intrude) = (args.parameters, args.intrude);
+    let done = bus.visit(async move |wire, heard| {
+        let options = scan::Options {
+            ask: true,
+            intrude,
+            heard,
+        };
+        let mut tell = |step: scan::Step| {
+            let (what, position, of) = (step.what, step.position, step.of);
+            bus::passing(&format!("{what} position {position}, {of} in all"));
+        };
+        let scan = scan::scan(&wire, options, &mut tell).await?;
+        let mut comparison = compare::compare(&machine, &scan);
+        if parameters && scan.asked {
+            compare::parameters(&wire, &machine, &scan, &mut comparison).await?;
+        }
+        Ok((scan, comparison))
+    });
+    bus::passed();
+    bus::done(done?, &nic)
+}
+
+/// The folders of the file's own ESI files, where nothing else is said.
+fn library(args: &Args, machine: &Machine) -> Result<Library, Failure> {
+    if let Some(path) = &args.esi {
+        return open(path);
+    }
+    let mut library: Option<Library> = None;
+    let mut folders: Vec<&Path> = Vec::new();
+    for device in &machine.devices {
+        let folder = device.esi_path.parent().unwrap_or(Path::new(""));
+        if folders.contains(&folder) {
+            continue;
+        }
+        folders.push(folder);
+        let here = if folder.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            folder
+        };
+        let next = Library::open(here, library::cache_file(here).as_deref())
+            .map_err(|error| Failure::new(hints::WRONG, error.to_string()))?;
+        // The one that describes most is asked; several folders are rare.
+        if library
+            .as_ref()
+            .is_none_or(|known| known.entries().len() < next.entries().len())
+        {
+            library = Some(next);
+        }
+    }
+    library.ok_or_else(|| Failure::new(hints::WRONG, "the file names no ESI file"))
+}
+
+fn rewrite(
+    args: &Args,
+    machine: &Machine,
+    seen: &Seen,
+    comparison: &Comparison,
+) -> Result<(), Failure> {
+    let file = &args.file;
+    let only_parameters = |d: &Difference| matches!(d, Difference::Parameter { .. });
+    if comparison.differences.iter().all(only_parameters) {
+        return Err(Failure::new(
+            hints::FAILED,
+            "only parameters differ, which `--apply` leaves alone",
+        )
+        .hint("start-up writes them at every run; `sdo` in the file says what it writes"));
+    }
+    let text = std::fs::read_to_string(file)
+        .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", file.display())))?;
+    let actual = Actual {
+        scan: &seen.scan,
+        described: &seen.described,
+        comparison,
+    };
+    let text = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
+    save(file, &text)?;
+    super::note(&format!(
+        "{} is as the bus now; `ecaxis check {}` and a look at what is marked \"{}\" are due",
+        file.display(),
+        file.display(),
+        scan::write::MARK
+    ));
+    Ok(())
+}
+
+fn refused(file: &Path, error: &ApplyError) -> Failure {
+    if let ApplyError::Wrong(wrong) = error {
+        let problems = hints::config(file, wrong);
+        let message = format!(
+            "{} was left as it is: the rewritten file would be wrong",
+            file.display()
+        );
+        let mut failure = Failure::new(hints::FAILED, message);
+        failure.hints.push(problems.message);
+        return failure;
+    }
+    let message = format!("{} was left as it is: {error}", file.display());
+    let failure = Failure::new(hints::FAILED, message);
+    match error {
+        ApplyError::NotDescribed { .. } => {
+            failure.hint("name a folder that has its ESI file with `--esi`")
+        }
+        ApplyError::NothingLeft => {
+            failure.hint("this is another machine: `ecaxis scan --write` makes a file for it")
+        }
+        _ => failure.hint("write each device as a [[device]] table"),
+    }
+}
+
+fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan) -> Value {
+    let name = |index: usize| machine.devices.get(index).map(|d| d.name.clone());
+    let each: Vec<Value> = comparison
+        .differences
+        .iter()
+        .map(|difference| {
+            let (kind, devices, positions) = match difference {
+                Difference::Missing { device } => ("missing", vec![*device], vec![]),
+                Difference::Added { position } => ("added", vec![], vec![*position]),
+                Difference::Swapped { devices, positions } => {
+                    ("swapped", devices.to_vec(), positions.to_vec())
+                }
+                Difference::Moved { device, to, .. } => ("moved", vec![*device], vec![*to]),
+                Difference::Revision {
+                    device, position, ..
+                } => ("revision", vec![*device], vec![*position]),
+                Difference::Alias {
+                    device, position, ..
+                } => ("alias", vec![*device], vec![*position]),
+                Difference::Serial {
+                    device, position, ..
+                } => ("serial", vec![*device], vec![*position]),
+                Difference::Modules {
+                    device, position, ..
+                } => ("modules", vec![*device], vec![*position]),
+                Difference::Parameter {
+                    device, position, ..
+                } => ("parameter", vec![*device], vec![*position]),
+            };
+            json!({
+                "kind": kind,
+                "devices": devices.into_iter().map(name).collect::<Vec<_>>(),
+                "positions": positions,
+                "text": difference.told(machine, scan).to_string(),
+            })
+        })
+        .collect();
+    json!({
+        "equal": each.is_empty(),
+        "differences": each,
+        "not_compared": comparison.unknown,
+    })
+}

@@ -1,0 +1,84 @@
+//! Writes what was found as a machine file.
+
+use std::io::Write;
+use std::path::Path;
+
+use ecaxis::config::{self, ConfigError};
+use ecaxis::scan::write::{self, MARK, Place};
+
+use super::super::{Failure, bus, hints, note, result};
+use super::Seen;
+
+/// A machine file is somebody's work.
+pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
+    if force || !path.exists() {
+        return Ok(());
+    }
+    let message = format!("{} is there already", path.display());
+    Err(Failure::new(hints::WRONG, message).hint(
+        "name another file, `--force` overwrites it, `ecaxis compare FILE --apply` only changes what differs",
+    ))
+}
+
+pub(super) fn machine_file(seen: &Seen, path: &Path, library: bool) -> Result<(), Failure> {
+    let place = Place {
+        nic: &seen.nic,
+        folder: path.parent().unwrap_or(Path::new("")),
+    };
+    let text = write::machine_file(&seen.scan, &seen.described, place);
+    save(path, &text)?;
+    let devices = seen.scan.devices.len();
+    let axes = text.matches("[device.axis]").count();
+    let plural = |n: usize| if n == 1 { "" } else { "s" };
+    let mut told = format!(
+        "{}: {devices} device{}, {axes} of them {}\n",
+        path.display(),
+        plural(devices),
+        if axes == 1 { "an axis" } else { "axes" },
+    );
+    let checks = text.lines().filter(|line| line.contains(MARK));
+    // The first lines of the file explain the mark.
+    let checks = checks.filter(|line| !line.starts_with("# Written")).count();
+    told += &format!("{checks} lines are marked \"{MARK}\" and want a look\n");
+    let file = path.display();
+    told += &format!("next: `ecaxis check {file}`, then `ecaxis run {file} --no-enable`\n");
+    if !seen.scan.asked {
+        bus::warn("the devices were not asked: units, limits and modules in the file are guesses");
+    }
+    if seen.described.iter().any(Option::is_none) {
+        bus::warn("some devices have no ESI file, so the file cannot be run yet");
+        note(if library {
+            "  = help: put their makers' files into the folder of ESI files, and scan again with --force"
+        } else {
+            "  = help: name the folder of ESI files with `--esi`"
+        });
+    } else if let Err(ConfigError::Problems(problems)) = config::load(path) {
+        bus::warn(format_args!(
+            "the file has {} problem{}: `ecaxis check {file}` shows them",
+            problems.len(),
+            plural(problems.len()),
+        ));
+    }
+    result(&told)
+}
+
+/// Writes beside the file first, so that it is either the old one or the new one.
+pub(crate) fn save(path: &Path, text: &str) -> Result<(), Failure> {
+    let failed = |e: std::io::Error| {
+        let message = format!("cannot write {}: {e}", path.display());
+        Failure::new(hints::FAILED, message)
+    };
+    let mut beside = path.as_os_str().to_owned();
+    beside.push(".new");
+    let beside = Path::new(&beside);
+    let written = std::fs::File::create(beside)
+        .and_then(|mut file| {
+            file.write_all(text.as_bytes())
+                .and_then(|()| file.sync_all())
+        })
+        .and_then(|()| std::fs::rename(beside, path));
+    written.map_err(|e| {
+        let _ = std::fs::remove_file(beside);
+        failed(e)
+    })
+}

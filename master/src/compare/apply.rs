@@ -1,0 +1,415 @@
+//! The machine file rewritten so that it is as the bus. What does not differ stays as it is written, comments included.
+
+use std::path::Path;
+
+use toml_edit::{Array, ArrayOfTables, DocumentMut, Item, Table, TableLike, Value};
+
+use super::{Comparison, Difference};
+use crate::config::{self, ConfigError, Locator, Machine};
+use crate::library::Match;
+use crate::scan::write::{self, Place};
+use crate::scan::{Described, Scan};
+
+/// Repetitions inside one another, as deep as a file may have them and then some.
+const DEPTH: usize = 16;
+
+#[derive(Debug, thiserror::Error)]
+pub enum ApplyError {
+    #[error("the file is not TOML: {0}")]
+    NotToml(String),
+    #[error("the devices of the file are not written as [[device]]")]
+    OtherForm,
+    #[error("position {position}: no ESI file describes it")]
+    NotDescribed { position: u16 },
+    #[error("all devices of the file are missing")]
+    NothingLeft,
+    #[error("the rewritten file would be wrong: {0}")]
+    Wrong(ConfigError),
+}
+
+/// What a bus is like, for the file.
+#[derive(Debug, Clone, Copy)]
+pub struct Actual<'a> {
+    pub scan: &'a Scan,
+    /// One for each device of the scan.
+    pub described: &'a [Option<Described>],
+    pub comparison: &'a Comparison,
+}
+
+impl Actual<'_> {
+    fn described(&self, position: u16) -> Option<&Described> {
+        self.described.get(usize::from(position))?.as_ref()
+    }
+}
+
+/// Rewrites `text`, the file at `path`, which was checked to be `machine`. Parameters stay as they are. The result is a file without
+/// mistakes.
+///
+/// # Errors
+/// Where the file cannot become as the bus.
+pub fn apply(
+    path: &Path,
+    text: &str,
+    machine: &Machine,
+    actual: Actual<'_>,
+) -> Result<String, ApplyError> {
+    let mut document: DocumentMut = text
+        .parse()
+        .map_err(|error: toml_edit::TomlError| ApplyError::NotToml(error.to_string()))?;
+    let place = Place {
+        nic: "",
+        folder: path.parent().unwrap_or(Path::new("")),
+    };
+    let differences = &actual.comparison.differences;
+
+    // New ones first: a file without devices says nothing of how they are written.
+    let mut new = Vec::new();
+    for difference in differences {
+        if let Difference::Added { position } = difference {
+            new.push(*position);
+        }
+    }
+    let sections = added(machine, actual, place, &new)?;
+    for (index, config) in machine.devices.iter().enumerate() {
+        let Some(position) = actual.comparison.places.get(index).copied().flatten() else {
+            continue;
+        };
+        let table = device(&mut document, &config.name)?;
+        if let Locator::Position(from) = config.at
+            && from != position
+        {
+            set(table, "position", &position.to_string());
+        }
+    }
+    for difference in differences {
+        change(&mut document, machine, actual, place, difference)?;
+    }
+    for difference in differences {
+        if let Difference::Missing { device } = difference
+            && let Some(config) = machine.devices.get(*device)
+        {
+            remove(&mut document, &config.name)?;
+        }
+    }
+    let list = devices(&mut document)?;
+    for section in sections {
+        list.push(section);
+    }
+    if list.is_empty() {
+        return Err(ApplyError::NothingLeft);
+    }
+    let text = document.to_string();
+    config::parse(path, &text).map_err(ApplyError::Wrong)?;
+    Ok(text)
+}
+
+fn devices(document: &mut DocumentMut) -> Result<&mut ArrayOfTables, ApplyError> {
+    let item = document.get_mut("device");
+    item.and_then(Item::as_array_of_tables_mut)
+        .ok_or(ApplyError::OtherForm)
+}
+
+fn device<'d>(document: &'d mut DocumentMut, name: &str) -> Result<&'d mut Table, ApplyError> {
+    let mut all = devices(document)?.iter_mut();
+    let named = |table: &&mut Table| table.get("name").and_then(Item::as_str) == Some(name);
+    all.find(named).ok_or(ApplyError::OtherForm)
+}
+
+/// Writes a value in the place of the one there is, with its comment; or at the end.
+fn set(table: &mut Table, key: &str, value: &str) {
+    let Ok(mut value) = value.parse::<Value>() else {
+        return;
+    };
+    match table.get_mut(key).and_then(Item::as_value_mut) {
+        Some(old) => {
+            *value.decor_mut() = old.decor().clone();
+            *old = value;
+        }
+        None => {
+            // Beside the others of its table, in columns as they are.
+            value.decor_mut().set_prefix(" ");
+            table.insert(key, Item::Value(value));
+        }
+    }
+}
+
+fn quoted(text: &str) -> String {
+    Value::from(text).to_string()
+}
+
+/// Sections of devices that the file does not have.
+fn added(
+    machine: &Machine,
+    actual: Actual<'_>,
+    place: Place<'_>,
+    positions: &[u16],
+) -> Result<Vec<Table>, ApplyError> {
+    let aliases = write::aliases(actual.scan);
+    let taken: Vec<String> = machine.devices.iter().map(|d| d.name.clone()).collect();
+    let mut all = Vec::with_capacity(positions.len());
+    for position in positions {
+        let device = actual.scan.devices.get(usize::from(*position));
+        let described = actual.described(*position);
+        let (Some(device), Some(described)) = (device, described) else {
+            return Err(ApplyError::NotDescribed {
+                position: *position,
+            });
+        };
+        all.push((device, Some(described)));
+    }
+    let named = write::names(all.iter().copied(), &taken);
+    let mut tables = Vec::with_capacity(all.len());
+    for ((device, described), named) in all.into_iter().zip(&named) {
+        let cycle = machine.bus.cycle_ns;
+        let text = write::device_section(device, described, named, &aliases, place, cycle);
+        let mut section: DocumentMut = text
+            .parse()
+            .map_err(|error: toml_edit::TomlError| ApplyError::NotToml(error.to_string()))?;
+        let list = devices(&mut section)?;
+        let Some(table) = list.get_mut(0) else {
+            return Err(ApplyError::OtherForm);
+        };
+        let mut table = table.clone();
+        unplaced(&mut table, DEPTH);
+        table.decor_mut().set_prefix("\n");
+        tables.push(table);
+    }
+    Ok(tables)
+}
+
+/// Tables of another file stand where they are put.
+fn unplaced(table: &mut Table, depth: usize) {
+    table.set_position(None);
+    if depth == 0 {
+        return;
+    }
+    for (_, item) in table.iter_mut() {
+        if let Item::Table(inner) = item {
+            unplaced(inner, depth - 1);
+        }
+    }
+}
+
+/// What can be changed in the device's own table.
+fn change(
+    document: &mut DocumentMut,
+    machine: &Machine,
+    actual: Actual<'_>,
+    place: Place<'_>,
+    difference: &Difference,
+) -> Result<(), ApplyError> {
+    let name = |index: usize| machine.devices.get(index).map(|d| d.name.as_str());
+    match difference {
+        Difference::Alias {
+            device: index,
+            position,
+            expected,
+            found,
+        } => {
+            let Some(name) = name(*index) else {
+                return Ok(());
+            };
+            let table = device(document, name)?;
+            let key = match expected {
+                Locator::Id(_) => "id",
+                _ => "alias",
+            };
+            if *found == 0 {
+                table.remove(key);
+                set(table, "position", &position.to_string());
+            } else {
+                set(table, key, &found.to_string());
+            }
+        }
+        Difference::Serial {
+            device: index,
+            found,
+            ..
+        } => {
+            if let Some(name) = name(*index) {
+                set(device(document, name)?, "serial", &found.to_string());
+            }
+        }
+        Difference::Modules {
+            device: index,
+            found,
+            ..
+        } => {
+            if let Some(name) = name(*index) {
+                let list: Array = found.iter().map(String::as_str).collect();
+                let list = Value::Array(list).to_string();
+                set(device(document, name)?, "modules", &list);
+            }
+        }
+        Difference::Revision {
+            device: index,
+            position,
+            found,
+            ..
+        } => {
+            let described = actual.described(*position);
+            let described = described.ok_or(ApplyError::NotDescribed {
+                position: *position,
+            })?;
+            let Some(config) = machine.devices.get(*index) else {
+                return Ok(());
+            };
+            let table = device(document, &config.name)?;
+            revision(table, config, described, *found, place);
+        }
+        Difference::Missing { .. }
+        | Difference::Added { .. }
+        | Difference::Swapped { .. }
+        | Difference::Moved { .. }
+        | Difference::Parameter { .. } => {}
+    }
+    Ok(())
+}
+
+/// The description that fits best, and a rule where it is of another revision.
+fn revision(
+    table: &mut Table,
+    config: &config::DeviceConfig,
+    described: &Described,
+    found: u32,
+    place: Place<'_>,
+) {
+    let identity = |d: &ecaxis_esi::Device| {
+        let id = d.identity;
+        (id.vendor, id.product, id.revision)
+    };
+    let wanted = identity(&described.device);
+    // The file that is named may describe it as well.
+    if !config.esi.devices.iter().any(|d| identity(d) == wanted) {
+        let path = write::relative(&described.path, place.folder);
+        set(table, "esi", &quoted(&path.display().to_string()));
+    }
+    let (.., revision) = wanted;
+    set(table, "revision", &format!("0x{revision:08x}"));
+    let rule = if revision == found {
+        Match::Equal
+    } else if Match::Newer.accepts(revision, found) {
+        Match::Newer
+    } else {
+        Match::Ignore
+    };
+    match rule {
+        Match::Equal if config.identity.accepts(revision, found) => {}
+        Match::Equal => set(table, "identity", &quoted("equal")),
+        Match::Newer => set(table, "identity", &quoted(">=")),
+        _ => set(table, "identity", &quoted("ignore")),
+    }
+}
+
+/// Takes a device out, and everything that names it.
+fn remove(document: &mut DocumentMut, name: &str) -> Result<(), ApplyError> {
+    let named = |table: &Table| table.get("name").and_then(Item::as_str) == Some(name);
+    let list = devices(document)?;
+    list.retain(|table| !named(table));
+    for table in list.iter_mut() {
+        let sim = table.get_mut("sim").and_then(Item::as_table_like_mut);
+        if let Some(sim) = sim
+            && sim.get("after").and_then(Item::as_str) == Some(name)
+        {
+            sim.remove("after");
+            sim.remove("port");
+        }
+    }
+    if let Some(steps) = document.get_mut("step") {
+        forget_in_steps(steps, name, DEPTH);
+    }
+    if let Some(stop) = document.get_mut("stop").and_then(Item::as_table_like_mut) {
+        forget_in_stop(stop, name);
+    }
+    for key in ["step", "stop"] {
+        if document.get(key).is_some_and(is_empty) {
+            document.remove(key);
+        }
+    }
+    Ok(())
+}
+
+fn is_empty(item: &Item) -> bool {
+    match item {
+        Item::None => true,
+        Item::Value(Value::Array(array)) => array.is_empty(),
+        Item::Value(Value::InlineTable(table)) => table.is_empty(),
+        Item::Value(_) => false,
+        Item::Table(table) => table.is_empty(),
+        Item::ArrayOfTables(tables) => tables.is_empty(),
+    }
+}
+
+/// A step that only this device took part in goes.
+fn forget_in_steps(steps: &mut Item, name: &str, depth: usize) {
+    let Some(steps) = steps.as_array_of_tables_mut().filter(|_| depth > 0) else {
+        return;
+    };
+    let mut kept = Vec::with_capacity(steps.len());
+    for step in steps.iter_mut() {
+        kept.push(forget_in_step(step, name, depth));
+    }
+    let mut kept = kept.into_iter();
+    steps.retain(|_| kept.next().unwrap_or(true));
+}
+
+/// Whether anything is left to be done.
+fn forget_in_step(step: &mut Table, name: &str, depth: usize) -> bool {
+    let mut kept = true;
+    for (_, item) in step.iter_mut() {
+        let before = is_empty(item);
+        match item {
+            Item::ArrayOfTables(_) => forget_in_steps(item, name, depth - 1),
+            Item::Value(Value::Array(names)) => names.retain(|n| n.as_str() != Some(name)),
+            _ => {
+                if let Some(axes) = item.as_table_like_mut() {
+                    forget_axis(axes, name);
+                }
+            }
+        }
+        // Nobody is left to take part.
+        kept &= before || !is_empty(item);
+    }
+    kept
+}
+
+/// An axis' own entry, and those of axes that follow it.
+fn forget_axis(axes: &mut dyn TableLike, name: &str) {
+    axes.remove(name);
+    let follows = |item: &Item| {
+        let gear = item.as_table_like();
+        gear.and_then(|gear| gear.get("to")).and_then(Item::as_str) == Some(name)
+    };
+    let followers: Vec<String> = axes
+        .iter()
+        .filter(|(_, item)| follows(item))
+        .map(|(key, _)| key.to_owned())
+        .collect();
+    for follower in followers {
+        axes.remove(&follower);
+    }
+}
+
+fn forget_in_stop(stop: &mut dyn TableLike, name: &str) {
+    let emergency = stop.get_mut("emergency");
+    if let Some(conditions) = emergency.and_then(Item::as_table_like_mut) {
+        conditions.remove(name);
+    }
+    if stop.get("emergency").is_some_and(is_empty) {
+        stop.remove("emergency");
+    }
+    let groups = stop.get_mut("group").and_then(Item::as_array_of_tables_mut);
+    if let Some(groups) = groups {
+        for group in groups.iter_mut() {
+            for key in ["axes", "devices"] {
+                if let Some(names) = group.get_mut(key).and_then(Item::as_array_mut) {
+                    names.retain(|n| n.as_str() != Some(name));
+                }
+            }
+        }
+        groups.retain(|group| group.get("axes").is_some_and(|axes| !is_empty(axes)));
+    }
+    if stop.get("group").is_some_and(is_empty) {
+        stop.remove("group");
+    }
+}

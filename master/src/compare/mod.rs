@@ -1,0 +1,521 @@
+//! A machine file against a bus: who is missing, who is there besides, who stands where another should. Pure, but for [`parameters`].
+//!
+//! - here: which device of the bus is which of the file, and what is wrong with it;
+//! - `parameters`: what the devices hold of the start-up SDOs;
+//! - [`apply`]: the file rewritten so that it is as the bus.
+
+use std::fmt;
+
+use ecaxis_esi::Mode;
+
+use crate::config::{DeviceConfig, Locator, Machine};
+use crate::scan::{Device, Scan};
+
+mod align;
+pub mod apply;
+mod parameters;
+
+pub use parameters::parameters;
+
+/// One thing about which bus and file disagree. Devices of the file are indices into [`Machine::devices`], those of the bus positions.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Difference {
+    /// Nobody on the bus is this device.
+    Missing { device: usize },
+    /// The file does not name this one.
+    Added { position: u16 },
+    /// Each stands where the other should.
+    Swapped {
+        devices: [usize; 2],
+        positions: [u16; 2],
+    },
+    /// It stands elsewhere; those between may have moved on with it.
+    Moved { device: usize, from: u16, to: u16 },
+    /// A revision that the device's `identity` does not take.
+    Revision {
+        device: usize,
+        position: u16,
+        expected: u32,
+        found: u32,
+    },
+    /// The device is there, under another alias or device identification.
+    Alias {
+        device: usize,
+        position: u16,
+        expected: Locator,
+        found: u16,
+    },
+    Serial {
+        device: usize,
+        position: u16,
+        expected: u32,
+        found: u32,
+    },
+    /// Modules by their names, slot by slot.
+    Modules {
+        device: usize,
+        position: u16,
+        expected: Vec<String>,
+        found: Vec<String>,
+    },
+    /// What a start-up SDO would write, and what the device holds.
+    Parameter {
+        device: usize,
+        position: u16,
+        index: u16,
+        sub: u8,
+        name: String,
+        expected: Vec<u8>,
+        found: Vec<u8>,
+    },
+}
+
+/// What a comparison found.
+#[derive(Debug, Clone, Default)]
+pub struct Comparison {
+    pub differences: Vec<Difference>,
+    /// For each device of the file its position on the bus.
+    pub places: Vec<Option<u16>>,
+    /// What could not be compared.
+    pub unknown: Vec<String>,
+}
+
+/// Compares a machine with a bus that was scanned.
+#[must_use]
+pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
+    let mut comparison = Comparison {
+        places: vec![None; machine.devices.len()],
+        ..Comparison::default()
+    };
+    let mut free: Vec<bool> = vec![true; scan.devices.len()];
+    by_serial(machine, scan, &mut comparison.places, &mut free);
+    by_alias(machine, scan, &mut comparison.places, &mut free);
+    by_order(machine, scan, &mut comparison.places, &mut free);
+    elsewhere(machine, scan, &mut comparison, &mut free);
+
+    let missing = comparison.places.iter().enumerate();
+    let missing = missing.filter(|(_, place)| place.is_none());
+    comparison
+        .differences
+        .extend(missing.map(|(device, _)| Difference::Missing { device }));
+    for (device, _) in scan.devices.iter().zip(&free).filter(|(_, free)| **free) {
+        if device.identity().is_none() {
+            comparison.unknown.push(format!(
+                "position {}: its EEPROM could not be read",
+                device.position()
+            ));
+        }
+        let position = device.position();
+        comparison.differences.push(Difference::Added { position });
+    }
+    order(machine, &mut comparison);
+    for (index, config) in machine.devices.iter().enumerate() {
+        let place = comparison.places.get(index).copied().flatten();
+        if let Some(device) = place.and_then(|at| scan.devices.get(usize::from(at))) {
+            one(index, config, device, scan.asked, &mut comparison);
+        }
+    }
+    comparison
+}
+
+fn is_product(config: &DeviceConfig, device: &Device) -> bool {
+    let ours = config.selection.identity;
+    device
+        .identity()
+        .is_some_and(|i| (i.vendor, i.product) == (ours.vendor, ours.product))
+}
+
+type Places = [Option<u16>];
+
+/// Serial numbers tell devices apart whatever else has changed.
+fn by_serial(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [bool]) {
+    claim(machine, scan, places, free, |config, device| {
+        config.serial.is_some() && config.serial == device.serial()
+    });
+}
+
+fn by_alias(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [bool]) {
+    claim(machine, scan, places, free, |config, device| {
+        match config.at {
+            Locator::Position(_) => false,
+            Locator::Alias(alias) => device.found.alias == alias,
+            Locator::Id(id) => device.id == Some(id),
+        }
+    });
+}
+
+/// Gives each device of the file that has no place yet the first free one of its product that fits.
+fn claim(
+    machine: &Machine,
+    scan: &Scan,
+    places: &mut Places,
+    free: &mut [bool],
+    fits: impl Fn(&DeviceConfig, &Device) -> bool,
+) {
+    for (config, place) in machine.devices.iter().zip(places) {
+        if place.is_some() {
+            continue;
+        }
+        let mut all = scan.devices.iter().zip(free.iter_mut());
+        let found =
+            all.find(|(device, free)| **free && is_product(config, device) && fits(config, device));
+        if let Some((device, free)) = found {
+            *free = false;
+            *place = Some(device.position());
+        }
+    }
+}
+
+/// The longest row of devices that stand in the order of the file: one that is missing or added moves the others, and nothing else.
+fn by_order(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [bool]) {
+    let mut expected: Vec<(u16, usize)> = machine
+        .devices
+        .iter()
+        .enumerate()
+        .filter_map(|(index, config)| match config.at {
+            Locator::Position(position) => Some((position, index)),
+            _ => None,
+        })
+        .filter(|(_, index)| places.get(*index).is_some_and(Option::is_none))
+        .collect();
+    expected.sort_unstable();
+    let there: Vec<usize> = (0..scan.devices.len())
+        .filter(|at| free.get(*at).copied().unwrap_or(false))
+        .collect();
+    let same = |e: usize, t: usize| {
+        let config = expected.get(e).and_then(|(_, i)| machine.devices.get(*i));
+        let device = there.get(t).and_then(|at| scan.devices.get(*at));
+        config
+            .zip(device)
+            .is_some_and(|(config, device)| is_product(config, device))
+    };
+    for (e, t) in align::longest(expected.len(), there.len(), same) {
+        let (Some((_, index)), Some(at)) = (expected.get(e), there.get(t)) else {
+            continue;
+        };
+        if let (Some(place), Some(free)) = (places.get_mut(*index), free.get_mut(*at)) {
+            *place = u16::try_from(*at).ok();
+            *free = false;
+        }
+    }
+}
+
+/// What is left of a product is that device in another place, or under another alias.
+fn elsewhere(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: &mut [bool]) {
+    let before = comparison.places.clone();
+    claim(machine, scan, &mut comparison.places, free, |_, _| true);
+    for (index, config) in machine.devices.iter().enumerate() {
+        let now = comparison.places.get(index).copied().flatten();
+        let (Some(None), Some(position)) = (before.get(index), now) else {
+            continue;
+        };
+        let device = scan.devices.get(usize::from(position));
+        let found = match (config.at, device) {
+            (Locator::Alias(_), Some(device)) => device.found.alias,
+            (Locator::Id(_), Some(device)) => device.id.unwrap_or(0),
+            _ => continue,
+        };
+        comparison.differences.push(Difference::Alias {
+            device: index,
+            position,
+            expected: config.at,
+            found,
+        });
+    }
+}
+
+/// Devices that are found by position, and stand in another order.
+fn order(machine: &Machine, comparison: &mut Comparison) {
+    let mut all: Vec<(u16, u16, usize)> = machine
+        .devices
+        .iter()
+        .zip(&comparison.places)
+        .enumerate()
+        .filter_map(|(index, (config, place))| match config.at {
+            Locator::Position(position) => Some((position, (*place)?, index)),
+            _ => None,
+        })
+        .collect();
+    all.sort_unstable();
+    // Ranks: what is missing or added moves nobody.
+    let mut places: Vec<u16> = all.iter().map(|(_, place, _)| *place).collect();
+    places.sort_unstable();
+    let rank = |place: u16| places.iter().position(|other| *other == place);
+    let ranks: Vec<Option<usize>> = all.iter().map(|(_, place, _)| rank(*place)).collect();
+    for (n, ((from, to, device), found)) in all.iter().zip(&ranks).enumerate() {
+        let Some(found) = *found else { continue };
+        if found == n {
+            continue;
+        }
+        let back = ranks.get(found).copied().flatten() == Some(n);
+        match all.get(found) {
+            Some((_, other_to, other)) if back => {
+                // Told once, by the first.
+                if found > n {
+                    comparison.differences.push(Difference::Swapped {
+                        devices: [*device, *other],
+                        positions: [*to, *other_to],
+                    });
+                }
+            }
+            _ => comparison.differences.push(Difference::Moved {
+                device: *device,
+                from: *from,
+                to: *to,
+            }),
+        }
+    }
+}
+
+/// A device that is there.
+fn one(
+    index: usize,
+    config: &DeviceConfig,
+    device: &Device,
+    asked: bool,
+    comparison: &mut Comparison,
+) {
+    let position = device.position();
+    let expected = config.selection.identity.revision;
+    if let Some(found) = device.identity().map(|i| i.revision)
+        && !config.identity.accepts(expected, found)
+    {
+        comparison.differences.push(Difference::Revision {
+            device: index,
+            position,
+            expected,
+            found,
+        });
+    }
+    if let (Some(expected), Some(found)) = (config.serial, device.serial())
+        && expected != found
+    {
+        comparison.differences.push(Difference::Serial {
+            device: index,
+            position,
+            expected,
+            found,
+        });
+    }
+    modules(index, config, device, asked, comparison);
+}
+
+/// Where a mode picks the module, the device takes what it is told.
+fn modules(
+    index: usize,
+    config: &DeviceConfig,
+    device: &Device,
+    asked: bool,
+    comparison: &mut Comparison,
+) {
+    let selection = &config.selection;
+    if config.device.slots.is_none() || selection.mode.is_some_and(Mode::is_cyclic) {
+        return;
+    }
+    let detected = match &device.answers {
+        Some(Ok(answers)) => answers.detected.as_ref(),
+        _ => None,
+    };
+    let Some(detected) = detected else {
+        if !asked {
+            let text = format!("`{}`: its modules, which it was not asked for", config.name);
+            comparison.unknown.push(text);
+        }
+        return;
+    };
+    let mut expected: Vec<u32> = Vec::new();
+    for module in &selection.modules {
+        let Some(new) = module.place.checked_add(1).filter(|n| *n <= 255) else {
+            continue;
+        };
+        expected.resize(expected.len().max(new), 0);
+        if let Some(ident) = expected.get_mut(module.place) {
+            *ident = module.ident;
+        }
+    }
+    let trimmed = |idents: &[u32]| {
+        let end = idents.iter().rposition(|ident| *ident != 0);
+        idents
+            .get(..end.map_or(0, |end| end + 1))
+            .unwrap_or_default()
+            .to_vec()
+    };
+    let (expected, found) = (trimmed(&expected), trimmed(detected));
+    if expected == found {
+        return;
+    }
+    let name = |ident: &u32| match ident {
+        0 => "-".to_owned(),
+        ident => {
+            let known = config.esi.modules.iter().find(|m| m.ident == *ident);
+            known.map_or_else(|| format!("0x{ident:08x}"), |m| m.type_name.clone())
+        }
+    };
+    comparison.differences.push(Difference::Modules {
+        device: index,
+        position: device.position(),
+        expected: expected.iter().map(name).collect(),
+        found: found.iter().map(name).collect(),
+    });
+}
+
+impl Difference {
+    /// In words.
+    #[must_use]
+    pub fn told<'a>(&'a self, machine: &'a Machine, scan: &'a Scan) -> impl fmt::Display + 'a {
+        Told {
+            difference: self,
+            machine,
+            scan,
+        }
+    }
+}
+
+struct Told<'a> {
+    difference: &'a Difference,
+    machine: &'a Machine,
+    scan: &'a Scan,
+}
+
+impl Told<'_> {
+    fn name(&self, device: usize) -> &str {
+        let device = self.machine.devices.get(device);
+        device.map_or("?", |device| device.name.as_str())
+    }
+
+    fn kind(&self, device: usize) -> String {
+        let device = self.machine.devices.get(device);
+        device.map_or_else(String::new, |d| d.device.type_name.clone())
+    }
+
+    /// Who stands at a position.
+    fn there(&self, position: u16) -> String {
+        let device = self.scan.devices.get(usize::from(position));
+        let Some(identity) = device.and_then(Device::identity) else {
+            return "somebody unknown".to_owned();
+        };
+        let esi = self.machine.devices.iter().flat_map(|d| &d.esi.devices);
+        let mut of_product = esi.filter(|d| {
+            (d.identity.vendor, d.identity.product) == (identity.vendor, identity.product)
+        });
+        let known = of_product.next().map(|d| format!("{}, ", d.type_name));
+        format!("{}{identity}", known.unwrap_or_default())
+    }
+}
+
+impl fmt::Display for Told<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.difference {
+            Difference::Missing { device } => {
+                let at = self.machine.devices.get(*device).map(|d| d.at.to_string());
+                write!(
+                    f,
+                    "`{}` ({}) is missing: no {} is left on the bus for it",
+                    self.name(*device),
+                    at.unwrap_or_default(),
+                    self.kind(*device)
+                )
+            }
+            Difference::Added { position } => write!(
+                f,
+                "position {position} is not in the file: {}",
+                self.there(*position)
+            ),
+            Difference::Swapped { devices, positions } => write!(
+                f,
+                "`{}` and `{}` are swapped: `{}` is at position {}, `{}` at position {}",
+                self.name(devices[0]),
+                self.name(devices[1]),
+                self.name(devices[0]),
+                positions[0],
+                self.name(devices[1]),
+                positions[1]
+            ),
+            Difference::Moved { device, from, to } => write!(
+                f,
+                "`{}` is at position {to}, in the file at position {from}",
+                self.name(*device)
+            ),
+            Difference::Revision {
+                device,
+                position,
+                expected,
+                found,
+            } => {
+                let rule = self.machine.devices.get(*device).map(|d| d.identity);
+                write!(
+                    f,
+                    "`{}` (position {position}) has revision 0x{found:08x}, its ESI describes 0x{expected:08x} (identity = \"{}\")",
+                    self.name(*device),
+                    rule.unwrap_or_default()
+                )
+            }
+            Difference::Alias {
+                device,
+                position,
+                expected,
+                found,
+            } => {
+                let what = match expected {
+                    Locator::Id(_) => "device identification",
+                    _ => "alias",
+                };
+                write!(
+                    f,
+                    "`{}`: nobody has {expected}; the {} at position {position} has {what} {found}",
+                    self.name(*device),
+                    self.kind(*device)
+                )
+            }
+            Difference::Serial {
+                device,
+                position,
+                expected,
+                found,
+            } => write!(
+                f,
+                "`{}` (position {position}) has serial number {found}, the file says {expected}",
+                self.name(*device)
+            ),
+            Difference::Modules {
+                device,
+                position,
+                expected,
+                found,
+            } => write!(
+                f,
+                "`{}` (position {position}) holds the modules [{}], the file says [{}]",
+                self.name(*device),
+                found.join(", "),
+                expected.join(", ")
+            ),
+            Difference::Parameter {
+                device,
+                position,
+                index,
+                sub,
+                name,
+                expected,
+                found,
+            } => write!(
+                f,
+                "`{}` (position {position}): 0x{index:04X}:{sub:02X} {name} is {}, start-up writes {}",
+                self.name(*device),
+                number(found),
+                number(expected)
+            ),
+        }
+    }
+}
+
+/// Little-endian bytes as a number.
+fn number(bytes: &[u8]) -> String {
+    if bytes.len() > 8 {
+        return format!("{} bytes", bytes.len());
+    }
+    let value = bytes
+        .iter()
+        .rev()
+        .fold(0_u64, |value, byte| value << 8 | u64::from(*byte));
+    format!("{value} (0x{value:0width$x})", width = bytes.len() * 2)
+}

@@ -1,0 +1,200 @@
+//! What a controller's registers mean (ETG.1000.4; Beckhoff ESC data sheet, section II).
+
+use std::fmt;
+
+/// 0x0000 to 0x0009.
+pub const CONTROLLER_BYTES: usize = 10;
+
+/// Bits of 0x0008.
+const DC: u16 = 0x0004;
+const DC_64_BIT: u16 = 0x0008;
+const NO_LRW: u16 = 0x0200;
+
+/// What a controller says of itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Controller {
+    /// 0x0000: 0x04 IP core, 0x11 ET1100, 0x12 ET1200, 0xc0 LAN9252 …
+    pub kind: u8,
+    pub revision: u8,
+    pub build: u16,
+    pub fmmus: u8,
+    pub sync_managers: u8,
+    /// Process RAM.
+    pub ram_kib: u8,
+    pub ports: [PortKind; 4],
+    /// 0x0008.
+    pub features: u16,
+}
+
+/// What a port is made for (0x0007).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum PortKind {
+    #[default]
+    None,
+    NotConfigured,
+    Ebus,
+    Mii,
+}
+
+impl fmt::Display for PortKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::None => "none",
+            Self::NotConfigured => "not configured",
+            Self::Ebus => "E-bus",
+            Self::Mii => "MII",
+        })
+    }
+}
+
+impl Controller {
+    #[must_use]
+    pub fn from_registers(bytes: [u8; CONTROLLER_BYTES]) -> Self {
+        let [
+            kind,
+            revision,
+            b0,
+            b1,
+            fmmus,
+            sync_managers,
+            ram_kib,
+            ports,
+            f0,
+            f1,
+        ] = bytes;
+        let port = |n: u8| match ports >> (2 * n) & 3 {
+            0 => PortKind::None,
+            1 => PortKind::NotConfigured,
+            2 => PortKind::Ebus,
+            _ => PortKind::Mii,
+        };
+        Self {
+            kind,
+            revision,
+            build: u16::from_le_bytes([b0, b1]),
+            fmmus,
+            sync_managers,
+            ram_kib,
+            ports: [port(0), port(1), port(2), port(3)],
+            features: u16::from_le_bytes([f0, f1]),
+        }
+    }
+
+    /// Distributed clocks: receive times at least.
+    #[must_use]
+    pub fn has_receive_times(&self) -> bool {
+        self.features & DC != 0
+    }
+
+    /// Of the distributed clock.
+    #[must_use]
+    pub fn clock_bits(&self) -> u8 {
+        if self.features & DC_64_BIT != 0 {
+            64
+        } else {
+            32
+        }
+    }
+
+    #[must_use]
+    pub fn knows_lrw(&self) -> bool {
+        self.features & NO_LRW == 0
+    }
+}
+
+/// What a port does (DL status, 0x0110).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Port {
+    /// The cable, or the neighbour on the E-bus, is there.
+    pub link: bool,
+    /// Frames go out and come back.
+    pub open: bool,
+}
+
+#[must_use]
+pub fn ports(dl_status: u16) -> [Port; 4] {
+    [0, 1, 2, 3].map(|n: u16| {
+        let looped = dl_status >> (8 + 2 * n) & 1 != 0;
+        let communicates = dl_status >> (9 + 2 * n) & 1 != 0;
+        Port {
+            link: dl_status >> (4 + n) & 1 != 0,
+            open: !looped && communicates,
+        }
+    })
+}
+
+#[must_use]
+pub fn open_ports(dl_status: u16) -> [bool; 4] {
+    ports(dl_status).map(|port| port.open)
+}
+
+/// 0x0900 to 0x090F: nanoseconds of the device's own time at which a frame came in at each port.
+#[must_use]
+pub fn receive_times(bytes: [u8; 16]) -> [u32; 4] {
+    let mut times = [0; 4];
+    for (time, word) in times.iter_mut().zip(bytes.chunks_exact(4)) {
+        *time = word
+            .iter()
+            .rev()
+            .fold(0, |time, byte| time << 8 | u32::from(*byte));
+    }
+    times
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_controller() {
+        // ET1100 with two MII ports.
+        let bytes = [0x11, 0, 2, 0, 8, 8, 8, 0x0f, 0xfc, 0x00];
+        let controller = Controller::from_registers(bytes);
+        assert_eq!(controller.kind, 0x11);
+        assert_eq!(controller.build, 2);
+        assert_eq!(
+            controller.ports,
+            [PortKind::Mii, PortKind::Mii, PortKind::None, PortKind::None]
+        );
+        assert!(controller.has_receive_times() && controller.knows_lrw());
+        assert_eq!(controller.clock_bits(), 64);
+        let without = Controller::from_registers([0x12, 0, 0, 0, 3, 4, 1, 0x8a, 0x00, 0x02]);
+        assert!(!without.has_receive_times() && !without.knows_lrw());
+        assert_eq!(without.ports[3], PortKind::Ebus);
+        assert_eq!(without.clock_bits(), 32);
+    }
+
+    /// Rows of the table "DL status": link, loop, communication.
+    #[test]
+    fn ports_are_open_where_they_communicate_and_have_no_loop() {
+        for (status, link, open) in [
+            (0x5530, [true, true, false, false], [false; 4]),
+            (
+                0x5a30,
+                [true, true, false, false],
+                [true, true, false, false],
+            ),
+            (
+                0x5610,
+                [true, false, false, false],
+                [true, false, false, false],
+            ),
+            (
+                0x99b0,
+                [true, true, false, true],
+                [false, true, false, true],
+            ),
+        ] {
+            let ports = ports(status);
+            assert_eq!(ports.map(|p| p.link), link, "0x{status:04x}");
+            assert_eq!(ports.map(|p| p.open), open, "0x{status:04x}");
+        }
+    }
+
+    #[test]
+    fn times_are_little_endian() {
+        let mut bytes = [0; 16];
+        bytes[4..8].copy_from_slice(&0x1234_5678_u32.to_le_bytes());
+        assert_eq!(receive_times(bytes), [0, 0x1234_5678, 0, 0]);
+    }
+}

@@ -1,0 +1,216 @@
+//! What a drive's answers say of its axis.
+
+use ecaxis_axis::scale::{AccelerationUnit, Scale, VelocityUnit};
+use ecaxis_axis::units::{RawAcceleration, RawVelocity};
+use ecaxis_esi as esi;
+
+use super::MARK;
+use super::lines::Lines;
+use crate::scan::{Described, Device, DriveAnswers};
+
+/// Where nobody says otherwise: 500 lines of an incremental encoder.
+const USUAL_ENCODER: f64 = 2000.0;
+/// Turns a second, and a second squared.
+const USUAL_VELOCITY: f64 = 1.0;
+const USUAL_ACCELERATION: f64 = 10.0;
+/// A drive cannot tell more counts apart.
+const MOST_COUNTS: f64 = 2_147_483_648.0;
+/// Percent of the rated torque that every motor stands.
+const TORQUE: f64 = 100.0;
+
+/// The mode to begin with: the first that the ESI offers and the drive does not deny.
+pub(super) fn mode(device: &Device, described: Option<&Described>) -> Option<esi::Mode> {
+    let described = described?;
+    if !device.says_drive() && !described.is_drive() {
+        return None;
+    }
+    let supported = drive(device).and_then(|drive| drive.supported_modes);
+    let offered = esi::offered_modes(&described.file, &described.device);
+    let possible = |mode: &esi::Mode| {
+        // 0x6502: bit 0 is mode 1.
+        let bit = u32::from(mode.code().to_le_bytes()[0]).saturating_sub(1);
+        let supports = |modes: u32| modes.checked_shr(bit).unwrap_or(0) & 1 != 0;
+        offered.contains(mode) && supported.filter(|modes| *modes != 0).is_none_or(supports)
+    };
+    let wanted = [esi::Mode::Csp, esi::Mode::Csv, esi::Mode::Cst];
+    wanted.into_iter().find(possible)
+}
+
+fn drive(device: &Device) -> Option<&DriveAnswers> {
+    match &device.answers {
+        Some(Ok(answers)) => answers.drive.as_ref(),
+        _ => None,
+    }
+}
+
+/// `[device.axis]`, in turns of the motor.
+pub(super) fn section(device: &Device, described: &Described) -> String {
+    let unknown = DriveAnswers::default();
+    let drive = drive(device).unwrap_or(&unknown);
+    let mut lines = Lines::default();
+    lines.header("[device.axis]");
+    let comment = format!("{MARK} of the motor; or your own, with `per_turn`");
+    lines.add("unit", "\"turn\"", &comment);
+    let encoder = encoder(drive, &mut lines);
+    if let Some(polarity) = drive.units.polarity.filter(|p| p & 0xc0 != 0) {
+        lines.comment(&format!(
+            "{MARK} the drive inverts by itself, 0x607E is 0x{polarity:02x}"
+        ));
+    }
+    if let Some(code) = drive.units.velocity_unit
+        && VelocityUnit::from_si_code(code).is_none()
+    {
+        let comment =
+            format!("{MARK} the drive's unit of velocity, 0x60A9, is 0x{code:08x}: not understood");
+        lines.add("velocity_unit", "\"counts/s\"", &comment);
+    }
+    if let Ok(scale) = Scale::new(encoder, 1.0) {
+        limits(
+            drive,
+            scale_of(drive, scale, described),
+            encoder,
+            &mut lines,
+        );
+    }
+    lines.text()
+}
+
+fn encoder(drive: &DriveAnswers, lines: &mut Lines) -> f64 {
+    let sensor = drive.sensor_resolution.filter(|counts| *counts > 0);
+    let said = drive.units.counts_per_turn();
+    let said = said.filter(|(_, counts)| (1.0..=MOST_COUNTS).contains(counts));
+    let (counts, comment) = match (said, sensor) {
+        (Some((index, counts)), _) => {
+            let comment = format!("counts a motor turn, by 0x{index:04X}");
+            (counts, comment)
+        }
+        (None, Some(counts)) => (
+            f64::from(counts),
+            "counts a motor turn, by 0x3000:05".to_owned(),
+        ),
+        (None, None) => (
+            USUAL_ENCODER,
+            format!("{MARK} counts a motor turn; the drive does not say"),
+        ),
+    };
+    lines.add("encoder", &plain(counts), &comment);
+    counts
+}
+
+/// As the drive counts velocities and accelerations.
+fn scale_of(drive: &DriveAnswers, scale: Scale, described: &Described) -> Scale {
+    let default = |index: u16| {
+        let item = described.device.dictionary.item(index, 0)?;
+        let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
+        item.has_default.then(|| u32::from_le_bytes(bytes))
+    };
+    let velocity = drive.units.velocity_unit.or_else(|| default(0x60a9));
+    let velocity = velocity.and_then(VelocityUnit::from_si_code);
+    let velocity = velocity.unwrap_or_default();
+    let acceleration = drive.units.acceleration_unit.or_else(|| default(0x60aa));
+    let acceleration = acceleration.and_then(AccelerationUnit::from_si_code);
+    scale
+        .with_velocity_unit(velocity)
+        .with_acceleration_unit(acceleration.unwrap_or(velocity.into()))
+}
+
+fn limits(drive: &DriveAnswers, scale: Scale, encoder: f64, lines: &mut Lines) {
+    if let Some([low, high]) = range(drive) {
+        let [low, high] = [low, high].map(|n| number(f64::from(n) / encoder));
+        let comment = format!("{MARK} the drive's own, 0x607D");
+        lines.add("limits.position", &format!("[{low}, {high}]"), &comment);
+    } else {
+        lines.comment(&format!(
+            "limits.position = [-10.0, 10.0]  {MARK} the drive knows no ends"
+        ));
+    }
+
+    // The smaller of two that stand for the same.
+    let profile = drive.max_profile_velocity.filter(|n| *n > 0);
+    let profile = profile.and_then(|n| i32::try_from(n).ok());
+    let profile = profile.map(|n| (scale.velocity_to_user(RawVelocity(n)).0, "0x607F"));
+    let motor = drive.max_motor_speed.filter(|n| *n > 0);
+    let motor = motor.map(|rpm| (f64::from(rpm) / 60.0, "0x6080"));
+    let both = [profile, motor].into_iter().flatten();
+    let slowest = both.min_by(|a, b| a.0.total_cmp(&b.0));
+    // What a drive cannot be told is no limit either.
+    let most = scale.velocity_to_user(RawVelocity(i32::MAX)).0;
+    let velocity = slowest.filter(|(velocity, _)| *velocity <= most);
+    said_or(
+        "limits.velocity",
+        velocity,
+        USUAL_VELOCITY.min(most),
+        "turns/s",
+        lines,
+    );
+
+    let raws = [
+        (drive.max_acceleration, "0x60C5"),
+        (drive.max_deceleration, "0x60C6"),
+    ];
+    let each = raws.into_iter().filter_map(|(raw, object)| {
+        let raw = raw.filter(|n| *n > 0 && *n < u32::MAX)?;
+        Some((scale.acceleration_to_user(RawAcceleration(raw)).0, object))
+    });
+    let acceleration = each.min_by(|a, b| a.0.total_cmp(&b.0));
+    said_or(
+        "limits.acceleration",
+        acceleration,
+        USUAL_ACCELERATION,
+        "turns/s²",
+        lines,
+    );
+
+    let allowed = drive.max_torque.filter(|n| *n > 0);
+    let comment = match allowed {
+        Some(n) => format!(
+            "% of the rated torque; 0x6072 allows {}",
+            plain(f64::from(n) / 10.0)
+        ),
+        None => "% of the rated torque".to_owned(),
+    };
+    let torque = allowed.map_or(TORQUE, |n| TORQUE.min(f64::from(n) / 10.0));
+    lines.add("limits.torque", &number(torque), &comment);
+
+    let window = drive.following_window.filter(|n| (1..u32::MAX).contains(n));
+    let window = window.map(|n| scale.units_of_counts(f64::from(n)));
+    match window {
+        Some(turns) => {
+            let comment = format!("{MARK} turns; the drive's own, 0x6065");
+            lines.add("limits.following_error", &number(turns), &comment);
+        }
+        None => lines.comment(&format!(
+            "limits.following_error = 0.5  {MARK} the drive does not watch it"
+        )),
+    }
+}
+
+/// The drive's software limits, where they are narrower than all that it can count.
+fn range(drive: &DriveAnswers) -> Option<[i32; 2]> {
+    let [low, high] = drive.software_limits?;
+    let wide = i64::from(high) - i64::from(low);
+    (low < high && low > i32::MIN && high < i32::MAX && wide < i64::from(i32::MAX))
+        .then_some([low, high])
+}
+
+fn said_or(key: &str, said: Option<(f64, &str)>, usual: f64, unit: &str, lines: &mut Lines) {
+    let (value, comment) = match said {
+        Some((value, object)) => (value, format!("{MARK} {unit}; the drive's own, {object}")),
+        None => (usual, format!("{MARK} {unit}; the drive does not say")),
+    };
+    lines.add(key, &number(value), &comment);
+}
+
+/// A whole number without a point.
+fn plain(value: f64) -> String {
+    let text = number(value);
+    text.strip_suffix(".0").map_or(text.clone(), str::to_owned)
+}
+
+/// With a point, as far as it means something.
+fn number(value: f64) -> String {
+    let rounded = (value * 1e4).round() / 1e4;
+    // Below that the digits begin to count.
+    let shown = if rounded == 0.0 { value } else { rounded };
+    format!("{shown:?}")
+}

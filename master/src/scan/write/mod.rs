@@ -1,0 +1,400 @@
+//! The machine file that follows from a scan. Pure: a scan and descriptions in, text out.
+//!
+//! `axis` is what a drive's answers say of its axis; `lines` lays keys and comments out.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use ecaxis_esi as esi;
+
+use super::{Described, Device, Scan};
+use crate::config::duration;
+use crate::library::Match;
+
+mod axis;
+mod lines;
+
+use lines::Lines;
+
+/// What every doubtful line says, for people to search for.
+pub const MARK: &str = "CHECK:";
+
+/// Cycles to begin with, nanoseconds: the first that all devices take.
+const CYCLES: [u64; 5] = [1_000_000, 2_000_000, 4_000_000, 500_000, 250_000];
+
+/// Where the file will be.
+#[derive(Debug, Clone, Copy)]
+pub struct Place<'a> {
+    /// `"sim"`, or a network interface.
+    pub nic: &'a str,
+    /// The machine file's folder: paths in it are relative.
+    pub folder: &'a Path,
+}
+
+/// How a device of the scan is called in the file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Named {
+    pub name: String,
+    pub mode: Option<esi::Mode>,
+}
+
+/// A whole machine file. Lines with [`MARK`] want a look.
+#[must_use]
+pub fn machine_file(scan: &Scan, described: &[Option<Described>], place: Place<'_>) -> String {
+    let described = || described.iter().map(Option::as_ref);
+    let named = names(scan.devices.iter().zip(described()), &[]);
+    let cycle_ns = cycle(described().zip(&named));
+    let mut text = head(&named, place, cycle_ns);
+    let aliases = aliases(scan);
+    for ((device, described), named) in scan.devices.iter().zip(described()).zip(&named) {
+        text += "\n";
+        text += &device_section(device, described, named, &aliases, place, cycle_ns);
+    }
+    text + &steps(&named)
+}
+
+fn head(named: &[Named], place: Place<'_>, cycle_ns: u64) -> String {
+    let mut text = format!(
+        "# Written by `ecaxis scan`. Lines with \"{MARK}\" want a look.\n\
+         # `ecaxis check FILE` finds mistakes, `ecaxis explain FILE` shows what follows,\n\
+         # `ecaxis compare FILE` tells whether the bus is still as it was.\n\n",
+    );
+    let mut lines = Lines::default();
+    if named.iter().any(|named| named.mode.is_some()) {
+        let comment =
+            format!("{MARK} look at the limits first; then take this out, or `run --enable`");
+        lines.add("enable", "false", &comment);
+        text += &lines.text();
+        text += "\n";
+    }
+    let mut lines = Lines::default();
+    lines.header("[bus]");
+    let nic = quoted(place.nic);
+    lines.add("nic", &nic, "`ecaxis run FILE --sim` simulates the bus");
+    let cycle = quoted(&duration::show(cycle_ns).replace(' ', ""));
+    lines.add("cycle", &cycle, "");
+    let comment = format!("{MARK} a machine wants 3");
+    lines.add("lost_frames", "20", &comment);
+    text + &lines.text()
+}
+
+/// The first cycle that every device can be configured with.
+fn cycle<'d>(devices: impl Iterator<Item = (Option<&'d Described>, &'d Named)> + Clone) -> u64 {
+    let takes = |cycle_ns: &u64| {
+        devices.clone().all(|(described, named)| {
+            described.is_none_or(|d| selection(d, named.mode, *cycle_ns).is_some())
+        })
+    };
+    let found = CYCLES.into_iter().find(takes);
+    found.unwrap_or(CYCLES[0])
+}
+
+fn selection(
+    described: &Described,
+    mode: Option<esi::Mode>,
+    cycle_ns: u64,
+) -> Option<esi::Selection> {
+    let choice = esi::Choice {
+        mode,
+        cycle_ns,
+        ..esi::Choice::default()
+    };
+    esi::select(&described.file, &described.device, &choice).ok()
+}
+
+/// Axes are counted, other devices are called what they are. `taken`: names that are not free.
+pub fn names<'d>(
+    devices: impl Iterator<Item = (&'d Device, Option<&'d Described>)>,
+    taken: &[String],
+) -> Vec<Named> {
+    let mut taken: Vec<String> = taken.to_vec();
+    let mut all = Vec::new();
+    for (device, described) in devices {
+        let mode = axis::mode(device, described);
+        let word = match mode {
+            Some(_) => "axis".to_owned(),
+            None => word(device, described),
+        };
+        // The first axis is axis1; the first terminal is what it is, the second has a 2.
+        let first = if mode.is_some() { 1 } else { 0 };
+        let numbered = |n: usize| match (n, word.ends_with(|c: char| c.is_ascii_digit())) {
+            (0, _) => word.clone(),
+            (n, true) => format!("{word}_{}", n + 1),
+            (n, false) if mode.is_none() => format!("{word}{}", n + 1),
+            (n, false) => format!("{word}{n}"),
+        };
+        // No more are taken than there are.
+        let free = (first..=first + taken.len()).map(numbered);
+        let name = free
+            .into_iter()
+            .find(|name| !taken.contains(name))
+            .unwrap_or(word.clone());
+        taken.push(name.clone());
+        all.push(Named { name, mode });
+    }
+    all
+}
+
+/// A word for a key: letters, digits and underscores.
+fn word(device: &Device, described: Option<&Described>) -> String {
+    let general = device.sii.as_ref().ok().and_then(|s| s.general.as_ref());
+    let type_name = described
+        .map(|d| d.device.type_name.as_str())
+        .or(general.map(|g| g.order.as_str()))
+        .unwrap_or_default();
+    let mut word = String::new();
+    for c in type_name.chars().take(24) {
+        match c {
+            c if c.is_ascii_alphanumeric() => word.push(c.to_ascii_lowercase()),
+            _ if word.ends_with('_') || word.is_empty() => {}
+            _ => word.push('_'),
+        }
+    }
+    let word = word.trim_end_matches('_').to_owned();
+    match word.chars().next() {
+        None => "device".to_owned(),
+        Some(c) if c.is_ascii_digit() => format!("device_{word}"),
+        Some(_) => word,
+    }
+}
+
+/// Aliases and device identifications, each with how many devices have it.
+#[derive(Debug, Default)]
+pub struct Aliases {
+    aliases: BTreeMap<u16, usize>,
+    ids: BTreeMap<u16, usize>,
+}
+
+#[must_use]
+pub fn aliases(scan: &Scan) -> Aliases {
+    let mut all = Aliases::default();
+    for device in &scan.devices {
+        *all.aliases.entry(device.found.alias).or_default() += 1;
+        if let Some(id) = device.id {
+            *all.ids.entry(id).or_default() += 1;
+        }
+    }
+    all
+}
+
+/// One `[[device]]` with what belongs to it.
+#[must_use]
+pub fn device_section(
+    device: &Device,
+    described: Option<&Described>,
+    named: &Named,
+    aliases: &Aliases,
+    place: Place<'_>,
+    cycle_ns: u64,
+) -> String {
+    let mut lines = Lines::default();
+    lines.header("[[device]]");
+    let what = described.map(|d| d.device.name.as_str());
+    lines.add("name", &quoted(&named.name), what.unwrap_or_default());
+    esi_keys(device, described, place, &mut lines);
+    locator(device, aliases, &mut lines);
+    if let Some(mode) = named.mode {
+        let offered = described.map(|d| esi::offered_modes(&d.file, &d.device));
+        let others: Vec<&str> = offered
+            .iter()
+            .flatten()
+            .filter(|m| m.is_cyclic() && **m != mode)
+            .map(|m| m.name())
+            .collect();
+        let comment = match others.is_empty() {
+            true => String::new(),
+            false => format!("also {}", others.join(", ")),
+        };
+        lines.add("mode", &quoted(mode.name()), &comment);
+    }
+    if let Some(described) = described {
+        if let Some(modules) = modules(device, described, named.mode) {
+            lines.add("modules", &modules.0, &modules.1);
+        }
+        let selection = selection(described, named.mode, cycle_ns);
+        if selection.is_some_and(|s| s.dc.is_some()) && !device.dc {
+            let comment = format!("{MARK} the ESI wants SYNC0, the device shows no clock");
+            lines.add("dc", &quoted("off"), &comment);
+        }
+    }
+    if let Some(serial) = device.serial().filter(|serial| *serial != 0) {
+        lines.comment(&format!(
+            "serial = {serial} would take this very device only"
+        ));
+    }
+    let mut text = lines.text();
+    if let (Some(_), Some(described)) = (named.mode, described) {
+        text += "\n";
+        text += &axis::section(device, described);
+    }
+    text
+}
+
+/// `esi`, and which of its devices.
+fn esi_keys(device: &Device, described: Option<&Described>, place: Place<'_>, lines: &mut Lines) {
+    let identity = device.identity().unwrap_or_default();
+    let Some(described) = described else {
+        let comment = format!(
+            "{MARK} no ESI file here describes {identity}: get it from its maker, put it here"
+        );
+        lines.add("esi", &quoted("esi/MISSING.xml"), &comment);
+        return;
+    };
+    let path = relative(&described.path, place.folder);
+    lines.add("esi", &quoted(&path.display().to_string()), "");
+    let ours = described.device.identity;
+    let devices = &described.file.devices;
+    let mut others = devices
+        .iter()
+        .filter(|d| d.identity.product != ours.product)
+        .peekable();
+    if others.peek().is_some() {
+        lines.add("type", &quoted(&described.device.type_name), "");
+        if others.any(|d| d.type_name == described.device.type_name) {
+            lines.add("product", &format!("0x{:08x}", ours.product), "");
+        }
+    }
+    let newer = devices
+        .iter()
+        .any(|d| d.identity.product == ours.product && d.identity.revision > ours.revision);
+    if newer {
+        lines.add("revision", &format!("0x{:08x}", ours.revision), "");
+    }
+    match described.rule {
+        Match::Equal => {}
+        rule => {
+            let rule = if rule == Match::Newer { ">=" } else { "ignore" };
+            let comment = format!(
+                "{MARK} the device has revision 0x{:08x}, the file 0x{:08x}",
+                identity.revision, ours.revision
+            );
+            lines.add("identity", &quoted(rule), &comment);
+        }
+    }
+}
+
+/// How it is found: by what stays with it, if it has that.
+fn locator(device: &Device, aliases: &Aliases, lines: &mut Lines) {
+    let position = device.position();
+    let alias = device.found.alias;
+    if alias != 0 && aliases.aliases.get(&alias) == Some(&1) {
+        let comment = format!("at position {position}");
+        lines.add("alias", &alias.to_string(), &comment);
+        return;
+    }
+    let id = device.id.filter(|id| *id != 0);
+    if let Some(id) = id.filter(|id| aliases.ids.get(id) == Some(&1)) {
+        let comment = format!("at position {position}");
+        lines.add("id", &id.to_string(), &comment);
+        return;
+    }
+    let comment = if alias == 0 {
+        String::new()
+    } else {
+        format!("{MARK} its alias {alias} is another's, too")
+    };
+    lines.add("position", &position.to_string(), &comment);
+}
+
+/// The modules that were found, and a comment. Where a mode picks the module nothing needs to be said.
+#[must_use]
+pub fn modules(
+    device: &Device,
+    described: &Described,
+    mode: Option<esi::Mode>,
+) -> Option<(String, String)> {
+    described.device.slots.as_ref()?;
+    if mode.is_some() {
+        return None;
+    }
+    let Some(Ok(answers)) = &device.answers else {
+        let comment = format!("{MARK} the device was not asked for its modules");
+        return Some(("[]".to_owned(), comment));
+    };
+    let lists = [&answers.detected, &answers.configured];
+    let plugged = |idents: &&Vec<u32>| idents.iter().any(|ident| *ident != 0);
+    let idents = lists.into_iter().flatten().find(plugged)?;
+    let mut names = Vec::with_capacity(idents.len());
+    let mut unknown = Vec::new();
+    for ident in idents {
+        let module = described.file.modules.iter().find(|m| m.ident == *ident);
+        names.push(match (ident, module) {
+            (0, _) => quoted("-"),
+            (_, Some(module)) => quoted(&module.type_name),
+            (ident, None) => {
+                unknown.push(format!("0x{ident:08x}"));
+                quoted(&format!("0x{ident:08x}"))
+            }
+        });
+    }
+    while names.last().is_some_and(|name| name == "\"-\"") {
+        names.pop();
+    }
+    let comment = match unknown.is_empty() {
+        true => "as they are plugged".to_owned(),
+        false => format!("{MARK} the ESI file does not know {}", unknown.join(", ")),
+    };
+    Some((format!("[{}]", names.join(", ")), comment))
+}
+
+/// A first move for the axes that can be sent somewhere.
+fn steps(named: &[Named]) -> String {
+    let axes: Vec<&str> = named
+        .iter()
+        .filter(|named| named.mode == Some(esi::Mode::Csp))
+        .map(|named| named.name.as_str())
+        .collect();
+    if axes.is_empty() {
+        return String::new();
+    }
+    let by = |way: &str| {
+        let each: Vec<String> = axes.iter().map(|axis| format!("{axis} = {way}")).collect();
+        format!(
+            "[[step]]\nmove_by = {{ {} }}\nspeed   = 0.05\nramp    = 0.05\n",
+            each.join(", ")
+        )
+    };
+    format!(
+        "\n# A first move, a tenth of a turn there and back, slowly: `ecaxis run FILE --enable`.\n{}\n{}",
+        by("0.1"),
+        by("-0.1")
+    )
+}
+
+/// From a folder to a file, both as they are from here.
+pub(crate) fn relative(file: &Path, folder: &Path) -> PathBuf {
+    let absolute = |path: &Path| {
+        let path = if path.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            path
+        };
+        std::fs::canonicalize(path).or_else(|_| std::path::absolute(path))
+    };
+    let (Ok(file_at), Ok(folder_at)) = (absolute(file), absolute(folder)) else {
+        return file.to_owned();
+    };
+    let (mut to, mut from) = (
+        file_at.components().peekable(),
+        folder_at.components().peekable(),
+    );
+    let mut shared = 0;
+    while to.peek().is_some() && to.peek() == from.peek() {
+        to.next();
+        from.next();
+        shared += 1;
+    }
+    let ups = from.count();
+    // Far apart, or with nothing but the root in common: the whole path is clearer.
+    if shared <= 1 || ups > 3 {
+        return file_at;
+    }
+    let up = std::iter::repeat_n(Path::new(".."), ups);
+    up.chain(to.map(|part| Path::new(part.as_os_str())))
+        .collect()
+}
+
+/// As TOML writes a text.
+fn quoted(text: &str) -> String {
+    toml::Value::String(text.to_owned()).to_string()
+}
