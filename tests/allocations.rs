@@ -101,7 +101,7 @@ fn the_counter_counts() {
 fn recording_beside_the_cycle_allocates_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.pcapng");
-    let mut recorder = Recorder::create(&path, Mode::Background).expect("a recording");
+    let mut recorder = Recorder::create(&path, Mode::Background, None).expect("a recording");
     let frame = [0x5a; MAX_FRAME];
     COUNT.set(0);
     METERED.set(true);

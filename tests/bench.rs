@@ -169,7 +169,7 @@ fn recorded_frames(axes: usize) -> Vec<Vec<u8>> {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("bench.pcapng");
     let segment = rig::segment(axes).expect("fits");
-    let recorder = Recorder::create(&path, Mode::Inline).expect("a recording");
+    let recorder = Recorder::create(&path, Mode::Inline, None).expect("a recording");
     let link = InProcess::new(segment, Hold::Fixed(1_000));
     let link = Box::new(Recorded::new(Box::new(link), recorder, 0));
     let setup = setup(axes, 2_000_000);

@@ -15,12 +15,15 @@
 //! - [`link`]: what carries Ethernet frames;
 //! - [`doctor`]: what in this computer keeps a cycle from being on time;
 //! - [`bench`]: what measuring needs;
+//! - [`recording`]: recordings as files, ours and others';
+//! - [`analyze`]: what a recording tells;
 //! - [`clock`]: monotonic or virtual time;
 //! - [`os`]: system calls; all unsafe code.
 
 #![deny(unsafe_code)]
 
 pub mod al_status;
+pub mod analyze;
 pub mod bench;
 pub mod bringup;
 pub mod clock;
@@ -31,6 +34,8 @@ pub mod library;
 pub mod link;
 pub mod mailbox;
 pub mod os;
+mod page;
+pub mod recording;
 pub mod rt;
 pub mod scan;
 pub mod service;

@@ -2,9 +2,9 @@
 
 use std::fmt::Write;
 
-use super::html::escaped;
 use super::report::Dist;
 use crate::config::duration::show as duration;
+use crate::page::{COLOURS, escaped};
 
 const WIDTH: f64 = 860.0;
 const HEIGHT: f64 = 260.0;
@@ -12,11 +12,6 @@ const LEFT: f64 = 64.0;
 const RIGHT: f64 = 12.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 40.0;
-
-/// One for each variant; told apart in grey, too.
-pub(super) const COLOURS: [&str; 6] = [
-    "#0b6e99", "#c2410c", "#6d28d9", "#15803d", "#a16207", "#be185d",
-];
 
 /// A chart of distributions, each with its place among [`COLOURS`].
 #[must_use]

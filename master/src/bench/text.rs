@@ -2,8 +2,9 @@
 
 use std::fmt::Write;
 
-use super::html::{MEASURES, time, times};
+use super::html::{MEASURES, times};
 use super::report::{Dist, Report, Variant, losses};
+use crate::page::time;
 
 const WIDTH: usize = 80;
 const NAME: usize = 34;

@@ -62,6 +62,15 @@ impl Failure {
     }
 }
 
+/// A recording that shows nothing of a bus.
+pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
+    failure.hint(if one_interface {
+        "leave `--interface` out to take them all"
+    } else {
+        "record on the interface of the bus: frames of EtherType 0x88a4, or UDP port 34980"
+    })
+}
+
 /// A run that failed. Hints depend on whether the bus is a real one.
 pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, message(error));
@@ -70,6 +79,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
         RunError::State(state) => self::state(state),
         RunError::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
+        RunError::Replay(_) => "a replay needs a recording of this machine file's run, as `ecaxis run --record` makes it".to_owned(),
         RunError::NotMapped { source, .. } => format!(
             "add \"0x{:04x}:{:02x}\" to the device's `pdo` lists, or leave them out to take the ESI's",
             source.index, source.sub,

@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
+mod analyze;
 mod bench;
 mod bus;
 mod check;
@@ -40,6 +41,7 @@ Examples:
   ecaxis explain machine.toml        what follows from it
   ecaxis run machine.toml --sim      its program on the simulated bus
   ecaxis run machine.toml            on the file's network interface
+  ecaxis analyze run.pcapng          what a recording shows
   ecaxis help run                    the options of a verb, with examples
 
 Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
@@ -64,6 +66,7 @@ enum Verb {
     Sim(sim::Args),
     Doctor(doctor::Args),
     Bench(bench::Args),
+    Analyze(analyze::Args),
     Completions(completions::Args),
     Man(man::Args),
 }
@@ -114,7 +117,8 @@ pub fn main() -> ExitCode {
         | Verb::Esi(_)
         | Verb::Doctor(_)
         | Verb::Completions(_)
-        | Verb::Man(_) => {}
+        | Verb::Man(_)
+        | Verb::Analyze(_) => {}
     }
     let done = match cli.verb {
         Verb::Run(args) => run::run(&args),
@@ -128,6 +132,7 @@ pub fn main() -> ExitCode {
         Verb::Bench(args) => bench::run(&args),
         Verb::Completions(args) => completions::run(&args),
         Verb::Man(args) => man::run(&args),
+        Verb::Analyze(args) => analyze::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -250,6 +255,14 @@ mod tests {
             ("ecaxis esi list d --revision 2", false),
             ("ecaxis esi list d --match roughly", false),
             ("ecaxis sim m.toml --nic veth0", true),
+            ("ecaxis analyze run.pcapng --all --html r.html", true),
+            ("ecaxis analyze a.pcapng b.pcap --interface 1 --json", true),
+            ("ecaxis analyze", false),
+            ("ecaxis run --record r.pcapng --record-limit 100MB", true),
+            ("ecaxis run --record r.pcapng --record-limit 100", false),
+            ("ecaxis run --record-limit 100MB", false),
+            ("ecaxis run --replay r.pcapng --record again.pcapng", true),
+            ("ecaxis run --replay r.pcapng --nic eth0", false),
             ("ecaxis doctor", true),
             (
                 "ecaxis doctor eth0 --machine m.toml --cpu 3 --cycle 250us --seconds 0 --json",

@@ -6,6 +6,7 @@ use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::Path;
 
 use ecaxis::config::Machine;
+use ecaxis::link::capture;
 
 use super::{Failure, hints};
 
@@ -41,6 +42,48 @@ pub(crate) fn check(
             let failure = refuse(format!("cannot write {shown}: {e}"));
             Err(failure.hint("name a file in a folder that exists and can be written"))
         }
+    }
+}
+
+/// Whether the parts of a recording with a limit would be written over something else.
+pub(crate) fn check_parts(target: &Path) -> Result<(), Failure> {
+    let parts = capture::parts_of(target).unwrap_or_default();
+    for part in parts {
+        if let Ok(Existing::Taken(what)) = existing(&part) {
+            let message = format!("--record-limit: {} {what}", part.display());
+            return Err(Failure::new(hints::WRONG, message).hint(NEW));
+        }
+    }
+    Ok(())
+}
+
+/// The first of four parts should hold the bring-up, also of a long bus.
+const SMALLEST: u64 = 10_000_000;
+
+/// A size as people write it (`100MB`, `2 GiB`), in bytes.
+pub(crate) fn size(text: &str) -> Result<u64, String> {
+    const UNITS: [(&str, u64); 7] = [
+        ("GiB", 1 << 30),
+        ("MiB", 1 << 20),
+        ("KiB", 1 << 10),
+        ("GB", 1_000_000_000),
+        ("MB", 1_000_000),
+        ("kB", 1_000),
+        ("B", 1),
+    ];
+    let text = text.trim();
+    let unit = UNITS
+        .iter()
+        .find_map(|(unit, scale)| Some((text.strip_suffix(unit)?, scale)));
+    let (number, scale) = unit.ok_or("a number and a unit, such as 100MB or 2GiB")?;
+    let number: u64 = number
+        .trim()
+        .parse()
+        .map_err(|_| "a whole number in front of the unit")?;
+    match number.checked_mul(*scale) {
+        Some(bytes @ SMALLEST..) => Ok(bytes),
+        Some(_) => Err("at least 10MB, so that a quarter of it holds the way to Op".to_owned()),
+        None => Err("too much".to_owned()),
     }
 }
 
@@ -154,5 +197,42 @@ mod tests {
                 fs::read(configs.join(name)).unwrap()
             );
         }
+    }
+
+    #[test]
+    fn sizes() {
+        for (text, bytes) in [
+            ("100MB", 100_000_000),
+            (" 2 GiB ", 2 << 30),
+            ("10000kB", 10_000_000),
+            ("10000000B", 10_000_000),
+        ] {
+            assert_eq!(size(text), Ok(bytes), "{text}");
+        }
+        for bad in [
+            "",
+            "MB",
+            "100",
+            "1.5MB",
+            "-1MB",
+            "9MB",
+            "99999999999999GB",
+            "1MBit",
+        ] {
+            assert!(size(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn parts_that_are_something_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.pcapng");
+        assert_eq!(check_parts(&path), Ok(()));
+        fs::write(folder.path().join("run.0001.pcapng"), MAGIC).unwrap();
+        fs::write(folder.path().join("run.notes.pcapng"), "no part").unwrap();
+        assert_eq!(check_parts(&path), Ok(()));
+        fs::write(folder.path().join("run.0002.pcapng"), "notes").unwrap();
+        let failure = check_parts(&path).unwrap_err();
+        assert!(failure.message.contains("run.0002.pcapng"), "{failure:?}");
     }
 }

@@ -66,6 +66,12 @@ pub(crate) struct Args {
     /// Keep every frame in this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Of a recording: keep its beginning and the newest frames, in parts, within this size, such as 100MB
+    #[arg(long, value_name = "SIZE", requires = "record", value_parser = record::size)]
+    record_limit: Option<u64>,
+    /// Answer from this recording of a `--virtual` run in the place of a bus, and tell where this run deviates from it
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["nic", "seed", "faults"])]
+    replay: Option<PathBuf>,
     #[command(flatten)]
     pub verbosity: super::Verbosity,
 }
@@ -131,7 +137,7 @@ fn tell(args: &Args, error: &str, hints: &[String], problems: Value) {
 fn load(args: &Args) -> Result<Machine, ConfigError> {
     let mut machine = config::load(&args.file)?;
     machine.enable = args.enable || machine.enable && !args.no_enable;
-    if args.sim || args.nic.as_deref() == Some("sim") {
+    if args.sim || args.replay.is_some() || args.nic.as_deref() == Some("sim") {
         machine.bus.nic = Nic::Sim;
     } else if let Some(nic) = &args.nic {
         machine.bus.nic = Nic::Interface(nic.clone());
@@ -151,8 +157,9 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
             return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
         }
     }
+    let virtual_time = args.virtual_time || args.replay.is_some();
     let ends = machine.enable && !machine.steps.is_empty();
-    if args.virtual_time && !ends && args.time.is_none() {
+    if virtual_time && !ends && args.time.is_none() {
         let message = "--virtual without a program would never end";
         return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
     }
@@ -160,11 +167,14 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     let faults = script.map(|path| faults(path, machine)).transpose()?;
     if let Some(path) = &args.record {
         record::check(path, machine, script)?;
+        if args.record_limit.is_some() {
+            record::check_parts(path)?;
+        }
     }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();
     Ok(Options {
-        clock: if args.virtual_time {
+        clock: if virtual_time {
             Clock::Virtual
         } else {
             Clock::Real
@@ -174,6 +184,8 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         seed: seed.unwrap_or(defaults.seed),
         faults,
         record: args.record.clone(),
+        record_limit: args.record_limit,
+        replay: args.replay.clone(),
         enable: machine.enable,
     })
 }

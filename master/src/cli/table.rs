@@ -32,6 +32,11 @@ impl Table {
         self.fitted(by, terminal_width())
     }
 
+    /// For a page of a fixed width, wider only where the terminal is.
+    pub fn within(&self, by: usize, width: usize) -> String {
+        self.fitted(by, Some(terminal_width().unwrap_or(width).max(width)))
+    }
+
     /// The widest columns give way until a line has no more than `limit` characters.
     fn fitted(&self, by: usize, limit: Option<usize>) -> String {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);

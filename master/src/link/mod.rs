@@ -6,6 +6,7 @@
 //! - [`sift`]: which of an interface's frames are ours;
 //! - [`sim`]: the simulated bus in this process;
 //! - [`recorded`], [`capture`]: a recording around any of them;
+//! - [`replay`]: a recording in the place of a bus;
 //! - [`port`]: ethercrab's two ends.
 
 use std::fmt;
@@ -16,6 +17,7 @@ pub mod interface;
 pub mod packet;
 pub mod port;
 pub mod recorded;
+pub mod replay;
 pub mod ring;
 pub mod sift;
 pub mod sim;
@@ -46,6 +48,11 @@ pub trait Link: fmt::Debug + Send {
     /// What has been seen beside the frames that were handed on. Not for the cycle: may ask the kernel.
     fn stats(&mut self) -> LinkStats {
         LinkStats::default()
+    }
+
+    /// What else there is to say at the end, in words. Not for the cycle.
+    fn remarks(&mut self) -> Vec<String> {
+        Vec::new()
     }
 
     /// Ends a recording that goes on in this link, if there is one. Blocks.

@@ -50,6 +50,10 @@ impl Link for Recorded {
         self.inner.stats()
     }
 
+    fn remarks(&mut self) -> Vec<String> {
+        self.inner.remarks()
+    }
+
     fn finish(self: Box<Self>) -> io::Result<Option<RecordStats>> {
         self.recorder.finish().map(Some)
     }

@@ -20,6 +20,8 @@ pub enum RunError {
     Sim(String),
     #[error("the recording: {0}")]
     Record(String),
+    #[error("the replay: {0}")]
+    Replay(String),
     #[error("starting a thread: {0}")]
     Thread(String),
     #[error("the link failed: {0}")]

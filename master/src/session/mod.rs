@@ -63,6 +63,10 @@ pub struct Options {
     pub faults: Option<FaultScript>,
     /// Keep every frame here.
     pub record: Option<PathBuf>,
+    /// Of a recording; the newest frames are kept, see [`crate::link::capture`].
+    pub record_limit: Option<u64>,
+    /// Answer from this recording in the place of a bus.
+    pub replay: Option<PathBuf>,
     /// Enable the axes and run the program; otherwise stay in Op without power.
     pub enable: bool,
 }
@@ -76,6 +80,8 @@ impl Default for Options {
             seed: 1,
             faults: None,
             record: None,
+            record_limit: None,
+            replay: None,
             enable: true,
         }
     }
@@ -265,6 +271,9 @@ pub fn prepare_on(
         }
         Err(error) => {
             go_silent(options.clock, main_device, link.as_mut(), &mut port);
+            for remark in link.remarks() {
+                let _ = progress.send(Progress::Warning(remark));
+            }
             // The bring-up's error is the one to report.
             let _ = link.finish();
             Err(error)
@@ -399,6 +408,9 @@ fn own_the_link(
         go_silent(options.clock, wire.main_device(), link.as_mut(), &mut port);
     }
     let seen = link.stats();
+    for remark in link.remarks() {
+        let _ = told.send(Progress::Warning(remark));
+    }
     let (record, result) = match link.finish() {
         Ok(record) => (record, result),
         Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),

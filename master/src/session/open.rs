@@ -16,22 +16,29 @@ use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
 use crate::link::capture::{Mode, Recorder};
 use crate::link::recorded::Recorded;
+use crate::link::replay::Replay;
 use crate::link::sim::SimLink;
 use crate::link::{self, Concern, Link};
+use crate::recording;
 
 pub(super) fn link(
     machine: &Machine,
     options: &Options,
     mut tell: impl FnMut(Concern),
 ) -> Result<Box<dyn Link>, RunError> {
-    let link: Box<dyn Link> = match &machine.bus.nic {
-        Nic::Sim => Box::new(SimLink::new(simulated_bus(
+    let link: Box<dyn Link> = match (&options.replay, &machine.bus.nic) {
+        (Some(path), _) => {
+            let failed = |error| RunError::Replay(format!("{}: {error}", path.display()));
+            let reader = recording::open(path).map_err(failed)?;
+            Box::new(Replay::new(reader).map_err(failed)?)
+        }
+        (None, Nic::Sim) => Box::new(SimLink::new(simulated_bus(
             machine,
             options.seed,
             options.faults.as_ref(),
             None,
         )?)),
-        Nic::Interface(nic) => {
+        (None, Nic::Interface(nic)) => {
             let (link, concerns) = link::open(nic, machine.bus.link)?;
             concerns.into_iter().for_each(&mut tell);
             link
@@ -45,7 +52,7 @@ pub(super) fn link(
         Clock::Virtual => (Mode::Inline, 0),
         Clock::Real => (Mode::Background, since_1970().saturating_sub(clock::now())),
     };
-    let recorder = Recorder::create(path, mode)
+    let recorder = Recorder::create(path, mode, options.record_limit)
         .map_err(|error| RunError::Record(format!("{}: {error}", path.display())))?;
     Ok(Box::new(Recorded::new(link, recorder, epoch)))
 }

@@ -1,0 +1,348 @@
+//! CiA 402 axes in process data: where their objects are on the wire, and what became of them.
+
+use ecaxis_axis::{Mode, State, Statusword};
+use ecaxis_esi::Layout;
+
+use super::events::What;
+use super::objects::{Mapped, Objects};
+use super::pair::Passed;
+use super::registers::Registers;
+
+/// Points of one curve; twice as many are folded in two.
+const POINTS: usize = 1500;
+/// Changes of state, mode or error that are kept of one axis.
+const CHANGES: usize = 2000;
+/// Objects of one device that are followed.
+const PLACES: usize = 256;
+/// Axes of one device: each has 0x800 objects.
+const AXES: u16 = 8;
+
+/// What of an axis is followed; indices of the first axis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Signal {
+    Controlword,
+    Statusword,
+    Mode,
+    ModeDisplay,
+    ErrorCode,
+    TargetPosition,
+    ActualPosition,
+    TargetVelocity,
+    ActualVelocity,
+    TargetTorque,
+    ActualTorque,
+}
+
+impl Signal {
+    fn of(index: u16) -> Option<Self> {
+        Some(match index {
+            0x6040 => Self::Controlword,
+            0x6041 => Self::Statusword,
+            0x6060 => Self::Mode,
+            0x6061 => Self::ModeDisplay,
+            0x603f => Self::ErrorCode,
+            0x607a => Self::TargetPosition,
+            0x6064 => Self::ActualPosition,
+            0x60ff => Self::TargetVelocity,
+            0x606c => Self::ActualVelocity,
+            0x6071 => Self::TargetTorque,
+            0x6077 => Self::ActualTorque,
+            _ => return None,
+        })
+    }
+}
+
+/// A curve with a bounded number of points: least and greatest of so many cycles each.
+#[derive(Debug, Default, Clone)]
+pub struct Curve {
+    /// Time of the first cycle in nanoseconds since 1970, least, greatest.
+    pub points: Vec<(u64, f64, f64)>,
+    /// Cycles to a point.
+    every: u64,
+    left: u64,
+}
+
+impl Curve {
+    fn add(&mut self, at: u64, value: f64) {
+        match self.points.last_mut().filter(|_| self.left > 0) {
+            Some((_, least, greatest)) => {
+                (*least, *greatest) = (least.min(value), greatest.max(value));
+                self.left -= 1;
+            }
+            None => {
+                self.points.push((at, value, value));
+                self.left = self.every;
+            }
+        }
+        if self.points.len() >= 2 * POINTS {
+            let pairs = self.points.chunks(2).filter_map(|pair| {
+                let (first, last) = (pair.first()?, pair.last()?);
+                Some((first.0, first.1.min(last.1), first.2.max(last.2)))
+            });
+            self.points = pairs.collect();
+            self.every = 2 * self.every + 1;
+            self.left = 0;
+        }
+    }
+
+    /// Least and greatest of all.
+    #[must_use]
+    pub fn range(&self) -> Option<(f64, f64)> {
+        let (_, least, greatest) = *self.points.first()?;
+        let both = self
+            .points
+            .iter()
+            .fold((least, greatest), |(l, g), p| (l.min(p.1), g.max(p.2)));
+        Some(both)
+    }
+}
+
+/// One axis of a device.
+#[derive(Debug, Default)]
+pub struct Axis {
+    /// 0 is the one at 0x6000.
+    pub number: u8,
+    pub cycles: u64,
+    pub state: Option<State>,
+    /// When which state began.
+    pub states: Vec<(u64, State)>,
+    /// When which mode began, as 0x6061 shows it, or 0x6060 where that is not mapped.
+    pub modes: Vec<(u64, Mode)>,
+    pub error: Option<u16>,
+    pub position: (Curve, Curve),
+    pub velocity: (Curve, Curve),
+    pub torque: (Curve, Curve),
+    /// Of target and actual position while Operation enabled in CSP, in counts.
+    pub largest_error: Option<i64>,
+    shows_mode: bool,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    axis: usize,
+    signal: Signal,
+    /// Logical address in bits.
+    bit: u64,
+    bits: u8,
+    output: bool,
+}
+
+/// The axes of one device.
+#[derive(Debug, Default)]
+pub struct Axes {
+    pub axes: Vec<Axis>,
+    places: Vec<Place>,
+}
+
+impl Axes {
+    /// Finds the objects anew: by what the recording shows of the PDOs, else by a layout.
+    pub fn locate(&mut self, registers: &Registers, objects: &Objects, layout: Option<&Layout>) {
+        self.places.clear();
+        let fmmus: Vec<_> = registers.fmmus().collect();
+        for sm in registers.sync_managers().filter(|sm| !sm.mailbox) {
+            let mapped = objects
+                .mapping(sm.number)
+                .or_else(|| Some(of_layout(layout?, sm.number)))
+                .unwrap_or_default();
+            for entry in mapped {
+                let physical = u64::from(sm.start) * 8 + u64::from(entry.bit);
+                let mut logical = fmmus
+                    .iter()
+                    .filter(|fmmu| if sm.output { fmmu.output } else { fmmu.input })
+                    .filter_map(|fmmu| {
+                        let from =
+                            u64::from(fmmu.physical) * 8 + u64::from(fmmu.physical_start_bit);
+                        let offset = physical.checked_sub(from)?;
+                        let within = offset + u64::from(entry.bits) <= u64::from(fmmu.len) * 8;
+                        let base = u64::from(fmmu.logical) * 8 + u64::from(fmmu.logical_start_bit);
+                        within.then_some(base + offset)
+                    });
+                if let Some(bit) = logical.next() {
+                    self.place(entry, bit, sm.output);
+                }
+            }
+        }
+        // A device without a Statusword or Controlword is no axis.
+        let is_word = |p: &Place| matches!(p.signal, Signal::Controlword | Signal::Statusword);
+        let words: Vec<usize> = self
+            .places
+            .iter()
+            .filter(|p| is_word(p))
+            .map(|p| p.axis)
+            .collect();
+        self.places.retain(|place| words.contains(&place.axis));
+        let shown = |n| {
+            self.places
+                .iter()
+                .any(|p| p.axis == n && p.signal == Signal::ModeDisplay)
+        };
+        let shown: Vec<bool> = (0..self.axes.len()).map(shown).collect();
+        for (axis, shown) in self.axes.iter_mut().zip(shown) {
+            axis.shows_mode = shown;
+        }
+    }
+
+    fn place(&mut self, entry: Mapped, bit: u64, output: bool) {
+        let Some(number) = entry
+            .index
+            .checked_sub(0x6000)
+            .map(|offset| offset / 0x0800)
+        else {
+            return;
+        };
+        let signal = Signal::of(entry.index.wrapping_sub(number * 0x0800));
+        let (Some(signal), true) = (signal, number < AXES && self.places.len() < PLACES) else {
+            return;
+        };
+        let number = number as u8;
+        let axis = self
+            .axes
+            .iter()
+            .position(|axis| axis.number == number)
+            .unwrap_or_else(|| {
+                self.axes.push(Axis {
+                    number,
+                    ..Axis::default()
+                });
+                self.axes.len() - 1
+            });
+        self.places.push(Place {
+            axis,
+            signal,
+            bit,
+            bits: entry.bits,
+            output,
+        });
+    }
+
+    /// One datagram of process data.
+    pub fn process_data(&mut self, passed: &Passed<'_>, mut tell: impl FnMut(What)) {
+        let start = u64::from(passed.address) * 8;
+        let mut targets = [None; AXES as usize];
+        for place in &self.places {
+            let data = if place.output {
+                passed.written().filter(|_| passed.command.writes())
+            } else {
+                passed.back.filter(|_| passed.command.reads())
+            };
+            let value = data.and_then(|data| bits(data, place.bit.checked_sub(start)?, place.bits));
+            let (Some(value), Some(axis)) = (value, self.axes.get_mut(place.axis)) else {
+                continue;
+            };
+            if place.signal == Signal::TargetPosition
+                && let Some(target) = targets.get_mut(place.axis)
+            {
+                *target = Some(value.1);
+            }
+            axis.takes(place.signal, passed.at, value, &mut tell);
+            if place.signal == Signal::ActualPosition
+                && let Some(Some(target)) = targets.get(place.axis)
+            {
+                axis.follows(*target, value.1);
+            }
+        }
+    }
+
+    /// Axes that showed something.
+    pub fn seen(&self) -> impl Iterator<Item = &Axis> {
+        self.axes.iter().filter(|axis| axis.cycles > 0)
+    }
+}
+
+impl Axis {
+    fn takes(&mut self, signal: Signal, at: u64, value: (u64, i64), tell: &mut impl FnMut(What)) {
+        let (raw, signed) = value;
+        let number = signed as f64;
+        match signal {
+            Signal::Controlword => {}
+            Signal::Statusword => {
+                self.cycles += 1;
+                let state = State::from_statusword(Statusword::from_bits_retain(raw as u16));
+                if self.state != Some(state) {
+                    self.state = Some(state);
+                    if self.states.len() < CHANGES {
+                        self.states.push((at, state));
+                        tell(What::Axis {
+                            axis: self.number,
+                            state,
+                        });
+                    }
+                }
+            }
+            Signal::Mode if self.shows_mode => {}
+            Signal::Mode | Signal::ModeDisplay => {
+                let mode = Mode::from_code(signed as i8);
+                if self.modes.last().map(|last| last.1) != Some(mode) && self.modes.len() < CHANGES
+                {
+                    self.modes.push((at, mode));
+                }
+            }
+            Signal::ErrorCode => {
+                let code = raw as u16;
+                if self.error.unwrap_or(0) != code {
+                    tell(What::AxisError {
+                        axis: self.number,
+                        code,
+                    });
+                }
+                self.error = Some(code);
+            }
+            Signal::TargetPosition => self.position.0.add(at, number),
+            Signal::ActualPosition => self.position.1.add(at, number),
+            Signal::TargetVelocity => self.velocity.0.add(at, number),
+            Signal::ActualVelocity => self.velocity.1.add(at, number),
+            Signal::TargetTorque => self.torque.0.add(at, number),
+            Signal::ActualTorque => self.torque.1.add(at, number),
+        }
+    }
+
+    fn follows(&mut self, target: i64, actual: i64) {
+        let csp = self.modes.last().is_none_or(|(_, mode)| *mode == Mode::Csp);
+        if csp && self.state == Some(State::OperationEnabled) {
+            let error = target.saturating_sub(actual).saturating_abs();
+            self.largest_error = self.largest_error.max(Some(error));
+        }
+    }
+}
+
+/// The objects of a SyncManager by a layout, each from the start of its SyncManager.
+fn of_layout(layout: &Layout, number: u8) -> Vec<Mapped> {
+    let both = [(&layout.outputs, &layout.rx), (&layout.inputs, &layout.tx)];
+    for (managers, fields) in both {
+        let mut from = 0;
+        for sm in managers {
+            let to = from + u32::from(sm.len) * 8;
+            if sm.sm == number {
+                let own = fields.iter().filter(|f| (from..to).contains(&f.bit_offset));
+                let mapped = own.map(|field| Mapped {
+                    index: field.index,
+                    sub: field.sub,
+                    bit: field.bit_offset - from,
+                    bits: u8::try_from(field.bit_len).unwrap_or(u8::MAX),
+                });
+                return mapped.collect();
+            }
+            from = to;
+        }
+    }
+    Vec::new()
+}
+
+/// Up to 64 bits of process data: without and with sign.
+fn bits(data: &[u8], at: u64, len: u8) -> Option<(u64, i64)> {
+    let len = u32::from(len);
+    if !(1..=64).contains(&len) {
+        return None;
+    }
+    let first = usize::try_from(at / 8).ok()?;
+    let shift = (at % 8) as u32;
+    let bytes = usize::try_from((shift + len).div_ceil(8)).ok()?;
+    let bytes = data.get(first..first.checked_add(bytes)?)?;
+    let wide = bytes
+        .iter()
+        .rev()
+        .fold(0_u128, |n, byte| n << 8 | u128::from(*byte))
+        >> shift;
+    let raw = (wide as u64) << (64 - len);
+    Some((raw >> (64 - len), (raw as i64) >> (64 - len)))
+}

@@ -1,0 +1,193 @@
+//! What happened, in order.
+
+use std::fmt;
+
+use ecaxis_axis::State;
+use ecaxis_axis::cia402::describe;
+
+use super::mailbox::{Ended, FileTransfer, Transfer, Way};
+use super::values::value;
+use crate::al_status::al_status_text;
+use crate::bringup::AlState;
+use crate::mailbox::{Emergency, abort_text, mailbox_error_text, object_name};
+
+/// Events that are kept; beyond, they are counted.
+pub const EVENTS: usize = 50_000;
+
+/// Which devices an event is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Of {
+    Bus,
+    /// Place in the list of devices.
+    Device(usize),
+}
+
+#[derive(Debug, Clone)]
+pub struct Event {
+    /// Nanoseconds since 1970.
+    pub at: u64,
+    pub of: Of,
+    pub what: What,
+}
+
+#[derive(Debug, Clone)]
+pub enum What {
+    /// So many devices answer a broadcast read.
+    Answering(u16),
+    /// A station address was given.
+    Station(u16),
+    Requested {
+        state: AlState,
+        acknowledge: bool,
+    },
+    State {
+        state: AlState,
+        error: bool,
+        code: Option<u16>,
+    },
+    /// The code of an error that was told before.
+    Code(u16),
+    Transfer(Box<Transfer>),
+    Emergency(Emergency),
+    File(Box<FileTransfer>),
+    ObjectList(usize),
+    NoInformation(u32),
+    Refused(u16),
+    Axis {
+        axis: u8,
+        state: State,
+    },
+    AxisError {
+        axis: u8,
+        code: u16,
+    },
+}
+
+impl What {
+    /// Belongs on the page, not only into the log.
+    pub fn matters(&self) -> bool {
+        match self {
+            Self::Transfer(transfer) => transfer.ended != Ended::Done,
+            Self::Station(_) | Self::Code(_) => false,
+            _ => true,
+        }
+    }
+
+    /// Something went wrong.
+    pub fn is_trouble(&self) -> bool {
+        match self {
+            Self::State { error, .. } => *error,
+            Self::Transfer(transfer) => transfer.ended != Ended::Done,
+            Self::Emergency(emergency) => !emergency.is_reset(),
+            Self::File(file) => file.error.is_some(),
+            Self::Refused(_) => true,
+            Self::Axis { state, .. } => {
+                matches!(state, State::Fault | State::FaultReactionActive)
+            }
+            Self::AxisError { code, .. } => *code != 0,
+            _ => false,
+        }
+    }
+}
+
+/// Object, transfer and outcome.
+impl fmt::Display for Transfer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let way = match self.way {
+            Way::Read => "read",
+            Way::Write => "write",
+        };
+        write!(f, "{way} 0x{:04x}", self.index)?;
+        if self.complete {
+            write!(f, " whole")?;
+        } else {
+            write!(f, ":{:02x}", self.sub)?;
+        }
+        if let Some(name) = object_name(self.index, self.sub) {
+            write!(f, " ({name})")?;
+        }
+        match self.ended {
+            Ended::Done => write!(f, " = {}", value(self)),
+            Ended::Aborted { code, by_device } => {
+                let who = if by_device { "" } else { " by the MainDevice" };
+                write!(f, ": aborted{who} with 0x{code:08x}, {}", abort_text(code))
+            }
+            Ended::Refused(code) => {
+                write!(
+                    f,
+                    ": refused with {code:#06x}, {}",
+                    mailbox_error_text(code)
+                )
+            }
+            Ended::Unanswered => write!(f, ": no answer"),
+        }
+    }
+}
+
+impl fmt::Display for FileTransfer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let way = match self.way {
+            Way::Read => "read",
+            Way::Write => "write",
+        };
+        write!(f, "{way} file `{}`, {} bytes", self.name, self.len)?;
+        match &self.error {
+            Some((code, text)) => write!(f, ": failed with {code:#010x} {text}"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl fmt::Display for What {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Answering(1) => write!(f, "1 device answers"),
+            Self::Answering(count) => write!(f, "{count} devices answer"),
+            Self::Station(station) => write!(f, "gets station address 0x{station:04x}"),
+            Self::Requested { state, acknowledge } => {
+                let and = if *acknowledge {
+                    ", errors acknowledged"
+                } else {
+                    ""
+                };
+                write!(f, "asked for {state}{and}")
+            }
+            Self::State { state, error, code } => {
+                write!(f, "{state}")?;
+                match (error, code) {
+                    (true, Some(0)) => write!(f, " with an error that has no code"),
+                    (true, Some(code)) => {
+                        write!(f, " with error {code:#06x}, {}", al_status_text(*code))
+                    }
+                    (true, None) => write!(f, " with an error"),
+                    _ => Ok(()),
+                }
+            }
+            Self::Code(code) => write!(f, "AL status code {code:#06x}, {}", al_status_text(*code)),
+            Self::Transfer(transfer) => transfer.fmt(f),
+            Self::Emergency(emergency) => emergency.fmt(f),
+            Self::File(file) => file.fmt(f),
+            Self::ObjectList(1) => write!(f, "lists 1 object"),
+            Self::ObjectList(count) => write!(f, "lists {count} objects"),
+            Self::NoInformation(code) => {
+                write!(
+                    f,
+                    "no object information: 0x{code:08x}, {}",
+                    abort_text(*code)
+                )
+            }
+            Self::Refused(code) => {
+                write!(
+                    f,
+                    "mailbox error {code:#06x}, {}",
+                    mailbox_error_text(*code)
+                )
+            }
+            Self::Axis { state, .. } => write!(f, "{state}"),
+            Self::AxisError { code: 0, .. } => write!(f, "error code 0x0000, no error"),
+            Self::AxisError { code, .. } => {
+                write!(f, "error code {code:#06x}, {}", describe(*code).text)
+            }
+        }
+    }
+}

@@ -1,0 +1,213 @@
+//! Which answer belongs to which request. A recording may show both, one of them, or begin in between.
+
+use std::collections::{HashSet, VecDeque};
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use crate::recording::Direction;
+use crate::recording::frame::{Command, Frame};
+
+/// Nothing is under way for longer: what has no answer by then has none.
+pub const PATIENCE_NS: u64 = 250_000_000;
+/// Requests that may be under way.
+const UNDER_WAY: usize = 2048;
+/// Frames that are looked at before the first is judged: so long until both sides have been seen.
+const LOOK_AHEAD: usize = 64;
+/// MainDevices of one recording.
+const SOURCES: usize = 256;
+
+/// A frame as it was sent, and as it came back.
+#[derive(Debug)]
+pub struct Exchange {
+    pub sent: Option<Frame>,
+    pub back: Option<Frame>,
+    /// The recording ends before the answer could have come.
+    pub open: bool,
+}
+
+/// One datagram of an [`Exchange`].
+#[derive(Debug, Clone, Copy)]
+pub struct Passed<'a> {
+    pub command: Command,
+    /// As sent, where that is known: SubDevices count positions up.
+    pub address: u32,
+    /// When it was sent, nanoseconds since 1970; when it came back where that alone is known.
+    pub at: u64,
+    pub back_at: Option<u64>,
+    pub sent: Option<&'a [u8]>,
+    pub back: Option<&'a [u8]>,
+    /// `None`: no answer.
+    pub wkc: Option<u16>,
+}
+
+impl<'a> Passed<'a> {
+    /// What was written, for commands that write. SubDevices hand it on as it is unless they read as well.
+    pub fn written(&self) -> Option<&'a [u8]> {
+        self.sent.or(self.back)
+    }
+
+    pub fn adp(&self) -> u16 {
+        (self.address & 0xffff) as u16
+    }
+
+    pub fn ado(&self) -> u16 {
+        (self.address >> 16) as u16
+    }
+}
+
+/// Data and working counter of a datagram.
+fn nth(frame: &Frame, n: usize) -> Option<(&[u8], u16)> {
+    let datagram = frame.datagrams.get(n)?;
+    Some((frame.data(datagram), datagram.wkc))
+}
+
+impl Exchange {
+    /// When it was sent, or came back where nothing else is known.
+    pub fn at(&self) -> u64 {
+        let frame = self.sent.as_ref().or(self.back.as_ref());
+        frame.map_or(0, |frame| frame.at)
+    }
+
+    pub fn datagrams(&self) -> impl Iterator<Item = Passed<'_>> {
+        let one = self.sent.as_ref().or(self.back.as_ref());
+        let count = one.map_or(0, |frame| frame.datagrams.len());
+        (0..count).filter_map(move |n| {
+            let sent = self.sent.as_ref().and_then(|frame| nth(frame, n));
+            let back = self.back.as_ref().and_then(|frame| nth(frame, n));
+            let head = one?.datagrams.get(n)?;
+            Some(Passed {
+                command: head.command,
+                address: head.address,
+                at: self.at(),
+                back_at: self.back.as_ref().map(|frame| frame.at),
+                sent: sent.map(|(data, _)| data),
+                back: back.map(|(data, _)| data),
+                wkc: back.map(|(_, wkc)| wkc),
+            })
+        })
+    }
+}
+
+/// Pairs frames. Exchanges come out when their answer does, or when there will be none.
+#[derive(Debug, Default)]
+pub struct Pairing {
+    ahead: VecDeque<Frame>,
+    /// Source addresses without the bit that SubDevices set.
+    senders: HashSet<[u8; 6]>,
+    under_way: VecDeque<(u64, Frame)>,
+    latest: u64,
+    longest_round_trip: u64,
+    answered: bool,
+    done: VecDeque<Exchange>,
+}
+
+/// Bit 1 of the first byte is set by the first SubDevice that a frame passes.
+const PASSED: u8 = 0x02;
+
+fn sender(source: [u8; 6]) -> [u8; 6] {
+    let [first, rest @ ..] = source;
+    let [a, b, c, d, e] = rest;
+    [first & !PASSED, a, b, c, d, e]
+}
+
+/// What is the same in request and answer.
+fn key(frame: &Frame) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    for datagram in &frame.datagrams {
+        let address = if datagram.command.is_positional() {
+            datagram.address & 0xffff_0000
+        } else {
+            datagram.address
+        };
+        let len = datagram.data.len();
+        (datagram.command, datagram.index, address, len).hash(&mut hasher);
+    }
+    sender(frame.source).hash(&mut hasher);
+    hasher.finish()
+}
+
+impl Pairing {
+    /// Takes the next frame of the recording.
+    pub fn push(&mut self, frame: Frame) {
+        if frame.source[0] & PASSED == 0 && self.senders.len() < SOURCES {
+            self.senders.insert(frame.source);
+        }
+        self.ahead.push_back(frame);
+        if self.ahead.len() > LOOK_AHEAD
+            && let Some(frame) = self.ahead.pop_front()
+        {
+            self.judge(frame);
+        }
+    }
+
+    /// The next exchange that is complete.
+    pub fn next(&mut self) -> Option<Exchange> {
+        self.done.pop_front()
+    }
+
+    /// No more frames come.
+    pub fn end(&mut self) {
+        while let Some(frame) = self.ahead.pop_front() {
+            self.judge(frame);
+        }
+        // Sent so shortly before the end that its answer cannot have been recorded.
+        let end = self.latest.saturating_sub(2 * self.longest_round_trip);
+        for (_, frame) in std::mem::take(&mut self.under_way) {
+            let open = self.answered && frame.at >= end;
+            self.done.push_back(Exchange {
+                sent: Some(frame),
+                back: None,
+                open,
+            });
+        }
+    }
+
+    fn judge(&mut self, frame: Frame) {
+        self.latest = self.latest.max(frame.at);
+        self.give_up();
+        let key = key(&frame);
+        let mine = self.under_way.iter().rposition(|(other, _)| *other == key);
+        if self.is_answer(&frame, mine.is_some()) {
+            let sent = mine
+                .and_then(|n| self.under_way.remove(n))
+                .map(|(_, frame)| frame);
+            if let Some(sent) = &sent {
+                let took = frame.at.saturating_sub(sent.at);
+                self.longest_round_trip = self.longest_round_trip.max(took);
+                self.answered = true;
+            }
+            self.done.push_back(Exchange {
+                sent,
+                back: Some(frame),
+                open: false,
+            });
+        } else {
+            self.under_way.push_back((key, frame));
+        }
+    }
+
+    fn is_answer(&self, frame: &Frame, awaited: bool) -> bool {
+        if frame.source[0] & PASSED == 0 {
+            return false;
+        }
+        // A MainDevice whose own address has the bit is told by what the recording says, or by what came before.
+        self.senders.contains(&sender(frame.source))
+            || match frame.direction {
+                Some(direction) => direction == Direction::In,
+                None => awaited || frame.datagrams.iter().any(|datagram| datagram.wkc > 0),
+            }
+    }
+
+    fn give_up(&mut self) {
+        while let Some((_, frame)) = self.under_way.front()
+            && (self.latest.saturating_sub(frame.at) > PATIENCE_NS
+                || self.under_way.len() > UNDER_WAY)
+        {
+            let sent = self.under_way.pop_front().map(|(_, frame)| frame);
+            self.done.push_back(Exchange {
+                sent,
+                back: None,
+                open: false,
+            });
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! What is known of a SubDevice's registers (ETG.1000.4), as they were written and read.
+
+/// Registers end where process memory begins.
+const REGISTERS: usize = 0x1000;
+const FMMUS: usize = 16;
+const SYNC_MANAGERS: usize = 16;
+/// Of SyncManagers that are mailboxes.
+const MODE_MAILBOX: u8 = 2;
+
+/// The registers of one device.
+#[derive(Clone)]
+pub struct Registers {
+    values: Vec<u8>,
+    known: Vec<bool>,
+}
+
+impl std::fmt::Debug for Registers {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let known = self.known.iter().filter(|known| **known).count();
+        f.debug_struct("Registers").field("known", &known).finish()
+    }
+}
+
+impl Default for Registers {
+    fn default() -> Self {
+        Self {
+            values: vec![0; REGISTERS],
+            known: vec![false; REGISTERS],
+        }
+    }
+}
+
+/// One SyncManager, as configured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SyncManager {
+    pub number: u8,
+    pub start: u16,
+    pub len: u16,
+    pub mailbox: bool,
+    /// MainDevice to SubDevice.
+    pub output: bool,
+    pub enabled: bool,
+}
+
+/// One FMMU, as configured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Fmmu {
+    pub number: u8,
+    pub logical: u32,
+    pub len: u16,
+    pub logical_start_bit: u8,
+    pub physical: u16,
+    pub physical_start_bit: u8,
+    /// MainDevice to SubDevice.
+    pub output: bool,
+    pub input: bool,
+}
+
+impl Registers {
+    pub fn set(&mut self, register: u16, data: &[u8]) {
+        let start = usize::from(register);
+        let values = self.values.iter_mut().skip(start);
+        let known = self.known.iter_mut().skip(start);
+        for ((value, known), new) in values.zip(known).zip(data) {
+            (*value, *known) = (*new, true);
+        }
+    }
+
+    /// Bytes that are all known.
+    pub fn bytes(&self, register: u16, len: usize) -> Option<&[u8]> {
+        let range = usize::from(register)..usize::from(register) + len;
+        let known = self.known.get(range.clone())?;
+        self.values
+            .get(range)
+            .filter(|_| known.iter().all(|known| *known))
+    }
+
+    pub fn u8(&self, register: u16) -> Option<u8> {
+        self.bytes(register, 1)?.first().copied()
+    }
+
+    pub fn u16(&self, register: u16) -> Option<u16> {
+        let bytes = self.bytes(register, 2)?.first_chunk()?;
+        Some(u16::from_le_bytes(*bytes))
+    }
+
+    pub fn u32(&self, register: u16) -> Option<u32> {
+        let bytes = self.bytes(register, 4)?.first_chunk()?;
+        Some(u32::from_le_bytes(*bytes))
+    }
+
+    /// SyncManagers whose start, length and control are known and that have a length.
+    pub fn sync_managers(&self) -> impl Iterator<Item = SyncManager> + '_ {
+        (0..SYNC_MANAGERS as u8).filter_map(|number| {
+            let at = 0x0800 + 8 * u16::from(number);
+            let control = self.u8(at + 4)?;
+            let len = self.u16(at + 2)?;
+            (len > 0).then_some(SyncManager {
+                number,
+                start: self.u16(at)?,
+                len,
+                mailbox: control & 0x03 == MODE_MAILBOX,
+                output: control >> 2 & 0x03 == 1,
+                enabled: self.u8(at + 6).is_some_and(|activate| activate & 1 != 0),
+            })
+        })
+    }
+
+    /// FMMUs that are active.
+    pub fn fmmus(&self) -> impl Iterator<Item = Fmmu> + '_ {
+        (0..FMMUS as u8).filter_map(|number| {
+            let at = 0x0600 + 16 * u16::from(number);
+            let kind = self.u8(at + 11)?;
+            (self.u8(at + 12)? & 1 != 0).then_some(Fmmu {
+                number,
+                logical: self.u32(at)?,
+                len: self.u16(at + 4)?,
+                logical_start_bit: self.u8(at + 6)? & 7,
+                physical: self.u16(at + 8)?,
+                physical_start_bit: self.u8(at + 10)? & 7,
+                output: kind & 2 != 0,
+                input: kind & 1 != 0,
+            })
+        })
+    }
+}
+
+/// The part of a datagram's data that is the register at `wanted`, where all of its `len` bytes are there.
+pub fn part(register: u16, data: &[u8], wanted: u16, len: usize) -> Option<&[u8]> {
+    let at = usize::from(wanted.checked_sub(register)?);
+    data.get(at..at.checked_add(len)?)
+}
+
+/// Likewise, as a little-endian number of two bytes.
+pub fn part_u16(register: u16, data: &[u8], wanted: u16) -> Option<u16> {
+    let bytes = part(register, data, wanted, 2)?.first_chunk()?;
+    Some(u16::from_le_bytes(*bytes))
+}

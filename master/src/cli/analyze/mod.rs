@@ -1,0 +1,107 @@
+//! `ecaxis analyze`: what a recording tells, as a page of text, as JSON, or as HTML with pictures of the axes.
+
+use std::path::{Path, PathBuf};
+
+use ecaxis::analyze::{self as analysis, Known};
+use ecaxis::{config, recording};
+
+use super::{Failure, hints, note, result};
+
+mod text;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis analyze run.pcapng                        the story on one page
+  ecaxis analyze run.pcapng --all                  every event and transfer
+  ecaxis analyze run.pcapng --machine m.toml       with its names and units
+  ecaxis analyze run.pcapng --html report.html     with pictures of each axis
+  ecaxis analyze other.pcap --esi esi/ --json      somebody else's, for a script
+  ecaxis analyze night.pcapng night.0*.pcapng      parts of one recording
+
+Reads pcap and pcapng of any MainDevice: `ecaxis run --record`, Wireshark,
+tcpdump. A file that is cut or damaged is read as far as it can be.
+Exit code: 0 read, 1 there is no EtherCAT in it, 2 it cannot be opened.";
+
+/// Tell what a recording shows: devices, states, SDO transfers, cycle, clocks, axes
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Recording (pcap or pcapng), or all its parts
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+    /// Take names, process data and units from this machine file
+    #[arg(long, value_name = "FILE")]
+    machine: Option<PathBuf>,
+    /// Take names and default process data from this ESI file or folder
+    #[arg(long, value_name = "PATH")]
+    esi: Option<PathBuf>,
+    /// Only what this interface of the recording saw
+    #[arg(long, value_name = "N")]
+    interface: Option<u32>,
+    /// Print every event, transfer and SyncManager
+    #[arg(long)]
+    all: bool,
+    /// Print what was found as JSON
+    #[arg(long)]
+    json: bool,
+    /// Write a report with pictures of the axes here
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let known = known(args)?;
+    let mut parts = Vec::new();
+    for path in &args.files {
+        let mut reader = recording::open(path).map_err(|e| {
+            let message = format!("cannot open {}: {e}", path.display());
+            Failure::new(hints::WRONG, message)
+        })?;
+        let begins = reader.peek().and_then(|packet| packet.at);
+        parts.push((path, reader, begins));
+    }
+    // However the shell sorted them.
+    parts.sort_by_cached_key(|(_, _, begins)| *begins);
+    let shown = parts.first().map_or(Path::new(""), |(path, ..)| path);
+    let name = shown
+        .file_name()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
+    let readers = parts.into_iter().map(|(_, reader, _)| reader).collect();
+    let report = analysis::analyze(readers, args.interface, known);
+    if let Some(path) = &args.html {
+        std::fs::write(path, analysis::html(&name, &report)).map_err(|e| {
+            let message = format!("cannot write {}: {e}", path.display());
+            Failure::new(hints::WRONG, message)
+        })?;
+        note(&format!("written: {}", path.display()));
+    }
+    let text = if args.json {
+        let json = serde_json::to_string_pretty(&report);
+        json.map_err(|e| Failure::new(hints::FAILED, format!("cannot write the result: {e}")))?
+            + "\n"
+    } else {
+        text::page(&name, &report, args.all)
+    };
+    result(&text)?;
+    if report.file.ethercat_frames == 0 {
+        let failure = Failure::new(hints::FAILED, format!("there is no EtherCAT in {name}"));
+        return Err(hints::no_ethercat(failure, args.interface.is_some()));
+    }
+    Ok(())
+}
+
+fn known(args: &Args) -> Result<Known, Failure> {
+    let mut known = Known::default();
+    if let Some(file) = &args.machine {
+        let machine = config::load(file).map_err(|e| hints::config(file, &e))?;
+        known = known.with_machine(&machine);
+    }
+    if let Some(path) = &args.esi {
+        let library = analysis::library(path)
+            .map_err(|e| Failure::new(hints::WRONG, format!("--esi: {e}")))?;
+        known = known.with_library(library);
+    }
+    Ok(known)
+}

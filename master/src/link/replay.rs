@@ -1,0 +1,344 @@
+//! A recording in the place of a bus: answers what was asked before as it was answered then, and tells where a run deviates from it.
+//!
+//! For tests and for looking at a run again, in virtual time; it allocates. A run that does as the recorded one did meets
+//! the same bytes after the same times, so its outcome is the same.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::io::{self, Read};
+
+use super::{Link, LinkError, MAX_FRAME, Nanos};
+use crate::clock;
+use crate::recording::frame::{Content, Frame, content};
+use crate::recording::{Direction, Reader};
+
+/// Recorded frames that are searched for one that was sent: so many may have been left out.
+const AHEAD: usize = 256;
+/// Deviations that are kept; beyond, they are counted.
+const DEVIATIONS: usize = 16;
+/// Bytes of a recording that is held in memory.
+const LIMIT: usize = 1 << 30;
+
+/// Bytes from a datagram's index to its data.
+const INDEX: usize = 9;
+
+/// How a run differs from the recorded one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Deviation {
+    /// Other data in a frame that was sent then as well; it is answered as that one was.
+    Data {
+        frame: u64,
+        datagram: usize,
+        offset: usize,
+        sent: u8,
+        recorded: u8,
+    },
+    /// Frames that were sent then, and not now: how many, and the first.
+    LeftOut { frame: u64, count: usize },
+    /// A frame that was not sent then: it gets no answer. `expected` is the number of the frame that was sent then instead.
+    Other {
+        sent: String,
+        recorded: String,
+        expected: u64,
+    },
+    /// Everything recorded has been sent; what follows gets no answer.
+    Beyond { sent: String },
+}
+
+impl fmt::Display for Deviation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Data {
+                frame,
+                datagram,
+                offset,
+                sent,
+                recorded,
+            } => write!(
+                f,
+                "frame {frame} of the recording, datagram {datagram}: byte {offset} of the data is 0x{sent:02x}, recorded is 0x{recorded:02x}"
+            ),
+            Self::LeftOut { frame, count } => {
+                write!(
+                    f,
+                    "{count} frames of the recording were not sent, frame {frame} first"
+                )
+            }
+            Self::Other {
+                sent,
+                recorded,
+                expected,
+            } => write!(
+                f,
+                "{sent} was sent where the recording has {recorded} (frame {expected}); it gets no answer"
+            ),
+            Self::Beyond { sent } => {
+                write!(
+                    f,
+                    "{sent} was sent after the recording's last frame; it gets no answer"
+                )
+            }
+        }
+    }
+}
+
+/// What was sent, and what came back for it.
+#[derive(Debug)]
+struct Sent {
+    frame: Frame,
+    /// Nanoseconds after it was sent.
+    answers: Vec<(Nanos, Vec<u8>)>,
+}
+
+/// Answers from a recording.
+#[derive(Debug)]
+pub struct Replay {
+    /// What has not been sent, in order.
+    left: VecDeque<Sent>,
+    /// When which frame arrives, the next one first.
+    under_way: VecDeque<(Nanos, Vec<u8>)>,
+    deviations: Vec<Deviation>,
+    more: u64,
+    too_long: bool,
+}
+
+impl Replay {
+    /// Reads a recording that shows both directions.
+    ///
+    /// # Errors
+    /// Where it shows no answers, or is longer than memory should hold.
+    pub fn new<R: Read>(mut reader: Reader<R>) -> io::Result<Self> {
+        let mut sent: Vec<Sent> = Vec::new();
+        let (mut bytes, mut answered) = (0, false);
+        while let Some(packet) = reader.next() {
+            let Content::Frame(frame) = content(packet) else {
+                continue;
+            };
+            bytes += frame.bytes.len();
+            if bytes > LIMIT {
+                return Err(io::Error::other("the recording is longer than 1 GiB"));
+            }
+            let is_answer = match frame.direction {
+                Some(direction) => direction == Direction::In,
+                None => frame.source[0] & 0x02 != 0,
+            };
+            if !is_answer {
+                sent.push(Sent {
+                    frame,
+                    answers: Vec::new(),
+                });
+                continue;
+            }
+            // The request it belongs to, or else whatever was sent before it.
+            let index =
+                |frame: &Frame| -> Vec<u8> { frame.datagrams.iter().map(|d| d.index).collect() };
+            let indices = index(&frame);
+            let fits =
+                |sent: &&mut Sent| index(&sent.frame) == indices && same_shape(&sent.frame, &frame);
+            let mut recent = sent.iter_mut().rev().take(AHEAD);
+            let own = recent.find(fits);
+            let own = match own {
+                Some(own) => Some(own),
+                None => sent.last_mut(),
+            };
+            if let Some(own) = own {
+                own.answers
+                    .push((frame.at.saturating_sub(own.frame.at), frame.bytes));
+                answered = true;
+            }
+        }
+        if !answered {
+            let message = "the recording has no frame that came back";
+            return Err(io::Error::new(io::ErrorKind::InvalidData, message));
+        }
+        Ok(Self {
+            left: sent.into(),
+            under_way: VecDeque::new(),
+            deviations: Vec::new(),
+            more: 0,
+            too_long: false,
+        })
+    }
+
+    fn tell(&mut self, deviation: Deviation) {
+        if self.deviations.len() < DEVIATIONS {
+            self.deviations.push(deviation);
+        } else {
+            self.more += 1;
+        }
+    }
+
+    /// How this run deviated so far; the first ones.
+    #[must_use]
+    pub fn deviations(&self) -> &[Deviation] {
+        &self.deviations
+    }
+
+    /// Answers to `sent`, with the indices of the frame that was sent now.
+    fn answer(&mut self, sent: Sent, now_sent: &Frame) {
+        let now = clock::now();
+        for (after, mut bytes) in sent.answers {
+            for (old, new) in sent.frame.datagrams.iter().zip(&now_sent.datagrams) {
+                let place = old.data.start.checked_sub(INDEX);
+                if let Some(index) = place.and_then(|at| bytes.get_mut(at))
+                    && *index == old.index
+                {
+                    *index = new.index;
+                }
+            }
+            let at = now.saturating_add(after);
+            let place = self.under_way.partition_point(|(other, _)| *other <= at);
+            self.under_way.insert(place, (at, bytes));
+        }
+    }
+
+    fn take(&mut self, n: usize) -> Option<Sent> {
+        if n > 0 {
+            let frame = self.left.front().map_or(0, |sent| sent.frame.number);
+            self.tell(Deviation::LeftOut { frame, count: n });
+            self.left.drain(..n);
+        }
+        self.left.pop_front()
+    }
+}
+
+/// The same commands to the same addresses, of the same lengths.
+fn same_shape(a: &Frame, b: &Frame) -> bool {
+    let key = |frame: &Frame| {
+        let of = |d: &crate::recording::frame::Datagram| {
+            let address = if d.command.is_positional() {
+                d.address & 0xffff_0000
+            } else {
+                d.address
+            };
+            (d.command, address, d.data.len())
+        };
+        frame.datagrams.iter().map(of).collect::<Vec<_>>()
+    };
+    a.source.get(1..) == b.source.get(1..) && key(a) == key(b)
+}
+
+/// Its datagrams in short.
+fn short(frame: &Frame) -> String {
+    let one = |d: &crate::recording::frame::Datagram| {
+        if d.command.is_logical() {
+            format!("{} 0x{:08x}", d.command.name(), d.address)
+        } else {
+            format!("{} 0x{:04x}:0x{:04x}", d.command.name(), d.adp(), d.ado())
+        }
+    };
+    frame
+        .datagrams
+        .iter()
+        .take(3)
+        .map(one)
+        .collect::<Vec<_>>()
+        .join(" + ")
+}
+
+fn parsed(bytes: &[u8]) -> Option<Frame> {
+    let packet = crate::recording::Packet {
+        number: 0,
+        at: Some(0),
+        interface: 0,
+        link_type: 1,
+        direction: Some(Direction::Out),
+        data: bytes.to_vec(),
+        original_len: bytes.len(),
+    };
+    match content(packet) {
+        Content::Frame(frame) => Some(frame),
+        _ => None,
+    }
+}
+
+impl Link for Replay {
+    fn send(&mut self, bytes: &[u8]) -> Result<(), LinkError> {
+        if bytes.len() > MAX_FRAME {
+            return Err(LinkError::TooLong(bytes.len()));
+        }
+        let Some(frame) = parsed(bytes) else {
+            return Ok(());
+        };
+        // Recordings may pad.
+        let equal = |sent: &Sent| sent.frame.bytes.starts_with(bytes);
+        let alike = |sent: &Sent| same_shape(&sent.frame, &frame);
+        let equal = self.left.iter().take(AHEAD).position(equal);
+        let near = equal.or_else(|| self.left.iter().take(AHEAD).position(alike));
+        if let Some(sent) = near.and_then(|n| self.take(n)) {
+            if let Some(deviation) = difference(&sent.frame, &frame) {
+                self.tell(deviation);
+            }
+            self.answer(sent, &frame);
+        } else {
+            let sent = short(&frame);
+            let deviation = match self.left.front() {
+                Some(next) => Deviation::Other {
+                    sent,
+                    recorded: short(&next.frame),
+                    expected: next.frame.number,
+                },
+                None => Deviation::Beyond { sent },
+            };
+            self.tell(deviation);
+        }
+        Ok(())
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        if self.next_arrival().is_none_or(|at| at > clock::now()) {
+            return Ok(None);
+        }
+        let Some((_, bytes)) = self.under_way.pop_front() else {
+            return Ok(None);
+        };
+        let Some(room) = buf.get_mut(..bytes.len()) else {
+            self.too_long = true;
+            return Ok(None);
+        };
+        room.copy_from_slice(&bytes);
+        Ok(Some(bytes.len()))
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.under_way.front().map(|(at, _)| *at)
+    }
+
+    fn remarks(&mut self) -> Vec<String> {
+        let mut remarks: Vec<String> = self.deviations.iter().map(ToString::to_string).collect();
+        if self.more > 0 {
+            remarks.push(format!(
+                "{} further deviations from the recording",
+                self.more
+            ));
+        }
+        if self.too_long {
+            remarks.push("the recording has frames that no link can carry".to_owned());
+        }
+        if !self.left.is_empty() {
+            remarks.push(format!(
+                "{} frames of the recording were not sent",
+                self.left.len()
+            ));
+        }
+        remarks
+    }
+}
+
+/// Where the data of two frames of one shape first differ. Indices may: they are the MainDevice's own affair.
+fn difference(recorded: &Frame, sent: &Frame) -> Option<Deviation> {
+    for (n, (old, new)) in recorded.datagrams.iter().zip(&sent.datagrams).enumerate() {
+        let both = recorded.data(old).iter().zip(sent.data(new));
+        if let Some((offset, (old, new))) = both.enumerate().find(|(_, (old, new))| old != new) {
+            return Some(Deviation::Data {
+                frame: recorded.number,
+                datagram: n + 1,
+                offset,
+                sent: *new,
+                recorded: *old,
+            });
+        }
+    }
+    None
+}

@@ -1,0 +1,302 @@
+//! What of a packet is EtherCAT (ETG.1000.4, clause 5): the datagrams of a frame in Ethernet, behind VLAN tags, or in UDP.
+
+use std::ops::Range;
+
+use super::{Direction, Packet};
+
+const ETHERTYPE: u16 = 0x88a4;
+const VLAN: [u16; 3] = [0x8100, 0x88a8, 0x9100];
+const IPV4: u16 = 0x0800;
+const UDP: u8 = 17;
+/// UDP port of EtherCAT.
+const UDP_PORT: u16 = 0x88a4;
+
+const LINK_ETHERNET: u16 = 1;
+/// Linux "cooked", as a recording of interface `any` has it, and its second version.
+const LINK_SLL: u16 = 113;
+const LINK_SLL2: u16 = 276;
+
+const DATAGRAM_HEADER: usize = 10;
+const WKC: usize = 2;
+/// Type of an EtherCAT frame that carries datagrams.
+const DLPDUS: u8 = 1;
+
+/// How an EtherCAT frame was carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Carrier {
+    Ethernet,
+    /// Behind at least one tag; the innermost's VLAN.
+    Vlan(u16),
+    Udp,
+}
+
+/// Commands of datagrams (ETG.1000.4 Table 12 and the following).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Command(pub u8);
+
+impl Command {
+    pub const APRD: Self = Self(1);
+    pub const APWR: Self = Self(2);
+    pub const APRW: Self = Self(3);
+    pub const FPRD: Self = Self(4);
+    pub const FPWR: Self = Self(5);
+    pub const FPRW: Self = Self(6);
+    pub const BRD: Self = Self(7);
+    pub const BWR: Self = Self(8);
+    pub const BRW: Self = Self(9);
+    pub const LRD: Self = Self(10);
+    pub const LWR: Self = Self(11);
+    pub const LRW: Self = Self(12);
+    pub const ARMW: Self = Self(13);
+    pub const FRMW: Self = Self(14);
+
+    /// Its abbreviation; unknown ones have none.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        const NAMES: [&str; 15] = [
+            "NOP", "APRD", "APWR", "APRW", "FPRD", "FPWR", "FPRW", "BRD", "BWR", "BRW", "LRD",
+            "LWR", "LRW", "ARMW", "FRMW",
+        ];
+        if (self.0 as usize) < NAMES.len() {
+            NAMES[self.0 as usize]
+        } else {
+            "?"
+        }
+    }
+
+    /// One 32-bit address in place of two of 16 bits.
+    #[must_use]
+    pub const fn is_logical(self) -> bool {
+        matches!(self, Self::LRD | Self::LWR | Self::LRW)
+    }
+
+    /// SubDevices count the address up.
+    #[must_use]
+    pub const fn is_positional(self) -> bool {
+        matches!(
+            self,
+            Self::APRD | Self::APWR | Self::APRW | Self::ARMW | Self::BRD | Self::BWR | Self::BRW
+        )
+    }
+
+    #[must_use]
+    pub const fn reads(self) -> bool {
+        !matches!(
+            self,
+            Self(0) | Self::APWR | Self::FPWR | Self::BWR | Self::LWR
+        )
+    }
+
+    #[must_use]
+    pub const fn writes(self) -> bool {
+        matches!(
+            self,
+            Self::APWR
+                | Self::APRW
+                | Self::FPWR
+                | Self::FPRW
+                | Self::BWR
+                | Self::BRW
+                | Self::LWR
+                | Self::LRW
+        )
+    }
+}
+
+/// One datagram; its data lies in the frame.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Datagram {
+    pub command: Command,
+    pub index: u8,
+    /// Low half: position or station address; high half: register. One number for logical commands.
+    pub address: u32,
+    /// Of the data, in [`Frame::bytes`].
+    pub data: Range<usize>,
+    pub wkc: u16,
+}
+
+impl Datagram {
+    /// Position (counted down from 0) or station address.
+    #[must_use]
+    pub const fn adp(&self) -> u16 {
+        (self.address & 0xffff) as u16
+    }
+
+    /// Register, or address in the memory of the SubDevice.
+    #[must_use]
+    pub const fn ado(&self) -> u16 {
+        (self.address >> 16) as u16
+    }
+}
+
+/// An EtherCAT frame.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Frame {
+    pub number: u64,
+    /// Nanoseconds since 1970.
+    pub at: u64,
+    pub source: [u8; 6],
+    pub direction: Option<Direction>,
+    pub interface: u32,
+    pub carrier: Carrier,
+    pub datagrams: Vec<Datagram>,
+    /// The packet as recorded.
+    pub bytes: Vec<u8>,
+    /// Datagrams do not fill what they should, or exceed it.
+    pub cut: bool,
+}
+
+impl Frame {
+    #[must_use]
+    pub fn data(&self, datagram: &Datagram) -> &[u8] {
+        self.bytes.get(datagram.data.clone()).unwrap_or_default()
+    }
+}
+
+/// What a packet is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Content {
+    Frame(Frame),
+    /// EtherCAT that carries no datagrams: network variables, mailbox gateway; the type.
+    OtherEthercat(u8),
+    /// Not EtherCAT.
+    Other,
+}
+
+/// Big-endian, as everything before EtherCAT is.
+fn be16(bytes: &[u8], at: usize) -> Option<u16> {
+    let two = bytes.get(at..)?.first_chunk()?;
+    Some(u16::from_be_bytes(*two))
+}
+
+/// Looks for EtherCAT in a packet.
+#[must_use]
+pub fn content(packet: Packet) -> Content {
+    match find(&packet.data, packet.link_type) {
+        Some(found) => found.read(packet),
+        None => Content::Other,
+    }
+}
+
+/// Where EtherCAT begins.
+struct Found {
+    at: usize,
+    source: [u8; 6],
+    carrier: Carrier,
+    sent: Option<Direction>,
+}
+
+fn find(bytes: &[u8], link_type: u16) -> Option<Found> {
+    let (mut at, source, sent) = match link_type {
+        LINK_ETHERNET => (12, 6, None),
+        LINK_SLL => (14, 6, Some(be16(bytes, 0)?)),
+        LINK_SLL2 => (0, 12, Some(u16::from(*bytes.get(10)?))),
+        _ => return None,
+    };
+    let source = *bytes.get(source..)?.first_chunk::<6>()?;
+    // 4: sent by the recording computer.
+    let sent = sent.map(|kind| {
+        if kind == 4 {
+            Direction::Out
+        } else {
+            Direction::In
+        }
+    });
+    let mut kind = be16(bytes, at)?;
+    // The protocol stands first in the second version, everything else behind its head.
+    at = if link_type == LINK_SLL2 { 20 } else { at + 2 };
+    let mut carrier = Carrier::Ethernet;
+    while VLAN.contains(&kind) {
+        carrier = Carrier::Vlan(be16(bytes, at)? & 0x0fff);
+        kind = be16(bytes, at + 2)?;
+        at += 4;
+    }
+    if kind == IPV4 {
+        at = udp(bytes, at)?;
+        carrier = Carrier::Udp;
+    } else if kind != ETHERTYPE {
+        return None;
+    }
+    Some(Found {
+        at,
+        source,
+        carrier,
+        sent,
+    })
+}
+
+/// Where the payload of a UDP packet to or from EtherCAT's port begins.
+fn udp(bytes: &[u8], at: usize) -> Option<usize> {
+    let first = *bytes.get(at)?;
+    let head = usize::from(first & 0x0f) * 4;
+    // A later fragment has no UDP header.
+    let fragment = be16(bytes, at + 6)? & 0x1fff;
+    if first >> 4 != 4 || head < 20 || fragment != 0 || *bytes.get(at + 9)? != UDP {
+        return None;
+    }
+    let udp = at + head;
+    let ours = be16(bytes, udp + 2)? == UDP_PORT || be16(bytes, udp)? == UDP_PORT;
+    ours.then_some(udp + 8)
+}
+
+impl Found {
+    fn read(self, packet: Packet) -> Content {
+        let bytes = packet.data;
+        let Some(head) = bytes.get(self.at..).and_then(<[u8]>::first_chunk::<2>) else {
+            return Content::Other;
+        };
+        let head = u16::from_le_bytes(*head);
+        let kind = (head >> 12) as u8;
+        if kind != DLPDUS {
+            return Content::OtherEthercat(kind);
+        }
+        let start = self.at + 2;
+        let end = start + usize::from(head & 0x07ff);
+        let (datagrams, cut) = datagrams(&bytes, start, end.min(bytes.len()));
+        Content::Frame(Frame {
+            number: packet.number,
+            at: packet.at.unwrap_or(0),
+            source: self.source,
+            direction: packet.direction.or(self.sent),
+            interface: packet.interface,
+            carrier: self.carrier,
+            datagrams,
+            cut: cut || end > bytes.len(),
+            bytes,
+        })
+    }
+}
+
+/// Whole datagrams, and whether something is missing.
+fn datagrams(bytes: &[u8], start: usize, end: usize) -> (Vec<Datagram>, bool) {
+    let mut found = Vec::new();
+    let mut at = start;
+    loop {
+        let Some(head) = bytes
+            .get(at..end)
+            .and_then(<[u8]>::first_chunk::<DATAGRAM_HEADER>)
+        else {
+            return (found, true);
+        };
+        let [command, index, a0, a1, a2, a3, l0, l1, ..] = *head;
+        let len = u16::from_le_bytes([l0, l1]);
+        let data = at + DATAGRAM_HEADER..at + DATAGRAM_HEADER + usize::from(len & 0x07ff);
+        let wkc = bytes
+            .get(data.end..end)
+            .and_then(<[u8]>::first_chunk::<WKC>);
+        let Some(wkc) = wkc else {
+            return (found, true);
+        };
+        at = data.end + WKC;
+        found.push(Datagram {
+            command: Command(command),
+            index,
+            address: u32::from_le_bytes([a0, a1, a2, a3]),
+            data,
+            wkc: u16::from_le_bytes(*wkc),
+        });
+        if len & 0x8000 == 0 {
+            return (found, false);
+        }
+    }
+}

@@ -1,0 +1,221 @@
+//! pcapng: sections of blocks, each with its type, its length, and its length once more
+//! (<https://www.ietf.org/archive/id/draft-ietf-opsawg-pcapng-02.html>).
+
+use std::io::Read;
+
+use super::window::{Order, Window};
+use super::{Direction, MAX_PACKET, Packet, Step};
+
+pub(super) const SECTION: u32 = 0x0a0d_0d0a;
+const MAGIC: u32 = 0x1a2b_3c4d;
+const INTERFACE: u32 = 1;
+/// Obsolete, before enhanced packets.
+const PACKET: u32 = 2;
+const SIMPLE: u32 = 3;
+const ENHANCED: u32 = 6;
+/// Type, length, length.
+const EMPTY: usize = 12;
+/// What is no packet (names, statistics, secrets) may be longer than one.
+const MAX_BLOCK: usize = 64 << 20;
+/// More than anybody has; the others' packets are of an unknown kind.
+const MAX_INTERFACES: usize = 1024;
+
+const OPTION_END: u16 = 0;
+const EPB_FLAGS: u16 = 2;
+const IF_TSRESOL: u16 = 9;
+const IF_TSOFFSET: u16 = 14;
+
+#[derive(Debug, Clone, Copy)]
+struct Interface {
+    link_type: u16,
+    /// As `if_tsresol` has it: a power of ten, or with the highest bit of two, in negative.
+    resolution: u8,
+    offset_s: i64,
+}
+
+#[derive(Debug)]
+pub(super) struct Pcapng {
+    order: Order,
+    interfaces: Vec<Interface>,
+}
+
+impl Default for Pcapng {
+    fn default() -> Self {
+        Self {
+            order: Order::Little,
+            interfaces: Vec::new(),
+        }
+    }
+}
+
+impl Pcapng {
+    /// Type and length of a block whose head can be one. A section's head also tells the byte order.
+    fn head(&self, head: &[u8]) -> Option<(u32, usize, Order)> {
+        if head.len() < EMPTY {
+            return None;
+        }
+        // The same in both orders.
+        let order = if Order::Little.u32(head, 0) == SECTION {
+            let of = |order: Order| (order.u32(head, 8) == MAGIC).then_some(order);
+            of(Order::Little).or_else(|| of(Order::Big))?
+        } else {
+            self.order
+        };
+        let kind = order.u32(head, 0);
+        let len = usize::try_from(order.u32(head, 4)).ok()?;
+        let most = if matches!(kind, PACKET | SIMPLE | ENHANCED) {
+            MAX_PACKET
+        } else {
+            MAX_BLOCK
+        };
+        (len >= EMPTY && len.is_multiple_of(4) && len <= most).then_some((kind, len, order))
+    }
+
+    pub fn step<R: Read>(&mut self, window: &mut Window<R>) -> Step {
+        let head = window.fill(EMPTY);
+        match head.len() {
+            0 => return Step::End,
+            EMPTY => {}
+            _ => return Step::Truncated,
+        }
+        let Some((kind, len, order)) = self.head(head) else {
+            return Step::Damaged;
+        };
+        if !matches!(kind, SECTION | INTERFACE | PACKET | SIMPLE | ENHANCED) {
+            return if window.take(len) < len {
+                Step::Truncated
+            } else {
+                Step::Skip
+            };
+        }
+        let block = window.fill(len);
+        if block.len() < len {
+            return Step::Truncated;
+        }
+        if usize::try_from(order.u32(block, len - 4)) != Ok(len) {
+            return Step::Damaged;
+        }
+        let body = block.get(8..len - 4).unwrap_or_default();
+        let step = match kind {
+            SECTION => {
+                self.order = order;
+                self.interfaces.clear();
+                Step::Skip
+            }
+            INTERFACE => {
+                if self.interfaces.len() < MAX_INTERFACES {
+                    self.interfaces.push(interface(order, body));
+                }
+                Step::Skip
+            }
+            _ => self.packet(kind, body).map_or(Step::Damaged, Step::Packet),
+        };
+        if !matches!(step, Step::Damaged) {
+            window.take(len);
+        }
+        step
+    }
+
+    fn packet(&self, kind: u32, body: &[u8]) -> Option<Packet> {
+        let word = |at| self.order.u32(body, at);
+        let (interface, fixed, kept, original): (u32, usize, u32, u32) = match kind {
+            ENHANCED => (word(0), 20, word(12), word(16)),
+            PACKET => (u32::from(self.order.u16(body, 0)), 20, word(12), word(16)),
+            // Cut by the interface's length alone.
+            _ => {
+                let there = u32::try_from(body.len().saturating_sub(4)).ok()?;
+                (0, 4, word(0).min(there), word(0))
+            }
+        };
+        let kept = usize::try_from(kept).ok()?;
+        let data = body.get(fixed..fixed.checked_add(kept)?)?.to_vec();
+        let known = usize::try_from(interface)
+            .ok()
+            .and_then(|n| self.interfaces.get(n));
+        let at = (kind != SIMPLE).then(|| {
+            let raw = u64::from(word(4)) << 32 | u64::from(word(8));
+            known.map_or(0, |interface| interface.nanos(raw))
+        });
+        let options = body
+            .get(fixed + kept.next_multiple_of(4)..)
+            .unwrap_or_default();
+        let flags = option(self.order, options, EPB_FLAGS).map(|flags| self.order.u32(flags, 0));
+        let direction = match flags.filter(|_| kind == ENHANCED).map(|flags| flags & 3) {
+            Some(1) => Some(Direction::In),
+            Some(2) => Some(Direction::Out),
+            _ => None,
+        };
+        Some(Packet {
+            number: 0,
+            at,
+            interface,
+            link_type: known.map_or(u16::MAX, |interface| interface.link_type),
+            direction,
+            data,
+            original_len: usize::try_from(original).ok()?,
+        })
+    }
+
+    /// Whether a block begins here: known, and with its length at both ends.
+    pub fn sound<R: Read>(&mut self, window: &mut Window<R>) -> bool {
+        let Some((kind, len, order)) = self.head(window.fill(EMPTY)) else {
+            return false;
+        };
+        // Unknown kinds and long blocks are nothing to rely on.
+        matches!(kind, SECTION | INTERFACE | PACKET | SIMPLE | ENHANCED)
+            && len <= MAX_PACKET
+            && usize::try_from(order.u32(window.fill(len), len - 4)) == Ok(len)
+    }
+}
+
+impl Interface {
+    /// Nanoseconds since 1970 of a time stamp; what does not fit is 0 or as late as can be.
+    fn nanos(&self, raw: u64) -> u64 {
+        let raw = u128::from(raw);
+        let exponent = u32::from(self.resolution & 0x7f);
+        let nanos = if self.resolution & 0x80 != 0 {
+            (raw * 1_000_000_000).checked_shr(exponent).unwrap_or(0)
+        } else if exponent <= 9 {
+            raw * 10_u128.pow(9 - exponent)
+        } else {
+            10_u128
+                .checked_pow(exponent - 9)
+                .map_or(0, |unit| raw / unit)
+        };
+        let nanos = i128::try_from(nanos).unwrap_or(i128::MAX);
+        let nanos = nanos.saturating_add(i128::from(self.offset_s) * 1_000_000_000);
+        u64::try_from(nanos.max(0)).unwrap_or(u64::MAX)
+    }
+}
+
+fn interface(order: Order, body: &[u8]) -> Interface {
+    let options = body.get(8..).unwrap_or_default();
+    let offset = option(order, options, IF_TSOFFSET).and_then(<[u8]>::first_chunk::<8>);
+    Interface {
+        link_type: order.u16(body, 0),
+        resolution: option(order, options, IF_TSRESOL)
+            .and_then(|value| value.first().copied())
+            .unwrap_or(6),
+        offset_s: offset.map_or(0, |bytes| match order {
+            Order::Little => i64::from_le_bytes(*bytes),
+            Order::Big => i64::from_be_bytes(*bytes),
+        }),
+    }
+}
+
+/// The value of the first option with this code.
+fn option(order: Order, mut options: &[u8], wanted: u16) -> Option<&[u8]> {
+    while options.len() >= 4 {
+        let code = order.u16(options, 0);
+        let len = usize::from(order.u16(options, 2));
+        if code == OPTION_END {
+            return None;
+        }
+        let value = options.get(4..4 + len)?;
+        if code == wanted {
+            return Some(value);
+        }
+        options = options.get(4 + len.next_multiple_of(4)..)?;
+    }
+    None
+}
