@@ -683,7 +683,7 @@ fn every_capture_cut_anywhere() {
         let step = if bytes.len() < 2_000 {
             1
         } else {
-            bytes.len() / 150
+            bytes.len() / 60
         };
         let ends = (0..bytes.len())
             .step_by(step)

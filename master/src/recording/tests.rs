@@ -191,10 +191,11 @@ fn what_is_damaged_is_left_out_and_the_rest_read() {
     old[at..at + 4].fill(0xee);
     let new: Vec<_> = (0..20_u64).map(|n| (0, n, &[7; 60][..], 0)).collect();
     let mut new = pcapng(false, &[Some(9)], &new);
-    let at = new.len() - 5 * 104 - 4;
+    // Blocks of 100 bytes.
+    let at = new.len() - 5 * 100 - 4;
     // The second length of one, the first of another.
     new[at..at + 4].fill(0xee);
-    let at = at - 5 * 104 - 96;
+    let at = at - 5 * 100 - 92;
     new[at..at + 4].fill(0xee);
     for (file, kept, places) in [(old, 19, 1), (new, 18, 2)] {
         let (packets, remarks) = all(&file);

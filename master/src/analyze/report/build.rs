@@ -1,0 +1,341 @@
+//! Devices, story and transfers, from what the segment kept.
+
+use super::cyclic::{axes, clocks, cycle};
+use super::{DeviceReport, FileReport, Line, Report, SyncManagerReport, TransferReport, trouble};
+use crate::analyze::events::{Event, Of, What};
+use crate::analyze::mailbox::{Ended, Way};
+use crate::analyze::segment::{Device, Segment};
+use crate::analyze::values::value;
+use crate::analyze::{Counted, Known};
+use crate::mailbox::object_name;
+use crate::recording::frame::Carrier;
+
+/// Transfers that are listed; they are counted beyond.
+const TRANSFERS: usize = 20_000;
+/// Lines that are looked back for one that says the same.
+const TOGETHER: usize = 256;
+
+/// Seconds since the recording's first frame.
+pub(super) struct Since(u64);
+
+impl Since {
+    pub fn seconds(&self, at: u64) -> f64 {
+        at.saturating_sub(self.0) as f64 / 1e9
+    }
+}
+
+pub(in crate::analyze) fn report(
+    remarks: Vec<String>,
+    counted: &Counted,
+    mut segment: Segment,
+) -> Report {
+    let since = Since(counted.first.unwrap_or(0));
+    // As they are cabled, as far as that is known.
+    let mut order: Vec<usize> = (0..segment.devices.len()).collect();
+    order.sort_by_key(|n| {
+        let device = segment.devices.get(*n);
+        let (position, station) = device.map_or((None, None), |d| (d.position, d.station));
+        (position.is_none(), position, station)
+    });
+    let place = |n: usize| order.iter().position(|m| *m == n).unwrap_or(n);
+    let mut devices = Vec::new();
+    for n in &order {
+        let Some(device) = segment.devices.get(*n) else {
+            continue;
+        };
+        let own = segment
+            .events
+            .iter()
+            .filter(|event| event.of == Of::Device(*n));
+        devices.push(device_report(device, &mut segment.known, own));
+    }
+    let (transfers, more_transfers) = transfers(&segment, &since, place);
+    let story = lines(
+        segment.events.iter().filter(|event| event.what.matters()),
+        &since,
+        place,
+    );
+    let mut report = Report {
+        file: file(remarks, counted, &segment),
+        trouble: Vec::new(),
+        answering: segment.answering,
+        story: together(story),
+        events: lines(segment.events.iter(), &since, place),
+        more_events: segment.more_events,
+        transfers,
+        more_transfers,
+        cycle: cycle(&segment.cycle, &since),
+        clocks: clocks(&segment.clocks),
+        axes: axes(&segment, &order, &devices, &since),
+        devices,
+    };
+    report.trouble = trouble::of(&report);
+    report
+}
+
+fn file(mut remarks: Vec<String>, counted: &Counted, segment: &Segment) -> FileReport {
+    let mut remark = |count: u64, text: &str| {
+        if count > 0 {
+            remarks.push(format!("{count} {text}"));
+        }
+    };
+    remark(counted.other, "packets are not EtherCAT");
+    remark(
+        counted.other_ethercat,
+        "EtherCAT packets carry no datagrams (network variables, mailbox gateway)",
+    );
+    remark(
+        counted.cut,
+        "EtherCAT frames are cut: datagrams are missing",
+    );
+    remark(
+        counted.back,
+        "frames are recorded before the one in front of them",
+    );
+    remark(
+        segment.cycle.unfollowed,
+        "datagrams of further process data were not followed",
+    );
+    remark(
+        segment.unfollowed,
+        "datagrams of further devices were not followed",
+    );
+    if counted.interfaces.len() > 1 {
+        let interfaces: Vec<String> = counted.interfaces.iter().map(ToString::to_string).collect();
+        remarks.push(format!(
+            "EtherCAT on interfaces {}, taken together; `--interface` picks one",
+            interfaces.join(", ")
+        ));
+    }
+    for carrier in &counted.carriers {
+        match carrier {
+            Carrier::Ethernet => {}
+            Carrier::Vlan(vlan) => remarks.push(format!("frames carry the tag of VLAN {vlan}")),
+            Carrier::Udp => remarks.push("frames are carried in UDP".to_owned()),
+        }
+    }
+    let began = counted.first.unwrap_or(0);
+    FileReport {
+        packets: counted.packets,
+        ethercat_frames: counted.frames,
+        other_packets: counted.other + counted.other_ethercat,
+        began_ns: began,
+        seconds: Since(began).seconds(counted.last),
+        sent: segment.sent,
+        answered: segment.answered,
+        lost: segment.unanswered,
+        without_request: segment.unasked,
+        open: segment.open,
+        remarks,
+    }
+}
+
+fn device_report<'e>(
+    device: &Device,
+    known: &mut Known,
+    events: impl Iterator<Item = &'e Event>,
+) -> DeviceReport {
+    let configuration = device.configuration();
+    let sync_managers: Vec<SyncManagerReport> = configuration
+        .sync_managers()
+        .map(|sm| SyncManagerReport {
+            number: sm.number,
+            start: sm.start,
+            len: sm.len,
+            usage: match (sm.mailbox, sm.output) {
+                (true, true) => "mailbox out",
+                (true, false) => "mailbox in",
+                (false, true) => "outputs",
+                (false, false) => "inputs",
+            },
+        })
+        .collect();
+    let bytes = |usage: &str| {
+        let all = sync_managers.iter().filter(|sm| sm.usage == usage);
+        all.map(|sm| u32::from(sm.len)).sum()
+    };
+    let (eeprom, objects) = (&device.eeprom, device.objects.identity());
+    let vendor = eeprom.vendor().or(objects.0);
+    let product = eeprom.product().or(objects.1);
+    let revision = eeprom.revision().or(objects.2);
+    let by_machine = known.name(device.position, product).map(ToOwned::to_owned);
+    let by_esi = match (vendor, product) {
+        (Some(vendor), Some(product)) => known.type_name(vendor, product, revision.unwrap_or(0)),
+        _ => None,
+    };
+    // Cyclic operation of SYNC0 is bit 1 of what activates it.
+    let sync0 = configuration
+        .u8(0x0981)
+        .is_some_and(|activation| activation & 2 != 0);
+    let mut report = DeviceReport {
+        position: device.position,
+        station: device.station,
+        alias: configuration
+            .u16(0x0012)
+            .or(eeprom.alias())
+            .filter(|alias| *alias != 0),
+        name: by_machine
+            .or(by_esi)
+            .or_else(|| eeprom.name())
+            .or_else(|| device.objects.name()),
+        vendor,
+        product,
+        revision,
+        serial: eeprom.serial().or(objects.3),
+        states: device.reached.iter().map(ToString::to_string).collect(),
+        state: device.state.map(|state| state.to_string()),
+        al_error: device.error,
+        al_code: device.code,
+        output_bytes: bytes("outputs"),
+        input_bytes: bytes("inputs"),
+        sync_managers,
+        fmmus: configuration.fmmus().count(),
+        sync0_ns: configuration.u32(0x09a0).filter(|ns| sync0 && *ns > 0),
+        eeprom_words: eeprom.words(),
+        errors: errors(device),
+        reads: 0,
+        writes: 0,
+        failed_transfers: 0,
+        emergencies: 0,
+    };
+    for event in events {
+        match &event.what {
+            What::Transfer(transfer) => {
+                match transfer.way {
+                    Way::Read => report.reads += 1,
+                    Way::Write => report.writes += 1,
+                }
+                report.failed_transfers += u64::from(transfer.ended != Ended::Done);
+            }
+            What::Emergency(_) => report.emergencies += 1,
+            _ => {}
+        }
+    }
+    report
+}
+
+/// Error counters from 0x0300 on.
+fn errors(device: &Device) -> Vec<(String, u8)> {
+    let ports = 0..4_u16;
+    let of_port = |port: u16| {
+        [
+            (0x0300 + 2 * port, format!("invalid frames at port {port}")),
+            (0x0301 + 2 * port, format!("receive errors at port {port}")),
+            (0x0308 + port, format!("errors forwarded to port {port}")),
+            (0x0310 + port, format!("links lost at port {port}")),
+        ]
+    };
+    let unit = [
+        (0x030c, "errors of the processing unit".to_owned()),
+        (0x030d, "errors of the process data interface".to_owned()),
+    ];
+    let all = ports.flat_map(of_port).chain(unit);
+    let counted = all.filter_map(|(register, what)| Some((what, device.registers.u8(register)?)));
+    counted.filter(|(_, count)| *count > 0).collect()
+}
+
+fn lines<'e>(
+    events: impl Iterator<Item = &'e Event>,
+    since: &Since,
+    place: impl Fn(usize) -> usize,
+) -> Vec<Line> {
+    let line = |event: &Event| {
+        let axis = match event.what {
+            What::Axis { axis: n @ 1.., .. } | What::AxisError { axis: n @ 1.., .. } => {
+                format!("axis {n}: ")
+            }
+            _ => String::new(),
+        };
+        Line {
+            at: since.seconds(event.at),
+            devices: match event.of {
+                Of::Bus => Vec::new(),
+                Of::Device(n) => vec![place(n)],
+            },
+            text: format!("{axis}{}", event.what),
+            trouble: event.what.is_trouble(),
+            times: 1,
+        }
+    };
+    events.map(line).collect()
+}
+
+/// Lines that say the same of several devices become one: bring-up does everything device by device.
+fn together(lines: Vec<Line>) -> Vec<Line> {
+    let mut kept: Vec<Line> = Vec::new();
+    for line in lines {
+        if let Some(last) = kept.last_mut()
+            && (&last.text, &last.devices) == (&line.text, &line.devices)
+        {
+            last.times += 1;
+            continue;
+        }
+        // Back to what was said of the same device, or of the whole bus.
+        let other = |old: &&mut Line| {
+            old.devices.is_empty() || line.devices.iter().any(|n| old.devices.contains(n))
+        };
+        let same = kept
+            .iter_mut()
+            .rev()
+            .take(TOGETHER)
+            .take_while(|old| !other(old) && line.at - old.at < 1.0)
+            .find(|old| old.text == line.text && old.times == 1);
+        match same {
+            Some(old) if !line.devices.is_empty() => old.devices.extend(&line.devices),
+            _ => kept.push(line),
+        }
+    }
+    for line in &mut kept {
+        line.devices.sort_unstable();
+    }
+    kept
+}
+
+fn transfers(
+    segment: &Segment,
+    since: &Since,
+    place: impl Fn(usize) -> usize,
+) -> (Vec<TransferReport>, u64) {
+    let all = segment
+        .events
+        .iter()
+        .filter_map(|event| match (&event.what, event.of) {
+            (What::Transfer(transfer), Of::Device(n)) => Some((n, transfer)),
+            _ => None,
+        });
+    let (mut listed, mut more) = (Vec::new(), 0);
+    for (n, transfer) in all {
+        if listed.len() >= TRANSFERS {
+            more += 1;
+            continue;
+        }
+        let names = segment.devices.get(n).map(|device| &device.mailbox.names);
+        let told = names.and_then(|names| {
+            let own = names.get(&(transfer.index, u16::from(transfer.sub)));
+            own.or_else(|| names.get(&(transfer.index, u16::MAX)))
+        });
+        let standard = object_name(transfer.index, transfer.sub).map(ToOwned::to_owned);
+        let (ended, code) = match transfer.ended {
+            Ended::Done => ("done", None),
+            Ended::Aborted { code, .. } => ("aborted", Some(code)),
+            Ended::Refused(code) => ("refused", Some(u32::from(code))),
+            Ended::Unanswered => ("no answer", None),
+        };
+        listed.push(TransferReport {
+            at: since.seconds(transfer.began),
+            device: place(n),
+            took_ns: transfer.ended_at.saturating_sub(transfer.began),
+            write: transfer.way == Way::Write,
+            index: transfer.index,
+            sub: transfer.sub,
+            complete: transfer.complete,
+            name: standard.or_else(|| told.cloned()),
+            bytes: transfer.len,
+            segments: transfer.segments,
+            value: value(transfer),
+            ended,
+            code,
+        });
+    }
+    (listed, more)
+}

@@ -1,0 +1,254 @@
+//! The file of a recording, or its parts.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Read, Write};
+use std::path::{Path, PathBuf};
+
+use super::Dir;
+use crate::link::{MAX_FRAME, Nanos};
+
+/// A recording with a limit: how many parts there are at a time.
+const PARTS: u64 = 4;
+
+/// The part of a recording with this number.
+fn part_name(path: &Path, number: u32) -> PathBuf {
+    let mut name = path
+        .file_stem()
+        .map_or_else(OsString::new, ToOwned::to_owned);
+    name.push(format!(".{number:04}"));
+    if let Some(extension) = path.extension() {
+        name.push(".");
+        name.push(extension);
+    }
+    path.with_file_name(name)
+}
+
+/// Numbered parts of a recording of this name that exist, whatever they are.
+///
+/// # Errors
+/// Where the folder cannot be read.
+pub fn parts_of(path: &Path) -> io::Result<Vec<PathBuf>> {
+    let folder = match path.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    let mut found = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let name = entry?.file_name();
+        // The number is what remains of the stem.
+        let number = Path::new(&name)
+            .file_stem()
+            .and_then(|stem| Path::new(stem).extension());
+        let number = number.and_then(|n| n.to_str()?.parse::<u32>().ok());
+        if let Some(number) = number
+            && part_name(path, number).file_name() == Some(&name)
+        {
+            found.push(path.with_file_name(name));
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// The file or files of a recording.
+pub(super) struct Parts {
+    file: Pcapng<BufWriter<File>>,
+    path: PathBuf,
+    /// Bytes of a part.
+    each: Option<u64>,
+    /// Of the part that is being written; 0 is the first.
+    number: u32,
+    /// Frames in parts before this one.
+    before: u64,
+}
+
+fn open_part(path: &Path) -> io::Result<Pcapng<BufWriter<File>>> {
+    Pcapng::new(BufWriter::with_capacity(1 << 20, File::create(path)?))
+}
+
+impl Parts {
+    pub fn create(path: &Path, limit: Option<u64>) -> io::Result<Self> {
+        let file = open_part(path)?;
+        if limit.is_some() {
+            for old in parts_of(path)? {
+                let mut magic = Vec::new();
+                File::open(&old)?.take(4).read_to_end(&mut magic)?;
+                if magic == SECTION.to_le_bytes() {
+                    fs::remove_file(old)?;
+                }
+            }
+        }
+        Ok(Self {
+            file,
+            path: path.to_owned(),
+            each: limit.map(|limit| limit / PARTS),
+            number: 0,
+            before: 0,
+        })
+    }
+
+    pub fn packet(&mut self, dir: Dir, at: Nanos, frame: &[u8]) -> io::Result<()> {
+        let room = |each| self.file.bytes + BLOCK_MOST <= each;
+        if !self.each.is_none_or(room) {
+            self.turn()?;
+        }
+        self.file.packet(dir, at, frame)
+    }
+
+    /// Goes on in a new part, and removes the one that is too old.
+    fn turn(&mut self) -> io::Result<()> {
+        let next = open_part(&part_name(&self.path, self.number + 1))?;
+        self.before += std::mem::replace(&mut self.file, next).finish()?;
+        self.number += 1;
+        if let Some(old) = self
+            .number
+            .checked_sub(PARTS as u32 - 1)
+            .filter(|old| *old > 0)
+        {
+            fs::remove_file(part_name(&self.path, old))?;
+        }
+        Ok(())
+    }
+
+    /// How many frames were written, those of removed parts as well.
+    pub fn finish(self) -> io::Result<u64> {
+        Ok(self.before + self.file.finish()?)
+    }
+}
+
+/// pcapng blocks, written by hand: one section, one Ethernet interface, nanoseconds.
+struct Pcapng<W> {
+    out: W,
+    /// One block, so that the file is written once a frame.
+    block: Vec<u8>,
+    written: u64,
+    /// Of the file so far.
+    bytes: u64,
+}
+
+const SECTION: u32 = 0x0a0d_0d0a;
+/// The longest block.
+const BLOCK_MOST: u64 = 48 + MAX_FRAME as u64;
+const LINKTYPE_ETHERNET: u16 = 1;
+const EPB_FLAGS: u16 = 2;
+const IF_TSRESOL: u16 = 9;
+
+impl<W: Write> Pcapng<W> {
+    fn new(mut out: W) -> io::Result<Self> {
+        let mut head = Vec::with_capacity(64);
+        // Section header; the length of the section is not known (-1).
+        for word in [SECTION, 28, 0x1a2b_3c4d, 1, u32::MAX, u32::MAX, 28_u32] {
+            head.extend(word.to_le_bytes());
+        }
+        // Interface description with if_tsresol = 10^-9 and the end of its options.
+        for word in [1_u32, 32] {
+            head.extend(word.to_le_bytes());
+        }
+        head.extend(LINKTYPE_ETHERNET.to_le_bytes());
+        head.extend([0, 0]);
+        head.extend(0_u32.to_le_bytes());
+        head.extend(IF_TSRESOL.to_le_bytes());
+        head.extend([1, 0, 9, 0, 0, 0]);
+        head.extend(0_u32.to_le_bytes());
+        head.extend(32_u32.to_le_bytes());
+        out.write_all(&head)?;
+        Ok(Self {
+            out,
+            block: Vec::with_capacity(48 + MAX_FRAME),
+            written: 0,
+            bytes: head.len() as u64,
+        })
+    }
+
+    fn packet(&mut self, dir: Dir, at: Nanos, frame: &[u8]) -> io::Result<()> {
+        let too_long = || io::Error::from(io::ErrorKind::InvalidInput);
+        let len = u32::try_from(frame.len()).map_err(|_| too_long())?;
+        let padding = frame.len().next_multiple_of(4) - frame.len();
+        // 28 before the data, 12 of options and 4 after it.
+        let total = u32::try_from(44 + frame.len() + padding).map_err(|_| too_long())?;
+        let [t0, t1, t2, t3, t4, t5, t6, t7] = at.to_le_bytes();
+
+        let mut head = [0; 28];
+        head[0..4].copy_from_slice(&6_u32.to_le_bytes());
+        head[4..8].copy_from_slice(&total.to_le_bytes());
+        head[12..16].copy_from_slice(&[t4, t5, t6, t7]);
+        head[16..20].copy_from_slice(&[t0, t1, t2, t3]);
+        head[20..24].copy_from_slice(&len.to_le_bytes());
+        head[24..28].copy_from_slice(&len.to_le_bytes());
+
+        let mut tail = [0; 16];
+        tail[0..2].copy_from_slice(&EPB_FLAGS.to_le_bytes());
+        tail[2..4].copy_from_slice(&4_u16.to_le_bytes());
+        tail[4..8].copy_from_slice(&dir.flag().to_le_bytes());
+        tail[12..16].copy_from_slice(&total.to_le_bytes());
+
+        self.block.clear();
+        self.block.extend_from_slice(&head);
+        self.block.extend_from_slice(frame);
+        self.block.extend_from_slice(&[0; 3][..padding]);
+        self.block.extend_from_slice(&tail);
+        self.out.write_all(&self.block)?;
+        self.written += 1;
+        self.bytes += self.block.len() as u64;
+        Ok(())
+    }
+
+    fn finish(mut self) -> io::Result<u64> {
+        self.out.flush()?;
+        Ok(self.written)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Mode, Recorder};
+    use super::*;
+
+    #[test]
+    fn a_limit_keeps_the_beginning_and_the_newest() {
+        const LIMIT: u64 = 200_000;
+        for mode in [Mode::Inline, Mode::Background] {
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join("a night.pcapng");
+            // Of an older recording, and of somebody else.
+            let old = dir.path().join("a night.0042.pcapng");
+            let other = dir.path().join("a night.0043.pcapng");
+            fs::write(&old, SECTION.to_le_bytes()).unwrap();
+            fs::write(&other, "notes").unwrap();
+            let mut recorder = Recorder::create(&path, mode, Some(LIMIT)).unwrap();
+            let frames = 3_000;
+            for at in 0..frames {
+                recorder.frame(Dir::Out, at, &[0x5a; 200]);
+            }
+            let stats = recorder.finish().unwrap();
+            assert_eq!((stats.written, stats.dropped), (frames, 0));
+            assert!(!old.exists() && other.exists());
+            fs::remove_file(other).unwrap();
+
+            let mut files = parts_of(&path).unwrap();
+            assert_eq!(files.len(), 3, "{files:?}");
+            files.insert(0, path);
+            let sizes = files.iter().map(|file| file.metadata().unwrap().len());
+            assert!(sizes.sum::<u64>() <= LIMIT);
+            let stamps = files.iter().flat_map(|file| {
+                let mut reader = crate::recording::open(file).unwrap();
+                let stamps: Vec<u64> = std::iter::from_fn(|| reader.next())
+                    .map(|packet| packet.at.unwrap())
+                    .collect();
+                assert_eq!(reader.remarks(), []);
+                stamps
+            });
+            let stamps: Vec<u64> = stamps.collect();
+            assert_eq!(
+                (stamps.first(), stamps.last()),
+                (Some(&0), Some(&(frames - 1)))
+            );
+            let jumps = stamps
+                .windows(2)
+                .filter(|pair| pair[1] != pair[0] + 1)
+                .count();
+            assert_eq!(jumps, 1, "between the first part and the newest");
+        }
+    }
+}
