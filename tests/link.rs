@@ -128,6 +128,7 @@ fn what_is_not_ours_is_counted_and_passed_over() {
         let expected = LinkStats {
             tagged,
             foreign: 3,
+            main_devices: 2,
             damaged: 2,
             dropped: 0,
         };

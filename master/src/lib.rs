@@ -5,6 +5,7 @@
 //! - [`library`]: ESI files on disk, one or a folder of them;
 //! - [`config`]: the machine file as written, then validated;
 //! - [`session`]: one run of a machine, from the file to the summary;
+//! - [`story`]: what stopped a run, and on which device;
 //! - [`supervise`]: everything beside the cycle while the machine runs;
 //! - [`bringup`]: from a silent wire to SafeOp; may block and allocate;
 //! - [`rt`]: the cycle; must not block or allocate;
@@ -40,5 +41,6 @@ pub mod rt;
 pub mod scan;
 pub mod service;
 pub mod session;
+pub mod story;
 pub mod supervise;
 mod wire;

@@ -205,7 +205,7 @@ pub fn wire_time(len: usize) -> u64 {
     (u64::try_from(len).unwrap_or(0).max(60) + 24) * 80
 }
 
-/// Builds frames; for tests and tools, the simulated devices never need it.
+/// Builds frames; for tests, tools and faults, the simulated devices never need it.
 #[derive(Debug, Clone)]
 pub struct FrameBuilder {
     frame: Vec<u8>,
@@ -214,15 +214,21 @@ pub struct FrameBuilder {
 
 impl Default for FrameBuilder {
     fn default() -> Self {
-        let mut frame = vec![0xff; 6];
-        frame.extend_from_slice(&[0x10; 6]);
-        frame.extend_from_slice(&ETHERTYPE.to_be_bytes());
-        frame.extend_from_slice(&[0, 0x10]);
-        Self { frame, last: None }
+        Self::from_source([0x10; 6])
     }
 }
 
 impl FrameBuilder {
+    /// With another source address than most MainDevices have.
+    #[must_use]
+    pub fn from_source(source: [u8; 6]) -> Self {
+        let mut frame = vec![0xff; 6];
+        frame.extend_from_slice(&source);
+        frame.extend_from_slice(&ETHERTYPE.to_be_bytes());
+        frame.extend_from_slice(&[0, 0x10]);
+        Self { frame, last: None }
+    }
+
     /// Appends a datagram with a working counter of 0.
     #[must_use]
     pub fn datagram(mut self, command: u8, adp: u16, ado: u16, data: &[u8]) -> Self {

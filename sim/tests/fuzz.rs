@@ -75,6 +75,11 @@ const KINDS: &[&str] = &[
     "frame-duplicate",
     "frame-corrupt",
     "frame-delay",
+    "sdo-ignored",
+    "mailbox-silent",
+    "sync-late",
+    "watchdog",
+    "other-main-device",
     "melt",
 ];
 const STATES: &[&str] = &[

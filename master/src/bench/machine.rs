@@ -36,6 +36,7 @@ pub fn run(
         summary,
         result,
         stats,
+        ..
     } = outcome;
     match result {
         Ok(()) => {}

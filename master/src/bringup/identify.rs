@@ -21,6 +21,15 @@ struct Present {
     station: u16,
 }
 
+/// DL status, for whoever asks later what has changed; 0 where it is not to be had.
+pub(super) async fn dl_status(wire: &Datagrams, position: u16) -> u16 {
+    let mut status = [0; 2];
+    match wire.read_at(position, 0x0110, &mut status).await {
+        Ok(1) => u16::from_le_bytes(status),
+        _ => 0,
+    }
+}
+
 /// At least one SubDevice answers a broadcast.
 pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
     for _ in 0..TRIES {
@@ -156,6 +165,7 @@ pub(super) async fn assign(
                 esi: config.esi_path.display().to_string(),
                 expected: format!("{} ({expected})", config.selection.device_name),
                 found: known(machine, identity),
+                revisions: product.then_some((expected.revision, identity.revision)),
             });
         }
         if expected.revision != identity.revision {

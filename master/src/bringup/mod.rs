@@ -72,6 +72,8 @@ pub struct BusDevice {
     pub adopted: Option<Box<Adopted>>,
     /// From the reference clock, nanoseconds.
     pub propagation_delay: u32,
+    /// DL status (0x0110) after the scan: which ports are in use.
+    pub dl_status: u16,
 }
 
 /// A segment in SafeOp, ready for cyclic exchange.
@@ -167,6 +169,8 @@ pub enum BringUpError {
         esi: String,
         expected: String,
         found: String,
+        /// Expected and found, where nothing else differs.
+        revisions: Option<(u32, u32)>,
     },
     #[error(
         "{device}: identify: the machine file names serial number {expected}, the device has {found}"
@@ -299,6 +303,7 @@ pub async fn bring_up(
             adopted: None,
             dc,
             propagation_delay: sub_device.propagation_delay(),
+            dl_status: identify::dl_status(&wire, position).await,
         });
     }
 

@@ -17,10 +17,12 @@ use super::note;
 
 mod host;
 mod service;
+mod story;
 
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
 pub(crate) use service::service;
+pub(crate) use story::cause;
 
 /// The machine or the bus failed.
 pub(crate) const FAILED: u8 = 1;

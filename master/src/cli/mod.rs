@@ -2,7 +2,8 @@
 //!
 //! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
 //! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile;
-//! [`record`] keeps a recording from destroying another file; [`style`] decides about colours.
+//! [`record`] keeps a recording from destroying another file; [`style`] decides about colours;
+//! [`story`] lays out what stopped a run.
 
 use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
@@ -28,6 +29,7 @@ mod run;
 mod scan;
 mod signals;
 mod sim;
+mod story;
 mod style;
 mod table;
 mod tables;

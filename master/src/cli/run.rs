@@ -7,10 +7,12 @@ use std::sync::atomic::AtomicBool;
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, ConfigError, Machine, Nic, duration};
 use ecaxis::session::{self, Options, Outcome, RunError};
+use ecaxis::story::Story;
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
 use super::progress::Teller;
+use super::story::{self, Keep};
 use super::{Failure, check, hints, note, record, report, result, signals};
 
 const EXAMPLES: &str = "\
@@ -72,6 +74,13 @@ pub(crate) struct Args {
     /// Answer from this recording of a `--virtual` run in the place of a bus, and tell where this run deviates from it
     #[arg(long, value_name = "FILE", conflicts_with_all = ["nic", "seed", "faults"])]
     replay: Option<PathBuf>,
+    /// When the run fails, write its story here, and as JSON beside it; without this it goes to
+    /// ecaxis-stop-TIME.txt in the current folder, on a real bus
+    #[arg(long, value_name = "FILE")]
+    story: Option<PathBuf>,
+    /// Keep no story
+    #[arg(long, conflicts_with = "story")]
+    no_story: bool,
     #[command(flatten)]
     pub verbosity: super::Verbosity,
 }
@@ -95,13 +104,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Outcome {
         summary,
         result: ended,
+        story,
         ..
     } = session::run(machine, options, stop, &mut teller);
     drop(teller);
 
     // The user's own wish is no failure, but a script must not take it for a finished run.
     let interrupted = matches!(ended, Err(RunError::Interrupted));
-    let failure = ended.err().map(|error| hints::run(&error, &nic));
+    let mut failure = ended.err().map(|error| hints::run(&error, &nic));
+    if let (Some(story), Some(failure)) = (&story, &mut failure) {
+        tell_story(args, story, failure, &nic);
+    }
     let text = if args.json {
         let report = json!({
             "ok": failure.is_none(),
@@ -109,6 +122,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "hints": failure.as_ref().map_or(&[][..], |f| &f.hints),
             "problems": [],
             "summary": summary,
+            "story": story,
         });
         format!("{report:#}\n")
     } else {
@@ -121,6 +135,33 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => {}
     }
     written
+}
+
+/// In short on stderr, whole in a file. Where it knows the cause, its advice takes the place of that for the error.
+fn tell_story(args: &Args, story: &Story, failure: &mut Failure, nic: &Nic) {
+    let advice = hints::cause(&story.cause);
+    if !advice.is_empty() {
+        failure.hints = advice;
+    }
+    let short = story::short(story);
+    if !short.is_empty() {
+        note(short.trim_end());
+    }
+    let keep = match (&args.story, nic) {
+        _ if args.no_story => Keep::No,
+        (Some(path), _) => Keep::File(path.clone()),
+        (None, Nic::Interface(_)) => Keep::Folder(PathBuf::new()),
+        // It can be run again.
+        (None, Nic::Sim) => Keep::No,
+    };
+    match story::keep(story, &failure.hints, &keep) {
+        Ok(Some(path)) => note(&format!(
+            "  the whole story: {}, and as JSON beside it",
+            path.display()
+        )),
+        Ok(None) => {}
+        Err(trouble) => note(&format!("  warning: {}", trouble.message)),
+    }
 }
 
 /// A script that asked for JSON gets it for a file that is wrong, too.

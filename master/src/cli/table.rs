@@ -37,6 +37,11 @@ impl Table {
         self.fitted(by, Some(terminal_width().unwrap_or(width).max(width)))
     }
 
+    /// For a page of this many columns.
+    pub fn on_page(&self, by: usize, columns: usize) -> String {
+        self.fitted(by, Some(columns))
+    }
+
     /// The widest columns give way until a line has no more than `limit` characters.
     fn fitted(&self, by: usize, limit: Option<usize>) -> String {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
@@ -89,7 +94,7 @@ fn terminal_width() -> Option<usize> {
 }
 
 /// In lines of at most `width` characters, between words where there is a place.
-fn broken(cell: &str, width: usize) -> Vec<String> {
+pub(crate) fn broken(cell: &str, width: usize) -> Vec<String> {
     if cell.chars().count() <= width {
         return vec![cell.to_owned()];
     }

@@ -34,8 +34,10 @@ pub enum Refused {
     Outgoing,
     /// It had a VLAN tag, which the kernel has taken out. Ours have none.
     Tagged,
-    /// Another protocol, or another MainDevice's.
+    /// Another protocol.
     Foreign,
+    /// EtherCAT, but not from our addresses.
+    MainDevice,
     /// Shorter than its headers say, or longer than a frame may be.
     Damaged,
 }
@@ -45,6 +47,8 @@ pub enum Refused {
 pub struct LinkStats {
     /// Frames of other protocols or other MainDevices.
     pub foreign: u64,
+    /// Those of them that are EtherCAT: another MainDevice's.
+    pub main_devices: u64,
     /// Frames with a VLAN tag.
     pub tagged: u64,
     /// Frames too short for what they say, or too long.
@@ -59,6 +63,10 @@ impl LinkStats {
             Refused::Outgoing => {}
             Refused::Tagged => self.tagged += 1,
             Refused::Foreign => self.foreign += 1,
+            Refused::MainDevice => {
+                self.foreign += 1;
+                self.main_devices += 1;
+            }
             Refused::Damaged => self.damaged += 1,
         }
     }
@@ -90,8 +98,11 @@ pub fn sift(seen: &Seen<'_>) -> Result<(), Refused> {
         return Err(Refused::Damaged);
     };
     let (to, rest) = headers.split_at(TO_ALL.len());
-    if to != TO_ALL || rest[6..] != ETHERCAT {
+    if rest[6..] != ETHERCAT {
         return Err(Refused::Foreign);
+    }
+    if to != TO_ALL {
+        return Err(Refused::MainDevice);
     }
     // A frame to everybody is for this host, except where its tag named a VLAN that this host is not in: then the kernel
     // has taken the tag out and says nothing else of it.
@@ -99,7 +110,7 @@ pub fn sift(seen: &Seen<'_>) -> Result<(), Refused> {
         return Err(Refused::Tagged);
     }
     if rest[0] & !PROCESSED != SOURCE[0] || rest[1..4] != SOURCE[1..] {
-        return Err(Refused::Foreign);
+        return Err(Refused::MainDevice);
     }
     // ETG.1000.4, table 11: 11 bits of length, a reserved one, and the type, 1 for datagrams.
     let header = u16::from_le_bytes([low, high]);
@@ -155,11 +166,11 @@ pub(super) mod tests {
 
     #[test]
     fn others_do_not() {
-        use Refused::{Damaged, Foreign};
+        use Refused::{Damaged, Foreign, MainDevice};
         assert_eq!(judged(|f| f[12] = 0x08), Err(Foreign), "EtherType");
-        assert_eq!(judged(|f| f[0] = 0x01), Err(Foreign), "destination");
-        assert_eq!(judged(|f| f[6] = 0x52), Err(Foreign), "source");
-        assert_eq!(judged(|f| f[9] = 0x11), Err(Foreign), "source");
+        assert_eq!(judged(|f| f[0] = 0x01), Err(MainDevice), "destination");
+        assert_eq!(judged(|f| f[6] = 0x52), Err(MainDevice), "source");
+        assert_eq!(judged(|f| f[9] = 0x11), Err(MainDevice), "source");
         assert_eq!(judged(|f| f[15] = 0x40), Err(Foreign), "network variables");
         assert_eq!(
             judged(|f| f.truncate(59)),

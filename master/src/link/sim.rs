@@ -2,6 +2,7 @@
 
 use ecaxis_sim::{Segment, Transit};
 
+use super::sift::{LinkStats, Seen, sift};
 use super::{Link, LinkError, MAX_FRAME, Nanos};
 use crate::clock;
 
@@ -25,6 +26,7 @@ pub struct SimLink {
     free: Vec<usize>,
     /// Arrival and slot of frames on their way back, the next one last.
     under_way: Vec<(Nanos, usize)>,
+    stats: LinkStats,
 }
 
 impl SimLink {
@@ -41,6 +43,7 @@ impl SimLink {
             slots: vec![empty; IN_FLIGHT],
             free: (0..IN_FLIGHT).collect(),
             under_way: Vec::with_capacity(IN_FLIGHT),
+            stats: LinkStats::default(),
         }
     }
 
@@ -82,6 +85,18 @@ impl Link for SimLink {
                 }
             }
         }
+        if let Some((_, frame)) = self.segment.take_overheard() {
+            // It is sifted out when it arrives, and nobody else looks at it.
+            let seen = Seen {
+                frame: &frame,
+                wire_len: frame.len(),
+                status: 0,
+                packet_type: libc::PACKET_BROADCAST,
+            };
+            if let Err(refused) = sift(&seen) {
+                self.stats.count(refused);
+            }
+        }
         Ok(())
     }
 
@@ -96,6 +111,10 @@ impl Link for SimLink {
         let slot = &self.slots[n];
         buf[..slot.len].copy_from_slice(&slot.frame[..slot.len]);
         Ok(Some(slot.len))
+    }
+
+    fn stats(&mut self) -> LinkStats {
+        self.stats
     }
 
     fn next_arrival(&self) -> Option<Nanos> {

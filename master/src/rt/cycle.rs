@@ -11,6 +11,7 @@ use super::feed::FeedState;
 use super::groups::{Group, GroupStatus};
 use super::guard::{Guard, StopCause};
 use super::handover::{Event, PhaseStatus, RtEnd, Snapshot};
+use super::history::{self, History};
 use super::image::SignalBits;
 use super::journal::Note;
 use super::margin::{Margin, Spin};
@@ -73,6 +74,7 @@ pub struct Engine {
     guard: Guard,
     guarding: bool,
     stats: Stats,
+    history: History,
     end: RtEnd,
     next: Nanos,
     started: Nanos,
@@ -117,6 +119,8 @@ pub struct Remains {
     pub diagnoses: Vec<Diagnosis>,
     /// The first cycle was due then.
     pub started: Nanos,
+    /// The cycles around the stop.
+    pub history: History,
 }
 
 impl Engine {
@@ -127,6 +131,7 @@ impl Engine {
         let started = clock::now() + parts.timing.cycle_ns;
         let clocks_off = vec![false; parts.exchange.diagnoses().len()];
         let mode = parts.exchange.mode();
+        let history = History::new(parts.axes.len());
         Self {
             clock: parts.clock,
             timing: parts.timing,
@@ -149,6 +154,7 @@ impl Engine {
             guard: parts.guard,
             guarding: false,
             stats: Stats::default(),
+            history,
             end: parts.end,
             next: started,
             started,
@@ -187,6 +193,7 @@ impl Engine {
             spin_ns: self.margin.get(),
             diagnoses: self.exchange.diagnoses().to_vec(),
             started: self.started,
+            history: self.history,
         }
     }
 
@@ -221,6 +228,7 @@ impl Engine {
         self.act();
         self.exchange.stage();
         self.publish(woke);
+        self.remember(lateness);
         self.plan_next(adjust);
         self.stats.work.record(clock::now().saturating_sub(woke));
     }
@@ -333,6 +341,14 @@ impl Engine {
         snapshot.events_lost = self.events_lost;
         snapshot.orders_taken = self.orders_taken;
         self.end.snapshots.publish();
+    }
+
+    fn remember(&mut self, lateness: Nanos) {
+        let number = self.stats.counters.cycles;
+        let cycle =
+            history::Cycle::new(number, self.next, lateness, &self.answer, self.phase_error);
+        let axes = self.axes.iter().map(|slot| slot.axis.status());
+        self.history.keep(cycle, axes);
     }
 
     /// A cycle that is already over is left out instead of sent in a burst.

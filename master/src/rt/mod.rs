@@ -10,6 +10,7 @@
 //! - [`slot`]: one axis in the cycle;
 //! - [`stats`]: bounded histograms and counters;
 //! - [`journal`]: what the cycle has noticed, in order;
+//! - [`history`]: the last cycles as they were;
 //! - [`handover`]: the queues to and from everybody else;
 //! - [`controller`]: a user's own code in the cycle;
 //! - [`cycle`]: one turn of the loop, from wake-up to publishing;
@@ -36,6 +37,7 @@ pub mod feed;
 pub mod groups;
 pub mod guard;
 pub mod handover;
+pub mod history;
 pub mod image;
 pub mod journal;
 pub mod margin;

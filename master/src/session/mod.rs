@@ -28,6 +28,7 @@ use crate::rt::image::{self, AxisBits, Bits, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::rt::slot::AxisSlot;
 use crate::rt::stats::Stats;
+use crate::story::{Look, Story, look};
 use crate::supervise::{Supervisor, interruptible};
 use crate::wire::Datagrams;
 
@@ -35,6 +36,7 @@ mod error;
 mod events;
 mod open;
 mod progress;
+mod story;
 mod summary;
 mod turn;
 
@@ -43,6 +45,7 @@ pub use events::EventLine;
 pub(crate) use events::clock_off;
 pub use open::{simulated_bus, topology};
 pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
+use story::{Left, Seen};
 use summary::Aside;
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
 use turn::Turned;
@@ -94,6 +97,8 @@ pub struct Outcome {
     pub result: Result<(), RunError>,
     /// What the summary is of.
     pub stats: Option<Box<Stats>>,
+    /// Of a failure on the bus.
+    pub story: Option<Box<Story>>,
 }
 
 impl From<RunError> for Outcome {
@@ -102,6 +107,7 @@ impl From<RunError> for Outcome {
             summary: None,
             result: Err(error),
             stats: None,
+            story: None,
         }
     }
 }
@@ -177,22 +183,48 @@ pub fn prepare(
     progress: Sender<Progress>,
     controller: Option<Box<dyn Controller>>,
 ) -> Result<Prepared, RunError> {
+    let seen = &mut Seen::default();
+    prepare_seeing(machine, options, stop, progress, controller, seen)
+}
+
+/// Likewise; `seen` is what a bus looked like that did not come up.
+fn prepare_seeing(
+    machine: &Arc<Machine>,
+    options: &Options,
+    stop: Arc<AtomicBool>,
+    progress: Sender<Progress>,
+    controller: Option<Box<dyn Controller>>,
+    seen: &mut Seen,
+) -> Result<Prepared, RunError> {
     // Whatever can be known to fail without a bus fails before there is one.
     plan(machine)?;
     let link = open::link(machine, options, |concern| {
         let _ = progress.send(Progress::Concern(concern));
     })?;
-    prepare_on(link, machine, options, stop, progress, controller)
+    prepare_with(link, machine, options, stop, progress, controller, seen)
 }
 
 /// Likewise, on a link of one's own in the place of the file's `nic`.
 pub fn prepare_on(
+    link: Box<dyn Link>,
+    machine: &Arc<Machine>,
+    options: &Options,
+    stop: Arc<AtomicBool>,
+    progress: Sender<Progress>,
+    controller: Option<Box<dyn Controller>>,
+) -> Result<Prepared, RunError> {
+    let seen = &mut Seen::default();
+    prepare_with(link, machine, options, stop, progress, controller, seen)
+}
+
+fn prepare_with(
     mut link: Box<dyn Link>,
     machine: &Arc<Machine>,
     options: &Options,
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
     controller: Option<Box<dyn Controller>>,
+    seen: &mut Seen,
 ) -> Result<Prepared, RunError> {
     let (image, ..) = plan(machine)?;
     let (main_device, mut port) = main_device(machine.bus.cycle_ns);
@@ -266,11 +298,24 @@ pub fn prepare_on(
                 stopped: Vec::new(),
                 last_status: clock::now(),
                 listened: (clock::now(), 0),
+                looks: Vec::new(),
             };
             Ok(Prepared { parts, supervisor })
         }
         Err(error) => {
+            seen.on_the_bus = true;
+            // What has panicked may have left anything behind.
+            if !matches!(
+                error,
+                RunError::Interrupted | RunError::Panicked(_) | RunError::Link(_)
+            ) {
+                seen.looks = vec![Look::default(); machine.devices.len()];
+                let wire = Datagrams::new(main_device);
+                let look = look::at_registers(&wire, &mut seen.looks);
+                let _ = pump(&mut port, link.as_mut(), options.clock, look);
+            }
             go_silent(options.clock, main_device, link.as_mut(), &mut port);
+            seen.link = link.stats();
             for remark in link.remarks() {
                 let _ = progress.send(Progress::Warning(remark));
             }
@@ -377,16 +422,23 @@ fn own_the_link(
 ) -> Outcome {
     options.clock.enter();
     let told = progress.clone();
-    let Prepared { parts, supervisor } = match prepare(machine, options, stop, progress, controller)
-    {
+    let mut seen = Seen::default();
+    let prepared = prepare_seeing(machine, options, stop, progress, controller, &mut seen);
+    let Prepared { parts, supervisor } = match prepared {
         Ok(prepared) => prepared,
-        Err(error) => return error.into(),
+        Err(error) => {
+            return Outcome {
+                story: story::of_bring_up(machine, options, &error, seen),
+                ..error.into()
+            };
+        }
     };
     let wire = supervisor.wire;
+    let places = story::places(&supervisor.bus);
     let machine = &Arc::clone(&supervisor.machine);
     let Turned {
         remains,
-        result: (ended, result),
+        result: (mut ended, result),
         used,
     } = match options.clock {
         Clock::Virtual => turn::in_virtual_time(parts, supervisor),
@@ -403,6 +455,7 @@ fn own_the_link(
         spin_ns,
         diagnoses,
         started,
+        history,
     } = remains;
     if result.is_err() {
         go_silent(options.clock, wire.main_device(), link.as_mut(), &mut port);
@@ -416,18 +469,34 @@ fn own_the_link(
         Err(error) => (None, result.and(Err(RunError::Record(error.to_string())))),
     };
     let thread = used.map(|(used, wall_ns)| ThreadSummary::new(used, wall_ns, spin_ns, &stats));
+    let events = events::lines(&stats.journal, started, machine);
+    let story = result.as_ref().err().and_then(|error| {
+        let left = Left {
+            places,
+            looks: std::mem::take(&mut ended.looks),
+            diagnoses: &diagnoses,
+            stats: &stats,
+            axes: &axes,
+            history: &history,
+            started,
+            link: seen,
+            events: &events,
+        };
+        story::of_run(machine, options, error, left)
+    });
     let aside = Aside {
         link: seen,
         thread,
         record,
         errors: summary::device_errors(machine, &diagnoses),
-        events: events::lines(&stats.journal, started, machine),
+        events,
     };
     let summary = Summary::new(machine, options.clock, &axes, &stats, ended, aside);
     Outcome {
         summary: Some(summary),
         result,
         stats: Some(Box::new(stats)),
+        story,
     }
 }
 

@@ -1,6 +1,6 @@
 //! What stopped the machine, in words: asks the devices while they still answer.
 
-use ecaxis_axis::{AxisStatus, State};
+use ecaxis_axis::{AxisStatus, State, Trip};
 
 use super::Supervisor;
 use crate::bringup::al;
@@ -9,6 +9,7 @@ use crate::rt::feed::FeedState;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Order, Snapshot};
 use crate::session::{Progress, RunError};
+use crate::story::{Look, look};
 
 const ERROR_CODE: u16 = 0x603f;
 const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
@@ -145,6 +146,34 @@ impl Supervisor {
         let result = coe.upload(&self.wire, index, 0, false).await;
         self.tell_emergencies(device);
         result.ok()
+    }
+
+    /// Asks all SubDevices what they know of a failure, and drives that have one what it is.
+    pub(super) async fn look(&mut self) {
+        if self.outer.orders.is_abandoned() {
+            return;
+        }
+        let mut looks = vec![Look::default(); self.bus.devices.len()];
+        look::at_registers(&self.wire, &mut looks).await;
+        let snapshot = self.outer.snapshots.read().clone();
+        let end = clock::now().saturating_add(look::PATIENCE);
+        for (&device, status) in self.axes.iter().zip(&snapshot.axes) {
+            let following = matches!(status.trip, Some(Trip::FollowingError { .. }));
+            let ask = look::Ask {
+                error_code: status.fault.is_some(),
+                interpolation: status.fault.is_some() || following,
+            };
+            let Some(device) = self.bus.devices.get_mut(device) else {
+                continue;
+            };
+            let Some(look) = looks.get_mut(usize::from(device.at.position)) else {
+                continue;
+            };
+            if look.answers && ask != look::Ask::default() && clock::now() < end {
+                look::at_objects(&self.wire, device, ask, look).await;
+            }
+        }
+        self.looks = looks;
     }
 
     /// Empties the mailbox of the next device and passes its emergencies on.

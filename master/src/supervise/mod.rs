@@ -21,6 +21,7 @@ use crate::rt::exchange::Probe;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
 use crate::session::{Capture, GroupStop, Progress, RunError, Status, clock_off};
+use crate::story::{Look, look};
 use crate::wire::Datagrams;
 use groups::StoppedGroup;
 
@@ -80,6 +81,8 @@ pub struct Supervisor {
     pub last_status: Nanos,
     /// When a mailbox was last listened to, and the device whose turn is next.
     pub listened: (Nanos, usize),
+    /// What the SubDevices told after a failure, in the order of the segment.
+    pub looks: Vec<Look>,
 }
 
 /// How the machine's program ended.
@@ -93,6 +96,8 @@ pub struct Ended {
     pub captures: Vec<Capture>,
     /// Groups that stopped while the machine went on.
     pub group_stops: Vec<GroupStop>,
+    /// What the SubDevices told after a failure, in the order of the segment.
+    pub looks: Vec<Look>,
 }
 
 /// Runs a future until it ends or the user wants everything to; `None` then.
@@ -116,12 +121,18 @@ impl Supervisor {
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
+        if result.is_err() {
+            // The axes come to rest meanwhile.
+            self.order(Order::Stop).await;
+            self.look().await;
+        }
         let back = self.wind_down().await;
         if result.is_ok() {
             result = back;
         }
         self.order(Order::Halt).await;
         ended.captures = std::mem::take(&mut self.captures);
+        ended.looks = std::mem::take(&mut self.looks);
         (ended, result)
     }
 
@@ -305,6 +316,11 @@ impl Supervisor {
         self.tell(Progress::Stopping);
         self.order(Order::Stop).await;
         let result = self.await_rest().await;
+        if result.is_err() && self.looks.is_empty() {
+            self.look().await;
+        } else {
+            look::again(&self.wire, &mut self.looks).await;
+        }
         self.pass_events_on();
         self.order(Order::Unguard).await;
         let stopped = |device: usize| self.is_stopped(self.machine.group_of(device));

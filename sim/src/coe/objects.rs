@@ -32,6 +32,8 @@ pub(crate) struct Dictionary<'a> {
     pub(crate) refuse_mapped: bool,
     /// Injected aborts: index, subindex, code.
     pub(crate) forced: &'a [(u16, u8, u32)],
+    /// Writes that are confirmed and change nothing: index, subindex.
+    pub(crate) ignored: &'a [(u16, u8)],
     pub(crate) command: Option<ParameterCommand>,
 }
 
@@ -186,6 +188,9 @@ impl Dictionary<'_> {
             && !choices.contains(&extended(data))
         {
             return Err(Abort::VALUE);
+        }
+        if self.ignored.contains(&(index, sub)) {
+            return Ok(());
         }
         let value = low_bits(data);
         self.pdo

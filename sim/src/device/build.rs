@@ -260,6 +260,8 @@ impl SimDevice {
             hangs: false,
             refusals: Vec::new(),
             forced_aborts: Vec::new(),
+            ignored_writes: Vec::new(),
+            mailbox_silent: false,
         };
         sim.power_on(0);
         Ok(sim)

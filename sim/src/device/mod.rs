@@ -153,6 +153,8 @@ pub struct SimDevice {
     fresh: Box<Fresh>,
     pub(crate) refusals: Vec<(AlState, u16)>,
     pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
+    pub(crate) ignored_writes: Vec<(u16, u8)>,
+    mailbox_silent: bool,
 }
 
 impl SimDevice {
@@ -308,7 +310,8 @@ impl SimDevice {
             let (eeprom, watchdog) = (self.esc.eeprom.due(), self.esc.watchdog.due());
             let pdi = self.esc.pdi_watchdog_due();
             let (tick, mailbox, al) = if self.application_runs() {
-                let mailbox = self.mailbox.as_ref().map_or(u64::MAX, Mailbox::due);
+                let mailbox = self.mailbox.as_ref().filter(|_| !self.mailbox_silent);
+                let mailbox = mailbox.map_or(u64::MAX, Mailbox::due);
                 (self.tick, mailbox, self.al.due)
             } else {
                 (u64::MAX, u64::MAX, u64::MAX)
@@ -503,6 +506,27 @@ impl SimDevice {
             register: 1,
             data: [0; 5],
         });
+    }
+
+    /// The watchdog of the process data expires now.
+    pub(crate) fn expire_watchdog(&mut self) {
+        if self.powered {
+            self.watchdog_expired();
+        }
+    }
+
+    /// Whoever looks after the mailbox does not, or does again.
+    pub(crate) fn silence_mailbox(&mut self, silent: bool) {
+        if std::mem::replace(&mut self.mailbox_silent, silent) && !silent {
+            self.resume_mailbox();
+        }
+    }
+
+    /// SYNC0 begins so much later than its start time says, from the next start on.
+    pub(crate) fn delay_sync(&mut self, late: Nanos) {
+        if let Some(dc) = &mut self.esc.dc {
+            dc.sync.late = late;
+        }
     }
 
     pub(crate) fn hold_drive_in(&mut self, state: Option<State>) {

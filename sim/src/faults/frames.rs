@@ -3,6 +3,7 @@
 use super::script::{FaultKind, Hits};
 use super::{Faults, Phase, Running};
 use crate::Nanos;
+use crate::esc::al::AlState;
 use crate::random::Random;
 
 /// What happens to one frame.
@@ -15,6 +16,8 @@ pub(crate) struct Fate {
     pub(crate) twice: bool,
     /// Comes back so much later.
     pub(crate) delay: Nanos,
+    /// Another MainDevice's frame follows it; the state that it sends everybody to.
+    pub(crate) other: Option<Option<AlState>>,
 }
 
 /// Where a bit turns over.
@@ -32,6 +35,7 @@ impl FaultKind {
             Self::FrameLoss { hits }
             | Self::FrameDuplicate { hits }
             | Self::FrameDelay { hits, .. }
+            | Self::OtherMainDevice { hits, .. }
             | Self::FrameCorrupt { hits, .. } => Some(*hits),
             _ => None,
         }
@@ -78,6 +82,7 @@ impl Faults {
                 FaultKind::FrameDelay { delay, .. } => {
                     fate.delay = fate.delay.saturating_add(delay);
                 }
+                FaultKind::OtherMainDevice { state, .. } => fate.other = Some(state),
                 FaultKind::FrameCorrupt { at, .. } => {
                     fate.corrupted = Some(match at {
                         Some((device, port)) => Corrupted::At { device, port },

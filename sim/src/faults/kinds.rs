@@ -15,6 +15,11 @@ const KINDS: &[(&str, &[&str])] = &[
     ("drive-fault", &["device", "code"]),
     ("emergency", &["device", "code"]),
     ("sdo-abort", &["device", "index", "sub", "code"]),
+    ("sdo-ignored", &["device", "index", "sub"]),
+    ("mailbox-silent", &["device"]),
+    ("watchdog", &["device"]),
+    ("sync-late", &["device", "delay"]),
+    ("other-main-device", &["count", "probability", "state"]),
     ("refuse-state", &["device", "state", "code"]),
     ("stuck", &["device", "state"]),
     ("load", &["device", "torque"]),
@@ -109,6 +114,19 @@ fn kind(name: &str, raw: &RawFault) -> Result<FaultKind, String> {
             index: raw.index.ok_or("`index` is missing")?,
             sub: raw.sub.unwrap_or(0),
             code: raw.code.ok_or("`code` is missing")?,
+        },
+        "sdo-ignored" => FaultKind::SdoIgnored {
+            index: raw.index.ok_or("`index` is missing")?,
+            sub: raw.sub.unwrap_or(0),
+        },
+        "mailbox-silent" => FaultKind::MailboxSilent,
+        "watchdog" => FaultKind::Watchdog,
+        "sync-late" => FaultKind::SyncLate {
+            delay: duration(raw.delay.as_deref().ok_or("`delay` is missing")?)?,
+        },
+        "other-main-device" => FaultKind::OtherMainDevice {
+            hits: hits(raw)?,
+            state: raw.state.as_deref().map(al_state).transpose()?,
         },
         "refuse-state" => FaultKind::RefuseState {
             state: al_state(state()?)?,

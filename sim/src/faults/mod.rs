@@ -26,6 +26,11 @@
 //! | `identity` | `device`; `vendor`, `product`, `revision` | EEPROM and 0x1018 say something else |
 //! | `refuse-state` | `device`, `state`, `code` | the state is refused with this AL status code |
 //! | `sdo-abort` | `device`, `index`, `sub`, `code` | the SDO is aborted |
+//! | `sdo-ignored` | `device`, `index`, `sub` | the SDO is confirmed, the object keeps its value |
+//! | `mailbox-silent` | `device` | requests stay in the mailbox and are not answered |
+//! | `watchdog` | `device` | the watchdog of its process data expires once, whatever comes |
+//! | `sync-late` | `device`, `delay` | SYNC0 begins so much later than its start time says |
+//! | `other-main-device` | `count` or `probability`; `state` | behind frames of ours comes one of another MainDevice: it reads AL status, or sends all devices to the state |
 //! | `drive-fault` | `device`, `code` | the drive detects this error |
 //! | `stuck` | `device`, `state` | the drive does not leave this CiA 402 state |
 //! | `load` | `device`, `torque` | a torque (N·m) pulls the shaft towards negative positions |
@@ -159,18 +164,27 @@ impl Faults {
         for (n, device) in devices.iter_mut().enumerate() {
             device.refusals.clear();
             device.forced_aborts.clear();
+            device.ignored_writes.clear();
             let mut held = None;
+            let (mut silent, mut late) = (false, 0);
             for fault in self.active().filter(|fault| fault.device == n) {
                 match fault.kind {
                     FaultKind::RefuseState { state, code } => device.refusals.push((state, code)),
                     FaultKind::SdoAbort { index, sub, code } => {
                         device.forced_aborts.push((index, sub, code));
                     }
+                    FaultKind::SdoIgnored { index, sub } => {
+                        device.ignored_writes.push((index, sub));
+                    }
+                    FaultKind::MailboxSilent => silent = true,
+                    FaultKind::SyncLate { delay } => late = delay,
                     FaultKind::Stuck { state } => held = Some(state),
                     _ => {}
                 }
             }
             device.hold_drive_in(held);
+            device.silence_mailbox(silent);
+            device.delay_sync(late);
         }
         let concerns_frames = self.active().any(|fault| fault.kind.hits().is_some());
         self.concerns_frames = concerns_frames;
@@ -224,6 +238,7 @@ impl Running {
                     drive.inject_fault(code);
                 }
             }
+            FaultKind::Watchdog => device.expire_watchdog(),
             FaultKind::Load { torque } => load(device, torque),
             FaultKind::Blocked => block(device, true),
             FaultKind::Emergency { code } => device.inject_emergency(code),

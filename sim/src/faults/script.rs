@@ -79,6 +79,24 @@ pub enum FaultKind {
         sub: u8,
         code: u32,
     },
+    /// The SDO server confirms what one subindex is written with, and keeps the old value.
+    SdoIgnored {
+        index: u16,
+        sub: u8,
+    },
+    /// Requests stay in the device's mailbox; nobody fetches or answers them.
+    MailboxSilent,
+    /// The watchdog of the process data expires, whatever comes.
+    Watchdog,
+    /// SYNC0 begins so much later than its start time says.
+    SyncLate {
+        delay: Nanos,
+    },
+    /// Another MainDevice sends a frame behind ours: it reads AL status, or sends everybody to a state.
+    OtherMainDevice {
+        hits: Hits,
+        state: Option<AlState>,
+    },
     /// The device refuses to enter a state.
     RefuseState {
         state: AlState,
@@ -124,6 +142,7 @@ impl Fault {
             FaultKind::FrameLoss { .. }
             | FaultKind::FrameDuplicate { .. }
             | FaultKind::FrameDelay { .. }
+            | FaultKind::OtherMainDevice { .. }
             | FaultKind::Silent => None,
             FaultKind::FrameCorrupt { at, .. } => at.map(|(device, port)| (device, Some(port))),
             FaultKind::LinkBreak { port } => Some((self.device, Some(port))),

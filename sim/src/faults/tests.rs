@@ -69,6 +69,24 @@ fn every_kind_parses() {
         [[fault]]
         kind = "swap"
         serial = 9
+        [[fault]]
+        kind = "sdo-ignored"
+        index = 0x60c2
+        sub = 1
+        [[fault]]
+        kind = "mailbox-silent"
+        [[fault]]
+        kind = "sync-late"
+        delay = "20s"
+        [[fault]]
+        kind = "other-main-device"
+        count = 1
+        state = "init"
+        [[fault]]
+        kind = "other-main-device"
+        probability = 0.5
+        [[fault]]
+        kind = "watchdog"
         "#,
     )
     .unwrap();
@@ -122,6 +140,23 @@ fn every_kind_parses() {
             alias: Some(0),
             ..NewIdentity::default()
         }),
+        FaultKind::SdoIgnored {
+            index: 0x60c2,
+            sub: 1,
+        },
+        FaultKind::MailboxSilent,
+        FaultKind::SyncLate {
+            delay: 20_000_000_000,
+        },
+        FaultKind::OtherMainDevice {
+            hits: one,
+            state: Some(AlState::Init),
+        },
+        FaultKind::OtherMainDevice {
+            hits: Hits::Each(0.5),
+            state: None,
+        },
+        FaultKind::Watchdog,
     ];
     assert_eq!(kinds, expected);
     assert_eq!(script.faults[0].at, 1_500_000_000);
@@ -150,6 +185,10 @@ fn errors_name_line_and_field() {
         ("kind = \"frame-delay\"\ncount = 1\n", "`delay` is missing"),
         ("kind = \"frame-delay\"\ncount = 1\ndelay = \"1\"\n", "not a duration"),
         ("kind = \"swap\"\nstate = \"op\"\n", "`state` means nothing here; what it knows is `device`, `vendor`"),
+        ("kind = \"sync-late\"\n", "`delay` is missing"),
+        ("kind = \"sdo-ignored\"\n", "`index` is missing"),
+        ("kind = \"other-main-device\"\n", "needs either"),
+        ("kind = \"mailbox-silent\"\nport = 1\n", "what it knows is `device`"),
         ("at = \"soon\"\nkind = \"absent\"\n", "not a duration"),
         ("kind = \"silent\"\nwhen = 1\n", "when"),
     ];

@@ -15,9 +15,11 @@ use std::cmp::Ordering;
 
 use crate::Nanos;
 use crate::device::{Seen, SimDevice};
+use crate::esc::al::AlState;
 use crate::esc::ports::Medium;
+use crate::esc::registers as reg;
 use crate::faults::{Corrupted, FaultReport, FaultScript, Faults};
-use crate::frame::{self, Kind};
+use crate::frame::{self, FrameBuilder, Kind};
 use route::{Goal, Pass, Route};
 use topology::Topology;
 pub use wiring::Nic;
@@ -77,6 +79,8 @@ pub struct Segment {
     latches: Vec<bool>,
     /// The frame under way wrote DL control.
     settles: bool,
+    /// Another MainDevice's frame on its way to ours, and when it arrives.
+    overheard: Option<(Nanos, Vec<u8>)>,
 }
 
 impl Segment {
@@ -107,6 +111,7 @@ impl Segment {
             next_change: Nanos::MAX,
             latches: vec![false; n],
             settles: false,
+            overheard: None,
             devices,
         };
         segment.relink();
@@ -321,6 +326,9 @@ impl Segment {
             self.reroute();
         }
         self.settle(back);
+        if let Some(state) = fate.other {
+            self.other_main_device(nic, state, epoch);
+        }
         match goal {
             Goal::Back(nic) if came_through && !fate.lost_on_the_way_back => {
                 let at = (epoch + back).saturating_add(fate.delay);
@@ -332,6 +340,32 @@ impl Segment {
             }
             _ => Transit::Lost,
         }
+    }
+
+    /// Another MainDevice at the same end of the wire sends a frame as soon as it is free: it reads AL status of all, or sends all to a
+    /// state.
+    fn other_main_device(&mut self, nic: Nic, state: Option<AlState>, epoch: Nanos) {
+        let frame = FrameBuilder::from_source(OTHER);
+        let mut frame = match state {
+            Some(state) => frame.datagram(BWR, 0, reg::AL_CONTROL, &[state.code(), 0]),
+            None => frame.datagram(BRD, 0, reg::AL_STATUS, &[0, 0]),
+        }
+        .build();
+        let wire = frame::wire_time(frame.len());
+        let free = &mut self.wire_free[nic as usize];
+        let start = *free;
+        *free = start + wire;
+        let came_through = self.walk(nic, &mut frame, start);
+        let route = &self.routes[nic as usize];
+        let back = start + route.time + wire;
+        let returns = came_through && matches!(route.goal, Goal::Back(_));
+        self.settle(back);
+        self.overheard = returns.then_some((epoch + back, frame));
+    }
+
+    /// The last frame of another MainDevice that comes by the MainDevice's port, and when it is there completely.
+    pub fn take_overheard(&mut self) -> Option<(Nanos, Vec<u8>)> {
+        self.overheard.take()
     }
 
     /// First bit sent at `start`; false where a device destroys the frame.
@@ -436,6 +470,11 @@ impl Segment {
         self.schedule();
     }
 }
+
+/// Another MainDevice's source address: its own, where others take one that says nothing.
+const OTHER: [u8; 6] = [0x00, 0x1b, 0x21, 0x0e, 0xca, 0x75];
+const BRD: u8 = 7;
+const BWR: u8 = 8;
 
 /// SubDevices mark what they pass on: the source address becomes a local one.
 fn mark(route: &Route, bytes: &mut [u8]) {

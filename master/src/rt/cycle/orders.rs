@@ -8,6 +8,7 @@ use crate::rt::feed::{self, Start};
 use crate::rt::groups::{Group, Stop, Way, admit};
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order};
+use crate::rt::history::Anchor;
 use crate::rt::slot::AxisSlot;
 
 impl Engine {
@@ -84,6 +85,12 @@ impl Engine {
             .and_then(|own| self.groups.get(own))
             .is_some_and(Group::alone);
         let machine_stops = self.stopping().is_some();
+        if !goes_on {
+            self.history.stopping(match cause {
+                StopCause::Requested => Anchor::Requested,
+                _ => Anchor::Failure,
+            });
+        }
         if let Some(own) = own.filter(|_| goes_on) {
             self.leave_lines(own);
         }

@@ -1,5 +1,7 @@
 //! What the diagnostic slot reads, one register block of one SubDevice a cycle.
 
+use serde::Serialize;
+
 /// What is read in turn of every SubDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probe {
@@ -38,7 +40,7 @@ impl Probe {
 }
 
 /// A SubDevice's error counters. Each stands still at 255; nobody clears them.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct ErrorCounters {
     /// Per port: frames with a wrong checksum or cut off.
     pub invalid_frames: [u8; 4],
@@ -93,6 +95,32 @@ impl Diagnosis {
     #[must_use]
     pub fn grown(&self) -> ErrorCounters {
         self.errors.since(&self.start)
+    }
+
+    /// As [`Diagnosis::grown`], up to counters that somebody else has read since.
+    #[must_use]
+    pub fn grown_to(&self, now: &ErrorCounters) -> ErrorCounters {
+        let since = now.since(&self.start);
+        let begun = |probe: Probe| self.begun.get(probe as usize) == Some(&true);
+        let mut grown = self.grown();
+        let more = |to: &mut [u8; 4], new: [u8; 4]| {
+            for (to, new) in to.iter_mut().zip(new) {
+                *to = new.max(*to);
+            }
+        };
+        if begun(Probe::RxErrors) {
+            more(&mut grown.invalid_frames, since.invalid_frames);
+            more(&mut grown.rx_errors, since.rx_errors);
+        }
+        if begun(Probe::Forwarded) {
+            more(&mut grown.forwarded, since.forwarded);
+            grown.processing = grown.processing.max(since.processing);
+            grown.pdi = grown.pdi.max(since.pdi);
+        }
+        if begun(Probe::LostLinks) {
+            more(&mut grown.lost_links, since.lost_links);
+        }
+        grown
     }
 
     /// Takes an answer in. RT.
@@ -178,6 +206,21 @@ mod tests {
         assert_eq!(diagnosis.grown(), grown);
         diagnosis.take(Probe::LostLinks, &[0; 6]);
         assert_eq!(diagnosis.grown(), grown, "an answer of another length");
+        let mut later = diagnosis.errors;
+        later.invalid_frames[1] = 4;
+        let more = ErrorCounters {
+            invalid_frames: [2, 4, 0, 0],
+            ..grown
+        };
+        assert_eq!(diagnosis.grown_to(&later), more);
+        // After a loss of power they begin at zero.
+        let none = ErrorCounters::default();
+        assert_eq!(diagnosis.grown_to(&none), grown);
+        assert_eq!(
+            Diagnosis::default().grown_to(&later),
+            none,
+            "nothing to compare with"
+        );
     }
 
     #[test]

@@ -212,6 +212,22 @@ impl SimDevice {
         self.plan_fetch(local);
     }
 
+    /// What has become due while nobody looked after the mailbox is due now.
+    pub(super) fn resume_mailbox(&mut self) {
+        let now = self.local;
+        let Some(mailbox) = &mut self.mailbox else {
+            return;
+        };
+        for due in [
+            &mut mailbox.fetch_due,
+            &mut mailbox.answer_due,
+            &mut mailbox.transfer_due,
+        ] {
+            *due = (*due).max(now);
+        }
+        self.plan_fetch(now);
+    }
+
     fn fetch_request(&mut self, local: u64) {
         let Some(mailbox) = &mut self.mailbox else {
             return;
@@ -297,6 +313,7 @@ impl SimDevice {
                     complete_access: options.complete_access.unwrap_or(self.complete_access),
                     refuse_mapped: options.refuse_mapped,
                     forced: &self.forced_aborts,
+                    ignored: &self.ignored_writes,
                     command: None,
                 };
                 let coe = &mut mailbox.coe;

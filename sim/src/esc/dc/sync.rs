@@ -66,6 +66,8 @@ pub struct SyncUnit {
     unacknowledged: u8,
     /// SYNC0 pulses since activation.
     pub pulses: u64,
+    /// The first pulse comes so much later than the start time says: a fault.
+    pub(crate) late: u64,
 }
 
 impl SyncUnit {
@@ -200,7 +202,7 @@ impl SyncUnit {
         let next = if implausible && value & activation::PLAUSIBILITY != 0 {
             system.wrapping_add(1)
         } else {
-            self.start
+            self.start.wrapping_add(self.late)
         };
         self.base = Base::Running {
             next: self.width.cut(next),

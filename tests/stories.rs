@@ -1,0 +1,233 @@
+//! Faults staged on the simulated bus, and what the story of each says. Virtual time.
+//!
+//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes the first lines in `tests/snapshots/stories.txt` anew; the difference then wants reviewing.
+
+mod common;
+
+use std::fmt::Write;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use common::{Heard, axes, faults, fixture, machine, run, run_well, virtual_time};
+use ecaxis::clock::{self, Clock};
+use ecaxis::config::Machine;
+use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::session::{Options, run_with};
+use ecaxis::story::{Cause, Story};
+
+/// Runs a machine that must fail on the bus.
+#[track_caller]
+fn story(machine: Machine, options: Options) -> Story {
+    let (outcome, heard) = run(machine, options);
+    let Err(error) = outcome.result else {
+        panic!("the run must fail; {:?}", heard.warnings());
+    };
+    match outcome.story {
+        Some(story) => *story,
+        None => panic!("no story of {error}"),
+    }
+}
+
+/// Name, machine file, fault script.
+fn staged() -> Vec<(&'static str, String, &'static str)> {
+    let patient = axes(3).replace("cycle =", "lost_frames = 90\ncycle =");
+    vec![
+        (
+            "cable break between two devices",
+            axes(3),
+            "[[fault]]\nkind = \"link-break\"\nat = \"1.5s\"\ndevice = 1\nport = 0\n",
+        ),
+        (
+            "CRC errors on one port",
+            axes(3),
+            "[[fault]]\nkind = \"frame-corrupt\"\nat = \"1.5s\"\nprobability = 0.6\ndevice = 1\nport = 0\n",
+        ),
+        (
+            "CRC errors on the way back",
+            axes(3),
+            "[[fault]]\nkind = \"frame-corrupt\"\nat = \"1.5s\"\nprobability = 0.6\ndevice = 1\nport = 1\n",
+        ),
+        (
+            "drive undervoltage",
+            axes(3),
+            "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x3220\n",
+        ),
+        (
+            "wrong ESI revision",
+            axes(3),
+            "[[fault]]\nkind = \"identity\"\ndevice = 1\nrevision = 0x00020000\n",
+        ),
+        (
+            "PDO length refused",
+            axes(3),
+            "[[fault]]\nkind = \"refuse-state\"\ndevice = 1\nstate = \"safeop\"\ncode = 0x001e\n",
+        ),
+        (
+            "PDO assignment too long",
+            axes(3),
+            "[[fault]]\nkind = \"sdo-abort\"\ndevice = 2\nindex = 0x1c13\nsub = 0\ncode = 0x06040042\n",
+        ),
+        (
+            "watchdog",
+            axes(3),
+            "[[fault]]\nkind = \"watchdog\"\nat = \"1.5s\"\ndevice = 1\n",
+        ),
+        (
+            "frames vanish for a while",
+            patient.clone(),
+            "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\nfor = \"300ms\"\nprobability = 1.0\n",
+        ),
+        (
+            "SYNC0 too late",
+            axes(3),
+            "[[fault]]\nkind = \"sync-late\"\ndevice = 2\ndelay = \"30s\"\n",
+        ),
+        (
+            "mailbox dead",
+            axes(3),
+            "[[fault]]\nkind = \"mailbox-silent\"\ndevice = 1\n",
+        ),
+        (
+            "another MainDevice takes the bus",
+            axes(3),
+            "[[fault]]\nkind = \"other-main-device\"\nat = \"1.2s\"\nprobability = 0.2\n\
+             [[fault]]\nkind = \"other-main-device\"\nat = \"1.5s\"\ncount = 1\nstate = \"preop\"\n",
+        ),
+        (
+            "device power-cycled",
+            axes(3),
+            "[[fault]]\nkind = \"power-off\"\nat = \"1.5s\"\nfor = \"300ms\"\ndevice = 1\n",
+        ),
+        (
+            "last device without power",
+            axes(3),
+            "[[fault]]\nkind = \"power-off\"\nat = \"1.5s\"\ndevice = 2\n",
+        ),
+        (
+            "cable of this computer unplugged",
+            axes(3),
+            "[[fault]]\nkind = \"silent\"\nat = \"1.5s\"\n",
+        ),
+        (
+            "cable of this computer loose",
+            patient,
+            "[[fault]]\nkind = \"silent\"\nat = \"1.5s\"\nfor = \"300ms\"\n",
+        ),
+        (
+            "a device is missing from the start",
+            axes(3),
+            "[[fault]]\nkind = \"absent\"\ndevice = 1\n",
+        ),
+        (
+            "a drive follows badly",
+            axes(3),
+            "[[fault]]\nkind = \"blocked\"\nat = \"1.5s\"\ndevice = 2\n",
+        ),
+    ]
+}
+
+/// Works far too long in one cycle, as a controller does that computes more than it has time for.
+struct Slow {
+    at: u64,
+    for_ns: u64,
+}
+
+impl Controller for Slow {
+    fn cycle(&mut self, cycle: &mut Cycle<'_>) {
+        if cycle.number() == self.at {
+            Clock::Virtual.sleep_until(clock::now() + self.for_ns, 0);
+        }
+    }
+}
+
+fn overloaded(for_ns: u64) -> Story {
+    let stop = Arc::new(AtomicBool::new(false));
+    let controller = Box::new(Slow { at: 1500, for_ns });
+    let mut heard = Heard::default();
+    let outcome = run_with(
+        machine(&axes(3)),
+        virtual_time(),
+        stop,
+        &mut heard,
+        controller,
+    );
+    assert!(outcome.result.is_err());
+    *outcome.story.expect("a story")
+}
+
+#[test]
+fn first_lines() {
+    let mut text = String::new();
+    for (name, machine_file, script) in staged() {
+        let story = story(machine(&machine_file), faults(script));
+        let _ = write!(text, "{name}\n  {}\n", story.headline);
+        for also in &story.also {
+            let _ = writeln!(text, "  also: {also}");
+        }
+    }
+    let story = overloaded(250_000_000);
+    let _ = write!(text, "overload of the host\n  {}\n", story.headline);
+    let kept = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/snapshots/stories.txt");
+    if std::env::var_os("ECAXIS_UPDATE_SNAPSHOTS").is_some() {
+        std::fs::write(&kept, &text).expect("the snapshot can be written");
+    }
+    let expected = std::fs::read_to_string(&kept).expect("a snapshot");
+    assert_eq!(text, expected);
+}
+
+/// A real drive's ESI; what the drive confirms of 0x60C2 it does not take. Told the cycle, it follows closely enough.
+#[test]
+fn a_drive_that_was_not_told_the_cycle() {
+    let Some(esi) = fixture("esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
+        return;
+    };
+    let text = axes(1)
+        .replace("esi/EPOS4.xml", esi.to_str().expect("UTF-8"))
+        .replace("\"1ms\"", "\"4ms\"")
+        .replace("following_error = 1.0", "following_error = 0.44");
+    run_well(machine(&text), virtual_time());
+    let script = "[[fault]]\nkind = \"sdo-ignored\"\nindex = 0x60c2\nsub = 1\n";
+    let story = story(machine(&text), faults(script));
+    let first = "`a0` (position 0): the drive was not told the cycle of 4 ms (0x60C2 is 0); then: `a0`: following error ";
+    assert!(story.headline.starts_with(first), "{}", story.headline);
+}
+
+/// What led to the stop lies before it, what it led to behind it.
+#[test]
+fn the_cycles_around_the_stop_are_kept() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x3220\n";
+    let story = story(machine(&axes(2)), faults(script));
+    let stop = story.stop.expect("it ran").cycle;
+    let numbers: Vec<u64> = story.cycles.iter().map(|page| page.cycle.number).collect();
+    assert_eq!(numbers.len(), 200);
+    assert_eq!((numbers[0], numbers[199]), (stop - 150, stop + 49));
+    let fault = |page: &ecaxis::story::page::CyclePage| page.axes[1].statusword & 0x08 != 0;
+    let first = story.cycles.iter().find(|page| fault(page));
+    assert_eq!(first.map(|page| page.cycle.number), Some(stop));
+    // The other axis is on its ramp, and leaves its target no faster than its limits allow.
+    for pair in story.cycles.windows(2) {
+        let step = pair[1].axes[0].target_position - pair[0].axes[0].target_position;
+        assert!(step.abs() <= 50.0 * 0.001 + 1e-9, "{step}");
+    }
+    assert_eq!(story.axes.len(), 2);
+    assert!(matches!(story.cause, Cause::AsTold { .. }));
+    assert_eq!(story.devices[1].error_code, Some(0x3220));
+}
+
+#[test]
+fn the_same_run_tells_the_same_story() {
+    let (_, text, script) = staged().swap_remove(1);
+    let tell = || serde_json::to_string(&story(machine(&text), faults(script))).expect("JSON");
+    assert_eq!(tell(), tell());
+}
+
+#[test]
+fn a_run_that_ends_well_or_is_interrupted_has_none() {
+    let (outcome, _) = run(machine(&axes(1)), virtual_time());
+    assert!(outcome.result.is_ok() && outcome.story.is_none());
+    let stop = Arc::new(AtomicBool::new(true));
+    let mut heard = Heard::default();
+    let outcome = ecaxis::session::run(machine(&axes(1)), virtual_time(), stop, &mut heard);
+    assert!(outcome.result.is_err() && outcome.story.is_none());
+}
