@@ -15,10 +15,10 @@ use super::{Failure, hints, result};
 
 const EXAMPLES: &str = "\
 Examples:
-  ecaxis compare machine.toml                   the bus at the file's interface
-  ecaxis compare machine.toml --nic enp3s0      at another
-  ecaxis compare machine.toml --sim other.toml  another file's simulated bus
-  ecaxis compare machine.toml --apply           make the file as the bus is";
+  ecaxis compare m.toml                    the bus at the file's interface
+  ecaxis compare m.toml --nic enp3s0       at another one
+  ecaxis compare m.toml --sim other.toml   another file's simulated bus
+  ecaxis compare m.toml --apply            make the file as the bus is";
 
 /// Compare a machine file with the bus: missing, added, swapped devices, revisions, aliases, serial numbers, modules
 ///
@@ -71,6 +71,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let (scan, comparison) = look(bus, &machine, args)?;
     let seen = Seen::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
+    if seen.scan.devices.iter().any(|device| device.sii.is_err()) {
+        let message = "an EEPROM could not be read, so it is not known who is there";
+        return Err(Failure::new(hints::FAILED, message)
+            .hint("end the other master, or lead the devices to Init, and compare again"));
+    }
     for unknown in &comparison.unknown {
         bus::warn(format_args!("not compared: {unknown}"));
     }

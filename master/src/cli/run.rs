@@ -97,6 +97,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let options =
         options(args, &machine).inspect_err(|f| tell(args, &f.message, &f.hints, json!([])))?;
+    if !machine.enable && !args.no_enable {
+        note(
+            "note: the file says `enable = false`: the axes get no power; `--enable` gives it to them",
+        );
+    }
     let nic = machine.bus.nic.clone();
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);

@@ -365,6 +365,11 @@ fn forget_in_step(step: &mut Table, name: &str, depth: usize) -> bool {
                 if let Some(axes) = item.as_table_like_mut() {
                     forget_axis(axes, name);
                 }
+                // The last one before the brace has the blank.
+                let inline = item.as_inline_table_mut();
+                if let Some((_, last)) = inline.and_then(|axes| axes.iter_mut().last()) {
+                    last.decor_mut().set_suffix(" ");
+                }
             }
         }
         // Nobody is left to take part.

@@ -99,12 +99,6 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
         .differences
         .extend(missing.map(|(device, _)| Difference::Missing { device }));
     for (device, _) in scan.devices.iter().zip(&free).filter(|(_, free)| **free) {
-        if device.identity().is_none() {
-            comparison.unknown.push(format!(
-                "position {}: its EEPROM could not be read",
-                device.position()
-            ));
-        }
         let position = device.position();
         comparison.differences.push(Difference::Added { position });
     }
@@ -398,8 +392,11 @@ impl Told<'_> {
         let mut of_product = esi.filter(|d| {
             (d.identity.vendor, d.identity.product) == (identity.vendor, identity.product)
         });
-        let known = of_product.next().map(|d| format!("{}, ", d.type_name));
-        format!("{}{identity}", known.unwrap_or_default())
+        let known = of_product.next().map(|d| d.type_name.clone());
+        match known.or_else(|| device.and_then(Device::own_name)) {
+            Some(name) => format!("{name}, {identity}"),
+            None => identity.to_string(),
+        }
     }
 }
 

@@ -5,6 +5,7 @@
 //! - `xdp`: a network interface before the network stack (feature `xdp`);
 //! - [`sift`]: which of an interface's frames are ours;
 //! - [`sim`]: the simulated bus in this process;
+//! - [`apart`]: an address of one's own, beside a machine that runs on the same interface;
 //! - [`recorded`], [`capture`]: a recording around any of them;
 //! - [`replay`]: a recording in the place of a bus;
 //! - [`port`]: ethercrab's two ends.
@@ -12,6 +13,7 @@
 use std::fmt;
 use std::time::{Duration, Instant};
 
+pub mod apart;
 pub mod capture;
 pub mod interface;
 pub mod packet;

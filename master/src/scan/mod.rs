@@ -17,7 +17,7 @@ use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{self, General, Protocols, Sii};
 
 use crate::bringup::DeviceRef;
-use crate::bringup::al;
+use crate::bringup::al::{self, AlState};
 use crate::mailbox::Wire;
 use crate::service::eeprom::{Claim, Eeprom};
 use crate::service::station::{self, Found};
@@ -27,6 +27,8 @@ pub mod answers;
 pub mod described;
 pub mod others;
 pub mod registers;
+#[cfg(test)]
+mod tests;
 pub mod tree;
 pub mod write;
 
@@ -116,6 +118,16 @@ impl Device {
         self.sii.as_ref().ok().map(|sii| sii.serial)
     }
 
+    /// As its EEPROM calls it: by its type, or by a longer name.
+    #[must_use]
+    pub fn own_name(&self) -> Option<String> {
+        let general = self.sii.as_ref().ok()?.general.as_ref()?;
+        let name = [&general.order, &general.name]
+            .into_iter()
+            .find(|name| !name.is_empty())?;
+        Some(name.chars().filter(|c| !c.is_control()).collect())
+    }
+
     /// Names of its mailbox protocols.
     #[must_use]
     pub fn protocols(&self) -> Vec<&'static str> {
@@ -166,18 +178,26 @@ pub async fn scan(
     let mut found = station::census(wire).await?;
     let others = others::look(wire, &found, options.heard, WATCH).await?;
     let quiet = others.is_empty();
-    station::address(wire, &mut found).await?;
+    // One that is bringing the segment up gives out addresses and reads EEPROMs itself.
+    let shared = others.iter().any(Sign::is_live) && !options.intrude;
+    if !shared {
+        station::address(wire, &mut found).await?;
+    }
 
     let of = found.len();
+    let stations: Vec<u16> = found.iter().map(|found| found.station).collect();
     let mut devices = Vec::with_capacity(of);
     for found in found {
+        let same = stations.iter().filter(|other| **other == found.station);
+        let addressed = found.station != 0 && same.count() == 1;
+        let readable = addressed && !(shared && found.state == AlState::Init);
         let position = found.position;
         tell(Step {
             what: "reading",
             position,
             of,
         });
-        devices.push(look_at(wire, found).await?);
+        devices.push(look_at(wire, found, readable).await?);
     }
     place(&mut devices);
     delays(wire, &mut devices, quiet).await?;
@@ -209,7 +229,7 @@ pub async fn scan(
 }
 
 /// Registers and EEPROM; nothing that a state machine would notice.
-async fn look_at(wire: &Datagrams, found: Found) -> Result<Device, ServiceError> {
+async fn look_at(wire: &Datagrams, found: Found, readable: bool) -> Result<Device, ServiceError> {
     const STEP: &str = "reading what its controller is";
     let position = found.position;
     let controller: [u8; CONTROLLER_BYTES] = station::at(wire, position, STEP, CONTROLLER).await?;
@@ -222,7 +242,13 @@ async fn look_at(wire: &Datagrams, found: Found) -> Result<Device, ServiceError>
             Ok(1..)
         );
     let at = found.named(format!("position {position}"));
-    let sii = read_eeprom(wire, &at).await;
+    let sii = if readable {
+        read_eeprom(wire, &at).await
+    } else {
+        Err(format!(
+            "{at}: its EEPROM was left alone: another master may be reading it"
+        ))
+    };
     Ok(Device {
         found,
         controller,

@@ -12,15 +12,7 @@ pub(super) fn type_name(device: &Device, described: Option<&Described>) -> Strin
     if let Some(described) = described {
         return described.device.type_name.clone();
     }
-    let general = device.sii.as_ref().ok().and_then(|s| s.general.as_ref());
-    let names = general.map(|general| [&general.order, &general.name]);
-    let named = names.into_iter().flatten().find(|name| !name.is_empty());
-    named.map_or_else(|| "?".to_owned(), |name| printable(name))
-}
-
-/// Names come from EEPROMs.
-fn printable(text: &str) -> String {
-    text.chars().filter(|c| !c.is_control()).collect()
+    device.own_name().unwrap_or_else(|| "?".to_owned())
 }
 
 pub(super) fn is_drive(device: &Device, described: Option<&Described>) -> bool {

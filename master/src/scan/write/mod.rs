@@ -137,11 +137,8 @@ pub fn names<'d>(
 
 /// A word for a key: letters, digits and underscores.
 fn word(device: &Device, described: Option<&Described>) -> String {
-    let general = device.sii.as_ref().ok().and_then(|s| s.general.as_ref());
-    let type_name = described
-        .map(|d| d.device.type_name.as_str())
-        .or(general.map(|g| g.order.as_str()))
-        .unwrap_or_default();
+    let type_name = described.map(|d| d.device.type_name.clone());
+    let type_name = type_name.or_else(|| device.own_name()).unwrap_or_default();
     let mut word = String::new();
     for c in type_name.chars().take(24) {
         match c {

@@ -1,0 +1,362 @@
+//! `ecaxis compare`: every kind of difference is named, and `--apply` makes a file without mistakes of it.
+
+use serde_json::Value;
+
+use crate::bench::{Bench, reviewed};
+
+/// A machine with everything that may differ.
+const MACHINE: &str = r#"# The machine at the window.
+
+[bus]
+cycle = "1ms"              # as short as it must be
+
+[[device]]
+name     = "coupler"
+esi      = "esi/terminals.xml"
+type     = "CP0"
+position = 0
+
+[[device]]
+name     = "doors"         # of the cabinet
+esi      = "esi/terminals.xml"
+type     = "DI8"
+position = 1
+
+[[device]]
+name     = "x"             # left to right
+esi      = "esi/EPOS4.xml"
+position = 2
+serial   = 1002
+mode     = "csp"
+
+[device.axis]
+unit    = "mm"
+encoder = 2000
+limits  = { velocity = 10.0, acceleration = 100.0 }
+
+[[device]]
+name     = "y"             # front to back
+esi      = "esi/IDX.xml"
+position = 3
+mode     = "csp"
+
+[device.axis]
+unit    = "mm"
+encoder = 2000
+limits  = { velocity = 10.0, acceleration = 100.0 }
+
+[[device]]
+name     = "block"
+esi      = "esi/MIO2.xml"
+position = 4
+modules  = ["IN8", "OUT8"] # as they were plugged
+
+[[device]]
+name     = "lamp"
+esi      = "esi/IO8.xml"
+alias    = 20
+
+[stop]
+emergency = { doors."Channel 1" = false }   # somebody is inside
+
+[[stop.group]]
+name    = "table"
+axes    = ["x", "y"]
+
+[[step]]                   # both at once
+move = { x = 1.0, y = 2.0 }
+
+[[step]]
+set = { lamp."Output 1" = true }
+
+[[step]]
+repeat = 2
+
+[[step.step]]
+move = { y = 0.0 }
+
+[[step.step]]
+dwell = "10ms"
+"#;
+
+struct Case {
+    name: &'static str,
+    /// Kinds, as JSON has them.
+    kinds: &'static [&'static str],
+    /// In what is told.
+    told: &'static [&'static str],
+    /// From the machine file to that of the other bus.
+    other: fn(&str) -> String,
+}
+
+/// The text of one [[device]].
+fn section<'t>(text: &'t str, name: &str) -> &'t str {
+    let from = text.find(&format!("[[device]]\nname     = \"{name}\""));
+    let rest = &text[from.expect("the device")..];
+    match rest.find("\n[[") {
+        Some(to) => &rest[..=to],
+        None => rest,
+    }
+}
+
+fn only_devices(text: &str) -> String {
+    text[..text.find("[stop]").expect("[stop]")].to_owned()
+}
+
+fn without(text: &str, name: &str) -> String {
+    let devices = only_devices(text);
+    devices.replace(section(&devices, name), "")
+}
+
+fn cases() -> Vec<Case> {
+    vec![
+        Case {
+            name: "missing",
+            kinds: &["missing"],
+            told: &["`y` (position 3) is missing: no IDX is left on the bus for it"],
+            other: |text| without(text, "y").replace("position = 4", "position = 3"),
+        },
+        Case {
+            name: "missing-alias",
+            kinds: &["missing"],
+            told: &["`lamp` (alias 20) is missing"],
+            other: |text| without(text, "lamp"),
+        },
+        Case {
+            name: "added",
+            kinds: &["added"],
+            told: &["position 2 is not in the file: SV1, "],
+            other: |text| {
+                let text = only_devices(text)
+                    .replace("position = 4", "position = 5")
+                    .replace("position = 3", "position = 4")
+                    .replace("position = 2", "position = 3");
+                let esi = "[[device]]\nname = \"new\"\nesi = \"esi/SV1.xml\"\nposition = 2\nserial = 77\n";
+                format!("{text}\n{esi}")
+            },
+        },
+        Case {
+            name: "swapped",
+            kinds: &["swapped"],
+            told: &["`x` and `y` are swapped: `x` is at position 3, `y` at position 2"],
+            other: |text| {
+                only_devices(text)
+                    .replace("position = 3", "position = 99")
+                    .replace("position = 2", "position = 3")
+                    .replace("position = 99", "position = 2")
+            },
+        },
+        Case {
+            name: "revision",
+            kinds: &["revision"],
+            told: &["`y` (position 3) has revision 0x00010007, its ESI describes 0x00010000"],
+            other: |text| only_devices(text).replace("esi/IDX.xml", "newer/IDX.xml"),
+        },
+        Case {
+            name: "alias",
+            kinds: &["alias"],
+            told: &["`lamp`: nobody has alias 20; the IO8 at position 5 has alias 21"],
+            other: |text| only_devices(text).replace("alias    = 20", "alias    = 21"),
+        },
+        Case {
+            name: "serial",
+            kinds: &["serial"],
+            told: &["`x` (position 2) has serial number 4711, the file says 1002"],
+            other: |text| only_devices(text).replace("serial   = 1002", "serial   = 4711"),
+        },
+        Case {
+            name: "modules",
+            kinds: &["modules"],
+            told: &[
+                "`block` (position 4) holds the modules [OUT8, OUT8], the file says [IN8, OUT8]",
+            ],
+            other: |text| only_devices(text).replace("[\"IN8\", \"OUT8\"]", "[\"OUT8\", \"OUT8\"]"),
+        },
+        Case {
+            name: "replaced",
+            kinds: &["missing", "added"],
+            told: &[
+                "`doors` (position 1) is missing",
+                "position 1 is not in the file: DO8",
+            ],
+            other: |text| only_devices(text).replace("\"DI8\"", "\"DO8\""),
+        },
+    ]
+}
+
+fn bench() -> Bench {
+    let bench = Bench::new();
+    bench.write("machine.toml", MACHINE);
+    std::fs::create_dir(bench.path().join("newer")).expect("a folder");
+    let esi = bench.read("esi/IDX.xml");
+    let newer = esi.replace("RevisionNo=\"#x00010000\"", "RevisionNo=\"#x00010007\"");
+    bench.write("newer/IDX.xml", &newer);
+    bench
+}
+
+#[test]
+fn equal_buses_are_as_in_the_file() {
+    let bench = bench();
+    let compare = ["compare", "machine.toml", "--sim", "machine.toml"];
+    let ran = bench.ecaxis(&compare);
+    assert_eq!(
+        (ran.code, ran.out.as_str()),
+        (0, "as in the file\n"),
+        "{}",
+        ran.err
+    );
+    assert_eq!(ran.err, "");
+    let json = bench.well(&[&compare[..], &["--json"]].concat());
+    let json: Value = serde_json::from_str(&json).expect("JSON");
+    assert_eq!(json["equal"], true);
+    // Nothing to be applied leaves every byte.
+    bench.well(&[&compare[..], &["--apply"]].concat());
+    assert_eq!(bench.read("machine.toml"), MACHINE);
+}
+
+#[test]
+fn every_difference_is_named_and_can_be_applied() {
+    let bench = bench();
+    for case in cases() {
+        let name = case.name;
+        bench.write("machine.toml", MACHINE);
+        bench.write("other.toml", &(case.other)(MACHINE));
+        let compare = ["compare", "machine.toml", "--sim", "other.toml"];
+        let ran = bench.ecaxis(&compare);
+        assert_eq!(ran.code, 1, "{name}: {}{}", ran.out, ran.err);
+        for part in case.told {
+            assert!(
+                ran.out.contains(part),
+                "{name}: `{part}` is not in:\n{}",
+                ran.out
+            );
+        }
+        assert_eq!(
+            ran.out.lines().count(),
+            case.kinds.len(),
+            "{name}: {}",
+            ran.out
+        );
+        let ran = bench.ecaxis(&[&compare[..], &["--json"]].concat());
+        let json: Value = serde_json::from_str(&ran.out).expect("JSON");
+        let kinds: Vec<_> = json["differences"]
+            .as_array()
+            .expect("a list")
+            .iter()
+            .filter_map(|d| d["kind"].as_str())
+            .collect();
+        assert_eq!(kinds, case.kinds, "{name}");
+        assert_eq!(bench.read("machine.toml"), MACHINE, "{name}: only compared");
+
+        let ran = bench.ecaxis(&[&compare[..], &["--apply"]].concat());
+        assert_eq!(ran.code, 0, "{name}: {}", ran.err);
+        let applied = bench.read("machine.toml");
+        reviewed(&format!("apply/{name}.toml"), &applied);
+        let check = bench.ecaxis(&["check", "machine.toml"]);
+        assert_eq!(check.code, 0, "{name}: {}\n{applied}", check.err);
+        let ran = bench.ecaxis(&compare);
+        assert_eq!(ran.code, 0, "{name}: {}{}\n{applied}", ran.out, ran.err);
+        for comment in [
+            "# The machine at the window.",
+            "# as short as it must be",
+            "# left to right",
+        ] {
+            assert!(applied.contains(comment), "{name}: `{comment}` is gone");
+        }
+    }
+}
+
+/// What `identity` takes is no difference, and brings the bus up.
+#[test]
+fn policies() {
+    let bench = bench();
+    for (policy, newer, older) in [
+        ("equal", false, false),
+        (">=", true, false),
+        ("high-word", true, true),
+        ("low-word", false, false),
+        ("ignore", true, true),
+    ] {
+        for (esi, other, expected) in [
+            ("esi/IDX.xml", "newer/IDX.xml", newer),
+            ("newer/IDX.xml", "esi/IDX.xml", older),
+        ] {
+            let text = MACHINE.replace(
+                "esi      = \"esi/IDX.xml\"",
+                &format!("esi      = \"{esi}\"\nidentity = \"{policy}\""),
+            );
+            bench.write("machine.toml", &text);
+            bench.write(
+                "other.toml",
+                &only_devices(&MACHINE.replace("esi/IDX.xml", other)),
+            );
+            let ran = bench.ecaxis(&["compare", "machine.toml", "--sim", "other.toml"]);
+            assert_eq!(
+                ran.code == 0,
+                expected,
+                "{policy} {esi}: {}{}",
+                ran.out,
+                ran.err
+            );
+        }
+    }
+    bench.write(
+        "machine.toml",
+        &MACHINE.replace(
+            "mode     = \"csp\"",
+            "mode = \"csp\"\nidentity = \"newest\"",
+        ),
+    );
+    let check = bench.ecaxis(&["check", "machine.toml"]);
+    assert_eq!(check.code, 2);
+    assert!(
+        check.err.contains("unknown identity \"newest\""),
+        "{}",
+        check.err
+    );
+}
+
+/// Start-up SDOs that the device does not hold yet.
+#[test]
+fn parameters_on_request() {
+    let bench = bench();
+    let text = MACHINE.replace(
+        "mode     = \"csp\"\n\n[device.axis]\nunit    = \"mm\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
+        "mode     = \"csp\"\nsdo      = [{ index = 0x6065, value = 1234 }]\n\n[device.axis]\nunit    = \"mm\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
+    );
+    assert_ne!(text, MACHINE);
+    bench.write("machine.toml", &text);
+    let compare = ["compare", "machine.toml", "--sim", "machine.toml"];
+    assert_eq!(bench.well(&compare), "as in the file\n");
+    let ran = bench.ecaxis(&[&compare[..], &["--parameters"]].concat());
+    assert_eq!(ran.code, 1, "{}", ran.err);
+    let expected = "`x` (position 2): 0x6065:00 Following error window is 2000 (0x000007d0), start-up writes 1234 (0x000004d2)";
+    assert!(ran.out.lines().any(|line| line == expected), "{}", ran.out);
+    // They are no part of the topology.
+    let ran = bench.ecaxis(&[&compare[..], &["--parameters", "--apply"]].concat());
+    assert_eq!(ran.code, 1);
+    assert_eq!(bench.read("machine.toml"), text);
+}
+
+#[test]
+fn another_machine_altogether() {
+    let bench = bench();
+    bench.copy("commissioning.toml", "other.toml");
+    let text = "[bus]\ncycle = \"1ms\"\n\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 0\n";
+    bench.write("machine.toml", text);
+    let ran = bench.ecaxis(&["compare", "machine.toml", "--sim", "other.toml"]);
+    assert_eq!(ran.code, 1);
+    assert_eq!(ran.out.lines().count(), 10, "{}", ran.out);
+    let ran = bench.ecaxis(&[
+        "compare",
+        "machine.toml",
+        "--sim",
+        "other.toml",
+        "--apply",
+        "--esi",
+        "newer",
+    ]);
+    assert_eq!(ran.code, 1);
+    assert!(ran.err.contains("no ESI file describes it"), "{}", ran.err);
+    assert_eq!(bench.read("machine.toml"), text);
+}

@@ -1,0 +1,235 @@
+//! `ecaxis scan` on simulated buses.
+
+use serde_json::Value;
+
+use crate::bench::{Bench, fits, reviewed};
+
+fn bench() -> Bench {
+    let bench = Bench::new();
+    bench.copy("commissioning.toml", "bench.toml");
+    bench
+}
+
+#[test]
+fn what_is_printed() {
+    let bench = bench();
+    for (name, arguments) in [
+        ("tables.txt", &["scan", "--sim", "bench.toml"][..]),
+        ("tree.txt", &["scan", "--sim", "bench.toml", "--tree"]),
+    ] {
+        let out = bench.well(arguments);
+        fits(&out);
+        reviewed(name, &out);
+    }
+}
+
+#[test]
+fn as_json() {
+    let bench = bench();
+    let out = bench.well(&["scan", "--sim", "bench.toml", "--ask", "--json"]);
+    let seen: Value = serde_json::from_str(&out).expect("JSON");
+    assert_eq!(seen["other_master"], false);
+    let devices = seen["devices"].as_array().expect("devices");
+    assert_eq!(devices.len(), 9);
+    let names: Vec<_> = devices.iter().map(|d| d["name"].as_str()).collect();
+    let expected = [
+        "CP0", "DI8", "DO8", "DI4", "DO4", "EPOS4", "IDX", "SV1", "GW64",
+    ];
+    assert_eq!(names, expected.map(Some));
+    for (position, device) in devices.iter().enumerate() {
+        assert_eq!(device["position"], position);
+        assert_eq!(device["state"], "Init", "as it was");
+        assert_eq!(device["serial"], 1000 + position);
+        assert_eq!(device["esi"]["fits"], "equal");
+    }
+    let drive = &devices[7]["answers"]["drive"];
+    assert_eq!(drive["encoder_resolution"][0], 131_072);
+    assert_eq!(drive["velocity_unit"], 0x00b5_0300);
+    assert_eq!(drive["software_limits"][1], 13_107_200);
+    assert_eq!(devices[5]["drive"], true);
+    assert_eq!(devices[8]["drive"], false);
+    assert!(devices[1]["answers"].is_null(), "no mailbox");
+    // Every cable takes its time.
+    let delays: Vec<_> = devices
+        .iter()
+        .filter_map(|d| d["delay_ns"].as_u64())
+        .collect();
+    assert!(delays.len() > 3 && delays.is_sorted(), "{delays:?}");
+}
+
+/// The coupler takes receive times but has no clock; the first drive's is the reference of the others.
+#[test]
+fn drives_behind_a_coupler_without_a_clock_keep_time() {
+    let bench = bench();
+    let out = bench.well(&["run", "bench.toml", "--virtual", "--json"]);
+    let run: Value = serde_json::from_str(&out).expect("JSON");
+    assert_eq!(run["ok"], true, "{out}");
+    assert_eq!(run["summary"]["program_runs"], 1);
+}
+
+#[test]
+fn a_file_that_is_there_stays() {
+    let bench = bench();
+    bench.write("mine.toml", "# mine\n");
+    let write = ["scan", "--sim", "bench.toml", "--write", "mine.toml"];
+    let ran = bench.ecaxis(&write);
+    assert_eq!(ran.code, 2);
+    assert!(
+        ran.err.contains("mine.toml is there already"),
+        "{}",
+        ran.err
+    );
+    assert_eq!(bench.read("mine.toml"), "# mine\n");
+    bench.well(&[&write[..], &["--force"]].concat());
+    assert!(bench.read("mine.toml").contains("[[device]]"));
+}
+
+/// What is written is a file without mistakes, and of the bus that it was made from.
+#[test]
+fn every_bus_of_ours_can_be_written_down() {
+    let bench = Bench::new();
+    for config in [
+        "commissioning",
+        "controller",
+        "demo",
+        "gateway",
+        "groups",
+        "loops",
+        "modes",
+        "probe",
+        "profiles",
+        "terminals",
+        "tuned",
+    ] {
+        bench.copy(&format!("{config}.toml"), "bench.toml");
+        let write = [
+            "scan",
+            "--sim",
+            "bench.toml",
+            "--write",
+            "machine.toml",
+            "--force",
+        ];
+        let ran = bench.ecaxis(&write);
+        assert_eq!((ran.code, ran.err.as_str()), (0, ""), "{config}");
+        let checked = bench.ecaxis(&["check", "machine.toml"]);
+        assert_eq!(checked.code, 0, "{config}: {}", checked.err);
+        let compared = bench.well(&["compare", "machine.toml", "--sim", "bench.toml"]);
+        assert_eq!(compared, "as in the file\n", "{config}");
+    }
+}
+
+/// Without its ESI file a device is written down all the same, and the file says what is missing.
+#[test]
+fn a_device_that_nothing_describes() {
+    let bench = bench();
+    std::fs::create_dir(bench.path().join("few")).expect("a folder");
+    bench.write("few/EPOS4.xml", &bench.read("esi/EPOS4.xml"));
+    let ran = bench.ecaxis(&[
+        "scan",
+        "--sim",
+        "bench.toml",
+        "--esi",
+        "few",
+        "--write",
+        "machine.toml",
+    ]);
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    assert!(
+        ran.err.contains("some devices have no ESI file"),
+        "{}",
+        ran.err
+    );
+    let text = bench.read("machine.toml");
+    assert_eq!(text.matches("MISSING.xml").count(), 8, "{text}");
+    let check = bench.ecaxis(&["check", "machine.toml"]);
+    assert_eq!(check.code, 2);
+    assert!(check.err.contains("MISSING.xml"), "{}", check.err);
+}
+
+#[test]
+fn wrong_arguments() {
+    let bench = bench();
+    for (arguments, expected) in [
+        (&["scan"][..], "<IF>"),
+        (&["scan", "--sim", "missing.toml"], "missing.toml"),
+        (&["scan", "no-such-if"], "no-such-if"),
+        (
+            &["scan", "--sim", "bench.toml", "--esi", "nowhere"],
+            "nowhere",
+        ),
+        (
+            &["compare", "bench.toml", "--sim", "missing.toml"],
+            "missing.toml",
+        ),
+    ] {
+        let ran = bench.ecaxis(arguments);
+        assert_ne!(ran.code, 0, "{arguments:?}");
+        assert_eq!(ran.out, "", "{arguments:?}");
+        assert!(ran.err.contains(expected), "{arguments:?}: {}", ran.err);
+    }
+}
+
+/// Modules, an alias, a newer firmware than its ESI: what becomes of it in the file.
+#[test]
+fn what_a_written_file_says() {
+    let bench = Bench::new();
+    let esi = bench.read("esi/EPOS4.xml");
+    let newer = esi.replace("RevisionNo=\"#x00010000\"", "RevisionNo=\"#x00010005\"");
+    std::fs::create_dir(bench.path().join("newer")).expect("a folder");
+    bench.write("newer/EPOS4.xml", &newer);
+    bench.write(
+        "bench.toml",
+        r#"
+[bus]
+cycle = "1ms"
+
+[[device]]
+name = "block"
+esi = "esi/MIO2.xml"
+position = 0
+modules = ["OUT8", "IN8"]
+
+[[device]]
+name = "x"
+esi = "newer/EPOS4.xml"
+alias = 77
+mode = "csp"
+
+[device.axis]
+encoder = 2000
+limits = { velocity = 10.0, acceleration = 100.0 }
+
+[[device]]
+name = "io"
+esi = "esi/IO8.xml"
+alias = 78
+
+[[device]]
+name = "more"
+esi = "esi/IO8.xml"
+position = 3
+"#,
+    );
+    let arguments = [
+        "scan",
+        "--sim",
+        "bench.toml",
+        "--esi",
+        "esi",
+        "--write",
+        "machine.toml",
+    ];
+    let told = bench.well(&arguments);
+    assert!(told.contains("4 devices"), "{told}");
+    let text = bench.read("machine.toml");
+    reviewed("modules.toml", &text);
+    bench.well(&["check", "machine.toml"]);
+    // It finds the bus that it was made from, and this one has the newer firmware.
+    let compared = bench.well(&["compare", "machine.toml", "--sim", "bench.toml"]);
+    assert_eq!(compared, "as in the file\n");
+    let run = ["run", "machine.toml", "--virtual", "--for", "100ms"];
+    let ran = bench.ecaxis(&run);
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    assert!(ran.out.contains("4 SubDevices"), "{}", ran.out);
+}

@@ -1,0 +1,247 @@
+//! What docs/first-steps.md shows is what happens.
+
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::sync::Mutex;
+use std::time::Duration;
+
+use ecaxis::bench::veth::VethPair;
+
+use crate::bench::{Bench, root};
+
+/// The interface of the document.
+const NIC: &str = "enp3s0";
+
+/// A command of the document and what it shows of its output: `…` stands for anything.
+struct Shown {
+    command: String,
+    output: String,
+}
+
+fn shown() -> Vec<Shown> {
+    let document = std::fs::read_to_string(root().join("docs/first-steps.md"));
+    let document = document.expect("the document");
+    let mut all: Vec<Shown> = Vec::new();
+    for block in document.split("```console\n").skip(1) {
+        let block = block.split("```").next().unwrap_or_default();
+        for line in block.lines() {
+            if let Some(command) = line.strip_prefix("$ ") {
+                all.push(Shown {
+                    command: command.to_owned(),
+                    output: String::new(),
+                });
+            } else if let Some(last) = all.last_mut() {
+                last.output += line;
+                last.output.push('\n');
+            }
+        }
+    }
+    all
+}
+
+/// Whether a text is as it is shown.
+fn is_shown(shown: &str, text: &str) -> bool {
+    let mut parts = shown.split('…');
+    let Some(mut rest) = parts.next().and_then(|first| text.strip_prefix(first)) else {
+        return false;
+    };
+    let parts: Vec<&str> = parts.collect();
+    let Some((last, between)) = parts.split_last() else {
+        return rest.is_empty();
+    };
+    for part in between {
+        let Some(at) = rest.find(part) else {
+            return false;
+        };
+        rest = &rest[at + part.len()..];
+    }
+    // Behind a line of its own that stands for many, nothing may follow as well.
+    rest.ends_with(last) || *last == "\n"
+}
+
+#[test]
+fn what_stands_for_anything() {
+    for (shown, text, expected) in [
+        ("a\n", "a\n", true),
+        ("a\n", "b\n", false),
+        ("a … c\n", "a b c\n", true),
+        ("a … c\n", "a b d\n", false),
+        ("a\n…\nz\n", "a\nb\nc\nz\n", true),
+        ("a\n…\nz\n", "a\nb\nc\n", false),
+        ("a …\n", "a b\nc\n", true),
+        ("…", "anything", true),
+    ] {
+        assert_eq!(is_shown(shown, text), expected, "{shown:?} {text:?}");
+    }
+}
+
+/// Runs every command of the document, in its order and in one folder. `as_here` turns a command into one that can be run here, `as_there` its
+/// output into what the document would show; `after` comes after each command.
+fn follow(
+    bench: &Bench,
+    as_here: impl Fn(&str) -> String,
+    as_there: impl Fn(&str) -> String,
+    after: impl Fn(&str),
+) {
+    let program = Path::new(env!("CARGO_BIN_EXE_ecaxis"));
+    let folder = program.parent().expect("a folder");
+    let path = std::env::var("PATH").unwrap_or_default();
+    let commands = shown();
+    assert!(commands.len() > 6, "the document shows the whole way");
+    for Shown { command, output } in commands {
+        let here = as_here(&command);
+        let ran = bench
+            .command("sh")
+            .args(["-c", &format!("{{ {here}\n}} 2>&1")])
+            .env("PATH", format!("{}:{path}", folder.display()))
+            .output()
+            .expect("a shell");
+        let now = as_there(&String::from_utf8(ran.stdout).expect("UTF-8"));
+        assert!(ran.status.success(), "{here}:\n{now}");
+        assert!(
+            is_shown(&output, &now),
+            "$ {command}\n{now}\nis shown as\n{output}"
+        );
+        after(&command);
+    }
+}
+
+fn bench() -> Bench {
+    let bench = Bench::new();
+    bench.copy("commissioning.toml", "bench.toml");
+    bench
+}
+
+#[test]
+fn first_steps_on_the_simulated_bus() {
+    let bench = bench();
+    let as_here = |command: &str| {
+        let command = command.replace(&format!("scan {NIC}"), "scan --sim bench.toml");
+        if command.starts_with("ecaxis compare") {
+            return format!("{command} --sim bench.toml");
+        }
+        if command.starts_with("ecaxis run") {
+            return format!("{command} --virtual");
+        }
+        command
+    };
+    let as_there = |text: &str| {
+        let named = text.replace("`sim`", &format!("`{NIC}`"));
+        // The root of a tree.
+        match named.strip_prefix("sim\n") {
+            Some(rest) => format!("{NIC}\n{rest}"),
+            None => named,
+        }
+    };
+    follow(&bench, as_here, as_there, |_| {});
+}
+
+/// The simulated bus of another process.
+struct Served(Child);
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// `None`, with the reason printed, where interfaces may not be created.
+fn pair() -> Option<VethPair> {
+    match VethPair::new() {
+        Ok(pair) => Some(pair),
+        Err(error) => {
+            println!("skipped: a veth pair needs root: {error}");
+            None
+        }
+    }
+}
+
+fn serve(bench: &Bench, pair: &VethPair) -> Served {
+    let served = bench
+        .command(env!("CARGO_BIN_EXE_ecaxis"))
+        .args(["sim", "bench.toml", "--nic", &pair.a])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn();
+    let served = Served(served.expect("the binary starts"));
+    std::thread::sleep(Duration::from_millis(500));
+    served
+}
+
+/// The two tests would take each other's processors.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+/// On a test machine both ends of the wire share processors, and either may be held up for long.
+fn patient(text: &str) -> String {
+    assert!(text.contains("lost_frames = 20"), "{text}");
+    text.replace(
+        "lost_frames = 20",
+        "lost_frames = 900\nwatchdog = \"2s\"\n#",
+    )
+}
+
+/// A machine that runs on the same interface goes on as if nobody looked.
+#[test]
+fn a_running_machine_is_left_alone() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    let bench = bench();
+    bench.write("machine.toml", &patient(&bench.read("bench.toml")));
+    let _served = serve(&bench, &pair);
+    let run = bench
+        .command(env!("CARGO_BIN_EXE_ecaxis"))
+        .args(["run", "machine.toml", "--nic", &pair.b])
+        .args(["--no-enable", "--for", "8s", "--json"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the binary starts");
+    let mut seen = serde_json::Value::Null;
+    for _ in 0..30 {
+        std::thread::sleep(Duration::from_millis(200));
+        let ran = bench.ecaxis(&["scan", &pair.b, "--ask", "--json"]);
+        seen = serde_json::from_str(&ran.out).expect("JSON");
+        if seen["devices"]
+            .as_array()
+            .is_some_and(|all| all.iter().all(|d| d["state"] == "Op"))
+        {
+            assert!(
+                ran.err.contains("another master is driving this bus"),
+                "{}",
+                ran.err
+            );
+            break;
+        }
+    }
+    assert_eq!(seen["other_master"], true, "{seen:#}");
+    assert_eq!(seen["asked"], false);
+    assert_eq!(seen["devices"][5]["state"], "Op", "{seen:#}");
+    assert_eq!(seen["devices"][5]["serial"], 1005);
+    let ended = run.wait_with_output().expect("it ends");
+    let ended: serde_json::Value = serde_json::from_slice(&ended.stdout).expect("JSON");
+    assert_eq!(ended["ok"], true, "{ended:#}");
+    assert_eq!(ended["summary"]["counters"]["wkc_errors"], 0, "{ended:#}");
+}
+
+#[test]
+fn first_steps_over_a_real_interface() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    let bench = bench();
+    let _served = serve(&bench, &pair);
+    let as_here = |command: &str| command.replace(NIC, &pair.b);
+    // A busy test machine is no computer for a cycle of a millisecond: it warns, and it is late.
+    let as_there = |text: &str| {
+        let lines = text.lines().filter(|line| !line.starts_with("warning: "));
+        let lines = lines.filter(|line| !line.starts_with("  = help: "));
+        let text: String = lines.map(|line| format!("{line}\n")).collect();
+        text.replace(&pair.b, NIC)
+    };
+    let after = |command: &str| {
+        if command.contains("--write") {
+            bench.write("machine.toml", &patient(&bench.read("machine.toml")));
+        }
+    };
+    follow(&bench, as_here, as_there, after);
+}
