@@ -21,6 +21,7 @@ mod doctor;
 mod esi;
 mod explain;
 mod hints;
+mod jog;
 mod man;
 mod progress;
 mod record;
@@ -69,6 +70,7 @@ enum Verb {
     Doctor(doctor::Args),
     Bench(bench::Args),
     Analyze(analyze::Args),
+    Jog(jog::Args),
     Completions(completions::Args),
     Man(man::Args),
 }
@@ -118,6 +120,7 @@ pub fn main() -> ExitCode {
         | Verb::Explain(_)
         | Verb::Esi(_)
         | Verb::Doctor(_)
+        | Verb::Jog(_)
         | Verb::Completions(_)
         | Verb::Man(_)
         | Verb::Analyze(_) => {}
@@ -132,6 +135,7 @@ pub fn main() -> ExitCode {
         Verb::Sim(args) => sim::run(&args),
         Verb::Doctor(args) => doctor::run(&args),
         Verb::Bench(args) => bench::run(&args),
+        Verb::Jog(args) => jog::run(&args),
         Verb::Completions(args) => completions::run(&args),
         Verb::Man(args) => man::run(&args),
         Verb::Analyze(args) => analyze::run(&args),
@@ -206,8 +210,8 @@ mod tests {
                     continue;
                 };
                 // What the example is about stands behind a wide gap.
-                let words = example.split("   ").next().unwrap_or_default();
-                let words = words.split(['>', '|']).next().unwrap_or_default();
+                let words = example.split("  ").next().unwrap_or_default();
+                let words = words.split(['<', '>', '|']).next().unwrap_or_default();
                 let line = std::iter::once("ecaxis").chain(words.split_whitespace());
                 match Cli::try_parse_from(line) {
                     Ok(_) => {}

@@ -86,8 +86,12 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let machine = match load(args) {
-        Ok(machine) => machine,
+    let sim = args.sim || args.replay.is_some();
+    let machine = match load(&args.file, args.nic.as_deref(), sim) {
+        Ok(machine) => Machine {
+            enable: args.enable || machine.enable && !args.no_enable,
+            ..machine
+        },
         Err(error) => {
             let short = check::in_short(&args.file, &error);
             let failure = hints::config(&args.file, &error);
@@ -180,13 +184,13 @@ fn tell(args: &Args, error: &str, hints: &[String], problems: Value) {
     }
 }
 
-fn load(args: &Args) -> Result<Machine, ConfigError> {
-    let mut machine = config::load(&args.file)?;
-    machine.enable = args.enable || machine.enable && !args.no_enable;
-    if args.sim || args.replay.is_some() || args.nic.as_deref() == Some("sim") {
+/// A machine on the bus that the command line says, or its file.
+pub(super) fn load(file: &Path, nic: Option<&str>, sim: bool) -> Result<Machine, ConfigError> {
+    let mut machine = config::load(file)?;
+    if sim || nic == Some("sim") {
         machine.bus.nic = Nic::Sim;
-    } else if let Some(nic) = &args.nic {
-        machine.bus.nic = Nic::Interface(nic.clone());
+    } else if let Some(nic) = nic {
+        machine.bus.nic = Nic::Interface(nic.to_owned());
     }
     Ok(machine)
 }

@@ -29,6 +29,7 @@ use crate::rt::phase::Phase;
 use crate::rt::slot::AxisSlot;
 use crate::rt::stats::Stats;
 use crate::story::{Look, Story, look};
+use crate::supervise::manual::{self, Operator};
 use crate::supervise::{Supervisor, interruptible};
 use crate::wire::Datagrams;
 
@@ -120,7 +121,7 @@ pub fn run(
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
 ) -> Outcome {
-    start(machine, options, stop, observer, None)
+    start(machine, options, stop, observer, Instead::Nobody)
 }
 
 /// Like [`run`], with a controller of one's own in the place of the file's program: all axes are enabled, then they are
@@ -132,7 +133,33 @@ pub fn run_with(
     observer: &mut dyn Observer,
     controller: Box<dyn Controller>,
 ) -> Outcome {
-    start(machine, options, stop, observer, Some(controller))
+    let controller = Instead::Controller(controller);
+    start(machine, options, stop, observer, controller)
+}
+
+/// Like [`run`], with somebody in the file's program's place: axes are enabled and moved when they ask for it, until they
+/// leave or something else ends the run. See [`manual::by_hand`] for what of the file is different.
+pub fn run_by_hand(
+    machine: Machine,
+    options: Options,
+    stop: Arc<AtomicBool>,
+    observer: &mut dyn Observer,
+    operator: Box<dyn Operator>,
+) -> Outcome {
+    let machine = manual::by_hand(machine);
+    let options = Options {
+        enable: true,
+        ..options
+    };
+    let operator = Instead::Operator(operator);
+    start(machine, options, stop, observer, operator)
+}
+
+/// Who takes the place of the file's program.
+enum Instead {
+    Nobody,
+    Controller(Box<dyn Controller>),
+    Operator(Box<dyn Operator>),
 }
 
 fn start(
@@ -140,13 +167,13 @@ fn start(
     options: Options,
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
-    controller: Option<Box<dyn Controller>>,
+    instead: Instead,
 ) -> Outcome {
     let (progress, told) = channel();
     let owner = thread::Builder::new()
         .name("ecaxis-rt".to_owned())
         .stack_size(STACK)
-        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, controller));
+        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, instead));
     let owner = match owner {
         Ok(owner) => owner,
         Err(error) => return RunError::Thread(error.to_string()).into(),
@@ -290,6 +317,8 @@ fn prepare_with(
                 limit: options.limit,
                 enable: options.enable,
                 controlled,
+                operator: None,
+                seen: Vec::new(),
                 axes,
                 stop_patience: patience.unwrap_or(0),
                 orders_given: 0,
@@ -418,13 +447,21 @@ fn own_the_link(
     options: &Options,
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
-    controller: Option<Box<dyn Controller>>,
+    instead: Instead,
 ) -> Outcome {
     options.clock.enter();
     let told = progress.clone();
     let mut seen = Seen::default();
+    let (controller, operator) = match instead {
+        Instead::Nobody => (None, None),
+        Instead::Controller(controller) => (Some(controller), None),
+        Instead::Operator(operator) => (None, Some(operator)),
+    };
     let prepared = prepare_seeing(machine, options, stop, progress, controller, &mut seen);
-    let Prepared { parts, supervisor } = match prepared {
+    let Prepared {
+        parts,
+        mut supervisor,
+    } = match prepared {
         Ok(prepared) => prepared,
         Err(error) => {
             return Outcome {
@@ -433,6 +470,7 @@ fn own_the_link(
             };
         }
     };
+    supervisor.operator = operator;
     let wire = supervisor.wire;
     let places = story::places(&supervisor.bus);
     let machine = &Arc::clone(&supervisor.machine);

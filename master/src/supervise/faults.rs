@@ -12,7 +12,7 @@ use crate::session::{Progress, RunError};
 use crate::story::{Look, look};
 
 const ERROR_CODE: u16 = 0x603f;
-const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
+pub(super) const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
 
 impl Supervisor {
     /// `group`: the one that stops, where the machine does not.

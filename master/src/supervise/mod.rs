@@ -29,6 +29,7 @@ pub mod executor;
 mod faults;
 mod follow;
 mod groups;
+pub mod manual;
 mod program;
 
 /// Cycles are looked at this often.
@@ -65,6 +66,10 @@ pub struct Supervisor {
     pub enable: bool,
     /// A controller takes the program's place.
     pub controlled: bool,
+    /// Somebody who takes the program's place.
+    pub operator: Option<Box<dyn manual::Operator>>,
+    /// Axes whose faults and trips they have seen.
+    pub seen: Vec<usize>,
     /// Indices into the machine's devices, one an axis of the cycle.
     pub axes: Vec<usize>,
     /// How long the cycle waits for its slowest axis to come to rest.
@@ -150,6 +155,9 @@ impl Supervisor {
         }
         if self.controlled {
             return self.follow_controller(ended).await;
+        }
+        if let Some(mut operator) = self.operator.take() {
+            return self.attend(operator.as_mut()).await;
         }
         if !enables(&self.machine.steps) {
             let all: Vec<usize> = (0..self.axes.len()).collect();
@@ -257,8 +265,15 @@ impl Supervisor {
         (brakes.fold(0.0, f64::max) * 1e9) as Nanos
     }
 
-    /// Waits for the next look at the cycle; fails if the cycle has stopped the machine.
+    /// Waits for the next look at the cycle, and asks the devices what there is to be asked; fails if the cycle has stopped the machine.
     async fn tick(&mut self) -> Result<Snapshot, RunError> {
+        let snapshot = self.glance().await?;
+        self.ask_devices(&snapshot).await;
+        Ok(snapshot)
+    }
+
+    /// Waits for the next look at the cycle, and for no device; fails if the cycle has stopped the machine.
+    async fn glance(&mut self) -> Result<Snapshot, RunError> {
         clock::delay(TICK).await;
         if self.outer.orders.is_abandoned() {
             return Err(RunError::Thread("the cycle has ended by itself".to_owned()));
@@ -278,11 +293,15 @@ impl Supervisor {
         {
             return Err(self.explain_stop(cause, None, &snapshot).await);
         }
-        self.tell_of_groups(&snapshot).await;
+        Ok(snapshot)
+    }
+
+    /// What has stopped groups, and emergencies. Takes as long as the devices take to answer.
+    async fn ask_devices(&mut self, snapshot: &Snapshot) {
+        self.tell_of_groups(snapshot).await;
         if clock::now().saturating_sub(self.listened.0) >= LISTEN_PERIOD {
             self.listen().await;
         }
-        Ok(snapshot)
     }
 
     fn pass_events_on(&mut self) {
@@ -386,7 +405,8 @@ impl Supervisor {
                     (None, Some(trip)) => StopCause::Trip { axis, trip },
                     (None, None) => continue,
                 };
-                if self.enable && !self.is_stopped(self.group_of(axis)) {
+                let known = self.is_stopped(self.group_of(axis)) || self.seen.contains(&axis);
+                if self.enable && !known {
                     return Err(self.explain_stop(cause, None, &snapshot).await);
                 }
             }

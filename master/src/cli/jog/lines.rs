@@ -1,0 +1,402 @@
+//! Commands as lines: for scripts, and where there is no terminal.
+
+use std::io::{self, BufRead, IsTerminal, Read, Write};
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::{Receiver, RecvError, Sender, TryRecvError, channel, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+
+use ecaxis::clock::{Clock, Nanos};
+use ecaxis::config::{Machine, duration, nearest};
+use ecaxis::session::{self, Observer, Options, Progress, RunError};
+use ecaxis::supervise::manual::{MOST_SPEED, Operator, Presence, Request, Turn, View};
+use ecaxis_axis::Mode;
+use serde_json::json;
+
+use super::super::progress::Teller;
+use super::super::{Failure, hints, note};
+use super::panel::{AxisPanel, Panel, number};
+
+/// Lines that have been read ahead; whoever writes more waits.
+const AHEAD: usize = 64;
+/// Longer ones are not understood.
+const LONGEST: usize = 1_000;
+const SPEED: f64 = 0.05;
+
+const HELP: &str = "\
+enable [AXIS…]            disable [AXIS…]         all axes where none is named
+jog AXIS VELOCITY         for 0.3 s; again and again for longer
+by AXIS DISTANCE          move AXIS POSITION
+speed PERCENT             of moves, of the velocity limit: 5 at first, 25 at most
+home AXIS                 mode AXIS MODE          reset [AXIS…]
+stop [AXIS…]              brake and hold
+estop                     emergency stop: no motion and no power
+status                    how the axes are
+wait                      until everything asked for is done
+wait DURATION             such as 500ms
+quit                      or the end of the input: stop, disable, bus down";
+
+/// A line that is understood.
+#[derive(Debug, Clone, PartialEq)]
+enum Line {
+    For(Vec<Request>),
+    Speed(f64),
+    Status,
+    Help,
+    /// `None`: until everything is done.
+    Wait(Option<Nanos>),
+    Quit,
+    Nothing,
+}
+
+pub(super) fn run(
+    machine: Machine,
+    options: Options,
+    stop: Arc<AtomicBool>,
+    json: bool,
+) -> Result<(), Failure> {
+    let (lines, read) = sync_channel(AHEAD);
+    let (say, said) = channel::<String>();
+    // Ends with the program: it may wait for a line for ever.
+    thread::Builder::new()
+        .name("lines".to_owned())
+        .spawn(move || {
+            let mut input = io::stdin().lock();
+            while let Some(line) = next_line(&mut input) {
+                if lines.send(line).is_err() {
+                    return;
+                }
+            }
+        })
+        .map_err(|e| Failure::new(hints::FAILED, format!("starting a thread: {e}")))?;
+    // A reader that does not read must not hold the machine up.
+    let printer = thread::Builder::new()
+        .name("answers".to_owned())
+        .spawn(move || {
+            let mut out = io::stdout().lock();
+            for text in said {
+                // A reader that has gone is no reason to stop.
+                let _ = writeln!(out, "{text}").and_then(|()| out.flush());
+            }
+        })
+        .map_err(|e| Failure::new(hints::FAILED, format!("starting a thread: {e}")))?;
+    let failure = Arc::default();
+    let nic = machine.bus.nic.clone();
+    let mut teller = Quiet(Teller::new(options.clock, &machine.bus, true));
+    let script = Script {
+        lines: read,
+        patient: options.clock == Clock::Virtual,
+        answers: Answers { say, json },
+        // Somebody who types makes mistakes, a script that goes wrong must not go on.
+        strict: !io::stdin().is_terminal(),
+        failure: Arc::clone(&failure),
+        speed: SPEED,
+        waiting: None,
+        began: None,
+    };
+    let outcome = session::run_by_hand(machine, options, stop, &mut teller, Box::new(script));
+    drop(teller);
+    let _ = printer.join();
+    match outcome.result {
+        Err(RunError::Interrupted) => note("interrupted"),
+        Err(error) => return Err(hints::run(&error, &nic)),
+        Ok(()) => {}
+    }
+    let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
+    failure.take().map_or(Ok(()), Err)
+}
+
+/// `None`: the end. A line that is too long comes in pieces, none of which is understood.
+fn next_line(input: &mut impl BufRead) -> Option<String> {
+    let mut bytes = Vec::new();
+    let mut part = input.take(LONGEST as u64 + 2);
+    match part.read_until(b'\n', &mut bytes) {
+        Ok(1..) => Some(String::from_utf8_lossy(&bytes).into_owned()),
+        Ok(0) | Err(_) => None,
+    }
+}
+
+/// A run's progress, without what `status` tells.
+struct Quiet(Teller);
+
+impl Observer for Quiet {
+    fn progress(&mut self, progress: &Progress) {
+        if !matches!(progress, Progress::Status(_)) {
+            self.0.progress(progress);
+        }
+    }
+}
+
+/// What is printed.
+#[derive(Debug)]
+struct Answers {
+    say: Sender<String>,
+    json: bool,
+}
+
+impl Answers {
+    fn say(&self, text: &str) {
+        let _ = self.say.send(text.to_owned());
+    }
+
+    fn news(&self, axis: &str, text: &str, bad: bool) {
+        self.say(&if self.json {
+            json!({ "axis": axis, "ok": !bad, "what": text }).to_string()
+        } else {
+            format!("{axis}: {text}")
+        });
+    }
+
+    fn status(&self, panel: &Panel) {
+        for axis in &panel.axes {
+            let AxisPanel {
+                name,
+                unit,
+                position,
+                velocity,
+                torque,
+                torque_unit,
+                ..
+            } = axis;
+            self.say(&if self.json {
+                json!({
+                    "axis": name, "state": axis.state.to_string(), "mode": axis.mode.to_string(),
+                    "enabled": axis.enabled, "doing": axis.doing(), "unit": unit,
+                    "position": position, "velocity": velocity, "target": axis.target,
+                    "following_error": axis.following_error, "torque": torque,
+                    "torque_unit": torque_unit.sign(), "homed": axis.homed,
+                    "trouble": axis.trouble, "limits": axis.limits,
+                })
+                .to_string()
+            } else {
+                let [position, velocity, torque] = [position, velocity, torque].map(|x| number(*x));
+                let trouble = axis.trouble.as_ref().map(|t| format!("; {t}"));
+                format!(
+                    "{name}: {}, {}, {position} {unit}, {velocity} {unit}/s, {torque} {torque_unit}, {}{}",
+                    axis.state,
+                    axis.mode,
+                    axis.doing(),
+                    trouble.unwrap_or_default(),
+                )
+            });
+        }
+    }
+}
+
+/// Line after line; one that waits keeps those behind it waiting.
+#[derive(Debug)]
+struct Script {
+    lines: Receiver<String>,
+    /// Time stands still until the next line is there.
+    patient: bool,
+    answers: Answers,
+    strict: bool,
+    failure: Arc<Mutex<Option<Failure>>>,
+    /// Fraction of the velocity limit.
+    speed: f64,
+    /// Until then, or until everything is done.
+    waiting: Option<Option<Nanos>>,
+    began: Option<Nanos>,
+}
+
+impl Script {
+    /// `true`: it is not to go on.
+    fn fail(&self, code: u8, message: String) -> bool {
+        let failure = Failure::new(code, message);
+        if self.strict {
+            let mut first = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
+            first.get_or_insert(failure);
+        } else {
+            failure.print();
+        }
+        self.strict
+    }
+
+    /// Whether there is another line: `None` for not yet.
+    fn next(&self) -> Option<Result<String, RecvError>> {
+        if self.patient {
+            return Some(self.lines.recv());
+        }
+        match self.lines.try_recv() {
+            Ok(line) => Some(Ok(line)),
+            Err(TryRecvError::Empty) => None,
+            Err(TryRecvError::Disconnected) => Some(Err(RecvError)),
+        }
+    }
+}
+
+impl Operator for Script {
+    fn turn(&mut self, view: &View<'_>) -> Turn {
+        let mut turn = Turn::default();
+        let gone = Turn {
+            presence: Presence::Gone,
+            requests: Vec::new(),
+        };
+        let began = *self.began.get_or_insert(view.now);
+        for news in view.news {
+            let (axis, text) = (view.name(news.axis()), news.to_string());
+            self.answers.news(axis, &text, news.bad());
+            if news.bad() && self.fail(hints::FAILED, format!("{axis}: {text}")) {
+                return gone;
+            }
+        }
+        loop {
+            let waits = match self.waiting {
+                Some(None) => !view.idle(),
+                Some(Some(until)) => view.now < until,
+                None => false,
+            };
+            // Whoever types another line waits no longer.
+            if waits && self.strict {
+                return turn;
+            }
+            let line = match self.next() {
+                None => return turn,
+                Some(Err(RecvError)) => return gone,
+                Some(Ok(line)) => line,
+            };
+            self.waiting = None;
+            // What follows is judged by what this one does.
+            match parse(&line, view, self.speed) {
+                Ok(Line::For(requests)) => {
+                    turn.requests.extend(requests);
+                    return turn;
+                }
+                Ok(Line::Speed(speed)) => self.speed = speed,
+                Ok(Line::Status) => self.answers.status(&Panel::new(view, began)),
+                Ok(Line::Help) => self.answers.say(HELP),
+                Ok(Line::Wait(time)) => {
+                    self.waiting = Some(time.map(|time| view.now.saturating_add(time)));
+                    // Whoever types is not waited for with this one.
+                    return turn;
+                }
+                Ok(Line::Quit) => return gone,
+                Ok(Line::Nothing) => {}
+                Err(why) => {
+                    if self.fail(hints::WRONG, format!("`{}`: {why}", line.trim())) {
+                        return gone;
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
+    if line.trim_end().len() > LONGEST {
+        return Err("the line is too long".to_owned());
+    }
+    let line = line.split('#').next().unwrap_or_default();
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let Some((&verb, rest)) = words.split_first() else {
+        return Ok(Line::Nothing);
+    };
+    let axis = |name: &str| {
+        let mut axes = 0..view.axes.len();
+        axes.find(|&axis| view.name(axis) == name).ok_or_else(|| {
+            let all = (0..view.axes.len()).map(|axis| view.name(axis));
+            match nearest(name, all.clone()) {
+                Some(near) => format!("no axis is named `{name}`; did you mean `{near}`?"),
+                None => format!(
+                    "no axis is named `{name}`; there are {}",
+                    all.collect::<Vec<_>>().join(", ")
+                ),
+            }
+        })
+    };
+    // All of them where none is named.
+    let each = |request: fn(usize) -> Request| -> Result<Line, String> {
+        let named: Result<Vec<usize>, String> = rest.iter().map(|name| axis(name)).collect();
+        let mut axes = named?;
+        if axes.is_empty() {
+            axes = (0..view.axes.len()).collect();
+        }
+        Ok(Line::For(axes.into_iter().map(request).collect()))
+    };
+    let one = || match rest {
+        [name] => axis(name),
+        _ => Err(format!("`{verb}` takes the name of an axis")),
+    };
+    let with_number = || match rest {
+        [name, value] => {
+            let number = value.parse::<f64>().ok().filter(|n| n.is_finite());
+            let number = number.ok_or_else(|| format!("`{value}` is not a number"))?;
+            Ok((axis(name)?, number))
+        }
+        _ => Err(format!("`{verb}` takes the name of an axis and a number")),
+    };
+    let alone = |line: Line| {
+        if rest.is_empty() {
+            return Ok(line);
+        }
+        Err(format!("`{verb}` stands alone"))
+    };
+    match verb {
+        "enable" => each(|axis| Request::Enable { axis }),
+        "disable" => each(|axis| Request::Disable { axis }),
+        "reset" => each(|axis| Request::Reset { axis }),
+        "stop" if rest.is_empty() => Ok(Line::For(vec![Request::StopAll])),
+        "stop" => each(|axis| Request::Stop { axis }),
+        "estop" => alone(Line::For(vec![Request::EmergencyStop])),
+        "home" => Ok(Line::For(vec![Request::Home { axis: one()? }])),
+        "jog" => {
+            let (axis, velocity) = with_number()?;
+            Ok(Line::For(vec![Request::Jog { axis, velocity }]))
+        }
+        "by" => {
+            let (axis, distance) = with_number()?;
+            Ok(Line::For(vec![Request::MoveBy {
+                axis,
+                distance,
+                speed,
+            }]))
+        }
+        "move" => {
+            let (axis, position) = with_number()?;
+            Ok(Line::For(vec![Request::MoveTo {
+                axis,
+                position,
+                speed,
+            }]))
+        }
+        "mode" => match rest {
+            [name, mode] => {
+                let mode = mode_named(mode).ok_or_else(|| {
+                    format!("`{mode}` is no mode; there are csp, csv, cst, pp and pv")
+                })?;
+                let axis = axis(name)?;
+                Ok(Line::For(vec![Request::SetMode { axis, mode }]))
+            }
+            _ => Err("`mode` takes the name of an axis and a mode".to_owned()),
+        },
+        "speed" => {
+            let percent = match rest {
+                [value] => value.trim_end_matches('%').parse::<f64>().ok(),
+                _ => None,
+            };
+            let part = percent.map(|percent| percent / 100.0);
+            let part = part.filter(|part| *part > 0.0 && *part <= MOST_SPEED);
+            part.map(Line::Speed).ok_or_else(|| {
+                let most = MOST_SPEED * 100.0;
+                format!("`speed` takes percent of the velocity limit, above 0 and up to {most}")
+            })
+        }
+        "wait" => match rest {
+            [] => Ok(Line::Wait(None)),
+            [time] => duration::parse(time)
+                .map(|time| Line::Wait(Some(time)))
+                .map_err(|e| e.to_string()),
+            _ => Err("`wait` takes a duration, or nothing".to_owned()),
+        },
+        "status" => alone(Line::Status),
+        "help" => alone(Line::Help),
+        "quit" => alone(Line::Quit),
+        _ => Err("not understood; `help` lists what is".to_owned()),
+    }
+}
+
+fn mode_named(name: &str) -> Option<Mode> {
+    [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv]
+        .into_iter()
+        .find(|mode| mode.to_string().eq_ignore_ascii_case(name))
+}

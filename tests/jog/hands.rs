@@ -1,0 +1,81 @@
+//! Operators made of closures, and what they have seen.
+
+use std::fmt;
+use std::sync::{Arc, Mutex};
+
+use ecaxis::config::Machine;
+use ecaxis::session::{self, Options, Outcome};
+use ecaxis::supervise::manual::{News, Operator, Presence, Request, Turn, View};
+use ecaxis_axis::AxisStatus;
+
+use super::common::Heard;
+
+/// One turn.
+#[derive(Debug, Clone)]
+pub struct Seen {
+    /// Of the cycle, since the first.
+    pub time_s: f64,
+    pub axes: Vec<AxisStatus>,
+    pub news: Vec<News>,
+}
+
+pub fn here() -> Turn {
+    Turn::default()
+}
+
+pub fn request(request: Request) -> Turn {
+    Turn {
+        requests: vec![request],
+        ..Turn::default()
+    }
+}
+
+pub fn gone() -> Turn {
+    Turn {
+        presence: Presence::Gone,
+        ..Turn::default()
+    }
+}
+
+struct Plan<F> {
+    plan: F,
+    began: Option<u64>,
+    seen: Arc<Mutex<Vec<Seen>>>,
+}
+
+impl<F> fmt::Debug for Plan<F> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Plan")
+    }
+}
+
+impl<F: FnMut(&View<'_>, f64) -> Turn + Send> Operator for Plan<F> {
+    fn turn(&mut self, view: &View<'_>) -> Turn {
+        let began = *self.began.get_or_insert(view.now);
+        let time_s = (view.now - began) as f64 * 1e-9;
+        self.seen.lock().expect("no panic").push(Seen {
+            time_s: (view.snapshot.time.saturating_sub(began)) as f64 * 1e-9,
+            axes: view.snapshot.axes.clone(),
+            news: view.news.to_vec(),
+        });
+        (self.plan)(view, time_s)
+    }
+}
+
+/// Runs a machine in the hands of `plan`, which is given the seconds since its first turn.
+pub fn by_hand(
+    machine: Machine,
+    options: Options,
+    plan: impl FnMut(&View<'_>, f64) -> Turn + Send + 'static,
+) -> (Outcome, Vec<Seen>) {
+    let seen = Arc::new(Mutex::new(Vec::new()));
+    let operator = Box::new(Plan {
+        plan,
+        began: None,
+        seen: Arc::clone(&seen),
+    });
+    let mut heard = Heard::default();
+    let outcome = session::run_by_hand(machine, options, Arc::default(), &mut heard, operator);
+    let seen = std::mem::take(&mut *seen.lock().expect("no panic"));
+    (outcome, seen)
+}

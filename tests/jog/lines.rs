@@ -1,0 +1,152 @@
+//! `ecaxis jog --lines`: scripts on standard input, in virtual time.
+
+use std::io::Write;
+use std::process::{Command, Stdio};
+
+use serde_json::Value;
+
+use super::common::root;
+
+/// Exit code, standard output and standard error.
+fn script(lines: &str, more: &[&str]) -> (i32, String, String) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+        .args(["jog", "configs/demo.toml", "--sim", "--lines", "--virtual"])
+        .args(more)
+        .current_dir(root())
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the binary runs");
+    let mut stdin = child.stdin.take().expect("a pipe");
+    // It may have left at a line that is wrong.
+    let _ = stdin.write_all(lines.as_bytes());
+    drop(stdin);
+    let output = child.wait_with_output().expect("it ends");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("UTF-8");
+    let code = output.status.code().expect("an exit code");
+    (code, text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn a_script_moves_a_machine() {
+    let lines = "\
+enable              # both
+wait
+speed 20
+move x 10
+by y -5
+wait
+status
+disable x
+wait
+quit
+";
+    let (code, out, err) = script(lines, &[]);
+    assert_eq!(code, 0, "{err}");
+    let (status, news): (Vec<&str>, Vec<&str>) = out.lines().partition(|l| l.contains("CSP"));
+    let told = [
+        "x: enabled",
+        "y: enabled",
+        "y: is there",
+        "x: is there",
+        "x: disabled",
+    ];
+    assert_eq!(news, told);
+    for (line, begins, place) in [
+        (0, "x: Operation enabled, CSP, ", 10.0),
+        (1, "y: Operation enabled, CSP, ", -5.0),
+    ] {
+        let rest = status[line].strip_prefix(begins).expect(status[line]);
+        let (position, rest) = rest.split_once(" mm, ").expect("a position");
+        let position: f64 = position.parse().expect("a number");
+        assert!((position - place).abs() < 0.01, "{out}");
+        assert!(rest.ends_with(" %, holds"), "{out}");
+    }
+    let (_, again, _) = script(lines, &[]);
+    assert_eq!(again, out, "virtual time is the same every time");
+}
+
+#[test]
+fn a_jog_lasts_as_long_as_it_is_asked_for() {
+    let jog = "jog x 10\nwait 100ms\n".repeat(10);
+    let lines = format!("enable x\nwait\n{jog}wait\nstatus\n");
+    let (code, out, err) = script(&lines, &["--json"]);
+    assert_eq!(code, 0, "{err}");
+    let answers: Vec<Value> = out
+        .lines()
+        .map(|line| serde_json::from_str(line).expect("an object a line"))
+        .collect();
+    let what: Vec<_> = answers.iter().filter_map(|a| a["what"].as_str()).collect();
+    assert_eq!(what, ["enabled", "let go, brakes", "stopped"]);
+    // A second, and what it takes until it is missed.
+    let status = answers
+        .iter()
+        .find(|a| a["axis"] == "x" && a["state"].is_string());
+    let position = status.expect("a status")["position"]
+        .as_f64()
+        .expect("a number");
+    assert!((11.5..12.5).contains(&position), "{position} mm");
+}
+
+#[test]
+fn a_script_ends_at_the_first_line_that_goes_wrong() {
+    for (lines, code, parts) in [
+        (
+            "wiggle x\nenable\n",
+            2,
+            &["`wiggle x`", "not understood", "help"][..],
+        ),
+        ("enable z\n", 2, &["no axis is named `z`", "x, y"]),
+        (
+            "move x\n",
+            2,
+            &["`move` takes the name of an axis and a number"],
+        ),
+        ("jog x NaN\n", 2, &["`NaN` is not a number"]),
+        ("mode x warp\n", 2, &["`warp` is no mode", "csp"]),
+        ("speed 26\n", 2, &["up to 25"]),
+        ("wait 5\n", 2, &["unit"]),
+        (
+            "move x 10\nwait\nstatus\n",
+            1,
+            &["x: refused", "not enabled"],
+        ),
+        (
+            "enable x\nwait\njog x 200\nwait\n",
+            1,
+            &["x: refused", "62.5 mm/s"],
+        ),
+        (
+            "enable x\nwait\nmove x 61\nwait\n",
+            1,
+            &["x: refused", "range"],
+        ),
+        ("home x\nwait\n", 1, &["x: refused", "homing"]),
+        (
+            "estop\nenable x\nwait\n",
+            1,
+            &["x: refused", "emergency stop"],
+        ),
+    ] {
+        let (exit, out, err) = script(lines, &[]);
+        assert_eq!(exit, code, "{lines}{out}{err}");
+        for part in parts {
+            assert!(err.contains(part), "`{part}` is not in:\n{err}");
+        }
+    }
+}
+
+#[test]
+fn the_end_of_the_input_is_the_end_of_the_run() {
+    for lines in ["", "# nothing\n\n", "enable x\nwait\njog x 10\n"] {
+        let (code, _, err) = script(lines, &[]);
+        assert_eq!(code, 0, "{lines:?}: {err}");
+    }
+    let (code, out, _) = script("help\n", &[]);
+    assert_eq!(code, 0);
+    assert!(out.contains("estop"), "{out}");
+    let (code, _, err) = script(&"x".repeat(100_000), &[]);
+    assert_eq!(code, 2);
+    assert!(err.contains("too long"), "{err}");
+}

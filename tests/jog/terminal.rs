@@ -1,0 +1,234 @@
+//! `ecaxis jog` in a terminal, driven through tmux; and where there is none.
+
+#![allow(clippy::print_stdout, reason = "a skipped test says why")]
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use super::common::root;
+
+/// Much longer than anything takes.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[test]
+fn without_a_terminal_it_says_what_else_there_is() {
+    let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+        .args(["jog", "configs/demo.toml", "--sim"])
+        .current_dir(root())
+        .stdin(Stdio::null())
+        .output()
+        .expect("the binary runs");
+    assert_eq!(output.status.code(), Some(2));
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        text.contains("no terminal") && text.contains("--lines"),
+        "{text}"
+    );
+    assert!(output.stdout.is_empty());
+}
+
+/// A session of tmux, 80 × 24, with a server of its own.
+struct Tmux {
+    folder: tempfile::TempDir,
+}
+
+impl Tmux {
+    /// `None`, with the reason printed, where there is no tmux.
+    fn new(arguments: &str) -> Option<Self> {
+        let there = Command::new("tmux").arg("-V").output().is_ok();
+        assert!(there || std::env::var_os("CI").is_none(), "no tmux on CI");
+        if !there {
+            println!("skipped: there is no tmux");
+            return None;
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        // A computer that is busy with tests stalls for longer than a machine may.
+        let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
+        let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
+        let esi = root().join("configs/esi");
+        let calm = calm.replace("\"esi/", &format!("\"{}/", esi.display()));
+        assert!(calm.contains("watchdog"));
+        std::fs::write(folder.path().join("m.toml"), calm).expect("written");
+        let tmux = Self { folder };
+        let script = format!(
+            "cd {}; stty -g > before; {} jog m.toml --sim {arguments}; echo $? > code; stty -g > after; echo over; cat",
+            tmux.folder.path().display(),
+            env!("CARGO_BIN_EXE_ecaxis"),
+        );
+        tmux.ask(&[
+            "-f",
+            "/dev/null",
+            "new-session",
+            "-d",
+            "-x",
+            "80",
+            "-y",
+            "24",
+            "sh",
+            "-c",
+            &script,
+        ]);
+        Some(tmux)
+    }
+
+    fn ask(&self, arguments: &[&str]) -> String {
+        let output = Command::new("tmux")
+            .arg("-S")
+            .arg(self.folder.path().join("socket"))
+            .args(arguments)
+            .env("TERM", "xterm")
+            .env_remove("TMUX")
+            .output()
+            .expect("tmux runs");
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    }
+
+    fn screen(&self) -> String {
+        self.ask(&["capture-pane", "-p"])
+    }
+
+    fn keys(&self, keys: &[&str]) {
+        self.ask(&[&["send-keys"], keys].concat());
+    }
+
+    /// Until the screen shows it.
+    #[track_caller]
+    fn shows(&self, what: impl Fn(&str) -> bool, text: &str) -> String {
+        let began = Instant::now();
+        loop {
+            let screen = self.screen();
+            if what(&screen) {
+                return screen;
+            }
+            assert!(began.elapsed() < PATIENCE, "never {text}:\n{screen}");
+            sleep(Duration::from_millis(50));
+        }
+    }
+
+    #[track_caller]
+    fn says(&self, text: &str) -> String {
+        self.shows(|screen| screen.contains(text), text)
+    }
+
+    fn file(&self, name: &str) -> String {
+        let path = self.folder.path().join(name);
+        std::fs::read_to_string(path).unwrap_or_default()
+    }
+
+    /// The process itself.
+    fn pid(&self) -> String {
+        let shell = self.ask(&["display-message", "-p", "#{pane_pid}"]);
+        let shell = shell.trim();
+        let children = Path::new("/proc").join(shell).join("task").join(shell);
+        let children = std::fs::read_to_string(children.join("children")).expect("Linux");
+        children.trim().to_owned()
+    }
+
+    /// It has ended with this code, and the terminal is as it was.
+    #[track_caller]
+    fn left(&self, code: &str) {
+        let screen = self.says("over");
+        assert_eq!(self.file("code").trim(), code, "{screen}");
+        assert!(!self.file("before").is_empty());
+        assert_eq!(
+            self.file("after"),
+            self.file("before"),
+            "the terminal is not as it was"
+        );
+    }
+}
+
+impl Drop for Tmux {
+    fn drop(&mut self) {
+        self.ask(&["kill-server"]);
+    }
+}
+
+/// What the row of an axis shows of its position.
+fn position(screen: &str, axis: &str) -> Option<f64> {
+    let row = screen.lines().find(|line| {
+        let mut words = line.trim_start_matches([' ', '>']).split_whitespace();
+        words.next() == Some(axis) && line.contains("CSP")
+    })?;
+    let (_, numbers) = row.split_once("CSP")?;
+    numbers.split_whitespace().next()?.parse().ok()
+}
+
+#[test]
+fn a_machine_is_driven_from_a_terminal() {
+    let Some(tmux) = Tmux::new("") else { return };
+    tmux.says("x no power");
+    tmux.keys(&["e"]);
+    tmux.says("x holds");
+    // One key moves nothing; the second one in time does, and not for long.
+    tmux.keys(&["Right"]);
+    tmux.says("keep holding");
+    let before = position(&tmux.screen(), "x").expect("a position");
+    assert!(before.abs() < 0.01, "{before}");
+    tmux.keys(&["Right", "Right"]);
+    let screen = tmux.says("x: let go, brakes");
+    let after = tmux.shows(|s| s.contains("x holds"), "x holds");
+    let after = position(&after, "x").expect("a position");
+    assert!(after > 1.0, "{after}: {screen}");
+    // A position that is typed; and one that is out of reach.
+    tmux.keys(&["+", "m", "-", "1", "2", ".", "5"]);
+    tmux.says("move x to -12.5_ mm");
+    tmux.keys(&["Enter"]);
+    tmux.shows(|s| position(s, "x") == Some(-12.5), "x at -12.5");
+    tmux.keys(&["m", "6", "1", "Enter"]);
+    tmux.says("x: refused: position 61 is outside the range");
+    // A step of the other axis, which is enabled first.
+    tmux.keys(&["Down", "e"]);
+    tmux.says("y holds");
+    tmux.keys(&["."]);
+    tmux.shows(|s| position(s, "y") == Some(1.0), "y at 1");
+    // A long way, and a hand that slips.
+    tmux.keys(&["-", "-", "m", "5", "0", "Enter"]);
+    tmux.says("y moves to 50 mm");
+    tmux.keys(&["z"]);
+    tmux.says("y: stopped");
+    let screen = tmux.says("y holds");
+    let stopped = position(&screen, "y").expect("a position");
+    assert!((1.0..50.0).contains(&stopped), "{stopped}");
+    tmux.keys(&["x"]);
+    tmux.says("emergency stop");
+    tmux.keys(&["r"]);
+    tmux.says("has been reset");
+    tmux.keys(&["q"]);
+    tmux.left("0");
+}
+
+#[test]
+fn a_signal_ends_it_in_order() {
+    for signal in ["-TERM", "-HUP"] {
+        let Some(tmux) = Tmux::new("") else { return };
+        tmux.says("x no power");
+        tmux.keys(&["e"]);
+        tmux.says("x holds");
+        tmux.keys(&["m", "5", "0", "Enter"]);
+        tmux.says("x moves to 50 mm");
+        let kill = Command::new("kill").args([signal, &tmux.pid()]).status();
+        assert!(kill.expect("kill runs").success());
+        tmux.left("0");
+    }
+}
+
+#[test]
+fn leaving_before_the_bus_is_up_is_possible() {
+    let Some(tmux) = Tmux::new("") else { return };
+    tmux.says("EMERGENCY STOP");
+    tmux.keys(&["q"]);
+    tmux.left("0");
+}
+
+#[test]
+fn a_file_that_is_wrong_leaves_the_terminal_alone() {
+    let Some(tmux) = Tmux::new("--faults nowhere.toml") else {
+        return;
+    };
+    tmux.left("2");
+    let screen = tmux.screen();
+    assert!(screen.contains("cannot read nowhere.toml"), "{screen}");
+}
