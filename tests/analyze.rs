@@ -5,8 +5,13 @@
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
 mod common;
+#[path = "analyze/hostile.rs"]
+mod hostile;
+#[path = "analyze/replay.rs"]
+mod replay;
+#[path = "analyze/tshark.rs"]
+mod tshark;
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -14,8 +19,8 @@ use common::{axes, fixture, load, machine, root, run, run_well, virtual_time};
 use ecaxis::analyze::{self, Known, Report};
 use ecaxis::config::Machine;
 use ecaxis::recording::Reader;
-use ecaxis::session::{Options, Progress};
-use proptest::prelude::*;
+use ecaxis::recording::frame::{Content, Frame, content};
+use ecaxis::session::Options;
 
 const CAPTURES: [&str; 11] = [
     "ethercrab-dumps/rs-example-sii-el2004.ecat-only.pcapng",
@@ -98,243 +103,6 @@ fn the_story_of_every_capture() {
         }
     }
     assert!(differ.is_empty(), "{}", differ.join("\n"));
-}
-
-/// One datagram as tshark dissects it.
-struct Dissected {
-    at_ns: u64,
-    answer: bool,
-    command: u8,
-    /// Register, or logical address.
-    address: u32,
-    wkc: u16,
-    /// Of the frame.
-    source: String,
-}
-
-fn tshark(arguments: &[&str]) -> Option<String> {
-    let output = match Command::new("tshark").args(arguments).output() {
-        Ok(output) => output,
-        Err(error) => {
-            println!("skipped: tshark: {error}");
-            return None;
-        }
-    };
-    assert!(output.status.success(), "{}", text(&output.stderr));
-    Some(text(&output.stdout))
-}
-
-fn dissected(path: &Path) -> Option<Vec<Dissected>> {
-    let fields = [
-        "frame.time_epoch",
-        "eth.src",
-        "ecat.cmd",
-        "ecat.ado",
-        "ecat.lad",
-        "ecat.cnt",
-    ];
-    let mut arguments = vec!["-r", path.to_str()?, "-T", "fields", "-E", "separator=|"];
-    arguments.extend(fields.iter().flat_map(|field| ["-e", *field]));
-    let number = |text: &str| u32::from_str_radix(text.trim_start_matches("0x"), 16).expect("hex");
-    let mut found = Vec::new();
-    for line in tshark(&arguments)?.lines() {
-        let parts: Vec<&str> = line.split('|').collect();
-        let [time, source, commands, registers, logical, counters] = parts[..] else {
-            panic!("{line}");
-        };
-        let (seconds, fraction) = time.split_once('.').expect("a fraction");
-        let at_ns = seconds.parse::<u64>().expect("seconds") * 1_000_000_000
-            + format!("{fraction:0<9}")[..9]
-                .parse::<u64>()
-                .expect("nanoseconds");
-        let (mut registers, mut logical) = (registers.split(','), logical.split(','));
-        for (command, wkc) in commands.split(',').zip(counters.split(',')) {
-            let command = number(command) as u8;
-            let of = if (10..=12).contains(&command) {
-                &mut logical
-            } else {
-                &mut registers
-            };
-            found.push(Dissected {
-                at_ns,
-                answer: number(&source[..2]) & 2 != 0,
-                command,
-                address: number(of.next().expect("an address")),
-                wkc: wkc.parse().expect("a working counter"),
-                source: source.to_owned(),
-            });
-        }
-    }
-    Some(found)
-}
-
-/// Device count, states, SDO transfers, cycle time and working counters, by somebody else's dissector.
-#[test]
-fn every_capture_as_tshark_shows_it() {
-    for path in captures() {
-        let name = path.display();
-        let report = of_file(&path);
-        let Some(seen) = dissected(&path) else {
-            return;
-        };
-        // Frames: a datagram's time and source tell frames apart well enough where there is one at a time.
-        let sources: std::collections::BTreeSet<&str> = seen.iter().map(|d| &*d.source).collect();
-        assert!(sources.len() <= 2, "{name}: {sources:?}");
-
-        let broadcast = seen
-            .iter()
-            .filter(|d| d.answer && d.command == 7 && d.address < 0x10);
-        let expected = broadcast.map(|d| d.wkc).max();
-        assert_eq!(report.answering, expected, "{name}: devices");
-        if let Some(count) = expected {
-            assert_eq!(report.devices.len(), usize::from(count), "{name}: devices");
-        }
-
-        // Process data: how often, working counters, and the median interval.
-        let mut groups: BTreeMap<u32, (Vec<u64>, BTreeMap<u16, u64>)> = BTreeMap::new();
-        for d in seen.iter().filter(|d| (10..=12).contains(&d.command)) {
-            let group = groups.entry(d.address).or_default();
-            if d.answer {
-                *group.1.entry(d.wkc).or_default() += 1;
-            } else {
-                group.0.push(d.at_ns);
-            }
-        }
-        assert_eq!(report.cycle.len(), groups.len(), "{name}: process data");
-        for cycle in &report.cycle {
-            let (times, counters) = &groups[&cycle.logical_address];
-            assert_eq!(cycle.count, times.len() as u64, "{name}");
-            let expected: Vec<(u16, u64)> = counters.iter().map(|(w, n)| (*w, *n)).collect();
-            assert_eq!(cycle.wkc, expected, "{name}: working counters");
-            let mut intervals: Vec<u64> = times.windows(2).map(|w| w[1] - w[0]).collect();
-            intervals.sort_unstable();
-            let median = intervals[(intervals.len() - 1) / 2];
-            let off = cycle.cycle_ns.abs_diff(median) as f64 / median as f64;
-            assert!(off < 1e-3, "{name}: {} against {median}", cycle.cycle_ns);
-            assert!(
-                cycle.interval_max_ns.abs_diff(*intervals.last().unwrap()) < 2_000,
-                "{name}"
-            );
-        }
-        states_as_tshark(&path, &report);
-        transfers_as_tshark(&path, &report);
-    }
-}
-
-/// Every state that some device is seen in, by reads of AL status.
-fn states_as_tshark(path: &Path, report: &Report) {
-    let filter = "ecat.ado == 0x130 && (eth.src[0] & 2)";
-    let fields = [
-        "-e",
-        "ecat.cmd",
-        "-e",
-        "ecat.ado",
-        "-e",
-        "ecat.adp",
-        "-e",
-        "ecat.cnt",
-        "-e",
-        "ecat.reg.alstatus.status",
-    ];
-    let mut arguments = vec![
-        "-r",
-        path.to_str().unwrap(),
-        "-Y",
-        filter,
-        "-T",
-        "fields",
-        "-E",
-        "separator=|",
-    ];
-    arguments.extend(fields);
-    let mut expected: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
-    let number = |text: &str| u32::from_str_radix(text.trim_start_matches("0x"), 16).unwrap();
-    for line in tshark(&arguments).unwrap_or_default().lines() {
-        let parts: Vec<&str> = line.split('|').collect();
-        let [commands, registers, stations, counters, states] = parts[..] else {
-            panic!("{line}");
-        };
-        // Where every datagram is such a read, states belong to stations one by one.
-        let all = |list: &str, wanted: &str| list.split(',').all(|one| one == wanted);
-        if !all(commands, "0x04") || !all(registers, "0x0130") || !all(counters, "1") {
-            continue;
-        }
-        for (station, state) in stations.split(',').zip(states.split(',')) {
-            expected
-                .entry(number(station))
-                .or_default()
-                .push(number(state));
-        }
-    }
-    for (station, states) in expected {
-        let device = report
-            .devices
-            .iter()
-            .find(|d| d.station.map(u32::from) == Some(station));
-        let device = device.unwrap_or_else(|| panic!("{}: 0x{station:04x}", path.display()));
-        for state in states {
-            let name = match state & 0x0f {
-                1 => "Init",
-                2 => "PreOp",
-                4 => "SafeOp",
-                8 => "Op",
-                other => panic!("state {other}"),
-            };
-            assert!(
-                device.states.iter().any(|s| s == name),
-                "{}: {name} of {device:?}",
-                path.display()
-            );
-        }
-    }
-}
-
-/// Objects in the order in which they were asked for.
-fn transfers_as_tshark(path: &Path, report: &Report) {
-    // Initiating requests: downloads and uploads, but no segments.
-    let filter = "ecat_mailbox.coe.sdoccsid || ecat_mailbox.coe.sdoccsiu";
-    let both = format!("({filter}) && !(eth.src[0] & 2)");
-    let fields = [
-        "-e",
-        "ecat_mailbox.coe.sdoidx",
-        "-e",
-        "ecat_mailbox.coe.sdosub",
-        "-e",
-        "ecat_mailbox.coe.sdoreq",
-    ];
-    let mut arguments = vec![
-        "-r",
-        path.to_str().unwrap(),
-        "-Y",
-        &both,
-        "-T",
-        "fields",
-        "-E",
-        "separator=|",
-    ];
-    arguments.extend(fields);
-    let number = |text: &str| u32::from_str_radix(text.trim_start_matches("0x"), 16).unwrap();
-    let mut expected = Vec::new();
-    for line in tshark(&arguments).unwrap_or_default().lines() {
-        let parts: Vec<&str> = line.split('|').collect();
-        // 1: download, 2: upload.
-        expected.push((
-            number(parts[0]) as u16,
-            number(parts[1]) as u8,
-            parts[2] == "1",
-        ));
-    }
-    let found = report
-        .transfers
-        .iter()
-        .map(|t| (t.index, t.sub, t.write))
-        .collect::<Vec<_>>();
-    assert_eq!(found, expected, "{}", path.display());
-    assert!(
-        report.transfers.iter().all(|t| t.ended == "done"),
-        "{:?}",
-        report.transfers
-    );
 }
 
 #[test]
@@ -453,39 +221,163 @@ fn well_formed(html: &str) {
 #[test]
 fn faults_stand_out() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let path = folder.path().join("run.pcapng");
-    let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1s\"\ncount = 2\n\
-                  [[fault]]\nkind = \"drive-fault\"\nat = \"1500ms\"\ndevice = 1\ncode = 0x3210\n";
-    let options = Options {
-        record: Some(path.clone()),
-        ..common::faults(script)
+    let told = |script: &str| {
+        let path = folder.path().join("run.pcapng");
+        let options = Options {
+            record: Some(path.clone()),
+            ..common::faults(script)
+        };
+        let (outcome, _) = run(machine(&axes(2)), options);
+        assert!(outcome.result.is_err(), "a fault that stops the machine");
+        of_file(&path)
     };
-    let (outcome, _) = run(machine(&axes(2)), options);
-    assert!(outcome.result.is_err(), "a drive fault stops the machine");
-    let report = of_file(&path);
+    let report = told(
+        "[[fault]]\nkind = \"frame-loss\"\nat = \"1s\"\ncount = 2\n\
+         [[fault]]\nkind = \"drive-fault\"\nat = \"1500ms\"\ndevice = 1\ncode = 0x3210\n",
+    );
     assert_eq!(report.file.lost, 2, "{:?}", report.trouble);
-    let told = report.trouble.join("\n");
-    assert!(told.contains("2 frames of"), "{told}");
+    let all = report.trouble.join("\n");
+    assert!(all.contains("2 frames of"), "{all}");
+    assert!(all.contains("Fault reaction active"), "{all}");
     assert!(
-        told.contains("Fault") || told.contains("emergency 0x3210"),
-        "{told}"
+        !all.contains("interval"),
+        "a lost frame was sent in time:\n{all}"
     );
-    let emergencies: Vec<u64> = report.devices.iter().map(|d| d.emergencies).collect();
-    assert!(
-        report.axes[1]
+    let faulted = |n: usize| {
+        report.axes[n]
             .states
             .iter()
-            .any(|(_, state)| state == "Fault"),
+            .any(|(_, state)| state == "Fault")
+    };
+    assert!(faulted(1) && !faulted(0));
+
+    let report =
+        told("[[fault]]\nkind = \"refuse-state\"\ndevice = 0\nstate = \"safeop\"\ncode = 0x001e\n");
+    let first = &report.trouble[0];
+    assert!(
+        first.contains("PreOp with error 0x001e, invalid input configuration"),
+        "{first}"
+    );
+    assert_eq!(
+        (report.devices[0].al_error, report.devices[0].al_code),
+        (true, Some(0x1e))
+    );
+    assert!(!report.devices[1].al_error);
+    let path = folder.path().join("run.pcapng");
+    let page = text(&ecaxis(&[path.to_str().expect("UTF-8")]).stdout);
+    assert!(
+        page.contains("help: EPOS4, 0x001e: the length of the inputs'"),
+        "{page}"
+    );
+
+    let report = told(
+        "[[fault]]\nkind = \"sdo-abort\"\ndevice = 1\nindex = 0x6060\nsub = 0\ncode = 0x06090030\n",
+    );
+    let first = &report.trouble[0];
+    for part in [
+        "write 0x6060:00 (Modes of operation)",
+        "0x06090030, the value is out of range",
+    ] {
+        assert!(first.contains(part), "{:?}", report.trouble);
+    }
+    let failed = report
+        .transfers
+        .iter()
+        .find(|t| t.write && t.ended == "aborted");
+    let failed = failed.expect("the transfer");
+    assert_eq!(
+        (failed.device, failed.index, failed.code),
+        (1, 0x6060, Some(0x0609_0030))
+    );
+}
+
+/// A pcap of the packets that `keep` wants.
+fn filtered(bytes: &[u8], keep: impl Fn(&Frame) -> bool) -> Vec<u8> {
+    let mut reader = Reader::new(bytes);
+    let mut file = Vec::new();
+    for word in [0xa1b2_3c4d_u32, 0x0004_0002, 0, 0, 65_535, 1] {
+        file.extend(word.to_le_bytes());
+    }
+    while let Some(packet) = reader.next() {
+        let (at, data) = (packet.at.expect("a time"), packet.data.clone());
+        let Content::Frame(frame) = content(packet) else {
+            continue;
+        };
+        if keep(&frame) {
+            let len = u32::try_from(data.len()).expect("a frame");
+            let (seconds, nanos) = (at / 1_000_000_000, at % 1_000_000_000);
+            for word in [seconds as u32, nanos as u32, len, len] {
+                file.extend(word.to_le_bytes());
+            }
+            file.extend(data);
+        }
+    }
+    file
+}
+
+/// A recording that lacks the start-up SDOs does not show what PDOs carry.
+#[test]
+fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let once = Options {
+        repeat: Some(1),
+        ..virtual_time()
+    };
+    let path = recorded(folder.path(), load("demo.toml"), once);
+    let bytes = std::fs::read(path).expect("the recording");
+    let mailbox = |frame: &Frame| {
+        frame
+            .datagrams
+            .iter()
+            .any(|d| !d.command.is_logical() && d.ado() >= 0x1000)
+    };
+    let without = filtered(&bytes, |frame| !mailbox(frame));
+    let alone = analyzed(&without, Known::default());
+    assert!(alone.transfers.is_empty() && alone.axes.is_empty());
+    let whole = analyzed(&bytes, Known::default());
+    let known = Known::default().with_machine(&load("demo.toml"));
+    let report = analyzed(&without, known);
+    let moved = |report: &Report| -> Vec<_> {
+        report
+            .axes
+            .iter()
+            .map(|a| (a.cycles, a.states.clone()))
+            .collect()
+    };
+    assert_eq!(moved(&report), moved(&whole));
+    let library = analyze::library(&root().join("configs/esi")).expect("our ESI files");
+    let by_esi = analyzed(&without, Known::default().with_library(library));
+    let names: Vec<_> = by_esi
+        .devices
+        .iter()
+        .filter_map(|d| d.name.as_deref())
+        .collect();
+    assert_eq!(names, ["EPOS4", "IDX"]);
+
+    // Each direction alone still tells its part.
+    let answers = analyzed(
+        &filtered(&bytes, |frame| frame.source[0] & 2 != 0),
+        Known::default(),
+    );
+    assert_eq!(
+        (answers.file.sent, answers.file.without_request),
+        (0, whole.file.answered)
+    );
+    let stations =
+        |report: &Report| -> Vec<_> { report.devices.iter().map(|d| d.station).collect() };
+    assert_eq!(stations(&answers), stations(&whole));
+    assert_eq!(answers.transfers.len(), whole.transfers.len());
+    assert_eq!(answers.cycle[0].wkc, whole.cycle[0].wkc);
+    let requests = analyzed(
+        &filtered(&bytes, |frame| frame.source[0] & 2 == 0),
+        Known::default(),
+    );
+    assert!(
+        requests.trouble[0].contains("no frame came back"),
         "{:?}",
-        report.axes[1].states
+        requests.trouble
     );
-    assert!(
-        report.axes[0]
-            .states
-            .iter()
-            .all(|(_, state)| state != "Fault")
-    );
-    println!("emergencies {emergencies:?}\n{told}");
+    assert_eq!(requests.cycle[0].count, whole.cycle[0].count);
 }
 
 #[test]
@@ -549,206 +441,4 @@ fn parts_of_a_recording_are_one() {
     );
     let lost = json["file"]["lost"].as_u64().expect("a number");
     assert_eq!(lost, 0, "what the gap cut off is not lost");
-}
-
-// A recording in the place of a bus.
-
-fn moved(options: Options) -> (String, Vec<String>) {
-    let (outcome, heard) = run(load("demo.toml"), options);
-    if let Err(error) = outcome.result {
-        panic!("{error}; {:?}", heard.warnings());
-    }
-    let mut summary = serde_json::to_value(outcome.summary.expect("a summary")).expect("JSON");
-    // Of the recording itself.
-    for key in ["recorded_frames", "recorded_frames_dropped"] {
-        summary.as_object_mut().expect("an object").remove(key);
-    }
-    let told = heard
-        .0
-        .iter()
-        .filter(|progress| !matches!(progress, Progress::Status(_)));
-    (
-        summary.to_string(),
-        told.map(|progress| format!("{progress:?}")).collect(),
-    )
-}
-
-#[test]
-fn a_replayed_run_has_the_same_outcome() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let path = folder.path().join("run.pcapng");
-    let once = Options {
-        repeat: Some(1),
-        ..virtual_time()
-    };
-    let first = moved(Options {
-        record: Some(path.clone()),
-        ..once.clone()
-    });
-    // Recorded again, the replay has the same bytes at the same times.
-    let again = folder.path().join("again.pcapng");
-    let second = moved(Options {
-        replay: Some(path.clone()),
-        record: Some(again.clone()),
-        ..once
-    });
-    assert_eq!(first, second);
-    assert!(
-        std::fs::read(path).expect("a recording") == std::fs::read(again).expect("a recording")
-    );
-}
-
-#[test]
-fn a_run_that_deviates_is_told_where() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let once = Options {
-        repeat: Some(1),
-        ..virtual_time()
-    };
-    let path = recorded(folder.path(), load("demo.toml"), once.clone());
-    let replay = || Options {
-        replay: Some(path.clone()),
-        ..once.clone()
-    };
-    // Another target: the same frames with other set-points. Axes that do not obey are noticed.
-    let text =
-        std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demonstration");
-    let other = machine(&text.replace("x = 50.0, y = 50.0", "x = 40.0, y = 50.0"));
-    let (outcome, heard) = run(other, replay());
-    assert!(outcome.result.is_err());
-    let told = heard.warnings().join("\n");
-    assert!(
-        told.contains("of the data is 0x") && told.contains("frame "),
-        "{told}"
-    );
-    // More devices than were there: the recording ends, or has something else; nothing hangs.
-    let (outcome, heard) = run(machine(&axes(3)), replay());
-    let error = outcome
-        .result
-        .expect_err("the recording has two devices")
-        .to_string();
-    let told = heard.warnings().join("\n");
-    assert!(told.contains("recording"), "{error}\n{told}");
-    // A recording without answers is none.
-    let empty = folder.path().join("empty.pcapng");
-    std::fs::write(&empty, b"\n\r\r\n").expect("written");
-    let (outcome, _) = run(
-        load("demo.toml"),
-        Options {
-            replay: Some(empty),
-            ..once
-        },
-    );
-    assert!(
-        outcome
-            .result
-            .expect_err("refused")
-            .to_string()
-            .contains("the replay"),
-        "says what"
-    );
-}
-
-// Nothing that is in a file may be more than a remark.
-
-/// The first part of a run, configuration and some cycles.
-fn sample() -> &'static [u8] {
-    static SAMPLE: std::sync::OnceLock<Vec<u8>> = std::sync::OnceLock::new();
-    SAMPLE.get_or_init(|| {
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let options = Options {
-            repeat: Some(1),
-            ..virtual_time()
-        };
-        let path = recorded(folder.path(), machine(&axes(1)), options);
-        let mut bytes = std::fs::read(path).expect("the recording");
-        bytes.truncate(120_000);
-        bytes
-    })
-}
-
-fn survives(bytes: &[u8]) {
-    let report = analyzed(bytes, Known::default());
-    well_formed(&analyze::html("x", &report));
-    serde_json::to_string(&report).expect("JSON");
-}
-
-#[test]
-fn every_capture_cut_anywhere() {
-    let mut tried = 0;
-    for path in captures() {
-        let bytes = std::fs::read(&path).expect("readable");
-        let whole = of_file(&path);
-        // Every byte of short ones and of the ends, some of the others.
-        let step = if bytes.len() < 2_000 {
-            1
-        } else {
-            bytes.len() / 60
-        };
-        let ends = (0..bytes.len())
-            .step_by(step)
-            .chain(bytes.len() - 120..bytes.len());
-        for end in ends {
-            let report = analyzed(&bytes[..end], Known::default());
-            assert!(report.file.ethercat_frames <= whole.file.ethercat_frames);
-            assert!(report.devices.len() <= whole.devices.len(), "cut at {end}");
-            tried += 1;
-        }
-    }
-    println!("{tried} cuts");
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(96))]
-
-    #[test]
-    fn damage_is_a_remark(
-        cut in 0_usize..120_000,
-        flips in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..60),
-        noise in prop::collection::vec(any::<u8>(), 0..300),
-        at in any::<prop::sample::Index>(),
-    ) {
-        let mut bytes = sample().to_vec();
-        bytes.truncate(cut.max(100));
-        for (place, value) in flips {
-            let place = place.index(bytes.len());
-            bytes[place] = value;
-        }
-        let at = at.index(bytes.len());
-        bytes.splice(at..at, noise);
-        survives(&bytes);
-    }
-
-    /// Sound files with hostile frames: what is inside is noise.
-    #[test]
-    fn hostile_frames(seed in prop::collection::vec(any::<(u8, u16, u16, Vec<u8>, u16)>(), 1..40)) {
-        let mut file = Vec::new();
-        for word in [0xa1b2_3c4d_u32, 0x0004_0002, 0, 0, 65_535, 1] {
-            file.extend(word.to_le_bytes());
-        }
-        for (n, (command, adp, ado, data, wkc)) in seed.iter().enumerate() {
-            for way in [0x10_u8, 0x12] {
-                let data = &data[..data.len().min(200)];
-                let len = data.len() as u16;
-                let mut frame = vec![0xff; 6];
-                frame.extend([way, 1, 1, 1, 1, 1, 0x88, 0xa4]);
-                frame.extend((0x1000 | (len + 12)).to_le_bytes());
-                // Registers and mailboxes that mean something are met more often than not.
-                let ado = [0x10, 0x120, 0x130, 0x502, 0x508, 0x600, 0x800, 0x910, 0x92c, 0x1000, 0x1800, *ado];
-                frame.extend([command % 16, n as u8]);
-                frame.extend((adp % 4).to_le_bytes());
-                frame.extend(ado[usize::from(*wkc) % ado.len()].to_le_bytes());
-                frame.extend(len.to_le_bytes());
-                frame.extend([0, 0]);
-                frame.extend(data);
-                frame.extend(if way == 0x10 { 0 } else { wkc % 4 }.to_le_bytes());
-                let kept = frame.len() as u32;
-                for word in [1, n as u32 * 1000, kept, kept] {
-                    file.extend(word.to_le_bytes());
-                }
-                file.extend(frame);
-            }
-        }
-        survives(&file);
-    }
 }

@@ -67,7 +67,7 @@ impl What {
     /// Belongs on the page, not only into the log.
     pub fn matters(&self) -> bool {
         match self {
-            Self::Transfer(transfer) => transfer.ended != Ended::Done,
+            Self::Transfer(transfer) => transfer.is_trouble(),
             Self::Station(_) | Self::Code(_) => false,
             _ => true,
         }
@@ -77,7 +77,7 @@ impl What {
     pub fn is_trouble(&self) -> bool {
         match self {
             Self::State { error, .. } => *error,
-            Self::Transfer(transfer) => transfer.ended != Ended::Done,
+            Self::Transfer(transfer) => transfer.is_trouble(),
             Self::Emergency(emergency) => !emergency.is_reset(),
             Self::File(file) => file.error.is_some(),
             Self::Refused(_) => true,

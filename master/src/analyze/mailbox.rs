@@ -55,6 +55,25 @@ pub struct Transfer {
     pub ended: Ended,
 }
 
+impl Transfer {
+    /// Asked for an object that is not there: how one finds out what a device has.
+    pub fn is_absent(&self) -> bool {
+        let absent = matches!(
+            self.ended,
+            Ended::Aborted {
+                code: 0x0602_0000 | 0x0609_0011,
+                ..
+            }
+        );
+        absent && self.way == Way::Read
+    }
+
+    /// Did not end as it should.
+    pub fn is_trouble(&self) -> bool {
+        self.ended != Ended::Done && !self.is_absent()
+    }
+}
+
 /// A file over FoE.
 #[derive(Debug, Clone)]
 pub struct FileTransfer {

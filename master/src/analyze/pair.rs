@@ -1,6 +1,6 @@
 //! Which answer belongs to which request. A recording may show both, one of them, or begin in between.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::hash::{DefaultHasher, Hash, Hasher};
 
 use crate::recording::Direction;
@@ -87,18 +87,30 @@ impl Exchange {
     }
 }
 
-/// Pairs frames. Exchanges come out when their answer does, or when there will be none.
+/// Pairs frames. Exchanges come out in the order in which they were sent: one that waits for its answer holds up the later ones.
 #[derive(Debug, Default)]
 pub struct Pairing {
     ahead: VecDeque<Frame>,
     /// Source addresses without the bit that SubDevices set.
     senders: HashSet<[u8; 6]>,
-    under_way: VecDeque<(u64, Frame)>,
+    /// Of addresses with that bit: answers without a request, and with one.
+    answers: HashMap<[u8; 6], (u64, u64)>,
+    under_way: VecDeque<Waiting>,
     latest: u64,
     longest_round_trip: u64,
     answered: bool,
     done: VecDeque<Exchange>,
 }
+
+#[derive(Debug)]
+struct Waiting {
+    key: u64,
+    sent: Option<Frame>,
+    back: Option<Frame>,
+}
+
+/// So many answers and no request: the recording shows answers only, also where nobody did what they say.
+const ONE_SIDED: u64 = 4;
 
 /// Bit 1 of the first byte is set by the first SubDevice that a frame passes.
 const PASSED: u8 = 0x02;
@@ -150,64 +162,76 @@ impl Pairing {
             self.judge(frame);
         }
         // Sent so shortly before the end that its answer cannot have been recorded.
-        let end = self.latest.saturating_sub(2 * self.longest_round_trip);
-        for (_, frame) in std::mem::take(&mut self.under_way) {
-            let open = self.answered && frame.at >= end;
-            self.done.push_back(Exchange {
-                sent: Some(frame),
-                back: None,
-                open,
-            });
+        let end = self
+            .latest
+            .saturating_sub(self.longest_round_trip.saturating_mul(2));
+        for Waiting { sent, back, .. } in std::mem::take(&mut self.under_way) {
+            let late = sent.as_ref().is_some_and(|frame| frame.at >= end);
+            let open = self.answered && late && back.is_none();
+            self.done.push_back(Exchange { sent, back, open });
         }
     }
 
     fn judge(&mut self, frame: Frame) {
         self.latest = self.latest.max(frame.at);
-        self.give_up();
         let key = key(&frame);
-        let mine = self.under_way.iter().rposition(|(other, _)| *other == key);
-        if self.is_answer(&frame, mine.is_some()) {
-            let sent = mine
-                .and_then(|n| self.under_way.remove(n))
-                .map(|(_, frame)| frame);
-            if let Some(sent) = &sent {
-                let took = frame.at.saturating_sub(sent.at);
-                self.longest_round_trip = self.longest_round_trip.max(took);
-                self.answered = true;
-            }
-            self.done.push_back(Exchange {
-                sent,
-                back: Some(frame),
-                open: false,
-            });
-        } else {
-            self.under_way.push_back((key, frame));
-        }
-    }
-
-    fn is_answer(&self, frame: &Frame, awaited: bool) -> bool {
-        if frame.source[0] & PASSED == 0 {
-            return false;
-        }
+        let mut waiting = self.under_way.iter_mut().rev();
+        let mine = waiting.find(|other| other.key == key && other.back.is_none());
+        let awaited = mine.is_some();
+        let seen = self.answers.get(&frame.source).copied().unwrap_or_default();
+        let passed = frame.source[0] & PASSED != 0;
+        let worked = frame.datagrams.iter().any(|datagram| datagram.wkc > 0);
         // A MainDevice whose own address has the bit is told by what the recording says, or by what came before.
-        self.senders.contains(&sender(frame.source))
-            || match frame.direction {
-                Some(direction) => direction == Direction::In,
-                None => awaited || frame.datagrams.iter().any(|datagram| datagram.wkc > 0),
+        let is_answer = passed
+            && (self.senders.contains(&sender(frame.source))
+                || match frame.direction {
+                    Some(direction) => direction == Direction::In,
+                    None => awaited || worked || seen.0 >= ONE_SIDED && seen.1 == 0,
+                });
+        if is_answer {
+            if self.answers.len() < SOURCES || self.answers.contains_key(&frame.source) {
+                let (alone, paired) = self.answers.entry(frame.source).or_default();
+                *alone += u64::from(!awaited);
+                *paired += u64::from(awaited);
             }
+            self.answered = true;
+            if let Some(mine) = mine {
+                let sent_at = mine.sent.as_ref().map_or(frame.at, |sent| sent.at);
+                let took = frame.at.saturating_sub(sent_at);
+                self.longest_round_trip = self.longest_round_trip.max(took);
+                mine.back = Some(frame);
+            } else {
+                self.under_way.push_back(Waiting {
+                    key,
+                    sent: None,
+                    back: Some(frame),
+                });
+            }
+        } else {
+            self.under_way.push_back(Waiting {
+                key,
+                sent: Some(frame),
+                back: None,
+            });
+        }
+        self.give_up();
     }
 
+    /// Lets go what is complete, or has waited for too long.
     fn give_up(&mut self) {
-        while let Some((_, frame)) = self.under_way.front()
-            && (self.latest.saturating_sub(frame.at) > PATIENCE_NS
-                || self.under_way.len() > UNDER_WAY)
-        {
-            let sent = self.under_way.pop_front().map(|(_, frame)| frame);
-            self.done.push_back(Exchange {
-                sent,
-                back: None,
-                open: false,
-            });
+        while let Some(first) = self.under_way.front() {
+            let waits = |sent: &Frame| self.latest.saturating_sub(sent.at) <= PATIENCE_NS;
+            if first.back.is_none()
+                && first.sent.as_ref().is_some_and(waits)
+                && self.under_way.len() <= UNDER_WAY
+            {
+                break;
+            }
+            let Some(Waiting { sent, back, .. }) = self.under_way.pop_front() else {
+                break;
+            };
+            let open = false;
+            self.done.push_back(Exchange { sent, back, open });
         }
     }
 }

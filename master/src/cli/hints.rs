@@ -64,6 +64,11 @@ impl Failure {
     }
 }
 
+/// What to look at for an emergency's code, as for 0x603F.
+pub(crate) fn emergency(code: u16) -> &'static str {
+    describe(code).hint
+}
+
 /// A recording that shows nothing of a bus.
 pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
     failure.hint(if one_interface {
@@ -385,7 +390,7 @@ fn state(error: &StateError) -> String {
 }
 
 /// What to look at for an AL status code (ETG.1020).
-fn al_status(code: u16) -> &'static str {
+pub(crate) fn al_status(code: u16) -> &'static str {
     al_status_hint(code).unwrap_or("look the code up in the device's manual")
 }
 

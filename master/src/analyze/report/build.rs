@@ -197,6 +197,8 @@ fn device_report<'e>(
         writes: 0,
         failed_transfers: 0,
         emergencies: 0,
+        al_errors: Vec::new(),
+        emergency_codes: Vec::new(),
     };
     for event in events {
         match &event.what {
@@ -207,11 +209,33 @@ fn device_report<'e>(
                 }
                 report.failed_transfers += u64::from(transfer.ended != Ended::Done);
             }
-            What::Emergency(_) => report.emergencies += 1,
+            What::Emergency(emergency) => {
+                report.emergencies += 1;
+                if !emergency.is_reset() {
+                    once(&mut report.emergency_codes, emergency.code);
+                }
+            }
+            What::State {
+                code: Some(code), ..
+            }
+            | What::Code(code)
+                if *code != 0 =>
+            {
+                once(&mut report.al_errors, *code);
+            }
             _ => {}
         }
     }
     report
+}
+
+/// Codes of one kind that a device is told to have had.
+const CODES: usize = 16;
+
+fn once(codes: &mut Vec<u16>, code: u16) {
+    if !codes.contains(&code) && codes.len() < CODES {
+        codes.push(code);
+    }
 }
 
 /// Error counters from 0x0300 on.

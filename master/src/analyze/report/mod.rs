@@ -84,6 +84,9 @@ pub struct DeviceReport {
     pub writes: u64,
     pub failed_transfers: u64,
     pub emergencies: u64,
+    /// AL status codes of errors, and codes of emergencies, each once and in the order in which they came first.
+    pub al_errors: Vec<u16>,
+    pub emergency_codes: Vec<u16>,
 }
 
 #[derive(Debug, Serialize)]

@@ -28,17 +28,6 @@ pub(super) fn of(report: &Report) -> Vec<String> {
         );
     }
     story(report, &mut found);
-    let failed: u64 = report
-        .devices
-        .iter()
-        .map(|device| device.failed_transfers)
-        .sum();
-    if failed > 0 {
-        found.push(format!(
-            "{} refused or not answered",
-            plural(failed, "SDO transfer was", "SDO transfers were")
-        ));
-    }
     if file.lost > 0 && file.answered > 0 {
         found.push(format!(
             "{} of {} sent did not come back",
@@ -109,13 +98,9 @@ fn odd(cycle: &CycleReport) -> (u64, f64) {
     (count, odd.first().map_or(0.0, |run| run.at))
 }
 
-/// AL errors, emergencies and faults, as they were told first.
+/// AL errors, refused transfers, emergencies and faults, as they were told first.
 fn story(report: &Report, found: &mut Vec<String>) {
-    let troubles = report.story.iter().filter(|line| line.trouble);
-    // Transfers are counted beside.
-    let troubles: Vec<_> = troubles
-        .filter(|line| !line.text.starts_with("read ") && !line.text.starts_with("write "))
-        .collect();
+    let troubles: Vec<_> = report.story.iter().filter(|line| line.trouble).collect();
     for line in troubles.iter().take(LINES) {
         let names = line
             .devices

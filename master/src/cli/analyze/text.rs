@@ -2,6 +2,7 @@
 
 use ecaxis::analyze::{CycleReport, DeviceReport, Line, Report, called, highest, time};
 
+use super::super::hints;
 use super::super::table::Table;
 
 /// Columns of a line.
@@ -26,6 +27,7 @@ pub(super) fn page(name: &str, report: &Report, all: bool) -> String {
     for line in &report.trouble {
         out += &item("- ", line);
     }
+    help(report, &mut out);
     devices(report, all, &mut out);
     story(report, all, &mut out);
     transfers(report, all, &mut out);
@@ -113,6 +115,26 @@ fn utc(nanos: u64) -> String {
         rest / 60 % 60,
         rest % 60
     )
+}
+
+/// What to look at for each code.
+fn help(report: &Report, out: &mut String) {
+    for (place, device) in report.devices.iter().enumerate() {
+        let states = device
+            .al_errors
+            .iter()
+            .map(|code| (*code, hints::al_status(*code)));
+        let emergencies = device
+            .emergency_codes
+            .iter()
+            .map(|code| (*code, hints::emergency(*code)));
+        for (code, hint) in states.chain(emergencies) {
+            *out += &item(
+                "help: ",
+                &format!("{}, {code:#06x}: {hint}", called(place, device)),
+            );
+        }
+    }
 }
 
 fn hex(value: Option<u32>) -> String {

@@ -1,0 +1,102 @@
+//! A recording in the place of a bus.
+
+use ecaxis::session::{Options, Progress};
+
+use super::common::{axes, load, machine, root, run, virtual_time};
+use super::recorded;
+
+fn moved(options: Options) -> (String, Vec<String>) {
+    let (outcome, heard) = run(load("demo.toml"), options);
+    if let Err(error) = outcome.result {
+        panic!("{error}; {:?}", heard.warnings());
+    }
+    let mut summary = serde_json::to_value(outcome.summary.expect("a summary")).expect("JSON");
+    // Of the recording itself.
+    for key in ["recorded_frames", "recorded_frames_dropped"] {
+        summary.as_object_mut().expect("an object").remove(key);
+    }
+    let told = heard
+        .0
+        .iter()
+        .filter(|progress| !matches!(progress, Progress::Status(_)));
+    (
+        summary.to_string(),
+        told.map(|progress| format!("{progress:?}")).collect(),
+    )
+}
+
+#[test]
+fn a_replayed_run_has_the_same_outcome() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("run.pcapng");
+    let once = Options {
+        repeat: Some(1),
+        ..virtual_time()
+    };
+    let first = moved(Options {
+        record: Some(path.clone()),
+        ..once.clone()
+    });
+    // Recorded again, the replay has the same bytes at the same times.
+    let again = folder.path().join("again.pcapng");
+    let second = moved(Options {
+        replay: Some(path.clone()),
+        record: Some(again.clone()),
+        ..once
+    });
+    assert_eq!(first, second);
+    assert!(
+        std::fs::read(path).expect("a recording") == std::fs::read(again).expect("a recording")
+    );
+}
+
+#[test]
+fn a_run_that_deviates_is_told_where() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let once = Options {
+        repeat: Some(1),
+        ..virtual_time()
+    };
+    let path = recorded(folder.path(), load("demo.toml"), once.clone());
+    let replay = || Options {
+        replay: Some(path.clone()),
+        ..once.clone()
+    };
+    // Another target: the same frames with other set-points. Axes that do not obey are noticed.
+    let text =
+        std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demonstration");
+    let other = machine(&text.replace("x = 50.0, y = 50.0", "x = 40.0, y = 50.0"));
+    let (outcome, heard) = run(other, replay());
+    assert!(outcome.result.is_err());
+    let told = heard.warnings().join("\n");
+    assert!(
+        told.contains("of the data is 0x") && told.contains("frame "),
+        "{told}"
+    );
+    // More devices than were there: the recording ends, or has something else; nothing hangs.
+    let (outcome, heard) = run(machine(&axes(3)), replay());
+    let error = outcome
+        .result
+        .expect_err("the recording has two devices")
+        .to_string();
+    let told = heard.warnings().join("\n");
+    assert!(told.contains("recording"), "{error}\n{told}");
+    // A recording without answers is none.
+    let empty = folder.path().join("empty.pcapng");
+    std::fs::write(&empty, b"\n\r\r\n").expect("written");
+    let (outcome, _) = run(
+        load("demo.toml"),
+        Options {
+            replay: Some(empty),
+            ..once
+        },
+    );
+    assert!(
+        outcome
+            .result
+            .expect_err("refused")
+            .to_string()
+            .contains("the replay"),
+        "says what"
+    );
+}
