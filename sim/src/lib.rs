@@ -10,6 +10,7 @@
 //! * [`device`]: the controller and the application behind it: state machine, mailbox, process data
 //! * [`coe`]: object dictionary, SDO server, SDO Information
 //! * [`foe`]: a device's files
+//! * [`firmware`]: its program memory and its boot loader
 //! * [`drive`]: a CiA 402 drive down to the motor shaft
 //! * [`gateway`]: a CANopen gateway and the network behind it
 //! * [`faults`]: what goes wrong on purpose
@@ -21,6 +22,7 @@ pub mod device;
 pub mod drive;
 pub mod esc;
 pub mod faults;
+pub mod firmware;
 pub mod foe;
 pub mod frame;
 pub mod gateway;
@@ -34,6 +36,7 @@ pub use esc::al::AlState;
 pub use esc::info::EscInfo;
 pub use esc::ports::Medium;
 pub use faults::{FaultReport, FaultScript, ScriptError};
+pub use firmware::{FirmwareHeader, FirmwareOptions};
 pub use foe::{FileStore, FoeOptions};
 pub use network::topology::{SecondPort, Topology, TopologyError, Uplink, Wish};
 pub use network::{Nic, Segment, SegmentOptions, Transit};

@@ -2,6 +2,7 @@
 //! services survive as [`Message::Other`]. Only a message that contradicts itself is a [`Flaw`].
 
 use super::emergency::Emergency;
+use super::port::Emit;
 
 /// Mailbox header (ETG.1000.4 Table 29): length, address, channel and priority, type and counter.
 pub(super) const MAILBOX_HEADER: usize = 6;
@@ -14,7 +15,7 @@ const SEGMENT_MIN: usize = 7;
 /// Shortest mailbox that holds an expedited transfer and a segment.
 pub(super) const MAILBOX_MIN: u16 = 16;
 
-const TYPE_ERROR: u8 = 0;
+pub(super) const TYPE_ERROR: u8 = 0;
 const TYPE_COE: u8 = 3;
 
 const SERVICE_EMERGENCY: u16 = 1;
@@ -77,10 +78,8 @@ pub(super) enum Request<'a> {
     },
 }
 
-impl Request<'_> {
-    /// Writes the message over `out` and pads it to `mailbox` bytes: a SyncManager hands a mailbox over when its last
-    /// byte is written.
-    pub(super) fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>) {
+impl Emit for Request<'_> {
+    fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>) {
         out.clear();
         out.extend_from_slice(&[0, 0, 0, 0, 0, TYPE_COE | counter << 4]);
         let service = match self {
@@ -214,12 +213,14 @@ pub(super) enum Flaw {
     Oversized { length: usize, room: usize },
     #[error("{what} of {length} bytes is too short")]
     Short { what: &'static str, length: usize },
+    #[error("FoE opcode {0} is none that a SubDevice sends")]
+    Opcode(u8),
     #[error("SDO command {0:#04x} is none")]
     Command(u8),
 }
 
-/// Reads one whole mailbox.
-pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
+/// Type and contents of one whole mailbox.
+pub(super) fn open(mailbox: &[u8]) -> Result<(u8, &[u8]), Flaw> {
     let [len_low, len_high, _, _, _, kind, body @ ..] = mailbox else {
         return Err(Flaw::Short {
             what: "a mailbox",
@@ -233,16 +234,26 @@ pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
             room: body.len(),
         });
     };
-    match kind & 0x0f {
-        TYPE_COE => parse_coe(body),
-        TYPE_ERROR => match body {
-            [_, _, low, high, ..] => Ok(Message::Refused(u16::from_le_bytes([*low, *high]))),
-            _ => Err(Flaw::Short {
-                what: "a mailbox error",
-                length,
-            }),
-        },
+    Ok((kind & 0x0f, body))
+}
+
+/// Reads one whole mailbox.
+pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
+    match open(mailbox)? {
+        (TYPE_COE, body) => parse_coe(body),
+        (TYPE_ERROR, body) => refused(body).map(Message::Refused),
         _ => Ok(Message::Other),
+    }
+}
+
+/// The code of a mailbox error (ETG.1000.4 Table 30).
+pub(super) fn refused(body: &[u8]) -> Result<u16, Flaw> {
+    match body {
+        [_, _, low, high, ..] => Ok(u16::from_le_bytes([*low, *high])),
+        _ => Err(Flaw::Short {
+            what: "a mailbox error",
+            length: body.len(),
+        }),
     }
 }
 

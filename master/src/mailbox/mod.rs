@@ -1,10 +1,11 @@
-//! CoE over raw datagrams, beside the cyclic loop. May wait and allocate; never panics on what a device sends.
+//! CoE and FoE over raw datagrams, beside the cyclic loop. May wait and allocate; never panics on what a device sends.
 //!
 //! - [`Wire`]: the two datagrams, the delay and the clock that everything here is made of.
 //! - `port`: the mailbox SyncManagers: taking turns, lost answers, emergencies in between.
 //! - `coe`: the bytes of mailbox, CoE and SDO headers (ETG.1000.4, ETG.1000.6).
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
 //! - `info`: what objects a device has, as it says itself (SDO Information).
+//! - [`foe`]: [`FoeClient`], files.
 //! - `error`, `abort`, `emergency`, `objects`: what is said when something goes wrong.
 
 use std::time::Duration;
@@ -13,6 +14,7 @@ mod abort;
 mod coe;
 mod emergency;
 mod error;
+pub mod foe;
 mod info;
 mod objects;
 mod port;
@@ -24,6 +26,7 @@ mod transfer;
 pub use abort::{abort_text, mailbox_error_text};
 pub use emergency::{EMERGENCY_QUEUE, Emergency};
 pub use error::{Phase, SdoError};
+pub use foe::{FoeClient, FoeError};
 pub use info::{Asked, EntryDescription, InfoError, ObjectDescription, ObjectList};
 pub use objects::{ObjectAddress, object_name};
 pub use sdo::{CoeClient, MAX_OBJECT};

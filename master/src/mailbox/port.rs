@@ -4,7 +4,7 @@
 use std::mem;
 use std::time::Duration;
 
-use super::coe::{MAILBOX_MIN, Message, Request, parse};
+use super::coe::{MAILBOX_MIN, Message, parse};
 use super::emergency::Emergencies;
 use super::error::Phase;
 use super::{MailboxLayout, Timeouts, Wire, WireError};
@@ -29,12 +29,19 @@ const REPEATS: u32 = 3;
 const POLL_MIN: Duration = Duration::from_micros(200);
 const POLL_MAX: Duration = Duration::from_millis(2);
 
+/// A message for a SubDevice.
+pub(super) trait Emit {
+    /// Writes the message over `out` and pads it to `mailbox` bytes: a SyncManager hands a mailbox over when its last
+    /// byte is written.
+    fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>);
+}
+
 #[derive(Debug)]
 pub(super) enum Trouble {
     Timeout(Phase),
     Gone,
     Wire(WireError),
-    /// The configured mailboxes cannot carry CoE.
+    /// The configured mailboxes cannot carry messages.
     Layout,
 }
 
@@ -115,7 +122,7 @@ impl Port {
     pub(super) async fn send<W: Wire>(
         &mut self,
         w: &W,
-        request: &Request<'_>,
+        request: &impl Emit,
     ) -> Result<(), Trouble> {
         self.counter = self.counter % 7 + 1;
         request.emit(self.counter, self.layout.out_len, &mut self.outgoing);

@@ -7,6 +7,7 @@ use super::store::{Item, ObjectStore, Slot};
 use super::{Abort, datatype};
 use crate::coe::datatype::Kind;
 use crate::esc::al::AlState;
+use crate::firmware::Processor;
 
 const STORE_PARAMETERS: u16 = 0x1010;
 const RESTORE_PARAMETERS: u16 = 0x1011;
@@ -35,6 +36,8 @@ pub(crate) struct Dictionary<'a> {
     /// Writes that are confirmed and change nothing: index, subindex.
     pub(crate) ignored: &'a [(u16, u8)],
     pub(crate) command: Option<ParameterCommand>,
+    /// Which serves the objects of its program itself.
+    pub(crate) processor: Option<&'a mut Processor>,
 }
 
 /// What complete access carries at most; no device has longer objects, and an ESI may place an item anywhere.
@@ -151,7 +154,10 @@ impl Dictionary<'_> {
         }
         let (_, item) = self.find(index, sub)?;
         self.check_access(item)?;
-        Ok(item.bit_len.div_ceil(8) as usize)
+        match &self.processor {
+            Some(processor) if processor.serves(index, sub) => processor.capacity(index),
+            _ => Ok(item.bit_len.div_ceil(8) as usize),
+        }
     }
 
     pub(crate) fn write(
@@ -169,8 +175,14 @@ impl Dictionary<'_> {
     }
 
     fn write_item(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
-        let (slot, item) = self.find(index, sub)?;
+        let (_, item) = self.find(index, sub)?;
         self.check_access(item)?;
+        if let Some(processor) = &mut self.processor
+            && processor.serves(index, sub)
+        {
+            return processor.write(index, data, self.state);
+        }
+        let (slot, item) = self.find(index, sub)?;
         let len = item.bit_len.div_ceil(8) as usize;
         if data.len() > len {
             return Err(Abort::TOO_LONG);

@@ -17,6 +17,7 @@ use crate::esc::info::Needs;
 use crate::esc::ports::Medium;
 use crate::esc::registers::{ADDRESS_SPACE, PROCESS_RAM};
 use crate::esc::{Esc, EscConfig, EscInfo};
+use crate::firmware::{FirmwareOptions, Processor};
 use crate::foe::FileStore;
 use crate::gateway::{Gateway, GatewayError, GatewayOptions};
 
@@ -52,6 +53,8 @@ pub struct DeviceOptions {
     /// The chip; `None`: the smallest in which the device fits. Process RAM grows where SyncManagers need more.
     pub esc: Option<EscInfo>,
     pub mailbox: MailboxOptions,
+    /// A boot loader that takes firmware in Bootstrap, and where the ESI has 0x1F51 by that, too ([`crate::firmware`]).
+    pub firmware: Option<FirmwareOptions>,
     /// Of a CANopen gateway and the nodes behind it; a gateway without options has no nodes.
     pub gateway: Option<GatewayOptions>,
 }
@@ -73,6 +76,7 @@ impl Default for DeviceOptions {
             state_notice_ns: None,
             esc: None,
             mailbox: MailboxOptions::default(),
+            firmware: None,
             gateway: None,
         }
     }
@@ -219,6 +223,10 @@ impl SimDevice {
             .as_ref()
             .and_then(|mailbox| mailbox.coe.as_ref());
         let has_foe = device.mailbox.as_ref().is_some_and(|mailbox| mailbox.foe);
+        let made_for = (device.identity.vendor, device.identity.product);
+        let processor = options
+            .firmware
+            .map(|o| Processor::new(o, &store, made_for));
         let mut sim = Self {
             name: device.type_name.clone(),
             delays: Delays {
@@ -258,6 +266,10 @@ impl SimDevice {
             arrivals: Default::default(),
             local: 0,
             hangs: false,
+            processor,
+            parked: None,
+            restarts_until: None,
+            was_reset: false,
             refusals: Vec::new(),
             forced_aborts: Vec::new(),
             ignored_writes: Vec::new(),

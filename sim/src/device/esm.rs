@@ -148,6 +148,7 @@ impl SimDevice {
             AlState::PreOp if rising => self.check_mailbox(code::INVALID_MAILBOX_PREOP),
             AlState::Boot if !self.has_boot => Err(code::BOOT_NOT_SUPPORTED),
             AlState::Boot => self.check_mailbox(code::INVALID_MAILBOX_BOOT),
+            AlState::SafeOp if self.is_stopped() => Err(code::NO_VALID_FIRMWARE),
             AlState::SafeOp if rising => {
                 self.check_process_data()?;
                 self.check_sync()

@@ -7,6 +7,7 @@
 //! * `mailbox`: requests and replies
 //! * `parameters`: what outlives a power cycle
 //! * `process`: process data and objects
+//! * `program`: with and without a program
 //! * `supervision`: whether they come in time
 //!
 //! Everything a device does by itself happens in [`SimDevice::advance`], in the order of its clock.
@@ -18,6 +19,7 @@ mod from_sii;
 pub(crate) mod mailbox;
 mod parameters;
 mod process;
+mod program;
 mod supervision;
 
 use crate::Nanos;
@@ -27,6 +29,7 @@ use crate::drive::{Drive, Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
+use crate::firmware::Processor;
 use crate::foe::FileStore;
 use crate::frame;
 use application::Application;
@@ -150,6 +153,13 @@ pub struct SimDevice {
     local: u64,
     /// The application hangs; its controller does not.
     hangs: bool,
+    /// One that can have another program; what belongs to the program while only the boot loader runs; and the local time until
+    /// which it restarts.
+    processor: Option<Processor>,
+    parked: Option<Box<(PdoRules, Vec<ProcessData>)>>,
+    restarts_until: Option<u64>,
+    /// It has reset its controller since the last frame.
+    was_reset: bool,
     fresh: Box<Fresh>,
     pub(crate) refusals: Vec<(AlState, u16)>,
     pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
@@ -268,7 +278,7 @@ impl SimDevice {
 
     /// An application without a sound configuration in its EEPROM never starts.
     fn application_runs(&self) -> bool {
-        !self.hangs && self.esc.is_loaded()
+        !self.hangs && self.esc.is_loaded() && !self.is_restarting()
     }
 
     fn start_ticking(&mut self, local: u64) {
@@ -286,6 +296,8 @@ impl SimDevice {
         self.powered = true;
         self.esc.power_on(now);
         self.restart_application(now);
+        self.boot(false);
+        self.restarts_until = None;
         self.al = Al::default();
         if let Some(mailbox) = &mut self.mailbox {
             mailbox.reset();
@@ -304,7 +316,7 @@ impl SimDevice {
         if !self.powered {
             return;
         }
-        let local = self.esc.clock.local(now);
+        let mut local = self.esc.clock.local(now);
         loop {
             let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.sync.due());
             let (eeprom, watchdog) = (self.esc.eeprom.due(), self.esc.watchdog.due());
@@ -317,12 +329,19 @@ impl SimDevice {
                 (u64::MAX, u64::MAX, u64::MAX)
             };
             let own = tick.min(mailbox).min(al);
+            let restarted = match self.restarts_until {
+                Some(until) if !self.hangs => until,
+                _ => u64::MAX,
+            };
+            let own = own.min(restarted);
             let due = sync.min(eeprom).min(watchdog).min(pdi).min(own);
             if due > local {
                 return;
             }
             self.local = due;
-            if due == sync {
+            if due == restarted {
+                self.restarted(due);
+            } else if due == sync {
                 let edges = self.esc.fire_sync(due);
                 self.synchronized(edges);
             } else if due == tick {
@@ -335,6 +354,11 @@ impl SimDevice {
                 self.serve_mailbox(due);
             } else if due == al {
                 self.al_step(due);
+                if self.starts_new_program() {
+                    self.reset(due);
+                    // Its clock started anew.
+                    local = self.esc.clock.local(now);
+                }
             } else {
                 self.esc.expire_pdi_watchdog();
             }
@@ -416,11 +440,7 @@ impl SimDevice {
         self.esc.end_frame();
         let raised = self.esc.take_raised();
         if raised.reset {
-            let links = self.esc.links();
-            self.power_on(now);
-            for (port, up) in (0..).zip(links) {
-                self.esc.set_link(port, up);
-            }
+            self.reset_at(now);
             return Seen {
                 latches: false,
                 dl_control: true,
@@ -452,7 +472,7 @@ impl SimDevice {
         }
         Seen {
             latches: self.esc.take_latch(),
-            dl_control: self.esc.dl_control_changed(),
+            dl_control: self.esc.dl_control_changed() | std::mem::take(&mut self.was_reset),
         }
     }
 

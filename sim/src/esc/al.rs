@@ -49,6 +49,7 @@ pub mod code {
     pub const INVALID_STATE_CHANGE: u16 = 0x0011;
     pub const UNKNOWN_STATE: u16 = 0x0012;
     pub const BOOT_NOT_SUPPORTED: u16 = 0x0013;
+    pub const NO_VALID_FIRMWARE: u16 = 0x0014;
     pub const INVALID_MAILBOX_BOOT: u16 = 0x0015;
     pub const INVALID_MAILBOX_PREOP: u16 = 0x0016;
     pub const SYNC_ERROR: u16 = 0x001a;

@@ -3,15 +3,16 @@
 //! * `files`: the files, kept over a power cycle
 //! * `server`: one transfer at a time, packet by packet
 //!
-//! A firmware update is a file like any other here: it comes back byte for byte and changes nothing else. Whoever
-//! drives the simulation learns of it from [`crate::SimDevice::take_written_file`] and may then change what the
-//! device says of itself (0x1018, 0x100A) through [`crate::SimDevice::store_mut`].
+//! A device with a boot loader ([`crate::DeviceOptions::firmware`]) takes what is written in Bootstrap for firmware
+//! ([`crate::firmware`]). Without one a firmware update is a file like any other: it comes back byte for byte and changes
+//! nothing else. Whoever drives the simulation learns of it from [`crate::SimDevice::take_written_file`] and may then
+//! change what the device says of itself (0x1018, 0x100A) through [`crate::SimDevice::store_mut`].
 
 mod files;
 mod server;
 
 pub use files::FileStore;
-pub(crate) use server::{FoeRequest, FoeServer};
+pub(crate) use server::{FoeRequest, FoeServer, Target};
 
 #[derive(Debug, Clone)]
 pub struct FoeOptions {
@@ -39,7 +40,7 @@ impl Default for FoeOptions {
     }
 }
 
-/// Error codes (ETG.1000.6 table 92).
+/// Error codes (ETG.1000.6 table 92; from 0x800C on ETG.1020).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum FoeError {
     NotFound = 0x8001,
@@ -49,6 +50,9 @@ pub(crate) enum FoeError {
     PacketNumber = 0x8005,
     BootstrapOnly = 0x8008,
     NoRights = 0x800a,
+    Checksum = 0x800c,
+    OtherHardware = 0x800d,
+    NoHeader = 0x8010,
 }
 
 impl FoeError {
@@ -61,6 +65,9 @@ impl FoeError {
             Self::PacketNumber => "packet number wrong",
             Self::BootstrapOnly => "bootstrap only",
             Self::NoRights => "no rights",
+            Self::Checksum => "wrong checksum",
+            Self::OtherHardware => "for another device",
+            Self::NoHeader => "no firmware header",
         }
     }
 }

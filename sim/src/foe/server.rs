@@ -1,7 +1,9 @@
 //! One transfer: packets counted from 1, each acknowledged; the first one shorter than the mailbox, perhaps empty, is the last.
 
 use super::{FileStore, FoeError, FoeOptions};
+use crate::Nanos;
 use crate::device::mailbox::{Answer, Detail, Room};
+use crate::firmware::Flash;
 
 /// Opcode, a reserved byte, and password, packet number, error code or progress.
 const HEADER: usize = 6;
@@ -43,15 +45,51 @@ pub(crate) struct FoeServer {
 pub(crate) struct FoeRequest<'a> {
     pub(crate) options: &'a FoeOptions,
     pub(crate) bootstrap: bool,
+    /// The device's own time.
+    pub(crate) now: Nanos,
     /// Without the mailbox header.
     pub(crate) message: &'a [u8],
     pub(crate) room: Room,
 }
 
+/// Where files come from and go to.
+#[derive(Debug)]
+pub(crate) enum Target<'a> {
+    Files(&'a mut FileStore),
+    /// Whatever it is called, a file is firmware.
+    Program(&'a mut Flash),
+}
+
+impl Target<'_> {
+    fn get(&self, name: &str) -> Option<&[u8]> {
+        match self {
+            Self::Files(files) => files.get(name),
+            Self::Program(flash) => flash.file(),
+        }
+    }
+
+    fn has_room(&self, name: &str, len: usize, options: &FoeOptions) -> bool {
+        match self {
+            Self::Files(files) => files.has_room(name, len, options.capacity),
+            Self::Program(flash) => len <= flash.capacity(),
+        }
+    }
+
+    fn put(&mut self, name: String, data: Vec<u8>) -> Result<(), FoeError> {
+        match self {
+            Self::Files(files) => {
+                files.write(name, data);
+                Ok(())
+            }
+            Self::Program(flash) => flash.finish(data),
+        }
+    }
+}
+
 type Reply = Result<Option<Vec<u8>>, FoeError>;
 
 impl FoeServer {
-    pub(crate) fn request(&mut self, files: &mut FileStore, request: FoeRequest<'_>) -> Answer {
+    pub(crate) fn request(&mut self, mut target: Target<'_>, request: FoeRequest<'_>) -> Answer {
         let Some((&[opcode, _, a, b, c, d], rest)) = request.message.split_first_chunk() else {
             return Answer::Error(Detail::TooShort);
         };
@@ -60,10 +98,10 @@ impl FoeServer {
         }
         let number = u32::from_le_bytes([a, b, c, d]);
         let reply = match (opcode, self.transfer.take()) {
-            (opcode::READ, None) => self.read(files, request, number, rest),
-            (opcode::WRITE, None) => self.write(files, request, number, rest),
+            (opcode::READ, None) => self.read(&target, request, number, rest),
+            (opcode::WRITE, None) => self.write(&mut target, request, number, rest),
             (opcode::DATA, Some(transfer @ Transfer::Write { .. })) => {
-                self.data(files, request, transfer, number, rest)
+                self.data(&mut target, request, transfer, number, rest)
             }
             (opcode::ACK, Some(transfer @ Transfer::Read { .. })) => {
                 self.acknowledged(transfer, number, request.room)
@@ -90,7 +128,7 @@ impl FoeServer {
 
     fn read(
         &mut self,
-        files: &FileStore,
+        files: &Target<'_>,
         request: FoeRequest<'_>,
         password: u32,
         name: &[u8],
@@ -136,7 +174,7 @@ impl FoeServer {
 
     fn write(
         &mut self,
-        files: &FileStore,
+        files: &mut Target<'_>,
         request: FoeRequest<'_>,
         password: u32,
         name: &[u8],
@@ -148,8 +186,11 @@ impl FoeServer {
         if request.options.read_only.contains(&name) {
             return Err(FoeError::AccessDenied);
         }
-        if !files.has_room(&name, 0, request.options.capacity) {
+        if !files.has_room(&name, 0, request.options) {
             return Err(FoeError::DiskFull);
+        }
+        if let Target::Program(flash) = files {
+            flash.begin();
         }
         self.transfer = Some(Transfer::Write {
             name,
@@ -162,7 +203,7 @@ impl FoeServer {
 
     fn data(
         &mut self,
-        files: &mut FileStore,
+        files: &mut Target<'_>,
         request: FoeRequest<'_>,
         transfer: Transfer,
         number: u32,
@@ -180,23 +221,30 @@ impl FoeServer {
         if number != packet {
             return Err(FoeError::PacketNumber);
         }
-        if !files.has_room(&name, data.len() + bytes.len(), request.options.capacity) {
+        if !files.has_room(&name, data.len() + bytes.len(), request.options) {
             return Err(FoeError::DiskFull);
         }
+        let is_last = bytes.len() < request.room.receive - HEADER;
         let every = request.options.busy_every;
-        if every > 0 && packet.is_multiple_of(every) && !was_busy {
+        let busy = match files {
+            // Half done: 50 of 100.
+            _ if every > 0 && packet.is_multiple_of(every) && !was_busy => Some((50, 100)),
+            Target::Files(_) => None,
+            Target::Program(flash) => flash.take(&data, bytes, is_last, request.now)?,
+        };
+        if let Some((done, entire)) = busy {
             self.transfer = Some(Transfer::Write {
                 name,
                 data,
                 packet,
                 was_busy: true,
             });
-            // Half done: 50 of 100.
-            return Ok(Some(message(opcode::BUSY, 100 << 16 | 50)));
+            let progress = u32::from(entire) << 16 | u32::from(done);
+            return Ok(Some(message(opcode::BUSY, progress)));
         }
         data.extend_from_slice(bytes);
-        if bytes.len() < request.room.receive - HEADER {
-            files.write(name, data);
+        if is_last {
+            files.put(name, data)?;
         } else {
             self.transfer = Some(Transfer::Write {
                 name,

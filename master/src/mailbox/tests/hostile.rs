@@ -12,7 +12,7 @@ use crate::mailbox::{EMERGENCY_QUEUE, ObjectList, Wire, WireError};
 
 /// Answers every datagram with anything. Time passes only where the client waits, so that a loop without a pause
 /// never ends, and runs into the limit.
-struct Noise {
+pub struct Noise {
     now: Cell<u64>,
     datagrams: Cell<u64>,
     random: Cell<u64>,
@@ -26,6 +26,17 @@ struct Noise {
 const DATAGRAMS: u64 = 1_000_000;
 
 impl Noise {
+    pub fn new(mailboxes: Vec<Vec<u8>>, seed: u64, lost: u8, untouched: u8) -> Self {
+        Self {
+            now: Cell::new(0),
+            datagrams: Cell::new(0),
+            random: Cell::new(seed),
+            mailboxes: RefCell::new(mailboxes),
+            lost,
+            untouched,
+        }
+    }
+
     /// xorshift64.
     fn next(&self) -> u64 {
         let mut x = self.random.get();
@@ -132,14 +143,7 @@ proptest! {
         data in prop::collection::vec(any::<u8>(), 0..200),
         complete: bool,
     ) {
-        let noise = Noise {
-            now: Cell::new(0),
-            datagrams: Cell::new(0),
-            random: Cell::new(seed),
-            mailboxes: RefCell::new(mailboxes),
-            lost,
-            untouched,
-        };
+        let noise = Noise::new(mailboxes, seed, lost, untouched);
         let mut client = client();
         for _ in 0..3 {
             let begin = noise.now();

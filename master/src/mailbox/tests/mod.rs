@@ -1,4 +1,4 @@
-//! The client against a small SDO server that shares no code with it.
+//! The clients against a small SDO and file server that shares no code with them.
 
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
@@ -8,6 +8,8 @@ use super::{CoeClient, MailboxLayout, Timeouts};
 
 mod describe;
 mod errors;
+mod files;
+mod foe;
 mod hostile;
 mod info;
 mod mischief;

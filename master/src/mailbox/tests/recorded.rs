@@ -1,6 +1,7 @@
 //! What real devices and another MainDevice said: an EK1914 and an EL3004 to ethercrab, a LAN9252 to SOEM.
 
 use crate::mailbox::coe::{Answer, Message, Request, parse};
+use crate::mailbox::port::Emit;
 
 /// Mailbox header and CoE message as recorded, without the padding that fills the mailbox.
 fn emitted(request: &Request<'_>, counter: u8) -> Vec<u8> {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use super::STATION;
 use super::describe;
+use super::files::Files;
 use super::mischief::Mischief;
 use crate::mailbox::{Wire, WireError};
 
@@ -45,6 +46,7 @@ struct Inner {
     ready_at: u64,
     transfer: Segmented,
     log: Vec<Vec<u8>>,
+    files: Files,
 }
 
 pub struct Server {
@@ -83,6 +85,7 @@ impl Server {
                 ready_at: 0,
                 transfer: Segmented::Idle,
                 log: Vec::new(),
+                files: Files::default(),
             }),
             now: Cell::new(0),
             datagrams: Cell::new(0),
@@ -105,6 +108,11 @@ impl Server {
     /// The requests that were worked on, duplicates left out.
     pub fn log(&self) -> Vec<Vec<u8>> {
         self.inner.borrow().log.clone()
+    }
+
+    /// Its files, and how they are handed out.
+    pub fn files<T>(&self, with: impl FnOnce(&mut Files) -> T) -> T {
+        with(&mut self.inner.borrow_mut().files)
     }
 
     pub fn forgive(&self) {
@@ -177,31 +185,35 @@ impl Inner {
             "the client announced more than the mailbox holds"
         );
         let body = request[6..6 + length].to_vec();
-        assert_eq!(request[5] & 0x0f, 3, "CoE");
         self.log.push(body.clone());
         if self.is(&Mischief::Mute) {
             return;
         }
+        if request[5] & 0x0f == 4 {
+            for answer in self.files.answer(&body, len - 6) {
+                self.give(4, &answer, len);
+            }
+            return;
+        }
+        assert_eq!(request[5] & 0x0f, 3, "CoE");
         let service = body[1] >> 4;
         let answers = match service {
             2 => self.answer(&body[2..], len).into_iter().collect(),
             8 => describe::answers(&self.objects, &body[2..], len),
             _ => panic!("service {service} is none of a client's"),
         };
+        let service = if service == 8 { 0x80 } else { 0x30 };
         for answer in answers {
-            self.give(if service == 8 { 0x80 } else { 0x30 }, &answer, len);
+            self.give(3, &[&[0x00, service], &answer[..]].concat(), len);
         }
     }
 
-    fn give(&mut self, service: u8, answer: &[u8], len: usize) {
+    fn give(&mut self, protocol: u8, answer: &[u8], len: usize) {
         self.answers_made += 1;
         let n = self.answers_made;
         self.own_counter = self.own_counter % 7 + 1;
-        let mut message = u16::try_from(answer.len() + 2)
-            .unwrap()
-            .to_le_bytes()
-            .to_vec();
-        message.extend([0, 0, 0, 0x03 | self.own_counter << 4, 0x00, service]);
+        let mut message = u16::try_from(answer.len()).unwrap().to_le_bytes().to_vec();
+        message.extend([0, 0, 0, protocol | self.own_counter << 4]);
         message.extend(answer);
         for mischief in self.mischief.clone() {
             match mischief {

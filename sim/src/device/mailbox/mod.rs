@@ -17,7 +17,7 @@ use crate::coe::{self, CoeServer, CoeServices, Dictionary, ParameterCommand};
 use crate::drive::Emergency;
 use crate::esc::al::AlState;
 use crate::esc::registers as reg;
-use crate::foe::{FoeRequest, FoeServer};
+use crate::foe::{FoeRequest, FoeServer, Target};
 
 /// Between a request arriving and the device fetching it.
 const FETCH_NS: u64 = 100_000;
@@ -99,6 +99,17 @@ impl Mailbox {
         *self = Self::new(self.receive, self.send);
     }
 
+    /// Nothing happens before this time.
+    pub(super) fn rest_until(&mut self, local: u64) {
+        for due in [
+            &mut self.fetch_due,
+            &mut self.answer_due,
+            &mut self.transfer_due,
+        ] {
+            *due = (*due).max(local);
+        }
+    }
+
     /// When [`SimDevice::serve_mailbox`] has something to do, in local time.
     pub(super) fn due(&self) -> u64 {
         self.fetch_due.min(self.answer_due).min(self.transfer_due)
@@ -147,7 +158,7 @@ impl SimDevice {
     }
 
     /// A request that lies there is fetched as soon as there is room for its answer.
-    fn plan_fetch(&mut self, local: u64) {
+    pub(super) fn plan_fetch(&mut self, local: u64) {
         let Some(mailbox) = &mut self.mailbox else {
             return;
         };
@@ -164,6 +175,9 @@ impl SimDevice {
 
     /// Moves the next message into the send SyncManager if that is free.
     pub(super) fn pump_mailbox(&mut self) {
+        if self.is_restarting() {
+            return;
+        }
         let Some(mailbox) = &mut self.mailbox else {
             return;
         };
@@ -281,6 +295,9 @@ impl SimDevice {
         }
         let protocol = kind & 0x0f;
         let answer = self.protocol_answer(protocol, payload, room);
+        if self.obey_program_control() {
+            return;
+        }
         let Some(mailbox) = &mut self.mailbox else {
             return;
         };
@@ -304,7 +321,11 @@ impl SimDevice {
                 let services = CoeServices {
                     sdo_info: options.sdo_info.unwrap_or(self.sdo_info),
                     segmented: options.segmented,
-                    buffer: options.sdo_buffer,
+                    buffer: self
+                        .processor
+                        .as_ref()
+                        .map_or(0, |processor| processor.flash.capacity())
+                        .max(options.sdo_buffer),
                 };
                 let mut dictionary = Dictionary {
                     store: &mut self.store,
@@ -315,6 +336,7 @@ impl SimDevice {
                     forced: &self.forced_aborts,
                     ignored: &self.ignored_writes,
                     command: None,
+                    processor: self.processor.as_mut(),
                 };
                 let coe = &mut mailbox.coe;
                 let answer = coe.request(&mut dictionary, services, payload, room);
@@ -325,15 +347,21 @@ impl SimDevice {
                 }
                 answer
             }
-            protocol::FOE if self.has_foe => mailbox.foe.request(
-                &mut self.files,
-                FoeRequest {
+            protocol::FOE if self.has_foe => {
+                let bootstrap = state == AlState::Boot;
+                let target = match &mut self.processor {
+                    Some(processor) if bootstrap => Target::Program(&mut processor.flash),
+                    _ => Target::Files(&mut self.files),
+                };
+                let request = FoeRequest {
                     options: &options.foe,
-                    bootstrap: state == AlState::Boot,
+                    bootstrap,
+                    now: self.local,
                     message: payload,
                     room,
-                },
-            ),
+                };
+                mailbox.foe.request(target, request)
+            }
             _ => Answer::Error(Detail::UnsupportedProtocol),
         }
     }
