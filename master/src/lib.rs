@@ -13,6 +13,7 @@
 //! - [`service`]: a bus without a cycle, taken as it is found;
 //! - [`scan`]: who is on a segment, and the machine file that follows from it;
 //! - [`compare`]: a machine file against a bus;
+//! - [`firmware`]: another program for a device;
 //! - [`link`]: what carries Ethernet frames;
 //! - [`doctor`]: what in this computer keeps a cycle from being on time;
 //! - [`bench`]: what measuring needs;
@@ -31,6 +32,7 @@ pub mod clock;
 pub mod compare;
 pub mod config;
 pub mod doctor;
+pub mod firmware;
 pub mod library;
 pub mod link;
 pub mod mailbox;

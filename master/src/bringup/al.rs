@@ -10,7 +10,7 @@ use crate::al_status::al_status_text;
 use crate::mailbox::{Wire, WireError};
 
 const AL_CONTROL: u16 = 0x0120;
-const AL_STATUS: u16 = 0x0130;
+pub(crate) const AL_STATUS: u16 = 0x0130;
 const ERROR: u8 = 0x10;
 const ID_REQUEST: u8 = 0x20;
 const POLL: Duration = Duration::from_micros(500);

@@ -15,10 +15,12 @@ use ecaxis_sim::ServeError;
 
 use super::note;
 
+mod firmware;
 mod host;
 mod service;
 mod story;
 
+pub(crate) use firmware::{TRY_AGAIN, firmware};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
 pub(crate) use service::service;

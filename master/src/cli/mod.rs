@@ -20,6 +20,7 @@ mod completions;
 mod doctor;
 mod esi;
 mod explain;
+mod firmware;
 mod hints;
 mod jog;
 mod man;
@@ -70,6 +71,7 @@ enum Verb {
     Doctor(doctor::Args),
     Bench(bench::Args),
     Analyze(analyze::Args),
+    Firmware(firmware::Args),
     Jog(jog::Args),
     Completions(completions::Args),
     Man(man::Args),
@@ -113,7 +115,8 @@ pub fn main() -> ExitCode {
         | Verb::Scan(scan::Args { verbosity, .. })
         | Verb::Compare(compare::Args { verbosity, .. })
         | Verb::Sim(sim::Args { verbosity, .. })
-        | Verb::Bench(bench::Args { verbosity, .. }) => {
+        | Verb::Bench(bench::Args { verbosity, .. })
+        | Verb::Firmware(firmware::Args { verbosity, .. }) => {
             verbosity.start_logging();
         }
         Verb::Check(_)
@@ -135,6 +138,7 @@ pub fn main() -> ExitCode {
         Verb::Sim(args) => sim::run(&args),
         Verb::Doctor(args) => doctor::run(&args),
         Verb::Bench(args) => bench::run(&args),
+        Verb::Firmware(args) => firmware::run(&args),
         Verb::Jog(args) => jog::run(&args),
         Verb::Completions(args) => completions::run(&args),
         Verb::Man(args) => man::run(&args),
@@ -269,6 +273,22 @@ mod tests {
             ("ecaxis run --record-limit 100MB", false),
             ("ecaxis run --replay r.pcapng --record again.pcapng", true),
             ("ecaxis run --replay r.pcapng --nic eth0", false),
+            ("ecaxis firmware", false),
+            ("ecaxis firmware info m.toml x --sim --json", true),
+            ("ecaxis firmware info --nic eth0 --position 0", true),
+            ("ecaxis firmware info --nic eth0 --sim", false),
+            (
+                "ecaxis firmware update m.toml x f.bin --via foe --yes",
+                true,
+            ),
+            (
+                "ecaxis firmware update f.bin --nic eth0 --alias 7 --dry-run",
+                true,
+            ),
+            ("ecaxis firmware update f.bin --dry-run --yes", false),
+            ("ecaxis firmware update", false),
+            ("ecaxis firmware sample m.toml x -o f.bin --size 1MiB", true),
+            ("ecaxis firmware sample m.toml x -o f.bin --size 1MB", false),
             ("ecaxis doctor", true),
             (
                 "ecaxis doctor eth0 --machine m.toml --cpu 3 --cycle 250us --seconds 0 --json",

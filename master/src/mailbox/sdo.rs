@@ -7,7 +7,7 @@ use super::port::{Deadline, Port, Trouble};
 use super::transfer::{Ended, Transfer, explain};
 use super::{MailboxLayout, Timeouts, Wire};
 
-/// Bytes of the largest object that is read or written.
+/// Bytes of the largest object that is read.
 pub const MAX_OBJECT: usize = 1 << 20;
 /// Messages that [`CoeClient::drain`] reads at most in one go.
 const DRAIN: usize = 64;
@@ -41,6 +41,11 @@ impl CoeClient {
         self
     }
 
+    /// From the next message on.
+    pub fn set_timeouts(&mut self, timeouts: Timeouts) {
+        self.port.timeouts = timeouts;
+    }
+
     pub fn layout(&self) -> &MailboxLayout {
         &self.port.layout
     }
@@ -68,7 +73,20 @@ impl CoeClient {
         data: &[u8],
     ) -> Result<(), SdoError> {
         let mut transfer = self.begin(w, index, sub, complete).await?;
-        let result = self.download_in(w, &mut transfer, data).await;
+        let result = self.download_in(w, &mut transfer, data, &mut |_| {}).await;
+        self.end(w, &transfer, result).await
+    }
+
+    /// Writes one subindex, which may be as long as a program, and tells how many bytes have been taken.
+    pub async fn download_with<W: Wire>(
+        &mut self,
+        w: &W,
+        (index, sub): (u16, u8),
+        data: &[u8],
+        progress: &mut dyn FnMut(usize),
+    ) -> Result<(), SdoError> {
+        let mut transfer = self.begin(w, index, sub, false).await?;
+        let result = self.download_in(w, &mut transfer, data, progress).await;
         self.end(w, &transfer, result).await
     }
 
@@ -236,6 +254,7 @@ impl CoeClient {
         w: &W,
         transfer: &mut Transfer,
         data: &[u8],
+        progress: &mut dyn FnMut(usize),
     ) -> Result<(), Ended> {
         let Transfer {
             index,
@@ -244,8 +263,8 @@ impl CoeClient {
             ..
         } = *transfer;
         let size = match u32::try_from(data.len()) {
-            Ok(size) if data.len() <= MAX_OBJECT => size,
-            _ => return Err(transfer.too_large(data.len())),
+            Ok(size) => size,
+            Err(_) => return Err(transfer.too_large(data.len())),
         };
         let expedited = (1..=4).contains(&data.len()) && !complete;
         let room = download_room(self.port.layout.out_len);
@@ -273,6 +292,7 @@ impl CoeClient {
             matches!(answer, Answer::Download { .. }).then_some(())
         })
         .await?;
+        progress(first.len());
 
         let room = segment_room(self.port.layout.out_len);
         let mut toggle = false;
@@ -296,6 +316,7 @@ impl CoeClient {
                     .telling(ABORT_TOGGLE));
             }
             toggle = !toggle;
+            progress(data.len() - rest.len());
         }
         Ok(())
     }

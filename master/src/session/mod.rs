@@ -44,7 +44,7 @@ mod turn;
 pub use error::RunError;
 pub use events::EventLine;
 pub(crate) use events::clock_off;
-pub use open::{simulated_bus, topology};
+pub use open::{link as open_link, recorded, simulated_bus, topology};
 pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
 use story::{Left, Seen};
 use summary::Aside;

@@ -7,7 +7,8 @@ use ecaxis_esi::{Device, Slots};
 
 use ecaxis_sim::network::topology::media;
 use ecaxis_sim::{
-    DeviceOptions, FaultScript, SecondPort, Segment, SegmentOptions, SimDevice, Topology,
+    DeviceOptions, FaultScript, FirmwareOptions, SecondPort, Segment, SegmentOptions, SimDevice,
+    Topology,
 };
 
 use super::{Options, RunError};
@@ -21,7 +22,11 @@ use crate::link::sim::SimLink;
 use crate::link::{self, Concern, Link};
 use crate::recording;
 
-pub(super) fn link(
+/// Blocks.
+///
+/// # Errors
+/// [`RunError::Open`], [`RunError::Sim`], [`RunError::Record`].
+pub fn link(
     machine: &Machine,
     options: &Options,
     mut tell: impl FnMut(Concern),
@@ -44,6 +49,14 @@ pub(super) fn link(
             link
         }
     };
+    recorded(link, options)
+}
+
+/// A link with the recording around it that is asked for, if one is.
+///
+/// # Errors
+/// [`RunError::Record`].
+pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>, RunError> {
     let Some(path) = &options.record else {
         return Ok(link);
     };
@@ -110,6 +123,10 @@ pub fn topology(machine: &Machine) -> Result<Topology, RunError> {
 /// clock control that does nothing.
 const DRIFTS_PPM: [f64; 4] = [18.0, -23.0, 7.0, -11.0];
 
+/// Vendor of the demonstration devices. They have boot loaders, which take nothing but their own firmware files; other devices keep a file that is
+/// written in Bootstrap as any other.
+const DEMONSTRATION: u32 = 0x0e0a;
+
 /// The device with the modules of the file in its slots. Where a mode picks the module it is no hardware: the device takes what it is told.
 fn plugged(device: &DeviceConfig) -> Cow<'_, Device> {
     let selection = &device.selection;
@@ -158,6 +175,7 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
         clock_jitter_ns: device.sim.jitter_ns,
         jitter_seed: seed.wrapping_add(u64::from(place)),
         gateway: device.sim.gateway.clone(),
+        firmware: (device.device.identity.vendor == DEMONSTRATION).then(FirmwareOptions::default),
         ..DeviceOptions::default()
     };
     match device.at {

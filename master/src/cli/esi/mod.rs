@@ -196,7 +196,7 @@ fn load(path: &Path) -> Result<EsiFile, Failure> {
     })
 }
 
-fn number(text: &str) -> Result<u32, String> {
+pub(super) fn number(text: &str) -> Result<u32, String> {
     let hex = text.strip_prefix("0x").or(text.strip_prefix("0X"));
     let value = hex.map_or_else(
         || text.parse().ok(),

@@ -14,8 +14,9 @@ const ACK: u8 = 4;
 const ERROR: u8 = 5;
 const BUSY: u8 = 6;
 
-/// Bytes of a file, or of its name, that one mailbox carries.
-pub(super) fn room(mailbox: u16) -> usize {
+/// Bytes of a file, or of its name, that a mailbox of so many bytes carries.
+#[must_use]
+pub fn room(mailbox: u16) -> usize {
     usize::from(mailbox).saturating_sub(MAILBOX_HEADER + FOE_HEADER)
 }
 

@@ -17,7 +17,8 @@ mod error;
 mod message;
 
 pub use error::{FoeError, foe_error_text};
-use message::{Message, Request, parse, room};
+pub use message::room;
+use message::{Message, Request, parse};
 
 /// Messages that are cleared away before a transfer at most.
 const DRAIN: usize = 64;
@@ -177,7 +178,7 @@ impl FoeClient {
             .check()
             .map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
         let room = room(self.port.layout.out_len);
-        if file.is_empty() || file.len() > room || file.contains('\0') {
+        if !is_name(file, room) {
             return Err(FoeError::Name {
                 station: transfer.station,
                 file: file.to_owned(),
@@ -475,6 +476,12 @@ impl Transfer<'_> {
             tell: Some(ILLEGAL),
         }
     }
+}
+
+/// Whether a file can be asked for by this name through a mailbox with [`room`] for so many bytes.
+#[must_use]
+pub fn is_name(name: &str, room: usize) -> bool {
+    (1..=room).contains(&name.len()) && !name.contains('\0')
 }
 
 /// A SubDevice's own words, as far as a terminal can show them.

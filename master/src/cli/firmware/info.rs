@@ -1,0 +1,36 @@
+//! `ecaxis firmware info`: who a device is, what runs in it, and how it takes another program.
+
+use ecaxis::firmware::{self, FirmwareError};
+
+use super::show;
+use super::target::{self, Where};
+use crate::cli::{Failure, hints, result};
+
+/// Show what runs in a device and how it takes another program; changes nothing
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Machine file and the device's name in it, or neither
+    #[arg(value_names = ["MACHINE", "DEVICE"], num_args = 0..=2)]
+    words: Vec<String>,
+    #[command(flatten)]
+    at: Where,
+    /// Print it as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let target = args.at.target(&args.words)?;
+    let (which, name, nic) = (target.which, target.name.clone(), target.nic().clone());
+    let found = target.visit(async move |wire| firmware::examine(&wire, which, &name).await)?;
+    let Some(found) = found else {
+        target::interrupted();
+        return Ok(());
+    };
+    let examined = found.map_err(|error: FirmwareError| hints::firmware(&error, &nic))?;
+    result(&if args.json {
+        format!("{:#}\n", show::as_json(&examined))
+    } else {
+        show::info(&examined)
+    })
+}

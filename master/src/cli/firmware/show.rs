@@ -1,0 +1,162 @@
+//! What is printed of a device.
+
+use ecaxis::firmware::{Examined, Runs, Spoken, Via};
+use serde_json::{Value, json};
+
+use crate::cli::report::Table;
+
+const WAYS: [(Via, &str); 2] = [(Via::Foe, "foe"), (Via::Program, "program")];
+
+/// What differs from one program to the next: what it is, and the value before or now.
+type Row = (&'static str, fn(&Examined) -> Option<String>);
+
+const VERSION: [Row; 7] = [
+    ("revision (0x1018:03)", |e| hex(spoken(e)?.identity[2])),
+    ("product (0x1018:02)", |e| hex(spoken(e)?.identity[1])),
+    ("revision (EEPROM)", |e| hex(Some(e.sii.identity.revision))),
+    ("device type (0x1000)", |e| hex(spoken(e)?.device_type)),
+    ("software version (0x100A)", |e| spoken(e)?.software.clone()),
+    ("software identification (0x1F56)", |e| {
+        hex(spoken(e)?.identification)
+    }),
+    ("program control (0x1F51)", |e| {
+        spoken(e)?.control.map(|value| match value {
+            0 => "0 (stopped)".to_owned(),
+            1 => "1 (started)".to_owned(),
+            other => other.to_string(),
+        })
+    }),
+];
+
+fn spoken(examined: &Examined) -> Option<&Spoken> {
+    examined.spoken.as_ref()
+}
+
+fn hex(value: Option<u32>) -> Option<String> {
+    value.map(|value| format!("0x{value:08x}"))
+}
+
+fn shown(value: Option<String>) -> String {
+    value.unwrap_or_else(|| "-".to_owned())
+}
+
+/// What changed, and that all is the same where nothing did.
+pub(super) fn change(before: &Examined, now: &Examined) -> String {
+    let mut table = Table::new(&["", "before", "now"]);
+    for (what, of) in VERSION {
+        let (before, now) = (of(before), of(now));
+        if before.is_some() || now.is_some() {
+            table.row([what, &shown(before), &shown(now)]);
+        }
+    }
+    let mut text = format!("{}\n", table.shown(2));
+    if VERSION.iter().all(|(_, of)| of(before) == of(now)) {
+        text += "It says the same of itself as before.\n";
+    }
+    text
+}
+
+/// Everything that is known of it.
+pub(super) fn info(examined: &Examined) -> String {
+    let identity = examined.sii.identity;
+    let mut table = Table::new(&["", ""]);
+    let mut row = |what: &str, value: String| table.row([what, &value]);
+    row("state", state(examined));
+    row("runs", examined.runs().to_string());
+    row("vendor (EEPROM)", format!("0x{:08x}", identity.vendor));
+    row("product (EEPROM)", format!("0x{:08x}", identity.product));
+    row("serial number (EEPROM)", examined.sii.serial.to_string());
+    if let Some(spoken) = spoken(examined) {
+        for (what, text) in [
+            ("device name (0x1008)", &spoken.name),
+            ("hardware version (0x1009)", &spoken.hardware),
+        ] {
+            if let Some(text) = text {
+                row(what, text.clone());
+            }
+        }
+    }
+    for (what, of) in VERSION {
+        if let Some(value) = of(examined) {
+            row(what, value);
+        }
+    }
+    for (via, _) in WAYS {
+        let offered = match examined.offers(via) {
+            Ok(()) if via == Via::Foe => {
+                let boot = examined.sii.bootstrap;
+                let (out, back) = (boot.receive_size, boot.send_size);
+                format!("yes, mailboxes of {out} and {back} bytes")
+            }
+            Ok(()) => "yes".to_owned(),
+            Err(reason) => format!("no: {reason}"),
+        };
+        row(&via.to_string(), offered);
+    }
+    let mut text = format!("{}\n{}\n", examined.device, table.shown(2));
+    if let Some(silent) = &examined.silent {
+        text += &format!("It does not speak: {silent}\n");
+    }
+    text
+}
+
+fn state(examined: &Examined) -> String {
+    let mut text = examined.state.to_string();
+    if examined.error {
+        let code = examined.code;
+        let meaning = ecaxis::al_status::al_status_text(code);
+        text += &format!(", AL status code 0x{code:04x}: {meaning}");
+    }
+    text
+}
+
+/// The same for a script.
+pub(super) fn as_json(examined: &Examined) -> Value {
+    let identity = examined.sii.identity;
+    let spoken = spoken(examined);
+    let offers: Vec<&str> = WAYS
+        .into_iter()
+        .filter(|(via, _)| examined.offers(*via).is_ok())
+        .map(|(_, name)| name)
+        .collect();
+    let [vendor, product, revision, serial] = spoken.map_or([None; 4], |s| s.identity);
+    json!({
+        "name": examined.device.name,
+        "position": examined.device.position,
+        "station": examined.device.station,
+        "state": examined.state.to_string(),
+        "al_status_code": examined.error.then_some(examined.code),
+        "runs": match examined.runs() {
+            Runs::Program => "program",
+            Runs::BootLoader => "boot-loader",
+            Runs::Unknown => "unknown",
+        },
+        "eeprom": {
+            "vendor": identity.vendor,
+            "product": identity.product,
+            "revision": identity.revision,
+            "serial": examined.sii.serial,
+        },
+        "identity": {
+            "vendor": vendor,
+            "product": product,
+            "revision": revision,
+            "serial": serial,
+        },
+        "device_type": spoken.and_then(|s| s.device_type),
+        "device_name": spoken.and_then(|s| s.name.clone()),
+        "hardware_version": spoken.and_then(|s| s.hardware.clone()),
+        "software_version": spoken.and_then(|s| s.software.clone()),
+        "program_control": spoken.and_then(|s| s.control),
+        "software_identification": spoken.and_then(|s| s.identification),
+        "offers": offers,
+        "silent": examined.silent.as_ref().map(ToString::to_string),
+    })
+}
+
+/// As `--via` has it.
+pub(super) fn name(via: Via) -> &'static str {
+    WAYS.iter()
+        .find(|(known, _)| *known == via)
+        .map_or("", |(_, name)| name)
+}
