@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use super::error::{Broken, Cause, Step};
-use super::{Examined, Order, ReadBack, Told, since};
+use super::{Examined, INIT_TIMEOUT, Order, ReadBack, Told, since};
 use crate::bringup::al::{self, AlState};
 use crate::mailbox::foe::FoeProgress;
 use crate::mailbox::{FoeClient, FoeError, Wire};
@@ -18,7 +18,7 @@ pub(super) async fn send(
 ) -> Result<(ReadBack, Duration), Broken> {
     let devices = std::slice::from_ref(&before.device);
     tell(Told::Step(Step::Prepare));
-    al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT)
+    al::change_state(wire, devices, AlState::Init, INIT_TIMEOUT)
         .await
         .map_err(|error| Step::Prepare.failed(error))?;
 

@@ -29,6 +29,8 @@ pub use examine::{BOOT_LOADER, Examined, Expected, Runs, Spoken, examine};
 
 /// From a reset or a start until the program runs, at most.
 pub const START_TIMEOUT: Duration = Duration::from_secs(30);
+/// Until a device is in Init: one that a broken update left at erasing its memory does not look after its state meanwhile.
+const INIT_TIMEOUT: Duration = Duration::from_secs(30);
 /// A device that resets itself may be seen as it was before.
 const SETTLE: Duration = Duration::from_millis(500);
 const LOOK_AGAIN: Duration = Duration::from_millis(200);
@@ -110,10 +112,13 @@ impl Examined {
                 Err("its EEPROM has no mailboxes for Bootstrap")
             }
             Via::Foe => Ok(()),
+            Via::Program if !self.sii.protocols.has(Protocols::COE) => {
+                Err("its EEPROM names no CoE")
+            }
             Via::Program => match &self.spoken {
-                Some(spoken) if spoken.control.is_some() => Ok(()),
-                Some(_) => Err("it has no object 0x1F51"),
-                None => Err("it does not say whether it has the object 0x1F51"),
+                Some(spoken) if spoken.control.is_none() => Err("it has no object 0x1F51"),
+                // One that does not speak now may have it.
+                Some(_) | None => Ok(()),
             },
         }
     }

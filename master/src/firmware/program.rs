@@ -7,7 +7,7 @@
 use std::time::Duration;
 
 use super::error::{Broken, Cause, Step};
-use super::{Examined, LOOK_AGAIN, Order, ReadBack, Told, after, since};
+use super::{Examined, INIT_TIMEOUT, LOOK_AGAIN, Order, ReadBack, Told, after, since};
 use crate::bringup::DeviceRef;
 use crate::bringup::al::{self, AlState};
 use crate::mailbox::{CoeClient, SdoError, Timeouts, Wire};
@@ -111,7 +111,7 @@ async fn pre_op(
     device: &DeviceRef,
 ) -> Result<CoeClient, ServiceError> {
     let devices = std::slice::from_ref(device);
-    al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await?;
+    al::change_state(wire, devices, AlState::Init, INIT_TIMEOUT).await?;
     let registers = Registers {
         wire,
         device,

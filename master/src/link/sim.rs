@@ -52,6 +52,10 @@ impl SimLink {
         &self.segment
     }
 
+    pub fn segment_mut(&mut self) -> &mut Segment {
+        &mut self.segment
+    }
+
     /// Every slot is free or under way, so that neither list ever grows beyond its capacity.
     fn arrives(&mut self, at: Nanos, slot: usize) {
         let at = at.saturating_add(self.start);

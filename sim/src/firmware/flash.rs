@@ -26,8 +26,10 @@ pub(crate) struct Flash {
     pub(super) program: Option<Program>,
     /// A program that starts when Bootstrap is left.
     is_new: bool,
-    /// Erased for the file that is on its way.
-    erased: bool,
+    /// Erased, and nothing has been written since.
+    blank: bool,
+    /// The file that is on its way is for this device, and what was here has been erased for it.
+    accepted: bool,
     busy_from: Nanos,
     busy_until: Nanos,
 }
@@ -39,7 +41,8 @@ impl Flash {
             device,
             program: Some(Program::default()),
             is_new: false,
-            erased: false,
+            blank: false,
+            accepted: false,
             busy_from: 0,
             busy_until: 0,
         }
@@ -69,18 +72,18 @@ impl Flash {
 
     pub(crate) fn erase(&mut self) {
         self.program = None;
-        self.is_new = false;
+        (self.blank, self.is_new) = (true, false);
     }
 
     /// The local clock starts anew, and what was under way is over.
     pub(super) fn restart(&mut self) {
         (self.busy_from, self.busy_until) = (0, 0);
-        (self.erased, self.is_new) = (false, false);
+        (self.accepted, self.is_new) = (false, false);
     }
 
     /// A file begins to come.
     pub(crate) fn begin(&mut self) {
-        self.erased = false;
+        self.accepted = false;
     }
 
     /// The next packet of a file. `Ok(Some)`: not now; so much of so much is done.
@@ -98,15 +101,18 @@ impl Flash {
         if len > self.options.capacity {
             return Err(FoeError::DiskFull);
         }
-        if !self.erased && (len >= HEADER || is_last) {
+        if !self.accepted && (len >= HEADER || is_last) {
             let mut head = so_far.to_vec();
             head.extend(packet.iter().take(HEADER));
             self.check(&head).map_err(refusal)?;
-            self.erase();
-            self.erased = true;
-            self.busy(now, self.options.erase_ns);
-            return Ok(Some(self.progress(now)));
+            self.accepted = true;
+            if !self.blank {
+                self.erase();
+                self.busy(now, self.options.erase_ns);
+                return Ok(Some(self.progress(now)));
+            }
         }
+        self.blank &= !self.accepted;
         let pages = |len: usize| len.checked_div(self.options.page);
         if pages(so_far.len()) != pages(len) {
             self.busy(now, self.options.page_ns);
@@ -137,6 +143,7 @@ impl Flash {
 
     fn program(&mut self, file: Vec<u8>) -> Result<(), Unfit> {
         self.check(&file)?;
+        self.blank = false;
         let (header, checksum) = FirmwareHeader::verify(&file)?;
         self.program = Some(Program {
             header: Some(header),

@@ -31,8 +31,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value = "0x00020000", value_parser = number)]
     revision: u32,
     /// Software version that it shows then: four characters
-    #[arg(long = "software", value_name = "TEXT", default_value = "2.00", value_parser = version)]
-    version: [u8; 4],
+    #[arg(long, value_name = "TEXT", default_value = "2.00", value_parser = version)]
+    software: [u8; 4],
 }
 
 fn size(text: &str) -> Result<usize, String> {
@@ -62,7 +62,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         vendor: identity.vendor,
         product: identity.product,
         revision: args.revision,
-        version: args.version,
+        version: args.software,
     };
     let file = header.file(&program(args.size));
     write(&args.output, &file)?;

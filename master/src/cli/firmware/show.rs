@@ -3,7 +3,7 @@
 use ecaxis::firmware::{Examined, Runs, Spoken, Via};
 use serde_json::{Value, json};
 
-use crate::cli::report::Table;
+use crate::cli::table::Table;
 
 const WAYS: [(Via, &str); 2] = [(Via::Foe, "foe"), (Via::Program, "program")];
 
@@ -87,6 +87,9 @@ pub(super) fn info(examined: &Examined) -> String {
                 let boot = examined.sii.bootstrap;
                 let (out, back) = (boot.receive_size, boot.send_size);
                 format!("yes, mailboxes of {out} and {back} bytes")
+            }
+            Ok(()) if examined.spoken.is_none() => {
+                "not known: it does not speak in this state".to_owned()
             }
             Ok(()) => "yes".to_owned(),
             Err(reason) => format!("no: {reason}"),
