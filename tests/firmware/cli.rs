@@ -66,7 +66,7 @@ fn from_a_sample_to_a_drive_that_runs_it() {
         &[
             "`x` (position 0",
             "0x00010000",
-            "runs its program",
+            "its program",
             "mailboxes of 100",
         ],
     );
@@ -110,7 +110,7 @@ fn every_failure_has_its_code_device_step_cause_and_hint() {
     let empty = folder.path().join("empty.bin");
     std::fs::write(&empty, []).expect("written");
     let off = folder.path().join("off.toml");
-    let script = "[[fault]]\nkind = \"power-off\"\ndevice = 0\nat = \"2s\"\n";
+    let script = "[[fault]]\nkind = \"power-off\"\ndevice = 0\nat = \"800ms\"\n";
     std::fs::write(&off, script).expect("written");
     let off = off.to_str().expect("UTF-8");
     let name = "n".repeat(200);

@@ -6,8 +6,18 @@ use super::show;
 use super::target::{self, Where};
 use crate::cli::{Failure, hints, result};
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis firmware info m.toml x
+  ecaxis firmware info --nic enp3s0 --position 0 --json";
+
+const USAGE: &str = "\
+ecaxis firmware info [OPTIONS] <MACHINE> <DEVICE>
+       ecaxis firmware info [OPTIONS] --nic <IF> --position <N>";
+
 /// Show what runs in a device and how it takes another program; changes nothing
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, override_usage = USAGE)]
 pub(crate) struct Args {
     /// Machine file and the device's name in it, or neither
     #[arg(value_names = ["MACHINE", "DEVICE"], num_args = 0..=2)]

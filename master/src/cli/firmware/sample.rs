@@ -12,8 +12,14 @@ use crate::cli::{Failure, hints, note};
 /// Longest program that is made.
 const MOST: usize = 16 << 20;
 
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis firmware sample configs/demo.toml x -o new.bin --size 1MiB
+  ecaxis firmware update configs/demo.toml x new.bin --sim --yes";
+
 /// Write a firmware file for a device of the simulated bus (no real device takes it)
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "MACHINE")]

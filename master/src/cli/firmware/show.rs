@@ -62,7 +62,15 @@ pub(super) fn info(examined: &Examined) -> String {
     let mut table = Table::new(&["", ""]);
     let mut row = |what: &str, value: String| table.row([what, &value]);
     row("state", state(examined));
-    row("runs", examined.runs().to_string());
+    row(
+        "what runs",
+        match examined.runs() {
+            Runs::Program => "its program",
+            Runs::BootLoader => "its boot loader alone",
+            Runs::Unknown => "not known",
+        }
+        .to_owned(),
+    );
     row("vendor (EEPROM)", format!("0x{:08x}", identity.vendor));
     row("product (EEPROM)", format!("0x{:08x}", identity.product));
     row("serial number (EEPROM)", examined.sii.serial.to_string());

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
 use ecaxis::firmware::{self, Done, Examined, FirmwareError, Order, ReadBack, Step, Told, Via};
@@ -12,15 +12,29 @@ use serde_json::{Value, json};
 use super::show;
 use super::target::{self, Where};
 use crate::cli::esi::number;
-use crate::cli::{Failure, hints, note, result, stderr_is_terminal};
+use crate::cli::{Failure, hints, note, result, style};
 
 /// No program memory of a drive is larger.
 const MOST: u64 = 256 << 20;
 /// Where lines stay, one a so many percent.
 const PERCENT: usize = 10;
+/// A pause is worth no line of its own, a wait is.
+const BUSY: Duration = Duration::from_secs(1);
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis firmware update m.toml x new.msdc --dry-run
+  ecaxis firmware update m.toml x new.msdc --yes
+  ecaxis firmware update m.toml x new.msdc --via program --yes
+  ecaxis firmware update --nic enp3s0 --position 0 app.bin --name app --yes";
+
+const USAGE: &str = "\
+ecaxis firmware update [OPTIONS] <MACHINE> <DEVICE> <FILE>
+       ecaxis firmware update [OPTIONS] --nic <IF> --position <N> <FILE>";
 
 /// Put another program into a device and start it
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, override_usage = USAGE)]
 pub(crate) struct Args {
     /// Machine file and the device's name in it, or neither; then the firmware file
     #[arg(value_names = ["MACHINE", "DEVICE", "FILE"], num_args = 1..=3, required = true)]
@@ -242,12 +256,13 @@ struct Teller {
 #[derive(Default)]
 struct Said {
     percent: Option<usize>,
-    busy: bool,
+    /// Since when the device has been busy, or since that was said last.
+    busy: Option<Instant>,
 }
 
 impl Teller {
     fn new(plain: bool) -> Self {
-        let bar = (stderr_is_terminal() && !plain).then(|| {
+        let bar = (style::rewrites() && !plain).then(|| {
             let bar = ProgressBar::new(0);
             let template =
                 "{msg} {bar:20} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}";
@@ -287,12 +302,17 @@ impl Teller {
                 }
             }
             (Told::Busy { .. }, Some(bar)) => bar.set_message("busy"),
-            (Told::Busy { done, entire }, None) if !said.busy => {
-                note(&format!("  the device is busy: {done} of {entire} done"));
+            (Told::Busy { done, entire }, None) => {
+                let since = said.busy.get_or_insert_with(Instant::now);
+                if since.elapsed() >= BUSY {
+                    *since = Instant::now();
+                    note(&format!("  the device is busy: {done} of {entire} done"));
+                }
             }
-            (Told::Busy { .. }, None) => {}
         }
-        said.busy = matches!(told, Told::Busy { .. });
+        if !matches!(told, Told::Busy { .. }) {
+            said.busy = None;
+        }
         if matches!(told, Told::Step(Step::Check)) {
             self.clear();
         }
