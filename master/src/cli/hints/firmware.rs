@@ -3,9 +3,8 @@
 use ecaxis::config::Nic;
 use ecaxis::firmware::{Cause, FirmwareError, Left, Via};
 use ecaxis::mailbox::FoeError;
-use ecaxis::service::ServiceError;
 
-use super::{FAILED, Failure, WRONG, interfaces, state};
+use super::{FAILED, Failure, WRONG, service, state};
 
 /// What holds for every update that has begun.
 pub(crate) const TRY_AGAIN: &str =
@@ -14,7 +13,7 @@ pub(crate) const TRY_AGAIN: &str =
 pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, error.to_string());
     match error {
-        FirmwareError::Service(error) => service(failure, error, nic),
+        FirmwareError::Service(error) => service(error, nic),
         FirmwareError::Eeprom { .. } => {
             failure.hint("the device's EEPROM is damaged: its maker's tools can write it anew")
         }
@@ -114,22 +113,5 @@ fn again(left: Left) -> String {
             "once it answers again, it has its boot loader at least; the same command tries again"
                 .to_owned()
         }
-    }
-}
-
-fn service(failure: Failure, error: &ServiceError, nic: &Nic) -> Failure {
-    match (error, nic) {
-        (ServiceError::NoAnswer, Nic::Interface(name)) => failure
-            .hint(format!("is `{name}` the right interface? {}", interfaces()))
-            .hint("check that the first SubDevice has power and its IN port is connected"),
-        (ServiceError::NotFound { .. } | ServiceError::Ambiguous { .. }, _) => {
-            failure.hint("say where the device is with `--position`")
-        }
-        (ServiceError::State(error), _) => failure.hint(state(error)),
-        (
-            ServiceError::Silent { .. } | ServiceError::Wire { .. } | ServiceError::NotTaken { .. },
-            _,
-        ) => failure.hint("frames are lost or a device restarts: check cables and supply"),
-        _ => failure,
     }
 }
