@@ -7,7 +7,7 @@ use super::port::{Deadline, Port, Trouble};
 use super::transfer::{Ended, Transfer, explain};
 use super::{MailboxLayout, Timeouts, Wire};
 
-/// Bytes of the largest object that is read.
+/// Bytes of the largest object that is read or written; a program may be longer.
 pub const MAX_OBJECT: usize = 1 << 20;
 /// Messages that [`CoeClient::drain`] reads at most in one go.
 const DRAIN: usize = 64;
@@ -73,7 +73,9 @@ impl CoeClient {
         data: &[u8],
     ) -> Result<(), SdoError> {
         let mut transfer = self.begin(w, index, sub, complete).await?;
-        let result = self.download_in(w, &mut transfer, data, &mut |_| {}).await;
+        let result = self
+            .download_in(w, &mut transfer, data, MAX_OBJECT, &mut |_| {})
+            .await;
         self.end(w, &transfer, result).await
     }
 
@@ -86,7 +88,9 @@ impl CoeClient {
         progress: &mut dyn FnMut(usize),
     ) -> Result<(), SdoError> {
         let mut transfer = self.begin(w, index, sub, false).await?;
-        let result = self.download_in(w, &mut transfer, data, progress).await;
+        let result = self
+            .download_in(w, &mut transfer, data, usize::MAX, progress)
+            .await;
         self.end(w, &transfer, result).await
     }
 
@@ -254,6 +258,7 @@ impl CoeClient {
         w: &W,
         transfer: &mut Transfer,
         data: &[u8],
+        most: usize,
         progress: &mut dyn FnMut(usize),
     ) -> Result<(), Ended> {
         let Transfer {
@@ -263,8 +268,8 @@ impl CoeClient {
             ..
         } = *transfer;
         let size = match u32::try_from(data.len()) {
-            Ok(size) => size,
-            Err(_) => return Err(transfer.too_large(data.len())),
+            Ok(size) if data.len() <= most => size,
+            _ => return Err(transfer.too_large(data.len())),
         };
         let expedited = (1..=4).contains(&data.len()) && !complete;
         let room = download_room(self.port.layout.out_len);

@@ -3,7 +3,6 @@
 use super::SimDevice;
 use super::application::{Application, Io};
 use crate::Nanos;
-use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
 use crate::esc::al::AlState;
 use crate::firmware::{Next, PROGRAM_IDENTIFICATION, boot_objects};
@@ -37,7 +36,7 @@ impl SimDevice {
         if processor.stopped {
             self.store = boot_objects(&self.fresh.store, processor);
             self.application = Application::Io(Io::default());
-            let pdo = std::mem::replace(&mut self.pdo, PdoRules::default());
+            let pdo = std::mem::take(&mut self.pdo);
             let process = std::mem::take(&mut self.process);
             self.parked = Some(Box::new((pdo, process)));
         } else if let Some((header, checksum)) = processor.program() {
