@@ -145,7 +145,8 @@ fn what_is_left_without_a_program() {
     assert_eq!(bus.upload(S, 0x1008, 0), Ok(b"EPOS4".to_vec()));
     let refused = bus.request(S, u16::from(SAFEOP));
     assert_eq!(refused, (0x12, NO_VALID_FIRMWARE));
-    bus.to(S, PREOP | 0x10);
+    let acknowledged = bus.request(S, u16::from(PREOP) | 0x10);
+    assert_eq!(acknowledged, (u16::from(PREOP), 0));
     // Stopped is not cleared: it starts with its program.
     assert!(bus.segment.device(0).unwrap().is_stopped());
     power_cycle(&mut bus);
