@@ -14,6 +14,7 @@
 //! - [`scan`]: who is on a segment, and the machine file that follows from it;
 //! - [`compare`]: a machine file against a bus;
 //! - [`firmware`]: another program for a device;
+//! - [`parameters`]: what a device's objects are called and hold; in files, compared, restored;
 //! - [`link`]: what carries Ethernet frames;
 //! - [`doctor`]: what in this computer keeps a cycle from being on time;
 //! - [`bench`]: what measuring needs;
@@ -38,6 +39,7 @@ pub mod link;
 pub mod mailbox;
 pub mod os;
 mod page;
+pub mod parameters;
 pub mod recording;
 pub mod rt;
 pub mod scan;

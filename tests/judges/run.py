@@ -21,7 +21,7 @@ import tempfile
 import rig
 from report import Report, Stop
 
-SECTIONS = ["bringup", "overlap", "mailbox", "operation", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings"]
+SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings"]
 
 
 def main():

@@ -5,7 +5,9 @@
 //! [`record`] keeps a recording from destroying another file; [`style`] decides about colours;
 //! [`story`] lays out what stopped a run.
 
+use std::fs::File;
 use std::io::{self, IsTerminal, Write};
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -17,7 +19,9 @@ mod bus;
 mod check;
 mod compare;
 mod completions;
+mod device;
 mod doctor;
+mod eeprom;
 mod esi;
 mod explain;
 mod firmware;
@@ -29,6 +33,7 @@ mod record;
 mod report;
 mod run;
 mod scan;
+mod sdo;
 mod signals;
 mod sim;
 mod story;
@@ -66,6 +71,8 @@ enum Verb {
     Explain(explain::Args),
     Scan(scan::Args),
     Compare(compare::Args),
+    Sdo(sdo::Args),
+    Eeprom(eeprom::Args),
     Esi(esi::Args),
     Sim(sim::Args),
     Doctor(doctor::Args),
@@ -114,6 +121,8 @@ pub fn main() -> ExitCode {
         Verb::Run(run::Args { verbosity, .. })
         | Verb::Scan(scan::Args { verbosity, .. })
         | Verb::Compare(compare::Args { verbosity, .. })
+        | Verb::Sdo(sdo::Args { verbosity, .. })
+        | Verb::Eeprom(eeprom::Args { verbosity, .. })
         | Verb::Sim(sim::Args { verbosity, .. })
         | Verb::Bench(bench::Args { verbosity, .. })
         | Verb::Firmware(firmware::Args { verbosity, .. }) => {
@@ -134,6 +143,8 @@ pub fn main() -> ExitCode {
         Verb::Explain(args) => explain::run(&args),
         Verb::Scan(args) => scan::run(&args),
         Verb::Compare(args) => compare::run(&args),
+        Verb::Sdo(args) => sdo::run(&args),
+        Verb::Eeprom(args) => eeprom::run(&args),
         Verb::Esi(args) => esi::run(&args),
         Verb::Sim(args) => sim::run(&args),
         Verb::Doctor(args) => doctor::run(&args),
@@ -168,6 +179,23 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
         )),
         _ => Ok(()),
     }
+}
+
+/// A file that must not exist yet.
+pub(crate) fn keep(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    let written = File::create_new(path).and_then(|mut file| file.write_all(bytes));
+    written.map_err(|error| match error.kind() {
+        io::ErrorKind::AlreadyExists => in_the_way(path),
+        _ => Failure::new(
+            hints::WRONG,
+            format!("cannot write {}: {error}", path.display()),
+        ),
+    })
+}
+
+pub(crate) fn in_the_way(path: &Path) -> Failure {
+    Failure::new(hints::WRONG, format!("{} exists already", path.display()))
+        .hint("nothing is written over; name another file or remove that one")
 }
 
 /// A line on stderr.
@@ -264,6 +292,25 @@ mod tests {
             ),
             ("ecaxis esi list d --revision 2", false),
             ("ecaxis esi list d --match roughly", false),
+            (
+                "ecaxis sdo read m.toml x 0x6064 Statusword --sim --json",
+                true,
+            ),
+            ("ecaxis sdo read --nic eth0 --position 1 0x6064", true),
+            ("ecaxis sdo read --position 1 0x6064", false),
+            (
+                "ecaxis sdo read --nic eth0 --position 1 --alias 2 0x6064",
+                false,
+            ),
+            ("ecaxis sdo read", false),
+            ("ecaxis sdo write m.toml x 0x6065 -5", true),
+            ("ecaxis sdo store --nic eth0 --alias 0x10", true),
+            ("ecaxis sdo compare a.toml b.toml --all", true),
+            ("ecaxis eeprom alias m.toml x 1001 --yes", true),
+            (
+                "ecaxis eeprom read m.toml x image.bin --category 30 --all",
+                false,
+            ),
             ("ecaxis sim m.toml --nic veth0", true),
             ("ecaxis analyze run.pcapng --all --html r.html", true),
             ("ecaxis analyze a.pcapng b.pcap --interface 1 --json", true),

@@ -3,77 +3,22 @@
 use ecaxis_esi::{ObjectItem, Writable};
 
 use super::raw::SdoValue;
+use crate::parameters::{DataType, Kind};
 
 /// What is wrong with the value, and a hint.
 pub(crate) type Refusal = (String, Option<String>);
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    Signed(u32),
-    Unsigned(u32),
-    Float(u32),
-    Text,
-    Bytes,
-}
-
-const TYPES: [(&str, Kind); 12] = [
-    ("bool", Kind::Unsigned(1)),
-    ("i8", Kind::Signed(8)),
-    ("u8", Kind::Unsigned(8)),
-    ("i16", Kind::Signed(16)),
-    ("u16", Kind::Unsigned(16)),
-    ("i32", Kind::Signed(32)),
-    ("u32", Kind::Unsigned(32)),
-    ("i64", Kind::Signed(64)),
-    ("u64", Kind::Unsigned(64)),
-    ("f32", Kind::Float(32)),
-    ("f64", Kind::Float(64)),
-    ("text", Kind::Text),
+/// Names that are told; those of ETG.2000 are taken as well.
+const TYPES: [&str; 12] = [
+    "bool", "i8", "u8", "i16", "u16", "i32", "u32", "i64", "u64", "f32", "f64", "text",
 ];
-
-/// ETG.2000 base types, and the short names of [`TYPES`].
-fn kind(name: &str, bits: u32) -> Option<Kind> {
-    let upper = name.trim().to_ascii_uppercase();
-    let stem = upper.split(['(', '[', ' ']).next().unwrap_or_default();
-    Some(match stem {
-        "BOOL" | "BIT" | "BIT1" => Kind::Unsigned(1),
-        "SINT" => Kind::Signed(8),
-        "USINT" | "BYTE" | "BITARR8" => Kind::Unsigned(8),
-        "INT" => Kind::Signed(16),
-        "UINT" | "WORD" | "BITARR16" => Kind::Unsigned(16),
-        "DINT" => Kind::Signed(32),
-        "UDINT" | "DWORD" | "BITARR32" => Kind::Unsigned(32),
-        "LINT" => Kind::Signed(64),
-        "ULINT" | "LWORD" => Kind::Unsigned(64),
-        "REAL" => Kind::Float(32),
-        "LREAL" => Kind::Float(64),
-        "STRING" | "VISIBLE_STRING" => Kind::Text,
-        "ARRAY" | "OCTET_STRING" => Kind::Bytes,
-        _ => match TYPES
-            .iter()
-            .find(|(short, _)| short.eq_ignore_ascii_case(stem))
-        {
-            Some((_, kind)) => *kind,
-            // INT24 and the like: a width is all that is needed.
-            None if (1..=64).contains(&bits) => {
-                if stem.starts_with("INT") {
-                    Kind::Signed(bits)
-                } else {
-                    Kind::Unsigned(bits)
-                }
-            }
-            None if bits > 0 => Kind::Bytes,
-            None => return None,
-        },
-    })
-}
 
 pub(crate) fn encode(
     value: &SdoValue,
     type_name: Option<&str>,
     item: Option<&ObjectItem>,
 ) -> Result<Vec<u8>, Refusal> {
-    let names = || TYPES.map(|(name, _)| format!("`{name}`")).join(", ");
+    let names = || TYPES.map(|name| format!("`{name}`")).join(", ");
     if let Some(item) = item {
         let closed = match item.access.write {
             Writable::Never => true,
@@ -87,14 +32,14 @@ pub(crate) fn encode(
             ));
         }
     }
-    let kind = match (type_name, item) {
-        (Some(name), _) => kind(name, 0).ok_or_else(|| {
+    let data_type = match (type_name, item) {
+        (Some(name), _) => DataType::named(name, 0).ok_or_else(|| {
             (
                 format!("unknown type `{name}`"),
                 Some(format!("types: {}", names())),
             )
         })?,
-        (None, Some(item)) => kind(&item.type_name, item.bit_len).ok_or_else(|| {
+        (None, Some(item)) => DataType::named(&item.type_name, item.bit_len).ok_or_else(|| {
             (
                 format!("the ESI's type `{}` is not known", item.type_name),
                 None,
@@ -105,9 +50,9 @@ pub(crate) fn encode(
             return Err(("the ESI has no such object".to_owned(), Some(hint)));
         }
     };
-    let bytes = bytes(value, kind)?;
+    let bytes = bytes(value, data_type)?;
     if let (Some(item), SdoValue::Integer(n)) = (item, value) {
-        let signed = matches!(kind, Kind::Signed(_));
+        let signed = data_type.kind == Kind::Signed;
         let low = item.min.as_deref().map(|b| little_endian(b, signed));
         let high = item.max.as_deref().map(|b| little_endian(b, signed));
         let n = i128::from(*n);
@@ -129,61 +74,28 @@ fn little_endian(bytes: &[u8], signed: bool) -> i128 {
     i128::from_le_bytes(all)
 }
 
-fn bytes(value: &SdoValue, kind: Kind) -> Result<Vec<u8>, Refusal> {
-    let misfit = |found: &str| -> Result<Vec<u8>, Refusal> {
-        let wanted = match kind {
-            Kind::Signed(bits) | Kind::Unsigned(bits) => format!("an integer of {bits} bits"),
-            Kind::Float(_) => "a number".to_owned(),
-            Kind::Text => "a text".to_owned(),
-            Kind::Bytes => "bytes, such as [0x01, 0x02]".to_owned(),
-        };
-        Err((format!("the object takes {wanted}, not {found}"), None))
+fn bytes(value: &SdoValue, data_type: DataType) -> Result<Vec<u8>, Refusal> {
+    let number = matches!(data_type.kind, Kind::Unsigned | Kind::Signed);
+    let written = match value {
+        SdoValue::Bytes(bytes) => return Ok(bytes.clone()),
+        // TOML has taken the quotes and escapes out already.
+        SdoValue::Text(text) if data_type.kind == Kind::Text => {
+            return Ok(text.clone().into_bytes());
+        }
+        SdoValue::Text(text) => text.clone(),
+        SdoValue::Integer(n) => n.to_string(),
+        // In TOML it is `nan`.
+        SdoValue::Float(x) => x.to_string().to_lowercase(),
+        SdoValue::Boolean(b) if number => u8::from(*b).to_string(),
+        SdoValue::Boolean(b) => b.to_string(),
     };
-    let integer = |n: i64, bits: u32, signed: bool| {
-        let n = i128::from(n);
-        let (low, high) = if signed {
-            (-(1_i128 << (bits - 1)), (1_i128 << (bits - 1)) - 1)
-        } else {
-            (0, (1_i128 << bits) - 1)
-        };
-        if !(low..=high).contains(&n) {
-            return Err((
-                format!("{n} does not fit; the object takes {low} to {high}"),
-                None,
-            ));
-        }
-        let len = usize::try_from(bits.div_ceil(8)).unwrap_or(8);
-        Ok(n.to_le_bytes().into_iter().take(len).collect())
-    };
-    match (value, kind) {
-        (SdoValue::Bytes(b), _) => Ok(b.clone()),
-        (SdoValue::Text(t), Kind::Text) => Ok(t.clone().into_bytes()),
-        (SdoValue::Text(t), Kind::Signed(bits) | Kind::Unsigned(bits)) => {
-            match super::fields::unquoted(t) {
-                Some(n) => integer(n, bits, matches!(kind, Kind::Signed(_))),
-                None => misfit("a text"),
-            }
-        }
-        (SdoValue::Integer(n), Kind::Signed(bits)) => integer(*n, bits, true),
-        (SdoValue::Integer(n), Kind::Unsigned(bits)) => integer(*n, bits, false),
-        (SdoValue::Boolean(b), Kind::Signed(bits) | Kind::Unsigned(bits)) => {
-            integer(i64::from(*b), bits, false)
-        }
-        (SdoValue::Integer(n), Kind::Float(bits)) => Ok(float(*n as f64, bits)),
-        (SdoValue::Float(x), Kind::Float(bits)) => Ok(float(*x, bits)),
-        (SdoValue::Float(x), _) => misfit(&x.to_string()),
-        (SdoValue::Integer(n), _) => misfit(&n.to_string()),
-        (SdoValue::Boolean(b), _) => misfit(&b.to_string()),
-        (SdoValue::Text(_), _) => misfit("a text"),
+    let texts = matches!(data_type.kind, Kind::Text | Kind::Unicode);
+    if texts && !matches!(value, SdoValue::Text(_)) {
+        return Err((format!("the object takes a text, not {written}"), None));
     }
-}
-
-fn float(x: f64, bits: u32) -> Vec<u8> {
-    if bits == 32 {
-        (x as f32).to_le_bytes().to_vec()
-    } else {
-        x.to_le_bytes().to_vec()
-    }
+    data_type
+        .read(&written)
+        .map_err(|error| (error.to_string(), None))
 }
 
 #[cfg(test)]

@@ -52,6 +52,7 @@ impl SimLink {
         &self.segment
     }
 
+    /// To take a device's power, or pull a cable, between frames.
     pub fn segment_mut(&mut self) -> &mut Segment {
         &mut self.segment
     }

@@ -41,9 +41,9 @@ impl CoeClient {
         self
     }
 
-    /// From the next message on.
-    pub fn set_timeouts(&mut self, timeouts: Timeouts) {
-        self.port.timeouts = timeouts;
+    /// For what takes longer or shorter; returns those until now.
+    pub fn set_timeouts(&mut self, timeouts: Timeouts) -> Timeouts {
+        std::mem::replace(&mut self.port.timeouts, timeouts)
     }
 
     pub fn layout(&self) -> &MailboxLayout {

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::{Registers, ServiceError};
-use crate::bringup::DeviceRef;
+use crate::bringup::{AlState, DeviceRef};
 use crate::mailbox::Wire;
 
 const ACCESS: u16 = 0x0500;
@@ -51,6 +51,8 @@ pub enum EepromError {
     NotAcknowledged { word: u32, status: u16 },
     #[error("word 0x{word:04x}: writing is not permitted (status 0x{status:04x})")]
     WriteProtected { word: u32, status: u16 },
+    #[error("word 0x{word:04x}: 0x{wanted:04x} was written, 0x{found:04x} is there")]
+    NotKept { word: u32, wanted: u16, found: u16 },
 }
 
 /// Whether an EEPROM may be taken from the device's own processor.
@@ -59,6 +61,17 @@ pub enum Claim {
     /// Only where it is not lent.
     IfFree,
     Force,
+}
+
+impl Claim {
+    /// In Init a device has no use for its EEPROM; some MainDevices leave it lent there.
+    #[must_use]
+    pub fn of(state: AlState) -> Self {
+        match state {
+            AlState::Init => Self::Force,
+            _ => Self::IfFree,
+        }
+    }
 }
 
 /// The EEPROM of one device, held until [`Eeprom::give_back`].
@@ -266,7 +279,7 @@ impl<'a, W: Wire> Eeprom<'a, W> {
         }
     }
 
-    fn failed(&self, source: EepromError) -> ServiceError {
+    pub(super) fn failed(&self, source: EepromError) -> ServiceError {
         ServiceError::Eeprom {
             device: self.registers.device.clone(),
             step: self.registers.step,

@@ -5,7 +5,9 @@
 //!
 //! - [`visit`], [`carry`]: frames go back and forth while a piece of work lasts;
 //! - [`station`]: who answers, and under which address;
+//! - [`device`]: one of them, by what it is found by;
 //! - [`eeprom`]: the EEPROM interface of one device;
+//! - [`image`]: what is in an EEPROM, and how it gets there;
 //! - [`mailbox`]: the mailboxes of one device, and the state in which it has them.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -13,17 +15,21 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::thread;
 
+use ecaxis_esi::sii::SiiError;
+
 use crate::bringup::{DeviceRef, StateError};
 use crate::clock::Clock;
 use crate::link::Link;
 use crate::link::port::{main_device, pump};
-use crate::mailbox::{SdoError, Wire, WireError};
+use crate::mailbox::{InfoError, SdoError, Wire, WireError};
 use crate::session::{RunError, panic_text};
 use crate::supervise::interruptible;
 
 pub use crate::wire::Datagrams;
 
+pub mod device;
 pub mod eeprom;
+pub mod image;
 pub mod mailbox;
 pub mod station;
 #[cfg(test)]
@@ -70,12 +76,19 @@ pub enum ServiceError {
         step: &'static str,
         source: eeprom::EepromError,
     },
+    #[error("{device}: its EEPROM: {source}")]
+    Sii { device: DeviceRef, source: SiiError },
     #[error("{device}: the EEPROM says nothing of a mailbox")]
     NoMailbox { device: DeviceRef },
     #[error("{device}: is in {state}, where it has no CoE mailbox")]
     WrongState { device: DeviceRef, state: String },
     #[error("{device}: {source}")]
     Sdo { device: DeviceRef, source: SdoError },
+    #[error("{device}: {source}")]
+    Information {
+        device: DeviceRef,
+        source: Box<InfoError>,
+    },
     #[error(transparent)]
     State(#[from] StateError),
 }

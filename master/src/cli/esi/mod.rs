@@ -12,7 +12,7 @@ use super::{Failure, hints, note};
 mod check;
 mod diff;
 mod list;
-mod objects;
+pub(super) mod objects;
 mod show;
 mod sii;
 
@@ -203,6 +203,13 @@ pub(super) fn number(text: &str) -> Result<u32, String> {
         |hex| u32::from_str_radix(hex, 16).ok(),
     );
     value.ok_or_else(|| "a number of 32 bits, decimal or 0x…".to_owned())
+}
+
+pub(super) fn number_16(text: &str) -> Result<u16, String> {
+    let value = number(text)
+        .ok()
+        .and_then(|value| u16::try_from(value).ok());
+    value.ok_or_else(|| "a number of 16 bits, decimal or 0x…".to_owned())
 }
 
 fn mode(text: &str) -> Result<Mode, String> {

@@ -1,6 +1,6 @@
 //! `ecaxis esi objects`: the object dictionary of a device.
 
-use ecaxis_esi::{Bytes, Choice, Mode, ObjectItem, PdoMapping, Writable, select};
+use ecaxis_esi::{Bytes, Choice, Dictionary, Mode, ObjectItem, PdoMapping, Writable, select};
 use serde_json::json;
 
 use super::super::report::Table;
@@ -46,6 +46,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(hints::WRONG, message)
             .hint("`ecaxis esi show` has the objects in its PDOs"));
     }
+    result(&listed(&dictionary, args.json))
+}
+
+/// Every subindex, as a table or as JSON.
+pub(crate) fn listed(dictionary: &Dictionary, json: bool) -> String {
     let mut table = Table::new(&[
         "object", "type", "bits", "access", "PDO", "default", "min", "max", "name",
     ]);
@@ -84,10 +89,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             ]);
         }
     }
-    if args.json {
-        return result(&format!("{:#}\n", serde_json::Value::Array(all)));
+    if json {
+        return format!("{:#}\n", serde_json::Value::Array(all));
     }
-    result(&(table.shown(0) + "\n"))
+    table.shown(0) + "\n"
 }
 
 fn access(item: &ObjectItem) -> String {

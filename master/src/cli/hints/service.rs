@@ -2,6 +2,7 @@
 
 use ecaxis::bringup::BringUpError;
 use ecaxis::config::Nic;
+use ecaxis::mailbox::{InfoError, SdoError};
 use ecaxis::service::ServiceError;
 use ecaxis::service::eeprom::EepromError;
 
@@ -11,7 +12,7 @@ const FRAMES: &str = "frames are lost or a device restarts: check cables and sup
 
 /// Work on devices that were taken as they were found.
 pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
-    let failure = Failure::new(FAILED, error.to_string());
+    let failure = Failure::new(FAILED, message(error));
     let hint = match error {
         ServiceError::NoAnswer => return bring_up(failure, &BringUpError::NoAnswer, nic),
         ServiceError::Silent { .. }
@@ -32,14 +33,59 @@ pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
             _ => "the EEPROM is defective, or the device writes to it: switch it off and on"
                 .to_owned(),
         },
+        ServiceError::Sii { .. } => {
+            "the image in its EEPROM is damaged: `ecaxis eeprom verify` says how, `ecaxis esi sii` makes one from an ESI file".to_owned()
+        }
+        ServiceError::Information { source, .. } => match source.as_ref() {
+            InfoError::Mailbox(source) => parameter(source),
+            source if source.is_refusal() => {
+                "the device does not tell about its objects: give its ESI file, by a machine file or with `--esi`".to_owned()
+            }
+            _ => "the device answers too slowly or damaged: give its ESI file, by a machine file or with `--esi`".to_owned(),
+        },
         ServiceError::NoMailbox { .. } => {
             "devices without a mailbox, such as digital terminals, have no parameters".to_owned()
         }
         ServiceError::WrongState { .. } => {
             "lead it to Init first, or switch it off and on".to_owned()
         }
-        ServiceError::Sdo { source, .. } => sdo(source, "the device"),
+        ServiceError::Sdo { source, .. } => parameter(source),
         ServiceError::State(error) => state(error),
     };
     failure.hint(hint)
+}
+
+/// The error's text, with the device's address once: what its mailbox says carries it, too.
+fn message(error: &ServiceError) -> String {
+    let text = error.to_string();
+    let (device, source) = match error {
+        ServiceError::Sdo { device, source } => (device, source.to_string()),
+        ServiceError::Information { device, source } => (device, source.to_string()),
+        _ => return text,
+    };
+    let short = source.strip_prefix(&format!("station {:#06x}", device.station));
+    match (short, text.strip_suffix(&source)) {
+        (Some(short), Some(head)) => head.to_owned() + short.trim_start_matches(':').trim_start(),
+        _ => text,
+    }
+}
+
+/// An object that somebody asked for.
+fn parameter(error: &SdoError) -> String {
+    let hint = match error.abort_code() {
+        Some(0x0602_0000 | 0x0609_0011) => "`ecaxis sdo list` shows what it has",
+        Some(0x0601_0001 | 0x0601_0002) => "`ecaxis sdo list` shows what can be read and written",
+        Some(0x0601_0000 | 0x0601_0004 | 0x0601_0005) => "read or write its subindices one by one",
+        Some(0x0609_0030..=0x0609_0036) => {
+            "`ecaxis esi objects` shows the range, where the ESI file says it"
+        }
+        Some(0x0607_0010..=0x0607_0013) => {
+            "the device has another type there than its ESI file: give the value with `--type`"
+        }
+        Some(0x0601_0006 | 0x0800_0020..=0x0800_0022) => {
+            "the device forbids it in its present state: disable the axis or end what drives the bus, then try again"
+        }
+        _ => return sdo(error, "the device"),
+    };
+    hint.to_owned()
 }

@@ -1,0 +1,356 @@
+//! Which device, for verbs that work on one: named by a machine file, or by its place on an interface.
+
+use std::path::PathBuf;
+
+use ecaxis::bringup::{AlState, DeviceRef};
+use ecaxis::config::{self, DeviceConfig, Locator, Machine, Nic, nearest};
+use ecaxis::library::{self, Library, Match, cache_file};
+use ecaxis::mailbox::{CoeClient, ObjectAddress};
+use ecaxis::parameters::dump::Origin;
+use ecaxis::parameters::learn;
+use ecaxis::service::{Datagrams, ServiceError, device};
+use ecaxis_esi::sii::Sii;
+use ecaxis_esi::{Choice, Dictionary, Identity, select};
+
+use super::bus::{self, Bus};
+use super::{Failure, hints};
+
+/// Where the device is
+#[derive(Debug, Clone, clap::Args)]
+#[command(next_help_heading = "Which device")]
+pub(crate) struct Place {
+    /// Use this network interface; without a machine file, with --position or --alias
+    #[arg(long, value_name = "IF", conflicts_with = "sim")]
+    nic: Option<String>,
+    /// Use the machine file's simulated bus
+    #[arg(long)]
+    sim: bool,
+    /// The device's place on the interface; the first is 0
+    #[arg(long, value_name = "N", requires = "nic", conflicts_with = "alias")]
+    position: Option<u16>,
+    /// The device's station alias
+    #[arg(long, value_name = "A", requires = "nic", value_parser = super::esi::number_16)]
+    alias: Option<u16>,
+    /// ESI file of the device, or a folder of ESI files, where there is no machine file
+    #[arg(long, value_name = "PATH", requires = "nic")]
+    esi: Option<PathBuf>,
+}
+
+/// A device that was asked for.
+#[derive(Debug)]
+pub(crate) struct Target {
+    pub bus: Bus,
+    at: Locator,
+    /// Its part of the machine file.
+    config: Option<Box<DeviceConfig>>,
+    esi: Option<PathBuf>,
+}
+
+impl Place {
+    /// The device, and the words that are left. Without `--position` or `--alias` the first two are the machine file and the
+    /// device's name in it; `rest` says what comes then.
+    pub fn take<'w>(
+        &self,
+        words: &'w [String],
+        rest: &str,
+    ) -> Result<(Target, &'w [String]), Failure> {
+        let at = match (self.position, self.alias) {
+            (Some(position), _) => Some(Locator::Position(position)),
+            (None, alias) => alias.map(Locator::Alias),
+        };
+        if let (Some(nic), Some(at)) = (&self.nic, at) {
+            if nic == "sim" {
+                let message = "the simulated bus is a machine file's: `FILE DEVICE --sim`";
+                return Err(Failure::new(hints::WRONG, message));
+            }
+            let target = Target {
+                bus: Bus::interface(nic),
+                at,
+                config: None,
+                esi: self.esi.clone(),
+            };
+            return Ok((target, words));
+        }
+        let [file, name, rest @ ..] = words else {
+            let message = format!("which device? A machine file and a name in it, then {rest}");
+            return Err(Failure::new(hints::WRONG, message).hint(
+                "without a machine file: `--nic IF` with `--position N` or `--alias A`; `ecaxis scan` shows them",
+            ));
+        };
+        let file = PathBuf::from(file);
+        let mut machine = config::load(&file).map_err(|error| hints::config(&file, &error))?;
+        if self.sim || self.nic.as_deref() == Some("sim") {
+            machine.bus.nic = Nic::Sim;
+        } else if let Some(nic) = &self.nic {
+            machine.bus.nic = Nic::Interface(nic.clone());
+        }
+        let config = named(&machine, name)?;
+        let target = Target {
+            bus: Bus::of(&machine),
+            at: config.at,
+            config: Some(Box::new(config.clone())),
+            esi: self.esi.clone(),
+        };
+        Ok((target, rest))
+    }
+}
+
+fn named<'m>(machine: &'m Machine, name: &str) -> Result<&'m DeviceConfig, Failure> {
+    let found = machine.devices.iter().find(|device| device.name == name);
+    found.ok_or_else(|| {
+        let names = machine.devices.iter().map(|device| device.name.as_str());
+        let message = format!("{}: no device is called `{name}`", machine.path.display());
+        let all: Vec<&str> = names.clone().collect();
+        Failure::new(hints::WRONG, message).hint(match nearest(name, names) {
+            Some(known) => format!("did you mean `{known}`?"),
+            None => format!("there are {}", all.join(", ")),
+        })
+    })
+}
+
+/// A device that was found.
+#[derive(Debug)]
+pub(crate) struct Located {
+    pub wire: Datagrams,
+    pub device: DeviceRef,
+    /// As it was found.
+    pub state: AlState,
+    /// Of the ESI that the machine file names.
+    pub expected: Option<(String, Identity)>,
+    config: Option<Box<DeviceConfig>>,
+    esi: Option<PathBuf>,
+    nic: Nic,
+    found: ecaxis::service::station::Found,
+}
+
+impl Target {
+    /// Does a piece of work on the device, as it is found.
+    pub fn visit<T: Send + 'static>(
+        self,
+        work: impl AsyncFnOnce(&Located) -> Result<T, Failure> + Send + 'static,
+    ) -> Result<T, Failure> {
+        let Self {
+            bus,
+            at,
+            config,
+            esi,
+        } = self;
+        let nic = bus.nic();
+        let done = bus.visit(async move |wire: Datagrams, others| {
+            if others > 0 {
+                bus::warn("another MainDevice is at work on this bus; what both do may collide");
+            }
+            let name = config.as_ref().map(|config| config.name.as_str());
+            let located = device::locate(&wire, at, name).await;
+            let (found, device) = located.map_err(|error| hints::service(&error, &nic))?;
+            let located = Located {
+                wire,
+                device,
+                state: found.state,
+                expected: config.as_ref().map(|config| {
+                    let selection = &config.selection;
+                    (selection.device_name.to_string(), selection.identity)
+                }),
+                config,
+                esi,
+                nic,
+                found,
+            };
+            work(&located).await
+        });
+        done?
+    }
+
+    /// Does a piece of work on the device's mailbox. A device in Init is in PreOp meanwhile.
+    pub fn open<T: Send + 'static>(
+        self,
+        work: impl AsyncFnOnce(&mut Open<'_>) -> Result<T, Failure> + Send + 'static,
+    ) -> Result<T, Failure> {
+        self.visit(async move |located: &Located| {
+            let at = located;
+            let sii = device::information(&at.wire, &at.found, &at.device).await;
+            let sii = at.told(sii)?;
+            at.check(sii.identity)?;
+            let done = device::with_mailbox(&at.wire, &at.device, &sii, async |lent| {
+                let mut open = Open {
+                    at,
+                    sii: &sii,
+                    coe: &mut lent.coe,
+                };
+                work(&mut open).await.map_err(Trouble::Told)
+            });
+            done.await.map_err(|trouble| match trouble {
+                Trouble::Told(failure) => failure,
+                Trouble::Service(error) => hints::service(&error, &at.nic),
+            })
+        })
+    }
+}
+
+/// What ends a piece of work.
+enum Trouble {
+    Told(Failure),
+    Service(ServiceError),
+}
+
+impl From<ServiceError> for Trouble {
+    fn from(error: ServiceError) -> Self {
+        Self::Service(error)
+    }
+}
+
+impl Located {
+    /// As the user sees it.
+    pub fn told<T>(&self, result: Result<T, ServiceError>) -> Result<T, Failure> {
+        result.map_err(|error| hints::service(&error, &self.nic))
+    }
+
+    /// The device is the machine file's. One that does not tell is taken for it.
+    pub fn check(&self, actual: Identity) -> Result<(), Failure> {
+        match &self.expected {
+            Some((name, expected))
+                if actual.vendor != 0
+                    && (actual.vendor, actual.product) != (expected.vendor, expected.product) =>
+            {
+                let device = &self.device;
+                let message = format!(
+                    "{device}: the machine file says that it is {name} ({expected}), it is {actual}"
+                );
+                Err(Failure::new(hints::FAILED, message)
+                    .hint("check the order of the devices; `ecaxis scan` shows who is there"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// A device with its mailbox open.
+#[derive(Debug)]
+pub(crate) struct Open<'a> {
+    pub at: &'a Located,
+    pub sii: &'a Sii,
+    pub coe: &'a mut CoeClient,
+}
+
+impl Open<'_> {
+    /// The dictionary of the ESI file, where there is one. `ask`: the device's own all the same.
+    pub async fn dictionary(&mut self, ask: bool) -> Result<Dictionary, Failure> {
+        match self.described(ask)? {
+            Some(dictionary) => Ok(dictionary),
+            None => self.own_dictionary().await,
+        }
+    }
+
+    /// What an ESI file says.
+    pub fn described(&self, ask: bool) -> Result<Option<Dictionary>, Failure> {
+        if ask {
+            return Ok(None);
+        }
+        if let Some(config) = &self.at.config {
+            let dictionary = &config.selection.dictionary;
+            return Ok((!dictionary.objects.is_empty()).then(|| dictionary.clone()));
+        }
+        let path = self.at.esi.as_deref();
+        let described = path.map(|path| self.in_library(path)).transpose()?;
+        Ok(described.filter(|dictionary| !dictionary.objects.is_empty()))
+    }
+
+    fn in_library(&self, path: &std::path::Path) -> Result<Dictionary, Failure> {
+        let wrong = |error: library::LoadError| Failure::new(hints::WRONG, error.to_string());
+        let library = match path.is_dir() {
+            true => Library::open(path, cache_file(path).as_deref()),
+            false => Library::of_file(path),
+        };
+        let library = library.map_err(wrong)?;
+        let identity = self.sii.identity;
+        let entry = library.find(identity, Match::Newer).ok_or_else(|| {
+            let message = format!("{}: describes no {identity}", path.display());
+            Failure::new(hints::WRONG, message).hint(format!(
+                "`ecaxis esi list {}` shows what it describes",
+                path.display()
+            ))
+        })?;
+        let file = library::load(&library.folder().join(&entry.file)).map_err(wrong)?;
+        let wanted = Identity {
+            revision: entry.revision,
+            ..identity
+        };
+        let device = file.devices.iter().find(|device| device.identity == wanted);
+        let Some(device) = device else {
+            return Ok(Dictionary::default());
+        };
+        let choice = Choice {
+            cycle_ns: 1_000_000,
+            ..Choice::default()
+        };
+        // Where the default configuration is impossible the device's own objects are still there.
+        let selected = select(&file, device, &choice).map(|selection| selection.dictionary);
+        Ok(selected.unwrap_or_else(|_| device.dictionary.clone()))
+    }
+
+    async fn own_dictionary(&mut self) -> Result<Dictionary, Failure> {
+        let Self { at, coe, .. } = self;
+        let mut progress = counter("asking for objects");
+        let learned = learn::dictionary(coe, &at.wire, &at.device, &mut progress).await;
+        bus::passed();
+        at.told(learned)
+    }
+
+    /// Who it is, by its own objects; what they do not tell is the EEPROM's.
+    pub async fn origin(&mut self) -> Result<Origin, Failure> {
+        let sii = self.sii;
+        let general = sii.general.as_ref();
+        let name = general.map(|general| general.name.clone());
+        let known = [
+            sii.identity.vendor,
+            sii.identity.product,
+            sii.identity.revision,
+            sii.serial,
+        ];
+        let mut told = [0; 4];
+        for (n, (value, known)) in (1..).zip(told.iter_mut().zip(known)) {
+            let read = self.read(0x1018, n).await?;
+            let read = read.ok().and_then(|bytes| bytes.try_into().ok());
+            *value = read.map_or(known, u32::from_le_bytes);
+        }
+        let [vendor, product, revision, serial] = told;
+        Ok(Origin {
+            name: name.unwrap_or_else(|| self.at.device.name.clone()),
+            vendor,
+            product,
+            revision,
+            serial,
+        })
+    }
+
+    /// One subindex, or the abort code of the device's refusal.
+    pub async fn read(&mut self, index: u16, sub: u8) -> Result<Result<Vec<u8>, u32>, Failure> {
+        let read = self.coe.upload(&self.at.wire, index, sub, false).await;
+        match read.map_err(|error| (error.abort_code(), error)) {
+            Ok(value) => Ok(Ok(value)),
+            Err((Some(code), _)) => Ok(Err(code)),
+            Err((None, source)) => self.at.told(Err(ServiceError::Sdo {
+                device: self.at.device.clone(),
+                source,
+            })),
+        }
+    }
+}
+
+/// Tells how far a long piece of work is.
+pub(crate) fn counter(what: &'static str) -> impl FnMut(usize, usize) {
+    let mut last = usize::MAX;
+    move |done, all| {
+        // A terminal need not be written to a thousand times a second.
+        let part = done * 100 / all.max(1);
+        if part != last {
+            last = part;
+            bus::passing(&format!("{what}: {done} of {all}"));
+        }
+    }
+}
+
+/// `0x6041:00`
+pub(crate) fn address(at: ObjectAddress) -> String {
+    format!("{:#06x}:{:02}", at.index, at.sub)
+}

@@ -1,0 +1,452 @@
+//! `ecaxis eeprom`: the EEPROM of a device: read, written, checked, and its station alias set.
+
+use std::path::{Path, PathBuf};
+
+use clap::Subcommand;
+use ecaxis::service::eeprom::{Claim, Eeprom};
+use ecaxis::service::image::{category, with_alias, with_category, write};
+use ecaxis_esi::Identity;
+use ecaxis_esi::sii::{self, Sii};
+use serde_json::json;
+
+use super::device::{Located, Place, counter};
+use super::{Failure, Verbosity, bus, hints, keep, note, result};
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis eeprom verify machine.toml x
+  ecaxis eeprom read machine.toml x x.bin
+  ecaxis eeprom alias machine.toml x 1001 --yes
+  ecaxis eeprom alias --nic enp3s0 --position 0 1001 --yes
+  ecaxis eeprom write machine.toml x x.bin --yes --backup old.bin
+
+What is written is read back; the old image is kept in a file first. A station
+alias counts when the device is switched on again.";
+
+const READ_EXAMPLES: &str = "\
+Examples:
+  ecaxis eeprom read machine.toml x x.bin
+  ecaxis eeprom read --nic enp3s0 --position 0 general.bin --category 30";
+
+const WRITE_EXAMPLES: &str = "\
+Examples:
+  ecaxis eeprom write machine.toml x x.bin --yes
+  ecaxis eeprom write machine.toml x general.bin --category 30 --yes";
+
+const ALIAS_EXAMPLES: &str = "\
+Examples:
+  ecaxis eeprom alias machine.toml x 1001 --yes
+  ecaxis eeprom alias --nic enp3s0 --position 0 1001 --yes";
+
+const VERIFY_EXAMPLES: &str = "\
+Examples:
+  ecaxis eeprom verify machine.toml x
+  ecaxis eeprom verify machine.toml x x.bin --json";
+
+/// Read, write and check the EEPROM of a device, set its station alias
+///
+/// The device is named by a machine file and its name in it, or by --nic with --position or --alias.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    pub verbosity: Verbosity,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Read(ReadArgs),
+    Write(WriteArgs),
+    Alias(AliasArgs),
+    Verify(VerifyArgs),
+}
+
+/// Keep the image, or one category of it, in a file
+#[derive(Debug, clap::Args)]
+#[command(after_help = READ_EXAMPLES, override_usage = "ecaxis eeprom read FILE DEVICE IMAGE\n       \
+    ecaxis eeprom read --nic IF --position N IMAGE")]
+struct ReadArgs {
+    /// Machine file, device, and the file to write, which must not exist yet
+    #[arg(required = true, value_name = "WORD")]
+    words: Vec<String>,
+    /// Only the data of this category, such as 30 (general) or 41 (SyncManagers)
+    #[arg(long, value_name = "TYPE", value_parser = super::esi::number_16)]
+    category: Option<u16>,
+    /// All that the chip holds, not only up to the image's end
+    #[arg(long, conflicts_with = "category")]
+    all: bool,
+    #[command(flatten)]
+    place: Place,
+}
+
+/// What keeps somebody from losing an image.
+#[derive(Debug, Clone, clap::Args)]
+struct Care {
+    /// Really write: a wrong image makes a device unusable
+    #[arg(long)]
+    yes: bool,
+    /// Keep the image as it was in this file, which must not exist yet; without it a name is chosen
+    #[arg(long, value_name = "FILE")]
+    backup: Option<PathBuf>,
+}
+
+/// Write an image, or one category of it; the old image is kept in a file, the new one read back
+#[derive(Debug, clap::Args)]
+#[command(after_help = WRITE_EXAMPLES, override_usage = "ecaxis eeprom write FILE DEVICE IMAGE --yes\n       \
+    ecaxis eeprom write --nic IF --position N IMAGE --yes"
+)]
+struct WriteArgs {
+    /// Machine file, device, and the image
+    #[arg(required = true, value_name = "WORD")]
+    words: Vec<String>,
+    /// The file holds the data of this category alone
+    #[arg(long, value_name = "TYPE", value_parser = super::esi::number_16)]
+    category: Option<u16>,
+    /// Even where the image is of another device
+    #[arg(long)]
+    other_device: bool,
+    #[command(flatten)]
+    care: Care,
+    #[command(flatten)]
+    place: Place,
+}
+
+/// Set the station alias, with its checksum; it counts when the device is switched on again
+#[derive(Debug, clap::Args)]
+#[command(after_help = ALIAS_EXAMPLES, override_usage = "ecaxis eeprom alias FILE DEVICE ALIAS --yes\n       \
+    ecaxis eeprom alias --nic IF --position N ALIAS --yes"
+)]
+struct AliasArgs {
+    /// Machine file, device, and the alias; 0 is none
+    #[arg(required = true, value_name = "WORD")]
+    words: Vec<String>,
+    #[command(flatten)]
+    care: Care,
+    #[command(flatten)]
+    place: Place,
+}
+
+/// Check the image in the device: by itself, against the machine file, against an image in a file
+#[derive(Debug, clap::Args)]
+#[command(after_help = VERIFY_EXAMPLES, override_usage = "ecaxis eeprom verify FILE DEVICE [IMAGE]\n       \
+    ecaxis eeprom verify --nic IF --position N [IMAGE]")]
+struct VerifyArgs {
+    /// Machine file, device, and an image to compare with
+    #[arg(value_name = "WORD")]
+    words: Vec<String>,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    place: Place,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.command {
+        Command::Read(args) => read(args),
+        Command::Write(args) => replace(args),
+        Command::Alias(args) => alias(args),
+        Command::Verify(args) => verify(args),
+    }
+}
+
+fn read(args: &ReadArgs) -> Result<(), Failure> {
+    let (target, rest) = args.place.take(&args.words, "a file to write")?;
+    let path = only(rest, "one file to write")?;
+    if path.exists() {
+        return Err(super::in_the_way(&path));
+    }
+    let all = args.all;
+    let image = target.visit(async move |at: &Located| image(at, all).await)?;
+    let bytes = match args.category {
+        None => image.as_slice(),
+        Some(kind) => {
+            let place = category(&image, kind).ok_or_else(|| no_category(kind, &image))?;
+            image.get(place).unwrap_or_default()
+        }
+    };
+    keep(&path, bytes)?;
+    note(&format!("{}: {} bytes", path.display(), bytes.len()));
+    Ok(())
+}
+
+fn replace(args: &WriteArgs) -> Result<(), Failure> {
+    let (target, rest) = args.place.take(&args.words, "an image")?;
+    let path = only(rest, "one image")?;
+    let given = load(&path)?;
+    if args.category.is_none() {
+        sound(&path, &given)?;
+    }
+    args.care.allow()?;
+    let (kind, care, other_device) = (args.category, args.care.clone(), args.other_device);
+    let done = target.visit(async move |at: &Located| {
+        let old = image(at, false).await?;
+        let new = match kind {
+            None => given,
+            Some(kind) => {
+                with_category(&old, kind, &given).ok_or_else(|| no_category(kind, &old))?
+            }
+        };
+        let (was, becomes) = (identity(&old), identity(&new));
+        if was != becomes && !other_device {
+            let device = &at.device;
+            let message = format!("{device}: is {was}, {} is an image of {becomes}", path.display());
+            return Err(Failure::new(hints::FAILED, message)
+                .hint("with it the device would be taken for another; `--other-device` writes it all the same"));
+        }
+        for (what, was, becomes) in kept(&old, &new) {
+            bus::warn(format!("the {what} {was} becomes {becomes}"));
+        }
+        burn(at, &care, &old, &new).await
+    })?;
+    note(&done);
+    Ok(())
+}
+
+fn alias(args: &AliasArgs) -> Result<(), Failure> {
+    let (target, rest) = args.place.take(&args.words, "an alias")?;
+    let alias = match rest {
+        [alias] => super::esi::number_16(alias),
+        _ => Err("one alias, decimal or 0x…".to_owned()),
+    };
+    let alias = alias.map_err(|error| Failure::new(hints::WRONG, error))?;
+    args.care.allow()?;
+    let care = args.care.clone();
+    let done = target.visit(async move |at: &Located| {
+        let old = image(at, false).await?;
+        let mut new = old.clone();
+        let Some(area) = new.first_chunk_mut() else {
+            return Err(Failure::new(
+                hints::FAILED,
+                "the image has no configuration area",
+            ));
+        };
+        *area = with_alias(*area, alias);
+        burn(at, &care, &old, &new).await
+    })?;
+    note(&done);
+    note("the alias counts when the device is switched on again");
+    Ok(())
+}
+
+fn verify(args: &VerifyArgs) -> Result<(), Failure> {
+    let (target, rest) = args.place.take(&args.words, "nothing or an image")?;
+    let other = match rest {
+        [] => None,
+        rest => {
+            let path = only(rest, "one image")?;
+            Some((load(&path)?, path))
+        }
+    };
+    let (there, expected, device) = target.visit(async move |at: &Located| {
+        let there = image(at, false).await?;
+        Ok((there, at.expected.clone(), at.device.clone()))
+    })?;
+    let mut problems = Vec::new();
+    let mut remarks = Vec::new();
+    match sii::inspect(&there) {
+        Ok((sii, warnings)) => {
+            match &expected {
+                Some((name, expected)) if sii.identity != *expected => problems.push(format!(
+                    "it is of {}, the machine file says {name} ({expected})",
+                    sii.identity
+                )),
+                _ => {}
+            }
+            if !sii.checksum_ok {
+                problems.push("the checksum of its configuration area is wrong".to_owned());
+            }
+            remarks.extend(warnings.iter().map(ToString::to_string));
+        }
+        Err(error) => problems.push(error.to_string()),
+    }
+    if let Some((image, path)) = &other {
+        problems.extend(differing(&there, image, path));
+    }
+    if args.json {
+        let report = json!({
+            "ok": problems.is_empty(), "device": device.name, "position": device.position,
+            "bytes": there.len(), "problems": problems, "remarks": remarks,
+        });
+        result(&format!("{report:#}\n"))?;
+    } else {
+        for line in problems.iter().chain(&remarks) {
+            result(&format!("{line}\n"))?;
+        }
+    }
+    if problems.is_empty() {
+        return Ok(());
+    }
+    Err(Failure::new(
+        hints::FAILED,
+        format!("{device}: the image in its EEPROM is not right"),
+    )
+    .hint("`ecaxis eeprom write` writes another"))
+}
+
+/// Where an image in a file differs from that in the device; the device may hold more.
+fn differing(there: &[u8], image: &[u8], path: &Path) -> Option<String> {
+    let at = (0..image.len()).filter(|at| there.get(*at) != image.get(*at));
+    let all: Vec<usize> = at.collect();
+    let first = all.first()?;
+    Some(format!(
+        "{} bytes are not those of {}, the first at 0x{first:04x}",
+        all.len(),
+        path.display()
+    ))
+}
+
+impl Care {
+    fn allow(&self) -> Result<(), Failure> {
+        if self.yes {
+            return Ok(());
+        }
+        Err(
+            Failure::new(hints::WRONG, "nothing was written: say `--yes`")
+                .hint("a wrong image makes a device unusable; the old one is kept in a file first"),
+        )
+    }
+
+    /// Keeps the old image, and says where.
+    fn keep(&self, at: &Located, old: &[u8]) -> Result<PathBuf, Failure> {
+        if let Some(path) = &self.backup {
+            return keep(path, old).map(|()| path.clone());
+        }
+        let serial = sii::parse(old).map_or(0, |sii| sii.serial);
+        let plain = |c: char| if c.is_alphanumeric() { c } else { '-' };
+        let name: String = at.device.name.chars().map(plain).collect();
+        for n in 1..1000 {
+            let path = PathBuf::from(format!("eeprom-{name}-{serial}-{n}.bin"));
+            if !path.exists() {
+                return keep(&path, old).map(|()| path);
+            }
+        }
+        Err(
+            Failure::new(hints::WRONG, "too many old images in this folder")
+                .hint("name the file with `--backup`"),
+        )
+    }
+}
+
+/// Keeps the old image, writes the new one, reads it back.
+async fn burn(at: &Located, care: &Care, old: &[u8], new: &[u8]) -> Result<String, Failure> {
+    let eeprom = claim(at, "writing its EEPROM").await?;
+    let done = async {
+        let room = at.told(eeprom.size().await)?;
+        if new.len() > room {
+            let message = format!("the image has {} bytes, the EEPROM {room}", new.len());
+            return Err(Failure::new(hints::FAILED, message));
+        }
+        let backup = care.keep(at, old)?;
+        note(&format!("the old image is in {}", backup.display()));
+        let mut progress = counter("writing words");
+        let written = write(&eeprom, new, &mut progress).await;
+        bus::passed();
+        at.told(written)
+    };
+    let done = done.await;
+    let back = eeprom.give_back().await;
+    let written = done?;
+    at.told(back)?;
+    let words = if written == 1 { "word" } else { "words" };
+    Ok(format!(
+        "{}: {written} {words} written and read back",
+        at.device
+    ))
+}
+
+async fn claim<'a>(
+    at: &'a Located,
+    step: &'static str,
+) -> Result<Eeprom<'a, ecaxis::service::Datagrams>, Failure> {
+    at.told(Eeprom::claim(&at.wire, &at.device, step, Claim::of(at.state)).await)
+}
+
+/// What the device holds.
+async fn image(at: &Located, all: bool) -> Result<Vec<u8>, Failure> {
+    let eeprom = claim(at, "reading its EEPROM").await?;
+    let mut progress = counter("reading bytes");
+    let image = match all {
+        true => eeprom.all(&mut progress).await,
+        false => eeprom.image(&mut progress).await,
+    };
+    bus::passed();
+    at.told(eeprom.give_back().await)?;
+    at.told(image)
+}
+
+fn identity(image: &[u8]) -> Identity {
+    let word = |at: usize| {
+        let bytes = image.get(at..).and_then(<[u8]>::first_chunk);
+        bytes.map_or(0, |bytes| u32::from_le_bytes(*bytes))
+    };
+    Identity {
+        vendor: word(0x10),
+        product: word(0x14),
+        revision: word(0x18),
+    }
+}
+
+/// What is the device's own, and changes.
+fn kept(old: &[u8], new: &[u8]) -> Vec<(&'static str, u32, u32)> {
+    let (Ok(old), Ok(new)) = (sii::parse(old), sii::parse(new)) else {
+        return Vec::new();
+    };
+    let own = |sii: &Sii| {
+        [
+            ("serial number", sii.serial),
+            ("station alias", u32::from(sii.alias)),
+        ]
+    };
+    let both = own(&old).into_iter().zip(own(&new));
+    let changed = both.filter(|((_, was), (_, becomes))| was != becomes);
+    changed
+        .map(|((what, was), (_, becomes))| (what, was, becomes))
+        .collect()
+}
+
+fn load(path: &Path) -> Result<Vec<u8>, Failure> {
+    /// No EEPROM holds more.
+    const MAX_BYTES: u64 = 512 * 1024;
+    let shown = path.display();
+    let wrong = |what: String| Failure::new(hints::WRONG, what);
+    let bytes = std::fs::metadata(path).map(|meta| meta.len());
+    if bytes.is_ok_and(|bytes| bytes > MAX_BYTES) {
+        return Err(wrong(format!("{shown} is too long for an EEPROM")));
+    }
+    std::fs::read(path).map_err(|error| wrong(format!("cannot read {shown}: {error}")))
+}
+
+/// A device with a broken image has no mailbox, and some have no controller.
+fn sound(path: &Path, image: &[u8]) -> Result<(), Failure> {
+    let wrong = |what: String| {
+        Failure::new(hints::WRONG, format!("{}: {what}", path.display()))
+            .hint("`ecaxis esi sii` makes an image from an ESI file")
+    };
+    match sii::parse(image) {
+        Ok(sii) if !sii.checksum_ok => Err(wrong(
+            "the checksum of its configuration area is wrong; a controller would ignore it"
+                .to_owned(),
+        )),
+        Ok(_) => Ok(()),
+        Err(error) => Err(wrong(error.to_string())),
+    }
+}
+
+fn no_category(kind: u16, image: &[u8]) -> Failure {
+    let there: Vec<String> = (0..0x1000)
+        .filter(|kind| category(image, *kind).is_some())
+        .map(|kind| kind.to_string())
+        .collect();
+    Failure::new(hints::WRONG, format!("the image has no category {kind}"))
+        .hint(format!("it has {}", there.join(", ")))
+}
+
+fn only(words: &[String], what: &str) -> Result<PathBuf, Failure> {
+    match words {
+        [path] => Ok(PathBuf::from(path)),
+        _ => Err(Failure::new(hints::WRONG, what)),
+    }
+}

@@ -1,0 +1,39 @@
+//! `ecaxis sdo list`.
+
+use super::super::device::Open;
+use super::super::esi::objects;
+use super::super::{Failure, hints, result};
+use super::Common;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis sdo list machine.toml x
+  ecaxis sdo list machine.toml x --ask    what the device itself says
+  ecaxis sdo list --nic enp3s0 --position 0 --json";
+
+/// List the objects of a device: types, access, what can be mapped, names
+///
+/// By the ESI file, or by the device's own account (SDO Information) where there is none, or with --ask.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, override_usage = "ecaxis sdo list FILE DEVICE\n       \
+    ecaxis sdo list --nic IF --position N")]
+pub(super) struct Args {
+    /// Machine file and device
+    #[arg(value_name = "WORD")]
+    words: Vec<String>,
+    #[command(flatten)]
+    common: Common,
+}
+
+pub(super) fn run(args: &Args) -> Result<(), Failure> {
+    let (target, rest) = args.common.place.take(&args.words, "nothing")?;
+    if let Some(word) = rest.first() {
+        return Err(Failure::new(
+            hints::WRONG,
+            format!("`{word}` is one word too many"),
+        ));
+    }
+    let ask = args.common.ask;
+    let dictionary = target.open(async move |open: &mut Open<'_>| open.dictionary(ask).await)?;
+    result(&objects::listed(&dictionary, args.common.json))
+}

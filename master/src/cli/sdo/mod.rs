@@ -1,0 +1,201 @@
+//! `ecaxis sdo`: the parameters of a device, read, written, listed, kept in a file and brought back. One file a command.
+
+use std::path::Path;
+
+use clap::Subcommand;
+use ecaxis::mailbox::{ObjectAddress, abort_text};
+use ecaxis::parameters::compare::Difference;
+use ecaxis::parameters::dump::Dump;
+use ecaxis::parameters::find::{FindError, Wanted, find};
+use ecaxis_esi::Dictionary;
+use serde_json::{Value, json};
+
+use super::device::{Place, address};
+use super::table::Table;
+use super::{Failure, Verbosity, hints};
+
+mod command;
+mod compare;
+mod dump;
+mod list;
+mod read;
+mod restore;
+mod write;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis sdo read machine.toml x Statusword 0x1018
+  ecaxis sdo write machine.toml x 0x6065 2000
+  ecaxis sdo list --nic enp3s0 --position 0
+  ecaxis sdo dump machine.toml x x.toml       every readable object in a file
+  ecaxis sdo compare machine.toml x x.toml    prints what differs
+  ecaxis sdo restore machine.toml x x.toml    writes the settings back
+  ecaxis sdo store machine.toml x             keeps them over a power cycle
+
+Values are decimal, hexadecimal (0x10), text, or bytes ([01 02]). An object is
+a number (0x6065, 0x1018:01) or a name (Statusword, \"Identity: Vendor ID\").";
+
+/// Read and write the parameters of a device, keep them in a file, bring them back
+///
+/// The device is named by a machine file and its name in it, or by --nic with --position or --alias. It is taken as it is found: one in
+/// Init is in PreOp meanwhile, one in Op stays there.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    pub verbosity: Verbosity,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Read(read::Args),
+    Write(write::Args),
+    List(list::Args),
+    Dump(dump::Args),
+    Compare(compare::Args),
+    Restore(restore::Args),
+    /// Keep the parameters over power cycles (0x1010 "save")
+    Store(command::Args),
+    /// Back to the maker's parameters at the next start (0x1011 "load")
+    Defaults(command::Args),
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.command {
+        Command::Read(args) => read::run(args),
+        Command::Write(args) => write::run(args),
+        Command::List(args) => list::run(args),
+        Command::Dump(args) => dump::run(args),
+        Command::Compare(args) => compare::run(args),
+        Command::Restore(args) => restore::run(args),
+        Command::Store(args) => command::run(args, ecaxis::parameters::command::Command::Store),
+        Command::Defaults(args) => {
+            command::run(args, ecaxis::parameters::command::Command::Defaults)
+        }
+    }
+}
+
+/// What every command has.
+#[derive(Debug, Clone, clap::Args)]
+struct Common {
+    #[command(flatten)]
+    place: Place,
+    /// Ask the device itself for its objects (SDO Information), even where an ESI file describes them
+    #[arg(long)]
+    ask: bool,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// An object that was asked for by number or name.
+fn wanted(dictionary: Option<&Dictionary>, text: &str) -> Result<Wanted, Failure> {
+    find(dictionary, text).map_err(|error| {
+        let failure = Failure::new(hints::WRONG, error.to_string());
+        match error {
+            FindError::Unknown {
+                near: Some(near), ..
+            } => failure.hint(format!("did you mean `{near}`?")),
+            FindError::Unknown { .. } => failure
+                .hint("`ecaxis sdo list` shows the names; a number such as 0x6041:00 always works"),
+            FindError::Ambiguous { .. } => failure.hint(
+                "give the number, or the object's name before its own: `Identity: Vendor ID`",
+            ),
+            FindError::Number(_) => failure,
+        }
+    })
+}
+
+/// A file of parameters.
+fn load(path: &Path) -> Result<Dump, Failure> {
+    /// No dump is longer.
+    const MAX_BYTES: u64 = 64 << 20;
+    let shown = path.display();
+    let wrong = |what: String| Failure::new(hints::WRONG, what);
+    let bytes = std::fs::metadata(path).map(|meta| meta.len());
+    if bytes.is_ok_and(|bytes| bytes > MAX_BYTES) {
+        return Err(wrong(format!(
+            "{shown} is too long for a file of parameters"
+        )));
+    }
+    let text = std::fs::read_to_string(path);
+    let text = text.map_err(|error| wrong(format!("cannot read {shown}: {error}")))?;
+    Dump::parse(&text).map_err(|error| {
+        wrong(format!("{shown}: {error}"))
+            .hint("`ecaxis sdo dump` writes such files; `value` may be changed by hand")
+    })
+}
+
+/// The only line of a value that stands alone, and the row of one among others.
+struct Line {
+    at: ObjectAddress,
+    name: String,
+    data_type: String,
+    /// As text, and as a number in hexadecimal where it is one.
+    value: Result<(String, Option<String>), u32>,
+}
+
+fn lines(all: &[Line]) -> String {
+    if let [line] = all {
+        let Line {
+            at,
+            name,
+            data_type,
+            value,
+        } = line;
+        let name = match name.as_str() {
+            "" => String::new(),
+            name => format!(" {name}"),
+        };
+        let value = match value {
+            Ok((value, Some(hex))) => format!("{value} ({hex})"),
+            Ok((value, None)) => value.clone(),
+            Err(code) => refusal(*code),
+        };
+        return format!("{}{name} ({data_type}) = {value}\n", address(*at));
+    }
+    let mut table = Table::new(&["object", "type", "value", "hex", "name"]);
+    for line in all {
+        let (value, hex) = match &line.value {
+            Ok((value, hex)) => (value.clone(), hex.clone().unwrap_or_default()),
+            Err(code) => (refusal(*code), String::new()),
+        };
+        table.row([&address(line.at), &line.data_type, &value, &hex, &line.name]);
+    }
+    table.shown(0) + "\n"
+}
+
+fn refusal(code: u32) -> String {
+    format!("refused with {code:#010x}: {}", abort_text(code))
+}
+
+/// Differences between two sides, for people.
+fn differences(sides: [&str; 2], all: &[Difference]) -> String {
+    if all.is_empty() {
+        return String::new();
+    }
+    let [left, right] = sides;
+    let mut table = Table::new(&["object", left, right, "name"]);
+    let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
+    for difference in all {
+        table.row([
+            &address(difference.at),
+            &side(&difference.left),
+            &side(&difference.right),
+            &difference.name,
+        ]);
+    }
+    table.shown(0) + "\n"
+}
+
+fn as_json(all: &[Difference]) -> Value {
+    let each = all.iter().map(|difference| {
+        json!({
+            "index": difference.at.index, "sub": difference.at.sub, "name": difference.name,
+            "left": difference.left, "right": difference.right,
+        })
+    });
+    each.collect()
+}

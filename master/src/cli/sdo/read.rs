@@ -1,0 +1,282 @@
+//! `ecaxis sdo read`.
+
+use std::path::PathBuf;
+
+use ecaxis::mailbox::{ObjectAddress, SdoError, object_name};
+use ecaxis::parameters::find::Wanted;
+use ecaxis::parameters::{DataType, learn, name_of, type_of};
+use ecaxis::service::ServiceError;
+use ecaxis_esi::Object;
+use serde_json::json;
+
+use super::super::device::Open;
+use super::super::{Failure, hints, note, result};
+use super::{Common, Line, wanted};
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis sdo read machine.toml x Statusword
+  ecaxis sdo read machine.toml x 0x6064 0x1018:01 --json
+  ecaxis sdo read --nic enp3s0 --position 0 0x1018
+  ecaxis sdo read machine.toml x 0x2100 --to large.bin";
+
+/// Read objects: by number (0x6064, 0x1018:01) or by name
+///
+/// An object without subindex is read with all that it has.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, override_usage = "ecaxis sdo read FILE DEVICE OBJECT...\n       \
+    ecaxis sdo read --nic IF --position N OBJECT...")]
+pub(super) struct Args {
+    /// Machine file, device, and one or more objects
+    #[arg(required = true, value_name = "WORD")]
+    words: Vec<String>,
+    /// Take the object for this type: u16, i32, f32, text, bytes, or a name of ETG.2000 such as UDINT
+    #[arg(long = "type", value_name = "TYPE")]
+    data_type: Option<String>,
+    /// Read each object in one piece (complete access)
+    #[arg(long)]
+    complete: bool,
+    /// Write the bytes of the one object to this file, which must not exist yet
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["complete", "json"])]
+    to: Option<PathBuf>,
+    #[command(flatten)]
+    common: Common,
+}
+
+pub(super) fn run(args: &Args) -> Result<(), Failure> {
+    let (target, objects) = args.common.place.take(&args.words, "objects")?;
+    if objects.is_empty() {
+        return Err(Failure::new(hints::WRONG, "which object?")
+            .hint("by number, such as 0x6041, or by name, such as Statusword"));
+    }
+    let data_type = data_type(args.data_type.as_deref())?;
+    let (objects, ask, complete) = (objects.to_vec(), args.common.ask, args.complete);
+    let to_file = args.to.is_some();
+    let read = target.open(async move |open: &mut Open<'_>| {
+        let mut out = Vec::new();
+        for (wanted, object) in describe(open, ask, &objects).await? {
+            if complete {
+                out.extend(whole(open, wanted, object.as_ref(), data_type).await?);
+                continue;
+            }
+            for (at, name, known) in parts(wanted, object.as_ref()) {
+                let value = open.read(at.index, at.sub).await?;
+                out.push((at, name, data_type.or(known), value));
+            }
+        }
+        // One value that is refused is why somebody asked; among others it is one of them.
+        match out.as_slice() {
+            [(at, .., Err(code))] => open.at.told(Err(ServiceError::Sdo {
+                device: open.at.device.clone(),
+                source: SdoError::Abort {
+                    station: open.at.device.station,
+                    index: at.index,
+                    sub: at.sub,
+                    code: *code,
+                },
+            })),
+            [_, _, ..] if to_file => {
+                Err(Failure::new(hints::WRONG, "a file takes one subindex")
+                    .hint("name it: 0x1018:01"))
+            }
+            _ => Ok(out),
+        }
+    })?;
+    if let (Some(path), [(_, _, _, Ok(value))]) = (&args.to, read.as_slice()) {
+        super::super::keep(path, value)?;
+        note(&format!("{}: {} bytes", path.display(), value.len()));
+        return Ok(());
+    }
+    let lines: Vec<Line> = read.into_iter().map(line).collect();
+    if args.common.json {
+        let each = lines.iter().map(|line| {
+            json!({
+                "index": line.at.index, "sub": line.at.sub, "name": line.name, "type": line.data_type,
+                "value": line.value.as_ref().ok().map(|(value, _)| value),
+                "hex": line.value.as_ref().ok().and_then(|(_, hex)| hex.as_ref()),
+                "abort": line.value.as_ref().err(),
+            })
+        });
+        let all: serde_json::Value = each.collect();
+        return result(&format!("{all:#}\n"));
+    }
+    result(&super::lines(&lines))
+}
+
+type Read = (
+    ObjectAddress,
+    String,
+    Option<DataType>,
+    Result<Vec<u8>, u32>,
+);
+
+fn line((at, name, data_type, value): Read) -> Line {
+    let data_type = data_type.unwrap_or(DataType::BYTES);
+    Line {
+        at,
+        name,
+        data_type: match data_type {
+            DataType::BYTES => "bytes".to_owned(),
+            known => known.to_string(),
+        },
+        value: value.map(|bytes| (data_type.show(&bytes), hex(data_type, &bytes))),
+    }
+}
+
+/// Numbers of more than one bit.
+pub(super) fn hex(data_type: DataType, bytes: &[u8]) -> Option<String> {
+    data_type.integer(bytes).filter(|_| data_type.bits > 1)?;
+    let digits: String = bytes
+        .iter()
+        .rev()
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
+    Some(format!("0x{digits}"))
+}
+
+pub(super) fn data_type(name: Option<&str>) -> Result<Option<DataType>, Failure> {
+    let Some(name) = name else {
+        return Ok(None);
+    };
+    DataType::named(name, 0).map(Some).ok_or_else(|| {
+        Failure::new(hints::WRONG, format!("unknown type `{name}`"))
+            .hint("u8 to u64, i8 to i64, f32, f64, bool, text, bytes, or a name of ETG.2000 such as UDINT")
+    })
+}
+
+/// The objects that are meant, each with what is known of it. The whole dictionary is only asked for where a name needs it.
+pub(super) async fn describe(
+    open: &mut Open<'_>,
+    ask: bool,
+    objects: &[String],
+) -> Result<Vec<(Wanted, Option<Object>)>, Failure> {
+    let mut dictionary = open.described(ask)?;
+    let mut all = Vec::new();
+    for text in objects {
+        let found = match (wanted(dictionary.as_ref(), text), &dictionary) {
+            (Err(failure), None) if !text.starts_with(|c: char| c.is_ascii_digit()) => {
+                note("asking the device for the names of its objects");
+                let own = open.dictionary(true).await;
+                // What the device does not tell is no news; that there is no such name is.
+                let own = own.map_err(|_| failure)?;
+                wanted(Some(dictionary.insert(own)), text)?
+            }
+            (found, _) => found?,
+        };
+        let known = dictionary.as_ref().and_then(|d| d.object(found.index));
+        let object = match (known, &dictionary) {
+            (Some(object), _) => Some(object.clone()),
+            // An object that an ESI does not know may be there all the same.
+            (None, _) => learn::object(open.coe, &open.at.wire, found.index)
+                .await
+                .ok(),
+        };
+        all.push((found, object.filter(|object| !object.items.is_empty())));
+    }
+    Ok(all)
+}
+
+type Part = (ObjectAddress, String, Option<DataType>);
+
+/// The subindices that are meant.
+pub(super) fn parts(wanted: Wanted, object: Option<&Object>) -> Vec<Part> {
+    let index = wanted.index;
+    let nameless = |sub: u8| {
+        let name = object_name(index, sub).unwrap_or_default().to_owned();
+        (ObjectAddress { index, sub }, name, None)
+    };
+    let Some(object) = object else {
+        return vec![nameless(wanted.sub.unwrap_or(0))];
+    };
+    let items = object.items.iter().filter(|item| match wanted.sub {
+        Some(sub) => item.sub == sub,
+        None => item.access.read,
+    });
+    let known: Vec<Part> = items
+        .map(|item| {
+            let at = ObjectAddress {
+                index,
+                sub: item.sub,
+            };
+            (at, name_of(object, item), Some(type_of(item)))
+        })
+        .collect();
+    match known.is_empty() {
+        true => vec![nameless(wanted.sub.unwrap_or(0))],
+        false => known,
+    }
+}
+
+/// By complete access, taken apart by the dictionary.
+async fn whole(
+    open: &mut Open<'_>,
+    wanted: Wanted,
+    object: Option<&Object>,
+    data_type: Option<DataType>,
+) -> Result<Vec<Read>, Failure> {
+    let index = wanted.index;
+    let first = wanted.sub.unwrap_or(0);
+    let read = open.coe.upload(&open.at.wire, index, first, true).await;
+    let bytes = open.at.told(read.map_err(|source| ServiceError::Sdo {
+        device: open.at.device.clone(),
+        source,
+    }))?;
+    let at = ObjectAddress { index, sub: first };
+    let Some(object) = object.filter(|object| object.items.len() > 1 && data_type.is_none()) else {
+        let name = object
+            .map(|object| object.name.to_string())
+            .unwrap_or_default();
+        return Ok(vec![(at, name, data_type, Ok(bytes))]);
+    };
+    // Subindex 0 takes 16 bits.
+    let start = if first == 0 { 0 } else { 16 };
+    let items = object.items.iter().filter(|item| item.sub >= first);
+    let known = items.map_while(|item| {
+        let from = usize::try_from(item.bit_offset.checked_sub(start)?).ok()?;
+        let value = bits(&bytes, from, usize::try_from(item.bit_len).ok()?)?;
+        let at = ObjectAddress {
+            index,
+            sub: item.sub,
+        };
+        Some((at, name_of(object, item), Some(type_of(item)), Ok(value)))
+    });
+    Ok(known.collect())
+}
+
+/// `len` bits from bit `from` on; `None` beyond the end.
+fn bits(bytes: &[u8], from: usize, len: usize) -> Option<Vec<u8>> {
+    let end = from
+        .checked_add(len)
+        .filter(|end| *end <= bytes.len() * 8)?;
+    let mut out = vec![0_u8; len.div_ceil(8)];
+    for (n, at) in (from..end).enumerate() {
+        let bit = bytes.get(at / 8)? >> (at % 8) & 1;
+        *out.get_mut(n / 8)? |= bit << (n % 8);
+    }
+    Some(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_are_cut_out() {
+        let bytes = [0b1010_0110, 0xff, 0x01];
+        assert_eq!(bits(&bytes, 1, 3), Some(vec![0b011]));
+        assert_eq!(bits(&bytes, 4, 12), Some(vec![0xfa, 0x0f]));
+        assert_eq!(bits(&bytes, 8, 16), Some(vec![0xff, 0x01]));
+        assert_eq!(bits(&bytes, 20, 5), None);
+        assert_eq!(bits(&bytes, usize::MAX, 2), None);
+    }
+
+    #[test]
+    fn numbers_in_hexadecimal_have_all_their_digits() {
+        let ty = |name: &str| DataType::named(name, 0).expect("a type");
+        assert_eq!(hex(ty("UINT"), &[0x50, 2]).as_deref(), Some("0x0250"));
+        assert_eq!(hex(ty("SINT"), &[0xfe]).as_deref(), Some("0xfe"));
+        assert_eq!(hex(ty("BOOL"), &[1]), None);
+        assert_eq!(hex(ty("REAL"), &[0; 4]), None);
+        assert_eq!(hex(ty("UINT"), &[0; 4]), None);
+    }
+}

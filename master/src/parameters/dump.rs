@@ -1,0 +1,202 @@
+//! Parameters in a file: TOML, one line an object.
+//!
+//! ```toml
+//! [device]
+//! name = "EPOS4"
+//! vendor = 0x000000fb
+//!
+//! [parameters]
+//! "0x6065:00" = { name = "Following error window", type = "UDINT", access = "rw", value = 2000 }
+//! ```
+
+use std::collections::BTreeMap;
+
+use ecaxis_esi::Identity;
+use serde::Deserialize;
+
+use super::{DataType, Parameter};
+use crate::mailbox::ObjectAddress;
+
+/// Whose parameters they are.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Origin {
+    pub name: String,
+    pub vendor: u32,
+    pub product: u32,
+    pub revision: u32,
+    #[serde(default)]
+    pub serial: u32,
+}
+
+impl Origin {
+    #[must_use]
+    pub fn identity(&self) -> Identity {
+        Identity {
+            vendor: self.vendor,
+            product: self.product,
+            revision: self.revision,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Dump {
+    pub device: Origin,
+    /// By index and subindex, rising.
+    pub parameters: Vec<Parameter>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Raw {
+    device: Origin,
+    parameters: BTreeMap<String, Line>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Line {
+    #[serde(default)]
+    name: String,
+    #[serde(rename = "type")]
+    data_type: String,
+    #[serde(default)]
+    access: String,
+    value: toml::Value,
+}
+
+/// Access of what a restore may write.
+const READ_WRITE: &str = "rw";
+const READ_ONLY: &str = "ro";
+
+/// What is wrong with a file; complete in itself but for the file's name.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DumpError {
+    #[error("{0}")]
+    Toml(String),
+    #[error("[parameters] \"{0}\": not an object, such as \"0x6065:00\"")]
+    Address(String),
+    #[error("[parameters] \"{key}\": unknown type `{name}`")]
+    Type { key: String, name: String },
+    #[error("[parameters] \"{key}\": access is \"ro\" or \"rw\", not \"{access}\"")]
+    Access { key: String, access: String },
+    #[error("[parameters] \"{key}\": {source}")]
+    Value {
+        key: String,
+        source: super::ValueError,
+    },
+    #[error("[parameters] \"{0}\": a value is a number, a text, true or false")]
+    NoValue(String),
+}
+
+impl Dump {
+    /// As a file.
+    #[must_use]
+    pub fn to_toml(&self) -> String {
+        let Origin {
+            name,
+            vendor,
+            product,
+            revision,
+            serial,
+        } = &self.device;
+        let mut text = format!(
+            "# Parameters of a device, by `ecaxis sdo dump`. `ecaxis sdo restore` writes back those with access \"rw\".\n\n[device]\nname = {}\nvendor = {vendor:#010x}\nproduct = {product:#010x}\nrevision = {revision:#010x}\nserial = {serial}\n\n[parameters]\n",
+            quoted(name),
+        );
+        for parameter in &self.parameters {
+            let ObjectAddress { index, sub } = parameter.at;
+            text += &format!(
+                "\"{index:#06x}:{sub:02}\" = {{ name = {}, type = {}, access = \"{}\", value = {} }}\n",
+                quoted(&parameter.name),
+                quoted(&parameter.data_type.to_string()),
+                if parameter.writable {
+                    READ_WRITE
+                } else {
+                    READ_ONLY
+                },
+                value(parameter),
+            );
+        }
+        text
+    }
+
+    /// From a file.
+    ///
+    /// # Errors
+    /// [`DumpError`].
+    pub fn parse(text: &str) -> Result<Self, DumpError> {
+        let raw: Raw = toml::from_str(text).map_err(|error| DumpError::Toml(error.to_string()))?;
+        let mut parameters = Vec::with_capacity(raw.parameters.len());
+        for (key, line) in raw.parameters {
+            parameters.push(line.parameter(key)?);
+        }
+        parameters.sort_by_key(|p| (p.at.index, p.at.sub));
+        Ok(Self {
+            device: raw.device,
+            parameters,
+        })
+    }
+}
+
+impl Line {
+    fn parameter(self, key: String) -> Result<Parameter, DumpError> {
+        let at = match super::find::find(None, &key) {
+            Ok(super::find::Wanted {
+                index,
+                sub: Some(sub),
+            }) => ObjectAddress { index, sub },
+            _ => return Err(DumpError::Address(key)),
+        };
+        let Some(data_type) = DataType::named(&self.data_type, 0) else {
+            let name = self.data_type;
+            return Err(DumpError::Type { key, name });
+        };
+        let writable = match self.access.as_str() {
+            READ_WRITE => true,
+            READ_ONLY | "" => false,
+            _ => {
+                let access = self.access;
+                return Err(DumpError::Access { key, access });
+            }
+        };
+        let written = match self.value {
+            toml::Value::String(text) => text,
+            toml::Value::Integer(n) => n.to_string(),
+            toml::Value::Float(x) => x.to_string(),
+            toml::Value::Boolean(b) => b.to_string(),
+            _ => return Err(DumpError::NoValue(key)),
+        };
+        match data_type.read(&written) {
+            Ok(value) => Ok(Parameter {
+                at,
+                name: self.name,
+                data_type,
+                writable,
+                value,
+            }),
+            Err(source) => Err(DumpError::Value { key, source }),
+        }
+    }
+}
+
+/// Numbers and truth values as TOML has them, everything else as text.
+fn value(parameter: &Parameter) -> String {
+    let shown = parameter.shown();
+    let bare = match parameter.data_type.kind {
+        super::Kind::Unsigned | super::Kind::Signed => {
+            shown.parse::<i64>().is_ok() || matches!(shown.as_str(), "true" | "false")
+        }
+        super::Kind::Real => {
+            let plain = shown.contains('.') && !shown.contains('e');
+            plain || matches!(shown.as_str(), "inf" | "-inf" | "nan")
+        }
+        _ => false,
+    };
+    if bare { shown } else { quoted(&shown) }
+}
+
+fn quoted(text: &str) -> String {
+    toml::Value::String(text.to_owned()).to_string()
+}

@@ -1,0 +1,138 @@
+//! Which object somebody means: `0x6064`, `0x1018:1`, `Statusword`, `"Identity: Vendor ID"`.
+
+use std::collections::BTreeMap;
+
+use ecaxis_esi::Dictionary;
+
+use super::{items, name_of};
+use crate::config::nearest;
+use crate::mailbox::object_name;
+
+/// Names of a dictionary that are told where one does not say which.
+const TOLD: usize = 6;
+
+/// An object, or one subindex of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Wanted {
+    pub index: u16,
+    /// `None`: whatever it has.
+    pub sub: Option<u8>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FindError {
+    #[error("`{0}` is no object: indices have 16 bits, subindices 8, such as 0x6041 or 0x1018:01")]
+    Number(String),
+    #[error("no object is called `{name}`")]
+    Unknown { name: String, near: Option<String> },
+    #[error("`{name}` is the name of several: {}", among.join(", "))]
+    Ambiguous { name: String, among: Vec<String> },
+}
+
+/// By the dictionary where there is one, else by the names of the standards.
+///
+/// # Errors
+/// [`FindError`].
+pub fn find(dictionary: Option<&Dictionary>, text: &str) -> Result<Wanted, FindError> {
+    let text = text.trim();
+    if text.starts_with(|c: char| c.is_ascii_digit()) {
+        return number(text).ok_or_else(|| FindError::Number(text.to_owned()));
+    }
+    let mut names: BTreeMap<String, Vec<Wanted>> = BTreeMap::new();
+    let mut originals = Vec::new();
+    let mut add = |name: &str, wanted: Wanted| {
+        let known = names.entry(plain(name)).or_default();
+        if !known.contains(&wanted) {
+            known.push(wanted);
+            originals.push(name.to_owned());
+        }
+    };
+    for (object, item) in dictionary.into_iter().flat_map(items) {
+        let index = object.index;
+        add(&object.name, Wanted { index, sub: None });
+        let sub = Some(item.sub);
+        if object.items.len() > 1 {
+            add(&name_of(object, item), Wanted { index, sub });
+            add(&item.name, Wanted { index, sub });
+        }
+    }
+    let wanted = plain(text);
+    if !names.contains_key(&wanted) {
+        for (name, known) in of_the_standards() {
+            let entry = names.entry(plain(name)).or_default();
+            if !entry.contains(&known) {
+                entry.push(known);
+                originals.push(name.to_owned());
+            }
+        }
+    }
+    match names.get(&wanted).map(Vec::as_slice) {
+        Some([one]) if !wanted.is_empty() => Ok(*one),
+        Some([_, ..]) if !wanted.is_empty() => {
+            let all = names.get(&wanted).into_iter().flatten();
+            let mut among: Vec<String> = all.take(TOLD).map(ToString::to_string).collect();
+            if names.get(&wanted).is_some_and(|all| all.len() > TOLD) {
+                among.push("…".to_owned());
+            }
+            Err(FindError::Ambiguous {
+                name: text.to_owned(),
+                among,
+            })
+        }
+        _ => Err(FindError::Unknown {
+            name: text.to_owned(),
+            near: nearest(text, originals.iter().map(String::as_str)).map(ToOwned::to_owned),
+        }),
+    }
+}
+
+impl std::fmt::Display for Wanted {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.sub {
+            Some(sub) => write!(f, "{:#06x}:{sub:02}", self.index),
+            None => write!(f, "{:#06x}", self.index),
+        }
+    }
+}
+
+/// Upper and lower case, spaces and hyphens differ from file to file.
+fn plain(name: &str) -> String {
+    let letters = name.chars().filter(|c| c.is_alphanumeric());
+    letters.flat_map(char::to_lowercase).collect()
+}
+
+/// What CiA 301, CiA 402 and ETG.1000.6 call the objects that have a name of their own.
+fn of_the_standards() -> impl Iterator<Item = (&'static str, Wanted)> {
+    let indices = (0x1000..0x1100).chain(0x6000..0x6600);
+    indices.flat_map(|index| {
+        (0..8).filter_map(move |sub| {
+            let name = object_name(index, sub)?;
+            // The same for every subindex: it is the whole object's.
+            let whole = object_name(index, 0xfe) == Some(name) || sub == 0;
+            let sub = (!whole).then_some(sub);
+            Some((name, Wanted { index, sub }))
+        })
+    })
+}
+
+/// Subindices as in the machine file: decimal, or hexadecimal with 0x.
+fn number(text: &str) -> Option<Wanted> {
+    let (index, sub) = match text.split_once(':') {
+        Some((index, sub)) => (index, Some(sub)),
+        None => (text, None),
+    };
+    let value = |text: &str| match text.strip_prefix("0x").or(text.strip_prefix("0X")) {
+        Some(hex) if hex.chars().all(|c| c.is_ascii_hexdigit()) => {
+            u32::from_str_radix(hex, 16).ok()
+        }
+        Some(_) => None,
+        None => text.parse().ok(),
+    };
+    Some(Wanted {
+        index: u16::try_from(value(index)?).ok()?,
+        sub: match sub {
+            Some(sub) => Some(u8::try_from(value(sub)?).ok()?),
+            None => None,
+        },
+    })
+}

@@ -1,0 +1,160 @@
+//! EEPROM images: their parts, and how one gets into a device. ETG.1000.6 and ETG.2010 say what lies where.
+
+use std::ops::Range;
+
+use ecaxis_esi::sii::checksum;
+
+use super::ServiceError;
+use super::eeprom::{Eeprom, EepromError};
+use crate::mailbox::Wire;
+
+/// Bytes of the area that a controller reads by itself, its checksum included.
+const CONFIGURATION: usize = 16;
+const ALIAS: usize = 8;
+const CHECKSUM: usize = 14;
+const CATEGORIES: usize = 0x80;
+const END: u16 = 0xffff;
+
+/// The configuration area with another station alias and the checksum that belongs to it.
+#[must_use]
+pub fn with_alias(area: [u8; CONFIGURATION], alias: u16) -> [u8; CONFIGURATION] {
+    let mut area = area;
+    let [low, high] = alias.to_le_bytes();
+    (area[ALIAS], area[ALIAS + 1]) = (low, high);
+    let mut summed = [0; CHECKSUM];
+    for (to, from) in summed.iter_mut().zip(area) {
+        *to = from;
+    }
+    area[CHECKSUM] = checksum(&summed);
+    area[CHECKSUM + 1] = 0;
+    area
+}
+
+/// Where the data of the first category of this type are; `None` where the image has none.
+#[must_use]
+pub fn category(image: &[u8], kind: u16) -> Option<Range<usize>> {
+    let word = |at: usize| {
+        let bytes = image.get(at..)?.first_chunk()?;
+        Some(u16::from_le_bytes(*bytes))
+    };
+    let mut at = CATEGORIES;
+    loop {
+        let (found, words) = (word(at)?, word(at + 2)?);
+        let data = at + 4..at + 4 + 2 * usize::from(words);
+        if found == END || data.end > image.len() {
+            return None;
+        }
+        if found == kind {
+            return Some(data);
+        }
+        at = data.end;
+    }
+}
+
+/// The image with other data in a category, padded to whole words; what follows moves. `None` where the image has no such
+/// category, or the data are too long for any.
+#[must_use]
+pub fn with_category(image: &[u8], kind: u16, data: &[u8]) -> Option<Vec<u8>> {
+    let place = category(image, kind)?;
+    let words = u16::try_from(data.len().div_ceil(2)).ok()?;
+    let mut out = image.get(..place.start.checked_sub(2)?)?.to_vec();
+    out.extend_from_slice(&words.to_le_bytes());
+    out.extend_from_slice(data);
+    out.resize(out.len() + data.len() % 2, 0xff);
+    out.extend_from_slice(image.get(place.end..)?);
+    Some(out)
+}
+
+/// Writes those words that differ, and reads all of them back. What the controller reads by itself comes last: a device
+/// that loses its power before is still itself. Returns how many words were written. `progress` is told words done and
+/// words there are.
+///
+/// # Errors
+/// [`EepromError::NotKept`] where a word reads back as another; else as [`Eeprom::write`].
+pub async fn write<W: Wire>(
+    eeprom: &Eeprom<'_, W>,
+    image: &[u8],
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<usize, ServiceError> {
+    let mut wanted = image.to_vec();
+    wanted.resize(image.len().next_multiple_of(2), 0xff);
+    let mut there = vec![0; wanted.len()];
+    eeprom.read(0, &mut there).await?;
+    let differing = |there: &[u8]| -> Vec<(u32, [u8; 2], [u8; 2])> {
+        let (wanted, _) = wanted.as_chunks::<2>();
+        let (there, _) = there.as_chunks::<2>();
+        let both = (0..).zip(wanted.iter().zip(there));
+        let differ = both.filter(|(_, (wanted, there))| wanted != there);
+        differ
+            .map(|(word, (wanted, there))| (word, *wanted, *there))
+            .collect()
+    };
+    let mut writes = differing(&there);
+    let first = u32::try_from(CONFIGURATION / 2).unwrap_or(0);
+    let own = writes.partition_point(|(word, ..)| *word < first);
+    writes.rotate_left(own);
+    for (n, (word, value, _)) in writes.iter().enumerate() {
+        progress(n, writes.len());
+        eeprom.write(*word, *value).await?;
+    }
+    eeprom.read(0, &mut there).await?;
+    match differing(&there).first() {
+        None => Ok(writes.len()),
+        Some((word, wanted, found)) => Err(eeprom.failed(EepromError::NotKept {
+            word: *word,
+            wanted: u16::from_le_bytes(*wanted),
+            found: u16::from_le_bytes(*found),
+        })),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecaxis_esi::sii::{self, Sii};
+
+    use super::*;
+
+    fn image() -> Vec<u8> {
+        let mut sii = Sii {
+            alias: 5,
+            byte_size: 2048,
+            ended: true,
+            ..Sii::default()
+        };
+        sii.others = vec![(0x0801, vec![1, 2, 3, 4]), (0x0802, vec![9, 9])];
+        sii.to_bytes()
+    }
+
+    #[test]
+    fn an_alias_comes_with_its_checksum() {
+        let mut image = image();
+        let area = with_alias(*image.first_chunk().expect("an area"), 1001);
+        image[..16].copy_from_slice(&area);
+        let sii = sii::parse(&image).expect("an image");
+        assert_eq!((sii.alias, sii.checksum_ok), (1001, true));
+    }
+
+    #[test]
+    fn a_category_is_found_and_replaced() {
+        let image = image();
+        assert_eq!(
+            category(&image, 0x0801).map(|r| image[r].to_vec()),
+            Some(vec![1, 2, 3, 4])
+        );
+        assert_eq!(category(&image, 0x0803), None);
+        for data in [&[][..], &[7], &[7; 8]] {
+            let other = with_category(&image, 0x0801, data).expect("replaced");
+            let sii = sii::parse(&other).expect("an image");
+            let mut padded = data.to_vec();
+            padded.resize(data.len().next_multiple_of(2), 0xff);
+            assert_eq!(sii.others, [(0x0801, padded), (0x0802, vec![9, 9])]);
+            assert!(sii.ended);
+        }
+        assert_eq!(with_category(&image, 0x0803, &[1]), None);
+        assert_eq!(with_category(&image, 0x0801, &vec![0; 0x2_0000]), None);
+        // An image that ends anywhere.
+        for end in 0..image.len() {
+            let _ = with_category(&image[..end], 0x0802, &[1]);
+        }
+    }
+}

@@ -1,0 +1,642 @@
+//! Parameters and EEPROMs of simulated devices: through the library in virtual time, and as a user meets `ecaxis sdo` and `ecaxis eeprom`.
+
+mod common;
+
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
+use std::thread;
+
+use common::{fixture, machine, root};
+use ecaxis::bringup::{AlState, bring_up};
+use ecaxis::clock::Clock;
+use ecaxis::config::{self, Locator, Machine};
+use ecaxis::link::sim::SimLink;
+use ecaxis::mailbox::{CoeClient, ObjectList, Wire};
+use ecaxis::parameters::collect::{Collected, collect};
+use ecaxis::parameters::compare::compare;
+use ecaxis::parameters::dump::Dump;
+use ecaxis::parameters::restore::restore;
+use ecaxis::parameters::rules::is_setting;
+use ecaxis::parameters::{DataType, Kind, items, learn};
+use ecaxis::rt::image::{plan, process_data};
+use ecaxis::service::eeprom::{Claim, Eeprom};
+use ecaxis::service::image::{with_alias, write};
+use ecaxis::service::{Datagrams, ServiceError, carry, device};
+use ecaxis::session::simulated_bus;
+use ecaxis_esi::Dictionary;
+
+/// Futures here hold whole frames by value.
+const STACK: usize = 16 << 20;
+
+type Work<T> = Box<dyn FnOnce(&mut SimLink) -> T + Send>;
+
+/// Something done on a machine's simulated bus, in virtual time, between one power-on and the next.
+fn on<T: Send + 'static>(machine: Machine, works: Vec<Work<T>>) -> Vec<T> {
+    let there = thread::Builder::new().stack_size(STACK).spawn(move || {
+        Clock::Virtual.enter();
+        let segment = simulated_bus(&machine, 1, None, None).expect("a bus");
+        let mut link = SimLink::new(segment);
+        let count = machine.devices.len();
+        let mut done = Vec::new();
+        for work in works {
+            done.push(work(&mut link));
+            for position in 0..count {
+                link.segment_mut().power(position, false);
+                link.segment_mut().power(position, true);
+            }
+        }
+        done
+    });
+    there.expect("a thread").join().expect("no panic")
+}
+
+fn carried<T>(link: &mut SimLink, work: impl AsyncFnOnce(Datagrams) -> T) -> T {
+    carry(link, Clock::Virtual, &AtomicBool::new(false), work).expect("carried")
+}
+
+/// A piece of work on one device's mailbox.
+async fn with_device<T>(
+    wire: &Datagrams,
+    position: u16,
+    work: impl AsyncFnOnce(&mut CoeClient) -> T,
+) -> T {
+    let at = Locator::Position(position);
+    let (found, at) = device::locate(wire, at, None).await.expect("located");
+    let sii = device::information(wire, &found, &at)
+        .await
+        .expect("an image");
+    let done: Result<T, ServiceError> =
+        device::with_mailbox(wire, &at, &sii, async |lent| Ok(work(&mut lent.coe).await)).await;
+    done.expect("a mailbox")
+}
+
+/// A device with mailboxes of 48 bytes: 440 objects and more, one of 64 KiB, a record of 60 entries.
+fn large() -> (tempfile::TempDir, Machine) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let esi = root().join("tests/judges/esi/mailbox.xml");
+    let text = std::fs::read_to_string(esi).expect("the judges' ESI");
+    let sub = |n: u32| {
+        format!(
+            "<SubItem><SubIdx>{n}</SubIdx><Name>Entry {n}</Name><Type>UDINT</Type><BitSize>32</BitSize><BitOffs>{}</BitOffs><Flags><Access>rw</Access></Flags></SubItem>",
+            16 + 32 * (n - 1)
+        )
+    };
+    let types = format!(
+        "<DataType><Name>ARRAY [0..65535] OF BYTE</Name><BaseType>BYTE</BaseType><BitSize>524288</BitSize><ArrayInfo><LBound>0</LBound><Elements>65536</Elements></ArrayInfo></DataType>\
+        <DataType><Name>DT3000</Name><BitSize>{}</BitSize><SubItem><SubIdx>0</SubIdx><Name>SubIndex 000</Name><Type>USINT</Type><BitSize>8</BitSize><BitOffs>0</BitOffs><Flags><Access>ro</Access></Flags></SubItem>{}</DataType></DataTypes>",
+        16 + 60 * 32,
+        (1..=60).map(sub).collect::<String>(),
+    );
+    let values: String = (1..=60)
+        .map(|n| format!("<SubItem><Name>Entry {n}</Name><Info><DefaultValue>{}</DefaultValue></Info></SubItem>", n * 1000))
+        .collect();
+    let kinds = [
+        ("UINT", 16),
+        ("DINT", 32),
+        ("REAL", 32),
+        ("USINT", 8),
+        ("LREAL", 64),
+    ];
+    let many: String = (0..420)
+        .zip(kinds.iter().cycle())
+        .map(|(n, (name, bits))| {
+            format!(
+                "<Object><Index>#x{:04X}</Index><Name>Parameter number {n}</Name><Type>{name}</Type><BitSize>{bits}</BitSize><Flags><Access>rw</Access></Flags></Object>",
+                0x4000 + n
+            )
+        })
+        .collect();
+    let objects = format!(
+        "<Object><Index>#x2100</Index><Name>A large object</Name><Type>ARRAY [0..65535] OF BYTE</Type><BitSize>524288</BitSize><Flags><Access>rw</Access></Flags></Object>\
+        <Object><Index>#x3000</Index><Name>A long record</Name><Type>DT3000</Type><BitSize>{}</BitSize><Info><SubItem><Name>SubIndex 000</Name><Info><DefaultValue>60</DefaultValue></Info></SubItem>{values}</Info></Object>{many}</Objects>",
+        16 + 60 * 32,
+    );
+    let text = text
+        .replacen("</DataTypes>", &types, 1)
+        .replacen("</Objects>", &objects, 1);
+    std::fs::write(folder.path().join("large.xml"), text).expect("written");
+    let file = folder.path().join("machine.toml");
+    std::fs::write(
+        &file,
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n[[device]]\nname = \"large\"\nesi = \"large.xml\"\nposition = 0\n",
+    )
+    .expect("written");
+    let machine = config::load(&file).unwrap_or_else(|error| panic!("{error}"));
+    (folder, machine)
+}
+
+#[test]
+fn a_small_mailbox_carries_what_is_large() {
+    let (_folder, machine) = large();
+    let described = machine.devices[0].selection.dictionary.clone();
+    let work = Box::new(move |link: &mut SimLink| {
+        carried(link, async |wire| {
+            with_device(&wire, 0, async |coe| {
+                assert_eq!((coe.layout().out_len, coe.layout().in_len), (48, 48));
+                // 64 KiB there and back.
+                let data: Vec<u8> = (0..65_536_u32).map(|n| (n * 7 + n / 251) as u8).collect();
+                coe.download(&wire, 0x2100, 0, false, &data)
+                    .await
+                    .expect("written");
+                let back = coe.upload(&wire, 0x2100, 0, false).await.expect("read");
+                assert!(back == data, "{} bytes", back.len());
+
+                // The record, in one piece and in parts.
+                let whole = coe.upload(&wire, 0x3000, 0, true).await.expect("read");
+                let (count, entries) = whole.split_at(2);
+                assert_eq!((count, entries.len()), (&[60, 0][..], 240));
+                let (entries, _) = entries.as_chunks::<4>();
+                for (n, entry) in (1..).zip(entries) {
+                    let one = coe.upload(&wire, 0x3000, n, false).await.expect("read");
+                    assert_eq!(one, entry);
+                    assert_eq!(u32::from_le_bytes(*entry), u32::from(n) * 1000);
+                }
+
+                // The list, and what every object is.
+                let list = coe
+                    .object_list(&wire, ObjectList::All)
+                    .await
+                    .expect("a list");
+                assert!(list.len() >= 440, "{}", list.len());
+                let at = device::locate(&wire, Locator::Position(0), None)
+                    .await
+                    .expect("there")
+                    .1;
+                let mut told = (0, 0);
+                let mut progress = |done, all| told = (done, all);
+                let own = learn::dictionary(coe, &wire, &at, &mut progress).await;
+                let own = own.expect("a dictionary");
+                assert_eq!(told, (list.len() - 1, list.len()));
+                same(&described, &own);
+            })
+            .await;
+        });
+    });
+    on(machine, vec![work]);
+}
+
+/// What the ESI says the device says, too.
+fn same(described: &Dictionary, own: &Dictionary) {
+    for (object, item) in items(described) {
+        let at = format!("{:#06x}:{:02}", object.index, item.sub);
+        let told = own
+            .object(object.index)
+            .unwrap_or_else(|| panic!("{at} is missing"));
+        assert_eq!(told.name, object.name, "{at}");
+        let found = own.item(object.index, item.sub);
+        let found = found.unwrap_or_else(|| panic!("{at} is missing"));
+        if !item.name.is_empty() {
+            assert_eq!(found.name, item.name, "{at}");
+        }
+        assert_eq!(found.access, item.access, "{at}");
+        let types =
+            [item, found].map(|i| DataType::named(&i.type_name, i.bit_len).expect("a type"));
+        let [expected, told] = types;
+        assert_eq!(told.kind, expected.kind, "{at}");
+        if expected.bits <= 0xffff {
+            assert_eq!(told.bits, expected.bits, "{at}");
+        }
+    }
+}
+
+/// Two drives of a kind.
+fn twins(esi: &str) -> Machine {
+    let drive = |name: &str, position: u32| {
+        format!(
+            "[[device]]\nname = \"{name}\"\nesi = \"{esi}\"\ntype = \"EPOS4\"\nposition = {position}\nmode = \"csp\"\n[device.axis]\nunit = \"turn\"\nencoder = 2000\nlimits = {{ position = [-1000.0, 1000.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 1.0 }}\n"
+        )
+    };
+    machine(&format!(
+        "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n{}{}",
+        drive("x", 0),
+        drive("y", 1)
+    ))
+}
+
+async fn everything(wire: &Datagrams, position: u16, dictionary: &Dictionary) -> Collected {
+    let at = device::locate(wire, Locator::Position(position), None)
+        .await
+        .expect("there")
+        .1;
+    with_device(wire, position, async |coe| {
+        let all = collect(coe, wire, &at, dictionary, &mut |_, _| {}).await;
+        all.expect("collected")
+    })
+    .await
+}
+
+/// Changes what can be changed, keeps it in a file, brings it to the other drive.
+fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
+    let dictionary = machine.devices[0].selection.dictionary.clone();
+    let work = Box::new(move |link: &mut SimLink| {
+        carried(link, async |wire| {
+            let before = everything(&wire, 0, &dictionary).await;
+            assert_eq!(before.refused, []);
+            // Every setting that takes another value gets one; PDO lists get shorter.
+            let mut changed = 0;
+            with_device(&wire, 0, async |coe| {
+                for list in [0x1c12, 0x1c13] {
+                    let _ = coe.download(&wire, list, 0, false, &[0]).await;
+                }
+                for parameter in before.parameters.iter().filter(|p| is_setting(p)) {
+                    let (index, sub) = (parameter.at.index, parameter.at.sub);
+                    let mut value = parameter.value.clone();
+                    if let (Kind::Unsigned | Kind::Signed, Some(first)) =
+                        (parameter.data_type.kind, value.first_mut())
+                    {
+                        *first = if index < 0x1c00 && sub == 0 && *first > 0 {
+                            *first - 1
+                        } else {
+                            *first ^ 1
+                        };
+                        let list = (0x1600..0x1d00).contains(&index) && sub > 0;
+                        if !list && coe.download(&wire, index, sub, false, &value).await.is_ok() {
+                            changed += 1;
+                        }
+                    }
+                }
+            })
+            .await;
+
+            let left = everything(&wire, 0, &dictionary).await;
+            let right = everything(&wire, 1, &dictionary).await;
+            let differ = compare(&left.parameters, &right.parameters, false);
+            assert!(changed > 0 && !differ.is_empty());
+            let dump = Dump {
+                parameters: left.parameters,
+                ..Dump::default()
+            };
+            let dump = Dump::parse(&dump.to_toml()).expect("a file");
+
+            let at = device::locate(&wire, Locator::Position(1), None)
+                .await
+                .expect("there")
+                .1;
+            let restored = with_device(&wire, 1, async |coe| {
+                let file = &dump.parameters;
+                let done = restore(coe, &wire, &at, &dictionary, file, &mut |_, _| {}).await;
+                done.expect("restored")
+            })
+            .await;
+            assert!(restored.complete(), "{restored:?}");
+            // Elements beyond a shorter list's count are not written.
+            let meant = differ.iter().filter(|difference| difference.left.is_some());
+            assert_eq!(restored.written, meant.count(), "{restored:?}");
+
+            let right = everything(&wire, 1, &dictionary).await;
+            let differ_now = compare(&dump.parameters, &right.parameters, false);
+            assert_eq!(differ_now, []);
+            // Once more there is nothing to do.
+            let again = with_device(&wire, 1, async |coe| {
+                let file = &dump.parameters;
+                let done = restore(coe, &wire, &at, &dictionary, file, &mut |_, _| {}).await;
+                done.expect("restored")
+            })
+            .await;
+            assert_eq!((again.written, again.complete()), (0, true), "{again:?}");
+            (differ.len(), restored.written)
+        })
+    });
+    on(machine, vec![work])[0]
+}
+
+#[test]
+fn the_settings_of_one_drive_become_those_of_another() {
+    let (differed, written) = from_one_to_the_other(twins("esi/EPOS4.xml"));
+    assert!(differed >= 15 && written >= 15, "{differed} {written}");
+}
+
+#[test]
+fn also_with_the_makers_own_description() {
+    let Some(esi) = fixture("esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
+        return;
+    };
+    let esi = esi.canonicalize().expect("a path");
+    let (differed, written) = from_one_to_the_other(twins(esi.to_str().expect("UTF-8")));
+    assert!(differed >= 50 && written >= 50, "{differed} {written}");
+}
+
+#[test]
+fn an_alias_that_is_written_counts_after_the_next_power_on() {
+    let text = std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demo");
+    let demo = machine(&text);
+    let by_alias = machine(&text.replacen("position = 0", "alias = 1001", 1));
+    let set = Box::new(|link: &mut SimLink| {
+        carried(link, async |wire| {
+            let at = device::locate(&wire, Locator::Position(0), None)
+                .await
+                .expect("there")
+                .1;
+            let eeprom = Eeprom::claim(&wire, &at, "writing", Claim::IfFree)
+                .await
+                .expect("free");
+            let mut image = eeprom.image(&mut |_, _| {}).await.expect("an image");
+            let area = with_alias(*image.first_chunk().expect("an area"), 1001);
+            image[..area.len()].copy_from_slice(&area);
+            let words = write(&eeprom, &image, &mut |_, _| {})
+                .await
+                .expect("written");
+            // The alias and the checksum.
+            assert_eq!(words, 2);
+            // Not before the device is switched on again.
+            let found = device::locate(&wire, Locator::Alias(1001), None).await;
+            assert!(
+                matches!(found, Err(ServiceError::NotFound { .. })),
+                "{found:?}"
+            );
+        });
+    });
+    let find = Box::new(move |link: &mut SimLink| {
+        carried(link, async |wire| {
+            let (found, _) = device::locate(&wire, Locator::Alias(1001), None)
+                .await
+                .expect("found");
+            assert_eq!(found.position, 0);
+            let image = plan(&process_data(&by_alias)).expect("a plan");
+            let bus = bring_up(wire.main_device(), &by_alias, image, &mut |_| {}).await;
+            let bus = bus.unwrap_or_else(|error| panic!("{error}"));
+            let x = &bus.devices[0].at;
+            assert_eq!((x.name.as_str(), x.position), ("x", 0));
+        });
+    });
+    on(demo, vec![set, find]);
+}
+
+#[test]
+fn a_device_in_init_goes_back_there_with_its_eeprom_lent_as_before() {
+    let work = Box::new(|link: &mut SimLink| {
+        carried(link, async |wire| {
+            // As other MainDevices leave it behind: with its EEPROM lent to the device.
+            let at = device::locate(&wire, Locator::Position(0), None).await;
+            let station = at.expect("there").1.station;
+            wire.write(station, 0x0500, &[1]).await.expect("written");
+            let state = async |wire: &Datagrams| {
+                let at = device::locate(wire, Locator::Position(0), None).await;
+                at.expect("there").0.state
+            };
+            let status = async |coe: &mut CoeClient| {
+                coe.upload(&wire, 0x6041, 0, false)
+                    .await
+                    .expect("read")
+                    .len()
+            };
+            assert_eq!(state(&wire).await, AlState::Init);
+            assert_eq!(with_device(&wire, 0, status).await, 2);
+            assert_eq!(state(&wire).await, AlState::Init);
+            let mut lent = [0];
+            wire.read(station, 0x0500, &mut lent).await.expect("read");
+            assert_eq!(lent, [1]);
+        });
+    });
+    on(twins("esi/EPOS4.xml"), vec![work]);
+}
+
+/// Exit code, standard output and standard error.
+fn ran(folder: &Path, arguments: &[&str]) -> (i32, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+        .args(arguments)
+        .current_dir(folder)
+        .env("XDG_CACHE_HOME", folder)
+        .output()
+        .expect("the binary runs");
+    let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).expect("UTF-8");
+    let code = output.status.code().expect("an exit code");
+    (code, text(&output.stdout), text(&output.stderr))
+}
+
+fn demo() -> String {
+    let path = root().join("configs/demo.toml");
+    path.to_str().expect("UTF-8").to_owned()
+}
+
+#[test]
+fn values_on_the_command_line() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let demo = demo();
+    let sdo = |words: &[&str], more: &[&str]| {
+        let (verb, words) = words.split_first().expect("a verb");
+        let line = [&["sdo", verb, &demo, "x"], words, &["--sim"], more].concat();
+        ran(folder.path(), &line)
+    };
+    for (words, out) in [
+        (
+            &["read", "0x6065"][..],
+            "0x6065:00 Following error window (UDINT) = 2000 (0x000007d0)\n",
+        ),
+        (
+            &["read", "following error window"],
+            "0x6065:00 Following error window (UDINT) = 2000 (0x000007d0)\n",
+        ),
+        (
+            &["write", "0x6065", "0x100"],
+            "0x6065:00 Following error window (UDINT) = 256 (0x00000100)\n",
+        ),
+        (
+            &["read", "0x6065", "--type", "bytes"],
+            "0x6065:00 Following error window (bytes) = d0 07 00 00\n",
+        ),
+    ] {
+        let (code, told, err) = sdo(words, &[]);
+        assert_eq!((code, told.as_str()), (0, out), "{words:?}: {err}");
+        assert!(
+            told.lines().all(|line| line.chars().count() <= 80),
+            "{told}"
+        );
+    }
+    let (code, told, err) = sdo(&["read", "0x1018"], &[]);
+    assert_eq!(code, 0, "{err}");
+    assert!(told.contains("0x1018:01  UDINT"), "{told}");
+    let (code, told, _) = sdo(&["read", "0x1018:1"], &["--json"]);
+    let json: serde_json::Value = serde_json::from_str(&told).expect("JSON");
+    assert_eq!((code, &json[0]["hex"]), (0, &"0x00000e0a".into()));
+    for (words, code, part) in [
+        (
+            &["read", "Folowing error window"][..],
+            2,
+            "did you mean `Following error window`?",
+        ),
+        (&["read"], 2, "which object?"),
+        (&["read", "0x12345"], 2, "indices have 16 bits"),
+        (&["read", "0x5fff"], 1, "the object does not exist"),
+        (
+            &["write", "0x6065", "-1"],
+            2,
+            "-1 does not fit; the object takes 0 to 4294967295",
+        ),
+        (&["write", "0x6041", "1"], 1, "the object is read-only"),
+        (&["write", "0x6065"], 2, "one object and one value"),
+        (&["write", "0x6065", "[01]"], 1, "too short"),
+        (
+            &["dump", "/nowhere/x.toml"],
+            2,
+            "cannot write /nowhere/x.toml",
+        ),
+        (&["restore", "missing.toml"], 2, "cannot read missing.toml"),
+    ] {
+        let (ended, told, err) = sdo(words, &[]);
+        assert_eq!((ended, told.as_str()), (code, ""), "{words:?}: {err}");
+        assert!(err.contains(part), "{words:?}: `{part}` is not in:\n{err}");
+    }
+    let (code, _, err) = ran(
+        folder.path(),
+        &["sdo", "read", &demo, "z", "0x6041", "--sim"],
+    );
+    assert_eq!(code, 2);
+    assert!(err.contains("no device is called `z`"), "{err}");
+    let (code, told, _) = sdo(&["store"], &[]);
+    assert_eq!((code, told.as_str()), (0, ""));
+    assert_eq!(sdo(&["defaults"], &["--json"]).0, 0);
+}
+
+#[test]
+fn a_file_of_parameters_on_the_command_line() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let demo = demo();
+    let run = |words: &[&str]| ran(folder.path(), words);
+    let (code, out, err) = run(&["sdo", "dump", &demo, "x", "x.toml", "--sim"]);
+    assert_eq!((code, out.as_str()), (0, ""), "{err}");
+    let (code, _, err) = run(&["sdo", "dump", &demo, "x", "x.toml", "--sim"]);
+    assert_eq!(code, 2);
+    assert!(err.contains("x.toml exists already"), "{err}");
+    assert_eq!(
+        run(&["sdo", "compare", &demo, "x", "x.toml", "--sim"]),
+        (0, String::new(), String::new())
+    );
+    assert_eq!(
+        run(&["sdo", "compare", "x.toml", "x.toml"]),
+        (0, String::new(), String::new())
+    );
+
+    let text = std::fs::read_to_string(folder.path().join("x.toml")).expect("the file");
+    let line = "\"0x6065:00\" = { name = \"Following error window\", type = \"UDINT\", access = \"rw\", value = 2000 }";
+    assert!(text.contains(line), "{text}");
+    std::fs::write(
+        folder.path().join("y.toml"),
+        text.replacen("value = 2000 }", "value = 2001 }", 1),
+    )
+    .expect("written");
+    let (code, out, err) = run(&["sdo", "compare", "x.toml", "y.toml"]);
+    assert_eq!(code, 1, "{err}");
+    assert!(
+        out.contains("2000") && out.contains("2001") && err.contains("1 settings differ"),
+        "{out}{err}"
+    );
+    let (code, out, err) = run(&["sdo", "restore", &demo, "x", "y.toml", "--sim", "--json"]);
+    let json: serde_json::Value = serde_json::from_str(&out).expect("JSON");
+    assert_eq!((code, &json["written"]), (0, &1.into()), "{out}{err}");
+    // Another product.
+    let (code, _, err) = run(&["sdo", "restore", &demo, "y", "x.toml", "--sim"]);
+    assert_eq!(code, 1);
+    assert!(err.contains("--other-device"), "{err}");
+}
+
+#[test]
+fn the_list_is_the_same_by_the_esi_and_by_the_device() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let demo = demo();
+    let list = |more: &[&str]| {
+        let line = [&["sdo", "list", &demo, "x", "--sim", "--json"], more].concat();
+        let (code, out, err) = ran(folder.path(), &line);
+        assert_eq!(code, 0, "{err}");
+        let all: Vec<serde_json::Value> = serde_json::from_str(&out).expect("JSON");
+        all
+    };
+    let (described, own) = (list(&[]), list(&["--ask"]));
+    assert!(described.len() > 100);
+    for item in &described {
+        let same = |other: &&serde_json::Value| {
+            other["index"] == item["index"] && other["sub"] == item["sub"]
+        };
+        let other = own.iter().find(same).unwrap_or_else(|| panic!("{item}"));
+        assert_eq!(other["bits"], item["bits"], "{item}");
+    }
+}
+
+#[test]
+fn eeproms_on_the_command_line() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let demo = demo();
+    let run = |words: &[&str]| {
+        let (verb, words) = words.split_first().expect("a verb");
+        let line = [&["eeprom", verb, &demo, "x"], words, &["--sim"]].concat();
+        ran(folder.path(), &line)
+    };
+    let at = |name: &str| folder.path().join(name);
+    let (code, out, err) = run(&["read", "x.bin"]);
+    assert_eq!((code, out.as_str()), (0, ""), "{err}");
+    let image = std::fs::read(at("x.bin")).expect("the image");
+    let sii = ecaxis_esi::sii::parse(&image).expect("an image");
+    assert!(sii.checksum_ok && sii.ended);
+    assert_eq!(run(&["verify"]), (0, String::new(), String::new()));
+    assert_eq!(run(&["verify", "x.bin"]).0, 0);
+    assert_eq!(run(&["read", "general.bin", "--category", "30"]).0, 0);
+    assert!(
+        !std::fs::read(at("general.bin"))
+            .expect("the category")
+            .is_empty()
+    );
+
+    // Not without being told so, and not what is not sound or is another's.
+    let refused = |words: &[&str], code: i32, part: &str| {
+        let (ended, out, err) = run(words);
+        assert_eq!((ended, out.as_str()), (code, ""), "{words:?}: {err}");
+        assert!(err.contains(part), "{words:?}: {err}");
+        assert!(!at("kept.bin").exists());
+    };
+    refused(&["alias", "1001"], 2, "nothing was written: say `--yes`");
+    refused(&["write", "x.bin"], 2, "nothing was written: say `--yes`");
+    refused(&["alias", "70000", "--yes"], 2, "a number of 16 bits");
+    refused(&["read", "x.bin"], 2, "x.bin exists already");
+    refused(
+        &["read", "none.bin", "--category", "77"],
+        2,
+        "the image has no category 77",
+    );
+    let spoilt = |name: &str, place: usize| {
+        let mut other = image.clone();
+        other[place] ^= 1;
+        std::fs::write(at(name), other).expect("written");
+    };
+    spoilt("sum.bin", 14);
+    spoilt("other.bin", 0x14);
+    refused(
+        &["write", "sum.bin", "--yes", "--backup", "kept.bin"],
+        2,
+        "the checksum",
+    );
+    refused(
+        &["write", "other.bin", "--yes", "--backup", "kept.bin"],
+        1,
+        "--other-device",
+    );
+    let (code, out, _) = run(&["verify", "other.bin"]);
+    assert_eq!(
+        (code, out.as_str()),
+        (
+            1,
+            "1 bytes are not those of other.bin, the first at 0x0014\n"
+        )
+    );
+
+    let (code, out, err) = run(&[
+        "write",
+        "other.bin",
+        "--yes",
+        "--other-device",
+        "--backup",
+        "kept.bin",
+    ]);
+    assert_eq!((code, out.as_str()), (0, ""), "{err}");
+    assert!(err.contains("1 word written and read back"), "{err}");
+    assert_eq!(std::fs::read(at("kept.bin")).expect("kept"), image);
+    let (code, _, err) = run(&["alias", "0x3e9", "--yes"]);
+    assert_eq!(code, 0, "{err}");
+    assert!(
+        err.contains("2 words written") && err.contains("switched on again"),
+        "{err}"
+    );
+    // The name was chosen from the device's.
+    let name = format!("eeprom-x-{}-1.bin", sii.serial);
+    assert_eq!(std::fs::read(at(&name)).expect("kept"), image);
+}
