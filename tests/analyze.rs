@@ -130,9 +130,11 @@ fn our_own_run_tells_its_story() {
         assert!(device.reads > 0 && device.writes > 20);
     }
     assert_eq!((report.file.lost, report.file.without_request), (0, 0));
-    let [cycle] = &report.cycle[..] else {
+    let [cycle, mailboxes] = &report.cycle[..] else {
         panic!("{:?}", report.cycle);
     };
+    assert_eq!((mailboxes.command, mailboxes.bytes), ("LRD", 2));
+    assert_eq!((mailboxes.usual_wkc, mailboxes.lost), (Some(2), 0));
     // SYNC0's millisecond, and the reference clock is 18 ppm fast.
     assert!(cycle.cycle_ns.abs_diff(999_982) < 200, "{cycle:?}");
     assert_eq!((cycle.usual_wkc, cycle.lost), (Some(6), 0));

@@ -285,7 +285,7 @@ fn a_clock_outside_its_window_is_warned_of() {
             .warnings()
             .into_iter()
             .filter(|w| w.contains("the clock of"));
-        of_clocks.map(str::to_owned).collect::<Vec<_>>()
+        of_clocks.collect::<Vec<_>>()
     };
     assert_eq!(warned("10us"), [""; 0]);
     let warnings = warned("100ns");

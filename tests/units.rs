@@ -70,7 +70,7 @@ fn told(machine: Machine) -> (Vec<String>, Vec<String>) {
         Progress::Step(Step::Adopted { device, what }) => Some(format!("{device}: {what}")),
         _ => None,
     });
-    let warnings = heard.warnings().into_iter().map(str::to_owned);
+    let warnings = heard.warnings().into_iter();
     (taken.collect(), warnings.collect())
 }
 

@@ -1,24 +1,32 @@
 //! Raw datagrams through ethercrab's PDU loop: what bring-up, mailboxes and recovery are written
 //! against.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use ethercrab::error::Error;
 use ethercrab::{Command, MainDevice};
 
-use crate::clock;
-use crate::mailbox::{Wire, WireError};
+use crate::clock::{self, Nanos};
+use crate::mailbox::{Seen, Wire, WireError};
+use crate::rt::exchange::Sights;
+use turns::Turns;
 
-/// Datagrams to configured station addresses, each in a frame of its own.
+mod turns;
+
+/// Datagrams to configured station addresses, each in a frame of its own and in its turn.
 #[derive(Debug, Clone, Copy)]
 pub struct Datagrams {
     device: &'static MainDevice<'static>,
+    turns: &'static Turns,
 }
 
 impl Datagrams {
+    /// To be copied, so that all keep to the same turns. They live as long as the MainDevice: as the process.
     #[must_use]
     pub fn new(device: &'static MainDevice<'static>) -> Self {
-        Self { device }
+        let turns = Box::leak(Box::default());
+        Self { device, turns }
     }
 
     #[must_use]
@@ -28,6 +36,7 @@ impl Datagrams {
 
     /// How many SubDevices answer a broadcast read.
     pub async fn count(&self) -> Result<u16, WireError> {
+        let _turn = self.turns.take().await;
         let answer = Command::brd(0)
             .with_wkc(0)
             .receive_slice(self.device, 1)
@@ -46,6 +55,7 @@ impl Datagrams {
         buf: &mut [u8],
     ) -> Result<u16, WireError> {
         let len = length(buf)?;
+        let _turn = self.turns.take().await;
         let answer = Command::aprd(position, register)
             .receive_slice(self.device, len)
             .await;
@@ -62,6 +72,7 @@ impl Datagrams {
         register: u16,
         data: &[u8],
     ) -> Result<u16, WireError> {
+        let _turn = self.turns.take().await;
         let answer = Command::apwr(position, register)
             .send_receive_slice(self.device, data)
             .await;
@@ -112,6 +123,7 @@ fn copy(from: &[u8], to: &mut [u8]) {
 impl Wire for Datagrams {
     async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
         let len = length(buf)?;
+        let _turn = self.turns.take().await;
         let answer = Command::fprd(station, register)
             .receive_slice(self.device, len)
             .await;
@@ -119,6 +131,7 @@ impl Wire for Datagrams {
     }
 
     async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
+        let _turn = self.turns.take().await;
         let answer = Command::fpwr(station, register)
             .send_receive_slice(self.device, data)
             .await;
@@ -131,6 +144,60 @@ impl Wire for Datagrams {
 
     fn now(&self) -> u64 {
         clock::now()
+    }
+}
+
+/// Cycles after which what was seen of a mailbox is old.
+const SIGHT_CYCLES: Nanos = 4;
+
+/// Datagrams of one SubDevice's mailbox while the cycle runs, and what the cycle sees of it.
+#[derive(Debug, Clone)]
+pub struct BesideCycle {
+    datagrams: Datagrams,
+    sights: Arc<Sights>,
+    member: usize,
+    old_ns: Nanos,
+}
+
+impl BesideCycle {
+    /// For all members of the exchange.
+    #[must_use]
+    pub fn all(
+        datagrams: Datagrams,
+        sights: &Arc<Sights>,
+        members: usize,
+        cycle_ns: Nanos,
+    ) -> Vec<Self> {
+        let each = (0..members).map(|member| Self {
+            datagrams,
+            sights: Arc::clone(sights),
+            member,
+            old_ns: cycle_ns.saturating_mul(SIGHT_CYCLES),
+        });
+        each.collect()
+    }
+}
+
+impl Wire for BesideCycle {
+    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+        self.datagrams.read(station, register, buf).await
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
+        self.datagrams.write(station, register, data).await
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.datagrams.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.datagrams.now()
+    }
+
+    fn seen(&self) -> Option<Seen> {
+        let seen = self.sights.mailbox(self.member)?;
+        (clock::now().saturating_sub(seen.at) <= self.old_ns).then_some(seen)
     }
 }
 

@@ -69,11 +69,13 @@ impl Observer for Heard {
 }
 
 impl Heard {
-    pub fn warnings(&self) -> Vec<&str> {
+    /// With what devices reported unasked.
+    pub fn warnings(&self) -> Vec<String> {
         self.0
             .iter()
             .filter_map(|p| match p {
-                Progress::Warning(text) => Some(text.as_str()),
+                Progress::Warning(text) => Some(text.clone()),
+                Progress::Emergency(report) => Some(report.to_string()),
                 _ => None,
             })
             .collect()

@@ -3,8 +3,8 @@
 use std::fmt;
 
 use super::{
-    DcMode, Dictionary, Fmmu, LocalName, Mailbox, Pdo, Position, Slots, SmMapping, SyncManager,
-    SyncUnit,
+    DcMode, Dictionary, Fmmu, FmmuUse, LocalName, Mailbox, Pdo, Position, Slots, SmMapping, SmUse,
+    SyncManager, SyncUnit,
 };
 
 /// Identity object 0x1018 without the serial number.
@@ -74,6 +74,23 @@ impl Device {
     pub fn speaks_soe_alone(&self) -> bool {
         let mailbox = self.mailbox.as_ref();
         mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none())
+    }
+
+    /// The SyncManager through which its mailbox is read.
+    #[must_use]
+    pub fn mailbox_in(&self) -> Option<u8> {
+        self.mailbox.as_ref()?;
+        let mut all = self.sync_managers.iter();
+        u8::try_from(all.position(|sm| sm.usage == SmUse::MBoxIn)?).ok()
+    }
+
+    /// The FMMU that brings the status of that SyncManager into the process image (`Fmmu` of `MBoxState`), and the SyncManager.
+    #[must_use]
+    pub fn mailbox_status_fmmu(&self) -> Option<(u8, u8)> {
+        let sm = self.mailbox_in()?;
+        let mut all = self.fmmus.iter();
+        let fmmu = all.position(|fmmu| fmmu.usage == FmmuUse::MBoxState)?;
+        Some((u8::try_from(fmmu).ok()?, sm))
     }
 }
 

@@ -105,6 +105,7 @@ fn plan(axes: usize) -> Result<ImagePlan, RigError> {
         in_len: DRIVE_BYTES,
         group: 0,
         lrw: true,
+        mailbox: false,
     };
     image::plan(&vec![drive; axes]).map_err(|_| RigError::TooMany(axes))
 }
@@ -156,6 +157,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(Parts, OuterEnd), Rig
         .map(|n| Member {
             station: FIRST_STATION + n,
             clock: true,
+            mailbox: None,
         })
         .collect();
     let clock = ClockPlan {

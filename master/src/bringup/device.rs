@@ -11,9 +11,12 @@ use crate::rt::image::Region;
 /// FMMU registers (ETG.1000.4, Table 56): 16 bytes each.
 const FMMU: u16 = 0x0600;
 const FMMU_SIZE: u16 = 16;
+/// One that maps nothing, as all are after a reset.
+const OFF: [u8; FMMU_SIZE as usize] = [0; FMMU_SIZE as usize];
 /// SyncManager registers (ETG.1000.4, Table 58): 8 bytes each.
 pub(super) const SYNC_MANAGER: u16 = 0x0800;
 pub(super) const SYNC_MANAGER_SIZE: u16 = 8;
+const STATUS: u16 = 5;
 const WATCHDOG_DIVIDER: u16 = 0x0400;
 const WATCHDOG_PROCESS_DATA: u16 = 0x0420;
 /// (2498 + 2) × 40 ns: the process-data watchdog counts in 100 µs.
@@ -105,13 +108,14 @@ fn format_value(data: &[u8]) -> String {
     format!("0x{value:0width$x}", width = data.len() * 2)
 }
 
-/// Configures the SyncManagers of the process data, and one FMMU for each. Outputs and inputs start
-/// at the same logical address.
+/// Configures the SyncManagers of the process data, and one FMMU for each; and the one of the mailbox's status, to be read at
+/// `status`. Outputs and inputs start at the same logical address.
 pub(super) async fn map_process_data(
     wire: &impl Wire,
     config: &DeviceConfig,
     device: &BusDevice,
     region: Option<Region>,
+    status: Option<u32>,
 ) -> Result<(), BringUpError> {
     const READ: u8 = 1;
     const WRITE: u8 = 2;
@@ -131,12 +135,19 @@ pub(super) async fn map_process_data(
             )
             .await?;
             if sm.len > 0 {
-                fmmus.push(fmmu(logical, sm, kind));
+                fmmus.push(fmmu(logical, sm.start_address, sm.len, kind));
                 logical = logical.saturating_add(u32::from(sm.len));
             }
         }
     }
-    for (i, fmmu) in fmmus.iter().enumerate() {
+    if let (Some(logical), Some((number, sm))) = (status, config.device.mailbox_status_fmmu()) {
+        // The ESI's number, unless the process data has taken that.
+        let number = usize::from(number).max(fmmus.len());
+        fmmus.resize(number, OFF);
+        let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm) + STATUS;
+        fmmus.push(fmmu(logical, register, 1, READ));
+    }
+    for (i, fmmu) in fmmus.iter().enumerate().filter(|(_, fmmu)| **fmmu != OFF) {
         let register = FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
         write(wire, device, "configuring FMMUs", register, fmmu).await?;
     }
@@ -150,10 +161,10 @@ fn sync_manager(sm: &SmLayout) -> [u8; SYNC_MANAGER_SIZE as usize] {
     [p0, p1, n0, n1, sm.control_byte, 0, u8::from(sm.len > 0), 0]
 }
 
-fn fmmu(logical: u32, sm: &SmLayout, kind: u8) -> [u8; FMMU_SIZE as usize] {
+fn fmmu(logical: u32, physical: u16, len: u16, kind: u8) -> [u8; FMMU_SIZE as usize] {
     let [l0, l1, l2, l3] = logical.to_le_bytes();
-    let [n0, n1] = sm.len.to_le_bytes();
-    let [p0, p1] = sm.start_address.to_le_bytes();
+    let [n0, n1] = len.to_le_bytes();
+    let [p0, p1] = physical.to_le_bytes();
     // Start bit 0 to stop bit 7; physical start bit 0; enabled.
     [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, 1, 0, 0, 0]
 }

@@ -16,6 +16,7 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use crate::clock;
 use crate::config::{Adopted, Machine, UnitProblem};
+use crate::mailbox::desk::Listen;
 use crate::mailbox::{CoeClient, SdoError, WireError};
 use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
@@ -62,7 +63,7 @@ impl fmt::Display for DeviceRef {
 #[derive(Debug)]
 pub struct BusDevice {
     pub at: DeviceRef,
-    /// `None` where the device has no CoE mailbox.
+    /// `None` where the device has no CoE mailbox, and once its mailbox is looked after beside the cycle.
     pub coe: Option<CoeClient>,
     /// It has a system time: not every one that says so in 0x0008 has it switched on.
     pub dc: bool,
@@ -249,12 +250,13 @@ fn list(problems: &[UnitProblem]) -> String {
     each.join("; ")
 }
 
-/// Brings the segment from whatever it is in to SafeOp.
+/// Brings the segment from whatever it is in to SafeOp. The listener is told what devices say unasked, whether that succeeds or not.
 pub async fn bring_up(
     main_device: &'static MainDevice<'static>,
     machine: &Machine,
-    mut image: ImagePlan,
+    image: ImagePlan,
     progress: &mut dyn FnMut(Step),
+    listener: &dyn Listen,
 ) -> Result<Bus, BringUpError> {
     let wire = Datagrams::new(main_device);
     progress(Step::Scan);
@@ -311,38 +313,66 @@ pub async fn bring_up(
         clocks::set_anew(&wire, &devices).await?;
     }
 
-    for (config, device) in machine.devices.iter().zip(&mut devices) {
-        device::start_up(&wire, config, device, Moment::InPreOp, progress).await?;
-        mapping::compare(&wire, config, device).await?;
-        units::compare(&wire, config, device, progress).await?;
-        held::read(&wire, config, device).await?;
-    }
-
     // From here on ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
+    let set_up = set_up(&wire, machine, image, &mut devices, progress, listener).await;
+    for device in &devices {
+        device.tell(listener);
+    }
+    let (image, dc) = set_up?;
+    Ok(Bus { devices, image, dc })
+}
 
-    if let Some(without) = without_lrw(&wire, machine, &devices).await? {
+/// From PreOp to SafeOp.
+async fn set_up(
+    wire: &Datagrams,
+    machine: &Machine,
+    mut image: ImagePlan,
+    devices: &mut [BusDevice],
+    progress: &mut dyn FnMut(Step),
+    listener: &dyn Listen,
+) -> Result<(ImagePlan, Option<ClockPlan>), BringUpError> {
+    for (config, device) in machine.devices.iter().zip(&mut *devices) {
+        device::start_up(wire, config, device, Moment::InPreOp, progress).await?;
+        mapping::compare(wire, config, device).await?;
+        units::compare(wire, config, device, progress).await?;
+        held::read(wire, config, device).await?;
+        device.tell(listener);
+    }
+
+    if let Some(without) = without_lrw(wire, machine, devices).await? {
         image = without;
     }
 
-    for ((config, device), region) in machine.devices.iter().zip(&devices).zip(&image.regions) {
-        device::map_process_data(&wire, config, device, *region).await?;
-        device::set_watchdog(&wire, &machine.bus, device).await?;
+    let regions = machine.devices.iter().zip(&*devices).zip(&image.regions);
+    for (index, ((config, device), region)) in regions.enumerate() {
+        let status = image.mailboxes.as_ref().and_then(|m| m.logical_of(index));
+        device::map_process_data(wire, config, device, *region, status).await?;
+        device::set_watchdog(wire, &machine.bus, device).await?;
     }
     progress(Step::ProcessData {
         bytes: image.len,
         frames: image.frames(),
     });
 
-    let dc = clocks::configure(&wire, machine, &devices, progress).await?;
+    let dc = clocks::configure(wire, machine, devices, progress).await?;
 
     let at: Vec<_> = devices.iter().map(|d| d.at.clone()).collect();
-    al::change_state(&wire, &at, AlState::SafeOp, al::SAFE_OP_TIMEOUT).await?;
+    al::change_state(wire, &at, AlState::SafeOp, al::SAFE_OP_TIMEOUT).await?;
     progress(Step::State(AlState::SafeOp));
-    for (config, device) in machine.devices.iter().zip(&mut devices) {
-        device::start_up(&wire, config, device, Moment::InSafeOp, progress).await?;
+    for (config, device) in machine.devices.iter().zip(devices) {
+        device::start_up(wire, config, device, Moment::InSafeOp, progress).await?;
     }
-    Ok(Bus { devices, image, dc })
+    Ok((image, dc))
+}
+
+impl BusDevice {
+    /// What it has said unasked.
+    fn tell(&self, listener: &dyn Listen) {
+        if let Some(coe) = &self.coe {
+            listener.listen(&self.at.name, &coe.emergencies());
+        }
+    }
 }
 
 /// The image with the devices whose controllers say that they know no LRW (0x0008 bit 9) beyond those of which the ESI says so;

@@ -289,6 +289,9 @@ fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
     for datagram in &plan.datagrams {
         frames[datagram.frame] += DATAGRAM + datagram.len;
     }
+    if let Some(mailboxes) = &plan.mailboxes {
+        frames[mailboxes.frame] += DATAGRAM + mailboxes.devices.len();
+    }
     frames
         .into_iter()
         .map(|len| ETHERNET + (ECAT_HEADER + len).max(SHORTEST_PAYLOAD))
@@ -358,6 +361,9 @@ fn commands(plan: &ImagePlan) -> String {
             1 => text += &format!("{name}, "),
             several => text += &format!("{several} {name}, "),
         }
+    }
+    if plan.mailboxes.is_some() {
+        text += "LRD of mailbox status, ";
     }
     text
 }

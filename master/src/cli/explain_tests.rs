@@ -9,6 +9,7 @@ fn bytes_on_the_wire_as_counted_by_hand() {
             in_len: 12,
             group: 0,
             lrw: true,
+            mailbox: false,
         };
         let plan = image::plan(&vec![axis; axes]).unwrap();
         let frames = frame_bytes(&plan, true);

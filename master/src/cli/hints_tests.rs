@@ -153,6 +153,7 @@ fn every_failure_says_what_next() {
                 device: device(),
                 code: Some(0x2310),
                 statusword: 8,
+                report: Box::default(),
             },
             FAILED,
             describe(0x2310).hint,

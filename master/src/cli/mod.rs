@@ -22,6 +22,7 @@ mod completions;
 mod device;
 mod doctor;
 mod eeprom;
+mod emergencies;
 mod esi;
 mod explain;
 mod firmware;

@@ -103,6 +103,8 @@ impl Observer for Teller {
                 }
             }
             Progress::Warning(text) => self.line(&format!("warning: {text}")),
+            Progress::Emergency(report) => self.line(&format!("warning: {report}")),
+            Progress::Mailboxes(_) => {}
             Progress::GroupStopped { group, cause } => {
                 self.line(&format!(
                     "warning: the group `{group}` stops, the rest goes on: {cause}"

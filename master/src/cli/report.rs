@@ -52,6 +52,10 @@ pub(crate) fn summary(summary: &Summary) -> String {
         text += &errors(&summary.errors).indented(2);
         text += "\n";
     }
+    if !summary.emergencies.is_empty() {
+        text += "\n";
+        text += &super::emergencies::table(&summary.emergencies, summary.more_emergencies);
+    }
     if summary.events.iter().any(|event| event.failure) {
         text += &format!("\n{}\n", events(&summary.events));
     }
@@ -314,6 +318,8 @@ fn positive_zero(x: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use ecaxis::session::EmergencyLine;
+
     use super::*;
 
     fn sample() -> Summary {
@@ -377,6 +383,16 @@ mod tests {
                 processing_unit: 0,
                 pdi: 0,
             }],
+            emergencies: vec![EmergencyLine {
+                device: "x".into(),
+                at_s: -0.25,
+                dc_time_ns: None,
+                code: 0x8611,
+                text: "following error".into(),
+                register: 0x20,
+                data: [1, 2, 3, 4, 0xff],
+            }],
+            more_emergencies: 2,
             events: vec![
                 EventLine {
                     at_s: 1.25,
@@ -427,6 +443,10 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
 
   SubDevice  port  invalid frames  receive errors  found bad before  lost links
   x          1     3               4               0                 1
+
+  time      device  emergency  register  data            what
+  -0.250 s  x       0x8611     0x20      01 02 03 04 ff  following error
+  2 more emergencies are not kept
 
   time     cycle      what the cycle noticed last
   1.250 s  1250-1252  frames were not back before the deadline

@@ -2,6 +2,9 @@
 
 use std::collections::VecDeque;
 use std::fmt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use ecaxis_axis::cia402::describe;
 
 /// How many emergencies wait to be taken. Beyond it the newest are dropped and counted: the first tell the cause.
 pub const EMERGENCY_QUEUE: usize = 32;
@@ -25,6 +28,15 @@ impl Emergency {
             register: *register,
             data: *data,
         })
+    }
+
+    /// What the code means, as far as CiA 301, CiA 402 and maxon list it.
+    pub fn text(&self) -> &'static str {
+        match self.code {
+            0xa000 | 0xa001 => self.class(),
+            _ if self.is_reset() => "an earlier error is gone",
+            code => describe(code).text,
+        }
     }
 
     /// An earlier error is gone.
@@ -65,33 +77,52 @@ impl fmt::Display for Emergency {
             f,
             "emergency {:#06x} ({}), error register {:#04x}, data {a:02x} {b:02x} {c:02x} {d:02x} {e:02x}",
             self.code,
-            self.class(),
+            self.text(),
             self.register
         )
     }
 }
 
-/// A bounded queue that keeps the first.
+/// An emergency, and when it was read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Received {
+    /// On the wire's clock, nanoseconds.
+    pub at: u64,
+    pub emergency: Emergency,
+}
+
+/// What a device has said unasked and nobody has taken yet: bounded, the first are kept. Clones are the same queue, so that it can be
+/// emptied while a transfer goes on.
+#[derive(Debug, Clone, Default)]
+pub struct Emergencies(Arc<Mutex<Queue>>);
+
 #[derive(Debug, Default)]
-pub(super) struct Emergencies {
-    queue: VecDeque<Emergency>,
+struct Queue {
+    waiting: VecDeque<Received>,
     lost: u64,
 }
 
 impl Emergencies {
-    pub(super) fn push(&mut self, emergency: Emergency) {
-        if self.queue.len() < EMERGENCY_QUEUE {
-            self.queue.push_back(emergency);
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn push(&self, at: u64, emergency: Emergency) {
+        let mut queue = self.queue();
+        if queue.waiting.len() < EMERGENCY_QUEUE {
+            queue.waiting.push_back(Received { at, emergency });
         } else {
-            self.lost += 1;
+            queue.lost += 1;
         }
     }
 
-    pub(super) fn take(&mut self) -> impl Iterator<Item = Emergency> + '_ {
-        self.queue.drain(..)
+    /// Those that wait, oldest first.
+    pub fn take(&self) -> Vec<Received> {
+        self.queue().waiting.drain(..).collect()
     }
 
-    pub(super) fn lost(&self) -> u64 {
-        self.lost
+    /// How many found the queue full.
+    pub fn lost(&self) -> u64 {
+        self.queue().lost
     }
 }

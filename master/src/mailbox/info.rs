@@ -347,7 +347,7 @@ impl CoeClient {
                     .into());
                 }
                 Ok(_) => {
-                    self.port.set_aside();
+                    self.port.set_aside(w);
                     if answer.passed(w) {
                         return Err(self
                             .in_trouble(asked, Trouble::Timeout(Phase::Answer))

@@ -6,12 +6,14 @@
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
 //! - `info`: what objects a device has, as it says itself (SDO Information).
 //! - [`foe`]: [`FoeClient`], files.
+//! - `desk`: [`Mailboxes`], transfers for everybody while somebody else looks after the mailboxes.
 //! - `error`, `abort`, `emergency`, `objects`: what is said when something goes wrong.
 
 use std::time::Duration;
 
 mod abort;
 mod coe;
+pub mod desk;
 mod emergency;
 mod error;
 pub mod foe;
@@ -24,7 +26,8 @@ mod tests;
 mod transfer;
 
 pub use abort::{abort_text, mailbox_error_text};
-pub use emergency::{EMERGENCY_QUEUE, Emergency};
+pub use desk::{DeviceMailbox, MailboxError, Mailboxes};
+pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
 pub use error::{Phase, SdoError};
 pub use foe::{FoeClient, FoeError};
 pub use info::{Asked, EntryDescription, InfoError, ObjectDescription, ObjectList};
@@ -44,6 +47,20 @@ pub trait Wire {
 
     /// Nanoseconds of a clock that never goes back and that [`Wire::delay`] advances.
     fn now(&self) -> u64;
+
+    /// What somebody else has lately seen of the SubDevice's mailbox, the one that is read; `None` where nobody looks.
+    fn seen(&self) -> Option<Seen> {
+        None
+    }
+}
+
+/// A mailbox as the cycle saw it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Seen {
+    /// On [`Wire::now`]'s clock; the mailbox was looked at then or later.
+    pub at: u64,
+    /// A message waits in it.
+    pub full: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -23,6 +23,8 @@ const MAILBOX_MAX: u16 = 1486;
 
 /// Consecutive frames that may be lost, or come back untouched, before a device or bus counts as gone.
 const PATIENCE: u32 = 5;
+/// Messages in a row that are counted up show that a device counts; one alone may be chance.
+const COUNTED: u32 = 3;
 /// How often one answer may get lost.
 const REPEATS: u32 = 3;
 
@@ -83,6 +85,12 @@ pub(super) struct Port {
     pub(super) forgotten: u64,
     outgoing: Vec<u8>,
     incoming: Vec<u8>,
+    /// The message before it.
+    previous: Vec<u8>,
+    /// Messages in a row that the SubDevice has counted up.
+    in_order: u32,
+    /// When the mailbox was last read: what was seen of it before says nothing of what is in it now.
+    read_at: u64,
     /// The SubDevice has taken the last request, so what fills its mailbox next is the next one.
     pub(super) free: bool,
     /// 1 to 7; tells the SubDevice a new message from one sent again.
@@ -98,6 +106,9 @@ impl Port {
             forgotten: 0,
             outgoing: Vec::with_capacity(usize::from(layout.out_len)),
             incoming: vec![0; usize::from(layout.in_len)],
+            previous: vec![0; usize::from(layout.in_len)],
+            in_order: 0,
+            read_at: 0,
             free: false,
             counter: 0,
         }
@@ -145,7 +156,7 @@ impl Port {
                         return Ok(());
                     }
                     if !arrived && self.fetch(w, &mut patience).await? == Fetched::Message {
-                        self.set_aside();
+                        self.set_aside(w);
                     }
                 }
                 Touched::Lost => arrived = true,
@@ -166,7 +177,7 @@ impl Port {
         let mut patience = Patience::default();
         let mut repeats = 0;
         loop {
-            match self.fetch(w, &mut patience).await? {
+            match self.look(w, &mut patience).await? {
                 Fetched::Message => return Ok(()),
                 Fetched::Lost if repeats < REPEATS => {
                     repeats += 1;
@@ -182,11 +193,32 @@ impl Port {
         }
     }
 
+    /// As [`Port::fetch`], without a datagram where the cycle sees that there is nothing.
+    async fn look<W: Wire>(&mut self, w: &W, patience: &mut Patience) -> Result<Fetched, Trouble> {
+        match w.seen() {
+            Some(seen) if !seen.full || seen.at <= self.read_at => Ok(Fetched::Nothing),
+            Some(_) => self.read(w, patience).await,
+            None => self.fetch(w, patience).await,
+        }
+    }
+
+    /// Whether somebody has seen a message since the mailbox was last read.
+    pub(super) fn waits<W: Wire>(&self, w: &W) -> bool {
+        w.seen()
+            .is_some_and(|seen| seen.full && seen.at > self.read_at)
+    }
+
     /// Reads the mailbox if it is full.
     async fn fetch<W: Wire>(&mut self, w: &W, patience: &mut Patience) -> Result<Fetched, Trouble> {
         if !self.status(w, self.layout.in_sm, patience).await? {
             return Ok(Fetched::Nothing);
         }
+        self.read(w, patience).await
+    }
+
+    /// Reads the mailbox, which is full.
+    async fn read<W: Wire>(&mut self, w: &W, patience: &mut Patience) -> Result<Fetched, Trouble> {
+        mem::swap(&mut self.incoming, &mut self.previous);
         let read = w
             .read(
                 self.layout.station,
@@ -194,7 +226,16 @@ impl Port {
                 &mut self.incoming,
             )
             .await;
-        match patience.judge(read)? {
+        self.read_at = w.now();
+        let touched = patience.judge(read);
+        if !matches!(touched, Ok(Touched::Yes)) {
+            mem::swap(&mut self.incoming, &mut self.previous);
+        }
+        match touched? {
+            Touched::Yes if self.is_repeated() => {
+                self.forgotten += 1;
+                Ok(Fetched::Waiting)
+            }
             Touched::Yes => Ok(Fetched::Message),
             // The frame was lost on its way there, so the message still waits; or on its way back, and it is gone.
             Touched::No | Touched::Lost if self.status(w, self.layout.in_sm, patience).await? => {
@@ -202,6 +243,22 @@ impl Port {
             }
             Touched::No | Touched::Lost => Ok(Fetched::Lost),
         }
+    }
+
+    /// Whether the message is the one before it once more: the same counter and content. Only devices that count are judged, which
+    /// shows in the messages before; others send the same counter whatever they say.
+    fn is_repeated(&mut self) -> bool {
+        let counter = |message: &[u8]| message.get(5).map_or(0, |kind| kind >> 4 & 7);
+        let (now, before) = (counter(&self.incoming), counter(&self.previous));
+        if self.in_order >= COUNTED && self.incoming == self.previous {
+            return true;
+        }
+        self.in_order = if before != 0 && now == before % 7 + 1 {
+            self.in_order.saturating_add(1)
+        } else {
+            0
+        };
+        false
     }
 
     /// Has the SubDevice put the last message back into its mailbox.
@@ -239,7 +296,7 @@ impl Port {
         for _ in 0..most {
             match self.fetch(w, &mut patience).await? {
                 Fetched::Message => {
-                    self.set_aside();
+                    self.set_aside(w);
                     count += 1;
                 }
                 Fetched::Waiting => w.delay(POLL_MIN).await,
@@ -256,9 +313,9 @@ impl Port {
     }
 
     /// Keeps an emergency and forgets everything else.
-    pub(super) fn set_aside(&mut self) {
+    pub(super) fn set_aside<W: Wire>(&mut self, w: &W) {
         match parse(&self.incoming) {
-            Ok(Message::Emergency(emergency)) => self.emergencies.push(emergency),
+            Ok(Message::Emergency(emergency)) => self.emergencies.push(w.now(), emergency),
             _ => self.forgotten += 1,
         }
     }

@@ -1,7 +1,7 @@
 //! The CoE client of one SubDevice: SDO upload and download, expedited, normal and segmented, with complete access.
 
 use super::coe::{Answer, Message, Request, download_room, parse, segment_room};
-use super::emergency::Emergency;
+use super::emergency::{Emergencies, Emergency};
 use super::error::{Phase, SdoError};
 use super::port::{Deadline, Port, Trouble};
 use super::transfer::{Ended, Transfer, explain};
@@ -24,6 +24,8 @@ pub struct CoeClient {
     pub(super) port: Port,
     /// A transfer ended without its last answer; it may still come.
     pub(super) unsettled: bool,
+    /// The object whose segments are under way.
+    in_segments: Option<(u16, u8)>,
 }
 
 impl CoeClient {
@@ -31,6 +33,7 @@ impl CoeClient {
         Self {
             port: Port::new(layout),
             unsettled: true,
+            in_segments: None,
         }
     }
 
@@ -107,7 +110,25 @@ impl CoeClient {
 
     /// What the SubDevice reported unasked since the last call, oldest first.
     pub fn take_emergencies(&mut self) -> impl Iterator<Item = Emergency> + '_ {
-        self.port.emergencies.take()
+        let taken = self.port.emergencies.take().into_iter();
+        taken.map(|received| received.emergency)
+    }
+
+    /// The queue of what the SubDevice reports unasked; it can be emptied while a transfer goes on.
+    pub fn emergencies(&self) -> Emergencies {
+        self.port.emergencies.clone()
+    }
+
+    /// Whether somebody else has seen a message in the mailbox that nobody has read.
+    pub fn waits<W: Wire>(&self, w: &W) -> bool {
+        self.port.waits(w)
+    }
+
+    /// Ends a transfer whose future was dropped: the SubDevice is told, and its mailbox emptied. The next transfer would do so.
+    pub async fn give_up<W: Wire>(&mut self, w: &W) -> Result<(), SdoError> {
+        let settled = self.settle(w).await;
+        let station = self.port.layout.station;
+        settled.map_err(|trouble| explain(&self.port, trouble, |_| SdoError::Gone { station }))
     }
 
     /// How many emergencies found the queue full.
@@ -143,6 +164,12 @@ impl CoeClient {
     /// Makes sure that what arrives from now on belongs to what is sent from now on.
     pub(super) async fn settle<W: Wire>(&mut self, w: &W) -> Result<(), Trouble> {
         self.port.check()?;
+        if let Some((index, sub)) = self.in_segments.take() {
+            let code = ABORT_GENERAL;
+            let farewell = Request::Abort { index, sub, code };
+            // The device may not hear it; whether it is there at all shows now.
+            let _ = self.port.send(w, &farewell).await;
+        }
         if self.unsettled {
             self.port.drain(w, DRAIN).await?;
         }
@@ -156,6 +183,7 @@ impl CoeClient {
         transfer: &Transfer,
         result: Result<T, Ended>,
     ) -> Result<T, SdoError> {
+        self.in_segments = None;
         match result {
             Ok(value) => {
                 self.unsettled = false;
@@ -211,6 +239,7 @@ impl CoeClient {
         if data.len() >= size {
             return Ok(data);
         }
+        self.in_segments = Some((index, sub));
         let mut toggle = false;
         loop {
             let (seen, last, part) = self
@@ -300,6 +329,7 @@ impl CoeClient {
         progress(first.len());
 
         let room = segment_room(self.port.layout.out_len);
+        self.in_segments = (!rest.is_empty()).then_some((index, sub));
         let mut toggle = false;
         while !rest.is_empty() {
             let (part, remaining) = rest.split_at(room.min(rest.len()));
@@ -380,7 +410,7 @@ impl CoeClient {
                 Ok(_) => {}
                 Err(flaw) => return Err(told(transfer.malformed(flaw), ABORT_GENERAL)),
             }
-            self.port.set_aside();
+            self.port.set_aside(w);
             if deadline.passed(w) {
                 let ended = transfer.trouble(&self.port, Trouble::Timeout(Phase::Answer));
                 return Err(told(ended, ABORT_TIMEOUT));

@@ -1,9 +1,11 @@
 //! The frames of a cycle: FRMW of the system time, an LRW of each group's process data (LWR and LRD where a SubDevice
-//! knows no LRW), one BRD of AL status and one diagnostic read; built once, refilled every cycle, sent back to back.
+//! knows no LRW), an LRD of the status of mailboxes, one BRD of AL status and one diagnostic read; built once, refilled every cycle, sent back to back.
 //!
 //! Ours and ethercrab's frames are told apart by the last byte of the source MAC, because
 //! ethercrab uses all 256 datagram indices. The byte before it numbers the frames of a cycle, and
 //! the datagram index numbers the cycle, so that late and repeated frames are recognised.
+
+use std::sync::Arc;
 
 use super::image::{Access, ImagePlan};
 use super::phase::ClockPlan;
@@ -14,10 +16,13 @@ use crate::link::{Link, LinkError, MAX_FRAME};
 mod flight;
 mod frame;
 mod probe;
+mod sights;
 
 use flight::Flight;
 use frame::{DATAGRAM_HEADER, Frame, MAC_TAIL, Place, WKC, clear_wkc, push, write_header};
+use probe::Turn;
 pub use probe::{Diagnosis, ErrorCounters, Probe};
+pub use sights::Sights;
 
 const FPRD: u8 = 4;
 const BRD: u8 = 7;
@@ -45,6 +50,8 @@ pub struct Member {
     pub station: u16,
     /// It takes the system time.
     pub clock: bool,
+    /// The SyncManager through which its mailbox is read; `None` where it has none.
+    pub mailbox: Option<u8>,
 }
 
 /// What came back of one group's process data in a cycle.
@@ -135,12 +142,18 @@ pub struct Exchange {
     cycle_ns: u64,
     process_data: Vec<ProcessDatagram>,
     al_status: Place,
+    /// Status of mailboxes, a byte a device.
+    mailboxes: Option<Place>,
+    /// Whose they are.
+    mailbox_devices: Vec<usize>,
+    sights: Arc<Sights>,
     probe_at: usize,
     members: Vec<Member>,
     shares: Vec<Share>,
     diagnoses: Vec<Diagnosis>,
-    /// Which device and probe the next diagnostic datagram reads.
-    probe: (usize, usize),
+    turns: Vec<Turn>,
+    /// The next one.
+    turn: usize,
     cycle: u8,
     outputs: Vec<u8>,
     inputs: Vec<u8>,
@@ -185,6 +198,12 @@ impl Exchange {
                 .iter()
                 .position(|member| member.station == clock.reference)
         });
+        let mapped = plan.mailboxes.as_ref().map_or(&[][..], |m| &m.devices);
+        let polled: Vec<_> = members
+            .iter()
+            .enumerate()
+            .map(|(index, member)| member.mailbox.filter(|_| !mapped.contains(&index)))
+            .collect();
         let mut exchange = Self {
             flights,
             staged: 0,
@@ -194,11 +213,15 @@ impl Exchange {
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
             process_data: places.process_data,
             al_status: places.al_status,
+            mailboxes: places.mailboxes,
+            mailbox_devices: mapped.to_vec(),
+            sights: Arc::new(Sights::new(members.len())),
             probe_at: places.probe_at,
             members: members.to_vec(),
             shares,
             diagnoses: vec![Diagnosis::default(); members.len()],
-            probe: (0, 0),
+            turns: Probe::turns(&polled),
+            turn: 0,
             cycle: 0,
             outputs: vec![0; plan.len],
             inputs: vec![0; plan.len],
@@ -240,15 +263,21 @@ impl Exchange {
         &self.diagnoses
     }
 
+    /// What the cycle sees of mailboxes and of time, for everybody beside it.
+    #[must_use]
+    pub fn sights(&self) -> Arc<Sights> {
+        Arc::clone(&self.sights)
+    }
+
     /// Whose clock difference the answers of this cycle have brought.
     #[must_use]
     pub fn clock_read(&self) -> Option<(usize, i32)> {
         let flight = self.flights.get(self.due())?;
-        let (device, probe) = flight.probe;
+        let turn = self.turns.get(flight.turn)?;
         flight.answer(0)?;
-        let found = self.diagnoses.get(device)?;
-        let read = Probe::ALL.get(probe) == Some(&Probe::ClockDifference) && found.answers;
-        read.then_some((device, found.clock_difference))
+        let found = self.diagnoses.get(turn.device)?;
+        let read = turn.probe == Probe::ClockDifference && found.answers;
+        read.then_some((turn.device, found.clock_difference))
     }
 
     /// The flight whose answers this cycle takes: the oldest.
@@ -273,21 +302,21 @@ impl Exchange {
             }
             clear_wkc(frame, place);
         }
+        if let Some(place) = self.mailboxes {
+            let frame = &mut flight.frames[place.frame].bytes;
+            frame[place.data()].fill(Sights::UNSEEN);
+            clear_wkc(frame, place);
+        }
         let first = &mut flight.frames[0].bytes;
-        flight.probe = self.probe;
-        if let Some(member) = self.members.get(self.probe.0) {
+        flight.turn = self.turn;
+        if let Some(turn) = self.turns.get(self.turn) {
             // The last datagram of its frame, so its length may change; within the capacity of the frame.
-            let (register, len) = Probe::ALL[self.probe.1].register_and_len();
             first.truncate(self.probe_at);
-            first.resize(self.probe_at + DATAGRAM_HEADER + len + WKC, 0);
-            let address = u32::from(register) << 16 | u32::from(member.station);
-            write_header(first, self.probe_at, FPRD, address, len);
-            let next = self.probe.0 + 1;
-            self.probe = if next < self.members.len() {
-                (next, self.probe.1)
-            } else {
-                (0, (self.probe.1 + 1) % Probe::ALL.len())
-            };
+            first.resize(self.probe_at + DATAGRAM_HEADER + turn.len + WKC, 0);
+            let station = self.members.get(turn.device).map_or(0, |m| m.station);
+            let address = u32::from(turn.register) << 16 | u32::from(station);
+            write_header(first, self.probe_at, FPRD, address, turn.len);
+            self.turn = (self.turn + 1) % self.turns.len();
         }
         if let Some(place) = self.clock {
             first[place.data()].copy_from_slice(&time.to_le_bytes());
@@ -371,26 +400,40 @@ impl Exchange {
             al_status: None,
             sent_late: flight.sent_late.unwrap_or(0),
         };
+        if let Some(place) = self.mailboxes
+            && let Some(seen) = flight.answer(place.frame)
+            && let Some(seen) = seen.get(place.data())
+        {
+            for (&device, &status) in self.mailbox_devices.iter().zip(seen) {
+                self.sights.see(device, flight.sent_at, status);
+            }
+        }
         let Some(first) = first else {
             return answer;
         };
         answer.al_status = first
             .get(self.al_status.data())
             .and_then(|data| Some((*data.first()?, self.al_status.wkc(first))));
-        let (device, probe) = flight.probe;
-        if let (Some(to), Some(probe)) = (self.diagnoses.get_mut(device), Probe::ALL.get(probe)) {
+        if let Some(turn) = self.turns.get(flight.turn)
+            && let Some(to) = self.diagnoses.get_mut(turn.device)
+        {
             let place = Place {
                 frame: 0,
                 offset: self.probe_at,
-                len: probe.register_and_len().1,
+                len: turn.len,
             };
             to.answers = place.wkc(first) == 1;
-            if let (true, Some(data)) = (to.answers, first.get(place.data())) {
-                to.take(*probe, data);
+            match first.get(place.data()) {
+                Some(&[status]) if to.answers && turn.probe == Probe::Mailbox => {
+                    self.sights.see(turn.device, flight.sent_at, status);
+                }
+                Some(data) if to.answers => to.take(turn.probe, data),
+                _ => {}
             }
         }
         answer.system_time = self.system_time(first);
         if let Some(time) = answer.system_time {
+            self.sights.set_clock(flight.sent_at, time);
             // Of the flight that is staged next; those under way lie between.
             let ahead = self.cycle_ns.saturating_mul(self.flights.len() as u64);
             self.expected_time = time.wrapping_add(ahead);
@@ -428,6 +471,7 @@ impl Exchange {
 struct Places {
     clock: Option<Place>,
     process_data: Vec<ProcessDatagram>,
+    mailboxes: Option<Place>,
     al_status: Place,
     probe_at: usize,
 }
@@ -457,12 +501,17 @@ impl Places {
             }
         });
         let process_data = process_data.collect();
+        let mailboxes = plan.mailboxes.as_ref().map(|m| {
+            let (frame, len) = (m.frame, m.devices.len());
+            push(&mut frames[frame], frame, LRD, m.logical, len)
+        });
         let al_status = push(&mut frames[0], 0, BRD, u32::from(AL_STATUS) << 16, 2);
         let probe_at = frames[0].bytes.len();
         debug_assert!(probe_at + DATAGRAM_HEADER + Probe::LONGEST + WKC <= MAX_FRAME);
         Self {
             clock,
             process_data,
+            mailboxes,
             al_status,
             probe_at,
         }

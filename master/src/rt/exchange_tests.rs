@@ -49,6 +49,7 @@ fn axis(group: usize) -> ProcessData {
         in_len: 12,
         group,
         lrw: true,
+        mailbox: false,
     }
 }
 
@@ -69,6 +70,7 @@ fn exchange(devices: &[ProcessData], mode: Mode) -> Exchange {
         .map(|i| Member {
             station: 0x1000 + i as u16,
             clock: i == 0,
+            mailbox: None,
         })
         .collect();
     let clock = ClockPlan {
@@ -223,7 +225,8 @@ fn the_diagnostic_slot_walks_through_devices_and_probes() {
     let mut exchange = axes(2);
     let mut seen = Vec::new();
     for _ in 0..2 * Probe::ALL.len() {
-        seen.push(exchange.flights[0].probe);
+        let turn = exchange.turns[exchange.flights[0].turn];
+        seen.push((turn.device, turn.probe as usize));
         let frame = reflect(&mut exchange, 0, 1);
         exchange.receive(&frame);
         exchange.answer();

@@ -1,5 +1,6 @@
 //! Why a run failed: what, where, which code. What to do about it is the command line's to say.
 
+use std::fmt;
 use std::sync::Arc;
 
 use ecaxis_axis::cia402::describe;
@@ -9,7 +10,8 @@ use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
-use crate::session::StepRef;
+use crate::session::{EmergencyReport, StepRef};
+use crate::supervise::history::DiagnosisMessage;
 
 /// A machine or a bus that failed.
 #[derive(Debug, thiserror::Error)]
@@ -65,11 +67,12 @@ pub enum RunError {
         expected: i8,
         display: i8,
     },
-    #[error("{device}: drive fault (Statusword 0x{statusword:04x}){}", code_note(*code))]
+    #[error("{device}: drive fault (Statusword 0x{statusword:04x}){}{report}", code_note(*code))]
     DriveFault {
         device: DeviceRef,
         code: Option<u16>,
         statusword: u16,
+        report: Box<DriveReport>,
     },
     #[error("{device}: {trip}")]
     Trip { device: DeviceRef, trip: Trip },
@@ -196,6 +199,27 @@ pub enum RunError {
     Interrupted,
     #[error("internal error: {0}")]
     Panicked(String),
+}
+
+/// What a device that has failed says of it, beside its error code.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct DriveReport {
+    /// The last few, oldest first.
+    pub emergencies: Vec<EmergencyReport>,
+    /// Of its diagnosis history (0x10F3), newest first.
+    pub history: Vec<DiagnosisMessage>,
+}
+
+impl fmt::Display for DriveReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for report in &self.emergencies {
+            write!(f, "; {}", report.emergency)?;
+        }
+        for message in &self.history {
+            write!(f, "; diagnosis history: {message}")?;
+        }
+        Ok(())
+    }
 }
 
 fn al_note(al_status: Option<(u8, u16)>) -> String {

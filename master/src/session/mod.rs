@@ -18,6 +18,8 @@ use crate::clock::{self, Clock, Nanos};
 use crate::config::{Machine, Signal};
 use crate::link::Link;
 use crate::link::port::{Port, main_device, pump};
+use crate::mailbox::Mailboxes;
+use crate::mailbox::desk::{self, Desk, Listen, Opening};
 use crate::rt::controller::Controller;
 use crate::rt::cycle::{Parts, Remains, Signals, Timing, first_snapshot};
 use crate::rt::exchange::{Exchange, Member};
@@ -31,8 +33,9 @@ use crate::rt::stats::Stats;
 use crate::story::{Look, Story, look};
 use crate::supervise::manual::{self, Operator};
 use crate::supervise::{Supervisor, interruptible};
-use crate::wire::Datagrams;
+use crate::wire::{BesideCycle, Datagrams};
 
+mod emergencies;
 mod error;
 mod events;
 mod open;
@@ -41,7 +44,9 @@ mod story;
 mod summary;
 mod turn;
 
-pub use error::RunError;
+pub use crate::supervise::history::{DiagnosisKind, DiagnosisMessage};
+pub use emergencies::{EmergencyLine, EmergencyReport, Log};
+pub use error::{DriveReport, RunError};
 pub use events::EventLine;
 pub(crate) use events::clock_off;
 pub use open::{link as open_link, recorded, simulated_bus, topology};
@@ -261,8 +266,9 @@ fn prepare_with(
         link: link.as_mut(),
         port: &mut port,
     };
-    match come_up(machine, main_device, image, carried, &progress) {
-        Ok(bus) => {
+    let log = Log::new(progress.clone());
+    match come_up(machine, main_device, image, carried, &progress, &log) {
+        Ok(mut bus) => {
             let machine = &as_the_drives_say(machine, &bus);
             let (_, slots, axes, signals) = plan(machine)?;
             let wire = Datagrams::new(main_device);
@@ -277,6 +283,7 @@ fn prepare_with(
             let members = bus.devices.iter().map(|device| Member {
                 station: device.at.station,
                 clock: device.dc,
+                mailbox: device.coe.as_ref().map(|coe| coe.layout().in_sm),
             });
             let members: Vec<_> = members.collect();
             let (rt_end, outer) = ends(&first_snapshot(
@@ -289,6 +296,9 @@ fn prepare_with(
                 Exchange::new(&bus.image, bus.dc.as_ref(), &members, machine.bus.exchange);
             hold_outputs(machine, &bus, &mut exchange);
             exchange.stage();
+            log.set_sights(exchange.sights());
+            let (mailboxes, desks) = desks(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
+            let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
             let controlled = controller.is_some();
             let parts = Parts {
                 clock,
@@ -310,6 +320,9 @@ fn prepare_with(
                 machine: Arc::clone(machine),
                 bus,
                 wire,
+                mailboxes,
+                desks,
+                log,
                 outer,
                 stop,
                 progress,
@@ -326,7 +339,6 @@ fn prepare_with(
                 captures: Vec::new(),
                 stopped: Vec::new(),
                 last_status: clock::now(),
-                listened: (clock::now(), 0),
                 looks: Vec::new(),
             };
             Ok(Prepared { parts, supervisor })
@@ -353,6 +365,24 @@ fn prepare_with(
             Err(error)
         }
     }
+}
+
+/// A desk for every mailbox of the bus.
+fn desks(
+    bus: &mut Bus,
+    wire: Datagrams,
+    exchange: &Exchange,
+    cycle_ns: Nanos,
+    log: &Log,
+) -> (Mailboxes, Vec<Desk<BesideCycle>>) {
+    let wires = BesideCycle::all(wire, &exchange.sights(), bus.devices.len(), cycle_ns);
+    let openings = bus.devices.iter_mut().zip(wires).map(|(device, wire)| {
+        let mailbox = device.coe.take().map(|coe| (wire, coe));
+        let name = device.at.name.clone();
+        Opening { name, mailbox }
+    });
+    let listener: Arc<dyn Listen> = Arc::new(log.clone());
+    desk::open(openings, &listener)
 }
 
 /// The machine with its axes in the drives' own units.
@@ -473,6 +503,7 @@ fn own_the_link(
     supervisor.operator = operator;
     let wire = supervisor.wire;
     let places = story::places(&supervisor.bus);
+    let log = supervisor.log.clone();
     let machine = &Arc::clone(&supervisor.machine);
     let Turned {
         remains,
@@ -528,6 +559,7 @@ fn own_the_link(
         record,
         errors: summary::device_errors(machine, &diagnoses),
         events,
+        emergencies: log.lines(started),
     };
     let summary = Summary::new(machine, options.clock, &axes, &stats, ended, aside);
     Outcome {
@@ -552,6 +584,7 @@ fn come_up(
     image: ImagePlan,
     carried: Carried<'_>,
     progress: &Sender<Progress>,
+    log: &Log,
 ) -> Result<Bus, RunError> {
     let mut tell = |step| {
         let _ = progress.send(match step {
@@ -567,7 +600,7 @@ fn come_up(
     } = carried;
     // ethercrab panics on some things a wire can carry (a SubDevice without an open port, say).
     let run = std::panic::AssertUnwindSafe(|| {
-        let bring_up = Box::pin(bring_up(main_device, machine, image, &mut tell));
+        let bring_up = Box::pin(bring_up(main_device, machine, image, &mut tell, log));
         pump(port, link, clock, interruptible(stop, bring_up))
     });
     match std::panic::catch_unwind(run) {

@@ -10,10 +10,11 @@ use crate::bringup::Step;
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
 use crate::link::Concern;
+use crate::mailbox::Mailboxes;
 use crate::rt::handover::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
 use crate::rt::thread::{Denied, Overload};
-use crate::session::RunError;
+use crate::session::{EmergencyReport, RunError};
 
 /// Listens to a run.
 pub trait Observer {
@@ -62,6 +63,10 @@ pub enum Progress {
         run: u32,
         capture: Capture,
     },
+    /// A device has reported something unasked.
+    Emergency(EmergencyReport),
+    /// From here to the end of the run anybody may make transfers beside the cycle.
+    Mailboxes(Mailboxes),
     /// A group of axes has begun to stop; the machine goes on without it.
     GroupStopped {
         group: String,

@@ -15,6 +15,7 @@ use crate::rt::stats::{Counters, Percentiles, Stats};
 use crate::supervise::Ended;
 
 use super::Capture;
+use super::emergencies::EmergencyLine;
 use super::events::EventLine;
 
 /// The result of a run. In virtual time every figure depends on the file and the seed alone.
@@ -51,6 +52,10 @@ pub struct Summary {
     pub errors: Vec<DeviceErrors>,
     /// The last that the cycle has noticed, oldest first.
     pub events: Vec<EventLine>,
+    /// What devices reported unasked, oldest first, as many as are kept.
+    pub emergencies: Vec<EmergencyLine>,
+    /// Further ones: told but not kept, or lost because a device's queue was full.
+    pub more_emergencies: u64,
     /// Stops of groups that the machine went on through.
     pub group_stops: Vec<GroupStop>,
     pub recorded_frames: Option<u64>,
@@ -118,6 +123,8 @@ pub(super) struct Aside {
     pub record: Option<RecordStats>,
     pub errors: Vec<DeviceErrors>,
     pub events: Vec<EventLine>,
+    /// And how many more.
+    pub emergencies: (Vec<EmergencyLine>, u64),
 }
 
 /// A group of axes that stopped while the machine went on.
@@ -228,6 +235,8 @@ impl Summary {
             probes: ended.captures,
             errors: aside.errors,
             events: aside.events,
+            emergencies: aside.emergencies.0,
+            more_emergencies: aside.emergencies.1,
             group_stops: ended.group_stops,
             recorded_frames: aside.record.map(|r| r.written),
             recorded_frames_dropped: aside.record.map(|r| r.dropped),

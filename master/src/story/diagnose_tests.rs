@@ -198,6 +198,7 @@ fn which_device_and_which_cause() {
                 device: at(1),
                 code: Some(0x3220),
                 statusword: 0x0218,
+                report: Box::default(),
             },
             with(overrun),
             "`a1` (position 1, station 0x1001): drive fault (Statusword 0x0218), error code (0x603F) 0x3220: DC link undervoltage",
@@ -327,6 +328,7 @@ fn what_else_was_seen_is_kept() {
         device: at(1),
         code: Some(0x3220),
         statusword: 0x0218,
+        report: Box::default(),
     };
     let evidence = with(|e| {
         e.devices[2].grown.invalid_frames[0] = 7;

@@ -7,9 +7,8 @@ use std::task::Poll;
 
 use serde::Serialize;
 
-use crate::bringup::BusDevice;
 use crate::clock::{self, Nanos};
-use crate::mailbox::{Wire, WireError};
+use crate::mailbox::{DeviceMailbox, Wire, WireError};
 use crate::rt::exchange::ErrorCounters;
 use crate::wire::Datagrams;
 
@@ -144,19 +143,16 @@ pub async fn again(wire: &Datagrams, looks: &mut [Look]) {
 }
 
 /// Objects of one drive.
-pub async fn at_objects(wire: &Datagrams, device: &mut BusDevice, ask: Ask, look: &mut Look) {
-    let Some(coe) = device.coe.as_mut() else {
-        return;
-    };
+pub async fn at_objects(mailbox: &DeviceMailbox, ask: Ask, look: &mut Look) {
     if ask.error_code
-        && let Some(Ok(bytes)) = within(coe.upload(wire, ERROR_CODE, 0, false)).await
+        && let Some(Ok(bytes)) = within(mailbox.upload(ERROR_CODE, 0)).await
         && let [low, high] = *bytes
     {
         look.error_code = Some(u16::from_le_bytes([low, high]));
     }
     if ask.interpolation
-        && let Some(Ok(value)) = within(coe.upload(wire, INTERPOLATION_TIME, 1, false)).await
-        && let Some(Ok(index)) = within(coe.upload(wire, INTERPOLATION_TIME, 2, false)).await
+        && let Some(Ok(value)) = within(mailbox.upload(INTERPOLATION_TIME, 1)).await
+        && let Some(Ok(index)) = within(mailbox.upload(INTERPOLATION_TIME, 2)).await
         && let (&[value], &[index]) = (&*value, &*index)
     {
         look.interpolation_ns = interpolation(value, index as i8);

@@ -1,18 +1,28 @@
 //! What stopped the machine, in words: asks the devices while they still answer.
 
+use std::future::{Future, poll_fn};
+use std::pin::pin;
+use std::task::Poll;
+use std::time::Duration;
+
 use ecaxis_axis::{AxisStatus, State, Trip};
 
-use super::Supervisor;
+use super::{Supervisor, history};
 use crate::bringup::al;
 use crate::clock::{self, Nanos};
 use crate::rt::feed::FeedState;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Order, Snapshot};
-use crate::session::{Progress, RunError};
+use crate::session::{DriveReport, Progress, RunError};
 use crate::story::{Look, look};
 
 const ERROR_CODE: u16 = 0x603f;
 pub(super) const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
+
+/// What a device is asked while a stop is explained is waited for so long: it may be the one that hangs, or at a long transfer.
+const ASK_TIMEOUT: Duration = Duration::from_millis(500);
+/// What a device has reported so long before its fault belongs to the fault.
+const BEFORE_A_FAULT: Nanos = 1_000_000_000;
 
 impl Supervisor {
     /// `group`: the one that stops, where the machine does not.
@@ -50,6 +60,7 @@ impl Supervisor {
                     .map_or(State::OperationEnabled, |s| s.state),
             },
             StopCause::DriveFault { axis } => {
+                let since = clock::now().saturating_sub(BEFORE_A_FAULT);
                 let code = self.error_code(axis).await;
                 if let Some(code) = code {
                     self.order(Order::ErrorCode { axis, code }).await;
@@ -62,6 +73,7 @@ impl Supervisor {
                         .get(axis)
                         .and_then(|s| s.fault)
                         .map_or(0, |fault| fault.statusword),
+                    report: self.report(axis, since).await,
                 }
             }
             StopCause::Trip { axis, trip } => RunError::Trip {
@@ -140,12 +152,10 @@ impl Supervisor {
         }
     }
 
+    /// An object of an axis' device; `None` where it does not come soon.
     async fn upload(&mut self, axis: usize, index: u16) -> Option<Vec<u8>> {
-        let device = *self.axes.get(axis)?;
-        let coe = self.bus.devices.get_mut(device)?.coe.as_mut()?;
-        let result = coe.upload(&self.wire, index, 0, false).await;
-        self.tell_emergencies(device);
-        result.ok()
+        let mailbox = self.mailboxes.urgent(*self.axes.get(axis)?)?;
+        within(ASK_TIMEOUT, mailbox.upload(index, 0)).await?.ok()
     }
 
     /// Asks all SubDevices what they know of a failure, and drives that have one what it is.
@@ -163,49 +173,36 @@ impl Supervisor {
                 error_code: status.fault.is_some(),
                 interpolation: status.fault.is_some() || following,
             };
-            let Some(device) = self.bus.devices.get_mut(device) else {
+            let (Some(mailbox), Some(found)) =
+                (self.mailboxes.urgent(device), self.bus.devices.get(device))
+            else {
                 continue;
             };
-            let Some(look) = looks.get_mut(usize::from(device.at.position)) else {
+            let Some(look) = looks.get_mut(usize::from(found.at.position)) else {
                 continue;
             };
             if look.answers && ask != look::Ask::default() && clock::now() < end {
-                look::at_objects(&self.wire, device, ask, look).await;
+                look::at_objects(&mailbox, ask, look).await;
             }
         }
         self.looks = looks;
     }
 
-    /// Empties the mailbox of the next device and passes its emergencies on.
-    pub(super) async fn listen(&mut self) {
-        let (_, device) = self.listened;
-        if let Some(coe) = self
-            .bus
-            .devices
-            .get_mut(device)
-            .and_then(|d| d.coe.as_mut())
+    /// What a device that has failed says of it. Best effort: the machine stops meanwhile.
+    async fn report(&mut self, axis: usize, since: Nanos) -> Box<DriveReport> {
+        let device = self.axes.get(axis).copied().unwrap_or(usize::MAX);
+        let mut history = Vec::new();
+        if let (Some(mailbox), Some(config)) = (
+            self.mailboxes.urgent(device),
+            self.machine.devices.get(device),
+        ) && let Some(Ok(messages)) = within(ASK_TIMEOUT, history::read(&mailbox, config)).await
         {
-            // A device that is gone is the cycle's to notice.
-            let _ = coe.drain(&self.wire).await;
-            self.tell_emergencies(device);
+            history = messages;
         }
-        let next = (device + 1) % self.bus.devices.len().max(1);
-        self.listened = (clock::now(), next);
-    }
-
-    fn tell_emergencies(&mut self, device: usize) {
-        let Some(device) = self.bus.devices.get_mut(device) else {
-            return;
-        };
-        let emergencies: Vec<_> = device
-            .coe
-            .iter_mut()
-            .flat_map(|c| c.take_emergencies())
-            .collect();
-        let at = device.at.clone();
-        for emergency in emergencies {
-            self.tell(Progress::Warning(format!("{at}: {emergency}")));
-        }
+        Box::new(DriveReport {
+            emergencies: self.log.last_of(&self.axis_name(axis), since),
+            history,
+        })
     }
 
     /// Modes of operation display is in the process data of most drives, and is then checked every
@@ -238,4 +235,15 @@ impl Supervisor {
         }
         Ok(())
     }
+}
+
+/// `None` where a future takes longer.
+async fn within<F: Future>(time: Duration, future: F) -> Option<F::Output> {
+    let mut future = pin!(future);
+    let mut over = pin!(clock::delay(time));
+    poll_fn(|context| match future.as_mut().poll(context) {
+        Poll::Ready(output) => Poll::Ready(Some(output)),
+        Poll::Pending => over.as_mut().poll(context).map(|()| None),
+    })
+    .await
 }

@@ -16,19 +16,22 @@ use crate::bringup::{AlState, Bus, DeviceRef, StateError, al};
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
 use crate::config::{Machine, Step};
+use crate::mailbox::Mailboxes;
+use crate::mailbox::desk::{Desk, beside};
 use crate::rt::cycle::has_power;
 use crate::rt::exchange::Probe;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
-use crate::session::{Capture, GroupStop, Progress, RunError, Status, clock_off};
+use crate::session::{Capture, GroupStop, Log, Progress, RunError, Status, clock_off};
 use crate::story::{Look, look};
-use crate::wire::Datagrams;
+use crate::wire::{BesideCycle, Datagrams};
 use groups::StoppedGroup;
 
 pub mod executor;
 mod faults;
 mod follow;
 mod groups;
+pub(crate) mod history;
 pub mod manual;
 mod program;
 
@@ -47,8 +50,6 @@ const STOP_MARGIN: Nanos = 3_000_000_000;
 /// On a bus that has been silent for so long nobody can report that it stands.
 const LOST_BUS_TIMEOUT: Nanos = 1_000_000_000;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
-/// One mailbox after the other is looked into for emergencies.
-const LISTEN_PERIOD: Nanos = 50_000_000;
 
 /// Drives a machine from SafeOp through its program and back to Init.
 #[derive(Debug)]
@@ -56,6 +57,11 @@ pub struct Supervisor {
     pub machine: Arc<Machine>,
     pub bus: Bus,
     pub wire: Datagrams,
+    /// Transfers with devices; [`Supervisor::run`] looks after the desks that make them.
+    pub mailboxes: Mailboxes,
+    pub desks: Vec<Desk<BesideCycle>>,
+    /// What devices have reported unasked.
+    pub log: Log,
     pub outer: OuterEnd,
     pub stop: Arc<AtomicBool>,
     pub progress: Sender<Progress>,
@@ -84,8 +90,6 @@ pub struct Supervisor {
     pub stopped: Vec<StoppedGroup>,
     /// When the last status was told.
     pub last_status: Nanos,
-    /// When a mailbox was last listened to, and the device whose turn is next.
-    pub listened: (Nanos, usize),
     /// What the SubDevices told after a failure, in the order of the segment.
     pub looks: Vec<Look>,
 }
@@ -120,6 +124,11 @@ pub async fn interruptible<F: Future>(stop: &AtomicBool, future: F) -> Option<F:
 impl Supervisor {
     /// The whole life beside the cycle. The cycle ends when this has ended.
     pub async fn run(mut self) -> (Ended, Result<(), RunError>) {
+        let desks = std::mem::take(&mut self.desks);
+        beside(desks, self.live()).await
+    }
+
+    async fn live(mut self) -> (Ended, Result<(), RunError>) {
         let mut ended = Ended::default();
         let stop = Arc::clone(&self.stop);
         let worked = interruptible(&stop, self.work(&mut ended)).await;
@@ -296,12 +305,9 @@ impl Supervisor {
         Ok(snapshot)
     }
 
-    /// What has stopped groups, and emergencies. Takes as long as the devices take to answer.
+    /// What has stopped groups. Takes as long as the devices take to answer.
     async fn ask_devices(&mut self, snapshot: &Snapshot) {
         self.tell_of_groups(snapshot).await;
-        if clock::now().saturating_sub(self.listened.0) >= LISTEN_PERIOD {
-            self.listen().await;
-        }
     }
 
     fn pass_events_on(&mut self) {

@@ -387,7 +387,7 @@ impl FoeClient {
                 self.port.free = true;
                 return Ok(answer);
             }
-            self.port.set_aside();
+            self.port.set_aside(w);
             if deadline.passed(w) {
                 return Err(transfer.trouble(&self.port, Trouble::Timeout(Phase::Answer)));
             }

@@ -1,7 +1,7 @@
 //! One cycle's frames, from staging until their answers are judged.
 
 use super::frame::{FIRST_DATAGRAM, Frame, new_frame, number, same_headers};
-use crate::clock::Nanos;
+use crate::clock::{self, Nanos};
 use crate::link::{Link, LinkError};
 
 #[derive(Debug)]
@@ -11,8 +11,10 @@ pub(super) struct Flight {
     cycle: u8,
     /// After the planned release; `None`: not sent yet.
     pub sent_late: Option<Nanos>,
-    /// Which device and probe its diagnostic datagram reads.
-    pub probe: (usize, usize),
+    /// When it was sent, by the session's clock.
+    pub sent_at: Nanos,
+    /// Which of the diagnostic slot's turns it carries.
+    pub turn: usize,
 }
 
 impl Flight {
@@ -23,7 +25,8 @@ impl Flight {
             frames: frames.collect(),
             cycle: 0,
             sent_late: None,
-            probe: (0, 0),
+            sent_at: 0,
+            turn: 0,
         }
     }
 
@@ -39,6 +42,7 @@ impl Flight {
 
     pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
         self.sent_late = Some(late);
+        self.sent_at = clock::now();
         for frame in &self.frames {
             link.send(&frame.bytes)?;
         }

@@ -7,7 +7,8 @@ use crate::config::Kind;
 pub mod plan;
 
 pub use plan::{
-    Access, DatagramPlan, ImagePlan, ProcessData, Region, TooLarge, of, plan, process_data,
+    Access, DatagramPlan, ImagePlan, MailboxPlan, ProcessData, Region, TooLarge, of, plan,
+    process_data,
 };
 
 /// Bits of one object in the image.

@@ -22,6 +22,8 @@ pub struct ProcessData {
     pub group: usize,
     /// It processes LRW; otherwise it is reached by LWR and LRD of its own.
     pub lrw: bool,
+    /// It has an FMMU for the status of its mailbox.
+    pub mailbox: bool,
 }
 
 /// The place of one SubDevice's outputs and inputs. Both start at the same logical address, so one
@@ -64,6 +66,25 @@ pub struct DatagramPlan {
     pub expected_wkc: u16,
 }
 
+/// The datagram, an LRD, that carries the status of mailboxes: a byte each, the SyncManager's status register. It lies beside the
+/// process data, because a status that is always there would hide inputs that are missing from the working counter.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MailboxPlan {
+    pub frame: usize,
+    pub logical: u32,
+    /// The devices whose bytes follow each other, by index.
+    pub devices: Vec<usize>,
+}
+
+impl MailboxPlan {
+    /// The logical address of a device's status.
+    #[must_use]
+    pub fn logical_of(&self, device: usize) -> Option<u32> {
+        let place = self.devices.iter().position(|&other| other == device)?;
+        Some(self.logical.saturating_add(u32::try_from(place).ok()?))
+    }
+}
+
 /// The whole image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ImagePlan {
@@ -72,6 +93,8 @@ pub struct ImagePlan {
     /// The group of each device.
     pub groups: Vec<usize>,
     pub datagrams: Vec<DatagramPlan>,
+    /// `None` where no device has an FMMU for it.
+    pub mailboxes: Option<MailboxPlan>,
     pub len: usize,
 }
 
@@ -88,7 +111,9 @@ impl ImagePlan {
     /// Frames of a cycle; the first is sent whatever it carries.
     #[must_use]
     pub fn frames(&self) -> usize {
-        self.datagrams.last().map_or(1, |last| last.frame + 1)
+        let data = self.datagrams.last().map_or(0, |last| last.frame);
+        let mailboxes = self.mailboxes.as_ref().map_or(0, |plan| plan.frame);
+        data.max(mailboxes) + 1
     }
 }
 
@@ -103,6 +128,7 @@ pub fn process_data(machine: &Machine) -> Vec<ProcessData> {
             in_len: layout.tx_bytes(),
             group: machine.group_of(index),
             lrw: !device.device.use_lrd_lwr,
+            mailbox: device.device.mailbox_status_fmmu().is_some(),
         }
     });
     each.collect()
@@ -192,6 +218,19 @@ pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
         });
         image.len += len;
     }
+    let watched = devices.iter().enumerate().filter(|(_, d)| d.mailbox);
+    // What no frame holds is looked after in the diagnostic slot.
+    let watched: Vec<usize> = watched
+        .map(|(index, _)| index)
+        .take(NEXT_FRAME - DATAGRAM)
+        .collect();
+    if !watched.is_empty() {
+        image.mailboxes = Some(MailboxPlan {
+            frame: frames.place(watched.len()),
+            logical: LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX)),
+            devices: watched,
+        });
+    }
     Ok(image)
 }
 
@@ -224,6 +263,7 @@ mod tests {
             in_len,
             group: 0,
             lrw: true,
+            mailbox: false,
         });
         each.collect()
     }
@@ -324,22 +364,30 @@ mod tests {
         /// Every byte of every device in one datagram of its group each way, none over another, every frame within its room.
         #[test]
         fn whatever_is_laid_out_fits(
-            devices in proptest::collection::vec((0_usize..900, 0_usize..1486, 0_usize..4, any::<bool>()), 0..40),
+            devices in proptest::collection::vec((0_usize..900, 0_usize..1486, 0_usize..4, any::<bool>(), any::<bool>()), 0..40),
         ) {
             let devices: Vec<ProcessData> = devices
                 .into_iter()
-                .map(|(out_len, in_len, group, lrw)| ProcessData { out_len, in_len, group, lrw })
+                .map(|(out_len, in_len, group, lrw, mailbox)| ProcessData { out_len, in_len, group, lrw, mailbox })
                 .collect();
             let image = plan(&devices).expect("none is too large");
             for frame in 0..image.frames() {
                 let of_frame = image.datagrams.iter().filter(|d| d.frame == frame);
-                let bytes: usize = of_frame.map(|d| d.len + DATAGRAM).sum();
+                let mailboxes = image.mailboxes.iter().filter(|m| m.frame == frame);
+                let bytes: usize = of_frame.map(|d| d.len + DATAGRAM).sum::<usize>()
+                    + mailboxes.map(|m| m.devices.len() + DATAGRAM).sum::<usize>();
                 let room = if frame == 0 { FIRST_FRAME } else { NEXT_FRAME };
                 prop_assert!(bytes <= room);
             }
             for datagram in &image.datagrams {
                 prop_assert_eq!(datagram.logical, LOGICAL_BASE + datagram.offset as u32);
                 prop_assert!(datagram.offset + datagram.len <= image.len);
+            }
+            let watched: Vec<usize> = (0..devices.len()).filter(|&d| devices[d].mailbox).collect();
+            prop_assert_eq!(image.mailboxes.as_ref().map_or(&[][..], |m| &m.devices), &watched[..]);
+            for (place, &device) in watched.iter().enumerate() {
+                let logical = image.mailboxes.as_ref().and_then(|m| m.logical_of(device));
+                prop_assert_eq!(logical, Some(LOGICAL_BASE + (image.len + place) as u32));
             }
             let carried = |access: Access, group: usize, from: usize, to: usize| {
                 let carries = image.datagrams.iter().filter(|d| {

@@ -1,0 +1,306 @@
+//! Mailboxes beside the cycle: emergencies from bring-up to the end, transfers by whoever asks.
+
+mod common;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use common::{Heard, axes, faults, machine, virtual_time};
+use ecaxis::mailbox::{MailboxError, Mailboxes, SdoError};
+use ecaxis::session::{self, EmergencyReport, Observer, Options, Outcome, Progress, RunError};
+
+fn emergencies(heard: &Heard) -> Vec<&EmergencyReport> {
+    let each = heard.0.iter().filter_map(|progress| match progress {
+        Progress::Emergency(report) => Some(report),
+        _ => None,
+    });
+    each.collect()
+}
+
+fn script(times: &[(&str, u32, u16)]) -> String {
+    let each = times.iter().map(|(at, device, code)| {
+        format!(
+            "[[fault]]\nkind = \"emergency\"\nat = \"{at}\"\ndevice = {device}\ncode = {code:#06x}\n"
+        )
+    });
+    each.collect()
+}
+
+/// The devices of `configs/`, whose mailbox states are in the process image, and one without.
+fn with_and_without_status_fmmu() -> [(&'static str, String); 2] {
+    let with = axes(2);
+    let without = with.replace("esi/EPOS4.xml", "NO_STATUS");
+    [("status FMMU", with), ("diagnostic slot", without)]
+}
+
+/// The demonstration drive's ESI without its third FMMU, in a folder of its own.
+fn parsed(text: &str) -> (ecaxis::config::Machine, tempfile::TempDir) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let configs = common::root().join("configs");
+    let esi = std::fs::read_to_string(configs.join("esi/EPOS4.xml")).expect("an ESI file");
+    let fmmu = "<Fmmu>MBoxState</Fmmu>";
+    assert_eq!(esi.matches(fmmu).count(), 1);
+    let path = folder.path().join("EPOS4.xml");
+    std::fs::write(&path, esi.replace(fmmu, "")).expect("written");
+    let text = text.replace("NO_STATUS", &path.display().to_string());
+    (machine(&text), folder)
+}
+
+#[test]
+fn every_emergency_is_told_once_from_bring_up_to_the_end() {
+    let sent = [
+        ("5ms", 0, 0x1000),
+        ("60ms", 0, 0x1001),
+        ("70ms", 1, 0x1002),
+        ("400ms", 0, 0x1003),
+        ("1500ms", 1, 0x1004),
+        ("1500ms", 1, 0x1005),
+        ("1501ms", 0, 0x1006),
+        ("2500ms", 1, 0x1007),
+    ];
+    for (way, text) in with_and_without_status_fmmu() {
+        let (machine, _folder) = parsed(&text);
+        let (outcome, heard) = common::run(machine, faults(&script(&sent)));
+        outcome
+            .result
+            .unwrap_or_else(|error| panic!("{way}: {error}"));
+        let told: Vec<_> = emergencies(&heard)
+            .iter()
+            .map(|report| (report.device.clone(), report.emergency.code))
+            .collect();
+        // In Init nobody sends emergencies; the first is lost in any case.
+        let mut expected: Vec<_> = sent[1..]
+            .iter()
+            .map(|&(_, device, code)| (format!("a{device}"), code))
+            .collect();
+        let mut sorted = told.clone();
+        sorted.sort();
+        expected.sort();
+        assert_eq!(sorted, expected, "{way}: {told:?}");
+        let summary = outcome.summary.expect("a summary");
+        assert_eq!(summary.emergencies.len(), told.len(), "{way}");
+        assert_eq!(summary.more_emergencies, 0);
+        let codes = summary.emergencies.iter().map(|line| line.code);
+        assert!(codes.eq(told.iter().map(|(_, code)| *code)));
+        for line in &summary.emergencies {
+            let in_bring_up = line.at_s < 0.0;
+            assert_eq!(line.dc_time_ns.is_none(), in_bring_up, "{way}: {line:?}");
+        }
+        let in_bring_up = summary.emergencies.iter().filter(|line| line.at_s < 0.0);
+        assert!(in_bring_up.count() >= 2, "{way}: {:?}", summary.emergencies);
+    }
+}
+
+#[test]
+fn emergencies_are_stamped_when_they_come() {
+    let script = script(&[("1500ms", 1, 0x5000), ("1750ms", 1, 0x5001)]);
+    for (way, text) in with_and_without_status_fmmu() {
+        let (machine, _folder) = parsed(&text);
+        let (outcome, heard) = common::run(machine, faults(&script));
+        outcome.result.expect("emergencies alone stop nothing");
+        let told = emergencies(&heard);
+        let [first, second] = told[..] else {
+            panic!("{way}: {told:?}")
+        };
+        let apart = |a: u64, b: u64| (b - a).abs_diff(250_000_000);
+        // A mailbox is looked into every cycle, or three times in a round of the diagnostic slot.
+        assert!(apart(first.at, second.at) < 30_000_000, "{way}: {told:?}");
+        let (Some(a), Some(b)) = (first.dc_time, second.dc_time) else {
+            panic!("{way}: {told:?}")
+        };
+        assert!(apart(a, b) < 30_000_000, "{way}: {told:?}");
+    }
+}
+
+#[test]
+fn the_report_of_a_fault_has_what_the_drive_said() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x7320\n";
+    let (outcome, _) = common::run(machine(&axes(2)), faults(script));
+    let Err(RunError::DriveFault { code, report, .. }) = &outcome.result else {
+        panic!("{:?}", outcome.result)
+    };
+    assert_eq!(*code, Some(0x7320));
+    let codes: Vec<_> = report
+        .emergencies
+        .iter()
+        .map(|r| r.emergency.code)
+        .collect();
+    assert_eq!(codes, [0x7320]);
+    let text = outcome.result.expect_err("it failed").to_string();
+    assert!(text.contains("; emergency 0x7320 ("), "{text}");
+}
+
+/// Hands the mailboxes to a user on a thread with a tokio runtime of its own, and ends the run when the user is done.
+struct WithUser<F> {
+    user: Option<F>,
+    stop: Arc<AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+    heard: Heard,
+}
+
+impl<F> Observer for WithUser<F>
+where
+    F: AsyncFnOnce(Mailboxes) + Send + 'static,
+{
+    fn progress(&mut self, progress: &Progress) {
+        self.heard.progress(progress);
+        if let Progress::Mailboxes(mailboxes) = progress
+            && let Some(user) = self.user.take()
+        {
+            let (mailboxes, stop) = (mailboxes.clone(), Arc::clone(&self.stop));
+            self.thread = Some(std::thread::spawn(move || {
+                let runtime = tokio::runtime::Builder::new_current_thread()
+                    .enable_time()
+                    .build()
+                    .expect("a runtime");
+                let _ended = EndsTheRun(stop);
+                runtime.block_on(user(mailboxes));
+            }));
+        }
+    }
+}
+
+/// However the user ends.
+struct EndsTheRun(Arc<AtomicBool>);
+
+impl Drop for EndsTheRun {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Runs a machine of so many axes, without moving them, for as long as a user needs; an hour at most.
+fn with_user<F>(axis_count: usize, options: Options, user: F) -> (Outcome, Heard)
+where
+    F: AsyncFnOnce(Mailboxes) + Send + 'static,
+{
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut observer = WithUser {
+        user: Some(user),
+        stop: Arc::clone(&stop),
+        thread: None,
+        heard: Heard::default(),
+    };
+    let options = Options {
+        limit: Some(3_600_000_000_000),
+        enable: false,
+        ..options
+    };
+    let outcome = session::run(machine(&axes(axis_count)), options, stop, &mut observer);
+    let thread = observer.thread.expect("the user was asked");
+    thread.join().expect("the user's expectations hold");
+    (outcome, observer.heard)
+}
+
+#[test]
+fn users_read_and_write_beside_the_cycle() {
+    const VENDOR: [u8; 4] = 0x0e0a_u32.to_le_bytes();
+    let (outcome, _) = with_user(3, virtual_time(), async |mailboxes| {
+        assert!(mailboxes.names().eq(["a0", "a1", "a2"]));
+        let each = async |name: &str, value: u32| {
+            let mailbox = mailboxes.device(name).expect("it is there");
+            for round in 0..10_u32 {
+                assert_eq!(mailbox.upload(0x1018, 1).await, Ok(VENDOR.to_vec()));
+                let value = (value + round).to_le_bytes();
+                mailbox.download(0x6065, 0, &value).await.expect("written");
+                assert_eq!(mailbox.upload(0x6065, 0).await, Ok(value.to_vec()));
+                // These drives know no complete access.
+                let whole = mailbox.upload_complete(0x1018, 0).await;
+                assert!(matches!(whole, Err(MailboxError::Sdo { .. })), "{whole:?}");
+            }
+        };
+        tokio::join!(each("a0", 1000), each("a1", 2000), each("a2", 3000));
+
+        let unknown = mailboxes.upload("b", 0x1018, 1).await;
+        assert_eq!(unknown, Err(MailboxError::Unknown { name: "b".into() }));
+        let aborted = mailboxes.upload("a1", 0x2fff, 0).await;
+        let Err(MailboxError::Sdo { name, source }) = aborted else {
+            panic!("{aborted:?}")
+        };
+        assert_eq!(
+            (name.as_str(), source.abort_code()),
+            ("a1", Some(0x0602_0000))
+        );
+        let read_only = mailboxes.download("a0", 0x1018, 1, &[0; 4]).await;
+        let Err(MailboxError::Sdo {
+            source: SdoError::Abort { code, .. },
+            ..
+        }) = read_only
+        else {
+            panic!("{read_only:?}")
+        };
+        assert_eq!(code, 0x0601_0002);
+    });
+    outcome.result.expect("nobody was disturbed");
+    let summary = outcome.summary.expect("a summary");
+    assert_eq!(
+        summary.counters.lost_frames + summary.counters.wkc_errors,
+        0
+    );
+}
+
+/// Each is polled once and dropped: some wait in the queue, some are under way.
+#[test]
+fn dropped_futures_leave_nothing_behind() {
+    let (outcome, _) = with_user(1, virtual_time(), async |mailboxes| {
+        let mailbox = mailboxes.device("a0").expect("it is there");
+        for round in 0..40_u64 {
+            let long = mailbox.upload(0x1008, 0);
+            let patience = std::time::Duration::from_micros(50 * (round % 8));
+            let _ = tokio::time::timeout(patience, long).await;
+            if round % 4 == 3 {
+                let name = mailbox.upload(0x1008, 0).await.expect("read");
+                assert!(!name.is_empty());
+                assert_eq!(mailbox.upload(0x6041, 0).await.map(|s| s.len()), Ok(2));
+            }
+        }
+    });
+    outcome.result.expect("nobody was disturbed");
+}
+
+#[test]
+fn transfers_go_on_among_emergencies() {
+    let sent: Vec<(String, u16)> = (0..60)
+        .map(|n| (format!("{}ms", 600 + 7 * n), 0x9000 + n))
+        .collect();
+    let sent: Vec<_> = sent
+        .iter()
+        .map(|(at, code)| (at.as_str(), 0, *code))
+        .collect();
+    let options = faults(&script(&sent));
+    let (outcome, heard) = with_user(1, options, async |mailboxes| {
+        let mailbox = mailboxes.device("a0").expect("it is there");
+        for round in 0..200_u32 {
+            let value = round.to_le_bytes();
+            mailbox.download(0x6065, 0, &value).await.expect("written");
+            assert_eq!(mailbox.upload(0x6065, 0).await, Ok(value.to_vec()));
+        }
+        // The script goes on for a second.
+        tokio::time::sleep(std::time::Duration::from_millis(300)).await;
+    });
+    outcome.result.expect("nobody was disturbed");
+    let codes: Vec<u16> = emergencies(&heard)
+        .iter()
+        .map(|r| r.emergency.code)
+        .collect();
+    assert_eq!(codes, (0x9000..0x9000 + 60).collect::<Vec<_>>());
+}
+
+#[test]
+fn nobody_is_asked_when_the_run_is_over() {
+    let kept = Arc::new(std::sync::Mutex::new(None));
+    let keeps = Arc::clone(&kept);
+    with_user(1, virtual_time(), async move |mailboxes| {
+        *keeps.lock().expect("nobody panics with it") = Some(mailboxes);
+    });
+    let mailboxes = kept
+        .lock()
+        .expect("nobody panics with it")
+        .take()
+        .expect("kept");
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .build()
+        .expect("a runtime");
+    let asked = runtime.block_on(mailboxes.upload("a0", 0x1018, 1));
+    assert_eq!(asked, Err(MailboxError::Closed { name: "a0".into() }));
+}
