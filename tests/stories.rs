@@ -6,10 +6,11 @@ mod common;
 
 use std::fmt::Write;
 use std::path::Path;
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use common::{Heard, axes, faults, fixture, machine, run, run_well, virtual_time};
+use common::{Heard, axes, faults, fixture, machine, root, run, run_well, virtual_time};
 use ecaxis::clock::{self, Clock};
 use ecaxis::config::Machine;
 use ecaxis::rt::controller::{Controller, Cycle};
@@ -113,6 +114,11 @@ fn staged() -> Vec<(&'static str, String, &'static str)> {
             "cable of this computer loose",
             patient,
             "[[fault]]\nkind = \"silent\"\nat = \"1.5s\"\nfor = \"300ms\"\n",
+        ),
+        (
+            "frames come back too late",
+            axes(3),
+            "[[fault]]\nkind = \"frame-delay\"\nat = \"1.5s\"\nprobability = 1.0\ndelay = \"1.2ms\"\n",
         ),
         (
             "a device is missing from the start",
@@ -220,6 +226,71 @@ fn the_same_run_tells_the_same_story() {
     let (_, text, script) = staged().swap_remove(1);
     let tell = || serde_json::to_string(&story(machine(&text), faults(script))).expect("JSON");
     assert_eq!(tell(), tell());
+}
+
+/// What a user gets: the cause on stderr, the page in a file, the data beside it and in `--json`.
+#[test]
+fn a_story_on_the_command_line() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let script = folder.path().join("faults.toml");
+    let page = folder.path().join("why.txt");
+    let text = "[[fault]]\nkind = \"link-break\"\nat = \"1.5s\"\ndevice = 1\n";
+    std::fs::write(&script, text).expect("written");
+    let run = |more: &[&str]| {
+        Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+            .args(["run", "configs/demo.toml", "--virtual", "--faults"])
+            .arg(&script)
+            .args(more)
+            .current_dir(root())
+            .output()
+            .expect("the binary runs")
+    };
+    let cause = "`y` (position 1) is out of reach: port 1 of `x` has no link";
+    let output = run(&["--story", page.to_str().expect("UTF-8")]);
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    let told: Vec<&str> = stderr
+        .lines()
+        .skip_while(|line| !line.starts_with("story: "))
+        .take_while(|line| !line.starts_with("error: "))
+        .collect();
+    assert!(told.first().is_some_and(|l| l.contains(cause)), "{stderr}");
+    assert!(told.len() <= 20, "{stderr}");
+    assert!(
+        stderr.contains("= help: look at the link lights"),
+        "{stderr}"
+    );
+    let text = std::fs::read_to_string(&page).expect("a page");
+    assert!(text.starts_with(cause), "{text}");
+    for part in [
+        "What to do",
+        "in order",
+        "SubDevices",
+        "lost links",
+        "cycles",
+    ] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+    for line in text.lines().chain(told) {
+        assert!(line.chars().count() <= 80, "longer than 80: {line}");
+    }
+    let json = std::fs::read(page.with_extension("json")).expect("beside it");
+    let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
+    assert_eq!(json["cause"]["cause"], "out-of-reach");
+    assert_eq!(json["cycles"].as_array().map(Vec::len), Some(200));
+
+    // The simulated bus can be run again: nothing is kept unless it is asked for.
+    let output = run(&["--json"]);
+    let json: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(json["ok"], false);
+    assert!(
+        json["story"]["headline"]
+            .as_str()
+            .is_some_and(|h| h.starts_with(cause))
+    );
+    let left = std::fs::read_dir(root()).expect("the folder").flatten();
+    let left = left.filter(|e| e.file_name().to_string_lossy().starts_with("ecaxis-stop"));
+    assert_eq!(left.count(), 0);
 }
 
 #[test]

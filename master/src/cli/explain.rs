@@ -57,20 +57,26 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let cpu = bus
         .cpu
         .map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"));
-    let mut table = Table::new(&["setting", "value", "meaning"]);
-    table.row(nic);
-    table.row([
+    let written = |key: &str| bus.written.iter().find(|(written, _)| *written == key);
+    let origin =
+        |key: &str| written(key).map_or("default".to_owned(), |(_, line)| format!("line {line}"));
+    let mut table = Table::new(&["setting", "value", "from", "meaning"]);
+    let mut row = |[key, value, meaning]: [&str; 3]| {
+        table.row([key, value, &origin(key), meaning]);
+    };
+    row(nic);
+    row([
         "cycle",
         &duration::show(bus.cycle_ns),
         "from frame to frame; also 0x60C2 and SYNC0",
     ]);
     let lost = bus.lost_frames.to_string();
-    table.row([
+    row([
         "lost_frames",
         &lost,
         "consecutive cycles without a valid answer stop the axes",
     ]);
-    table.row(match bus.exchange {
+    row(match bus.exchange {
         Exchange::SameCycle => [
             "exchange",
             "same-cycle",
@@ -89,15 +95,15 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
             #[cfg(feature = "xdp")]
             BackEnd::Xdp => "frames are taken before the network stack sees them",
         };
-        table.row(["link", bus.link.name(), meaning]);
+        row(["link", bus.link.name(), meaning]);
     }
-    table.row([
+    row([
         "priority",
         &format!("SCHED_FIFO {}", bus.priority),
         "of the real-time thread",
     ]);
-    table.row(["cpu", &cpu, "where it runs"]);
-    table.row([
+    row(["cpu", &cpu, "where it runs"]);
+    row([
         "spin",
         &match bus.spin {
             Spin::Auto => "auto".to_owned(),
@@ -105,7 +111,7 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         },
         "before a cycle is due, sleeping becomes spinning",
     ]);
-    table.row(if bus.awake {
+    row(if bus.awake {
         [
             "idle",
             "awake",
@@ -115,25 +121,25 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         ["idle", "sleep", "CPUs sleep between two cycles"]
     });
     let watchdog = duration::show(bus.watchdog_ns);
-    table.row([
+    row([
         "watchdog",
         &watchdog,
         "SyncManager and PDI watchdog (0x0400, 0x0410, 0x0420)",
     ]);
     if machine.devices.iter().any(|d| d.selection.dc.is_some()) {
-        table.row([
+        row([
             "clock_window",
             &duration::show(bus.clock_window_ns),
-            "a clock farther from the reference is warned of (0x092C)",
+            "a clock farther off is warned of (0x092C)",
         ]);
     }
-    table.row([
+    row([
         "op_timeout",
         &duration::show(bus.op_timeout_ns),
         "from SafeOp to Op",
     ]);
     let enable = duration::show(bus.enable_timeout_ns);
-    table.row([
+    row([
         "enable_timeout",
         &enable,
         "until a drive reports Operation enabled",
@@ -345,7 +351,36 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
         ns.div_ceil(1000),
         (ns * 100).div_ceil(machine.bus.cycle_ns),
     )?;
-    writeln!(out, "  expected working counter {wkc}")
+    writeln!(out, "  expected working counter {wkc}")?;
+    let (ns, why) = load(machine, ns);
+    writeln!(
+        out,
+        "  estimated load of the real-time thread: about {} µs, {} % of its CPU\n    ({why}; `ecaxis bench` measures it)",
+        ns.div_ceil(1000),
+        (ns * 100).div_ceil(machine.bus.cycle_ns),
+    )
+}
+
+/// CPU time a cycle, by what was measured on small computers (docs/realtime.md), and what it consists of.
+fn load(machine: &Machine, wire_ns: u64) -> (u64, &'static str) {
+    /// Waking up, building frames, stepping the axes, publishing.
+    const WORK_NS: u64 = 20_000;
+    const AXIS_NS: u64 = 200;
+    /// What `"auto"` settles at; it never exceeds these parts of a cycle.
+    const SPIN_NS: u64 = 50_000;
+    let axes = machine.devices.iter().filter(|d| d.axis.is_some()).count();
+    let work = WORK_NS + AXIS_NS * u64::try_from(axes).unwrap_or(u64::MAX / AXIS_NS);
+    let spin = match machine.bus.spin {
+        Spin::Auto => SPIN_NS.min(match machine.bus.exchange {
+            Exchange::SameCycle => machine.bus.cycle_ns * 2 / 5,
+            Exchange::Pipelined => machine.bus.cycle_ns * 4 / 25,
+        }),
+        Spin::For(ns) => ns,
+    };
+    match machine.bus.exchange {
+        Exchange::SameCycle => (work + spin + wire_ns, "work, spinning, waiting for answers"),
+        Exchange::Pipelined => (work + spin, "work, spinning"),
+    }
 }
 
 /// `LRW, ` or `2 LRW, LWR, LRD, `.

@@ -109,9 +109,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::BusLost { answered: false, .. } => {
             "check cables and power; `lost_frames` sets how many bad cycles are ridden through".to_owned()
         }
-        RunError::BusLost { answered: true, .. } => {
-            "a SubDevice dropped out: check its power and the cable to it".to_owned()
-        }
+        RunError::BusLost { answered: true, wkc, .. } => story::working_counter(*wkc).to_owned(),
         RunError::LeftOp { code, .. } => al_status(*code).to_owned(),
         RunError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
         RunError::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
@@ -368,6 +366,9 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             0x0604_0041..=0x0604_0042 => {
                 "the drive cannot map what the ESI file lists: choose other objects with `pdo.rx` and `pdo.tx`"
             }
+            0x0800_0021 => "the drive is under local control: end its panel or commissioning tool; an object that is mapped now may not be writable either",
+            0x0504_0005 | 0x0800_0020 | 0x0606_0000 => "the drive cannot store it now: switch it off and on, then look at its own error history",
+            0x0604_0043 | 0x0604_0047 if own => "the value contradicts another setting of the drive: the order of `sdo` matters, and the mode must allow it",
             0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },

@@ -179,6 +179,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         clock_window_ns: clock_window_ns?,
         exchange: exchange?,
         link: link?,
+        written: raw.written,
     })
 }
 

@@ -47,6 +47,18 @@ impl<'d> Fields<'d> {
         value
     }
 
+    /// Keys that stand in the table and were asked for, each with its line.
+    pub fn written(&self, problems: &Problems<'_>) -> Vec<(&'static str, u32)> {
+        let keys = self.table.keys().filter_map(|key| {
+            let known = self
+                .asked
+                .iter()
+                .find(|asked| **asked == key.get_ref().as_ref())?;
+            Some((*known, problems.line(&key.span())))
+        });
+        keys.collect()
+    }
+
     pub fn asked(&self, key: &str) -> bool {
         self.asked.contains(&key)
     }

@@ -101,6 +101,8 @@ pub struct Bus {
     pub exchange: Exchange,
     /// How frames are taken from the network interface.
     pub link: BackEnd,
+    /// Keys that the file has, each with its line; the others are defaults.
+    pub written: Vec<(&'static str, u32)>,
 }
 
 impl Default for Bus {
@@ -119,6 +121,7 @@ impl Default for Bus {
             clock_window_ns: 10_000,
             exchange: Exchange::SameCycle,
             link: BackEnd::default(),
+            written: Vec::new(),
         }
     }
 }

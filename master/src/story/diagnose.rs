@@ -13,6 +13,7 @@ use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::clock::Nanos;
 use crate::config::duration;
 use crate::mailbox::SdoError;
+use crate::rt::stats::Counters;
 use crate::session::RunError;
 
 /// AL status codes that a lost synchronization brings about (ETG.1020).
@@ -55,6 +56,8 @@ pub enum Cause {
     Interface { refused: u64 },
     /// No frame comes back.
     NobodyAnswers { first: Option<String> },
+    /// Frames come back, but only in a later cycle.
+    LateFrames { late: u64, cycle_ns: Nanos },
     /// For a while no frame came back; then they did again, from everybody.
     Silence { silence_ns: Nanos },
     /// Devices from this one on are out of reach.
@@ -141,6 +144,7 @@ pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
     seen.extend(overload(error, evidence, class));
     seen.extend(damaged_frames(evidence));
     seen.extend(loose_link(evidence));
+    seen.extend(late_frames(evidence));
     seen.extend(nobody_answers(error, evidence));
     if seen.is_empty() {
         seen.extend(silence(error, evidence));
@@ -348,6 +352,21 @@ fn nobody_answers(error: &RunError, evidence: &Evidence) -> Option<Cause> {
     let first = evidence.devices.first()?;
     (silent && evidence.devices.iter().all(unknown)).then(|| Cause::NobodyAnswers {
         first: Some(first.place()),
+    })
+}
+
+/// More than one in a row may come of one that was held up.
+fn late_frames(evidence: &Evidence) -> Option<Cause> {
+    const SOME: u64 = 3;
+    let Counters {
+        late_frames: late,
+        lost_frames: lost,
+        ..
+    } = evidence.counters;
+    // Most of what was missed has come after all.
+    (late >= SOME && late >= lost / 2).then_some(Cause::LateFrames {
+        late,
+        cycle_ns: evidence.cycle_ns,
     })
 }
 
@@ -606,6 +625,11 @@ impl fmt::Display for Cause {
                     None => f.write_str(" is broken, or the first device has no power"),
                 }
             }
+            Self::LateFrames { late, cycle_ns } => write!(
+                f,
+                "frames come back too late for a cycle of {}: {late} came in a later one",
+                time(cycle_ns)
+            ),
             Self::Silence { silence_ns } => write!(
                 f,
                 "no frame came back for {}, then all devices answered again: the first cable, or this computer's interface",

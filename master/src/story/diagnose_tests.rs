@@ -292,6 +292,14 @@ fn which_device_and_which_cause() {
         ),
         (
             lost(false),
+            with(|e| {
+                e.counters.lost_frames = 5;
+                e.counters.late_frames = 4;
+            }),
+            "frames come back too late for a cycle of 1 ms: 4 came in a later one",
+        ),
+        (
+            lost(false),
             with(|e| e.counters.link_errors = 500),
             "this computer's network interface refused to send or to receive, 500 times",
         ),

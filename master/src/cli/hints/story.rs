@@ -22,6 +22,11 @@ pub(crate) fn cause(cause: &Cause) -> Vec<String> {
             "look at the link light of the first device's IN port, at its power, and at the cable".to_owned(),
             "`ip link` shows whether the interface still has a carrier".to_owned(),
         ],
+        Cause::LateFrames { .. } => vec![
+            "switch interrupt coalescing off: `ethtool -C IF rx-usecs 0 tx-usecs 0`; `ecaxis doctor IF` says what else delays frames".to_owned(),
+            "USB adapters and virtual interfaces take a millisecond now and then: use a card of its own".to_owned(),
+            "or take a longer `cycle`, or `exchange = \"pipelined\"`, which gives frames a cycle to come back".to_owned(),
+        ],
         Cause::Silence { .. } => vec![
             "look for a loose plug at this computer or at the first device, and for an interface that resets (`dmesg`, `ethtool -S`)".to_owned(),
             "`lost_frames` in the machine file sets how many cycles in a row are ridden through".to_owned(),
@@ -85,5 +90,51 @@ pub(crate) fn cause(cause: &Cause) -> Vec<String> {
             "`identity` in the machine file says which other revisions may stand for that of the ESI file".to_owned(),
         ],
         Cause::AsTold { .. } => Vec::new(),
+    }
+}
+
+/// What a working counter that is too small says: a device adds 1 where its inputs are read, 2 where its outputs are written
+/// (ETG.1000.4, LRW), 3 for both.
+pub(super) fn working_counter((seen, expected): (u16, u16)) -> &'static str {
+    match (seen, expected.saturating_sub(seen)) {
+        (0, _) => {
+            "nobody takes part: the devices are not in SafeOp or Op, or another program has changed their FMMUs"
+        }
+        (_, 0) => {
+            "more devices take part than should: another device answers at the same logical address"
+        }
+        (_, missing) if missing % 3 == 0 => {
+            "a device with inputs and outputs is missing as a whole: check its power and the cable to it"
+        }
+        (_, missing) if missing % 3 == 2 => {
+            "a device does not take its outputs: it has left Op (look at its AL status code), or its controller knows no LRW"
+        }
+        _ => {
+            "a device does not give its inputs: look at its state, and whether it has an FMMU left"
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_of_a_working_counter() {
+        for (seen, expected, word) in [
+            (0, 9, "nobody takes part"),
+            (6, 9, "as a whole"),
+            (3, 9, "as a whole"),
+            (7, 9, "does not take its outputs"),
+            (8, 9, "does not give its inputs"),
+            (9, 9, "more devices"),
+            (12, 9, "more devices"),
+            (u16::MAX, 0, "more devices"),
+        ] {
+            assert!(
+                working_counter((seen, expected)).contains(word),
+                "{seen} of {expected}"
+            );
+        }
     }
 }

@@ -55,6 +55,8 @@ pub(crate) struct RawBus {
     pub clock_window: Option<Spanned<u64>>,
     pub exchange: Option<Spanned<String>>,
     pub link: Option<Spanned<String>>,
+    /// Keys that are there, each with its line.
+    pub written: Vec<(&'static str, u32)>,
 }
 
 #[derive(Debug)]
@@ -164,7 +166,7 @@ fn tables<'d>(
 
 fn read_bus(mut f: Fields<'_>, p: &mut Problems<'_>) -> RawBus {
     let cycle = f.need("cycle", "cycle = \"1ms\"");
-    let bus = RawBus {
+    let mut bus = RawBus {
         nic: optional!(p, f, "nic", string),
         cycle: cycle.and_then(|v| fields::duration(p, v)),
         lost_frames: optional!(p, f, "lost_frames", integer(1, 1000)),
@@ -178,7 +180,9 @@ fn read_bus(mut f: Fields<'_>, p: &mut Problems<'_>) -> RawBus {
         clock_window: optional!(p, f, "clock_window", duration),
         exchange: optional!(p, f, "exchange", string),
         link: optional!(p, f, "link", string),
+        written: Vec::new(),
     };
+    bus.written = f.written(p);
     f.done(p);
     bus
 }
