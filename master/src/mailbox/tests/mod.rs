@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use super::{CoeClient, MailboxLayout, Timeouts};
 
+mod beside;
 mod describe;
 mod errors;
 mod files;

@@ -33,6 +33,7 @@ struct Inner {
     mischief: Vec<Mischief>,
     out_mailbox: Option<Vec<u8>>,
     in_mailbox: Option<Vec<u8>>,
+    filled_at: u64,
     last_sent: Vec<u8>,
     queue: VecDeque<Vec<u8>>,
     activate: u8,
@@ -72,6 +73,7 @@ impl Server {
                 mischief: mischief.to_vec(),
                 out_mailbox: None,
                 in_mailbox: None,
+                filled_at: 0,
                 last_sent: Vec::new(),
                 queue: VecDeque::new(),
                 activate: 0x01,
@@ -130,6 +132,12 @@ impl Server {
         self.inner.borrow_mut().mischief.push(mischief);
     }
 
+    /// Since when a message has been waiting.
+    pub fn full_since(&self) -> Option<u64> {
+        let inner = self.inner.borrow();
+        inner.in_mailbox.as_ref().map(|_| inner.filled_at)
+    }
+
     /// Something that the device says unasked.
     pub fn say(&self, bytes: &[u8]) {
         self.inner.borrow_mut().queue.push_back(bytes.to_vec());
@@ -161,6 +169,7 @@ impl Inner {
             self.pdi_control ^= 0x02;
             if self.in_mailbox.is_none() && !self.last_sent.is_empty() {
                 self.in_mailbox = Some(self.last_sent.clone());
+                self.filled_at = now;
             }
         }
         if self.in_mailbox.is_none()
@@ -169,6 +178,7 @@ impl Inner {
             message.resize(len, 0xa5);
             self.last_sent.clone_from(&message);
             self.in_mailbox = Some(message);
+            self.filled_at = now;
         }
     }
 
