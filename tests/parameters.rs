@@ -12,7 +12,8 @@ use ecaxis::bringup::{AlState, bring_up};
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, Locator, Machine};
 use ecaxis::link::sim::SimLink;
-use ecaxis::mailbox::{CoeClient, ObjectList, Wire};
+use ecaxis::mailbox::desk::Listen;
+use ecaxis::mailbox::{CoeClient, Emergencies, ObjectList, Wire};
 use ecaxis::parameters::collect::{Collected, collect};
 use ecaxis::parameters::compare::compare;
 use ecaxis::parameters::dump::Dump;
@@ -25,6 +26,14 @@ use ecaxis::service::image::{with_alias, write};
 use ecaxis::service::{Datagrams, ServiceError, carry, device};
 use ecaxis::session::simulated_bus;
 use ecaxis_esi::Dictionary;
+
+/// Hears no emergencies.
+#[derive(Debug)]
+struct Deaf;
+
+impl Listen for Deaf {
+    fn listen(&self, _: &str, _: &Emergencies) {}
+}
 
 /// Futures here hold whole frames by value.
 const STACK: usize = 16 << 20;
@@ -354,7 +363,7 @@ fn an_alias_that_is_written_counts_after_the_next_power_on() {
                 .expect("found");
             assert_eq!(found.position, 0);
             let image = plan(&process_data(&by_alias)).expect("a plan");
-            let bus = bring_up(wire.main_device(), &by_alias, image, &mut |_| {}).await;
+            let bus = bring_up(wire.main_device(), &by_alias, image, &mut |_| {}, &Deaf).await;
             let bus = bus.unwrap_or_else(|error| panic!("{error}"));
             let x = &bus.devices[0].at;
             assert_eq!((x.name.as_str(), x.position), ("x", 0));
