@@ -122,7 +122,7 @@ fn what_a_counting_device_says_twice_counts_once() {
     for _ in 0..5 {
         block_on(client.upload(&server, 0x6041, 0, false)).expect("read");
     }
-    for counter in [3, 3, 3, 4, 4] {
+    for counter in [6, 6, 6, 7, 7] {
         server.say(&said(counter));
     }
     block_on(client.drain(&server)).expect("it is there");
