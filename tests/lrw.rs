@@ -74,12 +74,13 @@ fn logical(recording: &Path) -> Vec<BTreeMap<u8, u16>> {
 
 #[test]
 fn each_device_is_reached_as_it_can_be() {
-    // LRW counts 1 for reading and 2 for writing each device, LRD and LWR 1.
+    // LRW counts 1 for reading and 2 for writing each device, LRD and LWR 1. All three have the status of their mailbox read by LRD.
+    const STATUS: u16 = 3;
     for (without, expected) in [
-        (&[][..], vec![(LRW, 9)]),
-        (&["y"], vec![(LRD, 1), (LWR, 1), (LRW, 6)]),
-        (&["x", "z"], vec![(LRD, 2), (LWR, 2), (LRW, 3)]),
-        (&["x", "y", "z"], vec![(LRD, 3), (LWR, 3)]),
+        (&[][..], vec![(LRD, STATUS), (LRW, 9)]),
+        (&["y"], vec![(LRD, STATUS + 1), (LWR, 1), (LRW, 6)]),
+        (&["x", "z"], vec![(LRD, STATUS + 2), (LWR, 2), (LRW, 3)]),
+        (&["x", "y", "z"], vec![(LRD, STATUS + 3), (LWR, 3)]),
     ] {
         for exchange in ["same-cycle", "pipelined"] {
             let folder = tempfile::tempdir().expect("a temporary folder");

@@ -53,7 +53,7 @@ impl Tmux {
         std::fs::write(folder.path().join("m.toml"), calm).expect("written");
         let tmux = Self { folder };
         let script = format!(
-            "cd {}; stty -g > before; {} jog m.toml --sim {arguments}; echo $? > code; stty -g > after; echo over; cat",
+            "cd {}; stty -g > before; {} jog m.toml --sim {arguments}; echo $? > code; stty -g > after; echo all-is-done; cat",
             tmux.folder.path().display(),
             env!("CARGO_BIN_EXE_ecaxis"),
         );
@@ -129,7 +129,8 @@ impl Tmux {
     /// It has ended with this code, and the terminal is as it was.
     #[track_caller]
     fn left(&self, code: &str) {
-        let screen = self.says("over");
+        // Not a word of the summary before.
+        let screen = self.says("all-is-done");
         assert_eq!(self.file("code").trim(), code, "{screen}");
         assert!(!self.file("before").is_empty());
         assert_eq!(
