@@ -144,7 +144,7 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         &enable,
         "until a drive reports Operation enabled",
     ]);
-    writeln!(out, "\nbus\n{}", table.indented(2))
+    writeln!(out, "\nbus\n{}", table.shown(2))
 }
 
 fn device(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
@@ -234,7 +234,7 @@ fn sync_managers(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
             &fmmu,
         ]);
     }
-    writeln!(out, "\n{}", table.indented(2))
+    writeln!(out, "\n{}", table.shown(2))
 }
 
 fn clock(device: &DeviceConfig, out: &mut String) -> std::fmt::Result {
@@ -327,7 +327,7 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
             &(region.frame + 1).to_string(),
         ]);
     }
-    writeln!(out, "{}", table.indented(2))?;
+    writeln!(out, "{}", table.shown(2))?;
     let clock = machine.devices.iter().any(|d| d.selection.dc.is_some());
     let frames = frame_bytes(&plan, clock);
     let total: usize = frames.iter().sum();

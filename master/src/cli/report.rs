@@ -21,7 +21,7 @@ pub(crate) fn summary(summary: &Summary) -> String {
     }
     if !summary.axes.is_empty() {
         text += "\n";
-        text += &axes(&summary.axes).indented(2);
+        text += &axes(&summary.axes).shown(2);
         text += "\n";
     }
     for axis in &summary.axes {
@@ -49,7 +49,7 @@ pub(crate) fn summary(summary: &Summary) -> String {
     }
     if !summary.errors.is_empty() {
         text += "\n";
-        text += &errors(&summary.errors).indented(2);
+        text += &errors(&summary.errors).shown(2);
         text += "\n";
     }
     if !summary.emergencies.is_empty() {

@@ -19,7 +19,7 @@ pub(super) fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
     if let Some(homing) = &axis.homing {
         self::homing(homing, &axis.unit, &mut table);
     }
-    writeln!(out, "\n{}", table.indented(2))
+    writeln!(out, "\n{}", table.shown(2))
 }
 
 /// Six significant digits are enough to read.

@@ -29,7 +29,7 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
     ]);
     table.row(["no process data", &lost, "`bus_lost`"]);
     table.row(["emergency stop", &emergency, "`emergency`"]);
-    writeln!(out, "\nstop\n{}", table.indented(2))?;
+    writeln!(out, "\nstop\n{}", table.shown(2))?;
     if stop.groups.is_empty() {
         return writeln!(out, "\n  all axes stop together");
     }
@@ -61,7 +61,7 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
         way(stop.others),
         "stops",
     ]);
-    writeln!(out, "\n{}", table.indented(2))
+    writeln!(out, "\n{}", table.shown(2))
 }
 
 fn way(way: StopBy) -> &'static str {

@@ -1,0 +1,196 @@
+//! Transfers beside the cycle, over a veth pair (root): drives on the simulated bus, in a process of its own, are asked for ten objects each
+//! over and over, in turns with runs in which nobody asks. What the real-time thread does is compared.
+//!
+//! `cargo bench -p ecaxis --bench mailboxes [-- AXES ASKED SECONDS ROUNDS]`; 8 8 10 3 if nothing is said. Without root it says so and ends.
+
+#![allow(clippy::print_stdout, reason = "a bench prints its result")]
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+
+use ecaxis::bench::veth::VethPair;
+use ecaxis::config;
+use ecaxis::mailbox::Mailboxes;
+use ecaxis::session::{self, Observer, Options, Progress, Summary};
+
+/// Identity, state, position and settings, as a commissioning tool would look at them.
+const OBJECTS: [(u16, u8); 10] = [
+    (0x1018, 1),
+    (0x1018, 2),
+    (0x1018, 3),
+    (0x6041, 0),
+    (0x6061, 0),
+    (0x6064, 0),
+    (0x6065, 0),
+    (0x607d, 1),
+    (0x607d, 2),
+    (0x6098, 0),
+];
+
+#[derive(Debug, Default)]
+struct Counts {
+    done: AtomicU64,
+    failed: AtomicU64,
+}
+
+/// Asks the first devices as long as the run lasts.
+struct Asking {
+    devices: usize,
+    counts: Arc<Counts>,
+    user: Option<JoinHandle<()>>,
+}
+
+impl Observer for Asking {
+    fn progress(&mut self, progress: &Progress) {
+        if let Progress::Mailboxes(mailboxes) = progress
+            && self.user.is_none()
+            && self.devices > 0
+        {
+            let (mailboxes, devices) = (mailboxes.clone(), self.devices);
+            let counts = Arc::clone(&self.counts);
+            self.user = Some(std::thread::spawn(move || {
+                let runtime = tokio::runtime::Builder::new_current_thread()
+                    .enable_time()
+                    .build()
+                    .expect("a runtime");
+                runtime.block_on(ask(mailboxes, devices, counts));
+            }));
+        }
+    }
+}
+
+async fn ask(mailboxes: Mailboxes, devices: usize, counts: Arc<Counts>) {
+    let mut tasks = tokio::task::JoinSet::new();
+    let names: Vec<String> = mailboxes.names().take(devices).map(str::to_owned).collect();
+    for name in names {
+        let mailbox = mailboxes.device(&name).expect("one of them");
+        let counts = Arc::clone(&counts);
+        tasks.spawn(async move {
+            // Until the run is over, when nobody serves any more.
+            let mut in_a_row = 0;
+            while in_a_row < OBJECTS.len() {
+                for (index, sub) in OBJECTS {
+                    if mailbox.upload(index, sub).await.is_ok() {
+                        in_a_row = 0;
+                        counts.done.fetch_add(1, Ordering::Relaxed);
+                    } else {
+                        in_a_row += 1;
+                        counts.failed.fetch_add(1, Ordering::Relaxed);
+                    }
+                }
+            }
+        });
+    }
+    while tasks.join_next().await.is_some() {}
+}
+
+struct Bus(Child);
+
+impl Drop for Bus {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn machine(nic: &str, axes: usize) -> String {
+    let mut text = format!(
+        "[bus]\nnic = \"{nic}\"\ncycle = \"1ms\"\nlost_frames = 1000\nwatchdog = \"6s\"\ncpu = 1\n"
+    );
+    for axis in 0..axes {
+        text += &format!(
+            "[[device]]\nname = \"a{axis}\"\nesi = \"esi/EPOS4.xml\"\nposition = {axis}\nmode = \"csp\"\n\
+             [device.axis]\nunit = \"turn\"\nper_turn = 1.0\nencoder = 2000\n\
+             limits = {{ position = [-100.0, 100.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 100.0 }}\n"
+        );
+    }
+    text
+}
+
+fn run(nic: &str, axes: usize, asked: usize, seconds: u64) -> (Summary, u64, u64) {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let text = machine(nic, axes);
+    let machine = config::parse(&root.join("configs/bench.toml"), &text);
+    let machine = machine.unwrap_or_else(|error| panic!("{error}"));
+    let counts = Arc::new(Counts::default());
+    let mut observer = Asking {
+        devices: asked,
+        counts: Arc::clone(&counts),
+        user: None,
+    };
+    let options = Options {
+        limit: Some(seconds * 1_000_000_000),
+        enable: false,
+        ..Options::default()
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    let outcome = session::run(machine, options, stop, &mut observer);
+    if let Some(user) = observer.user {
+        user.join().expect("the user ends");
+    }
+    if let Err(error) = outcome.result {
+        println!("the run ended: {error}");
+    }
+    let summary = outcome.summary.expect("the cycle ran");
+    let failed = counts.failed.load(Ordering::Relaxed);
+    (summary, counts.done.load(Ordering::Relaxed), failed)
+}
+
+fn us(ns: u64) -> f64 {
+    ns as f64 / 1e3
+}
+
+fn main() {
+    let numbers: Vec<u64> = std::env::args().filter_map(|a| a.parse().ok()).collect();
+    let number = |n: usize, usual| numbers.get(n).copied().unwrap_or(usual);
+    let (axes, asked) = (number(0, 8) as usize, number(1, 8) as usize);
+    let (seconds, rounds) = (number(2, 10), number(3, 3));
+    let pair = match VethPair::new() {
+        Ok(pair) => pair,
+        Err(error) => return println!("skipped: a veth pair needs root: {error}"),
+    };
+    let file = tempfile::Builder::new()
+        .suffix(".toml")
+        .tempfile_in(Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs"))
+        .expect("a machine file");
+    std::fs::write(file.path(), machine("sim", axes)).expect("written");
+    let bus = Command::new("taskset")
+        .args(["-c", "0", env!("CARGO_BIN_EXE_ecaxis"), "sim"])
+        .arg(file.path())
+        .args(["--nic", &pair.b])
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn();
+    let _bus = Bus(bus.expect("taskset starts the bus"));
+    std::thread::sleep(std::time::Duration::from_secs(1));
+    println!("{axes} drives at 1 ms, {asked} of them asked; {rounds} rounds of {seconds} s each");
+    println!(
+        "wake-up lateness p50/p99/p99.9/max, work p99.9, in us; page faults; switches a cycle"
+    );
+    for round in 1..=rounds {
+        for devices in [0, asked] {
+            let (summary, done, failed) = run(&pair.a, axes, devices, seconds);
+            let late = &summary.wake_up_lateness;
+            let thread = summary.thread.as_ref().map(|thread| thread.used);
+            let cycles = summary.counters.cycles.max(1);
+            println!(
+                "{round} asked {devices}: {:.2} / {:.1} / {:.1} / {:.0}, work {:.1}; {}; {:.2}; {} cycles, {} lost, {} wkc; {:.0} transfers/s, {failed} failed at the end",
+                us(late.p50_ns),
+                us(late.p99_ns),
+                us(late.p99_9_ns),
+                us(late.max_ns),
+                us(summary.work.p99_9_ns),
+                thread.map_or(0, |t| t.minor_faults + t.major_faults),
+                thread.map_or(0.0, |t| t.voluntary_switches as f64 / cycles as f64),
+                summary.counters.cycles,
+                summary.counters.lost_frames,
+                summary.counters.wkc_errors,
+                done as f64 / summary.machine_seconds.max(1e-9),
+            );
+        }
+    }
+}
