@@ -213,6 +213,7 @@ pub(crate) fn check(
     let identity = identity(raw.identity.as_ref(), p);
     let (esi_path, file) = file?;
     Some(DeviceConfig {
+        modules_named: raw.modules.is_some(),
         name: raw.name?.into_inner(),
         at: at?,
         esi_path,

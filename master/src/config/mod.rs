@@ -136,6 +136,8 @@ pub enum Nic {
 
 #[derive(Debug, Clone)]
 pub struct DeviceConfig {
+    /// The file names the modules in its slots; otherwise they are what the ESI makes of the choice.
+    pub modules_named: bool,
     pub name: String,
     pub at: Locator,
     pub esi_path: PathBuf,

@@ -127,13 +127,13 @@ const DRIFTS_PPM: [f64; 4] = [18.0, -23.0, 7.0, -11.0];
 /// written in Bootstrap as any other.
 const DEMONSTRATION: u32 = 0x0e0a;
 
-/// The device with the modules of the file in its slots. Where a mode picks the module it is no hardware: the device takes what it is told.
+/// The device with the modules that the file names in its slots. Where a mode picks the module it is no hardware: the device takes what it is told.
 fn plugged(device: &DeviceConfig) -> Cow<'_, Device> {
     let selection = &device.selection;
     let Some(slots) = &device.device.slots else {
         return Cow::Borrowed(&device.device);
     };
-    if selection.mode.is_some() {
+    if selection.mode.is_some() || !device.modules_named {
         return Cow::Borrowed(&device.device);
     }
     let mut hardware = Device::clone(&device.device);
