@@ -1,5 +1,6 @@
 """Cyclic exchange at 1 kHz by pysoem, and the way of a whole bus to Op."""
 
+import contextlib
 import gc
 import os
 import time
@@ -70,13 +71,18 @@ class Cycle:
         return f"{self.good} good, {self.missed} missed, wrong {self.wrong or 'none'}"
 
 
+@contextlib.contextmanager
 def real_time():
     """The priority a MainDevice has; below what the kernel needs, and above the simulated bus."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(75))
-    except OSError:
-        return False
-    return True
+    except OSError as error:
+        print(f"     without real-time priority: {error}", flush=True)
+    try:
+        yield
+    finally:
+        # What is built or read between two buses has no right to it.
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def states(master):

@@ -150,6 +150,10 @@ class Served:
         self.errors = errors
         self.output = None
 
+    def strike(self):
+        """The fault script begins now."""
+        self.child.send_signal(signal.SIGUSR1)
+
     def end(self):
         if self.output is None:
             self.child.send_signal(signal.SIGINT)
@@ -169,7 +173,8 @@ def served(program, machine, nic, faults=None, options=()):
         if faults:
             script = pathlib.Path(folder) / "faults.toml"
             script.write_text(faults)
-            command += ["--faults", str(script)]
+            # A script that ran from the start would strike a slow computer in bring-up.
+            command += ["--faults", str(script), "--faults-on-signal"]
         errors = pathlib.Path(folder) / "errors"
         with errors.open("w") as err, process(command, stdout=subprocess.PIPE, stderr=err) as child:
             deadline = time.monotonic() + 20

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
-use tokio::runtime::Builder;
+use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::hints::FAILED;
@@ -20,6 +20,31 @@ pub(crate) fn stop_on_interrupt(stop: &Arc<AtomicBool>) {
 /// Likewise, at the end of the terminal, too; nothing is written on it.
 pub(crate) fn stop_quietly(stop: &Arc<AtomicBool>) {
     told(listen(Arc::clone(stop), false));
+}
+
+/// Sets `flag` at every SIGUSR1.
+pub(crate) fn raise_on_usr1(flag: &Arc<AtomicBool>) -> io::Result<()> {
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    let guard = runtime.enter();
+    let mut user = signal(SignalKind::user_defined1())?;
+    drop(guard);
+    let flag = Arc::clone(flag);
+    let wait = async move {
+        while user.recv().await.is_some() {
+            flag.store(true, Ordering::Relaxed);
+        }
+    };
+    in_background(runtime, wait)
+}
+
+fn in_background(
+    runtime: Runtime,
+    wait: impl Future<Output = ()> + Send + 'static,
+) -> io::Result<()> {
+    thread::Builder::new()
+        .name("signals".into())
+        .spawn(move || runtime.block_on(wait))?;
+    Ok(())
 }
 
 fn told(listens: io::Result<()>) {
@@ -58,10 +83,7 @@ fn listen(stop: Arc<AtomicBool>, aloud: bool) -> io::Result<()> {
             }
         }
     };
-    thread::Builder::new()
-        .name("signals".into())
-        .spawn(move || runtime.block_on(wait))?;
-    Ok(())
+    in_background(runtime, wait)
 }
 
 /// Never, where nobody listens.

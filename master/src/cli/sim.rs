@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis::config;
 use ecaxis::link::OpenError;
@@ -42,6 +42,9 @@ pub(crate) struct Args {
     /// Fault script
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
+    /// The fault script begins at SIGUSR1, and anew at each further one, not with the first frame
+    #[arg(long, requires = "faults")]
+    faults_on_signal: bool,
     /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …
     #[arg(long, value_name = "FOLDER")]
     sii: Option<PathBuf>,
@@ -72,11 +75,20 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .and_then(|f| f.seed)
         .unwrap_or(session::Options::default().seed);
     let ring = args.nic2.as_ref().map(|_| SecondPort::Listens);
-    let mut segment = session::simulated_bus(&machine, seed, faults.as_ref(), ring)
+    let (at_once, on_signal) = match args.faults_on_signal {
+        true => (None, faults),
+        false => (faults, None),
+    };
+    let mut segment = session::simulated_bus(&machine, seed, at_once.as_ref(), ring)
         .map_err(|error| hints::run(&error, &machine.bus.nic))?;
 
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
+    let signalled = Arc::new(AtomicBool::new(false));
+    if on_signal.is_some() {
+        signals::raise_on_usr1(&signalled)
+            .map_err(|e| Failure::new(hints::FAILED, format!("cannot wait for SIGUSR1: {e}")))?;
+    }
     // What cannot be opened is told before anything is said to answer.
     for nic in &nics {
         match PacketLink::open(nic) {
@@ -107,7 +119,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         note(&format!("warning: {denied}"));
     }
     let stats = server
-        .serve(&mut segment, &stop)
+        .serve(&mut segment, &stop, |segment, now| {
+            if let Some(script) = &on_signal
+                && signalled.swap(false, Ordering::Relaxed)
+            {
+                segment.start_faults(script.clone(), now);
+            }
+        })
         .map_err(|e| hints::serve(&e))?;
     let report = report(&stats, &segment);
     result(&if args.json {

@@ -15,6 +15,15 @@ pub struct FaultScript {
     pub faults: Vec<Fault>,
 }
 
+impl FaultScript {
+    /// Everything happens `by` later.
+    pub(crate) fn delay(&mut self, by: Nanos) {
+        for fault in &mut self.faults {
+            fault.at = fault.at.saturating_add(by);
+        }
+    }
+}
+
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fault {
     pub at: Nanos,

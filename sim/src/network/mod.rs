@@ -124,6 +124,13 @@ impl Segment {
         self.schedule();
     }
 
+    /// Replaces the faults; times in the script count from the caller's `now`.
+    pub fn start_faults(&mut self, mut script: FaultScript, now: Nanos) {
+        let begin = self.world_time(now).max(self.latest);
+        script.delay(begin);
+        self.set_faults(script);
+    }
+
     /// What has become of every fault of the script.
     pub fn fault_reports(&self) -> impl Iterator<Item = FaultReport> + '_ {
         self.faults.reports()

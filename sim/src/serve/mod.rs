@@ -64,10 +64,13 @@ impl Server {
     ///
     /// The thread sleeps until a frame comes. One that spins answers 1.5 times as fast at the median and takes
     /// ten times the processor's time; a MainDevice at 1 kHz would not notice.
+    ///
+    /// `between` is called between frames, once a millisecond at least, with the time.
     pub fn serve(
         &self,
         segment: &mut Segment,
         stop: &AtomicBool,
+        mut between: impl FnMut(&mut Segment, Nanos),
     ) -> Result<ServeStats, ServeError> {
         let mut replies = Replies {
             sockets: &self.sockets,
@@ -80,6 +83,7 @@ impl Server {
             let now = clock(libc::CLOCK_MONOTONIC);
             replies.release(now);
             segment.advance(now);
+            between(segment, now);
             if !socket::wait(&self.sockets, replies.patience(now)) {
                 idle += 1;
                 if idle.is_multiple_of(CHECK) {

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pysoem
 
+import cycle
 import rig
 from report import Report
 
@@ -77,7 +78,8 @@ class Bench:
         master = pysoem.Master()
         master.open(self.nic, second)
         try:
-            yield master
+            with cycle.real_time():
+                yield master
         finally:
             master.state = pysoem.INIT_STATE
             master.write_state()

@@ -52,10 +52,8 @@ def bringup(bench):
                 # Longer than this computer may stall.
                 slave.set_watchdog("processdata", 2_000)
         wkc = expected_wkc(machine)
-        real_time = cyclic.real_time()
         cycle = cyclic.to_op(master, wkc)
         report.need("Op", cycle is not None, cyclic.states(master))
-        report.note("SCHED_FIFO" if real_time else "without real-time priority")
         cycle.until(lambda: False, 0.2)
         many(bench, cycle, 5_000)
         move(bench, cycle, master, machine)

@@ -52,11 +52,12 @@ def noise(bench):
     report.section("a noisy line")
     machine = bench.machine()
     kinds = ("frame-loss", "frame-duplicate", "frame-corrupt", "frame-delay")
-    faults = [f'[[fault]]\nat = "3s"\nkind = "{kind}"\nprobability = 0.01\n' for kind in kinds]
+    faults = [f'[[fault]]\nkind = "{kind}"\nprobability = 0.01\n' for kind in kinds]
     script = "".join(faults) + 'delay = "3ms"\n'
     with bench.serve(machine, "noise", script, ["--json"], steady=False) as bus, bench.master() as master:
         cycle = prepared(bench, master, machine, 300)
-        cycle.until(lambda: False, 3)
+        bus.strike()
+        cycle.until(lambda: False, 0.5)
         cycle.forget()
         cycle.run(3_000)
         report.check("no working counter is wrong", not cycle.wrong, cycle)
@@ -77,9 +78,10 @@ def outage(bench, what, fault):
     report = bench.report
     report.section(what)
     machine = bench.machine()
-    script = f'[[fault]]\nat = "4s"\nfor = "1500ms"\n{fault}'
-    with bench.serve(machine, "outage", script, steady=False), bench.master() as master:
+    script = f'[[fault]]\nfor = "1500ms"\n{fault}'
+    with bench.serve(machine, "outage", script, steady=False) as bus, bench.master() as master:
         cycle = prepared(bench, master, machine, 300)
+        bus.strike()
         broken = cycle.until(lambda: sum(cycle.wrong.values()) + cycle.missed > 100, 10)
         report.need("the bus breaks", broken, cycle)
         back(bench, cycle, master)

@@ -10,7 +10,7 @@ import pcapng
 import rig
 from cycle import reach
 
-EMERGENCY = '[[fault]]\nat = "3s"\ndevice = 0\nkind = "emergency"\ncode = 0x2310\n'
+EMERGENCY = '[[fault]]\ndevice = 0\nkind = "emergency"\ncode = 0x2310\n'
 ESI = rig.HERE / "esi/mailbox.xml"
 BLOB = esi.default_data(ESI, 0x2000)
 FOE, FOE_ERROR, NOT_FOUND = 4, 5, 0x8001
@@ -22,7 +22,7 @@ def mailbox(bench):
     machine = bench.machine()
     images = bench.folder / "sii"
     options = ["--sii", str(images)]
-    with bench.serve(machine, "mailbox", EMERGENCY, options), bench.master() as master:
+    with bench.serve(machine, "mailbox", EMERGENCY, options) as bus, bench.master() as master:
         bench.found(master, machine)
         at = machine.index("mailbox")
         large, x = master.slaves[at], master.slaves[0]
@@ -33,7 +33,7 @@ def mailbox(bench):
         resize(bench, master, large, 1024)
         large_objects(bench, large, "mailboxes of 1024 bytes")
         files(bench, large, "mailboxes of 1024 bytes")
-        emergency(bench, x)
+        emergency(bench, bus, x)
         bootstrap(bench, master, x)
         dictionary(bench, large)
     file_errors(bench)
@@ -169,17 +169,25 @@ def eeprom(bench, master, machine, images):
     all_of_them = zip(machine.names, master.slaves, machine.devices)
     for position, (name, slave, device) in enumerate(all_of_them):
         image = (images / f"{position}.bin").read_bytes()
-        read = b"".join(slave.eeprom_read(word) for word in range(0, len(image) // 2, 2))
+        read = b"".join(eeprom_words(slave, word, image[2 * word :][:4]) for word in range(0, len(image) // 2, 2))
         report.check(f"{name}: EEPROM as served", read == image, f"{len(read)} bytes")
         identity = struct.unpack_from("<III", read, 16)
         report.equal(f"{name}: EEPROM words 8 to 13 are the identity", identity, device.identity)
         report.equal(f"{name}: checksum of the configuration area", read[14], crc8(read[:14]), hex)
     slave, last = master.slaves[0], 0x3F0
     old = slave.eeprom_read(last)[:2]
-    slave.eeprom_write(last, b"\xc3\x5a")
-    report.equal("an EEPROM word is written and read back", slave.eeprom_read(last)[:2], b"\xc3\x5a")
-    slave.eeprom_write(last, old)
-    report.equal("and again", slave.eeprom_read(last)[:2], old)
+    for what, data in (("an EEPROM word is written and read back", b"\xc3\x5a"), ("and again", old)):
+        slave.eeprom_write(last, data)
+        report.equal(what, eeprom_words(slave, last, data), data)
+
+
+def eeprom_words(slave, word, expected):
+    """SOEM yields zeros where a read took longer than 20 ms; then it is asked again."""
+    for _ in range(5):
+        read = slave.eeprom_read(word)[: len(expected)]
+        if any(read) or not any(expected):
+            break
+    return read
 
 
 def crc8(data):
@@ -192,9 +200,10 @@ def crc8(data):
     return crc
 
 
-def emergency(bench, slave):
+def emergency(bench, bus, slave):
     heard = []
     slave.add_emergency_callback(heard.append)
+    bus.strike()
     end = time.monotonic() + 10
     while not heard and time.monotonic() < end:
         slave.mbx_receive()

@@ -5,7 +5,7 @@ import rig
 
 from .bringup import expected_wkc, mirror
 
-BREAK = '[[fault]]\nat = "4s"\nfor = "1500ms"\ndevice = 1\nport = 0\nkind = "link-break"\n'
+BREAK = '[[fault]]\nat = "500ms"\nfor = "1500ms"\ndevice = 1\nport = 0\nkind = "link-break"\n'
 
 
 def ring(bench):
@@ -14,7 +14,7 @@ def ring(bench):
     machine = bench.machine()
     with rig.veth_pair("cd") as (bus, nic):
         options = ["--nic2", bus]
-        with bench.serve(machine, "ring", BREAK, options, steady=False), bench.master(nic) as master:
+        with bench.serve(machine, "ring", BREAK, options, steady=False) as served, bench.master(nic) as master:
             bench.found(master, machine)
             master.config_map()
             for slave, device in zip(master.slaves, machine.devices):
@@ -23,8 +23,9 @@ def ring(bench):
             cycle = cyclic.to_op(master, expected_wkc(machine))
             report.need("Op", cycle is not None, cyclic.states(master))
             cycle.forget()
+            served.strike()
             # Over the break and the healing.
-            cycle.run(6_000)
+            cycle.run(3_000)
             lost = cycle.missed + sum(cycle.wrong.values())
             report.check("all cycles but a few have the full working counter", lost < 100, cycle)
             # Lost link counters: port 1 of x, port 0 of y.
