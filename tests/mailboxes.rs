@@ -33,16 +33,25 @@ fn with_and_without_status_fmmu() -> [(&'static str, String); 2] {
     [("status FMMU", with), ("diagnostic slot", without)]
 }
 
-/// The demonstration drive's ESI without its third FMMU, in a folder of its own.
+/// With the demonstration drive's ESI without its third FMMU as `NO_STATUS`.
 fn parsed(text: &str) -> (ecaxis::config::Machine, tempfile::TempDir) {
+    with_esi(text, "NO_STATUS", "<Fmmu>MBoxState</Fmmu>", "")
+}
+
+/// `name` in the machine file is the demonstration drive's ESI with something else in it, in a folder of its own.
+fn with_esi(
+    text: &str,
+    name: &str,
+    old: &str,
+    new: &str,
+) -> (ecaxis::config::Machine, tempfile::TempDir) {
     let folder = tempfile::tempdir().expect("a folder");
     let configs = common::root().join("configs");
     let esi = std::fs::read_to_string(configs.join("esi/EPOS4.xml")).expect("an ESI file");
-    let fmmu = "<Fmmu>MBoxState</Fmmu>";
-    assert_eq!(esi.matches(fmmu).count(), 1);
+    assert_eq!(esi.matches(old).count(), 1);
     let path = folder.path().join("EPOS4.xml");
-    std::fs::write(&path, esi.replace(fmmu, "")).expect("written");
-    let text = text.replace("NO_STATUS", &path.display().to_string());
+    std::fs::write(&path, esi.replace(old, new)).expect("written");
+    let text = text.replace(name, &path.display().to_string());
     (machine(&text), folder)
 }
 
@@ -128,6 +137,32 @@ fn the_report_of_a_fault_has_what_the_drive_said() {
     assert_eq!(codes, [0x7320]);
     let text = outcome.result.expect_err("it failed").to_string();
     assert!(text.contains("; emergency 0x7320 ("), "{text}");
+}
+
+#[test]
+fn a_device_that_keeps_a_history_is_asked_for_it_when_it_faults() {
+    let text = axes(2).replace("esi/EPOS4.xml", "KEEPS");
+    let coe = "<CoE SdoInfo=\"1\" PdoAssign=\"1\"";
+    let (machine, _folder) = with_esi(&text, "KEEPS", coe, &format!("{coe} DiagHistory=\"1\""));
+    let emergencies = (0..9).map(|n| (format!("{}ms", 1000 + 20 * n), 0x6100 + n));
+    let mut script: String = emergencies
+        .map(|(at, code)| {
+            format!(
+                "[[fault]]\nkind = \"emergency\"\nat = \"{at}\"\ndevice = 1\ncode = {code:#06x}\n"
+            )
+        })
+        .collect();
+    script += "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x7320\n";
+    let (outcome, _) = common::run(machine, faults(&script));
+    let Err(RunError::DriveFault { report, .. }) = &outcome.result else {
+        panic!("{:?}", outcome.result)
+    };
+    // The device keeps eight: the two newest lie at the beginning, the third at the end.
+    let codes: Vec<_> = report.history.iter().map(|m| m.code).collect();
+    assert_eq!(codes, [0x7320_e800, 0x6108_e800, 0x6107_e800]);
+    assert!(report.history.iter().all(|m| m.time > 0), "{report:?}");
+    let text = outcome.result.expect_err("it failed").to_string();
+    assert!(text.contains("0x7320e800"), "{text}");
 }
 
 /// Hands the mailboxes to a user on a thread with a tokio runtime of its own, and ends the run when the user is done.

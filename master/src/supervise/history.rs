@@ -6,9 +6,11 @@ use ecaxis_axis::cia402::describe;
 use ecaxis_esi::model::DiagMessage;
 
 use crate::config::DeviceConfig;
-use crate::mailbox::{DeviceMailbox, MailboxError};
+use crate::mailbox::{DeviceMailbox, MailboxError, SdoError};
 
 const HISTORY: u16 = 0x10f3;
+/// How many messages are kept.
+const MOST_KEPT: u8 = 1;
 /// Subindex of the newest message.
 const NEWEST: u8 = 2;
 /// Subindex of the first message.
@@ -101,16 +103,40 @@ pub(super) async fn read(
     if !keeps_history(config) {
         return Ok(messages);
     }
-    let newest = mailbox.upload(HISTORY, NEWEST).await?;
-    let newest = newest.first().copied().unwrap_or(0);
-    for sub in (FIRST..=newest).rev().take(MOST) {
+    let number = async |sub| {
         let bytes = mailbox.upload(HISTORY, sub).await?;
+        Ok::<_, MailboxError>(bytes.first().copied().unwrap_or(0))
+    };
+    let (kept, newest) = (number(MOST_KEPT).await?, number(NEWEST).await?);
+    for sub in newest_first(kept, newest) {
+        let bytes = match mailbox.upload(HISTORY, sub).await {
+            Ok(bytes) => bytes,
+            // No message has come here yet.
+            Err(MailboxError::Sdo {
+                source: SdoError::Abort { .. },
+                ..
+            }) => break,
+            Err(error) => return Err(error),
+        };
+        if bytes.iter().all(|byte| *byte == 0) {
+            break;
+        }
         messages.extend(DiagnosisMessage::parse(
             &bytes,
             &config.device.diag_messages,
         ));
     }
     Ok(messages)
+}
+
+/// Subindices of the newest messages. They go round: before the first comes the last that is kept.
+fn newest_first(kept: u8, newest: u8) -> impl Iterator<Item = u8> {
+    let last = FIRST.saturating_add(kept).saturating_sub(1).max(newest);
+    let there = newest >= FIRST;
+    let round = (FIRST..=newest)
+        .rev()
+        .chain((newest.saturating_add(1)..=last).rev());
+    round.filter(move |_| there).take(MOST)
 }
 
 fn keeps_history(config: &DeviceConfig) -> bool {
@@ -124,6 +150,25 @@ fn keeps_history(config: &DeviceConfig) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_newest_messages_go_round() {
+        let table: [(u8, u8, &[u8]); 8] = [
+            (8, 0, &[]),
+            (8, 5, &[]),
+            (1, 6, &[6]),
+            (8, 6, &[6, 13, 12]),
+            (8, 7, &[7, 6, 13]),
+            (8, 13, &[13, 12, 11]),
+            // What a device says of itself may be wrong.
+            (0, 255, &[255, 254, 253]),
+            (255, 6, &[6, 255, 254]),
+        ];
+        for (kept, newest, subs) in table {
+            let order: Vec<_> = newest_first(kept, newest).collect();
+            assert_eq!(order, subs, "{kept} kept, {newest} newest");
+        }
+    }
 
     #[test]
     fn messages_are_what_etg_1020_says() {

@@ -7,11 +7,13 @@
 //! * `pdo`: PDO assignment and mapping, modules
 //! * `sdo`: the SDO server: expedited, normal and segmented transfers
 //! * `info`: SDO Information: what objects there are
+//! * `history`: the diagnosis history
 //!
 //! Messages in, answers out; mailboxes, their counters and queues are the device's.
 
 mod abort;
 mod datatype;
+pub(crate) mod history;
 mod info;
 mod objects;
 pub mod pdo;

@@ -4,7 +4,7 @@ use ecaxis_esi::model::{ObjectCode, Writable};
 
 use super::pdo::PdoRules;
 use super::store::{Item, ObjectStore, Slot};
-use super::{Abort, datatype};
+use super::{Abort, datatype, history};
 use crate::coe::datatype::Kind;
 use crate::esc::al::AlState;
 use crate::firmware::Processor;
@@ -203,6 +203,10 @@ impl Dictionary<'_> {
         }
         if self.ignored.contains(&(index, sub)) {
             return Ok(());
+        }
+        if history::is_acknowledgement(index, sub) {
+            let up_to = data.first().copied().unwrap_or(0);
+            return history::acknowledge(self.store, up_to);
         }
         let value = low_bits(data);
         self.pdo

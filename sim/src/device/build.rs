@@ -10,6 +10,7 @@ use super::process::ProcessData;
 use super::supervision::Supervision;
 use super::{Delays, Fresh, MailboxLimits, SimDevice};
 use crate::Nanos;
+use crate::coe::history;
 use crate::coe::pdo::{PdoRules, expand};
 use crate::coe::store::ObjectStore;
 use crate::drive::PlantParams;
@@ -354,6 +355,13 @@ fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
     for (sub, (name, value)) in (1..).zip(identity) {
         let slot = store.ensure(0x1018, sub, name, 32, ro, &[]);
         store.set(slot, i64::from(value));
+    }
+    let coe = device
+        .mailbox
+        .as_ref()
+        .and_then(|mailbox| mailbox.coe.as_ref());
+    if coe.is_some_and(|coe| coe.diag_history) {
+        history::create(store);
     }
     let types: Vec<u8> = device.sync_managers.iter().take(8).map(sm_type).collect();
     let count = u8::try_from(types.len()).unwrap_or(8);

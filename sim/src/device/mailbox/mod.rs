@@ -381,6 +381,12 @@ impl SimDevice {
         if matches!(self.al.state, AlState::Init | AlState::Boot) || !self.has_coe {
             return;
         }
+        let time = self
+            .esc
+            .dc
+            .as_ref()
+            .map_or(self.local, |dc| dc.system(self.local));
+        coe::history::add(&mut self.store, emergency.code, time);
         if let Some(mailbox) = &mut self.mailbox {
             let message = coe::emergency(emergency.code, emergency.register, emergency.data);
             mailbox
