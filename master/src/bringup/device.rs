@@ -4,8 +4,8 @@ use ecaxis_esi::StartupSdo;
 use ecaxis_esi::layout::SmLayout;
 
 use super::{BringUpError, BusDevice, DeviceRef, Step};
-use crate::config::{Bus, DeviceConfig};
-use crate::mailbox::{CoeClient, Wire};
+use crate::config::{Bus, DeviceConfig, StartupWay};
+use crate::mailbox::{CoeClient, ObjectAddress, SdoError, Wire, object_name};
 use crate::rt::image::Region;
 
 /// FMMU registers (ETG.1000.4, Table 56): 16 bytes each.
@@ -59,15 +59,131 @@ pub(super) async fn start_up(
             device: device.at.clone(),
             source,
         })?;
+    let mut held = 0;
     for (done, sdo) in list.iter().enumerate() {
-        download(wire, &device.at, coe, sdo).await?;
+        let way = config.startup.way(sdo.index, sdo.sub);
+        match start_up_one(wire, &device.at, coe, sdo, way).await? {
+            Done::Held => held += 1,
+            Done::Unreadable => progress(Step::Warning(format!(
+                "{}: {} cannot be read, so it is not verified",
+                device.at,
+                object(sdo)
+            ))),
+            Done::Written => {}
+        }
         progress(Step::StartUp {
             device: config.name.clone(),
             done: done + 1,
             of: list.len(),
         });
     }
+    if held > 0 {
+        progress(Step::Held {
+            device: config.name.clone(),
+            held,
+            of: list.len(),
+        });
+    }
     Ok(())
+}
+
+/// What became of a start-up SDO.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Done {
+    /// And verified, where that was wanted.
+    Written,
+    /// The device held it already.
+    Held,
+    /// Written, and not verified: it cannot be read.
+    Unreadable,
+}
+
+/// Writes one start-up SDO, unless the device holds it and that is enough; reads it back where that is wanted.
+async fn start_up_one(
+    wire: &impl Wire,
+    at: &DeviceRef,
+    coe: &mut CoeClient,
+    sdo: &StartupSdo,
+    way: StartupWay,
+) -> Result<Done, BringUpError> {
+    if way.skip_equal
+        && let Some(now) = read_back(wire, at, coe, sdo).await?
+        && holds(sdo, &now)
+    {
+        tracing::debug!(device = %at, "{} is held already", object(sdo));
+        return Ok(Done::Held);
+    }
+    download(wire, at, coe, sdo).await?;
+    if !way.verify {
+        return Ok(Done::Written);
+    }
+    match read_back(wire, at, coe, sdo).await? {
+        None => Ok(Done::Unreadable),
+        Some(now) if holds(sdo, &now) => Ok(Done::Written),
+        Some(now) => Err(BringUpError::NotHeld {
+            device: at.clone(),
+            object: object(sdo),
+            value: format_value(&sdo.data),
+            origin: sdo.origin.clone(),
+            holds: format_value(&now),
+        }),
+    }
+}
+
+/// What the device holds; `None` where it does not let it be read.
+async fn read_back(
+    wire: &impl Wire,
+    at: &DeviceRef,
+    coe: &mut CoeClient,
+    sdo: &StartupSdo,
+) -> Result<Option<Vec<u8>>, BringUpError> {
+    match coe
+        .upload(wire, sdo.index, sdo.sub, sdo.complete_access)
+        .await
+    {
+        Ok(data) => Ok(Some(data)),
+        Err(SdoError::Abort { .. }) => Ok(None),
+        Err(source) => Err(failed(at, sdo, source)),
+    }
+}
+
+/// By complete access a device may tell more than was written.
+fn holds(sdo: &StartupSdo, now: &[u8]) -> bool {
+    if sdo.complete_access {
+        now.starts_with(&sdo.data)
+    } else {
+        now == sdo.data
+    }
+}
+
+/// `0x6065:00 (Following error window)`, with the ESI's name where it has one.
+fn object(sdo: &StartupSdo) -> String {
+    let (index, sub) = (sdo.index, sdo.sub);
+    if sdo.name.is_empty() {
+        return ObjectAddress { index, sub }.to_string();
+    }
+    format!("{index:#06x}:{sub:02x} ({})", sdo.name)
+}
+
+fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> BringUpError {
+    let known = || {
+        object_name(sdo.index, sdo.sub)
+            .unwrap_or_default()
+            .to_owned()
+    };
+    BringUpError::StartUp {
+        device: at.clone(),
+        index: sdo.index,
+        sub: sdo.sub,
+        name: if sdo.name.is_empty() {
+            known()
+        } else {
+            sdo.name.clone()
+        },
+        value: format_value(&sdo.data),
+        origin: sdo.origin.clone(),
+        source,
+    }
 }
 
 /// Downloads one start-up SDO.
@@ -79,15 +195,7 @@ pub(super) async fn download(
 ) -> Result<(), BringUpError> {
     coe.download(wire, sdo.index, sdo.sub, sdo.complete_access, &sdo.data)
         .await
-        .map_err(|source| BringUpError::StartUp {
-            device: at.clone(),
-            index: sdo.index,
-            sub: sdo.sub,
-            name: sdo.name.clone(),
-            value: format_value(&sdo.data),
-            origin: sdo.origin.clone(),
-            source,
-        })?;
+        .map_err(|source| failed(at, sdo, source))?;
     tracing::debug!(
         device = %at,
         "SDO 0x{:04x}:{:02x} {} = {} ({})",
@@ -245,5 +353,100 @@ fn taken(
             step,
             source,
         }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mailbox::tests::mischief::Mischief;
+    use crate::mailbox::tests::server::Server;
+    use crate::mailbox::tests::{STATION, block_on, client};
+
+    const HELD: (u16, u8) = (0x6065, 0);
+    const WRITE_ONLY: (u16, u8) = (0x2000, 1);
+
+    fn sdo((index, sub): (u16, u8), data: &[u8], name: &str) -> StartupSdo {
+        StartupSdo {
+            transition: "PS",
+            index,
+            sub,
+            complete_access: false,
+            data: data.to_vec(),
+            name: name.to_owned(),
+            origin: "a test".to_owned(),
+        }
+    }
+
+    /// What becomes of one SDO, and how many the device was asked for.
+    fn done(
+        sdo: &StartupSdo,
+        verify: bool,
+        skip_equal: bool,
+        mischief: &[Mischief],
+    ) -> (Result<Done, String>, usize) {
+        let server = Server::new(
+            48,
+            &[
+                (HELD.0, HELD.1, &[7, 0, 0, 0]),
+                (WRITE_ONLY.0, WRITE_ONLY.1, &[0]),
+            ],
+            mischief,
+        );
+        let at = DeviceRef {
+            name: "x".to_owned(),
+            position: 0,
+            station: STATION,
+        };
+        let way = StartupWay { verify, skip_equal };
+        let done = block_on(start_up_one(&server, &at, &mut client(), sdo, way));
+        (done.map_err(|error| error.to_string()), server.log().len())
+    }
+
+    #[test]
+    fn what_is_held_is_not_written_where_that_is_enough() {
+        let (same, other) = (sdo(HELD, &[7, 0, 0, 0], ""), sdo(HELD, &[8, 0, 0, 0], ""));
+        assert_eq!(done(&same, false, true, &[]), (Ok(Done::Held), 1));
+        assert_eq!(done(&same, true, true, &[]), (Ok(Done::Held), 1));
+        assert_eq!(done(&same, false, false, &[]), (Ok(Done::Written), 1));
+        assert_eq!(done(&other, false, true, &[]), (Ok(Done::Written), 2));
+        assert_eq!(done(&other, true, true, &[]), (Ok(Done::Written), 3));
+    }
+
+    #[test]
+    fn what_is_written_and_not_held_is_told_with_its_name() {
+        let forgets = [Mischief::Forgetful];
+        let known = sdo(HELD, &[8, 0, 0, 0], "");
+        let (told, _) = done(&known, true, false, &forgets);
+        let told = told.expect_err("it holds another value");
+        assert!(
+            told.contains("0x6065:00 (Following error window)")
+                && told.contains("0x00000008")
+                && told.contains("0x00000007"),
+            "{told}"
+        );
+        let named = sdo(HELD, &[8, 0, 0, 0], "Window");
+        let told = done(&named, true, false, &forgets).0.expect_err("likewise");
+        assert!(told.contains("0x6065:00 (Window)"), "{told}");
+        assert_eq!(done(&known, false, false, &forgets), (Ok(Done::Written), 1));
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_written_and_that_is_said() {
+        let secret = sdo(WRITE_ONLY, &[1], "");
+        let hidden = [Mischief::WriteOnly(WRITE_ONLY.0)];
+        assert_eq!(
+            done(&secret, true, true, &hidden),
+            (Ok(Done::Unreadable), 3)
+        );
+    }
+
+    #[test]
+    fn errors_name_the_object() {
+        let missing = sdo((0x607d, 2), &[0; 4], "");
+        let told = done(&missing, false, false, &[])
+            .0
+            .expect_err("it is not there");
+        assert!(told.contains("0x607d:02 Max position limit"), "{told}");
     }
 }

@@ -98,6 +98,12 @@ pub enum Step {
         done: usize,
         of: usize,
     },
+    /// Start-up SDOs that the device held already.
+    Held {
+        device: String,
+        held: usize,
+        of: usize,
+    },
     ProcessData {
         bytes: usize,
         frames: usize,
@@ -130,6 +136,12 @@ impl fmt::Display for Step {
                 )
             }
             Self::StartUp { device, done, of } => write!(f, "`{device}`: start-up SDO {done}/{of}"),
+            Self::Held { device, held, of } => {
+                write!(
+                    f,
+                    "`{device}`: {held} of {of} start-up SDOs were held already"
+                )
+            }
             Self::ProcessData { bytes, frames } => {
                 write!(f, "process image: {bytes} bytes in {frames} frame(s)")
             }
@@ -194,6 +206,17 @@ pub enum BringUpError {
         value: String,
         origin: String,
         source: SdoError,
+    },
+    /// `verify` in the machine file.
+    #[error(
+        "{device}: start-up SDO {object} = {value} (from {origin}) was taken, but the device holds {holds}"
+    )]
+    NotHeld {
+        device: DeviceRef,
+        object: String,
+        value: String,
+        origin: String,
+        holds: String,
     },
     #[error(
         "{device}: reading the PDO mapping back: 0x{index:04x}:{sub:02x} holds {actual}, the ESI's layout has {expected}"

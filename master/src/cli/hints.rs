@@ -258,6 +258,9 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }
         BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
+        BringUpError::NotHeld { .. } => {
+            "the device rounds or limits the value, or another object has changed it: write what it holds, or leave `verify` out for this object".to_owned()
+        }
         BringUpError::Mailbox { source, .. }
         | BringUpError::ReadBack { source, .. }
         | BringUpError::ReadUnits { source, .. } => {

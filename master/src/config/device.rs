@@ -9,7 +9,7 @@ use toml::Spanned;
 
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, axis, sdo, sim};
+use super::{DeviceConfig, Locator, Startup, axis, sdo, sim};
 use crate::library::{self, Library, LoadError, Match};
 
 /// What all devices share: where ESI files are, those read so far, and the cycle.
@@ -209,6 +209,7 @@ pub(crate) fn check(
         };
         sim::check(sim, names, device, axis, p)
     });
+    let startup = Startup::of(&raw);
     let device = device.map(|d| Arc::new(d.clone()));
     let identity = identity(raw.identity.as_ref(), p);
     let (esi_path, file) = file?;
@@ -220,6 +221,7 @@ pub(crate) fn check(
         device: device?,
         esi: file,
         selection: chosen?,
+        startup,
         identity: identity?,
         serial: raw.serial.map(Spanned::into_inner),
         axis: match axis {

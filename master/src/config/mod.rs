@@ -9,6 +9,7 @@
 //! | `check.rs` | raw → [`Machine`]: bus, names, places |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
+//! | `startup.rs` | whether they are verified, or skipped where the device holds them |
 //! | `axis.rs` | limits; units in `axis/scale.rs`, loops, guards and homing in `axis/control.rs` |
 //! | `adopt.rs` | what the drive itself says of its units |
 //! | `sim.rs` | what only the simulated bus needs: connections, clocks |
@@ -36,6 +37,7 @@ mod raw;
 mod sdo;
 mod signal;
 pub mod sim;
+mod startup;
 pub(crate) mod steps;
 #[cfg(test)]
 mod tests;
@@ -46,6 +48,7 @@ pub use adopt::{Adopted, UnitProblem};
 pub(crate) use axis::is_maxon;
 pub use problem::{ConfigError, Problem, nearest};
 pub use signal::{AxisRef, InputRef, NameError, OutputRef};
+pub use startup::{Startup, StartupWay};
 
 pub use crate::rt::exchange::Mode as Exchange;
 
@@ -144,6 +147,7 @@ pub struct DeviceConfig {
     pub esi: Arc<esi::EsiFile>,
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
+    pub startup: Startup,
     /// Which revisions may stand for the ESI's.
     pub identity: Match,
     /// The one device that it must be.

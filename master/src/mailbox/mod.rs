@@ -22,7 +22,7 @@ mod objects;
 mod port;
 mod sdo;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod transfer;
 
 pub use abort::{abort_text, mailbox_error_text};

@@ -82,6 +82,8 @@ pub(crate) struct RawDevice {
     pub rx: Option<Spanned<Vec<RawEntry>>>,
     pub tx: Option<Spanned<Vec<RawEntry>>>,
     pub sdo: Vec<RawSdo>,
+    /// `startup`: of all start-up SDOs.
+    pub startup: RawStartup,
     pub axis: Option<RawAxis>,
     pub sim: Option<RawSim>,
 }
@@ -100,6 +102,14 @@ pub(crate) struct RawSdo {
     pub sub: u8,
     pub value: Spanned<SdoValue>,
     pub type_name: Option<Spanned<String>>,
+    pub startup: RawStartup,
+}
+
+/// What is done beside writing; `None`: the file does not say.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct RawStartup {
+    pub verify: Option<bool>,
+    pub skip_equal: Option<bool>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -226,6 +236,7 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
         rx: None,
         tx: None,
         sdo: Vec::new(),
+        startup: RawStartup::default(),
         axis: None,
         sim: None,
     };
@@ -233,6 +244,12 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
         device.rx = pdo.get("rx").and_then(|v| read_entries(v, p));
         device.tx = pdo.get("tx").and_then(|v| read_entries(v, p));
         pdo.done(p);
+    }
+    if let Some(value) = f.get("startup")
+        && let Some(mut startup) = fields::table(p, value, "`startup`")
+    {
+        device.startup = read_startup(&mut startup, p);
+        startup.done(p);
     }
     let sdos = f
         .get("sdo")
@@ -307,11 +324,19 @@ pub(crate) fn read_entries(
     Some(Spanned::new(all, entries))
 }
 
+fn read_startup(f: &mut Fields<'_>, p: &mut Problems<'_>) -> RawStartup {
+    RawStartup {
+        verify: optional!(p, f, "verify", boolean).map(Spanned::into_inner),
+        skip_equal: optional!(p, f, "skip_equal", boolean).map(Spanned::into_inner),
+    }
+}
+
 fn read_sdo(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawSdo> {
     let index = f.need("index", "index = 0x6065");
     let index = index.and_then(|v| fields::integer(p, v, 1, u16::MAX));
     let sub = optional!(p, f, "sub", integer(0, u8::MAX));
     let type_name = optional!(p, f, "type", string);
+    let startup = read_startup(&mut f, p);
     let value = f.need("value", "value = 2000").and_then(|v| {
         let read = match v.get_ref() {
             DeValue::Integer(_) => {
@@ -340,5 +365,6 @@ fn read_sdo(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawSd
         sub,
         value: value?,
         type_name,
+        startup,
     })
 }

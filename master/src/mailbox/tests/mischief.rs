@@ -36,6 +36,10 @@ pub enum Mischief {
     WrongToggle,
     /// Announces this size in normal uploads, whatever it sends.
     AnnounceSize(u32),
+    /// Takes what is written and keeps what it had.
+    Forgetful,
+    /// Does not let this object be read.
+    WriteOnly(u16),
     /// Every segment but the last is empty, and there is no last.
     EmptySegments,
 }

@@ -13,12 +13,12 @@ mod files;
 mod foe;
 mod hostile;
 mod info;
-mod mischief;
+pub(crate) mod mischief;
 mod recorded;
-mod server;
+pub(crate) mod server;
 mod transfers;
 
-const STATION: u16 = 0x1001;
+pub(crate) const STATION: u16 = 0x1001;
 
 fn layout(len: u16) -> MailboxLayout {
     MailboxLayout {
@@ -32,7 +32,7 @@ fn layout(len: u16) -> MailboxLayout {
     }
 }
 
-fn client() -> CoeClient {
+pub(crate) fn client() -> CoeClient {
     CoeClient::new(layout(48)).with_timeouts(Timeouts {
         request: Duration::from_millis(100),
         answer: Duration::from_millis(500),
@@ -41,7 +41,7 @@ fn client() -> CoeClient {
 }
 
 /// Nothing in these tests waits for anything but virtual time, so a future is ready at once.
-fn block_on<T>(future: impl Future<Output = T>) -> T {
+pub(crate) fn block_on<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     match future
         .as_mut()

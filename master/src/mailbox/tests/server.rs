@@ -260,6 +260,9 @@ impl Inner {
     fn begin_upload(&mut self, sdo: &[u8], len: usize) -> Vec<u8> {
         let (index, sub) = (u16::from_le_bytes([sdo[1], sdo[2]]), sdo[3]);
         let complete = sdo[0] & 0x10 != 0;
+        if self.is(&Mischief::WriteOnly(index)) {
+            return abort(index, sub, 0x0601_0001);
+        }
         let data = if complete {
             self.whole(index, sub)
         } else {
@@ -430,11 +433,14 @@ impl Inner {
             }
             return vec![0x70, address[0], address[1], sub, 0, 0, 0, 0];
         }
+        let forgetful = self.is(&Mischief::Forgetful);
         match self.objects.get_mut(&(index, sub)) {
             None => abort(index, sub, 0x0602_0000),
             Some(_) if index == 0x1000 => abort(index, sub, 0x0601_0002),
             Some(value) => {
-                *value = data.to_vec();
+                if !forgetful {
+                    *value = data.to_vec();
+                }
                 vec![0x60, address[0], address[1], sub, 0, 0, 0, 0]
             }
         }
