@@ -1,9 +1,13 @@
 //! Transfers beside the cycle, over a veth pair (root): drives on the simulated bus, in a process of its own, are asked for ten objects each
 //! over and over, in turns with runs in which nobody asks. What the real-time thread does is compared.
 //!
-//! `cargo bench -p ecaxis --bench mailboxes [-- AXES ASKED SECONDS ROUNDS]`; 8 8 10 3 if nothing is said. Without root it says so and ends.
+//! `cargo bench -p ecaxis --bench mailboxes [-- AXES ASKED SECONDS ROUNDS]`; 8 8 10 3 if nothing is said. With 0 rounds there is one with traffic,
+//! and programs beside it that keep a processor and the memory busy. Without root it says so and ends.
 
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
+
+#[path = "../axis/tests/counting/mod.rs"]
+mod counting;
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -14,6 +18,7 @@ use std::thread::JoinHandle;
 use ecaxis::bench::veth::VethPair;
 use ecaxis::config;
 use ecaxis::mailbox::Mailboxes;
+use ecaxis::rt::controller::{Controller, Cycle};
 use ecaxis::session::{self, Observer, Options, Progress, Summary};
 
 /// Identity, state, position and settings, as a commissioning tool would look at them.
@@ -34,6 +39,28 @@ const OBJECTS: [(u16, u8); 10] = [
 struct Counts {
     done: AtomicU64,
     failed: AtomicU64,
+}
+
+/// Cycles after which the real-time thread has everything that it will need.
+const SETTLED: u64 = 1_000;
+
+/// What the real-time thread allocates or frees once it has settled.
+struct Meter {
+    cycles: u64,
+    before: u64,
+    since: Arc<AtomicU64>,
+}
+
+impl Controller for Meter {
+    fn cycle(&mut self, _: &mut Cycle<'_>) {
+        let so_far = counting::allocations();
+        self.cycles += 1;
+        if self.cycles == SETTLED {
+            self.before = so_far;
+        } else if self.cycles > SETTLED {
+            self.since.store(so_far - self.before, Ordering::Relaxed);
+        }
+    }
 }
 
 /// Asks the first devices as long as the run lasts.
@@ -87,9 +114,10 @@ async fn ask(mailboxes: Mailboxes, devices: usize, counts: Arc<Counts>) {
     while tasks.join_next().await.is_some() {}
 }
 
-struct Bus(Child);
+/// Ends with this.
+struct Beside(Child);
 
-impl Drop for Bus {
+impl Drop for Beside {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -110,7 +138,25 @@ fn machine(nic: &str, axes: usize) -> String {
     text
 }
 
-fn run(nic: &str, axes: usize, asked: usize, seconds: u64) -> (Summary, u64, u64) {
+/// Arithmetic without end, and memory taken, written and given back.
+fn load() -> Vec<Beside> {
+    let arithmetic = "while :; do :; done";
+    let memory = "while :; do head -c 200000000 /dev/zero | tail -n 1 > /dev/null; done";
+    let start = |script| {
+        let child = Command::new("sh").args(["-c", script]).stdin(Stdio::null());
+        Beside(child.spawn().expect("a shell"))
+    };
+    [arithmetic, memory].map(start).into()
+}
+
+struct Ran {
+    summary: Summary,
+    done: u64,
+    failed: u64,
+    allocated: u64,
+}
+
+fn run(nic: &str, axes: usize, asked: usize, seconds: u64) -> Ran {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let text = machine(nic, axes);
     let machine = config::parse(&root.join("configs/bench.toml"), &text);
@@ -127,16 +173,25 @@ fn run(nic: &str, axes: usize, asked: usize, seconds: u64) -> (Summary, u64, u64
         ..Options::default()
     };
     let stop = Arc::new(AtomicBool::new(false));
-    let outcome = session::run(machine, options, stop, &mut observer);
+    let allocated = Arc::new(AtomicU64::new(u64::MAX));
+    let meter = Meter {
+        cycles: 0,
+        before: 0,
+        since: Arc::clone(&allocated),
+    };
+    let outcome = session::run_with(machine, options, stop, &mut observer, Box::new(meter));
     if let Some(user) = observer.user {
         user.join().expect("the user ends");
     }
     if let Err(error) = outcome.result {
         println!("the run ended: {error}");
     }
-    let summary = outcome.summary.expect("the cycle ran");
-    let failed = counts.failed.load(Ordering::Relaxed);
-    (summary, counts.done.load(Ordering::Relaxed), failed)
+    Ran {
+        summary: outcome.summary.expect("the cycle ran"),
+        done: counts.done.load(Ordering::Relaxed),
+        failed: counts.failed.load(Ordering::Relaxed),
+        allocated: allocated.load(Ordering::Relaxed),
+    }
 }
 
 fn us(ns: u64) -> f64 {
@@ -165,20 +220,27 @@ fn main() {
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn();
-    let _bus = Bus(bus.expect("taskset starts the bus"));
+    let _bus = Beside(bus.expect("taskset starts the bus"));
     std::thread::sleep(std::time::Duration::from_secs(1));
     println!("{axes} drives at 1 ms, {asked} of them asked; {rounds} rounds of {seconds} s each");
     println!(
-        "wake-up lateness p50/p99/p99.9/max, work p99.9, in us; page faults; switches a cycle"
+        "wake-up lateness p50/p99/p99.9/max, work p99.9, in us; page faults, allocations and frees after {SETTLED} cycles; switches a cycle"
     );
-    for round in 1..=rounds {
-        for devices in [0, asked] {
-            let (summary, done, failed) = run(&pair.a, axes, devices, seconds);
+    let _load = if rounds == 0 { load() } else { Vec::new() };
+    let turns: &[usize] = if rounds == 0 { &[asked] } else { &[0, asked] };
+    for round in 1..=rounds.max(1) {
+        for &devices in turns {
+            let Ran {
+                summary,
+                done,
+                failed,
+                allocated,
+            } = run(&pair.a, axes, devices, seconds);
             let late = &summary.wake_up_lateness;
             let thread = summary.thread.as_ref().map(|thread| thread.used);
             let cycles = summary.counters.cycles.max(1);
             println!(
-                "{round} asked {devices}: {:.2} / {:.1} / {:.1} / {:.0}, work {:.1}; {}; {:.2}; {} cycles, {} lost, {} wkc; {:.0} transfers/s, {failed} failed at the end",
+                "{round} asked {devices}: {:.2} / {:.1} / {:.1} / {:.0}, work {:.1}; {}, {allocated}; {:.2}; {} cycles, {} lost, {} wkc; {:.0} transfers/s, {failed} failed at the end",
                 us(late.p50_ns),
                 us(late.p99_ns),
                 us(late.p99_9_ns),

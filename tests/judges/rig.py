@@ -187,14 +187,21 @@ def served(program, machine, nic, faults=None, options=()):
             bus.end()
 
 
+def packets(nic, way):
+    return int(pathlib.Path(f"/sys/class/net/{nic}/statistics/{way}_packets").read_text())
+
+
 @contextlib.contextmanager
-def recorded(nic, path):
+def recorded(nic, path, steady):
     """Every frame on the interface, both ways, as pcapng."""
     command = [sys.executable, str(HERE / "recorder.py"), nic, str(path)]
     with process(command, stdout=subprocess.PIPE) as child:
         child.stdout.readline()
         yield
-        # What has been received is to be written.
+        # Every answer is to come, and to be written.
+        deadline = time.monotonic() + 10
+        while steady and packets(nic, "rx") < packets(nic, "tx") and time.monotonic() < deadline:
+            time.sleep(0.05)
         time.sleep(0.2)
         child.send_signal(signal.SIGTERM)
         child.wait(timeout=30)

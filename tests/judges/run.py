@@ -17,6 +17,7 @@ import pathlib
 import signal
 import sys
 import tempfile
+import traceback
 
 import rig
 from report import Report, Stop
@@ -62,6 +63,11 @@ def run(arguments, report):
                 getattr(sections, name)(bench)
             except Stop:
                 report.note("the rest of this section is left out")
+            except rig.Skip:
+                raise
+            except Exception as error:
+                traceback.print_exc()
+                report.check(f"{name} comes to its end", False, repr(error))
 
 
 if __name__ == "__main__":

@@ -9,16 +9,21 @@ thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
+fn count() {
+    ALLOCATIONS.with(|n| n.set(n.get() + 1));
+}
+
 // SAFETY: every call is passed on unchanged to the system's allocator; counting touches only a const-initialised
 // thread-local without a destructor, which does not allocate.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|n| n.set(n.get() + 1));
+        count();
         // SAFETY: the caller keeps the contract of `alloc`.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
+        count();
         // SAFETY: `at` came from `alloc` above, that is, from the system's allocator, with this layout.
         unsafe { System.dealloc(at, layout) }
     }
@@ -27,7 +32,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// By this thread, so far.
+/// Allocations and frees by this thread, so far.
 pub fn allocations() -> u64 {
     ALLOCATIONS.with(Cell::get)
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ecaxis::config::duration;
 use ecaxis::rt::history::AxisCycle;
-use ecaxis::story::diagnose::about;
+use ecaxis::story::cause::about;
 use ecaxis::story::page::{CyclePage, DevicePage};
 use ecaxis::story::{Cause, Story};
 use ecaxis_axis::cia402::{State, Statusword};

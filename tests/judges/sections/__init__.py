@@ -28,6 +28,22 @@ MAXON = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml"
 OWN = rig.ROOT / "configs/esi"
 
 
+@contextlib.contextmanager
+def patience(master):
+    """SOEM takes an answer that it has given up for that of its next question; this computer may stall for a second."""
+    timeouts = pysoem.settings.timeouts
+    names = ("ret", "eeprom", "tx_mailbox", "rx_mailbox")
+    before = {name: getattr(timeouts, name) for name in names}
+    for name in names:
+        setattr(timeouts, name, cycle.PATIENCE_US)
+    master.sdo_read_timeout = master.sdo_write_timeout = cycle.PATIENCE_US
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(timeouts, name, value)
+
+
 @dataclass
 class Bench:
     """Where a section works."""
@@ -63,7 +79,7 @@ class Bench:
         """The bus, served, recorded, and the recording judged."""
         recording = self.folder / f"{name}.pcapng"
         with rig.served(self.program, machine, self.bus, faults, options) as bus:
-            with rig.recorded(self.nic, recording):
+            with rig.recorded(self.nic, recording, steady):
                 yield bus
             code, output = bus.end()
             self.report.equal("the simulated bus ends in order on SIGINT", code, 0)
@@ -73,12 +89,12 @@ class Bench:
         judge(self, recording, [device.dc for device in machine.devices], steady)
 
     @contextlib.contextmanager
-    def master(self, second=None):
-        """pysoem; with a second interface, with cable redundancy."""
+    def master(self, second=None, patient=True):
+        """pysoem; with a second interface, with cable redundancy. Where frames are meant to vanish it is not to wait for them."""
         master = pysoem.Master()
         master.open(self.nic, second)
         try:
-            with cycle.real_time():
+            with cycle.real_time(), patience(master) if patient else contextlib.nullcontext():
                 yield master
         finally:
             master.state = pysoem.INIT_STATE

@@ -83,7 +83,7 @@ def nodes(bench, device):
     report.equal("all nodes are started", device.command(START, ALL), START, hex)
     for node in (1, 2):
         # A heartbeat tells it.
-        end = time.monotonic() + 2
+        end = time.monotonic() + 10
         while device.command(NODE_STATE, node) != NODE_STATE | OPERATIONAL and time.monotonic() < end:
             pass
         state = device.command(NODE_STATE, node)

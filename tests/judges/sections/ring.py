@@ -14,12 +14,12 @@ def ring(bench):
     machine = bench.machine()
     with rig.veth_pair("cd") as (bus, nic):
         options = ["--nic2", bus]
-        with bench.serve(machine, "ring", BREAK, options, steady=False) as served, bench.master(nic) as master:
+        with bench.serve(machine, "ring", BREAK, options, steady=False) as served, bench.master(nic, patient=False) as master:
             bench.found(master, machine)
             master.config_map()
             for slave, device in zip(master.slaves, machine.devices):
                 if device.rx_bits:
-                    slave.set_watchdog("processdata", 300)
+                    slave.set_watchdog("processdata", 2_000)
             cycle = cyclic.to_op(master, expected_wkc(machine))
             report.need("Op", cycle is not None, cyclic.states(master))
             cycle.forget()
@@ -29,7 +29,7 @@ def ring(bench):
             lost = cycle.missed + sum(cycle.wrong.values())
             report.check("all cycles but a few have the full working counter", lost < 100, cycle)
             # Lost link counters: port 1 of x, port 0 of y.
-            links = master.slaves[0]._fprd(0x0310, 4), master.slaves[1]._fprd(0x0310, 4)
+            links = master.slaves[0]._fprd(0x0310, 4, cyclic.PATIENCE_US), master.slaves[1]._fprd(0x0310, 4, cyclic.PATIENCE_US)
             report.equal("both ends have counted the break", (links[0][1], links[1][0]), (1, 1))
             report.equal("nobody left Op", set(cyclic.states(master)), {"Op"})
             mirror(bench, cycle, master, machine)
