@@ -9,7 +9,6 @@ use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::look::SyncLook;
 use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
-use crate::clock::Nanos;
 use crate::mailbox::SdoError;
 use crate::rt::stats::Counters;
 use crate::session::RunError;

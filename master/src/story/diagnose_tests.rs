@@ -1,6 +1,7 @@
 //! A line of three devices and what can be seen of it; one row a failure.
 
 use super::*;
+use crate::clock::Nanos;
 use crate::link::LinkStats;
 use crate::rt::exchange::ErrorCounters;
 use crate::rt::guard::StopCause;
@@ -8,6 +9,7 @@ use crate::rt::handover::Event;
 use crate::rt::journal::{Entry, Note};
 use crate::rt::stats::Counters;
 use crate::story::Look;
+use crate::story::cause::about;
 use crate::story::look::WatchdogLook;
 
 const MS: Nanos = 1_000_000;
