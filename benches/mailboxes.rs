@@ -143,8 +143,11 @@ fn load() -> Vec<Beside> {
     let arithmetic = "while :; do :; done";
     let memory = "while :; do head -c 200000000 /dev/zero | tail -n 1 > /dev/null; done";
     let start = |script| {
-        let child = Command::new("sh").args(["-c", script]).stdin(Stdio::null());
-        Beside(child.spawn().expect("a shell"))
+        let child = Command::new("sh")
+            .args(["-c", script])
+            .stdin(Stdio::null())
+            .spawn();
+        Beside(child.expect("a shell"))
     };
     [arithmetic, memory].map(start).into()
 }

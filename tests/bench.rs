@@ -3,6 +3,9 @@
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
+#[path = "common/wire.rs"]
+mod wire;
+
 use std::num::NonZeroU64;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -13,29 +16,20 @@ use ecaxis::bench::bus::{Bus, Counts, Hold, Mischief, Options};
 use ecaxis::bench::in_process::InProcess;
 use ecaxis::bench::rig::{self, Setup};
 use ecaxis::bench::turn::{self, Measured, Thread};
-use ecaxis::bench::veth::{VethPair, leftovers};
+use ecaxis::bench::veth::leftovers;
 use ecaxis::config::Exchange;
 use ecaxis::link::capture::{Mode, Recorder};
 use ecaxis::link::recorded::Recorded;
 use ecaxis::link::{self, BackEnd, Link};
 use ecaxis::rt::margin::Spin;
 use ecaxis_sim::frame::{self, Command};
+use wire::pair;
 
 /// Two real-time threads on two processors leave no room for another two.
 static ALONE: Mutex<()> = Mutex::new(());
 
 fn alone() -> MutexGuard<'static, ()> {
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-fn pair() -> Option<VethPair> {
-    match VethPair::new() {
-        Ok(pair) => Some(pair),
-        Err(error) => {
-            println!("skipped: a veth pair needs root: {error}");
-            None
-        }
-    }
 }
 
 fn exists(nic: &str) -> bool {
@@ -141,8 +135,16 @@ fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
         late_every: Some((every, 6_000_000)),
         ..Mischief::default()
     };
-    let Some((measured, bus)) = over_veth(late, BackEnd::Ring) else {
-        return;
+    // A computer that stalls leaves few cycles; then once more.
+    let mut tries = 0;
+    let (measured, bus) = loop {
+        let Some((measured, bus)) = over_veth(late, BackEnd::Ring) else {
+            return;
+        };
+        tries += 1;
+        if measured.stats.counters.cycles > 300 || tries == 3 {
+            break (measured, bus);
+        }
     };
     let counters = measured.stats.counters;
     assert!(bus.delayed > 10, "{bus:?}");
@@ -270,6 +272,6 @@ fn an_interrupt_ends_a_bench_before_anything_moves() {
 }
 
 #[test]
-fn too_many_axes_are_refused() {
+fn the_most_axes_fit_a_bus() {
     assert!(rig::segment(rig::MOST_AXES).is_ok());
 }

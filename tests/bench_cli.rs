@@ -2,6 +2,9 @@
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
+#[path = "common/wire.rs"]
+mod wire;
+
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::thread;
@@ -183,10 +186,7 @@ fn soon(what: impl Fn() -> bool) -> bool {
 /// Whatever ends a bench, its interfaces go with it.
 #[test]
 fn a_bench_leaves_no_interface_behind() {
-    if ecaxis::bench::veth::VethPair::new().is_err() {
-        println!("skipped: a veth pair needs root");
-        return;
-    }
+    let Some(_) = wire::pair() else { return };
     for signal in ["-INT", "-KILL"] {
         let line = "--axes 1 --cycle 5ms --seconds 100";
         let mut command = ecaxis(&line.split(' ').collect::<Vec<_>>());

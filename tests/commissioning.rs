@@ -13,3 +13,5 @@ mod compare;
 mod scan;
 #[path = "commissioning/story.rs"]
 mod story;
+#[path = "common/wire.rs"]
+mod wire;

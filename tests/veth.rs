@@ -1,39 +1,22 @@
 //! Two processes, the simulated bus and the master, on the two ends of a veth pair. Needs root.
 
-#![allow(clippy::print_stdout, reason = "a skipped test says why")]
+#![allow(clippy::print_stdout, reason = "what was counted")]
 
 mod common;
 
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Mutex;
 use std::time::Duration;
 
 use common::root;
+use common::wire::{Told, pair};
 use ecaxis::bench::veth::VethPair;
 use ecaxis::link::BackEnd;
 
-/// `None`, with the reason printed, where interfaces may not be created.
-fn pair() -> Option<VethPair> {
-    match VethPair::new() {
-        Ok(pair) => Some(pair),
-        Err(error) => {
-            println!("skipped: a veth pair needs root: {error}");
-            None
-        }
-    }
-}
-
 /// The demo's bus on one end of the pair, and the machine file for the other.
 struct Served {
-    child: Child,
+    _bus: Told,
     file: tempfile::NamedTempFile,
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
 }
 
 fn ecaxis() -> Command {
@@ -63,8 +46,7 @@ static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 /// With `more` in the file's [bus].
 fn serve(pair: &VethPair, more: &str) -> Served {
     let apart = can_be_kept_apart();
-    // The demo, but patient: a busy test machine may hold either process up for longer than three
-    // cycles, and both ends share its processors.
+    // The demo, but patient: a busy test machine may hold either process up for long, and both ends share its processors.
     let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demo");
     let file = tempfile::Builder::new()
         .prefix("test-veth-")
@@ -72,17 +54,14 @@ fn serve(pair: &VethPair, more: &str) -> Served {
         .tempfile_in(root().join("configs"))
         .expect("a temporary file");
     let cpu = if apart { "cpu = 1" } else { "" };
-    let patient = format!("lost_frames = 900\nwatchdog = \"2s\"\n{cpu}\n{more}");
+    let patient = format!("lost_frames = 1000\nwatchdog = \"6s\"\n{cpu}\n{more}");
     std::fs::write(file.path(), demo.replace("lost_frames = 20", &patient)).expect("written");
     let path = file.path().to_str().expect("a path in UTF-8");
-    let child = if apart { on_cpu_0() } else { ecaxis() }
-        .args(["sim", path, "--nic", &pair.a])
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the binary starts");
-    std::thread::sleep(Duration::from_millis(300));
-    Served { child, file }
+    let mut command = if apart { on_cpu_0() } else { ecaxis() };
+    command.args(["sim", path, "--nic", &pair.a]);
+    let mut bus = Told::start(command.stdout(Stdio::null()));
+    bus.says("answer");
+    Served { _bus: bus, file }
 }
 
 #[test]
@@ -127,18 +106,14 @@ fn an_interface_goes_down_and_up_again_while_the_machine_runs() {
     for link in BackEnd::ALL {
         let served = serve(&pair, &format!("link = \"{link}\""));
         let file = served.file.path().to_str().expect("a path in UTF-8");
-        let run = ecaxis()
-            .args(["run", file, "--nic", &pair.b, "--json"])
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("the binary runs");
-        // In the middle of the first moves.
-        std::thread::sleep(Duration::from_millis(3_000));
+        let mut command = ecaxis();
+        command.args(["run", file, "--nic", &pair.b, "--json"]);
+        let mut run = Told::start(command.stdout(Stdio::piped()));
+        run.says("run 1, step 1: ");
         pair.set(&pair.b, false).expect("down");
         std::thread::sleep(Duration::from_millis(100));
         pair.set(&pair.b, true).expect("up");
-        let output = run.wait_with_output().expect("it ends");
+        let output = run.end();
         let errors = String::from_utf8_lossy(&output.stderr);
         let result: serde_json::Value =
             serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {errors}"));

@@ -1,13 +1,13 @@
 //! What docs/first-steps.md shows is what happens.
 
 use std::path::Path;
-use std::process::{Child, Stdio};
+use std::process::Stdio;
 use std::sync::Mutex;
-use std::time::Duration;
 
 use ecaxis::bench::veth::VethPair;
 
 use crate::bench::{Bench, root};
+use crate::wire::{Told, pair};
 
 /// The interface of the document.
 const NIC: &str = "enp3s0";
@@ -137,35 +137,11 @@ fn first_steps_on_the_simulated_bus() {
 }
 
 /// The simulated bus of another process.
-struct Served(Child);
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// `None`, with the reason printed, where interfaces may not be created.
-fn pair() -> Option<VethPair> {
-    match VethPair::new() {
-        Ok(pair) => Some(pair),
-        Err(error) => {
-            println!("skipped: a veth pair needs root: {error}");
-            None
-        }
-    }
-}
-
-fn serve(bench: &Bench, pair: &VethPair) -> Served {
-    let served = bench
-        .command(env!("CARGO_BIN_EXE_ecaxis"))
-        .args(["sim", "bench.toml", "--nic", &pair.a])
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn();
-    let served = Served(served.expect("the binary starts"));
-    std::thread::sleep(Duration::from_millis(500));
+fn serve(bench: &Bench, pair: &VethPair) -> Told {
+    let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
+    command.args(["sim", "bench.toml", "--nic", &pair.a]);
+    let mut served = Told::start(command.stdout(Stdio::null()));
+    served.says("answer");
     served
 }
 
@@ -177,7 +153,7 @@ fn patient(text: &str) -> String {
     assert!(text.contains("lost_frames = 20"), "{text}");
     text.replace(
         "lost_frames = 20",
-        "lost_frames = 900\nwatchdog = \"2s\"\n#",
+        "lost_frames = 1000\nwatchdog = \"6s\"\n#",
     )
 }
 
@@ -189,36 +165,20 @@ fn a_running_machine_is_left_alone() {
     let bench = bench();
     bench.write("machine.toml", &patient(&bench.read("bench.toml")));
     let _served = serve(&bench, &pair);
-    let run = bench
-        .command(env!("CARGO_BIN_EXE_ecaxis"))
-        .args(["run", "machine.toml", "--nic", &pair.b])
-        .args(["--no-enable", "--for", "8s", "--json"])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the binary starts");
-    let mut seen = serde_json::Value::Null;
-    for _ in 0..30 {
-        std::thread::sleep(Duration::from_millis(200));
-        let ran = bench.ecaxis(&["scan", &pair.b, "--ask", "--json"]);
-        seen = serde_json::from_str(&ran.out).expect("JSON");
-        if seen["devices"]
-            .as_array()
-            .is_some_and(|all| all.iter().all(|d| d["state"] == "Op"))
-        {
-            assert!(
-                ran.err.contains("another master is driving this bus"),
-                "{}",
-                ran.err
-            );
-            break;
-        }
-    }
+    let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
+    command.args(["run", "machine.toml", "--nic", &pair.b]);
+    command.args(["--no-enable", "--for", "8s", "--json"]);
+    let mut run = Told::start(command.stdout(Stdio::piped()));
+    run.says("all SubDevices in Op");
+    let ran = bench.ecaxis(&["scan", &pair.b, "--ask", "--json"]);
+    let seen: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
+    let warned = ran.err.contains("another master is driving this bus");
+    assert!(warned, "{}", ran.err);
     assert_eq!(seen["other_master"], true, "{seen:#}");
     assert_eq!(seen["asked"], false);
     assert_eq!(seen["devices"][5]["state"], "Op", "{seen:#}");
     assert_eq!(seen["devices"][5]["serial"], 1005);
-    let ended = run.wait_with_output().expect("it ends");
+    let ended = run.end();
     let ended: serde_json::Value = serde_json::from_slice(&ended.stdout).expect("JSON");
     assert_eq!(ended["ok"], true, "{ended:#}");
     assert_eq!(ended["summary"]["counters"]["wkc_errors"], 0, "{ended:#}");

@@ -4,6 +4,7 @@
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
 pub mod script;
+pub mod wire;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -197,10 +197,11 @@ def recorded(nic, path, steady):
     command = [sys.executable, str(HERE / "recorder.py"), nic, str(path)]
     with process(command, stdout=subprocess.PIPE) as child:
         child.stdout.readline()
+        owed = packets(nic, "tx") - packets(nic, "rx")
         yield
         # Every answer is to come, and to be written.
         deadline = time.monotonic() + 10
-        while steady and packets(nic, "rx") < packets(nic, "tx") and time.monotonic() < deadline:
+        while steady and packets(nic, "tx") - packets(nic, "rx") > owed and time.monotonic() < deadline:
             time.sleep(0.05)
         time.sleep(0.2)
         child.send_signal(signal.SIGTERM)

@@ -1,0 +1,99 @@
+//! Pairs of virtual interfaces, and programs on their ends.
+
+#![allow(dead_code, reason = "every test binary uses a part")]
+#![allow(clippy::print_stdout, reason = "a skipped test says why")]
+
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+use ecaxis::bench::veth::VethPair;
+
+/// Much longer than anything takes.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// `None`, with the reason printed, where interfaces may not be created.
+pub fn pair() -> Option<VethPair> {
+    match VethPair::new() {
+        Ok(pair) => Some(pair),
+        Err(error) => {
+            let root = rustix::process::geteuid().is_root();
+            let on_ci = std::env::var_os("CI").is_some();
+            assert!(!(root && on_ci), "no pair of interfaces on CI: {error}");
+            println!("skipped: a veth pair needs root: {error}");
+            None
+        }
+    }
+}
+
+/// A program whose messages are read while it runs, and which ends with this.
+pub struct Told {
+    child: Child,
+    lines: Receiver<String>,
+    heard: String,
+}
+
+impl Told {
+    pub fn start(command: &mut Command) -> Self {
+        let mut child = command.stderr(Stdio::piped()).spawn().expect("it starts");
+        let messages = BufReader::new(child.stderr.take().expect("piped"));
+        let (to, lines) = channel();
+        std::thread::spawn(move || {
+            for line in messages.lines() {
+                let Ok(line) = line else { return };
+                if to.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        Self {
+            child,
+            lines,
+            heard: String::new(),
+        }
+    }
+
+    /// Until a message says this.
+    #[track_caller]
+    pub fn says(&mut self, text: &str) {
+        let began = Instant::now();
+        loop {
+            let left = PATIENCE.saturating_sub(began.elapsed());
+            match self.lines.recv_timeout(left) {
+                Ok(line) => {
+                    self.heard += &line;
+                    self.heard.push('\n');
+                    if line.contains(text) {
+                        return;
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => panic!("never `{text}`:\n{}", self.heard),
+                Err(RecvTimeoutError::Disconnected) => {
+                    panic!("ended without `{text}`:\n{}", self.heard)
+                }
+            }
+        }
+    }
+
+    /// What it leaves, with all of its messages.
+    pub fn end(mut self) -> Output {
+        let stdout = self.child.stdout.take();
+        let stdout = stdout.map(std::io::read_to_string).transpose();
+        let status = self.child.wait().expect("it ends");
+        let rest = self.lines.iter().map(|line| line + "\n");
+        self.heard.extend(rest);
+        Output {
+            status,
+            stdout: stdout.expect("text").unwrap_or_default().into_bytes(),
+            stderr: std::mem::take(&mut self.heard).into_bytes(),
+        }
+    }
+}
+
+impl Drop for Told {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
