@@ -3,8 +3,14 @@
 use std::path::Path;
 use std::process::Stdio;
 use std::sync::Mutex;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use ecaxis::bench::veth::VethPair;
+use ecaxis::clock::Clock;
+use ecaxis::link::{self, BackEnd};
+use ecaxis::mailbox::Wire;
+use ecaxis::service::{Datagrams, carry};
 
 use crate::bench::{Bench, root};
 use crate::wire::{Told, pair};
@@ -138,11 +144,34 @@ fn first_steps_on_the_simulated_bus() {
 
 /// The simulated bus of another process.
 fn serve(bench: &Bench, pair: &VethPair) -> Told {
+    serve_file(bench, pair, "bench.toml")
+}
+
+pub fn serve_file(bench: &Bench, pair: &VethPair, file: &str) -> Told {
     let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
-    command.args(["sim", "bench.toml", "--nic", &pair.a]);
+    command.args(["sim", file, "--nic", &pair.a]);
     let mut served = Told::start(command.stdout(Stdio::null()));
     served.says("answer");
     served
+}
+
+/// Leads a device whose controller takes every state to SafeOp, as another master would have left it.
+pub fn led_to_safe_op(pair: &VethPair, position: u16) {
+    let (mut link, _) = link::open(&pair.b, BackEnd::default()).expect("the interface");
+    let stop = AtomicBool::new(false);
+    let led = carry(
+        link.as_mut(),
+        Clock::Real,
+        &stop,
+        async |wire: Datagrams| {
+            for state in [2, 4] {
+                let took = wire.write_at(position, 0x0120, &[state, 0]).await;
+                assert_eq!(took.expect("an answer"), 1);
+                wire.delay(Duration::from_millis(100)).await;
+            }
+        },
+    );
+    led.expect("carried");
 }
 
 /// The two tests would take each other's processors.
@@ -204,4 +233,23 @@ fn first_steps_over_a_real_interface() {
         }
     };
     follow(&bench, as_here, as_there, after);
+}
+
+/// A run leaves no sign of itself: what a scan writes after it is what it wrote before.
+#[test]
+fn a_run_leaves_a_quiet_bus() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    let bench = bench();
+    let _served = serve(&bench, &pair);
+    bench.well(&["scan", &pair.b, "--write", "before.toml"]);
+    bench.write("machine.toml", &patient(&bench.read("before.toml")));
+    bench.well(&["run", "machine.toml", "--no-enable", "--for", "500ms"]);
+    let ran = bench.ecaxis(&["scan", &pair.b, "--write", "after.toml"]);
+    assert_eq!((ran.code, ran.err.as_str()), (0, ""));
+    assert_eq!(bench.read("after.toml"), bench.read("before.toml"));
+    // Everything was asked, though devices have forgotten the 0x6060 of the run.
+    let ran = bench.ecaxis(&["compare", "machine.toml", "--parameters", "--json"]);
+    let json: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
+    assert_eq!(json["not_compared"], serde_json::json!([]), "{json:#}");
 }

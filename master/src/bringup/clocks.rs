@@ -15,7 +15,7 @@ use crate::wire::Datagrams;
 const STEP: &str = "starting SYNC0";
 const SYSTEM_TIME: u16 = 0x0910;
 /// 0x0980 cyclic unit control, 0x0981 activation.
-const ACTIVATION: u16 = 0x0980;
+pub(crate) const ACTIVATION: u16 = 0x0980;
 const START_TIME: u16 = 0x0990;
 const SYNC0_CYCLE: u16 = 0x09a0;
 const SYNC1_CYCLE: u16 = 0x09a4;
@@ -110,6 +110,17 @@ pub(super) async fn configure(
     Err(BringUpError::NoStart {
         device: reference.at.clone(),
     })
+}
+
+/// Ends SYNC0 and SYNC1 of devices that are in PreOp or Init again: it is a sign of somebody who drives the segment.
+pub(crate) async fn stop(wire: &impl Wire, stations: impl Iterator<Item = u16>) {
+    for station in stations {
+        // The segment goes to Init all the same.
+        if let Err(error) = wire.write(station, ACTIVATION, &[0, 0]).await {
+            tracing::debug!("SYNC0 goes on: {error}");
+            break;
+        }
+    }
 }
 
 /// Sets the clocks anew, by the first device that has one. ethercrab takes the first that has receive times for the reference; where that one

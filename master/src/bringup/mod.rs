@@ -23,7 +23,7 @@ use crate::rt::phase::ClockPlan;
 use crate::wire::Datagrams;
 
 pub mod al;
-mod clocks;
+pub(crate) mod clocks;
 mod device;
 mod held;
 mod identify;

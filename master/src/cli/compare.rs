@@ -68,7 +68,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let nic = bus.nic();
     let library = args.apply.then(|| library(args, &machine)).transpose()?;
-    let (scan, comparison) = look(bus, &machine, args)?;
+    let (scan, mut comparison) = look(bus, &machine, args)?;
+    if args.parameters && !scan.asked {
+        let text = "the parameters: the devices were not asked";
+        comparison.unknown.push(text.to_owned());
+    }
     let seen = Seen::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
     if seen.scan.devices.iter().any(|device| device.sii.is_err()) {
@@ -79,6 +83,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     for unknown in &comparison.unknown {
         bus::warn(format_args!("not compared: {unknown}"));
     }
+    // Without parameters, what a bus that somebody drives tells is all that was wanted.
+    let complete = !args.parameters || comparison.unknown.is_empty();
     let differences: Vec<String> = comparison
         .differences
         .iter()
@@ -87,15 +93,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         result(&format!(
             "{:#}\n",
-            as_json(&machine, &comparison, &seen.scan)
+            as_json(&machine, &comparison, &seen.scan, complete)
         ))?;
-    } else if differences.is_empty() {
+    } else if differences.is_empty() && comparison.unknown.is_empty() {
         result("as in the file\n")?;
+    } else if differences.is_empty() {
+        result("as in the file, as far as it could be compared\n")?;
     } else {
         result(&(differences.join("\n") + "\n"))?;
     }
     if differences.is_empty() {
-        return Ok(());
+        return if complete {
+            Ok(())
+        } else {
+            Err(incomplete(&args.file, seen.scan.asked))
+        };
     }
     if args.apply {
         return rewrite(args, &machine, &seen, &comparison);
@@ -116,6 +128,18 @@ fn differs(file: &Path, count: usize) -> Failure {
     Failure::new(hints::FAILED, message).hint(
         "correct the bus, or `--apply` makes the file as the bus is; what revisions may stand for others, `identity` says",
     )
+}
+
+fn incomplete(file: &Path, asked: bool) -> Failure {
+    let message = format!(
+        "not all parameters could be compared with {}",
+        file.display()
+    );
+    Failure::new(hints::FAILED, message).hint(if asked {
+        "once the devices named above answer, compare again"
+    } else {
+        "end the other master and compare again; `--intrude` asks the devices all the same"
+    })
 }
 
 fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), Failure> {
@@ -231,7 +255,8 @@ fn refused(file: &Path, error: &ApplyError) -> Failure {
     }
 }
 
-fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan) -> Value {
+/// `complete`: everything that was wanted was compared.
+fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan, complete: bool) -> Value {
     let name = |index: usize| machine.devices.get(index).map(|d| d.name.clone());
     let each: Vec<Value> = comparison
         .differences
@@ -269,7 +294,7 @@ fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan) -> Value {
         })
         .collect();
     json!({
-        "equal": each.is_empty(),
+        "equal": each.is_empty() && complete,
         "differences": each,
         "not_compared": comparison.unknown,
     })

@@ -93,16 +93,10 @@ pub async fn look(
     }
     for device in found {
         let position = device.position;
-        if matches!(device.state, AlState::SafeOp | AlState::Op) {
-            let state = device.state;
-            signs.push(Sign::State { position, state });
-        }
-        // SYNC0 and SYNC1, where there is a clock.
         let mut activation = [0; 1];
         let answer = wire.read_at(position, ACTIVATION, &mut activation).await;
-        if matches!(answer, Ok(1..)) && activation[0] & 0x06 != 0 && activation[0] & 1 != 0 {
-            signs.push(Sign::Sync { position });
-        }
+        let clocked = matches!(answer, Ok(1..));
+        signs.extend(left(device, clocked.then_some(activation[0])));
     }
     let mut first: Vec<Look> = Vec::with_capacity(found.len());
     for n in 0..LOOKS {
@@ -119,6 +113,18 @@ pub async fn look(
         }
     }
     Ok(signs)
+}
+
+/// What somebody must have led a device to. `activation`: 0x0981, where there is a clock.
+fn left(device: &Found, activation: Option<u8>) -> impl Iterator<Item = Sign> + use<> {
+    let (position, state) = (device.position, device.state);
+    let led = matches!(state, AlState::SafeOp | AlState::Op);
+    // Below SafeOp nobody uses SYNC0 or SYNC1: it is what a MainDevice that went away has forgotten.
+    let sync = led && activation.is_some_and(|on| on & 1 != 0 && on & 0x06 != 0);
+    let state = led.then_some(Sign::State { position, state });
+    state
+        .into_iter()
+        .chain(sync.then_some(Sign::Sync { position }))
 }
 
 /// What has changed, once each.
@@ -202,6 +208,31 @@ mod tests {
         ]
         .concat();
         assert_eq!(full_buffers(&all), 0b00_10_00_00);
+    }
+
+    #[test]
+    fn sync0_is_a_sign_where_it_is_used() {
+        for (state, activation, expected) in [
+            (AlState::Init, Some(3), 0),
+            (AlState::PreOp, Some(7), 0),
+            (AlState::SafeOp, None, 1),
+            (AlState::SafeOp, Some(1), 1),
+            (AlState::SafeOp, Some(2), 1),
+            (AlState::SafeOp, Some(3), 2),
+            (AlState::Op, Some(5), 2),
+        ] {
+            let found = Found {
+                position: 1,
+                station: 0x1001,
+                alias: 0,
+                state,
+                error: false,
+                code: 0,
+            };
+            let signs: Vec<_> = left(&found, activation).collect();
+            assert_eq!(signs.len(), expected, "{state} {activation:?}: {signs:?}");
+            assert!(!signs.iter().any(Sign::is_live));
+        }
     }
 
     #[test]

@@ -4,18 +4,24 @@ use std::future::{Future, poll_fn};
 use std::path::Path;
 use std::pin::pin;
 use std::sync::atomic::AtomicBool;
-use std::task::Poll;
+use std::sync::mpsc::channel;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::task::{Context, Poll, Waker};
 use std::time::Duration;
+
+use ecaxis_sim::FaultScript;
 
 use super::{Options, Scan, Sign, scan};
 use crate::bringup::AlState;
-use crate::clock::Clock;
-use crate::config;
+use crate::clock::{Clock, Nanos};
+use crate::config::{self, Machine};
 use crate::link::sim::SimLink;
+use crate::link::{Link, LinkError, MAX_FRAME};
 use crate::mailbox::Wire;
+use crate::rt::cycle::Engine;
 use crate::service::station::{address, census};
 use crate::service::{Datagrams, carry};
-use crate::session::simulated_bus;
+use crate::session::{self, Prepared, prepare_on, simulated_bus};
 
 const STACK: usize = 16 * 1024 * 1024;
 
@@ -131,8 +137,33 @@ fn another_master_shows_by_the_time_that_it_gives() {
     }
 }
 
+/// A terminal goes where AL control says.
 #[test]
 fn a_bus_that_was_left_running() {
+    let (scan, link) = on("terminals.toml", async |wire| {
+        let mut found = census(&wire).await.expect("devices");
+        address(&wire, &mut found).await.expect("addresses");
+        let station = found[1].station;
+        for state in [2, 4] {
+            wire.write(station, 0x0120, &[state, 0])
+                .await
+                .expect("written");
+        }
+        let ask = Options {
+            ask: true,
+            ..Options::default()
+        };
+        scanned(&wire, ask).await
+    });
+    let state = AlState::SafeOp;
+    assert_eq!(scan.others, [Sign::State { position: 1, state }]);
+    assert!(!scan.asked);
+    assert_eq!(states(&link, 3), ["Init", "SafeOp", "Init"]);
+}
+
+/// SYNC0 of a device in Init was forgotten by somebody; nobody is disturbed.
+#[test]
+fn a_forgotten_sync0_is_no_master() {
     let (scan, link) = on("demo.toml", async |wire| {
         let mut found = census(&wire).await.expect("two");
         address(&wire, &mut found).await.expect("addresses");
@@ -151,9 +182,119 @@ fn a_bus_that_was_left_running() {
         };
         scanned(&wire, ask).await
     });
-    assert_eq!(scan.others, [Sign::Sync { position: 1 }]);
-    assert!(!scan.asked);
+    assert_eq!(scan.others, []);
+    assert!(scan.asked);
     assert_eq!(states(&link, 2), ["Init", "Init"]);
+}
+
+/// A bus that can be looked at when the run that had it is over.
+#[derive(Debug, Clone)]
+struct Shared(Arc<Mutex<SimLink>>);
+
+impl Shared {
+    fn bus(&self) -> MutexGuard<'_, SimLink> {
+        self.0.lock().expect("one thread")
+    }
+}
+
+impl Link for Shared {
+    fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        self.bus().send(frame)
+    }
+
+    fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError> {
+        self.bus().recv(buf)
+    }
+
+    fn next_arrival(&self) -> Option<Nanos> {
+        self.bus().next_arrival()
+    }
+}
+
+/// Brings a machine up and runs it until it stops, in virtual time.
+fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
+    let options = session::Options {
+        clock: Clock::Virtual,
+        ..session::Options::default()
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    let (progress, _told) = channel();
+    let own = Box::new(link.clone());
+    let Ok(Prepared { parts, supervisor }) =
+        prepare_on(own, machine, &options, stop, progress, None)
+    else {
+        return false;
+    };
+    let mut engine = Engine::new(parts);
+    let mut beside = pin!(supervisor.run());
+    let mut context = Context::from_waker(Waker::noop());
+    let mut done = None;
+    while !engine.halted() {
+        engine.cycle();
+        if done.is_none()
+            && let Poll::Ready((_, result)) = beside.as_mut().poll(&mut context)
+        {
+            done = Some(result);
+        }
+    }
+    matches!(done, Some(Ok(())))
+}
+
+/// However a run ends, a scan after it finds a bus that nobody drives, and SYNC0 off in every device.
+#[test]
+fn after_a_run_nobody_seems_to_drive_the_bus() {
+    // Faults, and whether the machine comes up and does its program.
+    for (faults, comes_up, works) in [
+        ("", true, true),
+        (
+            "[[fault]]\nkind = \"drive-fault\"\nat = \"1s\"\ndevice = 1\ncode = 0x3210",
+            true,
+            false,
+        ),
+        (
+            "[[fault]]\nkind = \"refuse-state\"\ndevice = 1\nstate = \"safe-op\"\ncode = 0x1e",
+            false,
+            false,
+        ),
+    ] {
+        let there = std::thread::Builder::new().stack_size(STACK);
+        let done = there.spawn(move || {
+            Clock::Virtual.enter();
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+            let machine = Arc::new(config::load(&path).expect("a machine"));
+            let script = FaultScript::parse(faults).expect("faults");
+            let bus = simulated_bus(&machine, 1, Some(&script), None).expect("a bus");
+            let link = Shared(Arc::new(Mutex::new(SimLink::new(bus))));
+            assert_eq!(ran_well(&link, &machine), works, "{faults}");
+            for position in 0..2 {
+                let bus = link.bus();
+                let device = bus.segment().device(position).expect("a device");
+                let pulses = device.sync0_log().next().is_some();
+                assert_eq!(pulses, comes_up, "{faults}: position {position}");
+            }
+            let mut bus = link.clone();
+            let ask = Options {
+                ask: true,
+                ..Options::default()
+            };
+            let stop = AtomicBool::new(false);
+            let look = carry(&mut bus, Clock::Virtual, &stop, async |wire: Datagrams| {
+                let mut activations = Vec::new();
+                for position in 0..2 {
+                    let mut activation = [0xa5; 1];
+                    let answer = wire.read_at(position, 0x0981, &mut activation).await;
+                    assert_eq!(answer.expect("read"), 1);
+                    activations.push(activation[0]);
+                }
+                (activations, scanned(&wire, ask).await)
+            });
+            let (activations, scan) = look.expect("carried");
+            assert_eq!(activations, [0, 0], "{faults}");
+            assert_eq!(scan.others, [], "{faults}");
+            assert!(scan.asked, "{faults}");
+        });
+        done.expect("a thread").join().expect("no panic");
+    }
 }
 
 #[test]

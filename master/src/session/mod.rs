@@ -8,12 +8,13 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Sender, channel};
 use std::thread;
+use std::time::Duration;
 
 use ecaxis_axis::Axis;
 use ecaxis_sim::FaultScript;
 use ethercrab::{Command as Datagram, MainDevice};
 
-use crate::bringup::{Bus, Step, bring_up};
+use crate::bringup::{Bus, Step, bring_up, clocks};
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Machine, Signal};
 use crate::link::Link;
@@ -612,15 +613,23 @@ fn come_up(
     }
 }
 
-/// Every SubDevice that listens back to Init, whatever it is doing.
+/// Every SubDevice that listens back to Init and without SYNC0, whatever it is doing.
 fn go_silent(
     clock: Clock,
     main_device: &'static MainDevice<'static>,
     link: &mut dyn Link,
     port: &mut Port,
 ) {
-    let init = Datagram::bwr(0x0120)
-        .ignore_wkc()
-        .send(main_device, 0x0011_u16);
-    let _ = pump(port, link, clock, init);
+    /// A device in Op takes a missing SYNC0 for an error until it has read the request.
+    const TO_INIT: Duration = Duration::from_millis(20);
+    let all = async |register: u16, value: u16| {
+        let datagram = Datagram::bwr(register).ignore_wkc();
+        let _ = datagram.send(main_device, value).await;
+    };
+    let silence = async {
+        all(0x0120, 0x0011).await;
+        clock::delay(TO_INIT).await;
+        all(clocks::ACTIVATION, 0).await;
+    };
+    let _ = pump(port, link, clock, silence);
 }

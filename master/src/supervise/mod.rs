@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use ecaxis_axis::{Command, Refused};
 
-use crate::bringup::{AlState, Bus, DeviceRef, StateError, al};
+use crate::bringup::{AlState, Bus, DeviceRef, StateError, al, clocks};
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
 use crate::config::{Machine, Step};
@@ -357,6 +357,9 @@ impl Supervisor {
         let (stopped, others) = (addresses(stopped), addresses(others));
         let mut lowered = Ok(());
         for state in [AlState::SafeOp, AlState::PreOp, AlState::Init] {
+            if state == AlState::Init {
+                self.end_sync().await;
+            }
             match al::lower_state(&self.wire, &others, state, al::BACK_TIMEOUT).await {
                 Ok(()) => self.tell(Progress::Step(crate::bringup::Step::State(state))),
                 Err(error) => {
@@ -377,6 +380,13 @@ impl Supervisor {
             }
         }
         result.and(lowered)
+    }
+
+    /// In PreOp nobody wants SYNC0 any more, and in Init it would look as if a machine ran.
+    async fn end_sync(&self) {
+        let devices = self.machine.devices.iter().zip(&self.bus.devices);
+        let pulsed = devices.filter(|(config, _)| config.selection.dc.is_some());
+        clocks::stop(&self.wire, pulsed.map(|(_, device)| device.at.station)).await;
     }
 
     /// Until every axis is without power, the patience is over, or nobody has answered for long.

@@ -17,6 +17,7 @@ const USUAL_ACCELERATION: f64 = 10.0;
 const MOST_COUNTS: f64 = 2_147_483_648.0;
 /// Percent of the rated torque that every motor stands.
 const TORQUE: f64 = 100.0;
+const SILENT: &str = "the drive does not say";
 
 /// The mode to begin with: the first that the ESI offers and the drive does not deny.
 pub(super) fn mode(device: &Device, described: Option<&Described>) -> Option<esi::Mode> {
@@ -43,6 +44,15 @@ fn drive(device: &Device) -> Option<&DriveAnswers> {
     }
 }
 
+/// Why a value is a guess. `silent`: what it means that a drive that was asked does not say.
+fn unsaid(device: &Device, silent: &'static str) -> &'static str {
+    match device.answers {
+        Some(Ok(_)) => silent,
+        Some(Err(_)) => "it did not answer",
+        None => "it was not asked",
+    }
+}
+
 /// `[device.axis]`, in turns of the motor.
 pub(super) fn section(device: &Device, described: &Described) -> String {
     let unknown = DriveAnswers::default();
@@ -51,7 +61,7 @@ pub(super) fn section(device: &Device, described: &Described) -> String {
     lines.header("[device.axis]");
     let comment = format!("{MARK} of the motor; or your own, with `per_turn`");
     lines.add("unit", "\"turn\"", &comment);
-    let encoder = encoder(drive, &mut lines);
+    let encoder = encoder(device, drive, &mut lines);
     if let Some(polarity) = drive.units.polarity.filter(|p| p & 0xc0 != 0) {
         lines.comment(&format!(
             "{MARK} the drive inverts by itself, 0x607E is 0x{polarity:02x}"
@@ -65,17 +75,12 @@ pub(super) fn section(device: &Device, described: &Described) -> String {
         lines.add("velocity_unit", "\"counts/s\"", &comment);
     }
     if let Ok(scale) = Scale::new(encoder, 1.0) {
-        limits(
-            drive,
-            scale_of(drive, scale, described),
-            encoder,
-            &mut lines,
-        );
+        limits(device, drive, scale_of(drive, scale, described), &mut lines);
     }
     lines.text()
 }
 
-fn encoder(drive: &DriveAnswers, lines: &mut Lines) -> f64 {
+fn encoder(device: &Device, drive: &DriveAnswers, lines: &mut Lines) -> f64 {
     let sensor = drive.sensor_resolution.filter(|counts| *counts > 0);
     let said = drive.units.counts_per_turn();
     let said = said.filter(|(_, counts)| (1.0..=MOST_COUNTS).contains(counts));
@@ -90,7 +95,7 @@ fn encoder(drive: &DriveAnswers, lines: &mut Lines) -> f64 {
         ),
         (None, None) => (
             USUAL_ENCODER,
-            format!("{MARK} counts a motor turn; the drive does not say"),
+            format!("{MARK} counts a motor turn; {}", unsaid(device, SILENT)),
         ),
     };
     lines.add("encoder", &plain(counts), &comment);
@@ -114,15 +119,14 @@ fn scale_of(drive: &DriveAnswers, scale: Scale, described: &Described) -> Scale 
         .with_acceleration_unit(acceleration.unwrap_or(velocity.into()))
 }
 
-fn limits(drive: &DriveAnswers, scale: Scale, encoder: f64, lines: &mut Lines) {
+fn limits(device: &Device, drive: &DriveAnswers, scale: Scale, lines: &mut Lines) {
     if let Some([low, high]) = range(drive) {
-        let [low, high] = [low, high].map(|n| number(f64::from(n) / encoder));
+        let [low, high] = [low, high].map(|n| number(scale.units_of_counts(f64::from(n))));
         let comment = format!("{MARK} the drive's own, 0x607D");
         lines.add("limits.position", &format!("[{low}, {high}]"), &comment);
     } else {
-        lines.comment(&format!(
-            "limits.position = [-10.0, 10.0]  {MARK} the drive knows no ends"
-        ));
+        let why = unsaid(device, "the drive knows no ends");
+        lines.comment(&format!("limits.position = [-10.0, 10.0]  {MARK} {why}"));
     }
 
     // The smaller of two that stand for the same.
@@ -140,7 +144,7 @@ fn limits(drive: &DriveAnswers, scale: Scale, encoder: f64, lines: &mut Lines) {
         "limits.velocity",
         velocity,
         USUAL_VELOCITY.min(most),
-        "turns/s",
+        ("turns/s", unsaid(device, SILENT)),
         lines,
     );
 
@@ -157,7 +161,7 @@ fn limits(drive: &DriveAnswers, scale: Scale, encoder: f64, lines: &mut Lines) {
         "limits.acceleration",
         acceleration,
         USUAL_ACCELERATION,
-        "turns/s²",
+        ("turns/s²", unsaid(device, SILENT)),
         lines,
     );
 
@@ -179,9 +183,10 @@ fn limits(drive: &DriveAnswers, scale: Scale, encoder: f64, lines: &mut Lines) {
             let comment = format!("{MARK} turns; the drive's own, 0x6065");
             lines.add("limits.following_error", &number(turns), &comment);
         }
-        None => lines.comment(&format!(
-            "limits.following_error = 0.5  {MARK} the drive does not watch it"
-        )),
+        None => {
+            let why = unsaid(device, "the drive does not watch it");
+            lines.comment(&format!("limits.following_error = 0.5  {MARK} {why}"));
+        }
     }
 }
 
@@ -193,10 +198,18 @@ fn range(drive: &DriveAnswers) -> Option<[i32; 2]> {
         .then_some([low, high])
 }
 
-fn said_or(key: &str, said: Option<(f64, &str)>, usual: f64, unit: &str, lines: &mut Lines) {
+/// `words`: the unit, and why nothing is said.
+fn said_or(
+    key: &str,
+    said: Option<(f64, &str)>,
+    usual: f64,
+    words: (&str, &str),
+    lines: &mut Lines,
+) {
+    let (unit, unsaid) = words;
     let (value, comment) = match said {
         Some((value, object)) => (value, format!("{MARK} {unit}; the drive's own, {object}")),
-        None => (usual, format!("{MARK} {unit}; the drive does not say")),
+        None => (usual, format!("{MARK} {unit}; {unsaid}")),
     };
     lines.add(key, &number(value), &comment);
 }
