@@ -231,7 +231,9 @@ fn main() {
     );
     let _load = if rounds == 0 { load() } else { Vec::new() };
     let turns: &[usize] = if rounds == 0 { &[asked] } else { &[0, asked] };
+    let mut ratios = Vec::new();
     for round in 1..=rounds.max(1) {
+        let mut jitter = Vec::new();
         for &devices in turns {
             let Ran {
                 summary,
@@ -240,6 +242,7 @@ fn main() {
                 allocated,
             } = run(&pair.a, axes, devices, seconds);
             let late = &summary.wake_up_lateness;
+            jitter.push(late.p99_9_ns as f64);
             let thread = summary.thread.as_ref().map(|thread| thread.used);
             let cycles = summary.counters.cycles.max(1);
             println!(
@@ -257,5 +260,12 @@ fn main() {
                 done as f64 / summary.machine_seconds.max(1e-9),
             );
         }
+        if let [quiet, asked] = jitter[..] {
+            ratios.push(asked / quiet.max(1.0));
+        }
+    }
+    ratios.sort_by(f64::total_cmp);
+    if let Some(median) = ratios.get(ratios.len() / 2) {
+        println!("p99.9 with traffic to without, by round: {ratios:.2?}; median {median:.2}");
     }
 }

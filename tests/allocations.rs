@@ -5,7 +5,7 @@ mod common;
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
-use std::pin::pin;
+use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
@@ -16,9 +16,10 @@ use ecaxis::clock::Nanos;
 use ecaxis::config::{AxisRef, Machine};
 use ecaxis::link::capture::{Dir, Mode, Recorder};
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
+use ecaxis::mailbox::DeviceMailbox;
 use ecaxis::rt::controller::{Controller, Cycle};
 use ecaxis::rt::cycle::{Engine, Remains};
-use ecaxis::session::{Options, Prepared, RunError, prepare};
+use ecaxis::session::{Options, Prepared, Progress, RunError, prepare};
 
 thread_local! {
     static METERED: Cell<bool> = const { Cell::new(false) };
@@ -126,8 +127,20 @@ fn metered(
     controller: Option<Box<dyn Controller>>,
     cycles: u64,
 ) -> (u64, Remains, Ended) {
+    let (counted, remains, ended, _) = metered_among_users(machine, options, controller, cycles, 0);
+    (counted, remains, ended)
+}
+
+/// Likewise, while the mailboxes of the first devices are read over and over; how many transfers that were.
+fn metered_among_users(
+    machine: Machine,
+    options: &Options,
+    controller: Option<Box<dyn Controller>>,
+    cycles: u64,
+    asked: usize,
+) -> (u64, Remains, Ended, u64) {
     options.clock.enter();
-    let (progress, _told) = channel();
+    let (progress, told) = channel();
     let stop = Arc::new(AtomicBool::new(false));
     let Prepared {
         mut parts,
@@ -138,6 +151,8 @@ fn metered(
     let mut beside = pin!(supervisor.run());
     let mut context = Context::from_waker(Waker::noop());
     let mut result = None;
+    let done = Cell::new(0);
+    let mut users: Vec<Pin<Box<dyn Future<Output = ()> + '_>>> = Vec::new();
 
     COUNT.set(0);
     for _ in 0..cycles {
@@ -145,12 +160,33 @@ fn metered(
         engine.cycle();
         METERED.set(false);
         if result.is_none()
-            && let Poll::Ready((_, done)) = beside.as_mut().poll(&mut context)
+            && let Poll::Ready((_, ended)) = beside.as_mut().poll(&mut context)
         {
-            result = Some(done);
+            result = Some(ended);
         }
+        for said in told.try_iter() {
+            if let Progress::Mailboxes(mailboxes) = said {
+                let names = mailboxes.names().take(asked);
+                let each = names.filter_map(|name| mailboxes.device(name).ok());
+                users = each.map(|mailbox| reading(mailbox, &done)).collect();
+            }
+        }
+        users.retain_mut(|user| user.as_mut().poll(&mut context).is_pending());
     }
-    (COUNT.get(), engine.into_remains(), result)
+    drop(users);
+    (COUNT.get(), engine.into_remains(), result, done.get())
+}
+
+/// Reads what is expedited and what takes several messages, until nobody answers.
+fn reading(mailbox: DeviceMailbox, done: &Cell<u64>) -> Pin<Box<dyn Future<Output = ()> + '_>> {
+    Box::pin(async move {
+        for (index, sub) in [(0x6041, 0), (0x1008, 0), (0x6064, 0)].into_iter().cycle() {
+            if mailbox.upload(index, sub).await.is_err() {
+                return;
+            }
+            done.set(done.get() + 1);
+        }
+    })
 }
 
 #[test]
@@ -181,6 +217,19 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
     );
     assert!(remains.axes.iter().all(|slot| slot.last_enabled.is_some()));
     assert_eq!(counted, 0, "allocations in {CYCLES} cycles");
+}
+
+#[test]
+fn transfers_beside_the_cycle_cost_it_no_allocation() {
+    let options = Options {
+        repeat: Some(1_000_000),
+        ..virtual_time()
+    };
+    let bus = machine(&axes(4));
+    let (counted, remains, _, done) = metered_among_users(bus, &options, None, 20_000, 3);
+    assert!(done > 1_000, "{done} transfers");
+    assert_eq!(remains.stats.counters.wkc_errors, 0);
+    assert_eq!(counted, 0, "allocations beside {done} transfers");
 }
 
 /// Mode switches, homing, profiles, lines, gears, tables, waves, inputs and outputs.

@@ -43,7 +43,8 @@ fn every_capture_cut_anywhere() {
         };
         let ends = (0..bytes.len())
             .step_by(step)
-            .chain(bytes.len() - 120..bytes.len());
+            // Seven and four have nothing in common: blocks are padded to four.
+            .chain((bytes.len() - 120..bytes.len()).step_by(7));
         for end in ends {
             let report = analyzed(&bytes[..end], Known::default());
             assert!(report.file.ethercat_frames <= whole.file.ethercat_frames);
