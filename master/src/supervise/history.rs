@@ -131,7 +131,7 @@ pub(super) async fn read(
 
 /// Subindices of the newest messages. They go round: before the first comes the last that is kept.
 fn newest_first(kept: u8, newest: u8) -> impl Iterator<Item = u8> {
-    let last = FIRST.saturating_add(kept).saturating_sub(1).max(newest);
+    let last = FIRST.saturating_add(kept.saturating_sub(1)).max(newest);
     let there = newest >= FIRST;
     let round = (FIRST..=newest)
         .rev()
