@@ -3,6 +3,7 @@
 //! One thread owns the link. In real time it becomes the real-time thread and a second one runs
 //! the supervisor beside it; in virtual time it does both in turn, so that a run can be repeated.
 
+use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -336,7 +337,7 @@ fn prepare_with(
                 axes,
                 stop_patience: patience.unwrap_or(0),
                 orders_given: 0,
-                refused: None,
+                refused: VecDeque::new(),
                 captures: Vec::new(),
                 stopped: Vec::new(),
                 last_status: clock::now(),

@@ -2,6 +2,7 @@
 //! of the program, and what to say when something stops it. MAY BLOCK AND ALLOCATE; talks to the
 //! cycle through `rt::handover` alone.
 
+use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
 use std::pin::pin;
 use std::sync::Arc;
@@ -49,6 +50,8 @@ const SETTLED_NS: u32 = 1_000;
 const STOP_MARGIN: Nanos = 3_000_000_000;
 /// On a bus that has been silent for so long nobody can report that it stands.
 const LOST_BUS_TIMEOUT: Nanos = 1_000_000_000;
+/// Refusals that are kept until somebody looks.
+const REFUSALS: usize = 256;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
 
 /// Drives a machine from SafeOp through its program and back to Init.
@@ -82,8 +85,8 @@ pub struct Supervisor {
     pub stop_patience: Nanos,
     /// Orders handed over so far.
     pub orders_given: u64,
-    /// The last command that an axis did not take.
-    pub refused: Option<(usize, Refused)>,
+    /// Commands that axes did not take, in order; of too many the first, and the last.
+    pub refused: VecDeque<(usize, Refused)>,
     /// What probing has found, one for each step.
     pub captures: Vec<Capture>,
     /// Stops of groups that the machine went on through, in the order in which they were told.
@@ -240,7 +243,7 @@ impl Supervisor {
         loop {
             let snapshot = self.tick().await?;
             self.none_stopped(step, axes)?;
-            if let Some((axis, reason)) = self.refused.take() {
+            if let Some((axis, reason)) = self.refused.pop_front() {
                 return Err(RunError::EnableRefused {
                     device: self.device_of(axis),
                     reason: reason.to_string(),
@@ -326,7 +329,10 @@ impl Supervisor {
                     let name = devices.get(device).map_or("?", |d| d.name.as_str());
                     self.tell(Progress::Warning(clock_off(name, difference_ns)));
                 }
-                Event::Refused { axis, reason, .. } => self.refused = Some((axis, reason)),
+                Event::Refused { axis, reason, .. } => {
+                    self.refused.truncate(REFUSALS - 1);
+                    self.refused.push_back((axis, reason));
+                }
                 // The snapshot tells of stops, and cannot be lost.
                 Event::Stopping { .. }
                 | Event::GroupStopping { .. }

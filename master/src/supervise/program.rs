@@ -374,7 +374,7 @@ impl Supervisor {
             if snapshot.orders_taken < self.orders_given {
                 continue;
             }
-            if let Some((axis, reason)) = self.refused.take() {
+            if let Some((axis, reason)) = self.refused.pop_front() {
                 return Err(RunError::Refused {
                     device: self.device_of(axis),
                     step: step.into(),

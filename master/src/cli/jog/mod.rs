@@ -17,12 +17,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use ecaxis::clock::{Clock, Nanos};
 use ecaxis::config::{Machine, Nic};
 use ecaxis::session::{self, Observer, Options, Outcome, Progress, RunError};
-use ecaxis::supervise::manual::{Operator, Presence, Turn, View};
+use ecaxis::supervise::manual::{LET_GO, Operator, Presence, Request, Turn, View};
 
 use super::{Failure, hints, note, record, report, result, run, signals, style};
 use draw::Picture;
@@ -40,6 +40,9 @@ mod ui;
 
 /// Nothing heard of the terminal for so long: nobody is there.
 const AWAY: Nanos = 500_000_000;
+/// What has waited for longer, while devices were asked or this computer stalled, is no longer what somebody wants, unless it
+/// stops something.
+const TOO_OLD: Duration = Duration::from_nanos(LET_GO);
 /// How often what is shown is looked at anew.
 const SHOWN: Nanos = 50_000_000;
 /// How long a key is waited for, milliseconds; also what may lie between the bytes of one.
@@ -240,7 +243,7 @@ impl Shared {
 /// The machine's end: asked beside the cycle.
 #[derive(Debug)]
 struct Hands {
-    asked: Receiver<Ask>,
+    asked: Receiver<(Instant, Ask)>,
     shared: Arc<Shared>,
     /// When the terminal last gave a sign of life.
     heard: Option<Nanos>,
@@ -250,30 +253,49 @@ struct Hands {
     gone: bool,
 }
 
-impl Operator for Hands {
-    fn turn(&mut self, view: &View<'_>) -> Turn {
-        let now = view.now;
+impl Hands {
+    /// What has been asked for since the last turn, as far as it still counts.
+    fn hear(&mut self, now: Nanos) -> Vec<Request> {
         let mut requests = Vec::new();
-        loop {
-            match self.asked.try_recv() {
-                Ok(Ask::Alive) => self.heard = Some(now),
-                Ok(Ask::For(request)) => requests.push(request),
-                Ok(Ask::Leave) | Err(TryRecvError::Disconnected) => self.gone = true,
+        let mut too_late = false;
+        while !self.gone {
+            let (age, ask) = match self.asked.try_recv() {
+                Ok((at, ask)) => (at.elapsed(), ask),
                 Err(TryRecvError::Empty) => break,
-            }
-            if self.gone {
-                break;
+                Err(TryRecvError::Disconnected) => (Duration::ZERO, Ask::Leave),
+            };
+            match ask {
+                Ask::Alive => {
+                    let age = u64::try_from(age.as_nanos()).unwrap_or(u64::MAX);
+                    let at = now.saturating_sub(age);
+                    self.heard = Some(self.heard.map_or(at, |heard| heard.max(at)));
+                }
+                Ask::For(request) if age < TOO_OLD || request.stops() => requests.push(request),
+                Ask::For(_) => too_late = true,
+                Ask::Leave => self.gone = true,
             }
         }
-        for news in view.news {
-            let text = format!("{}: {news}", view.name(news.axis()));
-            self.shared.tell(text, news.bad());
+        if too_late {
+            self.shared
+                .tell("too late, not done: keys from before", true);
         }
         let away = now.saturating_sub(*self.heard.get_or_insert(now)) > AWAY;
         if away && !self.away {
             self.shared.tell("the terminal hangs: axes brake", true);
         }
         self.away = away;
+        requests
+    }
+}
+
+impl Operator for Hands {
+    fn turn(&mut self, view: &View<'_>) -> Turn {
+        let now = view.now;
+        let requests = self.hear(now);
+        for news in view.news {
+            let text = format!("{}: {news}", view.name(news.axis()));
+            self.shared.tell(text, news.bad());
+        }
         let shown = self
             .shown
             .is_none_or(|last| now.saturating_sub(last) >= SHOWN);
@@ -283,7 +305,7 @@ impl Operator for Hands {
             let panel = Panel::new(view, began);
             self.shared.seen().panel = Some(panel);
         }
-        let presence = match (self.gone, away) {
+        let presence = match (self.gone, self.away) {
             (true, _) => Presence::Gone,
             (_, true) => Presence::Away,
             _ => Presence::Here,
@@ -330,7 +352,7 @@ impl Observer for Listener {
 /// The terminal's end.
 struct Seat<'s> {
     terminal: Terminal,
-    asks: Sender<Ask>,
+    asks: Sender<(Instant, Ask)>,
     shared: &'s Shared,
     stop: &'s AtomicBool,
     title: &'s str,
@@ -356,7 +378,7 @@ impl Seat<'_> {
             }
             let Seen { panel, messages } = self.shared.seen().clone();
             let now = u64::try_from(began.elapsed().as_millis()).unwrap_or(u64::MAX);
-            let _ = self.asks.send(Ask::Alive);
+            self.send(Ask::Alive);
             for key in typed {
                 for ask in ui.key(key, now, panel.as_ref()) {
                     self.ask(ask, panel.is_some());
@@ -386,6 +408,14 @@ impl Seat<'_> {
         if ask == Ask::Leave && !attended {
             self.stop.store(true, Ordering::Relaxed);
         }
-        let _ = self.asks.send(ask);
+        self.send(ask);
+    }
+
+    fn send(&self, ask: Ask) {
+        let _ = self.asks.send((Instant::now(), ask));
     }
 }
+
+#[cfg(test)]
+#[path = "hands_tests.rs"]
+mod tests;

@@ -91,6 +91,11 @@ impl Ui {
             return Vec::new();
         };
         let selected = self.selected;
+        // Whatever is being typed.
+        if key == Key::Char('x') {
+            (self.typed, self.held) = (None, None);
+            return vec![Ask::For(Request::EmergencyStop)];
+        }
         if let Some(typed) = &mut self.typed {
             match key {
                 Key::Char(c @ ('0'..='9' | '.' | '-' | '+')) => {
@@ -170,7 +175,6 @@ impl Ui {
             }
             Key::Char('E') => return all(enable),
             Key::Char('D') => return all(disable),
-            Key::Char('x') => Request::EmergencyStop,
             Key::Char('e') => enable(selected),
             Key::Char('d') => disable(selected),
             Key::Char('h') => Request::Home { axis: selected },

@@ -101,6 +101,9 @@ fn positions_are_typed() {
     // `q` is no digit: it stops, and what has been typed is gone.
     assert_eq!(typed("m1q"), [Ask::For(Request::StopAll)]);
     assert_eq!(typed("q"), [Ask::Leave]);
+    // An emergency stop is one whatever is being typed, and nothing of it is left.
+    assert_eq!(typed("m1x"), [Ask::For(Request::EmergencyStop)]);
+    assert_eq!(typed("2\r"), [Ask::For(Request::StopAll); 2]);
     let long = format!("m{}\r", "9".repeat(500));
     assert_eq!(typed(&long).len(), 1);
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ecaxis_axis::Command;
 
 use super::desk::{Commands, Desk, Doing, Scene};
-use super::{News, Operator, Presence, Request, View};
+use super::{News, Operator, Presence, View};
 use crate::clock;
 use crate::rt::groups::GroupStatus;
 use crate::rt::handover::Order;
@@ -50,7 +50,7 @@ impl Supervisor {
                 axes: &axes,
                 snapshot: &snapshot,
             };
-            if let Some((axis, reason)) = self.refused.take() {
+            for (axis, reason) in self.refused.drain(..) {
                 desk.refused(axis, reason, &scene, &mut commands);
             }
             // Until then the snapshot does not show what was ordered.
@@ -68,17 +68,8 @@ impl Supervisor {
             });
             desk.watch(&scene, turn.presence, &mut commands);
             let there = turn.presence == Presence::Here;
-            let stops = |request: &Request| {
-                matches!(
-                    request,
-                    Request::Stop { .. }
-                        | Request::StopAll
-                        | Request::EmergencyStop
-                        | Request::Disable { .. }
-                )
-            };
             for (index, request) in turn.requests.into_iter().enumerate() {
-                if stops(&request) || (there && index < MOST_REQUESTS) {
+                if request.stops() || (there && index < MOST_REQUESTS) {
                     desk.take(request, &scene, &mut commands);
                 }
             }

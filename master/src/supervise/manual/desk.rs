@@ -103,9 +103,15 @@ impl Scene<'_> {
         device.map_or(0, |&device| self.machine.group_of(device))
     }
 
+    fn enabled(&self, axis: usize) -> bool {
+        let status = self.snapshot.axes.get(axis);
+        status.is_some_and(|status| status.enabled)
+    }
+
+    /// A velocity that is reached goes on: the set-point has arrived, and moves.
     fn moving(&self, axis: usize) -> bool {
         let status = self.snapshot.axes.get(axis);
-        status.is_some_and(|status| status.enabled && status.moving)
+        status.is_some_and(|s| s.enabled && (s.moving || s.target_velocity != 0.0))
     }
 
     fn stopped(&self, axis: usize) -> bool {
@@ -126,13 +132,18 @@ impl Desk {
         }
     }
 
-    /// The cycle did not take what was ordered of an axis. Whatever it is doing instead is not what was last asked for.
+    /// The cycle did not take what was ordered of an axis. Whatever it is doing instead is not what was last asked for; the
+    /// snapshot may not show it yet.
     pub fn refused(&mut self, axis: usize, reason: Refused, scene: &Scene<'_>, out: &mut Commands) {
         if let Some(hand) = self.hands.get_mut(axis) {
-            if hand.doing.moves() && scene.moving(axis) {
+            let moved = hand.doing.moves();
+            if moved && scene.moving(axis) {
                 hand.stop(axis, scene.now, out);
             } else {
                 hand.doing = Doing::Nothing;
+                if moved && scene.enabled(axis) {
+                    out.push((axis, Command::Stop));
+                }
             }
         }
         let why = reason.to_string();
@@ -205,7 +216,7 @@ impl Desk {
         match request {
             Request::StopAll => {
                 for (axis, hand) in self.hands.iter_mut().enumerate() {
-                    if scene.snapshot.axes.get(axis).is_some_and(|s| s.enabled) {
+                    if scene.enabled(axis) {
                         hand.stop(axis, scene.now, out);
                     }
                 }
@@ -249,6 +260,7 @@ impl Desk {
         out: &mut Commands,
     ) {
         if let Some(hand) = self.hands.get_mut(axis) {
+            hand.give_way(doing, axis, out);
             hand.begin(doing, scene.now);
             out.push((axis, command));
         }
@@ -288,6 +300,7 @@ impl Desk {
             let ill = status.is_some_and(|s| s.fault.is_some() || s.trip.is_some());
             let with_it = group != 0 && scene.group(other) == group && (ill || stopped);
             if other == axis || with_it {
+                hand.give_way(Doing::Resetting, other, out);
                 hand.begin(Doing::Resetting, scene.now);
                 out.push((other, Command::ResetFault));
             }
@@ -298,6 +311,16 @@ impl Desk {
 impl Hand {
     fn begin(&mut self, doing: Doing, now: Nanos) {
         (self.doing, self.since) = (doing, now);
+    }
+
+    /// Before something else takes its place. Most of it leaves the set-point alone, and a motion may be refused: nothing that
+    /// nobody watches any more goes on behind it. What is taken in the same cycle takes over without braking first.
+    fn give_way(&self, next: Doing, axis: usize, out: &mut Commands) {
+        let jogs = matches!(self.doing, Doing::Jogging { .. });
+        let brakes = matches!(next, Doing::Stopping | Doing::Disabling);
+        if !brakes && (jogs || (self.doing.moves() && !next.moves())) {
+            out.push((axis, Command::Stop));
+        }
     }
 
     fn stop(&mut self, axis: usize, now: Nanos, out: &mut Commands) {
@@ -343,6 +366,7 @@ impl Hand {
             Doing::Homing => {
                 return match status.homing {
                     HomingStatus::Failed(error) => Some(Err(error.to_string())),
+                    HomingStatus::None => Some(Err("the axis has not begun it".to_owned())),
                     HomingStatus::Attained if status.switching.is_none() && status.ready => {
                         Some(Ok(()))
                     }

@@ -84,7 +84,8 @@ pub enum Presence {
     Gone,
 }
 
-/// Axes by their places in the cycle; values in user units.
+/// Axes by their places in the cycle; values in user units. A jog that is followed by anything else has been let go; so has
+/// a move by what is none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Request {
     Enable {
@@ -133,12 +134,23 @@ pub enum Request {
     EmergencyStop,
 }
 
+impl Request {
+    /// Whether it only ends motion: such a request is never refused for being one too many, late, or from afar.
+    #[must_use]
+    pub fn stops(&self) -> bool {
+        matches!(
+            self,
+            Self::Stop { .. } | Self::StopAll | Self::EmergencyStop | Self::Disable { .. }
+        )
+    }
+}
+
 /// What became of a request.
 #[derive(Debug, Clone, PartialEq)]
 pub enum News {
     /// It is done.
     Done { axis: usize, what: Doing },
-    /// It was not taken; nothing has changed.
+    /// It was not taken. Where it would have moved the axis, the axis brakes from what it did before.
     Refused { axis: usize, why: String },
     /// A jog was not asked for again, and the axis brakes.
     LetGo { axis: usize },
