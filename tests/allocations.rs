@@ -12,7 +12,7 @@ use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
 use common::{axes, faults, load, machine, virtual_time};
-use ecaxis::clock::Nanos;
+use ecaxis::clock::{self, Clock, Nanos};
 use ecaxis::config::{AxisRef, Machine};
 use ecaxis::link::capture::{Dir, Mode, Recorder};
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
@@ -20,6 +20,7 @@ use ecaxis::mailbox::DeviceMailbox;
 use ecaxis::rt::controller::{Controller, Cycle};
 use ecaxis::rt::cycle::{Engine, Remains};
 use ecaxis::session::{Options, Prepared, Progress, RunError, prepare};
+use ecaxis_axis::Command;
 
 thread_local! {
     static METERED: Cell<bool> = const { Cell::new(false) };
@@ -265,6 +266,36 @@ fn a_controller_is_called_without_an_allocation() {
     let x = machine.axis("x").expect("an axis");
     let controller = Box::new(Swing(x, 0.0));
     let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
+    assert!(remains.axes[0].axis.status().enabled);
+    assert_eq!(counted, 0);
+}
+
+struct Stalls(AxisRef, u32);
+
+impl Controller for Stalls {
+    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+        if !machine.axis(self.0).ready {
+            return;
+        }
+        self.1 += 1;
+        if self.1 == 1 {
+            let (velocity, ramp) = (5.0, 1.0);
+            let _ = machine.command(self.0, Command::Velocity { velocity, ramp });
+        } else if self.1.is_multiple_of(500) {
+            Clock::Virtual.relax(clock::now() + 40_000_000);
+        }
+    }
+}
+
+/// Nor does what makes up for cycles that were left out.
+#[test]
+fn stalling_allocates_nothing() {
+    let machine = load("controller.toml");
+    let x = machine.axis("x").expect("an axis");
+    let controller = Box::new(Stalls(x, 0));
+    let (counted, remains, _) = metered(machine, &virtual_time(), Some(controller), 5_000);
+    let counters = remains.stats.counters;
+    assert!(counters.overruns > 200, "{counters:?}");
     assert!(remains.axes[0].axis.status().enabled);
     assert_eq!(counted, 0);
 }

@@ -3,9 +3,10 @@
 mod common;
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, atomic::AtomicBool};
+use std::sync::{Arc, Mutex, atomic::AtomicBool};
 
 use common::{Heard, load, virtual_time};
+use ecaxis::clock::{self, Clock};
 use ecaxis::config::{AxisRef, InputRef, Machine, OutputRef};
 use ecaxis::rt::controller::{Controller, Cycle};
 use ecaxis::session::{Outcome, RunError, run_with};
@@ -114,6 +115,60 @@ fn it_moves_axes_and_reads_and_sets_signals() {
     );
     assert_eq!(axes[1].target_position, -3.0);
     assert_eq!(f64::from_bits(reached.load(Ordering::Relaxed)), 1.0);
+}
+
+/// A computer that stalls leaves cycles out. The drives stand at their last targets meanwhile, and do not find themselves at
+/// full speed again.
+#[test]
+fn motion_goes_on_from_rest_after_cycles_that_were_left_out() {
+    const SPEED: f64 = 50.0;
+    const STALL: u64 = 40_000_000;
+    let (machine, names) = bench();
+    let seen = Arc::new(Mutex::new(Vec::new()));
+    let told = Arc::clone(&seen);
+    let mut cycles = 0;
+    let outcome = control(
+        machine,
+        Closure(move |machine: &mut Cycle<'_>| {
+            let status = machine.axis(names.x);
+            if machine.stopping() || !status.ready {
+                return;
+            }
+            cycles += 1;
+            match cycles {
+                1 => machine
+                    .command(
+                        names.x,
+                        Command::Velocity {
+                            velocity: SPEED,
+                            ramp: 1.0,
+                        },
+                    )
+                    .expect("x is ready"),
+                100 => Clock::Virtual.relax(clock::now() + STALL),
+                300 => machine.finish(),
+                _ => {}
+            }
+            if cycles >= 100 {
+                told.lock().expect("no panic").push(status);
+            }
+        }),
+    );
+    outcome.result.expect("runs");
+    let counters = outcome.summary.expect("the cycle has run").counters;
+    assert!((38..=40).contains(&counters.overruns), "{counters:?}");
+    let seen = seen.lock().expect("no panic");
+    assert_eq!(seen[0].target_velocity, SPEED);
+    let mut before = 0.0;
+    for (n, status) in seen[1..].iter().enumerate() {
+        let change = status.target_velocity - before;
+        assert!(change <= 2.5 + 1e-6, "cycle {n}: {change} mm/s");
+        let way = status.target_position - seen[n].target_position;
+        assert!(way <= SPEED * 0.001 + 1e-6, "cycle {n}: {way} mm");
+        assert_eq!(status.trip, None);
+        before = status.target_velocity;
+    }
+    assert_eq!(before, SPEED);
 }
 
 /// A set-point that jumps never reaches the wire.

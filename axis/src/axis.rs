@@ -17,7 +17,7 @@
 //! | `home` | homing |
 //! | `wish` | where the power goes |
 //! | `actual`, `supervise` | what the drive reports, and what is made of it |
-//! | `blind` | lost frames |
+//! | `blind` | lost frames, and cycles that were left out |
 //! | `report` | the status |
 
 use crate::cia402::{self, Controlword, Memory, Mode, Power, Progress, Request, State, Statusword};
@@ -101,6 +101,8 @@ pub struct Axis {
     held_by_range: bool,
     guarded_cycles: u32,
     stale_cycles: u32,
+    /// Answers still to come that are older than a gap in the cycle.
+    overdue: u8,
     /// CSP: lost frames stopped a set-point that was moving, and none has come through since.
     cut_short: bool,
     /// A drive that keeps a velocity or torque moved on meanwhile: the set-point starts anew from where that led.
@@ -149,6 +151,7 @@ impl Axis {
             held_by_range: false,
             guarded_cycles: 0,
             stale_cycles: 0,
+            overdue: 0,
             cut_short: false,
             regain: false,
             fed: None,
@@ -201,8 +204,9 @@ impl Axis {
             0.0
         };
         self.dt_s = dt_s;
-        self.fresh = inputs.fresh;
-        if inputs.fresh {
+        self.fresh = inputs.fresh && self.overdue == 0;
+        self.overdue = self.overdue.saturating_sub(1);
+        if self.fresh {
             self.read(inputs);
             self.judge();
         } else {

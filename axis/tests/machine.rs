@@ -195,6 +195,14 @@ impl Checker {
         }
     }
 
+    /// What is sent after cycles that were left out goes on from rest.
+    fn left_out(&mut self, axis: &Axis, out: Outputs) {
+        self.before = (axis.status(), out);
+        if self.before.0.stale_cycles > 2 {
+            self.step_before = 0.0;
+        }
+    }
+
     fn check(
         &mut self,
         axis: &Axis,
@@ -384,9 +392,9 @@ fn run(seed: u64, sum: &mut Sum) -> Result<(), String> {
         deadline_s: None,
     };
     let cycles = (RUN_S / DT) as u64;
-    let (mut lost, mut quiet, mut unblock) = (0u32, 0u32, 0u64);
+    let (mut lost, mut unheard, mut quiet, mut unblock) = (0u32, 0u32, 0u32, 0u64);
     for cycle in 0..cycles {
-        let (mut word, mut shown) = (None, None);
+        let (mut word, mut shown, mut left_out) = (None, None, 0u32);
         quiet = quiet.saturating_sub(1);
         if quiet == 0 {
             quiet = dice.pick(&[1, 10, 50, 200, 200, 400]);
@@ -423,18 +431,30 @@ fn run(seed: u64, sum: &mut Sum) -> Result<(), String> {
                 4 => shown = Some(dice.next() as i8),
                 5 => lost = dice.pick(&[50, 500, 4000]),
                 6..=10 => lost = dice.pick(&[1, 2, 3, 4, 10]),
+                11..=13 => unheard = dice.pick(&[1, 2, 3, 4, 10, 50]),
+                14..=16 => left_out = dice.pick(&[1, 2, 3, 4, 40]),
                 _ => {}
             }
+        }
+        let turns = |drive: &Drive| {
+            drive.state == State::OperationEnabled && drive.mode != Mode::Csp.code()
+        };
+        if left_out > 0 {
+            if turns(&rig.drive) {
+                rig.drive.position += rig.drive.velocity * DT * f64::from(left_out);
+            }
+            rig.out = rig.axis.skipped(left_out);
+            checker.left_out(&rig.axis, rig.out);
         }
         rig.drive.blocked &= cycle < unblock;
         let mut inputs = rig.drive.inputs();
         inputs.statusword = word.unwrap_or(inputs.statusword);
         inputs.mode_display = shown.or(inputs.mode_display);
         inputs.touch_probe_status = Some(if dice.one_in(50) { 0x0303 } else { 0x0101 });
-        inputs.fresh = lost == 0;
-        if inputs.fresh {
+        inputs.fresh = lost == 0 && unheard == 0;
+        if lost == 0 {
             rig.drive.cycle(&rig.out, DT);
-        } else if rig.drive.state == State::OperationEnabled && rig.drive.mode != Mode::Csp.code() {
+        } else if turns(&rig.drive) {
             // The motor turns on.
             rig.drive.position += rig.drive.velocity * DT;
         }
@@ -442,6 +462,7 @@ fn run(seed: u64, sum: &mut Sum) -> Result<(), String> {
         let most = 1.1 * LIMITS.velocity * COUNTS_PER_UNIT;
         rig.drive.velocity = rig.drive.velocity.clamp(-most, most);
         lost = lost.saturating_sub(1);
+        unheard = unheard.saturating_sub(1);
         rig.out = rig.axis.step(&inputs, DT);
         let was = checker.before.0;
         checker

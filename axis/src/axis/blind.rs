@@ -3,8 +3,10 @@
 //! A lost frame takes its targets with it, and the first one that gets through makes up for all of them in one step. So only
 //! [`RIDE_THROUGH_CYCLES`] are planned blind; then the set-point waits where it is, as the drive does with the last target it
 //! got.
+//!
+//! A cycle that was left out sent nothing, which is the same for the drive.
 
-use super::{Axis, Control, Plan};
+use super::{Axis, Control, Outputs, Plan};
 use crate::cia402::Mode;
 use crate::setpoint::{Goal, Motion, Trapezoid};
 
@@ -17,12 +19,33 @@ impl Axis {
         self.stale_cycles > RIDE_THROUGH_CYCLES
     }
 
+    /// `cycles` in a row were left out: their frames never went, which for the drive are so many that were lost. To be called
+    /// before the [`Axis::observe`] that follows them, and before the frame that waits is sent: with these outputs in the place of
+    /// those it has. RT: O(1).
+    #[must_use]
+    pub fn skipped(&mut self, cycles: u32) -> Outputs {
+        if cycles > 0 {
+            self.stale_cycles = self.stale_cycles.saturating_add(cycles);
+            self.watch.lost(self.sent_before);
+            self.actual.pass(f64::from(cycles) * self.dt_s);
+        }
+        if self.frozen() {
+            // Answers that were under way are from before.
+            self.overdue = self.config.answers_late;
+            self.hold_back();
+            if self.active {
+                self.freeze();
+            }
+        }
+        self.outputs()
+    }
+
     /// Instead of an advance. The plan stays: in CSP it goes on from rest, for the drive stands at its last target; in CSV and
     /// CST it goes on from the velocity or torque that the drive has kept. What comes from outside does not go on.
     pub(super) fn freeze(&mut self) {
-        if self.mode == Mode::Csp {
+        if self.mode == Mode::Csp && !self.left_csp() {
             self.come_to_rest();
-        } else if self.grip() == Control::Position && self.motion.velocity != 0.0 {
+        } else if self.motion.velocity != 0.0 {
             self.regain = true;
         }
         if self.plan == Plan::Fed {
@@ -43,12 +66,13 @@ impl Axis {
             return;
         }
         if self.mode == Mode::Csp {
-            // Entered while frames were lost: the drive has the target that came with the mode, and goes there.
+            // Entered while frames were lost: the drive has the target that came with the mode, and goes there. Or asked to leave
+            // it, and still there.
             self.come_to_rest();
             return;
         }
         let velocity = match self.mode {
-            Mode::Csv => self.motion.velocity,
+            Mode::Csv if !self.shows_next() => self.motion.velocity,
             _ => self.drift(),
         };
         self.motion = self.tracked(velocity);

@@ -24,6 +24,9 @@ pub struct AxisConfig {
     /// From a set-point's leaving here until a reported position can show it, seconds: the wire both ways, the drive's
     /// interpolation and its lag. Set-point and reported position are compared over this time, in every mode.
     pub dead_time_s: f64,
+    /// Cycles by which inputs are older than those of the frame that went out last: 0 where each cycle takes the answer to its
+    /// own frame.
+    pub answers_late: u8,
     /// How long 0x6061 may take to show the mode that was commanded, seconds.
     pub mode_time_s: f64,
     /// 0x605A, where it is known: without transition 16 an axis is enabled again by way of Switch on disabled.
@@ -51,6 +54,7 @@ impl AxisConfig {
             jerk_limited: false,
             loops: Loops::default(),
             dead_time_s: 0.0,
+            answers_late: 0,
             mode_time_s: 1.0,
             quick_stop: None,
             supervision: Supervision::default(),

@@ -107,7 +107,7 @@ impl Axis {
                 if self.switch.map(|switch| switch.to) != Some(order.mode)
                     && self.switch_failed != Some(order.mode)
                 {
-                    self.begin_switch(order.mode);
+                    self.begin_switch_late(order.mode);
                 }
             }
             Outcome::Running => {}

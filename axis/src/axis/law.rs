@@ -143,7 +143,7 @@ impl Axis {
         let actual = self.actual.counts().unwrap_or_default();
         let mut out = Outputs {
             controlword: self.controlword.bits(),
-            mode: mode.code(),
+            mode: self.mode_asked().code(),
             target_position: actual.wrapped(),
             touch_probe_function: if self.probe_mapped {
                 self.probes.function()

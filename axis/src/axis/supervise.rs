@@ -149,7 +149,8 @@ impl Axis {
         let limits = self.config.limits;
         let position = self.actual.position();
         let mut cause = None;
-        if self.grip() == Control::Position {
+        // What the drive did without a set-point is no deviation from one.
+        if self.grip() == Control::Position && !self.regain {
             let scale = &self.config.scale;
             // The set-point here is a cycle old already.
             let commanded = self.expected(self.config.dead_time_s - self.dt_s);

@@ -2,6 +2,10 @@
 //!
 //! The drive changes over somewhere between the frame that carries the new mode and the one that shows it. So from the first
 //! to the last of these cycles the targets of both modes are valid, made from the one set-point.
+//!
+//! While frames are lost nobody knows whether it has. A drive that turns meanwhile must not find itself in CSP with a target
+//! from before: until an answer has come to a frame that asked for CSP, the mode before is asked for again. The other way the
+//! drive stands at its last target, or already has the velocity that is still being sent.
 
 use super::supervise::Watch;
 use super::{Axis, Control, Plan};
@@ -9,10 +13,38 @@ use crate::cia402::{Mode, State};
 use crate::profile::{Goal, Profile};
 use crate::setpoint::Ramp;
 
+/// A drive that was asked for one mode and the other in turn, and does not change over at once, is in the new one after so
+/// many fresh cycles that show it.
+const CERTAIN_CYCLES: u8 = 10;
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Switch {
     pub(super) to: Mode,
+    /// Without the new mode, though it was asked for.
     elapsed_s: f64,
+    /// Cycles in a row whose outputs ask for the new mode.
+    asked: u8,
+    /// The drive has answered a frame that did.
+    pub(super) reached: bool,
+    /// Frames are being lost: the mode before is asked for.
+    pub(super) held_back: bool,
+    /// Fresh cycles in a row that have shown the new mode, and how many it takes.
+    shown: u8,
+    certain: u8,
+}
+
+impl Switch {
+    const fn new(to: Mode) -> Self {
+        Self {
+            to,
+            elapsed_s: 0.0,
+            asked: 0,
+            reached: false,
+            held_back: false,
+            shown: 0,
+            certain: 1,
+        }
+    }
 }
 
 impl Axis {
@@ -32,25 +64,91 @@ impl Axis {
             // Where the axis is now is where the position set-point begins.
             self.motion.position = self.tracked(self.motion.velocity).position;
         }
-        self.switch = Some(Switch { to, elapsed_s: 0.0 });
+        self.switch = Some(Switch::new(to));
         self.switch_failed = None;
+    }
+
+    /// [`Axis::begin_switch`] in a cycle whose [`Axis::settle_mode`] is over.
+    pub(super) fn begin_switch_late(&mut self, to: Mode) {
+        self.begin_switch(to);
+        if let Some(switch) = &mut self.switch {
+            switch.asked = 1;
+        }
     }
 
     /// Once a cycle.
     pub(super) fn settle_mode(&mut self, fresh: bool, dt_s: f64) {
+        self.hold_back();
+        let (display, late) = (self.mode_display, self.config.answers_late);
         let Some(switch) = &mut self.switch else {
             return;
         };
         let to = switch.to;
-        if fresh && self.mode_display == Some(to.code()) {
-            self.enter(to);
+        let shows = display == Some(to.code());
+        if fresh {
+            // What is answered now was asked while the mode was held back.
+            if core::mem::take(&mut switch.held_back) {
+                switch.asked = 0;
+            }
+            switch.reached |= switch.asked > late;
+            let counts = shows && switch.reached;
+            switch.shown = if counts { switch.shown + 1 } else { 0 };
+            if switch.shown >= switch.certain {
+                self.enter(to);
+                return;
+            }
+        }
+        if switch.held_back {
             return;
         }
-        switch.elapsed_s += dt_s;
+        switch.asked = switch.asked.saturating_add(1);
+        if !shows {
+            switch.elapsed_s += dt_s;
+        }
         if switch.elapsed_s > self.config.mode_time_s {
             self.switch = None;
             self.switch_failed = Some(to);
         }
+    }
+
+    /// Too many frames in a row were lost, and the drive may turn in the mode before. After homing it stands, and bit 4 might
+    /// start another.
+    pub(super) fn hold_back(&mut self) {
+        let turns = self.mode != Mode::Hm;
+        // A set-point that follows the axis must not be followed by it for long.
+        let certain = if self.grip() == Control::Position {
+            CERTAIN_CYCLES
+        } else {
+            1
+        };
+        let frozen = self.frozen();
+        if let Some(switch) = &mut self.switch
+            && frozen
+            && turns
+            && !switch.reached
+            && switch.to == Mode::Csp
+        {
+            (switch.held_back, switch.asked) = (true, 0);
+            (switch.shown, switch.certain) = (0, certain);
+        }
+    }
+
+    /// CSP was left: the drive keeps what it has got of the new mode, and does not stand at its last target.
+    pub(super) fn left_csp(&self) -> bool {
+        self.switch
+            .is_some_and(|switch| switch.reached && switch.to != Mode::Csp)
+    }
+
+    /// The drive shows the new mode, which does not count yet.
+    pub(super) fn shows_next(&self) -> bool {
+        self.switch
+            .is_some_and(|switch| self.mode_display == Some(switch.to.code()))
+    }
+
+    /// 0x6060.
+    pub(super) fn mode_asked(&self) -> Mode {
+        let switch = self.switch.filter(|switch| !switch.held_back);
+        switch.map_or(self.mode, |switch| switch.to)
     }
 
     /// The drive is in the new mode: from now on its law counts alone.

@@ -77,6 +77,8 @@ pub struct Engine {
     history: History,
     end: RtEnd,
     next: Nanos,
+    /// When the last frames went; `None`: none yet.
+    woke: Option<Nanos>,
     started: Nanos,
     margin: Margin,
     answer: Answer,
@@ -157,6 +159,7 @@ impl Engine {
             history,
             end: parts.end,
             next: started,
+            woke: None,
             started,
             margin: Margin::new(parts.timing.spin, parts.timing.cycle_ns, mode),
             answer: Answer::default(),
@@ -208,6 +211,7 @@ impl Engine {
             self.jot(Note::WokeLate(lateness));
         }
 
+        self.catch_up(woke);
         self.send(lateness);
         self.margin.slept(slept);
         if let Some(late) = slept {

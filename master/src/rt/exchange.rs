@@ -289,19 +289,11 @@ impl Exchange {
     pub fn stage(&mut self) {
         self.cycle = self.cycle.wrapping_add(1);
         self.staged = self.due();
+        self.restage();
         let time = self.expected_time;
         let Some(flight) = self.flights.get_mut(self.staged) else {
             return;
         };
-        for datagram in &self.process_data {
-            let place = datagram.place;
-            let frame = &mut flight.frames[place.frame].bytes;
-            if datagram.access != Access::Inputs {
-                let from = datagram.image..datagram.image + place.len;
-                frame[place.data()].copy_from_slice(&self.outputs[from]);
-            }
-            clear_wkc(frame, place);
-        }
         if let Some(place) = self.mailboxes {
             let frame = &mut flight.frames[place.frame].bytes;
             frame[place.data()].fill(Sights::UNSEEN);
@@ -326,6 +318,22 @@ impl Exchange {
         clear_wkc(first, self.al_status);
         flight.stage(self.cycle);
         self.expected_time = time.wrapping_add(self.cycle_ns);
+    }
+
+    /// Outputs have changed since the frames were filled, and before they are sent. RT: O(image).
+    pub fn restage(&mut self) {
+        let Some(flight) = self.flights.get_mut(self.staged) else {
+            return;
+        };
+        for datagram in &self.process_data {
+            let place = datagram.place;
+            let frame = &mut flight.frames[place.frame].bytes;
+            if datagram.access != Access::Inputs {
+                let from = datagram.image..datagram.image + place.len;
+                frame[place.data()].copy_from_slice(&self.outputs[from]);
+            }
+            clear_wkc(frame, place);
+        }
     }
 
     /// Sends all frames of the cycle back to back, `late` after their planned release. RT: blocks on the wire only.

@@ -421,8 +421,8 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
         })?;
         let mut config = setup.config;
         // A report is of the set-point of a cycle earlier.
-        let later = machine.bus.exchange.flights() - 1;
-        config.dead_time_s += f64::from(later) * machine.bus.cycle_ns as f64 * 1e-9;
+        config.answers_late = machine.bus.exchange.flights() - 1;
+        config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
         let axis = Axis::new(config).map_err(|source| RunError::Axis {
             name: name(index),
             source,

@@ -13,6 +13,22 @@ const SETTLE: Nanos = 100_000_000;
 const STUCK: Nanos = 3_000_000_000;
 
 impl Engine {
+    /// Cycles that were left out sent nothing, and drives hold what they got last: the axes go on from there. They are told before
+    /// the frames that wait are sent, which are from before.
+    pub(super) fn catch_up(&mut self, woke: Nanos) {
+        let before = self.woke.replace(woke).unwrap_or(woke);
+        let silent = woke.saturating_sub(before) / self.timing.cycle_ns;
+        if silent < 2 {
+            return;
+        }
+        let skipped = u32::try_from(silent - 1).unwrap_or(u32::MAX);
+        for slot in &mut self.axes {
+            let outputs = slot.axis.skipped(skipped);
+            slot.write(self.exchange.outputs_mut(), &outputs);
+        }
+        self.exchange.restage();
+    }
+
     /// Masters before those that follow them, so that a follower's set-point is of the same cycle.
     pub(super) fn act(&mut self) {
         // Gears form no rings, so every round acts on one axis at least.
