@@ -279,14 +279,17 @@ fn power_lost_at_forty_percent() {
                 Via::Foe => {
                     assert_eq!(*step, Step::Send);
                     let gone = match position {
-                        0 => matches!(cause, Cause::Foe(FoeError::Wire(_))),
+                        0 => matches!(cause, Cause::Foe(FoeError::Wire { .. })),
                         _ => matches!(cause, Cause::Foe(FoeError::Gone { .. })),
                     };
                     assert!(gone, "{error}");
                 }
                 Via::Program => {
                     assert_eq!(*step, Step::Download);
-                    assert!(matches!(cause, Cause::Sdo(SdoError::Wire(_))), "{error}");
+                    assert!(
+                        matches!(cause, Cause::Sdo(SdoError::Wire { .. })),
+                        "{error}"
+                    );
                 }
             }
             assert_eq!(*left, Left::Silent);

@@ -8,12 +8,12 @@ use std::sync::atomic::AtomicBool;
 use std::thread;
 
 use common::{fixture, machine, root};
-use ecaxis::bringup::{AlState, bring_up};
+use ecaxis::bringup::{AlState, al, bring_up};
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, Locator, Machine};
 use ecaxis::link::sim::SimLink;
 use ecaxis::mailbox::desk::Listen;
-use ecaxis::mailbox::{CoeClient, Emergencies, ObjectList, Wire};
+use ecaxis::mailbox::{CoeClient, Emergencies, FoeClient, ObjectList, Wire};
 use ecaxis::parameters::collect::{Collected, collect};
 use ecaxis::parameters::compare::compare;
 use ecaxis::parameters::dump::Dump;
@@ -23,9 +23,10 @@ use ecaxis::parameters::{DataType, Kind, items, learn};
 use ecaxis::rt::image::{plan, process_data};
 use ecaxis::service::eeprom::{Claim, Eeprom};
 use ecaxis::service::image::{with_alias, write};
-use ecaxis::service::{Datagrams, ServiceError, carry, device};
+use ecaxis::service::{Datagrams, Registers, ServiceError, carry, device, mailbox};
 use ecaxis::session::simulated_bus;
 use ecaxis_esi::Dictionary;
+use ecaxis_sim::FirmwareHeader;
 
 /// Hears no emergencies.
 #[derive(Debug)]
@@ -85,6 +86,11 @@ fn large() -> (tempfile::TempDir, Machine) {
     let folder = tempfile::tempdir().expect("a folder");
     let esi = root().join("tests/judges/esi/mailbox.xml");
     let text = std::fs::read_to_string(esi).expect("the judges' ESI");
+    large_with(|esi| esi)
+}
+
+/// Likewise, described otherwise.
+fn large_with(change: impl FnOnce(String) -> String) -> (tempfile::TempDir, Machine) {
     let sub = |n: u32| {
         format!(
             "<SubItem><SubIdx>{n}</SubIdx><Name>Entry {n}</Name><Type>UDINT</Type><BitSize>32</BitSize><BitOffs>{}</BitOffs><Flags><Access>rw</Access></Flags></SubItem>",
@@ -124,7 +130,7 @@ fn large() -> (tempfile::TempDir, Machine) {
     let text = text
         .replacen("</DataTypes>", &types, 1)
         .replacen("</Objects>", &objects, 1);
-    std::fs::write(folder.path().join("large.xml"), text).expect("written");
+    std::fs::write(folder.path().join("large.xml"), change(text)).expect("written");
     let file = folder.path().join("machine.toml");
     std::fs::write(
         &file,
@@ -188,6 +194,79 @@ fn a_small_mailbox_carries_what_is_large() {
 /// What the ESI says the device says, too.
 fn same(described: &Dictionary, own: &Dictionary) {
     for (object, item) in items(described) {
+/// The largest there are: one datagram of a full frame.
+#[test]
+fn mailboxes_as_long_as_a_frame_carry_everything() {
+    let (_folder, machine) = large_with(|esi| {
+        let long = esi.replace("DefaultSize=\"48\"", "DefaultSize=\"1486\"");
+        let boot = "<BootStrap>0010000100160001</BootStrap>";
+        assert!(long.contains(boot));
+        long.replace(boot, "<BootStrap>0010ce050016ce05</BootStrap>")
+    });
+    let identity = machine.devices[0].device.identity;
+    let header = FirmwareHeader {
+        vendor: identity.vendor,
+        product: identity.product,
+        revision: 2,
+        version: *b"2.00",
+    };
+    let program: Vec<u8> = (0..10_000_u32).map(|n| (n * 13 + n / 251) as u8).collect();
+    let file = header.file(&program);
+    let sent = file.clone();
+    let work = Box::new(move |link: &mut SimLink| {
+        carried(link, async |wire| {
+            with_device(&wire, 0, async |coe| {
+                assert_eq!((coe.layout().out_len, coe.layout().in_len), (1486, 1486));
+                let vendor = coe.upload(&wire, 0x1018, 1, false).await.expect("read");
+                assert_eq!(vendor, identity.vendor.to_le_bytes());
+                // In one message, and in segments.
+                assert_eq!(
+                    coe.upload(&wire, 0x2000, 0, false)
+                        .await
+                        .expect("read")
+                        .len(),
+                    500
+                );
+                let data: Vec<u8> = (0..65_536_u32).map(|n| (n * 7 + n / 251) as u8).collect();
+                coe.download(&wire, 0x2100, 0, false, &data)
+                    .await
+                    .expect("written");
+                let back = coe.upload(&wire, 0x2100, 0, false).await.expect("read");
+                assert!(back == data, "{} bytes", back.len());
+            })
+            .await;
+
+            let at = device::locate(&wire, Locator::Position(0), None).await;
+            let (found, at) = at.expect("located");
+            let sii = device::information(&wire, &found, &at)
+                .await
+                .expect("an image");
+            let registers = Registers {
+                wire: &wire,
+                device: &at,
+                step: "a test",
+            };
+            let layout = mailbox::configure(&registers, &sii, sii.bootstrap).await;
+            let layout = layout.expect("configured");
+            assert_eq!((layout.out_len, layout.in_len), (1486, 1486));
+            let devices = std::slice::from_ref(&at);
+            let patient = mailbox::PRE_OP_TIMEOUT;
+            al::change_state(&wire, devices, AlState::Bootstrap, patient)
+                .await
+                .expect("Bootstrap");
+            let mut foe = FoeClient::new(layout);
+            foe.write(&wire, "new.bin", 0, &sent, &mut |_| {})
+                .await
+                .expect("written");
+            let back = foe.read(&wire, "new.bin", 0, 1 << 20, &mut |_| {}).await;
+            assert!(back.expect("read") == sent);
+        });
+        let device = link.segment().device(0).expect("a device");
+        assert_eq!(device.firmware(), Some(&file[..]));
+    });
+    on(machine, vec![work]);
+}
+
         let at = format!("{:#06x}:{:02}", object.index, item.sub);
         let told = own
             .object(object.index)

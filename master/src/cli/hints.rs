@@ -376,6 +376,7 @@ fn sdo(error: &SdoError, origin: &str) -> String {
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
         SdoError::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
+        SdoError::Gone { .. } | SdoError::Wire { .. } => "check the device's power and the cable to it",
         _ => "look at the exchange with `--record`",
     }
     .to_owned()

@@ -32,6 +32,9 @@ pub use sift::LinkStats;
 
 /// Largest frame without FCS.
 pub const MAX_FRAME: usize = 1514;
+/// Data of the only datagram in such a frame: behind the Ethernet header (14 bytes), the frame's own (2) and the datagram's (10), before
+/// its working counter (2).
+pub const MAX_DATA: u16 = 1486;
 
 /// A place to send frames to and receive them from. RT: no method blocks or allocates.
 pub trait Link: fmt::Debug + Send {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use ethercrab::{MainDevice, MainDeviceConfig, PduRx, PduStorage, PduTx, RetryBehaviour, Timeouts};
 
-use super::{Link, LinkError, MAX_FRAME};
+use super::{Link, LinkError, MAX_DATA, MAX_FRAME};
 use crate::clock::{self, Clock, Nanos};
 
 /// EtherType of EtherCAT frames.
@@ -19,8 +19,9 @@ const ETHERCRAB_MAC_TAIL: u8 = 0x10;
 
 /// Frames that ethercrab may have under way; it takes one an awaited datagram.
 const FRAMES: usize = 16;
-/// Payload of one frame: headers and data of its datagrams.
-const FRAME_DATA: usize = PduStorage::element_size(1400);
+/// Bytes of one frame: a full one, so that the largest mailbox fits.
+const FRAME_BYTES: usize = PduStorage::element_size(MAX_DATA as usize);
+const _: () = assert!(FRAME_BYTES == MAX_FRAME);
 
 /// How far virtual time moves at most while nothing is under way.
 const IDLE_STEP: Nanos = 20_000;
@@ -54,7 +55,7 @@ impl std::fmt::Debug for Port {
 /// is waited for must exceed a few cycles.
 #[must_use]
 pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, Port) {
-    let storage: &'static PduStorage<FRAMES, FRAME_DATA> = Box::leak(Box::new(PduStorage::new()));
+    let storage: &'static PduStorage<FRAMES, FRAME_BYTES> = Box::leak(Box::new(PduStorage::new()));
     let Ok((tx, rx, pdu_loop)) = storage.try_split() else {
         unreachable!("a new storage splits once");
     };

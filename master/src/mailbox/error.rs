@@ -57,18 +57,55 @@ pub enum SdoError {
         size: usize,
     },
     /// Frames come back, but this SubDevice touched none of them.
-    #[error("station {station:#06x} does not answer: it is off, or has lost its address")]
-    Gone { station: u16 },
     #[error(
-        "station {station:#06x}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE"
+        "station {station:#06x}: {asked}: the device does not answer: it is off, or has lost its address"
+    )]
+    Gone { station: u16, asked: About },
+    #[error(
+        "station {station:#06x}: {asked}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE"
     )]
     Mailbox {
         station: u16,
+        asked: About,
         out_len: u16,
         in_len: u16,
     },
-    #[error(transparent)]
-    Wire(#[from] WireError),
+    /// Frames do not come back.
+    #[error("station {station:#06x}: {asked}: {}", Lost(source))]
+    Wire {
+        station: u16,
+        asked: About,
+        source: WireError,
+    },
+}
+
+/// What a mailbox was used for when nothing could be had of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum About {
+    Object(ObjectAddress),
+    /// What lay in it was fetched, whatever it was.
+    Emptying,
+}
+
+impl fmt::Display for About {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Object(at) => at.fmt(f),
+            Self::Emptying => f.write_str("emptying its mailbox"),
+        }
+    }
+}
+
+/// Without the address of a datagram, which could be taken for an object's.
+pub(super) struct Lost<'a>(pub(super) &'a WireError);
+
+impl fmt::Display for Lost<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            WireError::Timeout { .. } => f.write_str("no frame came back"),
+            WireError::Other(why) => f.write_str(why),
+        }
+    }
 }
 
 impl SdoError {

@@ -6,11 +6,10 @@ use std::time::Duration;
 
 use super::abort::{abort_text, mailbox_error_text};
 use super::coe::{Answer, Fragment, Message, Request, parse};
-use super::error::{Phase, SdoError};
+use super::error::{Lost, Phase};
 use super::objects::ObjectAddress;
 use super::port::{Deadline, Trouble};
-use super::transfer::explain;
-use super::{CoeClient, Wire};
+use super::{CoeClient, MailboxLayout, Wire, WireError};
 
 const LIST: u8 = 1;
 const OBJECT: u8 = 3;
@@ -138,9 +137,27 @@ pub enum InfoError {
         asked: Asked,
         what: String,
     },
-    /// Whatever was asked: the SubDevice is gone, its mailboxes carry no CoE, or the wire failed.
-    #[error(transparent)]
-    Mailbox(SdoError),
+    /// Frames come back, but this SubDevice touched none of them.
+    #[error(
+        "station {station:#06x}: {asked}: the device does not answer: it is off, or has lost its address"
+    )]
+    Gone { station: u16, asked: Asked },
+    #[error(
+        "station {station:#06x}: {asked}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE"
+    )]
+    Mailbox {
+        station: u16,
+        asked: Asked,
+        out_len: u16,
+        in_len: u16,
+    },
+    /// Frames do not come back.
+    #[error("station {station:#06x}: {asked}: {}", Lost(source))]
+    Wire {
+        station: u16,
+        asked: Asked,
+        source: WireError,
+    },
 }
 
 impl InfoError {
@@ -412,17 +429,31 @@ impl CoeClient {
     }
 
     fn in_trouble(&self, asked: Asked, trouble: Trouble) -> InfoError {
-        let Trouble::Timeout(phase) = trouble else {
-            let station = self.port.layout.station;
-            return InfoError::Mailbox(explain(&self.port, trouble, |_| SdoError::Gone {
+        let MailboxLayout {
+            station,
+            out_len,
+            in_len,
+            ..
+        } = self.port.layout;
+        match trouble {
+            Trouble::Timeout(phase) => InfoError::Timeout {
                 station,
-            }));
-        };
-        InfoError::Timeout {
-            station: self.port.layout.station,
-            asked,
-            phase,
-            after: self.port.timeouts.of(phase),
+                asked,
+                phase,
+                after: self.port.timeouts.of(phase),
+            },
+            Trouble::Gone => InfoError::Gone { station, asked },
+            Trouble::Wire(source) => InfoError::Wire {
+                station,
+                asked,
+                source,
+            },
+            Trouble::Layout => InfoError::Mailbox {
+                station,
+                asked,
+                out_len,
+                in_len,
+            },
         }
     }
 }

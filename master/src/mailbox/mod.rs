@@ -28,7 +28,7 @@ mod transfer;
 pub use abort::{abort_text, mailbox_error_text};
 pub use desk::{DeviceMailbox, MailboxError, Mailboxes};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
-pub use error::{Phase, SdoError};
+pub use error::{About, Phase, SdoError};
 pub use foe::{FoeClient, FoeError};
 pub use info::{Asked, EntryDescription, InfoError, ObjectDescription, ObjectList};
 pub use objects::{ObjectAddress, object_name};

@@ -8,6 +8,7 @@ use super::coe::{MAILBOX_MIN, Message, parse};
 use super::emergency::Emergencies;
 use super::error::Phase;
 use super::{MailboxLayout, Timeouts, Wire, WireError};
+use crate::link::MAX_DATA;
 
 /// SyncManager register block: 8 bytes each from 0x0800.
 const SM_BASE: u16 = 0x0800;
@@ -17,9 +18,6 @@ const SM_PDI_CONTROL: u16 = 7;
 const MAILBOX_FULL: u8 = 0x08;
 /// In SM_ACTIVATE the request, in SM_PDI_CONTROL its acknowledgement: equal once the message has been repeated.
 const REPEAT: u8 = 0x02;
-
-/// Largest mailbox that one datagram in one frame carries.
-const MAILBOX_MAX: u16 = 1486;
 
 /// Consecutive frames that may be lost, or come back untouched, before a device or bus counts as gone.
 const PATIENCE: u32 = 5;
@@ -115,7 +113,7 @@ impl Port {
     }
 
     pub(super) fn check(&self) -> Result<(), Trouble> {
-        let fits = |len| (MAILBOX_MIN..=MAILBOX_MAX).contains(&len);
+        let fits = |len| (MAILBOX_MIN..=MAX_DATA).contains(&len);
         if fits(self.layout.out_len) && fits(self.layout.in_len) {
             Ok(())
         } else {

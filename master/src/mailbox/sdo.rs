@@ -4,7 +4,7 @@ use super::coe::{Answer, Message, Request, download_room, parse, segment_room};
 use super::emergency::{Emergencies, Emergency};
 use super::error::{Phase, SdoError};
 use super::port::{Deadline, Port, Trouble};
-use super::transfer::{Ended, Transfer, explain};
+use super::transfer::{Ended, Transfer, emptying};
 use super::{MailboxLayout, Timeouts, Wire};
 
 /// Bytes of the largest object that is read or written; a program may be longer.
@@ -103,9 +103,7 @@ impl CoeClient {
             Ok(()) => self.port.drain(w, DRAIN).await,
             Err(trouble) => Err(trouble),
         };
-        // Draining waits for no answer, so only the device itself can be missing.
-        let station = self.port.layout.station;
-        drained.map_err(|trouble| explain(&self.port, trouble, |_| SdoError::Gone { station }))
+        drained.map_err(|trouble| emptying(&self.port, trouble))
     }
 
     /// What the SubDevice reported unasked since the last call, oldest first.
@@ -127,8 +125,7 @@ impl CoeClient {
     /// Ends a transfer whose future was dropped: the SubDevice is told, and its mailbox emptied. The next transfer would do so.
     pub async fn give_up<W: Wire>(&mut self, w: &W) -> Result<(), SdoError> {
         let settled = self.settle(w).await;
-        let station = self.port.layout.station;
-        settled.map_err(|trouble| explain(&self.port, trouble, |_| SdoError::Gone { station }))
+        settled.map_err(|trouble| emptying(&self.port, trouble))
     }
 
     /// How many emergencies found the queue full.

@@ -2,7 +2,8 @@
 
 use super::MailboxLayout;
 use super::coe::Answer;
-use super::error::{Phase, SdoError};
+use super::error::{About, Phase, SdoError};
+use super::objects::ObjectAddress;
 use super::port::{Deadline, Port, Trouble};
 
 #[derive(Debug)]
@@ -57,7 +58,8 @@ impl Transfer {
             sub,
             ..
         } = *self;
-        Ended::from(explain(port, trouble, |phase| SdoError::Timeout {
+        let asked = About::Object(ObjectAddress { index, sub });
+        Ended::from(explain(port, trouble, asked, |phase| SdoError::Timeout {
             station,
             index,
             sub,
@@ -128,10 +130,11 @@ impl Transfer {
     }
 }
 
-/// The mailbox's trouble with the SubDevice's address; `timeout` says what a timeout means.
+/// The mailbox's trouble with the SubDevice's address and what was asked; `timeout` says what a timeout means.
 pub(super) fn explain(
     port: &Port,
     trouble: Trouble,
+    asked: About,
     timeout: impl FnOnce(Phase) -> SdoError,
 ) -> SdoError {
     let MailboxLayout {
@@ -142,12 +145,23 @@ pub(super) fn explain(
     } = port.layout;
     match trouble {
         Trouble::Timeout(phase) => timeout(phase),
-        Trouble::Gone => SdoError::Gone { station },
-        Trouble::Wire(error) => SdoError::Wire(error),
+        Trouble::Gone => SdoError::Gone { station, asked },
+        Trouble::Wire(source) => SdoError::Wire {
+            station,
+            asked,
+            source,
+        },
         Trouble::Layout => SdoError::Mailbox {
             station,
+            asked,
             out_len,
             in_len,
         },
     }
+}
+
+/// Trouble with a mailbox that is emptied. That waits for no answer, so only the device itself can be missing.
+pub(super) fn emptying(port: &Port, trouble: Trouble) -> SdoError {
+    let (station, asked) = (port.layout.station, About::Emptying);
+    explain(port, trouble, asked, |_| SdoError::Gone { station, asked })
 }

@@ -108,7 +108,7 @@ impl Class {
                 | BringUpError::Mailbox { source, .. }
                 | BringUpError::ReadBack { source, .. }
                 | BringUpError::ReadUnits { source, .. } => match source {
-                    SdoError::Gone { .. } | SdoError::Wire(_) => Self::Bus,
+                    SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
                     _ => Self::Device,
                 },
                 _ => Self::Device,

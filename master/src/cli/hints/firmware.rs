@@ -96,7 +96,7 @@ fn foe(error: &FoeError) -> Option<&'static str> {
         FoeError::Busy { .. } | FoeError::Timeout { .. } => {
             Some("the device did not go on: switch it off and on")
         }
-        FoeError::Gone { .. } | FoeError::Wire(_) => {
+        FoeError::Gone { .. } | FoeError::Wire { .. } => {
             Some("check the device's power and the cable to it")
         }
         _ => None,

@@ -37,7 +37,7 @@ pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
             "the image in its EEPROM is damaged: `ecaxis eeprom verify` says how, `ecaxis esi sii` makes one from an ESI file".to_owned()
         }
         ServiceError::Information { source, .. } => match source.as_ref() {
-            InfoError::Mailbox(source) => parameter(source),
+            InfoError::Gone { .. } | InfoError::Wire { .. } => FRAMES.to_owned(),
             source if source.is_refusal() => {
                 "the device does not tell about its objects: give its ESI file, by a machine file or with `--esi`".to_owned()
             }

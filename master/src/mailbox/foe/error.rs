@@ -4,6 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use super::super::abort::mailbox_error_text;
+use super::super::error::Lost;
 use super::super::{Phase, WireError};
 
 /// `station` is the SubDevice's configured address, `file` the name that it was asked for. The transfer is over in every
@@ -79,18 +80,29 @@ pub enum FoeError {
         room: usize,
     },
     /// Frames come back, but this SubDevice touched none of them.
-    #[error("station {station:#06x} does not answer: it is off, or has lost its address")]
-    Gone { station: u16 },
+    #[error("station {station:#06x}: file `{file}`: the device does not answer{}: it is off, or has lost its address", At(*packet))]
+    Gone {
+        station: u16,
+        file: String,
+        packet: u32,
+    },
     #[error(
-        "station {station:#06x}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry files"
+        "station {station:#06x}: file `{file}`: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry files"
     )]
     Layout {
         station: u16,
+        file: String,
         out_len: u16,
         in_len: u16,
     },
-    #[error(transparent)]
-    Wire(#[from] WireError),
+    /// Frames do not come back.
+    #[error("station {station:#06x}: file `{file}`: {}{}", Lost(source), At(*packet))]
+    Wire {
+        station: u16,
+        file: String,
+        packet: u32,
+        source: WireError,
+    },
 }
 
 impl FoeError {

@@ -421,10 +421,22 @@ impl Transfer<'_> {
                 },
                 tell: Some(NOT_DEFINED),
             },
-            Trouble::Gone => FoeError::Gone { station }.into(),
-            Trouble::Wire(error) => FoeError::Wire(error).into(),
+            Trouble::Gone => FoeError::Gone {
+                station,
+                file: self.file.to_owned(),
+                packet,
+            }
+            .into(),
+            Trouble::Wire(source) => FoeError::Wire {
+                station,
+                file: self.file.to_owned(),
+                packet,
+                source,
+            }
+            .into(),
             Trouble::Layout => FoeError::Layout {
                 station,
+                file: self.file.to_owned(),
                 out_len: port.layout.out_len,
                 in_len: port.layout.in_len,
             }

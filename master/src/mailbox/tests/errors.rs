@@ -6,7 +6,9 @@ use std::time::Duration;
 use super::mischief::{Mischief, emergency};
 use super::server::Server;
 use super::{STATION, block_on, client, layout};
-use crate::mailbox::{CoeClient, MAX_OBJECT, Phase, SdoError, Wire, WireError};
+use crate::mailbox::{
+    About, CoeClient, FoeClient, MAX_OBJECT, ObjectAddress, Phase, SdoError, Wire, WireError,
+};
 
 const LONG: &[u8] = &[7; 100];
 const OBJECTS: &[(u16, u8, &[u8])] = &[
@@ -145,14 +147,24 @@ fn a_mailbox_that_stays_full_times_out() {
     assert!(server.now() - before < 150_000_000);
 }
 
+fn gone(index: u16) -> SdoError {
+    SdoError::Gone {
+        station: STATION,
+        asked: About::Object(ObjectAddress { index, sub: 0 }),
+    }
+}
+
 #[test]
 fn a_device_that_is_gone_is_not_waited_for() {
     let server = server(&[Mischief::Off]);
     let error = block_on(client().upload(&server, 0x6041, 0, false)).unwrap_err();
-    assert_eq!(error, SdoError::Gone { station: STATION });
+    assert_eq!(error, gone(0x6041));
     assert_eq!(
         block_on(client().drain(&server)),
-        Err(SdoError::Gone { station: STATION })
+        Err(SdoError::Gone {
+            station: STATION,
+            asked: About::Emptying
+        })
     );
     assert!(server.now() < 10_000_000, "{}", server.now());
 }
@@ -164,7 +176,7 @@ fn a_device_that_goes_in_mid_transfer_is_not_waited_for() {
     block_on(client.drain(&server)).unwrap();
     server.commit(Mischief::Off);
     let error = block_on(client.download(&server, 0x2000, 0, false, LONG)).unwrap_err();
-    assert_eq!(error, SdoError::Gone { station: STATION });
+    assert_eq!(error, gone(0x2000));
 }
 
 #[test]
@@ -441,44 +453,161 @@ fn mailboxes_that_cannot_carry_coe_are_refused_before_anything_is_sent() {
     for len in [0, 6, 15, 1487] {
         let server = server(&[]);
         let mut client = CoeClient::new(layout(len));
-        let refused = SdoError::Mailbox {
+        let refused = |asked| SdoError::Mailbox {
             station: STATION,
+            asked,
             out_len: len,
             in_len: len,
         };
+        let object = About::Object(ObjectAddress {
+            index: 0x6041,
+            sub: 0,
+        });
         assert_eq!(
             block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err(),
-            refused
+            refused(object)
         );
-        assert_eq!(block_on(client.drain(&server)).unwrap_err(), refused);
+        assert_eq!(
+            block_on(client.drain(&server)).unwrap_err(),
+            refused(About::Emptying)
+        );
         assert_eq!(server.datagrams.get(), 0);
+    }
+}
+
+/// No frame comes back.
+struct Silent;
+
+impl Wire for Silent {
+    async fn read(&self, station: u16, register: u16, _: &mut [u8]) -> Result<u16, WireError> {
+        Err(WireError::Timeout { station, register })
+    }
+
+    async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, WireError> {
+        Err(WireError::Timeout { station, register })
+    }
+
+    async fn delay(&self, _: Duration) {}
+
+    fn now(&self) -> u64 {
+        0
     }
 }
 
 #[test]
 fn a_silent_bus_is_reported_as_such() {
-    struct Silent;
-    impl Wire for Silent {
-        async fn read(&self, station: u16, register: u16, _: &mut [u8]) -> Result<u16, WireError> {
-            Err(WireError::Timeout { station, register })
-        }
-        async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, WireError> {
-            Err(WireError::Timeout { station, register })
-        }
-        async fn delay(&self, _: Duration) {}
-        fn now(&self) -> u64 {
-            0
-        }
-    }
     let error = block_on(client().upload(&Silent, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
             error,
-            SdoError::Wire(WireError::Timeout {
-                station: STATION,
+            SdoError::Wire {
+                source: WireError::Timeout {
+                    station: STATION,
+                    ..
+                },
                 ..
-            })
+            }
         ),
         "{error}"
     );
+}
+
+/// Whatever fails, it is told of what, and no register is shown that looks like an object.
+#[test]
+fn every_error_has_its_object_or_its_file() {
+    const NAMED: &str = "station 0x1001: 0x6065:00 (Following error window)";
+    let named = |text: String| {
+        assert!(text.starts_with(NAMED), "{text}");
+        assert!(!text.contains("register"), "{text}");
+        text
+    };
+    let silent = [
+        block_on(client().upload(&Silent, 0x6065, 0, false)).map(|_| ()),
+        block_on(client().download(&Silent, 0x6065, 0, false, &[1])),
+        block_on(client().download(&Silent, 0x6065, 0, false, LONG)),
+    ];
+    for error in silent {
+        let text = named(error.unwrap_err().to_string());
+        assert_eq!(text, format!("{NAMED}: no frame came back"));
+    }
+    let off = server(&[Mischief::Off]);
+    let error = block_on(client().upload(&off, 0x6065, 0, false)).unwrap_err();
+    assert!(named(error.to_string()).ends_with("it is off, or has lost its address"));
+
+    let (index, sub, station) = (0x6065, 0, STATION);
+    let asked = About::Object(ObjectAddress { index, sub });
+    let source = WireError::Other("a frame was too long".to_owned());
+    for error in [
+        SdoError::Abort {
+            station,
+            index,
+            sub,
+            code: 1,
+        },
+        SdoError::Timeout {
+            station,
+            index,
+            sub,
+            phase: Phase::Answer,
+            after: Duration::ZERO,
+            set_aside: 0,
+        },
+        SdoError::Refused {
+            station,
+            index,
+            sub,
+            code: 1,
+        },
+        SdoError::Malformed {
+            station,
+            index,
+            sub,
+            what: String::new(),
+        },
+        SdoError::TooLarge {
+            station,
+            index,
+            sub,
+            size: 1,
+        },
+        SdoError::Gone { station, asked },
+        SdoError::Mailbox {
+            station,
+            asked,
+            out_len: 1,
+            in_len: 1,
+        },
+        SdoError::Wire {
+            station,
+            asked,
+            source,
+        },
+    ] {
+        named(error.to_string());
+    }
+
+    let asked = "station 0x1001: the description of 0x6065:00 (Following error window): ";
+    for error in [
+        block_on(client().entry_description(&Silent, 0x6065, 0)).unwrap_err(),
+        block_on(client().entry_description(&off, 0x6065, 0)).unwrap_err(),
+        block_on(CoeClient::new(layout(6)).entry_description(&off, 0x6065, 0)).unwrap_err(),
+    ] {
+        let text = error.to_string();
+        assert!(
+            text.starts_with(asked) && !text.contains("register"),
+            "{text}"
+        );
+    }
+    for error in [
+        block_on(FoeClient::new(layout(48)).write(&Silent, "new.bin", 0, &[1], &mut |_| {})),
+        block_on(FoeClient::new(layout(48)).write(&off, "new.bin", 0, &[1], &mut |_| {})),
+        block_on(FoeClient::new(layout(6)).write(&off, "new.bin", 0, &[1], &mut |_| {})),
+    ] {
+        let text = error.unwrap_err().to_string();
+        assert!(
+            text.starts_with("station 0x1001: file `new.bin`: "),
+            "{text}"
+        );
+        assert!(!text.contains("register"), "{text}");
+    }
 }

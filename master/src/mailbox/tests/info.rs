@@ -205,6 +205,6 @@ fn silence_and_absence_end_in_time() {
     }
     let (server, mut client) = (server(48, &[Mischief::Off]), client(48));
     let error = block_on(client.list_lengths(&server)).unwrap_err();
-    assert!(matches!(error, InfoError::Mailbox(_)), "{error}");
+    assert!(matches!(error, InfoError::Gone { .. }), "{error}");
     assert!(error.to_string().contains("does not answer"));
 }
