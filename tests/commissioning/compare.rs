@@ -250,6 +250,12 @@ fn every_difference_is_named_and_can_be_applied() {
 
         let ran = bench.ecaxis(&[&compare[..], &["--apply"]].concat());
         assert_eq!(ran.code, 0, "{name}: {}", ran.err);
+        assert!(
+            ran.err.contains("the old text is in machine.toml.old"),
+            "{name}: {}",
+            ran.err
+        );
+        assert_eq!(bench.read("machine.toml.old"), MACHINE, "{name}");
         let applied = bench.read("machine.toml");
         reviewed(&format!("apply/{name}.toml"), &applied);
         let check = bench.ecaxis(&["check", "machine.toml"]);

@@ -17,7 +17,7 @@ use ecaxis::rt::margin::Spin;
 use ecaxis::session::Observer;
 
 use super::progress::Teller;
-use super::{Failure, hints, note, result, signals};
+use super::{Failure, files, hints, note, result, signals};
 
 /// The shortest cycle that is measured; SYNC0 of most drives is no faster.
 const SHORTEST: u64 = 20_000;
@@ -180,6 +180,16 @@ fn against(text: &str) -> Result<Against, String> {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let plan = plan(args)?;
+    for (option, path, kind) in [
+        ("--html", &args.html, &files::PAGE),
+        ("--save", &args.save, &files::FIGURES),
+    ] {
+        let machine = args.machine.iter();
+        let inputs = machine.map(|file| (file.as_path(), "the machine file"));
+        if let Some(path) = path {
+            files::may_replace(option, path, kind, inputs)?;
+        }
+    }
     for nic in veth::leftovers() {
         note(&format!(
             "note: `{nic}` was left by a program that was killed; `ip link del {nic}` removes it"

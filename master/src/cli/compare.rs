@@ -10,7 +10,8 @@ use ecaxis::scan::{self, Scan};
 use serde_json::{Value, json};
 
 use super::bus::{self, Bus};
-use super::scan::{Seen, open, save};
+use super::files::{Old, replace};
+use super::scan::{Seen, open};
 use super::{Failure, hints, result};
 
 const EXAMPLES: &str = "\
@@ -221,7 +222,10 @@ fn rewrite(
         comparison,
     };
     let text = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
-    save(file, &text)?;
+    let kept = replace(file, &text, Old::Kept)?;
+    if let Some(kept) = kept {
+        super::note(&format!("the old text is in {}", kept.display()));
+    }
     super::note(&format!(
         "{} is as the bus now; `ecaxis check {}` and a look at what is marked \"{}\" are due",
         file.display(),

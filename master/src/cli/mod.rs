@@ -2,12 +2,10 @@
 //!
 //! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
 //! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile;
-//! [`record`] keeps a recording from destroying another file; [`style`] decides about colours;
-//! [`story`] lays out what stopped a run.
+//! [`files`] and [`record`] keep what is written from destroying another file; [`style`] decides about
+//! colours; [`story`] lays out what stopped a run; [`bus`] is the one way to a bus without a cycle.
 
-use std::fs::File;
 use std::io::{self, IsTerminal, Write};
-use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -25,6 +23,7 @@ mod eeprom;
 mod emergencies;
 mod esi;
 mod explain;
+mod files;
 mod firmware;
 mod hints;
 mod jog;
@@ -42,6 +41,7 @@ mod style;
 mod table;
 mod tables;
 
+pub(crate) use files::{in_the_way, keep};
 pub(crate) use hints::Failure;
 
 const EXAMPLES: &str = "\
@@ -180,23 +180,6 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
         )),
         _ => Ok(()),
     }
-}
-
-/// A file that must not exist yet.
-pub(crate) fn keep(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    let written = File::create_new(path).and_then(|mut file| file.write_all(bytes));
-    written.map_err(|error| match error.kind() {
-        io::ErrorKind::AlreadyExists => in_the_way(path),
-        _ => Failure::new(
-            hints::WRONG,
-            format!("cannot write {}: {error}", path.display()),
-        ),
-    })
-}
-
-pub(crate) fn in_the_way(path: &Path) -> Failure {
-    Failure::new(hints::WRONG, format!("{} exists already", path.display()))
-        .hint("nothing is written over; name another file or remove that one")
 }
 
 /// A line on stderr.

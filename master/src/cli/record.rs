@@ -1,17 +1,12 @@
 //! Where a recording goes: never over a file that is something else.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, ErrorKind, Read};
-use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::Path;
 
 use ecaxis::config::Machine;
 use ecaxis::link::capture;
 
+use super::files::{Existing, RECORDING, existing, may_replace};
 use super::{Failure, hints};
-
-/// How a pcapng file begins, in either byte order.
-const MAGIC: [u8; 4] = [0x0a, 0x0d, 0x0d, 0x0a];
 
 /// Whether a run may write its frames to `target`.
 pub(crate) fn check(
@@ -19,39 +14,34 @@ pub(crate) fn check(
     machine: &Machine,
     faults: Option<&Path>,
 ) -> Result<(), Failure> {
-    let shown = target.display();
-    let refuse = |what: String| Failure::new(hints::WRONG, format!("--record: {what}"));
-    let inputs = [(machine.path.as_path(), "the machine file")]
-        .into_iter()
+    check_beside(target, Some(machine), faults, None)
+}
+
+/// Whether frames may be written to `target`; `input` is another file that is read, and what it is.
+pub(crate) fn check_beside(
+    target: &Path,
+    machine: Option<&Machine>,
+    faults: Option<&Path>,
+    input: Option<(&Path, &str)>,
+) -> Result<(), Failure> {
+    let files = machine.into_iter().flat_map(|machine| {
+        let esi = machine.devices.iter().map(|d| d.esi_path.as_path());
+        let esi = esi.map(|path| (path, "an ESI file of this machine"));
+        std::iter::once((machine.path.as_path(), "the machine file")).chain(esi)
+    });
+    let inputs = files
         .chain(faults.map(|path| (path, "the fault script")))
-        .chain(
-            machine
-                .devices
-                .iter()
-                .map(|d| (d.esi_path.as_path(), "an ESI file of this machine")),
-        );
-    for (input, what) in inputs {
-        if same_file(input, target) {
-            return Err(refuse(format!("{shown} is {what}")).hint(NEW));
-        }
-    }
-    match existing(target) {
-        Ok(Existing::Free) => Ok(()),
-        Ok(Existing::Taken(what)) => Err(refuse(format!("{shown} {what}")).hint(NEW)),
-        Err(e) => {
-            let failure = refuse(format!("cannot write {shown}: {e}"));
-            Err(failure.hint("name a file in a folder that exists and can be written"))
-        }
-    }
+        .chain(input);
+    may_replace("--record", target, &RECORDING, inputs)
 }
 
 /// Whether the parts of a recording with a limit would be written over something else.
 pub(crate) fn check_parts(target: &Path) -> Result<(), Failure> {
     let parts = capture::parts_of(target).unwrap_or_default();
     for part in parts {
-        if let Ok(Existing::Taken(what)) = existing(&part) {
+        if let Ok(Existing::Taken(what)) = existing(&part, &RECORDING) {
             let message = format!("--record-limit: {} {what}", part.display());
-            return Err(Failure::new(hints::WRONG, message).hint(NEW));
+            return Err(Failure::new(hints::WRONG, message).hint(RECORDING.instead));
         }
     }
     Ok(())
@@ -87,55 +77,10 @@ pub(crate) fn size(text: &str) -> Result<u64, String> {
     }
 }
 
-const NEW: &str = "name a new file, or a recording to write over";
-
-fn same_file(a: &Path, b: &Path) -> bool {
-    match (fs::metadata(a), fs::metadata(b)) {
-        (Ok(a), Ok(b)) => (a.dev(), a.ino()) == (b.dev(), b.ino()),
-        _ => false,
-    }
-}
-
-enum Existing {
-    /// Nothing that would be lost.
-    Free,
-    Taken(&'static str),
-}
-
-/// Tries what recording will do, and leaves everything as it was.
-fn existing(target: &Path) -> io::Result<Existing> {
-    let kind = match fs::metadata(target) {
-        Ok(metadata) => metadata.file_type(),
-        Err(e) if e.kind() == ErrorKind::NotFound => {
-            drop(File::create(target)?);
-            // The file, not a link that leads to it.
-            fs::remove_file(fs::canonicalize(target)?)?;
-            return Ok(Existing::Free);
-        }
-        Err(e) => return Err(e),
-    };
-    if kind.is_dir() {
-        return Ok(Existing::Taken("is a folder"));
-    }
-    if kind.is_block_device() {
-        return Ok(Existing::Taken("is a disk"));
-    }
-    // A pipe into a program, a null device: opening it could block, and nothing is kept there.
-    if !kind.is_file() {
-        return Ok(Existing::Free);
-    }
-    let mut file = OpenOptions::new().read(true).write(true).open(target)?;
-    let mut head = Vec::new();
-    file.by_ref().take(4).read_to_end(&mut head)?;
-    Ok(if head.is_empty() || head == MAGIC {
-        Existing::Free
-    } else {
-        Existing::Taken("exists and is not a recording (pcapng)")
-    })
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]
@@ -228,7 +173,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.pcapng");
         assert_eq!(check_parts(&path), Ok(()));
-        fs::write(folder.path().join("run.0001.pcapng"), MAGIC).unwrap();
+        fs::write(folder.path().join("run.0001.pcapng"), "\n\r\r\n").unwrap();
         fs::write(folder.path().join("run.notes.pcapng"), "no part").unwrap();
         assert_eq!(check_parts(&path), Ok(()));
         fs::write(folder.path().join("run.0002.pcapng"), "notes").unwrap();

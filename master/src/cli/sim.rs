@@ -12,7 +12,7 @@ use ecaxis::session;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
-use super::{Failure, hints, note, result, run, signals};
+use super::{Failure, hints, keep, note, result, run, signals};
 
 /// SCHED_FIFO priority of the simulated bus; below that of a master on the same computer.
 const PRIORITY: u8 = 70;
@@ -45,7 +45,7 @@ pub(crate) struct Args {
     /// The fault script begins at SIGUSR1, and anew at each further one, not with the first frame
     #[arg(long, requires = "faults")]
     faults_on_signal: bool,
-    /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …
+    /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …; other files are not written over
     #[arg(long, value_name = "FOLDER")]
     sii: Option<PathBuf>,
     /// Print the statistics as JSON
@@ -145,7 +145,11 @@ fn write_images(segment: &Segment, folder: &Path) -> Result<(), Failure> {
     std::fs::create_dir_all(folder).map_err(|e| failed(folder, e))?;
     for (position, device) in devices(segment) {
         let path = folder.join(format!("{position}.bin"));
-        std::fs::write(&path, device.sii()).map_err(|e| failed(&path, e))?;
+        // The same image as last time is there already.
+        if std::fs::read(&path).is_ok_and(|there| there == device.sii()) {
+            continue;
+        }
+        keep(&path, device.sii())?;
     }
     Ok(())
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use ecaxis::analyze::{self as analysis, Known};
 use ecaxis::{config, recording};
 
-use super::{Failure, hints, note, result};
+use super::{Failure, files, hints, note, result};
 
 mod text;
 
@@ -50,6 +50,14 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    if let Some(path) = &args.html {
+        let recordings = args.files.iter().map(|file| (file, "a recording to read"));
+        let machine = args.machine.iter().map(|file| (file, "the machine file"));
+        let esi = args.esi.iter().map(|file| (file, "the ESI file"));
+        let inputs = recordings.chain(machine).chain(esi);
+        let inputs = inputs.map(|(file, what)| (file.as_path(), what));
+        files::may_replace("--html", path, &files::PAGE, inputs)?;
+    }
     let known = known(args)?;
     let mut parts = Vec::new();
     for path in &args.files {

@@ -1,13 +1,13 @@
 //! `ecaxis firmware sample`: a firmware file that a simulated device takes.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use ecaxis::config;
 use ecaxis_sim::FirmwareHeader;
 
 use super::target;
 use crate::cli::esi::number;
-use crate::cli::{Failure, hints, note};
+use crate::cli::{Failure, hints, keep, note};
 
 /// Longest program that is made.
 const MOST: usize = 16 << 20;
@@ -27,7 +27,7 @@ pub(crate) struct Args {
     /// The device's name in it
     #[arg(value_name = "DEVICE")]
     device: String,
-    /// File to write
+    /// File to write, which must not exist yet
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Bytes of program, such as 65536, 64KiB or 1MiB
@@ -71,7 +71,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         version: args.software,
     };
     let file = header.file(&program(args.size));
-    write(&args.output, &file)?;
+    keep(&args.output, &file)?;
     note(&format!(
         "{}: {} bytes for the simulated `{}`",
         args.output.display(),
@@ -90,13 +90,6 @@ fn program(len: usize) -> Vec<u8> {
         high
     };
     (0..len).map(|_| next()).collect()
-}
-
-fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    std::fs::write(path, bytes).map_err(|e| {
-        let message = format!("cannot write {}: {e}", path.display());
-        Failure::new(hints::FAILED, message)
-    })
 }
 
 #[cfg(test)]

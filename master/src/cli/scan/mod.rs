@@ -13,8 +13,6 @@ mod report;
 mod text;
 mod write;
 
-pub(crate) use write::save;
-
 const EXAMPLES: &str = "\
 Examples:
   ecaxis scan enp3s0                        who is there

@@ -1,11 +1,11 @@
 //! Writes what was found as a machine file.
 
-use std::io::Write;
 use std::path::Path;
 
 use ecaxis::config::{self, ConfigError};
 use ecaxis::scan::write::{self, MARK, Place};
 
+use super::super::files::{Old, replace};
 use super::super::{Failure, bus, hints, note, result};
 use super::Seen;
 
@@ -26,7 +26,7 @@ pub(super) fn machine_file(seen: &Seen, path: &Path, library: bool) -> Result<()
         folder: path.parent().unwrap_or(Path::new("")),
     };
     let text = write::machine_file(&seen.scan, &seen.described, place);
-    save(path, &text)?;
+    replace(path, &text, Old::Lost)?;
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
     let plural = |n: usize| if n == 1 { "" } else { "s" };
@@ -60,25 +60,4 @@ pub(super) fn machine_file(seen: &Seen, path: &Path, library: bool) -> Result<()
         ));
     }
     result(&told)
-}
-
-/// Writes beside the file first, so that it is either the old one or the new one.
-pub(crate) fn save(path: &Path, text: &str) -> Result<(), Failure> {
-    let failed = |e: std::io::Error| {
-        let message = format!("cannot write {}: {e}", path.display());
-        Failure::new(hints::FAILED, message)
-    };
-    let mut beside = path.as_os_str().to_owned();
-    beside.push(".new");
-    let beside = Path::new(&beside);
-    let written = std::fs::File::create(beside)
-        .and_then(|mut file| {
-            file.write_all(text.as_bytes())
-                .and_then(|()| file.sync_all())
-        })
-        .and_then(|()| std::fs::rename(beside, path));
-    written.map_err(|e| {
-        let _ = std::fs::remove_file(beside);
-        failed(e)
-    })
 }
