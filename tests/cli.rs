@@ -330,3 +330,151 @@ fn colours_only_where_they_are_wanted() {
     let both = [("CLICOLOR_FORCE", "1"), ("NO_COLOR", "1")];
     assert_eq!(stderr(&both), plain, "NO_COLOR wins");
 }
+
+/// A short recording, and whatever else a verb may destroy.
+struct Files(tempfile::TempDir);
+
+impl Files {
+    fn new() -> Self {
+        let files = Self(tempfile::tempdir().expect("a folder"));
+        files.records("ok.pcapng", &[]);
+        std::fs::write(files.0.path().join("notes.txt"), "dear diary").expect("written");
+        files
+    }
+
+    fn at(&self, name: &str) -> String {
+        let path = self.0.path().join(name);
+        path.to_str().expect("UTF-8").to_owned()
+    }
+
+    fn read(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.0.path().join(name)).expect("it is there")
+    }
+
+    fn records(&self, name: &str, more: &[&str]) {
+        let path = self.at(name);
+        let line = ["firmware", "info", "configs/demo.toml", "x"];
+        let simulated = ["--sim", "--virtual", "--record", &path];
+        let output = ecaxis(&[&line[..], &simulated, more].concat());
+        assert!(output.status.success(), "{output:?}");
+    }
+
+    /// What is refused leaves the file as it was.
+    #[track_caller]
+    fn keeps(&self, name: &str, line: &[&str], parts: &[&str]) {
+        let before = self.read(name);
+        let output = ecaxis(line);
+        let told = (output.status.code().unwrap_or(-1), text(&output.stderr));
+        fails(told, 2, parts);
+        assert!(self.read(name) == before, "{line:?}");
+    }
+}
+
+#[test]
+fn firmware_records_over_nothing_but_recordings() {
+    let files = Files::new();
+    let (notes, program) = (files.at("notes.txt"), files.at("new.bin"));
+    let sample = [
+        "firmware",
+        "sample",
+        "configs/demo.toml",
+        "x",
+        "-o",
+        &program,
+    ];
+    assert!(ecaxis(&sample).status.success());
+    let info = [
+        "firmware",
+        "info",
+        "configs/demo.toml",
+        "x",
+        "--sim",
+        "--virtual",
+        "--record",
+    ];
+    let refused = ["--record", "is not a recording", "= help: name a new file"];
+    files.keeps("notes.txt", &[&info[..], &[&notes]].concat(), &refused);
+    let update = [
+        "firmware",
+        "update",
+        "configs/demo.toml",
+        "x",
+        &program,
+        "--sim",
+        "--virtual",
+    ];
+    let line = [&update[..], &["--yes", "--record", &program]].concat();
+    files.keeps(
+        "new.bin",
+        &line,
+        &["--record", "new.bin is the firmware file"],
+    );
+    // Without a machine file, too: nothing is opened before.
+    let bare = [
+        "firmware",
+        "info",
+        "--nic",
+        "nonet7",
+        "--position",
+        "0",
+        "--record",
+        &notes,
+    ];
+    files.keeps("notes.txt", &bare, &refused);
+    // Over an old one.
+    files.records("ok.pcapng", &[]);
+    // What is made for the simulated bus is kept, too.
+    files.keeps(
+        "notes.txt",
+        &[&sample[..5], &[&notes]].concat(),
+        &["notes.txt exists already"],
+    );
+}
+
+#[test]
+fn reports_are_written_over_nothing_but_reports() {
+    let files = Files::new();
+    files.records("night2.pcapng", &[]);
+    let (ok, night, notes) = (
+        files.at("ok.pcapng"),
+        files.at("night2.pcapng"),
+        files.at("notes.txt"),
+    );
+    let recording = [
+        "--html",
+        "is a recording to read",
+        "= help: name a new file",
+    ];
+    files.keeps("ok.pcapng", &["analyze", &ok, "--html", &ok], &recording);
+    // A shell's pattern in the place of one name.
+    let line = ["analyze", "--html", &ok, &night];
+    files.keeps("ok.pcapng", &line, &["--html", "is not a report (HTML)"]);
+    std::fs::hard_link(&ok, files.at("hard")).expect("linked");
+    std::os::unix::fs::symlink(&ok, files.at("soft")).expect("linked");
+    for link in ["hard", "soft"] {
+        files.keeps(
+            "ok.pcapng",
+            &["analyze", &ok, "--html", &files.at(link)],
+            &recording,
+        );
+    }
+    files.keeps(
+        "notes.txt",
+        &["analyze", &ok, "--html", &notes],
+        &["is not a report"],
+    );
+    let page = files.at("report.html");
+    for _ in 0..2 {
+        let output = ecaxis(&["analyze", &ok, "--html", &page]);
+        assert!(output.status.success(), "{output:?}");
+        assert!(files.read("report.html").starts_with(b"<!DOCTYPE html>"));
+    }
+    // The figures of a bench, and its report; before anything is measured.
+    for (option, what) in [
+        ("--save", "is not a file of figures (JSON)"),
+        ("--html", "is not a report (HTML)"),
+    ] {
+        let line = ["bench", "--sim", "--seconds", "1", option, &notes];
+        files.keeps("notes.txt", &line, &[option, what]);
+    }
+}

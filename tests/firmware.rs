@@ -9,17 +9,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::load;
-use ecaxis::bringup::AlState;
+use ecaxis::bringup::{AlState, al};
 use ecaxis::clock::Clock;
+use ecaxis::config::Locator;
 use ecaxis::firmware::{
     self, BOOT_LOADER, Cause, Done, Examined, Expected, FirmwareError, Left, Order, ReadBack, Runs,
-    Step, Told, Via,
+    START_TIMEOUT, Step, Told, Via,
 };
 use ecaxis::link::sim::SimLink;
 use ecaxis::link::{Link, LinkError, MAX_FRAME, Nanos};
-use ecaxis::mailbox::{FoeError, SdoError};
-use ecaxis::service::carry;
+use ecaxis::mailbox::{FoeError, SdoError, Wire};
 use ecaxis::service::station::Which;
+use ecaxis::service::{Datagrams, carry, device, mailbox};
 use ecaxis::session::simulated_bus;
 use ecaxis_sim::{
     DeviceOptions, FaultScript, FirmwareHeader, FirmwareOptions, Segment, SegmentOptions, SimDevice,
@@ -31,10 +32,15 @@ struct Switched {
     link: SimLink,
     position: usize,
     off: Arc<AtomicBool>,
+    /// Datagrams that wrote to 0x0500: whose the EEPROM is.
+    claims: usize,
 }
 
 impl Link for Switched {
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
+        // The first datagram of each: FPWR, and its register.
+        let claim = frame.get(16) == Some(&5) && frame.get(20..22) == Some(&[0x00, 0x05]);
+        self.claims += usize::from(claim);
         let on = !self.off.load(Ordering::Relaxed);
         self.link.segment_mut().power(self.position, on);
         self.link.send(frame)
@@ -53,6 +59,8 @@ impl Link for Switched {
 struct Bench {
     link: Switched,
     off: Arc<AtomicBool>,
+    /// The user ends the next update.
+    stop: Arc<AtomicBool>,
     /// Of whom everything here is.
     position: u16,
     expected: Expected,
@@ -73,8 +81,10 @@ fn on_a_bus<T: Send + 'static>(
                 link: SimLink::new(segment()),
                 position: usize::from(position),
                 off: Arc::clone(&off),
+                claims: 0,
             },
             off,
+            stop: Arc::default(),
             position,
             expected: Expected::default(),
         };
@@ -153,8 +163,10 @@ impl Bench {
             let before = firmware::examine(&wire, which, "x").await?;
             firmware::update(&wire, &before, expected, &order, tell).await
         };
-        let stop = AtomicBool::new(false);
-        carry(&mut self.link, Clock::Virtual, &stop, work).expect("carried")
+        let stop = Arc::clone(&self.stop);
+        let done = carry(&mut self.link, Clock::Virtual, &stop, work).expect("carried");
+        self.stop.store(false, Ordering::Relaxed);
+        done
     }
 
     fn power(&mut self, on: bool) {
@@ -313,6 +325,124 @@ fn power_lost_at_forty_percent() {
             bench.succeeds(via, &file);
         });
     }
+}
+
+#[test]
+fn who_ends_an_update_leaves_no_device_in_bootstrap() {
+    for (position, via) in [(0, Via::Foe), (0, Via::Program), (1, Via::Foe)] {
+        on_a_bus(demo, position, move |bench| {
+            let file = file(position, 200_000);
+            // At once, in the middle of it, and when all is there.
+            for percent in [0, 40, 100] {
+                let stop = Arc::clone(&bench.stop);
+                let mut tell = |told| {
+                    if let Told::Moved { done, of } = told
+                        && done * 100 >= of * percent
+                    {
+                        stop.store(true, Ordering::Relaxed);
+                    }
+                };
+                let error = bench.update(via, &file, &mut tell).expect_err("ended");
+                let FirmwareError::Failed { cause, left, .. } = &error else {
+                    panic!("{error}")
+                };
+                assert!(matches!(cause, Cause::Interrupted), "{error}");
+                let init = Left::In {
+                    state: AlState::Init,
+                    code: 0,
+                };
+                assert_eq!(*left, init, "{percent} %");
+                assert!(
+                    error
+                        .to_string()
+                        .contains("interrupted; the device is in Init")
+                );
+                assert_eq!(bench.device().al_state(), ecaxis_sim::AlState::Init);
+            }
+            bench.succeeds(via, &file);
+        });
+    }
+}
+
+/// A device that has a mailbox and no process data, so that it is in Op without a cycle.
+fn without_process_data() -> Segment {
+    let esi = std::fs::read_to_string(common::root().join("tests/judges/esi/mailbox.xml"));
+    let mut text = esi.expect("the judges' ESI");
+    for (from, to) in [
+        ("<RxPdo", "</RxPdo>"),
+        ("<TxPdo", "</TxPdo>"),
+        ("<Sm MaxSize=\"32\"", "</Sm>"),
+        ("<Sm MaxSize=\"32\"", "</Sm>"),
+    ] {
+        let begin = text.find(from).expect("it is there");
+        let end = begin + text[begin..].find(to).expect("it ends") + to.len();
+        text.replace_range(begin..end, "");
+    }
+    let esi = ecaxis_esi::parse(text.as_bytes()).expect("an ESI");
+    let options = DeviceOptions {
+        firmware: Some(FirmwareOptions::default()),
+        ..DeviceOptions::default()
+    };
+    let device = SimDevice::from_esi(&esi.devices[0], &esi.modules, options);
+    Segment::new(vec![device.expect("a device")], SegmentOptions::default())
+}
+
+#[test]
+fn the_eeprom_of_a_device_that_runs_is_not_taken_from_it() {
+    on_a_bus(without_process_data, 0, |bench| {
+        bench.expected = Expected::default();
+        let state = |bench: &Bench| bench.device().al_state().to_string();
+        for wanted in [AlState::PreOp, AlState::SafeOp, AlState::Op] {
+            let name = &wanted.to_string();
+            let never = AtomicBool::new(false);
+            let work = async |wire: Datagrams| {
+                let at = device::locate(&wire, Locator::Position(0), None).await;
+                let (found, at) = at.expect("located");
+                if found.state == AlState::Init {
+                    let sii = device::information(&wire, &found, &at).await.expect("read");
+                    mailbox::lend(&wire, &at, &sii).await.expect("in PreOp");
+                    wire.write(at.station, 0x0500, &[1]).await.expect("lent");
+                } else {
+                    let devices = std::slice::from_ref(&at);
+                    let changed = al::change_state(&wire, devices, wanted, START_TIMEOUT).await;
+                    changed.unwrap_or_else(|error| panic!("{error}"));
+                }
+            };
+            carry(&mut bench.link, Clock::Virtual, &never, work).expect("carried");
+            assert_eq!(state(bench), *name);
+            bench.link.claims = 0;
+            let found = bench.examine();
+            assert!(found.in_use, "{name}");
+            let spoken = found.spoken.expect("it speaks");
+            assert_eq!(spoken.identity[1], Some(0x4d42_4f58));
+            assert_eq!((bench.link.claims, &state(bench)), (0, name));
+        }
+        let header = FirmwareHeader {
+            product: 0x4d42_4f58,
+            ..header(0)
+        };
+        let file = header.file(&[7; 5000]);
+        let error = bench
+            .update(Via::Foe, &file, &mut |_| {})
+            .expect_err("driven");
+        assert!(matches!(error, FirmwareError::Driven { .. }), "{error}");
+        assert_eq!((bench.link.claims, state(bench).as_str()), (0, "Op"));
+
+        // One that nobody drives gives it up for an update, and in Init.
+        let never = AtomicBool::new(false);
+        let back = async |wire: Datagrams| {
+            let at = device::locate(&wire, Locator::Position(0), None).await;
+            let devices = [at.expect("located").1];
+            al::change_state(&wire, &devices, AlState::PreOp, START_TIMEOUT).await
+        };
+        let back = carry(&mut bench.link, Clock::Virtual, &never, back).expect("carried");
+        back.unwrap_or_else(|error| panic!("{error}"));
+        let done = bench.update(Via::Foe, &file, &mut |_| {});
+        done.unwrap_or_else(|error| panic!("{error}"));
+        assert!(bench.link.claims > 0);
+        assert!(!bench.examine().in_use);
+        assert_eq!(bench.device().firmware(), Some(&file[..]));
+    });
 }
 
 #[test]

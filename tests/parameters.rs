@@ -77,20 +77,23 @@ async fn with_device<T>(
         .await
         .expect("an image");
     let done: Result<T, ServiceError> =
-        device::with_mailbox(wire, &at, &sii, async |lent| Ok(work(&mut lent.coe).await)).await;
+        device::with_mailbox(wire, &at, &sii, "a test", async |lent| {
+            Ok(work(&mut lent.coe).await)
+        })
+        .await;
     done.expect("a mailbox")
 }
 
 /// A device with mailboxes of 48 bytes: 440 objects and more, one of 64 KiB, a record of 60 entries.
 fn large() -> (tempfile::TempDir, Machine) {
-    let folder = tempfile::tempdir().expect("a folder");
-    let esi = root().join("tests/judges/esi/mailbox.xml");
-    let text = std::fs::read_to_string(esi).expect("the judges' ESI");
     large_with(|esi| esi)
 }
 
 /// Likewise, described otherwise.
 fn large_with(change: impl FnOnce(String) -> String) -> (tempfile::TempDir, Machine) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let esi = root().join("tests/judges/esi/mailbox.xml");
+    let text = std::fs::read_to_string(esi).expect("the judges' ESI");
     let sub = |n: u32| {
         format!(
             "<SubItem><SubIdx>{n}</SubIdx><Name>Entry {n}</Name><Type>UDINT</Type><BitSize>32</BitSize><BitOffs>{}</BitOffs><Flags><Access>rw</Access></Flags></SubItem>",
@@ -191,9 +194,6 @@ fn a_small_mailbox_carries_what_is_large() {
     on(machine, vec![work]);
 }
 
-/// What the ESI says the device says, too.
-fn same(described: &Dictionary, own: &Dictionary) {
-    for (object, item) in items(described) {
 /// The largest there are: one datagram of a full frame.
 #[test]
 fn mailboxes_as_long_as_a_frame_carry_everything() {
@@ -267,6 +267,9 @@ fn mailboxes_as_long_as_a_frame_carry_everything() {
     on(machine, vec![work]);
 }
 
+/// What the ESI says the device says, too.
+fn same(described: &Dictionary, own: &Dictionary) {
+    for (object, item) in items(described) {
         let at = format!("{:#06x}:{:02}", object.index, item.sub);
         let told = own
             .object(object.index)
@@ -574,7 +577,13 @@ fn values_on_the_command_line() {
     assert!(err.contains("no device is called `z`"), "{err}");
     let (code, told, _) = sdo(&["store"], &[]);
     assert_eq!((code, told.as_str()), (0, ""));
-    assert_eq!(sdo(&["defaults"], &["--json"]).0, 0);
+    assert_eq!(sdo(&["defaults"], &["--yes", "--json"]).0, 0);
+    for more in [&[][..], &["--json"]] {
+        let (code, told, err) = sdo(&["defaults"], more);
+        assert_eq!((code, told.as_str()), (2, ""), "{err}");
+        assert!(err.contains("nothing was written: say `--yes`"), "{err}");
+        assert!(err.contains("`ecaxis sdo dump` keeps"), "{err}");
+    }
 }
 
 #[test]
@@ -659,6 +668,27 @@ fn eeproms_on_the_command_line() {
     assert_eq!(run(&["verify"]), (0, String::new(), String::new()));
     assert_eq!(run(&["verify", "x.bin"]).0, 0);
     assert_eq!(run(&["read", "general.bin", "--category", "30"]).0, 0);
+    // All that the chip holds, and it differs behind the image's end alone.
+    assert_eq!(run(&["read", "all.bin", "--all"]).0, 0);
+    let all = std::fs::read(at("all.bin")).expect("the chip");
+    assert!(all.len() > image.len() && all.starts_with(&image));
+    let (code, out, err) = run(&["verify", "all.bin"]);
+    assert_eq!((code, out.as_str()), (0, ""), "{err}");
+    let mut other = all.clone();
+    *other.last_mut().expect("a byte") ^= 1;
+    std::fs::write(at("end.bin"), other).expect("written");
+    let (code, out, _) = run(&["verify", "end.bin"]);
+    let last = all.len() - 1;
+    let told = format!("1 bytes are not those of end.bin, the first at 0x{last:04x}\n");
+    assert_eq!((code, out), (1, told));
+    // More than the chip holds.
+    std::fs::write(at("long.bin"), [&all[..], &[0xff; 100]].concat()).expect("written");
+    let (code, out, _) = run(&["verify", "long.bin"]);
+    assert_eq!(code, 1);
+    assert!(
+        out.starts_with("100 bytes are not those of long.bin"),
+        "{out}"
+    );
     assert!(
         !std::fs::read(at("general.bin"))
             .expect("the category")
@@ -686,6 +716,18 @@ fn eeproms_on_the_command_line() {
         other[place] ^= 1;
         std::fs::write(at(name), other).expect("written");
     };
+    // A part with which nothing of the image could be read.
+    let entries = [0x00, 0x1a, 255, 3, 0, 0, 0, 0];
+    std::fs::write(at("absurd.bin"), entries).expect("written");
+    let line = [
+        "write",
+        "absurd.bin",
+        "--category",
+        "50",
+        "--yes",
+        "--backup",
+    ];
+    refused(&[&line[..], &["kept.bin"]].concat(), 2, "absurd.bin: ");
     spoilt("sum.bin", 14);
     spoilt("other.bin", 0x14);
     refused(
@@ -727,4 +769,24 @@ fn eeproms_on_the_command_line() {
     // The name was chosen from the device's.
     let name = format!("eeprom-x-{}-1.bin", sii.serial);
     assert_eq!(std::fs::read(at(&name)).expect("kept"), image);
+}
+
+/// A disk without room: half a backup is worse than none.
+#[test]
+fn a_file_that_cannot_be_written_to_its_end_is_not_left_behind() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = env!("CARGO_BIN_EXE_ecaxis");
+    let line = format!(
+        "trap '' XFSZ; ulimit -f 0; exec {program} eeprom read {} x x.bin --sim",
+        demo()
+    );
+    let output = Command::new("sh")
+        .args(["-c", &line])
+        .current_dir(folder.path())
+        .output()
+        .expect("a shell");
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{err}");
+    assert!(err.contains("cannot write x.bin: "), "{err}");
+    assert!(!folder.path().join("x.bin").exists());
 }

@@ -130,3 +130,51 @@ fn an_interface_goes_down_and_up_again_while_the_machine_runs() {
         assert!(output.status.success(), "{link}: {errors}\n{result:#}");
     }
 }
+
+/// What works on one device of a bus that a machine drives neither takes its frames nor leaves it in the dark.
+#[test]
+fn firmware_beside_a_machine_disturbs_nothing() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    let served = serve(&pair, "");
+    let file = served.file.path().to_str().expect("a path in UTF-8");
+    let mut command = ecaxis();
+    command.args(["run", file, "--nic", &pair.b, "--json", "--for", "10min"]);
+    let mut run = Told::start(command.stdout(Stdio::piped()));
+    run.says("run 1, step 1: ");
+    let beside = |arguments: &[&str]| {
+        let arguments = [arguments, &["--nic", &pair.b]].concat();
+        let output = ecaxis().args(arguments).output().expect("the binary runs");
+        let told = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code(), told)
+    };
+    let another = "another MainDevice is at work on this bus";
+    for _ in 0..3 {
+        let (code, told) = beside(&["firmware", "info", file, "x"]);
+        assert_eq!(code, Some(0), "{told}");
+        assert!(told.contains(another), "{told}");
+    }
+    let (code, told) = beside(&["firmware", "info", "--position", "0"]);
+    assert!(code == Some(0) && told.contains(another), "{told}");
+    let program = "Cargo.toml";
+    let (code, told) = beside(&["firmware", "update", file, "x", program, "--yes"]);
+    assert_eq!(code, Some(1), "{told}");
+    assert!(
+        told.contains(&format!("{another}: nothing was written")),
+        "{told}"
+    );
+    for command in [&["store", file, "x"][..], &["defaults", file, "x", "--yes"]] {
+        let (code, told) = beside(&[&["sdo"], command].concat());
+        assert_eq!(code, Some(1), "{told}");
+        assert!(told.contains("is in Op: parameters are"), "{told}");
+    }
+
+    run.interrupt();
+    let output = run.end();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    let result: serde_json::Value =
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {errors}"));
+    let counters = &result["summary"]["counters"];
+    assert_eq!(counters["refused_answers"], 0, "{counters:#}\n{errors}");
+    assert!(errors.contains("all SubDevices in Init"), "{errors}");
+}

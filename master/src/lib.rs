@@ -20,6 +20,7 @@
 //! - [`bench`]: what measuring needs;
 //! - [`recording`]: recordings as files, ours and others';
 //! - [`analyze`]: what a recording tells;
+//! - [`stop`]: ending a piece of work early;
 //! - [`clock`]: monotonic or virtual time;
 //! - [`os`]: system calls; all unsafe code.
 
@@ -45,6 +46,7 @@ pub mod rt;
 pub mod scan;
 pub mod service;
 pub mod session;
+pub mod stop;
 pub mod story;
 pub mod supervise;
 mod wire;

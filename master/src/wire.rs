@@ -10,6 +10,7 @@ use ethercrab::{Command, MainDevice};
 use crate::clock::{self, Nanos};
 use crate::mailbox::{Seen, Wire, WireError};
 use crate::rt::exchange::Sights;
+use crate::stop::Stop;
 use turns::Turns;
 
 mod turns;
@@ -19,14 +20,19 @@ mod turns;
 pub struct Datagrams {
     device: &'static MainDevice<'static>,
     turns: &'static Turns,
+    stop: &'static Stop,
 }
 
 impl Datagrams {
-    /// To be copied, so that all keep to the same turns. They live as long as the MainDevice: as the process.
+    /// To be copied, so that all keep to the same turns and one may end what all of them do. They live as long as the MainDevice: as
+    /// the process.
     #[must_use]
     pub fn new(device: &'static MainDevice<'static>) -> Self {
-        let turns = Box::leak(Box::default());
-        Self { device, turns }
+        Self {
+            device,
+            turns: Box::leak(Box::default()),
+            stop: Box::leak(Box::default()),
+        }
     }
 
     #[must_use]
@@ -144,6 +150,10 @@ impl Wire for Datagrams {
 
     fn now(&self) -> u64 {
         clock::now()
+    }
+
+    fn stop(&self) -> &Stop {
+        self.stop
     }
 }
 

@@ -76,6 +76,12 @@ impl Told {
         }
     }
 
+    /// As Ctrl-C does.
+    pub fn interrupt(&self) {
+        let pid = rustix::process::Pid::from_child(&self.child);
+        rustix::process::kill_process(pid, rustix::process::Signal::INT).expect("it runs");
+    }
+
     /// What it leaves, with all of its messages.
     pub fn end(mut self) -> Output {
         let stdout = self.child.stdout.take();

@@ -256,17 +256,21 @@ pub async fn read_explicit_id(wire: &impl Wire, station: u16) -> Result<Option<u
     let Some((state, _)) = read_status(wire, station).await? else {
         return Ok(None);
     };
-    write_control(wire, station, state & 0x0f | ID_REQUEST).await?;
-    let mut id = None;
-    for _ in 0..20 {
-        match read_status(wire, station).await? {
-            Some((status, code)) if status & ID_REQUEST != 0 => {
-                id = Some(code);
-                break;
+    let whole = async {
+        write_control(wire, station, state & 0x0f | ID_REQUEST).await?;
+        let mut id = None;
+        for _ in 0..20 {
+            match read_status(wire, station).await? {
+                Some((status, code)) if status & ID_REQUEST != 0 => {
+                    id = Some(code);
+                    break;
+                }
+                _ => wire.delay(POLL).await,
             }
-            _ => wire.delay(POLL).await,
         }
-    }
-    write_control(wire, station, state & 0x0f).await?;
-    Ok(id)
+        write_control(wire, station, state & 0x0f).await?;
+        Ok(id)
+    };
+    // The request is taken back.
+    wire.stop().hold(whole).await
 }

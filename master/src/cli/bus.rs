@@ -1,4 +1,4 @@
-//! A bus for verbs that turn no cycle: a network interface, or the simulated bus of a machine file in virtual time.
+//! A bus for verbs that turn no cycle: a network interface, or the simulated bus of a machine file.
 
 use std::io::Write;
 use std::sync::Arc;
@@ -17,7 +17,14 @@ use super::{Failure, hints, note, signals, style};
 const LISTEN: Duration = Duration::from_millis(100);
 
 #[derive(Debug)]
-pub(crate) enum Bus {
+pub(crate) struct Bus {
+    on: On,
+    /// Of them the clock, what happens on a simulated bus, and the recording.
+    options: Options,
+}
+
+#[derive(Debug)]
+enum On {
     Interface { nic: String, back_end: BackEnd },
     Sim(Box<Machine>),
 }
@@ -25,41 +32,50 @@ pub(crate) enum Bus {
 impl Bus {
     /// What the machine's `nic` names.
     pub fn of(machine: &Machine) -> Self {
-        match &machine.bus.nic {
-            Nic::Sim => Self::Sim(Box::new(machine.clone())),
-            Nic::Interface(nic) => Self::Interface {
-                nic: nic.clone(),
-                back_end: machine.bus.link,
-            },
-        }
+        let (on, clock) = match &machine.bus.nic {
+            Nic::Sim => (On::Sim(Box::new(machine.clone())), Clock::Virtual),
+            Nic::Interface(nic) => {
+                let (nic, back_end) = (nic.clone(), machine.bus.link);
+                (On::Interface { nic, back_end }, Clock::Real)
+            }
+        };
+        let options = Options {
+            clock,
+            ..Options::default()
+        };
+        Self { on, options }
     }
 
     pub fn interface(nic: &str) -> Self {
-        Self::Interface {
-            nic: nic.to_owned(),
-            back_end: BackEnd::default(),
+        let (nic, back_end) = (nic.to_owned(), BackEnd::default());
+        Self {
+            on: On::Interface { nic, back_end },
+            options: Options::default(),
         }
+    }
+
+    /// With a clock, faults and a recording of one's own.
+    pub fn with(self, options: Options) -> Self {
+        Self { options, ..self }
     }
 
     /// Hints depend on it.
     pub fn nic(&self) -> Nic {
-        match self {
-            Self::Interface { nic, .. } => Nic::Interface(nic.clone()),
-            Self::Sim(_) => Nic::Sim,
+        match &self.on {
+            On::Interface { nic, .. } => Nic::Interface(nic.clone()),
+            On::Sim(_) => Nic::Sim,
         }
     }
 
-    /// Does a piece of work on it; `work` is told how many frames of others came in before anything was sent. Ctrl-C ends it.
+    /// Does a piece of work on it; `work` is told how many frames of others came in before anything was sent. Ctrl-C ends it, and
+    /// what is in hand comes to its end first.
     pub fn visit<T, W>(self, work: W) -> Result<T, Failure>
     where
         T: Send + 'static,
         W: AsyncFnOnce(Datagrams, u64) -> T + Send + 'static,
     {
         let nic = self.nic();
-        let clock = match self {
-            Self::Interface { .. } => Clock::Real,
-            Self::Sim(_) => Clock::Virtual,
-        };
+        let clock = self.options.clock;
         let stop = Arc::new(AtomicBool::new(false));
         signals::stop_on_interrupt(&stop);
         let heard = Arc::new(AtomicU64::new(0));
@@ -74,21 +90,30 @@ impl Bus {
     }
 
     fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, RunError> {
-        match self {
-            Self::Sim(machine) => {
-                let seed = Options::default().seed;
-                let segment = session::simulated_bus(&machine, seed, None, None)?;
-                Ok(Box::new(link::sim::SimLink::new(segment)))
+        let Self { on, options } = self;
+        let link: Box<dyn Link> = match on {
+            On::Sim(machine) => {
+                let faults = options.faults.as_ref();
+                let segment = session::simulated_bus(&machine, options.seed, faults, None)?;
+                Box::new(link::sim::SimLink::new(segment))
             }
-            Self::Interface { nic, back_end } => {
+            On::Interface { nic, back_end } => {
                 // What only disturbs a cycle is no concern of a bus without one.
                 let (mut link, _) = link::open(&nic, back_end)?;
                 let frames = link::heard(link.as_mut(), LISTEN).map_err(RunError::Link)?;
                 heard.store(frames, Ordering::Relaxed);
                 // It may be a machine of this program's that runs there.
-                Ok(Box::new(link::apart::Apart::new(link, std::process::id())))
+                Box::new(link::apart::Apart::new(link, std::process::id()))
             }
-        }
+        };
+        session::recorded(link, &options)
+    }
+}
+
+/// Somebody else sent frames before anything was sent.
+pub(crate) fn warn_of(others: u64) {
+    if others > 0 {
+        warn("another MainDevice is at work on this bus; what both do may collide");
     }
 }
 

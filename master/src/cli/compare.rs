@@ -160,7 +160,7 @@ fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), 
         let scan = scan::scan(&wire, options, &mut tell).await?;
         let mut comparison = compare::compare(&machine, &scan);
         if parameters && scan.asked {
-            compare::parameters(&wire, &machine, &scan, &mut comparison).await?;
+            compare::parameters(&wire, &machine, &scan, &mut comparison).await;
         }
         Ok((scan, comparison))
     });

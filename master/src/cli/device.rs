@@ -137,33 +137,17 @@ impl Target {
         } = self;
         let nic = bus.nic();
         let done = bus.visit(async move |wire: Datagrams, others| {
-            if others > 0 {
-                bus::warn("another MainDevice is at work on this bus; what both do may collide");
-            }
-            let name = config.as_ref().map(|config| config.name.as_str());
-            let located = device::locate(&wire, at, name).await;
-            let (found, device) = located.map_err(|error| hints::service(&error, &nic))?;
-            let located = Located {
-                wire,
-                device,
-                state: found.state,
-                expected: config.as_ref().map(|config| {
-                    let selection = &config.selection;
-                    (selection.device_name.to_string(), selection.identity)
-                }),
-                config,
-                esi,
-                nic,
-                found,
-            };
-            work(&located).await
+            bus::warn_of(others);
+            let located = Located::find(wire, at, config, nic).await?;
+            work(&Located { esi, ..located }).await
         });
         done?
     }
 
-    /// Does a piece of work on the device's mailbox. A device in Init is in PreOp meanwhile.
+    /// Does a piece of work on the device's mailbox; `step` says which. A device in Init is in PreOp meanwhile.
     pub fn open<T: Send + 'static>(
         self,
+        step: &'static str,
         work: impl AsyncFnOnce(&mut Open<'_>) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {
         self.visit(async move |located: &Located| {
@@ -171,24 +155,22 @@ impl Target {
             let sii = device::information(&at.wire, &at.found, &at.device).await;
             let sii = at.told(sii)?;
             at.check(sii.identity)?;
-            let done = device::with_mailbox(&at.wire, &at.device, &sii, async |lent| {
+            let done = device::with_mailbox(&at.wire, &at.device, &sii, step, async |lent| {
                 let mut open = Open {
                     at,
                     sii: &sii,
                     coe: &mut lent.coe,
                 };
-                work(&mut open).await.map_err(Trouble::Told)
+                Ok(work(&mut open).await?)
             });
-            done.await.map_err(|trouble| match trouble {
-                Trouble::Told(failure) => failure,
-                Trouble::Service(error) => hints::service(&error, &at.nic),
-            })
+            at.ended(done.await)
         })
     }
 }
 
 /// What ends a piece of work.
-enum Trouble {
+#[derive(Debug)]
+pub(crate) enum Trouble {
     Told(Failure),
     Service(ServiceError),
 }
@@ -199,7 +181,60 @@ impl From<ServiceError> for Trouble {
     }
 }
 
+impl From<Failure> for Trouble {
+    fn from(failure: Failure) -> Self {
+        Self::Told(failure)
+    }
+}
+
 impl Located {
+    /// Without an ESI file of the command line's.
+    pub async fn find(
+        wire: Datagrams,
+        at: Locator,
+        config: Option<Box<DeviceConfig>>,
+        nic: Nic,
+    ) -> Result<Self, Failure> {
+        let name = config.as_ref().map(|config| config.name.as_str());
+        let located = device::locate(&wire, at, name).await;
+        let (found, device) = located.map_err(|error| hints::service(&error, &nic))?;
+        Ok(Self {
+            wire,
+            device,
+            state: found.state,
+            expected: config.as_ref().map(|config| {
+                let selection = &config.selection;
+                (selection.device_name.to_string(), selection.identity)
+            }),
+            config,
+            esi: None,
+            nic,
+            found,
+        })
+    }
+
+    /// Nobody drives it: its parameters as a whole can change. `what` is done with them.
+    pub fn at_rest(&self, what: &str) -> Result<(), Failure> {
+        if matches!(self.state, AlState::Init | AlState::PreOp) {
+            return Ok(());
+        }
+        let message = format!("{}: is in {}: {what} in PreOp", self.device, self.state);
+        Err(Failure::new(hints::FAILED, message)
+            .hint("end what drives the device first; then it is in Init or PreOp"))
+    }
+
+    /// An error of another kind, as the user sees it.
+    pub fn advised<E>(&self, error: &E, advice: impl FnOnce(&E, &Nic) -> Failure) -> Failure {
+        advice(error, &self.nic)
+    }
+
+    pub fn ended<T>(&self, result: Result<T, Trouble>) -> Result<T, Failure> {
+        result.map_err(|trouble| match trouble {
+            Trouble::Told(failure) => failure,
+            Trouble::Service(error) => hints::service(&error, &self.nic),
+        })
+    }
+
     /// As the user sees it.
     pub fn told<T>(&self, result: Result<T, ServiceError>) -> Result<T, Failure> {
         result.map_err(|error| hints::service(&error, &self.nic))

@@ -3,13 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use ecaxis::service::eeprom::{Claim, Eeprom};
+use ecaxis::service::Datagrams;
+use ecaxis::service::eeprom::{Claim, Eeprom, size_of, with_eeprom};
 use ecaxis::service::image::{category, with_alias, with_category, write};
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{self, Sii};
 use serde_json::json;
 
-use super::device::{Located, Place, counter};
+use super::device::{Located, Place, Trouble, counter};
 use super::{Failure, Verbosity, bus, hints, keep, note, result};
 
 const EXAMPLES: &str = "\
@@ -186,9 +187,18 @@ fn replace(args: &WriteArgs) -> Result<(), Failure> {
         let new = match kind {
             None => given,
             Some(kind) => {
-                with_category(&old, kind, &given).ok_or_else(|| no_category(kind, &old))?
+                let new = with_category(&old, kind, &given);
+                let new = new.ok_or_else(|| no_category(kind, &old))?;
+                // A broken image may be mended part by part.
+                if sii::parse(&old).is_ok() {
+                    sound(&path, &new)?;
+                }
+                new
             }
         };
+        for remark in new_remarks(&old, &new) {
+            bus::warn(format!("{}: {remark}", path.display()));
+        }
         let (was, becomes) = (identity(&old), identity(&new));
         if was != becomes && !other_device {
             let device = &at.device;
@@ -240,9 +250,20 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
             Some((load(&path)?, path))
         }
     };
-    let (there, expected, device) = target.visit(async move |at: &Located| {
-        let there = image(at, false).await?;
-        Ok((there, at.expected.clone(), at.device.clone()))
+    let compared = other.as_ref().map_or(0, |(image, _)| image.len());
+    let ((there, longer), expected, device) = target.visit(async move |at: &Located| {
+        let read = in_eeprom(at, "reading its EEPROM", async |eeprom| {
+            let mut progress = counter("reading bytes");
+            let there = eeprom.image(&mut progress).await?;
+            // A file may go on behind the image's end, and so does the chip.
+            let room = eeprom.size().await?.max(there.len());
+            let longer = compared.min(room);
+            let longer = eeprom.longer(there.clone(), longer, &mut progress).await?;
+            Ok((there, longer))
+        });
+        let read = read.await;
+        bus::passed();
+        Ok((read?, at.expected.clone(), at.device.clone()))
     })?;
     let mut problems = Vec::new();
     let mut remarks = Vec::new();
@@ -263,7 +284,7 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
         Err(error) => problems.push(error.to_string()),
     }
     if let Some((image, path)) = &other {
-        problems.extend(differing(&there, image, path));
+        problems.extend(differing(&longer, image, path));
     }
     if args.json {
         let report = json!({
@@ -332,24 +353,25 @@ impl Care {
 
 /// Keeps the old image, writes the new one, reads it back.
 async fn burn(at: &Located, care: &Care, old: &[u8], new: &[u8]) -> Result<String, Failure> {
-    let eeprom = claim(at, "writing its EEPROM").await?;
-    let done = async {
-        let room = at.told(eeprom.size().await)?;
+    let done = in_eeprom(at, "writing its EEPROM", async |eeprom| {
+        // What the device says of its chip may be what is to be mended; a smaller one shows when it is read back.
+        let room = eeprom.size().await?.max(size_of(new));
         if new.len() > room {
             let message = format!("the image has {} bytes, the EEPROM {room}", new.len());
-            return Err(Failure::new(hints::FAILED, message));
+            return Err(Failure::new(hints::FAILED, message).into());
         }
-        let backup = care.keep(at, old)?;
+        // What lies behind the old image's end is written over, too.
+        let bytes = new.len().next_multiple_of(2);
+        let there = eeprom.longer(old.to_vec(), bytes, &mut |_, _| {}).await?;
+        let backup = care.keep(at, &there)?;
         note(&format!("the old image is in {}", backup.display()));
         let mut progress = counter("writing words");
-        let written = write(&eeprom, new, &mut progress).await;
+        let written = write(eeprom, new, &mut progress).await;
         bus::passed();
-        at.told(written)
-    };
-    let done = done.await;
-    let back = eeprom.give_back().await;
-    let written = done?;
-    at.told(back)?;
+        let half = written.map_err(|e| at.advised(&e, |e, nic| hints::image(e, &backup, nic)));
+        Ok(half?)
+    });
+    let written = done.await?;
     let words = if written == 1 { "word" } else { "words" };
     Ok(format!(
         "{}: {written} {words} written and read back",
@@ -357,24 +379,40 @@ async fn burn(at: &Located, care: &Care, old: &[u8], new: &[u8]) -> Result<Strin
     ))
 }
 
-async fn claim<'a>(
-    at: &'a Located,
+/// Does a piece of work on the EEPROM, which goes back to whom it was lent.
+async fn in_eeprom<T>(
+    at: &Located,
     step: &'static str,
-) -> Result<Eeprom<'a, ecaxis::service::Datagrams>, Failure> {
-    at.told(Eeprom::claim(&at.wire, &at.device, step, Claim::of(at.state)).await)
+    work: impl AsyncFnOnce(&Eeprom<'_, Datagrams>) -> Result<T, Trouble>,
+) -> Result<T, Failure> {
+    at.ended(with_eeprom(&at.wire, &at.device, step, Claim::of(at.state), work).await)
 }
 
 /// What the device holds.
 async fn image(at: &Located, all: bool) -> Result<Vec<u8>, Failure> {
-    let eeprom = claim(at, "reading its EEPROM").await?;
-    let mut progress = counter("reading bytes");
-    let image = match all {
-        true => eeprom.all(&mut progress).await,
-        false => eeprom.image(&mut progress).await,
-    };
+    let read = in_eeprom(at, "reading its EEPROM", async |eeprom| {
+        let mut progress = counter("reading bytes");
+        Ok(match all {
+            true => eeprom.all(&mut progress).await?,
+            false => eeprom.image(&mut progress).await?,
+        })
+    });
+    let read = read.await;
     bus::passed();
-    at.told(eeprom.give_back().await)?;
-    at.told(image)
+    read
+}
+
+/// What is odd about an image, and not about the one before.
+fn new_remarks(old: &[u8], new: &[u8]) -> Vec<String> {
+    let remarks = |image: &[u8]| -> Vec<String> {
+        let warnings = sii::inspect(image).map(|(_, warnings)| warnings);
+        let warnings = warnings.unwrap_or_default();
+        warnings.iter().map(ToString::to_string).collect()
+    };
+    let old = remarks(old);
+    let mut new = remarks(new);
+    new.retain(|remark| !old.contains(remark));
+    new
 }
 
 fn identity(image: &[u8]) -> Identity {
@@ -450,3 +488,7 @@ fn only(words: &[String], what: &str) -> Result<PathBuf, Failure> {
         _ => Err(Failure::new(hints::WRONG, what)),
     }
 }
+
+#[cfg(test)]
+#[path = "eeprom_tests.rs"]
+mod tests;

@@ -20,10 +20,10 @@ mod host;
 mod service;
 mod story;
 
-pub(crate) use firmware::{TRY_AGAIN, firmware};
+pub(crate) use firmware::{firmware, shared_bus};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
-pub(crate) use service::service;
+pub(crate) use service::{image, restore, service};
 pub(crate) use story::cause;
 
 /// The machine or the bus failed.

@@ -6,7 +6,8 @@ use super::{Comparison, Difference};
 use crate::config::Machine;
 use crate::mailbox::SdoError;
 use crate::scan::Scan;
-use crate::service::{Datagrams, ServiceError, mailbox};
+use crate::service::device::with_mailbox;
+use crate::service::{Datagrams, ServiceError};
 
 /// What is no parameter: PDO mapping and assignment, the module list, the mode. Every start-up writes them anew.
 fn is_parameter(sdo: &StartupSdo) -> bool {
@@ -16,16 +17,14 @@ fn is_parameter(sdo: &StartupSdo) -> bool {
     )
 }
 
-/// Reads every object that a start-up SDO writes, and adds what differs. Devices in Init are in PreOp meanwhile.
-///
-/// # Errors
-/// Of the wire; a device that does not let itself be read is told of in [`Comparison::unknown`].
+/// Reads every object that a start-up SDO writes, and adds what differs. Devices in Init are in PreOp meanwhile. One that does not let
+/// itself be read, or does not go back to its state, is told of in [`Comparison::unknown`].
 pub async fn parameters(
     wire: &Datagrams,
     machine: &Machine,
     scan: &Scan,
     comparison: &mut Comparison,
-) -> Result<(), ServiceError> {
+) {
     for (index, config) in machine.devices.iter().enumerate() {
         let sdos: Vec<&StartupSdo> = config
             .selection
@@ -40,47 +39,40 @@ pub async fn parameters(
         };
         let Ok(sii) = &device.sii else { continue };
         let at = device.found.named(&config.name);
-        let mut lent = match mailbox::lend(wire, &at, sii).await {
-            Ok(lent) => lent,
-            Err(error) => {
-                comparison.unknown.push(error.to_string());
-                continue;
-            }
-        };
-        let mut failure = None;
-        // The last one written is what stays.
-        for (n, sdo) in sdos.iter().enumerate() {
-            let again = |later: &&StartupSdo| (later.index, later.sub) == (sdo.index, sdo.sub);
-            if sdos.iter().skip(n + 1).any(again) {
-                continue;
-            }
-            let read = lent
-                .coe
-                .upload(wire, sdo.index, sdo.sub, sdo.complete_access)
-                .await;
-            match read {
-                Ok(found) if found == sdo.data => {}
-                Ok(found) => comparison.differences.push(Difference::Parameter {
-                    device: index,
-                    position: device.position(),
-                    index: sdo.index,
-                    sub: sdo.sub,
-                    name: sdo.name.clone(),
-                    expected: sdo.data.clone(),
-                    found,
-                }),
-                // Some can only be written.
-                Err(SdoError::Abort { .. }) => {}
-                Err(error) => {
-                    failure = Some(error.to_string());
-                    break;
+        let read = with_mailbox(wire, &at, sii, "reading its parameters", async |lent| {
+            // The last one written is what stays.
+            for (n, sdo) in sdos.iter().enumerate() {
+                let again = |later: &&StartupSdo| (later.index, later.sub) == (sdo.index, sdo.sub);
+                if sdos.iter().skip(n + 1).any(again) {
+                    continue;
+                }
+                let read = lent
+                    .coe
+                    .upload(wire, sdo.index, sdo.sub, sdo.complete_access)
+                    .await;
+                match read {
+                    Ok(found) if found == sdo.data => {}
+                    Ok(found) => comparison.differences.push(Difference::Parameter {
+                        device: index,
+                        position: device.position(),
+                        index: sdo.index,
+                        sub: sdo.sub,
+                        name: sdo.name.clone(),
+                        expected: sdo.data.clone(),
+                        found,
+                    }),
+                    // Some can only be written.
+                    Err(SdoError::Abort { .. }) => {}
+                    Err(source) => {
+                        let device = at.clone();
+                        return Err(ServiceError::Sdo { device, source });
+                    }
                 }
             }
+            Ok(())
+        });
+        if let Err(error) = read.await {
+            comparison.unknown.push(error.to_string());
         }
-        if let Some(failure) = failure {
-            comparison.unknown.push(format!("{at}: {failure}"));
-        }
-        lent.give_back(wire).await?;
     }
-    Ok(())
 }

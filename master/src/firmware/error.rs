@@ -67,6 +67,8 @@ pub enum Cause {
         /// What the device answered when it was told, if it did.
         refused: Option<SdoError>,
     },
+    #[error("interrupted")]
+    Interrupted,
     #[error("what the device hands out differs from the file from byte {at} on")]
     Differs { at: usize },
     #[error("after {after:?} it is in {state} and {runs}")]

@@ -8,9 +8,10 @@ use ecaxis_esi::sii::{self, Protocols, Sii};
 use super::FirmwareError;
 use crate::bringup::{AlState, DeviceRef};
 use crate::mailbox::{CoeClient, SdoError, Timeouts};
-use crate::service::eeprom::{Claim, Eeprom};
+use crate::service::device::with_mailbox;
+use crate::service::eeprom::{Claim, EepromError, with_eeprom};
 use crate::service::station::{Which, address, census};
-use crate::service::{Datagrams, ServiceError, mailbox};
+use crate::service::{Datagrams, ServiceError};
 
 /// Device type (0x1000) of a drive of maxon while its program is stopped; with its program it is 0x00020192.
 pub const BOOT_LOADER: u32 = 0x0000_012e;
@@ -70,7 +71,10 @@ impl fmt::Display for Runs {
 #[derive(Debug)]
 pub struct Examined {
     pub device: DeviceRef,
+    /// What its EEPROM says.
     pub sii: Sii,
+    /// It was using its EEPROM itself, which was left to it: nothing is known of what that says.
+    pub in_use: bool,
     pub state: AlState,
     /// It holds an error that nobody has acknowledged, with this AL status code.
     pub error: bool,
@@ -81,6 +85,7 @@ pub struct Examined {
 }
 
 /// Finds a device and asks it who it is. Its objects are read in PreOp, to which it goes from Init and back; in Bootstrap it has none.
+/// An EEPROM that the device is using itself is left to it, except in Init and Bootstrap.
 ///
 /// # Errors
 /// [`FirmwareError::Service`], [`FirmwareError::Eeprom`]; a device that does not speak is no error.
@@ -89,15 +94,39 @@ pub async fn examine(
     which: Which,
     name: &str,
 ) -> Result<Examined, FirmwareError> {
+    look_at(wire, which, name, false).await
+}
+
+/// Likewise; `seize`: its EEPROM is taken from the device in any state.
+pub(super) async fn look_at(
+    wire: &Datagrams,
+    which: Which,
+    name: &str,
+    seize: bool,
+) -> Result<Examined, FirmwareError> {
+    const STEP: &str = "reading its EEPROM";
     let mut found = census(wire).await?;
     address(wire, &mut found).await?;
     let found = which.among(&found)?;
     let device = found.named(name);
-    // It is given back as it was.
-    let eeprom = Eeprom::claim(wire, &device, "reading the EEPROM", Claim::Force).await?;
-    let image = eeprom.image(&mut |_, _| {}).await;
-    eeprom.give_back().await?;
-    let sii = sii::parse(&image?).map_err(|source| FirmwareError::Eeprom {
+    let claim = match (seize, found.state) {
+        (true, _) | (false, AlState::Bootstrap) => Claim::Force,
+        (false, state) => Claim::of(state),
+    };
+    let has_mailbox = matches!(found.state, AlState::PreOp | AlState::SafeOp | AlState::Op);
+    let read = with_eeprom(wire, &device, STEP, claim, async |eeprom| {
+        eeprom.image(&mut |_, _| {}).await
+    });
+    let image: Option<Vec<u8>> = match read.await {
+        Ok(image) => Some(image),
+        Err(ServiceError::Eeprom {
+            source: EepromError::InUse,
+            ..
+        }) if has_mailbox => None,
+        Err(error) => return Err(error.into()),
+    };
+    let sii = image.as_deref().map(sii::parse).transpose();
+    let sii = sii.map_err(|source| FirmwareError::Eeprom {
         device: device.clone(),
         source,
     })?;
@@ -108,12 +137,14 @@ pub async fn examine(
         spoken: None,
         silent: None,
         device,
-        sii,
+        in_use: sii.is_none(),
+        sii: sii.unwrap_or_default(),
     };
-    let has_coe = examined.sii.protocols.has(Protocols::COE);
+    let has_coe = examined.in_use || examined.sii.protocols.has(Protocols::COE);
     if has_coe && examined.state != AlState::Bootstrap {
         match listen(wire, &examined).await {
             Ok(spoken) => examined.spoken = Some(spoken),
+            Err(error @ ServiceError::Stopped { .. }) => return Err(error.into()),
             Err(error) => examined.silent = Some(error),
         }
     }
@@ -121,15 +152,16 @@ pub async fn examine(
 }
 
 async fn listen(wire: &Datagrams, examined: &Examined) -> Result<Spoken, ServiceError> {
-    let mut lent = mailbox::lend(wire, &examined.device, &examined.sii).await?;
-    lent.coe.set_timeouts(PATIENT);
-    let spoken = ask(wire, &mut lent.coe).await;
-    let back = lent.give_back(wire).await;
-    let spoken = spoken.map_err(|source| ServiceError::Sdo {
-        device: examined.device.clone(),
-        source,
-    })?;
-    back.map(|()| spoken)
+    let Examined { device, sii, .. } = examined;
+    with_mailbox(wire, device, sii, "asking it who it is", async |lent| {
+        lent.coe.set_timeouts(PATIENT);
+        let spoken = ask(wire, &mut lent.coe).await;
+        spoken.map_err(|source| ServiceError::Sdo {
+            device: device.clone(),
+            source,
+        })
+    })
+    .await
 }
 
 async fn ask(wire: &Datagrams, coe: &mut CoeClient) -> Result<Spoken, SdoError> {
@@ -218,7 +250,7 @@ impl Examined {
             ("product", expected.product, identity.product, product),
         ] {
             let Some(wanted) = wanted else { continue };
-            if eeprom != wanted {
+            if eeprom != wanted && !self.in_use {
                 return Err(other("its EEPROM", what, wanted, eeprom));
             }
             let (wanted, words) = match words {
@@ -250,7 +282,7 @@ impl Examined {
             let (vendor, product, serial) = of(examined);
             format!("vendor {vendor:#010x}, product {product:#010x}, serial number {serial}")
         };
-        if of(self) == of(before) {
+        if self.in_use || of(self) == of(before) {
             return Ok(());
         }
         Err(FirmwareError::Changed {

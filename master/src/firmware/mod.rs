@@ -9,15 +9,19 @@
 //! afterwards, whether it is still the same and runs a program. A device whose update broke off keeps its boot loader, which waits in Bootstrap or
 //! with its program stopped; an update starts from there as from anywhere else.
 
+use std::cell::Cell;
 use std::fmt;
 use std::time::Duration;
 
 use ecaxis_esi::sii::Protocols;
 
 use crate::bringup::AlState;
+use crate::bringup::al;
 use crate::mailbox::{Wire, foe};
 use crate::service::Datagrams;
-use crate::service::station::Which;
+use crate::service::station::{Which, address, census};
+use error::Broken;
+use examine::look_at;
 
 mod bootstrap;
 mod error;
@@ -100,19 +104,20 @@ pub struct Done {
 }
 
 impl Examined {
-    /// Whether the device offers a way, and why not.
+    /// Whether the device offers a way, and why not. What the device keeps from being read it may have.
     ///
     /// # Errors
     /// What it lacks.
     pub fn offers(&self, via: Via) -> Result<(), &'static str> {
         let boot = self.sii.bootstrap;
         match via {
+            Via::Foe if self.in_use => Ok(()),
             Via::Foe if !self.sii.protocols.has(Protocols::FOE) => Err("its EEPROM names no FoE"),
             Via::Foe if boot.receive_size == 0 || boot.send_size == 0 => {
                 Err("its EEPROM has no mailboxes for Bootstrap")
             }
             Via::Foe => Ok(()),
-            Via::Program if !self.sii.protocols.has(Protocols::COE) => {
+            Via::Program if !self.in_use && !self.sii.protocols.has(Protocols::COE) => {
                 Err("its EEPROM names no CoE")
             }
             Via::Program => match &self.spoken {
@@ -159,7 +164,7 @@ impl Examined {
                 reason,
             })?;
         let room = foe::room(self.sii.bootstrap.receive_size);
-        if via == Via::Foe && !foe::is_name(&order.name, room) {
+        if via == Via::Foe && !self.in_use && !foe::is_name(&order.name, room) {
             return Err(FirmwareError::Name {
                 device: device(),
                 name: order.name.clone(),
@@ -176,7 +181,7 @@ impl Examined {
 /// Puts a program into a device and starts it. The device ends in Init.
 ///
 /// # Errors
-/// As [`Examined::ready`], with nothing touched; [`FirmwareError::Failed`] from then on.
+/// As [`Examined::ready`], with nothing touched; [`FirmwareError::Failed`] from then on, also where the user ends it.
 pub async fn update(
     wire: &Datagrams,
     before: &Examined,
@@ -185,22 +190,43 @@ pub async fn update(
     tell: &mut dyn FnMut(Told),
 ) -> Result<Done, FirmwareError> {
     before.ready(order, expected)?;
-    let begun = match order.via {
-        Via::Foe => bootstrap::send(wire, before, order, tell).await,
-        Via::Program => program::send(wire, before, order, tell).await,
+    let seized;
+    let before = if before.in_use {
+        let which = Which::Position(before.device.position);
+        seized = look_at(wire, which, &before.device.name, true).await?;
+        seized.ready(order, expected)?;
+        &seized
+    } else {
+        before
     };
-    let (read_back, took) = match begun {
-        Ok(sent) => sent,
-        Err(failed) => return Err(failed.at(wire, &before.device).await),
+    let step = Cell::new(Step::Prepare);
+    let mut telling = |told| {
+        if let Told::Step(now) = told {
+            step.set(now);
+        }
+        tell(told);
     };
-    tell(Told::Step(Step::Check));
-    let after = match running(wire, before).await {
-        Ok(after) => after,
-        Err(cause) => {
-            let failed = Step::Check.failed(cause);
-            return Err(failed.at(wire, &before.device).await);
+    let whole = async {
+        let work = async {
+            let (read_back, took) = match order.via {
+                Via::Foe => bootstrap::send(wire, before, order, &mut telling).await?,
+                Via::Program => program::send(wire, before, order, &mut telling).await?,
+            };
+            telling(Told::Step(Step::Check));
+            let after = running(wire, before).await;
+            let after = after.map_err(|cause| Step::Check.failed(cause))?;
+            Ok((after, read_back, took))
+        };
+        let done = match wire.stop().unless(work).await {
+            Some(done) => done,
+            None => Err(given_up(wire, before, step.get()).await),
+        };
+        match done {
+            Ok(done) => Ok(done),
+            Err(failed) => Err(failed.at(wire, &before.device).await),
         }
     };
+    let (after, read_back, took) = wire.stop().hold(whole).await?;
     // It may show another product once its program runs than it did without.
     after.check(expected)?;
     after.same_as(before)?;
@@ -209,6 +235,19 @@ pub async fn update(
         read_back,
         took,
     })
+}
+
+/// The device is not left in the middle of a transfer: in Init it starts what it has.
+async fn given_up(wire: &Datagrams, before: &Examined, step: Step) -> Broken {
+    // It may have another address than it had; how it is left is looked at afterwards in any case.
+    if let Ok(mut found) = census(wire).await
+        && address(wire, &mut found).await.is_ok()
+        && let Ok(found) = Which::Position(before.device.position).among(&found)
+    {
+        let device = [found.named(before.device.name.clone())];
+        let _ = al::change_state(wire, &device, AlState::Init, INIT_TIMEOUT).await;
+    }
+    step.failed(Cause::Interrupted)
 }
 
 /// Waits until the device answers again and runs a program, whatever its address and state are meanwhile.

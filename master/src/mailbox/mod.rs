@@ -11,6 +11,8 @@
 
 use std::time::Duration;
 
+use crate::stop::Stop;
+
 mod abort;
 mod coe;
 pub mod desk;
@@ -51,6 +53,11 @@ pub trait Wire {
     /// What somebody else has lately seen of the SubDevice's mailbox, the one that is read; `None` where nobody looks.
     fn seen(&self) -> Option<Seen> {
         None
+    }
+
+    /// Who may end what is done with it.
+    fn stop(&self) -> &Stop {
+        Stop::never()
     }
 }
 

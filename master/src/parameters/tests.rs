@@ -1,4 +1,7 @@
-//! Names, files, differences, and the order in which a restore writes.
+//! Names, files, differences, the order in which a restore writes, and how one ends early.
+
+use std::cell::Cell;
+use std::time::Duration;
 
 use ecaxis_esi::model::Access;
 use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
@@ -7,9 +10,15 @@ use proptest::prelude::*;
 use super::compare::compare;
 use super::dump::{Dump, DumpError, Origin};
 use super::find::{FindError, Wanted, find};
+use super::restore::{RestoreError, Restored, restore};
 use super::rules::{Write, order};
 use super::{DataType, Kind, Parameter};
-use crate::mailbox::ObjectAddress;
+use crate::bringup::DeviceRef;
+use crate::mailbox::tests::server::Server;
+use crate::mailbox::tests::{STATION, block_on, client};
+use crate::mailbox::{ObjectAddress, Wire, WireError};
+use crate::service::ServiceError;
+use crate::stop::Stop;
 
 fn parameter(index: u16, sub: u8, data_type: &str, value: &[u8]) -> Parameter {
     Parameter {
@@ -194,6 +203,177 @@ fn lists_are_emptied_filled_and_counted_before_everything_else() {
             "1c12:0", "6065:0"
         ]
     );
+}
+
+/// A device whose frames are lost from a download on, before it or with its answer.
+struct Failing {
+    server: Server,
+    downloads: Cell<usize>,
+    fails_at: usize,
+    arrives: bool,
+    dead: Cell<bool>,
+    stop: Stop,
+}
+
+impl Failing {
+    /// With a mapping and an assignment of one entry each, and two settings.
+    fn new(fails_at: usize, arrives: bool) -> Self {
+        let objects: [(u16, u8, &[u8]); 6] = [
+            (0x1600, 0, &[1]),
+            (0x1600, 1, &[0x20, 0, 0x40, 0x60]),
+            (0x1c12, 0, &[1]),
+            (0x1c12, 1, &[1, 0x16, 0, 0]),
+            (0x6065, 0, &[1, 0, 0, 0]),
+            (0x6066, 0, &[1, 0, 0, 0]),
+        ];
+        Self {
+            server: Server::new(48, &objects, &[]),
+            downloads: Cell::new(0),
+            fails_at,
+            arrives,
+            dead: Cell::new(false),
+            stop: Stop::default(),
+        }
+    }
+
+    /// Gives it other values of all of that.
+    fn restore(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Restored, RestoreError> {
+        let wanted = [
+            parameter(0x1600, 0, "USINT", &[1]),
+            parameter(0x1600, 1, "UDINT", &[0x20, 0, 0x7a, 0x60]),
+            parameter(0x1c12, 0, "USINT", &[1]),
+            parameter(0x1c12, 1, "UDINT", &[0, 0x16, 0, 0]),
+            parameter(0x6065, 0, "UDINT", &[7, 0, 0, 0]),
+            parameter(0x6066, 0, "UDINT", &[7, 0, 0, 0]),
+        ];
+        let dictionary = Dictionary {
+            objects: vec![
+                object(0x1600, "m", &["", ""]),
+                object(0x1c12, "a", &["", ""]),
+                object(0x6065, "x", &[""]),
+                object(0x6066, "y", &[""]),
+            ],
+        };
+        let device = DeviceRef {
+            name: "x".to_owned(),
+            position: 0,
+            station: STATION,
+        };
+        let mut coe = client();
+        block_on(restore(
+            &mut coe,
+            self,
+            &device,
+            &dictionary,
+            &wanted,
+            progress,
+        ))
+    }
+
+    fn is_empty(&self, index: u16) -> bool {
+        self.server.object(index, 0) == Some(vec![0])
+    }
+}
+
+impl Wire for Failing {
+    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+        match self.dead.get() {
+            true => Err(WireError::Timeout { station, register }),
+            false => self.server.read(station, register, buf).await,
+        }
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
+        // The mailbox, and in it an SDO download.
+        let download = register == 0x1000 && data.get(8).is_some_and(|c| c >> 5 == 1);
+        self.downloads
+            .set(self.downloads.get() + usize::from(download));
+        let dies = download && self.downloads.get() == self.fails_at;
+        if dies && self.arrives {
+            let _ = self.server.write(station, register, data).await;
+            self.server.delay(Duration::from_millis(10)).await;
+        }
+        self.dead.set(self.dead.get() || dies);
+        match self.dead.get() {
+            true => Err(WireError::Timeout { station, register }),
+            false => self.server.write(station, register, data).await,
+        }
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.server.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.server.now()
+    }
+
+    fn stop(&self) -> &Stop {
+        &self.stop
+    }
+}
+
+/// 1c12 = 0, 1600 = 0, 1600:1, 1600:0, 1c12:1, 1c12:0, 6065:0, 6066:0.
+const WRITES: usize = 8;
+
+#[test]
+fn a_restore_that_breaks_off_tells_what_it_leaves() {
+    let whole = Failing::new(0, false);
+    let done = whole.restore(&mut |_, _| {}).expect("restored");
+    assert!(done.complete(), "{done:?}");
+    assert_eq!((done.written, whole.downloads.get()), (4, WRITES));
+
+    let mut empty = 0;
+    for arrives in [false, true] {
+        for k in 1..=WRITES {
+            let device = Failing::new(k, arrives);
+            let error = device.restore(&mut |_, _| {}).expect_err("no frames");
+            assert!(matches!(error.source, ServiceError::Sdo { .. }), "{error}");
+            assert_eq!((error.written, error.of), (k - 1, WRITES), "{error}");
+            let text = error.to_string();
+            let told = match k {
+                1 => true,
+                k => text.contains(&format!("; {} of 8 writes were done", k - 1)),
+            };
+            assert!(told, "{text}");
+            for (index, name) in [(0x1c12, "0x1c12:00"), (0x1600, "0x1600:00")] {
+                if device.is_empty(index) {
+                    empty += 1;
+                    assert!(error.emptied.contains(&index), "{k}: {text}");
+                    let left = text.split("left empty").nth(1).unwrap_or_default();
+                    assert!(left.contains(name), "{k}: {text}");
+                }
+            }
+            // Nothing is said to be empty that is full again.
+            let still: &[u16] = match k {
+                1 | 5..=6 => &[0x1c12],
+                2..=4 => &[0x1c12, 0x1600],
+                _ => &[],
+            };
+            assert_eq!(error.emptied, still, "{k}: {text}");
+        }
+    }
+    assert!(empty > 10, "{empty}");
+}
+
+#[test]
+fn who_ends_a_restore_ends_it_where_no_list_is_empty() {
+    for k in 0..WRITES {
+        let device = Failing::new(0, false);
+        let mut progress = |n, _| {
+            if n == k {
+                device.stop.ask();
+            }
+        };
+        let ended = device.restore(&mut progress);
+        assert!(!device.is_empty(0x1c12) && !device.is_empty(0x1600), "{k}");
+        let error = ended.expect_err("ended");
+        let stopped = matches!(error.source, ServiceError::Stopped { .. });
+        assert!(stopped && error.emptied.is_empty(), "{k}: {error}");
+        // The lists are six writes; what is asked for among them is done at their end.
+        assert_eq!(error.written, (k + 1).max(6), "{k}: {error}");
+        assert_eq!(device.downloads.get(), error.written);
+    }
 }
 
 fn any_parameter() -> impl Strategy<Value = Parameter> {

@@ -19,9 +19,10 @@ use ecaxis_esi::sii::{self, General, Protocols, Sii};
 use crate::bringup::DeviceRef;
 use crate::bringup::al::{self, AlState};
 use crate::mailbox::Wire;
-use crate::service::eeprom::{Claim, Eeprom};
+use crate::service::device::with_mailbox;
+use crate::service::eeprom::{Claim, with_eeprom};
 use crate::service::station::{self, Found};
-use crate::service::{Datagrams, ServiceError, mailbox};
+use crate::service::{Datagrams, ServiceError};
 
 pub mod answers;
 pub mod described;
@@ -265,13 +266,11 @@ async fn look_at(wire: &Datagrams, found: Found, readable: bool) -> Result<Devic
 /// Only where nobody holds it.
 async fn read_eeprom(wire: &Datagrams, at: &DeviceRef) -> Result<Sii, String> {
     const STEP: &str = "reading the EEPROM";
-    let read = async {
-        let eeprom = Eeprom::claim(wire, at, STEP, Claim::IfFree).await?;
-        let image = eeprom.image(&mut |_, _| {}).await;
-        eeprom.give_back().await?;
-        image
-    };
-    let image = read.await.map_err(|error| error.to_string())?;
+    let read = with_eeprom(wire, at, STEP, Claim::IfFree, async |eeprom| {
+        eeprom.image(&mut |_, _| {}).await
+    });
+    let image: Result<Vec<u8>, ServiceError> = read.await;
+    let image = image.map_err(|error| error.to_string())?;
     sii::parse(&image).map_err(|error| format!("EEPROM: {error}"))
 }
 
@@ -367,15 +366,12 @@ async fn ask(wire: &Datagrams, device: &Device) -> Option<Result<Answers, String
     let at = device
         .found
         .named(format!("position {}", device.position()));
-    let mut lent = match mailbox::lend(wire, &at, sii).await {
-        Ok(lent) => lent,
-        Err(error) => return Some(Err(error.to_string())),
-    };
-    let answers = answers::ask(wire, &mut lent.coe, device).await;
-    let back = lent.give_back(wire).await;
-    Some(match (answers, back) {
-        (Ok(answers), Ok(())) => Ok(answers),
-        (Err(error), _) => Err(error.to_string()),
-        (_, Err(error)) => Err(error.to_string()),
-    })
+    let answers = with_mailbox(wire, &at, sii, "asking it who it is", async |lent| {
+        let answers = answers::ask(wire, &mut lent.coe, device).await;
+        answers.map_err(|source| ServiceError::Sdo {
+            device: at.clone(),
+            source,
+        })
+    });
+    Some(answers.await.map_err(|error| error.to_string()))
 }

@@ -2,7 +2,7 @@
 
 use ecaxis_esi::sii::{self, Sii};
 
-use super::eeprom::{Claim, Eeprom, EepromError};
+use super::eeprom::{Claim, EepromError, with_eeprom};
 use super::mailbox::{self, Lent};
 use super::station::{Found, Which, address, census};
 use super::{Datagrams, ServiceError};
@@ -56,37 +56,50 @@ pub async fn information(
 ) -> Result<Sii, ServiceError> {
     let has_mailbox = matches!(found.state, AlState::PreOp | AlState::SafeOp | AlState::Op);
     let claim = Claim::of(found.state);
-    let eeprom = match Eeprom::claim(wire, device, "reading its EEPROM", claim).await {
-        Ok(eeprom) => eeprom,
+    let image = with_eeprom(wire, device, "reading its EEPROM", claim, async |eeprom| {
+        eeprom.image(&mut |_, _| {}).await
+    });
+    let image: Vec<u8> = match image.await {
         Err(ServiceError::Eeprom {
             source: EepromError::InUse,
             ..
         }) if has_mailbox => return Ok(Sii::default()),
-        Err(error) => return Err(error),
+        image => image?,
     };
-    let image = eeprom.image(&mut |_, _| {}).await;
-    eeprom.give_back().await?;
-    sii::parse(&image?).map_err(|source| ServiceError::Sii {
+    sii::parse(&image).map_err(|source| ServiceError::Sii {
         device: device.clone(),
         source,
     })
 }
 
 /// Does a piece of work on a device's CoE mailbox. A device in Init is in PreOp meanwhile and in Init again afterwards,
-/// however the work ends.
+/// however the work ends. `step` says what is done.
 ///
 /// # Errors
-/// Of [`mailbox::lend`] and of going back; the work's own come first.
+/// Of [`mailbox::lend`] and of going back; [`ServiceError::Stopped`]; the work's own come first.
 pub async fn with_mailbox<T, E: From<ServiceError>>(
     wire: &Datagrams,
     device: &DeviceRef,
     sii: &Sii,
+    step: &'static str,
     work: impl AsyncFnOnce(&mut Lent) -> Result<T, E>,
 ) -> Result<T, E> {
-    let mut lent = mailbox::lend(wire, device, sii).await?;
-    let done = work(&mut lent).await;
-    let back = lent.give_back(wire).await;
-    let done = done?;
-    back?;
-    Ok(done)
+    let stop = wire.stop();
+    let whole = async {
+        let mut lent = mailbox::lend(wire, device, sii).await?;
+        let done = match stop.unless(work(&mut lent)).await {
+            Some(done) => done,
+            None => {
+                // One that stays in its state must not wait for the rest of a transfer.
+                let _ = lent.coe.give_up(wire).await;
+                let device = device.clone();
+                Err(ServiceError::Stopped { device, step }.into())
+            }
+        };
+        let back = lent.give_back(wire).await;
+        let done = done?;
+        back?;
+        Ok(done)
+    };
+    stop.hold(whole).await
 }

@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::{Registers, ServiceError};
 use crate::bringup::{AlState, DeviceRef};
 use crate::mailbox::Wire;
+use crate::stop::Stop;
 
 const ACCESS: u16 = 0x0500;
 const CONTROL: u16 = 0x0502;
@@ -74,6 +75,46 @@ impl Claim {
     }
 }
 
+/// Bytes that a chip holds by the image in it; as much as the controller reads by itself where it does not say.
+#[must_use]
+pub fn size_of(image: &[u8]) -> usize {
+    let at = usize::try_from(SIZE * 2).unwrap_or(usize::MAX);
+    let word = image.get(at..).and_then(<[u8]>::first_chunk);
+    word.map_or(HEADER_BYTES, |word| said(*word))
+}
+
+fn said(word: [u8; 2]) -> usize {
+    let kibit = usize::from(u16::from_le_bytes(word)).saturating_add(1);
+    kibit.saturating_mul(128).clamp(HEADER_BYTES, MAX_BYTES)
+}
+
+/// Does a piece of work on a device's EEPROM. Where it was lent to the device it is again afterwards, however the work ends. `step`
+/// says what is done.
+///
+/// # Errors
+/// Of [`Eeprom::claim`] and of giving it back; [`ServiceError::Stopped`]; the work's own come first.
+pub async fn with_eeprom<W: Wire, T, E: From<ServiceError>>(
+    wire: &W,
+    device: &DeviceRef,
+    step: &'static str,
+    claim: Claim,
+    work: impl AsyncFnOnce(&Eeprom<'_, W>) -> Result<T, E>,
+) -> Result<T, E> {
+    let stop = wire.stop();
+    let whole = async {
+        let eeprom = Eeprom::claim(wire, device, step, claim).await?;
+        let done = match stop.unless(work(&eeprom)).await {
+            Some(done) => done,
+            None => Err(eeprom.stopped().into()),
+        };
+        let back = eeprom.give_back().await;
+        let done = done?;
+        back?;
+        Ok(done)
+    };
+    stop.hold(whole).await
+}
+
 /// The EEPROM of one device, held until [`Eeprom::give_back`].
 #[derive(Debug)]
 pub struct Eeprom<'a, W> {
@@ -138,8 +179,8 @@ impl<'a, W: Wire> Eeprom<'a, W> {
         Ok(())
     }
 
-    /// The image up to the end of its last category; where it has no end, all that the chip holds. `progress` is told bytes read and
-    /// bytes there are at most.
+    /// The image up to the mark at the end of its last category, whatever it says of its size; where it has no end, what can be
+    /// addressed. `progress` is told bytes read and bytes there are at most.
     ///
     /// # Errors
     /// As [`Eeprom::read`].
@@ -152,24 +193,24 @@ impl<'a, W: Wire> Eeprom<'a, W> {
         self.read(0, &mut image).await?;
         loop {
             let at = image.len();
-            progress(at, size);
-            let Some(head) = self.next(&mut image, size, 4).await? else {
+            progress(at, size.max(at));
+            let Some(head) = self.next(&mut image, MAX_BYTES, 4).await? else {
                 return Ok(image);
             };
-            let [k0, k1, n0, n1] = [head[0], head[1], head[2], head[3]];
-            if u16::from_le_bytes([k0, k1]) == 0xffff {
-                // The end mark is one word; what follows belongs to nothing.
+            let [k0, k1, n0, n1] = head;
+            // The end mark is one word; what follows belongs to nothing. Zeros beyond what the image says to be are no categories.
+            if u16::from_le_bytes([k0, k1]) == 0xffff || head == [0; 4] && at >= size {
                 image.truncate(at + 2);
                 return Ok(image);
             }
             let bytes = usize::from(u16::from_le_bytes([n0, n1])) * 2;
-            if self.next(&mut image, size, bytes).await?.is_none() {
+            if self.next(&mut image, MAX_BYTES, bytes).await?.is_none() {
                 return Ok(image);
             }
         }
     }
 
-    /// All that the chip holds.
+    /// All that the chip holds, as the image says; the whole image at least.
     ///
     /// # Errors
     /// As [`Eeprom::read`].
@@ -178,9 +219,23 @@ impl<'a, W: Wire> Eeprom<'a, W> {
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Vec<u8>, ServiceError> {
         let size = self.size().await?;
-        let mut image = Vec::with_capacity(size);
-        while self.next(&mut image, size, 64).await?.is_some() && image.len() < size {
-            progress(image.len(), size);
+        let image = self.image(progress).await?;
+        self.longer(image, size, progress).await
+    }
+
+    /// More of it: so many bytes from its beginning, no more than can be addressed.
+    ///
+    /// # Errors
+    /// As [`Eeprom::read`].
+    pub async fn longer(
+        &self,
+        mut image: Vec<u8>,
+        bytes: usize,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Vec<u8>, ServiceError> {
+        let bytes = bytes.min(MAX_BYTES);
+        while image.len() < bytes && self.next(&mut image, bytes, 64).await?.is_some() {
+            progress(image.len(), bytes);
         }
         Ok(image)
     }
@@ -192,11 +247,10 @@ impl<'a, W: Wire> Eeprom<'a, W> {
     pub async fn size(&self) -> Result<usize, ServiceError> {
         let mut size = [0; 2];
         self.read(SIZE, &mut size).await?;
-        let kibit = usize::from(u16::from_le_bytes(size)).saturating_add(1);
-        Ok(kibit.saturating_mul(128).clamp(HEADER_BYTES, MAX_BYTES))
+        Ok(said(size))
     }
 
-    /// Appends so many bytes, no more than there are; `None` where there are none.
+    /// Appends so many bytes, up to `size` in all; `None` where there are none.
     async fn next(
         &self,
         image: &mut Vec<u8>,
@@ -276,6 +330,17 @@ impl<'a, W: Wire> Eeprom<'a, W> {
                 return Err(self.failed(EepromError::Busy { word }));
             }
             wire.delay(POLL).await;
+        }
+    }
+
+    pub(super) fn stop(&self) -> &Stop {
+        self.registers.wire.stop()
+    }
+
+    pub(super) fn stopped(&self) -> ServiceError {
+        ServiceError::Stopped {
+            device: self.registers.device.clone(),
+            step: self.registers.step,
         }
     }
 

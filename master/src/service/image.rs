@@ -65,21 +65,51 @@ pub fn with_category(image: &[u8], kind: u16, data: &[u8]) -> Option<Vec<u8>> {
     Some(out)
 }
 
+/// An image that did not get there.
+#[derive(Debug, thiserror::Error)]
+#[error("{source}{}", self.left())]
+pub struct WriteError {
+    pub source: ServiceError,
+    /// Words that were written.
+    pub written: usize,
+    /// Words that were to be.
+    pub of: usize,
+}
+
+impl WriteError {
+    /// How much got there, behind what failed.
+    #[must_use]
+    pub fn left(&self) -> String {
+        match (self.written, self.of) {
+            (0, _) => "; nothing was written".to_owned(),
+            (written, of) => format!("; {written} of {of} words were written"),
+        }
+    }
+}
+
 /// Writes those words that differ, and reads all of them back. What the controller reads by itself comes last: a device
 /// that loses its power before is still itself. Returns how many words were written. `progress` is told words done and
-/// words there are.
+/// words there are. Once the first word is written, nobody ends it but what fails.
 ///
 /// # Errors
-/// [`EepromError::NotKept`] where a word reads back as another; else as [`Eeprom::write`].
+/// [`EepromError::NotKept`] where a word reads back as another; [`ServiceError::Stopped`] before the first word; else as
+/// [`Eeprom::write`].
 pub async fn write<W: Wire>(
     eeprom: &Eeprom<'_, W>,
     image: &[u8],
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<usize, ServiceError> {
+) -> Result<usize, WriteError> {
     let mut wanted = image.to_vec();
     wanted.resize(image.len().next_multiple_of(2), 0xff);
     let mut there = vec![0; wanted.len()];
-    eeprom.read(0, &mut there).await?;
+    let failed = |written, of| {
+        move |source| WriteError {
+            source,
+            written,
+            of,
+        }
+    };
+    eeprom.read(0, &mut there).await.map_err(failed(0, 0))?;
     let differing = |there: &[u8]| -> Vec<(u32, [u8; 2], [u8; 2])> {
         let (wanted, _) = wanted.as_chunks::<2>();
         let (there, _) = there.as_chunks::<2>();
@@ -93,19 +123,29 @@ pub async fn write<W: Wire>(
     let first = u32::try_from(CONFIGURATION / 2).unwrap_or(0);
     let own = writes.partition_point(|(word, ..)| *word < first);
     writes.rotate_left(own);
-    for (n, (word, value, _)) in writes.iter().enumerate() {
-        progress(n, writes.len());
-        eeprom.write(*word, *value).await?;
+    let of = writes.len();
+    if eeprom.stop().is_asked() {
+        return Err(failed(0, of)(eeprom.stopped()));
     }
-    eeprom.read(0, &mut there).await?;
-    match differing(&there).first() {
-        None => Ok(writes.len()),
-        Some((word, wanted, found)) => Err(eeprom.failed(EepromError::NotKept {
-            word: *word,
-            wanted: u16::from_le_bytes(*wanted),
-            found: u16::from_le_bytes(*found),
-        })),
-    }
+    let whole = async {
+        for (n, (word, value, _)) in writes.iter().enumerate() {
+            progress(n, of);
+            eeprom.write(*word, *value).await.map_err(failed(n, of))?;
+        }
+        eeprom.read(0, &mut there).await.map_err(failed(of, of))?;
+        match differing(&there).first() {
+            None => Ok(of),
+            Some((word, wanted, found)) => {
+                let source = eeprom.failed(EepromError::NotKept {
+                    word: *word,
+                    wanted: u16::from_le_bytes(*wanted),
+                    found: u16::from_le_bytes(*found),
+                });
+                Err(failed(of, of)(source))
+            }
+        }
+    };
+    eeprom.stop().hold(whole).await
 }
 
 #[cfg(test)]

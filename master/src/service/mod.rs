@@ -23,7 +23,6 @@ use crate::link::Link;
 use crate::link::port::{main_device, pump};
 use crate::mailbox::{InfoError, SdoError, Wire, WireError};
 use crate::session::{RunError, panic_text};
-use crate::supervise::interruptible;
 
 pub use crate::wire::Datagrams;
 
@@ -82,6 +81,12 @@ pub enum ServiceError {
     NoMailbox { device: DeviceRef },
     #[error("{device}: is in {state}, where it has no CoE mailbox")]
     WrongState { device: DeviceRef, state: String },
+    /// By the user, with everything put back that had to be.
+    #[error("{device}: {step}: interrupted")]
+    Stopped {
+        device: DeviceRef,
+        step: &'static str,
+    },
     #[error("{device}: {source}")]
     Sdo { device: DeviceRef, source: SdoError },
     #[error("{device}: {source}")]
@@ -93,10 +98,11 @@ pub enum ServiceError {
     State(#[from] StateError),
 }
 
-/// Does a piece of work on a link of its own, on a thread of its own, until it is done or `stop` is set. Blocks.
+/// Does a piece of work on a link of its own, on a thread of its own, until it is done or `stop` is set and nothing is in hand
+/// ([`crate::stop::Stop`]). Blocks.
 ///
 /// # Errors
-/// [`RunError::Interrupted`] where `stop` ended it; what opens or carries the link.
+/// [`RunError::Interrupted`] where `stop` ended it between one thing and the next; what opens or carries the link.
 pub fn visit<T, W>(
     open: impl FnOnce() -> Result<Box<dyn Link>, RunError> + Send + 'static,
     clock: Clock,
@@ -137,8 +143,10 @@ pub fn carry<T>(
 ) -> Result<T, RunError> {
     let (main_device, mut port) = main_device(0);
     let run = AssertUnwindSafe(|| {
-        let work = Box::pin(work(Datagrams::new(main_device)));
-        pump(&mut port, link, clock, interruptible(stop, work))
+        let wire = Datagrams::new(main_device);
+        let work = Box::pin(work(wire));
+        let ends = wire.stop();
+        pump(&mut port, link, clock, ends.once(stop, ends.unless(work)))
     });
     match catch_unwind(run) {
         Ok(Ok(Some(done))) => Ok(done),

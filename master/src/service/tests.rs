@@ -1,18 +1,21 @@
 //! A segment taken as it is found, in virtual time.
 
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis_esi::sii;
 
-use super::eeprom::{Claim, Eeprom, EepromError};
+use super::device::{information, locate, with_mailbox};
+use super::eeprom::{Claim, Eeprom, EepromError, with_eeprom};
+use super::image::{WriteError, write};
 use super::station::{Found, Which, address, census};
 use super::{Datagrams, ServiceError, carry, mailbox};
-use crate::bringup::AlState;
+use crate::bringup::{AlState, DeviceRef};
 use crate::clock::Clock;
-use crate::config;
+use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
 use crate::mailbox::Wire;
+use crate::parameters::collect::collect;
 use crate::session::{RunError, simulated_bus};
 
 /// Two drives, and what is done with them.
@@ -244,4 +247,148 @@ fn the_user_ends_it() {
     })
     .join()
     .expect("no panic");
+}
+
+/// The first of two drives, and what is done with it until `stop` is set; then how it was left: its AL state and 0x0500. That
+/// one is `access` before.
+fn stopped<T: Send + 'static>(
+    access: u8,
+    work: impl AsyncFnOnce(Datagrams, Found, DeviceRef, &AtomicBool) -> T + Send + 'static,
+) -> (Result<T, RunError>, (String, u8), Vec<u8>) {
+    let there = std::thread::Builder::new().stack_size(super::STACK);
+    let done = there.spawn(move || {
+        Clock::Virtual.enter();
+        let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+        let machine = config::load(&demo).expect("a machine");
+        let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
+        let stop = AtomicBool::new(false);
+        let done = carry(&mut link, Clock::Virtual, &stop, async |wire: Datagrams| {
+            let at = locate(&wire, Locator::Position(0), None).await;
+            let (found, device) = at.expect("located");
+            let written = wire.write(device.station, 0x0500, &[access]).await;
+            assert_eq!(written, Ok(1));
+            work(wire, found, device, &stop).await
+        });
+        let never = AtomicBool::new(false);
+        let access = carry(&mut link, Clock::Virtual, &never, async |wire| {
+            let mut access = [0];
+            let read = wire.read_at(0, 0x0500, &mut access).await;
+            read.map(|_| access[0]).expect("read")
+        });
+        let device = link.segment().device(0).expect("a device");
+        let left = (device.al_state().to_string(), access.expect("carried"));
+        (done, left, device.sii().to_vec())
+    });
+    done.expect("a thread").join().expect("no panic")
+}
+
+#[test]
+fn whoever_ends_it_finds_the_device_as_it_was() {
+    for access in [0, 1] {
+        let work = async |wire: Datagrams, found: Found, at: DeviceRef, stop: &AtomicBool| {
+            let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+            let machine = config::load(&demo).expect("a machine");
+            let dictionary = &machine.devices[0].selection.dictionary;
+            let sii = information(&wire, &found, &at).await?;
+            let mut reached = 0;
+            let step = "reading its parameters";
+            let all = with_mailbox(&wire, &at, &sii, step, async |lent| {
+                let mut progress = |n, _| {
+                    reached = n;
+                    stop.store(n >= 10, Ordering::Relaxed);
+                };
+                collect(&mut lent.coe, &wire, &at, dictionary, &mut progress).await
+            });
+            let ended = all.await;
+            assert_eq!(reached, 10, "at once");
+            ended
+        };
+        let (done, left, _) = stopped(access, work);
+        let error = done.expect("it tells").expect_err("ended");
+        assert_eq!(
+            error.to_string(),
+            "device 0 (position 0, station 0x1000): reading its parameters: interrupted"
+        );
+        assert_eq!(left, ("Init".to_owned(), access));
+    }
+}
+
+#[test]
+fn an_eeprom_goes_back_to_whom_it_was_lent_when_reading_is_ended() {
+    let (done, left, _) = stopped(1, async |wire, found: Found, at, stop| {
+        let claim = Claim::of(found.state);
+        let read = with_eeprom(&wire, &at, "reading its EEPROM", claim, async |eeprom| {
+            let mut told = 0;
+            let mut progress = |_, _| {
+                told += 1;
+                stop.store(told == 3, Ordering::Relaxed);
+            };
+            eeprom.image(&mut progress).await
+        });
+        read.await
+    });
+    let error = done.expect("it tells").expect_err("ended");
+    assert!(matches!(error, ServiceError::Stopped { .. }), "{error}");
+    assert!(
+        error
+            .to_string()
+            .contains("reading its EEPROM: interrupted")
+    );
+    assert_eq!(left, ("Init".to_owned(), 1));
+}
+
+/// The image of the first drive with other words in a reserved area, and so many bytes behind its end.
+fn changed(there: &[u8], more: usize) -> Vec<u8> {
+    let mut image = there.to_vec();
+    for byte in &mut image[0x50..0x64] {
+        *byte ^= 0x5a;
+    }
+    image.resize(image.len() + more, 0x5a);
+    image
+}
+
+#[test]
+fn an_eeprom_is_written_to_its_last_word_or_not_at_all() {
+    // Ten words; nobody is asked after the first has been written.
+    for stop_at in [0, 5] {
+        let (done, left, sii) = stopped(1, async move |wire, found: Found, at, stop| {
+            let claim = Claim::of(found.state);
+            let written = with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
+                let image = changed(&eeprom.image(&mut |_, _| {}).await?, 0);
+                let mut progress = |n, _| stop.store(n == stop_at, Ordering::Relaxed);
+                let written = write(eeprom, &image, &mut progress).await;
+                Ok::<_, ServiceError>((written.map_err(|e| e.to_string()), image))
+            });
+            written.await
+        });
+        let (written, image) = done.expect("it tells").expect("written");
+        assert_eq!(written, Ok(10), "stopped at {stop_at}");
+        assert_eq!(sii[..image.len()], image);
+        assert_eq!(left, ("Init".to_owned(), 1));
+    }
+}
+
+#[test]
+fn how_much_of_an_image_got_there_is_told() {
+    // It ends behind the chip.
+    let (done, _, _) = stopped(0, async |wire, _, at, stop| {
+        let claim = Claim::IfFree;
+        let write = async |stop: &AtomicBool, more| {
+            with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
+                let image = changed(&eeprom.all(&mut |_, _| {}).await?, more);
+                let mut progress = |_, _| stop.store(true, Ordering::Relaxed);
+                Ok::<_, ServiceError>(write(eeprom, &image, &mut progress).await)
+            })
+            .await
+        };
+        let never = AtomicBool::new(false);
+        let failed = write(&never, 4).await;
+        stop.store(true, Ordering::Relaxed);
+        failed
+    });
+    let failed: Result<usize, WriteError> = done.expect("it tells").expect("a result");
+    let error = failed.expect_err("no such words");
+    assert_eq!((error.written, error.of), (10, 12));
+    let text = error.to_string();
+    assert!(text.ends_with("; 10 of 12 words were written"), "{text}");
 }

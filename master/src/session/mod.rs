@@ -51,7 +51,7 @@ pub use emergencies::{EmergencyLine, EmergencyReport, Log};
 pub use error::{DriveReport, RunError};
 pub use events::EventLine;
 pub(crate) use events::clock_off;
-pub use open::{link as open_link, recorded, simulated_bus, topology};
+pub use open::{recorded, simulated_bus, topology};
 pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
 use story::{Left, Seen};
 use summary::Aside;

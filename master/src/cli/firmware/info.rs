@@ -1,10 +1,10 @@
 //! `ecaxis firmware info`: who a device is, what runs in it, and how it takes another program.
 
-use ecaxis::firmware::{self, FirmwareError};
+use ecaxis::firmware;
 
 use super::show;
-use super::target::{self, Where};
-use crate::cli::{Failure, hints, result};
+use super::target::Where;
+use crate::cli::{Failure, bus, hints, result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -30,14 +30,13 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let target = args.at.target(&args.words)?;
-    let (which, name, nic) = (target.which, target.name.clone(), target.nic().clone());
-    let found = target.visit(async move |wire| firmware::examine(&wire, which, &name).await)?;
-    let Some(found) = found else {
-        target::interrupted();
-        return Ok(());
-    };
-    let examined = found.map_err(|error: FirmwareError| hints::firmware(&error, &nic))?;
+    let target = args.at.target(&args.words, None)?;
+    let (which, name, nic) = (target.which, target.name.clone(), target.nic());
+    let found = target.visit(async move |wire, others| {
+        bus::warn_of(others);
+        firmware::examine(&wire, which, &name).await
+    })?;
+    let examined = found.map_err(|error| hints::firmware(&error, &nic))?;
     result(&if args.json {
         format!("{:#}\n", show::as_json(&examined))
     } else {

@@ -13,7 +13,9 @@ type Row = (&'static str, fn(&Examined) -> Option<String>);
 const VERSION: [Row; 7] = [
     ("revision (0x1018:03)", |e| hex(spoken(e)?.identity[2])),
     ("product (0x1018:02)", |e| hex(spoken(e)?.identity[1])),
-    ("revision (EEPROM)", |e| hex(Some(e.sii.identity.revision))),
+    ("revision (EEPROM)", |e| {
+        hex((!e.in_use).then_some(e.sii.identity.revision))
+    }),
     ("device type (0x1000)", |e| hex(spoken(e)?.device_type)),
     ("software version (0x100A)", |e| spoken(e)?.software.clone()),
     ("software identification (0x1F56)", |e| {
@@ -71,9 +73,13 @@ pub(super) fn info(examined: &Examined) -> String {
         }
         .to_owned(),
     );
-    row("vendor (EEPROM)", format!("0x{:08x}", identity.vendor));
-    row("product (EEPROM)", format!("0x{:08x}", identity.product));
-    row("serial number (EEPROM)", examined.sii.serial.to_string());
+    if examined.in_use {
+        row("EEPROM", "left to the device, which is using it".to_owned());
+    } else {
+        row("vendor (EEPROM)", format!("0x{:08x}", identity.vendor));
+        row("product (EEPROM)", format!("0x{:08x}", identity.product));
+        row("serial number (EEPROM)", examined.sii.serial.to_string());
+    }
     if let Some(spoken) = spoken(examined) {
         for (what, text) in [
             ("device name (0x1008)", &spoken.name),
@@ -91,6 +97,7 @@ pub(super) fn info(examined: &Examined) -> String {
     }
     for (via, _) in WAYS {
         let offered = match examined.offers(via) {
+            Ok(()) if examined.in_use => "not known: its EEPROM says it".to_owned(),
             Ok(()) if via == Via::Foe => {
                 let boot = examined.sii.bootstrap;
                 let (out, back) = (boot.receive_size, boot.send_size);
@@ -125,11 +132,13 @@ fn state(examined: &Examined) -> String {
 pub(super) fn as_json(examined: &Examined) -> Value {
     let identity = examined.sii.identity;
     let spoken = spoken(examined);
-    let offers: Vec<&str> = WAYS
-        .into_iter()
-        .filter(|(via, _)| examined.offers(*via).is_ok())
-        .map(|(_, name)| name)
-        .collect();
+    // Of one that keeps its EEPROM to itself it is not known.
+    let known = !examined.in_use;
+    let offers = known.then(|| -> Vec<&str> {
+        let offered = WAYS.into_iter();
+        let offered = offered.filter(|(via, _)| examined.offers(*via).is_ok());
+        offered.map(|(_, name)| name).collect()
+    });
     let [vendor, product, revision, serial] = spoken.map_or([None; 4], |s| s.identity);
     json!({
         "name": examined.device.name,
@@ -142,12 +151,12 @@ pub(super) fn as_json(examined: &Examined) -> Value {
             Runs::BootLoader => "boot-loader",
             Runs::Unknown => "unknown",
         },
-        "eeprom": {
+        "eeprom": known.then(|| json!({
             "vendor": identity.vendor,
             "product": identity.product,
             "revision": identity.revision,
             "serial": examined.sii.serial,
-        },
+        })),
         "identity": {
             "vendor": vendor,
             "product": product,

@@ -1,18 +1,16 @@
 //! Which device on which bus.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, DeviceConfig, Locator, Machine, Nic};
 use ecaxis::firmware::Expected;
-use ecaxis::link::{self, BackEnd};
+use ecaxis::service::Datagrams;
 use ecaxis::service::station::Which;
-use ecaxis::service::{self, Datagrams};
-use ecaxis::session::{self, Options, RunError};
+use ecaxis::session::Options;
 
-use crate::cli::{Failure, hints, note, run, signals};
+use crate::cli::bus::Bus;
+use crate::cli::{Failure, hints, record, run};
 
 #[derive(Debug, clap::Args)]
 pub(super) struct Where {
@@ -40,9 +38,7 @@ pub(super) struct Where {
 }
 
 pub(super) struct Target {
-    machine: Option<Machine>,
-    nic: Nic,
-    options: Options,
+    bus: Bus,
     pub which: Which,
     /// In the machine file; else what it was found by.
     pub name: String,
@@ -51,9 +47,13 @@ pub(super) struct Target {
 }
 
 impl Where {
-    /// `words`: machine file and device, or nothing.
-    pub fn target(&self, words: &[String]) -> Result<Target, Failure> {
-        let machine = match words {
+    /// `words`: machine file and device, or nothing. `input` is a file that is read, too, and what it is.
+    pub fn target(
+        &self,
+        words: &[String],
+        input: Option<(&Path, &str)>,
+    ) -> Result<Target, Failure> {
+        let mut machine = match words {
             [] => None,
             [file, _] => {
                 let file = Path::new(file);
@@ -62,9 +62,10 @@ impl Where {
             _ => return Err(wrong("a machine file and a device's name belong together")),
         };
         let device = match (&machine, words) {
-            (Some(machine), [file, name]) => Some(named(machine, Path::new(file), name)?),
+            (Some(machine), [file, name]) => Some(named(machine, Path::new(file), name)?.clone()),
             _ => None,
         };
+        let device = device.as_ref();
         let which = match (self.position, self.alias, device.map(|device| device.at)) {
             (Some(position), ..) => Which::Position(position),
             (None, Some(alias), _) => Which::Alias(alias),
@@ -98,6 +99,9 @@ impl Where {
             (Some(file), Some(machine)) => Some(run::faults(file, machine)?),
             _ => None,
         };
+        if let Some(path) = &self.record {
+            record::check_beside(path, machine.as_ref(), self.faults.as_deref(), input)?;
+        }
         let mut options = Options {
             clock: if self.virtual_time {
                 Clock::Virtual
@@ -111,6 +115,14 @@ impl Where {
         if let Some(seed) = options.faults.as_ref().and_then(|faults| faults.seed) {
             options.seed = seed;
         }
+        let bus = match (&mut machine, nic) {
+            (Some(machine), nic) => {
+                machine.bus.nic = nic;
+                Bus::of(machine)
+            }
+            (None, Nic::Interface(nic)) => Bus::interface(&nic),
+            (None, Nic::Sim) => return Err(wrong("the simulated bus is a machine file's")),
+        };
         let identity = device.map(|device| device.device.identity);
         Ok(Target {
             name: device.map_or_else(|| which.to_string(), |device| device.name.clone()),
@@ -118,52 +130,25 @@ impl Where {
                 vendor: identity.map(|identity| identity.vendor),
                 product: identity.map(|identity| identity.product),
             },
-            machine,
-            nic,
-            options,
+            bus: bus.with(options),
             which,
         })
     }
 }
 
 impl Target {
-    pub fn nic(&self) -> &Nic {
-        &self.nic
+    /// Hints depend on it.
+    pub fn nic(&self) -> Nic {
+        self.bus.nic()
     }
 
-    /// Does a piece of work on the bus. `None` where Ctrl-C ended it.
-    pub fn visit<T, W>(self, work: W) -> Result<Option<T>, Failure>
+    /// Does a piece of work on the bus; `work` is told how many frames of others came in before anything was sent.
+    pub fn visit<T, W>(self, work: W) -> Result<T, Failure>
     where
         T: Send + 'static,
-        W: AsyncFnOnce(Datagrams) -> T + Send + 'static,
+        W: AsyncFnOnce(Datagrams, u64) -> T + Send + 'static,
     {
-        let Self {
-            machine,
-            nic,
-            options,
-            ..
-        } = self;
-        let stop = Arc::new(AtomicBool::new(false));
-        signals::stop_on_interrupt(&stop);
-        let clock = options.clock;
-        let on = nic.clone();
-        // What disturbs a cycle is no concern of a bus without one.
-        let open = move || match (machine, on) {
-            (Some(mut machine), nic) => {
-                machine.bus.nic = nic;
-                session::open_link(&machine, &options, |_| {})
-            }
-            (None, Nic::Interface(nic)) => {
-                let (link, _) = link::open(&nic, BackEnd::default())?;
-                session::recorded(link, &options)
-            }
-            (None, Nic::Sim) => Err(RunError::Sim("there is no machine file".to_owned())),
-        };
-        match service::visit(open, clock, stop, work) {
-            Ok(done) => Ok(Some(done)),
-            Err(RunError::Interrupted) => Ok(None),
-            Err(error) => Err(hints::run(&error, &nic)),
-        }
+        self.bus.visit(work)
     }
 }
 
@@ -185,8 +170,4 @@ pub(super) fn named<'a>(
 
 pub(super) fn wrong(message: &str) -> Failure {
     Failure::new(hints::WRONG, message)
-}
-
-pub(super) fn interrupted() {
-    note("interrupted");
 }

@@ -5,14 +5,14 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
-use ecaxis::firmware::{self, Done, Examined, FirmwareError, Order, ReadBack, Step, Told, Via};
+use ecaxis::firmware::{self, Done, Examined, Order, ReadBack, Step, Told, Via};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::show;
 use super::target::{self, Where};
 use crate::cli::esi::number;
-use crate::cli::{Failure, hints, note, result, style};
+use crate::cli::{Failure, bus, hints, note, result, style};
 
 /// No program memory of a drive is larger.
 const MOST: u64 = 256 << 20;
@@ -113,7 +113,8 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
         return Err(target::wrong("the firmware file is missing"));
     };
     let path = PathBuf::from(path);
-    let mut target = args.at.target(words)?;
+    let input = (path.as_path(), "the firmware file");
+    let mut target = args.at.target(words, Some(input))?;
     target.expected.vendor = args.expect_vendor.or(target.expected.vendor);
     target.expected.product = args.expect_product.or(target.expected.product);
     let file = read(&path)?;
@@ -125,36 +126,38 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
             .map(|name| name.to_string_lossy().into_owned())
             .unwrap_or_default(),
     };
-    let (which, expected, nic) = (target.which, target.expected, target.nic().clone());
+    let (which, expected, nic) = (target.which, target.expected, target.nic());
     let device = target.name.clone();
     let chosen = args.via.map(Via::from);
     let (password, read_back, write) = (args.password, args.read_back, args.yes);
     let teller = Teller::new(plain);
-    let visited = target.visit(async move |wire| {
-        let before = firmware::examine(&wire, which, &device).await?;
-        let via = before.way(chosen)?;
-        let order = Order {
-            via,
-            file,
-            name,
-            password,
-            read_back,
+    let visited = target.visit(async move |wire, others| {
+        if others > 0 && write {
+            return Err(hints::shared_bus());
+        }
+        bus::warn_of(others);
+        let visited = async {
+            let before = firmware::examine(&wire, which, &device).await?;
+            let via = before.way(chosen)?;
+            let order = Order {
+                via,
+                file,
+                name,
+                password,
+                read_back,
+            };
+            before.ready(&order, expected)?;
+            let done = if write {
+                let mut tell = |told| teller.tell(&told);
+                Some(firmware::update(&wire, &before, expected, &order, &mut tell).await?)
+            } else {
+                None
+            };
+            Ok(Visited { before, via, done })
         };
-        before.ready(&order, expected)?;
-        let done = if write {
-            let mut tell = |told| teller.tell(&told);
-            Some(firmware::update(&wire, &before, expected, &order, &mut tell).await?)
-        } else {
-            None
-        };
-        Ok::<_, FirmwareError>(Visited { before, via, done })
+        visited.await.map_err(|error| hints::firmware(&error, &nic))
     })?;
-    let Some(visited) = visited else {
-        target::interrupted();
-        return Err(Failure::new(hints::FAILED, "the update was interrupted")
-            .hint(hints::TRY_AGAIN.to_owned()));
-    };
-    let visited = visited.map_err(|error| hints::firmware(&error, &nic))?;
+    let visited = visited?;
     let Some(done) = &visited.done else {
         result(&if args.json {
             format!("{:#}\n", planned_json(&visited, bytes, &path))

@@ -6,9 +6,11 @@ use ecaxis::mailbox::FoeError;
 
 use super::{FAILED, Failure, WRONG, service, state};
 
-/// What holds for every update that has begun.
-pub(crate) const TRY_AGAIN: &str =
-    "the device may be left with its boot loader alone; the same command tries again";
+/// Nobody else may be on the bus while a program is written.
+pub(crate) fn shared_bus() -> Failure {
+    let message = "another MainDevice is at work on this bus: nothing was written";
+    Failure::new(FAILED, message).hint("end the program that drives the bus, then try again")
+}
 
 pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, error.to_string());
@@ -71,7 +73,7 @@ fn cause(cause: &Cause) -> Option<String> {
         Cause::NotBack { .. } => {
             "switch the device off and on, then look with `ecaxis firmware info`"
         }
-        Cause::Service(_) => return None,
+        Cause::Service(_) | Cause::Interrupted => return None,
     };
     Some(hint.to_owned())
 }

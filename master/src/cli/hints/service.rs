@@ -1,10 +1,14 @@
 //! A bus without a cycle.
 
+use std::path::Path;
+
 use ecaxis::bringup::BringUpError;
 use ecaxis::config::Nic;
 use ecaxis::mailbox::{InfoError, SdoError};
+use ecaxis::parameters::restore::RestoreError;
 use ecaxis::service::ServiceError;
 use ecaxis::service::eeprom::EepromError;
+use ecaxis::service::image::WriteError;
 
 use super::{FAILED, Failure, WRONG, bring_up, sdo, state};
 
@@ -49,10 +53,47 @@ pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
         ServiceError::WrongState { .. } => {
             "lead it to Init first, or switch it off and on".to_owned()
         }
+        ServiceError::Stopped { .. } => {
+            "the device is in the state again in which it was found; the same command begins anew"
+                .to_owned()
+        }
         ServiceError::Sdo { source, .. } => parameter(source),
         ServiceError::State(error) => state(error),
     };
     failure.hint(hint)
+}
+
+/// Settings that a device was not given to the end.
+pub(crate) fn restore(error: &RestoreError, nic: &Nic) -> Failure {
+    let source = service(&error.source, nic);
+    let failure = Failure {
+        message: format!("{}{}", source.message, error.left()),
+        ..source
+    };
+    if error.written == 0 && error.emptied.is_empty() {
+        return failure;
+    }
+    failure.hint("run the same command again; or switch the device off and on: nothing was stored")
+}
+
+/// An image that a device was not given to the end; the old one is kept.
+pub(crate) fn image(error: &WriteError, backup: &Path, nic: &Nic) -> Failure {
+    let source = service(&error.source, nic);
+    let backup = backup.display();
+    let failure = Failure {
+        message: format!(
+            "{}{}; the old image is in {backup}",
+            source.message,
+            error.left()
+        ),
+        ..source
+    };
+    if error.written == 0 {
+        return failure;
+    }
+    failure.hint(format!(
+        "before the device is switched off: the same command writes the rest, `ecaxis eeprom write` with {backup} brings the old image back"
+    ))
 }
 
 /// The error's text, with the device's address once: what its mailbox says carries it, too.

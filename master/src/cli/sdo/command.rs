@@ -1,20 +1,44 @@
 //! `ecaxis sdo store`, `ecaxis sdo defaults`.
 
+use ecaxis::mailbox::Wire;
 use ecaxis::parameters::command::Command;
 use serde_json::json;
 
 use super::super::device::{Open, Place};
 use super::super::{Failure, hints, note, result};
 
-const EXAMPLES: &str = "\
+const STORE_EXAMPLES: &str = "\
 Examples:
   ecaxis sdo store machine.toml x
-  ecaxis sdo defaults --nic enp3s0 --position 0";
+  ecaxis sdo store --nic enp3s0 --position 0";
 
-/// Which device
+const DEFAULTS_EXAMPLES: &str = "\
+Examples:
+  ecaxis sdo dump machine.toml x x.toml       keeps the present ones
+  ecaxis sdo defaults machine.toml x --yes
+  ecaxis sdo defaults --nic enp3s0 --position 0 --yes";
+
+/// Keep the parameters over power cycles (0x1010 "save")
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
-pub(super) struct Args {
+#[command(after_help = STORE_EXAMPLES)]
+pub(super) struct StoreArgs {
+    #[command(flatten)]
+    which: Which,
+}
+
+/// Back to the maker's parameters at the next start (0x1011 "load")
+#[derive(Debug, clap::Args)]
+#[command(after_help = DEFAULTS_EXAMPLES)]
+pub(super) struct DefaultsArgs {
+    /// Really forget the present parameters
+    #[arg(long)]
+    yes: bool,
+    #[command(flatten)]
+    which: Which,
+}
+
+#[derive(Debug, clap::Args)]
+struct Which {
     /// Machine file and device
     #[arg(value_name = "WORD")]
     words: Vec<String>,
@@ -25,20 +49,42 @@ pub(super) struct Args {
     json: bool,
 }
 
-pub(super) fn run(args: &Args, command: Command) -> Result<(), Failure> {
-    let (target, rest) = args.place.take(&args.words, "nothing")?;
+pub(super) fn store(args: &StoreArgs) -> Result<(), Failure> {
+    give(&args.which, Command::Store)
+}
+
+pub(super) fn defaults(args: &DefaultsArgs) -> Result<(), Failure> {
+    if !args.yes {
+        let failure = Failure::new(hints::WRONG, "nothing was written: say `--yes`");
+        return Err(failure.hint("`ecaxis sdo dump` keeps the present parameters in a file first"));
+    }
+    give(&args.which, Command::Defaults)
+}
+
+fn give(which: &Which, command: Command) -> Result<(), Failure> {
+    let (target, rest) = which.place.take(&which.words, "nothing")?;
     if let Some(word) = rest.first() {
         return Err(Failure::new(
             hints::WRONG,
             format!("`{word}` is one word too many"),
         ));
     }
-    let device = target.open(async move |open: &mut Open<'_>| {
+    let (step, what) = match command {
+        Command::Store => ("storing its parameters", "parameters are stored"),
+        Command::Defaults => ("resetting its parameters", "parameters are reset"),
+    };
+    let device = target.open(step, async move |open: &mut Open<'_>| {
         let at = open.at;
-        at.told(command.give(open.coe, &at.wire, &at.device).await)?;
+        at.at_rest(what)?;
+        // A device that has begun goes on, whether somebody waits or not.
+        let given = at
+            .wire
+            .stop()
+            .hold(command.give(open.coe, &at.wire, &at.device));
+        at.told(given.await)?;
         Ok(at.device.clone())
     })?;
-    if args.json {
+    if which.json {
         let report = json!({ "ok": true, "device": device.name, "position": device.position });
         return result(&format!("{report:#}\n"));
     }

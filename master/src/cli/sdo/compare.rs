@@ -46,10 +46,13 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             };
             let left = load(Path::new(file))?;
             let ask = args.common.ask;
-            let taken = target.open(async move |open: &mut Open<'_>| {
-                let (there, _) = taken(open, ask).await?;
-                Ok((there, open.at.device.name.clone()))
-            });
+            let taken = target.open(
+                "reading its parameters",
+                async move |open: &mut Open<'_>| {
+                    let (there, _) = taken(open, ask).await?;
+                    Ok((there, open.at.device.name.clone()))
+                },
+            );
             let (there, name) = taken?;
             (left, there, [file.clone(), name])
         }

@@ -37,7 +37,10 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         return Err(super::super::in_the_way(&path));
     }
     let ask = args.common.ask;
-    let (dump, refused) = target.open(async move |open: &mut Open<'_>| taken(open, ask).await)?;
+    let (dump, refused) = target.open(
+        "reading its parameters",
+        async move |open: &mut Open<'_>| taken(open, ask).await,
+    )?;
     keep(&path, dump.to_toml().as_bytes())?;
     for (at, code) in &refused {
         note(&format!("{} was {}", address(*at), refusal(*code)));

@@ -34,6 +34,9 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         ));
     }
     let ask = args.common.ask;
-    let dictionary = target.open(async move |open: &mut Open<'_>| open.dictionary(ask).await)?;
+    let dictionary = target.open(
+        "asking for its objects",
+        async move |open: &mut Open<'_>| open.dictionary(ask).await,
+    )?;
     result(&objects::listed(&dictionary, args.common.json))
 }

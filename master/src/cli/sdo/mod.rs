@@ -56,10 +56,8 @@ enum Command {
     Dump(dump::Args),
     Compare(compare::Args),
     Restore(restore::Args),
-    /// Keep the parameters over power cycles (0x1010 "save")
-    Store(command::Args),
-    /// Back to the maker's parameters at the next start (0x1011 "load")
-    Defaults(command::Args),
+    Store(command::StoreArgs),
+    Defaults(command::DefaultsArgs),
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -70,10 +68,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Command::Dump(args) => dump::run(args),
         Command::Compare(args) => compare::run(args),
         Command::Restore(args) => restore::run(args),
-        Command::Store(args) => command::run(args, ecaxis::parameters::command::Command::Store),
-        Command::Defaults(args) => {
-            command::run(args, ecaxis::parameters::command::Command::Defaults)
-        }
+        Command::Store(args) => command::store(args),
+        Command::Defaults(args) => command::defaults(args),
     }
 }
 

@@ -52,7 +52,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     let data_type = data_type(args.data_type.as_deref())?;
     let (objects, ask, complete) = (objects.to_vec(), args.common.ask, args.complete);
     let to_file = args.to.is_some();
-    let read = target.open(async move |open: &mut Open<'_>| {
+    let read = target.open("reading objects", async move |open: &mut Open<'_>| {
         let mut out = Vec::new();
         for (wanted, object) in describe(open, ask, &objects).await? {
             if complete {

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use ecaxis::bringup::AlState;
 use ecaxis::parameters::restore::{Restored, restore};
 use serde_json::json;
 
@@ -42,38 +41,34 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     };
     let dump = load(Path::new(file))?;
     let (ask, other_device, shown) = (args.common.ask, args.other_device, file.clone());
-    let done = target.open(async move |open: &mut Open<'_>| {
-        let at = open.at;
-        if !matches!(at.state, AlState::Init | AlState::PreOp) {
-            let message = format!(
-                "{}: is in {}: settings are restored in PreOp",
-                at.device, at.state
+    let done = target.open(
+        "restoring its settings",
+        async move |open: &mut Open<'_>| {
+            let at = open.at;
+            at.at_rest("settings are restored")?;
+            let actual = open.origin().await?.identity();
+            let of_file = dump.device.identity();
+            if actual != of_file && !other_device {
+                let message = format!("{}: is {actual}, {shown} is of {of_file}", at.device);
+                return Err(Failure::new(hints::FAILED, message)
+                    .hint("`--other-device` writes what it has in common with that one"));
+            }
+            let dictionary = open.dictionary(ask).await?;
+            let mut progress = counter("writing");
+            let parameters = &dump.parameters;
+            let restored = restore(
+                open.coe,
+                &at.wire,
+                &at.device,
+                &dictionary,
+                parameters,
+                &mut progress,
             );
-            return Err(Failure::new(hints::FAILED, message)
-                .hint("end what drives the device first; then it is in Init or PreOp"));
-        }
-        let actual = open.origin().await?.identity();
-        let of_file = dump.device.identity();
-        if actual != of_file && !other_device {
-            let message = format!("{}: is {actual}, {shown} is of {of_file}", at.device);
-            return Err(Failure::new(hints::FAILED, message)
-                .hint("`--other-device` writes what it has in common with that one"));
-        }
-        let dictionary = open.dictionary(ask).await?;
-        let mut progress = counter("writing");
-        let parameters = &dump.parameters;
-        let restored = restore(
-            open.coe,
-            &at.wire,
-            &at.device,
-            &dictionary,
-            parameters,
-            &mut progress,
-        );
-        let restored = restored.await;
-        bus::passed();
-        at.told(restored)
-    })?;
+            let restored = restored.await;
+            bus::passed();
+            restored.map_err(|error| at.advised(&error, hints::restore))
+        },
+    )?;
     report(args, file, &done)?;
     if done.complete() {
         return Ok(());

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use ecaxis::mailbox::Wire;
 use ecaxis::parameters::{DataType, ValueError};
 use ecaxis::service::ServiceError;
 use serde_json::json;
@@ -69,7 +70,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     };
     let data_type = data_type(args.data_type.as_deref())?;
     let (ask, complete) = (args.common.ask, args.complete);
-    let done = target.open(async move |open: &mut Open<'_>| {
+    let done = target.open("writing an object", async move |open: &mut Open<'_>| {
         let described = describe(open, ask, std::slice::from_ref(&object)).await?;
         let (wanted, known) = described.into_iter().next().ok_or_else(nothing)?;
         let mut parts = parts(wanted, known.as_ref());
@@ -90,10 +91,9 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         let shown = known.unwrap_or(DataType::BYTES);
         let wire = &open.at.wire;
         let before = open.coe.upload(wire, at.index, at.sub, complete).await.ok();
-        let sent = open
-            .coe
-            .download(wire, at.index, at.sub, complete, &value)
-            .await;
+        let download = open.coe.download(wire, at.index, at.sub, complete, &value);
+        // All of it or nothing.
+        let sent = wire.stop().hold(download).await;
         open.at.told(sent.map_err(|source| ServiceError::Sdo {
             device: open.at.device.clone(),
             source,

@@ -1,0 +1,163 @@
+//! What a device holds before and after, and what is kept of it.
+
+use std::sync::atomic::AtomicBool;
+use std::thread;
+
+use ecaxis::bringup::AlState;
+use ecaxis::clock::Clock;
+use ecaxis::config::{self, Locator, Nic};
+use ecaxis::link::sim::SimLink;
+use ecaxis::service::carry;
+use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice};
+
+use super::*;
+
+/// Bytes of the chip in these tests.
+const CHIP: usize = 2048;
+
+/// A drive with this in its EEPROM, and what is in it afterwards. Virtual time belongs to a thread.
+fn with_eeprom_of<T: Send + 'static>(
+    image: Vec<u8>,
+    work: impl AsyncFnOnce(&mut Located) -> T + Send + 'static,
+) -> (T, Vec<u8>) {
+    let there = thread::Builder::new().stack_size(16 << 20).spawn(move || {
+        Clock::Virtual.enter();
+        let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+        let machine = config::load(&demo).expect("a machine");
+        let config = machine.devices.first().expect("a device");
+        let options = DeviceOptions {
+            sii: Some(image),
+            ..DeviceOptions::default()
+        };
+        let device = SimDevice::from_esi(&config.device, &config.esi.modules, options);
+        let devices = vec![device.expect("a device")];
+        let mut link = SimLink::new(Segment::new(devices, SegmentOptions::default()));
+        let stop = AtomicBool::new(false);
+        let done = carry(&mut link, Clock::Virtual, &stop, async |wire| {
+            let at = Located::find(wire, Locator::Position(0), None, Nic::Sim).await;
+            work(&mut at.expect("located")).await
+        });
+        let device = link.segment().device(0).expect("a device");
+        (done.expect("carried"), device.sii().to_vec())
+    });
+    there.expect("a thread").join().expect("no panic")
+}
+
+/// The demonstration drive's image, as long as the chip.
+fn good() -> Vec<u8> {
+    let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+    let machine = config::load(&demo).expect("a machine");
+    let config = machine.devices.first().expect("a device");
+    let sii = Sii::from_device(
+        &config.device,
+        &config.esi.modules,
+        &sii::SiiOptions::default(),
+    );
+    let mut image = sii.to_bytes();
+    image.resize(CHIP, 0xff);
+    image[0x7c..0x7e].copy_from_slice(&15_u16.to_le_bytes());
+    image
+}
+
+fn keeps(path: PathBuf) -> Care {
+    Care {
+        yes: true,
+        backup: Some(path),
+    }
+}
+
+#[test]
+fn what_is_written_over_behind_the_end_is_in_the_backup() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let kept = folder.path().join("kept.bin");
+    let mut there = good();
+    there[1500..1504].copy_from_slice(b"own.");
+    let mut new = good();
+    new[0x1c] ^= 1;
+    let (before, care, wanted) = (there.clone(), keeps(kept.clone()), new.clone());
+    let (done, after) = with_eeprom_of(there, async move |at| {
+        let old = image(at, false).await.expect("an image");
+        assert!(old.len() < 1500, "{}", old.len());
+        burn(at, &care, &old, &wanted).await
+    });
+    // The serial number, and two words behind the end.
+    let done = done.expect("written");
+    assert!(done.contains("3 words written"), "{done}");
+    assert_eq!(after, new);
+    assert_eq!(std::fs::read(kept).expect("kept"), before);
+}
+
+#[test]
+fn an_image_that_belittles_its_chip_is_read_and_mended() {
+    for said in [0_u16, 1] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let kept = folder.path().join("kept.bin");
+        let mut there = good();
+        there[0x7c..0x7e].copy_from_slice(&said.to_le_bytes());
+        let new = good();
+        let (care, wanted) = (keeps(kept), new.clone());
+        let (done, after) = with_eeprom_of(there, async move |at| {
+            let old = image(at, false).await.expect("an image");
+            let all = image(at, true).await.expect("all of it");
+            assert!(all.starts_with(&old));
+            (sii::parse(&old), burn(at, &care, &old, &wanted).await)
+        });
+        let (old, done) = done;
+        let old = old.expect("an image");
+        assert!(old.ended && !old.sync_managers.is_empty());
+        let done = done.expect("written");
+        assert!(done.contains("1 word written"), "{done}");
+        assert_eq!(after, new);
+    }
+}
+
+#[test]
+fn a_chip_that_is_smaller_than_the_new_image_says_shows() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let kept = folder.path().join("kept.bin");
+    let mut new = good();
+    new.resize(2 * CHIP, 0x5a);
+    new[0x7c..0x7e].copy_from_slice(&31_u16.to_le_bytes());
+    let (care, shown) = (keeps(kept.clone()), kept.display().to_string());
+    let (failure, _) = with_eeprom_of(good(), async move |at| {
+        let old = image(at, false).await.expect("an image");
+        burn(at, &care, &old, &new).await.expect_err("no room")
+    });
+    assert_eq!(failure.code, hints::FAILED);
+    let message = &failure.message;
+    let told = format!("; 1 of 1025 words were written; the old image is in {shown}");
+    assert!(message.ends_with(&told), "{message}");
+    assert!(kept.exists());
+}
+
+#[test]
+fn zeros_are_no_image_of_any_length() {
+    let (read, _) = with_eeprom_of(vec![0; CHIP], async |at| image(at, false).await);
+    assert!(read.expect("read").len() < 0x100);
+}
+
+#[test]
+fn parameters_as_a_whole_change_at_rest_alone() {
+    let (allowed, _) = with_eeprom_of(good(), async |at| {
+        let states = [
+            (AlState::Init, true),
+            (AlState::PreOp, true),
+            (AlState::Bootstrap, false),
+            (AlState::SafeOp, false),
+            (AlState::Op, false),
+        ];
+        states.map(|(state, good)| {
+            at.state = state;
+            (at.at_rest("parameters are reset"), state, good)
+        })
+    });
+    for (allowed, state, good) in allowed {
+        assert_eq!(allowed.is_ok(), good, "{state}");
+        if let Err(failure) = allowed {
+            let told = format!("is in {state}: parameters are reset in PreOp");
+            assert_eq!(failure.code, hints::FAILED);
+            assert!(failure.message.ends_with(&told), "{failure:?}");
+            assert!(!failure.hints.is_empty());
+        }
+    }
+}
