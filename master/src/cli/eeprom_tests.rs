@@ -112,20 +112,21 @@ fn an_image_that_belittles_its_chip_is_read_and_mended() {
 }
 
 #[test]
-fn a_chip_that_is_smaller_than_the_new_image_says_shows() {
+fn an_image_that_says_more_than_the_chip_holds_is_not_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let kept = folder.path().join("kept.bin");
     let mut new = good();
     new.resize(2 * CHIP, 0x5a);
     new[0x7c..0x7e].copy_from_slice(&31_u16.to_le_bytes());
     let (care, shown) = (keeps(kept.clone()), kept.display().to_string());
-    let (failure, _) = with_eeprom_of(good(), async move |at| {
+    let (failure, after) = with_eeprom_of(good(), async move |at| {
         let old = image(at, false).await.expect("an image");
         burn(at, &care, &old, &new).await.expect_err("no room")
     });
+    assert_eq!(after, good());
     assert_eq!(failure.code, hints::FAILED);
     let message = &failure.message;
-    let told = format!("; 1 of 1025 words were written; the old image is in {shown}");
+    let told = format!("holds 2048 bytes; nothing was written; the old image is in {shown}");
     assert!(message.ends_with(&told), "{message}");
     assert!(kept.exists());
 }

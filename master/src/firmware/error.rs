@@ -58,14 +58,14 @@ pub enum Cause {
     #[error(transparent)]
     Service(#[from] ServiceError),
     /// 0x1F51 does not become what it should.
-    #[error("0x1F51:01 is not {wanted} within {after:?}: {last}{}", Refusal(refused.as_ref()))]
+    #[error("0x1F51:01 is not {wanted} within {after:?}: {last}{}", Refusal(refused.as_deref()))]
     Control {
         wanted: u8,
         after: Duration,
         /// What was read last, or why nothing.
         last: String,
         /// What the device answered when it was told, if it did.
-        refused: Option<SdoError>,
+        refused: Option<Box<SdoError>>,
     },
     #[error("interrupted")]
     Interrupted,

@@ -158,7 +158,7 @@ impl Session<'_> {
                     wanted,
                     after: OBEYED,
                     last,
-                    refused,
+                    refused: refused.map(Box::new),
                 });
             }
             self.wire.delay(LOOK_AGAIN).await;

@@ -52,6 +52,9 @@ pub enum EepromError {
     NotAcknowledged { word: u32, status: u16 },
     #[error("word 0x{word:04x}: writing is not permitted (status 0x{status:04x})")]
     WriteProtected { word: u32, status: u16 },
+    /// By what is read behind its end, which is its beginning again.
+    #[error("the image is longer than the chip, which holds {bytes} bytes")]
+    Smaller { bytes: usize },
     #[error("word 0x{word:04x}: 0x{wanted:04x} was written, 0x{found:04x} is there")]
     NotKept { word: u32, wanted: u16, found: u16 },
 }

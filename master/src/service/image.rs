@@ -92,7 +92,7 @@ impl WriteError {
 /// words there are. Once the first word is written, nobody ends it but what fails.
 ///
 /// # Errors
-/// [`EepromError::NotKept`] where a word reads back as another; [`ServiceError::Stopped`] before the first word; else as
+/// [`EepromError::Smaller`] before anything is written; [`EepromError::NotKept`] where a word reads back as another; [`ServiceError::Stopped`] before the first word; else as
 /// [`Eeprom::write`].
 pub async fn write<W: Wire>(
     eeprom: &Eeprom<'_, W>,
@@ -124,6 +124,9 @@ pub async fn write<W: Wire>(
     let own = writes.partition_point(|(word, ..)| *word < first);
     writes.rotate_left(own);
     let of = writes.len();
+    if let Some(bytes) = goes_round(&there) {
+        return Err(failed(0, of)(eeprom.failed(EepromError::Smaller { bytes })));
+    }
     if eeprom.stop().is_asked() {
         return Err(failed(0, of)(eeprom.stopped()));
     }
@@ -146,6 +149,18 @@ pub async fn write<W: Wire>(
         }
     };
     eeprom.stop().hold(whole).await
+}
+
+/// The length of a chip, a power of two, that was read beyond its end: what follows is its beginning.
+fn goes_round(there: &[u8]) -> Option<usize> {
+    let lengths = (0..usize::BITS).map(|n| 1 << n);
+    let lengths = lengths.skip_while(|length| *length < CATEGORIES);
+    let mut shorter = lengths.take_while(|length| *length < there.len());
+    shorter.find(|length| {
+        let (chip, behind) = there.split_at(*length);
+        let all_one = behind.windows(2).all(|two| two.first() == two.last());
+        chip.starts_with(behind.get(..chip.len()).unwrap_or(behind)) && !all_one
+    })
 }
 
 #[cfg(test)]

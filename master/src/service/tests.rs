@@ -1,7 +1,9 @@
 //! A segment taken as it is found, in virtual time.
 
+use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use ecaxis_esi::sii;
 
@@ -14,7 +16,7 @@ use crate::bringup::{AlState, DeviceRef};
 use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
-use crate::mailbox::Wire;
+use crate::mailbox::{Wire, WireError};
 use crate::parameters::collect::collect;
 use crate::session::{RunError, simulated_bus};
 
@@ -307,7 +309,7 @@ fn whoever_ends_it_finds_the_device_as_it_was() {
         let error = done.expect("it tells").expect_err("ended");
         assert_eq!(
             error.to_string(),
-            "device 0 (position 0, station 0x1000): reading its parameters: interrupted"
+            "`device 0` (position 0, station 0x1000): reading its parameters: interrupted"
         );
         assert_eq!(left, ("Init".to_owned(), access));
     }
@@ -337,13 +339,12 @@ fn an_eeprom_goes_back_to_whom_it_was_lent_when_reading_is_ended() {
     assert_eq!(left, ("Init".to_owned(), 1));
 }
 
-/// The image of the first drive with other words in a reserved area, and so many bytes behind its end.
-fn changed(there: &[u8], more: usize) -> Vec<u8> {
+/// The image of the first drive with ten other words in a reserved area.
+fn changed(there: &[u8]) -> Vec<u8> {
     let mut image = there.to_vec();
     for byte in &mut image[0x50..0x64] {
         *byte ^= 0x5a;
     }
-    image.resize(image.len() + more, 0x5a);
     image
 }
 
@@ -354,7 +355,7 @@ fn an_eeprom_is_written_to_its_last_word_or_not_at_all() {
         let (done, left, sii) = stopped(1, async move |wire, found: Found, at, stop| {
             let claim = Claim::of(found.state);
             let written = with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
-                let image = changed(&eeprom.image(&mut |_, _| {}).await?, 0);
+                let image = changed(&eeprom.image(&mut |_, _| {}).await?);
                 let mut progress = |n, _| stop.store(n == stop_at, Ordering::Relaxed);
                 let written = write(eeprom, &image, &mut progress).await;
                 Ok::<_, ServiceError>((written.map_err(|e| e.to_string()), image))
@@ -368,27 +369,93 @@ fn an_eeprom_is_written_to_its_last_word_or_not_at_all() {
     }
 }
 
+/// A wire that is cut after so many words.
+struct Cut<'w> {
+    wire: &'w Datagrams,
+    left: Cell<usize>,
+    cut: Cell<bool>,
+}
+
+impl Wire for Cut<'_> {
+    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+        match self.cut.get() {
+            true => Err(WireError::Timeout { station, register }),
+            false => self.wire.read(station, register, buf).await,
+        }
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
+        if register == 0x0508 {
+            self.cut.set(self.cut.get() || self.left.get() == 0);
+            self.left.set(self.left.get().saturating_sub(1));
+        }
+        match self.cut.get() {
+            true => Err(WireError::Timeout { station, register }),
+            false => self.wire.write(station, register, data).await,
+        }
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.wire.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.wire.now()
+    }
+}
+
 #[test]
 fn how_much_of_an_image_got_there_is_told() {
-    // It ends behind the chip.
-    let (done, _, _) = stopped(0, async |wire, _, at, stop| {
-        let claim = Claim::IfFree;
-        let write = async |stop: &AtomicBool, more| {
-            with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
-                let image = changed(&eeprom.all(&mut |_, _| {}).await?, more);
-                let mut progress = |_, _| stop.store(true, Ordering::Relaxed);
-                Ok::<_, ServiceError>(write(eeprom, &image, &mut progress).await)
-            })
-            .await
-        };
-        let never = AtomicBool::new(false);
-        let failed = write(&never, 4).await;
-        stop.store(true, Ordering::Relaxed);
-        failed
-    });
-    let failed: Result<usize, WriteError> = done.expect("it tells").expect("a result");
-    let error = failed.expect_err("no such words");
-    assert_eq!((error.written, error.of), (10, 12));
-    let text = error.to_string();
-    assert!(text.ends_with("; 10 of 12 words were written"), "{text}");
+    for (words, told) in [
+        (0, "; nothing was written"),
+        (6, "; 6 of 10 words were written"),
+    ] {
+        let (done, _, _) = stopped(0, async move |wire, _, at, _| {
+            let cut = Cut {
+                wire: &wire,
+                left: Cell::new(words),
+                cut: Cell::new(false),
+            };
+            let claim = Claim::IfFree;
+            let written = with_eeprom(&cut, &at, "writing its EEPROM", claim, async |eeprom| {
+                let image = changed(&eeprom.image(&mut |_, _| {}).await?);
+                Ok::<_, ServiceError>(write(eeprom, &image, &mut |_, _| {}).await)
+            });
+            written.await
+        });
+        let failed: Result<usize, WriteError> = done.expect("it tells").expect("a result");
+        let error = failed.expect_err("cut");
+        assert_eq!((error.written, error.of), (words, 10));
+        let text = error.to_string();
+        assert!(
+            text.contains("writing its EEPROM") && text.ends_with(told),
+            "{text}"
+        );
+    }
+}
+
+/// A small chip sees the lower bits of an address alone: what lies behind its end is its beginning.
+#[test]
+fn an_image_that_would_go_round_its_chip_is_not_written() {
+    for more in [4, 2048] {
+        let (done, _, sii) = stopped(0, async move |wire, _, at, _| {
+            let claim = Claim::IfFree;
+            let written = with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
+                let there = eeprom.all(&mut |_, _| {}).await?;
+                let mut image = changed(&there);
+                image.resize(there.len() + more, 0x5a);
+                Ok::<_, ServiceError>((there, write(eeprom, &image, &mut |_, _| {}).await))
+            });
+            written.await
+        });
+        let (there, failed) = done.expect("it tells").expect("a result");
+        let error = failed.expect_err("no room");
+        let smaller = EepromError::Smaller { bytes: there.len() };
+        assert!(
+            matches!(&error.source, ServiceError::Eeprom { source, .. } if *source == smaller),
+            "{error}"
+        );
+        assert_eq!(error.written, 0);
+        assert_eq!(sii, there);
+    }
 }

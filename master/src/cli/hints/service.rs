@@ -31,6 +31,9 @@ pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
             EepromError::InUse => {
                 "another MainDevice or the device itself is using it: try again in Init".to_owned()
             }
+            EepromError::Smaller { .. } => {
+                "take an image that is made for this device: its word 0x3E says how long it is".to_owned()
+            }
             EepromError::WriteProtected { .. } => {
                 "the device protects its EEPROM; its manual tells how to release it".to_owned()
             }
