@@ -46,9 +46,8 @@ fn gap(rig: &mut Rig, cycles: u32) {
 fn csp_goes_on_from_rest() {
     for cycles in [3, 4, 40, 1000] {
         let mut rig = under_way(all(Mode::Csp, TIGHT));
-        let sent = rig.out;
         gap(&mut rig, cycles);
-        assert_eq!(rig.out.target_position, sent.target_position, "it stays");
+        assert_eq!(rig.out.target_position, rig.drive.raw_position());
         let mut before = 0.0;
         for n in 0..100 {
             let status = rig.cycle();

@@ -197,9 +197,15 @@ impl Checker {
 
     /// What is sent after cycles that were left out goes on from rest.
     fn left_out(&mut self, axis: &Axis, out: Outputs) {
+        let (was, sent) = self.before;
         self.before = (axis.status(), out);
         if self.before.0.stale_cycles > 2 {
             self.step_before = 0.0;
+        }
+        if was.enabled && in_force(&was) == [Some(Mode::Csp), None] {
+            let step = f64::from(out.target_position.wrapping_sub(sent.target_position));
+            let most = self.config.limits.velocity * DT * COUNTS_PER_UNIT + 1.0;
+            assert!(step.abs() <= most, "{step} counts\n{was:#?}");
         }
     }
 

@@ -24,6 +24,7 @@ impl Axis {
     /// those it has. RT: O(1).
     #[must_use]
     pub fn skipped(&mut self, cycles: u32) -> Outputs {
+        let heard = self.stale_cycles == 0;
         if cycles > 0 {
             self.stale_cycles = self.stale_cycles.saturating_add(cycles);
             self.watch.lost(self.sent_before);
@@ -34,10 +35,21 @@ impl Axis {
             self.overdue = self.config.answers_late;
             self.hold_back();
             if self.active {
+                if heard {
+                    self.take_back();
+                }
                 self.freeze();
             }
         }
         self.outputs()
+    }
+
+    /// The target that waits never went: a drive in CSP stands at the one before.
+    fn take_back(&mut self) {
+        if self.mode == Mode::Csp && !self.left_csp() && self.motion.velocity != 0.0 {
+            self.sent = self.sent_before;
+            self.motion.position = self.config.scale.position_to_user(self.sent).0;
+        }
     }
 
     /// Instead of an advance. The plan stays: in CSP it goes on from rest, for the drive stands at its last target; in CSV and

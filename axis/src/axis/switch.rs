@@ -12,6 +12,7 @@ use super::{Axis, Control, Plan};
 use crate::cia402::{Mode, State};
 use crate::profile::{Goal, Profile};
 use crate::setpoint::Ramp;
+use crate::units::UserUnits;
 
 /// A drive that was asked for one mode and the other in turn, and does not change over at once, is in the new one after so
 /// many fresh cycles that show it.
@@ -157,6 +158,11 @@ impl Axis {
         self.mode = to;
         self.switch = None;
         self.given.enter();
+        if to == Mode::Csp {
+            // That was its target already.
+            let position = UserUnits(self.motion.position);
+            self.sent = self.config.scale.position_to_counts(position);
+        }
         if to != Mode::Cst {
             self.given.torque = 0.0;
         }
