@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::{Heard, axes, faults, machine, virtual_time};
+use ecaxis::bringup::Step;
 use ecaxis::mailbox::{MailboxError, Mailboxes, SdoError};
 use ecaxis::session::{self, EmergencyReport, Observer, Options, Outcome, Progress, RunError};
 
@@ -338,4 +339,57 @@ fn nobody_is_asked_when_the_run_is_over() {
         .expect("a runtime");
     let asked = runtime.block_on(mailboxes.upload("a0", 0x1018, 1));
     assert_eq!(asked, Err(MailboxError::Closed { name: "a0".into() }));
+}
+
+/// The devices of `axes` with something of their own in each table.
+fn with_start_up(more: &str) -> ecaxis::config::Machine {
+    let text = axes(2);
+    let mode = "mode = \"csp\"\n";
+    assert!(text.contains(mode), "{text}");
+    machine(&text.replace(mode, &format!("{mode}{more}\n")))
+}
+
+#[test]
+fn start_up_sdos_that_a_device_holds_are_left_out() {
+    for (more, leaves_out) in [
+        ("", false),
+        ("startup = { skip_equal = true }", true),
+        ("startup = { skip_equal = true, verify = true }", true),
+    ] {
+        let (outcome, heard) = common::run(with_start_up(more), virtual_time());
+        outcome
+            .result
+            .unwrap_or_else(|error| panic!("{more}: {error}"));
+        let told = heard.0.iter().filter_map(|progress| match progress {
+            Progress::Step(Step::Held { device, held, of }) => Some((device.as_str(), *held, *of)),
+            _ => None,
+        });
+        let told: Vec<_> = told.collect();
+        let devices: Vec<_> = told.iter().map(|(device, ..)| *device).collect();
+        assert_eq!(
+            devices,
+            if leaves_out { vec!["a0", "a1"] } else { vec![] },
+            "{more}"
+        );
+        for (_, held, of) in told {
+            assert!(0 < held && held < of, "{more}: {held} of {of}");
+        }
+    }
+}
+
+#[test]
+fn a_start_up_sdo_that_is_not_held_stops_bring_up_where_it_is_verified() {
+    let script = "[[fault]]\nkind = \"sdo-ignored\"\ndevice = 1\nindex = 0x6065\nsub = 0\n";
+    let sdo = "sdo = [{ index = 0x6065, value = 1234 }]";
+    let (outcome, _) = common::run(with_start_up(sdo), faults(script));
+    outcome.result.expect("nobody looks");
+    let verified = sdo.replace(" }", ", verify = true }");
+    let (outcome, _) = common::run(with_start_up(&verified), faults(script));
+    let told = outcome
+        .result
+        .expect_err("it holds another value")
+        .to_string();
+    for part in ["`a1`", "0x6065", "Following error window", "0x000004d2"] {
+        assert!(told.contains(part), "{part}: {told}");
+    }
 }

@@ -212,12 +212,21 @@ fn lines_gears_tables_and_waves() {
     );
 }
 
-/// A line goes on where lost frames have held it up. At two fifths of the limit, as a drive that loses its targets at full speed overshoots
-/// farther than its supervision allows.
+/// A line goes on where lost frames have held it up. A drive that loses its targets at full speed, 250 mm/s, overshoots by 2.7 mm:
+/// more than the 2.0 of the file.
 #[test]
 fn lost_frames_hold_a_line_up() {
+    for (speed, following_error) in [(0.4, "2.0"), (1.0, "3.0")] {
+        a_line_is_held_up(speed, following_error);
+    }
+}
+
+fn a_line_is_held_up(speed: f64, following_error: &str) {
+    let given = "following_error = 2.0";
+    assert!(HEAD.contains(given));
+    let head = HEAD.replace(given, &format!("following_error = {following_error}"));
     let text = format!(
-        "{HEAD}[[step]]\nline = {{ x = 50.0, y = 20.0 }}\nspeed = 0.4\n[[step]]\ndwell = \"200ms\"\n"
+        "{head}[[step]]\nline = {{ x = 50.0, y = 20.0 }}\nspeed = {speed:.1}\n[[step]]\ndwell = \"200ms\"\n"
     );
     let mut machine = machine(&text);
     machine.bus.lost_frames = 20;
