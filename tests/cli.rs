@@ -470,6 +470,17 @@ fn reports_are_written_over_nothing_but_reports() {
         assert!(files.read("report.html").starts_with(b"<!DOCTYPE html>"));
     }
     // The figures of a bench, and its report; before anything is measured.
+    let both = [
+        "bench",
+        "--sim",
+        "--seconds",
+        "1",
+        "--html",
+        &page,
+        "--save",
+        &page,
+    ];
+    files.keeps("report.html", &both, &["--save"]);
     for (option, what) in [
         ("--save", "is not a file of figures (JSON)"),
         ("--html", "is not a report (HTML)"),

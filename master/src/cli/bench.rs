@@ -190,6 +190,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             files::may_replace(option, path, kind, inputs)?;
         }
     }
+    if args.html.is_some() && args.html == args.save {
+        let message = "--html and --save: one file cannot hold both";
+        return Err(Failure::new(hints::WRONG, message));
+    }
     for nic in veth::leftovers() {
         note(&format!(
             "note: `{nic}` was left by a program that was killed; `ip link del {nic}` removes it"

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use ecaxis::service::Datagrams;
 use ecaxis::service::eeprom::{Claim, Eeprom, size_of, with_eeprom};
 use ecaxis::service::image::{category, with_alias, with_category, write};
+use ecaxis::service::{Datagrams, ServiceError};
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{self, Sii};
 use serde_json::json;
@@ -354,7 +354,7 @@ impl Care {
 /// Keeps the old image, writes the new one, reads it back.
 async fn burn(at: &Located, care: &Care, old: &[u8], new: &[u8]) -> Result<String, Failure> {
     let done = in_eeprom(at, "writing its EEPROM", async |eeprom| {
-        // What the device says of its chip may be what is to be mended; a smaller one shows when it is read back.
+        // What the device says of its chip may be what is to be mended; a smaller one shows by what is read behind its end.
         let room = eeprom.size().await?.max(size_of(new));
         if new.len() > room {
             let message = format!("the image has {} bytes, the EEPROM {room}", new.len());
@@ -385,7 +385,16 @@ async fn in_eeprom<T>(
     step: &'static str,
     work: impl AsyncFnOnce(&Eeprom<'_, Datagrams>) -> Result<T, Trouble>,
 ) -> Result<T, Failure> {
-    at.ended(with_eeprom(&at.wire, &at.device, step, Claim::of(at.state), work).await)
+    let done = with_eeprom(&at.wire, &at.device, step, Claim::of(at.state), work).await;
+    // Writing that has begun is never left.
+    let untouched = matches!(done, Err(Trouble::Service(ServiceError::Stopped { .. })));
+    at.ended(done).map_err(|failure| match untouched {
+        true => Failure {
+            message: format!("{}; nothing was written", failure.message),
+            ..failure
+        },
+        false => failure,
+    })
 }
 
 /// What the device holds.

@@ -7,6 +7,7 @@ use ecaxis::bringup::AlState;
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, Locator, Nic};
 use ecaxis::link::sim::SimLink;
+use ecaxis::mailbox::Wire;
 use ecaxis::service::carry;
 use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice};
 
@@ -129,6 +130,24 @@ fn an_image_that_says_more_than_the_chip_holds_is_not_written() {
     let told = format!("holds 2048 bytes; nothing was written; the old image is in {shown}");
     assert!(message.ends_with(&told), "{message}");
     assert!(kept.exists());
+}
+
+#[test]
+fn what_is_ended_before_the_first_word_says_so() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let kept = folder.path().join("kept.bin");
+    let mut new = good();
+    new[0x1c] ^= 1;
+    let care = keeps(kept.clone());
+    let (failure, after) = with_eeprom_of(good(), async move |at| {
+        let old = image(at, false).await.expect("an image");
+        at.wire.stop().ask();
+        burn(at, &care, &old, &new).await.expect_err("ended")
+    });
+    let told = "writing its EEPROM: interrupted; nothing was written";
+    assert!(failure.message.ends_with(told), "{failure:?}");
+    assert!(!failure.hints.is_empty() && !kept.exists());
+    assert_eq!(after, good());
 }
 
 #[test]

@@ -6,8 +6,8 @@ use ecaxis_esi::model::SmUse;
 use ecaxis_esi::sii::{MailboxAreas, Sii};
 
 use super::{Registers, ServiceError};
-use crate::bringup::DeviceRef;
 use crate::bringup::al::{self, AlState};
+use crate::bringup::{DeviceRef, StateError};
 use crate::mailbox::{CoeClient, MailboxLayout, Wire};
 
 /// SyncManager registers (ETG.1000.4, Table 58): 8 bytes each.
@@ -53,7 +53,14 @@ pub async fn lend(wire: &impl Wire, device: &DeviceRef, sii: &Sii) -> Result<Len
         AlState::Init => {
             let layout = configure(&registers, sii, sii.mailbox).await?;
             let devices = std::slice::from_ref(device);
-            al::change_state(wire, devices, AlState::PreOp, PRE_OP_TIMEOUT).await?;
+            let there = al::change_state(wire, devices, AlState::PreOp, PRE_OP_TIMEOUT).await;
+            if let Err(error) = there {
+                // It may be on its way all the same.
+                if !matches!(error, StateError::Refused { .. }) {
+                    let _ = al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await;
+                }
+                return Err(error.into());
+            }
             layout
         }
         state => {

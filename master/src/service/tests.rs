@@ -459,3 +459,46 @@ fn an_image_that_would_go_round_its_chip_is_not_written() {
         assert_eq!(sii, there);
     }
 }
+
+/// A wire that loses what comes back next, once the device has been asked for PreOp.
+struct Lossy<'w> {
+    wire: &'w Datagrams,
+    loses: Cell<bool>,
+}
+
+impl Wire for Lossy<'_> {
+    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+        match self.loses.take() {
+            true => Err(WireError::Timeout { station, register }),
+            false => self.wire.read(station, register, buf).await,
+        }
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
+        self.loses.set((register, data) == (0x0120, &[2, 0][..]));
+        self.wire.write(station, register, data).await
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.wire.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.wire.now()
+    }
+}
+
+#[test]
+fn a_device_whose_way_to_its_mailbox_is_lost_sight_of_goes_back() {
+    let (done, left, _) = stopped(0, async |wire, found, at, _| {
+        let sii = information(&wire, &found, &at).await?;
+        let lossy = Lossy {
+            wire: &wire,
+            loses: Cell::new(false),
+        };
+        mailbox::lend(&lossy, &at, &sii).await.map(|_| ())
+    });
+    let error = done.expect("carried").expect_err("a frame was lost");
+    assert!(matches!(error, ServiceError::State(_)), "{error}");
+    assert_eq!(left, ("Init".to_owned(), 0));
+}
