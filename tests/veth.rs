@@ -40,7 +40,7 @@ fn can_be_kept_apart() -> bool {
         && taskset.is_ok_and(|output| output.status.success())
 }
 
-/// The two tests would take each other's processors.
+/// The tests would take each other's processors.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 /// With `more` in the file's [bus].
@@ -177,4 +177,40 @@ fn firmware_beside_a_machine_disturbs_nothing() {
     let counters = &result["summary"]["counters"];
     assert_eq!(counters["refused_answers"], 0, "{counters:#}\n{errors}");
     assert!(errors.contains("all SubDevices in Init"), "{errors}");
+}
+
+/// Ctrl-C in the middle of an update: no device is left in Bootstrap, and it is told what was under way.
+#[test]
+fn an_update_that_the_user_ends_leaves_its_device_in_init() {
+    let _alone = ONE_AT_A_TIME.lock();
+    let Some(pair) = pair() else { return };
+    let served = serve(&pair, "");
+    let file = served.file.path().to_str().expect("a path in UTF-8");
+    let folder = tempfile::tempdir().expect("a folder");
+    let program = folder.path().join("new.bin");
+    let program = program.to_str().expect("a path in UTF-8");
+    let run = |arguments: &[&str]| ecaxis().args(arguments).output().expect("the binary runs");
+    let sample = ["firmware", "sample", file, "x", "-o", program, "--size"];
+    assert!(run(&[&sample[..], &["2MiB"]].concat()).status.success());
+
+    let update = ["firmware", "update", file, "x", program, "--yes", "--nic"];
+    let mut command = ecaxis();
+    command.args(update).arg(&pair.b);
+    let mut update = Told::start(command.stdout(Stdio::null()));
+    update.says("sending the file");
+    update.interrupt();
+    let output = update.end();
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{told}");
+    for part in [
+        "`x` (position 0",
+        "sending the file: interrupted; the device is in Init",
+        "the same command tries again",
+    ] {
+        assert!(told.contains(part), "`{part}` is not in:\n{told}");
+    }
+    let info = ["firmware", "info", file, "x", "--json", "--nic", &pair.b];
+    let output = run(&info);
+    let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(found["state"], "Init", "{found:#}");
 }
