@@ -199,6 +199,27 @@ fn a_running_machine_is_left_alone() {
     command.args(["--no-enable", "--for", "8s", "--json"]);
     let mut run = Told::start(command.stdout(Stdio::piped()));
     run.says("all SubDevices in Op");
+    // Nobody else takes the bus from under it.
+    for second in [
+        &["run", "machine.toml", "--nic", &pair.b, "--for", "1s"][..],
+        &[
+            "firmware",
+            "update",
+            "machine.toml",
+            "--nic",
+            &pair.b,
+            "--position",
+            "5",
+            "--yes",
+        ],
+    ] {
+        let ran = bench.ecaxis(second);
+        assert_eq!(ran.code, 1, "{second:?}: {}", ran.err);
+        let (pid, nic) = (run.id(), &pair.b);
+        let taken = format!("error: another ecaxis (pid {pid}) drives `{nic}`");
+        assert!(ran.err.contains(&taken), "{second:?}: {}", ran.err);
+        assert!(ran.err.contains("Ctrl-C there"), "{second:?}: {}", ran.err);
+    }
     let ran = bench.ecaxis(&["scan", &pair.b, "--ask", "--json"]);
     let seen: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
     let warned = ran.err.contains("another master is driving this bus");

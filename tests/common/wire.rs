@@ -54,6 +54,11 @@ impl Told {
         }
     }
 
+    /// Its process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Until a message says this.
     #[track_caller]
     pub fn says(&mut self, text: &str) {

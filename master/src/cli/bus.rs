@@ -21,6 +21,8 @@ pub(crate) struct Bus {
     on: On,
     /// Of them the clock, what happens on a simulated bus, and the recording.
     options: Options,
+    /// No other program drives the interface meanwhile.
+    alone: bool,
 }
 
 #[derive(Debug)]
@@ -43,7 +45,11 @@ impl Bus {
             clock,
             ..Options::default()
         };
-        Self { on, options }
+        Self {
+            on,
+            options,
+            alone: false,
+        }
     }
 
     pub fn interface(nic: &str) -> Self {
@@ -51,12 +57,21 @@ impl Bus {
         Self {
             on: On::Interface { nic, back_end },
             options: Options::default(),
+            alone: false,
         }
     }
 
     /// With a clock, faults and a recording of one's own.
     pub fn with(self, options: Options) -> Self {
         Self { options, ..self }
+    }
+
+    /// For work that no machine may be driven beside.
+    pub fn alone(self) -> Self {
+        Self {
+            alone: true,
+            ..self
+        }
     }
 
     /// Hints depend on it.
@@ -90,7 +105,7 @@ impl Bus {
     }
 
     fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, RunError> {
-        let Self { on, options } = self;
+        let Self { on, options, alone } = self;
         let link: Box<dyn Link> = match on {
             On::Sim(machine) => {
                 let faults = options.faults.as_ref();
@@ -99,7 +114,10 @@ impl Bus {
             }
             On::Interface { nic, back_end } => {
                 // What only disturbs a cycle is no concern of a bus without one.
-                let (mut link, _) = link::open(&nic, back_end)?;
+                let (mut link, _) = match alone {
+                    true => link::open_alone(&nic, back_end)?,
+                    false => link::open(&nic, back_end)?,
+                };
                 let frames = link::heard(link.as_mut(), LISTEN).map_err(RunError::Link)?;
                 heard.store(frames, Ordering::Relaxed);
                 // It may be a machine of this program's that runs there.

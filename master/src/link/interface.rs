@@ -31,6 +31,12 @@ pub enum OpenError {
     Mtu { nic: String, mtu: u32 },
     #[error("the interface `{nic}` {what}")]
     Unfit { nic: String, what: &'static str },
+    #[error("another ecaxis{} drives `{nic}`", holder(*pid))]
+    Taken {
+        nic: String,
+        /// Its process.
+        pid: Option<i32>,
+    },
     #[error("the kernel gives no receive ring on `{nic}`: {source}")]
     NoRing { nic: String, source: io::Error },
     #[error("the interface `{nic}`: {what}: {source}")]
@@ -39,6 +45,10 @@ pub enum OpenError {
         what: &'static str,
         source: io::Error,
     },
+}
+
+fn holder(pid: Option<i32>) -> String {
+    pid.map_or_else(String::new, |pid| format!(" (pid {pid})"))
 }
 
 /// Something about an interface that will disturb the cycle; it can be used all the same.

@@ -3,6 +3,7 @@
 //! - [`interface`]: what a network interface must be;
 //! - [`ring`], [`packet`]: a network interface, through mapped memory or a plain socket;
 //! - `xdp`: a network interface before the network stack (feature `xdp`);
+//! - [`claim`]: one program an interface;
 //! - [`sift`]: which of an interface's frames are ours;
 //! - [`sim`]: the simulated bus in this process;
 //! - [`apart`]: an address of one's own, beside a machine that runs on the same interface;
@@ -15,6 +16,7 @@ use std::time::{Duration, Instant};
 
 pub mod apart;
 pub mod capture;
+pub mod claim;
 pub mod interface;
 pub mod packet;
 pub mod port;
@@ -27,6 +29,7 @@ pub mod sim;
 pub mod xdp;
 
 pub use crate::clock::Nanos;
+pub use claim::open_alone;
 pub use interface::{Concern, OpenError};
 pub use sift::LinkStats;
 

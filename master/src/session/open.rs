@@ -44,7 +44,7 @@ pub fn link(
             None,
         )?)),
         (None, Nic::Interface(nic)) => {
-            let (link, concerns) = link::open(nic, machine.bus.link)?;
+            let (link, concerns) = link::open_alone(nic, machine.bus.link)?;
             concerns.into_iter().for_each(&mut tell);
             link
         }

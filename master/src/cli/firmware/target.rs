@@ -142,6 +142,12 @@ impl Target {
         self.bus.nic()
     }
 
+    /// Nobody may drive a machine beside the work.
+    pub fn alone(self) -> Self {
+        let bus = self.bus.alone();
+        Self { bus, ..self }
+    }
+
     /// Does a piece of work on the bus; `work` is told how many frames of others came in before anything was sent.
     pub fn visit<T, W>(self, work: W) -> Result<T, Failure>
     where

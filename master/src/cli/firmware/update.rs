@@ -131,6 +131,7 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
     let chosen = args.via.map(Via::from);
     let (password, read_back, write) = (args.password, args.read_back, args.yes);
     let teller = Teller::new(plain);
+    let target = if write { target.alone() } else { target };
     let visited = target.visit(async move |wire, others| {
         if others > 0 && write {
             return Err(hints::shared_bus());

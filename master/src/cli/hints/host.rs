@@ -26,6 +26,17 @@ pub(crate) fn interface(failure: Failure, error: &OpenError) -> Failure {
             ..failure
         }
         .hint(interfaces()),
+        OpenError::Taken { pid, .. } => {
+            let stop = match pid {
+                Some(pid) => format!("Ctrl-C there, or `kill -INT {pid}`,"),
+                None => "Ctrl-C there".to_owned(),
+            };
+            failure
+                .hint(format!(
+                    "{stop} brings its axes to rest and its bus to Init"
+                ))
+                .hint("`ecaxis scan`, `sdo` and `eeprom` go beside a machine that runs")
+        }
         OpenError::NoRing { .. } => failure.hint("write `link = \"packet\"` into [bus]"),
         OpenError::Io { .. } => failure,
     }
