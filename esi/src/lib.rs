@@ -1,5 +1,6 @@
 //! EtherCAT SubDevice Information: bytes in, data out. No I/O, no clock, no unsafe.
 //!
+//! - [`Address`]: index and subindex of an object
 //! - [`model`]: what an ESI file says, as data; every origin of a derived value keeps its line
 //! - [`parse`] (`xml/`): the file's bytes → model
 //! - [`select`](mod@select): the user's choice of device, module, PDOs and DC mode
@@ -10,6 +11,7 @@
 
 #![forbid(unsafe_code)]
 
+mod address;
 mod error;
 pub mod layout;
 pub mod lint;
@@ -20,6 +22,7 @@ pub mod sii;
 pub mod startup;
 mod xml;
 
+pub use address::{Address, address};
 pub use error::{EsiError, EsiProblem};
 pub use layout::{Field, Layout, SmLayout};
 pub use lint::{Finding, Severity, lint};

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use crate::address;
 use crate::model::{Device, Direction, EsiFile, InitCmd, Module, ObjectItem, Pdo, Position, SmUse};
 use crate::select::{Choice, SelectError, offered_modes, select};
 
@@ -246,8 +247,9 @@ fn pdo(found: &mut Found, path: &str, pdo: &Pdo, list: &[Pdo]) {
         let unread = |bits: u16| !entry.is_gap() && usize::from(bits) > 8 * 1486;
         if unread(entry.bit_len) {
             let message = format!(
-                "0x{:04x}:{:02x} has {} bits, more than a frame carries",
-                entry.index, entry.sub, entry.bit_len
+                "{} has {} bits, more than a frame carries",
+                address(entry.index, entry.sub),
+                entry.bit_len
             );
             found.warn(entry.position, &format!("{path}/Entry[{}]", n + 1), message);
         }
@@ -257,7 +259,7 @@ fn pdo(found: &mut Found, path: &str, pdo: &Pdo, list: &[Pdo]) {
 fn commands(found: &mut Found, path: &str, device: &Device, commands: &[InitCmd]) {
     for (n, command) in commands.iter().enumerate() {
         let path = format!("{path}/Mailbox/CoE/InitCmd[{}]", n + 1);
-        let what = format!("0x{:04x}:{:02x}", command.index, command.sub);
+        let what = address(command.index, command.sub);
         if command.transitions.is_empty() {
             found.warn(
                 command.position,

@@ -235,7 +235,7 @@ impl Contradiction {
 impl fmt::Display for Contradiction {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (index, subindex) = self.object();
-        write!(f, "0x{index:04X}:{subindex:02} ")?;
+        write!(f, "0x{index:04x}:{subindex:02x} ")?;
         let unit = |f: &mut fmt::Formatter<'_>, expected: &dyn fmt::Display, code: u32| {
             write!(f, "is 0x{code:08X}")?;
             if let Some(known) = VelocityUnit::from_si_code(code) {

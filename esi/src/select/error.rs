@@ -1,5 +1,6 @@
 //! Why a choice does not fit the ESI file.
 
+use crate::address;
 use crate::mode::Mode;
 use crate::model::Position;
 
@@ -98,14 +99,14 @@ pub enum SelectError {
         direction: &'static str,
     },
     #[error(
-        "{list}: object 0x{index:04x}:{sub:02x} is neither in the dictionary nor in a PDO of the ESI, so its length is unknown"
+        "{list}: object {} is neither in the dictionary nor in a PDO of the ESI, so its length is unknown", address(*index, *sub)
     )]
     UnknownEntry {
         list: &'static str,
         index: u16,
         sub: u8,
     },
-    #[error("{list}: object 0x{index:04x}:{sub:02x} ({name}) cannot be mapped into a {direction}")]
+    #[error("{list}: object {} ({name}) cannot be mapped into a {direction}", address(*index, *sub))]
     NotMappable {
         list: &'static str,
         index: u16,
@@ -190,7 +191,7 @@ pub enum SelectError {
         nearest: String,
     },
     #[error(
-        "start-up SDO 0x{index:04x}:{sub:02x} ({name}) has {given} bytes, the object has {expected}"
+        "start-up SDO {} ({name}) has {given} bytes, the object has {expected}", address(*index, *sub)
     )]
     SdoLength {
         index: u16,

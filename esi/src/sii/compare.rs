@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 
+use crate::address;
 use crate::model::FmmuUse;
 
 use super::{General, MailboxAreas, Protocols, Sii, SiiDc, SiiPdo};
@@ -387,7 +388,7 @@ fn mapping(index: u16, sub: u8, bits: u8) -> String {
     if index == 0 {
         format!("gap of {bits} bits")
     } else {
-        format!("0x{index:04x}:{sub:02x}, {bits} bits")
+        format!("{}, {bits} bits", address(index, sub))
     }
 }
 

@@ -11,7 +11,7 @@ use std::collections::HashMap;
 
 use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
 use crate::select::{Choice, SelectError, SelectedModule, Selection};
-use crate::{Dictionary, Mode};
+use crate::{Dictionary, Mode, address};
 
 /// One SDO download.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -312,8 +312,9 @@ fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list
         }
         if cmd.index == INTERPOLATION_TIME && list.knows_period {
             selection.notes.push(format!(
-                "InitCmd of {origin} (line {}) writes 0x60C2:{:02x}, which follows from cycle and mode; it is left out",
-                cmd.position.line, cmd.sub
+                "InitCmd of {origin} (line {}) writes {}, which follows from cycle and mode; it is left out",
+                cmd.position.line,
+                address(cmd.index, cmd.sub)
             ));
             continue;
         }
@@ -384,8 +385,8 @@ fn user(
                 }
             }
             None if !list.objects.is_empty() => selection.notes.push(format!(
-                "start-up SDO 0x{:04x}:{:02x} is not in the ESI's dictionary",
-                sdo.index, sdo.sub
+                "start-up SDO {} is not in the ESI's dictionary",
+                address(sdo.index, sdo.sub)
             )),
             None => {}
         }

@@ -2,6 +2,7 @@
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
+use crate::address;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, Position, SlotDependence, Text};
 
@@ -168,8 +169,8 @@ fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiErro
         c.warn(
             element,
             format!(
-                "0x{:04x}:{:02x} is mapped with a bit length of 0",
-                entry.index, entry.sub
+                "{} is mapped with a bit length of 0",
+                address(entry.index, entry.sub)
             ),
         );
     }

@@ -8,6 +8,7 @@ use super::datatype::{DataType, DataTypes};
 use super::literal;
 use super::number;
 use super::object::{Flags, Info, Literal, RawObject, SubItem};
+use crate::address;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Access, Bytes, Object, ObjectCode, ObjectItem, Position, Text, Writable};
 
@@ -92,10 +93,7 @@ pub(super) fn object<'t, 'a>(
                     c.warn_at(
                         position,
                         dictionary,
-                        format!(
-                            "object 0x{:04x}:{:02x}: {what} {problem}",
-                            raw.index, slot.sub
-                        ),
+                        format!("object {}: {what} {problem}", address(raw.index, slot.sub)),
                     );
                     None
                 }

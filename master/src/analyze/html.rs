@@ -2,6 +2,8 @@
 
 use std::fmt::Write;
 
+use ecaxis_esi::address;
+
 use super::plot::{Span, bands, curves};
 use super::report::{AxisReport, Report, called};
 use crate::page::{self, escaped, key, time};
@@ -118,7 +120,7 @@ fn sections(out: &mut String, report: &Report) -> std::fmt::Result {
                 format!("{:.6} s", transfer.at),
                 name(&transfer.device).unwrap_or_default(),
                 if transfer.write { "write" } else { "read" }.to_owned(),
-                format!("0x{:04x}:{:02x}", transfer.index, transfer.sub),
+                address(transfer.index, transfer.sub).to_string(),
                 transfer.name.clone().unwrap_or_default(),
                 match (transfer.ended, transfer.code) {
                     ("done", _) => transfer.value.clone(),

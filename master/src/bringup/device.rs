@@ -1,7 +1,7 @@
 //! The steps of one SubDevice on its way from PreOp to SafeOp.
 
-use ecaxis_esi::StartupSdo;
 use ecaxis_esi::layout::SmLayout;
+use ecaxis_esi::{StartupSdo, address};
 
 use super::{BringUpError, BusDevice, DeviceRef, Step};
 use crate::config::{Bus, DeviceConfig, StartupWay};
@@ -162,7 +162,7 @@ fn object(sdo: &StartupSdo) -> String {
     if sdo.name.is_empty() {
         return ObjectAddress { index, sub }.to_string();
     }
-    format!("{index:#06x}:{sub:02x} ({})", sdo.name)
+    format!("{} ({})", address(index, sub), sdo.name)
 }
 
 fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> BringUpError {
@@ -198,8 +198,8 @@ pub(super) async fn download(
         .map_err(|source| failed(at, sdo, source))?;
     tracing::debug!(
         device = %at,
-        "SDO 0x{:04x}:{:02x} {} = {} ({})",
-        sdo.index, sdo.sub, sdo.name, format_value(&sdo.data), sdo.origin
+        "SDO {} {} = {} ({})",
+        address(sdo.index, sdo.sub), sdo.name, format_value(&sdo.data), sdo.origin
     );
     Ok(())
 }

@@ -4,6 +4,7 @@
 //! bounds a motion: a maximal torque or velocity of zero holds the drive fast. Those keep the value
 //! that the drive itself holds, read before its process data begins to count.
 
+use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
 
 use super::{BringUpError, BusDevice};
@@ -50,7 +51,7 @@ pub(super) async fn read(
             .take(8)
             .rev()
             .fold(0_i64, |value, byte| value << 8 | i64::from(*byte));
-        tracing::debug!(device = %device.at, "0x{:04x}:{:02x} is held at {value}", field.index, field.sub);
+        tracing::debug!(device = %device.at, "{} is held at {value}", address(field.index, field.sub));
         device.held.push((field.index, field.sub, value));
     }
     Ok(())

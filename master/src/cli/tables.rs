@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use ecaxis_esi::{Field, StartupSdo};
+use ecaxis_esi::{Field, StartupSdo, address};
 
 use super::report::Table;
 
@@ -39,7 +39,7 @@ pub(super) fn fields(
         table.row([
             &place(field.bit_offset),
             &field.bit_len.to_string(),
-            &format!("0x{:04x}:{:02x}", field.index, field.sub),
+            &address(field.index, field.sub).to_string(),
             &field.data_type,
             &field.name,
             &format!("0x{:04x}", field.pdo),
@@ -62,7 +62,7 @@ pub(super) fn startup(startup: &[StartupSdo], out: &mut String) -> std::fmt::Res
     for sdo in startup {
         let object = match sdo.complete_access {
             true => format!("0x{:04x} CA", sdo.index),
-            false => format!("0x{:04x}:{:02x}", sdo.index, sdo.sub),
+            false => address(sdo.index, sdo.sub).to_string(),
         };
         table.row([
             sdo.transition,

@@ -6,7 +6,7 @@
 
 use std::fmt;
 
-use ecaxis_esi::Mode;
+use ecaxis_esi::{Mode, address};
 
 use crate::config::{DeviceConfig, Locator, Machine};
 use crate::scan::{Device, Scan};
@@ -496,8 +496,9 @@ impl fmt::Display for Told<'_> {
                 found,
             } => write!(
                 f,
-                "`{}` (position {position}): 0x{index:04X}:{sub:02X} {name} is {}, start-up writes {}",
+                "`{}` (position {position}): {} {name} is {}, start-up writes {}",
                 self.name(*device),
+                address(*index, *sub),
                 number(found),
                 number(expected)
             ),

@@ -392,7 +392,7 @@ impl Wanted<'_> {
                     data,
                 }),
                 Err((message, hint)) => {
-                    let message = format!("SDO 0x{:04x}:{:02x}: {message}", raw.index, raw.sub);
+                    let message = format!("SDO {}: {message}", esi::address(raw.index, raw.sub));
                     match hint {
                         Some(hint) => p.add_hint(raw.span.clone(), message, hint),
                         None => p.add(raw.value.span(), message),

@@ -125,7 +125,7 @@ fn link(mut f: Fields<'_>, p: &mut Problems<'_>) -> Option<PdoLink> {
                 Some(bits) => contents.push((entry.index, entry.sub, bits)),
                 None => p.add(
                     entry.span,
-                    format!("0x{:04x}:{:02x} cannot be mapped", entry.index, entry.sub),
+                    format!("{} cannot be mapped", esi::address(entry.index, entry.sub)),
                 ),
             }
         }

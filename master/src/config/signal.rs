@@ -81,7 +81,7 @@ impl<'d> Candidates<'d> {
 }
 
 fn show(field: &Field) -> String {
-    format!("0x{:04X}:{:02}", field.index, field.sub)
+    esi::address(field.index, field.sub).to_string()
 }
 
 /// `0x6000:01`; `None` where it is a name.
@@ -90,10 +90,9 @@ fn address(text: &str) -> Option<(u16, u8)> {
     let index = index
         .strip_prefix("0x")
         .or_else(|| index.strip_prefix("0X"))?;
-    let sub = sub.trim_start_matches("0x");
     Some((
         u16::from_str_radix(index, 16).ok()?,
-        u8::from_str_radix(sub, 16).ok()?,
+        esi::Address::sub_of(sub)?,
     ))
 }
 

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use ecaxis_esi::{Address, address};
+
 /// index:subindex; displayed with its name where it has one here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ObjectAddress {
@@ -9,9 +11,17 @@ pub struct ObjectAddress {
     pub sub: u8,
 }
 
+impl ObjectAddress {
+    /// Without its name.
+    #[must_use]
+    pub fn number(self) -> Address {
+        address(self.index, self.sub)
+    }
+}
+
 impl fmt::Display for ObjectAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:#06x}:{:02}", self.index, self.sub)?;
+        write!(f, "{}", self.number())?;
         match object_name(self.index, self.sub) {
             Some(name) => write!(f, " ({name})"),
             None => Ok(()),

@@ -1,6 +1,8 @@
 //! Parameters in a file: TOML, one line an object.
 //!
 //! ```toml
+//! format = 2
+//!
 //! [device]
 //! name = "EPOS4"
 //! vendor = 0x000000fb
@@ -11,7 +13,7 @@
 
 use std::collections::BTreeMap;
 
-use ecaxis_esi::Identity;
+use ecaxis_esi::{Address, Identity};
 use serde::Deserialize;
 
 use super::{DataType, Parameter};
@@ -50,8 +52,17 @@ pub struct Dump {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Raw {
+    #[serde(default = "first_format")]
+    format: u32,
     device: Origin,
     parameters: BTreeMap<String, Line>,
+}
+
+/// Subindices are hexadecimal; in the first, which did not say what it was, they were decimal.
+const FORMAT: u32 = 2;
+
+fn first_format() -> u32 {
+    1
 }
 
 #[derive(Deserialize)]
@@ -75,6 +86,8 @@ const READ_ONLY: &str = "ro";
 pub enum DumpError {
     #[error("{0}")]
     Toml(String),
+    #[error("format {0} is not known, only those up to {FORMAT}")]
+    Format(u32),
     #[error("[parameters] \"{0}\": not an object, such as \"0x6065:00\"")]
     Address(String),
     #[error("[parameters] \"{key}\": unknown type `{name}`")]
@@ -102,13 +115,13 @@ impl Dump {
             serial,
         } = &self.device;
         let mut text = format!(
-            "# Parameters of a device, by `ecaxis sdo dump`. `ecaxis sdo restore` writes back those with access \"rw\".\n\n[device]\nname = {}\nvendor = {vendor:#010x}\nproduct = {product:#010x}\nrevision = {revision:#010x}\nserial = {serial}\n\n[parameters]\n",
+            "# Parameters of a device, by `ecaxis sdo dump`. `ecaxis sdo restore` writes back those with access \"rw\".\n\nformat = {FORMAT}\n\n[device]\nname = {}\nvendor = {vendor:#010x}\nproduct = {product:#010x}\nrevision = {revision:#010x}\nserial = {serial}\n\n[parameters]\n",
             quoted(name),
         );
         for parameter in &self.parameters {
-            let ObjectAddress { index, sub } = parameter.at;
             text += &format!(
-                "\"{index:#06x}:{sub:02}\" = {{ name = {}, type = {}, access = \"{}\", value = {} }}\n",
+                "\"{}\" = {{ name = {}, type = {}, access = \"{}\", value = {} }}\n",
+                parameter.at.number(),
                 quoted(&parameter.name),
                 quoted(&parameter.data_type.to_string()),
                 if parameter.writable {
@@ -129,8 +142,12 @@ impl Dump {
     pub fn parse(text: &str) -> Result<Self, DumpError> {
         let raw: Raw = toml::from_str(text).map_err(|error| DumpError::Toml(error.to_string()))?;
         let mut parameters = Vec::with_capacity(raw.parameters.len());
+        let format = raw.format;
+        if !(1..=FORMAT).contains(&format) {
+            return Err(DumpError::Format(format));
+        }
         for (key, line) in raw.parameters {
-            parameters.push(line.parameter(key)?);
+            parameters.push(line.parameter(key, format)?);
         }
         parameters.sort_by_key(|p| (p.at.index, p.at.sub));
         Ok(Self {
@@ -141,13 +158,9 @@ impl Dump {
 }
 
 impl Line {
-    fn parameter(self, key: String) -> Result<Parameter, DumpError> {
-        let at = match super::find::find(None, &key) {
-            Ok(super::find::Wanted {
-                index,
-                sub: Some(sub),
-            }) => ObjectAddress { index, sub },
-            _ => return Err(DumpError::Address(key)),
+    fn parameter(self, key: String, format: u32) -> Result<Parameter, DumpError> {
+        let Some(at) = place(&key, format) else {
+            return Err(DumpError::Address(key));
         };
         let Some(data_type) = DataType::named(&self.data_type, 0) else {
             let name = self.data_type;
@@ -179,6 +192,19 @@ impl Line {
             Err(source) => Err(DumpError::Value { key, source }),
         }
     }
+}
+
+fn place(key: &str, format: u32) -> Option<ObjectAddress> {
+    let (index, sub) = key.split_once(':')?;
+    let hexadecimal = sub.starts_with("0x") || sub.starts_with("0X");
+    let sub = match format {
+        1 if !hexadecimal => sub.parse().ok()?,
+        _ => Address::sub_of(sub)?,
+    };
+    // A name in the place of a number would be one of the standards'.
+    let number = index.starts_with(|c: char| c.is_ascii_digit());
+    let index = super::find::find(None, index).ok()?.index;
+    number.then_some(ObjectAddress { index, sub })
 }
 
 /// Numbers and truth values as TOML has them, everything else as text.

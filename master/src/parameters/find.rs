@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ecaxis_esi::Dictionary;
+use ecaxis_esi::{Address, Dictionary, address};
 
 use super::{items, name_of};
 use crate::config::nearest;
@@ -21,7 +21,9 @@ pub struct Wanted {
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FindError {
-    #[error("`{0}` is no object: indices have 16 bits, subindices 8, such as 0x6041 or 0x1018:01")]
+    #[error(
+        "`{0}` is no object: indices have 16 bits, subindices two hexadecimal digits, such as 0x6041 or 0x1018:01"
+    )]
     Number(String),
     #[error("no object is called `{name}`")]
     Unknown { name: String, near: Option<String> },
@@ -59,10 +61,10 @@ pub fn find(dictionary: Option<&Dictionary>, text: &str) -> Result<Wanted, FindE
     let wanted = plain(text);
     if !names.contains_key(&wanted) {
         for (name, known) in of_the_standards() {
-            let entry = names.entry(plain(name)).or_default();
+            let entry = names.entry(plain(&name)).or_default();
             if !entry.contains(&known) {
                 entry.push(known);
-                originals.push(name.to_owned());
+                originals.push(name);
             }
         }
     }
@@ -89,7 +91,7 @@ pub fn find(dictionary: Option<&Dictionary>, text: &str) -> Result<Wanted, FindE
 impl std::fmt::Display for Wanted {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self.sub {
-            Some(sub) => write!(f, "{:#06x}:{sub:02}", self.index),
+            Some(sub) => write!(f, "{}", address(self.index, sub)),
             None => write!(f, "{:#06x}", self.index),
         }
     }
@@ -101,21 +103,25 @@ fn plain(name: &str) -> String {
     letters.flat_map(char::to_lowercase).collect()
 }
 
-/// What CiA 301, CiA 402 and ETG.1000.6 call the objects that have a name of their own.
-fn of_the_standards() -> impl Iterator<Item = (&'static str, Wanted)> {
+/// What CiA 301, CiA 402 and ETG.1000.6 call the objects that have a name of their own; subindices also with the object's before theirs.
+fn of_the_standards() -> impl Iterator<Item = (String, Wanted)> {
     let indices = (0x1000..0x1100).chain(0x6000..0x6600);
     indices.flat_map(|index| {
-        (0..8).filter_map(move |sub| {
-            let name = object_name(index, sub)?;
+        (0..8).flat_map(move |sub| {
+            let object = object_name(index, 0xfe);
+            let name = object_name(index, sub);
             // The same for every subindex: it is the whole object's.
-            let whole = object_name(index, 0xfe) == Some(name) || sub == 0;
+            let whole = object == name || sub == 0;
+            let both = object.zip(name).filter(|_| !whole);
+            let both = both.map(|(object, name)| format!("{object}: {name}"));
             let sub = (!whole).then_some(sub);
-            Some((name, Wanted { index, sub }))
+            let names = name.map(ToOwned::to_owned).into_iter().chain(both);
+            names.map(move |name| (name, Wanted { index, sub }))
         })
     })
 }
 
-/// Subindices as in the machine file: decimal, or hexadecimal with 0x.
+/// Subindices as in the machine file: hexadecimal.
 fn number(text: &str) -> Option<Wanted> {
     let (index, sub) = match text.split_once(':') {
         Some((index, sub)) => (index, Some(sub)),
@@ -131,7 +137,7 @@ fn number(text: &str) -> Option<Wanted> {
     Some(Wanted {
         index: u16::try_from(value(index)?).ok()?,
         sub: match sub {
-            Some(sub) => Some(u8::try_from(value(sub)?).ok()?),
+            Some(sub) => Some(Address::sub_of(sub)?),
             None => None,
         },
     })

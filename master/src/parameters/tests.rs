@@ -74,6 +74,15 @@ fn objects_by_number_and_name() {
         ("position actual value", at(0x6064, None)),
         ("Vendor ID", at(0x1018, Some(1))),
         ("Identity", at(0x1018, None)),
+        ("Identity: Vendor ID", at(0x1018, Some(1))),
+        (
+            "software position limit: max position limit",
+            at(0x607d, Some(2)),
+        ),
+        // Subindices are hexadecimal.
+        ("0x1600:0a", at(0x1600, Some(10))),
+        ("0x1600:10", at(0x1600, Some(16))),
+        ("0x1600:0x10", at(0x1600, Some(16))),
     ] {
         assert_eq!(find(Some(&dictionary), text), wanted, "{text}");
     }
@@ -95,6 +104,34 @@ fn objects_by_number_and_name() {
         Some("Axis configuration")
     );
     assert_eq!(near("-"), None);
+}
+
+/// The first ones, which did not say so, had them decimal.
+#[test]
+fn subindices_of_old_files_are_decimal() {
+    let file = |format: &str, key: &str| {
+        let text = format!(
+            "{format}[device]\nname = \"x\"\nvendor = 1\nproduct = 2\nrevision = 3\n[parameters]\n\"{key}\" = {{ type = \"UINT\", value = 1 }}\n"
+        );
+        Dump::parse(&text).map(|dump| dump.parameters[0].at.sub)
+    };
+    for (format, key, sub) in [
+        ("", "0x1600:10", Some(10)),
+        ("", "0x1600:0x10", Some(16)),
+        ("", "0x1600:0a", None),
+        ("format = 1\n", "0x1600:10", Some(10)),
+        ("format = 2\n", "0x1600:10", Some(16)),
+        ("format = 2\n", "0x1600:0a", Some(10)),
+        ("format = 2\n", "0x1600:fe", Some(254)),
+        ("format = 2\n", "Statusword:00", None),
+    ] {
+        assert_eq!(file(format, key).ok(), sub, "{format}{key}");
+    }
+    let error = file("format = 3\n", "0x1600:10").unwrap_err();
+    assert!(
+        error.to_string().contains("format 3 is not known"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -4,6 +4,8 @@ use std::path::Path;
 
 use ecaxis_axis::Trip;
 
+use ecaxis_esi::address;
+
 use super::cause::{Cause, Diagnosis};
 use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
 use super::look::SyncLook;
@@ -410,7 +412,7 @@ fn bring_up(error: &BringUpError, evidence: &Evidence) -> Option<Cause> {
             ..
         } => Some(Cause::Mailbox {
             device: place(device),
-            doing: format!("start-up SDO 0x{index:04x}:{sub:02x} {name}"),
+            doing: format!("start-up SDO {} {name}", address(*index, *sub)),
         }),
         BringUpError::Mailbox {
             device,

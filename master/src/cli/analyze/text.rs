@@ -2,6 +2,8 @@
 
 use ecaxis::analyze::{CycleReport, DeviceReport, Line, Report, called, highest, time};
 
+use ecaxis_esi::address;
+
 use super::super::hints;
 use super::super::table::Table;
 
@@ -312,7 +314,7 @@ fn transfers(report: &Report, all: bool, out: &mut String) {
             format!("{:.3} s", transfer.at),
             transfer.device.to_string(),
             if transfer.write { "write" } else { "read" }.to_owned(),
-            format!("0x{:04x}:{:02x}", transfer.index, transfer.sub),
+            address(transfer.index, transfer.sub).to_string(),
             transfer.name.clone().unwrap_or_default(),
             value,
         ]);

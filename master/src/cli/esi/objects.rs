@@ -1,6 +1,8 @@
 //! `ecaxis esi objects`: the object dictionary of a device.
 
-use ecaxis_esi::{Bytes, Choice, Dictionary, Mode, ObjectItem, PdoMapping, Writable, select};
+use ecaxis_esi::{
+    Bytes, Choice, Dictionary, Mode, ObjectItem, PdoMapping, Writable, address, select,
+};
 use serde_json::json;
 
 use super::super::report::Table;
@@ -62,7 +64,7 @@ pub(crate) fn listed(dictionary: &Dictionary, json: bool) -> String {
             } else {
                 object.name.to_string()
             };
-            let index = format!("0x{:04x}:{:02x}", object.index, item.sub);
+            let index = address(object.index, item.sub).to_string();
             let shown = |bytes: &[u8]| value(&item.type_name, bytes);
             let default = if item.has_default {
                 shown(&item.default)

@@ -9,6 +9,7 @@ use crate::config::axis::control::one_of;
 use crate::config::problem::Problems;
 use crate::config::raw::RawProbe;
 use crate::config::{Action, DeviceConfig};
+use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
 
 /// 0x60B8, 0x60B9.
@@ -137,7 +138,7 @@ fn with(fields: &[Field], more: &[u16]) -> String {
     let there = fields.iter().filter(|field| field.index != 0);
     let there = there.map(|field| match field.sub {
         0 => format!("\"0x{:04X}\"", field.index),
-        sub => format!("\"0x{:04X}:{sub:02X}\"", field.index),
+        sub => format!("\"{}\"", address(field.index, sub)),
     });
     let more = more.iter().map(|index| format!("\"0x{index:04X}\""));
     format!("[{}]", there.chain(more).collect::<Vec<_>>().join(", "))

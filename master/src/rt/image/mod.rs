@@ -1,5 +1,6 @@
 //! Where each SubDevice's process data lies: logical addresses, datagrams and frames ([`plan`]); the bits of objects.
 
+use ecaxis_esi::address;
 use ecaxis_esi::layout::{Field, Layout};
 
 use crate::config::Kind;
@@ -121,7 +122,7 @@ pub struct AxisBits {
 
 /// An object without which an axis cannot be run is not in the process data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("object 0x{index:04x}:{sub:02x} is not in the process data")]
+#[error("object {} is not in the process data", address(*index, *sub))]
 pub struct NotMapped {
     pub index: u16,
     pub sub: u8,

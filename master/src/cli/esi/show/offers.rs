@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use ecaxis::config::duration;
 use ecaxis_esi::{
-    Choice, Device, EsiFile, Field, Layout, Mode, Pdo, SelectError, Selection, SyncTime,
+    Choice, Device, EsiFile, Field, Layout, Mode, Pdo, SelectError, Selection, SyncTime, address,
     offered_modes, select,
 };
 
@@ -100,7 +100,7 @@ fn mapped(what: &str, modes: &[Mode], fields: Vec<&[Field]>, out: &mut String) -
             continue;
         }
         let mut cells = vec![
-            format!("0x{:04x}:{:02x}", field.index, field.sub),
+            address(field.index, field.sub).to_string(),
             field.bit_len.to_string(),
         ];
         cells.extend(fields.iter().map(|fields| {
@@ -266,7 +266,8 @@ fn pdo_list(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Resu
             .collect();
         let objects = pdo.entries.iter().filter(|entry| !entry.is_gap());
         let objects: Vec<String> = objects
-            .map(|e| format!("{:04x}:{:02x}", e.index, e.sub))
+            // A whole column of them says what they are.
+            .map(|e| address(e.index, e.sub).to_string().split_off(2))
             .collect();
         let more = objects.len().saturating_sub(6);
         let mut objects = objects.into_iter().take(6).collect::<Vec<_>>().join(" ");

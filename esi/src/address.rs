@@ -1,0 +1,56 @@
+//! Index and subindex as everybody here shows and takes them.
+
+use std::fmt;
+
+/// An object's place: `0x60c2:01`. Both are hexadecimal, so `0x1600:10` is the sixteenth entry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Address {
+    pub index: u16,
+    pub sub: u8,
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "0x{:04x}:{:02x}", self.index, self.sub)
+    }
+}
+
+#[must_use]
+pub fn address(index: u16, sub: u8) -> Address {
+    Address { index, sub }
+}
+
+impl Address {
+    /// What is written behind the colon: one or two hexadecimal digits, with or without 0x.
+    #[must_use]
+    pub fn sub_of(text: &str) -> Option<u8> {
+        let text = text.trim();
+        let digits = text.strip_prefix("0x").or_else(|| text.strip_prefix("0X"));
+        let digits = digits.unwrap_or(text);
+        let whole =
+            (1..=2).contains(&digits.len()) && digits.chars().all(|c| c.is_ascii_hexdigit());
+        whole.then(|| u8::from_str_radix(digits, 16).ok()).flatten()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_subindex_is_read_as_it_is_shown() {
+        for sub in 0..=u8::MAX {
+            let shown = address(0x1600, sub).to_string();
+            let (index, behind) = shown.split_once(':').unwrap();
+            assert_eq!(index, "0x1600");
+            assert_eq!(behind.len(), 2);
+            assert_eq!(Address::sub_of(behind), Some(sub), "{shown}");
+            assert_eq!(Address::sub_of(&format!("0x{behind}")), Some(sub));
+        }
+        assert_eq!(Address::sub_of("a"), Some(10));
+        assert_eq!(Address::sub_of("10"), Some(16));
+        for wrong in ["", "0x", "100", "001", "+1", "-1", "g", "1 0", "0x0x1"] {
+            assert_eq!(Address::sub_of(wrong), None, "{wrong}");
+        }
+    }
+}
