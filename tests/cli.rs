@@ -1,6 +1,10 @@
 //! The binary as a user meets it: exit codes, and messages that name the trouble.
 
 mod common;
+#[path = "cli/complaints.rs"]
+mod complaints;
+#[path = "cli/terminal.rs"]
+mod terminal;
 
 use std::process::{Command, Output};
 
@@ -305,7 +309,7 @@ fn the_manual_has_a_page_for_every_verb() {
     );
     // A file stands in the way.
     let refused = ecaxis(&["man", "--out", &format!("{path}/ecaxis.1")]);
-    assert_eq!(refused.status.code(), Some(1));
+    assert_eq!(refused.status.code(), Some(2));
     assert!(text(&refused.stderr).contains("cannot write"));
 }
 

@@ -22,6 +22,7 @@
 //! - [`analyze`]: what a recording tells;
 //! - [`stop`]: ending a piece of work early;
 //! - [`clock`]: monotonic or virtual time;
+//! - [`words`]: numbers and nouns;
 //! - [`os`]: system calls; all unsafe code.
 
 #![deny(unsafe_code)]
@@ -50,3 +51,4 @@ pub mod stop;
 pub mod story;
 pub mod supervise;
 mod wire;
+pub mod words;

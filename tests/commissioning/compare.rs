@@ -272,6 +272,35 @@ fn every_difference_is_named_and_can_be_applied() {
     }
 }
 
+/// What became of the program and of places is told where it is marked and where nothing is left to be marked.
+#[test]
+fn what_goes_with_a_device_is_told() {
+    let bench = bench();
+    bench.write("machine.toml", MACHINE);
+    bench.write(
+        "other.toml",
+        &without(MACHINE, "y").replace("position = 4", "position = 3"),
+    );
+    let apply = ["compare", "machine.toml", "--sim", "other.toml", "--apply"];
+    let ran = bench.ecaxis(&apply);
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    for part in [
+        "`block` has `position = 3` now, it was 4",
+        "step 3.1 is taken out",
+        "machine.toml is as the bus now",
+        "2 lines are marked \"CHECK:\" and want a look",
+    ] {
+        assert!(ran.err.contains(part), "`{part}` is not in:\n{}", ran.err);
+    }
+    // A serial number alone leaves nothing to be looked at.
+    bench.write("machine.toml", MACHINE);
+    let other = only_devices(MACHINE).replace("serial   = 1002", "serial   = 4711");
+    bench.write("other.toml", &other);
+    let ran = bench.ecaxis(&apply);
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    assert!(!ran.err.contains("CHECK"), "{}", ran.err);
+}
+
 /// What `identity` takes is no difference, and brings the bus up.
 #[test]
 fn policies() {

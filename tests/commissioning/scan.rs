@@ -16,6 +16,11 @@ fn what_is_printed() {
     for (name, arguments) in [
         ("tables.txt", &["scan", "--sim", "bench.toml"][..]),
         ("tree.txt", &["scan", "--sim", "bench.toml", "--tree"]),
+        ("asked.txt", &["scan", "--sim", "bench.toml", "--ask"]),
+        (
+            "asked-tree.txt",
+            &["scan", "--sim", "bench.toml", "--ask", "--tree"],
+        ),
     ] {
         let out = bench.well(arguments);
         fits(&out);

@@ -97,6 +97,11 @@ fn a_script_ends_at_the_first_line_that_goes_wrong() {
             2,
             &["`wiggle x`", "not understood", "help"][..],
         ),
+        (
+            "# by hand\nenabel x\n",
+            2,
+            &["line 2: `enabel x`", "did you mean `enable`?"],
+        ),
         ("enable z\n", 2, &["no axis is named `z`", "x, y"]),
         (
             "move x\n",

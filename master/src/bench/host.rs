@@ -42,6 +42,13 @@ pub fn cpus() -> (usize, Option<usize>) {
     (cycle, other)
 }
 
+/// The CPUs that are switched on, as the kernel writes them, where the one that is named is not among them.
+#[must_use]
+pub fn without(cpu: usize) -> Option<String> {
+    let online = read("/sys/devices/system/cpu/online")?;
+    (!list(&online).contains(&cpu)).then_some(online)
+}
+
 /// `0,2-4` as the kernel writes it.
 fn list(text: &str) -> Vec<usize> {
     let mut cpus = Vec::new();

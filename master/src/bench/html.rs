@@ -129,7 +129,7 @@ fn measure(
             "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
             key(*place, &variant.name),
             time(dist.p50_ns),
-            time(dist.p99_ns),
+            dist.p99_ns.map_or_else(|| "–".to_owned(), time),
             dist.p99_9_ns.map_or_else(|| "–".to_owned(), time),
             time(dist.max_ns),
             dist.count

@@ -2,12 +2,10 @@
 
 use super::host;
 use super::plan::{Plan, Target};
-use super::report::{Variant, losses};
+use super::report::{FEW, Variant, losses};
 
 /// More of a CPU than this, taken by the hypervisor, is felt in the rare wake-ups.
 const STEAL: f64 = 0.0005;
-/// A ratio of fewer cycles than this hardly has a 99th percentile.
-const FEW: u64 = 1_000;
 
 /// What to say of these.
 #[must_use]

@@ -65,12 +65,16 @@ pub struct Variant {
     pub bus: Option<Counts>,
 }
 
+/// Fewer times than this hardly have a 99th percentile.
+pub(super) const FEW: u64 = 1_000;
+
 /// A distribution of times.
 #[derive(Debug, Clone, Serialize)]
 pub struct Dist {
     pub count: u64,
     pub p50_ns: u64,
-    pub p99_ns: u64,
+    /// `null`: fewer than ten times are longer.
+    pub p99_ns: Option<u64>,
     /// `null`: fewer than ten times are longer.
     pub p99_9_ns: Option<u64>,
     pub max_ns: u64,
@@ -95,7 +99,7 @@ impl Dist {
         Some(Self {
             count: summary.count,
             p50_ns: summary.p50_ns,
-            p99_ns: summary.p99_ns,
+            p99_ns: (summary.count >= FEW).then_some(summary.p99_ns),
             p99_9_ns: (summary.count >= 10_000).then_some(summary.p99_9_ns),
             max_ns: summary.max_ns,
             histogram: steps.into_iter().map(|(step, n)| (end(step), n)).collect(),
@@ -181,7 +185,7 @@ fn of_two(first: &Variant, other: &Variant, hold: Option<u64>, ratios: &mut Vec<
             of: first.name.clone(),
             to: other.name.clone(),
             p50: by(a.p50_ns, b.p50_ns),
-            p99: by(a.p99_ns, b.p99_ns),
+            p99: a.p99_ns.zip(b.p99_ns).and_then(|(a, b)| by(a, b)),
             p99_9: a.p99_9_ns.zip(b.p99_9_ns).and_then(|(a, b)| by(a, b)),
             max: by(a.max_ns, b.max_ns),
             value: None,
@@ -264,6 +268,8 @@ mod tests {
         assert!(dist.p99_9_ns.is_some());
         assert!(Dist::of(&times([])).is_none());
         assert_eq!(Dist::of(&times([5; 9_999])).expect("some").p99_9_ns, None);
+        assert!(Dist::of(&times([5; 1_000])).expect("some").p99_ns.is_some());
+        assert_eq!(Dist::of(&times([5; 999])).expect("some").p99_ns, None);
     }
 
     #[test]

@@ -128,7 +128,7 @@ fn steps(
         svg,
         "<path d=\"{path}\" fill=\"{colour}\" fill-opacity=\"0.14\" stroke=\"{colour}\" stroke-width=\"1.3\"/>"
     )?;
-    for nanos in [Some(dist.p50_ns), Some(dist.p99_ns), dist.p99_9_ns] {
+    for nanos in [Some(dist.p50_ns), dist.p99_ns, dist.p99_9_ns] {
         let Some(nanos) = nanos else { continue };
         let at = x(nanos as f64);
         writeln!(

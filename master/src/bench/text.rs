@@ -89,6 +89,10 @@ fn head(out: &mut String, title: &str, cells: &[&str]) -> std::fmt::Result {
     writeln!(out, "{}", line.trim_end())
 }
 
+fn or_dash(nanos: Option<u64>) -> String {
+    nanos.map_or_else(|| "–".to_owned(), time)
+}
+
 fn measure(
     out: &mut String,
     report: &Report,
@@ -103,8 +107,8 @@ fn measure(
         let Some(dist) = get(variant) else { continue };
         let cells = [
             time(dist.p50_ns),
-            time(dist.p99_ns),
-            dist.p99_9_ns.map_or_else(|| "–".to_owned(), time),
+            or_dash(dist.p99_ns),
+            or_dash(dist.p99_9_ns),
             time(dist.max_ns),
         ];
         row(out, &variant.name, &cells)?;

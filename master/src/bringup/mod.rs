@@ -14,6 +14,8 @@ use std::fmt;
 
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
+use ecaxis_esi::address;
+
 use crate::clock;
 use crate::config::{Adopted, Machine, UnitProblem};
 use crate::mailbox::desk::Listen;
@@ -21,6 +23,7 @@ use crate::mailbox::{CoeClient, SdoError, WireError};
 use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
 use crate::wire::Datagrams;
+use crate::words::counted;
 
 pub mod al;
 pub(crate) mod clocks;
@@ -143,12 +146,18 @@ impl fmt::Display for Step {
                 )
             }
             Self::ProcessData { bytes, frames } => {
-                write!(f, "process image: {bytes} bytes in {frames} frame(s)")
+                write!(
+                    f,
+                    "process image: {} in {}",
+                    counted(*bytes, "byte"),
+                    counted(*frames, "frame")
+                )
             }
             Self::Clocks { reference, devices } => {
                 write!(
                     f,
-                    "distributed clocks: `{reference}` is the reference, SYNC0 on {devices} device(s)"
+                    "distributed clocks: `{reference}` is the reference, SYNC0 on {}",
+                    counted(*devices, "device")
                 )
             }
             Self::State(state) => write!(f, "all SubDevices in {state}"),
@@ -166,7 +175,8 @@ pub enum BringUpError {
     #[error("{step}: {message}")]
     Scan { step: &'static str, message: String },
     #[error(
-        "{found} SubDevice(s) answer, the machine file names {expected}: {missing} missing; found: {list}"
+        "{} {}, the machine file names {expected}: {missing} missing; found: {list}",
+        counted(*found, "SubDevice"), if *found == 1 { "answers" } else { "answer" }
     )]
     Missing {
         expected: usize,
@@ -196,7 +206,7 @@ pub enum BringUpError {
     #[error("`{name}`: no SubDevice has {locator}")]
     NotLocated { name: String, locator: String },
     #[error(
-        "{device}: start-up SDO 0x{index:04x}:{sub:02x} {name} = {value} (from {origin}): {source}"
+        "{device}: start-up SDO {} {name} = {value} (from {origin}): {source}", address(*index, *sub)
     )]
     StartUp {
         device: DeviceRef,
@@ -219,7 +229,7 @@ pub enum BringUpError {
         holds: String,
     },
     #[error(
-        "{device}: reading the PDO mapping back: 0x{index:04x}:{sub:02x} holds {actual}, the ESI's layout has {expected}"
+        "{device}: reading the PDO mapping back: {} holds {actual}, the ESI's layout has {expected}", address(*index, *sub)
     )]
     Mapping {
         device: DeviceRef,

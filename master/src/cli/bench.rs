@@ -17,7 +17,7 @@ use ecaxis::rt::margin::Spin;
 use ecaxis::session::Observer;
 
 use super::progress::Teller;
-use super::{Failure, files, hints, note, result, signals};
+use super::{Failure, files, hints, note, result, signals, unwritable};
 
 /// The shortest cycle that is measured; SYNC0 of most drives is no faster.
 const SHORTEST: u64 = 20_000;
@@ -180,6 +180,10 @@ fn against(text: &str) -> Result<Against, String> {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let plan = plan(args)?;
+    if let Some(online) = host::without(plan.cpu) {
+        let message = format!("there is no CPU {}; this computer has {online}", plan.cpu);
+        return Err(Failure::new(hints::WRONG, message));
+    }
     for (option, path, kind) in [
         ("--html", &args.html, &files::PAGE),
         ("--save", &args.save, &files::FIGURES),
@@ -214,13 +218,16 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     // Text as keys and numbers that are finite always are JSON.
     let json = serde_json::to_string_pretty(&report).unwrap_or_default() + "\n";
+    // What was measured is shown even where it cannot be kept.
+    let text = text::text(&report);
+    let shown = result(if args.json { &json } else { &text });
     if let Some(path) = &args.html {
         save(path, &html::html(&report))?;
     }
     if let Some(path) = &args.save {
         save(path, &json)?;
     }
-    result(&if args.json { json } else { text::text(&report) })?;
+    shown?;
     if stop.load(Ordering::Relaxed) {
         note("interrupted: this is what was measured so far");
     }
@@ -228,10 +235,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn save(path: &Path, text: &str) -> Result<(), Failure> {
-    std::fs::write(path, text).map_err(|e| {
-        let message = format!("cannot write {}: {e}", path.display());
-        Failure::new(hints::FAILED, message)
-    })
+    std::fs::write(path, text).map_err(|error| unwritable(path, &error))
 }
 
 fn plan(args: &Args) -> Result<Plan, Failure> {

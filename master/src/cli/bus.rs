@@ -1,6 +1,5 @@
 //! A bus for verbs that turn no cycle: a network interface, or the simulated bus of a machine file.
 
-use std::io::Write;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -11,7 +10,7 @@ use ecaxis::link::{self, BackEnd, Link};
 use ecaxis::service::{self, Datagrams};
 use ecaxis::session::{self, Options, RunError};
 
-use super::{Failure, hints, note, signals, style};
+use super::{Failure, hints, note, screen, signals};
 
 /// Another MainDevice on the interface shows within this time.
 const LISTEN: Duration = Duration::from_millis(100);
@@ -142,12 +141,7 @@ pub(crate) fn done<T>(result: Result<T, service::ServiceError>, nic: &Nic) -> Re
 
 /// A line on stderr where somebody watches.
 pub(crate) fn passing(text: &str) {
-    if style::rewrites() {
-        let mut err = std::io::stderr().lock();
-        // Over the last one, and gone with the next.
-        let _ = write!(err, "\r\x1b[K{text}");
-        let _ = err.flush();
-    }
+    screen::pass(text);
 }
 
 /// The last of those lines goes.

@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use ecaxis::config::{self, ConfigError, Machine, duration};
+use ecaxis::words::counted;
 use serde_json::json;
 
-use super::{Failure, hints, result};
+use super::{Failure, hints, page, result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -31,7 +32,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Ok(machine) => summary(machine),
         Err(_) => String::new(),
     };
-    let written = result(&text);
+    let written = if args.json {
+        result(&text)
+    } else {
+        page(&text)
+    };
     loaded.map_err(|e| hints::config(&args.file, &e))?;
     written
 }
@@ -79,23 +84,21 @@ pub(super) fn problems(error: &ConfigError) -> serde_json::Value {
 
 fn summary(machine: &Machine) -> String {
     let mut text = format!(
-        "{}: {} device{}, cycle {}, {} step{}\n",
+        "{}: {}, cycle {}, {}\n",
         machine.path.display(),
-        machine.devices.len(),
-        if machine.devices.len() == 1 { "" } else { "s" },
+        counted(machine.devices.len(), "device"),
         duration::show(machine.bus.cycle_ns),
-        machine.steps.len(),
-        if machine.steps.len() == 1 { "" } else { "s" },
+        counted(machine.steps.len(), "step"),
     );
     for device in &machine.devices {
         let selection = &device.selection;
         let mode = selection.mode.map_or("I/O".to_owned(), |m| m.to_string());
         text += &format!(
-            "  {} at {}: {}, {mode}, {} bytes out, {} in\n",
+            "  {} at {}: {}, {mode}, {} out, {} in\n",
             device.name,
             device.at,
             selection.device_name,
-            selection.layout.rx_bytes(),
+            counted(selection.layout.rx_bytes(), "byte"),
             selection.layout.tx_bytes(),
         );
         for note in &selection.notes {

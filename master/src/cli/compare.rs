@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use super::bus::{self, Bus};
 use super::files::{Old, replace};
 use super::scan::{Seen, open};
-use super::{Failure, hints, result};
+use super::{Failure, hints, page, result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -97,11 +97,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             as_json(&machine, &comparison, &seen.scan, complete)
         ))?;
     } else if differences.is_empty() && comparison.unknown.is_empty() {
-        result("as in the file\n")?;
+        page("as in the file\n")?;
     } else if differences.is_empty() {
-        result("as in the file, as far as it could be compared\n")?;
+        page("as in the file, as far as it could be compared\n")?;
     } else {
-        result(&(differences.join("\n") + "\n"))?;
+        page(&(differences.join("\n") + "\n"))?;
     }
     if differences.is_empty() {
         return if complete {
@@ -221,17 +221,31 @@ fn rewrite(
         described: &seen.described,
         comparison,
     };
-    let text = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
-    let kept = replace(file, &text, Old::Kept)?;
+    let applied = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
+    let kept = replace(file, &applied.text, Old::Kept)?;
+    for told in &applied.told {
+        super::note(&format!("  {told}"));
+    }
     if let Some(kept) = kept {
         super::note(&format!("the old text is in {}", kept.display()));
     }
+    let shown = file.display();
     super::note(&format!(
-        "{} is as the bus now; `ecaxis check {}` and a look at what is marked \"{}\" are due",
-        file.display(),
-        file.display(),
-        scan::write::MARK
+        "{shown} is as the bus now; `ecaxis check {shown}` is due"
     ));
+    let marked = applied.text.lines();
+    let marked = marked.filter(|line| line.contains(scan::write::MARK));
+    match marked.count() {
+        0 => {}
+        1 => super::note(&format!(
+            "1 line is marked \"{}\" and wants a look",
+            scan::write::MARK
+        )),
+        n => super::note(&format!(
+            "{n} lines are marked \"{}\" and want a look",
+            scan::write::MARK
+        )),
+    }
     Ok(())
 }
 

@@ -120,6 +120,8 @@ pub(crate) struct Located {
     config: Option<Box<DeviceConfig>>,
     esi: Option<PathBuf>,
     nic: Nic,
+    /// Another MainDevice is at work on the bus.
+    others: bool,
     found: ecaxis::service::station::Found,
 }
 
@@ -139,7 +141,13 @@ impl Target {
         let done = bus.visit(async move |wire: Datagrams, others| {
             bus::warn_of(others);
             let located = Located::find(wire, at, config, nic).await?;
-            work(&Located { esi, ..located }).await
+            let others = others > 0;
+            work(&Located {
+                esi,
+                others,
+                ..located
+            })
+            .await
         });
         done?
     }
@@ -209,6 +217,7 @@ impl Located {
             config,
             esi: None,
             nic,
+            others: false,
             found,
         })
     }
@@ -231,13 +240,21 @@ impl Located {
     pub fn ended<T>(&self, result: Result<T, Trouble>) -> Result<T, Failure> {
         result.map_err(|trouble| match trouble {
             Trouble::Told(failure) => failure,
-            Trouble::Service(error) => hints::service(&error, &self.nic),
+            Trouble::Service(error) => self.failure(&error),
         })
     }
 
     /// As the user sees it.
     pub fn told<T>(&self, result: Result<T, ServiceError>) -> Result<T, Failure> {
-        result.map_err(|error| hints::service(&error, &self.nic))
+        result.map_err(|error| self.failure(&error))
+    }
+
+    fn failure(&self, error: &ServiceError) -> Failure {
+        let failure = hints::service(error, &self.nic);
+        if self.others {
+            return hints::beside_another(failure, error);
+        }
+        failure
     }
 
     /// The device is the machine file's. One that does not tell is taken for it.
@@ -387,5 +404,5 @@ pub(crate) fn counter(what: &'static str) -> impl FnMut(usize, usize) {
 
 /// `0x6041:00`
 pub(crate) fn address(at: ObjectAddress) -> String {
-    format!("{:#06x}:{:02}", at.index, at.sub)
+    at.number().to_string()
 }

@@ -41,11 +41,16 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DURATION", value_parser = cycle)]
     cycle: Option<u64>,
     /// How long to measure wake-ups; 0 does not
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(0..=86_400))]
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = seconds)]
     seconds: u32,
     /// Print what was found as JSON
     #[arg(long)]
     json: bool,
+}
+
+fn seconds(text: &str) -> Result<u32, String> {
+    let seconds = text.parse().ok().filter(|seconds| *seconds <= 86_400);
+    seconds.ok_or_else(|| "whole seconds, such as 10, up to 86400".to_owned())
 }
 
 fn cycle(text: &str) -> Result<u64, String> {

@@ -218,7 +218,7 @@ fn replace(args: &WriteArgs) -> Result<(), Failure> {
 fn alias(args: &AliasArgs) -> Result<(), Failure> {
     let (target, rest) = args.place.take(&args.words, "an alias")?;
     let alias = match rest {
-        [alias] => super::esi::number_16(alias),
+        [alias] => super::esi::number_16(alias).map_err(|error| format!("`{alias}`: {error}")),
         _ => Err("one alias, decimal or 0x…".to_owned()),
     };
     let alias = alias.map_err(|error| Failure::new(hints::WRONG, error))?;

@@ -7,13 +7,14 @@ use ecaxis::config::{self, Action, DeviceConfig, Exchange, Machine, Nic, Step, d
 use ecaxis::link::BackEnd;
 use ecaxis::rt::image::{self, Access, ImagePlan};
 use ecaxis::rt::margin::Spin;
+use ecaxis::words::counted;
 use ecaxis_esi::SmLayout;
 
 mod axis;
 mod stop;
 
 use super::tables::{fields, startup};
-use super::{Failure, hints, report::Table, result};
+use super::{Failure, hints, page, report::Table};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -34,7 +35,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut text = String::new();
     // Writing into a String cannot fail.
     let _ = explain(&machine, &mut text);
-    result(&text)
+    page(&text)
 }
 
 fn explain(machine: &Machine, out: &mut String) -> std::fmt::Result {
@@ -311,8 +312,8 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     };
     writeln!(
         out,
-        "\nprocess image: {} bytes; outputs and inputs share addresses",
-        plan.len
+        "\nprocess image: {}; outputs and inputs share addresses",
+        counted(plan.len, "byte")
     )?;
     let mut table = Table::new(&["device", "logical", "outputs", "inputs", "frame"]);
     for (device, region) in machine.devices.iter().zip(&plan.regions) {
@@ -340,6 +341,7 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let clock = if clock { "FRMW 0x0910, " } else { "" };
     let process_data = commands(&plan);
     let ns = u64::try_from(ns).unwrap_or(u64::MAX);
+    let percent = |ns: u64| ns as f64 * 100.0 / machine.bus.cycle_ns as f64;
     writeln!(
         out,
         "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130), {total} bytes on the wire",
@@ -347,17 +349,17 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     )?;
     writeln!(
         out,
-        "  about {} µs from the first bit sent to the last received at 100 Mbit/s, {} % of the cycle",
+        "  about {} µs from the first bit sent to the last received at 100 Mbit/s, {:.1} % of the cycle",
         ns.div_ceil(1000),
-        (ns * 100).div_ceil(machine.bus.cycle_ns),
+        percent(ns),
     )?;
     writeln!(out, "  expected working counter {wkc}")?;
     let (ns, why) = load(machine, ns);
     writeln!(
         out,
-        "  estimated load of the real-time thread: about {} µs, {} % of its CPU\n    ({why}; `ecaxis bench` measures it)",
+        "  estimated load of the real-time thread: about {} µs, {:.1} % of its CPU\n    ({why}; `ecaxis bench` measures it)",
         ns.div_ceil(1000),
-        (ns * 100).div_ceil(machine.bus.cycle_ns),
+        percent(ns),
     )
 }
 

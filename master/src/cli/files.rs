@@ -19,12 +19,17 @@ const NAMES: u32 = 1000;
 pub(crate) fn keep(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     create(path, bytes).map_err(|error| match error.kind() {
         ErrorKind::AlreadyExists => in_the_way(path),
-        _ => Failure::new(
-            hints::WRONG,
-            format!("cannot write {}: {error}", path.display()),
-        ),
+        _ => unwritable(path, &error),
     })
 }
+
+/// A file that was named and cannot be written.
+pub(crate) fn unwritable(path: &Path, error: &io::Error) -> Failure {
+    let message = format!("cannot write {}: {error}", path.display());
+    Failure::new(hints::WRONG, message).hint(WRITABLE)
+}
+
+const WRITABLE: &str = "name a file in a folder that exists and can be written";
 
 pub(crate) fn in_the_way(path: &Path) -> Failure {
     Failure::new(hints::WRONG, format!("{} exists already", path.display()))
@@ -100,7 +105,7 @@ pub(crate) fn may_replace<'p>(
         Ok(Existing::Taken(what)) => Err(refuse(format!("{shown} {what}")).hint(kind.instead)),
         Err(e) => {
             let failure = refuse(format!("cannot write {shown}: {e}"));
-            Err(failure.hint("name a file in a folder that exists and can be written"))
+            Err(failure.hint(WRITABLE))
         }
     }
 }
@@ -162,10 +167,7 @@ pub(crate) enum Old {
 /// Gives a file, or one that does not exist yet, another text: it has the old one or the new one at any time. A link still leads to
 /// it, and it is as readable as before. Returns where the old text is kept.
 pub(crate) fn replace(path: &Path, text: &str, old: Old) -> Result<Option<PathBuf>, Failure> {
-    let failed = |e: io::Error| {
-        let message = format!("cannot write {}: {e}", path.display());
-        Failure::new(hints::FAILED, message)
-    };
+    let failed = |e: io::Error| unwritable(path, &e);
     let target = led_to(path).map_err(failed)?;
     let there = match fs::metadata(&target) {
         Ok(there) => Some(there),

@@ -11,6 +11,7 @@ use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
 use ecaxis_axis::scale::Contradiction;
 use ecaxis_axis::{HomingError, Refused, State, Trip, VelocityUnit};
+use ecaxis_esi::address;
 use ecaxis_sim::ServeError;
 
 use super::note;
@@ -23,7 +24,7 @@ mod story;
 pub(crate) use firmware::{firmware, shared_bus};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
-pub(crate) use service::{image, restore, service};
+pub(crate) use service::{beside_another, image, restore, service};
 pub(crate) use story::cause;
 
 /// The machine or the bus failed.
@@ -37,6 +38,8 @@ pub(crate) struct Failure {
     /// Complete in itself; a list of problems is already laid out.
     pub message: String,
     pub hints: Vec<String>,
+    /// A line that comes behind them.
+    pub after: Option<String>,
 }
 
 impl Failure {
@@ -45,6 +48,7 @@ impl Failure {
             code,
             message: message.into(),
             hints: Vec::new(),
+            after: None,
         }
     }
 
@@ -62,6 +66,9 @@ impl Failure {
         note(&format!("{prefix}{}", self.message));
         for hint in &self.hints {
             note(&format!("  = help: {hint}"));
+        }
+        if let Some(after) = &self.after {
+            note(after);
         }
     }
 }
@@ -88,10 +95,14 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
         RunError::State(state) => self::state(state),
         RunError::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
-        RunError::Replay(_) => "a replay needs a recording of this machine file's run, as `ecaxis run --record` makes it".to_owned(),
+        RunError::Replay(_) => {
+            // The file is the user's.
+            return Failure { code: WRONG, ..failure }
+                .hint("a replay needs a whole recording of this machine file's run, as `ecaxis run --record` makes it");
+        }
         RunError::NotMapped { source, .. } => format!(
-            "add \"0x{:04x}:{:02x}\" to the device's `pdo` lists, or leave them out to take the ESI's",
-            source.index, source.sub,
+            "add \"{}\" to the device's `pdo` lists, or leave them out to take the ESI's",
+            address(source.index, source.sub),
         ),
         RunError::NoProcessData { .. } => {
             "`ecaxis explain` shows the expected layout; a device without an FMMU left answers no process data".to_owned()
@@ -145,6 +156,25 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,
     };
     failure.hint(hint)
+}
+
+/// A run whose bus was a recording. Nothing can be done about that bus: whose it was may help.
+pub(crate) fn replayed(error: &RunError, devices: usize) -> Option<String> {
+    let RunError::BringUp(error) = error else {
+        return None;
+    };
+    let shown = match error.as_ref() {
+        BringUpError::Missing { found: 1, .. } => "1 SubDevice".to_owned(),
+        BringUpError::Missing { found, .. } => format!("{found} SubDevices"),
+        BringUpError::Unexpected { .. } => "more SubDevices".to_owned(),
+        BringUpError::Identity { .. }
+        | BringUpError::Serial { .. }
+        | BringUpError::NotLocated { .. } => "other SubDevices".to_owned(),
+        _ => return None,
+    };
+    Some(format!(
+        "the recording is of another machine, or of a bus that was not whole: it shows {shown}, the file has {devices}"
+    ))
 }
 
 /// The error's text, with the address of an SDO once: its own errors carry it, too.
@@ -492,7 +522,7 @@ fn machine_files(path: &Path) -> String {
             .map(|p| p.strip_prefix("./").unwrap_or(&p).display().to_string())
             .collect();
         names.sort();
-        names.truncate(10);
+        names.truncate(3);
         if !names.is_empty() {
             return format!("machine files nearby: {}", names.join(", "));
         }

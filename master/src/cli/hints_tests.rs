@@ -291,3 +291,73 @@ fn only_a_file_that_is_not_there_has_neighbours() {
         assert_eq!(nearby, hint.is_some(), "{failure:?}");
     }
 }
+
+/// Whoever waits in vain beside a machine that runs is not sent to its power switch.
+#[test]
+fn beside_another_main_device_nobody_switches_a_drive_off() {
+    let nic = Nic::Interface("eth9".into());
+    let timeout = SdoError::Timeout {
+        station: 0x1001,
+        index: 0x6065,
+        sub: 0,
+        phase: ecaxis::mailbox::Phase::Answer,
+        after: std::time::Duration::from_secs(6),
+        set_aside: 0,
+    };
+    let refused = SdoError::Abort {
+        station: 0x1001,
+        index: 0x6065,
+        sub: 0,
+        code: 0x0609_0030,
+    };
+    for (source, takes_away) in [(timeout, true), (refused, false)] {
+        let error = ecaxis::service::ServiceError::Sdo {
+            device: device(),
+            source,
+        };
+        let alone = service(&error, &nic);
+        let beside = beside_another(service(&error, &nic), &error);
+        let told = beside.hints.join("\n");
+        assert_eq!(
+            told.contains("takes the answers away"),
+            takes_away,
+            "{told}"
+        );
+        assert!(!told.contains("off and on"), "{told}");
+        assert_eq!(beside.hints != alone.hints, takes_away, "{told}");
+        assert_eq!((beside.code, beside.message), (alone.code, alone.message));
+    }
+}
+
+#[test]
+fn a_firmware_error_names_its_device_once() {
+    use ecaxis::firmware::{Cause, FirmwareError, Left, Step};
+    let abort = SdoError::Abort {
+        station: 0x1001,
+        index: 0x1f51,
+        sub: 1,
+        code: 0x0601_0002,
+    };
+    let state = StateError::Gone {
+        device: device(),
+        wanted: AlState::PreOp,
+    };
+    for (step, cause) in [
+        (Step::Clear, Cause::Sdo(abort)),
+        (Step::PreOp, Cause::State(state)),
+    ] {
+        let error = FirmwareError::Failed {
+            device: device(),
+            step,
+            cause,
+            left: Left::Silent,
+        };
+        let text = firmware(&error, &Nic::Sim).message;
+        assert!(
+            text.starts_with(&format!("{}: {step}: ", device())),
+            "{text}"
+        );
+        assert_eq!(text.matches("0x1001").count(), 1, "{text}");
+        assert!(text.ends_with("; the device does not answer"), "{text}");
+    }
+}

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap_mangen::Man;
 
-use super::{Failure, command, hints, note, result};
+use super::{Failure, command, note, result, unwritable};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -29,10 +29,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return result(&page(&Man::new(command)));
     };
     let pages = std::fs::create_dir_all(folder).and_then(|()| write_all(folder, &command));
-    let pages = pages.map_err(|e| {
-        let message = format!("cannot write to {}: {e}", folder.display());
-        Failure::new(hints::FAILED, message)
-    })?;
+    let pages = pages.map_err(|error| unwritable(folder, &error))?;
     note(&format!("{pages} pages in {}", folder.display()));
     Ok(())
 }

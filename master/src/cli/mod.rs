@@ -3,7 +3,8 @@
 //! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
 //! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile;
 //! [`files`] and [`record`] keep what is written from destroying another file; [`style`] decides about
-//! colours; [`story`] lays out what stopped a run; [`bus`] is the one way to a bus without a cycle.
+//! colours, [`screen`] about lines; [`story`] lays out what stopped a run; [`bus`] is the one way to a
+//! bus without a cycle.
 
 use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
@@ -33,6 +34,7 @@ mod record;
 mod report;
 mod run;
 mod scan;
+mod screen;
 mod sdo;
 mod signals;
 mod sim;
@@ -41,7 +43,7 @@ mod style;
 mod table;
 mod tables;
 
-pub(crate) use files::{in_the_way, keep};
+pub(crate) use files::{in_the_way, keep, unwritable};
 pub(crate) use hints::Failure;
 
 const EXAMPLES: &str = "\
@@ -88,7 +90,7 @@ enum Verb {
 #[derive(Debug, clap::Args)]
 pub(crate) struct Verbosity {
     /// Log what happens; twice for more. RUST_LOG overrides it
-    #[arg(short, long, action = clap::ArgAction::Count)]
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     verbose: u8,
 }
 
@@ -108,7 +110,7 @@ impl Verbosity {
         let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
         tracing_subscriber::fmt()
             .with_env_filter(filter)
-            .with_writer(io::stderr)
+            .with_writer(|| screen::Log)
             .with_ansi(style::on_stderr())
             .with_timer(tracing_subscriber::fmt::time::uptime())
             .init();
@@ -171,6 +173,11 @@ pub(crate) fn result(text: &str) -> Result<(), Failure> {
     written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
 }
 
+/// Prose on stdout: on a terminal, lines that are too long for it are broken.
+pub(crate) fn page(text: &str) -> Result<(), Failure> {
+    result(&screen::wrapped(text, screen::stdout_width()))
+}
+
 /// A reader that has gone (`| head`) is no failure.
 fn written(done: io::Result<()>) -> Result<(), Failure> {
     match done {
@@ -184,7 +191,8 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
 
 /// A line on stderr.
 pub(crate) fn note(text: &str) {
-    let _ = style::complaint(&mut style::stderr(), text);
+    let text = screen::wrapped(text, screen::stderr_width());
+    let _ = screen::stay(|mut err| style::complaint(&mut err, &text));
 }
 
 /// What the command line takes, without what is read from it.

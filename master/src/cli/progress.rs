@@ -10,7 +10,7 @@ use ecaxis::session::{AxisLine, Observer, Progress, Status};
 use ecaxis_axis::Mode;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{hints, note, style};
+use super::{hints, note, screen, style};
 
 /// Virtual time makes an hour of status lines in seconds; people read one a second.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
@@ -32,7 +32,9 @@ impl Teller {
         let bar = (style::rewrites() && !plain).then(|| {
             let bar = ProgressBar::new_spinner();
             let style = ProgressStyle::with_template("{spinner} {wide_msg}");
-            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()))
+            let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
+            screen::put_up(&bar);
+            bar
         });
         Self {
             bar,
@@ -41,14 +43,6 @@ impl Teller {
             nic: bus.nic.clone(),
             last_passing: None,
             advised: Vec::new(),
-        }
-    }
-
-    /// Something that stays on the screen.
-    fn line(&self, text: &str) {
-        match &self.bar {
-            Some(bar) => bar.suspend(|| note(text)),
-            None => note(text),
         }
     }
 
@@ -83,70 +77,68 @@ impl Observer for Teller {
             Progress::Step(step @ (Step::StartUp { .. } | Step::Scan)) => {
                 self.passing(&step.to_string());
             }
-            Progress::Step(step) => self.line(&step.to_string()),
+            Progress::Step(step) => note(&step.to_string()),
             Progress::Denied(denied) => {
-                self.line(&format!("warning: {denied}"));
+                note(&format!("warning: {denied}"));
                 let help = hints::denied(denied);
                 if !self.advised.contains(&help) {
-                    self.line(&format!("  = help: {help}"));
+                    note(&format!("  = help: {help}"));
                     self.advised.push(help);
                 }
             }
             Progress::Overload(overload) => {
-                self.line(&format!("warning: {overload}"));
-                self.line(&format!("  = help: {}", hints::overload()));
+                note(&format!("warning: {overload}"));
+                note(&format!("  = help: {}", hints::overload()));
             }
             Progress::Concern(concern) => {
-                self.line(&format!("warning: {concern}"));
+                note(&format!("warning: {concern}"));
                 if let Some(help) = hints::concern(concern) {
-                    self.line(&format!("  = help: {help}"));
+                    note(&format!("  = help: {help}"));
                 }
             }
-            Progress::Warning(text) => self.line(&format!("warning: {text}")),
-            Progress::Emergency(report) => self.line(&format!("warning: {report}")),
+            Progress::Warning(text) => note(&format!("warning: {text}")),
+            Progress::Emergency(report) => note(&format!("warning: {report}")),
             Progress::Mailboxes(_) => {}
             Progress::GroupStopped { group, cause } => {
-                self.line(&format!(
+                note(&format!(
                     "warning: the group `{group}` stops, the rest goes on: {cause}"
                 ));
                 for hint in hints::run(cause, &self.nic).hints {
-                    self.line(&format!("  = help: {hint}"));
+                    note(&format!("  = help: {hint}"));
                 }
             }
             Progress::GroupReleased { group } => {
-                self.line(&format!(
+                note(&format!(
                     "the group `{group}` has been reset and can be enabled again"
                 ));
             }
-            Progress::PhaseLocked => self.line("frames leave in phase with SYNC0"),
-            Progress::Enabled { axes: 1 } => self.line("1 axis in Operation enabled"),
-            Progress::Enabled { axes } => self.line(&format!("{axes} axes in Operation enabled")),
+            Progress::PhaseLocked => note("frames leave in phase with SYNC0"),
+            Progress::Enabled { axes: 1 } => note("1 axis in Operation enabled"),
+            Progress::Enabled { axes } => note(&format!("{axes} axes in Operation enabled")),
             Progress::Program { run, step, what } => {
                 let text = format!("run {run}, step {}: {what}", step.number);
                 if *run == 1 && self.bar.is_none() {
-                    self.line(&text);
+                    note(&text);
                 } else {
                     self.occasional(|| text);
                 }
             }
             Progress::Captured { run, capture } => {
-                self.line(&format!("run {run}, step {}: {capture}", capture.step));
+                note(&format!("run {run}, step {}: {capture}", capture.step));
             }
             Progress::Status(status) if self.clock == Clock::Virtual => {
                 let cycle_ns = self.cycle_ns;
                 self.occasional(|| status_line(status, cycle_ns));
             }
             Progress::Status(status) => self.passing(&status_line(status, self.cycle_ns)),
-            Progress::Stopping => self.line("stopping: axes to rest, power off, bus to Init"),
+            Progress::Stopping => note("stopping: axes to rest, power off, bus to Init"),
         }
     }
 }
 
 impl Drop for Teller {
     fn drop(&mut self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
+        screen::take_down();
     }
 }
 

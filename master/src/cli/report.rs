@@ -286,11 +286,12 @@ fn axes(axes: &[AxisSummary]) -> Table {
         let unit = &axis.unit;
         let position = |x: f64| format!("{:.4} {unit}", positive_zero(x));
         let cyclic_position = axis.mode == "csp" && axis.was_enabled;
+        let heard = axis.last_heard_s.is_none();
         let only = |show: bool, text: String| if show { text } else { "-".to_owned() };
         let off = match axis.final_error_counts {
-            Some(1) => "1 count".to_owned(),
-            Some(n) => format!("{n} counts"),
-            None => "-".to_owned(),
+            Some(1) if heard => "1 count".to_owned(),
+            Some(n) if heard => format!("{n} counts"),
+            _ => "-".to_owned(),
         };
         table.row([
             &axis.name,
@@ -300,12 +301,15 @@ fn axes(axes: &[AxisSummary]) -> Table {
                 position(axis.target_place.unwrap_or(axis.target_position)),
             ),
             &only(
-                axis.was_enabled,
+                axis.was_enabled && heard,
                 position(axis.final_place.unwrap_or(axis.final_position)),
             ),
             &off,
             &only(cyclic_position, position(axis.largest_following_error)),
-            &axis.final_state,
+            &match axis.last_heard_s {
+                Some(at_s) => format!("not heard since {}", seconds(at_s)),
+                None => axis.final_state.clone(),
+            },
         ]);
     }
     table
@@ -361,6 +365,7 @@ mod tests {
                 final_error_counts: Some(0),
                 largest_following_error: 0.1234,
                 final_state: "Switch on disabled".into(),
+                last_heard_s: None,
                 fault: None,
                 trip: None,
             }],
@@ -455,6 +460,29 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
   7 frames recorded
 ";
         assert_eq!(summary(&sample()), expected);
+    }
+
+    #[test]
+    fn what_was_not_heard_is_not_final() {
+        let mut summary = sample();
+        summary.axes[0].last_heard_s = Some(0.908);
+        let text = self::summary(&summary);
+        let line = text.lines().find(|line| line.starts_with("  x ")).unwrap();
+        let cells: Vec<&str> = line
+            .split("  ")
+            .map(str::trim)
+            .filter(|c| !c.is_empty())
+            .collect();
+        let expected = [
+            "x",
+            "csp",
+            "0.0000 mm",
+            "-",
+            "-",
+            "0.1234 mm",
+            "not heard since 0.908 s",
+        ];
+        assert_eq!(cells, expected);
     }
 
     #[test]

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 
 use super::progress::Teller;
 use super::story::{self, Keep};
-use super::{Failure, check, hints, note, record, report, result, signals};
+use super::{Failure, check, hints, note, page, record, report, result, signals};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -45,10 +45,10 @@ pub(crate) struct Args {
     #[arg(long = "virtual")]
     virtual_time: bool,
     /// Repeat the program until this time is over, such as 10s or 1h
-    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse, allow_hyphen_values = true)]
     time: Option<u64>,
     /// Run the program this often instead of the file's `repeat`
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), allow_hyphen_values = true)]
     repeat: Option<u32>,
     /// Seed of the simulated bus
     #[arg(long, value_name = "N")]
@@ -106,7 +106,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "note: the file says `enable = false`: the axes get no power; `--enable` gives it to them",
         );
     }
-    let nic = machine.bus.nic.clone();
+    let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
     let mut teller = Teller::new(options.clock, &machine.bus, args.verbosity.plain());
@@ -120,7 +120,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
     // The user's own wish is no failure, but a script must not take it for a finished run.
     let interrupted = matches!(ended, Err(RunError::Interrupted));
-    let mut failure = ended.err().map(|error| hints::run(&error, &nic));
+    let mut failure = ended.err().map(|error| {
+        let mut failure = hints::run(&error, &nic);
+        if args.replay.is_some()
+            && let Some(hint) = hints::replayed(&error, devices)
+        {
+            failure.hints = vec![hint];
+        }
+        failure
+    });
     if let (Some(story), Some(failure)) = (&story, &mut failure) {
         tell_story(args, story, failure, &nic);
     }
@@ -137,7 +145,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } else {
         summary.as_ref().map(report::summary).unwrap_or_default()
     };
-    let written = result(&text);
+    let written = if args.json {
+        result(&text)
+    } else {
+        page(&text)
+    };
     match failure {
         Some(_) if interrupted => note("interrupted"),
         Some(failure) => return Err(failure),
@@ -149,7 +161,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 /// In short on stderr, whole in a file. Where it knows the cause, its advice takes the place of that for the error.
 fn tell_story(args: &Args, story: &Story, failure: &mut Failure, nic: &Nic) {
     let advice = hints::cause(&story.cause);
-    if !advice.is_empty() {
+    // A bus that was recorded is not to be mended.
+    if !advice.is_empty() && args.replay.is_none() {
         failure.hints = advice;
     }
     let short = story::short(story);
@@ -164,10 +177,12 @@ fn tell_story(args: &Args, story: &Story, failure: &mut Failure, nic: &Nic) {
         (None, Nic::Sim) => Keep::No,
     };
     match story::keep(story, &failure.hints, &keep) {
-        Ok(Some(path)) => note(&format!(
-            "  the whole story: {}, and as JSON beside it",
-            path.display()
-        )),
+        Ok(Some(path)) => {
+            failure.after = Some(format!(
+                "  the whole story: {}, and as JSON beside it",
+                path.display()
+            ))
+        }
         Ok(None) => {}
         Err(trouble) => note(&format!("  warning: {}", trouble.message)),
     }

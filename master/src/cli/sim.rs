@@ -12,7 +12,7 @@ use ecaxis::session;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
-use super::{Failure, hints, keep, note, result, run, signals};
+use super::{Failure, hints, keep, note, result, run, signals, unwritable};
 
 /// SCHED_FIFO priority of the simulated bus; below that of a master on the same computer.
 const PRIORITY: u8 = 70;
@@ -136,13 +136,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn write_images(segment: &Segment, folder: &Path) -> Result<(), Failure> {
-    let failed = |path: &Path, e: std::io::Error| {
-        Failure::new(
-            hints::FAILED,
-            format!("cannot write {}: {e}", path.display()),
-        )
-    };
-    std::fs::create_dir_all(folder).map_err(|e| failed(folder, e))?;
+    std::fs::create_dir_all(folder).map_err(|error| unwritable(folder, &error))?;
     for (position, device) in devices(segment) {
         let path = folder.join(format!("{position}.bin"));
         // The same image as last time is there already.

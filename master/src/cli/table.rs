@@ -1,5 +1,7 @@
 //! Columns of text, on paper or on a terminal.
 
+use super::screen::stdout_width;
+
 /// Columns as wide as their widest cell.
 #[derive(Debug)]
 pub(crate) struct Table {
@@ -29,12 +31,12 @@ impl Table {
 
     /// For a result that may be read on a terminal: there, long cells are broken so that lines need not be.
     pub fn shown(&self, by: usize) -> String {
-        self.fitted(by, terminal_width())
+        self.fitted(by, stdout_width())
     }
 
     /// For a page of a fixed width, wider only where the terminal is.
     pub fn within(&self, by: usize, width: usize) -> String {
-        self.fitted(by, Some(terminal_width().unwrap_or(width).max(width)))
+        self.fitted(by, Some(stdout_width().unwrap_or(width).max(width)))
     }
 
     /// For a page of this many columns.
@@ -52,13 +54,27 @@ impl Table {
         let mut widths: Vec<usize> = (0..columns).map(width).collect();
         let between = by + GAP * columns.saturating_sub(1);
         let limit = limit.unwrap_or(usize::MAX);
-        while widths.iter().sum::<usize>() + between > limit {
-            let widest = widths
-                .iter_mut()
-                .filter(|width| **width > NARROWEST)
-                .max_by_key(|width| **width);
-            let Some(widest) = widest else { break };
-            *widest -= 1;
+        // Where columns of whole words are too wide still, words are broken, too.
+        let words = |column: usize| {
+            let cells = self.rows.iter().filter_map(|row| row.get(column));
+            let words = cells.flat_map(|cell| cell.split(' '));
+            words.map(|word| word.chars().count()).max().unwrap_or(0)
+        };
+        let words: Vec<usize> = (0..columns).map(words).collect();
+        for floor in [NARROWEST, 0, NARROWEST_WORD] {
+            let floors = words.iter().map(|word| match floor {
+                0 => (*word).clamp(NARROWEST_WORD, NARROWEST),
+                floor => floor,
+            });
+            let floors: Vec<usize> = floors.collect();
+            while widths.iter().sum::<usize>() + between > limit {
+                let wide = widths.iter_mut().zip(&floors);
+                let widest = wide
+                    .filter(|(width, floor)| **width > **floor)
+                    .max_by_key(|(width, _)| **width);
+                let Some((widest, _)) = widest else { break };
+                *widest -= 1;
+            }
         }
         let mut lines = Vec::new();
         for row in &self.rows {
@@ -84,14 +100,10 @@ impl Table {
 
 /// Between columns.
 const GAP: usize = 2;
-/// No column is made narrower to fit a terminal.
+/// Columns are made as narrow as this before others give way, too.
 const NARROWEST: usize = 14;
-
-/// `None`: the result goes to a file or another program.
-fn terminal_width() -> Option<usize> {
-    let size = rustix::termios::tcgetwinsize(std::io::stdout()).ok()?;
-    Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
-}
+/// No column is made narrower to fit a terminal.
+const NARROWEST_WORD: usize = 6;
 
 /// In lines of at most `width` characters, between words where there is a place.
 pub(crate) fn broken(cell: &str, width: usize) -> Vec<String> {

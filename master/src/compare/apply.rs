@@ -42,8 +42,16 @@ impl Actual<'_> {
     }
 }
 
+/// A file that is as the bus.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Applied {
+    pub text: String,
+    /// What else than the differences themselves has changed, in words: places that followed, steps and groups that went.
+    pub told: Vec<String>,
+}
+
 /// Rewrites `text`, the file at `path`, which was checked to be `machine`. Parameters stay as they are. The result is a file without
-/// mistakes.
+/// mistakes; what of it lost a device that it named is marked with [`write::MARK`].
 ///
 /// # Errors
 /// Where the file cannot become as the bus.
@@ -52,7 +60,8 @@ pub fn apply(
     text: &str,
     machine: &Machine,
     actual: Actual<'_>,
-) -> Result<String, ApplyError> {
+) -> Result<Applied, ApplyError> {
+    let mut told = Vec::new();
     let mut document: DocumentMut = text
         .parse()
         .map_err(|error: toml_edit::TomlError| ApplyError::NotToml(error.to_string()))?;
@@ -79,17 +88,24 @@ pub fn apply(
             && from != position
         {
             set(table, "position", &position.to_string());
+            told.push(format!(
+                "`{}` has `position = {position}` now, it was {from}",
+                config.name
+            ));
         }
     }
     for difference in differences {
         change(&mut document, machine, actual, place, difference)?;
     }
-    for difference in differences {
-        if let Difference::Missing { device } = difference
-            && let Some(config) = machine.devices.get(*device)
-        {
-            remove(&mut document, &config.name)?;
-        }
+    let missing = differences
+        .iter()
+        .filter_map(|difference| match difference {
+            Difference::Missing { device } => machine.devices.get(*device),
+            _ => None,
+        });
+    let names: Vec<&str> = missing.map(|config| config.name.as_str()).collect();
+    if !names.is_empty() {
+        remove(&mut document, &names, &mut told)?;
     }
     let list = devices(&mut document)?;
     for section in sections {
@@ -100,7 +116,7 @@ pub fn apply(
     }
     let text = document.to_string();
     config::parse(path, &text).map_err(ApplyError::Wrong)?;
-    Ok(text)
+    Ok(Applied { text, told })
 }
 
 fn devices(document: &mut DocumentMut) -> Result<&mut ArrayOfTables, ApplyError> {
@@ -301,25 +317,32 @@ fn revision(
     }
 }
 
-/// Takes a device out, and everything that names it.
-fn remove(document: &mut DocumentMut, name: &str) -> Result<(), ApplyError> {
-    let named = |table: &Table| table.get("name").and_then(Item::as_str) == Some(name);
+/// Takes devices out, and everything that names them.
+fn remove(
+    document: &mut DocumentMut,
+    names: &[&str],
+    told: &mut Vec<String>,
+) -> Result<(), ApplyError> {
+    let named = |item: Option<&Item>| {
+        let name = item.and_then(Item::as_str);
+        name.is_some_and(|name| names.contains(&name))
+    };
     let list = devices(document)?;
-    list.retain(|table| !named(table));
+    list.retain(|table| !named(table.get("name")));
     for table in list.iter_mut() {
         let sim = table.get_mut("sim").and_then(Item::as_table_like_mut);
         if let Some(sim) = sim
-            && sim.get("after").and_then(Item::as_str) == Some(name)
+            && named(sim.get("after"))
         {
             sim.remove("after");
             sim.remove("port");
         }
     }
     if let Some(steps) = document.get_mut("step") {
-        forget_in_steps(steps, name, DEPTH);
+        forget_in_steps(steps, names, DEPTH, "", told);
     }
-    if let Some(stop) = document.get_mut("stop").and_then(Item::as_table_like_mut) {
-        forget_in_stop(stop, name);
+    if let Some(stop) = document.get_mut("stop") {
+        forget_in_stop(stop, names, told);
     }
     for key in ["step", "stop"] {
         if document.get(key).is_some_and(is_empty) {
@@ -327,6 +350,29 @@ fn remove(document: &mut DocumentMut, name: &str) -> Result<(), ApplyError> {
         }
     }
     Ok(())
+}
+
+/// `` `x` is gone ``
+fn are_gone(names: &[&str]) -> String {
+    let quoted: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
+    let be = if names.len() == 1 { "is" } else { "are" };
+    format!("{} {be} gone", quoted.join(", "))
+}
+
+/// A comment behind what has lost a name, beside the one that is there.
+fn mark(item: &mut Item, gone: &[&str]) {
+    let decor = match item {
+        Item::Value(value) => value.decor_mut(),
+        Item::Table(table) => table.decor_mut(),
+        Item::None | Item::ArrayOfTables(_) => return,
+    };
+    let before = decor.suffix().and_then(|suffix| suffix.as_str());
+    let before = before.unwrap_or_default().trim_end();
+    let text = format!("{} {}", write::MARK, are_gone(gone));
+    decor.set_suffix(match before.trim().is_empty() {
+        true => format!("  # {text}"),
+        false => format!("{before}; {text}"),
+    });
 }
 
 fn is_empty(item: &Item) -> bool {
@@ -340,30 +386,50 @@ fn is_empty(item: &Item) -> bool {
     }
 }
 
-/// A step that only this device took part in goes.
-fn forget_in_steps(steps: &mut Item, name: &str, depth: usize) {
+/// A step that only these devices took part in goes. `outer`: the number of the step that these are in, with a point.
+fn forget_in_steps(
+    steps: &mut Item,
+    names: &[&str],
+    depth: usize,
+    outer: &str,
+    told: &mut Vec<String>,
+) {
     let Some(steps) = steps.as_array_of_tables_mut().filter(|_| depth > 0) else {
         return;
     };
     let mut kept = Vec::with_capacity(steps.len());
-    for step in steps.iter_mut() {
-        kept.push(forget_in_step(step, name, depth));
+    for (n, step) in (1..).zip(steps.iter_mut()) {
+        let number: String = format!("{outer}{n}");
+        let left = forget_in_step(step, names, depth, &number, told);
+        if !left {
+            told.push(format!("step {number} is taken out: nobody is left in it"));
+        }
+        kept.push(left);
     }
     let mut kept = kept.into_iter();
     steps.retain(|_| kept.next().unwrap_or(true));
 }
 
 /// Whether anything is left to be done.
-fn forget_in_step(step: &mut Table, name: &str, depth: usize) -> bool {
+fn forget_in_step(
+    step: &mut Table,
+    names: &[&str],
+    depth: usize,
+    number: &str,
+    told: &mut Vec<String>,
+) -> bool {
     let mut kept = true;
     for (_, item) in step.iter_mut() {
         let before = is_empty(item);
+        let mut gone = Vec::new();
         match item {
-            Item::ArrayOfTables(_) => forget_in_steps(item, name, depth - 1),
-            Item::Value(Value::Array(names)) => names.retain(|n| n.as_str() != Some(name)),
+            Item::ArrayOfTables(_) => {
+                forget_in_steps(item, names, depth - 1, &format!("{number}."), told);
+            }
+            Item::Value(Value::Array(list)) => gone = forget_in_list(list, names),
             _ => {
                 if let Some(axes) = item.as_table_like_mut() {
-                    forget_axis(axes, name);
+                    gone = forget_axes(axes, names);
                 }
                 // The last one before the brace has the blank.
                 let inline = item.as_inline_table_mut();
@@ -374,31 +440,69 @@ fn forget_in_step(step: &mut Table, name: &str, depth: usize) -> bool {
         }
         // Nobody is left to take part.
         kept &= before || !is_empty(item);
+        if !gone.is_empty() && !is_empty(item) {
+            mark(item, &gone);
+        }
     }
     kept
 }
 
-/// An axis' own entry, and those of axes that follow it.
-fn forget_axis(axes: &mut dyn TableLike, name: &str) {
-    axes.remove(name);
-    let follows = |item: &Item| {
-        let gear = item.as_table_like();
-        gear.and_then(|gear| gear.get("to")).and_then(Item::as_str) == Some(name)
-    };
-    let followers: Vec<String> = axes
-        .iter()
-        .filter(|(_, item)| follows(item))
-        .map(|(key, _)| key.to_owned())
-        .collect();
-    for follower in followers {
-        axes.remove(&follower);
-    }
+/// Which of the names were in it.
+fn forget_in_list<'n>(list: &mut Array, names: &[&'n str]) -> Vec<&'n str> {
+    let there = |name: &&&str| list.iter().any(|item| item.as_str() == Some(**name));
+    let gone: Vec<&str> = names.iter().filter(there).copied().collect();
+    list.retain(|item| !item.as_str().is_some_and(|name| gone.contains(&name)));
+    gone
 }
 
-fn forget_in_stop(stop: &mut dyn TableLike, name: &str) {
-    let emergency = stop.get_mut("emergency");
-    if let Some(conditions) = emergency.and_then(Item::as_table_like_mut) {
-        conditions.remove(name);
+/// The axes' own entries, and those of axes that follow them. Which of the names that concerned.
+fn forget_axes<'n>(axes: &mut dyn TableLike, names: &[&'n str]) -> Vec<&'n str> {
+    let mut gone = Vec::new();
+    for name in names {
+        let mut concerned = axes.remove(name).is_some();
+        let follows = |item: &Item| {
+            let gear = item.as_table_like();
+            gear.and_then(|gear| gear.get("to")).and_then(Item::as_str) == Some(name)
+        };
+        let followers: Vec<String> = axes
+            .iter()
+            .filter(|(_, item)| follows(item))
+            .map(|(key, _)| key.to_owned())
+            .collect();
+        for follower in followers {
+            axes.remove(&follower);
+            concerned = true;
+        }
+        if concerned {
+            gone.push(*name);
+        }
+    }
+    gone
+}
+
+fn forget_in_stop(stop: &mut Item, names: &[&str], told: &mut Vec<String>) {
+    // Within braces a comment would hide what closes them.
+    let roomy = stop.is_table();
+    let Some(stop) = stop.as_table_like_mut() else {
+        return;
+    };
+    if let Some(item) = stop.get_mut("emergency") {
+        let mut gone = Vec::new();
+        if let Some(conditions) = item.as_table_like_mut() {
+            for name in names {
+                if conditions.remove(name).is_some() {
+                    gone.push(*name);
+                }
+            }
+        }
+        if !gone.is_empty() && !is_empty(item) && roomy {
+            mark(item, &gone);
+        } else if !gone.is_empty() {
+            told.push(format!(
+                "`[stop] emergency` has lost inputs: {}",
+                are_gone(&gone)
+            ));
+        }
     }
     if stop.get("emergency").is_some_and(is_empty) {
         stop.remove("emergency");
@@ -407,12 +511,26 @@ fn forget_in_stop(stop: &mut dyn TableLike, name: &str) {
     if let Some(groups) = groups {
         for group in groups.iter_mut() {
             for key in ["axes", "devices"] {
-                if let Some(names) = group.get_mut(key).and_then(Item::as_array_mut) {
-                    names.retain(|n| n.as_str() != Some(name));
+                let Some(item) = group.get_mut(key) else {
+                    continue;
+                };
+                let gone = item.as_array_mut().map(|list| forget_in_list(list, names));
+                if let Some(gone) = gone.filter(|gone| !gone.is_empty()) {
+                    mark(item, &gone);
                 }
             }
         }
-        groups.retain(|group| group.get("axes").is_some_and(|axes| !is_empty(axes)));
+        groups.retain(|group| {
+            let kept = group.get("axes").is_some_and(|axes| !is_empty(axes));
+            if !kept {
+                let name = group.get("name").and_then(Item::as_str);
+                let name = name.unwrap_or_default();
+                told.push(format!(
+                    "the group `{name}` is taken out: no axis of it is left"
+                ));
+            }
+            kept
+        });
     }
     if stop.get("group").is_some_and(is_empty) {
         stop.remove("group");

@@ -555,18 +555,39 @@ pub fn load(path: &Path) -> Result<Machine, ConfigError> {
     parse(path, &text)
 }
 
+/// Of a text that is no TOML, as many are told.
+const MOST_SYNTAX_ERRORS: usize = 10;
+
 /// Checks a machine file's text; `path` is what its ESI files are relative to.
 ///
 /// # Errors
 /// Everything that is wrong with it.
 pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
     let mut problems = problem::Problems::new(path, text);
-    let (document, errors) = toml::de::DeTable::parse_recoverable(text);
-    for error in errors {
-        problems.add(error.span().unwrap_or(0..0), error.message());
+    let start = text.trim_start_matches('\u{feff}').trim_start();
+    if start.starts_with('<') {
+        let at = text.len() - start.len();
+        let hint = format!("`ecaxis esi check {}` looks at ESI files", path.display());
+        problems.add_hint(at..at + 1, "this is XML, not a machine file", hint);
+        return Err(problems.into_error());
     }
+    let (document, mut errors) = toml::de::DeTable::parse_recoverable(text);
     // What follows would be guesses about text that has not been understood.
-    if !problems.is_empty() {
+    if !errors.is_empty() {
+        // A table that is written wrong leaves those below it without one, which is then said of each of them.
+        raw::names(&document, &mut problems);
+        if !problems.is_empty() {
+            errors.retain(|error| !error.message().starts_with("duplicate key"));
+        }
+        errors.sort_by_key(|error| error.span().map_or(0, |span| span.start));
+        let more = errors.split_off(errors.len().min(MOST_SYNTAX_ERRORS));
+        for error in &errors {
+            problems.add(error.span().unwrap_or(0..0), error.message());
+        }
+        if let Some(next) = more.first() {
+            let message = format!("… and {} more mistakes from here on", more.len());
+            problems.add(next.span().unwrap_or(0..0), message);
+        }
         return Err(problems.into_error());
     }
     let raw = raw::read(&document, &mut problems);

@@ -109,6 +109,10 @@ impl Link for Claimed {
         self.link.remarks()
     }
 
+    fn lacks(&self) -> Option<&'static str> {
+        self.link.lacks()
+    }
+
     fn finish(self: Box<Self>) -> io::Result<Option<capture::RecordStats>> {
         self.link.finish()
     }

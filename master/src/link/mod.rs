@@ -63,6 +63,11 @@ pub trait Link: fmt::Debug + Send {
         Vec::new()
     }
 
+    /// Why nothing more can come, where the link knows it. Not for the cycle.
+    fn lacks(&self) -> Option<&'static str> {
+        None
+    }
+
     /// Ends a recording that goes on in this link, if there is one. Blocks.
     fn finish(self: Box<Self>) -> std::io::Result<Option<capture::RecordStats>> {
         Ok(None)

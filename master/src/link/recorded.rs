@@ -50,6 +50,10 @@ impl Link for Recorded {
         self.inner.stats()
     }
 
+    fn lacks(&self) -> Option<&'static str> {
+        self.inner.lacks()
+    }
+
     fn remarks(&mut self) -> Vec<String> {
         self.inner.remarks()
     }

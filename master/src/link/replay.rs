@@ -60,9 +60,10 @@ impl fmt::Display for Deviation {
                 "frame {frame} of the recording, datagram {datagram}: byte {offset} of the data is 0x{sent:02x}, recorded is 0x{recorded:02x}"
             ),
             Self::LeftOut { frame, count } => {
+                let plural = if *count == 1 { " was" } else { "s were" };
                 write!(
                     f,
-                    "{count} frames of the recording were not sent, frame {frame} first"
+                    "{count} frame{plural} not sent that the recording has, frame {frame} first"
                 )
             }
             Self::Other {
@@ -101,6 +102,8 @@ pub struct Replay {
     deviations: Vec<Deviation>,
     more: u64,
     too_long: bool,
+    /// Something was sent after the last frame.
+    beyond: bool,
 }
 
 impl Replay {
@@ -158,6 +161,7 @@ impl Replay {
             deviations: Vec::new(),
             more: 0,
             too_long: false,
+            beyond: false,
         })
     }
 
@@ -279,7 +283,10 @@ impl Link for Replay {
                     recorded: short(&next.frame),
                     expected: next.frame.number,
                 },
-                None => Deviation::Beyond { sent },
+                None => {
+                    self.beyond = true;
+                    Deviation::Beyond { sent }
+                }
             };
             self.tell(deviation);
         }
@@ -305,22 +312,33 @@ impl Link for Replay {
         self.under_way.front().map(|(at, _)| *at)
     }
 
+    fn lacks(&self) -> Option<&'static str> {
+        self.beyond.then_some("the recording ends")
+    }
+
+    /// The first deviation says most: what follows mostly follows from it.
     fn remarks(&mut self) -> Vec<String> {
-        let mut remarks: Vec<String> = self.deviations.iter().map(ToString::to_string).collect();
-        if self.more > 0 {
-            remarks.push(format!(
-                "{} further deviations from the recording",
-                self.more
-            ));
+        let mut remarks: Vec<String> = Vec::new();
+        if let Some(first) = self.deviations.first() {
+            remarks.push(format!("the run deviates from the recording: {first}"));
+        }
+        let more = self.deviations.len().saturating_sub(1);
+        match self
+            .more
+            .saturating_add(u64::try_from(more).unwrap_or(u64::MAX))
+        {
+            0 => {}
+            1 => remarks.push("1 further deviation from the recording".to_owned()),
+            more => remarks.push(format!("{more} further deviations from the recording")),
         }
         if self.too_long {
             remarks.push("the recording has frames that no link can carry".to_owned());
         }
         if !self.left.is_empty() {
-            remarks.push(format!(
-                "{} frames of the recording were not sent",
-                self.left.len()
-            ));
+            remarks.push(match self.left.len() {
+                1 => "1 frame of the recording was not sent".to_owned(),
+                n => format!("{n} frames of the recording were not sent"),
+            });
         }
         remarks
     }

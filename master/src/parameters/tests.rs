@@ -64,7 +64,7 @@ fn objects_by_number_and_name() {
         ("0x6064", at(0x6064, None)),
         ("0x6041:00", at(0x6041, Some(0))),
         ("0x1c12:0x0a", at(0x1c12, Some(10))),
-        ("24676:10", at(0x6064, Some(10))),
+        ("24676:10", at(0x6064, Some(16))),
         ("node id", at(0x2000, None)),
         ("Motor", at(0x3001, None)),
         ("sensors", at(0x3000, Some(1))),

@@ -123,6 +123,8 @@ pub struct Remains {
     pub started: Nanos,
     /// The cycles around the stop.
     pub history: History,
+    /// Since when each group has been stopping.
+    pub stops: Vec<Option<Nanos>>,
 }
 
 impl Engine {
@@ -197,6 +199,11 @@ impl Engine {
             diagnoses: self.exchange.diagnoses().to_vec(),
             started: self.started,
             history: self.history,
+            stops: self
+                .groups
+                .iter()
+                .map(|group| group.stop().map(|stop| stop.since))
+                .collect(),
         }
     }
 
@@ -260,6 +267,9 @@ impl Engine {
         let (image, shares) = (self.exchange.inputs(), self.exchange.shares());
         for slot in &mut self.axes {
             let fresh = shares.get(slot.group).is_some_and(|share| share.fresh);
+            if fresh {
+                slot.heard = Some(self.next);
+            }
             let inputs = slot.read(image, fresh);
             slot.axis.observe(&inputs, dt);
             slot.acted = false;

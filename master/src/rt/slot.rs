@@ -17,6 +17,8 @@ pub struct AxisSlot {
     /// Largest following error while enabled, and the status of the last enabled cycle.
     pub largest_following_error: f64,
     pub last_enabled: Option<AxisStatus>,
+    /// The last cycle with fresh inputs was due then.
+    pub heard: Option<Nanos>,
     /// Enabling was ordered and the drive had no fault since: from now on a fault stops its group.
     pub(super) armed: bool,
     pub(super) ordered: bool,
@@ -36,6 +38,7 @@ impl AxisSlot {
             feed: Feed::default(),
             largest_following_error: 0.0,
             last_enabled: None,
+            heard: None,
             armed: false,
             ordered: false,
             rested: 0,

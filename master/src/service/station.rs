@@ -83,6 +83,9 @@ impl Which {
                 wanted: self.to_string(),
                 found: match (self, found.len()) {
                     (_, 1) => "1 answers, at position 0".to_owned(),
+                    (Self::Alias(_), n) if found.iter().all(|f| f.alias == 0) => {
+                        format!("none of the {n} has one")
+                    }
                     (Self::Alias(_), _) => format!("their aliases are {}", aliases(found)),
                     (_, n) => format!("{n} answer, at positions 0 to {}", n.saturating_sub(1)),
                 },

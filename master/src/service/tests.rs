@@ -224,6 +224,13 @@ fn who_is_meant() {
         position(Which::Position(3)),
         Err("no SubDevice has position 3; 3 answer, at positions 0 to 2".to_owned())
     );
+    let nameless = found.get(1..2).map(<[Found]>::to_vec).unwrap_or_default();
+    let nameless = [nameless.clone(), nameless].concat();
+    let none = Which::Alias(7).among(&nameless).map_err(|e| e.to_string());
+    assert_eq!(
+        none.map(|found| found.position),
+        Err("no SubDevice has alias 7; none of the 2 has one".to_owned())
+    );
     assert_eq!(
         position(Which::Alias(7)),
         Err("no SubDevice has alias 7; their aliases are 5, 0, 5".to_owned())

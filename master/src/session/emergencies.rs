@@ -151,7 +151,7 @@ impl Listen for Log {
                 at: received.at,
                 dc_time: sights.and_then(|sights| sights.system_time(received.at)),
             };
-            tracing::warn!(dc_time = report.dc_time, "{report}");
+            tracing::debug!(dc_time = report.dc_time, "{report}");
             self.kept().keep(&report);
             // Nobody listening is no reason to stop.
             let _ = self.told.send(Progress::Emergency(report));

@@ -12,6 +12,7 @@ use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::session::{EmergencyReport, StepRef};
 use crate::supervise::history::DiagnosisMessage;
+use crate::words::counted;
 
 /// A machine or a bus that failed.
 #[derive(Debug, thiserror::Error)]
@@ -225,8 +226,10 @@ impl fmt::Display for DriveReport {
 fn al_note(al_status: Option<(u8, u16)>) -> String {
     match al_status {
         Some((status, count)) => {
+            let answer = if count == 1 { "answers" } else { "answer" };
             format!(
-                "the working counter is wrong; {count} SubDevice(s) answer, AL status 0x{status:02x}"
+                "the working counter is wrong; {} {answer}, AL status 0x{status:02x}",
+                counted(usize::from(count), "SubDevice")
             )
         }
         None => "cyclic frames do not return in time".to_owned(),

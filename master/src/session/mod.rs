@@ -346,6 +346,7 @@ fn prepare_with(
             Ok(Prepared { parts, supervisor })
         }
         Err(error) => {
+            let error = lacking(error, link.as_ref(), "bring-up is over");
             seen.on_the_bus = true;
             // What has panicked may have left anything behind.
             if !matches!(
@@ -527,7 +528,9 @@ fn own_the_link(
         diagnoses,
         started,
         history,
+        stops,
     } = remains;
+    let result = result.map_err(|error| lacking(error, link.as_ref(), "the run does"));
     if result.is_err() {
         go_silent(options.clock, wire.main_device(), link.as_mut(), &mut port);
     }
@@ -562,6 +565,8 @@ fn own_the_link(
         errors: summary::device_errors(machine, &diagnoses),
         events,
         emergencies: log.lines(started),
+        started,
+        stops,
     };
     let summary = Summary::new(machine, options.clock, &axes, &stats, ended, aside);
     Outcome {
@@ -569,6 +574,14 @@ fn own_the_link(
         result,
         stats: Some(Box::new(stats)),
         story,
+    }
+}
+
+/// Where nothing more could come, that is the error.
+fn lacking(error: RunError, link: &dyn Link, before: &str) -> RunError {
+    match link.lacks() {
+        Some(why) => RunError::Replay(format!("{why} before {before}")),
+        None => error,
     }
 }
 

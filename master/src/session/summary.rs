@@ -4,7 +4,7 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Mode, Scale};
 use serde::Serialize;
 
-use crate::clock::Clock;
+use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
 use crate::link::LinkStats;
 use crate::link::capture::RecordStats;
@@ -125,6 +125,10 @@ pub(super) struct Aside {
     pub events: Vec<EventLine>,
     /// And how many more.
     pub emergencies: (Vec<EmergencyLine>, u64),
+    /// The first cycle was due then.
+    pub started: Nanos,
+    /// Since when each group of axes has been stopping.
+    pub stops: Vec<Option<Nanos>>,
 }
 
 /// A group of axes that stopped while the machine went on.
@@ -154,12 +158,22 @@ pub struct AxisSummary {
     pub final_error_counts: Option<i64>,
     pub largest_following_error: f64,
     pub final_state: String,
+    /// Seconds from the first cycle to the last in which the drive was heard, where that was before the axis began to stop: position and
+    /// state are of that time.
+    pub last_heard_s: Option<f64>,
     pub fault: Option<String>,
     pub trip: Option<String>,
 }
 
 fn error_counts(scale: &Scale, status: &AxisStatus) -> i64 {
     ((status.target_position - status.position) * scale.counts_per_unit()).round() as i64
+}
+
+/// `None`: it was heard when the stop began.
+fn silent_since(slot: &AxisSlot, aside: &Aside) -> Option<f64> {
+    let stop = aside.stops.get(slot.group).copied().flatten()?;
+    let heard = slot.heard.unwrap_or(aside.started);
+    (heard < stop).then(|| heard.saturating_sub(aside.started) as f64 * 1e-9)
 }
 
 /// `csp`.
@@ -205,6 +219,7 @@ impl Summary {
                         .then(|| error_counts(&setup.config.scale, &last)),
                     largest_following_error: slot.largest_following_error,
                     final_state: now.state.to_string(),
+                    last_heard_s: silent_since(slot, &aside),
                     fault: now.fault.map(|fault| fault.to_string()),
                     trip: now.trip.map(|trip| trip.to_string()),
                 }

@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use ecaxis::analyze::{self as analysis, Known};
+use ecaxis::analyze::{self as analysis, DeviceReport, Known};
+use ecaxis::words::counted;
 use ecaxis::{config, recording};
 
-use super::{Failure, files, hints, note, result};
+use super::{Failure, files, hints, note, result, unwritable};
 
 mod text;
 
@@ -58,7 +59,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let inputs = inputs.map(|(file, what)| (file.as_path(), what));
         files::may_replace("--html", path, &files::PAGE, inputs)?;
     }
-    let known = known(args)?;
+    let (known, expected) = known(args)?;
     let mut parts = Vec::new();
     for path in &args.files {
         let mut reader = recording::open(path).map_err(|e| {
@@ -78,11 +79,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         .into_owned();
     let readers = parts.into_iter().map(|(_, reader, _)| reader).collect();
     let report = analysis::analyze(readers, args.interface, known);
+    if let Some((file, names)) = &expected
+        && let Some(odd) = other_machine(names, &report.devices)
+    {
+        note(&format!("note: {}: {odd}", file.display()));
+    }
     if let Some(path) = &args.html {
-        std::fs::write(path, analysis::html(&name, &report)).map_err(|e| {
-            let message = format!("cannot write {}: {e}", path.display());
-            Failure::new(hints::WRONG, message)
-        })?;
+        std::fs::write(path, analysis::html(&name, &report)).map_err(|e| unwritable(path, &e))?;
         note(&format!("written: {}", path.display()));
     }
     let text = if args.json {
@@ -100,16 +103,39 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-fn known(args: &Args) -> Result<Known, Failure> {
+/// A machine file, and its devices' names.
+type Expected<'a> = (&'a Path, Vec<String>);
+
+/// Where a machine file is not of the machine that was recorded: devices are only named where position and product fit.
+fn other_machine(names: &[String], devices: &[DeviceReport]) -> Option<String> {
+    let known = |device: &&DeviceReport| {
+        let name = device.name.as_ref();
+        name.is_some_and(|name| names.contains(name))
+    };
+    let fitting = devices.iter().filter(known).count();
+    if fitting == devices.len() && fitting == names.len() {
+        return None;
+    }
+    Some(format!(
+        "of its {}, {fitting} fit the recording, which shows {}: is it of this machine?",
+        counted(names.len(), "device"),
+        devices.len()
+    ))
+}
+
+fn known(args: &Args) -> Result<(Known, Option<Expected<'_>>), Failure> {
     let mut known = Known::default();
+    let mut expected = None;
     if let Some(file) = &args.machine {
         let machine = config::load(file).map_err(|e| hints::config(file, &e))?;
         known = known.with_machine(&machine);
+        let names = machine.devices.into_iter().map(|device| device.name);
+        expected = Some((file.as_path(), names.collect()));
     }
     if let Some(path) = &args.esi {
         let library = analysis::library(path)
             .map_err(|e| Failure::new(hints::WRONG, format!("--esi: {e}")))?;
         known = known.with_library(library);
     }
-    Ok(known)
+    Ok((known, expected))
 }

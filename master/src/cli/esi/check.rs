@@ -3,10 +3,11 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
+use ecaxis::words::counted;
 use ecaxis_esi::{Finding, Severity, lint};
 use serde_json::json;
 
-use super::super::{Failure, hints, note, result};
+use super::super::{Failure, hints, note, page, result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -49,15 +50,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
         text
     };
-    result(&text)?;
-    let devices = super::plural(file.devices.len(), "device");
-    let mut warnings = super::plural(count(Severity::Warning), "warning");
+    if args.json {
+        result(&text)
+    } else {
+        page(&text)
+    }?;
+    let devices = counted(file.devices.len(), "device");
+    let mut warnings = counted(count(Severity::Warning), "warning");
     match count(Severity::Note) {
         0 => {}
-        notes => warnings = format!("{warnings}, {}", super::plural(notes, "note")),
+        notes => warnings = format!("{warnings}, {}", counted(notes, "note")),
     }
     if errors > 0 {
-        let errors = super::plural(errors, "error");
+        let errors = counted(errors, "error");
         let message = format!("{}: {devices}, {errors}, {warnings}", args.file.display());
         return Err(Failure::new(hints::WRONG, message));
     }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use ecaxis::words::counted;
 use ecaxis_esi::sii::{self, Aspect, Difference, Sii, SiiOptions};
 use serde_json::json;
 
@@ -60,7 +61,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let told = format!(
         "{name} against {}: {} of identity, {behaviour} of behaviour, {} of description",
         device.name,
-        super::plural(identity, "difference"),
+        counted(identity, "difference"),
         count(Aspect::Description),
     );
     if identity + behaviour > 0 {

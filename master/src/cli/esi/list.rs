@@ -71,6 +71,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         return result(&format!("{:#}\n", json!(entries)));
     }
+    if entries.is_empty() {
+        let message = format!("{} describes no such device", library.folder().display());
+        return Err(Failure::new(hints::WRONG, message).hint(vendors(&library)));
+    }
     let mut table = Table::new(&["vendor", "product", "revision", "type", "name", "file"]);
     for e in &entries {
         table.row([
@@ -83,6 +87,22 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         ]);
     }
     result(&(table.shown(0) + "\n"))
+}
+
+/// Of whom there is something.
+fn vendors(library: &Library) -> String {
+    let mut all: Vec<String> = library
+        .entries()
+        .iter()
+        .map(|e| format!("0x{:08x} {}", e.vendor, e.vendor_name))
+        .collect();
+    all.sort();
+    all.dedup();
+    match all.len() {
+        0 => "there is no ESI file in it".to_owned(),
+        1 => format!("its only vendor is {}", all.concat()),
+        _ => format!("its vendors are {}", all.join(", ")),
+    }
 }
 
 fn open(args: &Args) -> Result<Library, LoadError> {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Subcommand;
 use ecaxis::config::nearest;
 use ecaxis::library::{self, LoadError};
+use ecaxis::words::counted;
 use ecaxis_esi::{self as esi, Device, DeviceQuery, EsiFile, Mode, SelectError};
 
 use super::{Failure, hints, note};
@@ -154,7 +155,7 @@ impl Which {
             (SelectError::NoSuchDevice { query, .. }, Some(name)) => {
                 let mut types: Vec<&str> = file.devices.iter().map(|d| &*d.type_name).collect();
                 types.dedup();
-                let count = plural(file.devices.len(), "device");
+                let count = counted(file.devices.len(), "device");
                 let failure = failure(format!("none of its {count} matches {query}"));
                 match nearest(name, types.iter().copied()) {
                     Some(known) => failure.hint(format!("did you mean `{known}`?")),
@@ -167,7 +168,7 @@ impl Which {
             (SelectError::NoSuchDevice { .. } | SelectError::Ambiguous { .. }, _) => {
                 let message = match error {
                     SelectError::Ambiguous { .. } if !self.says_which() => {
-                        format!("it describes {}", plural(file.devices.len(), "device"))
+                        format!("it describes {}", counted(file.devices.len(), "device"))
                     }
                     _ => error.to_string(),
                 };
@@ -215,11 +216,4 @@ pub(super) fn number_16(text: &str) -> Result<u16, String> {
 fn mode(text: &str) -> Result<Mode, String> {
     text.parse()
         .map_err(|error: esi::UnknownMode| error.to_string())
-}
-
-fn plural(count: usize, one: &str) -> String {
-    match count {
-        1 => format!("1 {one}"),
-        _ => format!("{count} {one}s"),
-    }
 }

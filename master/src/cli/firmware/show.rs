@@ -11,8 +11,8 @@ const WAYS: [(Via, &str); 2] = [(Via::Foe, "foe"), (Via::Program, "program")];
 type Row = (&'static str, fn(&Examined) -> Option<String>);
 
 const VERSION: [Row; 7] = [
-    ("revision (0x1018:03)", |e| hex(spoken(e)?.identity[2])),
     ("product (0x1018:02)", |e| hex(spoken(e)?.identity[1])),
+    ("revision (0x1018:03)", |e| hex(spoken(e)?.identity[2])),
     ("revision (EEPROM)", |e| {
         hex((!e.in_use).then_some(e.sii.identity.revision))
     }),

@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use super::show;
 use super::target::{self, Where};
 use crate::cli::esi::number;
-use crate::cli::{Failure, bus, hints, note, result, style};
+use crate::cli::{Failure, bus, hints, note, result, screen, style};
 
 /// No program memory of a drive is larger.
 const MOST: u64 = 256 << 20;
@@ -185,7 +185,12 @@ fn read(path: &Path) -> Result<Vec<u8>, Failure> {
     if known.len() > MOST {
         return Err(failed(format!("it has {} bytes", known.len())));
     }
-    std::fs::read(path).map_err(|e| failed(e.to_string()))
+    let file = std::fs::read(path).map_err(|e| failed(e.to_string()))?;
+    if file.is_empty() {
+        return Err(target::wrong(&format!("{} is empty", path.display()))
+            .hint("name the file that the device's maker made for it"));
+    }
+    Ok(file)
 }
 
 fn planned(visited: &Visited, bytes: usize, path: &Path) -> String {
@@ -271,7 +276,9 @@ impl Teller {
             let template =
                 "{msg} {bar:20} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}";
             let style = ProgressStyle::with_template(template);
-            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+            let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+            screen::put_up(&bar);
+            bar
         });
         Self {
             bar,
@@ -285,7 +292,7 @@ impl Teller {
         };
         match (told, &self.bar) {
             (Told::Step(step), Some(bar)) => {
-                bar.suspend(|| note(&step.to_string()));
+                note(&step.to_string());
                 bar.set_message("");
             }
             (Told::Step(step), None) => note(&step.to_string()),
@@ -323,9 +330,7 @@ impl Teller {
     }
 
     fn clear(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
+        screen::take_down();
     }
 }
 

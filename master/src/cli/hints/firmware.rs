@@ -13,7 +13,7 @@ pub(crate) fn shared_bus() -> Failure {
 }
 
 pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
-    let failure = Failure::new(FAILED, error.to_string());
+    let failure = Failure::new(FAILED, message(error));
     match error {
         FirmwareError::Service(error) => service(error, nic),
         FirmwareError::Eeprom { .. } => {
@@ -45,6 +45,20 @@ pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
             failure.hint(again(*left))
         }
     }
+}
+
+/// The error's text, with the device once: what failed at it mostly names it, too.
+fn message(error: &FirmwareError) -> String {
+    let text = error.to_string();
+    let FirmwareError::Failed { device, .. } = error else {
+        return text;
+    };
+    let head = format!("{device}: ");
+    let Some(rest) = text.strip_prefix(&head) else {
+        return text;
+    };
+    let station = format!("station {:#06x}: ", device.station);
+    head.clone() + &rest.replace(&head, "").replace(&station, "")
 }
 
 fn wrong(failure: Failure) -> Failure {

@@ -99,6 +99,27 @@ pub(crate) fn image(error: &WriteError, backup: &Path, nic: &Nic) -> Failure {
     ))
 }
 
+/// Where another MainDevice is at work: it takes answers away, and a drive that it moves must not be switched off.
+pub(crate) fn beside_another(failure: Failure, error: &ServiceError) -> Failure {
+    // What the device refused it has refused to us.
+    let lost = match error {
+        ServiceError::Sdo { source, .. } => source.abort_code().is_none(),
+        ServiceError::Information { source, .. } => !source.is_refusal(),
+        _ => false,
+    };
+    if !lost {
+        return failure;
+    }
+    let hints = [
+        "the other MainDevice uses the same mailbox and takes the answers away: stop it, or have it read and write",
+        "leave the drive switched on while somebody moves it",
+    ];
+    Failure {
+        hints: hints.map(str::to_owned).to_vec(),
+        ..failure
+    }
+}
+
 /// The error's text, with the device's address once: what its mailbox says carries it, too.
 fn message(error: &ServiceError) -> String {
     let text = error.to_string();

@@ -27,7 +27,7 @@ const HELP: &str = "\
 enable [AXIS…]            disable [AXIS…]         all axes where none is named
 jog AXIS VELOCITY         for 0.3 s; again and again for longer
 by AXIS DISTANCE          move AXIS POSITION
-speed PERCENT             of moves, of the velocity limit: 5 at first, 25 at most
+speed PERCENT             of moves, of the velocity limit: first 5, at most 25
 home AXIS                 mode AXIS MODE          reset [AXIS…]
 stop [AXIS…]              brake and hold
 estop                     emergency stop: no motion and no power
@@ -35,6 +35,11 @@ status                    how the axes are
 wait                      until everything asked for is done
 wait DURATION             such as 500ms
 quit                      or the end of the input: stop, disable, bus down";
+
+const VERBS: [&str; 15] = [
+    "enable", "disable", "reset", "stop", "estop", "home", "jog", "by", "move", "mode", "speed",
+    "wait", "status", "help", "quit",
+];
 
 /// A line that is understood.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,6 +98,7 @@ pub(super) fn run(
         speed: SPEED,
         waiting: None,
         began: None,
+        read: 0,
     };
     let outcome = session::run_by_hand(machine, options, stop, &mut teller, Box::new(script));
     drop(teller);
@@ -197,6 +203,8 @@ struct Script {
     /// Until then, or until everything is done.
     waiting: Option<Option<Nanos>>,
     began: Option<Nanos>,
+    /// Lines so far.
+    read: u64,
 }
 
 impl Script {
@@ -255,6 +263,7 @@ impl Operator for Script {
                 Some(Err(RecvError)) => return gone,
                 Some(Ok(line)) => line,
             };
+            self.read = self.read.saturating_add(1);
             self.waiting = None;
             // What follows is judged by what this one does.
             match parse(&line, view, self.speed) {
@@ -273,7 +282,9 @@ impl Operator for Script {
                 Ok(Line::Quit) => return gone,
                 Ok(Line::Nothing) => {}
                 Err(why) => {
-                    if self.fail(hints::WRONG, format!("`{}`: {why}", line.trim())) {
+                    let number = self.read;
+                    let message = format!("line {number}: `{}`: {why}", line.trim());
+                    if self.fail(hints::WRONG, message) {
                         return gone;
                     }
                 }
@@ -391,7 +402,10 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
         "status" => alone(Line::Status),
         "help" => alone(Line::Help),
         "quit" => alone(Line::Quit),
-        _ => Err("not understood; `help` lists what is".to_owned()),
+        _ => Err(match nearest(verb, VERBS) {
+            Some(near) => format!("not understood; did you mean `{near}`?"),
+            None => "not understood; `help` lists what is".to_owned(),
+        }),
     }
 }
 

@@ -1,11 +1,15 @@
 //! What was found, for people.
 
 use ecaxis::al_status::al_status_text;
-use ecaxis::scan::{Described, Device, registers};
+use ecaxis::scan::{Answers, Described, Device, registers};
+use ecaxis_axis::VelocityUnit;
 use ecaxis_esi as esi;
 
 use super::super::table::Table;
 use super::Seen;
+
+/// A page for what has long cells.
+const PAGE: usize = 80;
 
 /// As its ESI or its EEPROM calls it.
 pub(super) fn type_name(device: &Device, described: Option<&Described>) -> String {
@@ -31,6 +35,9 @@ pub(super) fn tables(seen: &Seen) -> String {
     let mut text = head(seen);
     for table in [identities(seen), places(seen), descriptions(seen)] {
         text += &format!("\n{}\n", table.shown(2));
+    }
+    if seen.scan.asked {
+        text += &asked(seen);
     }
     text + &notes(seen)
 }
@@ -124,6 +131,121 @@ fn descriptions(seen: &Seen) -> Table {
     table
 }
 
+/// What devices said over their mailboxes.
+fn asked(seen: &Seen) -> String {
+    let mut all = Table::new(&["pos", "name", "hardware", "software", "modules"]);
+    let mut drives = Table::new(&[
+        "pos",
+        "modes",
+        "counts/turn",
+        "velocity in",
+        "position range",
+        "speed",
+        "torque",
+        "window",
+    ]);
+    let (mut some, mut any_drive) = (false, false);
+    for (device, described) in seen.devices() {
+        let Some(Ok(answers)) = &device.answers else {
+            continue;
+        };
+        some = true;
+        let position = device.position().to_string();
+        all.row([
+            &position,
+            &or_dash(answers.name.clone()),
+            &or_dash(answers.hardware.clone()),
+            &or_dash(answers.software.clone()),
+            &or_dash(modules(answers, described)),
+        ]);
+        let Some(drive) = &answers.drive else {
+            continue;
+        };
+        any_drive = true;
+        let counts = drive.units.counts_per_turn().map(|(_, counts)| counts);
+        let velocity = drive.units.velocity_unit;
+        drives.row([
+            &position,
+            &or_dash(drive.supported_modes.map(mode_names)),
+            &or_dash(counts),
+            &or_dash(velocity.map(|code| match VelocityUnit::from_si_code(code) {
+                Some(unit) => unit.to_string(),
+                None => format!("0x{code:08x}"),
+            })),
+            &or_dash(drive.software_limits.map(range)),
+            &or_dash(drive.max_motor_speed.map(|rpm| format!("{rpm} rpm"))),
+            &or_dash(
+                drive
+                    .max_torque
+                    .map(|n| format!("{} %", f64::from(n) / 10.0)),
+            ),
+            &or_dash(drive.following_window),
+        ]);
+    }
+    let mut text = String::new();
+    if some {
+        text += &format!("\n{}\n", all.within(2, PAGE));
+    }
+    if any_drive {
+        text += &format!(
+            "\n{}\n  ranges and windows in counts; 0x6502, 0x608F, 0x60A9, 0x607D, 0x6080, 0x6072,\n  0x6065\n",
+            drives.within(2, PAGE)
+        );
+    }
+    text
+}
+
+/// A drive that may go through all that it can count has no ends.
+fn range([low, high]: [i32; 2]) -> String {
+    match i64::from(high) - i64::from(low) {
+        wide if wide >= i64::from(i32::MAX) => "no ends".to_owned(),
+        _ => format!("{low} to {high}"),
+    }
+}
+
+/// What is plugged, else what the device was told of; by their names where the ESI file has them.
+fn modules(answers: &Answers, described: Option<&Described>) -> Option<String> {
+    let lists = [&answers.detected, &answers.configured];
+    let plugged = |idents: &&Vec<u32>| idents.iter().any(|ident| *ident != 0);
+    let idents = lists.into_iter().flatten().find(plugged)?;
+    let end = idents.iter().rposition(|ident| *ident != 0)?;
+    let known = |ident: u32| {
+        let mut modules = described.into_iter().flat_map(|d| &d.file.modules);
+        modules.find(|module| module.ident == ident)
+    };
+    let names = idents
+        .iter()
+        .take(end + 1)
+        .map(|ident| match known(*ident) {
+            _ if *ident == 0 => "-".to_owned(),
+            Some(module) => module.type_name.to_string(),
+            None => format!("0x{ident:08x}"),
+        });
+    Some(names.collect::<Vec<_>>().join(" "))
+}
+
+/// 0x6502 (CiA 402-2, supported drive modes).
+fn mode_names(bits: u32) -> String {
+    const NAMES: [(u32, &str); 10] = [
+        (0, "pp"),
+        (1, "vl"),
+        (2, "pv"),
+        (3, "tq"),
+        (5, "hm"),
+        (6, "ip"),
+        (7, "csp"),
+        (8, "csv"),
+        (9, "cst"),
+        (10, "cstca"),
+    ];
+    let named = NAMES.iter().filter(|(bit, _)| bits >> bit & 1 != 0);
+    let names: Vec<&str> = named.map(|(_, name)| *name).collect();
+    match names.is_empty() {
+        true => format!("0x{bits:08x}"),
+        false => names.join(" "),
+    }
+}
+
 /// The ESI's revision beside the device's.
 fn fit(device: &Device, described: &Described) -> String {
     let ours = described.device.identity.revision;
@@ -208,6 +330,11 @@ pub(super) fn tree(seen: &Seen) -> String {
         facts.extend(device.delay_ns.map(|ns| format!("{ns} ns")));
         if is_drive(device, described) {
             facts.push("axis".to_owned());
+        }
+        if let Some(Ok(answers)) = &device.answers {
+            let software = answers.software.as_ref();
+            facts.extend(software.map(|version| format!("software {version}")));
+            facts.extend(modules(answers, described).map(|names| format!("modules {names}")));
         }
         text += &format!("{line} ({})\n", facts.join(", "));
     }

@@ -9,7 +9,7 @@ use ecaxis::service::ServiceError;
 use ecaxis_esi::Object;
 use serde_json::json;
 
-use super::super::device::Open;
+use super::super::device::{Open, address};
 use super::super::{Failure, hints, note, result};
 use super::{Common, Line, wanted};
 
@@ -54,14 +54,23 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     let to_file = args.to.is_some();
     let read = target.open("reading objects", async move |open: &mut Open<'_>| {
         let mut out = Vec::new();
+        let mut refused = Vec::new();
         for (wanted, object) in describe(open, ask, &objects).await? {
+            let before = out.len();
             if complete {
                 out.extend(whole(open, wanted, object.as_ref(), data_type).await?);
-                continue;
+            } else {
+                for (at, name, known) in parts(wanted, object.as_ref()) {
+                    let value = open.read(at.index, at.sub).await?;
+                    out.push((at, name, data_type.or(known), value));
+                }
             }
-            for (at, name, known) in parts(wanted, object.as_ref()) {
-                let value = open.read(at.index, at.sub).await?;
-                out.push((at, name, data_type.or(known), value));
+            let new = out.get(before..).unwrap_or_default();
+            if let Some(wrong) = data_type.and_then(|given| misfit(given, new)) {
+                return Err(wrong);
+            }
+            if new.iter().all(|(.., value)| value.is_err()) {
+                refused.push(wanted.to_string());
             }
         }
         // One value that is refused is why somebody asked; among others it is one of them.
@@ -79,9 +88,10 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
                 Err(Failure::new(hints::WRONG, "a file takes one subindex")
                     .hint("name it: 0x1018:01"))
             }
-            _ => Ok(out),
+            _ => Ok((out, refused)),
         }
     })?;
+    let (read, refused) = read;
     if let (Some(path), [(_, _, _, Ok(value))]) = (&args.to, read.as_slice()) {
         super::super::keep(path, value)?;
         note(&format!("{}: {} bytes", path.display(), value.len()));
@@ -98,9 +108,33 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
             })
         });
         let all: serde_json::Value = each.collect();
-        return result(&format!("{all:#}\n"));
+        result(&format!("{all:#}\n"))?;
+    } else {
+        result(&super::lines(&lines))?;
     }
-    result(&super::lines(&lines))
+    if refused.is_empty() {
+        return Ok(());
+    }
+    let message = format!("the device refused {}", refused.join(", "));
+    Err(Failure::new(hints::FAILED, message).hint("`ecaxis sdo list` shows what it has"))
+}
+
+/// A value that is not as long as the type that it should be taken for.
+fn misfit(given: DataType, values: &[Read]) -> Option<Failure> {
+    let width = given.width()?;
+    let bytes = |n: usize| format!("{n} byte{}", if n == 1 { "" } else { "s" });
+    values.iter().find_map(|(at, .., value)| {
+        let found = value.as_ref().ok()?.len();
+        let message = format!(
+            "{} has {}, a {given} has {width}",
+            address(*at),
+            bytes(found)
+        );
+        (found != width).then(|| {
+            Failure::new(hints::WRONG, message)
+                .hint("leave `--type` out, or give a type of that length; `--type bytes` takes any")
+        })
+    })
 }
 
 type Read = (

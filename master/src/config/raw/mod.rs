@@ -3,6 +3,8 @@
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
+use ecaxis_esi::Address;
+
 use super::fields::{self, Fields};
 use super::problem::{Problems, Span};
 use super::sim::{self, RawSim};
@@ -122,6 +124,15 @@ pub(crate) enum SdoValue {
 }
 
 type Value<'d> = &'d Spanned<DeValue<'d>>;
+
+/// Tables and keys of the whole file that are none.
+pub(crate) fn names(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) {
+    let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
+    for known in ["repeat", "enable", "bus", "device", "stop", "step"] {
+        let _ = f.get(known);
+    }
+    f.done(p);
+}
 
 pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> RawMachine {
     let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
@@ -308,11 +319,11 @@ pub(crate) fn read_entries(
             continue;
         };
         let (index, sub) = text.split_once(':').unwrap_or((text, "0"));
-        let sub = i64::from_str_radix(sub.trim().trim_start_matches("0x"), 16).ok();
+        let sub = Address::sub_of(sub);
         let index = fields::unquoted(index)
             .and_then(|i| u16::try_from(i).ok())
             .filter(|i| *i > 0);
-        match (index, sub.and_then(|s| u8::try_from(s).ok())) {
+        match (index, sub) {
             (Some(index), Some(sub)) => entries.push(RawEntry { span, index, sub }),
             _ => p.add_hint(
                 span,

@@ -6,11 +6,12 @@
 use std::fmt::Write;
 
 use ecaxis::config::duration;
+use ecaxis::words::counted;
 use ecaxis_esi::{Choice, EsiFile, Mode, SelectError, offered_modes, select};
 
 use super::super::report::Table;
-use super::super::{Failure, hints, note, result};
-use super::{Which, plural};
+use super::super::{Failure, hints, note, page, result};
+use super::Which;
 
 mod as_json;
 mod chosen;
@@ -64,7 +65,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let mut out = String::new();
         // Writing into a String cannot fail.
         let _ = devices(&file, &mut out);
-        return result(&out);
+        return page(&out);
     }
     let device = args.which.device(&file)?;
     let modules: Vec<&str> = args.modules.iter().map(String::as_str).collect();
@@ -116,7 +117,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
         _ => {}
     }
-    result(&out)
+    page(&out)
 }
 
 fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
@@ -125,8 +126,8 @@ fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
         "{} (0x{:08x}): {}, {}\n",
         file.vendor.name,
         file.vendor.id,
-        plural(file.devices.len(), "device"),
-        plural(file.modules.len(), "module"),
+        counted(file.devices.len(), "device"),
+        counted(file.modules.len(), "module"),
     )?;
     if file.devices.is_empty() {
         return modules(file, out);

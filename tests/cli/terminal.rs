@@ -1,0 +1,142 @@
+//! What stands on a terminal of 80 columns.
+
+#![allow(clippy::print_stdout, reason = "a skipped test says why")]
+
+use std::process::{Command, Stdio};
+
+use super::common::root;
+
+/// The program's whole output, stdout and stderr as they come, and its exit code. `None`, with the reason printed, where there is no `script`.
+fn on_terminal(arguments: &str) -> Option<(i32, String)> {
+    let there = Command::new("script").arg("--version").output().is_ok();
+    assert!(
+        there || std::env::var_os("CI").is_none(),
+        "no `script` on CI"
+    );
+    if !there {
+        println!("skipped: there is no `script`, which makes terminals");
+        return None;
+    }
+    let program = env!("CARGO_BIN_EXE_ecaxis");
+    let line = format!("stty cols 80 rows 24; {program} {arguments}");
+    let output = Command::new("script")
+        .args(["-qec", &line, "/dev/null"])
+        .current_dir(root())
+        .env("TERM", "xterm")
+        .env_remove("COLUMNS")
+        .env_remove("NO_COLOR")
+        .stdin(Stdio::null())
+        .output()
+        .expect("it runs");
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    Some((output.status.code().expect("an exit code"), text))
+}
+
+/// Without escape sequences; each way back to the line's beginning begins another.
+fn lines(text: &str) -> Vec<String> {
+    let mut plain = String::new();
+    let mut rest = text.chars();
+    while let Some(c) = rest.next() {
+        match c {
+            '\u{1b}' => {
+                // CSI sequences end with a letter.
+                let _ = rest.by_ref().skip(1).find(char::is_ascii_alphabetic);
+            }
+            '\r' => plain.push('\n'),
+            c => plain.push(c),
+        }
+    }
+    plain
+        .lines()
+        .map(|line| line.trim_end().to_owned())
+        .collect()
+}
+
+#[test]
+fn no_line_is_wider_than_the_terminal() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let silent = folder.path().join("silent.toml");
+    let script = "[[fault]]\nkind = \"power-off\"\nat = \"1s\"\ndevice = 1\n";
+    std::fs::write(&silent, script).expect("written");
+    let abort = folder.path().join("abort.toml");
+    let script =
+        "[[fault]]\nkind = \"sdo-abort\"\ndevice = 0\nindex = 0x60c2\nsub = 1\ncode = 0x06090030\n";
+    std::fs::write(&abort, script).expect("written");
+    let (silent, abort) = (silent.display(), abort.display());
+    let table = [
+        (0, "sdo list configs/demo.toml x --sim".to_owned()),
+        (0, "esi objects configs/esi/EPOS4.xml --mode csp".to_owned()),
+        (0, "check configs/commissioning.toml".to_owned()),
+        (0, "explain configs/groups.toml".to_owned()),
+        (0, "explain configs/commissioning.toml".to_owned()),
+        (0, "run configs/demo.toml --sim --virtual".to_owned()),
+        (
+            1,
+            format!("run configs/demo.toml --sim --virtual --faults {silent}"),
+        ),
+        (
+            1,
+            format!("run configs/demo.toml --sim --virtual --faults {abort}"),
+        ),
+        (
+            1,
+            "compare configs/demo.toml --sim configs/commissioning.toml".to_owned(),
+        ),
+        (0, "scan --sim configs/commissioning.toml --ask".to_owned()),
+        (2, "check configs/no-such.toml".to_owned()),
+        (1, "sdo write configs/demo.toml x 0x6041 1 --sim".to_owned()),
+        (1, "sdo read configs/demo.toml x 0x5fff --sim".to_owned()),
+    ];
+    for (expected, line) in table {
+        let Some((code, text)) = on_terminal(&line) else {
+            return;
+        };
+        assert_eq!(code, expected, "{line}: {text}");
+        assert!(text.lines().count() > 1, "{line}: {text}");
+        for one in lines(&text) {
+            assert!(one.chars().count() <= 80, "{line}: `{one}`");
+        }
+    }
+}
+
+/// Emergencies, warnings and what Ctrl-C says each have lines of their own, beside the one that is written over.
+#[test]
+fn lines_that_stay_do_not_mix_with_the_one_that_passes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let faults = folder.path().join("emergency.toml");
+    let script = "[[fault]]\nkind = \"emergency\"\nat = \"1s\"\ndevice = 1\ncode = 0x8611\n";
+    std::fs::write(&faults, script).expect("written");
+    // A computer that is busy with tests stalls for longer than a machine may.
+    let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
+    let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
+    let esi = root().join("configs/esi");
+    let calm = calm.replace("\"esi/", &format!("\"{}/", esi.display()));
+    let machine = folder.path().join("m.toml");
+    std::fs::write(&machine, calm).expect("written");
+    let line = format!(
+        "run {} --sim --for 60s --faults {} & sleep 6; kill -INT $!; wait $!",
+        machine.display(),
+        faults.display()
+    );
+    let Some((_, text)) = on_terminal(&line) else {
+        return;
+    };
+    let lines = lines(&text);
+    // The summary lists them once more.
+    let meanwhile = lines
+        .iter()
+        .take_while(|line| !line.contains("complete run"));
+    let meanwhile: Vec<&String> = meanwhile.collect();
+    let having = |part: &str| -> Vec<&String> {
+        let these = meanwhile.iter().filter(|line| line.contains(part));
+        these.copied().collect()
+    };
+    let [emergency] = having("0x8611")[..] else {
+        panic!("not told once:\n{text}");
+    };
+    assert!(emergency.starts_with("warning: `y`: "), "{emergency}");
+    assert_eq!(
+        having("stopping; once more"),
+        ["stopping; once more to leave at once"]
+    );
+}
