@@ -88,7 +88,7 @@ fn a_velocity_unit_that_the_file_says_and_the_drive_does_not_is_refused() {
         format!("{HEAD}{AXIS}{MOVE}").replace("encoder =", "velocity_unit = \"mrpm\"\nencoder =");
     let (error, summary) = run_badly(machine(&text), virtual_time());
     assert!(
-        error.contains("`x` (position 0, station 0x1000): the drive's units are not those of the machine file: 0x60A9:00 is 0x00B44700 (rpm), expected mrpm"),
+        error.contains("`x` (position 0, station 0x1000): the drive's units are not those of the machine file: 0x60a9:00 is 0x00B44700 (rpm), expected mrpm"),
         "{error}"
     );
     assert!(summary.is_none(), "nothing has moved");
@@ -150,7 +150,7 @@ fn another_encoder_is_refused() {
     };
     let error = run_with("2000").expect_err("twice the way").to_string();
     assert!(
-        error.contains("0x608F:01 makes 4096 counts per motor turn, expected 2000"),
+        error.contains("0x608f:01 makes 4096 counts per motor turn, expected 2000"),
         "{error}"
     );
     run_with("4096").expect("the same encoder");
@@ -164,11 +164,11 @@ fn a_drive_that_inverts_is_warned_of_and_one_that_inverts_half_is_refused() {
         panic!("{warnings:?}")
     };
     assert!(
-        warning.contains("0x607E:00 is 0xC0, expected 0x00: set 0x607E to 0"),
+        warning.contains("0x607e:00 is 0xC0, expected 0x00: set 0x607E to 0"),
         "{warning}"
     );
     let (error, _) = run_badly(with_object(&polarity("128"), &text), virtual_time());
-    assert!(error.contains("0x607E:00 is 0x80"), "{error}");
+    assert!(error.contains("0x607e:00 is 0x80"), "{error}");
 }
 
 #[test]
