@@ -465,7 +465,7 @@ fn a_device_s_own_interpolation_time_yields_to_the_bus_cycle() {
     assert_eq!(times, [(0x60c2, 1, 25), (0x60c2, 2, 0xfb)]);
     let left_out = |selection: &Selection| {
         let notes = selection.notes.iter();
-        notes.filter(|note| note.contains("0x60C2:01")).count()
+        notes.filter(|note| note.contains("0x60c2:01")).count()
     };
     assert_eq!(left_out(&selection), 1, "{:?}", selection.notes);
     // Where nothing follows from the cycle, the maker's value stays.

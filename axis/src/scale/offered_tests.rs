@@ -156,7 +156,7 @@ fn contradictions() {
         };
         assert_eq!(one.object(), object, "{one}");
         assert!(one.to_string().contains(text), "{one}");
-        assert!(one.to_string().starts_with(&format!("0x{:04X}:", object.0)));
+        assert!(one.to_string().starts_with(&format!("0x{:04x}:", object.0)));
         assert!(!one.advice().is_empty());
     }
     // Other bits of the polarity, and a feed of 1, mean nothing here.
