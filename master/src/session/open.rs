@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use ecaxis_esi::sii::{self, SiiOptions};
 use ecaxis_esi::{Device, Slots};
 
 use ecaxis_sim::network::topology::media;
@@ -189,6 +190,14 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
         options.plant.track = device.sim.track.track;
     }
     let hardware = plugged(device);
+    if let Cow::Owned(_) = hardware {
+        // Whatever is plugged, the EEPROM is as it left the factory.
+        let own = SiiOptions {
+            serial: options.serial,
+            alias: options.alias,
+        };
+        options.sii = Some(sii::emit(&device.device, &device.esi.modules, &own));
+    }
     SimDevice::from_esi(&hardware, &device.esi.modules, options)
         .map_err(|error| RunError::Sim(format!("`{}`: {error}", device.name)))
 }
