@@ -56,8 +56,6 @@ class Device:
     in_dictionary: bool = False
     # What a machine file has to name because no module is the default.
     modules: list = field(default_factory=list)
-    # Out and in, with those modules in their slots.
-    plugged_bits: list = field(default_factory=list)
 
     @property
     def identity(self):
@@ -152,14 +150,14 @@ def default_modules(root, device):
 
 def placeholders(root, device):
     """The first module of every slot that needs one."""
-    modules = {ident(module): module for module in root.iter("Module")}
-    chosen = []
+    types = {ident(module): " ".join(module.findtext("Type").split()) for module in root.iter("Module")}
+    names = []
     for slot in device.findall("Slots/Slot"):
         idents = slot.findall("ModuleIdent")
         if any(flag(e, "Default") for e in idents) or not int(slot.get("MinInstances", "0")):
             return []
-        chosen += [modules[number(idents[0].text)]] * int(slot.get("MinInstances"))
-    return chosen
+        names += [types[number(idents[0].text)]] * int(slot.get("MinInstances"))
+    return names
 
 
 def read(root, element):
@@ -197,30 +195,20 @@ def read(root, element):
     areas = [next((sm[:2] for sm in device.sms if sm[4] == kind), None) for kind in (1, 2)]
     if all(areas):
         device.mailbox = (*areas[0], *areas[1])
-    named = placeholders(root, element)
-    device.modules = [" ".join(module.findtext("Type").split()) for module in named]
+    device.modules = placeholders(root, element)
     slots = element.find("Slots")
     modules = list(default_modules(root, element))
-
-    def placed(direction, modules):
-        found = []
+    for direction in ("Rx", "Tx"):
+        own = pdos(element, f"{direction}Pdo")
+        placed = []
         for module, place in modules:
             shift = place * number(slots.get("SlotPdoIncrement", "0"))
             moved = place * number(slots.get("SlotIndexIncrement", "0"))
-            found += pdos(module, f"{direction}Pdo", shift, moved)
-        return found
-
-    def all_of(own, added):
-        replaced = {pdo.index for pdo, *_ in added}
-        return unassign([p for p in own if not (p[2] and p[0].index in replaced)] + added)
-
-    for direction in ("Rx", "Tx"):
-        own, added = pdos(element, f"{direction}Pdo"), placed(direction, modules)
-        device.of_modules |= not {pdo.index for pdo, *_ in added} <= {pdo.index for pdo, *_ in own}
-        setattr(device, direction.lower(), all_of(own, added))
-        # What is plugged besides is not in the EEPROM; over CoE the device tells it.
-        plugged = all_of(own, added + placed(direction, zip(named, range(len(named)))))
-        device.plugged_bits.append(sum(pdo.bits for pdo in plugged if pdo.sm is not None))
+            placed += pdos(module, f"{direction}Pdo", shift, moved)
+        replaced = {pdo.index for pdo, *_ in placed}
+        kept = [p for p in own if not (p[2] and p[0].index in replaced)]
+        device.of_modules |= not replaced <= {pdo.index for pdo, *_ in own}
+        setattr(device, direction.lower(), unassign(kept + placed))
     indices = [number(o.findtext("Index")) for o in element.iter("Object")]
     device.in_dictionary = not device.rx + device.tx and any(0x1600 <= n < 0x1C00 for n in indices)
     return device

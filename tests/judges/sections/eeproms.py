@@ -190,7 +190,7 @@ def by_soem(d, machine, found, images):
         assigned = [p for p in esi.rx + esi.tx if p.sm is not None]
         bits = tuple(sum(p.bits for p in pdos if p.sm is not None) for pdos in (esi.rx, esi.tx))
         d.compare("PDO bits", device, got.bits, bits)
-        d.compare("bits mapped", device, got.mapped[:2], tuple(esi.plugged_bits))
+        d.compare("bits mapped", device, got.mapped[:2], bits)
         d.compare("PDOs", device, [(p[2], p[1]) for p in got.pdos], [(p.index, p.sm) for p in assigned])
         for p, own in zip(got.pdos, assigned):
             d.compare("PDO names", device, p[3], own.name, text_same(SOEM_NAME))
@@ -287,7 +287,8 @@ def by_pysoem(bench, d, machine):
             _, esi = device
             if esi.in_dictionary:
                 continue
-            sizes = tuple(-(-n // 8) for n in esi.plugged_bits)
+            bits = [sum(p.bits for p in pdos if p.sm is not None) for pdos in (esi.rx, esi.tx)]
+            sizes = tuple(-(-n // 8) for n in bits)
             d.compare("bytes out and in", device, (len(slave.output), len(slave.input)), sizes)
 
 
