@@ -284,9 +284,19 @@ fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<
 
 #[test]
 fn an_interruption_in_motion_brings_the_axes_to_rest() {
-    let (summary, result) = interrupted(
-        |progress| matches!(progress, Progress::Status(status) if status.axes[0].position > 5.0),
-    );
+    let in_motion = |progress: &Progress| matches!(progress, Progress::Status(status) if status.axes[0].position > 5.0);
+    let mut tries = 0;
+    let (summary, result) = loop {
+        let (summary, result) = interrupted(in_motion);
+        tries += 1;
+        // A computer that wakes up half a cycle late reads positions of two cycles in one; then once more.
+        let stalled = summary
+            .as_ref()
+            .is_some_and(|summary| summary.wake_up_lateness.max_ns > 500_000);
+        if result.is_ok() || !stalled || tries == 5 {
+            break (summary, result);
+        }
+    };
     result.expect("an orderly stop");
     let summary = summary.expect("the cycle ran");
     assert!(summary.interrupted);
