@@ -473,6 +473,15 @@ fn reports_are_written_over_nothing_but_reports() {
         assert!(output.status.success(), "{output:?}");
         assert!(files.read("report.html").starts_with(b"<!DOCTYPE html>"));
     }
+    let story = [
+        "run",
+        "configs/demo.toml",
+        "--sim",
+        "--virtual",
+        "--story",
+        &notes,
+    ];
+    files.keeps("notes.txt", &story, &["--story", "is not a fault story"]);
     // The figures of a bench, and its report; before anything is measured.
     let both = [
         "bench",

@@ -10,7 +10,7 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::os::unix::fs::{FileTypeExt, MetadataExt, chown};
 use std::path::{Path, PathBuf};
 
-use super::{Failure, hints};
+use super::{Failure, hints, story};
 
 /// Names that are tried for a file beside another.
 const NAMES: u32 = 1000;
@@ -63,27 +63,60 @@ fn folder(path: &Path) -> &Path {
 /// What may be written over: a file of the kind that is written.
 #[derive(Debug)]
 pub(crate) struct Kind {
-    /// How every such file begins.
-    begins: &'static [u8],
+    /// What shows it.
+    sign: Sign,
     what: &'static str,
     pub instead: &'static str,
 }
 
+#[derive(Debug)]
+enum Sign {
+    /// Every such file begins with it.
+    Begins(&'static [u8]),
+    /// It is among the first of every such file's bytes.
+    Early(&'static str),
+}
+
+/// Bytes among which [`Sign::Early`] is.
+const EARLY: usize = 4096;
+
+impl Sign {
+    fn within(&self) -> usize {
+        match self {
+            Self::Begins(bytes) => bytes.len(),
+            Self::Early(_) => EARLY,
+        }
+    }
+
+    fn shows(&self, head: &[u8]) -> bool {
+        match self {
+            Self::Begins(bytes) => head == *bytes,
+            Self::Early(text) => String::from_utf8_lossy(head).contains(text),
+        }
+    }
+}
+
 /// pcapng, in either byte order.
 pub(crate) const RECORDING: Kind = Kind {
-    begins: &[0x0a, 0x0d, 0x0d, 0x0a],
+    sign: Sign::Begins(&[0x0a, 0x0d, 0x0d, 0x0a]),
     what: "a recording (pcapng)",
     instead: "name a new file, or a recording to write over",
 };
 pub(crate) const PAGE: Kind = Kind {
-    begins: b"<!DOCTYPE html>",
+    sign: Sign::Begins(b"<!DOCTYPE html>"),
     what: "a report (HTML)",
     instead: "name a new file, or a report to write over",
 };
 pub(crate) const FIGURES: Kind = Kind {
-    begins: b"{",
+    sign: Sign::Begins(b"{"),
     what: "a file of figures (JSON)",
     instead: "name a new file, or a file of figures to write over",
+};
+
+pub(crate) const STORY: Kind = Kind {
+    sign: Sign::Early(story::ENDED_WITH),
+    what: "a fault story",
+    instead: "name a new file, or a story to write over",
 };
 
 /// Whether `target`, which `option` names, may be written over; `inputs` are read, and what they are.
@@ -148,10 +181,10 @@ pub(crate) fn existing(target: &Path, kind: &Kind) -> io::Result<Existing> {
         return Ok(Existing::Free);
     }
     let file = OpenOptions::new().read(true).write(true).open(target)?;
-    let most = u64::try_from(kind.begins.len()).unwrap_or(u64::MAX);
+    let most = u64::try_from(kind.sign.within()).unwrap_or(u64::MAX);
     let mut head = Vec::new();
     file.take(most).read_to_end(&mut head)?;
-    if head.is_empty() || head == kind.begins {
+    if head.is_empty() || kind.sign.shows(&head) {
         return Ok(Existing::Free);
     }
     taken(&format!("exists and is not {}", kind.what))
@@ -298,14 +331,16 @@ mod tests {
         let page = file("page.html", b"<!DOCTYPE html>\n<html>");
         let figures = file("figures.json", b"{\n}");
         let recording = file("run.pcapng", b"\n\r\r\n and more");
+        let story = file("story", b"`y` is gone\n\nThe run ended with: nothing\n");
         let notes = file("notes", b"dear diary");
         let new = folder.path().join("new");
         for (kind, own) in [
             (&PAGE, &page),
             (&FIGURES, &figures),
             (&RECORDING, &recording),
+            (&STORY, &story),
         ] {
-            for target in [&page, &figures, &recording, &notes, &new] {
+            for target in [&page, &figures, &recording, &story, &notes, &new] {
                 let done = may_replace("--x", target, kind, []);
                 let free = target == own || *target == new;
                 assert_eq!(done.is_ok(), free, "{kind:?}, {}", target.display());

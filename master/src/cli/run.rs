@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 
 use super::progress::Teller;
 use super::story::{self, Keep};
-use super::{Failure, check, hints, note, page, record, report, result, signals};
+use super::{Failure, check, files, hints, note, page, record, report, result, signals};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -235,6 +235,10 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         if args.record_limit.is_some() {
             record::check_parts(path)?;
         }
+    }
+    if let Some(path) = &args.story {
+        files::may_replace("--story", path, &files::STORY, [])?;
+        files::may_replace("--story", &path.with_extension("json"), &files::FIGURES, [])?;
     }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();

@@ -59,11 +59,14 @@ fn paragraph(text: &str, indent: usize) -> String {
     out
 }
 
+/// Begins the second paragraph of every page.
+pub(crate) const ENDED_WITH: &str = "The run ended with: ";
+
 /// The whole page. The first line says which device and which cause.
 pub(crate) fn page(story: &Story, hints: &[String]) -> String {
     let mut text = paragraph(&story.headline, 0);
     text += "\n";
-    text += &paragraph(&format!("The run ended with: {}", story.error), 0);
+    text += &paragraph(&format!("{ENDED_WITH}{}", story.error), 0);
     let mut when = format!(
         "{}, cycle {}",
         story.machine,
