@@ -376,27 +376,22 @@ fn an_eeprom_is_written_to_its_last_word_or_not_at_all() {
     }
 }
 
-/// A wire that is cut after so many words.
-struct Cut<'w> {
+/// A wire on which datagrams get lost: before each of them it asks, with the register and what is to be written there.
+struct Lossy<'w, F> {
     wire: &'w Datagrams,
-    left: Cell<usize>,
-    cut: Cell<bool>,
+    loses: F,
 }
 
-impl Wire for Cut<'_> {
+impl<F: Fn(u16, Option<&[u8]>) -> bool> Wire for Lossy<'_, F> {
     async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
-        match self.cut.get() {
+        match (self.loses)(register, None) {
             true => Err(WireError::Timeout { station, register }),
             false => self.wire.read(station, register, buf).await,
         }
     }
 
     async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
-        if register == 0x0508 {
-            self.cut.set(self.cut.get() || self.left.get() == 0);
-            self.left.set(self.left.get().saturating_sub(1));
-        }
-        match self.cut.get() {
+        match (self.loses)(register, Some(data)) {
             true => Err(WireError::Timeout { station, register }),
             false => self.wire.write(station, register, data).await,
         }
@@ -418,10 +413,17 @@ fn how_much_of_an_image_got_there_is_told() {
         (6, "; 6 of 10 words were written"),
     ] {
         let (done, _, _) = stopped(0, async move |wire, _, at, _| {
-            let cut = Cut {
+            // From the word after them on, for good.
+            let (left, is_cut) = (Cell::<usize>::new(words), Cell::new(false));
+            let cut = Lossy {
                 wire: &wire,
-                left: Cell::new(words),
-                cut: Cell::new(false),
+                loses: |register, written: Option<&[u8]>| {
+                    if register == 0x0508 && written.is_some() {
+                        is_cut.set(is_cut.get() || left.get() == 0);
+                        left.set(left.get().saturating_sub(1));
+                    }
+                    is_cut.get()
+                },
             };
             let claim = Claim::IfFree;
             let written = with_eeprom(&cut, &at, "writing its EEPROM", claim, async |eeprom| {
@@ -467,41 +469,21 @@ fn an_image_that_would_go_round_its_chip_is_not_written() {
     }
 }
 
-/// A wire that loses what comes back next, once the device has been asked for PreOp.
-struct Lossy<'w> {
-    wire: &'w Datagrams,
-    loses: Cell<bool>,
-}
-
-impl Wire for Lossy<'_> {
-    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
-        match self.loses.take() {
-            true => Err(WireError::Timeout { station, register }),
-            false => self.wire.read(station, register, buf).await,
-        }
-    }
-
-    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
-        self.loses.set((register, data) == (0x0120, &[2, 0][..]));
-        self.wire.write(station, register, data).await
-    }
-
-    async fn delay(&self, duration: Duration) {
-        self.wire.delay(duration).await;
-    }
-
-    fn now(&self) -> u64 {
-        self.wire.now()
-    }
-}
-
 #[test]
 fn a_device_whose_way_to_its_mailbox_is_lost_sight_of_goes_back() {
     let (done, left, _) = stopped(0, async |wire, found, at, _| {
         let sii = information(&wire, &found, &at).await?;
+        // What comes back next, once it has been asked for PreOp.
+        let asked = Cell::new(false);
         let lossy = Lossy {
             wire: &wire,
-            loses: Cell::new(false),
+            loses: |register, written: Option<&[u8]>| match written {
+                None => asked.take(),
+                Some(data) => {
+                    asked.set((register, data) == (0x0120, &[2, 0][..]));
+                    false
+                }
+            },
         };
         mailbox::lend(&lossy, &at, &sii).await.map(|_| ())
     });
