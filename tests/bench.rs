@@ -16,14 +16,14 @@ use ecaxis::bench::bus::{Bus, Counts, Hold, Mischief, Options};
 use ecaxis::bench::in_process::InProcess;
 use ecaxis::bench::rig::{self, Setup};
 use ecaxis::bench::turn::{self, Measured, Thread};
-use ecaxis::bench::veth::leftovers;
+use ecaxis::bench::veth::{VethPair, leftovers};
 use ecaxis::config::Exchange;
 use ecaxis::link::capture::{Mode, Recorder};
 use ecaxis::link::recorded::Recorded;
 use ecaxis::link::{self, BackEnd, Link};
 use ecaxis::rt::margin::Spin;
 use ecaxis_sim::frame::{self, Command};
-use wire::pair;
+use wire::over_a_pair;
 
 /// Two real-time threads on two processors leave no room for another two.
 static ALONE: Mutex<()> = Mutex::new(());
@@ -81,89 +81,80 @@ fn run(link: Box<dyn Link>, setup: Setup, bus: Option<&Bus>, time: Duration) -> 
 }
 
 /// Axes over a pair of interfaces.
-fn over_veth(mischief: Mischief, link: BackEnd) -> Option<(Measured, Counts)> {
-    let pair = pair()?;
+fn over_veth(pair: &VethPair, mischief: Mischief, link: BackEnd) -> (Measured, Counts) {
     let setup = setup(3, 4_000_000);
     let segment = rig::segment(setup.axes).expect("few axes");
-    let bus = Bus::on(&pair, segment, options(setup.cycle_ns, mischief)).expect("answers");
+    let bus = Bus::on(pair, segment, options(setup.cycle_ns, mischief)).expect("answers");
     let (link, _) = link::open(&pair.a, link).expect("opens");
     let measured = run(link, setup, Some(&bus), Duration::from_secs(2));
     let counts = measured.bus.expect("a bus");
-    Some((measured, counts))
+    (measured, counts)
 }
 
 #[test]
 fn a_pair_is_out_of_sight_at_one_end_and_gone_in_the_end() {
-    let Some(pair) = pair() else { return };
-    let (near, far) = (pair.a.clone(), pair.b.clone());
-    assert!(exists(&near) && exists(&far));
-    let segment = rig::segment(1).expect("one axis");
-    let bus = Bus::on(&pair, segment, options(1_000_000, Mischief::default())).expect("answers");
-    assert!(exists(&near));
-    assert!(!exists(&far), "in the bus's own network namespace");
-    assert!(!leftovers().contains(&near), "its process lives");
-    drop(bus);
-    drop(pair);
-    let start = Instant::now();
-    while exists(&near) && start.elapsed() < Duration::from_secs(5) {
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    assert!(!exists(&near));
+    over_a_pair(|pair| {
+        let (near, far) = (pair.a.clone(), pair.b.clone());
+        assert!(exists(&near) && exists(&far));
+        let segment = rig::segment(1).expect("one axis");
+        let bus =
+            Bus::on(&pair, segment, options(1_000_000, Mischief::default())).expect("answers");
+        assert!(exists(&near));
+        assert!(!exists(&far), "in the bus's own network namespace");
+        assert!(!leftovers().contains(&near), "its process lives");
+        drop(bus);
+        drop(pair);
+        let start = Instant::now();
+        while exists(&near) && start.elapsed() < Duration::from_secs(5) {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        assert!(!exists(&near));
+    });
 }
 
 #[test]
 fn axes_move_over_every_back_end() {
-    for back_end in BackEnd::ALL {
-        let Some((measured, bus)) = over_veth(Mischief::default(), *back_end) else {
-            return;
-        };
-        let counters = measured.stats.counters;
-        assert!(counters.cycles > 0, "{back_end}");
-        assert_eq!(counters.wkc_errors, 0, "{back_end} {counters:?}");
-        assert_eq!(measured.stats.lateness.summary().count, counters.cycles);
-        assert_eq!((bus.malformed, bus.foreign), (0, 0), "{bus:?}");
-        assert!(bus.frames > 0);
-        assert!(measured.used.voluntary_switches > 0);
-    }
+    over_a_pair(|pair| {
+        for back_end in BackEnd::ALL {
+            let (measured, bus) = over_veth(&pair, Mischief::default(), *back_end);
+            let counters = measured.stats.counters;
+            assert!(counters.cycles > 0, "{back_end}");
+            assert_eq!(counters.wkc_errors, 0, "{back_end} {counters:?}");
+            assert_eq!(measured.stats.lateness.summary().count, counters.cycles);
+            assert_eq!((bus.malformed, bus.foreign), (0, 0), "{bus:?}");
+            assert!(bus.frames > 0);
+            assert!(measured.used.voluntary_switches > 0);
+        }
+    });
 }
 
 /// A reply that comes after its deadline is counted, and never stops the loop.
 #[test]
 fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
-    let every = NonZeroU64::new(7).expect("not zero");
-    let late = Mischief {
-        late_every: Some((every, 6_000_000)),
-        ..Mischief::default()
-    };
-    // A computer that stalls leaves few cycles; then once more.
-    let mut tries = 0;
-    let (measured, bus) = loop {
-        let Some((measured, bus)) = over_veth(late, BackEnd::Ring) else {
-            return;
+    over_a_pair(|pair| {
+        let every = NonZeroU64::new(7).expect("not zero");
+        let late = Mischief {
+            late_every: Some((every, 6_000_000)),
+            ..Mischief::default()
         };
-        tries += 1;
-        if measured.stats.counters.cycles > 300 || tries == 3 {
-            break (measured, bus);
-        }
-    };
-    let counters = measured.stats.counters;
-    assert!(bus.delayed > 10, "{bus:?}");
-    assert!(counters.late_frames > 10, "{counters:?}");
-    assert!(counters.lost_frames >= counters.late_frames / 2);
-    // One in seven is late; most of the others are in time even on a busy machine.
-    assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
+        let (measured, bus) = over_veth(&pair, late, BackEnd::Ring);
+        let counters = measured.stats.counters;
+        assert!(bus.delayed > 10, "{bus:?}");
+        assert!(counters.late_frames > 10, "{counters:?}");
+        assert!(counters.lost_frames >= counters.late_frames / 2);
+        // One in seven is late; most of the others are in time even on a busy machine.
+        assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
 
-    let dropped = Mischief {
-        drop_every: Some(every),
-        ..Mischief::default()
-    };
-    let Some((measured, bus)) = over_veth(dropped, BackEnd::Ring) else {
-        return;
-    };
-    let counters = measured.stats.counters;
-    assert!(bus.dropped > 10, "{bus:?}");
-    assert!(counters.lost_frames > 10, "{counters:?}");
-    assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
+        let dropped = Mischief {
+            drop_every: Some(every),
+            ..Mischief::default()
+        };
+        let (measured, bus) = over_veth(&pair, dropped, BackEnd::Ring);
+        let counters = measured.stats.counters;
+        assert!(bus.dropped > 10, "{bus:?}");
+        assert!(counters.lost_frames > 10, "{counters:?}");
+        assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
+    });
 }
 
 /// Bytes of every frame sent, by what a recording says of them.

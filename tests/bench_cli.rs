@@ -186,22 +186,23 @@ fn soon(what: impl Fn() -> bool) -> bool {
 /// Whatever ends a bench, its interfaces go with it.
 #[test]
 fn a_bench_leaves_no_interface_behind() {
-    let Some(_) = wire::pair() else { return };
-    for signal in ["-INT", "-KILL"] {
-        let line = "--axes 1 --cycle 5ms --seconds 100";
-        let mut command = ecaxis(&line.split(' ').collect::<Vec<_>>());
-        command.stdout(Stdio::null()).stderr(Stdio::null());
-        let mut bench = Killed(command.spawn().expect("starts"));
-        let nic = format!("/sys/class/net/ecx{}-0a", bench.0.id());
-        let nic = Path::new(&nic);
-        assert!(soon(|| nic.exists()), "an interface of its own");
-        thread::sleep(Duration::from_millis(500));
-        let kill = Command::new("kill")
-            .args([signal, &bench.0.id().to_string()])
-            .status();
-        assert!(kill.expect("kill").success());
-        let ended = bench.0.wait().expect("ended");
-        assert_eq!(ended.success(), signal == "-INT", "{signal}: {ended}");
-        assert!(soon(|| !nic.exists()), "{signal}");
-    }
+    wire::over_a_pair(|_| {
+        for signal in ["-INT", "-KILL"] {
+            let line = "--axes 1 --cycle 5ms --seconds 100";
+            let mut command = ecaxis(&line.split(' ').collect::<Vec<_>>());
+            command.stdout(Stdio::null()).stderr(Stdio::null());
+            let mut bench = Killed(command.spawn().expect("starts"));
+            let nic = format!("/sys/class/net/ecx{}-0a", bench.0.id());
+            let nic = Path::new(&nic);
+            assert!(soon(|| nic.exists()), "an interface of its own");
+            thread::sleep(Duration::from_millis(500));
+            let kill = Command::new("kill")
+                .args([signal, &bench.0.id().to_string()])
+                .status();
+            assert!(kill.expect("kill").success());
+            let ended = bench.0.wait().expect("ended");
+            assert_eq!(ended.success(), signal == "-INT", "{signal}: {ended}");
+            assert!(soon(|| !nic.exists()), "{signal}");
+        }
+    });
 }

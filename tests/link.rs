@@ -11,7 +11,7 @@ use ecaxis::bench::reflector::{Pace, Reflector};
 use ecaxis::bench::veth::VethPair;
 use ecaxis::link::{self, BackEnd, Concern, Link, LinkError, LinkStats, MAX_FRAME};
 use ecaxis::os::packet::{PacketSocket, interface_index};
-use wire::pair;
+use wire::over_a_pair;
 
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Sending alone; any will do.
@@ -62,79 +62,82 @@ fn intruder(nic: &str) -> PacketSocket {
 
 #[test]
 fn every_length_comes_back_the_same_over_both() {
-    let Some(pair) = pair() else { return };
-    let _reflector = Reflector::start(&pair.b, Pace::default(), None).expect("answers");
-    let lengths = [12_u16, 44, 45, 100, 486, 1000, 1498];
-    let mut all = Vec::new();
-    for back_end in BackEnd::ALL {
-        let mut link = open(&pair.a, *back_end);
-        // More frames than the ring has slots.
-        for turn in 0..100_u8 {
-            for len in lengths {
-                let sent = frame(len, turn);
-                link.send(&sent).expect("sends");
-                let mut expected = sent;
-                expected[6] = 0x12;
-                let got = receive(link.as_mut());
-                assert_eq!(got.as_ref(), Some(&expected), "{back_end}, {len} bytes");
-                all.push((len, turn));
+    over_a_pair(|pair| {
+        let _reflector = Reflector::start(&pair.b, Pace::default(), None).expect("answers");
+        let lengths = [12_u16, 44, 45, 100, 486, 1000, 1498];
+        let mut all = Vec::new();
+        for back_end in BackEnd::ALL {
+            let mut link = open(&pair.a, *back_end);
+            // More frames than the ring has slots.
+            for turn in 0..100_u8 {
+                for len in lengths {
+                    let sent = frame(len, turn);
+                    link.send(&sent).expect("sends");
+                    let mut expected = sent;
+                    expected[6] = 0x12;
+                    let got = receive(link.as_mut());
+                    assert_eq!(got.as_ref(), Some(&expected), "{back_end}, {len} bytes");
+                    all.push((len, turn));
+                }
             }
+            assert_eq!(link.stats(), LinkStats::default(), "{back_end}");
         }
-        assert_eq!(link.stats(), LinkStats::default(), "{back_end}");
-    }
-    assert_eq!(all.len(), 100 * lengths.len() * BackEnd::ALL.len());
+        assert_eq!(all.len(), 100 * lengths.len() * BackEnd::ALL.len());
+    });
 }
 
 #[test]
 fn what_is_not_ours_is_counted_and_passed_over() {
-    let Some(pair) = pair() else { return };
-    let tagged = |vlan: u16| {
-        let mut bytes = frame(44, 0);
-        bytes.splice(12..12, [0x81, 0x00].into_iter().chain(vlan.to_be_bytes()));
-        bytes
-    };
-    let changed = |at: usize, to: u8| {
-        let mut bytes = frame(44, 0);
-        bytes[at] = to;
-        bytes
-    };
-    for back_end in BackEnd::ALL {
-        let mut link = open(&pair.a, *back_end);
-        let intruder = intruder(&pair.b);
-        let inject = |bytes: &[u8]| intruder.send(bytes).expect("sent");
-        inject(&tagged(5));
-        inject(&tagged(4094));
-        // Another MainDevice, another receiver, another kind of EtherCAT frame.
-        inject(&changed(6, 0x50));
-        inject(&changed(0, 0x01));
-        inject(&changed(15, 0x40));
-        // Not of the EtherType: the kernel does not even show it.
-        inject(&changed(12, 0x08));
-        inject(&frame(44, 0)[..40]);
-        // A header alone is the least that the kernel sends.
-        inject(&frame(44, 0)[..14]);
-        inject(&frame(44, 7));
-        let got = receive(link.as_mut()).expect("the last one is ours");
-        assert_eq!(got[16], 7, "{back_end}");
-        // A program before the network stack sees the tag itself and lets such frames pass on.
-        let tagged = if back_end.name() == "xdp" { 0 } else { 2 };
-        let expected = LinkStats {
-            tagged,
-            foreign: 3,
-            main_devices: 2,
-            damaged: 2,
-            dropped: 0,
+    over_a_pair(|pair| {
+        let tagged = |vlan: u16| {
+            let mut bytes = frame(44, 0);
+            bytes.splice(12..12, [0x81, 0x00].into_iter().chain(vlan.to_be_bytes()));
+            bytes
         };
-        assert_eq!(link.stats(), expected, "{back_end}");
-    }
+        let changed = |at: usize, to: u8| {
+            let mut bytes = frame(44, 0);
+            bytes[at] = to;
+            bytes
+        };
+        for back_end in BackEnd::ALL {
+            let mut link = open(&pair.a, *back_end);
+            let intruder = intruder(&pair.b);
+            let inject = |bytes: &[u8]| intruder.send(bytes).expect("sent");
+            inject(&tagged(5));
+            inject(&tagged(4094));
+            // Another MainDevice, another receiver, another kind of EtherCAT frame.
+            inject(&changed(6, 0x50));
+            inject(&changed(0, 0x01));
+            inject(&changed(15, 0x40));
+            // Not of the EtherType: the kernel does not even show it.
+            inject(&changed(12, 0x08));
+            inject(&frame(44, 0)[..40]);
+            // A header alone is the least that the kernel sends.
+            inject(&frame(44, 0)[..14]);
+            inject(&frame(44, 7));
+            let got = receive(link.as_mut()).expect("the last one is ours");
+            assert_eq!(got[16], 7, "{back_end}");
+            // A program before the network stack sees the tag itself and lets such frames pass on.
+            let tagged = if back_end.name() == "xdp" { 0 } else { 2 };
+            let expected = LinkStats {
+                tagged,
+                foreign: 3,
+                main_devices: 2,
+                damaged: 2,
+                dropped: 0,
+            };
+            assert_eq!(link.stats(), expected, "{back_end}");
+        }
+    });
 }
 
 #[test]
 fn nobody_looks_and_the_kernel_counts_what_finds_no_room() {
-    let Some(pair) = pair() else { return };
-    for back_end in BackEnd::ALL.iter().filter(|b| **b != BackEnd::Packet) {
-        overflow(&pair, *back_end);
-    }
+    over_a_pair(|pair| {
+        for back_end in BackEnd::ALL.iter().filter(|b| **b != BackEnd::Packet) {
+            overflow(&pair, *back_end);
+        }
+    });
 }
 
 /// Rings of 256 frames.
@@ -162,48 +165,50 @@ fn overflow(pair: &VethPair, back_end: BackEnd) {
 
 #[test]
 fn an_interface_that_goes_down_is_an_error_until_it_is_up_again() {
-    let Some(pair) = pair() else { return };
-    let _reflector = Reflector::start(&pair.b, Pace::default(), None).expect("answers");
-    for back_end in BackEnd::ALL {
-        let mut link = open(&pair.a, *back_end);
-        let mut buf = [0; MAX_FRAME];
-        pair.set(&pair.a, false).expect("goes down");
-        let mut refused = 0;
-        for _ in 0..100 {
-            match link.send(&frame(44, 1)) {
-                Err(LinkError::Send(_)) => refused += 1,
-                other => panic!("{back_end}: {other:?}"),
+    over_a_pair(|pair| {
+        let _reflector = Reflector::start(&pair.b, Pace::default(), None).expect("answers");
+        for back_end in BackEnd::ALL {
+            let mut link = open(&pair.a, *back_end);
+            let mut buf = [0; MAX_FRAME];
+            pair.set(&pair.a, false).expect("goes down");
+            let mut refused = 0;
+            for _ in 0..100 {
+                match link.send(&frame(44, 1)) {
+                    Err(LinkError::Send(_)) => refused += 1,
+                    other => panic!("{back_end}: {other:?}"),
+                }
+                // Once told, or never; in no case does it wait.
+                let _ = link.recv(&mut buf);
             }
-            // Once told, or never; in no case does it wait.
-            let _ = link.recv(&mut buf);
+            assert_eq!(refused, 100);
+            pair.set(&pair.a, true).expect("goes up");
+            let start = Instant::now();
+            let answer = loop {
+                // The first one may still tell of the past.
+                let _ = link.send(&frame(44, 2));
+                std::thread::sleep(Duration::from_millis(1));
+                match link.recv(&mut buf) {
+                    Ok(Some(_)) => break buf[16],
+                    _ => assert!(start.elapsed() < PATIENCE, "{back_end}"),
+                }
+            };
+            assert_eq!(answer, 2, "{back_end}");
         }
-        assert_eq!(refused, 100);
-        pair.set(&pair.a, true).expect("goes up");
-        let start = Instant::now();
-        let answer = loop {
-            // The first one may still tell of the past.
-            let _ = link.send(&frame(44, 2));
-            std::thread::sleep(Duration::from_millis(1));
-            match link.recv(&mut buf) {
-                Ok(Some(_)) => break buf[16],
-                _ => assert!(start.elapsed() < PATIENCE, "{back_end}"),
-            }
-        };
-        assert_eq!(answer, 2, "{back_end}");
-    }
+    });
 }
 
 #[test]
 fn an_interface_with_an_address_is_told_of() {
-    let Some(pair) = pair() else { return };
-    let added = std::process::Command::new("ip")
-        .args(["addr", "add", "192.0.2.7/30", "dev", &pair.a])
-        .status();
-    assert!(added.expect("ip runs").success());
-    let (_, concerns) = link::open(&pair.a, BackEnd::Ring).expect("it opens all the same");
-    let expected = Concern::Addresses {
-        nic: pair.a.clone(),
-        addresses: vec!["192.0.2.7".parse().expect("an address")],
-    };
-    assert_eq!(concerns, [expected]);
+    over_a_pair(|pair| {
+        let added = std::process::Command::new("ip")
+            .args(["addr", "add", "192.0.2.7/30", "dev", &pair.a])
+            .status();
+        assert!(added.expect("ip runs").success());
+        let (_, concerns) = link::open(&pair.a, BackEnd::Ring).expect("it opens all the same");
+        let expected = Concern::Addresses {
+            nic: pair.a.clone(),
+            addresses: vec!["192.0.2.7".parse().expect("an address")],
+        };
+        assert_eq!(concerns, [expected]);
+    });
 }

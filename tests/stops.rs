@@ -3,6 +3,7 @@
 
 mod common;
 
+use common::wire::calmly;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -284,32 +285,23 @@ fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<
 
 #[test]
 fn an_interruption_in_motion_brings_the_axes_to_rest() {
-    let in_motion = |progress: &Progress| matches!(progress, Progress::Status(status) if status.axes[0].position > 5.0);
-    let mut tries = 0;
-    let (summary, result) = loop {
+    calmly(|| {
+        let in_motion = |progress: &Progress| matches!(progress, Progress::Status(status) if status.axes[0].position > 5.0);
         let (summary, result) = interrupted(in_motion);
-        tries += 1;
-        // A computer that wakes up half a cycle late reads positions of two cycles in one; then once more.
-        let stalled = summary
-            .as_ref()
-            .is_some_and(|summary| summary.wake_up_lateness.max_ns > 500_000);
-        if result.is_ok() || !stalled || tries == 5 {
-            break (summary, result);
-        }
-    };
-    result.expect("an orderly stop");
-    let summary = summary.expect("the cycle ran");
-    assert!(summary.interrupted);
-    let axis = &summary.axes[0];
-    assert!(
-        axis.final_position < 79.9 || summary.program_runs == 0,
-        "{axis:?}"
-    );
-    assert!(
-        axis.final_error_counts.is_some_and(|e| e.abs() <= 2),
-        "{axis:?}"
-    );
-    assert_ne!(axis.final_state, "Operation enabled");
+        result.expect("an orderly stop");
+        let summary = summary.expect("the cycle ran");
+        assert!(summary.interrupted);
+        let axis = &summary.axes[0];
+        assert!(
+            axis.final_position < 79.9 || summary.program_runs == 0,
+            "{axis:?}"
+        );
+        assert!(
+            axis.final_error_counts.is_some_and(|e| e.abs() <= 2),
+            "{axis:?}"
+        );
+        assert_ne!(axis.final_state, "Operation enabled");
+    });
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
+use crate::common::wire::calmly;
 use std::process::{Command, Stdio};
 
 use super::common::root;
@@ -102,41 +103,43 @@ fn no_line_is_wider_than_the_terminal() {
 /// Emergencies, warnings and what Ctrl-C says each have lines of their own, beside the one that is written over.
 #[test]
 fn lines_that_stay_do_not_mix_with_the_one_that_passes() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let faults = folder.path().join("emergency.toml");
-    let script = "[[fault]]\nkind = \"emergency\"\nat = \"1s\"\ndevice = 1\ncode = 0x8611\n";
-    std::fs::write(&faults, script).expect("written");
-    // A computer that is busy with tests stalls for longer than a machine may.
-    let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
-    let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
-    let esi = root().join("configs/esi");
-    let calm = calm.replace("\"esi/", &format!("\"{}/", esi.display()));
-    let machine = folder.path().join("m.toml");
-    std::fs::write(&machine, calm).expect("written");
-    let line = format!(
-        "run {} --sim --for 60s --faults {} & sleep 6; kill -INT $!; wait $!",
-        machine.display(),
-        faults.display()
-    );
-    let Some((_, text)) = on_terminal(&line) else {
-        return;
-    };
-    let lines = lines(&text);
-    // The summary lists them once more.
-    let meanwhile = lines
-        .iter()
-        .take_while(|line| !line.contains("complete run"));
-    let meanwhile: Vec<&String> = meanwhile.collect();
-    let having = |part: &str| -> Vec<&String> {
-        let these = meanwhile.iter().filter(|line| line.contains(part));
-        these.copied().collect()
-    };
-    let [emergency] = having("0x8611")[..] else {
-        panic!("not told once:\n{text}");
-    };
-    assert!(emergency.starts_with("warning: `y`: "), "{emergency}");
-    assert_eq!(
-        having("stopping; once more"),
-        ["stopping; once more to leave at once"]
-    );
+    calmly(|| {
+        let folder = tempfile::tempdir().expect("a folder");
+        let faults = folder.path().join("emergency.toml");
+        let script = "[[fault]]\nkind = \"emergency\"\nat = \"1s\"\ndevice = 1\ncode = 0x8611\n";
+        std::fs::write(&faults, script).expect("written");
+        // A computer that is busy with tests stalls for longer than a machine may.
+        let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
+        let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
+        let esi = root().join("configs/esi");
+        let calm = calm.replace("\"esi/", &format!("\"{}/", esi.display()));
+        let machine = folder.path().join("m.toml");
+        std::fs::write(&machine, calm).expect("written");
+        let line = format!(
+            "run {} --sim --for 60s --faults {} & sleep 6; kill -INT $!; wait $!",
+            machine.display(),
+            faults.display()
+        );
+        let Some((_, text)) = on_terminal(&line) else {
+            return;
+        };
+        let lines = lines(&text);
+        // The summary lists them once more.
+        let meanwhile = lines
+            .iter()
+            .take_while(|line| !line.contains("complete run"));
+        let meanwhile: Vec<&String> = meanwhile.collect();
+        let having = |part: &str| -> Vec<&String> {
+            let these = meanwhile.iter().filter(|line| line.contains(part));
+            these.copied().collect()
+        };
+        let [emergency] = having("0x8611")[..] else {
+            panic!("not told once:\n{text}");
+        };
+        assert!(emergency.starts_with("warning: `y`: "), "{emergency}");
+        assert_eq!(
+            having("stopping; once more"),
+            ["stopping; once more to leave at once"]
+        );
+    });
 }

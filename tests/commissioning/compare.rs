@@ -399,34 +399,33 @@ fn another_machine_altogether() {
 /// Of a bus that somebody drives nothing is known that is behind a mailbox: neither `scan --write` nor `compare` says more than it knows.
 #[test]
 fn what_was_not_asked_is_not_known() {
-    let bench = bench();
-    // A terminal whose controller keeps the state that it was led to by somebody.
-    let Some(pair) = crate::wire::pair() else {
-        return;
-    };
-    let _served = crate::story::serve_file(&bench, &pair, "machine.toml");
-    crate::story::led_to_safe_op(&pair, 1);
-    let compare = ["compare", "machine.toml", "--nic", &pair.b];
-    let ran = bench.ecaxis(&compare);
-    assert_eq!(ran.code, 0, "{}", ran.err);
-    assert_eq!(ran.out, "as in the file, as far as it could be compared\n");
-    let ran = bench.ecaxis(&[&compare[..], &["--parameters"]].concat());
-    assert_eq!(ran.code, 1, "{}", ran.err);
-    assert_eq!(ran.out, "as in the file, as far as it could be compared\n");
-    assert!(
-        ran.err
-            .contains("not compared: the parameters: the devices were not asked")
-            && ran.err.contains("--intrude"),
-        "{}",
-        ran.err
-    );
-    let ran = bench.ecaxis(&[&compare[..], &["--parameters", "--json"]].concat());
-    let json: Value = serde_json::from_str(&ran.out).expect("JSON");
-    assert_eq!((ran.code, &json["equal"]), (1, &Value::Bool(false)));
+    crate::wire::over_a_pair(|pair| {
+        let bench = bench();
+        // A terminal whose controller keeps the state that it was led to by somebody.
+        let _served = crate::story::serve_file(&bench, &pair, "machine.toml");
+        crate::story::led_to_safe_op(&pair, 1);
+        let compare = ["compare", "machine.toml", "--nic", &pair.b];
+        let ran = bench.ecaxis(&compare);
+        assert_eq!(ran.code, 0, "{}", ran.err);
+        assert_eq!(ran.out, "as in the file, as far as it could be compared\n");
+        let ran = bench.ecaxis(&[&compare[..], &["--parameters"]].concat());
+        assert_eq!(ran.code, 1, "{}", ran.err);
+        assert_eq!(ran.out, "as in the file, as far as it could be compared\n");
+        assert!(
+            ran.err
+                .contains("not compared: the parameters: the devices were not asked")
+                && ran.err.contains("--intrude"),
+            "{}",
+            ran.err
+        );
+        let ran = bench.ecaxis(&[&compare[..], &["--parameters", "--json"]].concat());
+        let json: Value = serde_json::from_str(&ran.out).expect("JSON");
+        assert_eq!((ran.code, &json["equal"]), (1, &Value::Bool(false)));
 
-    let ran = bench.ecaxis(&["scan", &pair.b, "--write", "guessed.toml"]);
-    assert_eq!(ran.code, 0, "{}", ran.err);
-    let guessed = bench.read("guessed.toml");
-    assert!(guessed.contains("it was not asked"), "{guessed}");
-    assert!(!guessed.contains("the drive does not say"), "{guessed}");
+        let ran = bench.ecaxis(&["scan", &pair.b, "--write", "guessed.toml"]);
+        assert_eq!(ran.code, 0, "{}", ran.err);
+        let guessed = bench.read("guessed.toml");
+        assert!(guessed.contains("it was not asked"), "{guessed}");
+        assert!(!guessed.contains("the drive does not say"), "{guessed}");
+    });
 }

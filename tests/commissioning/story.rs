@@ -2,7 +2,6 @@
 
 use std::path::Path;
 use std::process::Stdio;
-use std::sync::Mutex;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
@@ -13,7 +12,7 @@ use ecaxis::mailbox::Wire;
 use ecaxis::service::{Datagrams, carry};
 
 use crate::bench::{Bench, root};
-use crate::wire::{Told, pair};
+use crate::wire::{Told, over_a_pair};
 
 /// The interface of the document.
 const NIC: &str = "enp3s0";
@@ -174,9 +173,6 @@ pub fn led_to_safe_op(pair: &VethPair, position: u16) {
     led.expect("carried");
 }
 
-/// The two tests would take each other's processors.
-static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-
 /// On a test machine both ends of the wire share processors, and either may be held up for long.
 fn patient(text: &str) -> String {
     assert!(text.contains("lost_frames = 20"), "{text}");
@@ -189,88 +185,88 @@ fn patient(text: &str) -> String {
 /// A machine that runs on the same interface goes on as if nobody looked.
 #[test]
 fn a_running_machine_is_left_alone() {
-    let _alone = ONE_AT_A_TIME.lock();
-    let Some(pair) = pair() else { return };
-    let bench = bench();
-    bench.write("machine.toml", &patient(&bench.read("bench.toml")));
-    let _served = serve(&bench, &pair);
-    let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
-    command.args(["run", "machine.toml", "--nic", &pair.b]);
-    command.args(["--no-enable", "--for", "8s", "--json"]);
-    let mut run = Told::start(command.stdout(Stdio::piped()));
-    run.says("all SubDevices in Op");
-    // Nobody else takes the bus from under it.
-    for second in [
-        &["run", "machine.toml", "--nic", &pair.b, "--for", "1s"][..],
-        &[
-            "firmware",
-            "update",
-            "machine.toml",
-            "--nic",
-            &pair.b,
-            "--position",
-            "5",
-            "--yes",
-        ],
-    ] {
-        let ran = bench.ecaxis(second);
-        assert_eq!(ran.code, 1, "{second:?}: {}", ran.err);
-        let (pid, nic) = (run.id(), &pair.b);
-        let taken = format!("error: another ecaxis (pid {pid}) drives `{nic}`");
-        assert!(ran.err.contains(&taken), "{second:?}: {}", ran.err);
-        assert!(ran.err.contains("Ctrl-C there"), "{second:?}: {}", ran.err);
-    }
-    let ran = bench.ecaxis(&["scan", &pair.b, "--ask", "--json"]);
-    let seen: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
-    let warned = ran.err.contains("another master is driving this bus");
-    assert!(warned, "{}", ran.err);
-    assert_eq!(seen["other_master"], true, "{seen:#}");
-    assert_eq!(seen["asked"], false);
-    assert_eq!(seen["devices"][5]["state"], "Op", "{seen:#}");
-    assert_eq!(seen["devices"][5]["serial"], 1005);
-    let ended = run.end();
-    let ended: serde_json::Value = serde_json::from_slice(&ended.stdout).expect("JSON");
-    assert_eq!(ended["ok"], true, "{ended:#}");
-    assert_eq!(ended["summary"]["counters"]["wkc_errors"], 0, "{ended:#}");
+    over_a_pair(|pair| {
+        let bench = bench();
+        bench.write("machine.toml", &patient(&bench.read("bench.toml")));
+        let _served = serve(&bench, &pair);
+        let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
+        command.args(["run", "machine.toml", "--nic", &pair.b]);
+        command.args(["--no-enable", "--for", "8s", "--json"]);
+        let mut run = Told::start(command.stdout(Stdio::piped()));
+        run.says("all SubDevices in Op");
+        // Nobody else takes the bus from under it.
+        for second in [
+            &["run", "machine.toml", "--nic", &pair.b, "--for", "1s"][..],
+            &[
+                "firmware",
+                "update",
+                "machine.toml",
+                "--nic",
+                &pair.b,
+                "--position",
+                "5",
+                "--yes",
+            ],
+        ] {
+            let ran = bench.ecaxis(second);
+            assert_eq!(ran.code, 1, "{second:?}: {}", ran.err);
+            let (pid, nic) = (run.id(), &pair.b);
+            let taken = format!("error: another ecaxis (pid {pid}) drives `{nic}`");
+            assert!(ran.err.contains(&taken), "{second:?}: {}", ran.err);
+            assert!(ran.err.contains("Ctrl-C there"), "{second:?}: {}", ran.err);
+        }
+        let ran = bench.ecaxis(&["scan", &pair.b, "--ask", "--json"]);
+        let seen: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
+        let warned = ran.err.contains("another master is driving this bus");
+        assert!(warned, "{}", ran.err);
+        assert_eq!(seen["other_master"], true, "{seen:#}");
+        assert_eq!(seen["asked"], false);
+        assert_eq!(seen["devices"][5]["state"], "Op", "{seen:#}");
+        assert_eq!(seen["devices"][5]["serial"], 1005);
+        let ended = run.end();
+        let ended: serde_json::Value = serde_json::from_slice(&ended.stdout).expect("JSON");
+        assert_eq!(ended["ok"], true, "{ended:#}");
+        assert_eq!(ended["summary"]["counters"]["wkc_errors"], 0, "{ended:#}");
+    });
 }
 
 #[test]
 fn first_steps_over_a_real_interface() {
-    let _alone = ONE_AT_A_TIME.lock();
-    let Some(pair) = pair() else { return };
-    let bench = bench();
-    let _served = serve(&bench, &pair);
-    let as_here = |command: &str| command.replace(NIC, &pair.b);
-    // A busy test machine is no computer for a cycle of a millisecond: it warns, and it is late.
-    let as_there = |text: &str| {
-        let lines = text.lines().filter(|line| !line.starts_with("warning: "));
-        let lines = lines.filter(|line| !line.starts_with("  = help: "));
-        let text: String = lines.map(|line| format!("{line}\n")).collect();
-        text.replace(&pair.b, NIC)
-    };
-    let after = |command: &str| {
-        if command.contains("--write") {
-            bench.write("machine.toml", &patient(&bench.read("machine.toml")));
-        }
-    };
-    follow(&bench, as_here, as_there, after);
+    over_a_pair(|pair| {
+        let bench = bench();
+        let _served = serve(&bench, &pair);
+        let as_here = |command: &str| command.replace(NIC, &pair.b);
+        // A busy test machine is no computer for a cycle of a millisecond: it warns, and it is late.
+        let as_there = |text: &str| {
+            let lines = text.lines().filter(|line| !line.starts_with("warning: "));
+            let lines = lines.filter(|line| !line.starts_with("  = help: "));
+            let text: String = lines.map(|line| format!("{line}\n")).collect();
+            text.replace(&pair.b, NIC)
+        };
+        let after = |command: &str| {
+            if command.contains("--write") {
+                bench.write("machine.toml", &patient(&bench.read("machine.toml")));
+            }
+        };
+        follow(&bench, as_here, as_there, after);
+    });
 }
 
 /// A run leaves no sign of itself: what a scan writes after it is what it wrote before.
 #[test]
 fn a_run_leaves_a_quiet_bus() {
-    let _alone = ONE_AT_A_TIME.lock();
-    let Some(pair) = pair() else { return };
-    let bench = bench();
-    let _served = serve(&bench, &pair);
-    bench.well(&["scan", &pair.b, "--write", "before.toml"]);
-    bench.write("machine.toml", &patient(&bench.read("before.toml")));
-    bench.well(&["run", "machine.toml", "--no-enable", "--for", "500ms"]);
-    let ran = bench.ecaxis(&["scan", &pair.b, "--write", "after.toml"]);
-    assert_eq!((ran.code, ran.err.as_str()), (0, ""));
-    assert_eq!(bench.read("after.toml"), bench.read("before.toml"));
-    // Everything was asked, though devices have forgotten the 0x6060 of the run.
-    let ran = bench.ecaxis(&["compare", "machine.toml", "--parameters", "--json"]);
-    let json: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
-    assert_eq!(json["not_compared"], serde_json::json!([]), "{json:#}");
+    over_a_pair(|pair| {
+        let bench = bench();
+        let _served = serve(&bench, &pair);
+        bench.well(&["scan", &pair.b, "--write", "before.toml"]);
+        bench.write("machine.toml", &patient(&bench.read("before.toml")));
+        bench.well(&["run", "machine.toml", "--no-enable", "--for", "500ms"]);
+        let ran = bench.ecaxis(&["scan", &pair.b, "--write", "after.toml"]);
+        assert_eq!((ran.code, ran.err.as_str()), (0, ""));
+        assert_eq!(bench.read("after.toml"), bench.read("before.toml"));
+        // Everything was asked, though devices have forgotten the 0x6060 of the run.
+        let ran = bench.ecaxis(&["compare", "machine.toml", "--parameters", "--json"]);
+        let json: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
+        assert_eq!(json["not_compared"], serde_json::json!([]), "{json:#}");
+    });
 }

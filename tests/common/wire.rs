@@ -5,16 +5,35 @@
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::Mutex;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use ecaxis::bench::veth::VethPair;
 
+#[path = "calm.rs"]
+mod calm;
+
+pub use calm::calmly;
+
 /// Much longer than anything takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// Two of them would take each other's processors.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+/// A test over a pair of interfaces: alone, and judged where the computer let it run.
+pub fn over_a_pair(test: impl Fn(VethPair)) {
+    let _alone = ONE_AT_A_TIME.lock();
+    calmly(|| {
+        if let Some(pair) = pair() {
+            test(pair);
+        }
+    });
+}
+
 /// `None`, with the reason printed, where interfaces may not be created.
-pub fn pair() -> Option<VethPair> {
+fn pair() -> Option<VethPair> {
     match VethPair::new() {
         Ok(pair) => Some(pair),
         Err(error) => {

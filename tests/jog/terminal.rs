@@ -2,6 +2,7 @@
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
+use crate::common::wire::calmly;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread::sleep;
@@ -175,68 +176,74 @@ fn position(screen: &str, axis: &str) -> Option<f64> {
 
 #[test]
 fn a_machine_is_driven_from_a_terminal() {
-    let Some(tmux) = Tmux::new("") else { return };
-    tmux.says("x no power");
-    tmux.keys(&["e"]);
-    tmux.says("x holds");
-    // One key moves nothing; the second one in time does, and not for long.
-    tmux.again(&["Right"], |screen| screen.contains("keep holding"));
-    let before = position(&tmux.screen(), "x").expect("a position");
-    assert!(before.abs() < 0.01, "{before}");
-    tmux.again(&["Right", "Right"], |screen| {
-        let far = position(screen, "x").is_some_and(|x| x > 1.0);
-        far && screen.contains("x: let go, brakes") && screen.contains("x holds")
-    });
-    // A position that is typed; and one that is out of reach.
-    tmux.keys(&["+"]);
-    tmux.again(&["m", "-", "1", "2", ".", "5", "Enter"], |screen| {
-        position(screen, "x") == Some(-12.5)
-    });
-    tmux.keys(&["m", "6", "1"]);
-    tmux.says("move x to 61_ mm");
-    tmux.keys(&["Enter"]);
-    tmux.says("x: refused: position 61 is outside the range");
-    // A step of the other axis, which is enabled first.
-    tmux.keys(&["Down", "e"]);
-    tmux.says("y holds");
-    tmux.again(&["."], |screen| position(screen, "y") >= Some(1.0));
-    // A long way, and a hand that slips.
-    tmux.keys(&["-", "-", "m", "5", "0", "Enter"]);
-    tmux.says("y moves to 50 mm");
-    tmux.keys(&["z"]);
-    tmux.says("y: stopped");
-    let screen = tmux.says("y holds");
-    let stopped = position(&screen, "y").expect("a position");
-    assert!((1.0..50.0).contains(&stopped), "{stopped}");
-    tmux.keys(&["x"]);
-    tmux.says("emergency stop");
-    tmux.keys(&["r"]);
-    tmux.says("has been reset");
-    tmux.keys(&["q"]);
-    tmux.left("0");
-}
-
-#[test]
-fn a_signal_ends_it_in_order() {
-    for signal in ["-TERM", "-HUP"] {
+    calmly(|| {
         let Some(tmux) = Tmux::new("") else { return };
         tmux.says("x no power");
         tmux.keys(&["e"]);
         tmux.says("x holds");
-        tmux.keys(&["m", "5", "0", "Enter"]);
-        tmux.says("x moves to 50 mm");
-        let kill = Command::new("kill").args([signal, &tmux.pid()]).status();
-        assert!(kill.expect("kill runs").success());
+        // One key moves nothing; the second one in time does, and not for long.
+        tmux.again(&["Right"], |screen| screen.contains("keep holding"));
+        let before = position(&tmux.screen(), "x").expect("a position");
+        assert!(before.abs() < 0.01, "{before}");
+        tmux.again(&["Right", "Right"], |screen| {
+            let far = position(screen, "x").is_some_and(|x| x > 1.0);
+            far && screen.contains("x: let go, brakes") && screen.contains("x holds")
+        });
+        // A position that is typed; and one that is out of reach.
+        tmux.keys(&["+"]);
+        tmux.again(&["m", "-", "1", "2", ".", "5", "Enter"], |screen| {
+            position(screen, "x") == Some(-12.5)
+        });
+        tmux.keys(&["m", "6", "1"]);
+        tmux.says("move x to 61_ mm");
+        tmux.keys(&["Enter"]);
+        tmux.says("x: refused: position 61 is outside the range");
+        // A step of the other axis, which is enabled first.
+        tmux.keys(&["Down", "e"]);
+        tmux.says("y holds");
+        tmux.again(&["."], |screen| position(screen, "y") >= Some(1.0));
+        // A long way, and a hand that slips.
+        tmux.keys(&["-", "-", "m", "5", "0", "Enter"]);
+        tmux.says("y moves to 50 mm");
+        tmux.keys(&["z"]);
+        tmux.says("y: stopped");
+        let screen = tmux.says("y holds");
+        let stopped = position(&screen, "y").expect("a position");
+        assert!((1.0..50.0).contains(&stopped), "{stopped}");
+        tmux.keys(&["x"]);
+        tmux.says("emergency stop");
+        tmux.keys(&["r"]);
+        tmux.says("has been reset");
+        tmux.keys(&["q"]);
         tmux.left("0");
-    }
+    });
+}
+
+#[test]
+fn a_signal_ends_it_in_order() {
+    calmly(|| {
+        for signal in ["-TERM", "-HUP"] {
+            let Some(tmux) = Tmux::new("") else { return };
+            tmux.says("x no power");
+            tmux.keys(&["e"]);
+            tmux.says("x holds");
+            tmux.keys(&["m", "5", "0", "Enter"]);
+            tmux.says("x moves to 50 mm");
+            let kill = Command::new("kill").args([signal, &tmux.pid()]).status();
+            assert!(kill.expect("kill runs").success());
+            tmux.left("0");
+        }
+    });
 }
 
 #[test]
 fn leaving_before_the_bus_is_up_is_possible() {
-    let Some(tmux) = Tmux::new("") else { return };
-    tmux.says("EMERGENCY STOP");
-    tmux.keys(&["q"]);
-    tmux.left("0");
+    calmly(|| {
+        let Some(tmux) = Tmux::new("") else { return };
+        tmux.says("EMERGENCY STOP");
+        tmux.keys(&["q"]);
+        tmux.left("0");
+    });
 }
 
 #[test]
