@@ -14,6 +14,8 @@ use thread_priority::{
 };
 
 const TRIES: usize = 5;
+/// Nor once more after this long.
+const PATIENCE: Duration = Duration::from_secs(90);
 /// Above every thread of the program and of the tests: what keeps the watch from running is not theirs.
 const PRIORITY: u8 = 95;
 const EVERY: Duration = Duration::from_millis(1);
@@ -57,6 +59,7 @@ fn watch(cpu: usize, ended: &AtomicBool) -> Taken {
 /// repeated, and where it never gave a fair try, that is said instead.
 pub fn calmly(test: impl Fn()) {
     let mut fair = false;
+    let first = Instant::now();
     for attempt in 1.. {
         let ended = AtomicBool::new(false);
         let began = Instant::now();
@@ -85,12 +88,12 @@ pub fn calmly(test: impl Fn()) {
         if taken.longest.is_zero() {
             resume_unwind(panic);
         }
-        if attempt == TRIES {
+        if attempt == TRIES || first.elapsed() > PATIENCE {
             if fair {
                 resume_unwind(panic);
             }
             println!(
-                "skipped: a processor was away for more than a tenth of the time in each of {TRIES} tries"
+                "skipped: a processor was away for more than a tenth of the time in each of {attempt} tries"
             );
             return;
         }

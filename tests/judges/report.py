@@ -40,6 +40,18 @@ class Report:
         if not self.check(name, ok, detail):
             raise Stop(name)
 
+    def mark(self):
+        """The checks so far."""
+        return self.passed, len(self.failed)
+
+    def well_since(self, mark):
+        return len(self.failed) == mark[1]
+
+    def forget(self, mark):
+        """What was checked since is no verdict."""
+        self.passed = mark[0]
+        del self.failed[mark[1] :]
+
     def finish(self):
         """The exit code."""
         print(f"\n{self.passed} checks passed, {len(self.failed)} failed")
