@@ -114,8 +114,8 @@ fn a_pair_is_out_of_sight_at_one_end_and_gone_in_the_end() {
 
 #[test]
 fn axes_move_over_every_back_end() {
-    over_a_pair(|pair| {
-        for back_end in BackEnd::ALL {
+    for back_end in BackEnd::ALL {
+        over_a_pair(|pair| {
             let (measured, bus) = over_veth(&pair, Mischief::default(), *back_end);
             let counters = measured.stats.counters;
             assert!(counters.cycles > 0, "{back_end}");
@@ -124,15 +124,15 @@ fn axes_move_over_every_back_end() {
             assert_eq!((bus.malformed, bus.foreign), (0, 0), "{bus:?}");
             assert!(bus.frames > 0);
             assert!(measured.used.voluntary_switches > 0);
-        }
-    });
+        });
+    }
 }
 
 /// A reply that comes after its deadline is counted, and never stops the loop.
 #[test]
 fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
+    let every = NonZeroU64::new(7).expect("not zero");
     over_a_pair(|pair| {
-        let every = NonZeroU64::new(7).expect("not zero");
         let late = Mischief {
             late_every: Some((every, 6_000_000)),
             ..Mischief::default()
@@ -144,7 +144,8 @@ fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
         assert!(counters.lost_frames >= counters.late_frames / 2);
         // One in seven is late; most of the others are in time even on a busy machine.
         assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
-
+    });
+    over_a_pair(|pair| {
         let dropped = Mischief {
             drop_every: Some(every),
             ..Mischief::default()

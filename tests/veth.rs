@@ -67,7 +67,7 @@ fn the_demo_over_a_real_interface() {
         let file = served.file.path().to_str().expect("a path in UTF-8");
 
         let output = ecaxis()
-            .args(["run", file, "--nic", &pair.b, "--json"])
+            .args(["run", file, "--nic", &pair.b, "--no-story", "--json"])
             .output()
             .expect("the binary runs");
         let errors = String::from_utf8_lossy(&output.stderr);
@@ -104,7 +104,7 @@ fn an_interface_goes_down_and_up_again_while_the_machine_runs() {
             let served = serve(&pair, &format!("link = \"{link}\""));
             let file = served.file.path().to_str().expect("a path in UTF-8");
             let mut command = ecaxis();
-            command.args(["run", file, "--nic", &pair.b, "--json"]);
+            command.args(["run", file, "--nic", &pair.b, "--no-story", "--json"]);
             let mut run = Told::start(command.stdout(Stdio::piped()));
             run.says("run 1, step 1: ");
             pair.set(&pair.b, false).expect("down");
@@ -136,7 +136,16 @@ fn firmware_beside_a_machine_disturbs_nothing() {
         let served = serve(&pair, "");
         let file = served.file.path().to_str().expect("a path in UTF-8");
         let mut command = ecaxis();
-        command.args(["run", file, "--nic", &pair.b, "--json", "--for", "10min"]);
+        command.args([
+            "run",
+            file,
+            "--nic",
+            &pair.b,
+            "--no-story",
+            "--json",
+            "--for",
+            "10min",
+        ]);
         let mut run = Told::start(command.stdout(Stdio::piped()));
         run.says("run 1, step 1: ");
         let beside = |arguments: &[&str]| {
