@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use ecaxis::config::{self, Action, DeviceConfig, Exchange, Machine, Nic, Step, duration};
 use ecaxis::link::BackEnd;
+use ecaxis::rt::exchange::LONGEST_LOOK;
 use ecaxis::rt::image::{self, Access, ImagePlan};
 use ecaxis::rt::margin::Spin;
 use ecaxis::words::counted;
@@ -289,15 +290,12 @@ const SHORTEST_PAYLOAD: usize = 46;
 const NS_PER_BYTE: usize = 80;
 const FORWARDING_NS: usize = 1_000;
 
-/// Bytes on the wire of each frame of a cycle, gap included.
+/// Bytes on the wire of each frame of a cycle, at most, gap included.
 fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
     let mut frames = vec![0; plan.frames()];
-    frames[0] = AL_STATUS + if clock { CLOCK } else { 0 };
+    frames[0] = AL_STATUS + LONGEST_LOOK + if clock { CLOCK } else { 0 };
     for datagram in &plan.datagrams {
         frames[datagram.frame] += DATAGRAM + datagram.len;
-    }
-    if let Some(mailboxes) = &plan.mailboxes {
-        frames[mailboxes.frame] += DATAGRAM + mailboxes.devices.len();
     }
     frames
         .into_iter()
@@ -344,7 +342,7 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let percent = |ns: u64| ns as f64 * 100.0 / machine.bus.cycle_ns as f64;
     writeln!(
         out,
-        "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130), {total} bytes on the wire",
+        "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130, one diagnostic read), {total} bytes on the wire",
         frames.len()
     )?;
     writeln!(
@@ -398,9 +396,6 @@ fn commands(plan: &ImagePlan) -> String {
             1 => text += &format!("{name}, "),
             several => text += &format!("{several} {name}, "),
         }
-    }
-    if plan.mailboxes.is_some() {
-        text += "LRD of mailbox status, ";
     }
     text
 }

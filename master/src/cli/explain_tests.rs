@@ -15,7 +15,7 @@ fn bytes_on_the_wire_as_counted_by_hand() {
         let frames = frame_bytes(&plan, true);
         assert_eq!(
             frames.iter().sum::<usize>(),
-            bytes + AL_STATUS,
+            bytes + AL_STATUS + LONGEST_LOOK,
             "{axes} axes"
         );
         assert_eq!(frames.len(), 1);

@@ -1,5 +1,5 @@
 //! The frames of a cycle: FRMW of the system time, an LRW of each group's process data (LWR and LRD where a SubDevice
-//! knows no LRW), an LRD of the status of mailboxes, one BRD of AL status and one diagnostic read; built once, refilled every cycle, sent back to back.
+//! knows no LRW), one BRD of AL status and one read of the diagnostic slot; built once, refilled every cycle, sent back to back.
 //!
 //! Ours and ethercrab's frames are told apart by the last byte of the source MAC, because
 //! ethercrab uses all 256 datagram indices. The byte before it numbers the frames of a cycle, and
@@ -16,12 +16,14 @@ use crate::link::{Link, LinkError, MAX_FRAME};
 mod flight;
 mod frame;
 mod probe;
+mod rota;
 mod sights;
 
 use flight::Flight;
 use frame::{DATAGRAM_HEADER, Frame, MAC_TAIL, Place, WKC, clear_wkc, push, write_header};
-use probe::Turn;
 pub use probe::{Diagnosis, ErrorCounters, Probe};
+pub use rota::LONGEST_LOOK;
+use rota::{Look, Rota};
 pub use sights::Sights;
 
 const FPRD: u8 = 4;
@@ -142,18 +144,11 @@ pub struct Exchange {
     cycle_ns: u64,
     process_data: Vec<ProcessDatagram>,
     al_status: Place,
-    /// Status of mailboxes, a byte a device.
-    mailboxes: Option<Place>,
-    /// Whose they are.
-    mailbox_devices: Vec<usize>,
     sights: Arc<Sights>,
     probe_at: usize,
-    members: Vec<Member>,
     shares: Vec<Share>,
     diagnoses: Vec<Diagnosis>,
-    turns: Vec<Turn>,
-    /// The next one.
-    turn: usize,
+    rota: Rota,
     cycle: u8,
     outputs: Vec<u8>,
     inputs: Vec<u8>,
@@ -198,12 +193,6 @@ impl Exchange {
                 .iter()
                 .position(|member| member.station == clock.reference)
         });
-        let mapped = plan.mailboxes.as_ref().map_or(&[][..], |m| &m.devices);
-        let polled: Vec<_> = members
-            .iter()
-            .enumerate()
-            .map(|(index, member)| member.mailbox.filter(|_| !mapped.contains(&index)))
-            .collect();
         let mut exchange = Self {
             flights,
             staged: 0,
@@ -213,15 +202,11 @@ impl Exchange {
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
             process_data: places.process_data,
             al_status: places.al_status,
-            mailboxes: places.mailboxes,
-            mailbox_devices: mapped.to_vec(),
             sights: Arc::new(Sights::new(members.len())),
             probe_at: places.probe_at,
-            members: members.to_vec(),
             shares,
             diagnoses: vec![Diagnosis::default(); members.len()],
-            turns: Probe::turns(&polled),
-            turn: 0,
+            rota: Rota::new(members, plan.mailboxes.as_ref()),
             cycle: 0,
             outputs: vec![0; plan.len],
             inputs: vec![0; plan.len],
@@ -273,11 +258,13 @@ impl Exchange {
     #[must_use]
     pub fn clock_read(&self) -> Option<(usize, i32)> {
         let flight = self.flights.get(self.due())?;
-        let turn = self.turns.get(flight.turn)?;
+        let Look::At { device, probe } = flight.turn?.look else {
+            return None;
+        };
         flight.answer(0)?;
-        let found = self.diagnoses.get(turn.device)?;
-        let read = turn.probe == Probe::ClockDifference && found.answers;
-        read.then_some((turn.device, found.clock_difference))
+        let found = self.diagnoses.get(device)?;
+        let read = probe == Probe::ClockDifference && found.answers;
+        read.then_some((device, found.clock_difference))
     }
 
     /// The flight whose answers this cycle takes: the oldest.
@@ -294,21 +281,15 @@ impl Exchange {
         let Some(flight) = self.flights.get_mut(self.staged) else {
             return;
         };
-        if let Some(place) = self.mailboxes {
-            let frame = &mut flight.frames[place.frame].bytes;
-            frame[place.data()].fill(Sights::UNSEEN);
-            clear_wkc(frame, place);
-        }
         let first = &mut flight.frames[0].bytes;
-        flight.turn = self.turn;
-        if let Some(turn) = self.turns.get(self.turn) {
+        flight.turn = self.rota.next();
+        if let Some(turn) = flight.turn {
             // The last datagram of its frame, so its length may change; within the capacity of the frame.
-            first.truncate(self.probe_at);
-            first.resize(self.probe_at + DATAGRAM_HEADER + turn.len + WKC, 0);
-            let station = self.members.get(turn.device).map_or(0, |m| m.station);
-            let address = u32::from(turn.register) << 16 | u32::from(station);
-            write_header(first, self.probe_at, FPRD, address, turn.len);
-            self.turn = (self.turn + 1) % self.turns.len();
+            let data = self.probe_at + DATAGRAM_HEADER;
+            first.truncate(data);
+            first.resize(data + turn.len, Sights::UNSEEN);
+            first.resize(data + turn.len + WKC, 0);
+            write_header(first, self.probe_at, turn.command, turn.address, turn.len);
         }
         if let Some(place) = self.clock {
             first[place.data()].copy_from_slice(&time.to_le_bytes());
@@ -408,35 +389,34 @@ impl Exchange {
             al_status: None,
             sent_late: flight.sent_late.unwrap_or(0),
         };
-        if let Some(place) = self.mailboxes
-            && let Some(seen) = flight.answer(place.frame)
-            && let Some(seen) = seen.get(place.data())
-        {
-            for (&device, &status) in self.mailbox_devices.iter().zip(seen) {
-                self.sights.see(device, flight.sent_at, status);
-            }
-        }
         let Some(first) = first else {
             return answer;
         };
         answer.al_status = first
             .get(self.al_status.data())
             .and_then(|data| Some((*data.first()?, self.al_status.wkc(first))));
-        if let Some(turn) = self.turns.get(flight.turn)
-            && let Some(to) = self.diagnoses.get_mut(turn.device)
-        {
+        if let Some(turn) = flight.turn {
             let place = Place {
                 frame: 0,
                 offset: self.probe_at,
                 len: turn.len,
             };
-            to.answers = place.wkc(first) == 1;
-            match first.get(place.data()) {
-                Some(&[status]) if to.answers && turn.probe == Probe::Mailbox => {
-                    self.sights.see(turn.device, flight.sent_at, status);
+            let data = first.get(place.data()).unwrap_or_default();
+            match turn.look {
+                Look::At { device, probe } => {
+                    if let Some(to) = self.diagnoses.get_mut(device) {
+                        to.answers = place.wkc(first) == 1;
+                        if to.answers {
+                            to.take(probe, data);
+                        }
+                    }
                 }
-                Some(data) if to.answers => to.take(turn.probe, data),
-                _ => {}
+                Look::Mailboxes { first } => {
+                    let devices = self.rota.mailbox_devices.iter().skip(first);
+                    for (&device, &status) in devices.zip(data) {
+                        self.sights.see(device, flight.sent_at, status);
+                    }
+                }
             }
         }
         answer.system_time = self.system_time(first);
@@ -479,7 +459,6 @@ impl Exchange {
 struct Places {
     clock: Option<Place>,
     process_data: Vec<ProcessDatagram>,
-    mailboxes: Option<Place>,
     al_status: Place,
     probe_at: usize,
 }
@@ -509,17 +488,12 @@ impl Places {
             }
         });
         let process_data = process_data.collect();
-        let mailboxes = plan.mailboxes.as_ref().map(|m| {
-            let (frame, len) = (m.frame, m.devices.len());
-            push(&mut frames[frame], frame, LRD, m.logical, len)
-        });
         let al_status = push(&mut frames[0], 0, BRD, u32::from(AL_STATUS) << 16, 2);
         let probe_at = frames[0].bytes.len();
-        debug_assert!(probe_at + DATAGRAM_HEADER + Probe::LONGEST + WKC <= MAX_FRAME);
+        debug_assert!(probe_at + LONGEST_LOOK <= MAX_FRAME);
         Self {
             clock,
             process_data,
-            mailboxes,
             al_status,
             probe_at,
         }

@@ -225,8 +225,11 @@ fn the_diagnostic_slot_walks_through_devices_and_probes() {
     let mut exchange = axes(2);
     let mut seen = Vec::new();
     for _ in 0..2 * Probe::ALL.len() {
-        let turn = exchange.turns[exchange.flights[0].turn];
-        seen.push((turn.device, turn.probe as usize));
+        let turn = exchange.flights[0].turn.expect("there are members");
+        let Look::At { device, probe } = turn.look else {
+            panic!("nobody has a mailbox");
+        };
+        seen.push((device, probe as usize));
         let frame = reflect(&mut exchange, 0, 1);
         exchange.receive(&frame);
         exchange.answer();
@@ -249,6 +252,28 @@ fn the_diagnostic_slot_walks_through_devices_and_probes() {
         lost_links: [1; 4],
     };
     assert_eq!(found.errors, errors);
+}
+
+#[test]
+fn the_status_of_mailboxes_comes_in_every_other_cycle_and_costs_no_more_than_a_probe() {
+    let mut devices = vec![axis(0); 11];
+    for device in &mut devices {
+        device.mailbox = true;
+    }
+    let mut exchange = exchange(&devices, Mode::SameCycle);
+    let sights = exchange.sights();
+    let without = axes(11).frame_lengths().next().expect("a frame") - 18;
+    for cycle in 0..8 {
+        let frame = reflect(&mut exchange, 0, 0x08);
+        assert!(frame.len() - without <= 20, "{}", frame.len());
+        exchange.receive(&frame);
+        exchange.answer();
+        exchange.stage();
+        // Eight of them in the second cycle, three in the fourth.
+        let seen = |n: usize| sights.mailbox(n).is_some_and(|seen| seen.full);
+        assert_eq!((seen(0), seen(7)), (cycle >= 1, cycle >= 1), "{cycle}");
+        assert_eq!((seen(8), seen(10)), (cycle >= 3, cycle >= 3), "{cycle}");
+    }
 }
 
 #[test]
@@ -311,7 +336,6 @@ fn each_group_has_a_working_counter_of_its_own() {
 #[test]
 fn the_system_time_is_the_reference_s_alone() {
     let mut exchange = grouped(&[0, 1]);
-    exchange.members[1].clock = true;
     exchange.shares[1].clocks = 1;
     let mut answer = |wkc: u8, fresh: bool| {
         exchange.stage();

@@ -1,6 +1,7 @@
 //! One cycle's frames, from staging until their answers are judged.
 
 use super::frame::{FIRST_DATAGRAM, Frame, new_frame, number, same_headers};
+use super::rota::Turn;
 use crate::clock::{self, Nanos};
 use crate::link::{Link, LinkError};
 
@@ -13,8 +14,8 @@ pub(super) struct Flight {
     pub sent_late: Option<Nanos>,
     /// When it was sent, by the session's clock.
     pub sent_at: Nanos,
-    /// Which of the diagnostic slot's turns it carries.
-    pub turn: usize,
+    /// The diagnostic slot's turn that it carries.
+    pub turn: Option<Turn>,
 }
 
 impl Flight {
@@ -26,7 +27,7 @@ impl Flight {
             cycle: 0,
             sent_late: None,
             sent_at: 0,
-            turn: 0,
+            turn: None,
         }
     }
 

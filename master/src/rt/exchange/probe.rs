@@ -15,8 +15,6 @@ pub enum Probe {
     Forwarded,
     /// Lost links of the four ports, 0x0310–0x0313.
     LostLinks,
-    /// Status of the SyncManager of its mailbox, 0x0805 + 8 · SyncManager.
-    Mailbox,
 }
 
 impl Probe {
@@ -27,61 +25,16 @@ impl Probe {
         Self::Forwarded,
         Self::LostLinks,
     ];
-    /// The order of reading. Mailboxes come three times, of those devices alone whose status is read in no other way.
-    const ROUND: [Self; 8] = [
-        Self::AlStatus,
-        Self::ClockDifference,
-        Self::Mailbox,
-        Self::RxErrors,
-        Self::Forwarded,
-        Self::Mailbox,
-        Self::LostLinks,
-        Self::Mailbox,
-    ];
-    /// Bytes of the longest.
-    pub(super) const LONGEST: usize = 8;
-
-    /// Who is read when: each probe of all devices, one after the other. `polled` has the SyncManager of those whose mailbox is
-    /// looked into here.
-    #[allow(clippy::disallowed_methods, reason = "prepares")]
-    pub(super) fn turns(polled: &[Option<u8>]) -> Vec<Turn> {
-        let turns = Self::ROUND.iter().flat_map(|&probe| {
-            polled.iter().enumerate().filter_map(move |(device, sm)| {
-                let (register, len) = probe.register_and_len(*sm)?;
-                Some(Turn {
-                    device,
-                    probe,
-                    register,
-                    len,
-                })
-            })
-        });
-        turns.collect()
-    }
-
-    const fn register_and_len(self, mailbox: Option<u8>) -> Option<(u16, usize)> {
-        Some(match self {
+    /// Where it is, and how long.
+    pub(super) const fn register_and_len(self) -> (u16, usize) {
+        match self {
             Self::AlStatus => (0x0130, 6),
             Self::ClockDifference => (0x092c, 4),
             Self::RxErrors => (0x0300, 8),
             Self::Forwarded => (0x0308, 6),
             Self::LostLinks => (0x0310, 4),
-            Self::Mailbox => match mailbox {
-                Some(sm) => (0x0805 + 8 * sm as u16, 1),
-                None => return None,
-            },
-        })
+        }
     }
-}
-
-/// One read of the diagnostic slot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Turn {
-    /// Index among the members.
-    pub device: usize,
-    pub probe: Probe,
-    pub register: u16,
-    pub len: usize,
 }
 
 /// A SubDevice's error counters. Each stands still at 255; nobody clears them.
@@ -204,7 +157,7 @@ impl Diagnosis {
                     (start.processing, start.pdi) = (now.processing, now.pdi);
                 }
                 Probe::LostLinks => start.lost_links = now.lost_links,
-                Probe::AlStatus | Probe::ClockDifference | Probe::Mailbox => {}
+                Probe::AlStatus | Probe::ClockDifference => {}
             }
         }
     }
@@ -269,36 +222,9 @@ mod tests {
     }
 
     #[test]
-    fn none_is_longer_than_the_room_for_it() {
-        for turn in Probe::turns(&[None, Some(1)]) {
-            assert!(turn.len <= Probe::LONGEST);
-        }
+    fn each_has_its_own_place() {
         for probe in Probe::ALL {
             assert_eq!(Probe::ALL[probe as usize], probe);
         }
-    }
-
-    #[test]
-    fn mailboxes_are_looked_into_where_nothing_else_does() {
-        let turns = Probe::turns(&[None, Some(1), Some(3)]);
-        assert_eq!(turns.len(), 3 * 5 + 2 * 3);
-        let mailboxes: Vec<_> = turns
-            .iter()
-            .enumerate()
-            .filter(|(_, turn)| turn.probe == Probe::Mailbox)
-            .map(|(at, turn)| (at, turn.device, turn.register, turn.len))
-            .collect();
-        assert_eq!(
-            mailboxes,
-            [
-                (6, 1, 0x080d, 1),
-                (7, 2, 0x081d, 1),
-                (14, 1, 0x080d, 1),
-                (15, 2, 0x081d, 1),
-                (19, 1, 0x080d, 1),
-                (20, 2, 0x081d, 1),
-            ]
-        );
-        assert_eq!(Probe::turns(&[]), []);
     }
 }

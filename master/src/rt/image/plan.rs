@@ -66,11 +66,10 @@ pub struct DatagramPlan {
     pub expected_wkc: u16,
 }
 
-/// The datagram, an LRD, that carries the status of mailboxes: a byte each, the SyncManager's status register. It lies beside the
-/// process data, because a status that is always there would hide inputs that are missing from the working counter.
+/// Where the status of mailboxes is mapped to: a byte each, the SyncManager's status register. It lies beside the process data,
+/// because a status that is always there would hide inputs that are missing from the working counter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MailboxPlan {
-    pub frame: usize,
     pub logical: u32,
     /// The devices whose bytes follow each other, by index.
     pub devices: Vec<usize>,
@@ -81,7 +80,14 @@ impl MailboxPlan {
     #[must_use]
     pub fn logical_of(&self, device: usize) -> Option<u32> {
         let place = self.devices.iter().position(|&other| other == device)?;
-        Some(self.logical.saturating_add(u32::try_from(place).ok()?))
+        Some(self.address(place))
+    }
+
+    /// The logical address of the status in this place.
+    #[must_use]
+    pub fn address(&self, place: usize) -> u32 {
+        let place = u32::try_from(place).unwrap_or(u32::MAX);
+        self.logical.saturating_add(place)
     }
 }
 
@@ -111,9 +117,7 @@ impl ImagePlan {
     /// Frames of a cycle; the first is sent whatever it carries.
     #[must_use]
     pub fn frames(&self) -> usize {
-        let data = self.datagrams.last().map_or(0, |last| last.frame);
-        let mailboxes = self.mailboxes.as_ref().map_or(0, |plan| plan.frame);
-        data.max(mailboxes) + 1
+        self.datagrams.last().map_or(0, |last| last.frame) + 1
     }
 }
 
@@ -219,14 +223,9 @@ pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
         image.len += len;
     }
     let watched = devices.iter().enumerate().filter(|(_, d)| d.mailbox);
-    // What no frame holds is looked after in the diagnostic slot.
-    let watched: Vec<usize> = watched
-        .map(|(index, _)| index)
-        .take(NEXT_FRAME - DATAGRAM)
-        .collect();
+    let watched: Vec<usize> = watched.map(|(index, _)| index).collect();
     if !watched.is_empty() {
         image.mailboxes = Some(MailboxPlan {
-            frame: frames.place(watched.len()),
             logical: LOGICAL_BASE.saturating_add(u32::try_from(image.len).unwrap_or(u32::MAX)),
             devices: watched,
         });
@@ -373,9 +372,7 @@ mod tests {
             let image = plan(&devices).expect("none is too large");
             for frame in 0..image.frames() {
                 let of_frame = image.datagrams.iter().filter(|d| d.frame == frame);
-                let mailboxes = image.mailboxes.iter().filter(|m| m.frame == frame);
-                let bytes: usize = of_frame.map(|d| d.len + DATAGRAM).sum::<usize>()
-                    + mailboxes.map(|m| m.devices.len() + DATAGRAM).sum::<usize>();
+                let bytes: usize = of_frame.map(|d| d.len + DATAGRAM).sum();
                 let room = if frame == 0 { FIRST_FRAME } else { NEXT_FRAME };
                 prop_assert!(bytes <= room);
             }
