@@ -5,23 +5,25 @@ mod common;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, atomic::AtomicBool};
 
-use common::{Heard, load, virtual_time};
+use common::{Heard, faults, load, virtual_time};
 use ecaxis::clock::{self, Clock};
 use ecaxis::config::{AxisRef, InputRef, Machine, OutputRef};
 use ecaxis::rt::controller::{Controller, Cycle};
-use ecaxis::session::{Outcome, RunError, run_with};
+use ecaxis::session::{Options, Outcome, RunError, run_with};
 use ecaxis_axis::{Command, Refused};
 
 fn control(machine: Machine, controller: impl Controller + 'static) -> Outcome {
+    control_with(virtual_time(), machine, controller)
+}
+
+fn control_with(
+    options: Options,
+    machine: Machine,
+    controller: impl Controller + 'static,
+) -> Outcome {
     let stop = Arc::new(AtomicBool::new(false));
     let mut heard = Heard::default();
-    run_with(
-        machine,
-        virtual_time(),
-        stop,
-        &mut heard,
-        Box::new(controller),
-    )
+    run_with(machine, options, stop, &mut heard, Box::new(controller))
 }
 
 struct Closure<F>(F);
@@ -171,6 +173,57 @@ fn motion_goes_on_from_rest_after_cycles_that_were_left_out() {
         before = status.target_velocity;
     }
     assert_eq!(before, SPEED);
+}
+
+/// One frame in twenty is lost. A controller is told in each of these cycles, and in no other, how old what it sees is.
+#[test]
+fn inputs_are_stale_in_exactly_the_cycles_that_are_lost() {
+    let script = "seed = 5\n[[fault]]\nkind = \"frame-loss\"\nprobability = 0.05\nat = \"2s\"\n";
+    let (mut machine, names) = bench();
+    machine.bus.lost_frames = 8;
+    let seen = Arc::new(Mutex::new(Vec::new()));
+    let told = Arc::clone(&seen);
+    let outcome = control_with(
+        faults(script),
+        machine,
+        Closure(move |machine: &mut Cycle<'_>| {
+            let status = machine.axis(names.x);
+            if machine.in_op() {
+                let mut told = told.lock().expect("no panic");
+                told.push((machine.fresh(), status));
+            }
+            if status.ready && !machine.stopping() && status.target_velocity == 0.0 {
+                let command = Command::Velocity {
+                    velocity: 5.0,
+                    ramp: 1.0,
+                };
+                machine.command(names.x, command).expect("x is ready");
+            }
+            if machine.number() == 6_000 {
+                machine.finish();
+            }
+        }),
+    );
+    outcome.result.expect("nothing trips");
+    let counters = outcome.summary.expect("the cycle has run").counters;
+    let seen = seen.lock().expect("no panic");
+    let stale = seen.iter().filter(|(fresh, _)| !fresh).count();
+    assert!(stale > 150, "{counters:?}");
+    assert_eq!(stale as u64, counters.lost_frames, "{counters:?}");
+    let (mut moved, mut age) = (0, 0);
+    for pair in seen.windows(2) {
+        let [(_, before), (fresh, now)] = pair else {
+            unreachable!("windows of two");
+        };
+        age = if *fresh { 0 } else { age + 1 };
+        assert_eq!(now.stale_cycles, age);
+        if *fresh {
+            moved += usize::from(now.position != before.position);
+        } else {
+            assert_eq!(now.position, before.position);
+        }
+    }
+    assert!(moved > 3_000, "it moves all the while: {moved}");
 }
 
 /// A set-point that jumps never reaches the wire.
