@@ -5,6 +5,8 @@
 #[path = "common/wire.rs"]
 mod wire;
 
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use ecaxis::bench::reflector::{Pace, Reflector};
@@ -131,6 +133,44 @@ fn what_is_not_ours_is_counted_and_passed_over() {
     });
 }
 
+/// A machine that somebody else drives is left to him: nothing at all is sent.
+#[test]
+fn where_another_main_device_is_heard_no_machine_begins() {
+    let root = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+    over_a_pair(|pair| {
+        let intruder = intruder(&pair.b);
+        let ended = AtomicBool::new(false);
+        let told = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                // As SOEM sends them.
+                let mut bytes = frame(44, 0);
+                bytes[6..12].fill(0x01);
+                while !ended.load(Ordering::Relaxed) {
+                    intruder.send(&bytes).expect("sent");
+                    std::thread::sleep(Duration::from_millis(4));
+                }
+            });
+            let run = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+                .args(["run", "configs/demo.toml", "--no-story", "--nic", &pair.a])
+                .current_dir(root)
+                .output();
+            ended.store(true, Ordering::Relaxed);
+            let run = run.expect("the binary runs");
+            assert_eq!(run.status.code(), Some(1));
+            String::from_utf8_lossy(&run.stderr).into_owned()
+        });
+        let error = format!(
+            "error: another MainDevice drives the segment on `{}`: ",
+            pair.a
+        );
+        assert!(told.contains(&error), "{told}");
+        assert!(told.contains("= help: two of them"), "{told}");
+        let sent = format!("/sys/class/net/{}/statistics/tx_packets", pair.a);
+        let sent = std::fs::read_to_string(sent).expect("Linux");
+        assert_eq!(sent.trim(), "0", "frames went out");
+    });
+}
+
 #[test]
 fn nobody_looks_and_the_kernel_counts_what_finds_no_room() {
     over_a_pair(|pair| {
@@ -200,7 +240,7 @@ fn an_interface_that_goes_down_is_an_error_until_it_is_up_again() {
 #[test]
 fn an_interface_with_an_address_is_told_of() {
     over_a_pair(|pair| {
-        let added = std::process::Command::new("ip")
+        let added = Command::new("ip")
             .args(["addr", "add", "192.0.2.7/30", "dev", &pair.a])
             .status();
         assert!(added.expect("ip runs").success());

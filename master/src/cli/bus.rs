@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Duration;
 
 use ecaxis::clock::Clock;
 use ecaxis::config::{Machine, Nic};
@@ -11,9 +10,6 @@ use ecaxis::service::{self, Datagrams};
 use ecaxis::session::{self, Options, RunError};
 
 use super::{Failure, hints, note, screen, signals};
-
-/// Another MainDevice on the interface shows within this time.
-const LISTEN: Duration = Duration::from_millis(100);
 
 #[derive(Debug)]
 pub(crate) struct Bus {
@@ -117,7 +113,7 @@ impl Bus {
                     true => link::open_alone(&nic, back_end)?,
                     false => link::open(&nic, back_end)?,
                 };
-                let frames = link::heard(link.as_mut(), LISTEN).map_err(RunError::Link)?;
+                let frames = link::heard(link.as_mut()).map_err(RunError::Link)?;
                 heard.store(frames, Ordering::Relaxed);
                 // It may be a machine of this program's that runs there.
                 Box::new(link::apart::Apart::new(link, std::process::id()))

@@ -37,6 +37,8 @@ pub enum OpenError {
         /// Its process.
         pid: Option<i32>,
     },
+    #[error("another MainDevice drives the segment on `{nic}`: {frames} EtherCAT frames in {} ms that nobody here has sent", super::LISTEN.as_millis())]
+    Driven { nic: String, frames: u64 },
     #[error("the kernel gives no receive ring on `{nic}`: {source}")]
     NoRing { nic: String, source: io::Error },
     #[error("the interface `{nic}`: {what}: {source}")]

@@ -139,21 +139,24 @@ pub fn open(nic: &str, back_end: BackEnd) -> Result<(Box<dyn Link>, Vec<Concern>
     Ok((link, concerns))
 }
 
-/// Frames that come in within a time in which nothing is sent: another MainDevice's. Blocks, on the monotonic clock.
+/// How long is listened before anything is sent; the slowest cycles are of a few tens of milliseconds.
+pub const LISTEN: Duration = Duration::from_millis(100);
+
+/// EtherCAT frames that come in within [`LISTEN`], in which nothing is sent: another MainDevice's. Blocks, on the monotonic clock.
 ///
 /// # Errors
 /// Of the link.
-pub fn heard(link: &mut dyn Link, time: Duration) -> Result<u64, LinkError> {
+pub fn heard(link: &mut dyn Link) -> Result<u64, LinkError> {
     let mut buf = [0; MAX_FRAME];
     let mut frames = 0;
-    let end = Instant::now() + time;
+    let end = Instant::now() + LISTEN;
     while Instant::now() < end {
         while link.recv(&mut buf)?.is_some() {
             frames += 1;
         }
         std::thread::sleep(Duration::from_millis(1));
     }
-    Ok(frames + link.stats().foreign)
+    Ok(frames + link.stats().main_devices)
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

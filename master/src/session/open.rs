@@ -20,13 +20,13 @@ use crate::link::capture::{Mode, Recorder};
 use crate::link::recorded::Recorded;
 use crate::link::replay::Replay;
 use crate::link::sim::SimLink;
-use crate::link::{self, Concern, Link};
+use crate::link::{self, Concern, Link, OpenError};
 use crate::recording;
 
 /// Blocks.
 ///
 /// # Errors
-/// [`RunError::Open`], [`RunError::Sim`], [`RunError::Record`].
+/// [`RunError::Open`], also where another MainDevice is heard; [`RunError::Sim`], [`RunError::Record`], [`RunError::Link`].
 pub fn link(
     machine: &Machine,
     options: &Options,
@@ -45,7 +45,13 @@ pub fn link(
             None,
         )?)),
         (None, Nic::Interface(nic)) => {
-            let (link, concerns) = link::open_alone(nic, machine.bus.link)?;
+            let (mut link, concerns) = link::open_alone(nic, machine.bus.link)?;
+            // The first thing sent would take its drives to Init.
+            let frames = link::heard(link.as_mut()).map_err(RunError::Link)?;
+            if frames > 0 {
+                let nic = nic.clone();
+                return Err(OpenError::Driven { nic, frames }.into());
+            }
             concerns.into_iter().for_each(&mut tell);
             link
         }

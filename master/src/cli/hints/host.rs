@@ -37,6 +37,9 @@ pub(crate) fn interface(failure: Failure, error: &OpenError) -> Failure {
                 ))
                 .hint("`ecaxis scan`, `sdo` and `eeprom` go beside a machine that runs")
         }
+        OpenError::Driven { .. } => failure
+            .hint("two of them move the same drives: bring its axes to rest and end it first")
+            .hint("`ecaxis scan` goes beside a machine that runs"),
         OpenError::NoRing { .. } => failure.hint("write `link = \"packet\"` into [bus]"),
         OpenError::Io { .. } => failure,
     }
