@@ -157,7 +157,8 @@ impl Wire for Datagrams {
     }
 }
 
-/// Cycles after which what was seen of a mailbox is old.
+/// Cycles after which what was seen of a mailbox is old: on a bus where its turn comes less often, a transfer looks for itself. A
+/// message that nobody asked for was seen, however long ago.
 const SIGHT_CYCLES: Nanos = 4;
 
 /// Datagrams of one SubDevice's mailbox while the cycle runs, and what the cycle sees of it.
@@ -206,7 +207,11 @@ impl Wire for BesideCycle {
     }
 
     fn seen(&self) -> Option<Seen> {
-        let seen = self.sights.mailbox(self.member)?;
+        self.sights.mailbox(self.member)
+    }
+
+    fn seen_lately(&self) -> Option<Seen> {
+        let seen = self.seen()?;
         (clock::now().saturating_sub(seen.at) <= self.old_ns).then_some(seen)
     }
 }

@@ -50,9 +50,14 @@ pub trait Wire {
     /// Nanoseconds of a clock that never goes back and that [`Wire::delay`] advances.
     fn now(&self) -> u64;
 
-    /// What somebody else has lately seen of the SubDevice's mailbox, the one that is read; `None` where nobody looks.
+    /// What somebody else has last seen of the SubDevice's mailbox, the one that is read; `None` where nobody looks.
     fn seen(&self) -> Option<Seen> {
         None
+    }
+
+    /// The same, where it is so new that nobody else needs to look.
+    fn seen_lately(&self) -> Option<Seen> {
+        self.seen()
     }
 
     /// Who may end what is done with it.

@@ -193,9 +193,11 @@ impl Port {
 
     /// As [`Port::fetch`], without a datagram where the cycle sees that there is nothing.
     async fn look<W: Wire>(&mut self, w: &W, patience: &mut Patience) -> Result<Fetched, Trouble> {
-        match w.seen() {
-            Some(seen) if !seen.full || seen.at <= self.read_at => Ok(Fetched::Nothing),
-            Some(_) => self.read(w, patience).await,
+        if self.waits(w) {
+            return self.read(w, patience).await;
+        }
+        match w.seen_lately() {
+            Some(_) => Ok(Fetched::Nothing),
             None => self.fetch(w, patience).await,
         }
     }

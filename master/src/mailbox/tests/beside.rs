@@ -14,7 +14,20 @@ use crate::mailbox::{Seen, Wire, WireError};
 /// A wire on which waiting takes a turn of the executor, with a cycle that looks at the mailbox.
 struct Beside<'a> {
     server: &'a Server,
+    /// How often it looks.
     cycle: Option<Duration>,
+    /// How long what it has seen is new.
+    lasts: Duration,
+}
+
+impl<'a> Beside<'a> {
+    fn new(server: &'a Server, cycle: Option<Duration>) -> Self {
+        Self {
+            server,
+            cycle,
+            lasts: Duration::MAX,
+        }
+    }
 }
 
 impl Wire for Beside<'_> {
@@ -48,6 +61,12 @@ impl Wire for Beside<'_> {
             full: self.server.full_since().is_some_and(|since| since <= at),
         })
     }
+
+    fn seen_lately(&self) -> Option<Seen> {
+        let seen = self.seen()?;
+        let age = Duration::from_nanos(self.now() - seen.at);
+        (age <= self.lasts).then_some(seen)
+    }
 }
 
 /// However often it has to be asked.
@@ -66,10 +85,7 @@ fn finish<T>(future: impl Future<Output = T>) -> T {
 fn nothing_is_asked_for_what_the_cycle_sees() {
     let server = Server::new(48, &[(0x6041, 0, &[0x37, 2])], &[]);
     for (cycle, datagrams) in [(None, 4..100), (Some(Duration::from_micros(250)), 2..3)] {
-        let wire = Beside {
-            server: &server,
-            cycle,
-        };
+        let wire = Beside::new(&server, cycle);
         let mut client = client();
         finish(client.upload(&wire, 0x6041, 0, false)).expect("read");
         let before = server.datagrams.get();
@@ -85,10 +101,7 @@ fn nothing_is_asked_for_what_the_cycle_sees() {
 #[test]
 fn a_message_that_waits_is_noticed_once() {
     let server = Server::new(48, &[(0x6041, 0, &[0x37, 2])], &[]);
-    let wire = Beside {
-        server: &server,
-        cycle: Some(Duration::from_millis(1)),
-    };
+    let wire = Beside::new(&server, Some(Duration::from_millis(1)));
     let mut client = client();
     finish(client.drain(&wire)).expect("it is there");
     assert!(!client.waits(&wire));
@@ -103,6 +116,31 @@ fn a_message_that_waits_is_noticed_once() {
     let received = client.emergencies().take();
     assert_eq!(received.len(), 1);
     assert!(received[0].at >= 7_000_000, "{received:?}");
+}
+
+/// On a big bus its turn comes seldom: a transfer looks for itself, and what was said is noticed however long ago it was seen.
+#[test]
+fn where_the_cycle_looks_seldom_a_transfer_looks_for_itself() {
+    const SELDOM: Duration = Duration::from_millis(200);
+    let server = Server::new(48, &[(0x6041, 0, &[0x37, 2])], &[]);
+    let wire = Beside {
+        lasts: Duration::from_millis(4),
+        ..Beside::new(&server, Some(SELDOM))
+    };
+    let mut client = client();
+    finish(client.drain(&wire)).expect("it is there");
+    for _ in 0..3 {
+        let before = Duration::from_nanos(wire.now());
+        let read = finish(client.upload(&wire, 0x6041, 0, false));
+        assert_eq!(read.expect("read"), [0x37, 2]);
+        let took = Duration::from_nanos(wire.now()) - before;
+        assert!(took < SELDOM / 4, "{took:?}");
+    }
+    let next = SELDOM - Duration::from_nanos(wire.now() % SELDOM.as_nanos() as u64);
+    server.say(&emergency(0x8130));
+    assert!(!client.waits(&wire));
+    block_on(server.delay(next + SELDOM / 2));
+    assert!(wire.seen_lately().is_none() && client.waits(&wire));
 }
 
 #[test]
@@ -139,10 +177,7 @@ fn a_dropped_future_leaves_nothing_behind() {
     let mut told = 0;
     for turns in 0..200 {
         let server = Server::new(48, &[(0x2000, 0, &data), (0x6041, 0, &[0x37, 2])], &[]);
-        let wire = Beside {
-            server: &server,
-            cycle: None,
-        };
+        let wire = Beside::new(&server, None);
         let mut client = client();
         let ended = {
             let mut future = pin!(client.upload(&wire, 0x2000, 0, false));
