@@ -247,8 +247,9 @@ fn a_story_on_the_command_line() {
     };
     let stories = || {
         let left = std::fs::read_dir(root()).expect("the folder").flatten();
-        left.filter(|e| e.file_name().to_string_lossy().starts_with("ecaxis-stop"))
-            .count()
+        let names = left.map(|e| e.file_name().to_string_lossy().into_owned());
+        let stories = names.filter(|name| name.starts_with("ecaxis-stop"));
+        stories.collect::<std::collections::BTreeSet<_>>()
     };
     let before = stories();
     let cause = "`y` (position 1) is out of reach: port 1 of `x` has no link";
@@ -284,6 +285,21 @@ fn a_story_on_the_command_line() {
     let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
     assert_eq!(json["cause"]["cause"], "out-of-reach");
     assert_eq!(json["cycles"].as_array().map(Vec::len), Some(200));
+
+    // The next story takes its place, and that of nothing else.
+    let again = run(&["--story", page.to_str().expect("UTF-8")]);
+    assert_eq!(again.status.code(), Some(1));
+    std::fs::write(folder.path().join("package.json"), "{\"name\": 1}").expect("written");
+    for (name, refused) in [
+        ("package.txt", "is not the data of a fault story"),
+        ("why.json", "is where the data go"),
+    ] {
+        let name = folder.path().join(name);
+        let output = run(&["--story", name.to_str().expect("UTF-8")]);
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{told}");
+        assert!(told.contains(refused), "{told}");
+    }
 
     // The simulated bus can be run again: nothing is kept unless it is asked for.
     let output = run(&["--json"]);

@@ -73,11 +73,10 @@ pub(crate) struct Kind {
 enum Sign {
     /// Every such file begins with it.
     Begins(&'static [u8]),
-    /// It is among the first of every such file's bytes.
-    Early(&'static str),
+    /// By the first [`EARLY`] of its bytes.
+    Early(fn(&str) -> bool),
 }
 
-/// Bytes among which [`Sign::Early`] is.
 const EARLY: usize = 4096;
 
 impl Sign {
@@ -91,7 +90,7 @@ impl Sign {
     fn shows(&self, head: &[u8]) -> bool {
         match self {
             Self::Begins(bytes) => head == *bytes,
-            Self::Early(text) => String::from_utf8_lossy(head).contains(text),
+            Self::Early(shows) => shows(&String::from_utf8_lossy(head)),
         }
     }
 }
@@ -114,9 +113,15 @@ pub(crate) const FIGURES: Kind = Kind {
 };
 
 pub(crate) const STORY: Kind = Kind {
-    sign: Sign::Early(story::ENDED_WITH),
+    sign: Sign::Early(story::is_page),
     what: "a fault story",
     instead: "name a new file, or a story to write over",
+};
+/// What is beside [`STORY`].
+pub(crate) const STORY_DATA: Kind = Kind {
+    sign: Sign::Begins(br#"{"headline":"#),
+    what: "the data of a fault story (JSON)",
+    instead: "the data go beside the page: name another page",
 };
 
 /// Whether `target`, which `option` names, may be written over; `inputs` are read, and what they are.
@@ -332,13 +337,15 @@ mod tests {
         let figures = file("figures.json", b"{\n}");
         let recording = file("run.pcapng", b"\n\r\r\n and more");
         let story = file("story", b"`y` is gone\n\nThe run ended with: nothing\n");
-        let notes = file("notes", b"dear diary");
+        let data = file("story.json", b"{\"headline\":\"`y` is gone\"}");
+        let notes = file("notes", b"dear\n\ndiary\n\nThe run ended with: rain");
         let new = folder.path().join("new");
         for (kind, own) in [
             (&PAGE, &page),
             (&FIGURES, &figures),
             (&RECORDING, &recording),
             (&STORY, &story),
+            (&STORY_DATA, &data),
         ] {
             for target in [&page, &figures, &recording, &story, &notes, &new] {
                 let done = may_replace("--x", target, kind, []);

@@ -237,8 +237,14 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
         }
     }
     if let Some(path) = &args.story {
+        let data = path.with_extension("json");
+        if data == *path {
+            let message = format!("--story: {} is where the data go", path.display());
+            return Err(Failure::new(hints::WRONG, message)
+                .hint("name the page, such as `story.txt`; the data go beside it"));
+        }
         files::may_replace("--story", path, &files::STORY, [])?;
-        files::may_replace("--story", &path.with_extension("json"), &files::FIGURES, [])?;
+        files::may_replace("--story", &data, &files::STORY_DATA, [])?;
     }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();

@@ -60,13 +60,19 @@ fn paragraph(text: &str, indent: usize) -> String {
 }
 
 /// Begins the second paragraph of every page.
-pub(crate) const ENDED_WITH: &str = "The run ended with: ";
+const ENDED_WITH: &str = "The run ended with:";
+
+/// Whether a file that begins so is such a page: a paragraph of the cause, and the next one of the error.
+pub(crate) fn is_page(head: &str) -> bool {
+    let second = head.split_once("\n\n").map(|(_, rest)| rest);
+    second.is_some_and(|rest| rest.starts_with(ENDED_WITH))
+}
 
 /// The whole page. The first line says which device and which cause.
 pub(crate) fn page(story: &Story, hints: &[String]) -> String {
     let mut text = paragraph(&story.headline, 0);
     text += "\n";
-    text += &paragraph(&format!("{ENDED_WITH}{}", story.error), 0);
+    text += &paragraph(&format!("{ENDED_WITH} {}", story.error), 0);
     let mut when = format!(
         "{}, cycle {}",
         story.machine,
