@@ -7,8 +7,8 @@ use hdrhistogram::Histogram;
 use super::pair::Passed;
 use crate::recording::frame::Command;
 
-/// Datagrams with an address of their own that are followed; a bus has as many as it has groups.
-const GROUPS: usize = 16;
+/// Datagrams with an address of their own that are followed: one a group, and one for every eight mailboxes.
+const GROUPS: usize = 64;
 /// Changes of a working counter that are kept; they are counted beyond.
 const RUNS: usize = 256;
 /// Gaps that are kept.

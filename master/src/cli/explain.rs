@@ -342,7 +342,7 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let percent = |ns: u64| ns as f64 * 100.0 / machine.bus.cycle_ns as f64;
     writeln!(
         out,
-        "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130, one diagnostic read), {total} bytes on the wire",
+        "\nframes a cycle: {} ({clock}{process_data}BRD 0x0130, one diagnostic read), at most {total} bytes on the wire",
         frames.len()
     )?;
     writeln!(

@@ -8,6 +8,11 @@ const TAIL: std::ops::Range<usize> = 10..12;
 /// Of programs beside a cycle; ethercrab's is 0x10, the cycle's 0x20.
 const BESIDE: u8 = 0x30;
 
+/// Whether a frame is of such a program.
+pub(super) fn is_beside(frame: &[u8]) -> bool {
+    frame.get(TAIL).is_some_and(|tail| tail[1] == BESIDE)
+}
+
 /// Sends every frame from an address of its own, and hands back only what comes back to it.
 #[derive(Debug)]
 pub struct Apart {

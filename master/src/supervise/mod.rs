@@ -40,10 +40,8 @@ mod program;
 const TICK: Duration = Duration::from_millis(1);
 /// How long the phase may take to lock.
 const LOCK_TIMEOUT: Nanos = 5_000_000_000;
-/// Cycles before Op is asked for, besides those in which the diagnostic slot visits every device.
+/// Cycles before Op is asked for.
 const FIRST_CYCLES: u64 = 20;
-/// Diagnostic reads per device until its clock has been looked at.
-const PROBES: usize = Probe::ClockDifference as usize + 1;
 /// A clock closer to the reference than this has settled.
 const SETTLED_NS: u32 = 1_000;
 /// The drives' own quick stop may take so long after the cycle's patience is over.
@@ -182,10 +180,14 @@ impl Supervisor {
     /// SafeOp.
     async fn await_phase(&mut self) -> Result<(), RunError> {
         let start = clock::now();
-        let probes = u64::try_from(PROBES * self.bus.devices.len()).unwrap_or(u64::MAX);
+        // Every clock is to be looked at, which takes long on a big bus with a long cycle.
+        let looks = self.bus.devices.len() * Probe::ALL.len() * 2;
+        let looks = u64::try_from(looks).unwrap_or(u64::MAX);
+        let patience = LOCK_TIMEOUT.saturating_add(looks.saturating_mul(self.machine.bus.cycle_ns));
         loop {
             let snapshot = self.tick().await?;
-            let looked_at_all = snapshot.counters.cycles > FIRST_CYCLES.saturating_add(probes);
+            let looked_at_all =
+                snapshot.counters.cycles > FIRST_CYCLES && self.clocks_read(&snapshot);
             let locked = snapshot.phase.is_none_or(|phase| phase.locked);
             let unsettled = self.unsettled_clock(&snapshot);
             if looked_at_all && snapshot.inputs_fresh && locked && unsettled.is_none() {
@@ -194,7 +196,7 @@ impl Supervisor {
                 }
                 return Ok(());
             }
-            if clock::now().saturating_sub(start) > LOCK_TIMEOUT {
+            if clock::now().saturating_sub(start) > patience {
                 return Err(match (snapshot.phase, unsettled) {
                     _ if !snapshot.inputs_fresh => RunError::NoProcessData {
                         al_status: snapshot.al_status,
@@ -212,6 +214,12 @@ impl Supervisor {
                 });
             }
         }
+    }
+
+    /// The diagnostic slot has come to every clock.
+    fn clocks_read(&self, snapshot: &Snapshot) -> bool {
+        let mut devices = self.bus.devices.iter().zip(&snapshot.diagnoses);
+        devices.all(|(device, found)| !device.dc || found.has_read(Probe::ClockDifference))
     }
 
     fn unsettled_clock(&self, snapshot: &Snapshot) -> Option<(DeviceRef, i32)> {

@@ -94,7 +94,7 @@ impl Engine {
         self.stats.counters.refused_answers = self.port.refused;
     }
 
-    /// The difference of one clock a cycle. One that is outside the window is told of once, until it has come well inside.
+    /// The difference of one clock at a time. One that is outside the window is told of once, until it has come well inside.
     fn watch_clock(&mut self) {
         let Some((device, difference_ns)) = self.exchange.clock_read() else {
             return;

@@ -1,4 +1,4 @@
-//! What the diagnostic slot reads, one register block of one SubDevice a cycle.
+//! What the diagnostic slot reads of the SubDevices, one register block of one of them at a time.
 
 use serde::Serialize;
 
@@ -95,27 +95,32 @@ impl Diagnosis {
         self.errors.since(&self.start)
     }
 
+    /// What it says of this has been read, and is no default.
+    #[must_use]
+    pub fn has_read(&self, probe: Probe) -> bool {
+        self.begun.get(probe as usize) == Some(&true)
+    }
+
     /// As [`Diagnosis::grown`], up to counters that somebody else has read since.
     #[must_use]
     pub fn grown_to(&self, now: &ErrorCounters) -> ErrorCounters {
         let since = now.since(&self.start);
-        let begun = |probe: Probe| self.begun.get(probe as usize) == Some(&true);
         let mut grown = self.grown();
         let more = |to: &mut [u8; 4], new: [u8; 4]| {
             for (to, new) in to.iter_mut().zip(new) {
                 *to = new.max(*to);
             }
         };
-        if begun(Probe::RxErrors) {
+        if self.has_read(Probe::RxErrors) {
             more(&mut grown.invalid_frames, since.invalid_frames);
             more(&mut grown.rx_errors, since.rx_errors);
         }
-        if begun(Probe::Forwarded) {
+        if self.has_read(Probe::Forwarded) {
             more(&mut grown.forwarded, since.forwarded);
             grown.processing = grown.processing.max(since.processing);
             grown.pdi = grown.pdi.max(since.pdi);
         }
-        if begun(Probe::LostLinks) {
+        if self.has_read(Probe::LostLinks) {
             more(&mut grown.lost_links, since.lost_links);
         }
         grown
@@ -186,7 +191,9 @@ mod tests {
     #[test]
     fn counters_grow_from_where_they_were_first_seen() {
         let mut diagnosis = Diagnosis::default();
+        assert!(!diagnosis.has_read(Probe::RxErrors));
         diagnosis.take(Probe::RxErrors, &[3, 1, 0, 0, 0, 0, 0, 0]);
+        assert!(diagnosis.has_read(Probe::RxErrors) && !diagnosis.has_read(Probe::LostLinks));
         diagnosis.take(Probe::LostLinks, &[0, 2, 0, 0]);
         assert_eq!(diagnosis.grown(), ErrorCounters::default());
         diagnosis.take(Probe::RxErrors, &[5, 1, 0, 4, 0, 0, 0, 0]);

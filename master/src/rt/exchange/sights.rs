@@ -20,7 +20,7 @@ pub struct Sights {
 }
 
 impl Sights {
-    /// Sent in the place of a status. No SyncManager has it, so that what comes back so was read by nobody.
+    /// What every diagnostic read is sent filled with. No SyncManager has such a status, so that what comes back so was read by nobody.
     pub(super) const UNSEEN: u8 = 0xff;
 
     #[must_use]
