@@ -84,6 +84,34 @@ fn a_fault_in_a_group_stops_it_and_nothing_else() {
     assert_eq!(told.count(), 1);
 }
 
+/// A script must not take what went on without a group of its axes for a finished run.
+#[test]
+fn a_run_that_ends_without_one_of_its_groups_is_no_success() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let esi = common::root().join("configs/esi");
+    let fault = folder.path().join("fault.toml");
+    std::fs::write(&fault, FAULT).expect("written");
+    let again = "\n[[step]]\nreset = [\"x\", \"y\"]\n";
+    for (last, code) in [("", 1), (again, 0)] {
+        let steps = format!("{TURN}{BACK}{last}");
+        let text = bench(&[], &format!("{GANTRY}{ALONE}{steps}"));
+        let text = text.replace("\"esi/", &format!("\"{}/", esi.display()));
+        let file = folder.path().join("machine.toml");
+        std::fs::write(&file, text).expect("written");
+        let run = std::process::Command::new(env!("CARGO_BIN_EXE_ecaxis"))
+            .args(["run", "--sim", "--virtual", "--json", "--faults"])
+            .args([&fault, &file])
+            .output()
+            .expect("the binary runs");
+        let told = String::from_utf8_lossy(&run.stderr);
+        assert_eq!(run.status.code(), Some(code), "{told}");
+        let report: serde_json::Value = serde_json::from_slice(&run.stdout).expect("JSON");
+        assert_eq!(report["ok"], code == 0);
+        let error = "error: the group `gantry` has stopped and was not reset: `x`";
+        assert_eq!(told.contains(error), code == 1, "{told}");
+    }
+}
+
 /// The machine stops as without groups, unless it is told to go on.
 #[test]
 fn a_group_whose_outside_stops_takes_the_machine_along() {

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, ConfigError, Machine, Nic, duration};
-use ecaxis::session::{self, Options, Outcome, RunError};
+use ecaxis::session::{self, Options, Outcome, RunError, Summary};
 use ecaxis::story::Story;
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
@@ -132,6 +132,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let (Some(story), Some(failure)) = (&story, &mut failure) {
         tell_story(args, story, failure, &nic);
     }
+    let failure = failure.or_else(|| summary.as_ref().and_then(stopped_since));
     let text = if args.json {
         let report = json!({
             "ok": failure.is_none(),
@@ -156,6 +157,22 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => {}
     }
     written
+}
+
+/// A machine that went on without a group of its axes has not done all that it should.
+fn stopped_since(summary: &Summary) -> Option<Failure> {
+    let mut stopped = summary.group_stops.iter().filter(|stop| !stop.released);
+    let stop = stopped.next()?;
+    let others = match stopped.count() {
+        0 => String::new(),
+        n => format!(" (and {n} more)"),
+    };
+    let message = format!(
+        "the group `{}` has stopped and was not reset{others}: {}",
+        stop.group, stop.cause
+    );
+    let hint = "mend the cause and run again; in a program, the steps `reset` and `enable` bring a group back";
+    Some(Failure::new(hints::FAILED, message).hint(hint))
 }
 
 /// In short on stderr, whole in a file. Where it knows the cause, its advice takes the place of that for the error.
