@@ -10,7 +10,7 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use ecaxis::clock::Clock;
 use ecaxis::config;
 use ecaxis::rt::cycle::Engine;
-use ecaxis::session::{Options, prepare};
+use ecaxis::session::{Job, Options};
 use ecaxis_axis::{Axis, AxisConfig, Command, Inputs, Limits, Mode, Scale};
 
 /// A machine of `count` CSP axes at 1 ms.
@@ -39,8 +39,14 @@ fn whole_cycle(c: &mut Criterion) {
         options.clock.enter();
         let (progress, _told) = channel();
         let stop = Arc::new(AtomicBool::new(false));
-        let prepared =
-            prepare(&Arc::new(machine), &options, stop, progress, None).expect("comes up");
+        let job = Job {
+            machine: &Arc::new(machine),
+            options: &options,
+            stop,
+            progress,
+            controller: None,
+        };
+        let prepared = job.prepare().expect("comes up");
         let mut engine = Engine::new(prepared.parts);
         group.throughput(Throughput::Elements(count as u64));
         group.bench_function(BenchmarkId::from_parameter(count), |b| {

@@ -19,7 +19,7 @@ use ecaxis::link::{Link, LinkError, MAX_FRAME};
 use ecaxis::mailbox::DeviceMailbox;
 use ecaxis::rt::controller::{Controller, Cycle};
 use ecaxis::rt::cycle::{Engine, Remains};
-use ecaxis::session::{Options, Prepared, Progress, RunError, prepare};
+use ecaxis::session::{Job, Options, Prepared, Progress, RunError};
 use ecaxis_axis::Command;
 
 thread_local! {
@@ -143,10 +143,17 @@ fn metered_among_users(
     options.clock.enter();
     let (progress, told) = channel();
     let stop = Arc::new(AtomicBool::new(false));
+    let job = Job {
+        machine: &Arc::new(machine),
+        options,
+        stop,
+        progress,
+        controller,
+    };
     let Prepared {
         mut parts,
         supervisor,
-    } = prepare(&Arc::new(machine), options, stop, progress, controller).expect("comes up");
+    } = job.prepare().expect("comes up");
     parts.link = Box::new(Unmetered(parts.link));
     let mut engine = Engine::new(parts);
     let mut beside = pin!(supervisor.run());

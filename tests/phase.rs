@@ -18,7 +18,7 @@ use ecaxis::link::sim::SimLink;
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
 use ecaxis::rt::cycle::Engine;
 use ecaxis::rt::phase::{Gains, Phase};
-use ecaxis::session::{Prepared, Progress, prepare_on, simulated_bus};
+use ecaxis::session::{Job, Prepared, Progress, simulated_bus};
 
 const DRIVES: usize = 3;
 const SECOND: Nanos = 1_000_000_000;
@@ -122,18 +122,17 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
     };
     let (progress, told) = channel();
     let stop = Arc::new(AtomicBool::new(false));
+    let job = Job {
+        machine: &Arc::new(machine),
+        options: &options,
+        stop,
+        progress,
+        controller: None,
+    };
     let Prepared {
         mut parts,
         supervisor,
-    } = prepare_on(
-        Box::new(link),
-        &Arc::new(machine),
-        &options,
-        stop,
-        progress,
-        None,
-    )
-    .expect("comes up");
+    } = job.prepare_on(Box::new(link)).expect("comes up");
     let plan = supervisor.bus.dc.expect("a reference clock");
     parts.phase = Some(Phase::with_gains(&plan, gains));
     let mut engine = Engine::new(parts);

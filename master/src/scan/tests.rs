@@ -21,7 +21,7 @@ use crate::mailbox::Wire;
 use crate::rt::cycle::Engine;
 use crate::service::station::{address, census};
 use crate::service::{Datagrams, carry};
-use crate::session::{self, Prepared, prepare_on, simulated_bus};
+use crate::session::{self, Job, Prepared, simulated_bus};
 
 const STACK: usize = 16 * 1024 * 1024;
 
@@ -220,9 +220,14 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
     let stop = Arc::new(AtomicBool::new(false));
     let (progress, _told) = channel();
     let own = Box::new(link.clone());
-    let Ok(Prepared { parts, supervisor }) =
-        prepare_on(own, machine, &options, stop, progress, None)
-    else {
+    let job = Job {
+        machine,
+        options: &options,
+        stop,
+        progress,
+        controller: None,
+    };
+    let Ok(Prepared { parts, supervisor }) = job.prepare_on(own) else {
         return false;
     };
     let mut engine = Engine::new(parts);

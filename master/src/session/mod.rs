@@ -35,8 +35,8 @@ pub use error::{DriveReport, RunError};
 pub use events::EventLine;
 pub(crate) use events::clock_off;
 pub use open::{recorded, simulated_bus, topology};
-pub use prepare::{Prepared, prepare, prepare_on};
-use prepare::{go_silent, lacking, prepare_seeing};
+pub use prepare::{Job, Prepared};
+use prepare::{go_silent, lacking};
 pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
 use story::{Left, Seen};
 use summary::Aside;
@@ -201,7 +201,14 @@ fn own_the_link(
         Instead::Controller(controller) => (Some(controller), None),
         Instead::Operator(operator) => (None, Some(operator)),
     };
-    let prepared = prepare_seeing(machine, options, stop, progress, controller, &mut seen);
+    let job = Job {
+        machine,
+        options,
+        stop,
+        progress,
+        controller,
+    };
+    let prepared = job.prepare_seeing(&mut seen);
     let Prepared {
         parts,
         mut supervisor,

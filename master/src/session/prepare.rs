@@ -38,164 +38,157 @@ pub struct Prepared {
     pub supervisor: Supervisor,
 }
 
-/// Opens the link and brings the bus to SafeOp, on the calling thread and its clock
-/// ([`Clock::enter`]).
-pub fn prepare(
-    machine: &Arc<Machine>,
-    options: &Options,
-    stop: Arc<AtomicBool>,
-    progress: Sender<Progress>,
-    controller: Option<Box<dyn Controller>>,
-) -> Result<Prepared, RunError> {
-    let seen = &mut Seen::default();
-    prepare_seeing(machine, options, stop, progress, controller, seen)
+/// A run that is to be prepared.
+#[derive(Debug)]
+pub struct Job<'a> {
+    pub machine: &'a Arc<Machine>,
+    pub options: &'a Options,
+    /// Who may end it.
+    pub stop: Arc<AtomicBool>,
+    /// Who hears of it.
+    pub progress: Sender<Progress>,
+    /// In the place of the file's program.
+    pub controller: Option<Box<dyn Controller>>,
 }
 
-/// Likewise; `seen` is what a bus looked like that did not come up.
-pub(super) fn prepare_seeing(
-    machine: &Arc<Machine>,
-    options: &Options,
-    stop: Arc<AtomicBool>,
-    progress: Sender<Progress>,
-    controller: Option<Box<dyn Controller>>,
-    seen: &mut Seen,
-) -> Result<Prepared, RunError> {
-    // Whatever can be known to fail without a bus fails before there is one.
-    plan(machine)?;
-    let link = open::link(machine, options, |concern| {
-        let _ = progress.send(Progress::Concern(concern));
-    })?;
-    prepare_with(link, machine, options, stop, progress, controller, seen)
-}
+impl Job<'_> {
+    /// Opens the link and brings the bus to SafeOp, on the calling thread and its clock
+    /// ([`Clock::enter`]).
+    pub fn prepare(self) -> Result<Prepared, RunError> {
+        self.prepare_seeing(&mut Seen::default())
+    }
 
-/// Likewise, on a link of one's own in the place of the file's `nic`.
-pub fn prepare_on(
-    link: Box<dyn Link>,
-    machine: &Arc<Machine>,
-    options: &Options,
-    stop: Arc<AtomicBool>,
-    progress: Sender<Progress>,
-    controller: Option<Box<dyn Controller>>,
-) -> Result<Prepared, RunError> {
-    let seen = &mut Seen::default();
-    prepare_with(link, machine, options, stop, progress, controller, seen)
-}
+    /// Likewise; `seen` is what a bus looked like that did not come up.
+    pub(super) fn prepare_seeing(self, seen: &mut Seen) -> Result<Prepared, RunError> {
+        // Whatever can be known to fail without a bus fails before there is one.
+        plan(self.machine)?;
+        let link = open::link(self.machine, self.options, |concern| {
+            let _ = self.progress.send(Progress::Concern(concern));
+        })?;
+        self.prepare_with(link, seen)
+    }
 
-fn prepare_with(
-    mut link: Box<dyn Link>,
-    machine: &Arc<Machine>,
-    options: &Options,
-    stop: Arc<AtomicBool>,
-    progress: Sender<Progress>,
-    controller: Option<Box<dyn Controller>>,
-    seen: &mut Seen,
-) -> Result<Prepared, RunError> {
-    let (image, ..) = plan(machine)?;
-    let (main_device, mut port) = main_device(machine.bus.cycle_ns);
-    let carried = Carried {
-        clock: options.clock,
-        stop: &stop,
-        link: link.as_mut(),
-        port: &mut port,
-    };
-    let log = Log::new(progress.clone());
-    match come_up(machine, main_device, image, carried, &progress, &log) {
-        Ok(mut bus) => {
-            let machine = &as_the_drives_say(machine, &bus);
-            let (_, slots, axes, signals) = plan(machine)?;
-            let wire = Datagrams::new(main_device);
-            let timing = Timing {
-                cycle_ns: machine.bus.cycle_ns,
-                clock_window_ns: machine.bus.clock_window_ns,
-                spin: machine.bus.spin,
-            };
-            let groups = Group::all(machine);
-            let patience = groups.iter().map(|group| group.patience).max();
-            let clock = options.clock;
-            let members = bus.devices.iter().map(|device| Member {
-                station: device.at.station,
-                clock: device.dc,
-                mailbox: device.coe.as_ref().map(|coe| coe.layout().in_sm),
-            });
-            let members: Vec<_> = members.collect();
-            let (rt_end, outer) = ends(&first_snapshot(
-                &slots,
-                groups.len(),
-                &signals,
-                members.len(),
-            ));
-            let mut exchange =
-                Exchange::new(&bus.image, bus.dc.as_ref(), &members, machine.bus.exchange);
-            hold_outputs(machine, &bus, &mut exchange);
-            exchange.stage();
-            log.set_sights(exchange.sights());
-            let (mailboxes, desks) = desks(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
-            let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
-            let controlled = controller.is_some();
-            let parts = Parts {
-                clock,
-                timing,
-                link,
-                port,
-                exchange,
-                axes: slots,
-                groups,
-                signals,
-                controller,
-                tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
-                stop: machine.stop.clone(),
-                phase: bus.dc.as_ref().map(Phase::new),
-                guard: Guard::new(machine.bus.lost_frames, &bus.image.groups),
-                end: rt_end,
-            };
-            let supervisor = Supervisor {
-                machine: Arc::clone(machine),
-                bus,
-                wire,
-                mailboxes,
-                desks,
-                log,
-                outer,
-                stop,
-                progress,
-                repeat: options.repeat.unwrap_or(machine.repeat),
-                limit: options.limit,
-                enable: options.enable,
-                controlled,
-                operator: None,
-                seen: Vec::new(),
-                axes,
-                stop_patience: patience.unwrap_or(0),
-                orders_given: 0,
-                refused: VecDeque::new(),
-                captures: Vec::new(),
-                stopped: Vec::new(),
-                last_status: clock::now(),
-                looks: Vec::new(),
-            };
-            Ok(Prepared { parts, supervisor })
-        }
-        Err(error) => {
-            let error = lacking(error, link.as_ref(), "bring-up is over");
-            seen.on_the_bus = true;
-            // What has panicked may have left anything behind.
-            if !matches!(
-                error,
-                RunError::Interrupted | RunError::Panicked(_) | RunError::Link(_)
-            ) {
-                seen.looks = vec![Look::default(); machine.devices.len()];
+    /// Likewise, on a link of one's own in the place of the file's `nic`.
+    pub fn prepare_on(self, link: Box<dyn Link>) -> Result<Prepared, RunError> {
+        self.prepare_with(link, &mut Seen::default())
+    }
+
+    fn prepare_with(self, mut link: Box<dyn Link>, seen: &mut Seen) -> Result<Prepared, RunError> {
+        let Self {
+            machine,
+            options,
+            stop,
+            progress,
+            controller,
+        } = self;
+        let (image, ..) = plan(machine)?;
+        let (main_device, mut port) = main_device(machine.bus.cycle_ns);
+        let carried = Carried {
+            clock: options.clock,
+            stop: &stop,
+            link: link.as_mut(),
+            port: &mut port,
+        };
+        let log = Log::new(progress.clone());
+        match come_up(machine, main_device, image, carried, &progress, &log) {
+            Ok(mut bus) => {
+                let machine = &as_the_drives_say(machine, &bus);
+                let (_, slots, axes, signals) = plan(machine)?;
                 let wire = Datagrams::new(main_device);
-                let look = look::at_registers(&wire, &mut seen.looks);
-                let _ = pump(&mut port, link.as_mut(), options.clock, look);
+                let timing = Timing {
+                    cycle_ns: machine.bus.cycle_ns,
+                    clock_window_ns: machine.bus.clock_window_ns,
+                    spin: machine.bus.spin,
+                };
+                let groups = Group::all(machine);
+                let patience = groups.iter().map(|group| group.patience).max();
+                let clock = options.clock;
+                let members = bus.devices.iter().map(|device| Member {
+                    station: device.at.station,
+                    clock: device.dc,
+                    mailbox: device.coe.as_ref().map(|coe| coe.layout().in_sm),
+                });
+                let members: Vec<_> = members.collect();
+                let (rt_end, outer) = ends(&first_snapshot(
+                    &slots,
+                    groups.len(),
+                    &signals,
+                    members.len(),
+                ));
+                let mut exchange =
+                    Exchange::new(&bus.image, bus.dc.as_ref(), &members, machine.bus.exchange);
+                hold_outputs(machine, &bus, &mut exchange);
+                exchange.stage();
+                log.set_sights(exchange.sights());
+                let (mailboxes, desks) =
+                    desks(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
+                let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
+                let controlled = controller.is_some();
+                let parts = Parts {
+                    clock,
+                    timing,
+                    link,
+                    port,
+                    exchange,
+                    axes: slots,
+                    groups,
+                    signals,
+                    controller,
+                    tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
+                    stop: machine.stop.clone(),
+                    phase: bus.dc.as_ref().map(Phase::new),
+                    guard: Guard::new(machine.bus.lost_frames, &bus.image.groups),
+                    end: rt_end,
+                };
+                let supervisor = Supervisor {
+                    machine: Arc::clone(machine),
+                    bus,
+                    wire,
+                    mailboxes,
+                    desks,
+                    log,
+                    outer,
+                    stop,
+                    progress,
+                    repeat: options.repeat.unwrap_or(machine.repeat),
+                    limit: options.limit,
+                    enable: options.enable,
+                    controlled,
+                    operator: None,
+                    seen: Vec::new(),
+                    axes,
+                    stop_patience: patience.unwrap_or(0),
+                    orders_given: 0,
+                    refused: VecDeque::new(),
+                    captures: Vec::new(),
+                    stopped: Vec::new(),
+                    last_status: clock::now(),
+                    looks: Vec::new(),
+                };
+                Ok(Prepared { parts, supervisor })
             }
-            go_silent(options.clock, main_device, link.as_mut(), &mut port);
-            seen.link = link.stats();
-            for remark in link.remarks() {
-                let _ = progress.send(Progress::Warning(remark));
+            Err(error) => {
+                let error = lacking(error, link.as_ref(), "bring-up is over");
+                seen.on_the_bus = true;
+                // What has panicked may have left anything behind.
+                if !matches!(
+                    error,
+                    RunError::Interrupted | RunError::Panicked(_) | RunError::Link(_)
+                ) {
+                    seen.looks = vec![Look::default(); machine.devices.len()];
+                    let wire = Datagrams::new(main_device);
+                    let look = look::at_registers(&wire, &mut seen.looks);
+                    let _ = pump(&mut port, link.as_mut(), options.clock, look);
+                }
+                go_silent(options.clock, main_device, link.as_mut(), &mut port);
+                seen.link = link.stats();
+                for remark in link.remarks() {
+                    let _ = progress.send(Progress::Warning(remark));
+                }
+                // The bring-up's error is the one to report.
+                let _ = link.finish();
+                Err(error)
             }
-            // The bring-up's error is the one to report.
-            let _ = link.finish();
-            Err(error)
         }
     }
 }
