@@ -15,7 +15,7 @@
 //! | `law` | from the set-point to the drive's targets |
 //! | `switch` | from one mode to another |
 //! | `home` | homing |
-//! | `wish` | where the power goes |
+//! | `stop` | where the power goes, and the way to standstill |
 //! | `actual`, `supervise` | what the drive reports, and what is made of it |
 //! | `blind` | lost frames, and cycles that were left out |
 //! | `report` | the status |
@@ -36,9 +36,9 @@ mod io;
 mod law;
 mod plan;
 mod report;
+mod stop;
 mod supervise;
 mod switch;
-mod wish;
 
 pub use command::Command;
 pub use config::{AxisConfig, ConfigError};
@@ -49,8 +49,8 @@ use config::Control;
 use home::Home;
 use law::Given;
 use plan::Plan;
+use stop::PowerGoal;
 use switch::Switch;
-use wish::Wish;
 
 /// Less is no cycle at all; it would only make quotients overflow.
 const SHORTEST_CYCLE_S: f64 = 1e-6;
@@ -70,7 +70,7 @@ pub struct Axis {
     state: State,
     mode_display: Option<i8>,
     controlword: Controlword,
-    wish: Wish,
+    goal: PowerGoal,
     reset: bool,
     reset_failed: bool,
     actual: Actual,
@@ -84,10 +84,8 @@ pub struct Axis {
     home: Home,
     probes: Probes,
     probe_mapped: bool,
-    /// Power is to go the shortest way.
-    cut: bool,
-    hold: wish::Hold,
-    resets: wish::Resets,
+    brake_state: stop::BrakeState,
+    resets: stop::Resets,
     /// In target, and at rest, for so long.
     settled_s: f64,
     rested_s: f64,
@@ -103,10 +101,12 @@ pub struct Axis {
     stale_cycles: u32,
     /// Answers still to come that are older than a gap in the cycle.
     overdue: u8,
-    /// CSP: lost frames stopped a set-point that was moving, and none has come through since.
-    cut_short: bool,
-    /// A drive that keeps a velocity or torque moved on meanwhile: the set-point starts anew from where that led.
-    regain: bool,
+    /// Cycles since the last frame that is known to have reached the drive.
+    undelivered_cycles: u32,
+    /// Fresh cycles in a row without Statusword bit 12.
+    unfollowed_cycles: u8,
+    /// Nothing was planned for some cycles: the set-point goes on from what the drive has done meanwhile.
+    interrupted: bool,
     /// Set-point for this cycle from outside.
     fed: Option<Motion>,
     fault: Option<DriveFault>,
@@ -122,7 +122,7 @@ impl Axis {
             state: State::NotReadyToSwitchOn,
             mode_display: None,
             controlword: Controlword::DISABLE_VOLTAGE_COMMAND,
-            wish: Wish::Disabled,
+            goal: PowerGoal::Off,
             reset: false,
             reset_failed: false,
             actual: Actual::new(config.supervision.acceleration.is_some()),
@@ -138,9 +138,8 @@ impl Axis {
             home: Home::default(),
             probes: Probes::new(),
             probe_mapped: false,
-            cut: false,
-            hold: wish::Hold::default(),
-            resets: wish::Resets::default(),
+            brake_state: stop::BrakeState::default(),
+            resets: stop::Resets::default(),
             settled_s: 0.0,
             rested_s: 0.0,
             sent: Counts::default(),
@@ -152,8 +151,9 @@ impl Axis {
             guarded_cycles: 0,
             stale_cycles: 0,
             overdue: 0,
-            cut_short: false,
-            regain: false,
+            undelivered_cycles: 0,
+            unfollowed_cycles: 0,
+            interrupted: false,
             fed: None,
             fault: None,
             trip: None,
@@ -211,6 +211,11 @@ impl Axis {
             self.judge();
         } else {
             self.stale_cycles = self.stale_cycles.saturating_add(1);
+            self.undelivered_cycles = if inputs.late {
+                1 + u32::from(self.config.answers_late)
+            } else {
+                self.undelivered_cycles.saturating_add(1)
+            };
             self.watch.lost(self.sent_before);
         }
         self.actual.pass(dt_s);
@@ -219,7 +224,7 @@ impl Axis {
     /// The second half: from the inputs and commands to the outputs. RT: O(1), never blocks or allocates.
     pub fn act(&mut self) -> Outputs {
         let (fresh, dt_s) = (self.fresh, self.dt_s);
-        self.settle_wish(dt_s);
+        self.settle_stop(fresh, dt_s);
         self.settle_reset(dt_s);
         self.settle_mode(fresh, dt_s);
         self.settle_homing(fresh, dt_s);
@@ -232,6 +237,8 @@ impl Axis {
             self.follow();
         } else if self.frozen() {
             self.freeze();
+        } else if self.stale_cycles > blind::RIDE_THROUGH_CYCLES {
+            self.slow_down(dt_s);
         } else {
             self.advance(fresh, dt_s);
             self.close_loops(fresh, dt_s);
@@ -245,7 +252,7 @@ impl Axis {
 
     fn read(&mut self, inputs: &Inputs) {
         self.stale_cycles = 0;
-        self.cut_short = false;
+        self.undelivered_cycles = 0;
         self.statusword = Statusword::from_bits_retain(inputs.statusword);
         self.mode_display = inputs.mode_display;
         // Homing moves the origin.
@@ -275,16 +282,15 @@ impl Axis {
 
     fn switch_power(&mut self, fresh: bool, dt_s: f64) {
         let blind = self.blind();
-        let power = match self.wish {
-            Wish::Enabled | Wish::Disabling { .. } if blind => Power::Disabled,
-            Wish::Enabled | Wish::Disabling { .. } => Power::Enabled,
-            Wish::Disabled if self.cut => Power::Off,
-            Wish::Disabled => Power::Disabled,
-            Wish::QuickStop { .. } => Power::QuickStop,
+        let power = match self.goal {
+            PowerGoal::On if !blind => Power::Enabled,
+            PowerGoal::On | PowerGoal::Off => Power::Disabled,
+            PowerGoal::Stopping(stop) => stop.power(),
         };
         let request = Request {
             power,
             reset_fault: self.reset,
+            hold: !self.mode_confirmed(),
             no_return: self.config.quick_stop.is_some_and(|option| !option.stays()),
         };
         // While frames are lost, no time passes for the drive's state and the reset pulses.
@@ -295,7 +301,7 @@ impl Axis {
         if step.progress == Progress::ResetFailed {
             self.reset = false;
             self.reset_failed = true;
-            self.wish = Wish::Disabled;
+            self.goal = PowerGoal::Off;
         }
     }
 
@@ -305,12 +311,14 @@ impl Axis {
     }
 
     fn update_active(&mut self) {
-        let possible =
-            self.state == State::OperationEnabled && self.mode_confirmed() && !self.blind();
+        let possible = self.state == State::OperationEnabled
+            && self.mode_confirmed()
+            && self.reported_to_follow()
+            && !self.blind();
         if !possible {
             self.active = false;
             self.end_switch();
-        } else if !self.active && self.wish == Wish::Enabled {
+        } else if !self.active && self.goal == PowerGoal::On {
             self.active = true;
             self.follow();
             self.watch = supervise::Watch::starting_at(self.actual.position(), &self.config.limits);
@@ -325,6 +333,6 @@ impl Axis {
         self.profile = Profile::new();
         self.plan = Plan::braking(&self.config, self.mode);
         self.held_by_range = false;
-        self.regain = false;
+        self.interrupted = false;
     }
 }

@@ -46,5 +46,7 @@ pub use limits::{LimitError, Limits};
 pub use loops::{FeedForward, Loops, PositionPid, VelocityLoop};
 pub use probe::{Edge, Probe, ProbeStatus, Source};
 pub use scale::{AccelerationUnit, Scale, ScaleError, VelocityBase, VelocityUnit};
-pub use status::{AxisStatus, DriveFault, HomingStatus, Refused, Trip, Waiting};
-pub use supervision::{Brake, Emergency, FaultReset, Reaction, Supervision, TorqueWatch};
+pub use status::{
+    AxisStatus, DriveFault, HomingStatus, Refused, StopPhase, StopStatus, Trip, Waiting,
+};
+pub use supervision::{Brake, FaultReset, StopMethod, Supervision, TorqueWatch};

@@ -6,6 +6,7 @@ use crate::cia402::{Mode, ModeStatus, State, Statusword, describe};
 use crate::homing::HomingError;
 use crate::probe::ProbeStatus;
 use crate::setpoint::SetpointError;
+use crate::supervision::StopMethod;
 
 /// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -70,6 +71,10 @@ pub struct AxisStatus {
     pub fault: Option<DriveFault>,
     /// Why the axis stopped itself, first cause since the last reset.
     pub trip: Option<Trip>,
+    /// A stop that is to end without power, or in Quick stop active.
+    pub stop: Option<StopStatus>,
+    /// Statusword bit 11: the drive limits what it is commanded.
+    pub internal_limit: bool,
     /// Reset pulses are being sent.
     pub resetting: bool,
     /// The last reset did not help.
@@ -90,6 +95,31 @@ impl AxisStatus {
     }
 }
 
+/// A stop under way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StopStatus {
+    pub method: StopMethod,
+    pub phase: StopPhase,
+    /// Since the method was chosen; from the removal of the power on, since that.
+    pub elapsed_s: f64,
+    /// When a harder method takes over.
+    pub timeout_s: f64,
+}
+
+/// How far a stop is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum StopPhase {
+    Decelerating,
+    /// The axis stands; the brake closes.
+    Standstill,
+    /// The drive was told to remove the power and has not reported it yet.
+    RemovingPower,
+    /// The drive still reports power, long after its removal was requested.
+    PowerKept,
+    /// The drive has not been heard since, for as long.
+    Silent,
+}
+
 /// Why an axis that is to be enabled is not ready yet.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Waiting {
@@ -101,6 +131,8 @@ pub enum Waiting {
     Voltage,
     #[error("the drive shows mode {display} instead of {expected}")]
     Mode { expected: Mode, display: Mode },
+    #[error("the drive does not follow the command value: Statusword bit 12 is not set in {mode}")]
+    Follows { mode: Mode },
     #[error("the brake is opening")]
     Brake,
     /// And says nothing about why.
@@ -159,6 +191,18 @@ pub enum Trip {
     EmergencyStop,
     #[error("the drive did not acknowledge a set-point")]
     SetPointNotTaken,
+    #[error(
+        "the drive no longer follows the command value: Statusword bit 12 is not set in {mode}"
+    )]
+    NotFollowing { mode: Mode },
+    #[error(
+        "the axis was not brought to rest by {method} within {time_s:.2} s: it moves at {velocity:.4}"
+    )]
+    NotStopped {
+        velocity: f64,
+        time_s: f64,
+        method: StopMethod,
+    },
     #[error("the drive changed its mode of operation from {expected} to {display}")]
     ModeLost { expected: Mode, display: Mode },
 }

@@ -3,10 +3,10 @@
 /// Besides [`crate::Limits`]. The default supervises nothing more, and stops by quick stop.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Supervision {
-    /// What a trip does.
-    pub reaction: Reaction,
+    /// What a trip does. Where the drive does not follow set-points, a ramp becomes a quick stop.
+    pub reaction: StopMethod,
     /// What [`crate::Command::EmergencyStop`] does.
-    pub emergency: Emergency,
+    pub emergency: StopMethod,
     /// Reported torque that may not last.
     pub torque: Option<TorqueWatch>,
     /// Largest reported acceleration, user units/s², filtered over 10 ms and for five cycles in a row.
@@ -19,25 +19,26 @@ pub struct Supervision {
     pub standstill_dwell_s: f64,
 }
 
-/// How an axis that trips is stopped. Where the drive has left Operation enabled or its mode, a ramp is no choice any more and
-/// becomes a quick stop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Reaction {
-    /// The drive's (0x605A), then no power.
+/// How an axis is brought to rest before its power is removed, gentlest first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub enum StopMethod {
+    /// Set-points within the limits of the axis.
+    Ramp,
+    /// The drive's quick stop (0x605A, 0x6085).
     #[default]
     QuickStop,
-    /// Ours, by the acceleration limit, then no power.
-    Ramp,
     /// No power at once; the axis coasts, or its brake stops it.
     DisableVoltage,
 }
 
-/// The two ways that need nothing but one Controlword.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Emergency {
-    #[default]
-    QuickStop,
-    DisableVoltage,
+impl core::fmt::Display for StopMethod {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(match self {
+            Self::Ramp => "the ramp",
+            Self::QuickStop => "the drive's quick stop",
+            Self::DisableVoltage => "disable voltage",
+        })
+    }
 }
 
 /// Torque above a limit for a time.

@@ -4,8 +4,8 @@ mod common;
 
 use common::{DEAD_TIME_S, DT, Drive, LIMITS, Rig, looped};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, ConfigError, FeedForward, Limits, Loops, Mode, PositionPid, Refused,
-    VelocityLoop,
+    Axis, AxisConfig, AxisStatus, Command, ConfigError, FeedForward, Limits, Loops, Mode,
+    PositionPid, Refused, VelocityLoop,
 };
 
 const COUNTS_PER_UNIT: f64 = 400.0;
@@ -312,7 +312,7 @@ fn jerk_limited_moves() {
         };
         let mut rig = enabled(config);
         let mut before = rig.axis.status();
-        let mut watch = |rig: &mut Rig, cycles: u32| {
+        let watch = |before: &mut AxisStatus, rig: &mut Rig, cycles: u32| {
             let mut steepest = 0.0f64;
             for _ in 0..cycles {
                 let status = rig.cycle();
@@ -321,20 +321,27 @@ fn jerk_limited_moves() {
                 assert!(status.target_acceleration.abs() <= SLOW.acceleration * (1.0 + 1e-6));
                 assert_eq!((status.trip, status.guarded_cycles), (None, 0));
                 steepest = steepest.max(jerk.abs());
-                before = status;
+                *before = status;
             }
-            (before, steepest)
+            (*before, steepest)
         };
         rig.axis.command(to(50.0)).unwrap();
-        let (_, steepest) = watch(&mut rig, 800);
+        let (_, steepest) = watch(&mut before, &mut rig, 800);
         assert!(steepest > 0.9 * JERK, "uses what it may");
         rig.axis.command(to(-50.0)).unwrap();
-        watch(&mut rig, 900);
+        watch(&mut before, &mut rig, 900);
+        // What adds to the speed ends at once, whatever the jerk.
         rig.axis.command(Command::Stop).unwrap();
-        let (status, _) = watch(&mut rig, 1500);
+        let speed = rig.axis.status().target_velocity.abs();
+        before = rig.cycle();
+        assert!(
+            before.target_velocity.abs() <= speed * (1.0 + 1e-9),
+            "{mode}"
+        );
+        let (status, _) = watch(&mut before, &mut rig, 1500);
         assert!(status.at_rest && !status.moving, "{mode}");
         rig.axis.command(to(12.5)).unwrap();
-        let (status, _) = watch(&mut rig, 3000);
+        let (status, _) = watch(&mut before, &mut rig, 3000);
         assert!(status.in_target && status.at_rest);
         assert!(status.final_error_counts.unwrap().abs() <= 1);
     }

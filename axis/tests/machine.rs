@@ -8,8 +8,8 @@ mod common;
 
 use common::{DT, Drive, LIMITS, Rig, all};
 use ecaxis_axis::{
-    Axis, AxisConfig, AxisStatus, Brake, Command, Edge, Emergency, FaultReset, FeedForward, Inputs,
-    Limits, Loops, Mode, Outputs, Probe, Reaction, Source, State, Supervision, TorqueWatch,
+    Axis, AxisConfig, AxisStatus, Brake, Command, Edge, FaultReset, FeedForward, Inputs, Limits,
+    Loops, Mode, Outputs, Probe, Source, State, StopMethod, Supervision, TorqueWatch,
 };
 
 const COUNTS_PER_UNIT: f64 = 400.0;
@@ -19,7 +19,7 @@ const MRPM_PER_UNIT: f64 = 12_000.0;
 const RUN_S: f64 = 10.0;
 
 /// Trip until no power: a ramp or the drive's halt, the wait for lost frames, the brake, and a few cycles.
-const STOPPED_WITHIN_S: f64 = 2.0 + 3.0 * 0.1 + 0.05 + 0.01;
+const STOPPED_WITHIN_S: f64 = 2.0 * (1.0 + 0.2 + 0.1) + 3.0 * 0.1 + 0.05 + 0.01;
 
 /// splitmix64.
 struct Dice(u64);
@@ -79,11 +79,11 @@ fn config(dice: &mut Dice) -> AxisConfig {
         mode_time_s: 0.2,
         supervision: Supervision {
             reaction: dice.pick(&[
-                Reaction::QuickStop,
-                Reaction::Ramp,
-                Reaction::DisableVoltage,
+                StopMethod::QuickStop,
+                StopMethod::Ramp,
+                StopMethod::DisableVoltage,
             ]),
-            emergency: dice.pick(&[Emergency::QuickStop, Emergency::DisableVoltage]),
+            emergency: dice.pick(&[StopMethod::QuickStop, StopMethod::DisableVoltage]),
             torque: dice.pick(&[
                 None,
                 Some(TorqueWatch {
@@ -313,7 +313,10 @@ impl Checker {
         ensure(offsets || csp, "offsets outside CSP")?;
         let counts = |mode| live(mode) || in_force(&status).contains(&Some(mode));
         ensure(
-            out.target_velocity == 0 || counts(Mode::Csv) || counts(Mode::Pv),
+            out.target_velocity == 0
+                || counts(Mode::Csv)
+                || counts(Mode::Pv)
+                || status.switching == Some(Mode::Csp),
             "velocity where none counts",
         )?;
         ensure(
@@ -357,7 +360,7 @@ impl Checker {
             "still powered after a trip",
         )?;
 
-        let ramps = self.config.supervision.reaction == Reaction::Ramp;
+        let ramps = self.config.supervision.reaction == StopMethod::Ramp;
         self.ending |= status.trip.is_some() && ramps;
         let ended = status.fault.is_some() && !status.resetting || status.trip.is_some() && !ramps;
         if ended || self.ending && !status.enabled {

@@ -4,9 +4,8 @@ mod common;
 
 use common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Brake, Command, Edge, Emergency, FaultReset, Inputs, Limits, Mode, Probe,
-    ProbeStatus, QuickStopOption, Reaction, Refused, Source, State, Supervision, TorqueWatch, Trip,
-    Waiting,
+    Axis, AxisConfig, Brake, Command, Edge, FaultReset, Inputs, Limits, Mode, Probe, ProbeStatus,
+    QuickStopOption, Refused, Source, State, StopMethod, Supervision, TorqueWatch, Trip, Waiting,
 };
 
 const ENDLESS: Limits = Limits {
@@ -43,9 +42,9 @@ const fn run_at(velocity: f64) -> Command {
 #[test]
 fn reactions_row_by_row() {
     for (reaction, first, least, most) in [
-        (Reaction::QuickStop, 0x0002, 1, 60),
-        (Reaction::Ramp, 0x000F, 45, 60),
-        (Reaction::DisableVoltage, 0x0000, 1, 3),
+        (StopMethod::QuickStop, 0x0002, 100, 160),
+        (StopMethod::Ramp, 0x000F, 145, 160),
+        (StopMethod::DisableVoltage, 0x0000, 1, 3),
     ] {
         let mut rig = enabled(supervised(
             Mode::Csv,
@@ -100,7 +99,7 @@ fn a_ramp_is_no_reaction_to_a_lost_mode() {
     let mut rig = enabled(supervised(
         Mode::Csv,
         Supervision {
-            reaction: Reaction::Ramp,
+            reaction: StopMethod::Ramp,
             ..Supervision::default()
         },
     ));
@@ -115,8 +114,8 @@ fn a_ramp_is_no_reaction_to_a_lost_mode() {
 #[test]
 fn emergency_stop() {
     for (emergency, word) in [
-        (Emergency::QuickStop, 0x0002),
-        (Emergency::DisableVoltage, 0x0000),
+        (StopMethod::QuickStop, 0x0002),
+        (StopMethod::DisableVoltage, 0x0000),
     ] {
         let config = supervised(
             Mode::Csp,

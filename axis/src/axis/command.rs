@@ -1,12 +1,13 @@
 //! Commands: checked completely before anything changes.
 
-use super::wish::Resets;
-use super::{Axis, Control, Plan, Wish};
+use super::stop::{PowerGoal, Resets};
+use super::{Axis, Control, Plan};
 use crate::cia402::{Mode, State};
 use crate::probe::{Edge, Probe, Source};
 use crate::profile::Goal;
 use crate::setpoint::{self, Ramp, Trapezoid};
 use crate::status::Refused;
+use crate::supervision::StopMethod;
 use crate::units::{Counts, UserUnits};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -87,7 +88,7 @@ impl Axis {
         match command {
             Command::Enable => self.enable(),
             Command::Disable => {
-                self.disable();
+                self.stop_by(StopMethod::Ramp);
                 Ok(())
             }
             Command::ResetFault => {
@@ -99,7 +100,7 @@ impl Axis {
                 Ok(())
             }
             Command::DisableVoltage => {
-                self.cut_power();
+                self.stop_by(StopMethod::DisableVoltage);
                 Ok(())
             }
             Command::EmergencyStop => {
@@ -125,7 +126,7 @@ impl Axis {
             Command::SetMode(mode) => self.set_mode(mode),
             Command::Home { timeout_s } => self.home(timeout_s),
             Command::QuickStop => {
-                self.quick_stop(false);
+                self.begin_stop(StopMethod::QuickStop, true);
                 Ok(())
             }
             Command::MoveTo {
@@ -155,57 +156,27 @@ impl Axis {
         {
             return Err(Refused::Faulted(fault));
         }
-        if let Wish::QuickStop { then_disable, .. } = self.wish {
-            if then_disable || self.state == State::OperationEnabled {
-                return Err(Refused::Stopping);
+        match self.goal {
+            PowerGoal::Stopping(stop) if stop.removes_power() => {
+                // What the drive answers to the removal would look like a loss of power.
+                if self.active {
+                    return Err(Refused::Stopping);
+                }
             }
-            if !self.standing() {
-                return Err(Refused::StillMoving {
-                    velocity: self.actual.velocity(),
-                });
+            PowerGoal::Stopping(stop) => {
+                if !stop.stays || self.state == State::OperationEnabled {
+                    return Err(Refused::Stopping);
+                }
+                if !self.standing() {
+                    return Err(Refused::StillMoving {
+                        velocity: self.actual.velocity(),
+                    });
+                }
             }
+            PowerGoal::Off | PowerGoal::On => {}
         }
-        // The power is on its way off and the drive has not answered yet: what it answers would look like a loss.
-        if self.active && self.wish == Wish::Disabled {
-            return Err(Refused::Stopping);
-        }
-        self.cut = false;
-        self.wish = Wish::Enabled;
+        self.goal = PowerGoal::On;
         Ok(())
-    }
-
-    pub(super) fn disable(&mut self) {
-        self.brake();
-        self.wish = match self.wish {
-            Wish::QuickStop { elapsed_s, .. } => Wish::QuickStop {
-                then_disable: true,
-                elapsed_s,
-            },
-            // Asked for already, and perhaps granted without the set-point at rest: no power again.
-            Wish::Disabling { .. } | Wish::Disabled => self.wish,
-            _ if self.active => Wish::Disabling { frozen_s: 0.0 },
-            _ => Wish::Disabled,
-        };
-    }
-
-    /// Also how a trip stops the axis.
-    pub(super) fn quick_stop(&mut self, then_disable: bool) {
-        self.brake();
-        self.wish = match self.wish {
-            Wish::QuickStop {
-                then_disable: before,
-                elapsed_s,
-            } => Wish::QuickStop {
-                then_disable: before || then_disable,
-                elapsed_s,
-            },
-            // No power, or on its way off, perhaps after a quick stop that took too long: not from the beginning again.
-            Wish::Disabled => Wish::Disabled,
-            _ => Wish::QuickStop {
-                then_disable,
-                elapsed_s: 0.0,
-            },
-        };
     }
 
     fn reset_fault(&mut self) {
@@ -233,7 +204,7 @@ impl Axis {
         if let Some(switch) = self.switch {
             return Err(Refused::Switching { to: switch.to });
         }
-        if self.state == State::OperationEnabled
+        if matches!(self.state, State::SwitchedOn | State::OperationEnabled)
             && let Some(display) = self.mode_display
             && !self.mode_confirmed()
         {
@@ -245,7 +216,7 @@ impl Axis {
         if !self.active {
             return Err(Refused::NotEnabled { state: self.state });
         }
-        if self.wish != Wish::Enabled {
+        if self.goal != PowerGoal::On {
             return Err(Refused::Stopping);
         }
         if self.braked() {

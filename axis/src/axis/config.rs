@@ -34,6 +34,11 @@ pub struct AxisConfig {
     pub supervision: Supervision,
     pub brake: Brake,
     pub fault_reset: FaultReset,
+    /// When a stop becomes harder, seconds. `None`: calculated from speed, acceleration and jerk, and later where the axis
+    /// still slows down.
+    pub stop_timeout_s: Option<f64>,
+    /// The drive serves Statusword bit 12 (drive follows command value) in CSP, CSV and CST.
+    pub follows_bit: bool,
 }
 
 impl AxisConfig {
@@ -60,6 +65,8 @@ impl AxisConfig {
             supervision: Supervision::default(),
             brake: Brake::default(),
             fault_reset: FaultReset::default(),
+            stop_timeout_s: None,
+            follows_bit: true,
         }
     }
 
@@ -85,6 +92,7 @@ impl AxisConfig {
             ("supervised torque", watch.torque.map(|t| t.percent)),
             ("supervised acceleration", watch.acceleration),
             ("standstill window", watch.standstill),
+            ("stop_timeout_s", self.stop_timeout_s),
             ("kv", csv.map(|l| l.kv)),
             ("kp", cst.map(|l| l.kp)),
             ("tn_s", cst.and_then(|l| l.tn_s)),
@@ -132,6 +140,21 @@ impl AxisConfig {
         Ok(())
     }
 
+    /// When a stop from this speed becomes harder, seconds: what the ramp takes, with its jerk, and a second for the drive.
+    #[must_use]
+    pub fn stop_time_s(&self, mode: Mode, speed: f64) -> f64 {
+        let limits = &self.limits;
+        let ramp_s = match self.control(mode) {
+            Control::Torque => limits.torque / self.torque_slope,
+            _ if self.jerk_limited => {
+                speed / limits.acceleration + limits.acceleration / limits.jerk()
+            }
+            _ => speed / limits.acceleration,
+        };
+        let calculated_s = ramp_s + self.dead_time_s + STOP_MARGIN_S;
+        self.stop_timeout_s.unwrap_or(calculated_s).min(LONGEST_S)
+    }
+
     /// What can be commanded in a mode.
     pub(super) const fn control(&self, mode: Mode) -> Control {
         match mode {
@@ -145,6 +168,9 @@ impl AxisConfig {
 
 /// Longer is no dead time.
 const LONGEST_DEAD_TIME_S: f64 = 0.1;
+
+/// Added to the time that a deceleration takes: settling, a drive that follows late.
+const STOP_MARGIN_S: f64 = 1.0;
 
 /// An hour is longer than any dwell, delay or brake.
 const LONGEST_S: f64 = 3600.0;

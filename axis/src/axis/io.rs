@@ -19,9 +19,12 @@ pub struct Inputs {
     pub touch_probe_status: Option<u16>,
     /// 0x60BA, 0x60BB, 0x60BC, 0x60BD: probe 1 positive and negative edge, probe 2 positive and negative edge.
     pub touch_probe_positions: [Option<i32>; 4],
-    /// `false`: this cycle's frame was lost; the values are old and no decision is made on them. The set-point runs on for two
+    /// `false`: no answer came in time; the values are old and no decision is made on them. The set-point runs on for two
     /// such cycles in a row, then it waits.
     pub fresh: bool,
+    /// Where not fresh: the answer to an earlier frame came late. It proves that the targets arrive, so the set-point
+    /// decelerates instead of waiting.
+    pub late: bool,
 }
 
 /// One cycle's outputs of one drive. Every field is always a safe value, whichever of them are mapped. While the mode is

@@ -73,7 +73,7 @@ impl Axis {
     pub(super) fn close_loops(&mut self, fresh: bool, dt_s: f64) {
         let limits = self.config.limits;
         let loops = self.config.loops;
-        let switch = self.switch.map(|switch| switch.to);
+        let switch = self.other_mode();
         let velocity = self.motion.velocity;
         match self.mode {
             Mode::Csp if switch.is_none() => {
@@ -110,7 +110,7 @@ impl Axis {
     /// The targets of the mode that is being switched to. Also while frames are lost: the drive may have got the new mode.
     pub(super) fn shadow(&mut self) {
         let limits = self.config.limits;
-        match self.switch.map(|switch| switch.to) {
+        match self.other_mode() {
             Some(Mode::Csv | Mode::Pv) if self.mode != Mode::Csv => {
                 self.given.velocity = bounded(self.motion.velocity, limits.velocity);
             }
@@ -139,7 +139,7 @@ impl Axis {
 
     pub(super) fn outputs(&self) -> Outputs {
         let scale = &self.config.scale;
-        let mode = self.switch.map_or(self.mode, |switch| switch.to);
+        let mode = self.other_mode().unwrap_or(self.mode);
         let actual = self.actual.counts().unwrap_or_default();
         let mut out = Outputs {
             controlword: self.controlword.bits(),
@@ -150,7 +150,7 @@ impl Axis {
             } else {
                 0
             },
-            brake_open: self.hold.open,
+            brake_open: self.brake_state.open,
             profile_velocity: self.fixed.speed,
             profile_acceleration: self.fixed.acceleration,
             ..Outputs::default()

@@ -144,19 +144,6 @@ impl Axis {
         }
     }
 
-    /// [`super::Command::Stop`]: a move of bounded jerk ends with bounded jerk.
-    pub(super) fn stop(&mut self) {
-        if let Plan::Jerk(ref source) = self.plan {
-            let limits = source.order().limits;
-            let part = limits.acceleration / self.config.limits.acceleration;
-            if let Ok(stop) = self.jerk_limited(Goal::Velocity(0.0), limits.velocity, part) {
-                self.plan = Plan::Jerk(stop);
-                return;
-            }
-        }
-        self.brake();
-    }
-
     /// To rest, from whatever is going on.
     pub(super) fn brake(&mut self) {
         self.home.abort();
@@ -212,6 +199,11 @@ impl Axis {
             },
         }
         self.guard(grip, before, dt_s);
+        self.send_position(grip);
+    }
+
+    /// The set-point's position as the drive gets it; the actual one where no position is commanded.
+    pub(super) fn send_position(&mut self, grip: Control) {
         self.sent = if grip == Control::Position {
             let position = UserUnits(self.motion.position);
             self.config.scale.position_to_counts(position)

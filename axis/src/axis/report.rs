@@ -1,6 +1,7 @@
 //! The status: everything about the axis in one cycle.
 
-use super::{Axis, Plan, Wish};
+use super::stop::PowerGoal;
+use super::{Axis, Plan};
 use crate::cia402::{Mode, State, Statusword};
 use crate::status::{AxisStatus, Waiting};
 use crate::units::{Counts, UserUnits};
@@ -35,7 +36,7 @@ impl Axis {
             statusword: self.statusword.bits(),
             controlword: self.controlword.bits(),
             enabled: self.active,
-            ready: self.active && self.wish == Wish::Enabled && !self.braked(),
+            ready: self.active && self.goal == PowerGoal::On && !self.braked(),
             mode_confirmed: self.mode_confirmed(),
             moving: self.active && !arrived,
             in_target: arrived
@@ -64,6 +65,8 @@ impl Axis {
             homed: self.home.homed,
             fault: self.fault,
             trip: self.trip,
+            stop: self.stop_status(),
+            internal_limit: self.statusword.contains(Statusword::INTERNAL_LIMIT_ACTIVE),
             resetting: self.reset,
             reset_failed: self.reset_failed,
         }
@@ -89,7 +92,7 @@ impl Axis {
     }
 
     fn waiting(&self) -> Option<Waiting> {
-        if self.wish != Wish::Enabled {
+        if self.goal != PowerGoal::On {
             return None;
         }
         if self.active {
@@ -105,10 +108,17 @@ impl Axis {
         let word = self.statusword;
         let state = self.state;
         Some(match (state, self.mode_display) {
-            (State::OperationEnabled, Some(display)) => Waiting::Mode {
-                expected: self.mode,
-                display: Mode::from_code(display),
-            },
+            (State::SwitchedOn | State::OperationEnabled, Some(display))
+                if !self.mode_confirmed() =>
+            {
+                Waiting::Mode {
+                    expected: self.mode,
+                    display: Mode::from_code(display),
+                }
+            }
+            (State::OperationEnabled, _) if !self.reported_to_follow() => {
+                Waiting::Follows { mode: self.mode }
+            }
             _ if !word.contains(Statusword::REMOTE) => Waiting::Remote,
             _ if !word.contains(Statusword::VOLTAGE_ENABLED) => Waiting::Voltage,
             _ => Waiting::Drive { state },

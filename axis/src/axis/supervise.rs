@@ -1,17 +1,20 @@
 //! Judging what the drive reports, and the last guard before the outputs.
 
-use super::{Axis, Control, Wish};
-use crate::cia402::{Mode, State};
+use super::stop::PowerGoal;
+use super::{Axis, Control};
+use crate::cia402::{Mode, ModeStatus, State};
 use crate::limits::Limits;
 use crate::loops::bounded;
 use crate::setpoint::{Motion, braking_velocity};
 use crate::status::{DriveFault, Trip};
-use crate::supervision::{Emergency, Reaction};
 use crate::units::Counts;
 
 /// How much faster than the limit, and for how many fresh cycles in a row.
 const OVER_VELOCITY: f64 = 1.2;
 const OVER_VELOCITY_CYCLES: u8 = 5;
+
+/// Fresh cycles in a row without Statusword bit 12 after which an axis has lost control of its drive.
+const FOLLOW_CYCLES: u8 = 10;
 
 /// Fresh cycles after a lost frame until the drive has the newest target and its report shows it.
 const CATCH_UP_CYCLES: u8 = 2;
@@ -77,13 +80,18 @@ impl Axis {
     pub(super) fn judge(&mut self) {
         let before = self.state;
         self.state = State::from_statusword(self.statusword);
+        self.unfollowed_cycles = if self.follows_now() {
+            0
+        } else {
+            self.unfollowed_cycles.saturating_add(1)
+        };
         if self.state.is_fault() {
             if !before.is_fault() {
                 self.fault.get_or_insert(DriveFault {
                     statusword: self.statusword.bits(),
                     code: None,
                 });
-                self.wish = Wish::Disabled;
+                self.stop_by_fault();
                 self.reset = false;
             }
             return;
@@ -96,10 +104,8 @@ impl Axis {
             return;
         }
         if self.state != State::OperationEnabled {
-            match self.wish {
-                Wish::Enabled => self.trip(Trip::PowerLost { state: self.state }),
-                Wish::Disabling { .. } => self.wish = Wish::Disabled,
-                Wish::Disabled | Wish::QuickStop { .. } => {}
+            if self.goal == PowerGoal::On {
+                self.trip(Trip::PowerLost { state: self.state });
             }
             return;
         }
@@ -112,37 +118,43 @@ impl Axis {
             });
             return;
         }
+        // Targets follow actual values again where the axis stands; in motion it is a loss of control.
+        if !self.reported_to_follow() && !self.setpoint_at_rest() {
+            self.trip(Trip::NotFollowing { mode: self.mode });
+            return;
+        }
         if let Some(trip) = self.exceeded() {
             self.trip(trip);
         }
     }
 
-    /// The first cause stays. An axis already being disabled is not made to wait for another quick stop.
+    /// CSP, CSV and CST: an axis is enabled with Statusword bit 12, and keeps its set-points while it is missing for a few
+    /// cycles: a drive that catches up after a lost frame may limit the step, and clears it meanwhile.
+    pub(super) fn reported_to_follow(&self) -> bool {
+        let most = if self.active { FOLLOW_CYCLES } else { 1 };
+        self.unfollowed_cycles < most
+    }
+
+    /// Statusword bit 12 where it says this. While modes are switched it is the new mode's once that shows.
+    pub(super) fn follows_now(&self) -> bool {
+        let mode = self.mode_display.map_or(self.mode, Mode::from_code);
+        match self.statusword.in_mode(mode) {
+            ModeStatus::Csp { follows, .. }
+            | ModeStatus::Csv { follows }
+            | ModeStatus::Cst { follows } => follows || !self.config.follows_bit,
+            _ => true,
+        }
+    }
+
+    /// The first cause stays.
     fn trip(&mut self, trip: Trip) {
         self.trip.get_or_insert(trip);
-        if self.wish == Wish::Disabled {
-            return;
-        }
-        // Without power or in a mode of its own the drive would not follow a ramp.
-        let follows = self.active && self.state == State::OperationEnabled && self.mode_confirmed();
-        match self.config.supervision.reaction {
-            Reaction::Ramp if follows => self.disable(),
-            Reaction::Ramp | Reaction::QuickStop => self.quick_stop(true),
-            Reaction::DisableVoltage => self.cut_power(),
-        }
+        self.stop_by(self.config.supervision.reaction);
     }
 
     pub(super) fn emergency_stop(&mut self) {
         self.trip.get_or_insert(Trip::EmergencyStop);
-        match self.config.supervision.emergency {
-            Emergency::QuickStop => self.quick_stop(true),
-            Emergency::DisableVoltage => self.cut_power(),
-        }
-    }
-
-    pub(super) fn cut_power(&mut self) {
-        self.wish = Wish::Disabled;
-        self.cut = true;
+        self.stop_by(self.config.supervision.emergency);
     }
 
     fn exceeded(&mut self) -> Option<Trip> {
@@ -150,7 +162,8 @@ impl Axis {
         let position = self.actual.position();
         let mut cause = None;
         // What the drive did without a set-point is no deviation from one.
-        if self.grip() == Control::Position && !self.regain {
+        let unknown = self.interrupted && (self.mode != Mode::Csp || self.left_csp());
+        if self.grip() == Control::Position && !unknown {
             let scale = &self.config.scale;
             // The set-point here is a cycle old already.
             let commanded = self.expected(self.config.dead_time_s - self.dt_s);
@@ -253,10 +266,13 @@ impl Axis {
 
     /// The drive itself stands, as far as it can be told.
     pub(super) fn standing(&self) -> bool {
-        let slack = self.velocity_slack();
+        self.actual.velocity().abs() <= self.standstill_window()
+    }
+
+    pub(super) fn standstill_window(&self) -> f64 {
         let window = self.config.supervision.standstill;
         let window = window.unwrap_or(self.config.limits.velocity * 0.01);
-        self.actual.velocity().abs() <= slack.max(window)
+        self.velocity_slack().max(window)
     }
 
     /// Within 2 % of the target or 10 motor rpm of it, whichever is more; the latter never above a tenth of the limit.

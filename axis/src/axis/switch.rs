@@ -1,71 +1,74 @@
 //! From one mode to another: 0x6060 is written, 0x6061 awaited.
 //!
 //! The drive changes over somewhere between the frame that carries the new mode and the one that shows it. So from the first
-//! to the last of these cycles the targets of both modes are valid, made from the one set-point.
+//! to the last of these cycles the targets of both modes are valid, made from the one set-point, and the law in force is
+//! that of the mode that the drive shows.
 //!
-//! While frames are lost nobody knows whether it has. A drive that turns meanwhile must not find itself in CSP with a target
-//! from before: until an answer has come to a frame that asked for CSP, the mode before is asked for again. The other way the
-//! drive stands at its last target, or already has the velocity that is still being sent.
+//! While frames are lost, it is not known whether the drive has changed over. A drive that turns meanwhile must not find
+//! itself in CSP with a target from before: until an answer has come to a frame that asked for CSP, the mode before is asked
+//! for again. A drive that was asked for both in turn may show either for some cycles.
 
 use super::supervise::Watch;
-use super::{Axis, Control, Plan};
+use super::{Axis, Plan};
 use crate::cia402::{Mode, State};
 use crate::profile::{Goal, Profile};
 use crate::setpoint::Ramp;
 use crate::units::UserUnits;
 
-/// A drive that was asked for one mode and the other in turn, and does not change over at once, is in the new one after so
-/// many fresh cycles that show it.
+/// A drive that was asked for both modes in turn is in the new one after so many fresh cycles that show it.
 const CERTAIN_CYCLES: u8 = 10;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Switch {
+    from: Mode,
     pub(super) to: Mode,
     /// Without the new mode, though it was asked for.
     elapsed_s: f64,
     /// Cycles in a row whose outputs ask for the new mode.
     asked: u8,
     /// The drive has answered a frame that did.
-    pub(super) reached: bool,
-    /// Frames are being lost: the mode before is asked for.
-    pub(super) held_back: bool,
+    reached: bool,
     /// Fresh cycles in a row that have shown the new mode, and how many it takes.
     shown: u8,
     certain: u8,
 }
 
-impl Switch {
-    const fn new(to: Mode) -> Self {
-        Self {
+impl Axis {
+    /// 0x6061 shows the mode that counts or the other one of a switch, or is not mapped.
+    pub(super) fn mode_confirmed(&self) -> bool {
+        self.mode_display.is_none() || self.shows(self.mode) || self.shows_next()
+    }
+
+    fn shows(&self, mode: Mode) -> bool {
+        self.mode_display == Some(mode.code())
+    }
+
+    /// While modes are switched: the one whose law is not in force, whose targets are valid as well.
+    pub(super) fn other_mode(&self) -> Option<Mode> {
+        let switch = self.switch?;
+        Some(if self.mode == switch.to {
+            switch.from
+        } else {
+            switch.to
+        })
+    }
+
+    pub(super) fn begin_switch(&mut self, to: Mode) {
+        if self.config.control(to) == super::Control::Position
+            && self.grip() == super::Control::Velocity
+        {
+            // Where the axis is now is where the position set-point begins.
+            self.motion.position = self.tracked(self.motion.velocity).position;
+        }
+        self.switch = Some(Switch {
+            from: self.mode,
             to,
             elapsed_s: 0.0,
             asked: 0,
             reached: false,
-            held_back: false,
             shown: 0,
             certain: 1,
-        }
-    }
-}
-
-impl Axis {
-    /// 0x6061 shows the mode that counts or the one on its way, or is not mapped.
-    pub(super) fn mode_confirmed(&self) -> bool {
-        match self.mode_display {
-            None => true,
-            Some(display) if display == self.mode.code() => true,
-            Some(display) => self
-                .switch
-                .is_some_and(|switch| display == switch.to.code()),
-        }
-    }
-
-    pub(super) fn begin_switch(&mut self, to: Mode) {
-        if self.grip() == Control::Velocity && self.config.control(to) == Control::Position {
-            // Where the axis is now is where the position set-point begins.
-            self.motion.position = self.tracked(self.motion.velocity).position;
-        }
-        self.switch = Some(Switch::new(to));
+        });
         self.switch_failed = None;
     }
 
@@ -80,57 +83,55 @@ impl Axis {
     /// Once a cycle.
     pub(super) fn settle_mode(&mut self, fresh: bool, dt_s: f64) {
         self.hold_back();
-        let (display, late) = (self.mode_display, self.config.answers_late);
-        let Some(switch) = &mut self.switch else {
+        let Some(mut switch) = self.switch else {
             return;
         };
-        let to = switch.to;
-        let shows = display == Some(to.code());
+        let shows = self.shows(switch.to) && self.follows_now();
         if fresh {
-            // What is answered now was asked while the mode was held back.
-            if core::mem::take(&mut switch.held_back) {
-                switch.asked = 0;
+            switch.reached |= switch.asked > self.config.answers_late;
+            switch.shown = if shows { switch.shown + 1 } else { 0 };
+            if shows && self.mode != switch.to {
+                self.change_law(switch.to);
+            } else if self.shows(switch.from) && self.mode != switch.from {
+                self.change_law(switch.from);
             }
-            switch.reached |= switch.asked > late;
-            let counts = shows && switch.reached;
-            switch.shown = if counts { switch.shown + 1 } else { 0 };
             if switch.shown >= switch.certain {
-                self.enter(to);
+                self.switch = None;
                 return;
             }
         }
-        if switch.held_back {
-            return;
+        if !self.is_held_back(&switch) {
+            switch.asked = switch.asked.saturating_add(1);
+            if !shows {
+                switch.elapsed_s += dt_s;
+            }
         }
-        switch.asked = switch.asked.saturating_add(1);
-        if !shows {
-            switch.elapsed_s += dt_s;
-        }
+        self.switch = Some(switch);
         if switch.elapsed_s > self.config.mode_time_s {
+            if self.mode != switch.from {
+                self.change_law(switch.from);
+            }
             self.switch = None;
-            self.switch_failed = Some(to);
+            self.switch_failed = Some(switch.to);
         }
     }
 
     /// Too many frames in a row were lost, and the drive may turn in the mode before. After homing it stands, and bit 4 might
     /// start another.
-    pub(super) fn hold_back(&mut self) {
-        let turns = self.mode != Mode::Hm;
-        // A set-point that follows the axis must not be followed by it for long.
-        let certain = if self.grip() == Control::Position {
-            CERTAIN_CYCLES
-        } else {
-            1
-        };
-        let frozen = self.frozen();
-        if let Some(switch) = &mut self.switch
-            && frozen
-            && turns
+    fn is_held_back(&self, switch: &Switch) -> bool {
+        self.frozen()
             && !switch.reached
             && switch.to == Mode::Csp
+            && !matches!(self.mode, Mode::Hm | Mode::Csp)
+    }
+
+    pub(super) fn hold_back(&mut self) {
+        if let Some(mut switch) = self.switch
+            && self.is_held_back(&switch)
         {
-            (switch.held_back, switch.asked) = (true, 0);
-            (switch.shown, switch.certain) = (0, certain);
+            // What is answered next was asked for the mode before.
+            (switch.asked, switch.certain) = (0, CERTAIN_CYCLES);
+            self.switch = Some(switch);
         }
     }
 
@@ -140,23 +141,21 @@ impl Axis {
             .is_some_and(|switch| switch.reached && switch.to != Mode::Csp)
     }
 
-    /// The drive shows the new mode, which does not count yet.
-    pub(super) fn shows_next(&self) -> bool {
-        self.switch
-            .is_some_and(|switch| self.mode_display == Some(switch.to.code()))
+    /// The drive shows the other mode of a switch.
+    fn shows_next(&self) -> bool {
+        self.other_mode().is_some_and(|mode| self.shows(mode))
     }
 
     /// 0x6060.
     pub(super) fn mode_asked(&self) -> Mode {
-        let switch = self.switch.filter(|switch| !switch.held_back);
+        let switch = self.switch.filter(|switch| !self.is_held_back(switch));
         switch.map_or(self.mode, |switch| switch.to)
     }
 
-    /// The drive is in the new mode: from now on its law counts alone.
-    fn enter(&mut self, to: Mode) {
+    /// The drive is in this mode: from now on its law counts.
+    fn change_law(&mut self, to: Mode) {
         let from = self.mode;
         self.mode = to;
-        self.switch = None;
         self.given.enter();
         if to == Mode::Csp {
             // That was its target already.

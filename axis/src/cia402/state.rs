@@ -37,6 +37,15 @@ impl State {
         }
     }
 
+    /// The drive can move its axis.
+    #[must_use]
+    pub const fn has_power(self) -> bool {
+        matches!(
+            self,
+            Self::OperationEnabled | Self::QuickStopActive | Self::FaultReactionActive
+        )
+    }
+
     /// Fault or on the way into it.
     #[must_use]
     pub const fn is_fault(self) -> bool {

@@ -28,6 +28,8 @@ pub struct Request {
     pub reset_fault: bool,
     /// The drive's quick stop option code has no transition 16.
     pub no_return: bool,
+    /// Operation is not enabled yet: an enabled drive is taken as far as Switched on.
+    pub hold: bool,
 }
 
 /// What the state machine remembers between cycles.
@@ -210,6 +212,9 @@ pub fn step_in(mut memory: Memory, state: State, request: Request, dt_s: f64) ->
         memory.waited_s
     };
     let mut word = controlword(state, request.power, waited_s);
+    if request.hold && state == State::SwitchedOn && request.power == Power::Enabled {
+        word = Controlword::SWITCH_ON_COMMAND;
+    }
     if matches!(reset, Reset::High { .. }) {
         word |= Controlword::FAULT_RESET_COMMAND;
     }

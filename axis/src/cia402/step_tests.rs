@@ -275,6 +275,7 @@ fn exhaustive_sweep() {
                     power,
                     reset_fault,
                     no_return: bits & 1 == 0,
+                    hold: false,
                 };
                 let mut memory = Memory::new();
                 for dt_s in [0.001, 0.06, 0.6, f64::NAN, -1.0, f64::INFINITY] {

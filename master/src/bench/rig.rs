@@ -6,12 +6,12 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use ecaxis_axis::setpoint::{Motion, PositionWave, SetpointError, Shape, Wave};
-use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Scale};
+use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Scale, StopMethod};
 use ecaxis_esi::layout::{Field, Layout};
 
 use super::segment::{DRIVE_BYTES, FIRST_STATION, Segment};
 use crate::clock::{Clock, Nanos};
-use crate::config::{self, StopBy, StopSetup};
+use crate::config::{self, StopSetup};
 use crate::link::Link;
 use crate::link::port::main_device;
 use crate::rt::cycle::{Parts, Signals, Timing, first_snapshot};
@@ -150,7 +150,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(Parts, OuterEnd), Rig
     let mut slots = Vec::with_capacity(axes);
     for region in plan.regions.iter().flatten() {
         let bits = AxisBits::new(&layout, region)?;
-        slots.push(AxisSlot::new(Axis::new(config)?, bits, 0));
+        slots.push(AxisSlot::new(Axis::new(config)?, bits, slots.len(), 0));
     }
     let devices = u16::try_from(axes).unwrap_or(u16::MAX);
     let members: Vec<Member> = (0..devices)
@@ -179,10 +179,7 @@ pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(Parts, OuterEnd), Rig
         port: main_device(cycle_ns).1,
         exchange: Exchange::new(&plan, Some(&clock), &members, exchange),
         axes: slots,
-        groups: vec![Group::machine(
-            StopBy::Ramp,
-            LIMITS.velocity / LIMITS.acceleration,
-        )],
+        groups: vec![Group::machine(StopMethod::Ramp)],
         signals,
         controller: None,
         tables: Box::default(),

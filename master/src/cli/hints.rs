@@ -456,6 +456,12 @@ fn trip(trip: &Trip) -> &'static str {
         Trip::OverAcceleration { .. } => "check the load and the drive's tuning",
         Trip::EmergencyStop => "find out why it was pressed, then reset and enable the axis again",
         Trip::SetPointNotTaken => "the drive must be in profile position mode with 0x607A mapped",
+        Trip::NotFollowing { .. } => {
+            "look for a limit switch, a closed brake or an internal limit; for a drive that does not serve the bit set `follows_bit = false`"
+        }
+        Trip::NotStopped { .. } => {
+            "check the drive's quick stop (0x605A, 0x6085), its torque limit and the load; `stop_timeout` sets how long a stop may take"
+        }
         Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
     }
 }

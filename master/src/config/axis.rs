@@ -54,6 +54,9 @@ pub(crate) fn setup(
         Some(homing) => Some(control::homing(homing, &config, selection, p)?),
         None => None,
     };
+    let timeout = raw.stop_timeout.as_ref();
+    config.stop_timeout_s = timeout.map(|timeout| *timeout.get_ref() as f64 * 1e-9);
+    config.follows_bit = raw.follows_bit.as_ref().is_none_or(|bit| *bit.get_ref());
     if let Some(dead_time) = &raw.dead_time {
         config.dead_time_s = *dead_time.get_ref() as f64 * 1e-9;
     }
@@ -176,6 +179,13 @@ fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) 
             },
         ),
         ConfigError::Limit(LimitError::EmptyRange { .. }) => (position, error.to_string()),
+        ConfigError::NotPositive {
+            what: "stop_timeout_s",
+            ..
+        } => (
+            of(raw.stop_timeout.as_ref().map(Spanned::span)),
+            "`stop_timeout` must be above 0".to_owned(),
+        ),
         ConfigError::NotPositive { .. } => (
             of(raw.target_window.as_ref().map(Spanned::span)),
             error.to_string(),

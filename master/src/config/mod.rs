@@ -52,6 +52,7 @@ pub use startup::{Startup, StartupWay};
 
 pub use crate::rt::exchange::Mode as Exchange;
 
+use ecaxis_axis::StopMethod;
 use ecaxis_esi as esi;
 
 use crate::library::Match;
@@ -402,16 +403,27 @@ pub enum Action {
 }
 
 /// How the machine stops.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct StopSetup {
     /// Of the other axes when one faults or trips, where its group does not say otherwise.
-    pub others: StopBy,
-    /// Of all axes when the bus is lost or a SubDevice has left Op: no axis can be led to rest then.
-    pub bus_lost: StopByDrive,
+    pub others: StopMethod,
+    /// Of axes whose inputs no longer arrive; those that still answer stop by set-points.
+    pub bus_lost: StopMethod,
     /// One of them is enough for an emergency stop.
     pub emergency: Vec<Condition>,
     /// SubDevices that stop together; those in none are one more group.
     pub groups: Vec<StopGroup>,
+}
+
+impl Default for StopSetup {
+    fn default() -> Self {
+        Self {
+            others: StopMethod::Ramp,
+            bus_lost: StopMethod::QuickStop,
+            emergency: Vec::new(),
+            groups: Vec::new(),
+        }
+    }
 }
 
 /// SubDevices that stop together.
@@ -421,7 +433,7 @@ pub struct StopGroup {
     /// Indices into [`Machine::devices`], with and without an axis; in no other group.
     pub devices: Vec<usize>,
     /// Of its other axes when one faults or trips.
-    pub others: StopBy,
+    pub others: StopMethod,
     pub outside: Outside,
 }
 
@@ -451,24 +463,6 @@ impl Machine {
         let named = groups.position(|group| group.devices.contains(&device));
         named.map_or(0, |index| index + 1)
     }
-}
-
-/// How an axis comes to rest.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum StopBy {
-    /// Within its limits, then no power.
-    #[default]
-    Ramp,
-    QuickStop,
-    NoPower,
-}
-
-/// What a drive does by itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum StopByDrive {
-    #[default]
-    QuickStop,
-    NoPower,
 }
 
 /// A table of set-points and the file it comes from.

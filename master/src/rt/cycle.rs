@@ -2,11 +2,10 @@
 
 use std::panic::AssertUnwindSafe;
 
-use ecaxis_axis::State;
 use ecaxis_axis::setpoint::Table;
 
 use super::controller::{self, Controller};
-use super::exchange::{Answer, Diagnosis, Exchange};
+use super::exchange::{Answer, Diagnosis, Evidence, Exchange};
 use super::feed::FeedState;
 use super::groups::{Group, GroupStatus};
 use super::guard::{Guard, StopCause};
@@ -21,7 +20,10 @@ use super::stats::Stats;
 
 mod act;
 mod orders;
+mod panic;
 mod wire;
+
+use panic::Plain;
 
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Condition, StopSetup};
@@ -81,6 +83,7 @@ pub struct Engine {
     woke: Option<Nanos>,
     started: Nanos,
     margin: Margin,
+    plain: Plain,
     answer: Answer,
     events_lost: u64,
     orders_taken: u64,
@@ -137,6 +140,7 @@ impl Engine {
         let mode = parts.exchange.mode();
         let history = History::new(parts.axes.len());
         Self {
+            plain: Plain::new(&parts.axes),
             clock: parts.clock,
             timing: parts.timing,
             link: parts.link,
@@ -207,8 +211,7 @@ impl Engine {
         }
     }
 
-    /// One cycle. RT: blocks on the clock and the wire only; O(image + axes).
-    pub fn cycle(&mut self) {
+    fn turn(&mut self) {
         let slept = self.clock.sleep_until(self.next, self.margin.get());
         let woke = clock::now();
         let lateness = woke.saturating_sub(self.next);
@@ -245,7 +248,8 @@ impl Engine {
     }
 
     fn watch_bus(&mut self) {
-        self.guard.look(&self.answer, self.exchange.shares());
+        let (shares, evidence) = (self.exchange.shares(), self.exchange.evidence());
+        self.guard.look(&self.answer, shares, evidence);
         for group in 0..self.groups.len() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);
@@ -256,21 +260,16 @@ impl Engine {
         }
     }
 
-    fn without_power(&self) -> bool {
-        self.axes
-            .iter()
-            .all(|slot| !has_power(slot.axis.status().state))
-    }
-
     fn observe(&mut self) {
         let dt = self.timing.cycle_ns as f64 * 1e-9;
-        let (image, shares) = (self.exchange.inputs(), self.exchange.shares());
+        let image = self.exchange.inputs();
         for slot in &mut self.axes {
-            let fresh = shares.get(slot.group).is_some_and(|share| share.fresh);
+            let evidence = self.exchange.evidence().get(slot.device);
+            let fresh = evidence == Some(&Evidence::Fresh);
             if fresh {
                 slot.heard = Some(self.next);
             }
-            let inputs = slot.read(image, fresh);
+            let inputs = slot.read(image, fresh, self.exchange.came_late(slot.device));
             slot.axis.observe(&inputs, dt);
             slot.acted = false;
         }
@@ -316,6 +315,9 @@ impl Engine {
 
     fn publish(&mut self, woke: Nanos) {
         let stopping = self.stopping();
+        let stop_ended = stopping.is_some() && self.stop_ended();
+        let mut stops = self.groups.iter().filter_map(Group::stop);
+        let failure = stops.find_map(|stop| stop.failure);
         let snapshot = self.end.snapshots.input_buffer_mut();
         snapshot.time = woke;
         snapshot.counters = self.stats.counters;
@@ -338,6 +340,8 @@ impl Engine {
             *to = *diagnosis;
         }
         snapshot.stopping = stopping.map(|stop| stop.cause);
+        snapshot.failure = failure;
+        snapshot.stop_ended = stop_ended;
         let groups = self.groups.iter().zip(self.exchange.shares());
         for (to, (group, share)) in snapshot.groups.iter_mut().zip(groups) {
             *to = GroupStatus {
@@ -349,7 +353,7 @@ impl Engine {
         }
         for slot in &self.axes {
             if let Some(group) = snapshot.groups.get_mut(slot.group) {
-                group.powered |= has_power(slot.axis.status().state);
+                group.powered |= slot.axis.status().state.has_power();
             }
         }
         snapshot.events_lost = self.events_lost;
@@ -390,15 +394,6 @@ impl Engine {
     }
 }
 
-/// Whether a drive in this state can move its axis.
-#[must_use]
-pub fn has_power(state: State) -> bool {
-    matches!(
-        state,
-        State::OperationEnabled | State::QuickStopActive | State::FaultReactionActive
-    )
-}
-
 /// The snapshot before the first cycle, with room for all there is.
 #[must_use]
 #[allow(
@@ -424,6 +419,8 @@ pub fn first_snapshot(
         finished: false,
         diagnoses: vec![Diagnosis::default(); devices],
         stopping: None,
+        failure: None,
+        stop_ended: false,
         groups: vec![GroupStatus::default(); groups],
         events_lost: 0,
         orders_taken: 0,

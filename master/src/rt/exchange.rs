@@ -2,12 +2,16 @@
 //! knows no LRW), one BRD of AL status and one read of the diagnostic slot; built once, refilled every cycle, sent back to back.
 //!
 //! Ours and ethercrab's frames are told apart by the last byte of the source MAC, because
-//! ethercrab uses all 256 datagram indices. The byte before it numbers the frames of a cycle, and
-//! the datagram index numbers the cycle, so that late and repeated frames are recognised.
+//! ethercrab uses all 256 datagram indices. The byte before it numbers the frames of a cycle; what it has left and the
+//! datagram index number the cycle, so that late and repeated frames are recognised.
+//!
+//! Devices share datagrams and so working counters. After a wrong counter each device gets a datagram of its own, so that
+//! a device that is missing leaves the evidence of the others alone.
 
 use std::sync::Arc;
 
-use super::image::{Access, ImagePlan};
+use super::image::plan::frames as frames_of;
+use super::image::{Access, DatagramPlan, ImagePlan};
 use super::phase::ClockPlan;
 use crate::clock::Nanos;
 use crate::link::port::ETHERCAT;
@@ -20,7 +24,10 @@ mod rota;
 mod sights;
 
 use flight::Flight;
-use frame::{DATAGRAM_HEADER, Frame, MAC_TAIL, Place, WKC, clear_wkc, push, write_header};
+use frame::{
+    DATAGRAM_HEADER, FIRST_DATAGRAM, Frame, MAC_TAIL, Place, WKC, clear_wkc, frame_number,
+    frame_tag, new_frames, push, same_datagram, write_header,
+};
 pub use probe::{Diagnosis, ErrorCounters, Probe};
 pub use rota::LONGEST_LOOK;
 use rota::{Look, Rota};
@@ -33,6 +40,9 @@ const LWR: u8 = 11;
 const LRW: u8 = 12;
 const FRMW: u8 = 14;
 
+/// After a wrong working counter each device has a datagram of its own until so many cycles in a row were right.
+const SEPARATE_CYCLES: u16 = 100;
+
 const SYSTEM_TIME: u16 = 0x0910;
 const AL_STATUS: u16 = 0x0130;
 
@@ -44,6 +54,8 @@ struct ProcessDatagram {
     /// Offset in the image.
     image: usize,
     expected_wkc: u16,
+    /// Its devices: the first and one behind the last in [`Exchange::order`].
+    devices: (usize, usize),
 }
 
 /// A SubDevice as the exchange sees it.
@@ -79,6 +91,18 @@ impl Share {
             clocks: 0,
         }
     }
+}
+
+/// What a cycle's answers say of one device.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Evidence {
+    /// Its own working counter, or one that it shares, was right: it took its outputs, and its inputs are this cycle's.
+    Fresh,
+    /// A working counter that it shares with others was wrong.
+    #[default]
+    Unknown,
+    /// Its own working counter was wrong, or no answer came.
+    Missing,
 }
 
 /// What a received frame turned out to be.
@@ -136,20 +160,27 @@ pub struct Exchange {
     /// The one that is staged or was sent in this cycle, and those sent before.
     flights: Vec<Flight>,
     staged: usize,
-    clock: Option<Place>,
+    /// Where the datagrams lie: with shared ones, and with one for each device.
+    forms: Vec<Places>,
+    /// The form of each of the last cycles, by the low byte of its number.
+    form_of: [u8; 256],
+    /// Cycles for which each device still has a datagram of its own.
+    separate_cycles: u16,
+    /// Devices as the image lies.
+    order: Vec<usize>,
+    evidence: Vec<Evidence>,
+    /// Devices for which a late answer has come since the last cycle.
+    late: Vec<bool>,
     /// Index of the reference clock among the members.
     reference: usize,
     /// What a clock is set to if the reference before it does not answer: its own time, nearly.
     expected_time: u64,
     cycle_ns: u64,
-    process_data: Vec<ProcessDatagram>,
-    al_status: Place,
     sights: Arc<Sights>,
-    probe_at: usize,
     shares: Vec<Share>,
     diagnoses: Vec<Diagnosis>,
     rota: Rota,
-    cycle: u8,
+    cycle: u32,
     outputs: Vec<u8>,
     inputs: Vec<u8>,
 }
@@ -168,24 +199,34 @@ impl Exchange {
         members: &[Member],
         mode: Mode,
     ) -> Self {
-        let mut places = None;
-        let flights = (0..mode.flights())
-            .map(|_| {
-                let mut flight = Flight::new(plan.frames());
-                places = Some(Places::fill(&mut flight.frames, plan, clock));
-                flight
-            })
-            .collect();
-        let Some(places) = places else {
-            unreachable!("there is a flight in every mode");
-        };
+        let mut order: Vec<usize> = (0..plan.regions.len()).collect();
+        order.retain(|&device| plan.regions[device].is_some());
+        order.sort_by_key(|&device| plan.regions[device].map_or(0, |region| region.offset));
+        let mut datagrams = vec![&plan.datagrams];
+        if plan.separate.len() > plan.datagrams.len() {
+            datagrams.push(&plan.separate);
+        }
+        let mut forms = Vec::new();
+        let mut flights = Vec::new();
+        for flight in 0..mode.flights() {
+            let mut frames = Vec::new();
+            for datagrams in &datagrams {
+                let mut form = new_frames(frames_of(datagrams));
+                let places = Places::fill(&mut form, plan, datagrams, &order, clock);
+                frames.push(form);
+                if flight == 0 {
+                    forms.push(places);
+                }
+            }
+            flights.push(Flight::new(frames));
+        }
         // The first group is there without members, too.
         let groups = plan.groups.iter().max().map_or(1, |last| last + 1);
         let mut shares = vec![Share::default(); groups];
         for (member, &group) in members.iter().zip(&plan.groups) {
             shares[group].clocks += u16::from(member.clock);
         }
-        for datagram in &places.process_data {
+        for datagram in &forms[0].process_data {
             shares[datagram.group].wkc.1 += datagram.expected_wkc;
         }
         let reference = clock.and_then(|clock| {
@@ -196,14 +237,16 @@ impl Exchange {
         let mut exchange = Self {
             flights,
             staged: 0,
-            clock: places.clock,
+            forms,
+            form_of: [0; 256],
+            separate_cycles: 0,
+            order,
+            evidence: vec![Evidence::Unknown; members.len()],
+            late: vec![false; members.len()],
             reference: reference.unwrap_or(0),
             expected_time: 0,
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
-            process_data: places.process_data,
-            al_status: places.al_status,
             sights: Arc::new(Sights::new(members.len())),
-            probe_at: places.probe_at,
             shares,
             diagnoses: vec![Diagnosis::default(); members.len()],
             rota: Rota::new(members, plan.mailboxes.as_ref()),
@@ -242,6 +285,18 @@ impl Exchange {
         &self.shares
     }
 
+    /// What this cycle's answers say of each device, as of the last [`Exchange::answer`]; in the order of the members.
+    #[must_use]
+    pub fn evidence(&self) -> &[Evidence] {
+        &self.evidence
+    }
+
+    /// Whether an answer to an earlier cycle's frame has come late since the last cycle, in which this device took part.
+    #[must_use]
+    pub fn came_late(&self, device: usize) -> bool {
+        self.late.get(device).copied().unwrap_or(false)
+    }
+
     /// What the diagnostic slot has found, in the order of the members.
     #[must_use]
     pub fn diagnoses(&self) -> &[Diagnosis] {
@@ -276,27 +331,38 @@ impl Exchange {
     pub fn stage(&mut self) {
         self.cycle = self.cycle.wrapping_add(1);
         self.staged = self.due();
+        self.late.fill(false);
+        let separate = self.separate_cycles > 0 && self.forms.len() > 1;
+        self.separate_cycles = self.separate_cycles.saturating_sub(1);
+        let form = usize::from(separate);
+        self.form_of[(self.cycle & 0xff) as usize] = u8::from(separate);
+        if let Some(flight) = self.flights.get_mut(self.staged) {
+            flight.form = form;
+        }
         self.restage();
         let time = self.expected_time;
-        let Some(flight) = self.flights.get_mut(self.staged) else {
+        let (Some(flight), Some(places)) =
+            (self.flights.get_mut(self.staged), self.forms.get(form))
+        else {
             return;
         };
-        let first = &mut flight.frames[0].bytes;
-        flight.turn = self.rota.next();
-        if let Some(turn) = flight.turn {
+        let first = &mut flight.frames_mut()[0].bytes;
+        let turn = self.rota.next();
+        if let Some(turn) = turn {
             // The last datagram of its frame, so its length may change; within the capacity of the frame.
-            let data = self.probe_at + DATAGRAM_HEADER;
+            let data = places.probe_at + DATAGRAM_HEADER;
             first.truncate(data);
             first.resize(data + turn.len, Sights::UNSEEN);
             first.resize(data + turn.len + WKC, 0);
-            write_header(first, self.probe_at, turn.command, turn.address, turn.len);
+            write_header(first, places.probe_at, turn.command, turn.address, turn.len);
         }
-        if let Some(place) = self.clock {
+        if let Some(place) = places.clock {
             first[place.data()].copy_from_slice(&time.to_le_bytes());
             clear_wkc(first, place);
         }
-        first[self.al_status.data()].fill(0);
-        clear_wkc(first, self.al_status);
+        first[places.al_status.data()].fill(0);
+        clear_wkc(first, places.al_status);
+        flight.turn = turn;
         flight.stage(self.cycle);
         self.expected_time = time.wrapping_add(self.cycle_ns);
     }
@@ -306,9 +372,12 @@ impl Exchange {
         let Some(flight) = self.flights.get_mut(self.staged) else {
             return;
         };
-        for datagram in &self.process_data {
+        let Some(places) = self.forms.get(flight.form) else {
+            return;
+        };
+        for datagram in &places.process_data {
             let place = datagram.place;
-            let frame = &mut flight.frames[place.frame].bytes;
+            let frame = &mut flight.frames_mut()[place.frame].bytes;
             if datagram.access != Access::Inputs {
                 let from = datagram.image..datagram.image + place.len;
                 frame[place.data()].copy_from_slice(&self.outputs[from]);
@@ -330,16 +399,54 @@ impl Exchange {
         if frame.get(12..14) != Some(&ETHERCAT[..]) || frame.get(11) != Some(&MAC_TAIL) {
             return Received::Foreign;
         }
-        let number = frame.get(10).map_or(usize::MAX, |n| usize::from(*n));
-        let frames = self.flights.first().map_or(0, |f| f.frames.len());
-        if number >= frames {
-            return Received::Foreign;
-        }
         let mut flights = self.flights.iter_mut();
-        if flights.any(|flight| flight.receive(number, frame)) {
+        if flights.any(|flight| flight.receive(frame)) {
             Received::Current
         } else {
+            self.receive_late(frame);
             Received::Late
+        }
+    }
+
+    /// A frame of an earlier cycle that reached its devices all the same. RT: O(devices).
+    fn receive_late(&mut self, frame: &[u8]) {
+        let (Some(&low), Some(&tag)) = (frame.get(FIRST_DATAGRAM + 1), frame.get(10)) else {
+            return;
+        };
+        let form = usize::from(self.form_of[usize::from(low)]);
+        let (Some(places), Some(flight)) = (self.forms.get(form), self.flights.first()) else {
+            return;
+        };
+        let age = self.cycle.wrapping_sub(u32::from(low)) & 0xff;
+        let sent = flight.form_frames(form);
+        let number = frame_number(tag, sent.len());
+        let same_tag = tag == frame_tag(number, sent.len(), self.cycle.wrapping_sub(age));
+        let recent = age > 0 && age <= self.flights.len() as u32 + 1;
+        let Some(sent) = sent.get(number).filter(|_| recent && same_tag) else {
+            return;
+        };
+        // The diagnostic datagram may have another length; those before it have not.
+        let known = if number == 0 {
+            places.probe_at
+        } else {
+            sent.bytes.len()
+        };
+        if frame.len() < known {
+            return;
+        }
+        for datagram in &places.process_data {
+            let place = datagram.place;
+            if place.frame == number
+                && same_datagram(&sent.bytes, frame, place)
+                && place.wkc(frame) == datagram.expected_wkc
+            {
+                let (first, end) = datagram.devices;
+                for &device in self.order.get(first..end).unwrap_or_default() {
+                    if let Some(late) = self.late.get_mut(device) {
+                        *late = true;
+                    }
+                }
+            }
         }
     }
 
@@ -355,12 +462,23 @@ impl Exchange {
         let Some(flight) = self.flights.get(due) else {
             return Answer::default();
         };
+        let Some(places) = self.forms.get(flight.form) else {
+            return Answer::default();
+        };
         let first = flight.answer(0);
+        let alone = if first.is_some() {
+            Evidence::Fresh
+        } else {
+            Evidence::Missing
+        };
+        self.evidence.fill(alone);
+        let mut ambiguous = false;
+        let mut all_right = true;
         for share in &mut self.shares {
             let alive = share.wkc.1 > 0 || first.is_some();
             (share.answered, share.fresh, share.wkc.0) = (alive, alive, 0);
         }
-        for datagram in &self.process_data {
+        for datagram in &places.process_data {
             let Some(share) = self.shares.get_mut(datagram.group) else {
                 continue;
             };
@@ -368,6 +486,22 @@ impl Exchange {
             let answer = flight.answer(place.frame);
             let wkc = answer.map_or(0, |answer| place.wkc(answer));
             let right = answer.is_some() && wkc == datagram.expected_wkc;
+            let (begin, end) = datagram.devices;
+            let evidence = match answer {
+                None => Evidence::Missing,
+                Some(_) if right => Evidence::Fresh,
+                Some(_) if end - begin > 1 => Evidence::Unknown,
+                Some(_) => Evidence::Missing,
+            };
+            ambiguous |= evidence == Evidence::Unknown;
+            all_right &= right;
+            for &device in self.order.get(begin..end).unwrap_or_default() {
+                if let Some(of) = self.evidence.get_mut(device)
+                    && evidence != Evidence::Fresh
+                {
+                    *of = evidence;
+                }
+            }
             share.answered &= answer.is_some();
             share.fresh &= right;
             share.wkc.0 = share.wkc.0.saturating_add(wkc);
@@ -377,6 +511,9 @@ impl Exchange {
             {
                 self.inputs[datagram.image..datagram.image + data.len()].copy_from_slice(data);
             }
+        }
+        if ambiguous || (self.separate_cycles > 0 && !all_right) {
+            self.separate_cycles = SEPARATE_CYCLES;
         }
         let mut answer = Answer {
             complete: flight.complete(),
@@ -393,12 +530,12 @@ impl Exchange {
             return answer;
         };
         answer.al_status = first
-            .get(self.al_status.data())
-            .and_then(|data| Some((*data.first()?, self.al_status.wkc(first))));
+            .get(places.al_status.data())
+            .and_then(|data| Some((*data.first()?, places.al_status.wkc(first))));
         if let Some(turn) = flight.turn {
             let place = Place {
                 frame: 0,
-                offset: self.probe_at,
+                offset: places.probe_at,
                 len: turn.len,
             };
             let data = first.get(place.data()).unwrap_or_default();
@@ -419,7 +556,7 @@ impl Exchange {
                 }
             }
         }
-        answer.system_time = self.system_time(first);
+        answer.system_time = self.system_time(first, places.clock);
         if let Some(time) = answer.system_time {
             self.sights.set_clock(flight.sent_at, time);
             // Of the flight that is staged next; those under way lie between.
@@ -430,8 +567,8 @@ impl Exchange {
     }
 
     /// If the reference clock has given it: where clocks are missing, only those of groups that are, and it was seen lately.
-    fn system_time(&self, first: &[u8]) -> Option<u64> {
-        let place = self.clock?;
+    fn system_time(&self, first: &[u8], place: Option<Place>) -> Option<u64> {
+        let place = place?;
         let time = u64::from_le_bytes(first.get(place.data())?.try_into().ok()?);
         let wkc = place.wkc(first);
         let clocks = |shares: &mut dyn Iterator<Item = &Share>| -> u16 {
@@ -451,11 +588,12 @@ impl Exchange {
         let staged = self.flights.get(self.staged);
         staged
             .into_iter()
-            .flat_map(|flight| flight.frames.iter().map(|frame| frame.bytes.len()))
+            .flat_map(|flight| flight.frames().iter().map(|frame| frame.bytes.len()))
     }
 }
 
 /// Where the datagrams of a cycle lie in its frames.
+#[derive(Debug)]
 struct Places {
     clock: Option<Place>,
     process_data: Vec<ProcessDatagram>,
@@ -466,12 +604,22 @@ struct Places {
 impl Places {
     /// Puts all datagrams but the diagnostic one into empty frames.
     #[allow(clippy::disallowed_methods, reason = "prepares")]
-    fn fill(frames: &mut [Frame], plan: &ImagePlan, clock: Option<&ClockPlan>) -> Self {
+    fn fill(
+        frames: &mut [Frame],
+        plan: &ImagePlan,
+        datagrams: &[DatagramPlan],
+        order: &[usize],
+        clock: Option<&ClockPlan>,
+    ) -> Self {
         let clock = clock.map(|clock| {
             let address = u32::from(SYSTEM_TIME) << 16 | u32::from(clock.reference);
             push(&mut frames[0], 0, FRMW, address, 8)
         });
-        let process_data = plan.datagrams.iter().map(|datagram| {
+        let offset = |device: &usize| plan.regions[*device].map_or(0, |region| region.offset);
+        let process_data = datagrams.iter().map(|datagram| {
+            let first = order.partition_point(|device| offset(device) < datagram.offset);
+            let behind = datagram.offset + datagram.len;
+            let end = order.partition_point(|device| offset(device) < behind);
             let frame = datagram.frame;
             let command = match datagram.access {
                 Access::Both => LRW,
@@ -485,6 +633,7 @@ impl Places {
                 group: datagram.group,
                 image: datagram.offset,
                 expected_wkc: datagram.expected_wkc,
+                devices: (first, end),
             }
         });
         let process_data = process_data.collect();

@@ -21,7 +21,7 @@ impl Link for Nowhere {
 /// Sends the cycle's frames; what comes back of the one of this number, as from SubDevices that are all there.
 fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
     exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
-    let mut frame = exchange.flights[exchange.staged].frames[number]
+    let mut frame = exchange.flights[exchange.staged].frames()[number]
         .bytes
         .clone();
     frame[6] |= 0x02;
@@ -29,7 +29,8 @@ fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
     while at + DATAGRAM_HEADER <= frame.len() {
         let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 7]));
         let data = at + DATAGRAM_HEADER;
-        let expected = exchange
+        let form = exchange.flights[exchange.staged].form;
+        let expected = exchange.forms[form]
             .process_data
             .iter()
             .find(|d| (d.place.frame, d.place.offset) == (number, at));
@@ -87,7 +88,7 @@ fn frame_bytes_for_8_32_and_100_axes() {
         let exchange = axes(count);
         let lengths: Vec<_> = exchange.frame_lengths().collect();
         assert_eq!(lengths.len(), 1, "{count} axes in one frame");
-        assert_eq!(exchange.probe_at, cyclic);
+        assert_eq!(exchange.forms[0].probe_at, cyclic);
         assert!(
             lengths[0] <= cyclic + 20,
             "the diagnostic datagram takes at most 20 bytes"
@@ -188,8 +189,8 @@ fn a_device_without_lrw_gets_and_gives_its_data_by_two_datagrams() {
     let mut exchange = exchange(&[axis(0), without], Mode::SameCycle);
     exchange.outputs_mut().fill(0x77);
     exchange.stage();
-    let sent = exchange.flights[0].frames[0].bytes.clone();
-    let commands: Vec<(u8, bool)> = exchange
+    let sent = exchange.flights[0].frames()[0].bytes.clone();
+    let commands: Vec<(u8, bool)> = exchange.forms[0]
         .process_data
         .iter()
         .map(|d| {
@@ -211,7 +212,7 @@ fn a_device_without_lrw_gets_and_gives_its_data_by_two_datagrams() {
 fn a_wrong_working_counter_leaves_the_inputs_alone() {
     let mut exchange = axes(1);
     let mut frame = reflect(&mut exchange, 0, 0x11);
-    let wkc = exchange.process_data[0].place.data().end;
+    let wkc = exchange.forms[0].process_data[0].place.data().end;
     frame[wkc] = 2;
     assert_eq!(exchange.receive(&frame), Received::Current);
     let answer = exchange.answer();
@@ -306,9 +307,12 @@ proptest! {
 #[test]
 fn each_group_has_a_working_counter_of_its_own() {
     let mut exchange = grouped(&[1, 0, 2, 1]);
-    assert_eq!(exchange.probe_at, axes(4).probe_at + 2 * 12);
+    assert_eq!(
+        exchange.forms[0].probe_at,
+        axes(4).forms[0].probe_at + 2 * 12
+    );
     let mut frame = reflect(&mut exchange, 0, 0x11);
-    let of_first_group = exchange.process_data[1].place.data().end;
+    let of_first_group = exchange.forms[0].process_data[1].place.data().end;
     frame[of_first_group] = 4;
     assert_eq!(exchange.receive(&frame), Received::Current);
     let answer = exchange.answer();
@@ -340,9 +344,9 @@ fn the_system_time_is_the_reference_s_alone() {
     let mut answer = |wkc: u8, fresh: bool| {
         exchange.stage();
         let mut frame = reflect(&mut exchange, 0, 1);
-        let clock = exchange.clock.expect("a clock").data().end;
+        let clock = exchange.forms[0].clock.expect("a clock").data().end;
         frame[clock] = wkc;
-        let second = exchange.process_data[1].place.data().end;
+        let second = exchange.forms[0].process_data[1].place.data().end;
         frame[second] = if fresh { 3 } else { 0 };
         exchange.receive(&frame);
         exchange.answer().system_time.is_some()
@@ -367,4 +371,90 @@ fn a_frame_that_is_lost_concerns_its_groups() {
         panic!("two groups")
     };
     assert!(rest.fresh && !second.answered && !second.fresh);
+}
+
+/// After a wrong counter that devices share, each has a datagram and so evidence of its own, until all have been right for long.
+#[test]
+fn a_missing_device_leaves_the_evidence_of_the_others_alone() {
+    for mode in [Mode::SameCycle, Mode::Pipelined] {
+        let mut exchange = exchange(&[axis(0); 3], mode);
+        let missing_second = |exchange: &mut Exchange, input: u8| {
+            let mut frame = reflect(exchange, 0, input);
+            let form = exchange.flights[exchange.staged].form;
+            let at = exchange.forms[form].process_data[form].place.data().end;
+            frame[at] = if form == 0 { 6 } else { 0 };
+            assert_eq!(exchange.receive(&frame), Received::Current);
+            exchange.answer();
+            let evidence = exchange.evidence().to_vec();
+            exchange.stage();
+            evidence
+        };
+        let unknown = [Evidence::Unknown; 3];
+        let first = missing_second(&mut exchange, 1);
+        if mode == Mode::SameCycle {
+            assert_eq!(first, unknown);
+        } else {
+            assert_eq!(first, [Evidence::Missing; 3], "nothing was asked before");
+            assert_eq!(missing_second(&mut exchange, 1), unknown);
+            assert_eq!(missing_second(&mut exchange, 1), unknown);
+        }
+        let own = [Evidence::Fresh, Evidence::Missing, Evidence::Fresh];
+        for _ in 0..300 {
+            assert_eq!(missing_second(&mut exchange, 2), own);
+        }
+        assert_eq!(exchange.inputs()[..12], [2; 12]);
+        // Back, and after a while with shared datagrams again.
+        for cycle in 0..=SEPARATE_CYCLES + 2 {
+            let frame = reflect(&mut exchange, 0, 3);
+            assert_eq!(exchange.receive(&frame), Received::Current);
+            exchange.answer();
+            if cycle > 1 {
+                assert_eq!(exchange.evidence(), [Evidence::Fresh; 3]);
+            }
+            exchange.stage();
+        }
+        assert_eq!(exchange.flights[exchange.staged].form, 0);
+    }
+}
+
+#[test]
+fn a_late_answer_proves_delivery_and_an_old_one_nothing() {
+    let mut exchange = axes(2);
+    let first = reflect(&mut exchange, 0, 1);
+    exchange.answer();
+    assert_eq!(exchange.evidence(), [Evidence::Missing; 2]);
+    exchange.stage();
+    assert!(!exchange.came_late(0));
+    assert_eq!(exchange.receive(&first), Received::Late);
+    assert!(exchange.came_late(0) && exchange.came_late(1));
+    exchange.stage();
+    assert!(!exchange.came_late(0), "it is of one cycle");
+    // Of a device that did not take part, or of another frame.
+    let mut without = reflect(&mut exchange, 0, 1);
+    let wkc = exchange.forms[0].process_data[0].place.data().end;
+    without[wkc] = 3;
+    exchange.stage();
+    assert_eq!(exchange.receive(&without), Received::Late);
+    assert!(!exchange.came_late(0));
+    for cut in 0..first.len() {
+        exchange.receive(&first[..cut]);
+    }
+    for _ in 0..10 {
+        exchange.stage();
+    }
+    assert_eq!(exchange.receive(&first), Received::Late);
+    assert!(!exchange.came_late(0), "too old");
+}
+
+/// The number of a cycle is longer than the index of a datagram.
+#[test]
+fn an_answer_256_cycles_old_is_late() {
+    let mut exchange = axes(2);
+    let first = reflect(&mut exchange, 0, 1);
+    for _ in 0..256 {
+        exchange.stage();
+        exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
+    }
+    assert_eq!(exchange.receive(&first), Received::Late);
+    assert_eq!(exchange.answer().inputs_fresh, false);
 }

@@ -2,26 +2,20 @@
 //!
 //! The first group is what no other holds, and always there: where it stops, the machine stops, and the other way round.
 
-use ecaxis_axis::{Command, Refused};
+use ecaxis_axis::{Command, Refused, StopMethod};
 
 use super::guard::StopCause;
 use crate::clock::Nanos;
-use crate::config::{Machine, Outside, StopBy};
-
-/// How an axis is brought to rest.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Way {
-    By(StopBy),
-    Emergency,
-}
+use crate::config::{Machine, Outside};
 
 /// A stop under way, or done.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stop {
-    /// The first; what comes later is a consequence, and only makes the stop shorter.
+    /// The first; what comes later is a consequence.
     pub cause: StopCause,
     pub since: Nanos,
-    severity: u8,
+    /// What failed while a stop that was asked for was under way.
+    pub failure: Option<StopCause>,
     /// One of the axes has been reset since.
     acknowledged: bool,
 }
@@ -30,12 +24,9 @@ pub struct Stop {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Group {
     /// How its other axes stop when one faults, trips, or can no longer follow.
-    others: StopBy,
+    others: StopMethod,
     /// The machine goes on without it.
     alone: bool,
-    /// How long its slowest axis may take from full speed to rest. One that is not at rest this long
-    /// after the group began to stop is left to its drive's own quick stop.
-    pub patience: Nanos,
     stop: Option<Stop>,
     /// Stops so far that the machine went on through.
     pub stops: u32,
@@ -66,34 +57,20 @@ impl Group {
     )]
     pub fn all(machine: &Machine) -> Vec<Self> {
         let stop = &machine.stop;
-        let rest = (stop.others, false);
-        let named = stop.groups.iter();
-        let named = named.map(|group| (group.others, group.outside == Outside::Continue));
-        let groups = std::iter::once(rest).chain(named).enumerate();
-        groups
-            .map(|(index, (others, alone))| {
-                let devices = machine.devices.iter().enumerate();
-                let own = devices.filter(|(device, _)| machine.group_of(*device) == index);
-                let axes = own.filter_map(|(_, device)| device.axis.as_ref());
-                let times = axes.map(|axis| {
-                    let limits = axis.config.limits;
-                    limits.velocity / limits.acceleration
-                });
-                Self {
-                    alone,
-                    ..Self::machine(others, times.fold(0.0, f64::max))
-                }
-            })
-            .collect()
+        let rest = Self::machine(stop.others);
+        let named = stop.groups.iter().map(|group| Self {
+            alone: group.outside == Outside::Continue,
+            ..Self::machine(group.others)
+        });
+        std::iter::once(rest).chain(named).collect()
     }
 
-    /// A machine without groups, whose slowest axis comes to rest in `ramp_s` seconds.
+    /// A machine without groups.
     #[must_use]
-    pub fn machine(others: StopBy, ramp_s: f64) -> Self {
+    pub const fn machine(others: StopMethod) -> Self {
         Self {
             others,
             alone: false,
-            patience: patience(ramp_s),
             stop: None,
             stops: 0,
             found: None,
@@ -110,34 +87,30 @@ impl Group {
         self.alone
     }
 
-    /// Begins to stop at `now`, or stops anew by a shorter way. `false`: it is stopping for something as grave already.
-    pub(super) fn begin(&mut self, cause: StopCause, severity: u8, now: Nanos) -> bool {
-        if self.stop.is_some_and(|stop| severity <= stop.severity) {
+    /// Begins to stop at `now`. `false`: it is stopping already; a failure then is the stop's own, if it was asked for.
+    pub(super) fn begin(&mut self, cause: StopCause, now: Nanos) -> bool {
+        if let Some(stop) = &mut self.stop {
+            if !stop.cause.is_failure() && cause.is_failure() {
+                stop.failure.get_or_insert(cause);
+            }
             return false;
         }
-        let before = self
-            .stop
-            .map_or((cause, now), |stop| (stop.cause, stop.since));
         self.stop = Some(Stop {
-            cause: before.0,
-            since: before.1,
-            severity,
+            cause,
+            since: now,
+            failure: None,
             acknowledged: false,
         });
         true
     }
 
-    /// What `cause`, if it is the group's own, does to its axes.
-    pub(super) fn way(&self, cause: StopCause, bus_lost: StopBy) -> Way {
+    /// How `cause`, if it is the group's own, stops its axes; those whose device is missing are left to their drives.
+    pub(super) fn method(&self, cause: StopCause) -> StopMethod {
         match cause {
-            StopCause::BusLost { .. } | StopCause::LeftOp { .. } => Way::By(bus_lost),
             StopCause::DriveFault { .. }
             | StopCause::Trip { .. }
-            | StopCause::FollowLost { .. } => Way::By(self.others),
-            StopCause::Requested | StopCause::Controller | StopCause::Powered { .. } => {
-                Way::By(StopBy::Ramp)
-            }
-            StopCause::EmergencyStop => Way::Emergency,
+            | StopCause::FollowLost { .. } => self.others,
+            _ => StopMethod::Ramp,
         }
     }
 
@@ -155,12 +128,6 @@ impl Group {
         }
         released
     }
-}
-
-/// The slowest axis' time from full speed to rest, and a second for the drive.
-fn patience(slowest_s: f64) -> Nanos {
-    // Longer than an hour is as good as for ever; the cast saturates.
-    1_000_000_000 + (slowest_s.min(3600.0) * 1e9) as Nanos
 }
 
 /// What axes that are being stopped still take.

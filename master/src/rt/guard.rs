@@ -1,6 +1,6 @@
 //! How many bad cycles the machine rides through, and what stops it.
 
-use super::exchange::{Answer, Share};
+use super::exchange::{Answer, Evidence, Share};
 
 /// AL status that every SubDevice must show while the machine runs.
 const OP: u8 = 0x08;
@@ -31,32 +31,33 @@ pub enum StopCause {
     FollowLost { axis: usize },
     /// The user's controller panicked.
     Controller,
-    /// The drive of this axis keeps its power, long after its group began to stop.
+    /// The cycle itself panicked.
+    Panicked,
+    /// The drive of this axis keeps its power after its removal was requested.
     Powered { axis: usize },
     /// At least one SubDevice is no longer in Op.
     LeftOp { al_status: u8 },
 }
 
 impl StopCause {
-    /// A graver one stops a machine anew that is already stopping: by a shorter way.
+    /// The machine did not stop because it was asked to.
     #[must_use]
-    pub fn severity(&self) -> u8 {
-        match self {
-            Self::Requested | Self::Controller | Self::Powered { .. } => 1,
-            Self::DriveFault { .. } | Self::Trip { .. } | Self::FollowLost { .. } => 2,
-            Self::BusLost { .. } | Self::LeftOp { .. } => 3,
-            Self::EmergencyStop => 4,
-        }
+    pub fn is_failure(&self) -> bool {
+        !matches!(self, Self::Requested)
     }
 }
 
-/// Counts bad cycles in a row, of each group.
+/// Counts bad cycles in a row, of each group and each device.
 #[derive(Debug, Clone)]
 pub struct Guard {
     lost_frames: u32,
     groups: Vec<Watch>,
+    /// Cycles in which each device was missing by its own evidence.
+    missing: Vec<u32>,
     /// Cycles in which AL status was wrong and no group's working counter said whose.
     al: u32,
+    /// Cycles in which fewer SubDevices answered than the working counters account for.
+    absent: u32,
     al_status: u8,
 }
 
@@ -85,19 +86,28 @@ impl Guard {
         Self {
             lost_frames: lost_frames.max(1),
             groups: watches,
+            missing: vec![0; groups.len()],
             al: 0,
+            absent: 0,
             al_status: OP,
         }
     }
 
-    /// Looks at one cycle. RT: O(groups).
-    pub fn look(&mut self, answer: &Answer, shares: &[Share]) {
+    /// Looks at one cycle. RT: O(groups + devices).
+    pub fn look(&mut self, answer: &Answer, shares: &[Share], evidence: &[Evidence]) {
         for (watch, share) in self.groups.iter_mut().zip(shares) {
             watch.last = *share;
             watch.bad = if share.fresh {
                 0
             } else {
                 watch.bad.saturating_add(1)
+            };
+        }
+        for (missing, evidence) in self.missing.iter_mut().zip(evidence) {
+            *missing = match evidence {
+                Evidence::Fresh => 0,
+                Evidence::Unknown => *missing,
+                Evidence::Missing => missing.saturating_add(1),
             };
         }
         let Some((status, answering)) = answer.al_status else {
@@ -108,30 +118,38 @@ impl Guard {
             groups.map(|g| g.devices).fold(0, u16::saturating_add)
         };
         let expected = devices(&mut self.groups.iter());
-        let right = status == OP && answering == expected;
         // Who is not in Op does not take outputs, and who is not there takes nothing. That accounts for no more than they are.
         let bad = devices(&mut self.groups.iter().filter(|g| g.bad > 0));
-        let known = bad > 0 && answering >= expected.saturating_sub(bad);
+        let accounted = answering >= expected.saturating_sub(bad);
+        let known = bad > 0 && accounted;
+        let left_op = status != OP;
         for watch in &mut self.groups {
-            let guilty = !right && known && watch.bad > 0;
+            let guilty = left_op && known && watch.bad > 0;
             watch.al = if guilty {
                 watch.al.saturating_add(1)
             } else {
                 0
             };
         }
-        self.al = if right || known {
+        self.al = if left_op && !known {
+            self.al.saturating_add(1)
+        } else {
+            0
+        };
+        // A SubDevice that does not answer is a lost frame until there are too many of them.
+        self.absent = if accounted {
             0
         } else {
-            self.al.saturating_add(1)
+            self.absent.saturating_add(1)
         };
     }
 
-    /// Why the whole machine has to stop: SubDevices are not in Op, and nothing says which.
+    /// Why the whole machine has to stop: SubDevices are not in Op or do not answer, and no working counter says which.
     #[must_use]
     pub fn left_op(&self) -> Option<StopCause> {
         let al_status = self.al_status;
-        (self.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status })
+        let left = self.al >= AL_CYCLES || self.absent >= self.lost_frames;
+        left.then_some(StopCause::LeftOp { al_status })
     }
 
     /// Why a group has to stop.
@@ -147,6 +165,14 @@ impl Guard {
         }
         let al_status = self.al_status;
         (watch.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status })
+    }
+
+    /// The device has been missing for too long: what is sent to its drive cannot be relied on.
+    #[must_use]
+    pub fn device_lost(&self, device: usize) -> bool {
+        self.missing
+            .get(device)
+            .is_some_and(|missing| *missing >= self.lost_frames)
     }
 }
 
@@ -175,13 +201,13 @@ mod tests {
         for _ in 0..10 {
             for share in [GONE, GONE, SHARE] {
                 let back = share.answered.then_some((OP, 2));
-                guard.look(&answer(back), &[share]);
+                guard.look(&answer(back), &[share], &[]);
                 assert_eq!((guard.lost(0), guard.left_op()), (None, None));
             }
         }
-        guard.look(&answer(None), &[GONE]);
-        guard.look(&answer(None), &[GONE]);
-        guard.look(&answer(None), &[GONE]);
+        guard.look(&answer(None), &[GONE], &[]);
+        guard.look(&answer(None), &[GONE], &[]);
+        guard.look(&answer(None), &[GONE], &[]);
         let lost = StopCause::BusLost {
             cycles: 3,
             last_wkc: (0, 3),
@@ -190,18 +216,37 @@ mod tests {
         assert_eq!((guard.lost(0), guard.left_op()), (Some(lost), None));
     }
 
+    /// Not in Op: after two cycles. Not there: after as many as frames may be lost.
     #[test]
     fn a_device_that_leaves_op_stops_the_machine() {
-        for al in [(0x1c, 2), (OP, 1)] {
-            let mut guard = Guard::new(3, &[0, 0]);
-            guard.look(&answer(Some(al)), &[SHARE]);
-            assert_eq!(guard.left_op(), None);
-            guard.look(&answer(Some(al)), &[SHARE]);
+        for (al, cycles) in [((0x1c, 2), AL_CYCLES), ((OP, 1), 5)] {
+            let mut guard = Guard::new(5, &[0, 0]);
+            for _ in 1..cycles {
+                guard.look(&answer(Some(al)), &[SHARE], &[]);
+                assert_eq!(guard.left_op(), None);
+            }
+            guard.look(&answer(Some(al)), &[SHARE], &[]);
             let left = Some(StopCause::LeftOp { al_status: al.0 });
             assert_eq!((guard.lost(0), guard.left_op()), (None, left));
-            guard.look(&good(), &[SHARE]);
+            guard.look(&good(), &[SHARE], &[]);
             assert_eq!(guard.left_op(), None);
         }
+    }
+
+    #[test]
+    fn a_device_is_lost_by_its_own_evidence_alone() {
+        let mut guard = Guard::new(2, &[0, 0, 0]);
+        for evidence in [Evidence::Unknown; 5] {
+            guard.look(
+                &good(),
+                &[BAD],
+                &[evidence, Evidence::Missing, Evidence::Fresh],
+            );
+        }
+        let lost = [0, 1, 2].map(|device| guard.device_lost(device));
+        assert_eq!(lost, [false, true, false]);
+        guard.look(&good(), &[SHARE], &[Evidence::Fresh; 3]);
+        assert!(!guard.device_lost(1));
     }
 
     /// Devices 0, 1 and 2 are in groups 0, 1 and 2; the wrong working counter says whose AL status it is.
@@ -215,15 +260,21 @@ mod tests {
                 [None, left(0x1c), None],
                 None,
             ),
-            ((OP, 2), [SHARE, SHARE, BAD], [None, None, left(OP)], None),
-            ((OP, 1), [SHARE, BAD, BAD], [None, left(OP), left(OP)], None),
-            // One more is missing than the group has.
-            ((OP, 1), [SHARE, SHARE, BAD], [None, None, None], left(OP)),
+            // One more is out of Op than the group has.
+            (
+                (0x1c, 1),
+                [SHARE, SHARE, BAD],
+                [None, None, None],
+                left(0x1c),
+            ),
+            // A device that does not answer is counted with its process data.
+            ((OP, 2), [SHARE, SHARE, BAD], [None, None, None], None),
+            ((OP, 1), [SHARE, BAD, BAD], [None, None, None], None),
             ((OP, 3), [SHARE, BAD, SHARE], [None, None, None], None),
         ] {
             let mut guard = Guard::new(10, &[0, 1, 2]);
             for _ in 0..AL_CYCLES {
-                guard.look(&answer(Some(al)), &shares);
+                guard.look(&answer(Some(al)), &shares, &[]);
             }
             let found = [0, 1, 2].map(|group| guard.lost(group));
             assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
@@ -234,7 +285,7 @@ mod tests {
     fn a_group_without_its_process_data_is_lost_alone() {
         let mut guard = Guard::new(2, &[1]);
         for _ in 0..2 {
-            guard.look(&answer(Some((OP, 1))), &[SHARE, BAD]);
+            guard.look(&answer(Some((OP, 1))), &[SHARE, BAD], &[]);
         }
         assert_eq!(guard.lost(0), None);
         assert!(matches!(

@@ -109,6 +109,10 @@ pub struct Snapshot {
     pub diagnoses: Vec<Diagnosis>,
     /// First cause, once the machine is stopping.
     pub stopping: Option<StopCause>,
+    /// What failed while the machine was stopping because it was asked to.
+    pub failure: Option<StopCause>,
+    /// Nothing more can be done to stop any axis.
+    pub stop_ended: bool,
     /// The first is the rest of the machine.
     pub groups: Vec<GroupStatus>,
     /// Events that did not fit into the queue.

@@ -11,6 +11,8 @@ use crate::clock::Nanos;
 pub struct AxisSlot {
     pub axis: Axis,
     pub bits: AxisBits,
+    /// Index of its SubDevice.
+    pub device: usize,
     /// The axes that it stops with.
     pub group: usize,
     pub feed: Feed,
@@ -22,18 +24,17 @@ pub struct AxisSlot {
     /// Enabling was ordered and the drive had no fault since: from now on a fault stops its group.
     pub(super) armed: bool,
     pub(super) ordered: bool,
-    /// How long a stopping axis has been at rest.
-    pub(super) rested: Nanos,
     /// In this cycle.
     pub(super) acted: bool,
 }
 
 impl AxisSlot {
     #[must_use]
-    pub fn new(axis: Axis, bits: AxisBits, group: usize) -> Self {
+    pub fn new(axis: Axis, bits: AxisBits, device: usize, group: usize) -> Self {
         Self {
             axis,
             bits,
+            device,
             group,
             feed: Feed::default(),
             largest_following_error: 0.0,
@@ -41,14 +42,13 @@ impl AxisSlot {
             heard: None,
             armed: false,
             ordered: false,
-            rested: 0,
             acted: false,
         }
     }
 
     /// It has been stopped and reset: what it reports concerns nobody until it is enabled again.
     pub(super) fn disarm(&mut self) {
-        (self.armed, self.ordered, self.rested) = (false, false, 0);
+        (self.armed, self.ordered) = (false, false);
     }
 
     pub(super) fn command(&mut self, command: Command) -> Result<(), Refused> {
@@ -72,7 +72,7 @@ impl AxisSlot {
         Ok(())
     }
 
-    pub(super) fn read(&self, image: &[u8], fresh: bool) -> Inputs {
+    pub(super) fn read(&self, image: &[u8], fresh: bool, late: bool) -> Inputs {
         let bits = &self.bits;
         Inputs {
             statusword: bits.statusword.get(image) as u16,
@@ -86,6 +86,7 @@ impl AxisSlot {
                 .touch_probe_positions
                 .map(|b| b.map(|b| b.get(image) as i32)),
             fresh,
+            late,
         }
     }
 

@@ -101,7 +101,6 @@ impl Job<'_> {
                     spin: machine.bus.spin,
                 };
                 let groups = Group::all(machine);
-                let patience = groups.iter().map(|group| group.patience).max();
                 let clock = options.clock;
                 let members = bus.devices.iter().map(|device| Member {
                     station: device.at.station,
@@ -157,11 +156,11 @@ impl Job<'_> {
                     operator: None,
                     seen: Vec::new(),
                     axes,
-                    stop_patience: patience.unwrap_or(0),
                     orders_given: 0,
                     refused: VecDeque::new(),
                     captures: Vec::new(),
                     stopped: Vec::new(),
+                    limited: Vec::new(),
                     last_status: clock::now(),
                     looks: Vec::new(),
                 };
@@ -251,7 +250,7 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
             name: name(index),
             source,
         })?;
-        slots.push(AxisSlot::new(axis, bits, image.groups[index]));
+        slots.push(AxisSlot::new(axis, bits, index, image.groups[index]));
         axes.push(index);
     }
     let bits = |signal: &Signal, output: bool| {

@@ -52,6 +52,7 @@ impl Supervisor {
                 },
             },
             StopCause::Controller => RunError::Controller,
+            StopCause::Panicked => RunError::Panicked("the cycle".to_owned()),
             StopCause::Powered { axis } => RunError::NotDisabled {
                 device: self.device_of(axis),
                 state: snapshot
@@ -84,37 +85,45 @@ impl Supervisor {
                 cycles,
                 last_wkc,
                 answered,
-            } => RunError::BusLost {
-                group: group.map(|group| self.group_name(group)),
-                cycles,
-                wkc: last_wkc,
-                answered,
-            },
-            StopCause::LeftOp { al_status } => {
-                for (index, device) in self.bus.addresses().into_iter().enumerate() {
-                    let own = self.machine.group_of(index);
-                    // What is known of already is not the cause.
-                    if group.is_some_and(|group| group != own) || self.is_stopped(own) {
-                        continue;
-                    }
-                    match al::read_status(&self.wire, device.station).await {
-                        Ok(Some((status, code))) if status != 8 => {
-                            let state = al::AlState::from_status(status);
-                            return RunError::LeftOp {
-                                device,
-                                state,
-                                code,
-                            };
-                        }
-                        Ok(None) => {
-                            return RunError::Gone { device };
-                        }
-                        _ => {}
-                    }
+            } => {
+                if answered && let Some(missing) = self.find_missing(group).await {
+                    return missing;
                 }
-                RunError::LeftOpBriefly { al_status }
+                RunError::BusLost {
+                    group: group.map(|group| self.group_name(group)),
+                    cycles,
+                    wkc: last_wkc,
+                    answered,
+                }
+            }
+            StopCause::LeftOp { al_status } => match self.find_missing(group).await {
+                Some(missing) => missing,
+                None => RunError::LeftOpBriefly { al_status },
+            },
+        }
+    }
+
+    /// The first SubDevice, of a group or of all, that does not answer or is not in Op. What is known of already is not the cause.
+    async fn find_missing(&mut self, group: Option<usize>) -> Option<RunError> {
+        for (index, device) in self.bus.addresses().into_iter().enumerate() {
+            let own = self.machine.group_of(index);
+            if group.is_some_and(|group| group != own) || self.is_stopped(own) {
+                continue;
+            }
+            match al::read_status(&self.wire, device.station).await {
+                Ok(Some((status, code))) if status != 8 => {
+                    let state = al::AlState::from_status(status);
+                    return Some(RunError::LeftOp {
+                        device,
+                        state,
+                        code,
+                    });
+                }
+                Ok(None) => return Some(RunError::Gone { device }),
+                _ => {}
             }
         }
+        None
     }
 
     pub(super) async fn not_enabled(

@@ -19,7 +19,6 @@ use crate::config::steps::enables;
 use crate::config::{Machine, Step};
 use crate::mailbox::Mailboxes;
 use crate::mailbox::desk::{Desk, beside};
-use crate::rt::cycle::has_power;
 use crate::rt::exchange::Probe;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
@@ -44,10 +43,6 @@ const LOCK_TIMEOUT: Nanos = 5_000_000_000;
 const FIRST_CYCLES: u64 = 20;
 /// A clock closer to the reference than this has settled.
 const SETTLED_NS: u32 = 1_000;
-/// The drives' own quick stop may take so long after the cycle's patience is over.
-const STOP_MARGIN: Nanos = 3_000_000_000;
-/// On a bus that has been silent for so long nobody can report that it stands.
-const LOST_BUS_TIMEOUT: Nanos = 1_000_000_000;
 /// Refusals that are kept until somebody looks.
 const REFUSALS: usize = 256;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
@@ -79,8 +74,6 @@ pub struct Supervisor {
     pub seen: Vec<usize>,
     /// Indices into the machine's devices, one an axis of the cycle.
     pub axes: Vec<usize>,
-    /// How long the cycle waits for its slowest axis to come to rest.
-    pub stop_patience: Nanos,
     /// Orders handed over so far.
     pub orders_given: u64,
     /// Commands that axes did not take, in order; of too many the first, and the last.
@@ -89,6 +82,8 @@ pub struct Supervisor {
     pub captures: Vec<Capture>,
     /// Stops of groups that the machine went on through, in the order in which they were told.
     pub stopped: Vec<StoppedGroup>,
+    /// Axes whose drive has reported an internal limit.
+    pub limited: Vec<bool>,
     /// When the last status was told.
     pub last_status: Nanos,
     /// What the SubDevices told after a failure, in the order of the segment.
@@ -274,6 +269,17 @@ impl Supervisor {
         Ok(())
     }
 
+    /// From the full speed of the slowest axis to rest.
+    fn longest_stop(&self) -> Nanos {
+        let axes = self.machine.devices.iter().filter_map(|d| d.axis.as_ref());
+        let times = axes.map(|axis| {
+            let config = &axis.config;
+            config.stop_time_s(config.mode, config.limits.velocity)
+        });
+        // At most an hour; the cast saturates.
+        (times.fold(0.0, f64::max) * 1e9) as Nanos
+    }
+
     /// Of the brakes of axes: the drive is enabled meanwhile.
     fn longest_release(&self, axes: &[usize]) -> Nanos {
         let devices = axes.iter().filter_map(|&axis| self.axes.get(axis));
@@ -300,6 +306,7 @@ impl Supervisor {
         }
         let snapshot = self.outer.snapshots.read().clone();
         self.pass_events_on();
+        self.report_limits(&snapshot);
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
             self.tell(Progress::Status(Status::new(
@@ -314,6 +321,20 @@ impl Supervisor {
             return Err(self.explain_stop(cause, None, &snapshot).await);
         }
         Ok(snapshot)
+    }
+
+    /// Statusword bit 11, once for each axis.
+    fn report_limits(&mut self, snapshot: &Snapshot) {
+        self.limited.resize(snapshot.axes.len(), false);
+        for (axis, status) in snapshot.axes.iter().enumerate() {
+            if status.internal_limit && status.enabled && !self.limited[axis] {
+                self.limited[axis] = true;
+                let device = self.device_of(axis);
+                self.tell(Progress::Warning(format!(
+                    "{device}: the drive limits what it is commanded (Statusword bit 11, internal limit active)"
+                )));
+            }
+        }
     }
 
     /// What has stopped groups. Takes as long as the devices take to answer.
@@ -403,50 +424,23 @@ impl Supervisor {
         clocks::stop(&self.wire, pulsed.map(|(_, device)| device.at.station)).await;
     }
 
-    /// Until every axis is without power, the patience is over, or nobody has answered for long.
+    /// Until nothing more can be done to stop any axis. Each axis sees to it in bounded time.
     async fn await_rest(&mut self) -> Result<(), RunError> {
-        let start = clock::now();
-        let mut answered = vec![start; self.machine.stop.groups.len() + 1];
         loop {
             clock::delay(TICK).await;
             let snapshot = self.outer.snapshots.read().clone();
-            let now = clock::now();
-            for (last, group) in answered.iter_mut().zip(&snapshot.groups) {
-                if group.fresh {
-                    *last = now;
-                }
-            }
-            let silent = |group: usize| {
-                let last = answered.get(group).copied().unwrap_or(start);
-                now.saturating_sub(last) > LOST_BUS_TIMEOUT
-            };
-            let mut groups = snapshot.groups.iter().enumerate();
-            let rests = snapshot.stopping.is_some()
-                && groups.all(|(index, group)| !group.powered || silent(index));
-            let over = now.saturating_sub(start) > self.stop_patience + STOP_MARGIN
-                || self.outer.orders.is_abandoned();
-            if !rests && !over {
+            let gone = self.outer.orders.is_abandoned();
+            if !gone && (snapshot.stopping.is_none() || !snapshot.stop_ended) {
                 continue;
             }
-            // A fault that came while the machine was stopping has not been told yet.
-            for (axis, status) in snapshot.axes.iter().enumerate() {
-                let cause = match (status.fault, status.trip) {
-                    (Some(_), _) => StopCause::DriveFault { axis },
-                    (None, Some(trip)) => StopCause::Trip { axis, trip },
-                    (None, None) => continue,
-                };
-                let known = self.is_stopped(self.group_of(axis)) || self.seen.contains(&axis);
-                if self.enable && !known {
-                    return Err(self.explain_stop(cause, None, &snapshot).await);
-                }
+            if let Some(failure) = snapshot.failure {
+                return Err(self.explain_stop(failure, None, &snapshot).await);
             }
-            // What has not answered for long has been told of if its group was stopped.
-            let left = |axis: usize| {
-                let group = self.group_of(axis);
-                !(self.is_stopped(group) && silent(group))
-            };
+            // What has not answered for long has been reported if its group was stopped.
             let mut axes = snapshot.axes.iter().enumerate();
-            let powered = axes.find(|(axis, status)| has_power(status.state) && left(*axis));
+            let powered = axes.find(|(axis, status)| {
+                status.state.has_power() && !self.is_stopped(self.group_of(*axis))
+            });
             return match powered {
                 Some((axis, status)) => Err(RunError::NotDisabled {
                     device: self.device_of(axis),

@@ -4,9 +4,10 @@ use std::fmt::Write;
 
 use ecaxis::config::{AxisSetup, HomingSetup, TorqueUnit, UnitFrom, duration};
 use ecaxis_axis::Mode;
+use ecaxis_axis::StopMethod;
 use ecaxis_axis::homing;
 use ecaxis_axis::scale::Way;
-use ecaxis_axis::supervision::{Emergency, FaultReset, Reaction};
+use ecaxis_axis::supervision::FaultReset;
 
 use super::super::report::Table;
 
@@ -222,16 +223,28 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
         ]);
     }
     let reaction = match watch.reaction {
-        Reaction::QuickStop => "the drive's quick stop, then no power",
-        Reaction::Ramp => "by the acceleration limit, then no power",
-        Reaction::DisableVoltage => "no power at once",
+        StopMethod::QuickStop => "the drive's quick stop, then no power",
+        StopMethod::Ramp => "by the acceleration limit, then no power",
+        StopMethod::DisableVoltage => "no power at once",
     };
     table.row(["on a trip", reaction, "`on_trip`"]);
     let emergency = match watch.emergency {
-        Emergency::QuickStop => "the drive's quick stop",
-        Emergency::DisableVoltage => "no power at once",
+        StopMethod::Ramp | StopMethod::QuickStop => "the drive's quick stop",
+        StopMethod::DisableVoltage => "no power at once",
     };
     table.row(["on emergency", emergency, "`on_emergency`"]);
+    let full = config.stop_time_s(config.mode, config.limits.velocity);
+    let (stop, origin) = match config.stop_timeout_s {
+        Some(timeout) => (time(timeout), "`stop_timeout`"),
+        None => (
+            format!("{} from full speed, longer while it slows down", time(full)),
+            "ramp, jerk and 1 s",
+        ),
+    };
+    table.row(["stop time-out", &stop, origin]);
+    if !config.follows_bit {
+        table.row(["Statusword bit 12", "ignored", "`follows_bit`"]);
+    }
     if let Some(option) = config.quick_stop {
         let option = format!("option {}", option.0);
         table.row(["quick stop", &option, "0x605A from `sdo` or the ESI"]);

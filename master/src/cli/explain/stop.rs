@@ -2,15 +2,16 @@
 
 use std::fmt::Write;
 
-use ecaxis::config::{Machine, Outside, StopBy, StopByDrive};
+use ecaxis::config::{Machine, Outside};
+use ecaxis_axis::StopMethod;
 
 use super::Table;
 
 pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let stop = &machine.stop;
     let by_drive = match stop.bus_lost {
-        StopByDrive::QuickStop => "the drives' quick stop",
-        StopByDrive::NoPower => "no power",
+        StopMethod::Ramp | StopMethod::QuickStop => "the drive's quick stop",
+        StopMethod::DisableVoltage => "no power",
     };
     let conditions = stop.emergency.iter().map(|c| machine.condition(c));
     let emergency = match conditions.collect::<Vec<_>>() {
@@ -18,7 +19,7 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
         all => all.join(", or "),
     };
     let lost = format!(
-        "{} cycles long, or not in Op: {by_drive}",
+        "{} cycles long: axes that answer stop within their limits, the others by {by_drive}",
         machine.bus.lost_frames
     );
     let mut table = Table::new(&["when", "what happens", "key"]);
@@ -64,10 +65,10 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
     writeln!(out, "\n{}", table.shown(2))
 }
 
-fn way(way: StopBy) -> &'static str {
+fn way(way: StopMethod) -> &'static str {
     match way {
-        StopBy::Ramp => "within their limits",
-        StopBy::QuickStop => "quick stop",
-        StopBy::NoPower => "no power",
+        StopMethod::Ramp => "within their limits",
+        StopMethod::QuickStop => "quick stop",
+        StopMethod::DisableVoltage => "no power",
     }
 }

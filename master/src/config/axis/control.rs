@@ -1,7 +1,7 @@
 //! How an axis is controlled and watched: loops, brake, supervision, fault reset, homing.
 
 use ecaxis_axis::homing::{self, Homing, ParameterError};
-use ecaxis_axis::supervision::{Brake, Emergency, FaultReset, Reaction, Supervision, TorqueWatch};
+use ecaxis_axis::supervision::{Brake, FaultReset, StopMethod, Supervision, TorqueWatch};
 use ecaxis_axis::{AxisConfig, FeedForward, Loops, PositionPid, VelocityLoop};
 use ecaxis_esi as esi;
 use toml::Spanned;
@@ -126,18 +126,14 @@ pub(super) fn guards(
         "supervise.standstill",
         &format!("{unit}/s"),
     )?;
-    let reactions = [
-        ("quick-stop", Reaction::QuickStop),
-        ("ramp", Reaction::Ramp),
-        ("no-power", Reaction::DisableVoltage),
-    ];
-    let emergencies = [
-        ("quick-stop", Emergency::QuickStop),
-        ("no-power", Emergency::DisableVoltage),
-    ];
     config.supervision = Supervision {
-        reaction: one_of(raw.on_trip.as_ref(), &reactions, "on_trip", p)?,
-        emergency: one_of(raw.on_emergency.as_ref(), &emergencies, "on_emergency", p)?,
+        reaction: one_of(raw.on_trip.as_ref(), &STOP_METHODS, "on_trip", p)?,
+        emergency: one_of(
+            raw.on_emergency.as_ref(),
+            &STOPS_BY_DRIVE,
+            "on_emergency",
+            p,
+        )?,
         torque: torque.map(|torque| TorqueWatch {
             percent: known.percent(torque),
             time_s: seconds(watch.torque_time.as_ref()).unwrap_or(TORQUE_TIME_S),
@@ -151,6 +147,19 @@ pub(super) fn guards(
 }
 
 /// A word of a few, or the default.
+/// How an axis may be brought to rest, as the machine file names it.
+pub(crate) const STOP_METHODS: [(&str, StopMethod); 3] = [
+    ("quick-stop", StopMethod::QuickStop),
+    ("ramp", StopMethod::Ramp),
+    ("no-power", StopMethod::DisableVoltage),
+];
+
+/// Those that a drive carries out by itself.
+pub(crate) const STOPS_BY_DRIVE: [(&str, StopMethod); 2] = [
+    ("quick-stop", StopMethod::QuickStop),
+    ("no-power", StopMethod::DisableVoltage),
+];
+
 pub(crate) fn one_of<T: Copy + Default>(
     word: Option<&Spanned<String>>,
     all: &[(&str, T)],

@@ -4,25 +4,21 @@ use toml::Spanned;
 
 use super::Checker;
 use crate::config::axis::control::one_of;
+use crate::config::axis::control::{STOP_METHODS, STOPS_BY_DRIVE};
 use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{RawGroup, RawStop};
-use crate::config::{Outside, StopBy, StopByDrive, StopGroup, StopSetup};
+use crate::config::{Outside, StopGroup, StopSetup};
+use ecaxis_axis::StopMethod;
 
-const WAYS: [(&str, StopBy); 3] = [
-    ("ramp", StopBy::Ramp),
-    ("quick-stop", StopBy::QuickStop),
-    ("no-power", StopBy::NoPower),
-];
-const BY_DRIVE: [(&str, StopByDrive); 2] = [
-    ("quick-stop", StopByDrive::QuickStop),
-    ("no-power", StopByDrive::NoPower),
-];
 const OUTSIDE: [(&str, Outside); 2] = [("stop", Outside::Stop), ("continue", Outside::Continue)];
 
 impl Checker<'_> {
     /// What is wrong in it has been said, and the machine does not run.
     pub(super) fn stop(&mut self, raw: &RawStop, p: &mut Problems<'_>) -> StopSetup {
-        let others = one_of(raw.others.as_ref(), &WAYS, "others", p).unwrap_or_default();
+        let others = match &raw.others {
+            Some(_) => one_of(raw.others.as_ref(), &STOP_METHODS, "others", p).unwrap_or_default(),
+            None => StopMethod::Ramp,
+        };
         let mut groups: Vec<StopGroup> = Vec::new();
         for (index, group) in raw.groups.iter().enumerate() {
             let group = self.group(group, &raw.groups[..index], &groups, others, p);
@@ -48,7 +44,8 @@ impl Checker<'_> {
         }
         StopSetup {
             others,
-            bus_lost: one_of(raw.bus_lost.as_ref(), &BY_DRIVE, "bus_lost", p).unwrap_or_default(),
+            bus_lost: one_of(raw.bus_lost.as_ref(), &STOPS_BY_DRIVE, "bus_lost", p)
+                .unwrap_or_default(),
             emergency,
             groups,
         }
@@ -59,7 +56,7 @@ impl Checker<'_> {
         raw: &RawGroup,
         before: &[RawGroup],
         groups: &[StopGroup],
-        others: StopBy,
+        others: StopMethod,
         p: &mut Problems<'_>,
     ) -> StopGroup {
         if let Some(name) = &raw.name {
@@ -82,7 +79,9 @@ impl Checker<'_> {
                 .map_or_else(String::new, |n| n.get_ref().clone()),
             devices: Vec::new(),
             others: match &raw.others {
-                Some(_) => one_of(raw.others.as_ref(), &WAYS, "others", p).unwrap_or_default(),
+                Some(_) => {
+                    one_of(raw.others.as_ref(), &STOP_METHODS, "others", p).unwrap_or_default()
+                }
                 None => others,
             },
             outside: one_of(raw.outside.as_ref(), &OUTSIDE, "outside", p).unwrap_or_default(),

@@ -1,5 +1,7 @@
 use crate::config::tests::{GOOD, with_esi};
-use crate::config::{ConfigError, Outside, StopBy, StopGroup};
+use ecaxis_axis::StopMethod;
+
+use crate::config::{ConfigError, Outside, StopGroup};
 
 #[test]
 fn groups_of_axes() {
@@ -19,8 +21,8 @@ fn groups_of_axes() {
     assert_eq!(
         machine.stop.groups,
         [
-            group("g", 1, StopBy::NoPower, Outside::Continue),
-            group("h", 0, StopBy::QuickStop, Outside::Stop),
+            group("g", 1, StopMethod::DisableVoltage, Outside::Continue),
+            group("h", 0, StopMethod::QuickStop, Outside::Stop),
         ]
     );
 }

@@ -1,16 +1,10 @@
 //! From the inputs to the outputs: every axis once a cycle.
 
-use ecaxis_axis::Command;
+use ecaxis_axis::StopPhase;
 
-use super::orders::quick_stop;
-use super::{Engine, Nanos, has_power};
+use super::{Engine, Nanos};
 use crate::rt::feed;
 use crate::rt::guard::StopCause;
-
-/// An axis at rest settles on its target this long before its power is taken away.
-const SETTLE: Nanos = 100_000_000;
-/// A drive's own quick stop is given two seconds; one that has power so long after it was ordered does not obey.
-const STUCK: Nanos = 3_000_000_000;
 
 impl Engine {
     /// Cycles that were left out sent nothing, and drives hold what they got last: the axes go on from there. They are told before
@@ -31,6 +25,7 @@ impl Engine {
 
     /// Masters before those that follow them, so that a follower's set-point is of the same cycle.
     pub(super) fn act(&mut self) {
+        self.stop_missing_axes();
         // Gears form no rings, so every round acts on one axis at least.
         for _ in 0..self.axes.len() {
             let mut waiting = false;
@@ -86,22 +81,9 @@ impl Engine {
                 slot.largest_following_error.max(status.max_following_error);
             slot.last_enabled = Some(status);
         }
-        if let Some(stop) = group.stop() {
-            let at_rest = status.at_rest && !status.moving;
-            slot.rested = if at_rest {
-                slot.rested + self.timing.cycle_ns
-            } else {
-                0
-            };
-            let elapsed = self.next.saturating_sub(stop.since);
-            let known = status.stale_cycles == 0 && has_power(status.state);
-            if known && elapsed > group.patience + STUCK {
+        if group.stop().is_some() {
+            if status.stop.is_some_and(|s| s.phase == StopPhase::PowerKept) {
                 group.found = Some(StopCause::Powered { axis: index });
-            }
-            if status.enabled && elapsed > group.patience {
-                quick_stop(&mut slot.axis);
-            } else if status.enabled && slot.rested >= SETTLE {
-                let _ = slot.axis.command(Command::Disable);
             }
             // By command, or by itself where the machine file says so.
             if status.resetting {

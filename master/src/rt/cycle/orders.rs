@@ -1,11 +1,10 @@
 //! What the cycle is told to do, by the supervisor or by what has happened: orders and stops.
 
-use ecaxis_axis::{Axis, Command, Refused};
+use ecaxis_axis::{Command, Refused, StopMethod};
 
-use super::{Engine, has_power};
-use crate::config::{StopBy, StopByDrive};
+use super::Engine;
 use crate::rt::feed::{self, Start};
-use crate::rt::groups::{Group, Stop, Way, admit};
+use crate::rt::groups::{Group, Stop, admit};
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order};
 use crate::rt::history::Anchor;
@@ -67,10 +66,7 @@ impl Engine {
     /// The supervisor is gone without saying so: stop, then end the loop.
     fn end_alone(&mut self) {
         self.stop(None, StopCause::Requested);
-        let since = self.stopping().map_or(self.next, |stop| stop.since);
-        let patience = self.groups.iter().map(|group| group.patience).max();
-        self.halted =
-            self.without_power() || self.next.saturating_sub(since) > 2 * patience.unwrap_or(0);
+        self.halted = self.stop_ended();
     }
 
     /// Of the machine.
@@ -96,7 +92,7 @@ impl Engine {
         }
         for group in 0..self.groups.len() {
             if own.is_none_or(|own| own == group) {
-                let first = self.stop_group(group, cause, cause.severity(), None);
+                let first = self.stop_group(group, cause, None);
                 if first && goes_on && !machine_stops {
                     if let Some(group) = self.groups.get_mut(group) {
                         group.stops = group.stops.saturating_add(1);
@@ -109,8 +105,7 @@ impl Engine {
                     });
                 }
             } else if !goes_on {
-                let severity = StopCause::Requested.severity();
-                self.stop_group(group, cause, severity, Some(Way::By(StopBy::Ramp)));
+                self.stop_group(group, cause, Some(StopMethod::Ramp));
             }
         }
         if !machine_stops && !goes_on {
@@ -136,47 +131,42 @@ impl Engine {
         }
     }
 
-    /// By `way`, or as the cause demands. The first cause wins: its axes decelerate within their limits and are then disabled; where the bus
-    /// is not to be trusted, the drives do it by themselves, from the velocity that they know. `true`: it was not stopping before.
-    fn stop_group(
-        &mut self,
-        index: usize,
-        cause: StopCause,
-        severity: u8,
-        way: Option<Way>,
-    ) -> bool {
+    /// By `method`, or as the cause demands; an axis that stops already stops no gentler. `true`: it was not stopping before.
+    fn stop_group(&mut self, index: usize, cause: StopCause, method: Option<StopMethod>) -> bool {
         let Some(group) = self.groups.get_mut(index) else {
             return false;
         };
-        let first = group.stop().is_none();
-        if !group.begin(cause, severity, self.next) {
-            return false;
-        }
-        let bus_lost = match self.stop_setup.bus_lost {
-            StopByDrive::QuickStop => StopBy::QuickStop,
-            StopByDrive::NoPower => StopBy::NoPower,
+        // What follows from another group's failure is no failure of this one.
+        let first = if method.is_none() || group.stop().is_none() {
+            group.begin(cause, self.next)
+        } else {
+            false
         };
-        let way = way.unwrap_or_else(|| group.way(cause, bus_lost));
+        let method = method.unwrap_or_else(|| group.method(cause));
         for slot in self.axes.iter_mut().filter(|slot| slot.group == index) {
-            // An axis that does not take a command has no power, or is losing it already.
-            match way {
-                Way::By(StopBy::QuickStop) => quick_stop(&mut slot.axis),
-                Way::By(StopBy::NoPower) => {
-                    let _ = slot.axis.command(Command::DisableVoltage);
-                }
-                Way::Emergency => {
-                    let _ = slot.axis.command(Command::EmergencyStop);
-                }
-                Way::By(StopBy::Ramp) if slot.axis.status().enabled => {
-                    let _ = slot.axis.command(Command::Stop);
-                }
-                Way::By(StopBy::Ramp) => {
-                    let _ = slot.axis.command(Command::Disable);
-                }
+            if cause == StopCause::EmergencyStop {
+                let _ = slot.axis.command(Command::EmergencyStop);
+            } else {
+                slot.axis.stop_by(method);
             }
             slot.feed.end();
         }
         first
+    }
+
+    /// Axes that are stopping, and whose device is missing: the drive stops by itself, as far as it hears of it.
+    pub(super) fn stop_missing_axes(&mut self) {
+        for slot in &mut self.axes {
+            let stopping = self.groups.get(slot.group).and_then(Group::stop).is_some();
+            if stopping && self.guarding && self.guard.device_lost(slot.device) {
+                slot.axis.stop_by(self.stop_setup.bus_lost);
+            }
+        }
+    }
+
+    /// Nothing more can be done to stop any axis.
+    pub(super) fn stop_ended(&self) -> bool {
+        self.axes.iter().all(|slot| slot.axis.stop_ended())
     }
 
     /// Groups that have been reset may be enabled again: once they are at rest without power, no fault or trip is left, and their
@@ -191,7 +181,7 @@ impl Engine {
             let idle = |slot: &AxisSlot| {
                 let status = slot.axis.status();
                 let sound = status.fault.is_none() && status.trip.is_none();
-                sound && !has_power(status.state)
+                sound && !status.state.has_power()
             };
             let mut own = self.axes.iter().filter(|slot| slot.group == index);
             let Some(group) = self.groups.get_mut(index) else {
@@ -244,10 +234,4 @@ impl Engine {
         }
         true
     }
-}
-
-/// The drive's own quick stop, then no power.
-pub(super) fn quick_stop(axis: &mut Axis) {
-    let _ = axis.command(Command::QuickStop);
-    let _ = axis.command(Command::Disable);
 }

@@ -50,10 +50,19 @@ pub(super) struct Frame {
     clippy::disallowed_macros,
     reason = "prepares"
 )]
-pub(super) fn new_frame(number: u8) -> Frame {
+pub(super) fn new_frames(count: usize) -> Vec<Frame> {
+    (0..count).map(|_| new_frame()).collect()
+}
+
+#[allow(
+    clippy::disallowed_methods,
+    clippy::disallowed_macros,
+    reason = "prepares"
+)]
+fn new_frame() -> Frame {
     let mut bytes = Vec::with_capacity(crate::link::MAX_FRAME);
     bytes.extend_from_slice(&[0xff; 6]);
-    bytes.extend_from_slice(&[0x10, 0x10, 0x10, 0x10, number, MAC_TAIL]);
+    bytes.extend_from_slice(&[0x10, 0x10, 0x10, 0x10, 0, MAC_TAIL]);
     bytes.extend_from_slice(&ETHERCAT);
     bytes.extend_from_slice(&[0, 0]);
     Frame {
@@ -95,8 +104,26 @@ pub(super) fn clear_wkc(frame: &mut [u8], place: Place) {
     }
 }
 
-/// Writes the EtherCAT header, the cycle's index and the "more follows" flags of all datagrams.
-pub(super) fn number(frame: &mut [u8], cycle: u8) {
+/// Bits of a tag that hold the number of one of `count` frames.
+fn number_bits(count: usize) -> u32 {
+    count.next_power_of_two().trailing_zeros().min(8)
+}
+
+/// The byte of the source address that tells the frames of a cycle apart: number of the frame, and above it the bits of the
+/// cycle's number that follow the lowest eight.
+pub(super) fn frame_tag(number: usize, count: usize, cycle: u32) -> u8 {
+    let bits = number_bits(count);
+    (number as u32 | (cycle >> 8) << bits) as u8
+}
+
+/// The number of the frame in a tag.
+pub(super) fn frame_number(tag: u8, count: usize) -> usize {
+    usize::from(tag) & ((1 << number_bits(count)) - 1)
+}
+
+/// Writes the tag, the EtherCAT header, the cycle's index and the "more follows" flags of all datagrams.
+pub(super) fn number(frame: &mut [u8], tag: u8, cycle: u32) {
+    frame[10] = tag;
     let [low, high] = u16::try_from(frame.len() - FIRST_DATAGRAM)
         .unwrap_or(0)
         .to_le_bytes();
@@ -104,12 +131,23 @@ pub(super) fn number(frame: &mut [u8], cycle: u8) {
     frame[ETHERNET_HEADER + 1] = high & 0x07 | 0x10;
     let mut at = FIRST_DATAGRAM;
     while at + DATAGRAM_HEADER <= frame.len() {
-        frame[at + 1] = cycle;
+        frame[at + 1] = cycle as u8;
         let len = usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 0x07]));
         let next = at + DATAGRAM_HEADER + len + WKC;
         frame[at + 7] = frame[at + 7] & 0x07 | if next < frame.len() { 0x80 } else { 0 };
         at = next;
     }
+}
+
+/// Whether an answer has, in this place, the datagram that was sent there, whatever the cycle.
+pub(super) fn same_datagram(sent: &[u8], answer: &[u8], place: Place) -> bool {
+    let header = |frame: &[u8]| {
+        let header = frame.get(place.offset..place.offset + 8)?;
+        let mut header: [u8; 8] = header.try_into().ok()?;
+        (header[1], header[7]) = (0, header[7] & 0x07);
+        Some(header)
+    };
+    answer.len() >= place.end() && header(sent).is_some() && header(sent) == header(answer)
 }
 
 /// Whether an answer has our datagrams in our places. SubDevices change addresses (APRD, BRD),

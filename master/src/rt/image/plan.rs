@@ -99,6 +99,9 @@ pub struct ImagePlan {
     /// The group of each device.
     pub groups: Vec<usize>,
     pub datagrams: Vec<DatagramPlan>,
+    /// The same image with datagrams of its own for each device, so that each has a working counter of its own. Empty where
+    /// the cycle has no time for their frames.
+    pub separate: Vec<DatagramPlan>,
     /// `None` where no device has an FMMU for it.
     pub mailboxes: Option<MailboxPlan>,
     pub len: usize,
@@ -117,8 +120,24 @@ impl ImagePlan {
     /// Frames of a cycle; the first is sent whatever it carries.
     #[must_use]
     pub fn frames(&self) -> usize {
-        self.datagrams.last().map_or(0, |last| last.frame) + 1
+        frames(&self.datagrams)
     }
+}
+
+/// Frames that carry these datagrams; the first is sent whatever it carries.
+#[must_use]
+pub fn frames(datagrams: &[DatagramPlan]) -> usize {
+    datagrams.last().map_or(0, |last| last.frame) + 1
+}
+
+/// Nanoseconds that the frames of a cycle are on the wire: 100 Mbit/s, about a microsecond in each device.
+fn wire_ns(datagrams: &[DatagramPlan], devices: usize) -> u64 {
+    // What the first frame carries besides, headers, FCS, preamble and gap.
+    const FIRST: usize = 54;
+    const FRAME: usize = 16 + 4 + 20;
+    let data: usize = datagrams.iter().map(|d| d.len + DATAGRAM).sum();
+    let bytes = FIRST + frames(datagrams) * FRAME + data;
+    80 * bytes as u64 + 1000 * devices as u64
 }
 
 /// What the SubDevices of a machine exchange, as their ESIs say.
@@ -140,7 +159,11 @@ pub fn process_data(machine: &Machine) -> Vec<ProcessData> {
 
 /// The image of a machine, as far as its ESIs know.
 pub fn of(machine: &Machine) -> Result<ImagePlan, TooLarge> {
-    plan(&process_data(machine))
+    let mut image = plan(&process_data(machine))?;
+    if wire_ns(&image.separate, machine.devices.len()) > machine.bus.cycle_ns / 2 {
+        image.separate.clear();
+    }
+    Ok(image)
 }
 
 /// Lays devices out group by group, so that each group's working counters are its own. No device is split over two frames, and where
@@ -151,6 +174,18 @@ pub fn of(machine: &Machine) -> Result<ImagePlan, TooLarge> {
     reason = "prepares"
 )]
 pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
+    let separate = lay_out(devices, false)?.datagrams;
+    let image = lay_out(devices, true)?;
+    Ok(ImagePlan { separate, ..image })
+}
+
+/// `shared`: neighbours share a datagram.
+#[allow(
+    clippy::disallowed_methods,
+    clippy::disallowed_macros,
+    reason = "prepares"
+)]
+fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge> {
     let mut image = ImagePlan {
         regions: vec![None; devices.len()],
         groups: devices.iter().map(|device| device.group).collect(),
@@ -184,7 +219,8 @@ pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
         let first = image.datagrams.len();
         let frame = match image.datagrams.last_mut() {
             Some(last)
-                if device.lrw
+                if shared
+                    && device.lrw
                     && (last.access, last.group) == (Access::Both, device.group)
                     && len <= frames.room =>
             {

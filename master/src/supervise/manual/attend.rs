@@ -22,7 +22,7 @@ impl Supervisor {
         &mut self,
         operator: &mut dyn Operator,
     ) -> Result<(), RunError> {
-        let patience = self.machine.bus.enable_timeout_ns + self.stop_patience;
+        let patience = self.machine.bus.enable_timeout_ns + self.longest_stop();
         let all: Vec<usize> = (0..self.axes.len()).collect();
         let patience = patience + self.longest_release(&all);
         let mut desk = Desk::new(self.axes.len(), patience);

@@ -8,7 +8,6 @@ use ecaxis_axis::{AxisStatus, Command, HomingStatus, Mode, Refused};
 use super::{LET_GO, MOST_SPEED, News, Pending, Presence, RAMP, Request};
 use crate::clock::Nanos;
 use crate::config::{AxisSetup, Machine};
-use crate::rt::cycle::has_power;
 use crate::rt::handover::Snapshot;
 
 /// An axis whose set-point has arrived may take so long to follow.
@@ -350,7 +349,7 @@ impl Hand {
             Doing::Nothing | Doing::Jogging { .. } => return None,
             Doing::Enabling if stopped => return Some(Err(STOPPED.to_owned())),
             Doing::Enabling => status.ready,
-            Doing::Disabling => !has_power(status.state),
+            Doing::Disabling => !status.state.has_power(),
             Doing::Stopping => !(status.enabled && status.moving),
             Doing::Moving { .. } => {
                 if status.moving && !status.held_by_range {

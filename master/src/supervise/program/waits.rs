@@ -19,7 +19,7 @@ impl Supervisor {
         axes: &[usize],
     ) -> Result<(), RunError> {
         let begun = clock::now();
-        let timeout = self.machine.bus.enable_timeout_ns.max(self.stop_patience);
+        let timeout = self.machine.bus.enable_timeout_ns.max(self.longest_stop());
         self.watch(step, start, |this, snapshot| {
             let Some(&axis) = axes.iter().find(|&&axis| !holds(snapshot, axis)) else {
                 return Ok(true);

@@ -1,0 +1,364 @@
+//! The power of an axis, and the one way to take it away: decelerate → standstill → power off.
+//!
+//! A stop has one method and one timer. The method only becomes harder: set-points (`Ramp`), the drive's quick stop
+//! (`QuickStop`), no voltage (`DisableVoltage`). It becomes harder by a command, where the drive no longer follows
+//! set-points, and at the time-out, unless the axis still slows down and the configuration sets no time-out.
+//!
+//! The time-out follows from the speed at the beginning, the acceleration limit and, with jerk limits, the jerk. Time
+//! passes whether frames are lost or not, so power goes in bounded time even if no frame ever comes back.
+
+use super::{Axis, Control, Plan};
+use crate::cia402::{Power, State};
+use crate::setpoint::{Goal, JerkLimited, Motion, MotionLimits, Order};
+use crate::status::{StopPhase, StopStatus, Trip};
+use crate::supervision::{FaultReset, StopMethod};
+
+/// How long an axis stands before its power goes: its error settles meanwhile.
+const SETTLE_S: f64 = 0.1;
+/// After the time-out, an axis that has not become slower for this long does not decelerate.
+const UNSLOWED_S: f64 = 1.0;
+/// A drive that reports power this long after its removal was requested does not obey.
+const POWER_OFF_S: f64 = 3.0;
+/// An axis that has been enabled this long without a fault has all its automatic resets again.
+const FORGET_S: f64 = 60.0;
+/// Longer than any brake or stop takes; keeps sums finite.
+const LONGEST_S: f64 = 3600.0;
+
+/// Where the power of the axis is to be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum PowerGoal {
+    Off,
+    On,
+    Stopping(Stop),
+}
+
+/// A stop under way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Stop {
+    pub(super) method: StopMethod,
+    /// The drive stays in Quick stop active; its power is not removed.
+    pub(super) stays: bool,
+    removing_power: bool,
+    elapsed_s: f64,
+    timeout_s: f64,
+    /// The axis has been standing for so long.
+    standing_s: f64,
+    /// Lowest speed reported so far, and for how long there was no lower one.
+    slowest: f64,
+    unslowed_s: f64,
+}
+
+impl Stop {
+    /// What the power state machine is to do.
+    pub(super) fn power(self) -> Power {
+        match (self.removing_power, self.method) {
+            (true, StopMethod::DisableVoltage) => Power::Off,
+            (true, _) => Power::Disabled,
+            (false, StopMethod::Ramp) => Power::Enabled,
+            (false, _) => Power::QuickStop,
+        }
+    }
+
+    pub(super) const fn removes_power(&self) -> bool {
+        self.removing_power
+    }
+
+    /// The drive has had its time to remove the power, and does not slow the axis down.
+    fn is_over(&self) -> bool {
+        self.removing_power && self.elapsed_s > POWER_OFF_S && self.unslowed_s > POWER_OFF_S
+    }
+}
+
+/// The brake, as far as it is known here.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct BrakeState {
+    /// It is to be open.
+    pub(super) open: bool,
+    /// For so long it has been open, or, at rest, closed.
+    since_s: f64,
+}
+
+/// Automatic fault resets.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Resets {
+    pub(super) tried: u8,
+    waited_s: f64,
+    healthy_s: f64,
+}
+
+impl Axis {
+    /// Brings the axis to rest and removes its power; a stop under way is only made harder. RT: O(1).
+    pub fn stop_by(&mut self, method: StopMethod) {
+        self.begin_stop(method, false);
+    }
+
+    pub(super) fn begin_stop(&mut self, method: StopMethod, stays: bool) {
+        let method = match method {
+            StopMethod::Ramp if !self.follows_set_points() => StopMethod::QuickStop,
+            method => method,
+        };
+        match &mut self.goal {
+            PowerGoal::Off => return,
+            PowerGoal::Stopping(stop) if stop.removing_power || stop.method >= method => {
+                stop.stays &= stays;
+                return;
+            }
+            // The drive has no power to move with.
+            PowerGoal::On if !self.state.has_power() && !self.active => {
+                self.goal = PowerGoal::Off;
+                return;
+            }
+            PowerGoal::On | PowerGoal::Stopping(_) => {}
+        }
+        match method {
+            StopMethod::Ramp => self.stop(),
+            StopMethod::QuickStop | StopMethod::DisableVoltage => self.brake(),
+        }
+        let mut stop = self.new_stop(method);
+        stop.stays = stays;
+        self.goal = PowerGoal::Stopping(stop);
+        if stop.removing_power {
+            self.brake_state = BrakeState::default();
+        }
+    }
+
+    /// The drive follows what is sent: it has power, the mode shows, and it says so (Statusword bit 12).
+    pub(super) fn follows_set_points(&self) -> bool {
+        self.active
+            && self.state == State::OperationEnabled
+            && self.mode_confirmed()
+            && self.reported_to_follow()
+    }
+
+    fn new_stop(&self, method: StopMethod) -> Stop {
+        let speed = self.actual.velocity().abs();
+        let fastest = speed.max(self.motion.velocity.abs());
+        Stop {
+            method,
+            stays: false,
+            removing_power: method == StopMethod::DisableVoltage,
+            elapsed_s: 0.0,
+            timeout_s: self.config.stop_time_s(self.mode, fastest),
+            standing_s: 0.0,
+            slowest: speed,
+            unslowed_s: 0.0,
+        }
+    }
+
+    /// From one cycle to the next. Also while frames are lost.
+    pub(super) fn settle_stop(&mut self, fresh: bool, dt_s: f64) {
+        self.brake_state.since_s = (self.brake_state.since_s + dt_s).min(LONGEST_S);
+        let mut stop = match self.goal {
+            PowerGoal::Stopping(stop) => stop,
+            // A drive that was being enabled as its power was no longer wanted.
+            PowerGoal::Off if fresh && self.state == State::OperationEnabled => Stop {
+                removing_power: true,
+                ..self.new_stop(StopMethod::QuickStop)
+            },
+            _ => return,
+        };
+        if fresh && !self.state.has_power() {
+            self.goal = PowerGoal::Off;
+            return;
+        }
+        stop.elapsed_s = (stop.elapsed_s + dt_s).min(LONGEST_S);
+        stop.unslowed_s = (stop.unslowed_s + dt_s).min(LONGEST_S);
+        let speed = self.actual.velocity().abs();
+        if fresh && speed < stop.slowest - self.standstill_window() {
+            (stop.slowest, stop.unslowed_s) = (speed, 0.0);
+        }
+        if stop.removing_power {
+            self.goal = PowerGoal::Stopping(stop);
+            return;
+        }
+        if stop.method == StopMethod::Ramp && fresh && !self.follows_set_points() {
+            self.goal = PowerGoal::Stopping(self.new_stop(StopMethod::QuickStop));
+            return;
+        }
+        let commanded = match stop.method {
+            StopMethod::Ramp => self.setpoint_at_rest(),
+            _ => self.state == State::QuickStopActive,
+        };
+        stop.standing_s = if commanded && self.standing() {
+            stop.standing_s + dt_s
+        } else {
+            0.0
+        };
+        let standing = stop.standing_s >= SETTLE_S;
+        let timeout_set = self.config.stop_timeout_s.is_some();
+        self.goal = if standing && !stop.stays {
+            if self.brake_state.open {
+                self.brake_state = BrakeState::default();
+            }
+            if self.brake_state.since_s >= self.config.brake.engage_s {
+                (stop.removing_power, stop.elapsed_s) = (true, 0.0);
+            }
+            PowerGoal::Stopping(stop)
+        } else if !standing
+            && stop.elapsed_s > stop.timeout_s
+            && (timeout_set || stop.unslowed_s > UNSLOWED_S)
+        {
+            PowerGoal::Stopping(self.harder(stop))
+        } else {
+            PowerGoal::Stopping(stop)
+        };
+    }
+
+    /// At the time-out. An axis that still moves has failed to stop; torque alone stops none.
+    fn harder(&mut self, stop: Stop) -> Stop {
+        let expected =
+            stop.method == StopMethod::Ramp && self.config.control(self.mode) == Control::Torque;
+        if !expected && self.stale_cycles == 0 && !self.standing() {
+            self.trip.get_or_insert(Trip::NotStopped {
+                velocity: self.actual.velocity(),
+                time_s: stop.elapsed_s,
+                method: stop.method,
+            });
+        }
+        let method = match stop.method {
+            StopMethod::Ramp => StopMethod::QuickStop,
+            _ => StopMethod::DisableVoltage,
+        };
+        Stop {
+            stays: stop.stays && method == StopMethod::QuickStop,
+            ..self.new_stop(method)
+        }
+    }
+
+    /// The drive's fault: its reaction brakes, and it removes the power by itself.
+    pub(super) fn stop_by_fault(&mut self) {
+        self.goal = if self.state.has_power() {
+            let stop = self.new_stop(StopMethod::QuickStop);
+            PowerGoal::Stopping(Stop {
+                removing_power: true,
+                ..stop
+            })
+        } else {
+            PowerGoal::Off
+        };
+    }
+
+    /// Nothing more can be done to stop the axis: it has no power, keeps it against the request, or is not heard. RT: O(1).
+    #[must_use]
+    pub fn stop_ended(&self) -> bool {
+        match self.goal {
+            PowerGoal::Stopping(stop) => stop.is_over(),
+            PowerGoal::On | PowerGoal::Off => !self.state.has_power(),
+        }
+    }
+
+    pub(super) fn stop_status(&self) -> Option<StopStatus> {
+        let PowerGoal::Stopping(stop) = self.goal else {
+            return None;
+        };
+        let over =
+            stop.removing_power && stop.elapsed_s > POWER_OFF_S && stop.unslowed_s > POWER_OFF_S;
+        let phase = match (stop.removing_power, self.stale_cycles == 0) {
+            _ if over && self.stale_cycles == 0 => StopPhase::PowerKept,
+            _ if over => StopPhase::Silent,
+            (true, _) => StopPhase::RemovingPower,
+            (false, _) if stop.standing_s >= SETTLE_S => StopPhase::Standstill,
+            (false, _) => StopPhase::Decelerating,
+        };
+        Some(StopStatus {
+            method: stop.method,
+            phase,
+            elapsed_s: stop.elapsed_s,
+            timeout_s: stop.timeout_s,
+        })
+    }
+
+    /// [`super::Command::Stop`], and how a stop by set-points begins: with the limits of the axis, whatever was used
+    /// before. The speed falls from the first cycle on: an acceleration that adds to it ends at once.
+    pub(super) fn stop(&mut self) {
+        let braking = matches!(self.plan, Plan::Hold(_));
+        if self.config.jerk_limited
+            && !braking
+            && self.grip() == Control::Position
+            && let Some(plan) = self.jerk_limited_stop()
+        {
+            self.home.abort();
+            self.plan = Plan::Jerk(plan);
+            return;
+        }
+        self.brake();
+    }
+
+    fn jerk_limited_stop(&self) -> Option<JerkLimited> {
+        let limits = self.config.limits.motion();
+        let motion = self.motion;
+        let order = Order {
+            goal: Goal::Velocity(0.0),
+            limits,
+            ceiling: limits,
+            range: self
+                .config
+                .limits
+                .position
+                .map(|[low, high]| [low.min(motion.position), high.max(motion.position)]),
+        };
+        let adds = motion.acceleration * motion.velocity >= 0.0;
+        if let (Plan::Jerk(source), false) = (&self.plan, adds) {
+            return source.redirect(order, motion, self.dt_s).ok();
+        }
+        let start = Motion {
+            acceleration: taken_over(motion, limits),
+            ..motion
+        };
+        JerkLimited::new(order, start, self.dt_s).ok()
+    }
+
+    /// After the power: an axis that is enabled has its brake opened, one without power has it closed.
+    pub(super) fn settle_brake(&mut self) {
+        let powered = matches!(self.state, State::OperationEnabled | State::QuickStopActive);
+        if self.active && self.goal == PowerGoal::On && !self.brake_state.open {
+            self.brake_state = BrakeState {
+                open: true,
+                since_s: 0.0,
+            };
+        } else if !powered && self.brake_state.open {
+            self.brake_state = BrakeState::default();
+        }
+    }
+
+    /// The brake has not opened yet.
+    pub(super) fn braked(&self) -> bool {
+        !self.brake_state.open || self.brake_state.since_s < self.config.brake.release_s
+    }
+
+    /// Resets a fault by itself, if that is configured and not tried too often.
+    pub(super) fn settle_reset(&mut self, dt_s: f64) {
+        let FaultReset::Automatic { tries, delay_s } = self.config.fault_reset else {
+            return;
+        };
+        if self.active {
+            self.resets.healthy_s += dt_s;
+            if self.resets.healthy_s > FORGET_S {
+                self.resets.tried = 0;
+            }
+            return;
+        }
+        self.resets.healthy_s = 0.0;
+        if self.state != State::Fault || self.reset {
+            self.resets.waited_s = 0.0;
+            return;
+        }
+        self.resets.waited_s += dt_s;
+        if self.resets.waited_s >= delay_s && self.resets.tried < tries {
+            self.resets.tried = self.resets.tried.saturating_add(1);
+            self.resets.waited_s = 0.0;
+            self.reset_failed = false;
+            self.reset = true;
+        }
+    }
+}
+
+/// The deceleration that a stop may begin with: none that adds to the speed, and none that would turn the axis round
+/// before the jerk limit has taken it away.
+fn taken_over(motion: Motion, limits: MotionLimits) -> f64 {
+    if motion.acceleration * motion.velocity >= 0.0 {
+        return 0.0;
+    }
+    let most = (2.0 * limits.jerk * motion.velocity.abs()).sqrt();
+    motion.acceleration.max(-most).min(most)
+}

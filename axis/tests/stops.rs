@@ -1,0 +1,365 @@
+//! How an axis comes to rest: what the drive receives, in which order, until it has no power.
+
+mod common;
+
+use common::{DT, LIMITS, axis, scale};
+use ecaxis_axis::{
+    Axis, AxisConfig, Command, Inputs, Limits, Mode, Outputs, Refused, StopMethod, StopPhase, Trip,
+    Waiting,
+};
+
+const FREE: Limits = Limits {
+    position: None,
+    following_error: None,
+    ..LIMITS
+};
+
+fn inputs(word: u16, position: i32, display: i8) -> Inputs {
+    Inputs {
+        statusword: word,
+        position: Some(position),
+        velocity: Some(0),
+        torque: Some(0),
+        mode_display: Some(display),
+        fresh: true,
+        ..Inputs::default()
+    }
+}
+
+fn moving(word: u16, display: i8, mrpm: i32) -> Inputs {
+    Inputs {
+        velocity: Some(mrpm),
+        ..inputs(word, 0, display)
+    }
+}
+
+fn config(mode: Mode) -> AxisConfig {
+    AxisConfig::new(mode, scale(), FREE)
+}
+
+fn enabled(config: AxisConfig) -> Axis {
+    let display = config.mode.code();
+    let mut axis = Axis::new(config).unwrap();
+    axis.command(Command::Enable).unwrap();
+    for word in [0x0240, 0x0231, 0x0233, 0x1237, 0x1237] {
+        axis.step(&inputs(word, 0, display), DT);
+    }
+    assert!(axis.status().ready);
+    axis
+}
+
+const fn to(position: f64) -> Command {
+    Command::MoveTo {
+        position,
+        speed: 1.0,
+        ramp: 1.0,
+    }
+}
+
+/// CiA 402-2, Statusword bit 12 of CSP, CSV and CST: "drive follows the command value".
+#[test]
+fn targets_stay_at_actual_values_until_bit_12() {
+    for (mode, command) in [
+        (Mode::Csp, to(40.0)),
+        (
+            Mode::Csv,
+            Command::Velocity {
+                velocity: 10.0,
+                ramp: 1.0,
+            },
+        ),
+        (
+            Mode::Cst,
+            Command::Torque {
+                percent: 10.0,
+                ramp_s: 0.0,
+            },
+        ),
+    ] {
+        let mut axis = Axis::new(config(mode)).unwrap();
+        axis.command(Command::Enable).unwrap();
+        let display = mode.code();
+        for word in [0x0240, 0x0231, 0x0233, 0x0237, 0x0237] {
+            axis.step(&inputs(word, 0, display), DT);
+        }
+        // The drive moves by itself, as for its commutation.
+        for n in 0..200 {
+            let out = axis.step(&inputs(0x0237, n * 5, display), DT);
+            let targets = (out.target_position, out.target_velocity, out.target_torque);
+            assert_eq!(targets, (n * 5, 0, 0), "{mode}");
+            assert_eq!(out.controlword, 0x000F);
+        }
+        let status = axis.status();
+        assert_eq!((status.ready, status.enabled), (false, false));
+        assert_eq!(status.waiting, Some(Waiting::Follows { mode }));
+        assert!(matches!(
+            axis.command(command),
+            Err(Refused::NotEnabled { .. })
+        ));
+        let out = axis.step(&inputs(0x1237, 1000, display), DT);
+        assert_eq!(out.target_position, 1000, "no step");
+        assert!(axis.status().ready);
+        axis.command(command).unwrap();
+        // A drive that does not serve the bit.
+        let mut axis = Axis::new(AxisConfig {
+            follows_bit: false,
+            ..config(mode)
+        })
+        .unwrap();
+        axis.command(Command::Enable).unwrap();
+        for word in [0x0240, 0x0231, 0x0233, 0x0237, 0x0237] {
+            axis.step(&inputs(word, 0, display), DT);
+        }
+        assert!(axis.status().ready);
+    }
+}
+
+#[test]
+fn bit_12_that_is_lost_in_motion_is_a_trip() {
+    let mut axis = enabled(config(Mode::Csp));
+    axis.command(to(40.0)).unwrap();
+    let mut position = 0;
+    for _ in 0..100 {
+        position = axis.step(&inputs(0x1237, position, 8), DT).target_position;
+    }
+    // A drive that limits a step clears it for a cycle or two.
+    for _ in 0..9 {
+        position = axis.step(&inputs(0x0237, position, 8), DT).target_position;
+    }
+    position = axis.step(&inputs(0x1237, position, 8), DT).target_position;
+    for _ in 0..9 {
+        let out = axis.step(&inputs(0x0237, position, 8), DT);
+        assert_eq!(out.controlword, 0x000F);
+    }
+    let out = axis.step(&inputs(0x0237, position, 8), DT);
+    assert_eq!(out.controlword, 0x0002);
+    let trip = Some(Trip::NotFollowing { mode: Mode::Csp });
+    assert_eq!(axis.status().trip, trip);
+    // At rest the targets follow actual values until it is there again.
+    let mut axis = enabled(config(Mode::Csp));
+    for _ in 0..10 {
+        axis.step(&inputs(0x0237, 0, 8), DT);
+    }
+    for position in [10, 20] {
+        let out = axis.step(&inputs(0x0237, position, 8), DT);
+        assert_eq!((out.controlword, out.target_position), (0x000F, position));
+    }
+    assert_eq!((axis.status().trip, axis.status().ready), (None, false));
+    axis.step(&inputs(0x1237, 20, 8), DT);
+    assert!(axis.status().ready);
+}
+
+/// Switched on is held until 0x6061 shows the mode.
+#[test]
+fn operation_is_enabled_in_the_mode_that_shows() {
+    let mut axis = axis(Mode::Csp);
+    axis.command(Command::Enable).unwrap();
+    let mut words = Vec::new();
+    for (word, display) in [
+        (0x0240, 10),
+        (0x0231, 10),
+        (0x0233, 10),
+        (0x0233, 10),
+        (0x0233, 8),
+    ] {
+        words.push(axis.step(&inputs(word, 0, display), DT).controlword);
+    }
+    assert_eq!(words, [0x0006, 0x0007, 0x0007, 0x0007, 0x000F]);
+    for _ in 0..200 {
+        axis.step(&inputs(0x0233, 0, 10), DT);
+    }
+    let waiting = Waiting::Mode {
+        expected: Mode::Csp,
+        display: Mode::Cst,
+    };
+    assert_eq!(axis.status().waiting, Some(waiting));
+}
+
+/// Power is removed at standstill, however long the drive's ramp takes.
+#[test]
+fn a_long_quick_stop_keeps_its_power() {
+    let mut axis = enabled(config(Mode::Csv));
+    axis.step(&moving(0x1237, 9, 2_000_000), DT);
+    axis.stop_by(StopMethod::QuickStop);
+    let mut words: Vec<(u16, i32)> = Vec::new();
+    for n in 0..6000 {
+        let mrpm = (2_000_000 - n * 400).max(0);
+        let word = if axis.status().controlword == 0x0006 {
+            0x0231
+        } else {
+            0x0217
+        };
+        let out = axis.step(&moving(word, 9, mrpm), DT);
+        if words.last().map(|last| last.0) != Some(out.controlword) {
+            words.push((out.controlword, mrpm));
+        }
+    }
+    assert_eq!(words.len(), 2, "{words:?}");
+    assert_eq!(words[0].0, 0x0002);
+    assert!(words[1].0 == 0x0000 && words[1].1 <= 24_000, "{words:?}");
+    assert_eq!(axis.status().trip, None);
+}
+
+/// A drive that does not decelerate, and a time-out of the configuration: no voltage, and that is a trip.
+#[test]
+fn a_stop_that_fails_is_a_trip() {
+    for (timeout, decelerates, least, most) in
+        [(None, false, 1000, 1200), (Some(0.5), true, 490, 510)]
+    {
+        let mut axis = enabled(AxisConfig {
+            stop_timeout_s: timeout,
+            ..config(Mode::Csv)
+        });
+        axis.step(&moving(0x1237, 9, 2_000_000), DT);
+        axis.stop_by(StopMethod::QuickStop);
+        let mut cut = None;
+        for n in 0..4000 {
+            let mrpm = if decelerates {
+                2_000_000 - n * 400
+            } else {
+                2_000_000
+            };
+            let out = axis.step(&moving(0x0217, 9, mrpm), DT);
+            if out.controlword == 0x0000 {
+                cut = Some(n);
+                break;
+            }
+            assert_eq!(out.controlword, 0x0002);
+        }
+        let cut = cut.expect("no voltage");
+        assert!((least..=most).contains(&cut), "{cut}");
+        assert!(
+            matches!(
+                axis.status().trip,
+                Some(Trip::NotStopped {
+                    method: StopMethod::QuickStop,
+                    ..
+                })
+            ),
+            "{:?}",
+            axis.status().trip
+        );
+        for _ in 0..3500 {
+            axis.step(&moving(0x0217, 9, 2_000_000), DT);
+        }
+        let stop = axis.status().stop.unwrap();
+        assert_eq!(stop.phase, StopPhase::PowerKept);
+        assert!(axis.stop_ended());
+    }
+}
+
+fn follow(axis: &mut Axis, position: &mut i32) -> Outputs {
+    let velocity = axis.status().target_velocity * 12_000.0;
+    let seen = Inputs {
+        position: Some(*position),
+        velocity: Some(velocity as i32),
+        ..inputs(0x1237, *position, axis.status().mode.code())
+    };
+    let out = axis.step(&seen, DT);
+    *position = out.target_position;
+    out
+}
+
+/// Whatever move is interrupted: the stop uses the limits of the axis, never gains speed, and takes its time before it
+/// becomes harder.
+#[test]
+fn a_stop_uses_the_limits_of_the_axis() {
+    for (jerk, ramp) in [
+        (None, 1.0),
+        (None, 0.05),
+        (Some(20_000.0), 1.0),
+        (Some(20_000.0), 0.05),
+        (Some(1000.0), 1.0),
+        (Some(1000.0), 0.1),
+    ] {
+        let limits = Limits { jerk, ..FREE };
+        let calm = AxisConfig {
+            jerk_limited: jerk.is_some(),
+            limits,
+            ..config(Mode::Csp)
+        };
+        for cycles in [50, 300, 700, 2000, 6000] {
+            for disable in [false, true] {
+                let mut axis = enabled(calm);
+                let command = Command::MoveTo {
+                    position: 5000.0,
+                    speed: 1.0,
+                    ramp,
+                };
+                axis.command(command).unwrap();
+                let mut position = 0;
+                for _ in 0..cycles {
+                    follow(&mut axis, &mut position);
+                }
+                let mut speed = axis.status().target_velocity;
+                let jerk_s = jerk.map_or(0.0, |jerk| limits.acceleration / jerk);
+                let from_full_jerk = jerk.map_or(0.0, |jerk| 2.0 * (speed / jerk).sqrt());
+                let most_s = (speed / limits.acceleration + jerk_s).max(from_full_jerk);
+                axis.command(if disable {
+                    Command::Disable
+                } else {
+                    Command::Stop
+                })
+                .unwrap();
+                let mut n = 0;
+                while speed > 0.0 {
+                    let out = follow(&mut axis, &mut position);
+                    let status = axis.status();
+                    assert_eq!((out.controlword, status.trip), (0x000F, None));
+                    assert!(
+                        status.target_velocity <= speed * (1.0 + 1e-9),
+                        "{jerk:?} {ramp} {cycles}: {} after {speed}",
+                        status.target_velocity
+                    );
+                    speed = status.target_velocity;
+                    n += 1;
+                    assert!(
+                        f64::from(n) * DT <= most_s + 0.01,
+                        "{jerk:?} {ramp} {cycles}: {n} cycles, {most_s} s"
+                    );
+                }
+                assert!(speed >= 0.0);
+            }
+        }
+    }
+}
+
+/// Replies that come too late prove that targets arrive: they ramp down, and go on with the next one that is in time.
+#[test]
+fn late_replies_ramp_the_targets_down() {
+    let mut axis = enabled(config(Mode::Csp));
+    axis.command(to(4000.0)).unwrap();
+    let mut position = 0;
+    for _ in 0..300 {
+        follow(&mut axis, &mut position);
+    }
+    let most = LIMITS.acceleration * DT * DT * 400.0 + 2.0;
+    let mut step = 80;
+    for n in 0..30 {
+        let late = Inputs {
+            fresh: false,
+            late: n > 0,
+            ..inputs(0x1237, position, 8)
+        };
+        let target = axis.step(&late, DT).target_position;
+        let change = target - position - step;
+        assert!(
+            f64::from(change.abs()) <= most,
+            "cycle {n}: {step} {change}"
+        );
+        (step, position) = (target - position, target);
+    }
+    assert!(step < 70, "decelerates: {step}");
+    for n in 0..200 {
+        let before = position;
+        let target = follow(&mut axis, &mut position).target_position;
+        let change = target - before - step;
+        assert!(
+            f64::from(change.abs()) <= most,
+            "cycle {n}: {step} {change}"
+        );
+        step = target - before;
+    }
+    assert_eq!(axis.status().trip, None);
+    assert!(step >= 79, "goes on: {step}");
+}

@@ -1,0 +1,150 @@
+//! A panic in the cycle: the machine stops all the same.
+//!
+//! After the first one the cycle goes on, and stops the machine as for any other cause. After a second one nothing of the
+//! axes is relied on any more: their drives get "quick stop" by plain frames, and "disable voltage" once they stand.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use ecaxis_axis::{Controlword, State, Statusword};
+
+use super::{Engine, Nanos};
+use crate::clock;
+use crate::rt::guard::StopCause;
+use crate::rt::handover::Order;
+
+/// An axis whose position has not changed for so long stands.
+const STANDING: Nanos = 100_000_000;
+/// Changes of a position that are noise, counts.
+const NOISE: u64 = 2;
+/// Added to the time that the slowest axis takes to rest.
+const MARGIN_S: f64 = 2.0;
+
+/// How far the axes have come after a second panic.
+#[derive(Debug, Default)]
+pub(super) struct Plain {
+    since: Option<Nanos>,
+    /// Of each axis, where it was last, and since when.
+    rest: Vec<(i64, Nanos)>,
+    /// From full speed to rest.
+    slowest_s: f64,
+}
+
+impl Plain {
+    #[allow(
+        clippy::disallowed_macros,
+        clippy::disallowed_methods,
+        reason = "prepares"
+    )]
+    pub(super) fn new(axes: &[super::AxisSlot]) -> Self {
+        let times = axes.iter().map(|slot| {
+            let config = slot.axis.config();
+            config.stop_time_s(config.mode, config.limits.velocity)
+        });
+        Self {
+            since: None,
+            rest: vec![(i64::MAX, 0); axes.len()],
+            slowest_s: times.fold(0.0, f64::max),
+        }
+    }
+}
+
+impl Engine {
+    /// One cycle. RT: blocks on the clock and the wire only; O(image + axes). A panic in it stops the machine.
+    pub fn cycle(&mut self) {
+        let due = self.next;
+        if self.plain.since.is_some() {
+            self.plain_cycle();
+            return;
+        }
+        if !self.catch(Self::turn) {
+            return;
+        }
+        let again = self
+            .stopping()
+            .is_some_and(|s| s.cause == StopCause::Panicked)
+            || self
+                .stopping()
+                .is_some_and(|s| s.failure == Some(StopCause::Panicked));
+        let failed = again
+            || self.catch(|engine| {
+                engine.stop(None, StopCause::Panicked);
+                if engine.next == due {
+                    engine.exchange.stage();
+                    engine.plan_next(0);
+                }
+            });
+        if failed {
+            self.plain.since = Some(clock::now());
+            self.next = self.next.max(due) + self.timing.cycle_ns;
+        }
+    }
+
+    /// `true`: it panicked.
+    fn catch(&mut self, work: impl FnOnce(&mut Self)) -> bool {
+        catch_unwind(AssertUnwindSafe(|| work(self))).is_err()
+    }
+
+    fn plain_cycle(&mut self) {
+        self.clock.sleep_until(self.next, self.margin.get());
+        let woke = clock::now();
+        self.catch(|engine| engine.send(0));
+        self.catch(|engine| engine.receive(woke));
+        self.catch(|engine| engine.answer = engine.exchange.answer());
+        let mut ended = true;
+        self.catch(|engine| ended = engine.write_plain_words(woke));
+        self.catch(|engine| engine.exchange.stage());
+        self.catch(|engine| engine.publish_plain(woke, ended));
+        self.catch(|engine| {
+            while let Ok(order) = engine.end.orders.pop() {
+                engine.orders_taken += 1;
+                engine.halted |= order == Order::Halt;
+            }
+            engine.halted |= engine.end.orders.is_abandoned() && ended;
+        });
+        self.next += self.timing.cycle_ns;
+        let now = clock::now();
+        while self.next <= now {
+            self.next += self.timing.cycle_ns;
+        }
+    }
+
+    /// `true`: nothing more can be done.
+    fn write_plain_words(&mut self, now: Nanos) -> bool {
+        let since = self.plain.since.unwrap_or(now);
+        let most_ns = ((self.plain.slowest_s + MARGIN_S) * 1e9) as Nanos;
+        let over = now.saturating_sub(since) > most_ns;
+        let mut ended = true;
+        for (slot, rest) in self.axes.iter().zip(&mut self.plain.rest) {
+            let image = self.exchange.inputs();
+            let word = Statusword::from_bits_retain(slot.bits.statusword.get(image) as u16);
+            let powered = State::from_statusword(word).has_power();
+            let position = slot.bits.position.map(|bits| bits.get(image));
+            match position {
+                Some(position) if position.abs_diff(rest.0) <= NOISE => {}
+                _ => *rest = (position.unwrap_or(i64::MAX), now),
+            }
+            let stands = now.saturating_sub(rest.1) > STANDING && self.answer.inputs_fresh;
+            let word = if !powered || stands || over {
+                Controlword::DISABLE_VOLTAGE_COMMAND
+            } else {
+                Controlword::QUICK_STOP_COMMAND
+            };
+            ended &= !powered;
+            let outputs = self.exchange.outputs_mut();
+            slot.bits.controlword.set(outputs, i64::from(word.bits()));
+        }
+        // One more second for the drives to take the word.
+        ended || now.saturating_sub(since) > most_ns + 1_000_000_000
+    }
+
+    fn publish_plain(&mut self, now: Nanos, ended: bool) {
+        let snapshot = self.end.snapshots.input_buffer_mut();
+        snapshot.time = now;
+        snapshot.inputs_fresh = self.answer.inputs_fresh;
+        snapshot.al_status = self.answer.al_status;
+        snapshot.stopping = Some(StopCause::Panicked);
+        snapshot.stop_ended = ended;
+        snapshot.orders_taken = self.orders_taken;
+        self.end.snapshots.publish();
+    }
+}
