@@ -103,6 +103,12 @@ impl Datagram {
         write_u16(frame, self.header + 8, old | irq);
     }
 
+    /// Concerns the SubDevice at one station address and no other.
+    #[must_use]
+    pub fn is_to_station(&self) -> bool {
+        matches!(self.command, Command::Fprd | Command::Fpwr | Command::Fprw)
+    }
+
     fn has_next(&self, frame: &[u8]) -> bool {
         read_u16(frame, self.header + 6).is_some_and(|len| len & 0x8000 != 0)
     }

@@ -1,66 +1,72 @@
-//! Where an item's value is in the object dictionary's arena: what cycling needs to know of it, close
-//! together and read as one word.
+//! Where an item's value is in the object dictionary's arena: all that cycling needs to know of it, so that no table
+//! has to be looked into.
+
+use std::ops::Range;
 
 /// Bytes behind the last item, so that every item can be read as a whole word.
 pub(super) const TAIL: usize = size_of::<u64>();
 
-/// Where an item's low 64 bits are: all that cycling needs to know of it, close together.
-#[derive(Debug, Clone, Copy)]
+/// Where an item is in the arena.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Place {
-    start: usize,
-    /// The item's bits.
-    mask: u64,
-    /// The sign bit, if the dictionary's type has one.
-    sign: u64,
+    start: u32,
+    bits: u32,
+    /// The dictionary's type has a sign.
+    signed: bool,
 }
 
 impl Place {
-    pub(super) fn new(start: usize, bit_len: u32, signed: bool) -> Self {
-        let mask = match bit_len {
-            0 => 0,
-            bits => u64::MAX >> 64_u32.saturating_sub(bits),
-        };
+    pub(super) fn new(start: usize, bits: u32, signed: bool) -> Self {
         Self {
-            start,
-            mask,
-            sign: if signed { sign(mask) } else { 0 },
+            // Beyond 4 GiB there is nothing.
+            start: u32::try_from(start).unwrap_or(u32::MAX),
+            bits,
+            signed,
         }
     }
 
-    fn read(&self, arena: &[u8], sign: u64) -> i64 {
-        let word = arena.get(self.start..).and_then(<[u8]>::first_chunk);
-        let value = u64::from_le_bytes(*word.unwrap_or(&[0; TAIL])) & self.mask;
+    /// The item's bytes.
+    pub(super) fn range(self) -> Range<usize> {
+        let start = self.start as usize;
+        start..start + self.bits.div_ceil(8) as usize
+    }
+
+    fn read(self, arena: &[u8], signed: bool) -> i64 {
+        let word = arena
+            .get(self.start as usize..)
+            .and_then(<[u8]>::first_chunk);
+        let mask = low(self.bits);
+        let value = u64::from_le_bytes(*word.unwrap_or(&[0; TAIL])) & mask;
+        let sign = if signed { mask ^ mask >> 1 } else { 0 };
         (value ^ sign).wrapping_sub(sign).cast_signed()
     }
 
-    /// Sign-extended if the type is signed.
-    pub(super) fn get(&self, arena: &[u8]) -> i64 {
-        self.read(arena, self.sign)
+    /// Sign-extended if the type is signed; of long items the low 64 bits.
+    pub(super) fn get(self, arena: &[u8]) -> i64 {
+        self.read(arena, self.signed)
     }
 
-    pub(super) fn get_signed(&self, arena: &[u8]) -> i64 {
-        self.read(arena, sign(self.mask))
+    pub(super) fn get_signed(self, arena: &[u8]) -> i64 {
+        self.read(arena, true)
     }
 
     /// Whole bytes; what the value does not fill is zero.
-    pub(super) fn set(&self, arena: &mut [u8], value: i64) {
-        let whole = |n: u32| {
-            u64::MAX
-                .checked_shr(64 - n.next_multiple_of(8))
-                .unwrap_or(0)
-        };
-        let taken = whole(64 - self.mask.leading_zeros());
+    pub(super) fn set(self, arena: &mut [u8], value: i64) {
         let word = arena
-            .get_mut(self.start..)
+            .get_mut(self.start as usize..)
             .and_then(<[u8]>::first_chunk_mut);
         if let Some(word) = word {
+            let taken = low(self.bits.min(64).next_multiple_of(8));
             let others = u64::from_le_bytes(*word) & !taken;
-            *word = (others | value.cast_unsigned() & self.mask).to_le_bytes();
+            *word = (others | value.cast_unsigned() & low(self.bits)).to_le_bytes();
         }
     }
 }
 
-/// The highest bit.
-fn sign(mask: u64) -> u64 {
-    mask ^ mask >> 1
+/// So many low bits, 64 at most.
+fn low(bits: u32) -> u64 {
+    match bits {
+        0 => 0,
+        bits => u64::MAX >> 64_u32.saturating_sub(bits),
+    }
 }

@@ -2,7 +2,7 @@
 //! SDO transfers and the drive all work on slots, so that nothing is looked up or allocated while
 //! cycling.
 
-use std::ops::{Range, RangeInclusive};
+use std::ops::RangeInclusive;
 
 use ecaxis_esi::model::{Access, Bytes, Dictionary, ObjectCode, PdoMapping, Writable};
 
@@ -11,7 +11,10 @@ use super::place::{Place, TAIL};
 
 /// A subindex that exists, as a handle that stays valid for the store's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Slot(u32);
+pub struct Slot {
+    n: u32,
+    place: Place,
+}
 
 /// What the dictionary says about one subindex.
 #[derive(Debug, Clone)]
@@ -37,7 +40,7 @@ pub struct Item {
     pub max: Option<Bytes>,
     /// The only values that a client may write.
     pub choices: Option<&'static [i64]>,
-    range: Range<usize>,
+    place: Place,
 }
 
 impl Item {
@@ -61,7 +64,8 @@ struct Object {
 pub struct ObjectStore {
     /// Ends with [`TAIL`] bytes of no item, so that every item can be read as a whole word.
     arena: Vec<u8>,
-    places: Vec<Place>,
+    /// Changes, except by [`ObjectStore::show`] and [`ObjectStore::exchange_mut`].
+    edits: u64,
     /// The arena as the device left its maker.
     defaults: Vec<u8>,
     /// Sorted by index; objects nobody described are not in it.
@@ -114,7 +118,7 @@ impl ObjectStore {
                             min: item.min.clone(),
                             max: item.max.clone(),
                             choices: None,
-                            range: 0..0,
+                            place: Place::new(0, 0, false),
                         },
                         &item.default,
                     );
@@ -194,8 +198,7 @@ impl ObjectStore {
     }
 
     pub(crate) fn default_bytes(&self, slot: Slot) -> &[u8] {
-        let range = self.item(slot).map_or(0..0, |item| item.range.clone());
-        self.defaults.get(range).unwrap_or_default()
+        self.defaults.get(slot.place.range()).unwrap_or_default()
     }
 
     /// Copies one value from a store that has the same slots.
@@ -204,13 +207,9 @@ impl ObjectStore {
     }
 
     pub(crate) fn restore(&mut self, slot: Slot) {
-        let Some(item) = self.items.get(slot.0 as usize) else {
-            return;
-        };
-        let (to, from) = (
-            self.arena.get_mut(item.range.clone()),
-            self.defaults.get(item.range.clone()),
-        );
+        self.edits += 1;
+        let range = slot.place.range();
+        let (to, from) = (self.arena.get_mut(range.clone()), self.defaults.get(range));
         if let (Some(to), Some(from)) = (to, from) {
             overwrite(to, from);
         }
@@ -272,7 +271,7 @@ impl ObjectStore {
                 min: None,
                 max: None,
                 choices: None,
-                range: 0..0,
+                place: Place::new(0, 0, false),
             },
             default,
         )
@@ -291,10 +290,12 @@ impl ObjectStore {
                 .take(len)
                 .chain([0; TAIL]),
         );
-        item.range = start..start + len;
-        self.places
-            .push(Place::new(start, item.bit_len, item.signed()));
-        let slot = Slot(u32::try_from(self.items.len()).unwrap_or(u32::MAX));
+        item.place = Place::new(start, item.bit_len, item.signed());
+        self.edits += 1;
+        let slot = Slot {
+            n: u32::try_from(self.items.len()).unwrap_or(u32::MAX),
+            place: item.place,
+        };
         self.items.push(item);
         match self.order.binary_search_by_key(&key, |(k, _)| *k) {
             // The same subindex twice in one file: the later one counts.
@@ -350,19 +351,19 @@ impl ObjectStore {
 
     #[must_use]
     pub fn item(&self, slot: Slot) -> Option<&Item> {
-        self.items.get(slot.0 as usize)
+        self.items.get(slot.n as usize)
     }
 
     /// Lets CoE clients write (or no longer write) an item.
     pub fn set_access(&mut self, slot: Slot, write: Writable) {
-        if let Some(item) = self.items.get_mut(slot.0 as usize) {
+        if let Some(item) = self.items.get_mut(slot.n as usize) {
             item.access.write = write;
         }
     }
 
     /// Makes CoE clients write nothing but these values.
     pub fn set_choices(&mut self, slot: Slot, choices: &'static [i64]) {
-        if let Some(item) = self.items.get_mut(slot.0 as usize) {
+        if let Some(item) = self.items.get_mut(slot.n as usize) {
             item.choices = Some(choices);
         }
     }
@@ -370,7 +371,7 @@ impl ObjectStore {
     /// Names the base type of an item that [`Self::ensure`] created; unknown names change nothing.
     pub fn set_type(&mut self, slot: Slot, name: &str) {
         if let (Some(item), code @ 1..) =
-            (self.items.get_mut(slot.0 as usize), datatype::code(name))
+            (self.items.get_mut(slot.n as usize), datatype::code(name))
         {
             item.data_type = code;
         }
@@ -379,41 +380,45 @@ impl ObjectStore {
     /// The value, sign-extended if the dictionary's type is signed; of long items the low 64 bits.
     #[must_use]
     pub fn get(&self, slot: Slot) -> i64 {
-        self.places
-            .get(slot.0 as usize)
-            .map_or(0, |place| place.get(&self.arena))
+        slot.place.get(&self.arena)
     }
 
     /// The value as two's complement of its length, whatever the dictionary says.
     #[must_use]
     pub fn get_signed(&self, slot: Slot) -> i64 {
-        self.places
-            .get(slot.0 as usize)
-            .map_or(0, |place| place.get_signed(&self.arena))
+        slot.place.get_signed(&self.arena)
     }
 
     /// Stores the low `bit_len` bits of the value, little-endian.
     pub fn set(&mut self, slot: Slot, value: i64) {
-        if let Some(place) = self.places.get(slot.0 as usize) {
-            place.set(&mut self.arena, value);
-        }
+        self.edits += 1;
+        slot.place.set(&mut self.arena, value);
+    }
+
+    /// As [`Self::set`], for what an application shows of itself and never reads: it is no edit.
+    pub(crate) fn show(&mut self, slot: Slot, value: i64) {
+        slot.place.set(&mut self.arena, value);
+    }
+
+    /// Grows with every change that may concern what an application works by.
+    pub(crate) fn edits(&self) -> u64 {
+        self.edits
     }
 
     /// Little-endian, `bit_len.div_ceil(8)` bytes.
     #[must_use]
     pub fn bytes(&self, slot: Slot) -> &[u8] {
-        self.item(slot).map_or(&[], |item| self.slice(item))
+        self.arena.get(slot.place.range()).unwrap_or_default()
     }
 
     pub fn bytes_mut(&mut self, slot: Slot) -> &mut [u8] {
-        match self.items.get(slot.0 as usize) {
-            Some(item) => self.arena.get_mut(item.range.clone()).unwrap_or_default(),
-            None => &mut [],
-        }
+        self.edits += 1;
+        self.exchange_mut(slot)
     }
 
-    fn slice(&self, item: &Item) -> &[u8] {
-        self.arena.get(item.range.clone()).unwrap_or_default()
+    /// As [`Self::bytes_mut`], for process data that has just arrived: it is no edit.
+    pub(crate) fn exchange_mut(&mut self, slot: Slot) -> &mut [u8] {
+        self.arena.get_mut(slot.place.range()).unwrap_or_default()
     }
 }
 

@@ -80,7 +80,8 @@ impl Application {
     pub(super) fn laid_out(&mut self, process: &[ProcessData]) {
         match self {
             Self::Drive(drive) => {
-                drive.set_mapped(|slot| of(process, Direction::Rx).any(|m| m.slot == slot));
+                let mapped: Vec<Slot> = of(process, Direction::Rx).map(|m| m.slot).collect();
+                drive.set_mapped(&mapped);
             }
             Self::Gateway(_) => {}
             Self::Io(io) => {
@@ -106,7 +107,7 @@ impl Application {
         }
     }
 
-    /// Its period is over; `now` is the true time, which not everybody wants to know.
+    /// Its period is over; of a drive, the motor has turned. `now` is the true time, which not everybody wants to know.
     pub(super) fn act(
         &mut self,
         store: &mut ObjectStore,
@@ -114,7 +115,7 @@ impl Application {
         now: impl FnOnce() -> Nanos,
     ) {
         match self {
-            Self::Drive(drive) => drive.control(store, in_op),
+            Self::Drive(drive) => drive.end_control(store, in_op),
             Self::Gateway(gateway) => gateway.forward(store, in_op, now()),
             Self::Io(_) => {}
         }

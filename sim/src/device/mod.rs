@@ -9,8 +9,9 @@
 //! * `process`: process data and objects
 //! * `program`: with and without a program
 //! * `supervision`: whether they come in time
+//! * `time`: what a device does by itself, and until when it does nothing
 //!
-//! Everything a device does by itself happens in [`SimDevice::advance`], in the order of its clock.
+//! Everything a device does by itself happens in `time`, in the order of its clock.
 
 mod application;
 mod build;
@@ -21,6 +22,7 @@ mod parameters;
 mod process;
 mod program;
 mod supervision;
+mod time;
 
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
@@ -31,7 +33,7 @@ use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
 use crate::firmware::Processor;
 use crate::foe::FileStore;
-use crate::frame;
+use crate::frame::Datagram;
 use application::Application;
 pub use build::{DeviceOptions, SimError};
 use esm::Al;
@@ -39,6 +41,7 @@ use mailbox::Mailbox;
 pub use mailbox::MailboxOptions;
 use process::ProcessData;
 use supervision::Supervision;
+pub(crate) use time::Rest;
 
 /// Events remembered by [`SimDevice::sync0_log`] and its like.
 const LOG: usize = 64;
@@ -311,60 +314,6 @@ impl SimDevice {
         self.arrivals = EventLog::default();
     }
 
-    /// Lets the device live up to `now`. Allocates only for mailbox traffic and state changes.
-    pub(crate) fn advance(&mut self, now: Nanos) {
-        if !self.powered {
-            return;
-        }
-        let mut local = self.esc.clock.local(now);
-        loop {
-            let sync = self.esc.dc.as_ref().map_or(u64::MAX, |dc| dc.sync.due());
-            let (eeprom, watchdog) = (self.esc.eeprom.due(), self.esc.watchdog.due());
-            let pdi = self.esc.pdi_watchdog_due();
-            let (tick, mailbox, al) = if self.application_runs() {
-                let mailbox = self.mailbox.as_ref().filter(|_| !self.mailbox_silent);
-                let mailbox = mailbox.map_or(u64::MAX, Mailbox::due);
-                (self.tick, mailbox, self.al.due)
-            } else {
-                (u64::MAX, u64::MAX, u64::MAX)
-            };
-            let own = tick.min(mailbox).min(al);
-            let restarted = match self.restarts_until {
-                Some(until) if !self.hangs => until,
-                _ => u64::MAX,
-            };
-            let own = own.min(restarted);
-            let due = sync.min(eeprom).min(watchdog).min(pdi).min(own);
-            if due > local {
-                return;
-            }
-            self.local = due;
-            if due == restarted {
-                self.restarted(due);
-            } else if due == sync {
-                let edges = self.esc.fire_sync(due);
-                self.synchronized(edges);
-            } else if due == tick {
-                self.tick();
-            } else if due == watchdog {
-                self.watchdog_expired();
-            } else if due == eeprom {
-                self.eeprom_finished(due);
-            } else if due == mailbox {
-                self.serve_mailbox(due);
-            } else if due == al {
-                self.al_step(due);
-                if self.starts_new_program() {
-                    self.reset(due);
-                    // Its clock started anew.
-                    local = self.esc.clock.local(now);
-                }
-            } else {
-                self.esc.expire_pdi_watchdog();
-            }
-        }
-    }
-
     /// SYNC outputs rose.
     fn synchronized(&mut self, edges: Edges) {
         let at = self.esc.clock.true_time(self.local);
@@ -425,17 +374,15 @@ impl SimDevice {
     }
 
     /// Processes a frame whose first byte arrives at `now`.
-    pub(crate) fn process(&mut self, bytes: &mut [u8], now: Nanos) -> Seen {
+    pub(crate) fn process(&mut self, bytes: &mut [u8], datagrams: &[Datagram], now: Nanos) -> Seen {
         let local = self.esc.begin_frame(now);
         self.local = local;
         if self.application.samples_at_frames() && !self.sync0_decides() {
             // As digital inputs do: sampled when a frame begins.
             self.latch_inputs();
         }
-        let mut datagram = frame::next(bytes, None);
-        while let Some(d) = datagram {
-            self.esc.execute(bytes, &d);
-            datagram = frame::next(bytes, Some(&d));
+        for datagram in datagrams {
+            self.esc.execute(bytes, datagram);
         }
         self.esc.end_frame();
         let raised = self.esc.take_raised();

@@ -69,7 +69,7 @@ impl SimDevice {
                 continue;
             };
             for m in &data.map {
-                bits::copy(self.store.bytes_mut(m.slot), 0, buffer, m.bit, m.bits);
+                bits::copy(self.store.exchange_mut(m.slot), 0, buffer, m.bit, m.bits);
             }
         }
         self.application.sync(&mut self.store);

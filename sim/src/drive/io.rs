@@ -110,6 +110,10 @@ impl Inputs {
     pub(super) fn configure(&mut self, polarity: u32, live: u32) {
         self.inverted = self.track.normally_closed ^ polarity;
         self.live = live;
+    }
+
+    /// Wires from outside are looked at.
+    pub(super) fn refresh(&mut self) {
         self.on = self.levels();
     }
 

@@ -63,6 +63,9 @@ pub struct Drive {
     objects: Objects,
     parameters: Parameters,
     parameters_age: u32,
+    /// The store's edits when parameters, and control parameters, were read last; `None`: to be read again.
+    parameters_edits: Option<u64>,
+    tuning_edits: Option<u64>,
     homing: HomingParameters,
     tuning: Tuning,
     tuning_age: u32,
@@ -109,6 +112,8 @@ impl Drive {
             objects,
             parameters,
             parameters_age: 0,
+            parameters_edits: None,
+            tuning_edits: None,
             homing: HomingParameters::default(),
             params: plant,
             controller: Controller::new(&tuning, &plant, &motor),
@@ -140,8 +145,9 @@ impl Drive {
 
     /// Tells which objects the output process data carries, each time that is decided anew. A limit of
     /// zero that is received acts; one that is only an object without a value does not.
-    pub fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
-        self.objects.set_mapped(is_mapped);
+    pub fn set_mapped(&mut self, mapped: &[Slot]) {
+        self.objects.set_mapped(mapped);
+        (self.parameters_edits, self.tuning_edits) = (None, None);
     }
 
     /// SYNC0, or a SyncManager event where there is no distributed clock: set-points take effect.
@@ -179,12 +185,46 @@ impl Drive {
 
     /// One control cycle, every 0.4 ms of device time. Set-points and Controlword count only in Op.
     pub fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
+        self.begin_control(store);
+        self.controller.turn(&mut self.plant);
+        self.end_control(store, in_op);
+    }
+
+    /// The first part of a control cycle.
+    pub(crate) fn begin_control(&mut self, store: &ObjectStore) {
         self.parameters_age += 1;
         // What was written before a start counts for what it starts.
         if self.parameters_age >= PARAMETER_CYCLES || self.start {
             self.read_parameters(store);
         }
-        self.controller.advance(&mut self.plant);
+    }
+
+    /// The second part: the motors. Several at once take less time than one after the other.
+    pub(crate) fn turn(drives: [Option<&mut Self>; 4]) {
+        fn parts(drive: &mut Drive) -> (&mut Controller, &mut Plant) {
+            (&mut drive.controller, &mut drive.plant)
+        }
+        match drives {
+            [Some(a), Some(b), Some(c), Some(d)] => {
+                Controller::turn_together([a, b, c, d].map(parts));
+            }
+            [a, b, c, d] => {
+                for pair in [[a, b], [c, d]] {
+                    match pair {
+                        [Some(a), Some(b)] => Controller::turn_together([a, b].map(parts)),
+                        alone => alone
+                            .into_iter()
+                            .flatten()
+                            .for_each(|drive| drive.controller.turn(&mut drive.plant)),
+                    }
+                }
+            }
+        }
+    }
+
+    /// The third part: what the drive makes of it.
+    pub(crate) fn end_control(&mut self, store: &mut ObjectStore, in_op: bool) {
+        self.controller.observe(&self.plant);
         self.watch_inputs(store);
         self.connect(in_op);
         self.select_mode(store);
@@ -294,20 +334,28 @@ impl Drive {
         self.power.state() == State::OperationEnabled && self.power.stop().is_none()
     }
 
+    /// What the objects say now; where nobody has written to them since, that is known.
     fn read_parameters(&mut self, store: &ObjectStore) {
         self.parameters_age = 0;
-        self.parameters = self.objects.parameters(store, &self.params);
-        if self.mode == Some(Mode::Homing) {
+        let edits = Some(store.edits()).filter(|_| !self.objects.parameters_are_mapped());
+        if edits.is_none() || self.parameters_edits != edits {
+            self.parameters_edits = edits;
+            self.parameters = self.objects.parameters(store, &self.params);
             self.homing = self.objects.homing(store, &self.params);
+            self.frame.min = self.parameters.range_min;
+            self.frame.width = self.parameters.range_width;
+            self.frame.polarity = self.parameters.polarity;
+            let (polarity, live) = self.objects.io.wiring(store);
+            self.inputs.configure(polarity, live);
         }
-        self.frame.min = self.parameters.range_min;
-        self.frame.width = self.parameters.range_width;
-        self.frame.polarity = self.parameters.polarity;
-        let (polarity, live) = self.objects.io.wiring(store);
-        self.inputs.configure(polarity, live);
+        self.inputs.refresh();
         self.tuning_age += 1;
-        if self.tuning_age >= TUNING_ROUNDS {
-            self.tuning_age = 0;
+        if self.tuning_age < TUNING_ROUNDS {
+            return;
+        }
+        self.tuning_age = 0;
+        if edits.is_none() || self.tuning_edits != edits {
+            self.tuning_edits = edits;
             let tuning = self.objects.tuning(store);
             if tuning != self.tuning {
                 self.controller.tune(&tuning);

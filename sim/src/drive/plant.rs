@@ -87,24 +87,24 @@ impl PlantParams {
 #[derive(Debug, Clone)]
 pub(super) struct Plant {
     /// Encoder counts, with fraction.
-    position: f64,
+    pub(super) position: f64,
     /// rad/s.
-    velocity: f64,
+    pub(super) velocity: f64,
     /// A.
-    current: f64,
-    load_torque: f64,
-    blocked: bool,
+    pub(super) current: f64,
+    pub(super) load_torque: f64,
+    pub(super) blocked: bool,
     /// Mechanical ends, in counts.
-    ends: (f64, f64),
-    coulomb: f64,
-    torque_constant: f64,
+    pub(super) ends: (f64, f64),
+    pub(super) coulomb: f64,
+    pub(super) torque_constant: f64,
     counts_per_rad: f64,
     // Per current-loop step: what is left of current and speed, what a volt and a newton metre do.
-    current_decay: f64,
-    current_per_volt: f64,
-    velocity_decay: f64,
-    velocity_per_torque: f64,
-    counts_per_velocity: f64,
+    pub(super) current_decay: f64,
+    pub(super) current_per_volt: f64,
+    pub(super) velocity_decay: f64,
+    pub(super) velocity_per_torque: f64,
+    pub(super) counts_per_velocity: f64,
 }
 
 /// `x' = (u − drag·x) / storage` over one current-loop step with `u` held: what is left of x, and what

@@ -37,47 +37,47 @@ impl Drive {
         let velocity = self.controller.velocity();
         let torque_per_ampere = self.tuning.torque_constant / p.torque_unit.max(1e-12);
         let current = self.controller.current();
-        store.set(o.statusword, i64::from(self.statusword(limited)));
-        store.set(o.error_code, i64::from(self.faults.code()));
-        store.set(o.error_register, i64::from(self.faults.register()));
-        store.set(o.mode_display, self.mode.map_or(0, Mode::code));
-        store.set(o.position, self.frame.turned(self.frame.show(counts)));
-        store.set(
+        store.show(o.statusword, i64::from(self.statusword(limited)));
+        store.show(o.error_code, i64::from(self.faults.code()));
+        store.show(o.error_register, i64::from(self.faults.register()));
+        store.show(o.mode_display, self.mode.map_or(0, Mode::code));
+        store.show(o.position, self.frame.turned(self.frame.show(counts)));
+        store.show(
             o.velocity,
             polarity.velocity(whole(velocity / p.velocity_unit)),
         );
-        store.set(o.torque, whole(current * torque_per_ampere));
+        store.show(o.torque, whole(current * torque_per_ampere));
         let error = self.motion.following_error(demand, counts);
-        store.set(o.following_error, polarity.way(whole(error)));
+        store.show(o.following_error, polarity.way(whole(error)));
         let (position, speed) = match demand {
             Demand::Off => (float(counts), 0.0),
             _ => self.motion.demanded(),
         };
         let shown = self.frame.show(whole(position));
-        store.set(o.position_demand, self.frame.turned(shown));
-        store.set(
+        store.show(o.position_demand, self.frame.turned(shown));
+        store.show(
             o.velocity_demand,
             polarity.velocity(whole(speed / p.velocity_unit)),
         );
         if let Some(slot) = o.velocity_averaged {
             let averaged = self.controller.averaged_velocity();
-            store.set(slot, polarity.velocity(whole(averaged / p.velocity_unit)));
+            store.show(slot, polarity.velocity(whole(averaged / p.velocity_unit)));
         }
         if let Some(slot) = o.torque_averaged {
             let averaged = self.controller.averaged_current();
-            store.set(slot, whole(averaged * torque_per_ampere));
+            store.show(slot, whole(averaged * torque_per_ampere));
         }
         if let Some(slot) = o.current {
-            store.set(slot, whole(current * 1e3));
+            store.show(slot, whole(current * 1e3));
         }
         if let Some(slot) = o.current_averaged {
-            store.set(slot, whole(self.controller.averaged_current() * 1e3));
+            store.show(slot, whole(self.controller.averaged_current() * 1e3));
         }
         if let Some(slot) = o.current_demand {
-            store.set(slot, whole(self.controller.current_demand() * 1e3));
+            store.show(slot, whole(self.controller.current_demand() * 1e3));
         }
         if let Some(slot) = o.thermal_level {
-            store.set(slot, whole(self.controller.thermal_level() * 1e2));
+            store.show(slot, whole(self.controller.thermal_level() * 1e2));
         }
     }
 }

@@ -80,7 +80,7 @@ impl TouchProbes {
             }
         }
         let [first, second] = self.probes.map(|probe| probe.status);
-        store.set(slots.status, i64::from(u16::from_le_bytes([first, second])));
+        store.show(slots.status, i64::from(u16::from_le_bytes([first, second])));
     }
 }
 

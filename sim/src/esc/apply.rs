@@ -28,6 +28,16 @@ pub(super) struct Frame {
 }
 
 impl Esc {
+    /// Station address and alias, if a frame without a datagram to either changes nothing here and is not changed.
+    pub(crate) fn addresses(&self) -> Option<(u16, Option<u16>)> {
+        let quiet = self.u16_at(reg::ECAT_EVENT_MASK) == 0
+            && self.jitter.is_none()
+            && self.guard.is_idle()
+            && !self.eeprom_write_enable
+            && !self.dl_control_changed();
+        quiet.then_some((self.station, self.alias))
+    }
+
     /// A frame's first byte arrives at `now`; all its datagrams see this time. Returns it as local time.
     pub fn begin_frame(&mut self, now: Nanos) -> u64 {
         let local = self.clock.local(now);

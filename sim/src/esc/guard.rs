@@ -22,6 +22,11 @@ impl Guard {
         self.reset_byte = None;
     }
 
+    /// No reset sequence is under way, which any frame would break.
+    pub(super) fn is_idle(&self) -> bool {
+        self.progress == 0
+    }
+
     /// Whether a write from `start` to `end` is let through, given the protection registers.
     pub(super) fn allows(&self, start: usize, end: usize, registers: bool, all: bool) -> bool {
         let only = |register: u16| start == usize::from(register) && end == start + 1;

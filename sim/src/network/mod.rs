@@ -3,24 +3,24 @@
 //! * [`topology`]: which port leads to which device
 //! * `wiring`: the cables, and whether they carry anything
 //! * `route`: the way of a frame, worked out whenever links or loops change
+//! * `walk`: a frame on its way from device to device
 //!
 //! A frame is followed from end to end at once, with the time at which it passes each device; what
 //! it does there takes effect in that order.
 
 mod route;
 pub mod topology;
+mod walk;
 mod wiring;
 
-use std::cmp::Ordering;
-
 use crate::Nanos;
-use crate::device::{Seen, SimDevice};
+use crate::device::{Rest, SimDevice};
 use crate::esc::al::AlState;
 use crate::esc::ports::Medium;
 use crate::esc::registers as reg;
-use crate::faults::{Corrupted, FaultReport, FaultScript, Faults};
-use crate::frame::{self, FrameBuilder, Kind};
-use route::{Goal, Pass, Route};
+use crate::faults::{FaultReport, FaultScript, Faults};
+use crate::frame::{self, Datagram, FrameBuilder};
+use route::{Goal, Route};
 use topology::Topology;
 pub use wiring::Nic;
 use wiring::{End, Wiring};
@@ -57,6 +57,9 @@ pub enum Transit {
     },
 }
 
+/// As many as a frame can carry.
+const DATAGRAMS: usize = 128;
+
 /// A bus of SubDevices; time starts with the first frame or step.
 #[derive(Debug)]
 pub struct Segment {
@@ -75,6 +78,10 @@ pub struct Segment {
     latest: Nanos,
     /// Nothing happens to the network by itself before.
     next_change: Nanos,
+    /// Per device.
+    rests: Vec<Rest>,
+    /// Of the frame under way.
+    datagrams: Vec<Datagram>,
     /// Per device: the frame under way latches receive times.
     latches: Vec<bool>,
     /// The frame under way wrote DL control.
@@ -109,6 +116,8 @@ impl Segment {
             wire_free: [0; 2],
             latest: 0,
             next_change: Nanos::MAX,
+            rests: vec![Rest::default(); n],
+            datagrams: Vec::with_capacity(DATAGRAMS),
             latches: vec![false; n],
             settles: false,
             overheard: None,
@@ -152,7 +161,9 @@ impl Segment {
     }
 
     pub fn device_mut(&mut self, position: usize) -> Option<&mut SimDevice> {
-        self.devices.get_mut(position)
+        let device = self.devices.get_mut(position)?;
+        device.disturb(self.rests.get_mut(position)?);
+        Some(device)
     }
 
     #[must_use]
@@ -209,6 +220,13 @@ impl Segment {
 
     /// Lets devices, clocks and faults run up to `now`.
     pub fn advance(&mut self, now: Nanos) {
+        let to = self.strike(now);
+        self.run_to(to);
+    }
+
+    /// Lets everything up to `now` happen but what devices do after the last fault until then. Returns `now` as true
+    /// time.
+    fn strike(&mut self, now: Nanos) -> Nanos {
         let epoch = *self.epoch.get_or_insert(now);
         let to = now.saturating_sub(epoch).max(self.latest);
         // Faults strike at their own time, not at the next frame.
@@ -217,18 +235,24 @@ impl Segment {
             self.run_to(at);
             self.change(at);
         }
-        self.run_to(to);
+        to
     }
 
     fn run_to(&mut self, to: Nanos) {
-        for device in &mut self.devices {
-            device.advance(to);
-        }
+        SimDevice::advance_together(&mut self.devices, &mut self.rests, |_| to);
         self.latest = self.latest.max(to);
+    }
+
+    /// Whatever was known of devices at rest is known no longer.
+    fn disturb(&mut self) {
+        for (device, rest) in self.devices.iter_mut().zip(&mut self.rests) {
+            device.disturb(rest);
+        }
     }
 
     /// Faults begin or end, temporary settings run out.
     fn change(&mut self, at: Nanos) {
+        self.disturb();
         self.faults.apply(at, &mut self.devices);
         for device in self.faults.take_replaced() {
             self.power_cycle(device);
@@ -254,6 +278,7 @@ impl Segment {
 
     /// Power, then links, then the ways of frames follow from what is plugged in and switched on.
     fn relink(&mut self) {
+        self.disturb();
         for n in 0..self.devices.len() {
             let switched = !self.off.get(n).is_none_or(|off| *off) && !self.faults.is_off(n);
             let fed = self.topology.uplink(n).is_none_or(|up| {
@@ -306,7 +331,7 @@ impl Segment {
     /// As [`Segment::transit`], sent from either port of the MainDevice; from the second it is lost where
     /// there is none or nobody listens.
     pub fn transit_from(&mut self, nic: Nic, bytes: &mut [u8], now: Nanos) -> Transit {
-        self.advance(now);
+        let to = self.strike(now);
         let epoch = self.epoch.unwrap_or(now);
         let free = &mut self.wire_free[nic as usize];
         let start = now.saturating_sub(epoch).max(*free);
@@ -314,14 +339,16 @@ impl Segment {
         *free = start + wire;
         let fate = self.faults.fate();
         if fate.lost_on_the_way_out {
+            self.run_to(to);
             return Transit::Lost;
         }
         let came_through = match fate.corrupted.and_then(|at| self.corrupted_pass(nic, at)) {
             Some(pass) => {
+                self.run_to(to);
                 self.walk_corrupted(nic, bytes, start, pass);
                 false
             }
-            None => self.walk(nic, bytes, start),
+            None => self.walk(nic, bytes, start, to),
         };
         let route = &self.routes[nic as usize];
         let (goal, back) = (route.goal, start + route.time + wire);
@@ -362,7 +389,7 @@ impl Segment {
         let free = &mut self.wire_free[nic as usize];
         let start = *free;
         *free = start + wire;
-        let came_through = self.walk(nic, &mut frame, start);
+        let came_through = self.walk(nic, &mut frame, start, self.latest);
         let route = &self.routes[nic as usize];
         let back = start + route.time + wire;
         let returns = came_through && matches!(route.goal, Goal::Back(_));
@@ -373,96 +400,6 @@ impl Segment {
     /// The last frame of another MainDevice that comes by the MainDevice's port, and when it is there completely.
     pub fn take_overheard(&mut self) -> Option<(Nanos, Vec<u8>)> {
         self.overheard.take()
-    }
-
-    /// First bit sent at `start`; false where a device destroys the frame.
-    fn walk(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos) -> bool {
-        let route = &self.routes[nic as usize];
-        match frame::kind(bytes) {
-            Kind::EtherCat => {}
-            Kind::Foreign => return !route.ethercat_only,
-            Kind::Malformed => {
-                for visit in &route.visits {
-                    if let Some(device) = self.devices.get_mut(visit.device) {
-                        device.esc.count_processing_error();
-                    }
-                }
-                mark(route, bytes);
-                return true;
-            }
-        }
-        let mut latches = false;
-        for visit in &route.visits {
-            if visit.marks_circulating && !frame::circulate(bytes) {
-                self.latches.fill(false);
-                return false;
-            }
-            let Some(device) = self.devices.get_mut(visit.device) else {
-                continue;
-            };
-            let at = start + visit.after;
-            device.advance(at);
-            let seen = device.process(bytes, at);
-            self.settles |= seen.dl_control;
-            if seen.latches
-                && let Some(latch) = self.latches.get_mut(visit.device)
-            {
-                (*latch, latches) = (true, true);
-            }
-        }
-        if latches {
-            latch(&route.passes, &self.latches, &mut self.devices, start);
-            self.latches.fill(false);
-        }
-        mark(route, bytes);
-        true
-    }
-
-    /// How manieth port the frame arrives at is the first to see the error; one more than there are
-    /// for the MainDevice itself. `None` where the frame does not come by.
-    fn corrupted_pass(&self, nic: Nic, at: Corrupted) -> Option<usize> {
-        let passes = &self.routes[nic as usize].passes;
-        match at {
-            Corrupted::At { device, port } => passes
-                .iter()
-                .position(|pass| pass.device == device && pass.port == port),
-            Corrupted::Somewhere(lot) => usize::try_from(lot % (passes.len() as u64 + 1)).ok(),
-        }
-    }
-
-    /// As [`Segment::walk`] up to a port; from there on the frame is only counted. The first port
-    /// marks it, so that those behind it know that the error is not theirs.
-    fn walk_corrupted(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos, first: usize) {
-        let route = &self.routes[nic as usize];
-        let valid = frame::kind(bytes) == Kind::EtherCat;
-        for (n, pass) in route.passes.iter().enumerate() {
-            let Some(device) = self.devices.get_mut(pass.device) else {
-                continue;
-            };
-            let at = start + pass.after;
-            device.advance(at);
-            match n.cmp(&first) {
-                Ordering::Less => {}
-                Ordering::Equal => device.esc.count_rx_error(pass.port),
-                Ordering::Greater => device.esc.count_forwarded_error(pass.port),
-            }
-            let processed = pass.processed && valid && n < first;
-            let seen = if processed {
-                device.process(bytes, at)
-            } else {
-                Seen::default()
-            };
-            if pass.processed && !processed {
-                device.esc.count_processing_error();
-            }
-            self.settles |= seen.dl_control;
-            if let Some(latch) = self.latches.get_mut(pass.device) {
-                *latch |= seen.latches;
-            }
-        }
-        let before = route.passes.get(..first).unwrap_or_default();
-        latch(before, &self.latches, &mut self.devices, start);
-        self.latches.fill(false);
     }
 
     /// DL control that the frame wrote takes effect when it is over.
@@ -482,24 +419,3 @@ impl Segment {
 const OTHER: [u8; 6] = [0x00, 0x1b, 0x21, 0x0e, 0xca, 0x75];
 const BRD: u8 = 7;
 const BWR: u8 = 8;
-
-/// SubDevices mark what they pass on: the source address becomes a local one.
-fn mark(route: &Route, bytes: &mut [u8]) {
-    if route.ethercat_only
-        && let Some(source) = bytes.get_mut(6)
-    {
-        *source |= 0x02;
-    }
-}
-
-/// Notes when a frame arrived at the ports of the devices that it told to.
-fn latch(passes: &[Pass], latches: &[bool], devices: &mut [SimDevice], start: Nanos) {
-    for pass in passes {
-        if latches.get(pass.device) == Some(&true)
-            && let Some(device) = devices.get_mut(pass.device)
-        {
-            let at = start + pass.after;
-            device.esc.latch_port(pass.port, at, pass.processed);
-        }
-    }
-}

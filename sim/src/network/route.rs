@@ -52,6 +52,8 @@ pub(super) struct Route {
     pub(super) goal: Goal,
     /// From the first bit out to the first bit in.
     pub(super) time: Nanos,
+    /// The visits are to the first devices in their order, once each, and mark nothing.
+    pub(super) straight: bool,
     /// A device on the way destroys frames that are not EtherCAT and marks the others.
     pub(super) ethercat_only: bool,
 }
@@ -68,6 +70,12 @@ fn next(port: u8) -> u8 {
 
 impl Route {
     pub(super) fn trace(&mut self, from: Nic, wiring: &Wiring, devices: &[SimDevice]) {
+        self.follow(from, wiring, devices);
+        let mut visits = self.visits.iter().enumerate();
+        self.straight = visits.all(|(n, visit)| visit.device == n && !visit.marks_circulating);
+    }
+
+    fn follow(&mut self, from: Nic, wiring: &Wiring, devices: &[SimDevice]) {
         self.visits.clear();
         self.passes.clear();
         self.ethercat_only = false;

@@ -9,14 +9,14 @@ use crate::drive::plant::CURRENT_STEP;
 /// application notes, 2.3.1).
 #[derive(Debug, Clone)]
 pub(super) struct CurrentLoop {
-    p: f64,
+    pub(super) p: f64,
     /// Per step.
-    i: f64,
-    supply: f64,
+    pub(super) i: f64,
+    pub(super) supply: f64,
     /// V.
-    integral: f64,
+    pub(super) integral: f64,
     /// A, a step ago.
-    before: f64,
+    pub(super) before: f64,
 }
 
 impl CurrentLoop {

@@ -159,6 +159,9 @@ impl Frame {
 
     /// From one shown position to another, the short way round.
     fn way(&self, from: i64, to: i64) -> i64 {
+        if self.width == 1 << 32 {
+            return (to - from) << 32 >> 32;
+        }
         let half = self.width / 2;
         (to - from + half).rem_euclid(self.width) - half
     }

@@ -10,7 +10,7 @@ const ASSIGNED: u32 = 1 << input::NEGATIVE_LIMIT | 1 << input::POSITIVE_LIMIT | 
 #[derive(Debug, Clone)]
 pub(in crate::drive) struct IoSlots {
     pub inputs: Slot,
-    outputs: Slot,
+    pub outputs: Slot,
     /// 0x60FE:02: which outputs are driven. Without it, all.
     output_mask: Option<Slot>,
     polarity: Option<Slot>,
@@ -65,13 +65,13 @@ impl IoSlots {
 
     /// 0x60FD, and the same by input in 0x3141:01.
     pub(in crate::drive) fn publish(&self, store: &mut ObjectStore, inputs: u32) {
-        store.set(self.inputs, i64::from(inputs));
+        store.show(self.inputs, i64::from(inputs));
         if let Some(slot) = self.logic {
             let levels = self
                 .lines(store)
                 .filter(|(_, bit)| inputs & bit != 0)
                 .fold(0, |word, (n, _)| word | 1 << n);
-            store.set(slot, levels);
+            store.show(slot, levels);
         }
     }
 

@@ -77,6 +77,8 @@ pub(super) struct Objects {
     pub velocity_offset: Slot,
     pub torque_offset: Slot,
     parameters: ParameterSlots,
+    /// Process data carries parameters, too, and not only what [`super::Drive::sync`] takes.
+    parameters_are_mapped: bool,
     pub io: IoSlots,
     pub probes: Option<ProbeSlots>,
     tuning: TuningSlots,
@@ -150,6 +152,7 @@ impl Objects {
             velocity_offset: b.bind(0x60b1, 0, "Velocity offset", 32, RW),
             torque_offset: b.bind(0x60b2, 0, "Torque offset", 16, RW),
             parameters,
+            parameters_are_mapped: false,
             io: IoSlots::bind(&mut b),
             probes: ProbeSlots::find(&b),
             tuning,
@@ -157,8 +160,26 @@ impl Objects {
     }
 
     /// Which outputs the process data now carries.
-    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
-        self.parameters.set_mapped(is_mapped);
+    pub(super) fn set_mapped(&mut self, mapped: &[Slot]) {
+        self.parameters.set_mapped(|slot| mapped.contains(&slot));
+        let commands = [
+            self.controlword,
+            self.mode,
+            self.target_position,
+            self.target_velocity,
+            self.target_torque,
+            self.position_offset,
+            self.velocity_offset,
+            self.torque_offset,
+            self.io.outputs,
+            self.probes.as_ref().map_or(self.mode, |p| p.function),
+        ];
+        self.parameters_are_mapped = mapped.iter().any(|slot| !commands.contains(slot));
+    }
+
+    /// Process data may change any parameter.
+    pub(super) fn parameters_are_mapped(&self) -> bool {
+        self.parameters_are_mapped
     }
 
     /// Parameters change with the process data.
@@ -175,14 +196,14 @@ impl Objects {
         let mut used = 0;
         for slot in entries.into_iter().flatten() {
             let older = store.get(slot);
-            store.set(slot, carried);
+            store.show(slot, carried);
             used += 1;
             carried = older;
             if carried == 0 {
                 break;
             }
         }
-        store.set(count, used);
+        store.show(count, used);
     }
 
     pub(super) fn parameters(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {

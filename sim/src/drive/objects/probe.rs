@@ -52,10 +52,10 @@ impl ProbeSlots {
     ) {
         let at = |slots: &[[Option<Slot>; 2]; 2]| *slots.get(probe)?.get(edge)?;
         if let Some(slot) = at(&self.positions) {
-            store.set(slot, position);
+            store.show(slot, position);
         }
         if let Some(slot) = at(&self.counters) {
-            store.set(slot, store.get(slot).wrapping_add(1));
+            store.show(slot, store.get(slot).wrapping_add(1));
         }
     }
 }

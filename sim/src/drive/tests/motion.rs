@@ -231,7 +231,7 @@ fn speed_with(max_torque: i64, max_speed: i64, mapped: &[u16]) -> f64 {
     rig.drive = Drive::new(&mut store, PlantParams::default());
     rig.store = store;
     let slots: Vec<Slot> = mapped.iter().map(|index| rig.slot(*index, 0)).collect();
-    rig.drive.set_mapped(|slot| slots.contains(&slot));
+    rig.drive.set_mapped(&slots);
     rig.set(0x60c2, 1, 1);
     rig.set(0x6065, 0, 0xffff_ffff);
     rig.enable(9);
@@ -263,7 +263,7 @@ fn a_received_torque_limit_acts_in_the_next_control_cycle() {
     let mut store = ObjectStore::default();
     let limit = store.ensure(0x6072, 0, "Max torque", 16, Access::default(), &[]);
     let mut drive = Drive::new(&mut store, PlantParams::default());
-    drive.set_mapped(|slot| slot == limit);
+    drive.set_mapped(&[limit]);
     for permille in [1000, 0, 500] {
         store.set(limit, permille);
         drive.sync(&store);
