@@ -241,8 +241,7 @@ impl Engine {
         self.call_controller();
         self.act();
         self.exchange.stage();
-        self.publish(woke);
-        self.remember(lateness);
+        self.publish(woke, lateness);
         self.plan_next(adjust);
         self.stats.work.record(clock::now().saturating_sub(woke));
     }
@@ -313,7 +312,8 @@ impl Engine {
         }
     }
 
-    fn publish(&mut self, woke: Nanos) {
+    /// To those beside the cycle, and to the history.
+    fn publish(&mut self, woke: Nanos, lateness: Nanos) {
         let stopping = self.stopping();
         let stop_ended = stopping.is_some() && self.stop_ended();
         let mut stops = self.groups.iter().filter_map(Group::stop);
@@ -351,22 +351,18 @@ impl Engine {
                 powered: false,
             };
         }
-        for slot in &self.axes {
+        for (slot, status) in self.axes.iter().zip(&snapshot.axes) {
             if let Some(group) = snapshot.groups.get_mut(slot.group) {
-                group.powered |= slot.axis.status().state.has_power();
+                group.powered |= status.state.has_power();
             }
         }
         snapshot.events_lost = self.events_lost;
         snapshot.orders_taken = self.orders_taken;
-        self.end.snapshots.publish();
-    }
-
-    fn remember(&mut self, lateness: Nanos) {
         let number = self.stats.counters.cycles;
         let cycle =
             history::Cycle::new(number, self.next, lateness, &self.answer, self.phase_error);
-        let axes = self.axes.iter().map(|slot| slot.axis.status());
-        self.history.keep(cycle, axes);
+        self.history.keep(cycle, snapshot.axes.iter());
+        self.end.snapshots.publish();
     }
 
     /// A cycle that is already over is left out instead of sent in a burst.

@@ -63,8 +63,8 @@ pub struct AxisCycle {
     pub torque: f64,
 }
 
-impl From<AxisStatus> for AxisCycle {
-    fn from(status: AxisStatus) -> Self {
+impl From<&AxisStatus> for AxisCycle {
+    fn from(status: &AxisStatus) -> Self {
         Self {
             statusword: status.statusword,
             controlword: status.controlword,
@@ -128,7 +128,7 @@ impl History {
     }
 
     /// RT: O(axes).
-    pub fn keep(&mut self, cycle: Cycle, axes: impl Iterator<Item = AxisStatus>) {
+    pub fn keep<'a>(&mut self, cycle: Cycle, axes: impl Iterator<Item = &'a AxisStatus>) {
         match &mut self.anchor {
             Some((_, 0)) => return,
             Some((_, left)) => *left -= 1,

@@ -2,8 +2,9 @@
 
 use std::future::{Future, poll_fn};
 use std::pin::{Pin, pin};
-use std::sync::Arc;
-use std::task::{Context, Poll};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll, Wake, Waker};
 
 use tokio::sync::mpsc;
 
@@ -19,7 +20,31 @@ pub struct Desk<W> {
     emergencies: Emergencies,
     urgent: mpsc::Receiver<Job>,
     jobs: mpsc::Receiver<Job>,
+    arrivals: Arc<Arrivals>,
+    /// Wakes `arrivals`; whom these wake in turn.
+    waker: Waker,
+    outer: Option<Waker>,
     listener: Arc<dyn Listen>,
+}
+
+/// Whether one of the receivers is worth looking at. Looking costs more than everything else that an idle desk does,
+/// and every desk is polled in every cycle.
+#[derive(Debug)]
+struct Arrivals {
+    new: AtomicBool,
+    outer: Mutex<Waker>,
+}
+
+impl Wake for Arrivals {
+    fn wake(self: Arc<Self>) {
+        self.wake_by_ref();
+    }
+
+    fn wake_by_ref(self: &Arc<Self>) {
+        self.new.store(true, Ordering::Release);
+        let outer = self.outer.lock().unwrap_or_else(PoisonError::into_inner);
+        outer.wake_by_ref();
+    }
 }
 
 enum Next {
@@ -49,13 +74,8 @@ impl<W: Wire> Desk<W> {
 
     async fn next(&mut self) -> Next {
         poll_fn(|context| {
-            if let Poll::Ready(Some(job)) = self.urgent.poll_recv(context) {
-                return Poll::Ready(Next::Job(job));
-            }
-            match self.jobs.poll_recv(context) {
-                Poll::Ready(Some(job)) => return Poll::Ready(Next::Job(job)),
-                Poll::Ready(None) => return Poll::Ready(Next::End),
-                Poll::Pending => {}
+            if let Some(next) = self.arrived(context) {
+                return Poll::Ready(next);
             }
             // Nothing wakes us for it; every executor here asks again soon.
             if self.coe.waits(&self.wire) {
@@ -64,6 +84,32 @@ impl<W: Wire> Desk<W> {
             Poll::Pending
         })
         .await
+    }
+
+    /// What the receivers have, if anything has come since they had nothing.
+    fn arrived(&mut self, context: &Context<'_>) -> Option<Next> {
+        let known = self.outer.as_ref().filter(|w| w.will_wake(context.waker()));
+        if known.is_none() {
+            self.outer = Some(context.waker().clone());
+            let outer = self.arrivals.outer.lock();
+            *outer.unwrap_or_else(PoisonError::into_inner) = context.waker().clone();
+            self.arrivals.new.store(true, Ordering::Release);
+        }
+        if !self.arrivals.new.swap(false, Ordering::AcqRel) {
+            return None;
+        }
+        let mut inner = Context::from_waker(&self.waker);
+        let next = match self.urgent.poll_recv(&mut inner) {
+            Poll::Ready(Some(job)) => Next::Job(job),
+            _ => match self.jobs.poll_recv(&mut inner) {
+                Poll::Ready(Some(job)) => Next::Job(job),
+                Poll::Ready(None) => Next::End,
+                Poll::Pending => return None,
+            },
+        };
+        // There may be more.
+        self.arrivals.new.store(true, Ordering::Release);
+        Some(next)
     }
 
     async fn do_job(&mut self, job: Job) {
@@ -110,6 +156,10 @@ impl<W> Desk<W> {
         listener: Arc<dyn Listen>,
     ) -> Self {
         let emergencies = coe.emergencies();
+        let arrivals = Arc::new(Arrivals {
+            new: AtomicBool::new(true),
+            outer: Mutex::new(Waker::noop().clone()),
+        });
         Self {
             name,
             wire,
@@ -117,6 +167,9 @@ impl<W> Desk<W> {
             emergencies,
             urgent,
             jobs,
+            waker: Waker::from(Arc::clone(&arrivals)),
+            arrivals,
+            outer: None,
             listener,
         }
     }

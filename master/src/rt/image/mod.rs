@@ -39,6 +39,22 @@ impl Bits {
     /// The bits as a sign-extended number. RT.
     #[must_use]
     pub fn get(self, image: &[u8]) -> i64 {
+        // Whole objects of the usual lengths; the rest in general.
+        let at = image.get(self.byte..).unwrap_or_default();
+        match (self.shift, self.len) {
+            (0, 8) => return at.first_chunk().map_or(0, |b| i8::from_le_bytes(*b).into()),
+            (0, 16) => {
+                return at
+                    .first_chunk()
+                    .map_or(0, |b| i16::from_le_bytes(*b).into());
+            }
+            (0, 32) => {
+                return at
+                    .first_chunk()
+                    .map_or(0, |b| i32::from_le_bytes(*b).into());
+            }
+            _ => {}
+        }
         let end = self.byte + (usize::from(self.shift) + usize::from(self.len)).div_ceil(8);
         let mut raw = 0_u128;
         for (i, &byte) in image.get(self.byte..end).unwrap_or(&[]).iter().enumerate() {
@@ -51,6 +67,14 @@ impl Bits {
 
     /// Replaces the bits, leaving their neighbours. RT.
     pub fn set(self, image: &mut [u8], value: i64) {
+        if self.shift == 0 && matches!(self.len, 8 | 16 | 32) {
+            let len = usize::from(self.len / 8);
+            let to = image.get_mut(self.byte..self.byte + len);
+            if let (Some(to), Some(from)) = (to, value.to_le_bytes().get(..len)) {
+                to.copy_from_slice(from);
+            }
+            return;
+        }
         let end = self.byte + (usize::from(self.shift) + usize::from(self.len)).div_ceil(8);
         let mask = (u128::from(u64::MAX >> (64 - u32::from(self.len)))) << self.shift;
         let bits = (u128::from(value as u64) << self.shift) & mask;
