@@ -174,6 +174,7 @@ impl SimDevice {
     }
 
     pub fn drive_mut(&mut self) -> Option<&mut Drive> {
+        self.show();
         match &mut self.application {
             Application::Drive(drive) => Some(drive),
             _ => None,
@@ -192,6 +193,13 @@ impl SimDevice {
         match &mut self.application {
             Application::Gateway(gateway) => Some(gateway),
             _ => None,
+        }
+    }
+
+    /// Shows in the objects what the drive has done.
+    pub(super) fn show(&mut self) {
+        if let Application::Drive(drive) = &mut self.application {
+            drive.show(&mut self.store);
         }
     }
 

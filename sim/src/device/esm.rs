@@ -309,6 +309,7 @@ impl SimDevice {
             self.al.due = u64::MAX;
         }
         self.settle(state, code);
+        self.show();
         self.application.error(error);
     }
 

@@ -27,7 +27,7 @@ mod time;
 use crate::Nanos;
 use crate::coe::pdo::PdoRules;
 use crate::coe::store::ObjectStore;
-use crate::drive::{Drive, Emergency, State};
+use crate::drive::{Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
@@ -207,15 +207,23 @@ impl SimDevice {
     #[must_use]
     pub fn object(&self, index: u16, sub: u8) -> Option<Vec<u8>> {
         let slot = self.store.slot(index, sub)?;
-        Some(crate::coe::read_item(&self.store, slot))
+        let Some(drive) = self.drive() else {
+            return Some(crate::coe::read_item(&self.store, slot));
+        };
+        let mut store = self.store.clone();
+        drive.show_in(&mut store);
+        Some(crate::coe::read_item(&store, slot))
     }
 
+    /// The objects; those by which a drive shows its state may be up to a frame old ([`SimDevice::object`] has them as they
+    /// are).
     #[must_use]
     pub fn store(&self) -> &ObjectStore {
         &self.store
     }
 
     pub fn store_mut(&mut self) -> &mut ObjectStore {
+        self.show();
         &mut self.store
     }
 
@@ -360,7 +368,9 @@ impl SimDevice {
     }
 
     fn send_emergencies(&mut self) {
-        while let Some(emergency) = self.drive_mut().and_then(Drive::take_emergency) {
+        while let Application::Drive(drive) = &mut self.application
+            && let Some(emergency) = drive.take_emergency()
+        {
             self.queue_emergency(&emergency);
         }
     }

@@ -36,6 +36,7 @@ impl SimDevice {
 
     /// Takes outputs, if they count in this state, and latches inputs.
     pub(super) fn exchange(&mut self) {
+        self.show();
         // An emulated device stays in Op without outputs to obey.
         if self.al.state == AlState::Op && !self.esc.watchdog.expired() {
             self.take_outputs();
@@ -79,6 +80,7 @@ impl SimDevice {
         if self.al.state < AlState::SafeOp && !self.esc.emulates_device() {
             return;
         }
+        self.show();
         for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {
             // Registers that a SyncManager looks at are not the device's to fill.
             let ram = |sm: &&SyncManager| usize::from(sm.start) >= ADDRESS_SPACE;

@@ -118,8 +118,10 @@ impl SimDevice {
             } else if due == eeprom {
                 self.eeprom_finished(due);
             } else if due == mailbox {
+                self.show();
                 self.serve_mailbox(due);
             } else if due == al {
+                self.show();
                 self.al_step(due);
                 if self.starts_new_program() {
                     self.reset(due);

@@ -92,6 +92,8 @@ pub struct Drive {
     following_cycles: u32,
     following_error: bool,
     warning: bool,
+    /// What the last control cycle demanded, and whether that was limited, while the objects do not show it yet.
+    unseen: Option<(Demand, bool)>,
 }
 
 impl Drive {
@@ -136,6 +138,7 @@ impl Drive {
             following_cycles: 0,
             following_error: false,
             warning: false,
+            unseen: None,
         };
         drive.read_parameters(store);
         drive.show_inputs(store);
@@ -188,6 +191,7 @@ impl Drive {
         self.begin_control(store);
         self.controller.turn(&mut self.plant);
         self.end_control(store, in_op);
+        self.show(store);
     }
 
     /// The first part of a control cycle.
@@ -245,7 +249,21 @@ impl Drive {
         if let Some(code) = self.faults.take_unrecorded() {
             self.objects.record(store, code);
         }
-        self.publish(store, &demand, limited);
+        self.unseen = Some((demand, limited));
+    }
+
+    /// Shows in the objects what the last control cycle left. To be called before anybody reads them or does anything to
+    /// the drive but to let it go on.
+    pub(crate) fn show(&mut self, store: &mut ObjectStore) {
+        self.show_in(store);
+        self.unseen = None;
+    }
+
+    /// As [`Drive::show`], in a copy of the objects.
+    pub(crate) fn show_in(&self, store: &mut ObjectStore) {
+        if let Some((demand, limited)) = &self.unseen {
+            self.publish(store, demand, *limited);
+        }
     }
 
     /// The next emergency to send, oldest first.

@@ -30,7 +30,7 @@ impl Drive {
         word
     }
 
-    pub(super) fn publish(&mut self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
+    pub(super) fn publish(&self, store: &mut ObjectStore, demand: &Demand, limited: bool) {
         let (o, p) = (&self.objects, &self.parameters);
         let polarity = self.frame.polarity;
         let counts = self.controller.counts();
