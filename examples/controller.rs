@@ -17,13 +17,14 @@
 
 use std::error::Error;
 use std::f64::consts::TAU;
+use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use ecaxis::config::{self, AxisRef, OutputRef};
 use ecaxis::rt::controller::{Controller, Cycle};
-use ecaxis::session::{self, Observer, Options, Progress};
+use ecaxis::session::{self, Observer, Options, Progress, SignalReport};
 
 /// In user units, seconds and swings.
 const AMPLITUDE: f64 = 20.0;
@@ -69,8 +70,13 @@ struct Print;
 
 impl Observer for Print {
     fn progress(&mut self, progress: &Progress) {
-        eprintln!("{progress:?}");
+        say(&format!("{progress:?}"));
     }
+}
+
+/// `eprintln!` panics where nobody reads it any more.
+fn say(text: &str) {
+    let _ = writeln!(io::stderr(), "{text}");
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -92,6 +98,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         elapsed_s: 0.0,
     };
     let stop = Arc::new(AtomicBool::new(false));
+    // Ctrl-C, SIGTERM and a terminal that closes bring the axes to rest.
+    session::stop_on_signals(Arc::clone(&stop), |report| match report {
+        SignalReport::StopRepeated => std::process::exit(1),
+        report => say(&report.to_string()),
+    })?;
     let outcome = session::run_with(
         machine,
         Options::default(),
@@ -100,6 +111,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         Box::new(pendulum),
     );
     outcome.result?;
+    if outcome.summary.as_ref().is_some_and(|s| s.interrupted) {
+        std::process::exit(130);
+    }
     if let Some(summary) = outcome.summary {
         println!("{} cycles", summary.counters.cycles);
         for axis in summary.axes {

@@ -205,7 +205,7 @@ fn an_update_that_the_user_ends_leaves_its_device_in_init() {
         update.interrupt();
         let output = update.end();
         let told = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{told}");
+        assert_eq!(output.status.code(), Some(130), "{told}");
         for part in [
             "`x` (position 0",
             "sending the file: interrupted; the device is in Init",

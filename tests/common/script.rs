@@ -201,3 +201,36 @@ pub fn process_images(recording: &std::path::Path) -> Vec<(Vec<u8>, Vec<u8>)> {
     }
     images
 }
+
+/// Judges the first axis of a recording, a drive of `configs/esi` in CSP: it moved, no set-point changed faster than `step` counts
+/// a cycle, it stood before its Controlword took the power, and its power was taken in the end.
+#[track_caller]
+pub fn comes_to_rest(recording: &std::path::Path, step: i32) {
+    const POWERED: u16 = 0x000f;
+    let word = |data: &[u8]| u16::from_le_bytes([data[0], data[1]]);
+    let place = |data: &[u8]| i32::from_le_bytes([data[2], data[3], data[4], data[5]]);
+    let cycles: Vec<_> = process_images(recording)
+        .iter()
+        .filter(|(sent, back)| sent.len() > 6 && back.len() > 6)
+        .map(|(sent, back)| (word(sent), place(sent), place(back)))
+        .collect();
+    let powered = |cycle: &(u16, i32, i32)| cycle.0 == POWERED;
+    let first = cycles.iter().position(powered).expect("it had power");
+    let last = cycles.iter().rposition(powered).expect("it had power");
+    let moved = cycles[first..=last]
+        .windows(2)
+        .map(|pair| (pair[1].1 - pair[0].1).abs())
+        .max();
+    let moved = moved.unwrap_or_default();
+    assert!(moved > 1, "it moved: {moved} counts a cycle");
+    assert!(moved <= step, "a set-point changed by {moved} counts");
+    let end = &cycles[last.saturating_sub(10)..=last];
+    let turned = end.iter().map(|cycle| cycle.2);
+    let turned = turned.clone().max().unwrap_or(0) - turned.min().unwrap_or(0);
+    assert!(
+        turned <= 4,
+        "it turned by {turned} counts when it lost its power"
+    );
+    let over = cycles.last().map_or(0, |cycle| cycle.0);
+    assert_eq!(over & 0x0008, 0, "the last Controlword is {over:#06x}");
+}

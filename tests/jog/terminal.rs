@@ -9,6 +9,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use super::common::root;
+use super::common::script::comes_to_rest;
 
 /// Much longer than anything takes.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -38,6 +39,11 @@ struct Tmux {
 impl Tmux {
     /// `None`, with the reason printed, where there is no tmux.
     fn new(arguments: &str) -> Option<Self> {
+        Self::after("", arguments)
+    }
+
+    /// With something that the shell does first.
+    fn after(before: &str, arguments: &str) -> Option<Self> {
         let there = Command::new("tmux").arg("-V").output().is_ok();
         assert!(there || std::env::var_os("CI").is_none(), "no tmux on CI");
         if !there {
@@ -54,7 +60,7 @@ impl Tmux {
         std::fs::write(folder.path().join("m.toml"), calm).expect("written");
         let tmux = Self { folder };
         let script = format!(
-            "cd {}; stty -g > before; {} jog m.toml --sim {arguments}; echo $? > code; stty -g > after; echo all-is-done; cat",
+            "{before} cd {}; stty -g > before; {} jog m.toml --sim {arguments}; echo $? > code; stty -g > after; echo all-is-done; cat",
             tmux.folder.path().display(),
             env!("CARGO_BIN_EXE_ecaxis"),
         );
@@ -231,7 +237,36 @@ fn a_signal_ends_it_in_order() {
             tmux.says("x moves to 50 mm");
             let kill = Command::new("kill").args([signal, &tmux.pid()]).status();
             assert!(kill.expect("kill runs").success());
-            tmux.left("0");
+            tmux.left("130");
+        }
+    });
+}
+
+/// The shell ends with its terminal, and SIGHUP follows; or it stays, and jog sees that nobody can type any more.
+#[test]
+fn a_terminal_that_closes_ends_it_in_order() {
+    calmly(|| {
+        for before in ["", "trap : HUP;"] {
+            let Some(tmux) = Tmux::after(before, "--record r.pcapng") else {
+                return;
+            };
+            tmux.says("x no power");
+            tmux.keys(&["e"]);
+            tmux.says("x holds");
+            tmux.keys(&["m", "5", "0", "Enter"]);
+            tmux.says("x moves to 50 mm");
+            let process = Path::new("/proc").join(tmux.pid());
+            tmux.ask(&["kill-server"]);
+            let began = Instant::now();
+            while process.exists() || (!before.is_empty() && tmux.file("code").is_empty()) {
+                assert!(began.elapsed() < PATIENCE, "it goes on without a terminal");
+                sleep(Duration::from_millis(50));
+            }
+            if !before.is_empty() {
+                assert_eq!(tmux.file("code").trim(), "130");
+            }
+            // A quarter of 250 mm/s at most, of 400 counts a millimetre, and rounding.
+            comes_to_rest(&tmux.folder.path().join("r.pcapng"), 26);
         }
     });
 }

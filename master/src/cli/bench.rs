@@ -213,8 +213,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let report = compare::run(&plan, &stop, &mut told).map_err(|e| failure(&e, &plan))?;
     drop(told);
     let Some(report) = report else {
-        note("interrupted before anything was measured");
-        return Ok(());
+        return Err(Failure::new(
+            hints::INTERRUPTED,
+            "interrupted before anything was measured",
+        ));
     };
     // Text as keys and numbers that are finite always are JSON.
     let json = serde_json::to_string_pretty(&report).unwrap_or_default() + "\n";
@@ -229,7 +231,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     shown?;
     if stop.load(Ordering::Relaxed) {
-        note("interrupted: this is what was measured so far");
+        let message = "interrupted: this is what was measured so far";
+        return Err(Failure::new(hints::INTERRUPTED, message));
     }
     Ok(())
 }

@@ -31,6 +31,8 @@ pub(crate) use story::cause;
 pub(crate) const FAILED: u8 = 1;
 /// The file or the command line is wrong.
 pub(crate) const WRONG: u8 = 2;
+/// A signal ended the work, and nothing else failed: 128 + SIGINT, as a shell reports it.
+pub(crate) const INTERRUPTED: u8 = 130;
 
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Failure {
@@ -52,13 +54,18 @@ impl Failure {
         }
     }
 
+    /// Of work that a signal has ended.
+    pub fn interrupted() -> Self {
+        Self::new(INTERRUPTED, RunError::Interrupted.to_string())
+    }
+
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hints.push(hint.into());
         self
     }
 
     pub fn print(&self) {
-        let prefix = if self.message.starts_with("error: ") {
+        let prefix = if self.code == INTERRUPTED || self.message.starts_with("error: ") {
             ""
         } else {
             "error: "
@@ -153,7 +160,8 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         }
         RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
-        RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) | RunError::Interrupted => return failure,
+        RunError::Interrupted => return Failure { code: INTERRUPTED, ..failure },
+        RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) => return failure,
     };
     failure.hint(hint)
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, ConfigError, Machine, Nic, duration};
-use ecaxis::session::{self, Options, Outcome, RunError, Summary};
+use ecaxis::session::{self, Options, Outcome, Summary};
 use ecaxis::story::Story;
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
@@ -25,8 +25,9 @@ Examples:
   ecaxis run m.toml --no-enable             to Op, axes without power
   ecaxis run m.toml --json                  the result for a script
 
-Ctrl-C at any time: the axes decelerate within their limits, lose power, and
-the bus goes back to Init.";
+Ctrl-C, SIGTERM, or a terminal that closes: the axes decelerate within their
+limits, lose power, and the bus goes back to Init; the exit code is 130. Ctrl-Z
+is ignored.";
 
 /// Bring a machine up, run its program, and show what the bus and the axes did
 #[derive(Debug, clap::Args)]
@@ -118,8 +119,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } = session::run(machine, options, stop, &mut teller);
     drop(teller);
 
-    // The user's own wish is no failure, but a script must not take it for a finished run.
-    let interrupted = matches!(ended, Err(RunError::Interrupted));
     let mut failure = ended.err().map(|error| {
         let mut failure = hints::run(&error, &nic);
         if args.replay.is_some()
@@ -132,7 +131,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let (Some(story), Some(failure)) = (&story, &mut failure) {
         tell_story(args, story, failure, &nic);
     }
-    let failure = failure.or_else(|| summary.as_ref().and_then(stopped_since));
+    let failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
     let text = if args.json {
         let report = json!({
             "ok": failure.is_none(),
@@ -151,12 +150,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } else {
         page(&text)
     };
-    match failure {
-        Some(_) if interrupted => note("interrupted"),
-        Some(failure) => return Err(failure),
-        None => {}
-    }
-    written
+    failure.map_or(written, Err)
+}
+
+/// What a run that ended without an error has not done. What failed goes before an interruption.
+pub(super) fn unfinished(summary: &Summary) -> Option<Failure> {
+    let interrupted = summary.interrupted.then(Failure::interrupted);
+    stopped_since(summary).or(interrupted)
 }
 
 /// A machine that went on without a group of its axes has not done all that it should.

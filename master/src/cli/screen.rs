@@ -75,16 +75,14 @@ pub(super) fn take_down() {
     *passing = Passing::Nothing;
 }
 
-/// Log lines are lines that stay.
+/// Log lines are lines that stay. A terminal or reader that is gone is no error: the subscriber would report it on stderr, and
+/// panic there.
 pub(super) struct Log;
 
 impl Write for Log {
     fn write(&mut self, buf: &[u8]) -> io::Result<usize> {
-        stay(|err| err.write(buf))
-    }
-
-    fn write_all(&mut self, buf: &[u8]) -> io::Result<()> {
-        stay(|err| err.write_all(buf))
+        let _ = stay(|err| err.write_all(buf));
+        Ok(buf.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {

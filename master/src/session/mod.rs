@@ -3,9 +3,10 @@
 //! One thread owns the link. In real time it becomes the real-time thread and a second one runs
 //! the supervisor beside it; in virtual time it does both in turn, so that a run can be repeated.
 
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::thread;
 
@@ -13,6 +14,7 @@ use ecaxis_sim::FaultScript;
 
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
+use crate::link::Link;
 use crate::rt::controller::Controller;
 use crate::rt::cycle::Remains;
 use crate::rt::stats::Stats;
@@ -25,6 +27,7 @@ mod events;
 mod open;
 mod prepare;
 mod progress;
+mod signals;
 mod story;
 mod summary;
 mod turn;
@@ -38,6 +41,7 @@ pub use open::{recorded, simulated_bus, topology};
 pub use prepare::{Job, Prepared};
 use prepare::{go_silent, lacking};
 pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
+pub use signals::{SignalReport, stop_on_signals};
 use story::{Left, Seen};
 use summary::Aside;
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
@@ -105,15 +109,33 @@ impl From<RunError> for Outcome {
     }
 }
 
-/// Runs a machine until its program, its time limit, `stop` or an error ends it. Blocks; tells the
-/// observer meanwhile.
+/// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends it. Blocks; tells the
+/// observer meanwhile. Where the observer panics, the panic goes on once the machine has been stopped.
 pub fn run(
     machine: Machine,
     options: Options,
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
 ) -> Outcome {
-    start(machine, options, stop, observer, Instead::Nobody)
+    start(machine, options, stop, observer, Instead::Nobody, None)
+}
+
+/// Like [`run`], on a link of one's own in the place of the file's `nic`.
+pub fn run_on(
+    link: Box<dyn Link>,
+    machine: Machine,
+    options: Options,
+    stop: Arc<AtomicBool>,
+    observer: &mut dyn Observer,
+) -> Outcome {
+    start(
+        machine,
+        options,
+        stop,
+        observer,
+        Instead::Nobody,
+        Some(link),
+    )
 }
 
 /// Like [`run`], with a controller of one's own in the place of the file's program: all axes are enabled, then they are
@@ -126,7 +148,7 @@ pub fn run_with(
     controller: Box<dyn Controller>,
 ) -> Outcome {
     let controller = Instead::Controller(controller);
-    start(machine, options, stop, observer, controller)
+    start(machine, options, stop, observer, controller, None)
 }
 
 /// Like [`run`], with somebody in the file's program's place: axes are enabled and moved when they ask for it, until they
@@ -144,7 +166,7 @@ pub fn run_by_hand(
         ..options
     };
     let operator = Instead::Operator(operator);
-    start(machine, options, stop, observer, operator)
+    start(machine, options, stop, observer, operator, None)
 }
 
 /// Who takes the place of the file's program.
@@ -160,22 +182,31 @@ fn start(
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
     instead: Instead,
+    link: Option<Box<dyn Link>>,
 ) -> Outcome {
     let (progress, told) = channel();
+    let stopped = Arc::clone(&stop);
     let owner = thread::Builder::new()
         .name("ecaxis-rt".to_owned())
         .stack_size(STACK)
-        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, instead));
+        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, instead, link));
     let owner = match owner {
         Ok(owner) => owner,
         Err(error) => return RunError::Thread(error.to_string()).into(),
     };
-    for progress in told {
-        observer.progress(&progress);
+    let observed = catch_unwind(AssertUnwindSafe(|| {
+        for progress in told {
+            observer.progress(&progress);
+        }
+    }));
+    // The process may end with an observer that panics: the axes come to rest before.
+    if observed.is_err() {
+        stopped.store(true, Ordering::Relaxed);
     }
-    owner
+    let outcome = owner
         .join()
-        .unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into())
+        .unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into());
+    observed.map_or_else(|panic| resume_unwind(panic), |()| outcome)
 }
 
 pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
@@ -192,6 +223,7 @@ fn own_the_link(
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
     instead: Instead,
+    link: Option<Box<dyn Link>>,
 ) -> Outcome {
     options.clock.enter();
     let told = progress.clone();
@@ -208,7 +240,10 @@ fn own_the_link(
         progress,
         controller,
     };
-    let prepared = job.prepare_seeing(&mut seen);
+    let prepared = match link {
+        Some(link) => job.prepare_with(link, &mut seen),
+        None => job.prepare_seeing(&mut seen),
+    };
     let Prepared {
         parts,
         mut supervisor,

@@ -73,7 +73,11 @@ impl Job<'_> {
         self.prepare_with(link, &mut Seen::default())
     }
 
-    fn prepare_with(self, mut link: Box<dyn Link>, seen: &mut Seen) -> Result<Prepared, RunError> {
+    pub(super) fn prepare_with(
+        self,
+        mut link: Box<dyn Link>,
+        seen: &mut Seen,
+    ) -> Result<Prepared, RunError> {
         let Self {
             machine,
             options,

@@ -4,7 +4,7 @@ use ecaxis::config::Nic;
 use ecaxis::firmware::{Cause, FirmwareError, Left, Via};
 use ecaxis::mailbox::FoeError;
 
-use super::{FAILED, Failure, WRONG, service, state};
+use super::{FAILED, Failure, INTERRUPTED, WRONG, service, state};
 
 /// Nobody else may be on the bus while a program is written.
 pub(crate) fn shared_bus() -> Failure {
@@ -13,7 +13,14 @@ pub(crate) fn shared_bus() -> Failure {
 }
 
 pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
-    let failure = Failure::new(FAILED, message(error));
+    let code = match error {
+        FirmwareError::Failed {
+            cause: Cause::Interrupted,
+            ..
+        } => INTERRUPTED,
+        _ => FAILED,
+    };
+    let failure = Failure::new(code, message(error));
     match error {
         FirmwareError::Service(error) => service(error, nic),
         FirmwareError::Eeprom { .. } => {

@@ -10,13 +10,17 @@ use ecaxis::service::ServiceError;
 use ecaxis::service::eeprom::EepromError;
 use ecaxis::service::image::WriteError;
 
-use super::{FAILED, Failure, WRONG, bring_up, sdo, state};
+use super::{FAILED, Failure, INTERRUPTED, WRONG, bring_up, sdo, state};
 
 const FRAMES: &str = "frames are lost or a device restarts: check cables and supply";
 
 /// Work on devices that were taken as they were found.
 pub(crate) fn service(error: &ServiceError, nic: &Nic) -> Failure {
-    let failure = Failure::new(FAILED, message(error));
+    let code = match error {
+        ServiceError::Stopped { .. } => INTERRUPTED,
+        _ => FAILED,
+    };
+    let failure = Failure::new(code, message(error));
     let hint = match error {
         ServiceError::NoAnswer => return bring_up(failure, &BringUpError::NoAnswer, nic),
         ServiceError::Silent { .. }

@@ -8,13 +8,13 @@ use std::thread;
 
 use ecaxis::clock::{Clock, Nanos};
 use ecaxis::config::{Machine, duration, nearest};
-use ecaxis::session::{self, Observer, Options, Progress, RunError};
+use ecaxis::session::{self, Observer, Options, Progress};
 use ecaxis::supervise::manual::{MOST_SPEED, Operator, Presence, Request, Turn, View};
 use ecaxis_axis::Mode;
 use serde_json::json;
 
 use super::super::progress::Teller;
-use super::super::{Failure, hints, note};
+use super::super::{Failure, hints};
 use super::panel::{AxisPanel, Panel, number};
 
 /// Lines that have been read ahead; whoever writes more waits.
@@ -103,13 +103,15 @@ pub(super) fn run(
     let outcome = session::run_by_hand(machine, options, stop, &mut teller, Box::new(script));
     drop(teller);
     let _ = printer.join();
-    match outcome.result {
-        Err(RunError::Interrupted) => note("interrupted"),
-        Err(error) => return Err(hints::run(&error, &nic)),
-        Ok(()) => {}
-    }
+    outcome.result.map_err(|error| hints::run(&error, &nic))?;
     let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
-    failure.take().map_or(Ok(()), Err)
+    if let Some(failure) = failure.take() {
+        return Err(failure);
+    }
+    match outcome.summary {
+        Some(summary) if summary.interrupted => Err(Failure::interrupted()),
+        _ => Ok(()),
+    }
 }
 
 /// `None`: the end. A line that is too long comes in pieces, none of which is understood.

@@ -24,7 +24,7 @@ use ecaxis::config::{Machine, Nic};
 use ecaxis::session::{self, Observer, Options, Outcome, Progress, RunError};
 use ecaxis::supervise::manual::{LET_GO, Operator, Presence, Request, Turn, View};
 
-use super::{Failure, hints, note, record, report, result, run, signals, style};
+use super::{Failure, hints, record, report, result, run, signals, style};
 use draw::Picture;
 use keys::Keys;
 use panel::{Messages, Panel};
@@ -107,19 +107,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let terminal = Terminal::take().map_err(no_terminal)?;
     signals::stop_quietly(&stop);
+    let shared = Arc::new(Shared::default());
     let Outcome {
         summary,
         result: ended,
         ..
-    } = on(terminal, machine, options, &stop, args);
+    } = on(terminal, machine, options, &stop, args, &shared);
+    let left = shared.left.load(Ordering::Relaxed);
     let text = summary.as_ref().map(report::summary).unwrap_or_default();
     let written = result(&text);
     match ended {
-        Ok(()) => written,
-        Err(RunError::Interrupted) => {
-            note("interrupted");
-            written
-        }
+        // Whoever leaves with a key has not been interrupted; a terminal that closes interrupts.
+        Ok(()) | Err(RunError::Interrupted) if left => written,
+        Ok(()) => Err(Failure::interrupted()),
         Err(error) => Err(hints::run(&error, &nic)),
     }
 }
@@ -169,17 +169,17 @@ fn on(
     options: Options,
     stop: &Arc<AtomicBool>,
     args: &Args,
+    shared: &Arc<Shared>,
 ) -> Outcome {
     let bus = match &machine.bus.nic {
         Nic::Sim => "the simulated bus".to_owned(),
         Nic::Interface(nic) => nic.clone(),
     };
     let title = format!("jog  {}  {bus}", args.file.display());
-    let shared = Arc::new(Shared::default());
     let (asks, asked) = channel();
     let hands = Hands {
         asked,
-        shared: Arc::clone(&shared),
+        shared: Arc::clone(shared),
         heard: None,
         shown: None,
         began: None,
@@ -187,14 +187,14 @@ fn on(
         gone: false,
     };
     let mut listener = Listener {
-        shared: Arc::clone(&shared),
+        shared: Arc::clone(shared),
         nic: machine.bus.nic.clone(),
     };
     thread::scope(|scope| {
         let seat = Seat {
             terminal,
             asks,
-            shared: &shared,
+            shared,
             stop,
             title: &title,
         };
@@ -221,6 +221,8 @@ fn on(
 struct Shared {
     seen: Mutex<Seen>,
     over: AtomicBool,
+    /// The user has left with a key.
+    left: AtomicBool,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -405,8 +407,11 @@ impl Seat<'_> {
     }
 
     fn ask(&self, ask: Ask, attended: bool) {
-        if ask == Ask::Leave && !attended {
-            self.stop.store(true, Ordering::Relaxed);
+        if ask == Ask::Leave {
+            self.shared.left.store(true, Ordering::Relaxed);
+            if !attended {
+                self.stop.store(true, Ordering::Relaxed);
+            }
         }
         self.send(ask);
     }

@@ -1,0 +1,111 @@
+//! Signals of a process whose axes move: what stops the machine, and what must not stop the process.
+
+use std::fmt;
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use tokio::runtime::Builder;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use crate::os::signal as disposition;
+
+/// Signals whose default action ends or suspends the process, while the axes move.
+const IGNORED: [libc::c_int; 5] = [
+    libc::SIGUSR1,
+    libc::SIGUSR2,
+    libc::SIGPIPE,
+    libc::SIGTTIN,
+    libc::SIGTTOU,
+];
+
+/// Some programs, such as timeout(1), send the signal to the process and to its group.
+const REPEATED: Duration = Duration::from_millis(500);
+
+/// What [`stop_on_signals`] has done with a signal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SignalReport {
+    /// The flag is set: the run stops in order.
+    Stopping,
+    /// Another SIGINT or SIGTERM arrived. A program that ends now leaves its axes to their watchdogs.
+    StopRepeated,
+    /// SIGTSTP (Ctrl-Z) was ignored: a suspended process sends no frames.
+    NotSuspended,
+}
+
+impl fmt::Display for SignalReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Stopping => "stopping; once more to leave at once",
+            Self::StopRepeated => "left without stopping the machine",
+            Self::NotSuspended => "Ctrl-Z is ignored: frames must not stop; Ctrl-C stops in order",
+        })
+    }
+}
+
+/// Sets `stop` at SIGINT, SIGTERM or SIGHUP, so that a run with this flag stops in order. SIGHUP does
+/// nothing where it was ignored before, as by `nohup`.
+///
+/// From here on the process ignores SIGUSR1, SIGUSR2, SIGPIPE, SIGTTIN and SIGTTOU, and SIGTSTP does
+/// not suspend it. `report` is called on a thread of its own. SIGHUP is never reported as
+/// [`SignalReport::StopRepeated`]: a terminal that closes may send it several times.
+///
+/// # Errors
+/// Where a signal cannot be caught, or the thread cannot be started.
+pub fn stop_on_signals(
+    stop: Arc<AtomicBool>,
+    mut report: impl FnMut(SignalReport) + Send + 'static,
+) -> io::Result<()> {
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    let guard = runtime.enter();
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut hang_up = match disposition::is_ignored(libc::SIGHUP)? {
+        true => None,
+        false => Some(signal(SignalKind::hangup())?),
+    };
+    let mut suspend = signal(SignalKind::from_raw(libc::SIGTSTP))?;
+    drop(guard);
+    IGNORED.into_iter().try_for_each(disposition::ignore)?;
+    let serve = async move {
+        let mut first: Option<Instant> = None;
+        loop {
+            let hung_up = tokio::select! {
+                _ = interrupt.recv() => false,
+                _ = terminate.recv() => false,
+                () = received(&mut hang_up) => true,
+                _ = suspend.recv() => {
+                    report(SignalReport::NotSuspended);
+                    continue;
+                }
+            };
+            stop.store(true, Ordering::Relaxed);
+            match first {
+                None => {
+                    first = Some(Instant::now());
+                    report(SignalReport::Stopping);
+                }
+                Some(first) if !hung_up && first.elapsed() >= REPEATED => {
+                    report(SignalReport::StopRepeated);
+                }
+                Some(_) => {}
+            }
+        }
+    };
+    thread::Builder::new()
+        .name("signals".into())
+        .spawn(move || runtime.block_on(serve))?;
+    Ok(())
+}
+
+/// Never returns without a signal to wait for.
+async fn received(signal: &mut Option<Signal>) {
+    match signal {
+        Some(signal) => {
+            signal.recv().await;
+        }
+        None => std::future::pending().await,
+    }
+}
