@@ -124,6 +124,13 @@ pub(crate) const STORY_DATA: Kind = Kind {
     instead: "the data go beside the page: name another page",
 };
 
+/// As [`super::trace`] writes it.
+pub(crate) const TRACE: Kind = Kind {
+    sign: Sign::Begins(b"time_ns,position,device,"),
+    what: "a trace of `ecaxis sim` (CSV)",
+    instead: "name a new file, or a trace to write over",
+};
+
 /// Whether `target`, which `option` names, may be written over; `inputs` are read, and what they are.
 pub(crate) fn may_replace<'p>(
     option: &str,

@@ -42,6 +42,7 @@ mod story;
 mod style;
 mod table;
 mod tables;
+mod trace;
 
 pub(crate) use files::{in_the_way, keep, unwritable};
 pub(crate) use hints::Failure;

@@ -12,7 +12,8 @@ use ecaxis::session;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
-use super::{Failure, hints, keep, note, result, run, signals, unwritable};
+use super::trace::Trace;
+use super::{Failure, files, hints, keep, note, result, run, signals, unwritable};
 
 /// SCHED_FIFO priority of the simulated bus; below that of a master on the same computer.
 const PRIORITY: u8 = 70;
@@ -22,6 +23,7 @@ Examples:
   ecaxis sim m.toml --nic veth0             for a MainDevice at the other end
   ecaxis sim m.toml --nic veth0 --nic2 veth2
   ecaxis sim m.toml --nic veth0 --faults f.toml --sii eeproms
+  ecaxis sim m.toml --nic veth0 --trace t.csv
 
 `ip link add veth0 type veth peer name veth1` makes two interfaces that are
 connected; needs root, or cap_net_raw.";
@@ -45,6 +47,10 @@ pub(crate) struct Args {
     /// The fault script begins at SIGUSR1, and anew at each further one, not with the first frame
     #[arg(long, requires = "faults")]
     faults_on_signal: bool,
+    /// Write what every device does to this CSV file, once a millisecond: AL state and code, Controlword, Statusword, velocity of the
+    /// motor shaft in turns per second; times are CLOCK_MONOTONIC
+    #[arg(long, value_name = "FILE")]
+    trace: Option<PathBuf>,
     /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …; other files are not written over
     #[arg(long, value_name = "FOLDER")]
     sii: Option<PathBuf>,
@@ -108,6 +114,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if let Some(folder) = &args.sii {
         write_images(&segment, folder)?;
     }
+    let mut trace = args.trace.as_deref().map(trace).transpose()?;
+    if on_signal.is_some() {
+        let pid = std::process::id();
+        note(&format!("`kill -USR1 {pid}` begins the fault script"));
+    }
     note(&format!(
         "{devices} simulated SubDevice{} answer{} on `{}`; Ctrl-C ends it",
         if devices == 1 { "" } else { "s" },
@@ -125,6 +136,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             {
                 segment.start_faults(script.clone(), now);
             }
+            if let Some(to) = &mut trace
+                && let Err(e) = to.sample(segment, now)
+            {
+                note(&format!("warning: writing the trace: {e}; it ends here"));
+                trace = None;
+            }
         })
         .map_err(|e| hints::serve(&e))?;
     let report = report(&stats, &segment);
@@ -133,6 +150,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } else {
         text(&report)
     })
+}
+
+/// Only replaces a trace.
+fn trace(path: &Path) -> Result<Trace, Failure> {
+    files::may_replace("--trace", path, &files::TRACE, [])?;
+    let file = std::fs::File::create(path).and_then(Trace::new);
+    file.map_err(|error| unwritable(path, &error))
 }
 
 fn write_images(segment: &Segment, folder: &Path) -> Result<(), Failure> {

@@ -302,6 +302,24 @@ impl SimDevice {
         self.powered = false;
     }
 
+    #[must_use]
+    pub fn has_power(&self) -> bool {
+        self.powered
+    }
+
+    /// A motor without power turns on until friction has stopped it; `true` while it does.
+    fn coast(&mut self, now: Nanos) -> bool {
+        let local = self.esc.clock.local(now);
+        while self.tick <= local {
+            self.start_ticking(self.tick);
+            let Some(drive) = self.drive_mut() else {
+                return false;
+            };
+            drive.coast();
+        }
+        self.drive_mut().is_some_and(|drive| drive.velocity_rev_s() != 0.0)
+    }
+
     /// Everything volatile is lost; objects return to their defaults.
     pub(crate) fn power_on(&mut self, now: Nanos) {
         self.powered = true;

@@ -77,7 +77,8 @@ impl SimDevice {
     /// Lives up to `now`, or until a drive's motor is to turn before [`SimDevice::tick`] goes on.
     fn run(&mut self, now: Nanos) -> Run {
         if !self.powered {
-            return Run::Until(Nanos::MAX);
+            let turns = self.coast(now);
+            return Run::Until(if turns { now.saturating_add(1) } else { Nanos::MAX });
         }
         let mut local = self.esc.clock.local(now);
         loop {

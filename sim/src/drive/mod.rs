@@ -266,6 +266,11 @@ impl Drive {
         }
     }
 
+    /// One control period without power.
+    pub(crate) fn coast(&mut self) {
+        self.controller.coast(&mut self.plant);
+    }
+
     /// The next emergency to send, oldest first.
     pub fn take_emergency(&mut self) -> Option<Emergency> {
         self.faults.take_emergency()

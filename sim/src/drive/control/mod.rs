@@ -224,7 +224,8 @@ impl Controller {
         self.current = sum / f64::from(SUBSTEPS);
     }
 
-    fn coast(&mut self, plant: &mut Plant) {
+    /// One control period with the output stage off.
+    pub(super) fn coast(&mut self, plant: &mut Plant) {
         self.current_loop.reset();
         self.current = 0.0;
         if !plant.at_rest() {

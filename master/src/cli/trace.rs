@@ -1,0 +1,67 @@
+//! `ecaxis sim --trace`: what the simulated drives really do, as CSV.
+
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::{self, Write as _};
+
+use ecaxis_sim::{Nanos, Segment, SimDevice};
+
+const HEAD: &str =
+    "time_ns,position,device,al_state,al_status_code,controlword,statusword,velocity\n";
+const PERIOD: Nanos = 1_000_000;
+
+/// A line a device and millisecond. Each sample is written at once, so that it can be read while the bus is served.
+pub(super) struct Trace {
+    file: File,
+    next: Nanos,
+    lines: String,
+}
+
+impl Trace {
+    pub fn new(mut file: File) -> io::Result<Self> {
+        file.write_all(HEAD.as_bytes())?;
+        Ok(Self {
+            file,
+            next: 0,
+            lines: String::new(),
+        })
+    }
+
+    /// Writes a sample, if one is due.
+    pub fn sample(&mut self, segment: &Segment, now: Nanos) -> io::Result<()> {
+        if now < self.next {
+            return Ok(());
+        }
+        self.next = now + PERIOD;
+        self.lines.clear();
+        for position in 0..segment.len() {
+            if let Some(device) = segment.device(position) {
+                line(&mut self.lines, position, device, now);
+            }
+        }
+        self.file.write_all(self.lines.as_bytes())
+    }
+}
+
+/// Without power there is no AL state. What is no drive has no words and no velocity (of the motor shaft, turns per second).
+fn line(lines: &mut String, position: usize, device: &SimDevice, now: Nanos) {
+    let state = match device.has_power() {
+        true => device.al_state().to_string(),
+        false => String::new(),
+    };
+    let (name, code) = (device.name(), device.al_status_code());
+    // Writing to a string cannot fail.
+    let _ = write!(lines, "{now},{position},{name},{state},0x{code:04x},");
+    let _ = match device.drive() {
+        Some(drive) => {
+            let word = |index| match device.object(index, 0).as_deref() {
+                Some(&[low, high]) => u16::from_le_bytes([low, high]),
+                _ => 0,
+            };
+            let (control, status) = (word(0x6040), word(0x6041));
+            let velocity = drive.velocity_rev_s();
+            writeln!(lines, "0x{control:04x},0x{status:04x},{velocity:.4}")
+        }
+        None => writeln!(lines, ",,"),
+    };
+}
