@@ -47,7 +47,7 @@ pub(crate) struct Args {
     /// The fault script begins at SIGUSR1, and anew at each further one, not with the first frame
     #[arg(long, requires = "faults")]
     faults_on_signal: bool,
-    /// Write what every device does to this CSV file, once a millisecond: AL state and code, Controlword, Statusword, velocity of the
+    /// Write what every device does to this CSV file, once a millisecond: AL state and code, age of the outputs, Controlword, Statusword, velocity of the
     /// motor shaft in turns per second; times are CLOCK_MONOTONIC
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,

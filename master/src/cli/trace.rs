@@ -6,8 +6,7 @@ use std::io::{self, Write as _};
 
 use ecaxis_sim::{Nanos, Segment, SimDevice};
 
-const HEAD: &str =
-    "time_ns,position,device,al_state,al_status_code,controlword,statusword,velocity\n";
+const HEAD: &str = "time_ns,position,device,al_state,al_status_code,outputs_age_ns,controlword,statusword,velocity\n";
 const PERIOD: Nanos = 1_000_000;
 
 /// A line a device and millisecond. Each sample is written at once, so that it can be read while the bus is served.
@@ -36,7 +35,9 @@ impl Trace {
         self.lines.clear();
         for position in 0..segment.len() {
             if let Some(device) = segment.device(position) {
-                line(&mut self.lines, position, device, now);
+                let age = device.outputs_log().last();
+                let age = age.map(|at| segment.world_time(now).saturating_sub(at));
+                line(&mut self.lines, now, position, device, age);
             }
         }
         self.file.write_all(self.lines.as_bytes())
@@ -44,14 +45,15 @@ impl Trace {
 }
 
 /// Without power there is no AL state. What is no drive has no words and no velocity (of the motor shaft, turns per second).
-fn line(lines: &mut String, position: usize, device: &SimDevice, now: Nanos) {
+fn line(lines: &mut String, now: Nanos, position: usize, device: &SimDevice, age: Option<Nanos>) {
     let state = match device.has_power() {
         true => device.al_state().to_string(),
         false => String::new(),
     };
     let (name, code) = (device.name(), device.al_status_code());
+    let age = age.map(|age| age.to_string()).unwrap_or_default();
     // Writing to a string cannot fail.
-    let _ = write!(lines, "{now},{position},{name},{state},0x{code:04x},");
+    let _ = write!(lines, "{now},{position},{name},{state},0x{code:04x},{age},");
     let _ = match device.drive() {
         Some(drive) => {
             let word = |index| match device.object(index, 0).as_deref() {

@@ -1,0 +1,363 @@
+//! How drives in motion come to rest, whatever happens to the program, the host or the bus: over a veth pair (root), judged by what the
+//! simulated drives do (`ecaxis sim --trace`). Prints for each trial the time to standstill and the means.
+//!
+//! `ECAXIS_TRIALS=20` repeats every trial; `ECAXIS_TRIAL=TEXT` takes only those whose name contains the text.
+
+#![allow(clippy::print_stdout, reason = "prints a table")]
+
+mod common;
+
+#[path = "stop_trials/freeze.rs"]
+mod freeze;
+#[path = "stop_trials/library.rs"]
+mod library;
+#[path = "stop_trials/trace.rs"]
+mod trace;
+
+use std::cell::RefCell;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::thread::sleep;
+use std::time::Duration;
+
+use common::root;
+use common::wire::{Told, over_a_pair};
+use ecaxis::bench::veth::VethPair;
+use library::{Injected, Library};
+use rustix::process::Signal;
+use trace::{Stop, Table, Trace};
+
+/// Turns per second of both axes.
+const SPEED: f64 = 20.0;
+/// Longer than every stop may take.
+const PATIENCE: Duration = Duration::from_secs(6);
+
+/// Two drives, one of them in CSP and one in CSV, and an I/O block behind them.
+const MACHINE: &str = r#"
+[bus]
+nic = "sim"
+cycle = "1ms"
+lost_frames = 30
+CPU
+
+[[device]]
+name = "csp"
+esi = "esi/EPOS4.xml"
+position = 0
+mode = "csp"
+[device.axis]
+unit = "turn"
+encoder = 2000
+limits = { position = [-500000.0, 500000.0], velocity = 50.0, acceleration = 500.0, torque = 100.0, following_error = 5.0 }
+
+[[device]]
+name = "csv"
+esi = "esi/EPOS4.xml"
+position = 1
+mode = "csv"
+[device.axis]
+unit = "turn"
+encoder = 2000
+limits = { velocity = 50.0, acceleration = 500.0, torque = 100.0 }
+
+[[device]]
+name = "io"
+esi = "esi/IO8.xml"
+position = 2
+
+[[step]]
+velocity = { csp = SPEED, csv = SPEED }
+[[step]]
+dwell = "10min"
+"#;
+
+/// What happens in motion.
+#[derive(Debug, Clone, Copy)]
+enum Event {
+    /// To the process that drives the axes.
+    Signal(Signal),
+    /// Ignored; the machine is stopped by SIGTERM afterwards.
+    Ignored(Signal),
+    /// The fault script begins; the axes stop by themselves.
+    Fault,
+    /// The fault script begins and stops nothing; SIGTERM does, afterwards.
+    Tolerated,
+    /// The thread beside the cycle does not run any more.
+    Frozen,
+    /// In the process of this test, through the library.
+    Library(Injected),
+}
+
+struct Trial {
+    name: &'static str,
+    event: Event,
+    /// Of the script's only fault, from the event on.
+    fault: Option<&'static str>,
+    /// What the program exits with; `None`: it is killed.
+    exit: Option<i32>,
+    /// So many drives, from the first, are reached by frames and stop by set-points.
+    ramped: usize,
+}
+
+const fn trial(name: &'static str, event: Event, exit: Option<i32>, ramped: usize) -> Trial {
+    Trial {
+        name,
+        event,
+        fault: None,
+        exit,
+        ramped,
+    }
+}
+
+const fn fault(name: &'static str, script: &'static str, ramped: usize) -> Trial {
+    Trial {
+        name,
+        event: Event::Fault,
+        fault: Some(script),
+        exit: Some(1),
+        ramped,
+    }
+}
+
+const TRIALS: &[Trial] = &[
+    trial("kill -9", Event::Signal(Signal::KILL), None, 0),
+    trial("SIGTERM", Event::Signal(Signal::TERM), Some(130), 2),
+    trial("SIGHUP", Event::Signal(Signal::HUP), Some(130), 2),
+    trial(
+        "SIGTSTP, then SIGTERM",
+        Event::Ignored(Signal::TSTP),
+        Some(130),
+        2,
+    ),
+    // It goes on with SIGCONT, when the axes stand.
+    trial("SIGSTOP", Event::Signal(Signal::STOP), Some(1), 0),
+    trial("frozen mailbox thread", Event::Frozen, None, 2),
+    trial(
+        "panic in a controller",
+        Event::Library(Injected::Controller),
+        Some(1),
+        2,
+    ),
+    trial(
+        "panic in the cycle",
+        Event::Library(Injected::Cycle { times: 1 }),
+        Some(1),
+        0,
+    ),
+    trial(
+        "panic in the cycle and its stop",
+        Event::Library(Injected::Cycle { times: 2 }),
+        Some(1),
+        0,
+    ),
+    trial(
+        "panic in every frame",
+        Event::Library(Injected::Cycle { times: usize::MAX }),
+        Some(1),
+        0,
+    ),
+    fault(
+        "power loss of `csp`",
+        "kind = \"power-off\"\ndevice = 0\n",
+        0,
+    ),
+    fault(
+        "power loss of `csv`",
+        "kind = \"power-off\"\ndevice = 1\n",
+        1,
+    ),
+    fault(
+        "power loss of `io`",
+        "kind = \"power-off\"\ndevice = 2\n",
+        2,
+    ),
+    fault(
+        "cable break before `csp`",
+        "kind = \"link-break\"\ndevice = 0\n",
+        0,
+    ),
+    fault(
+        "cable break before `csv`",
+        "kind = \"link-break\"\ndevice = 1\n",
+        1,
+    ),
+    fault(
+        "cable break before `io`",
+        "kind = \"link-break\"\ndevice = 2\n",
+        2,
+    ),
+    Trial {
+        name: "silent mailbox, then SIGTERM",
+        event: Event::Tolerated,
+        fault: Some("kind = \"mailbox-silent\"\ndevice = 0\n"),
+        exit: Some(130),
+        ramped: 2,
+    },
+];
+
+/// The simulated bus of a trial.
+struct Bus {
+    process: Told,
+    trace: Trace,
+}
+
+struct Bench<'p> {
+    pair: &'p VethPair,
+    folder: tempfile::TempDir,
+    /// Both ends spin with real-time priority: each has a processor of its own, where there are two.
+    apart: bool,
+}
+
+impl<'p> Bench<'p> {
+    fn new(pair: &'p VethPair) -> Self {
+        let taskset = Command::new("taskset").arg("--version").output();
+        let apart = std::thread::available_parallelism().is_ok_and(|n| n.get() > 1)
+            && taskset.is_ok_and(|output| output.status.success());
+        let bench = Self {
+            pair,
+            folder: tempfile::tempdir().expect("a folder"),
+            apart,
+        };
+        let esi = root().join("configs/esi");
+        let text = MACHINE
+            .replace("CPU", if apart { "cpu = 1" } else { "" })
+            .replace("SPEED", &format!("{SPEED:.1}"))
+            .replace("\"esi/", &format!("\"{}/", esi.display()));
+        std::fs::write(bench.file(), text).expect("written");
+        bench
+    }
+
+    fn file(&self) -> PathBuf {
+        self.path("m.toml")
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn ecaxis(&self, cpu_0: bool) -> Command {
+        let program = env!("CARGO_BIN_EXE_ecaxis");
+        let mut command = match cpu_0 && self.apart {
+            true => {
+                let mut command = Command::new("taskset");
+                command.args(["-c", "0", program]);
+                command
+            }
+            false => Command::new(program),
+        };
+        command.current_dir(self.folder.path());
+        command.stdin(Stdio::null()).stdout(Stdio::null());
+        command
+    }
+
+    fn serve(&self, fault: Option<&str>) -> Bus {
+        let trace = self.path("trace.csv");
+        let _ = std::fs::remove_file(&trace);
+        let mut command = self.ecaxis(true);
+        command
+            .args(["sim", "m.toml", "--nic", &self.pair.a, "--trace"])
+            .arg(&trace);
+        if let Some(fault) = fault {
+            std::fs::write(self.path("f.toml"), format!("[[fault]]\n{fault}")).expect("written");
+            command.args(["--faults", "f.toml", "--faults-on-signal"]);
+        }
+        let mut process = Told::start(&mut command);
+        process.says("answer");
+        Bus {
+            process,
+            trace: Trace::open(&trace),
+        }
+    }
+
+    fn run(&self) -> Told {
+        let mut command = self.ecaxis(false);
+        Told::start(command.args(["run", "m.toml", "--no-story", "--nic", &self.pair.b]))
+    }
+
+    fn perform(&self, trial: &Trial, bus: &mut Bus) -> Stop {
+        if let Event::Library(injected) = trial.event {
+            let run = Library::start(&self.file(), &self.pair.b, injected);
+            bus.trace.await_speed(SPEED);
+            let began = bus.trace.now();
+            run.inject();
+            let stop = bus.trace.await_standstill(began, trial.ramped);
+            let failed = run.end();
+            assert_eq!(Some(i32::from(failed)), trial.exit, "{}", trial.name);
+            return bus.trace.stays(stop);
+        }
+        let run = self.run();
+        bus.trace.await_speed(SPEED);
+        let mut began = bus.trace.now();
+        let mut frozen = None;
+        match trial.event {
+            Event::Signal(signal) => run.signal(signal),
+            Event::Fault => bus.process.signal(Signal::USR1),
+            Event::Frozen => frozen = Some(freeze::thread(run.id(), "ecaxis-mailbox")),
+            Event::Ignored(_) | Event::Tolerated => {
+                match trial.event {
+                    Event::Ignored(signal) => run.signal(signal),
+                    _ => bus.process.signal(Signal::USR1),
+                }
+                sleep(Duration::from_millis(300));
+                bus.trace.await_speed(SPEED);
+                began = bus.trace.now();
+                run.signal(Signal::TERM);
+            }
+            Event::Library(_) => unreachable!("above"),
+        }
+        let stop = bus.trace.await_standstill(began, trial.ramped);
+        drop(frozen);
+        match trial.event {
+            Event::Signal(Signal::STOP) => run.signal(Signal::CONT),
+            Event::Frozen => run.signal(Signal::TERM),
+            _ => {}
+        }
+        let output = run.end();
+        let told = String::from_utf8_lossy(&output.stderr);
+        if trial.exit.is_some() {
+            assert_eq!(output.status.code(), trial.exit, "{}: {told}", trial.name);
+        }
+        // Nothing turns again, whatever the program did before it ended.
+        bus.trace.stays(stop)
+    }
+}
+
+fn repetitions() -> usize {
+    let wanted = std::env::var("ECAXIS_TRIALS").ok();
+    wanted.and_then(|n| n.parse().ok()).unwrap_or(1)
+}
+
+fn chosen() -> Vec<&'static Trial> {
+    let part = std::env::var("ECAXIS_TRIAL").unwrap_or_default();
+    let each = TRIALS.iter().filter(|trial| trial.name.contains(&part));
+    each.collect()
+}
+
+/// Over a pair of interfaces and a bus of its own. `None` where there can be none, or the computer gave no fair try.
+fn perform(trial: &Trial) -> Option<Stop> {
+    let done = RefCell::new(None);
+    over_a_pair(|pair| {
+        let bench = Bench::new(&pair);
+        let mut bus = bench.serve(trial.fault);
+        *done.borrow_mut() = Some(bench.perform(trial, &mut bus));
+    });
+    done.into_inner()
+}
+
+#[test]
+fn every_drive_comes_to_rest() {
+    let mut table = Table::default();
+    let mut failed = Vec::new();
+    for trial in chosen() {
+        for _ in 0..repetitions() {
+            match catch_unwind(AssertUnwindSafe(|| perform(trial))) {
+                Ok(Some(stop)) => table.add(trial.name, &stop),
+                Ok(None) => {}
+                Err(_) => failed.push(trial.name),
+            }
+        }
+    }
+    println!("{table}");
+    assert!(failed.is_empty(), "{failed:?}");
+}
