@@ -17,7 +17,7 @@ const STANDS: f64 = 0.1;
 /// An axis stands once it has for so long.
 const SETTLED_NS: u64 = 200_000_000;
 /// Outputs that are older come no more; a busy computer is late by milliseconds.
-const LATE_NS: u64 = 20_000_000;
+const LATE_NS: u64 = 10_000_000;
 /// The means that every stop begins with where a drive can be reached.
 pub(super) const SET_POINTS: &str = "set-points";
 /// Bring-up, with every start-up SDO.

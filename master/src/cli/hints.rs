@@ -158,6 +158,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
             let back = "once the cause is known, let steps bring the group back: `reset`, then `enable`";
             return cause.fold(failure, Failure::hint).hint(back);
         }
+        RunError::Unsupervised => "the computer had no time for it: give the cycle a CPU of its own (`cpu` in [bus]), and look with `ecaxis doctor`".to_owned(),
         RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
         RunError::Interrupted => return Failure { code: INTERRUPTED, ..failure },

@@ -10,6 +10,7 @@ use super::feed::FeedState;
 use super::groups::{Group, GroupStatus};
 use super::guard::{Guard, StopCause};
 use super::handover::{Event, PhaseStatus, RtEnd, Snapshot};
+use super::heartbeat;
 use super::history::{self, History};
 use super::image::SignalBits;
 use super::journal::Note;
@@ -75,6 +76,7 @@ pub struct Engine {
     clocks_off: Vec<bool>,
     guard: Guard,
     guarding: bool,
+    supervisor: heartbeat::Watch,
     stats: Stats,
     history: History,
     end: RtEnd,
@@ -161,6 +163,7 @@ impl Engine {
             clocks_off,
             guard: parts.guard,
             guarding: false,
+            supervisor: heartbeat::Watch::default(),
             stats: Stats::default(),
             history,
             end: parts.end,
@@ -233,6 +236,10 @@ impl Engine {
         let adjust = self.follow_clock();
         if self.guarding {
             self.watch_bus();
+            let heartbeat = &self.end.heartbeat;
+            if self.supervisor.is_silent(heartbeat, self.timing.cycle_ns) {
+                self.stop(None, StopCause::Unsupervised);
+            }
         }
 
         self.observe();

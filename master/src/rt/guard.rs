@@ -33,6 +33,8 @@ pub enum StopCause {
     Controller,
     /// The cycle itself panicked.
     Panicked,
+    /// The thread beside the cycle does not run any more.
+    Unsupervised,
     /// The drive of this axis keeps its power after its removal was requested.
     Powered { axis: usize },
     /// At least one SubDevice is no longer in Op.

@@ -6,6 +6,7 @@ use super::exchange::Diagnosis;
 use super::feed::{FeedState, Start};
 use super::groups::GroupStatus;
 use super::guard::StopCause;
+use super::heartbeat::Heartbeat;
 use super::stats::Counters;
 use crate::clock::Nanos;
 
@@ -134,6 +135,7 @@ pub struct RtEnd {
     pub orders: rtrb::Consumer<Order>,
     pub events: rtrb::Producer<Event>,
     pub snapshots: triple_buffer::Input<Snapshot>,
+    pub heartbeat: Heartbeat,
 }
 
 /// Everybody else's end.
@@ -142,6 +144,7 @@ pub struct OuterEnd {
     pub orders: rtrb::Producer<Order>,
     pub events: rtrb::Consumer<Event>,
     pub snapshots: triple_buffer::Output<Snapshot>,
+    pub heartbeat: Heartbeat,
 }
 
 /// Prepares both ends with room for what `first` holds.
@@ -150,16 +153,19 @@ pub fn ends(first: &Snapshot) -> (RtEnd, OuterEnd) {
     let (order_in, order_out) = rtrb::RingBuffer::new(ORDERS);
     let (event_in, event_out) = rtrb::RingBuffer::new(EVENTS);
     let (snapshot_in, snapshot_out) = triple_buffer::triple_buffer(first);
+    let heartbeat = Heartbeat::default();
     (
         RtEnd {
             orders: order_out,
             events: event_in,
             snapshots: snapshot_in,
+            heartbeat: heartbeat.clone(),
         },
         OuterEnd {
             orders: order_in,
             events: event_out,
             snapshots: snapshot_out,
+            heartbeat,
         },
     )
 }

@@ -11,6 +11,7 @@
 //! - [`stats`]: bounded histograms and counters;
 //! - [`journal`]: what the cycle has noticed, in order;
 //! - [`history`]: the last cycles as they were;
+//! - [`heartbeat`]: whether the thread beside the cycle still runs;
 //! - [`handover`]: the queues to and from everybody else;
 //! - [`controller`]: a user's own code in the cycle;
 //! - [`cycle`]: one turn of the loop, from wake-up to publishing;
@@ -37,6 +38,7 @@ pub mod feed;
 pub mod groups;
 pub mod guard;
 pub mod handover;
+pub mod heartbeat;
 pub mod history;
 pub mod image;
 pub mod journal;

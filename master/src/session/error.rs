@@ -196,6 +196,10 @@ pub enum RunError {
     },
     #[error("the controller panicked")]
     Controller,
+    #[error(
+        "the thread beside the cycle (`ecaxis-mailbox`) did not run for 2 s: the machine was stopped"
+    )]
+    Unsupervised,
     #[error("interrupted")]
     Interrupted,
     #[error("internal error: {0}")]

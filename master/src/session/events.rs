@@ -108,6 +108,7 @@ fn cause_told<'m>(cause: StopCause, axis: &impl Fn(usize) -> &'m str) -> String 
         }
         StopCause::Controller => "stop: the controller panicked".to_owned(),
         StopCause::Panicked => "stop: the cycle panicked".to_owned(),
+        StopCause::Unsupervised => "stop: the thread beside the cycle does not run".to_owned(),
         StopCause::LeftOp { al_status } => {
             format!("stop: a SubDevice has left Op, AL status 0x{al_status:02x}")
         }

@@ -53,6 +53,7 @@ impl Supervisor {
             },
             StopCause::Controller => RunError::Controller,
             StopCause::Panicked => RunError::Panicked("the cycle".to_owned()),
+            StopCause::Unsupervised => RunError::Unsupervised,
             StopCause::Powered { axis } => RunError::NotDisabled {
                 device: self.device_of(axis),
                 state: snapshot

@@ -121,7 +121,13 @@ impl Supervisor {
     /// The whole life beside the cycle. The cycle ends when this has ended.
     pub async fn run(mut self) -> (Ended, Result<(), RunError>) {
         let desks = std::mem::take(&mut self.desks);
-        beside(desks, self.live()).await
+        let heartbeat = self.outer.heartbeat.clone();
+        let mut work = pin!(beside(desks, self.live()));
+        poll_fn(|context| {
+            heartbeat.beat();
+            work.as_mut().poll(context)
+        })
+        .await
     }
 
     async fn live(mut self) -> (Ended, Result<(), RunError>) {
