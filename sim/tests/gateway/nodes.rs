@@ -2,6 +2,37 @@
 
 use super::*;
 
+/// A node without a partner repeats its boot-up message until the gateway listens; the reset that the gateway then
+/// orders must take that message with it.
+#[test]
+fn one_node_alone_starts_whatever_its_model() {
+    for (id, drive) in [(1, Epos::E24_1), (2, Epos::E24_5), (100, Epos::E70_10)] {
+        for supervision in [
+            Supervision::None,
+            Supervision::Heartbeat { period_ms: 50 },
+            Supervision::Guarding {
+                period_ms: 100,
+                retries: 3,
+            },
+        ] {
+            let alone = NodeOptions {
+                supervision,
+                mandatory: true,
+                ..node(id, drive, 2)
+            };
+            let options = GatewayOptions {
+                nodes: vec![alone],
+                ..GatewayOptions::default()
+            };
+            let mut line = Line::new("GW16", options);
+            assert_eq!(line.command(0x01, 0x80), Some(0x01), "{drive:?}");
+            line.cycles(100);
+            // The Statusword that the drive itself put into its PDO.
+            assert_eq!(line.input(2, 2) & 0x4f, 0x40, "{drive:?} {supervision:?}");
+        }
+    }
+}
+
 #[test]
 fn three_models_differ_as_they_do() {
     let mut line = Line::new("GW16", three_drives());

@@ -33,7 +33,11 @@ impl Gateway {
         if slave.boot != Boot::Waiting && assignment & 1 << 2 == 0 {
             return;
         }
-        slave.state = None;
+        // What a node was asked before it started again, it does not answer any more.
+        self.master.forget(Some(node));
+        let Some(slave) = self.master.slave(node) else {
+            return;
+        };
         match concise::parse(&dcf) {
             Some(settings) => {
                 slave.settings = settings;

@@ -279,7 +279,7 @@ impl Node {
         let own = u16::from(self.settings.id);
         let operational = self.nmt == NmtState::Operational;
         match (frame.id, frame.remote) {
-            (0, false) => self.network_management(frame, now),
+            (0, false) => self.network_management(frame, now, bus),
             (id, true) if id == 0x700 + own => self.guarded(now, bus),
             (id, true) if operational => self.requested(id, now, bus),
             (id, false) if id == 0x600 + own => self.sdo_request(frame, now, bus),
@@ -292,14 +292,19 @@ impl Node {
         }
     }
 
-    fn network_management(&mut self, frame: &CanFrame, now: u64) {
+    fn network_management(&mut self, frame: &CanFrame, now: u64, bus: &mut CanBus) {
         let &[specifier, node] = frame.data() else {
             return;
         };
         if node != 0 && node != self.settings.id {
             return;
         }
-        match NmtCommand::from_specifier(specifier) {
+        let command = NmtCommand::from_specifier(specifier);
+        if command.is_some_and(|command| command.leads_to() == NmtState::Initialising) {
+            // The CAN controller starts again, without what it had still to send.
+            bus.forget(self.settings.id);
+        }
+        match command {
             Some(NmtCommand::ResetNode) => self.power_on(now),
             Some(NmtCommand::ResetCommunication) => {
                 self.d.restore(&self.stored.clone(), 0x1000..=0x1fff);
