@@ -2,6 +2,7 @@
 //!
 //! The master is what its axis commands or reports, as the caller likes. While engaged, the follower is where it is to be in every cycle,
 //! exactly, as long as its own limits allow it; where they do not, at first or because the master jumps, it catches up within them.
+//! With smoothing the follower is there on average: reported positions are noisy, and noise is not followed.
 
 use super::error::{position, usable};
 use super::{Motion, MotionLimits, SetpointError, braking_velocity};
@@ -27,6 +28,8 @@ pub struct GearConfig {
     pub engage: Engage,
     /// Time constant with which the master's velocity is smoothed, seconds; 0 for none. Reported positions come in whole counts, and their
     /// differences would otherwise exceed the follower's acceleration. A master at rest or at constant velocity is followed without lag.
+    /// With smoothing, the follower is engaged as long as it is near on average: what is left of the noise may ask for more than
+    /// its acceleration.
     pub smoothing_s: f64,
     pub limits: MotionLimits,
     pub range: Option<[f64; 2]>,
@@ -47,6 +50,8 @@ pub struct Gear {
     master: Motion,
     /// Where the follower was to be in the last cycle.
     ideal: f64,
+    /// How far the follower is from there, averaged over the smoothing time.
+    behind: f64,
     engaged: bool,
     slips: u32,
 }
@@ -79,12 +84,13 @@ impl Gear {
             smoothing_s: config.smoothing_s,
             master,
             ideal,
+            behind: ideal - motion.position,
             engaged: false,
             slips: 0,
         })
     }
 
-    /// The follower is where it is to be.
+    /// The follower is where it is to be; with smoothing, but for the noise.
     #[must_use]
     pub const fn engaged(&self) -> bool {
         self.engaged
@@ -116,25 +122,50 @@ impl Gear {
         if position("gear position", ideal).is_ok() {
             self.ideal = ideal;
         }
-        let velocity = (self.ideal - before) / dt_s;
         let [slowest, fastest] = self.possible(motion, dt_s);
-        // Exactly there, at the velocity that keeps it there.
-        let needed = (self.ideal - motion.position) / dt_s;
-        let possible = (slowest..=fastest).contains(&needed);
-        let change = self.limits.acceleration * CATCHING_UP * dt_s;
         let was_engaged = self.engaged;
-        self.engaged = possible && (was_engaged || (needed - velocity).abs() <= change);
-        if self.engaged {
-            return motion.then(self.ideal, needed, dt_s);
-        }
-        self.slips = self.slips.saturating_add(u32::from(was_engaged));
         let left = before - motion.position;
         let braking = self.limits.acceleration * CATCHING_UP * PLANNED;
-        let closing = braking_velocity(left.abs(), braking, dt_s).copysign(left);
-        let wanted = velocity + closing;
+        let closing = braking_velocity(left.abs(), braking, dt_s);
+        let wanted = if self.smoothing_s > 0.0 {
+            // What is left of the noise is averaged out, not followed.
+            let closing = closing.min(left.abs() / self.smoothing_s);
+            self.ratio * self.master.velocity + closing.copysign(left)
+        } else {
+            let velocity = (self.ideal - before) / dt_s;
+            // Exactly there, at the velocity that keeps it there.
+            let needed = (self.ideal - motion.position) / dt_s;
+            let possible = (slowest..=fastest).contains(&needed);
+            let change = self.limits.acceleration * CATCHING_UP * dt_s;
+            self.engaged = possible && (was_engaged || (needed - velocity).abs() <= change);
+            if self.engaged {
+                return motion.then(self.ideal, needed, dt_s);
+            }
+            velocity + closing.copysign(left)
+        };
         // Not `clamp`: it panics on bounds that are not numbers.
         let velocity = wanted.max(slowest).min(fastest);
-        motion.then(motion.position + velocity * dt_s, velocity, dt_s)
+        let next = motion.then(motion.position + velocity * dt_s, velocity, dt_s);
+        self.engaged = self.follows(next, was_engaged, dt_s);
+        self.slips = self
+            .slips
+            .saturating_add(u32::from(was_engaged && !self.engaged));
+        next
+    }
+
+    /// Whether the follower of a smoothed master is as near as smoothing and noise let it be.
+    fn follows(&mut self, next: Motion, was_engaged: bool, dt_s: f64) -> bool {
+        let limits = &self.limits;
+        if self.smoothing_s == 0.0 {
+            return false;
+        }
+        let kept = (-dt_s / self.smoothing_s).exp();
+        self.behind = self.behind * kept + (self.ideal - next.position) * (1.0 - kept);
+        // A master that accelerates with the follower's limit is ahead by half of it: the smoothed velocity is late by
+        // twice the smoothing time.
+        let near = self.behind.abs() <= 4.0 * limits.acceleration * self.smoothing_s.powi(2);
+        let relative = (self.ratio * self.master.velocity - next.velocity).abs();
+        near && (was_engaged || relative <= limits.acceleration * self.smoothing_s)
     }
 
     /// An α-β filter, critically damped.

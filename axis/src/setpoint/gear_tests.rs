@@ -105,6 +105,48 @@ fn a_reported_master_is_smoothed() {
     assert!(worst < 0.0025, "{worst}");
 }
 
+/// A drive samples its position with its own loop: two or three of its cycles in one of the bus. Half of the bus cycles say too
+/// much, half too little, and the more so the faster the master is.
+#[test]
+fn a_master_sampled_by_its_own_loop_is_followed_up_to_the_velocity_limit() {
+    const SAMPLE: f64 = 0.0004;
+    for part in [0.2, 0.45, 0.6, 0.8, 0.95] {
+        for acceleration in [300.0, 2000.0] {
+            let velocity = LIMITS.velocity * part;
+            let limits = MotionLimits {
+                acceleration,
+                ..LIMITS
+            };
+            let config = GearConfig {
+                smoothing_s: 0.01,
+                limits,
+                ..config(1.0, Engage::Here)
+            };
+            let start = Motion {
+                velocity,
+                ..Motion::at(0.0)
+            };
+            let mut gear = Gear::new(config, start, start).unwrap();
+            // Every cycle's velocity, acceleration and jerk are judged.
+            let mut sequence = Sequence::from(start, limits, DT);
+            let (mut apart, mut worst) = (0, 0.0f64);
+            for cycle in 1..4000 {
+                let time = f64::from(cycle) * DT;
+                let sampled = (time / SAMPLE).floor() * SAMPLE * velocity;
+                let next = gear.advance(Motion::at(sampled), sequence.motion, DT);
+                sequence.then(next).unwrap();
+                if cycle > 500 {
+                    apart += u32::from(!gear.engaged());
+                    worst = worst.max((next.position - time * velocity).abs());
+                }
+            }
+            assert_eq!(apart, 0, "{part} {acceleration}");
+            // What a sample can be late, and what the smoothing leaves of it.
+            assert!(worst <= 1.5 * SAMPLE * velocity, "{part}: {worst}");
+        }
+    }
+}
+
 /// A master far beyond the follower's range, either way, and back.
 #[test]
 fn stops_at_the_end_of_the_range() {
