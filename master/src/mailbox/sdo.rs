@@ -24,7 +24,7 @@ pub struct CoeClient {
     pub(super) port: Port,
     /// A transfer ended without its last answer; it may still come.
     pub(super) unsettled: bool,
-    /// The object whose segments are under way.
+    /// The object whose segments are under way, as far as is known.
     in_segments: Option<(u16, u8)>,
 }
 
@@ -34,6 +34,18 @@ impl CoeClient {
             port: Port::new(layout),
             unsettled: true,
             in_segments: None,
+        }
+    }
+
+    /// The client of a mailbox that another program may have used since the device was in Init: which counter
+    /// (ETG.1000.4) the device saw last is not known, and a request with that counter would be dropped as a repetition.
+    /// An abort goes before the first request. No device answers an abort, whether it drops it or ends a transfer by
+    /// it, and the counter of the request is another one in either case.
+    pub fn joining(layout: MailboxLayout) -> Self {
+        const DEVICE_TYPE: u16 = 0x1000;
+        Self {
+            in_segments: Some((DEVICE_TYPE, 0)),
+            ..Self::new(layout)
         }
     }
 

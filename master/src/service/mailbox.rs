@@ -48,8 +48,10 @@ pub async fn lend(wire: &impl Wire, device: &DeviceRef, sii: &Sii) -> Result<Len
     let found = status.map_or(AlState::Unknown(0), |(status, _)| {
         AlState::from_status(status)
     });
-    let layout = match found {
-        AlState::PreOp | AlState::SafeOp | AlState::Op => configured(&registers).await?,
+    let coe = match found {
+        AlState::PreOp | AlState::SafeOp | AlState::Op => {
+            CoeClient::joining(configured(&registers).await?)
+        }
         AlState::Init => {
             let layout = configure(&registers, sii, sii.mailbox).await?;
             let devices = std::slice::from_ref(device);
@@ -61,7 +63,7 @@ pub async fn lend(wire: &impl Wire, device: &DeviceRef, sii: &Sii) -> Result<Len
                 }
                 return Err(error.into());
             }
-            layout
+            CoeClient::new(layout)
         }
         state => {
             return Err(ServiceError::WrongState {
@@ -71,7 +73,7 @@ pub async fn lend(wire: &impl Wire, device: &DeviceRef, sii: &Sii) -> Result<Len
         }
     };
     Ok(Lent {
-        coe: CoeClient::new(layout),
+        coe,
         device: device.clone(),
         found,
     })

@@ -159,6 +159,39 @@ fn what_is_lent_to_the_device_is_taken_by_force_alone_and_given_back() {
     assert_eq!(access, [1]);
 }
 
+/// A device that a program left in PreOp remembers the counter of that program's last request.
+#[test]
+fn a_mailbox_that_another_program_used_answers_the_first_request() {
+    let (answers, _) = with_drives(async |wire| {
+        let found = addressed(&wire).await;
+        let device = found[0].named("x");
+        let eeprom = Eeprom::claim(&wire, &device, "reading", Claim::IfFree)
+            .await
+            .expect("free");
+        let image = eeprom.image(&mut |_, _| {}).await.expect("read");
+        eeprom.give_back().await.expect("given back");
+        let sii = sii::parse(&image).expect("an image");
+        let mut first = mailbox::lend(&wire, &device, &sii).await.expect("lent");
+        let mut answers = Vec::new();
+        // Every one of the seven counters is the last one once.
+        for _ in 0..8 {
+            let read = first.coe.upload(&wire, 0x1018, 1, false).await;
+            read.expect("read");
+            let mut next = mailbox::lend(&wire, &device, &sii).await.expect("lent");
+            answers.push(next.coe.upload(&wire, 0x1018, 1, false).await);
+            first = next;
+            for _ in 0..answers.len() {
+                let read = first.coe.upload(&wire, 0x1018, 1, false).await;
+                read.expect("read");
+            }
+        }
+        answers
+    });
+    for answer in answers {
+        assert_eq!(answer.expect("an answer").len(), 4);
+    }
+}
+
 #[test]
 fn a_mailbox_in_init_is_opened_and_closed_again() {
     let (done, link) = with_drives(async |wire| {
