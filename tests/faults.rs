@@ -20,6 +20,21 @@ fn nobody_answers() {
     assert!(summary.is_none());
 }
 
+/// A device without a processor shows AL control in AL status, with the bit of an acknowledgement that the MainDevice wrote.
+#[test]
+fn a_bus_that_is_silent_for_a_while_has_refused_nothing() {
+    let io = "[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 0\n";
+    let text = axes(1).replace("position = 0\n", "position = 1\n");
+    let text = text.replacen("[[device]]", &format!("{io}[[device]]"), 1);
+    for at in [5, 10, 20, 30, 40, 50] {
+        let script = format!("[[fault]]\nkind = \"silent\"\nat = \"{at}ms\"\nfor = \"300ms\"\n");
+        let (outcome, _) = run(machine(&text), faults(&script));
+        let error = outcome.result.expect_err("frames are lost").to_string();
+        assert!(!error.contains("refused"), "{at} ms: {error}");
+        assert!(error.contains("timeout"), "{at} ms: {error}");
+    }
+}
+
 #[test]
 fn one_sub_device_too_few() {
     let (error, _) = run_badly(

@@ -163,6 +163,19 @@ fn overloaded(for_ns: u64) -> Story {
 }
 
 #[test]
+fn another_main_device_in_bring_up_is_the_cause() {
+    for at in [50, 70, 90, 110, 150, 200] {
+        let script = format!(
+            "[[fault]]\nkind = \"other-main-device\"\nat = \"{at}ms\"\ncount = 1\nstate = \"init\"\n"
+        );
+        let told = story(machine(&axes(2)), faults(&script));
+        let names = told.headline.contains("another MainDevice is on this wire");
+        assert!(names, "{at} ms: {}", told.headline);
+        assert!(told.headline.contains("`a0`"), "{at} ms: {}", told.headline);
+    }
+}
+
+#[test]
 fn first_lines() {
     let mut text = String::new();
     for (name, machine_file, script) in staged() {

@@ -11,8 +11,11 @@ use crate::mailbox::{Wire, WireError};
 
 const AL_CONTROL: u16 = 0x0120;
 pub(crate) const AL_STATUS: u16 = 0x0130;
-const ERROR: u8 = 0x10;
+pub(super) const ERROR: u8 = 0x10;
 const ID_REQUEST: u8 = 0x20;
+/// ESC configuration: device emulation.
+const ESC_CONFIGURATION: u16 = 0x0141;
+const DEVICE_EMULATION: u8 = 0x01;
 const POLL: Duration = Duration::from_micros(500);
 /// 200 ms for a device to take an acknowledgement.
 const ACKNOWLEDGE_POLLS: u32 = 400;
@@ -114,6 +117,16 @@ pub async fn read_status(wire: &impl Wire, station: u16) -> Result<Option<(u8, u
         status[0],
         u16::from_le_bytes([status[4], status[5]]),
     )))
+}
+
+/// Whether AL status is AL control, bit by bit, without anything behind the controller (device emulation, ETG.1000.4): the
+/// error bit is then the MainDevice's own acknowledgement, and no refusal.
+pub(super) async fn emulated(wire: &impl Wire, station: u16) -> bool {
+    let mut configuration = [0];
+    let read = wire
+        .read(station, ESC_CONFIGURATION, &mut configuration)
+        .await;
+    read.is_ok_and(|count| count == 1) && configuration[0] & DEVICE_EMULATION != 0
 }
 
 /// Sends all devices to `wanted` and waits until the last is there. Errors that devices still hold

@@ -1,6 +1,7 @@
 //! Who answers, and is it what the machine file says?
 
 use ecaxis_esi::model::Identity;
+use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
 use super::{BringUpError, DeviceRef, Group, Step, al, scan_error};
@@ -47,38 +48,58 @@ pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
     Err(BringUpError::NoAnswer)
 }
 
-/// ethercrab tells that a device did not reach PreOp, but neither which nor why: ask them all.
+/// ethercrab reports that a device did not reach PreOp, but neither which nor why: all devices are asked.
 pub(super) async fn explain_scan(
     wire: &Datagrams,
     machine: &Machine,
-    error: ethercrab::error::Error,
+    error: Error,
 ) -> BringUpError {
     let Ok(count) = answering(wire).await else {
         return BringUpError::NoAnswer;
     };
+    let mut behind = None;
     for position in 0..count {
         let station = FIRST_STATION.saturating_add(position);
-        if let Ok(Some((status, code))) = al::read_status(wire, station).await
-            && status & 0x10 != 0
-        {
-            let name = machine
-                .devices
-                .iter()
-                .find(|d| d.at == Locator::Position(position))
-                .map_or_else(|| format!("device {position}"), |d| d.name.clone());
+        let Ok(Some((status, code))) = al::read_status(wire, station).await else {
+            continue;
+        };
+        let device = DeviceRef {
+            name: name_at(machine, position),
+            position,
+            station,
+        };
+        let actual = al::AlState::from_status(status);
+        if status & al::ERROR != 0 && (code != 0 || !al::emulated(wire, station).await) {
             return BringUpError::State(al::StateError::Refused {
-                device: DeviceRef {
-                    name,
-                    position,
-                    station,
-                },
+                device,
                 wanted: al::AlState::PreOp,
-                actual: al::AlState::from_status(status),
+                actual,
                 code,
             });
         }
+        if actual != al::AlState::PreOp && behind.is_none() {
+            behind = Some((device, actual));
+        }
     }
-    scan_error("scanning the segment and going to PreOp", &error)
+    match (error, behind) {
+        (Error::Timeout(TimeoutError::StateTransition), Some((device, actual))) => {
+            BringUpError::State(al::StateError::Timeout {
+                device,
+                wanted: al::AlState::PreOp,
+                actual,
+                timeout: crate::link::port::STATE_TIMEOUT,
+            })
+        }
+        (error, _) => scan_error("scanning the segment and going to PreOp", &error),
+    }
+}
+
+fn name_at(machine: &Machine, position: u16) -> String {
+    let device = machine
+        .devices
+        .iter()
+        .find(|d| d.at == Locator::Position(position));
+    device.map_or_else(|| format!("device {position}"), |d| d.name.clone())
 }
 
 /// For each device of the machine file its position on the bus. Every SubDevice must be named and

@@ -29,6 +29,9 @@ const IDLE_STEP: Nanos = 20_000;
 /// How long one datagram is waited for at least; a busy host answers late, not never.
 const PDU_TIMEOUT: Duration = Duration::from_millis(30);
 
+/// How long all SubDevices may take to one state in ethercrab's part of the bring-up.
+pub(crate) const STATE_TIMEOUT: Duration = Duration::from_secs(5);
+
 /// Static drift compensation cycles; the cyclic exchange goes on compensating.
 const STATIC_SYNC_CYCLES: u32 = 1_000;
 
@@ -63,6 +66,7 @@ pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, Port) {
         pdu: Duration::from_nanos(cycle_ns.saturating_mul(5)).max(PDU_TIMEOUT),
         // Whole operations must outlast the repetition of a lost datagram.
         eeprom: Duration::from_secs(1),
+        state_transition: STATE_TIMEOUT,
         wait_loop_delay: Duration::from_micros(200),
         ..Timeouts::default()
     };

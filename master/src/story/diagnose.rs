@@ -49,6 +49,15 @@ pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
     let explains: fn(&Cause) -> bool = match class {
         Class::Bus => |_| true,
         Class::Timing => |cause| matches!(cause, Cause::Overload { .. }),
+        Class::State => |cause| {
+            matches!(
+                cause,
+                Cause::OtherMainDevice {
+                    device: Some(_),
+                    ..
+                }
+            )
+        },
         // A device may say that the bus is the trouble; it does not say so of itself.
         Class::Device => |_| false,
     };
@@ -78,6 +87,8 @@ enum Class {
     Bus,
     /// The moment at which frames come.
     Timing,
+    /// A device that does not reach a state, or whose mailbox does not answer: it may have been sent to another state.
+    State,
     /// One device, drive or axis, or the file.
     Device,
 }
@@ -111,6 +122,7 @@ impl Class {
                 | BringUpError::ReadBack { source, .. }
                 | BringUpError::ReadUnits { source, .. } => match source {
                     SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
+                    SdoError::Timeout { .. } => Self::State,
                     _ => Self::Device,
                 },
                 _ => Self::Device,
@@ -124,7 +136,7 @@ impl Class {
         match error {
             StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
             StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code),
-            StateError::Timeout { .. } => Self::Device,
+            StateError::Timeout { .. } => Self::State,
         }
     }
 
@@ -145,7 +157,7 @@ fn overload(error: &RunError, evidence: &Evidence, class: Class) -> Option<Cause
     const MISSED: u64 = 3;
     let Lateness { missed, longest } = evidence.lateness();
     let late = missed >= MISSED || longest > evidence.cycle_ns;
-    let then = (class != Class::Device).then(|| short(error));
+    let then = matches!(class, Class::Bus | Class::Timing).then(|| short(error));
     late.then_some(Cause::Overload {
         missed,
         longest_ns: longest,
@@ -158,19 +170,17 @@ fn other_main_device(evidence: &Evidence, class: Class) -> Option<Cause> {
     if frames == 0 {
         return None;
     }
-    // Whoever was sent to another state shows no error; one that fell by itself does.
-    let sent = |device: &&DeviceEvidence| {
-        device
-            .look
-            .al_status
-            .is_some_and(|status| status & AL_ERROR == 0 && status != OP)
-            && device.look.station != Some(0)
+    // Whoever was sent to another state shows no error; one that fell by itself does. Before Op, Init alone is a state in which
+    // no bring-up leaves a device.
+    let elsewhere = |status: u8| match class {
+        Class::Bus => status & AL_ERROR == 0 && status != OP,
+        Class::State => status == INIT,
+        Class::Timing | Class::Device => false,
     };
-    let sent = evidence
-        .devices
-        .iter()
-        .find(sent)
-        .filter(|_| class == Class::Bus);
+    let sent = |device: &&DeviceEvidence| {
+        device.look.al_status.is_some_and(elsewhere) && device.look.station != Some(0)
+    };
+    let sent = evidence.devices.iter().find(sent);
     Some(Cause::OtherMainDevice {
         frames,
         device: sent.map(DeviceEvidence::place),
