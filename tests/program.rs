@@ -56,6 +56,49 @@ fn program(text: &str) -> (Result<(), RunError>, Vec<String>, ecaxis::session::S
     (outcome.result, steps(&heard), summary)
 }
 
+/// An axis at constant velocity never stands: a switch of modes does not wait for that.
+#[test]
+fn a_mode_step_at_constant_velocity_does_not_wait() {
+    let endless = HEAD.replace("position = [-60.0, 60.0], ", "").replace(
+        "mode = \"csp\"\n",
+        "mode = \"csp\"\npdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x60FF\", \"0x6083\", \"0x6084\"]\n\
+         pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\", \"0x606C\"]\n",
+    );
+    let text = |modes: &str| {
+        let mut text = endless.clone() + "[[step]]\nvelocity = { x = 50.0 }\n";
+        for mode in modes.split_whitespace() {
+            text += &format!("[[step]]\nmode = {{ x = \"{mode}\" }}\n[[step]]\ndwell = \"10ms\"\n");
+        }
+        text + "[[step]]\nstop = [\"x\"]\n"
+    };
+    let cycles = |modes: &str| {
+        let (outcome, _) = run(machine(&text(modes)), virtual_time());
+        outcome
+            .result
+            .unwrap_or_else(|error| panic!("{modes}: {error}"));
+        outcome.summary.expect("a summary").counters.cycles
+    };
+    let without = cycles("");
+    for modes in ["csv", "csv csp", "pv csp", "csv pv csp"] {
+        // A second of simulated time is long for what takes a few cycles.
+        assert!(cycles(modes) < without + 1000, "{modes}");
+    }
+}
+
+/// The drive samples its position with its own loop, 2.5 times a cycle.
+#[test]
+fn a_reported_position_is_followed_up_to_the_velocity_limit() {
+    for speed in [0.3, 0.5, 0.7, 0.9] {
+        let text = format!(
+            "[[step]]\ngear = {{ y = {{ to = \"x\", actual = true }} }}\n\
+             [[step]]\nmove = {{ x = 55.0 }}\nspeed = {speed}\nramp = 0.5\n\
+             [[step]]\nmove = {{ x = -55.0 }}\nspeed = {speed}\nramp = 0.5\n"
+        );
+        let (result, ..) = program(&text);
+        result.unwrap_or_else(|error| panic!("{speed}: {error}"));
+    }
+}
+
 #[test]
 fn the_example_does_everything_in_order() {
     let (outcome, heard) = run(load("program.toml"), virtual_time());

@@ -1,7 +1,7 @@
 //! Steps that are over when something holds: states, homing, inputs.
 
-use ecaxis_axis::Command;
 use ecaxis_axis::status::HomingStatus;
+use ecaxis_axis::{AxisStatus, Command, Mode};
 
 use super::{SETTLE_TIMEOUT, STANDS, Supervisor};
 use crate::clock::{self, Nanos};
@@ -59,7 +59,11 @@ impl Supervisor {
         loop {
             let snapshot = self.tick().await?;
             let status = axes.iter().filter_map(|&axis| snapshot.axes.get(axis));
-            let settling: Vec<_> = status.filter(|s| s.enabled && !s.moving).collect();
+            // One at a constant velocity has arrived as well, and never stands. In other modes the velocity is the reported one.
+            let led = |s: &AxisStatus| matches!(s.mode, Mode::Csp | Mode::Csv | Mode::Pv);
+            let turns = |s: &AxisStatus| led(s) && s.target_velocity != 0.0;
+            let rests = |s: &&AxisStatus| s.enabled && !s.moving && !turns(s);
+            let settling: Vec<_> = status.filter(rests).collect();
             let now = clock::now();
             if settling.iter().any(|status| !status.at_rest) {
                 moved = now;
