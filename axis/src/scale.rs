@@ -217,6 +217,13 @@ impl Scale {
         UserUnits(counts.0 as f64 / self.counts_per_unit + self.offset)
     }
 
+    /// The positions that an axis without a range of its own takes: beyond 1e15 counts, f64 does not distinguish two of them.
+    #[must_use]
+    pub fn range(&self) -> [f64; 2] {
+        let far = self.units_of_counts(1e15);
+        [self.offset() - far, self.offset() + far]
+    }
+
     #[must_use]
     pub fn position_to_counts(&self, position: UserUnits) -> Counts {
         Counts(round_i64((position.0 - self.offset) * self.counts_per_unit))

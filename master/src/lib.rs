@@ -35,6 +35,7 @@ pub mod clock;
 pub mod compare;
 pub mod config;
 pub mod doctor;
+pub mod file;
 pub mod firmware;
 pub mod library;
 pub mod link;

@@ -77,9 +77,6 @@ pub enum Command {
     },
 }
 
-/// Beyond this many counts f64 no longer tells two apart.
-const FARTHEST_COUNTS: f64 = 1e15;
-
 /// Quotients of differences of f64s that were within a limit may be a little beyond it.
 const SET_POINT_ROUNDING: f64 = 1.0 + 1e-6;
 
@@ -281,10 +278,7 @@ impl Axis {
         fraction("ramp", ramp)?;
         let limits = self.config.limits;
         let scale = &self.config.scale;
-        let far = scale.units_of_counts(FARTHEST_COUNTS);
-        let [low, high] = limits
-            .position
-            .unwrap_or([scale.offset() - far, scale.offset() + far]);
+        let [low, high] = limits.position.unwrap_or(scale.range());
         if !(low..=high).contains(&position) {
             return Err(Refused::OutsideRange {
                 position,

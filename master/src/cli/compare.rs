@@ -206,6 +206,8 @@ fn rewrite(
     comparison: &Comparison,
 ) -> Result<(), Failure> {
     let file = &args.file;
+    /// No machine file is longer.
+    const MAX_BYTES: u64 = 16 << 20;
     let only_parameters = |d: &Difference| matches!(d, Difference::Parameter { .. });
     if comparison.differences.iter().all(only_parameters) {
         return Err(Failure::new(
@@ -214,7 +216,7 @@ fn rewrite(
         )
         .hint("start-up writes them at every run; `sdo` in the file says what it writes"));
     }
-    let text = std::fs::read_to_string(file)
+    let text = ecaxis::file::read_text(file, MAX_BYTES)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", file.display())))?;
     let actual = Actual {
         scan: &seen.scan,

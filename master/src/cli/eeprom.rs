@@ -459,11 +459,8 @@ fn load(path: &Path) -> Result<Vec<u8>, Failure> {
     const MAX_BYTES: u64 = 512 * 1024;
     let shown = path.display();
     let wrong = |what: String| Failure::new(hints::WRONG, what);
-    let bytes = std::fs::metadata(path).map(|meta| meta.len());
-    if bytes.is_ok_and(|bytes| bytes > MAX_BYTES) {
-        return Err(wrong(format!("{shown} is too long for an EEPROM")));
-    }
-    std::fs::read(path).map_err(|error| wrong(format!("cannot read {shown}: {error}")))
+    ecaxis::file::read(path, MAX_BYTES)
+        .map_err(|error| wrong(format!("cannot read {shown}: {error}")))
 }
 
 /// A device with a broken image has no mailbox, and some have no controller.

@@ -533,7 +533,9 @@ fn machine_files(path: &Path) -> String {
             .flatten()
             .map(|e| e.path())
             .filter(|p| p.extension().is_some_and(|e| e == "toml"))
-            .filter(|p| std::fs::read_to_string(p).is_ok_and(|text| text.contains("[bus]")))
+            .filter(|p| {
+                ecaxis::file::read_text(p, 1 << 20).is_ok_and(|text| text.contains("[bus]"))
+            })
             .map(|p| p.strip_prefix("./").unwrap_or(&p).display().to_string())
             .collect();
         names.sort();

@@ -282,9 +282,12 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     })
 }
 
+/// No fault script is longer.
+const MAX_BYTES: u64 = 16 << 20;
+
 /// A fault script from its file, for the machine's simulated bus.
 pub(super) fn faults(path: &Path, machine: &Machine) -> Result<FaultScript, Failure> {
-    let text = std::fs::read_to_string(path)
+    let text = ecaxis::file::read_text(path, MAX_BYTES)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
     let bus = session::topology(machine).map_err(|e| hints::run(&e, &machine.bus.nic))?;
     let script = FaultScript::parse(&text).and_then(|script| {

@@ -54,7 +54,7 @@ impl<'f> EsiFiles<'f> {
                 };
                 (unreadable(&path, &source), hint)
             }
-            LoadError::Esi { .. } | LoadError::TooLong { .. } => (
+            LoadError::Esi { .. } => (
                 e.to_string(),
                 "the file is damaged or is not an ESI file".to_owned(),
             ),

@@ -134,7 +134,10 @@ pub(crate) fn boolean(problems: &mut Problems<'_>, value: Value<'_>) -> Option<S
     }
 }
 
-/// A finite number, whole or not.
+/// The largest number that means something: beyond it, axes and tables refuse positions, and f64 knows no cents.
+const LARGEST: f64 = 1e15;
+
+/// A number, whole or not, of at most [`LARGEST`] either way.
 pub(crate) fn number(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<f64>> {
     let parsed = match value.get_ref() {
         DeValue::Float(f) => f.as_str().parse::<f64>().ok(),
@@ -142,8 +145,8 @@ pub(crate) fn number(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Sp
         _ => return wrong(problems, value, "a number"),
     };
     match parsed {
-        Some(n) if n.is_finite() => Some(Spanned::new(value.span(), n)),
-        _ => wrong_range(problems, value, "a finite number"),
+        Some(n) if n.abs() <= LARGEST => Some(Spanned::new(value.span(), n)),
+        _ => wrong_range(problems, value, "a number from -1e15 to 1e15"),
     }
 }
 
@@ -152,7 +155,14 @@ fn whole(i: &toml::de::DeInteger<'_>) -> Option<i64> {
 }
 
 fn wrong_range<T>(problems: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Option<T> {
+    /// Digits that are enough to find the number again.
+    const SHOWN: usize = 24;
     let text = problems.text(&value.span());
+    let cut = text.char_indices().nth(SHOWN).map(|(at, _)| at);
+    let text = match cut {
+        Some(at) => format!("{}…", &text[..at]),
+        None => text.to_owned(),
+    };
     problems.add(value.span(), format!("expected {wanted}, found {text}"));
     None
 }

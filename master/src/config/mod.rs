@@ -39,6 +39,7 @@ mod signal;
 pub mod sim;
 mod startup;
 pub(crate) mod steps;
+mod syntax;
 #[cfg(test)]
 mod tests;
 mod track;
@@ -55,6 +56,7 @@ pub use crate::rt::exchange::Mode as Exchange;
 use ecaxis_axis::StopMethod;
 use ecaxis_esi as esi;
 
+use crate::file;
 use crate::library::Match;
 use crate::link::BackEnd;
 use crate::rt::margin::Spin;
@@ -532,13 +534,16 @@ impl Signal {
     }
 }
 
+/// No machine file is longer.
+const MAX_BYTES: u64 = 16 << 20;
+
 /// Reads and checks a machine file and the ESI files it names.
 ///
 /// # Errors
 /// [`ConfigError::Io`] where the file cannot be read, [`ConfigError::NotText`] where it is no text, else
 /// everything that is wrong with it.
 pub fn load(path: &Path) -> Result<Machine, ConfigError> {
-    let bytes = std::fs::read(path).map_err(|source| ConfigError::Io {
+    let bytes = file::read(path, MAX_BYTES).map_err(|source| ConfigError::Io {
         path: path.to_owned(),
         source,
     })?;
@@ -576,7 +581,7 @@ pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
         errors.sort_by_key(|error| error.span().map_or(0, |span| span.start));
         let more = errors.split_off(errors.len().min(MOST_SYNTAX_ERRORS));
         for error in &errors {
-            problems.add(error.span().unwrap_or(0..0), error.message());
+            syntax::report(text, error, &mut problems);
         }
         if let Some(next) = more.first() {
             let message = format!("… and {} more mistakes from here on", more.len());

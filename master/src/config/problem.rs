@@ -1,6 +1,7 @@
 //! What is wrong with a machine file, and where: one [`Problem`] a mistake, with line, caret and a
 //! suggestion, all of them collected before anything is reported.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -90,7 +91,10 @@ pub(crate) type Span = Range<usize>;
 pub(crate) struct Problems<'s> {
     path: &'s Path,
     text: &'s str,
-    found: Vec<(usize, Problem)>,
+    /// Where lines begin.
+    lines: Vec<usize>,
+    /// By the byte at which they begin.
+    found: BTreeMap<usize, Vec<Problem>>,
 }
 
 impl<'s> Problems<'s> {
@@ -98,7 +102,10 @@ impl<'s> Problems<'s> {
         Self {
             path,
             text,
-            found: Vec::new(),
+            lines: std::iter::once(0)
+                .chain(text.match_indices('\n').map(|(at, _)| at + 1))
+                .collect(),
+            found: BTreeMap::new(),
         }
     }
 
@@ -113,15 +120,14 @@ impl<'s> Problems<'s> {
     fn push(&mut self, span: Span, message: String, hint: Option<String>) {
         let start = floor(self.text, span.start);
         let end = floor(self.text, span.end).max(start);
-        let before = &self.text[..start];
-        let line_start = before.rfind('\n').map_or(0, |i| i + 1);
+        let line = self.line_at(start);
+        let line_start = self.lines[line - 1];
         let rest = &self.text[line_start..];
         let source_line = rest.lines().next().unwrap_or_default();
         let column = self.text[line_start..start].chars().count() + 1;
         // A span over several lines (a table, a long list) is underlined on its first.
         let line_end = (line_start + source_line.len()).max(start);
         let width = self.text[start..end.min(line_end)].chars().count().max(1);
-        let line = before.matches('\n').count() + 1;
         let problem = Problem {
             path: self.path.to_owned(),
             line: small(line),
@@ -131,18 +137,19 @@ impl<'s> Problems<'s> {
             hint,
             source_line: source_line.to_owned(),
         };
-        if !self.found.iter().any(|(_, p)| *p == problem) {
-            self.found.push((start, problem));
+        let here = self.found.entry(start).or_default();
+        if !here.contains(&problem) {
+            here.push(problem);
         }
     }
 
     pub fn line(&self, span: &Span) -> u32 {
-        small(
-            self.text[..floor(self.text, span.start)]
-                .matches('\n')
-                .count()
-                + 1,
-        )
+        small(self.line_at(floor(self.text, span.start)))
+    }
+
+    /// The line of a byte, from 1.
+    fn line_at(&self, byte: usize) -> usize {
+        self.lines.partition_point(|start| *start <= byte)
     }
 
     /// The text a span covers.
@@ -152,7 +159,7 @@ impl<'s> Problems<'s> {
     }
 
     pub fn count(&self) -> usize {
-        self.found.len()
+        self.found.values().map(Vec::len).sum()
     }
 
     pub fn is_empty(&self) -> bool {
@@ -160,9 +167,8 @@ impl<'s> Problems<'s> {
     }
 
     /// All problems in the order of the file.
-    pub fn into_error(mut self) -> ConfigError {
-        self.found.sort_by_key(|(start, _)| *start);
-        ConfigError::Problems(self.found.into_iter().map(|(_, p)| p).collect())
+    pub fn into_error(self) -> ConfigError {
+        ConfigError::Problems(self.found.into_values().flatten().collect())
     }
 }
 
@@ -183,7 +189,14 @@ fn floor(text: &str, at: usize) -> usize {
 #[must_use]
 pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     let word = word.to_lowercase();
-    known
+    let known: Vec<&str> = known.into_iter().collect();
+    // `move_to` is farther from `move` than from `move_by`, which means something else.
+    let stem = |k: &&&str| {
+        word.strip_prefix(**k)
+            .is_some_and(|rest| rest.starts_with('_'))
+    };
+    let stem = known.iter().find(stem).copied();
+    let near = known
         .into_iter()
         .map(|k| (distance(&word, &k.to_lowercase()), k))
         .filter(|(d, k)| match k.chars().count().max(word.chars().count()) {
@@ -191,8 +204,11 @@ pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Opti
             0..=2 => *d == 0,
             longer => *d <= (longer / 3).max(1),
         })
-        .min_by_key(|(d, _)| *d)
-        .map(|(_, k)| k)
+        .min_by_key(|(d, _)| *d);
+    match (near, stem) {
+        (Some((2.., _)) | None, Some(stem)) => Some(stem),
+        (near, _) => near.map(|(_, k)| k),
+    }
 }
 
 /// ``did you mean `x`?``, or what there is to choose from.
@@ -253,6 +269,9 @@ mod tests {
         assert_eq!(nearest("cycel", ["nic", "cycle"]), Some("cycle"));
         assert_eq!(nearest("mms", ["ns", "ms", "s"]), Some("ms"));
         assert_eq!(nearest("frobnicate", ["nic", "cycle"]), None);
+        let moves = ["move", "move_by", "line", "line_by"];
+        assert_eq!(nearest("move_to", moves), Some("move"));
+        assert_eq!(nearest("move_bi", moves), Some("move_by"));
     }
 
     #[test]

@@ -395,7 +395,13 @@ fn every_way_to_be_wrong() {
         ("dwell = \"500ms\"", "table = { x = \"none.csv\" }", "none.csv", "relative to the machine file", "\"none.csv\""),
         ("dwell = \"500ms\"", "sine = 5", "expected one axis", "amplitude", "5"),
         ("dwell = \"500ms\"", "disable = []", "no axis is named", "`true` for every axis", "[]"),
-        ("dwell = \"500ms\"", "move_by = { x = 101 }", "outside the axis' limits, -100 to 100 mm", "", "101"),
+        ("dwell = \"500ms\"", "move_by = { x = 101 }", "a way of 101 mm is longer than the axis' range, -50 to 50 mm", "", "101"),
+        ("dwell = \"500ms\"", "move_to = { x = 5 }", "unknown key `move_to`", "did you mean `move`?", "move_to"),
+        ("dwell = \"500ms\"", "table = { x = \"/dev/zero\" }", "not a regular file", "relative", "\"/dev/zero\""),
+        ("{ x = 50.0 }", "{ x = 1e300 }", "a number from -1e15 to 1e15, found 1e300", "", "1e300"),
+        ("per_turn = 5.0\n", "", "`unit` is mm, but nothing says", "add `per_turn = 5.0`", "\"mm\""),
+        ("per_turn = 5.0\n", "gear = [3, 1]\n", "`unit` is mm, but nothing says", "`feed = 5.0`", "\"mm\""),
+        ("unit = \"mm\"\nper_turn = 5.0", "unit = \"custom:slots\"", "`unit` is slots, but nothing says", "leave `unit` out", "\"custom:slots\""),
         ("dwell = \"500ms\"", "repeat = 2", "nothing is repeated", "[[step.step]]", "2"),
         ("dwell = \"500ms\"", "wait = { z.In = true }", "no device is named `z`", "devices: `x`, `v`", "z"),
         ("dwell = \"500ms\"", "wait = { x.Nothing = true }", "no input \"Nothing\"", "its inputs: ", "Nothing"),
@@ -406,6 +412,85 @@ fn every_way_to_be_wrong() {
         ("dwell = \"500ms\"", "dwell = \"500 parsec\"", "unknown unit of time `parsec`", "units:", "parsec"),
     ] {
         one(from, to, message, hint, marked);
+    }
+}
+
+/// What an axis without a range would refuse once it has power.
+#[test]
+fn a_way_farther_than_an_axis_counts_is_refused() {
+    let endless = GOOD.replace("position = [-50.0, 50.0], ", "");
+    for (step, message) in [
+        (
+            "move_by = { x = 1e14 }",
+            "a way of 100000000000000 mm is longer",
+        ),
+        (
+            "line = { x = -1e14 }",
+            "-100000000000000 mm is outside the axis' limits",
+        ),
+    ] {
+        let found = problems(&endless.replace("dwell = \"500ms\"", step));
+        assert_eq!(found.len(), 1, "{found:#?}");
+        assert!(found[0].message.contains(message), "{}", found[0]);
+    }
+}
+
+#[test]
+fn what_is_no_toml_says_what_to_write() {
+    for (from, to, message, hint) in [
+        (
+            "\"D1.xml\"",
+            "\"esi\\SV1.xml\"",
+            "begins an escape",
+            "single quotes",
+        ),
+        (
+            "repeat = 2",
+            "enable = no",
+            "`no` is not a value",
+            "write `false`",
+        ),
+        (
+            "repeat = 2",
+            "enable = off # now",
+            "`off` is not a value",
+            "write `false`",
+        ),
+        (
+            "repeat = 2",
+            "enable = True",
+            "`True` is not a value",
+            "write `true`",
+        ),
+        ("\"csp\"", "csp", "`csp` is not a value", "`\"csp\"`"),
+    ] {
+        let found = broken(from, to);
+        assert!(found[0].message.contains(message), "{}", found[0]);
+        let said = found[0].hint.as_deref().unwrap_or_default();
+        assert!(said.contains(hint), "{}", found[0]);
+    }
+}
+
+/// Ten times the steps take ten times as long, not a hundred times; with and without mistakes in them.
+#[test]
+fn checking_is_linear_in_the_steps() {
+    let text = |steps: usize, wrong: &str| {
+        let step = |n: usize| format!("[[step]]\nmove = {{ x = {}.0 }}{wrong}\n", n % 7);
+        let steps: String = (0..steps).map(step).collect();
+        GOOD.replace("repeat = 2\n", "") + &steps
+    };
+    for wrong in ["", "\nspede = 5"] {
+        let shortest = |steps: usize| {
+            let text = text(steps, wrong);
+            let once = || {
+                let begun = std::time::Instant::now();
+                assert_eq!(with_esi(&text).is_ok(), wrong.is_empty());
+                begun.elapsed()
+            };
+            (0..3).map(|_| once()).min().unwrap()
+        };
+        let ratio = shortest(9_000).as_secs_f64() / shortest(900).as_secs_f64();
+        assert!(ratio < 30.0, "{ratio}");
     }
 }
 

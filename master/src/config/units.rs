@@ -6,6 +6,9 @@ use super::problem::{Problems, suggestion};
 
 const DEFAULT: &str = "turn";
 
+/// Those of a turn, which need no scale.
+const TURNS: [&str; 4] = ["turn", "turns", "rev", "revs"];
+
 const KNOWN: [&str; 23] = [
     "mm", "um", "µm", "nm", "cm", "m", "in", "inch", "ft", "deg", "°", "rad", "mrad", "arcmin",
     "arcsec", "turn", "turns", "rev", "revs", "count", "counts", "inc", "%",
@@ -42,4 +45,9 @@ pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Opt
         format!("{known}\nfor a unit of your own write `unit = \"{CUSTOM}{own}\"`"),
     );
     None
+}
+
+/// Whether a unit is a turn of the motor, or of the shaft behind its gear.
+pub(crate) fn is_turn(unit: &str) -> bool {
+    TURNS.contains(&unit)
 }

@@ -9,7 +9,8 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
-use super::Record;
+use super::{MAX_BYTES, Record};
+use crate::file;
 
 /// The number counts on whenever a file may come to another record than before.
 const HEAD: &str = concat!("ecaxis-esi-index ", env!("CARGO_PKG_VERSION"), " 2 ");
@@ -57,7 +58,7 @@ pub(super) type Index = BTreeMap<Stamp, Record>;
 
 /// Nothing, where there is no index or it is not to be believed.
 pub(super) fn read(path: &Path) -> Index {
-    let bytes = std::fs::read(path).unwrap_or_default();
+    let bytes = file::read(path, MAX_BYTES).unwrap_or_default();
     checked(&bytes).unwrap_or_default()
 }
 

@@ -17,6 +17,8 @@ use std::str::FromStr;
 use ecaxis_esi as esi;
 use serde::{Deserialize, Serialize};
 
+use crate::file;
+
 /// Files of a library; more are a mistake in the path.
 const MAX_FILES: usize = 10_000;
 /// Files that one file may refer to, directly and indirectly.
@@ -28,8 +30,6 @@ const MAX_BYTES: u64 = 256 << 20;
 pub enum LoadError {
     #[error("cannot read {}: {source}", path.display())]
     Read { path: PathBuf, source: io::Error },
-    #[error("{} has {bytes} bytes, more than any ESI file", path.display())]
-    TooLong { path: PathBuf, bytes: u64 },
     #[error("{}:{source}", path.display())]
     Esi {
         path: PathBuf,
@@ -42,14 +42,7 @@ fn read(path: &Path) -> Result<Vec<u8>, LoadError> {
         path: path.to_owned(),
         source,
     };
-    let bytes = std::fs::metadata(path).map_err(failed)?.len();
-    if bytes > MAX_BYTES {
-        return Err(LoadError::TooLong {
-            path: path.to_owned(),
-            bytes,
-        });
-    }
-    std::fs::read(path).map_err(failed)
+    file::read(path, MAX_BYTES).map_err(failed)
 }
 
 fn parse(path: &Path) -> Result<esi::EsiFile, LoadError> {
@@ -333,7 +326,6 @@ fn describe(folder: &Path, file: &Path) -> Record {
     let parsed = parse(&folder.join(file)).map_err(|error| match error {
         LoadError::Esi { source, .. } => source.to_string(),
         LoadError::Read { source, .. } => source.to_string(),
-        LoadError::TooLong { .. } => error.to_string(),
     })?;
     Ok(devices(file, &parsed))
 }

@@ -29,12 +29,15 @@ pub(crate) struct Args {
     json: bool,
 }
 
+/// No EEPROM holds more.
+const MAX_BYTES: u64 = 512 * 1024;
+
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let file = args.which.load()?;
     let name = args.image.display();
     let wrong = |message: String| Failure::new(hints::WRONG, message);
-    let bytes =
-        std::fs::read(&args.image).map_err(|e| wrong(format!("cannot read {name}: {e}")))?;
+    let bytes = ecaxis::file::read(&args.image, MAX_BYTES)
+        .map_err(|e| wrong(format!("cannot read {name}: {e}")))?;
     let (found, warnings) = sii::inspect(&bytes).map_err(|e| {
         wrong(format!("{name}: {e}")).hint("an image is the EEPROM's bytes, without any header")
     })?;

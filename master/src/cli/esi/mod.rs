@@ -192,7 +192,7 @@ fn load(path: &Path) -> Result<EsiFile, Failure> {
                 }
                 _ => "the file is damaged or is not an ESI file; its maker has the right one",
             }),
-            LoadError::Read { .. } | LoadError::TooLong { .. } => failure,
+            LoadError::Read { .. } => failure,
         }
     })
 }

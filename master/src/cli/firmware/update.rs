@@ -181,11 +181,7 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
 
 fn read(path: &Path) -> Result<Vec<u8>, Failure> {
     let failed = |why: String| target::wrong(&format!("cannot read {}: {why}", path.display()));
-    let known = std::fs::metadata(path).map_err(|e| failed(e.to_string()))?;
-    if known.len() > MOST {
-        return Err(failed(format!("it has {} bytes", known.len())));
-    }
-    let file = std::fs::read(path).map_err(|e| failed(e.to_string()))?;
+    let file = ecaxis::file::read(path, MOST).map_err(|e| failed(e.to_string()))?;
     if file.is_empty() {
         return Err(target::wrong(&format!("{} is empty", path.display()))
             .hint("name the file that the device's maker made for it"));

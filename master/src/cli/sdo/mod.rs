@@ -110,13 +110,7 @@ fn load(path: &Path) -> Result<Dump, Failure> {
     const MAX_BYTES: u64 = 64 << 20;
     let shown = path.display();
     let wrong = |what: String| Failure::new(hints::WRONG, what);
-    let bytes = std::fs::metadata(path).map(|meta| meta.len());
-    if bytes.is_ok_and(|bytes| bytes > MAX_BYTES) {
-        return Err(wrong(format!(
-            "{shown} is too long for a file of parameters"
-        )));
-    }
-    let text = std::fs::read_to_string(path);
+    let text = ecaxis::file::read_text(path, MAX_BYTES);
     let text = text.map_err(|error| wrong(format!("cannot read {shown}: {error}")))?;
     Dump::parse(&text).map_err(|error| {
         wrong(format!("{shown}: {error}"))

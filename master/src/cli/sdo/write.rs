@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use ecaxis::file;
 use ecaxis::mailbox::Wire;
 use ecaxis::parameters::{DataType, ValueError};
 use ecaxis::service::ServiceError;
@@ -41,6 +42,9 @@ pub(super) struct Args {
     common: Common,
 }
 
+/// No object is longer.
+const MAX_BYTES: u64 = 256 << 20;
+
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
     let (target, words) = args
         .common
@@ -48,7 +52,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         .take(&args.words, "an object and its value")?;
     let (object, written) = match (words, &args.from) {
         ([object], Some(path)) => {
-            let bytes = std::fs::read(path).map_err(|error| {
+            let bytes = file::read(path, MAX_BYTES).map_err(|error| {
                 Failure::new(
                     hints::WRONG,
                     format!("cannot read {}: {error}", path.display()),

@@ -8,6 +8,7 @@ use toml::Spanned;
 
 use super::super::problem::{Problems, suggestion};
 use super::super::raw::{RawAxis, RawSdo, SdoValue};
+use super::super::units::is_turn;
 use super::super::{TorqueSetup, TorqueUnit, UnitFrom};
 use super::control::one_of;
 use super::{MAXON, positive};
@@ -76,6 +77,23 @@ fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
     }
     if let Some(per_turn) = &raw.per_turn {
         return positive(per_turn, "per_turn", unit, p).copied();
+    }
+    if let (None, Some(name)) = (&raw.feed, &raw.unit)
+        && !is_turn(unit)
+    {
+        let message =
+            format!("`unit` is {unit}, but nothing says how many of them a turn of the motor is");
+        let example = if unit.starts_with("deg") || unit == "°" {
+            "360.0"
+        } else {
+            "5.0"
+        };
+        let hint = format!(
+            "add `per_turn = {example}`, gear included; or `feed = {example}`, per turn of the shaft behind `gear`; or leave \
+             `unit` out to count turns"
+        );
+        p.add_hint(name.span(), message, hint);
+        return None;
     }
     let feed = match &raw.feed {
         Some(feed) => *positive(feed, "feed", unit, p)?,

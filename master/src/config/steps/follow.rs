@@ -9,6 +9,10 @@ use super::Checker;
 use super::target::What;
 use crate::config::problem::{Problems, unreadable};
 use crate::config::{Action, AxisSetup, TableFile};
+use crate::file;
+
+/// No table is longer.
+const MAX_TABLE_BYTES: u64 = 64 << 20;
 
 impl Checker<'_> {
     /// An axis that follows positions at some time.
@@ -77,7 +81,7 @@ impl Checker<'_> {
         p: &mut Problems<'_>,
     ) -> Option<Action> {
         let path = self.folder.join(file.get_ref());
-        let text = match std::fs::read_to_string(&path) {
+        let text = match file::read_text(&path, MAX_TABLE_BYTES) {
             Ok(text) => text,
             Err(error) => {
                 let hint = "paths are relative to the machine file";

@@ -73,7 +73,9 @@ impl Checker<'_> {
             return None;
         };
         let wanted = Mode::from_code(wanted.code());
-        self.switched.push((index, wanted));
+        if !self.switched.contains(&(index, wanted)) {
+            self.switched.push((index, wanted));
+        }
         Some((index, wanted))
     }
 }

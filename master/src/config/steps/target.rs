@@ -152,16 +152,11 @@ pub(super) fn within(
 ) -> bool {
     let limits = &axis.config.limits;
     let unit = &axis.unit;
+    let range = limits.position.unwrap_or(axis.config.scale.range());
     let (low, high, unit) = match what {
-        What::Position | What::SetPoint => match limits.position {
-            Some([low, high]) => (low, high, unit.clone()),
-            None => return true,
-        },
+        What::Position | What::SetPoint => (range[0], range[1], unit.clone()),
         // Where it ends is known when it begins; it cannot be longer than the whole range.
-        What::Way => match limits.position {
-            Some([low, high]) => (low - high, high - low, unit.clone()),
-            None => return true,
-        },
+        What::Way => (range[0] - range[1], range[1] - range[0], unit.clone()),
         What::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
         What::Torque => {
             let limit = axis.torque.shown(limits.torque);
@@ -178,7 +173,13 @@ pub(super) fn within(
     if (low - rounding..=high + rounding).contains(&n) {
         return true;
     }
-    let message = format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}");
+    let message = match what {
+        What::Way => format!(
+            "a way of {n} {unit} is longer than the axis' range, {} to {} {unit}",
+            range[0], range[1]
+        ),
+        _ => format!("{n} {unit} is outside the axis' limits, {low} to {high} {unit}"),
+    };
     p.add(value.span(), message);
     false
 }
