@@ -49,7 +49,7 @@ pub struct Outputs {
     pub velocity_offset: i32,
     /// 0x60B8.
     pub touch_probe_function: u16,
-    /// For a brake that is switched from here: it is to be open.
+    /// The brake is to be open, where an output opens it.
     pub brake_open: bool,
     /// 0x60B2, added to the drive's own torque demand. 0 outside CSP.
     pub torque_offset: i16,

@@ -74,6 +74,7 @@ pub(crate) fn setup(
         torque,
         way,
         homing,
+        brake_output: None,
     })
 }
 

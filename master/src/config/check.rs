@@ -12,7 +12,7 @@ use super::steps::{self, Known};
 use crate::link::BackEnd;
 use crate::rt::margin::Spin;
 
-use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, duration};
+use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, Signal, duration, signal};
 
 /// `None` only where something has been reported.
 pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
@@ -31,7 +31,13 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         .filter_map(|d| Some(d.name.as_ref()?.get_ref().clone()))
         .collect();
     let connections = sim::Places::of(&raw.devices);
+    let mut brakes = Vec::new();
     for (raw, at) in raw.devices.into_iter().zip(places) {
+        if let (Some(name), Some(axis)) = (&raw.name, &raw.axis)
+            && let Some(output) = &axis.brake.output
+        {
+            brakes.push((name.get_ref().clone(), output.clone()));
+        }
         names.push((
             raw.name.as_ref().map(|n| n.get_ref().clone()),
             raw.axis.is_some(),
@@ -71,7 +77,14 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let cycle_s = bus.as_ref().map_or(1e-3, |b| b.cycle_ns as f64 * 1e-9);
     let repeat = raw.repeat.map_or(1, Spanned::into_inner);
     let program = steps::check(raw.steps, raw.stop, &known, folder, cycle_s, repeat, p);
-    let devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
+    let brakes = brake_outputs(&brakes, &known, &program.outputs, p);
+    let mut devices: Vec<DeviceConfig> = devices.into_iter().collect::<Option<_>>()?;
+    for (name, output) in brakes {
+        let device = devices.iter_mut().find(|d| d.name == name);
+        if let Some(axis) = device.and_then(|d| d.axis.as_mut()) {
+            axis.brake_output = Some(output);
+        }
+    }
     connections.check(&devices, p);
     Some(Machine {
         path: path.to_owned(),
@@ -85,6 +98,48 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         repeat,
         enable: raw.enable.is_none_or(Spanned::into_inner),
     })
+}
+
+/// The outputs that open brakes, by the name of the axis' device. `set` are those that steps set.
+fn brake_outputs(
+    brakes: &[(String, Spanned<String>)],
+    known: &[Known<'_>],
+    set: &[Signal],
+    p: &mut Problems<'_>,
+) -> Vec<(String, Signal)> {
+    let mut found: Vec<(String, Signal)> = Vec::new();
+    for (axis, text) in brakes {
+        let Some(output) = signal::output_of_text(text, known, p) else {
+            continue;
+        };
+        let taken = found.iter().find(|(_, other)| *other == output);
+        let problem = if output.field.bit_len != 1 {
+            let bits = output.field.bit_len;
+            Some((
+                format!("`{}` has {bits} bits", output.name),
+                "a brake is opened by an output of one bit",
+            ))
+        } else if let Some((other, _)) = taken {
+            let message = format!("`{}` opens the brake of `{other}` already", output.name);
+            Some((message, "each brake has an output of its own"))
+        } else if set.contains(&output) {
+            let message = format!(
+                "`{}` opens the brake of `{axis}`, and a step sets it",
+                output.name
+            );
+            Some((
+                message,
+                "take it out of the step: the axis opens and closes its brake",
+            ))
+        } else {
+            None
+        };
+        match problem {
+            Some((message, hint)) => p.add_hint(text.span(), message, hint),
+            None => found.push((axis.clone(), output)),
+        }
+    }
+    found
 }
 
 fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {

@@ -194,6 +194,8 @@ pub struct AxisSetup {
     /// Which way a modulo axis moves.
     pub way: ecaxis_axis::scale::Way,
     pub homing: Option<HomingSetup>,
+    /// The output that opens its brake, of one bit.
+    pub brake_output: Option<Signal>,
 }
 
 /// How an axis finds home.

@@ -3,6 +3,8 @@
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
 
+use toml::Spanned;
+
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::Known;
@@ -112,6 +114,40 @@ pub(crate) fn output(
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     said(raw, devices, Way::Out, p)
+}
+
+/// An output that no axis writes, as `io.Output 3`.
+pub(crate) fn output_of_text(
+    text: &Spanned<String>,
+    devices: &[Known<'_>],
+    p: &mut Problems<'_>,
+) -> Option<Signal> {
+    let word = text.get_ref();
+    // Names of devices may have dots.
+    let named = |d: &Known<'_>| {
+        word.strip_prefix(d.name)?
+            .strip_prefix('.')
+            .map(|_| d.name.len())
+    };
+    let split = devices
+        .iter()
+        .filter_map(named)
+        .max()
+        .or_else(|| word.find('.'));
+    let Some(split) = split else {
+        let message = format!("\"{word}\" names no output");
+        p.add_hint(
+            text.span(),
+            message,
+            "write a device and its output: \"io.Output 3\"",
+        );
+        return None;
+    };
+    let raw = RawSignal {
+        device: Spanned::new(text.span(), word[..split].to_owned()),
+        name: Spanned::new(text.span(), word[split + 1..].to_owned()),
+    };
+    output(&raw, devices, p)
 }
 
 fn said(raw: &RawSignal, devices: &[Known<'_>], way: Way, p: &mut Problems<'_>) -> Option<Signal> {
@@ -248,9 +284,20 @@ impl Machine {
     /// An output that no axis writes; named as inputs are.
     ///
     /// # Errors
-    /// Nothing has this name, several have, or an axis writes it.
+    /// Nothing has this name, several have, an axis writes it, or it opens a brake.
     pub fn output(&mut self, device: &str, name: &str) -> Result<OutputRef, NameError> {
         let signal = self.signal(device, name, Way::Out)?;
+        let brakes = |axis: &&DeviceConfig| {
+            let setup = axis.axis.as_ref();
+            setup.is_some_and(|setup| setup.brake_output.as_ref() == Some(&signal))
+        };
+        if let Some(axis) = self.devices.iter().find(brakes) {
+            return Err(NameError {
+                message: format!("`{}` opens the brake of `{}`", signal.name, axis.name),
+                hint: "the axis opens and closes its brake".to_owned(),
+                device: false,
+            });
+        }
         Ok(OutputRef(known(&mut self.outputs, signal)))
     }
 

@@ -495,6 +495,63 @@ fn checking_is_linear_in_the_steps() {
 }
 
 #[test]
+fn a_brake_has_an_output_of_its_own() {
+    let io = "[[device]]\nname = \"io.a\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
+    let axis = |name: &str, position: usize, brake: &str| {
+        format!(
+            "[[device]]\nname = \"{name}\"\nesi = \"esi/EPOS4.xml\"\nposition = {position}\nmode = \"csp\"\n[device.axis]\n\
+             encoder = 2000\nlimits = {{ velocity = 50.0, acceleration = 500.0 }}\nbrake = {{ {brake} }}\n"
+        )
+    };
+    let load = |first: &str, second: &str, steps: &str| {
+        let text = format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n{}{}{io}{steps}",
+            axis("x", 0, first),
+            axis("y", 1, second)
+        );
+        let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        parse(&folder.join("m.toml"), &text)
+    };
+    let first = "output = \"io.a.Output 1\", release = \"50ms\"";
+    let machine = load(first, "output = \"io.a.Output 2\"", "").unwrap();
+    let output = |axis: usize| {
+        let setup = machine.devices[axis].axis.as_ref();
+        setup
+            .and_then(|setup| setup.brake_output.as_ref())
+            .map(|s| (s.device, s.name.as_str()))
+    };
+    assert_eq!(
+        (output(0), output(1)),
+        (Some((2, "io.a.Output 1")), Some((2, "io.a.Output 2")))
+    );
+    let error = machine.clone().output("io.a", "Output 1").unwrap_err();
+    assert!(error.message.contains("opens the brake of `x`"), "{error}");
+    assert!(machine.clone().output("io.a", "Output 3").is_ok());
+    for (second, steps, message) in [
+        (
+            "output = \"io.a.Output 1\"",
+            "",
+            "opens the brake of `x` already",
+        ),
+        ("output = \"io.a.Output 9\"", "", "no output \"Output 9\""),
+        ("output = \"o.Output 1\"", "", "no device is named `o`"),
+        ("output = \"Output 1\"", "", "names no output"),
+        ("output = \"x.0x60B1\"", "", "written by the axis itself"),
+        (
+            "",
+            "[[step]]\nset = { \"io.a\".\"Output 1\" = true }\n",
+            "and a step sets it",
+        ),
+    ] {
+        let Err(ConfigError::Problems(found)) = load(first, second, steps) else {
+            panic!("{second} {steps}")
+        };
+        assert_eq!(found.len(), 1, "{found:#?}");
+        assert!(found[0].message.contains(message), "{}", found[0]);
+    }
+}
+
+#[test]
 fn modes_and_axes_belong_together() {
     let found = broken("mode = \"csv\"\n", "");
     assert_eq!(found.len(), 1, "{found:#?}");

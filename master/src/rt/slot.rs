@@ -3,7 +3,7 @@
 use ecaxis_axis::{Axis, AxisStatus, Command, Inputs, Outputs, Refused};
 
 use super::feed::Feed;
-use super::image::AxisBits;
+use super::image::{AxisBits, SignalBits};
 use crate::clock::Nanos;
 
 /// One axis and where its objects are.
@@ -13,6 +13,8 @@ pub struct AxisSlot {
     pub bits: AxisBits,
     /// Index of its SubDevice.
     pub device: usize,
+    /// The output that opens its brake, of whatever device.
+    pub brake: Option<SignalBits>,
     /// The axes that it stops with.
     pub group: usize,
     pub feed: Feed,
@@ -35,6 +37,7 @@ impl AxisSlot {
             axis,
             bits,
             device,
+            brake: None,
             group,
             feed: Feed::default(),
             largest_following_error: 0.0,
@@ -118,5 +121,15 @@ impl AxisSlot {
                 to.set(image, value);
             }
         }
+        if let Some(brake) = self.brake {
+            let open = outputs.brake_open && keeps_power(outputs.controlword);
+            brake.set(image, f64::from(u8::from(open)));
+        }
     }
+}
+
+/// Whether a drive in Operation enabled keeps its motor under power by this Controlword (CiA 402-2, commands of the device
+/// control): "Enable operation" and "Quick stop" do. A brake must not be open by any other.
+const fn keeps_power(controlword: u16) -> bool {
+    controlword & 0x0f == 0x0f || controlword & 0x06 == 0x02
 }

@@ -284,6 +284,11 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
         inputs: all(&machine.inputs, false)?,
         outputs: all(&machine.outputs, true)?,
     };
+    for (slot, &device) in slots.iter_mut().zip(&axes) {
+        let setup = machine.devices[device].axis.as_ref();
+        let brake = setup.and_then(|setup| setup.brake_output.clone());
+        slot.brake = all(brake.as_slice(), true)?.pop();
+    }
     Ok((image, slots, axes, signals))
 }
 

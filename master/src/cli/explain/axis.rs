@@ -257,9 +257,11 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
     };
     table.row(["fault reset", &reset, "`fault_reset`"]);
     let brake = config.brake;
-    if brake.release_s > 0.0 || brake.engage_s > 0.0 {
+    if brake.release_s > 0.0 || brake.engage_s > 0.0 || axis.brake_output.is_some() {
+        let by = axis.brake_output.as_ref();
+        let by = by.map_or(String::new(), |output| format!(", by `{}`", output.name));
         let times = format!(
-            "opens in {}, closes in {}",
+            "opens in {}, closes in {}{by}",
             time(brake.release_s),
             time(brake.engage_s)
         );

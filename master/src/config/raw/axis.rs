@@ -39,6 +39,8 @@ pub(crate) struct RawAxis {
 
 #[derive(Debug, Default)]
 pub(crate) struct RawBrake {
+    /// `io.Output 3`.
+    pub output: Option<Spanned<String>>,
     pub release: Option<Spanned<u64>>,
     pub engage: Option<Spanned<u64>>,
 }
@@ -202,6 +204,7 @@ fn guards(f: &mut Fields<'_>, axis: &mut RawAxis, p: &mut Problems<'_>) {
         && let Some(mut f) = fields::table(p, value, "`brake`")
     {
         axis.brake = RawBrake {
+            output: optional!(p, f, "output", string),
             release: optional!(p, f, "release", duration),
             engage: optional!(p, f, "engage", duration),
         };

@@ -1,0 +1,169 @@
+//! A brake that an output of another device opens: in which cycle the output changes, before and after what the drive gets.
+//! Read from the recording; virtual time.
+
+mod common;
+
+use std::path::Path;
+
+use common::{axes, machine, run, virtual_time};
+use ecaxis::session::Options;
+use ecaxis_sim::faults::FaultScript;
+use pcap_file::pcapng::{Block, PcapNgReader};
+
+/// Cycles of 1 ms.
+const RELEASE: usize = 80;
+const ENGAGE: usize = 120;
+/// Process data of an axis of our own ESI, 12 bytes out and 13 in, share their place.
+const REGION: usize = 13;
+
+/// Two axes and eight outputs; the first one opens the brake of `a0`.
+fn braked() -> String {
+    let text = axes(2).replacen(
+        "encoder = 2000\n",
+        "encoder = 2000\nbrake = { output = \"io.Output 1\", release = \"80ms\", engage = \"120ms\" }\n",
+        1,
+    );
+    let io = "\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
+    text.replacen("\n[[step]]", &format!("{io}\n[[step]]"), 1)
+}
+
+/// One cycle on the wire: what `a0` and the outputs got, and what `a0` answered.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Seen {
+    open: bool,
+    controlword: u16,
+    target: i32,
+    statusword: u16,
+    actual: i32,
+}
+
+impl Seen {
+    fn enabled(self) -> bool {
+        self.statusword & 0x6f == 0x27
+    }
+}
+
+fn cycles(recording: &Path) -> Vec<Seen> {
+    const FIRST_LRW_DATA: usize = 16 + 20 + 10;
+    let file = std::fs::File::open(recording).expect("the recording");
+    let mut reader = PcapNgReader::new(file).expect("pcapng");
+    let (mut sent, mut seen) = (None, Vec::new());
+    while let Some(block) = reader.next_block() {
+        let Block::EnhancedPacket(packet) = block.expect("a block") else {
+            continue;
+        };
+        let frame = packet.data;
+        if frame.get(11) != Some(&0x20) {
+            continue;
+        }
+        let data = frame[FIRST_LRW_DATA..].to_vec();
+        if frame[6] & 0x02 == 0 {
+            sent = Some(data);
+            continue;
+        }
+        let Some(out) = sent.take() else { continue };
+        let word = |data: &[u8]| u16::from_le_bytes([data[0], data[1]]);
+        let position = |data: &[u8]| i32::from_le_bytes([data[2], data[3], data[4], data[5]]);
+        seen.push(Seen {
+            open: out[2 * REGION] & 1 != 0,
+            controlword: word(&out),
+            target: position(&out),
+            statusword: word(&data),
+            actual: position(&data),
+        });
+    }
+    seen
+}
+
+/// Runs the machine; what was on the wire, and whether the run did all it should.
+fn recorded(name: &str, script: &str) -> (Vec<Seen>, bool) {
+    let path =
+        std::env::temp_dir().join(format!("ecaxis-brake-{}-{name}.pcapng", std::process::id()));
+    let faults = (!script.is_empty()).then(|| FaultScript::parse(script).expect("a script"));
+    let options = Options {
+        record: Some(path.clone()),
+        faults,
+        ..virtual_time()
+    };
+    let (outcome, _) = run(machine(&braked()), options);
+    let seen = cycles(&path);
+    std::fs::remove_file(&path).expect("removed");
+    (seen, outcome.result.is_ok())
+}
+
+/// Closed until the drive is enabled, and open so long before the first motion.
+#[track_caller]
+fn opens_before_motion(seen: &[Seen]) -> usize {
+    let enabled = seen.iter().position(|s| s.enabled()).expect("enabled");
+    let open = seen.iter().position(|s| s.open).expect("open");
+    assert!(open > enabled, "open in cycle {open}, enabled in {enabled}");
+    let start = seen[open].target;
+    let moves = seen.iter().position(|s| s.target.abs_diff(start) > 1);
+    let moves = moves.expect("it moves");
+    assert!(
+        moves >= open + RELEASE,
+        "open in cycle {open}, moves in {moves}"
+    );
+    open
+}
+
+/// The cycle in which the brake closes for good, the first without an order to keep power, and whether the axis stood.
+#[track_caller]
+fn closes(seen: &[Seen]) -> (usize, usize, bool) {
+    let closed = seen.iter().rposition(|s| s.open).expect("open") + 1;
+    assert!(closed < seen.len(), "the last outputs open the brake");
+    let powered = |s: &Seen| s.controlword & 0x0f == 0x0f || s.controlword & 0x06 == 0x02;
+    let off = seen.iter().rposition(powered).expect("powered") + 1;
+    let stood = seen[closed].target == seen[closed - 1].target
+        && seen[closed].actual.abs_diff(seen[closed - 1].actual) <= 1;
+    (closed, off, stood)
+}
+
+#[test]
+fn the_brake_opens_after_power_and_closes_before_it_goes() {
+    let (seen, done) = recorded("program", "");
+    assert!(done);
+    let open = opens_before_motion(&seen);
+    let (closed, off, stood) = closes(&seen);
+    assert!(stood && closed > open);
+    assert!(
+        off >= closed + ENGAGE,
+        "closed in cycle {closed}, no power in {off}"
+    );
+    // Once open, and never in between.
+    assert!(seen[open..closed].iter().all(|s| s.open));
+    let rest = &seen[closed];
+    assert!(seen[closed..off].iter().all(|s| s.target == rest.target));
+}
+
+#[test]
+fn a_fault_of_its_drive_closes_the_brake_at_once() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1s\"\ndevice = 0\ncode = 0x3220\n";
+    let (seen, done) = recorded("own", script);
+    assert!(!done);
+    opens_before_motion(&seen);
+    let (closed, ..) = closes(&seen);
+    // Fault reaction active, or Fault.
+    let fault = seen
+        .iter()
+        .position(|s| s.statusword & 0x4f == 0x08 || s.statusword & 0x4f == 0x0f);
+    let fault = fault.expect("a fault");
+    assert!(
+        closed <= fault + 2,
+        "a fault in cycle {fault}, closed in {closed}"
+    );
+}
+
+#[test]
+fn a_fault_of_another_drive_closes_the_brake_at_standstill() {
+    let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1s\"\ndevice = 1\ncode = 0x3220\n";
+    let (seen, done) = recorded("other", script);
+    assert!(!done);
+    opens_before_motion(&seen);
+    let (closed, off, stood) = closes(&seen);
+    assert!(stood, "{:?}", &seen[closed - 2..closed + 2]);
+    assert!(
+        off >= closed + ENGAGE,
+        "closed in cycle {closed}, no power in {off}"
+    );
+}
