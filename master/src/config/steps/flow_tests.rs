@@ -132,7 +132,7 @@ fn probing_needs_its_objects_in_the_process_data() {
         ("probe = { y = { to = 51.0 } }", "outside the axis' limits"),
         (
             "probe = { y = { by = -101.0 } }",
-            "outside the axis' limits",
+            "longer than the axis' range",
         ),
         (
             "probe = { y = { to = 5.0, edge = \"up\" } }",
