@@ -38,6 +38,11 @@ impl<'d> Fields<'d> {
             .map(|(_, v)| v)
     }
 
+    /// Whether it is there, understood or not.
+    pub fn has(&self, key: &str) -> bool {
+        self.table.contains_key(key)
+    }
+
     /// Like [`Fields::get`]; without it the table is incomplete. `example` is what could stand there.
     pub fn need(&mut self, key: &'static str, example: &'static str) -> Option<Value<'d>> {
         let value = self.get(key);

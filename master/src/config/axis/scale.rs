@@ -78,7 +78,7 @@ fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
     if let Some(per_turn) = &raw.per_turn {
         return positive(per_turn, "per_turn", unit, p).copied();
     }
-    if let (None, Some(name)) = (&raw.feed, &raw.unit)
+    if let (false, Some(name)) = (raw.scaled, &raw.unit)
         && !is_turn(unit)
     {
         let message =

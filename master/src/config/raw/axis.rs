@@ -14,6 +14,8 @@ pub(crate) struct RawAxis {
     pub gear: Option<Spanned<[u32; 2]>>,
     /// User units per turn of that shaft.
     pub feed: Option<Spanned<f64>>,
+    /// `per_turn` or `feed` is there, understood or not.
+    pub scaled: bool,
     pub modulo: Option<Spanned<f64>>,
     pub way: Option<Spanned<String>>,
     pub encoder: Option<Spanned<f64>>,
@@ -122,6 +124,7 @@ pub(super) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawAx
         per_turn: optional!(p, f, "per_turn", number),
         gear: f.get("gear").and_then(|v| gear(v, p)),
         feed: optional!(p, f, "feed", number),
+        scaled: f.has("per_turn") || f.has("feed"),
         modulo: optional!(p, f, "modulo", number),
         way: optional!(p, f, "way", string),
         encoder: encoder.and_then(|v| fields::number(p, v)),
