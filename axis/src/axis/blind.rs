@@ -109,7 +109,7 @@ impl Axis {
             return;
         }
         let velocity = match self.mode {
-            Mode::Csv => self.motion.velocity,
+            Mode::Csv if !self.shows_next() => self.motion.velocity,
             _ => self.drift(),
         };
         self.motion = self.tracked(velocity);

@@ -88,14 +88,16 @@ impl Axis {
         };
         let shows = self.shows(switch.to) && self.follows_now();
         if fresh {
-            switch.reached |= switch.asked > self.config.answers_late;
+            // No frame has asked for the mode before since the one that is answered.
+            let answered = switch.asked > self.config.answers_late;
+            switch.reached |= answered;
             switch.shown = if shows { switch.shown + 1 } else { 0 };
-            if shows && self.mode != switch.to {
+            if shows && answered && self.mode != switch.to {
                 self.change_law(switch.to);
             } else if self.shows(switch.from) && self.mode != switch.from {
                 self.change_law(switch.from);
             }
-            if switch.shown >= switch.certain {
+            if switch.shown >= switch.certain && self.mode == switch.to {
                 self.switch = None;
                 return;
             }
@@ -142,7 +144,7 @@ impl Axis {
     }
 
     /// The drive shows the other mode of a switch.
-    fn shows_next(&self) -> bool {
+    pub(super) fn shows_next(&self) -> bool {
         self.other_mode().is_some_and(|mode| self.shows(mode))
     }
 
