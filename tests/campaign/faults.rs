@@ -1,0 +1,142 @@
+//! Fault scripts: what goes wrong, when, and what a report may say of it (`docs/network.md`, "Fault
+//! scripts").
+
+use std::fmt::Write as _;
+
+/// What a run makes of a fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Effect {
+    /// Nothing that the file does not allow for: the run goes on.
+    None,
+    /// The run fails, if the fault strikes while its axes are powered.
+    Failure,
+    /// Either, by what else is going on.
+    Open,
+}
+
+#[derive(Debug, Clone)]
+pub struct Fault {
+    pub kind: &'static str,
+    /// Seconds since the first frame; 0: from the start.
+    pub at: f64,
+    /// `at` counts from the change of 0x6060 of this number, in a run without faults.
+    pub after_mode_change: Option<usize>,
+    pub lasts: Option<f64>,
+    /// Keys of its kind, as TOML.
+    pub keys: Vec<(&'static str, String)>,
+    pub device: Option<(u16, String)>,
+    pub effect: Effect,
+}
+
+impl Fault {
+    pub fn new(kind: &'static str, at: f64, effect: Effect) -> Self {
+        Self {
+            kind,
+            at,
+            after_mode_change: None,
+            lasts: None,
+            keys: Vec::new(),
+            device: None,
+            effect,
+        }
+    }
+
+    pub fn lasting(mut self, seconds: f64) -> Self {
+        self.lasts = Some(seconds);
+        self
+    }
+
+    pub fn key(mut self, key: &'static str, value: impl std::fmt::Display) -> Self {
+        self.keys.push((key, value.to_string()));
+        self
+    }
+
+    pub fn device(mut self, position: u16, name: &str) -> Self {
+        self.device = Some((position, name.to_string()));
+        self
+    }
+
+    fn value(&self, key: &str) -> Option<&str> {
+        self.keys
+            .iter()
+            .find(|of| of.0 == key)
+            .map(|of| of.1.as_str())
+    }
+
+    /// Whether a report can be about this fault: its cause by name, or its headline and error.
+    pub fn explains(&self, report: &Words) -> bool {
+        let text = &report.text;
+        let named = self
+            .device
+            .as_ref()
+            .is_some_and(|of| text.contains(&format!("`{}`", of.1)));
+        let cause = report.cause.as_str();
+        let silence = matches!(cause, "silence" | "nobody-answers")
+            || [
+                "answer",
+                "lost",
+                "no frame",
+                "process data",
+                "silent",
+                "too late",
+                "timed out",
+            ]
+            .iter()
+            .any(|word| text.contains(word));
+        let first = self.device.as_ref().is_some_and(|of| of.0 == 0);
+        match self.kind {
+            "frame-loss" | "silent" => silence,
+            "frame-delay" => cause == "late-frames" || silence,
+            "frame-corrupt" => cause == "damaged-frames" || silence,
+            "link-break" | "power-off" | "absent" => named || first && silence,
+            // A drive in a mode of motion reports RxPDO timeout (docs/drive-motion.md).
+            "watchdog" => {
+                let words = ["atchdog", "0x8250", "0x8180"];
+                named && (cause == "watchdog" || words.iter().any(|word| text.contains(word)))
+            }
+            "sync-late" => named && (cause == "sync" || text.contains("ync")),
+            "other-main-device" => cause == "other-main-device" || text.contains("MainDevice"),
+            "drive-fault" => {
+                let code = self.value("code").unwrap_or_default();
+                named && (text.contains(code) || text.contains("drive fault"))
+            }
+            "frame-duplicate" | "emergency" => false,
+            "refuse-state" => named && (text.contains("refus") || text.contains("AL status")),
+            _ => named,
+        }
+    }
+}
+
+/// What a report says, in its own words.
+#[derive(Debug, Clone, Default)]
+pub struct Words {
+    pub text: String,
+    /// The kind of cause of its story, or nothing.
+    pub cause: String,
+}
+
+/// Times of a script, in ms.
+fn ms(seconds: f64) -> String {
+    format!("{:.3}ms", seconds * 1e3)
+}
+
+/// The script as the user writes it.
+pub fn script(seed: u64, faults: &[Fault]) -> String {
+    let mut text = format!("seed = {}\n", seed % 1_000_000);
+    for fault in faults {
+        let _ = write!(text, "\n[[fault]]\nkind = \"{}\"\n", fault.kind);
+        if fault.at > 0.0 {
+            let _ = writeln!(text, "at = \"{}\"", ms(fault.at));
+        }
+        if let Some(lasts) = fault.lasts {
+            let _ = writeln!(text, "for = \"{}\"", ms(lasts));
+        }
+        if let Some((position, _)) = &fault.device {
+            let _ = writeln!(text, "device = {position}");
+        }
+        for (key, value) in &fault.keys {
+            let _ = writeln!(text, "{key} = {value}");
+        }
+    }
+    text
+}

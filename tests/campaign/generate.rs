@@ -1,0 +1,412 @@
+//! Machines, programs and fault scripts from a seed, as text that a user could have written
+//! (`docs/machine-file.md`, `docs/network.md`).
+
+use std::fmt::Write as _;
+
+use super::faults::{Effect, Fault, script};
+use super::random::Random;
+use super::scenes;
+use super::view::{Axis, CSP, CST, CSV, Machine, PP, PV};
+
+/// A run to be made, and what the judge knows of it.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    pub seed: u64,
+    pub scene: &'static str,
+    pub machine: Machine,
+    pub faults: Vec<Fault>,
+    /// `--for`, in seconds.
+    pub ends_at: f64,
+    /// The machine file itself is a reason to fail.
+    pub may_fail: bool,
+    pub machine_file: String,
+    pub fault_script: String,
+}
+
+/// A drive of `configs/esi`: its default process data, and what its velocities are in.
+#[derive(Debug, Clone, Copy)]
+struct DriveKind {
+    esi: &'static str,
+    /// Process data of one's own choice can be mapped.
+    free: bool,
+    /// 0x60A9: rpm, or counts/s.
+    rpm: bool,
+    encoder: u32,
+}
+
+const EPOS4: DriveKind = DriveKind {
+    esi: "esi/EPOS4.xml",
+    free: true,
+    rpm: true,
+    encoder: 2000,
+};
+const IDX: DriveKind = DriveKind {
+    esi: "esi/IDX.xml",
+    free: true,
+    rpm: true,
+    encoder: 4096,
+};
+const SV1: DriveKind = DriveKind {
+    esi: "esi/SV1.xml",
+    free: false,
+    rpm: false,
+    encoder: 131_072,
+};
+
+/// Outputs and inputs that allow every change of mode.
+const EVERY_MODE: [u16; 8] = [
+    0x6040, 0x6060, 0x607a, 0x60ff, 0x6071, 0x6081, 0x6083, 0x6084,
+];
+const INPUTS: [u16; 5] = [0x6041, 0x6061, 0x6064, 0x606c, 0x6077];
+/// Of the SV1, fixed in its ESI.
+const SV1_OUTPUTS: [u16; 4] = [0x6040, 0x607a, 0x60ff, 0x6071];
+const SV1_INPUTS: [u16; 5] = [0x6041, 0x6064, 0x606c, 0x6077, 0x6061];
+
+/// A machine that grows, its program and its faults.
+pub struct Draft {
+    pub random: Random,
+    pub machine: Machine,
+    pub faults: Vec<Fault>,
+    pub ends_at: f64,
+    pub may_fail: bool,
+    /// Names of I/O devices, by position.
+    pub passive: Vec<(u16, String)>,
+    devices: String,
+    pub stop: String,
+    /// `on_emergency` of the axes to come.
+    pub on_emergency: &'static str,
+    pub steps: String,
+    next_position: u16,
+}
+
+/// What a scene wants of an axis; the rest is at random.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Wanted {
+    pub mode: Option<i8>,
+    /// Every mode is mapped.
+    pub every_mode: bool,
+    /// Seconds from full speed to rest.
+    pub ramp_s: Option<f64>,
+    /// Acceleration / jerk in seconds; `Some(0)`: no limit of jerk.
+    pub jerk_s: Option<f64>,
+    /// Quick stop deceleration 0x6085 in rpm/s.
+    pub quick_stop: Option<u32>,
+    /// A start-up SDO of the user's own.
+    pub sdo: Option<(u16, i32)>,
+    /// Without a range.
+    pub endless: bool,
+}
+
+impl Draft {
+    fn new(seed: u64) -> Self {
+        let mut random = Random::new(seed);
+        let cycle_us = random.pick(&[500, 1000, 1000, 1000, 2000, 2000, 2000, 4000]);
+        Self {
+            machine: Machine {
+                cycle_ns: cycle_us * 1000,
+                lost_frames: random.pick(&[2, 3, 3, 3, 5, 8]),
+                pipelined: random.chance(0.2),
+                axes: Vec::new(),
+            },
+            random,
+            faults: Vec::new(),
+            ends_at: 2.0,
+            may_fail: false,
+            passive: Vec::new(),
+            devices: String::new(),
+            stop: String::new(),
+            on_emergency: "quick-stop",
+            steps: String::new(),
+            next_position: 0,
+        }
+    }
+
+    pub fn seconds(&self) -> f64 {
+        self.machine.seconds()
+    }
+
+    pub fn drive(&mut self, wanted: Wanted) -> usize {
+        let random = &mut self.random;
+        // The SV1 has a range of its own, and no objects for what a scene may want.
+        let free = wanted.every_mode || wanted.quick_stop.is_some() || wanted.sdo.is_some();
+        let kind = if free || wanted.endless {
+            random.pick(&[EPOS4, EPOS4, IDX])
+        } else {
+            random.pick(&[EPOS4, EPOS4, IDX, SV1])
+        };
+        let mode = wanted
+            .mode
+            .unwrap_or_else(|| random.pick(&[CSP, CSP, CSP, CSV]));
+        let every_mode = kind.free && (wanted.every_mode || random.chance(0.5));
+        let per_turn = random.pick(&[1.0, 1.0, 5.0, 360.0]);
+        let velocity = random.pick(&[10.0, 20.0, 30.0, 45.0]) * per_turn;
+        let ramp_s = wanted
+            .ramp_s
+            .unwrap_or_else(|| random.pick(&[0.1, 0.1, 0.2, 0.5]));
+        let acceleration = velocity / ramp_s;
+        let jerk_s = wanted
+            .jerk_s
+            .unwrap_or_else(|| random.pick(&[0.0, 0.0, 0.05, 0.2]));
+        let endless = wanted.endless || kind.free && random.chance(0.6);
+        let reach = velocity * 1.5;
+        let loops = every_mode;
+        let name = format!("a{}", self.machine.axes.len());
+        let position = self.next_position;
+        self.next_position += 1;
+
+        let text = &mut self.devices;
+        let mode_name = mode_name(mode);
+        let _ = write!(
+            text,
+            "\n[[device]]\nname = \"{name}\"\nesi = \"{}\"\nposition = {position}\n\
+             mode = \"{mode_name}\"\n",
+            kind.esi
+        );
+        let mut sdo = vec![format!(
+            "{{ index = 0x6065, value = {} }}",
+            kind.encoder * 20
+        )];
+        if let Some(quick_stop) = wanted.quick_stop {
+            sdo.push(format!("{{ index = 0x6085, value = {quick_stop} }}"));
+        }
+        if let Some((index, value)) = wanted.sdo {
+            sdo.push(format!("{{ index = {index:#06x}, value = {value} }}"));
+        }
+        let _ = writeln!(text, "sdo = [{}]", sdo.join(", "));
+        if every_mode {
+            let list = |objects: &[u16]| {
+                let each: Vec<String> = objects
+                    .iter()
+                    .map(|index| format!("\"{index:#06X}\""))
+                    .collect();
+                each.join(", ").replace("0X", "0x")
+            };
+            let _ = writeln!(text, "pdo.rx = [{}]", list(&EVERY_MODE));
+            let _ = writeln!(text, "pdo.tx = [{}]", list(&INPUTS));
+        }
+        let _ = write!(
+            text,
+            "[device.axis]\nunit = \"{}\"\nencoder = {}\nper_turn = {per_turn:?}\n",
+            if per_turn == 1.0 {
+                "turn"
+            } else if per_turn == 360.0 {
+                "deg"
+            } else {
+                "mm"
+            },
+            kind.encoder
+        );
+        let mut limits = vec![
+            format!("velocity = {velocity:?}"),
+            format!("acceleration = {acceleration:?}"),
+            "torque = 100.0".to_string(),
+        ];
+        if jerk_s > 0.0 {
+            limits.push(format!("jerk = {:?}", acceleration / jerk_s));
+        }
+        if !endless {
+            limits.push(format!("position = [{:?}, {reach:?}]", -reach));
+        }
+        let _ = writeln!(text, "limits = {{ {} }}", limits.join(", "));
+        if self.on_emergency != "quick-stop" {
+            let _ = writeln!(text, "on_emergency = \"{}\"", self.on_emergency);
+        }
+        if loops {
+            let dead_time = self.machine.cycle_ns * 3 / 1000 + 300;
+            let _ = write!(
+                text,
+                "dead_time = \"{dead_time}us\"\ncsv = {{ kv = 20.0, feed_forward = 1.0 }}\n"
+            );
+            if per_turn == 1.0 {
+                text.push_str("cst = { kp = 400.0, tn = \"40ms\", tv = \"12ms\" }\n");
+            }
+        }
+        let counts = f64::from(kind.encoder) / per_turn;
+        let rpm = 60.0 / per_turn;
+        let (outputs, inputs): (&[u16], &[u16]) = match (every_mode, kind.free) {
+            (true, _) => (&EVERY_MODE, &INPUTS),
+            (false, false) => (&SV1_OUTPUTS, &SV1_INPUTS),
+            (false, true) => (default_outputs(mode), &SV1_INPUTS),
+        };
+        self.machine.axes.push(Axis {
+            name,
+            position,
+            mode,
+            outputs: outputs.to_vec(),
+            inputs: inputs.to_vec(),
+            counts,
+            velocity_scale: if kind.rpm { rpm } else { counts },
+            acceleration_scale: if kind.rpm { rpm } else { 0.0 },
+            velocity,
+            acceleration,
+            jerk: if jerk_s > 0.0 {
+                acceleration / jerk_s
+            } else {
+                acceleration / 0.05
+            },
+            torque: 100.0,
+            range: (!endless).then_some((-reach * counts, reach * counts)),
+            loops,
+            may_lose_power: false,
+            disturbed: false,
+            alone: false,
+        });
+        self.machine.axes.len() - 1
+    }
+
+    pub fn io(&mut self) -> u16 {
+        let position = self.next_position;
+        self.next_position += 1;
+        let name = format!("io{position}");
+        let _ = write!(
+            self.devices,
+            "\n[[device]]\nname = \"{name}\"\nesi = \"esi/IO8.xml\"\nposition = {position}\n"
+        );
+        self.passive.push((position, name));
+        position
+    }
+
+    pub fn devices(&self) -> usize {
+        usize::from(self.next_position)
+    }
+
+    /// Name of the device at a position.
+    pub fn name(&self, position: u16) -> String {
+        let axis = self
+            .machine
+            .axes
+            .iter()
+            .find(|axis| axis.position == position);
+        let io = self.passive.iter().find(|of| of.0 == position);
+        axis.map(|axis| axis.name.clone())
+            .or(io.map(|of| of.1.clone()))
+            .unwrap_or_default()
+    }
+
+    pub fn step(&mut self, lines: &str) {
+        let _ = write!(self.steps, "\n[[step]]\n{lines}\n");
+    }
+
+    /// Turns every axis, and goes on until the run ends.
+    pub fn turn(&mut self, share: f64) {
+        self.run_up(share);
+        self.step("dwell = \"60s\"");
+    }
+
+    /// Steps that turn every axis at this share of its velocity limit, as far as its range goes.
+    pub fn run_up(&mut self, share: f64) {
+        let mut moves = Vec::new();
+        for axis in self.machine.axes.clone() {
+            let sign = if self.random.chance(0.5) { 1.0 } else { -1.0 };
+            if axis.range.is_none() {
+                let velocity = axis.velocity * share * sign;
+                self.step(&format!("velocity = {{ {} = {velocity:?} }}", axis.name));
+            } else if axis.mode == CSP || axis.loops {
+                moves.push(format!("{} = {:?}", axis.name, axis.velocity * 1.4 * sign));
+            }
+        }
+        if !moves.is_empty() {
+            self.step(&format!(
+                "move = {{ {} }}\nspeed = {share:?}",
+                moves.join(", ")
+            ));
+        }
+    }
+
+    pub fn fault(&mut self, fault: Fault) {
+        if let Some((position, _)) = &fault.device
+            && matches!(fault.kind, "load" | "blocked" | "stuck")
+            && let Some(axis) = self
+                .machine
+                .axes
+                .iter_mut()
+                .find(|of| of.position == *position)
+        {
+            axis.disturbed = true;
+        }
+        self.faults.push(fault);
+    }
+
+    /// A fault of one device, by its position.
+    pub fn strike(&mut self, kind: &'static str, at: f64, position: u16, effect: Effect) -> Fault {
+        Fault::new(kind, at, effect).device(position, &self.name(position))
+    }
+
+    fn finish(self, seed: u64, scene: &'static str) -> Plan {
+        let machine = &self.machine;
+        let mut file = format!(
+            "[bus]\nnic = \"sim\"\ncycle = \"{}us\"\nlost_frames = {}\n",
+            machine.cycle_ns / 1000,
+            machine.lost_frames
+        );
+        if machine.pipelined {
+            file.push_str("exchange = \"pipelined\"\n");
+        }
+        file.push_str(&self.devices);
+        if !self.stop.is_empty() {
+            let _ = write!(file, "\n[stop]\n{}", self.stop);
+        }
+        file.push_str(&self.steps);
+        Plan {
+            seed,
+            scene,
+            fault_script: script(seed, &self.faults),
+            machine_file: file,
+            machine: self.machine,
+            faults: self.faults,
+            ends_at: self.ends_at,
+            may_fail: self.may_fail,
+        }
+    }
+}
+
+impl Plan {
+    /// The plan with its faults placed at these changes of mode, in seconds; those of changes that
+    /// never come are left out.
+    pub fn placed(&self, changes: &[f64]) -> Self {
+        let mut plan = self.clone();
+        plan.faults
+            .retain_mut(|fault| match fault.after_mode_change {
+                Some(number) => {
+                    let change = changes.get(number).map(|change| change + fault.at);
+                    fault.at = change.unwrap_or_default();
+                    change.is_some()
+                }
+                None => true,
+            });
+        plan.fault_script = script(plan.seed, &plan.faults);
+        plan
+    }
+}
+
+pub fn mode_name(mode: i8) -> &'static str {
+    match mode {
+        CSV => "csv",
+        CST => "cst",
+        PP => "pp",
+        PV => "pv",
+        _ => "csp",
+    }
+}
+
+/// Of EPOS4 and IDX, in their ESI's modules and PDOs for each mode.
+fn default_outputs(mode: i8) -> &'static [u16] {
+    match mode {
+        CSV => &[0x6040, 0x60ff, 0x60b2],
+        CST => &[0x6040, 0x6071, 0x60b2],
+        _ => &[0x6040, 0x607a, 0x60b1, 0x60b2],
+    }
+}
+
+/// The plan that follows from a seed; every tenth or so is of each scene.
+pub fn plan(seed: u64, only: Option<&str>) -> Plan {
+    let mut draft = Draft::new(seed);
+    let scenes: Vec<_> = scenes::SCENES
+        .iter()
+        .filter(|scene| only.is_none_or(|name| name == scene.0))
+        .collect();
+    assert!(!scenes.is_empty(), "no scene {only:?}");
+    let (name, draw) = *draft.random.pick(&scenes);
+    draw(&mut draft);
+    draft.finish(seed, name)
+}

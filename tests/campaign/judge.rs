@@ -1,0 +1,100 @@
+//! Judges a run: what reached the drives, and whether exit code and report say so.
+
+use super::rules;
+use super::stops;
+use super::view::{Machine, Moment, moments};
+use super::wire::{Inputs, Wire};
+
+/// One rule broken.
+#[derive(Debug, Clone)]
+pub struct Finding {
+    pub rule: &'static str,
+    pub axis: String,
+    /// Where it was broken first.
+    pub cycle: usize,
+    /// Seconds since the first packet.
+    pub at: f64,
+    pub detail: String,
+    /// How often it was broken.
+    pub count: usize,
+}
+
+/// What the program said at the end, as its users read it.
+#[derive(Debug, Clone, Default)]
+pub struct Report {
+    pub exit: i32,
+    /// The error and the failures among the events.
+    pub text: String,
+    /// Seconds of the cycle, as the report counts them, of the stop that it reports.
+    pub stop_s: Option<f64>,
+    /// That stop was a failure.
+    pub failed: bool,
+}
+
+impl Report {
+    pub fn names(&self, axis: &str) -> bool {
+        self.exit != 0 && self.text.contains(&format!("`{axis}`"))
+    }
+}
+
+/// Where the findings of one axis are collected.
+pub struct Findings<'a> {
+    pub list: Vec<Finding>,
+    axis: &'a str,
+    answers: Vec<Option<Inputs>>,
+}
+
+impl Findings<'_> {
+    pub fn add(&mut self, rule: &'static str, moment: &Moment, detail: String) {
+        if let Some(first) = self.list.iter_mut().find(|finding| finding.rule == rule) {
+            first.count += 1;
+            return;
+        }
+        let at = moment.at as f64 * 1e-9;
+        let axis = self.axis.to_string();
+        self.list.push(Finding {
+            rule,
+            axis,
+            cycle: moment.cycle,
+            at,
+            detail,
+            count: 1,
+        });
+    }
+
+    /// What the drive answered to these outputs, whenever that came back.
+    pub fn answer(&self, moment: &Moment) -> Option<Inputs> {
+        self.answers[moment.cycle]
+    }
+}
+
+/// Returns every finding, in the order of the rules.
+pub fn judge(machine: &Machine, wire: &Wire, report: &Report) -> Vec<Finding> {
+    let views: Vec<Vec<Moment>> = (0..machine.axes.len())
+        .map(|drive| moments(machine, wire, drive))
+        .collect();
+    let stop = stops::machine_stop(machine, wire, report, &views);
+    let mut list = Vec::new();
+    if let Some(at) = wire.malformed.first() {
+        list.push(Finding {
+            rule: "malformed-frame",
+            axis: "-".to_string(),
+            cycle: 0,
+            at: *at as f64 * 1e-9,
+            detail: "not EtherCAT as ETG.1000.4 has it".to_string(),
+            count: wire.malformed.len(),
+        });
+    }
+    for (drive, (axis, view)) in machine.axes.iter().zip(&views).enumerate() {
+        let heard = |cycle: &super::wire::Cycle| Some(cycle.drives[drive]?.heard?.1);
+        let mut findings = Findings {
+            list: Vec::new(),
+            axis: &axis.name,
+            answers: wire.cycles.iter().map(heard).collect(),
+        };
+        rules::check(machine, axis, view, &mut findings);
+        stops::check(machine, axis, view, wire, stop, report, &mut findings);
+        list.append(&mut findings.list);
+    }
+    list
+}
