@@ -197,6 +197,8 @@ pub(super) struct Motion {
     referenced: bool,
     /// A set-point was cut by a position or speed limit.
     cut: bool,
+    /// The target position is outside the software limits.
+    ignored: bool,
     torque: f64,
 }
 
@@ -235,6 +237,7 @@ impl Motion {
             homing: Homing::default(),
             referenced: false,
             cut: false,
+            ignored: false,
             torque: 0.0,
         }
     }
@@ -270,6 +273,7 @@ impl Motion {
                     None => self.target,
                 };
                 self.cut = within != self.target;
+                self.ignored = self.cut;
                 self.position.take(float(within), p.period_ns);
             }
             Mode::CyclicVelocity => {
@@ -277,10 +281,11 @@ impl Motion {
                     float(set_points.velocity + set_points.velocity_offset) * p.velocity_unit;
                 let within = wanted.clamp(-p.max_speed, p.max_speed);
                 self.cut = within != wanted;
+                self.ignored = false;
                 self.velocity.take(within, p.period_ns);
             }
             Mode::CyclicTorque => {
-                self.cut = false;
+                (self.cut, self.ignored) = (false, false);
                 self.torque = float(set_points.torque + set_points.torque_offset) * p.torque_unit;
             }
             Mode::ProfilePosition | Mode::ProfileVelocity | Mode::Homing => {}
@@ -397,7 +402,8 @@ impl Motion {
         set(self.referenced, bit::REFERENCED);
         match mode {
             Mode::CyclicPosition | Mode::CyclicVelocity | Mode::CyclicTorque => {
-                set(follows && !self.cut && !self.halted, bit::MODE_12);
+                // A target that is limited in speed is followed; one outside the software limits is not.
+                set(follows && !self.ignored && !self.halted, bit::MODE_12);
             }
             Mode::ProfilePosition => {
                 set(self.point_to_point.acknowledged() && follows, bit::MODE_12);
