@@ -4,6 +4,9 @@
 
 mod common;
 
+#[path = "stories/causes.rs"]
+mod causes;
+
 use std::fmt::Write;
 use std::path::Path;
 use std::process::Command;

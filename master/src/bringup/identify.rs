@@ -12,7 +12,7 @@ use crate::wire::Datagrams;
 /// Broadcasts tried before the segment is called silent.
 const TRIES: u32 = 5;
 /// Station addresses as ethercrab gives them out.
-const FIRST_STATION: u16 = 0x1000;
+pub(crate) const FIRST_STATION: u16 = 0x1000;
 
 /// A SubDevice that was scanned.
 struct Present {
@@ -122,7 +122,7 @@ pub(super) async fn assign(
     }
 
     let mut order = Vec::with_capacity(machine.devices.len());
-    let mut missing = Vec::new();
+    let mut missing = false;
     for config in &machine.devices {
         let position = match config.at {
             Locator::Position(position) => {
@@ -134,9 +134,7 @@ pub(super) async fn assign(
         match position {
             Some(position) => order.push(u16::try_from(position).unwrap_or(u16::MAX)),
             None => match config.at {
-                Locator::Position(position) => {
-                    missing.push(format!("`{}` (position {position})", config.name));
-                }
+                Locator::Position(_) => missing = true,
                 Locator::Alias(alias) => {
                     return Err(not_located(&config.name, format!("alias {alias}")));
                 }
@@ -149,19 +147,11 @@ pub(super) async fn assign(
             },
         }
     }
-    if !missing.is_empty() {
-        let list: Vec<_> = found
-            .iter()
-            .enumerate()
-            .map(|(position, found)| {
-                format!("position {position}: {}", known(machine, found.identity))
-            })
-            .collect();
+    if missing {
         return Err(BringUpError::Missing {
             expected: machine.devices.len(),
             found: found.len(),
-            missing: missing.join(", "),
-            list: list.join("; "),
+            missing: missing_devices(machine, &found),
         });
     }
 
@@ -216,6 +206,48 @@ pub(super) async fn assign(
     Ok(order)
 }
 
+/// Devices at positions that are not on the bus. One that is missing in the middle of a tree moves those behind it: where the others
+/// are of the models that the file names, in its order, those are missing that lack between them, and the last ones otherwise.
+fn missing_devices(machine: &Machine, found: &[Present]) -> Vec<String> {
+    let mut expected: Vec<_> = machine
+        .devices
+        .iter()
+        .filter_map(|config| match config.at {
+            Locator::Position(position) => Some((position, config)),
+            Locator::Alias(_) | Locator::Id(_) => None,
+        })
+        .collect();
+    expected.sort_by_key(|(position, _)| *position);
+    let models = |identity: &Identity| (identity.vendor, identity.product);
+    let wanted = expected
+        .iter()
+        .map(|(_, config)| models(&config.selection.identity));
+    let there: Vec<_> = found
+        .iter()
+        .map(|present| models(&present.identity))
+        .collect();
+    let missing = lacking(&wanted.collect::<Vec<_>>(), &there);
+    let missing = missing.into_iter().filter_map(|index| expected.get(index));
+    missing
+        .map(|(position, config)| format!("`{}` (position {position})", config.name))
+        .collect()
+}
+
+/// Of `wanted`, those that `there` lacks.
+fn lacking<T: PartialEq>(wanted: &[T], there: &[T]) -> Vec<usize> {
+    let mut rest = there.iter().peekable();
+    let mut lacking = Vec::new();
+    for (index, one) in wanted.iter().enumerate() {
+        if rest.next_if_eq(&one).is_none() {
+            lacking.push(index);
+        }
+    }
+    match rest.next() {
+        None => lacking,
+        Some(_) => (there.len()..wanted.len()).collect(),
+    }
+}
+
 fn not_located(name: &str, locator: String) -> BringUpError {
     BringUpError::NotLocated {
         name: name.to_owned(),
@@ -251,4 +283,26 @@ fn known(machine: &Machine, identity: Identity) -> String {
             || identity.to_string(),
             |d| format!("{} ({identity})", d.name),
         )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_is_missing() {
+        for (there, expected) in [
+            ("caab", &[][..]),
+            ("cab", &[2]),
+            ("ca", &[2, 3]),
+            ("cb", &[1, 2]),
+            ("aab", &[0]),
+            ("", &[0, 1, 2, 3]),
+            // Another one among them: the last ones.
+            ("cx", &[2, 3]),
+        ] {
+            let there = there.as_bytes();
+            assert_eq!(lacking(b"caab", there), expected, "{there:?}");
+        }
+    }
 }

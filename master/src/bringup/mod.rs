@@ -30,6 +30,7 @@ pub(crate) mod clocks;
 mod device;
 mod held;
 mod identify;
+pub(crate) use identify::FIRST_STATION;
 mod mailbox;
 mod mapping;
 pub(crate) mod units;
@@ -167,6 +168,17 @@ impl fmt::Display for Step {
     }
 }
 
+/// The first of many.
+fn few(names: &[String]) -> String {
+    const FEW: usize = 3;
+    let first = names.iter().take(FEW).map(String::as_str);
+    let text = first.collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(FEW) {
+        0 => text,
+        more => format!("{text} and {more} more"),
+    }
+}
+
 /// Why the bus did not come up.
 #[derive(Debug, thiserror::Error)]
 pub enum BringUpError {
@@ -175,14 +187,14 @@ pub enum BringUpError {
     #[error("{step}: {message}")]
     Scan { step: &'static str, message: String },
     #[error(
-        "{} {}, the machine file names {expected}: {missing} missing; found: {list}",
-        counted(*found, "SubDevice"), if *found == 1 { "answers" } else { "answer" }
+        "scanning: {} of {expected} {}; missing: {}",
+        found, if *found == 1 { "SubDevice answers" } else { "SubDevices answer" }, few(missing)
     )]
     Missing {
         expected: usize,
         found: usize,
-        missing: String,
-        list: String,
+        /// Names with positions, in the order of the segment.
+        missing: Vec<String>,
     },
     #[error("the SubDevice at position {position} ({identity}) is not in the machine file")]
     Unexpected { position: u16, identity: String },

@@ -151,7 +151,10 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::Refused { by_axis, device, .. } => refused(by_axis.as_deref(), &device.name),
         RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
         RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
-        RunError::FollowLost { .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
+        RunError::FollowLost { cause: Some(cause), .. } => {
+            return Failure { hints: run(cause, nic).hints, ..failure };
+        }
+        RunError::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
         RunError::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
         RunError::GroupStopped { cause, .. } => {
             let cause = run(cause, nic).hints.into_iter();
@@ -282,7 +285,7 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             return failure;
         }
         BringUpError::Missing { .. } => {
-            "check power and the cable behind the last one found, or take the missing [[device]] out of the file".to_owned()
+            "check the power of the first one missing and the cable to it, or take its [[device]] out of the file; `ecaxis compare` shows all that differs".to_owned()
         }
         BringUpError::Unexpected { position, .. } => {
             format!("add a [[device]] with `position = {position}`, or disconnect it")

@@ -55,8 +55,7 @@ fn every_failure_says_what_next() {
     let missing = BringUpError::Missing {
         expected: 2,
         found: 1,
-        missing: "`y`".into(),
-        list: "EPOS4".into(),
+        missing: vec!["`y`".into()],
     };
     let units = |problem| {
         bring_up(BringUpError::Units {

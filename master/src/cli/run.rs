@@ -128,10 +128,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         }
         failure
     });
+    failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
     if let (Some(story), Some(failure)) = (&story, &mut failure) {
         tell_story(args, story, failure, &nic);
     }
-    let failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
     let text = if args.json {
         let report = json!({
             "ok": failure.is_none(),

@@ -70,6 +70,10 @@ impl Link for Apart {
         self.link.next_arrival()
     }
 
+    fn main_devices(&self) -> u64 {
+        self.link.main_devices()
+    }
+
     fn stats(&mut self) -> LinkStats {
         let mut stats = self.link.stats();
         stats.foreign += self.others;

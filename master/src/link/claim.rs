@@ -101,6 +101,10 @@ impl Link for Claimed {
         self.link.next_arrival()
     }
 
+    fn main_devices(&self) -> u64 {
+        self.link.main_devices()
+    }
+
     fn stats(&mut self) -> LinkStats {
         self.link.stats()
     }

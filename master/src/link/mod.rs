@@ -53,6 +53,11 @@ pub trait Link: fmt::Debug + Send {
         None
     }
 
+    /// EtherCAT frames of other MainDevices that came so far. RT.
+    fn main_devices(&self) -> u64 {
+        0
+    }
+
     /// What has been seen beside the frames that were handed on. Not for the cycle: may ask the kernel.
     fn stats(&mut self) -> LinkStats {
         LinkStats::default()

@@ -61,6 +61,10 @@ impl Link for PacketLink {
         Ok(None)
     }
 
+    fn main_devices(&self) -> u64 {
+        self.stats.main_devices
+    }
+
     fn stats(&mut self) -> LinkStats {
         interface::add_drops(&self.socket, &mut self.stats);
         self.stats

@@ -46,6 +46,10 @@ impl Link for Recorded {
         self.inner.next_arrival()
     }
 
+    fn main_devices(&self) -> u64 {
+        self.inner.main_devices()
+    }
+
     fn stats(&mut self) -> LinkStats {
         self.inner.stats()
     }

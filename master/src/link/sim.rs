@@ -118,6 +118,10 @@ impl Link for SimLink {
         Ok(Some(slot.len))
     }
 
+    fn main_devices(&self) -> u64 {
+        self.stats.main_devices
+    }
+
     fn stats(&mut self) -> LinkStats {
         self.stats
     }

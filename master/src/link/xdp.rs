@@ -87,6 +87,10 @@ impl Link for XdpLink {
         Ok(None)
     }
 
+    fn main_devices(&self) -> u64 {
+        self.stats.main_devices
+    }
+
     fn stats(&mut self) -> LinkStats {
         self.stats.dropped = self.socket.dropped().unwrap_or(self.stats.dropped);
         self.stats

@@ -5,7 +5,7 @@ use std::panic::AssertUnwindSafe;
 use ecaxis_axis::setpoint::Table;
 
 use super::controller::{self, Controller};
-use super::exchange::{Answer, Diagnosis, Evidence, Exchange};
+use super::exchange::{Answer, Diagnosis, Evidence, Exchange, Window};
 use super::feed::FeedState;
 use super::groups::{Group, GroupStatus};
 use super::guard::{Guard, StopCause};
@@ -89,6 +89,10 @@ pub struct Engine {
     answer: Answer,
     events_lost: u64,
     orders_taken: u64,
+    /// Frames of other MainDevices so far.
+    main_devices: u64,
+    /// The next window of the error counters begins then.
+    window: Nanos,
     halted: bool,
     buf: [u8; MAX_FRAME],
 }
@@ -124,6 +128,8 @@ pub struct Remains {
     pub spin_ns: Nanos,
     /// What the diagnostic slot has found, in the order of the exchange's members.
     pub diagnoses: Vec<Diagnosis>,
+    /// Of their error counters, around the stop.
+    pub windows: Vec<Window>,
     /// The first cycle was due then.
     pub started: Nanos,
     /// The cycles around the stop.
@@ -145,6 +151,8 @@ impl Engine {
             plain: Plain::new(&parts.axes),
             clock: parts.clock,
             timing: parts.timing,
+            main_devices: parts.link.main_devices(),
+            window: started + history::WINDOW,
             link: parts.link,
             port: parts.port,
             exchange: parts.exchange,
@@ -204,6 +212,7 @@ impl Engine {
             stats: self.stats,
             spin_ns: self.margin.get(),
             diagnoses: self.exchange.diagnoses().to_vec(),
+            windows: self.exchange.windows().to_vec(),
             started: self.started,
             history: self.history,
             stops: self
@@ -321,6 +330,10 @@ impl Engine {
 
     /// To those beside the cycle, and to the history.
     fn publish(&mut self, woke: Nanos, lateness: Nanos) {
+        if self.next >= self.window {
+            self.window = self.next + history::WINDOW;
+            self.exchange.begin_windows();
+        }
         let stopping = self.stopping();
         let stop_ended = stopping.is_some() && self.stop_ended();
         let mut stops = self.groups.iter().filter_map(Group::stop);

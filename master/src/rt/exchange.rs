@@ -28,7 +28,7 @@ use frame::{
     DATAGRAM_HEADER, FIRST_DATAGRAM, Frame, MAC_TAIL, Place, WKC, clear_wkc, frame_number,
     frame_tag, new_frames, push, same_datagram, write_header,
 };
-pub use probe::{Diagnosis, ErrorCounters, Probe};
+pub use probe::{Diagnosis, ErrorCounters, Probe, Window};
 pub use rota::LONGEST_LOOK;
 use rota::{Look, Rota};
 pub use sights::Sights;
@@ -179,6 +179,9 @@ pub struct Exchange {
     sights: Arc<Sights>,
     shares: Vec<Share>,
     diagnoses: Vec<Diagnosis>,
+    windows: Vec<Window>,
+    /// Of each member.
+    groups: Vec<usize>,
     rota: Rota,
     cycle: u32,
     outputs: Vec<u8>,
@@ -249,6 +252,8 @@ impl Exchange {
             sights: Arc::new(Sights::new(members.len())),
             shares,
             diagnoses: vec![Diagnosis::default(); members.len()],
+            windows: vec![Window::default(); members.len()],
+            groups: plan.groups.clone(),
             rota: Rota::new(members, plan.mailboxes.as_ref()),
             cycle: 0,
             outputs: vec![0; plan.len],
@@ -301,6 +306,38 @@ impl Exchange {
     #[must_use]
     pub fn diagnoses(&self) -> &[Diagnosis] {
         &self.diagnoses
+    }
+
+    /// What the error counters were around the stop, in the order of the members.
+    #[must_use]
+    pub fn windows(&self) -> &[Window] {
+        &self.windows
+    }
+
+    /// A window of what the error counters grow by begins. RT: O(members).
+    pub fn begin_windows(&mut self) {
+        for (window, found) in self.windows.iter_mut().zip(&self.diagnoses) {
+            window.begin(&found.errors);
+        }
+    }
+
+    /// The windows of a group stand still at its stop and end with the next read; `None`: all groups. RT: O(members).
+    pub fn stop_windows(&mut self, group: Option<usize>) {
+        for (window, own) in self.windows.iter_mut().zip(&self.groups) {
+            if group.is_none_or(|group| group == *own) {
+                window.stop();
+            }
+        }
+    }
+
+    /// A group has been reset. RT: O(members).
+    pub fn release_windows(&mut self, group: usize) {
+        let members = self.windows.iter_mut().zip(&self.diagnoses);
+        for ((window, found), own) in members.zip(&self.groups) {
+            if group == *own {
+                window.release(&found.errors);
+            }
+        }
     }
 
     /// What the cycle sees of mailboxes and of time, for everybody beside it.
@@ -544,7 +581,11 @@ impl Exchange {
                     if let Some(to) = self.diagnoses.get_mut(device) {
                         to.answers = place.wkc(first) == 1;
                         if to.answers {
+                            let first = !to.has_read(probe);
                             to.take(probe, data);
+                            if let Some(window) = self.windows.get_mut(device) {
+                                window.take(probe, &to.errors, first);
+                            }
                         }
                     }
                 }

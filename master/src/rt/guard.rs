@@ -3,7 +3,7 @@
 use super::exchange::{Answer, Evidence, Share};
 
 /// AL status that every SubDevice must show while the machine runs.
-const OP: u8 = 0x08;
+pub const OP: u8 = 0x08;
 /// Cycles that AL status may differ before the machine stops: one lost broadcast is not a fault.
 const AL_CYCLES: u32 = 2;
 

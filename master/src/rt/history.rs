@@ -11,6 +11,8 @@ use crate::clock::Nanos;
 pub const KEPT: usize = 200;
 /// So many of them are from the stop on.
 pub const AFTER: u32 = 50;
+/// What happened longer before a stop has nothing to do with it.
+pub const WINDOW: Nanos = 1_000_000_000;
 
 /// One cycle.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]

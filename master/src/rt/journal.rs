@@ -1,5 +1,6 @@
 //! What the cycle has noticed, in order: a ring of fixed size, so that what led to a stop is still there when somebody looks.
 
+use super::guard::StopCause;
 use super::handover::Event;
 use crate::clock::Nanos;
 
@@ -23,6 +24,8 @@ pub enum Note {
     Overrun(u64),
     /// The link refused to send or to receive.
     LinkError,
+    /// EtherCAT frames of another MainDevice came.
+    OtherMainDevice(u64),
     /// What the supervisor is told as well.
     Told(Event),
 }
@@ -39,6 +42,9 @@ impl Note {
         match (self, other) {
             (Self::WokeLate(a), Self::WokeLate(b)) => Self::WokeLate(a.max(b)),
             (Self::Overrun(a), Self::Overrun(b)) => Self::Overrun(a.saturating_add(b)),
+            (Self::OtherMainDevice(a), Self::OtherMainDevice(b)) => {
+                Self::OtherMainDevice(a.saturating_add(b))
+            }
             (first, _) => first,
         }
     }
@@ -60,6 +66,8 @@ pub struct Journal {
     ring: Box<[Option<Entry>]>,
     /// Entries ever made.
     made: u64,
+    /// Of them when the machine stopped for a reason.
+    stop: Option<u64>,
 }
 
 impl Default for Journal {
@@ -73,9 +81,13 @@ impl Default for Journal {
             // Written to, so that no page of it is met for the first time in a cycle.
             ring: vec![None; KEPT].into_boxed_slice(),
             made: 0,
+            stop: None,
         }
     }
 }
+
+/// Entries after the stop; with more, what led to it would be overwritten.
+const AFTER_STOP: u64 = KEPT as u64 / 2;
 
 impl Journal {
     fn place(&self, entry: u64) -> usize {
@@ -96,6 +108,14 @@ impl Journal {
                 last.note = last.note.graver(note);
                 return;
             }
+        }
+        match note {
+            Note::Told(Event::Stopping { cause, .. }) if cause != StopCause::Requested => {
+                self.stop.get_or_insert(self.made);
+            }
+            Note::Told(_) => {}
+            _ if self.stop.is_some_and(|stop| self.made - stop >= AFTER_STOP) => return,
+            _ => {}
         }
         let place = self.place(self.made);
         if let Some(entry) = self.ring.get_mut(place) {
@@ -163,6 +183,20 @@ mod tests {
         assert_eq!(first.len(), KEPT);
         assert_eq!((first[0], first[KEPT - 1]), (2 * (1000 - 256), 1998));
         assert!(first.is_sorted());
+    }
+
+    #[test]
+    fn what_led_to_a_stop_is_kept() {
+        let mut journal = Journal::default();
+        let cause = StopCause::LeftOp { al_status: 4 };
+        journal.note(1, 1, Note::Lost);
+        journal.note(2, 2, Note::Told(Event::Stopping { cycle: 2, cause }));
+        for cycle in 2..2000 {
+            journal.note(2 * cycle, 2 * cycle, Note::LinkError);
+        }
+        let cycles: Vec<u64> = journal.entries().map(|e| e.first_cycle).collect();
+        assert_eq!(cycles[..3], [1, 2, 4]);
+        assert_eq!(cycles.len(), 1 + KEPT / 2);
     }
 
     #[test]

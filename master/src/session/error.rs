@@ -182,8 +182,16 @@ pub enum RunError {
     NotDisabled { device: DeviceRef, state: State },
     #[error("emergency stop: {condition}")]
     EmergencyStop { condition: String },
-    #[error("{device}: follows no longer: {reason}")]
-    FollowLost { device: DeviceRef, reason: String },
+    #[error(
+        "{device}: follows no longer: {reason}{}",
+        cause.as_ref().map_or_else(String::new, |cause| format!(": {cause}"))
+    )]
+    FollowLost {
+        device: DeviceRef,
+        reason: String,
+        /// What stopped the group of the axis that it followed.
+        cause: Option<Arc<RunError>>,
+    },
     #[error("{device}: is not enabled: {reason}")]
     EnableRefused { device: DeviceRef, reason: String },
     #[error("{}{device}: stopped with its group `{group}`: {cause}", at(step.as_ref()))]
@@ -204,6 +212,50 @@ pub enum RunError {
     Interrupted,
     #[error("internal error: {0}")]
     Panicked(String),
+}
+
+impl RunError {
+    /// Of which this is only a consequence.
+    #[must_use]
+    pub fn cause(&self) -> Option<&Self> {
+        self.shared_cause().map(Arc::as_ref)
+    }
+
+    pub(crate) fn shared_cause(&self) -> Option<&Arc<Self>> {
+        match self {
+            Self::GroupStopped { cause, .. } => Some(cause),
+            Self::FollowLost { cause, .. } => cause.as_ref(),
+            _ => None,
+        }
+    }
+
+    /// The machine was not in Op yet.
+    pub(crate) fn is_on_the_way_to_op(&self) -> bool {
+        matches!(
+            self,
+            Self::State(_)
+                | Self::NoProcessData { .. }
+                | Self::PhaseNotLocked { .. }
+                | Self::ClockNotSettled { .. }
+        )
+    }
+
+    /// The cycle has stopped the machine for it.
+    pub(crate) fn is_of_cycle(&self) -> bool {
+        matches!(
+            self,
+            Self::BusLost { .. }
+                | Self::LeftOp { .. }
+                | Self::LeftOpBriefly { .. }
+                | Self::Gone { .. }
+                | Self::DriveFault { .. }
+                | Self::Trip { .. }
+                | Self::FollowLost { .. }
+                | Self::EmergencyStop { .. }
+                | Self::Controller
+                | Self::NotDisabled { .. }
+        )
+    }
 }
 
 /// What a device that has failed says of it, beside its error code.

@@ -7,6 +7,7 @@ use crate::config::{Machine, duration};
 use crate::rt::guard::StopCause;
 use crate::rt::handover::Event;
 use crate::rt::journal::{Entry, Journal, Note};
+use crate::words::counted;
 
 /// One thing that the cycle has noticed, or a run of the same in cycles that follow each other.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -49,6 +50,13 @@ fn told(note: &Note, machine: &Machine) -> String {
         Note::WokeLate(late) => format!("the thread woke up {} late", duration::show(late)),
         Note::Overrun(1) => "1 cycle was left out".to_owned(),
         Note::Overrun(missed) => format!("{missed} cycles were left out"),
+        Note::OtherMainDevice(frames) => {
+            let frames = usize::try_from(frames).unwrap_or(usize::MAX);
+            format!(
+                "{} of another MainDevice came",
+                counted(frames, "EtherCAT frame")
+            )
+        }
         Note::LinkError => "the interface refused to send or to receive".to_owned(),
         Note::Told(event) => event_told(event, machine),
     }

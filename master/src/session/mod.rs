@@ -94,7 +94,7 @@ pub struct Outcome {
     pub result: Result<(), RunError>,
     /// What the summary is of.
     pub stats: Option<Box<Stats>>,
-    /// Of a failure on the bus.
+    /// Of a failure on the bus, or of a group that stopped and was not reset.
     pub story: Option<Box<Story>>,
 }
 
@@ -279,6 +279,7 @@ fn own_the_link(
         stats,
         spin_ns,
         diagnoses,
+        windows,
         started,
         history,
         stops,
@@ -297,11 +298,15 @@ fn own_the_link(
     };
     let thread = used.map(|(used, wall_ns)| ThreadSummary::new(used, wall_ns, spin_ns, &stats));
     let events = events::lines(&stats.journal, started, machine);
-    let story = result.as_ref().err().and_then(|error| {
+    let (unreleased, then) = ended.left.take().unzip();
+    let failed = result.as_ref().err().or(unreleased.as_deref());
+    let witnessed = ended.witnessed.take().or(then).unwrap_or_default();
+    let story = failed.and_then(|error| {
         let left = Left {
             places,
-            looks: std::mem::take(&mut ended.looks),
+            witnessed,
             diagnoses: &diagnoses,
+            windows: &windows,
             stats: &stats,
             axes: &axes,
             history: &history,

@@ -27,7 +27,8 @@ use crate::rt::handover::ends;
 use crate::rt::image::{self, AxisBits, Bits, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
 use crate::rt::slot::AxisSlot;
-use crate::story::{Look, look};
+use crate::story::Look;
+use crate::story::look::{self, Depth};
 use crate::supervise::{Supervisor, interruptible};
 use crate::wire::{BesideCycle, Datagrams};
 
@@ -166,7 +167,7 @@ impl Job<'_> {
                     stopped: Vec::new(),
                     limited: Vec::new(),
                     last_status: clock::now(),
-                    looks: Vec::new(),
+                    witnessed: None,
                 };
                 Ok(Prepared { parts, supervisor })
             }
@@ -180,7 +181,10 @@ impl Job<'_> {
                 ) {
                     seen.looks = vec![Look::default(); machine.devices.len()];
                     let wire = Datagrams::new(main_device);
-                    let look = look::at_registers(&wire, &mut seen.looks);
+                    let stations: Vec<_> = (crate::bringup::FIRST_STATION..)
+                        .take(machine.devices.len())
+                        .collect();
+                    let look = look::at_registers(&wire, &stations, &mut seen.looks, Depth::Whole);
                     let _ = pump(&mut port, link.as_mut(), options.clock, look);
                 }
                 go_silent(options.clock, main_device, link.as_mut(), &mut port);

@@ -8,12 +8,13 @@ use crate::bringup::{Bus, DeviceRef};
 use crate::clock::{Clock, Nanos};
 use crate::config::{Locator, Machine};
 use crate::link::LinkStats;
-use crate::rt::exchange::{Diagnosis, ErrorCounters};
+use crate::rt::exchange::{Diagnosis, ErrorCounters, Window};
 use crate::rt::history::History;
 use crate::rt::slot::AxisSlot;
 use crate::rt::stats::Stats;
+use crate::story::evidence::Stopped;
 use crate::story::page::{AxisPage, CyclePage, DevicePage, Stop};
-use crate::story::{DeviceEvidence, Evidence, Look, Story, diagnose, ports};
+use crate::story::{DeviceEvidence, Evidence, Look, Story, Witnessed, diagnose, ports};
 
 /// What was seen on a bus that did not come up.
 #[derive(Debug, Default)]
@@ -46,8 +47,9 @@ pub(super) fn places(bus: &Bus) -> Vec<Place> {
 #[derive(Debug)]
 pub(super) struct Left<'a> {
     pub places: Vec<Place>,
-    pub looks: Vec<Look>,
+    pub witnessed: Witnessed,
     pub diagnoses: &'a [Diagnosis],
+    pub windows: &'a [Window],
     pub stats: &'a Stats,
     pub axes: &'a [AxisSlot],
     pub history: &'a History,
@@ -79,6 +81,10 @@ pub(super) fn of_bring_up(
         parent: parent.or_else(|| Some((usize::from(position.checked_sub(1)?), 1))),
         grown: ErrorCounters {
             // A cable that is plugged in is a link that was lost before.
+            lost_links: [0; 4],
+            ..look.errors.unwrap_or_default()
+        },
+        recent: ErrorCounters {
             lost_links: [0; 4],
             ..look.errors.unwrap_or_default()
         },
@@ -117,13 +123,15 @@ pub(super) fn of_run(
     if matches!(error, RunError::Interrupted | RunError::Record(_)) {
         return None;
     }
-    let mut places: Vec<_> = left.places.into_iter().zip(left.diagnoses).collect();
+    let group = left.witnessed.group;
+    let diagnoses = left.diagnoses.iter().zip(left.windows);
+    let mut places: Vec<_> = left.places.into_iter().zip(diagnoses).collect();
     places.sort_by_key(|(place, _)| place.at.position);
     let status: Vec<u16> = places.iter().map(|(place, _)| place.dl_status).collect();
     let parents = ports::parents(&status);
-    let mut looks = left.looks.into_iter();
+    let mut looks = left.witnessed.looks.into_iter();
     let devices = places.into_iter().zip(parents);
-    let devices = devices.map(|((place, diagnosis), parent)| {
+    let devices = devices.map(|((place, (diagnosis, window)), parent)| {
         let look = looks.next().unwrap_or_default();
         DeviceEvidence {
             at: place.at,
@@ -132,12 +140,25 @@ pub(super) fn of_run(
                 Some(errors) => diagnosis.grown_to(errors),
                 None => diagnosis.grown(),
             },
+            recent: window.grown(&diagnosis.latest(look.errors.as_ref())),
             look,
         }
     });
+    let notes: Vec<_> = left.stats.journal.entries().copied().collect();
+    let cause = error.cause().unwrap_or(error);
+    // On the way to Op whatever was seen may be what keeps it from there.
+    let stop =
+        Stopped::find(&notes, group, cause.is_of_cycle()).filter(|_| !cause.is_on_the_way_to_op());
+    let from = stop.map_or(u64::MAX, |stop| stop.cycle);
+    let mut cycles = left.history.cycles().map(|(cycle, _)| cycle);
+    let first = cycles.next().map_or(u64::MAX, |cycle| cycle.number);
+    // What was kept is of another stop where it began later.
+    let mut cycles = cycles.filter(|cycle| first <= from && cycle.number >= from);
     let evidence = Evidence {
         cycle_ns: machine.bus.cycle_ns,
-        notes: left.stats.journal.entries().copied().collect(),
+        stop,
+        al_status: cycles.find_map(|cycle| cycle.al_status),
+        notes,
         counters: left.stats.counters,
         link: left.link,
         devices: devices.collect(),

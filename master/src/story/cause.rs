@@ -79,6 +79,7 @@ pub enum Cause {
     /// SYNC0 does not come when the device needs it.
     Sync {
         device: String,
+        /// 0: the device waits and says nothing.
         code: u16,
         refused: bool,
         activation: Option<u8>,
@@ -246,11 +247,14 @@ impl fmt::Display for Cause {
                 next_ns,
             } => {
                 let what = if *refused { "refused Op" } else { "left Op" };
-                write!(
-                    f,
-                    "{device} {what}, AL status code 0x{code:04x} ({})",
-                    al_status_text(*code)
-                )?;
+                match code {
+                    0 => write!(f, "{device} did not reach Op")?,
+                    code => write!(
+                        f,
+                        "{device} {what}, AL status code 0x{code:04x} ({})",
+                        al_status_text(*code)
+                    )?,
+                }
                 match (activation, next_ns) {
                     (Some(activation), _) if activation & 3 != 3 => {
                         f.write_str(": its SYNC0 is not switched on")
@@ -258,7 +262,7 @@ impl fmt::Display for Cause {
                     (_, Some(next @ i64::MIN..0)) => {
                         write!(f, ": its SYNC0 was due {} ago", time(&next.unsigned_abs()))
                     }
-                    (_, Some(next)) if *next > SOON => write!(
+                    (_, Some(next)) if *next > SOON || *code == 0 => write!(
                         f,
                         ": its SYNC0 only begins in {}",
                         time(&next.unsigned_abs())

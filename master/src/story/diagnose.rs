@@ -12,7 +12,6 @@ use super::look::SyncLook;
 use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::mailbox::SdoError;
-use crate::rt::stats::Counters;
 use crate::session::RunError;
 
 /// AL status codes that a lost synchronization brings about (ETG.1020).
@@ -25,59 +24,62 @@ const AL_ERROR: u8 = 0x10;
 /// CiA 402: following error, in drives of all vendors.
 const FOLLOWING_ERROR: [u16; 2] = [0x8611, 0x8600];
 
+/// Something that was seen, and whether it accounts for what stopped the run.
+struct Seen {
+    cause: Cause,
+    explains: bool,
+}
+
+impl Seen {
+    fn when(explains: bool, cause: Cause) -> Self {
+        Self { cause, explains }
+    }
+}
+
 /// Pure: the same error and the same evidence give the same answer.
 #[must_use]
 pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
-    if let RunError::GroupStopped { cause, .. } = error {
+    if let Some(cause) = error.cause() {
         return diagnose(cause, evidence);
     }
-    let class = Class::of(error);
-    let mut seen: Vec<Cause> = Vec::new();
-    // What is certain comes before what may be chance: computers are late and cables see sparks on good days, too.
-    seen.extend(interface(evidence));
-    seen.extend(other_main_device(evidence, class));
-    seen.extend(restarted(evidence));
-    seen.extend(out_of_reach(evidence, class));
-    seen.extend(overload(error, evidence, class));
-    seen.extend(damaged_frames(evidence));
-    seen.extend(loose_link(evidence));
-    seen.extend(late_frames(evidence));
-    seen.extend(nobody_answers(error, evidence));
-    if seen.is_empty() {
-        seen.extend(silence(error, evidence));
-    }
-    let explains: fn(&Cause) -> bool = match class {
-        Class::Bus => |_| true,
-        Class::Timing => |cause| matches!(cause, Cause::Overload { .. }),
-        Class::State => |cause| {
-            matches!(
-                cause,
-                Cause::OtherMainDevice {
-                    device: Some(_),
-                    ..
-                }
-            )
-        },
-        // A device may say that the bus is the trouble; it does not say so of itself.
-        Class::Device => |_| false,
-    };
-    if let Some(first) = seen.iter().position(explains) {
-        let cause = seen.remove(first);
-        // A device that is gone takes a link with it.
-        if matches!(cause, Cause::Restarted { .. } | Cause::OutOfReach { .. }) {
-            let follows =
-                |c: &Cause| matches!(c, Cause::OutOfReach { .. } | Cause::LooseLink { .. });
-            seen.retain(|cause| !follows(cause));
+    let class = Class::of(error, evidence);
+    let on_the_bus = class == Class::Bus;
+    // What is certain comes before what may be chance: computers are late and cables see sparks on good days, too. What may be chance
+    // has to account for what stopped the run.
+    let seen = [
+        interface(evidence, class),
+        restarted(evidence, class),
+        out_of_reach(error, evidence, class),
+        other_main_device(error, evidence, class),
+        nobody_answers(error, evidence),
+        overload(error, evidence, class),
+        damaged_frames(error, evidence, class),
+        loose_link(error, evidence, class),
+        late_frames(error, evidence),
+        silence(error, evidence).filter(|_| on_the_bus),
+    ];
+    let mut seen: Vec<Seen> = seen.into_iter().flatten().collect();
+    let cause = match seen.iter().position(|seen| seen.explains) {
+        Some(first) => {
+            let cause = seen.remove(first).cause;
+            // A device that is gone takes a link with it.
+            if matches!(cause, Cause::Restarted { .. } | Cause::OutOfReach { .. }) {
+                let follows =
+                    |c: &Cause| matches!(c, Cause::OutOfReach { .. } | Cause::LooseLink { .. });
+                seen.retain(|seen| !follows(&seen.cause));
+            }
+            cause
         }
-        return Diagnosis { cause, also: seen };
+        None => of_one_device(error, evidence).unwrap_or_else(|| Cause::AsTold {
+            text: error.to_string(),
+        }),
+    };
+    // It is what the others have in common.
+    seen.retain(|seen| !matches!(seen.cause, Cause::Silence { .. }));
+    Diagnosis {
+        cause,
+        also: seen.into_iter().map(|seen| seen.cause).collect(),
     }
-    let cause = of_one_device(error, evidence).unwrap_or_else(|| Cause::AsTold {
-        text: match error {
-            RunError::BringUp(error) => error.to_string(),
-            error => error.to_string(),
-        },
-    });
-    Diagnosis { cause, also: seen }
 }
 
 /// What an error can be a consequence of.
@@ -87,14 +89,12 @@ enum Class {
     Bus,
     /// The moment at which frames come.
     Timing,
-    /// A device that does not reach a state, or whose mailbox does not answer: it may have been sent to another state.
-    State,
     /// One device, drive or axis, or the file.
     Device,
 }
 
 impl Class {
-    fn of(error: &RunError) -> Self {
+    fn of(error: &RunError, evidence: &Evidence) -> Self {
         match error {
             RunError::BusLost { .. }
             | RunError::Gone { .. }
@@ -103,26 +103,34 @@ impl Class {
             RunError::DriveFault {
                 code: Some(code), ..
             } => match code {
-                0x7500..=0x75ff | 0x8100..=0x81ff | 0x8250 | 0x8280..=0x82ff => Self::Bus,
+                0x7500..=0x75ff | 0x8100..=0x81ff | 0x8250 | 0x8280..=0x82ff => {
+                    Self::said_by_device(evidence)
+                }
                 0x8700..=0x87ff => Self::Timing,
                 _ => Self::Device,
             },
-            RunError::LeftOp { state, code, .. } => Self::of_state(*state, *code),
-            RunError::State(error) => Self::of_change(error),
+            RunError::LeftOp {
+                device,
+                state,
+                code: WATCHDOG,
+            } if *state != AlState::Op => Self::of_watchdog(&device.name, evidence),
+            RunError::LeftOp { state, code, .. } => Self::of_state(*state, *code, evidence),
+            RunError::State(error) => Self::of_change(error, evidence),
             RunError::BringUp(error) => match error.as_ref() {
                 BringUpError::NoAnswer
                 | BringUpError::Scan { .. }
                 | BringUpError::Missing { .. }
                 | BringUpError::Wire { .. }
                 | BringUpError::NotTaken { .. } => Self::Bus,
-                BringUpError::State(error) => Self::of_change(error),
+                BringUpError::State(error) => Self::of_change(error, evidence),
                 BringUpError::NoStart { .. } => Self::Timing,
                 BringUpError::StartUp { source, .. }
                 | BringUpError::Mailbox { source, .. }
                 | BringUpError::ReadBack { source, .. }
                 | BringUpError::ReadUnits { source, .. } => match source {
                     SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
-                    SdoError::Timeout { .. } => Self::State,
+                    // A device that was sent to Init has no mailbox.
+                    SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
                     _ => Self::Device,
                 },
                 _ => Self::Device,
@@ -132,66 +140,127 @@ impl Class {
         }
     }
 
-    fn of_change(error: &StateError) -> Self {
-        match error {
-            StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
-            StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code),
-            StateError::Timeout { .. } => Self::State,
+    /// A device says that the bus was the trouble: it is where the cycle has seen some.
+    fn said_by_device(evidence: &Evidence) -> Self {
+        let Lateness { missed, longest } = evidence.lateness();
+        let late = missed > 0 || longest > evidence.cycle_ns;
+        if late || evidence.without_data() > evidence.cycle_ns || evidence.stop.is_none() {
+            Self::Bus
+        } else {
+            Self::Device
         }
     }
 
-    fn of_state(state: AlState, code: u16) -> Self {
-        if code == 0 || code == WATCHDOG {
+    /// The watchdog can only have expired by itself where no process data came for about as long.
+    fn of_watchdog(device: &str, evidence: &Evidence) -> Self {
+        let look = evidence.named(device).and_then(|found| found.look.watchdog);
+        let enough = look.map_or(0, |watchdog| watchdog.time_ns / 2);
+        let without = evidence.without_data().max(evidence.lateness().longest);
+        if without > 0 && without >= enough {
             Self::Bus
-        } else if SYNC_CODES.contains(&code) && state == AlState::SafeOp {
-            Self::Timing
         } else {
             Self::Device
+        }
+    }
+
+    fn of_change(error: &StateError, evidence: &Evidence) -> Self {
+        // As a device does that somebody else has sent elsewhere.
+        const INVALID_CHANGE: u16 = 0x0011;
+        let others = evidence.other_frames() > 0;
+        match error {
+            StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
+            StateError::Refused {
+                code: INVALID_CHANGE,
+                ..
+            } if others => Self::Bus,
+            StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code, evidence),
+            StateError::Timeout { wanted, actual, .. } => {
+                if others && *wanted == AlState::Op && *actual != AlState::SafeOp {
+                    Self::Bus
+                } else {
+                    Self::Device
+                }
+            }
+        }
+    }
+
+    fn of_state(state: AlState, code: u16, evidence: &Evidence) -> Self {
+        if code == 0 || code == WATCHDOG {
+            Self::Bus
+        } else if !SYNC_CODES.contains(&code) || state != AlState::SafeOp {
+            Self::Device
+        } else if evidence.stop.is_some() && evidence.without_data() > evidence.cycle_ns {
+            Self::Bus
+        } else {
+            Self::Timing
         }
     }
 }
 
 /// Cycles that were left out, or wake-ups so late that a device must have noticed.
-fn overload(error: &RunError, evidence: &Evidence, class: Class) -> Option<Cause> {
+fn overload(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
     // As many as the guard rides through at most by default.
     const MISSED: u64 = 3;
-    let Lateness { missed, longest } = evidence.lateness();
-    let late = missed >= MISSED || longest > evidence.cycle_ns;
-    let then = matches!(class, Class::Bus | Class::Timing).then(|| short(error));
-    late.then_some(Cause::Overload {
-        missed,
-        longest_ns: longest,
-        then,
+    let late = |found: &Lateness| found.missed >= MISSED || found.longest > evidence.cycle_ns;
+    let found = evidence.lateness();
+    let explains = match class {
+        Class::Bus => late(&evidence.lateness_at_stop()),
+        Class::Timing => true,
+        Class::Device => false,
+    };
+    late(&found).then(|| {
+        let then = explains.then(|| short(error));
+        let Lateness { missed, longest } = found;
+        Seen::when(
+            explains,
+            Cause::Overload {
+                missed,
+                longest_ns: longest,
+                then,
+            },
+        )
     })
 }
 
-fn other_main_device(evidence: &Evidence, class: Class) -> Option<Cause> {
-    let frames = evidence.link.main_devices;
+fn other_main_device(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    let frames = evidence.other_frames();
     if frames == 0 {
         return None;
     }
-    // Whoever was sent to another state shows no error; one that fell by itself does. Before Op, Init alone is a state in which
-    // no bring-up leaves a device.
-    let elsewhere = |status: u8| match class {
-        Class::Bus => status & AL_ERROR == 0 && status != OP,
-        Class::State => status == INIT,
-        Class::Timing | Class::Device => false,
-    };
+    // Whoever was sent to another state shows no error; one that fell by itself does.
     let sent = |device: &&DeviceEvidence| {
-        device.look.al_status.is_some_and(elsewhere) && device.look.station != Some(0)
+        device
+            .look
+            .al_status
+            .is_some_and(|status| status & AL_ERROR == 0 && status != OP)
+            && device.look.station != Some(0)
     };
-    let sent = evidence.devices.iter().find(sent);
-    Some(Cause::OtherMainDevice {
-        frames,
-        device: sent.map(DeviceEvidence::place),
-        state: sent
-            .and_then(|device| device.look.al_status)
-            .map(|status| AlState::from_status(status).to_string()),
-    })
+    let sent = evidence
+        .devices
+        .iter()
+        .find(sent)
+        .filter(|_| class == Class::Bus && !evidence.all_in_op());
+    let silent = matches!(
+        error,
+        RunError::BusLost {
+            answered: false,
+            ..
+        }
+    );
+    Some(Seen::when(
+        class == Class::Bus && (sent.is_some() || !silent),
+        Cause::OtherMainDevice {
+            frames,
+            device: sent.map(DeviceEvidence::place),
+            state: sent
+                .and_then(|device| device.look.al_status)
+                .map(|status| AlState::from_status(status).to_string()),
+        },
+    ))
 }
 
 /// In Init, without an error, without the station address that it was given: it has been without power.
-fn restarted(evidence: &Evidence) -> Option<Cause> {
+fn restarted(evidence: &Evidence, class: Class) -> Option<Seen> {
     let mut devices = evidence.devices.iter().enumerate();
     let (index, device) = devices.find(|(_, device)| {
         let look = &device.look;
@@ -200,16 +269,16 @@ fn restarted(evidence: &Evidence) -> Option<Cause> {
     // A bus of which nobody has an address has not been addressed yet.
     let addressed = |device: &DeviceEvidence| device.look.station.is_some_and(|at| at != 0);
     let all = !evidence.devices.iter().any(addressed) && evidence.notes.is_empty();
-    (!all).then(|| Cause::Restarted {
+    let cause = || Cause::Restarted {
         device: device.place(),
         behind: behind(evidence, index).count(),
-    })
+    };
+    (!all).then(|| Seen::when(class == Class::Bus && !evidence.all_in_op(), cause()))
 }
 
-fn damaged_frames(evidence: &Evidence) -> Option<Cause> {
-    // One may be a spark; a bad cable brings more.
+fn damaged_frames(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
     // Where no cycle ran, nobody knows since when.
-    let some = if evidence.notes.is_empty() { 8 } else { 2 };
+    let some = if evidence.stop.is_none() { 8 } else { 1 };
     let devices = evidence.devices.iter().enumerate();
     let ports = devices.flat_map(|(index, device)| {
         (0..4u8).map(move |port| (device.damaged(usize::from(port)), index, port))
@@ -218,36 +287,54 @@ fn damaged_frames(evidence: &Evidence) -> Option<Cause> {
     let (count, index, port) =
         ports.max_by_key(|(count, index, port)| (*count, std::cmp::Reverse((*index, *port))))?;
     let device = evidence.devices.get(index)?;
-    (count >= some).then(|| Cause::DamagedFrames {
+    // One may be a spark; a bad cable brings as many as there are frames missing.
+    let enough = match error {
+        RunError::BusLost { .. } => u64::from(count) * 2 >= evidence.lost_at_stop(),
+        _ => count > 1,
+    };
+    let cause = || Cause::DamagedFrames {
         device: device.place(),
         port,
         partner: evidence.partner(index, port),
         count,
-    })
+    };
+    let explains = class == Class::Bus && (enough || count == u8::MAX);
+    (count >= some).then(|| Seen::when(explains, cause()))
 }
 
 /// Frames come back, and some devices have not touched them.
-fn out_of_reach(evidence: &Evidence, class: Class) -> Option<Cause> {
-    if class != Class::Bus {
-        return None;
-    }
+fn out_of_reach(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
     let missing = |device: &DeviceEvidence| device.look.absent || device.look.came_back;
     let mut devices = evidence.devices.iter().enumerate();
     let (index, device) = devices.find(|(_, device)| missing(device))?;
+    // Before they are known by their addresses, those behind a missing one have moved up.
+    let known = match error {
+        RunError::BringUp(error) => match error.as_ref() {
+            BringUpError::Missing { missing, .. } => missing.first() == Some(&device.place()),
+            _ => true,
+        },
+        _ => true,
+    };
+    if !known {
+        return None;
+    }
     let link = device.parent.and_then(|(parent, port)| {
         let status = evidence.devices.get(parent)?.look.dl_status?;
         Some(super::ports::has_link(status, port))
     });
-    Some(Cause::OutOfReach {
-        device: device.place(),
-        behind: behind(evidence, index).filter(|d| missing(d)).count(),
-        upstream: evidence.upstream(device),
-        link: link.filter(|_| !device.look.came_back),
-    })
+    Some(Seen::when(
+        class == Class::Bus && !evidence.all_in_op(),
+        Cause::OutOfReach {
+            device: device.place(),
+            behind: behind(evidence, index).filter(|d| missing(d)).count(),
+            upstream: evidence.upstream(device),
+            link: link.filter(|_| !device.look.came_back),
+        },
+    ))
 }
 
 /// They were asked, and no frame came back.
-fn nobody_answers(error: &RunError, evidence: &Evidence) -> Option<Cause> {
+fn nobody_answers(error: &RunError, evidence: &Evidence) -> Option<Seen> {
     let silent = matches!(
         error,
         RunError::BusLost {
@@ -257,28 +344,66 @@ fn nobody_answers(error: &RunError, evidence: &Evidence) -> Option<Cause> {
     );
     let unknown = |device: &DeviceEvidence| !device.look.answers && !device.look.absent;
     let first = evidence.devices.first()?;
-    (silent && evidence.devices.iter().all(unknown)).then(|| Cause::NobodyAnswers {
+    let cause = || Cause::NobodyAnswers {
         first: Some(first.place()),
-    })
+    };
+    (silent && evidence.devices.iter().all(unknown)).then(|| Seen::when(true, cause()))
 }
 
-/// More than one in a row may come of one that was held up.
-fn late_frames(evidence: &Evidence) -> Option<Cause> {
-    const SOME: u64 = 3;
-    let Counters {
-        late_frames: late,
-        lost_frames: lost,
-        ..
-    } = evidence.counters;
-    // Most of what was missed has come after all.
-    (late >= SOME && late >= lost / 2).then_some(Cause::LateFrames {
-        late,
-        cycle_ns: evidence.cycle_ns,
+/// Frames come back in a later cycle: most of what was missing when it stopped has come after all.
+fn late_frames(error: &RunError, evidence: &Evidence) -> Option<Seen> {
+    let silent = matches!(
+        error,
+        RunError::BusLost {
+            answered: false,
+            ..
+        } | RunError::NoProcessData { .. }
+    );
+    let late = evidence.late_at_stop();
+    (late > 0).then(|| {
+        Seen::when(
+            silent && late * 2 >= evidence.lost_at_stop(),
+            Cause::LateFrames {
+                late,
+                cycle_ns: evidence.cycle_ns,
+            },
+        )
     })
 }
 
 /// They were asked later, and all of them answered.
-fn silence(error: &RunError, evidence: &Evidence) -> Option<Cause> {
+fn silence(error: &RunError, evidence: &Evidence) -> Option<Seen> {
+    let silent = match error {
+        RunError::BusLost { answered, .. } => !answered,
+        // It says what it noticed of it.
+        RunError::LeftOp { code, .. } => SYNC_CODES.contains(code),
+        _ => false,
+    };
+    let silence_ns = evidence.silence();
+    let back = !evidence.devices.is_empty() && evidence.devices.iter().all(|d| d.look.answers);
+    let there = silent && silence_ns > 0 && (back || evidence.all_in_op());
+    there.then(|| Seen::when(true, Cause::Silence { silence_ns }))
+}
+
+/// The network interface did not take frames.
+fn interface(evidence: &Evidence, class: Class) -> Option<Seen> {
+    // Once may be a full queue.
+    const SOME: u64 = 3;
+    let refused = match evidence.stop {
+        Some(_) => evidence.refused(),
+        None => evidence.counters.link_errors,
+    };
+    (refused >= SOME).then(|| Seen::when(class == Class::Bus, Cause::Interface { refused }))
+}
+
+fn loose_link(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    let devices = evidence.devices.iter().enumerate();
+    let mut ports = devices.flat_map(|(index, device)| {
+        let counters = device.recent.lost_links.into_iter().zip(0u8..);
+        counters.map(move |(count, port)| (count, index, port))
+    });
+    let (count, index, port) = ports.find(|(count, ..)| *count > 0)?;
+    // Without a link behind the first device frames come back earlier, but they come back.
     let silent = matches!(
         error,
         RunError::BusLost {
@@ -286,32 +411,16 @@ fn silence(error: &RunError, evidence: &Evidence) -> Option<Cause> {
             ..
         }
     );
-    let silence_ns = evidence.silence();
-    let back = !evidence.devices.is_empty() && evidence.devices.iter().all(|d| d.look.answers);
-    (silent && back && silence_ns > 0).then_some(Cause::Silence { silence_ns })
-}
-
-/// The network interface did not take frames.
-fn interface(evidence: &Evidence) -> Option<Cause> {
-    // Once may be a full queue.
-    const SOME: u64 = 3;
-    let refused = evidence.counters.link_errors;
-    (refused >= SOME).then_some(Cause::Interface { refused })
-}
-
-fn loose_link(evidence: &Evidence) -> Option<Cause> {
-    let devices = evidence.devices.iter().enumerate();
-    let mut ports = devices.flat_map(|(index, device)| {
-        let counters = device.grown.lost_links.into_iter().zip(0u8..);
-        counters.map(move |(count, port)| (count, index, port))
-    });
-    let (count, index, port) = ports.find(|(count, ..)| *count > 0)?;
-    Some(Cause::LooseLink {
-        device: evidence.devices.get(index)?.place(),
-        port,
-        partner: evidence.partner(index, port),
-        count,
-    })
+    let first_cable = (index, port) == (0, 0);
+    Some(Seen::when(
+        class == Class::Bus && (first_cable || !silent || evidence.lost_at_stop() <= 2),
+        Cause::LooseLink {
+            device: evidence.devices.get(index)?.place(),
+            port,
+            partner: evidence.partner(index, port),
+            count,
+        },
+    ))
 }
 
 /// Everybody who hangs on this device.
@@ -340,6 +449,13 @@ fn of_one_device(error: &RunError, evidence: &Evidence) -> Option<Cause> {
         RunError::State(StateError::Refused { device, code, .. }) => {
             sync(device, *code, true, evidence)
         }
+        RunError::State(StateError::Timeout {
+            device,
+            wanted: AlState::Op,
+            actual: AlState::SafeOp,
+            ..
+        }) => late_sync(device, evidence),
+        RunError::BusLost { .. } | RunError::LeftOpBriefly { .. } if evidence.all_in_op() => None,
         RunError::BusLost { .. } | RunError::LeftOpBriefly { .. } => {
             let bad = |device: &&DeviceEvidence| {
                 let look = &device.look;
@@ -398,6 +514,20 @@ fn sync(device: &DeviceRef, code: u16, refused: bool, evidence: &Evidence) -> Op
         refused,
         activation: sync.map(|sync| sync.activation),
         next_ns: sync.map(|SyncLook { next_ns, .. }| next_ns),
+    })
+}
+
+/// It waits for a SYNC0 that does not come.
+fn late_sync(device: &DeviceRef, evidence: &Evidence) -> Option<Cause> {
+    let sync = evidence.named(&device.name)?.look.sync?;
+    let cycle = i64::from(sync.cycle_ns);
+    let off = sync.activation & 3 != 3 || sync.next_ns < 0 || sync.next_ns > 2 * cycle;
+    (cycle > 0 && off).then(|| Cause::Sync {
+        device: place(device),
+        code: 0,
+        refused: true,
+        activation: Some(sync.activation),
+        next_ns: Some(sync.next_ns),
     })
 }
 

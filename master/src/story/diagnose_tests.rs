@@ -10,6 +10,7 @@ use crate::rt::journal::{Entry, Note};
 use crate::rt::stats::Counters;
 use crate::story::Look;
 use crate::story::cause::about;
+use crate::story::evidence::Stopped;
 use crate::story::look::WatchdogLook;
 
 const MS: Nanos = 1_000_000;
@@ -31,6 +32,19 @@ fn note(cycle: u64, note: Note) -> Entry {
     }
 }
 
+const STOP: Stopped = Stopped {
+    cycle: 1000,
+    time: 1000 * MS,
+};
+
+/// A run of the same.
+fn cycles(first: u64, last: u64, what: Note) -> Entry {
+    Entry {
+        last_cycle: last,
+        ..note(first, what)
+    }
+}
+
 /// Everybody answers, in Op, with ports 0 and 1 in use; the machine stopped in cycle 1000.
 fn good() -> Evidence {
     let cause = StopCause::LeftOp { al_status: 8 };
@@ -40,6 +54,7 @@ fn good() -> Evidence {
             .checked_sub(1)
             .map(|before| (usize::from(before), 1)),
         grown: ErrorCounters::default(),
+        recent: ErrorCounters::default(),
         look: Look {
             answers: true,
             station: Some(0x1000 + position),
@@ -55,6 +70,8 @@ fn good() -> Evidence {
             1000,
             Note::Told(Event::Stopping { cycle: 1000, cause }),
         )],
+        stop: Some(STOP),
+        al_status: None,
         counters: Counters::default(),
         link: LinkStats::default(),
         devices: (0..3).map(device).collect(),
@@ -92,16 +109,16 @@ fn absent(evidence: &mut Evidence, from: usize) {
         };
     }
     evidence.devices[from - 1].look.dl_status = Some(0x0210);
-    evidence.devices[from - 1].grown.lost_links[1] = 1;
+    evidence.devices[from - 1].recent.lost_links[1] = 1;
 }
 
 #[test]
 fn which_device_and_which_cause() {
     let damaged = |evidence: &mut Evidence| {
-        evidence.devices[2].grown.invalid_frames[0] = 40;
-        evidence.devices[2].grown.rx_errors[0] = 30;
+        evidence.devices[2].recent.invalid_frames[0] = 40;
+        evidence.devices[2].recent.rx_errors[0] = 30;
         // Whoever comes behind only passes them on.
-        evidence.devices[1].grown.forwarded[1] = 40;
+        evidence.devices[1].recent.forwarded[1] = 40;
     };
     let overrun = |evidence: &mut Evidence| {
         evidence.notes.insert(0, note(990, Note::Overrun(120)));
@@ -146,13 +163,13 @@ fn which_device_and_which_cause() {
         (
             lost(false),
             with(|e| {
-                e.devices[1].grown.invalid_frames[1] = 255;
+                e.devices[1].recent.invalid_frames[1] = 255;
             }),
             "`a1` (position 1): frames arrive damaged at its port 1: 255 or more CRC errors on the cable from `a2`",
         ),
         (
             lost(false),
-            with(|e| e.devices[0].grown.lost_links[0] = 2),
+            with(|e| e.devices[0].recent.lost_links[0] = 2),
             "`a0` (position 0): its port 0 lost the link 2 times, on the cable to this computer",
         ),
         (
@@ -167,11 +184,7 @@ fn which_device_and_which_cause() {
         (
             lost(false),
             with(|e| {
-                let gone = Entry {
-                    last_cycle: 1199,
-                    ..note(1000, Note::Lost)
-                };
-                e.notes.insert(0, gone);
+                e.notes.insert(0, cycles(1000, 1199, Note::Lost));
             }),
             "no frame came back for 200 ms, then all devices answered again: the first cable, or this computer's interface",
         ),
@@ -189,8 +202,11 @@ fn which_device_and_which_cause() {
         (
             left_op(1, 0x001a),
             with(|e| {
-                e.notes[0].time = 10_000 * MS;
                 overrun(e);
+                e.stop = Some(Stopped {
+                    cycle: 10_000,
+                    time: 10_000 * MS,
+                });
             }),
             "`a1` (position 1) left Op, AL status code 0x001a (synchronization error)",
         ),
@@ -247,7 +263,7 @@ fn which_device_and_which_cause() {
                 code: 0,
             },
             with(|e| {
-                e.link.main_devices = 12;
+                e.notes.insert(0, note(999, Note::OtherMainDevice(12)));
                 e.devices[0].look.al_status = Some(1);
             }),
             "another MainDevice is on this wire: 12 EtherCAT frames that are not ours; `a0` (position 0) was sent to Init",
@@ -295,14 +311,14 @@ fn which_device_and_which_cause() {
         (
             lost(false),
             with(|e| {
-                e.counters.lost_frames = 5;
-                e.counters.late_frames = 4;
+                e.notes.insert(0, cycles(997, 1001, Note::Late));
+                e.notes.insert(0, cycles(996, 1000, Note::Lost));
             }),
-            "frames come back too late for a cycle of 1 ms: 4 came in a later one",
+            "frames come back too late for a cycle of 1 ms: 5 came in a later one",
         ),
         (
             lost(false),
-            with(|e| e.counters.link_errors = 500),
+            with(|e| e.notes.insert(0, cycles(501, 1000, Note::LinkError))),
             "this computer's network interface refused to send or to receive, 500 times",
         ),
         // Nobody was asked: only what the error says.
@@ -316,6 +332,63 @@ fn which_device_and_which_cause() {
         let told = diagnose(&error, &evidence).cause.to_string();
         assert_eq!(told, expected, "{error}");
     }
+}
+
+/// What lies in the window, but does not account for what stopped the machine, is no cause of it.
+#[test]
+fn certain_silence_before_occasional_trouble() {
+    let silence = "no frame came back for 20 ms, then all devices answered again";
+    type Change = fn(&mut Evidence);
+    let others: [Change; 7] = [
+        |_| {},
+        |e| e.notes.insert(0, cycles(700, 704, Note::Late)),
+        |e| e.notes.insert(0, note(800, Note::WokeLate(2 * MS))),
+        |e| e.notes.insert(0, note(900, Note::OtherMainDevice(1))),
+        |e| e.devices[1].recent.invalid_frames[0] = 3,
+        |e| e.devices[1].recent.lost_links[1] = 1,
+        // Gone after the stop: everybody was there when frames came back.
+        |e| {
+            absent(e, 2);
+            e.al_status = Some((OP, 3));
+        },
+    ];
+    for (n, other) in others.into_iter().enumerate() {
+        let evidence = with(|e| {
+            e.notes.insert(0, cycles(981, 1000, Note::Lost));
+            other(e);
+        });
+        let found = diagnose(&lost(false), &evidence).cause.to_string();
+        assert!(found.starts_with(silence), "{n}: {found}");
+    }
+}
+
+#[test]
+fn which_stop_an_error_is_of() {
+    let stopping = |cycle, cause| note(cycle, Note::Told(Event::Stopping { cycle, cause }));
+    let cause = StopCause::LeftOp { al_status: 4 };
+    let group = note(
+        100,
+        Note::Told(Event::GroupStopping {
+            cycle: 100,
+            group: 1,
+            cause,
+        }),
+    );
+    let notes = [
+        group,
+        stopping(500, StopCause::Requested),
+        stopping(600, cause),
+    ];
+    for (group, by_cycle, expected) in [
+        (Some(1), true, 100),
+        (None, true, 600),
+        (None, false, 500),
+        (Some(2), true, 600),
+    ] {
+        let found = Stopped::find(&notes, group, by_cycle).map(|stop| stop.cycle);
+        assert_eq!(found, Some(expected), "{group:?}, {by_cycle}");
+    }
+    assert_eq!(Stopped::find(&notes[..1], None, true), None);
 }
 
 #[test]
@@ -341,8 +414,8 @@ fn what_else_was_seen_is_kept() {
         report: Box::default(),
     };
     let evidence = with(|e| {
-        e.devices[2].grown.invalid_frames[0] = 7;
-        e.link.main_devices = 1;
+        e.devices[2].recent.invalid_frames[0] = 7;
+        e.notes.insert(0, note(999, Note::OtherMainDevice(1)));
     });
     let found = diagnose(&error, &evidence);
     assert!(matches!(found.cause, Cause::AsTold { .. }), "{found:?}");

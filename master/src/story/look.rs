@@ -1,5 +1,5 @@
-//! Asks the SubDevices after a stop. Reads only, by position in the segment, so that one that has lost its station address
-//! answers, too. MAY BLOCK AND ALLOCATE; bounded in time.
+//! Asks the SubDevices after a stop. Reads only, by station address, so that nobody is taken for a neighbour when devices are
+//! missing; one that has lost its address is looked for between those that have theirs. MAY BLOCK AND ALLOCATE; bounded in time.
 
 use std::future::Future;
 use std::pin::pin;
@@ -21,6 +21,7 @@ const SILENT: u32 = 2;
 /// Lost frames are sent again.
 const TRIES: u32 = 3;
 
+const OP: u8 = 8;
 const STATION: u16 = 0x0010;
 /// DL status; AL status and AL status code follow at 0x0130 and 0x0134.
 const STATUS: u16 = 0x0110;
@@ -42,9 +43,9 @@ const INTERPOLATION_TIME: u16 = 0x60c2;
 /// What one SubDevice told. `None`: it was not asked, or did not answer.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct Look {
-    /// It answered at its position.
+    /// It answered.
     pub answers: bool,
-    /// A frame came back that nobody at its position had touched.
+    /// A frame to it came back that nobody had touched.
     pub absent: bool,
     /// It did not answer at first, and does now.
     pub came_back: bool,
@@ -63,6 +64,22 @@ pub struct Look {
     pub error_code: Option<u16>,
     /// 0x60C2, nanoseconds.
     pub interpolation_ns: Option<u64>,
+}
+
+/// What was seen of the bus when something failed.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Witnessed {
+    /// What the SubDevices told, in the order of the segment.
+    pub looks: Vec<Look>,
+    /// The group that stopped while the machine went on.
+    pub group: Option<usize>,
+}
+
+impl Witnessed {
+    #[must_use]
+    pub fn of_machine(looks: Vec<Look>) -> Self {
+        Self { looks, group: None }
+    }
 }
 
 /// The watchdogs of a SubDevice.
@@ -95,50 +112,55 @@ pub struct Ask {
     pub interpolation: bool,
 }
 
-/// Everybody who answers, `looks` in the order of the positions; those that have answered before are not asked again.
-pub async fn at_registers(wire: &Datagrams, looks: &mut [Look]) {
-    let end = clock::now().saturating_add(PATIENCE);
-    let mut asker = Asker { wire, end, lost: 0 };
-    for (position, look) in looks.iter_mut().enumerate() {
-        asker.status(position, look).await;
-    }
-    for (position, look) in looks.iter_mut().enumerate().filter(|(_, l)| l.answers) {
+/// How far devices that are well are asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Depth {
+    /// States and error counters.
+    Brief,
+    /// Watchdogs, EEPROM and SYNC0, too.
+    Whole,
+}
+
+/// Everybody who answers, `looks` and `stations` in the order of the segment; those that have answered before are not asked
+/// again.
+pub async fn at_registers(wire: &Datagrams, stations: &[u16], looks: &mut [Look], depth: Depth) {
+    let mut asker = Asker::new(wire);
+    let places = asker.everybody(stations, looks).await;
+    for (place, look) in places
+        .iter()
+        .zip(looks.iter_mut())
+        .filter(|(_, l)| l.answers)
+    {
         if let Some(bytes) = asker
-            .read::<ERROR_COUNTERS_LEN>(position, ERROR_COUNTERS)
+            .read::<ERROR_COUNTERS_LEN>(*place, ERROR_COUNTERS)
             .await
         {
             look.errors = Some(counters(&bytes));
         }
     }
     // Those with something to tell first, while there is time.
-    let mut rest: Vec<_> = looks.iter_mut().enumerate().collect();
+    let mut rest: Vec<_> = places.iter().zip(looks).collect();
     rest.retain(|(_, look)| look.answers && look.watchdog.is_none());
-    rest.sort_by_key(|(_, look)| look.al_status == Some(8));
-    for (position, look) in rest {
-        asker.details(position, look).await;
+    if depth == Depth::Brief {
+        rest.retain(|(_, look)| look.al_status != Some(OP));
+    }
+    rest.sort_by_key(|(_, look)| look.al_status == Some(OP));
+    for (place, look) in rest {
+        asker.details(*place, look).await;
     }
 }
 
 /// Those that did not answer, once more. Where no frame came back before, everybody.
-pub async fn again(wire: &Datagrams, looks: &mut [Look]) {
+pub async fn again(wire: &Datagrams, stations: &[u16], looks: &mut [Look]) {
     if !looks.iter().any(|look| look.answers || look.absent) {
-        return at_registers(wire, looks).await;
+        return at_registers(wire, stations, looks, Depth::Whole).await;
     }
-    if !looks.iter().any(|look| look.absent) {
-        return;
+    let absent: Vec<bool> = looks.iter().map(|look| look.absent).collect();
+    if absent.contains(&true) {
+        Asker::new(wire).everybody(stations, looks).await;
     }
-    let mut asker = Asker {
-        wire,
-        end: clock::now().saturating_add(PATIENCE),
-        lost: 0,
-    };
-    for (position, look) in looks.iter_mut().enumerate() {
-        if !look.absent {
-            continue;
-        }
-        look.absent = false;
-        asker.status(position, look).await;
-        (look.came_back, look.absent) = (look.answers, !look.answers);
+    for (look, absent) in looks.iter_mut().zip(absent) {
+        look.came_back |= absent && look.answers;
     }
 }
 
@@ -186,6 +208,45 @@ enum Heard<const N: usize> {
     Nothing,
 }
 
+/// How a device is reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Place {
+    Station(u16),
+    /// It does not have the address that it was given.
+    Position(u16),
+}
+
+impl Place {
+    fn station(self) -> Option<u16> {
+        match self {
+            Self::Station(station) => Some(station),
+            Self::Position(_) => None,
+        }
+    }
+}
+
+/// Devices that have lost their addresses, as an index into `expected` and a position: in the order of the segment, between
+/// those that still have theirs. `found` are the addresses at the positions.
+fn realign(expected: &[u16], found: &[u16]) -> Vec<(usize, u16)> {
+    let known = |station: &u16| expected.iter().position(|other| other == station);
+    let mut lost = Vec::new();
+    let mut next = 0;
+    for (position, station) in (0u16..).zip(found) {
+        if let Some(index) = known(station) {
+            next = next.max(index + 1);
+            continue;
+        }
+        let behind = found.iter().skip(usize::from(position)).filter_map(known);
+        let end = behind.min().unwrap_or(expected.len());
+        let mut missing = next..end;
+        if let Some(index) = missing.find(|index| !found.contains(&expected[*index])) {
+            lost.push((index, position));
+            next = index + 1;
+        }
+    }
+    lost
+}
+
 struct Asker<'a> {
     wire: &'a Datagrams,
     end: Nanos,
@@ -193,17 +254,23 @@ struct Asker<'a> {
     lost: u32,
 }
 
-impl Asker<'_> {
-    async fn ask<const N: usize>(&mut self, position: usize, register: u16) -> Heard<N> {
-        let Ok(position) = u16::try_from(position) else {
-            return Heard::Nothing;
-        };
+impl<'a> Asker<'a> {
+    fn new(wire: &'a Datagrams) -> Self {
+        let end = clock::now().saturating_add(PATIENCE);
+        Self { wire, end, lost: 0 }
+    }
+
+    async fn ask<const N: usize>(&mut self, place: Place, register: u16) -> Heard<N> {
         let mut bytes = [0; N];
         for _ in 0..TRIES {
             if self.lost >= SILENT || self.wire.now() >= self.end {
                 return Heard::Nothing;
             }
-            match self.wire.read_at(position, register, &mut bytes).await {
+            let asked = match place {
+                Place::Station(station) => self.wire.read(station, register, &mut bytes).await,
+                Place::Position(at) => self.wire.read_at(at, register, &mut bytes).await,
+            };
+            match asked {
                 Ok(0) => {
                     self.lost = 0;
                     return Heard::Nobody;
@@ -220,15 +287,47 @@ impl Asker<'_> {
         Heard::Nothing
     }
 
-    async fn read<const N: usize>(&mut self, position: usize, register: u16) -> Option<[u8; N]> {
-        match self.ask(position, register).await {
+    async fn read<const N: usize>(&mut self, place: Place, register: u16) -> Option<[u8; N]> {
+        match self.ask(place, register).await {
             Heard::Answer(bytes) => Some(bytes),
             Heard::Nobody | Heard::Nothing => None,
         }
     }
 
-    async fn status(&mut self, position: usize, look: &mut Look) {
-        let bytes = match self.ask::<STATUS_LEN>(position, STATUS).await {
+    /// Status of those that have not answered yet; returns how each is reached.
+    async fn everybody(&mut self, stations: &[u16], looks: &mut [Look]) -> Vec<Place> {
+        let mut places: Vec<_> = stations.iter().map(|at| Place::Station(*at)).collect();
+        for (place, look) in places.iter().zip(looks.iter_mut()) {
+            if !look.answers {
+                self.status(*place, look).await;
+                look.station = place.station().filter(|_| look.answers);
+            }
+        }
+        if !looks.iter().any(|look| look.absent) {
+            return places;
+        }
+        let mut found = Vec::with_capacity(stations.len());
+        while let Ok(position) = u16::try_from(found.len())
+            && found.len() < stations.len()
+            && let Some(bytes) = self.read::<2>(Place::Position(position), STATION).await
+        {
+            found.push(u16::from_le_bytes(bytes));
+        }
+        for (index, position) in realign(stations, &found) {
+            if let (Some(place), Some(look)) = (places.get_mut(index), looks.get_mut(index))
+                && look.absent
+            {
+                *place = Place::Position(position);
+                self.status(*place, look).await;
+                let station = found.get(usize::from(position));
+                look.station = station.copied().filter(|_| look.answers);
+            }
+        }
+        places
+    }
+
+    async fn status(&mut self, place: Place, look: &mut Look) {
+        let bytes = match self.ask::<STATUS_LEN>(place, STATUS).await {
             Heard::Answer(bytes) => bytes,
             Heard::Nobody => {
                 look.absent = true;
@@ -237,16 +336,14 @@ impl Asker<'_> {
             Heard::Nothing => return,
         };
         let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
-        look.answers = true;
+        (look.answers, look.absent) = (true, false);
         look.dl_status = Some(word(0));
         look.al_status = Some(bytes[0x20]);
         look.al_code = Some(word(0x24));
-        let station = self.read::<2>(position, STATION).await;
-        look.station = station.map(u16::from_le_bytes);
     }
 
-    async fn details(&mut self, position: usize, look: &mut Look) {
-        let Some(bytes) = self.read::<WATCHDOG_LEN>(position, WATCHDOG).await else {
+    async fn details(&mut self, place: Place, look: &mut Look) {
+        let Some(bytes) = self.read::<WATCHDOG_LEN>(place, WATCHDOG).await else {
             return;
         };
         let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
@@ -257,13 +354,13 @@ impl Asker<'_> {
             expired: bytes[0x42],
             pdi_expired: bytes[0x43],
         });
-        let status = self.read::<2>(position, EEPROM_STATUS).await;
+        let status = self.read::<2>(place, EEPROM_STATUS).await;
         look.eeprom = status.map(u16::from_le_bytes);
         // In this order: a pulse that was still to come then may have come since, but not the other way round.
-        let Some(system) = self.read::<8>(position, SYSTEM_TIME).await else {
+        let Some(system) = self.read::<8>(place, SYSTEM_TIME).await else {
             return;
         };
-        let Some(sync) = self.read::<SYNC_LEN>(position, SYNC).await else {
+        let Some(sync) = self.read::<SYNC_LEN>(place, SYNC).await else {
             return;
         };
         let [next @ .., c0, c1, c2, c3] = sync;
@@ -312,6 +409,25 @@ mod tests {
         assert_eq!(found.forwarded, [8, 9, 10, 11]);
         assert_eq!((found.processing, found.pdi), (12, 13));
         assert_eq!(found.lost_links, [16, 17, 18, 19]);
+    }
+
+    #[test]
+    fn who_has_lost_its_address() {
+        for (found, expected) in [
+            (&[1, 2, 3, 4][..], &[][..]),
+            (&[1, 3, 4], &[]),
+            (&[1, 0, 3, 4], &[(1, 1)]),
+            (&[1, 0, 4], &[(1, 1)]),
+            (&[1, 0, 0, 4], &[(1, 1), (2, 2)]),
+            (&[0, 0, 0, 0], &[(0, 0), (1, 1), (2, 2), (3, 3)]),
+            // The second is gone, the last has restarted.
+            (&[1, 3, 0], &[(3, 2)]),
+            // A device more than there should be.
+            (&[1, 2, 0, 3, 4], &[]),
+            (&[], &[]),
+        ] {
+            assert_eq!(realign(&[1, 2, 3, 4], found), expected, "{found:?}");
+        }
     }
 
     #[test]

@@ -19,5 +19,5 @@ pub mod ports;
 pub use cause::{Cause, Diagnosis};
 pub use diagnose::diagnose;
 pub use evidence::{DeviceEvidence, Evidence};
-pub use look::Look;
+pub use look::{Look, Witnessed};
 pub use page::Story;

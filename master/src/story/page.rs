@@ -3,7 +3,7 @@
 use ecaxis_axis::cia402::describe;
 use serde::Serialize;
 
-use super::evidence::{Evidence, is_failure};
+use super::evidence::Evidence;
 use super::look::{SyncLook, WatchdogLook};
 use super::{Cause, ports};
 use crate::al_status::al_status_text;
@@ -116,12 +116,9 @@ pub(crate) fn since(time: Nanos, started: Nanos) -> f64 {
 
 impl Stop {
     pub(crate) fn of(evidence: &Evidence, started: Nanos) -> Option<Self> {
-        let stop = evidence
-            .notes
-            .iter()
-            .find(|entry| is_failure(&entry.note))?;
+        let stop = evidence.stop?;
         Some(Self {
-            cycle: stop.first_cycle,
+            cycle: stop.cycle,
             at_s: since(stop.time, started),
         })
     }

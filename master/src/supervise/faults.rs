@@ -2,6 +2,7 @@
 
 use std::future::{Future, poll_fn};
 use std::pin::pin;
+use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
@@ -14,7 +15,8 @@ use crate::rt::feed::FeedState;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Order, Snapshot};
 use crate::session::{DriveReport, Progress, RunError};
-use crate::story::{Look, look};
+use crate::story::look::{self, Depth};
+use crate::story::{Look, Witnessed};
 
 const ERROR_CODE: u16 = 0x603f;
 pub(super) const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
@@ -45,6 +47,7 @@ impl Supervisor {
             }
             StopCause::FollowLost { axis } => RunError::FollowLost {
                 device: self.device_of(axis),
+                cause: self.cause_of_others(axis, snapshot).await,
                 reason: match snapshot.feeds.get(axis) {
                     Some(FeedState::Refused(reason)) => reason.to_string(),
                     Some(FeedState::Lost(why)) => (*why).to_owned(),
@@ -127,6 +130,16 @@ impl Supervisor {
         None
     }
 
+    /// What has stopped a group in which an axis may have followed another.
+    async fn cause_of_others(&mut self, axis: usize, snapshot: &Snapshot) -> Option<Arc<RunError>> {
+        // The machine's stop is looked at first; the group's may be of the same cycle. Explained in a box: it may explain this one.
+        Box::pin(self.tell_of_groups(snapshot)).await;
+        let own = self.group_of(axis);
+        let mut others = self.stopped.iter().rev();
+        let last = others.find(|stop| !stop.released && stop.group != own)?;
+        Some(Arc::clone(&last.cause))
+    }
+
     pub(super) async fn not_enabled(
         &mut self,
         axis: usize,
@@ -168,13 +181,35 @@ impl Supervisor {
         within(ASK_TIMEOUT, mailbox.upload(index, 0)).await?.ok()
     }
 
+    /// Station addresses in the order of the segment.
+    pub(super) fn stations(&self) -> Vec<u16> {
+        let mut devices = self.bus.addresses();
+        devices.sort_by_key(|device| device.position);
+        devices.iter().map(|device| device.station).collect()
+    }
+
+    /// What has been seen of the bus when a failure happened; asked for now where nobody has.
+    pub(super) async fn witness(&mut self, error: &RunError) {
+        let group = error.shared_cause().and_then(|cause| {
+            let mut stops = self.stopped.iter();
+            stops.find(|stop| Arc::ptr_eq(&stop.cause, cause))
+        });
+        match group {
+            Some(stop) => self.witnessed = Some(stop.witnessed.clone()),
+            None => {
+                let looks = self.look(Depth::Whole).await;
+                self.witnessed = Some(Witnessed::of_machine(looks));
+            }
+        }
+    }
+
     /// Asks all SubDevices what they know of a failure, and drives that have one what it is.
-    pub(super) async fn look(&mut self) {
+    pub(super) async fn look(&mut self, depth: Depth) -> Vec<Look> {
         if self.outer.orders.is_abandoned() {
-            return;
+            return Vec::new();
         }
         let mut looks = vec![Look::default(); self.bus.devices.len()];
-        look::at_registers(&self.wire, &mut looks).await;
+        look::at_registers(&self.wire, &self.stations(), &mut looks, depth).await;
         let snapshot = self.outer.snapshots.read().clone();
         let end = clock::now().saturating_add(look::PATIENCE);
         for (&device, status) in self.axes.iter().zip(&snapshot.axes) {
@@ -195,7 +230,7 @@ impl Supervisor {
                 look::at_objects(&mailbox, ask, look).await;
             }
         }
-        self.looks = looks;
+        looks
     }
 
     /// What a device that has failed says of it. Best effort: the machine stops meanwhile.

@@ -6,6 +6,8 @@ use super::Supervisor;
 use crate::config::{Action, Step};
 use crate::rt::handover::Snapshot;
 use crate::session::{GroupStop, Progress, RunError};
+use crate::story::Witnessed;
+use crate::story::look::Depth;
 
 /// A stop of a group that the machine went on through.
 #[derive(Debug, Clone)]
@@ -15,6 +17,7 @@ pub struct StoppedGroup {
     /// Which of its stops it is, from 1.
     pub number: u32,
     pub cause: Arc<RunError>,
+    pub witnessed: Witnessed,
     pub released: bool,
 }
 
@@ -58,10 +61,15 @@ impl Supervisor {
             {
                 let cause = self.explain_stop(cause, Some(group), snapshot).await;
                 let cause = Arc::new(cause);
+                let witnessed = Witnessed {
+                    looks: self.look(Depth::Brief).await,
+                    group: Some(group),
+                };
                 self.stopped.push(StoppedGroup {
                     group,
                     number: now.stops,
                     cause: Arc::clone(&cause),
+                    witnessed,
                     released: false,
                 });
                 let group = self.group_name(group);

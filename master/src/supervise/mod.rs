@@ -23,7 +23,7 @@ use crate::rt::exchange::Probe;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
 use crate::session::{Capture, GroupStop, Log, Progress, RunError, Status, clock_off};
-use crate::story::{Look, look};
+use crate::story::{Witnessed, look};
 use crate::wire::{BesideCycle, Datagrams};
 use groups::StoppedGroup;
 
@@ -86,12 +86,12 @@ pub struct Supervisor {
     pub limited: Vec<bool>,
     /// When the last status was told.
     pub last_status: Nanos,
-    /// What the SubDevices told after a failure, in the order of the segment.
-    pub looks: Vec<Look>,
+    /// What was seen of the bus when it failed.
+    pub witnessed: Option<Witnessed>,
 }
 
 /// How the machine's program ended.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default)]
 pub struct Ended {
     /// Complete runs of the program.
     pub runs: u32,
@@ -101,8 +101,10 @@ pub struct Ended {
     pub captures: Vec<Capture>,
     /// Groups that stopped while the machine went on.
     pub group_stops: Vec<GroupStop>,
-    /// What the SubDevices told after a failure, in the order of the segment.
-    pub looks: Vec<Look>,
+    /// What was seen of the bus when it failed.
+    pub witnessed: Option<Witnessed>,
+    /// What stopped a group that was not reset, and what was seen of the bus then.
+    pub left: Option<(Arc<RunError>, Witnessed)>,
 }
 
 /// Runs a future until it ends or the user wants everything to; `None` then.
@@ -137,10 +139,10 @@ impl Supervisor {
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
-        if result.is_err() {
+        if let Err(error) = &result {
             // The axes come to rest meanwhile.
             self.order(Order::Stop).await;
-            self.look().await;
+            self.witness(error).await;
         }
         let back = self.wind_down().await;
         if result.is_ok() {
@@ -148,7 +150,9 @@ impl Supervisor {
         }
         self.order(Order::Halt).await;
         ended.captures = std::mem::take(&mut self.captures);
-        ended.looks = std::mem::take(&mut self.looks);
+        ended.witnessed = self.witnessed.take();
+        let left = self.stopped.into_iter().find(|stop| !stop.released);
+        ended.left = left.map(|stop| (stop.cause, stop.witnessed));
         (ended, result)
     }
 
@@ -382,10 +386,11 @@ impl Supervisor {
         self.tell(Progress::Stopping);
         self.order(Order::Stop).await;
         let result = self.await_rest().await;
-        if result.is_err() && self.looks.is_empty() {
-            self.look().await;
-        } else {
-            look::again(&self.wire, &mut self.looks).await;
+        let stations = self.stations();
+        if let Some(witnessed) = &mut self.witnessed {
+            look::again(&self.wire, &stations, &mut witnessed.looks).await;
+        } else if let Err(error) = &result {
+            self.witness(error).await;
         }
         self.pass_events_on();
         self.order(Order::Unguard).await;

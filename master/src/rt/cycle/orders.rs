@@ -81,6 +81,9 @@ impl Engine {
             .and_then(|own| self.groups.get(own))
             .is_some_and(Group::alone);
         let machine_stops = self.stopping().is_some();
+        if cause != StopCause::Requested {
+            self.exchange.stop_windows(own.filter(|_| goes_on));
+        }
         if !goes_on {
             self.history.stopping(match cause {
                 StopCause::Requested => Anchor::Requested,
@@ -193,6 +196,7 @@ impl Engine {
             for slot in self.axes.iter_mut().filter(|slot| slot.group == index) {
                 slot.disarm();
             }
+            self.exchange.release_windows(index);
             let cycle = self.stats.counters.cycles;
             let group = index;
             self.report(Event::GroupReleased { cycle, group });

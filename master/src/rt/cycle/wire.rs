@@ -75,6 +75,11 @@ impl Engine {
     }
 
     pub(super) fn count(&mut self) {
+        let others = self.link.main_devices();
+        let more = others.saturating_sub(std::mem::replace(&mut self.main_devices, others));
+        if more > 0 {
+            self.jot(Note::OtherMainDevice(more));
+        }
         if self.guarding {
             if !self.answer.complete {
                 self.stats.counters.lost_frames += 1;

@@ -55,6 +55,35 @@ pub struct ErrorCounters {
 }
 
 impl ErrorCounters {
+    /// Copies what one probe reads.
+    fn take(&mut self, probe: Probe, from: &Self) {
+        match probe {
+            Probe::RxErrors => {
+                self.invalid_frames = from.invalid_frames;
+                self.rx_errors = from.rx_errors;
+            }
+            Probe::Forwarded => {
+                self.forwarded = from.forwarded;
+                (self.processing, self.pdi) = (from.processing, from.pdi);
+            }
+            Probe::LostLinks => self.lost_links = from.lost_links,
+            Probe::AlStatus | Probe::ClockDifference => {}
+        }
+    }
+
+    /// The larger of each.
+    fn max(&self, other: &Self) -> Self {
+        let more = |a: [u8; 4], b: [u8; 4]| std::array::from_fn(|port: usize| a[port].max(b[port]));
+        Self {
+            invalid_frames: more(self.invalid_frames, other.invalid_frames),
+            rx_errors: more(self.rx_errors, other.rx_errors),
+            forwarded: more(self.forwarded, other.forwarded),
+            processing: self.processing.max(other.processing),
+            pdi: self.pdi.max(other.pdi),
+            lost_links: more(self.lost_links, other.lost_links),
+        }
+    }
+
     /// What they have grown by.
     #[must_use]
     pub fn since(&self, start: &Self) -> Self {
@@ -88,6 +117,65 @@ pub struct Diagnosis {
     begun: [bool; Probe::ALL.len()],
 }
 
+/// What the error counters of one SubDevice were shortly before a stop, and at it. Not part of what is published every cycle.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Window {
+    /// As they were when the last window began, and the one before it.
+    begins: [ErrorCounters; 2],
+    /// The first reads after the stop.
+    at_stop: ErrorCounters,
+    stopped: bool,
+    /// Those reads have been made; in the order of [`Probe::ALL`].
+    ended: [bool; Probe::ALL.len()],
+}
+
+impl Window {
+    /// What the counters grew by shortly before the stop: from the window before the last to the first read after the stop, or
+    /// to the `latest` where no such read was made.
+    #[must_use]
+    pub fn grown(&self, latest: &ErrorCounters) -> ErrorCounters {
+        let mut end = *latest;
+        for probe in Probe::ALL {
+            if self.ended[probe as usize] {
+                end.take(probe, &self.at_stop);
+            }
+        }
+        end.since(&self.begins[0])
+    }
+
+    /// A window begins; none does after a stop. RT.
+    pub(super) fn begin(&mut self, now: &ErrorCounters) {
+        if !self.stopped {
+            self.begins = [self.begins[1], *now];
+        }
+    }
+
+    /// What one probe has read. RT.
+    pub(super) fn take(&mut self, probe: Probe, now: &ErrorCounters, first: bool) {
+        if first {
+            for to in &mut self.begins {
+                to.take(probe, now);
+            }
+        }
+        if self.stopped && !std::mem::replace(&mut self.ended[probe as usize], true) {
+            self.at_stop.take(probe, now);
+        }
+    }
+
+    /// Its group stops. RT.
+    pub(super) fn stop(&mut self) {
+        self.stopped = true;
+    }
+
+    /// Its group has been reset. RT.
+    pub(super) fn release(&mut self, now: &ErrorCounters) {
+        *self = Self {
+            begins: [*now; 2],
+            ..Self::default()
+        };
+    }
+}
+
 impl Diagnosis {
     /// What the error counters have grown by since the cycle began.
     #[must_use]
@@ -104,26 +192,21 @@ impl Diagnosis {
     /// As [`Diagnosis::grown`], up to counters that somebody else has read since.
     #[must_use]
     pub fn grown_to(&self, now: &ErrorCounters) -> ErrorCounters {
-        let since = now.since(&self.start);
-        let mut grown = self.grown();
-        let more = |to: &mut [u8; 4], new: [u8; 4]| {
-            for (to, new) in to.iter_mut().zip(new) {
-                *to = new.max(*to);
+        self.latest(Some(now)).since(&self.start)
+    }
+
+    /// The error counters as they were last; `now` of those that have been read before.
+    #[must_use]
+    pub fn latest(&self, now: Option<&ErrorCounters>) -> ErrorCounters {
+        let mut latest = self.errors;
+        for probe in Probe::ALL {
+            if let Some(now) = now.filter(|_| self.has_read(probe)) {
+                let mut part = latest;
+                part.take(probe, now);
+                latest = latest.max(&part);
             }
-        };
-        if self.has_read(Probe::RxErrors) {
-            more(&mut grown.invalid_frames, since.invalid_frames);
-            more(&mut grown.rx_errors, since.rx_errors);
         }
-        if self.has_read(Probe::Forwarded) {
-            more(&mut grown.forwarded, since.forwarded);
-            grown.processing = grown.processing.max(since.processing);
-            grown.pdi = grown.pdi.max(since.pdi);
-        }
-        if self.has_read(Probe::LostLinks) {
-            more(&mut grown.lost_links, since.lost_links);
-        }
-        grown
+        latest
     }
 
     /// Takes an answer in. RT.
@@ -148,22 +231,8 @@ impl Diagnosis {
             _ => return,
         }
         let n = probe as usize;
-        if let Some(begun) = self.begun.get_mut(n)
-            && !std::mem::replace(begun, true)
-        {
-            let (now, start) = (&self.errors, &mut self.start);
-            match probe {
-                Probe::RxErrors => {
-                    start.invalid_frames = now.invalid_frames;
-                    start.rx_errors = now.rx_errors;
-                }
-                Probe::Forwarded => {
-                    start.forwarded = now.forwarded;
-                    (start.processing, start.pdi) = (now.processing, now.pdi);
-                }
-                Probe::LostLinks => start.lost_links = now.lost_links,
-                Probe::AlStatus | Probe::ClockDifference => {}
-            }
+        if !std::mem::replace(&mut self.begun[n], true) {
+            self.start.take(probe, &self.errors);
         }
     }
 }
@@ -226,6 +295,36 @@ mod tests {
             none,
             "nothing to compare with"
         );
+    }
+
+    #[test]
+    fn only_what_grew_around_the_stop_is_recent() {
+        let lost = |n: u8| ErrorCounters {
+            lost_links: [0, n, 0, 0],
+            ..ErrorCounters::default()
+        };
+        let mut window = Window::default();
+        let grown = |window: &Window, n| window.grown(&lost(n)).lost_links[1];
+        window.take(Probe::LostLinks, &lost(1), true);
+        window.take(Probe::LostLinks, &lost(3), false);
+        assert_eq!(grown(&window, 3), 2);
+        // Two windows later it is long ago.
+        window.begin(&lost(3));
+        assert_eq!(grown(&window, 3), 2);
+        window.begin(&lost(3));
+        assert_eq!(grown(&window, 3), 0);
+        window.stop();
+        window.begin(&lost(4));
+        window.begin(&lost(4));
+        // Not read since the stop: the latest.
+        assert_eq!(grown(&window, 6), 3);
+        window.take(Probe::RxErrors, &lost(5), false);
+        assert_eq!(grown(&window, 6), 3, "another probe");
+        window.take(Probe::LostLinks, &lost(5), false);
+        window.take(Probe::LostLinks, &lost(9), false);
+        assert_eq!(grown(&window, 9), 2, "the first read after the stop");
+        window.release(&lost(9));
+        assert_eq!(grown(&window, 10), 1);
     }
 
     #[test]
