@@ -76,6 +76,8 @@ pub enum Cause {
         silence_ns: Nanos,
         watchdog_ns: Option<Nanos>,
     },
+    /// A device in Op does not take its outputs: its watchdog has expired and is not started again.
+    OutputsNotTaken { device: String, watchdog_ns: Nanos },
     /// SYNC0 does not come when the device needs it.
     Sync {
         device: String,
@@ -239,6 +241,14 @@ impl fmt::Display for Cause {
                     n => write!(f, "; so did {n} other devices"),
                 }
             }
+            Self::OutputsNotTaken {
+                device,
+                watchdog_ns,
+            } => write!(
+                f,
+                "{device} does not take its outputs: its process data watchdog of {} has expired (0x0440)",
+                time(watchdog_ns)
+            ),
             Self::Sync {
                 device,
                 code,

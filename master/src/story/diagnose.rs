@@ -477,6 +477,14 @@ fn of_one_device(error: &RunError, evidence: &Evidence) -> Option<Cause> {
             code: Some(code),
             ..
         } if FOLLOWING_ERROR.contains(code) => interpolation(device, error, evidence),
+        RunError::NotEnabled { device, .. } => {
+            let watchdog = evidence.named(&device.name)?.look.watchdog?;
+            let expired = watchdog.time_ns > 0 && watchdog.expired > 0 && !watchdog.in_time;
+            expired.then(|| Cause::OutputsNotTaken {
+                device: place(device),
+                watchdog_ns: watchdog.time_ns,
+            })
+        }
         RunError::BringUp(error) => bring_up(error, evidence),
         _ => None,
     }

@@ -299,6 +299,24 @@ fn which_device_and_which_cause() {
             with(|e| e.devices[1].look.interpolation_ns = Some(MS)),
             "`a1` (position 1, station 0x1001): following error 2.0000 exceeds 1.0000",
         ),
+        (
+            RunError::NotEnabled {
+                device: at(1),
+                state: ecaxis_axis::State::SwitchOnDisabled,
+                statusword: 0x0240,
+                mode_confirmed: true,
+                code: None,
+                timeout_ms: 5000,
+            },
+            with(|e| {
+                e.devices[1].look.watchdog = Some(WatchdogLook {
+                    time_ns: 100 * MS,
+                    expired: 1,
+                    ..WatchdogLook::default()
+                });
+            }),
+            "`a1` (position 1) does not take its outputs: its process data watchdog of 100 ms has expired (0x0440)",
+        ),
         // The device that is not in Op is why the working counter was wrong.
         (
             lost(true),

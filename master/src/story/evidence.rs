@@ -265,8 +265,7 @@ impl Evidence {
 }
 
 impl Stopped {
-    /// The stop that an error is about: the named group's; the machine's first for a reason where the cycle found one, and
-    /// otherwise its first.
+    /// The stop that an error is about: the named group's; otherwise the machine's first, for a reason where the cycle found one.
     #[must_use]
     pub fn find(notes: &[Entry], group: Option<usize>, by_cycle: bool) -> Option<Self> {
         let cause = |entry: &Entry| match entry.note {
@@ -279,9 +278,7 @@ impl Stopped {
         };
         let own = |entry: &&Entry| matches!(entry.note, Note::Told(Event::GroupStopping { group: own, .. }) if Some(own) == group);
         let group = notes.iter().rev().find(own);
-        let found = group
-            .or_else(|| machine(true).filter(|_| by_cycle))
-            .or_else(|| machine(false))?;
+        let found = group.or_else(|| machine(by_cycle))?;
         Some(Self {
             cycle: found.first_cycle,
             time: found.time,

@@ -62,6 +62,9 @@ pub(crate) fn cause(cause: &Cause) -> Vec<String> {
             "find out why no frame came back: the cable, a device in front that restarted, or this computer (`ecaxis doctor`)".to_owned(),
             "`lost_frames` in the machine file stops the machine before the watchdogs do".to_owned(),
         ],
+        Cause::OutputsNotTaken { .. } => vec![
+            "switch the device off and on; look whether its outputs' SyncManager and FMMU are as `ecaxis explain` prints them".to_owned(),
+        ],
         Cause::Sync { code, .. } => {
             let own = al_status_hint(*code).map(ToOwned::to_owned);
             own.into_iter()
