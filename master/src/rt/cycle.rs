@@ -152,7 +152,7 @@ impl Engine {
             clock: parts.clock,
             timing: parts.timing,
             main_devices: parts.link.main_devices(),
-            window: started + history::WINDOW,
+            window: started + history::COUNTER_WINDOW,
             link: parts.link,
             port: parts.port,
             exchange: parts.exchange,
@@ -331,7 +331,7 @@ impl Engine {
     /// To those beside the cycle, and to the history.
     fn publish(&mut self, woke: Nanos, lateness: Nanos) {
         if self.next >= self.window {
-            self.window = self.next + history::WINDOW;
+            self.window = self.next + history::COUNTER_WINDOW;
             self.exchange.begin_windows();
         }
         let stopping = self.stopping();

@@ -13,6 +13,8 @@ pub const KEPT: usize = 200;
 pub const AFTER: u32 = 50;
 /// What happened longer before a stop has nothing to do with it.
 pub const WINDOW: Nanos = 1_000_000_000;
+/// Error counters are kept as they were one to two of these before a stop.
+pub const COUNTER_WINDOW: Nanos = 250_000_000;
 
 /// One cycle.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]

@@ -287,9 +287,9 @@ fn damaged_frames(error: &RunError, evidence: &Evidence, class: Class) -> Option
     let (count, index, port) =
         ports.max_by_key(|(count, index, port)| (*count, std::cmp::Reverse((*index, *port))))?;
     let device = evidence.devices.get(index)?;
-    // One may be a spark; a bad cable brings as many as there are frames missing.
+    // One may be a spark; each frame that a bad cable has taken is counted.
     let enough = match error {
-        RunError::BusLost { .. } => u64::from(count) * 2 >= evidence.lost_at_stop(),
+        RunError::BusLost { .. } => u64::from(count) >= evidence.lost_at_stop(),
         _ => count > 1,
     };
     let cause = || Cause::DamagedFrames {
