@@ -164,6 +164,10 @@ impl Axis {
         let grip = self.grip();
         self.held_by_range &= matches!(self.plan, Plan::Velocity(_) | Plan::Drive);
         match self.plan {
+            // The new mode shows, and the drive does not follow in it yet.
+            _ if grip == Control::Position && self.switch.is_some() && !self.follows_now() => {
+                self.motion = self.tracked(self.drift());
+            }
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
             Plan::Jerk(ref mut source) => self.motion = source.advance(before, dt_s),
             Plan::Move(trapezoid) => self.motion = trapezoid.advance(before, dt_s),

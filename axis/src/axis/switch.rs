@@ -86,12 +86,16 @@ impl Axis {
         let Some(mut switch) = self.switch else {
             return;
         };
-        let shows = self.shows(switch.to) && self.follows_now();
+        let shows = self.shows(switch.to);
         if fresh {
             // No frame has asked for the mode before since the one that is answered.
             let answered = switch.asked > self.config.answers_late;
             switch.reached |= answered;
-            switch.shown = if shows { switch.shown + 1 } else { 0 };
+            switch.shown = if shows && self.follows_now() {
+                switch.shown + 1
+            } else {
+                0
+            };
             if shows && answered && self.mode != switch.to {
                 self.change_law(switch.to);
             } else if self.shows(switch.from) && self.mode != switch.from {
