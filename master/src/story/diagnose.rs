@@ -71,7 +71,10 @@ pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
             cause
         }
         None => of_one_device(error, evidence).unwrap_or_else(|| Cause::AsTold {
-            text: error.to_string(),
+            text: match error {
+                RunError::BringUp(error) => error.to_string(),
+                error => error.to_string(),
+            },
         }),
     };
     // It is what the others have in common.
