@@ -139,7 +139,10 @@ pub fn select(
     };
     let rx = chooser(Direction::Rx).choose(choice.mode, choice.rx, &mut notes)?;
     let tx = chooser(Direction::Tx).choose(choice.mode, choice.tx, &mut notes)?;
-    let layout = Layout::new(device, &rx, &tx)?;
+    let mut layout = Layout::new(device, &rx, &tx)?;
+    if choice.mode.is_some() {
+        watch_outputs(device, &mut layout, &mut notes);
+    }
     let dc = dc_mode
         .filter(|mode| mode.assign_activate != 0)
         .map(|mode| dc::settings(mode, choice.cycle_ns))
@@ -180,6 +183,24 @@ pub fn select(
     selection.startup = startup::list(device, &mut selection, &dictionary, choice)?;
     selection.dictionary = dictionary;
     Ok(selection)
+}
+
+/// A drive stops by itself when its outputs do not come, whatever its ESI says: bit 6 of the
+/// ControlByte (ETG.1000.4, table 58) lets writing them trigger the watchdog.
+fn watch_outputs(device: &Device, layout: &mut Layout, notes: &mut Vec<String>) {
+    const WATCHDOG_TRIGGER: u8 = 0x40;
+    for sm in &mut layout.outputs {
+        let of_file = sm.control_byte;
+        sm.control_byte |= WATCHDOG_TRIGGER;
+        if sm.control_byte != of_file {
+            let line = device.sync_managers.get(usize::from(sm.sm));
+            let line = line.map_or(0, |sm| sm.position.line);
+            notes.push(format!(
+                "SyncManager {} gets ControlByte 0x{:02x}, with the watchdog trigger that 0x{of_file:02x} (line {line}) lacks",
+                sm.sm, sm.control_byte
+            ));
+        }
+    }
 }
 
 fn merged(device: &Device, placed: &[module::Placed<'_>]) -> Dictionary {
