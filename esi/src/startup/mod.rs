@@ -9,6 +9,7 @@ mod pdo;
 
 use std::collections::HashMap;
 
+use crate::layout::Layout;
 use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
 use crate::select::{Choice, SelectError, SelectedModule, Selection};
 use crate::{Dictionary, Mode, address};
@@ -32,6 +33,7 @@ pub struct StartupSdo {
 const UPWARDS: [&str; 3] = ["IP", "PS", "SO"];
 
 const MODES_OF_OPERATION: u16 = 0x6060;
+const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
 const INTERPOLATION_TIME: u16 = 0x60c2;
 const MODULE_LIST: u16 = 0xf030;
 
@@ -227,9 +229,9 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
     list.push(MODULE_LIST, 0, vec![count], &whole);
 }
 
-/// Cyclic set-points are interpolated over the bus cycle (CSP, CSV). In CST the EPOS4 application notes set the
-/// time to zero; that is written where the dictionary says that zero is allowed, because a time stored by an
-/// earlier configuration would otherwise stay.
+/// Cyclic set-points are interpolated over the bus cycle in CSP and CSV, whether the axis starts in them or can be
+/// switched to them. In CST alone the EPOS4 application notes set the time to zero; that is written where the
+/// dictionary says that zero is allowed, because a time stored by an earlier configuration would otherwise stay.
 fn interpolation_time(
     selection: &mut Selection,
     choice: &Choice<'_>,
@@ -240,12 +242,13 @@ fn interpolation_time(
     };
     let objects = list.objects;
     let item = objects.item(INTERPOLATION_TIME, 1);
+    let interpolates = mode != Mode::Cst || can_leave_cst(&selection.layout);
     let writable = match item {
         Some(item) => item.access.write != Writable::Never,
-        None => objects.is_empty() && mode != Mode::Cst,
+        None => objects.is_empty() && interpolates,
     };
     if !writable {
-        if mode != Mode::Cst {
+        if interpolates {
             selection.notes.push(format!(
                 "the dictionary has no writable 0x60C2; the drive is not told the cycle of {} µs",
                 choice.cycle_ns / 1000
@@ -253,7 +256,7 @@ fn interpolation_time(
         }
         return Ok(());
     }
-    if mode == Mode::Cst {
+    if !interpolates {
         let zero_allowed = item.is_some_and(|item| {
             item.min
                 .as_ref()
@@ -277,6 +280,16 @@ fn interpolation_time(
     );
     list.knows_period = true;
     Ok(())
+}
+
+/// The mode and its display are in the process data, and a target that is interpolated is.
+fn can_leave_cst(layout: &Layout) -> bool {
+    let mapped = |index| layout.rx_field(index, 0).is_some();
+    mapped(MODES_OF_OPERATION)
+        && layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_some()
+        && [Mode::Csp, Mode::Csv]
+            .into_iter()
+            .any(|mode| mode.target_object().is_some_and(mapped))
 }
 
 fn is_zero(bytes: &[u8]) -> bool {
