@@ -4,7 +4,7 @@ use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
 
 use super::{BringUpError, BusDevice, DeviceRef, Step};
-use crate::config::{Bus, DeviceConfig, StartupWay};
+use crate::config::{DeviceConfig, StartupWay};
 use crate::mailbox::{CoeClient, ObjectAddress, SdoError, Wire, object_name};
 use crate::rt::image::Region;
 
@@ -17,10 +17,6 @@ const OFF: [u8; FMMU_SIZE as usize] = [0; FMMU_SIZE as usize];
 pub(super) const SYNC_MANAGER: u16 = 0x0800;
 pub(super) const SYNC_MANAGER_SIZE: u16 = 8;
 const STATUS: u16 = 5;
-const WATCHDOG_DIVIDER: u16 = 0x0400;
-const WATCHDOG_PROCESS_DATA: u16 = 0x0420;
-/// (2498 + 2) × 40 ns: the process-data watchdog counts in 100 µs.
-const DIVIDER_100_US: u16 = 2498;
 
 /// When start-up SDOs are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -275,32 +271,6 @@ fn fmmu(logical: u32, physical: u16, len: u16, kind: u8) -> [u8; FMMU_SIZE as us
     let [p0, p1] = physical.to_le_bytes();
     // Start bit 0 to stop bit 7; physical start bit 0; enabled.
     [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, 1, 0, 0, 0]
-}
-
-/// A device without its outputs for longer than this leaves Op by itself.
-pub(super) async fn set_watchdog(
-    wire: &impl Wire,
-    bus: &Bus,
-    device: &BusDevice,
-) -> Result<(), BringUpError> {
-    const STEP: &str = "setting the process-data watchdog";
-    let ticks = u16::try_from(bus.watchdog_ns / 100_000)
-        .unwrap_or(u16::MAX)
-        .max(1);
-    // A controller without these registers watches nothing; that is not an error.
-    for (register, value) in [
-        (WATCHDOG_DIVIDER, DIVIDER_100_US),
-        (WATCHDOG_PROCESS_DATA, ticks),
-    ] {
-        wire.write(device.at.station, register, &value.to_le_bytes())
-            .await
-            .map_err(|source| BringUpError::Wire {
-                device: device.at.clone(),
-                step: STEP,
-                source,
-            })?;
-    }
-    Ok(())
 }
 
 /// A register write that the device must take.

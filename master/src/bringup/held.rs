@@ -8,13 +8,23 @@ use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
 
 use super::{BringUpError, BusDevice};
-use crate::config::DeviceConfig;
+use crate::config::{DeviceConfig, further_axis};
 use crate::mailbox::{SdoError, Wire};
 
 /// Objects for which zero is a value like any other, or the only safe one.
 const ZERO_IS_SAFE: [u16; 11] = [
     0x6040, 0x6060, 0x6071, 0x607a, 0x60b0, 0x60b1, 0x60b2, 0x60b8, 0x60fe, 0x60ff, 0x0000,
 ];
+
+/// Whether the output bounds a motion. Those of a drive's further axes do not: without a Controlword
+/// none of them moves.
+fn bounds(field: &Field, rx: &[Field]) -> bool {
+    let Some((axis, same)) = further_axis(field) else {
+        return !ZERO_IS_SAFE.contains(&field.index);
+    };
+    let has_controlword = rx.iter().any(|f| further_axis(f) == Some((axis, 0x6040)));
+    !has_controlword && !ZERO_IS_SAFE.contains(&same)
+}
 
 /// Reads what must be held into `device.held`.
 pub(super) async fn read(
@@ -25,8 +35,8 @@ pub(super) async fn read(
     if config.axis.is_none() {
         return Ok(());
     }
-    let bounds = |field: &&Field| !ZERO_IS_SAFE.contains(&field.index);
-    for field in config.selection.layout.rx.iter().filter(bounds) {
+    let rx = &config.selection.layout.rx;
+    for field in rx.iter().filter(|field| bounds(field, rx)) {
         let Some(coe) = device.coe.as_mut() else {
             return Ok(());
         };

@@ -17,7 +17,7 @@ use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 use ecaxis_esi::address;
 
 use crate::clock;
-use crate::config::{Adopted, Machine, UnitProblem};
+use crate::config::{Adopted, LimitConflict, Machine, UnitProblem};
 use crate::mailbox::desk::Listen;
 use crate::mailbox::{CoeClient, SdoError, WireError};
 use crate::rt::image::{self, ImagePlan};
@@ -31,15 +31,17 @@ mod device;
 mod held;
 mod identify;
 pub(crate) use identify::FIRST_STATION;
+mod limits;
 mod mailbox;
 mod mapping;
 pub(crate) mod units;
+mod watchdog;
 
 pub use al::{AlState, StateError};
 use device::Moment;
 
 /// SubDevices that ethercrab keeps in one group; a power of two.
-const MAX_SUBDEVICES: usize = 128;
+pub(crate) const MAX_SUBDEVICES: usize = 512;
 /// ethercrab's own process image, which stays unused.
 const MAX_PDI: usize = 1;
 
@@ -75,6 +77,8 @@ pub struct BusDevice {
     pub held: Vec<(u16, u8, i64)>,
     /// Of a drive: its axis, as the drive's own units make it.
     pub adopted: Option<Box<Adopted>>,
+    /// Of a drive: its own limits that the machine file exceeds.
+    pub limits: Vec<LimitConflict>,
     /// From the reference clock, nanoseconds.
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
@@ -260,6 +264,8 @@ pub enum BringUpError {
     },
     #[error("{device}: asking the drive for its units: {source}")]
     ReadUnits { device: DeviceRef, source: SdoError },
+    #[error("{device}: asking the drive for its limits: {source}")]
+    ReadLimits { device: DeviceRef, source: SdoError },
     #[error("{device}: emptying the mailbox: {source}")]
     Mailbox { device: DeviceRef, source: SdoError },
     #[error("{device}: reading the PDO mapping back: {source}")]
@@ -275,6 +281,14 @@ pub enum BringUpError {
         device: DeviceRef,
         step: &'static str,
         register: u16,
+    },
+    #[error("{device}: {what}: register 0x{register:04x} holds {found}, wanted is {wanted}")]
+    Watchdog {
+        device: DeviceRef,
+        what: &'static str,
+        register: u16,
+        wanted: String,
+        found: String,
     },
     #[error("{device}: the ESI asks for SYNC0, the device has no distributed clock")]
     NoClock { device: DeviceRef },
@@ -348,6 +362,7 @@ pub async fn bring_up(
             at,
             held: Vec::new(),
             adopted: None,
+            limits: Vec::new(),
             dc,
             propagation_delay: sub_device.propagation_delay(),
             dl_status: identify::dl_status(&wire, position).await,
@@ -381,6 +396,7 @@ async fn set_up(
         device::start_up(wire, config, device, Moment::InPreOp, progress).await?;
         mapping::compare(wire, config, device).await?;
         units::compare(wire, config, device, progress).await?;
+        limits::compare(wire, config, device, progress).await?;
         held::read(wire, config, device).await?;
         device.tell(listener);
     }
@@ -393,7 +409,7 @@ async fn set_up(
     for (index, ((config, device), region)) in regions.enumerate() {
         let status = image.mailboxes.as_ref().and_then(|m| m.logical_of(index));
         device::map_process_data(wire, config, device, *region, status).await?;
-        device::set_watchdog(wire, &machine.bus, device).await?;
+        watchdog::set(wire, &machine.bus, config, device, progress).await?;
     }
     progress(Step::ProcessData {
         bytes: image.len,

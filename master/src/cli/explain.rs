@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::path::PathBuf;
 
-use ecaxis::config::{self, Action, DeviceConfig, Exchange, Machine, Nic, Step, duration};
+use ecaxis::config::{self, Action, Bus, DeviceConfig, Exchange, Machine, Nic, Step, duration};
 use ecaxis::link::BackEnd;
 use ecaxis::rt::exchange::LONGEST_LOOK;
 use ecaxis::rt::image::{self, Access, ImagePlan};
@@ -123,11 +123,13 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         ["idle", "sleep", "CPUs sleep between two cycles"]
     });
     let watchdog = duration::show(bus.watchdog_ns);
-    row([
-        "watchdog",
-        &watchdog,
-        "SyncManager and PDI watchdog (0x0400, 0x0410, 0x0420)",
-    ]);
+    let registers = format!(
+        "of the process data: 0x0420 = {}, 0x0400 = {}; of the PDI: 0x0410 = {}",
+        bus.process_data_watchdog(),
+        Bus::WATCHDOG_DIVIDER,
+        Bus::PDI_WATCHDOG,
+    );
+    row(["watchdog", &watchdog, &registers]);
     if machine.devices.iter().any(|d| d.selection.dc.is_some()) {
         row([
             "clock_window",

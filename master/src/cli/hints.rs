@@ -5,7 +5,7 @@ use std::path::Path;
 
 use ecaxis::al_status::al_status_hint;
 use ecaxis::bringup::{BringUpError, StateError};
-use ecaxis::config::{ConfigError, Nic, UnitProblem};
+use ecaxis::config::{ConfigError, LimitConflict, Nic, UnitProblem};
 use ecaxis::mailbox::{ObjectAddress, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
@@ -121,6 +121,12 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::WrongMode { .. } => {
             "the drive refused the mode: check that its firmware supports it and that no parameter forbids it".to_owned()
         }
+        RunError::Trip { trip: Trip::FollowingError { .. }, limits, .. } if !limits.is_empty() => {
+            allows_less(limits)
+        }
+        RunError::DriveFault { code: Some(FOLLOWING_ERROR), report, .. } if !report.limits.is_empty() => {
+            allows_less(&report.limits)
+        }
         RunError::DriveFault { code: Some(code), .. } => describe(*code).hint.to_owned(),
         RunError::DriveFault { code: None, .. } => "read 0x603F and the error history 0x1003 of the drive".to_owned(),
         RunError::Trip { trip, .. } => self::trip(trip).to_owned(),
@@ -211,7 +217,8 @@ fn message(error: &RunError) -> String {
         }
         BringUpError::Mailbox { device, source }
         | BringUpError::ReadBack { device, source }
-        | BringUpError::ReadUnits { device, source } => (device, source, None),
+        | BringUpError::ReadUnits { device, source }
+        | BringUpError::ReadLimits { device, source } => (device, source, None),
         _ => return text,
     };
     let long = source.to_string();
@@ -305,8 +312,12 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
         }
         BringUpError::Mailbox { source, .. }
         | BringUpError::ReadBack { source, .. }
-        | BringUpError::ReadUnits { source, .. } => {
+        | BringUpError::ReadUnits { source, .. }
+        | BringUpError::ReadLimits { source, .. } => {
             sdo(source, "bring-up")
+        }
+        BringUpError::Watchdog { .. } => {
+            "without its watchdog the drive goes on when its outputs no longer come: ask its vendor how it is switched on".to_owned()
         }
         BringUpError::Units { problems, .. } => {
             return problems.iter().map(units).fold(failure, Failure::hint);
@@ -454,10 +465,22 @@ fn not_enabled(state: State, code: Option<u16>, mode_confirmed: bool) -> String 
     }
 }
 
+/// Error code of CiA 402.
+const FOLLOWING_ERROR: u16 = 0x8611;
+
+/// An axis could not follow where its drive bounds it more than the file does.
+fn allows_less(limits: &[LimitConflict]) -> String {
+    let each: Vec<_> = limits.iter().map(ToString::to_string).collect();
+    format!(
+        "the drive allows less than the machine file: {}",
+        each.join("; ")
+    )
+}
+
 fn trip(trip: &Trip) -> &'static str {
     match trip {
         Trip::FollowingError { .. } => {
-            "is the axis free to move and tuned? lower `speed` and `ramp`, or raise `limits.following_error`"
+            "is the axis free to move and tuned? lower `speed` and `ramp`, or raise `limits.following_error` and the drive's 0x6065"
         }
         Trip::PositionLimit { .. } => {
             "move the axis back by hand, or check `limits.position` and `offset`"

@@ -164,6 +164,7 @@ fn every_failure_says_what_next() {
                     error: 2.0,
                     limit: 1.0,
                 },
+                limits: Vec::new(),
             },
             FAILED,
             "following_error",

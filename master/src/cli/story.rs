@@ -184,9 +184,10 @@ fn details(device: &DevicePage) -> Vec<String> {
         let (sm, pdi) = (watchdog.expired, watchdog.pdi_expired);
         if sm > 0 {
             lines.push(format!(
-                "its process data watchdog ({}) has expired {} since power-on (0x0442)",
+                "its process data watchdog ({}) has expired {} since power-on (0x0442); {} (0x0440)",
                 duration::show(watchdog.time_ns),
-                times(sm)
+                times(sm),
+                if watchdog.in_time { "it is in time now" } else { "it is expired now" },
             ));
         }
         if pdi > 0 {

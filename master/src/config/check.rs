@@ -9,6 +9,7 @@ use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
 use super::steps::{self, Known};
+use crate::bringup::MAX_SUBDEVICES;
 use crate::link::BackEnd;
 use crate::rt::margin::Spin;
 
@@ -19,6 +20,10 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     let cycle_span = raw.bus.cycle.as_ref().map_or(0..0, Spanned::span);
     let bus = bus(raw.bus, p);
     unique_names(&raw.devices, p);
+    if let Some(beyond) = raw.devices.get(MAX_SUBDEVICES) {
+        let message = format!("a bus has at most {MAX_SUBDEVICES} SubDevices");
+        p.add(beyond.span.clone(), message);
+    }
     let places = places(&raw.devices, p);
 
     let folder = path.parent().unwrap_or(Path::new(""));

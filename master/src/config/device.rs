@@ -9,7 +9,7 @@ use toml::Spanned;
 
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
-use super::{DeviceConfig, Locator, Startup, axis, sdo, sim};
+use super::{DeviceConfig, Locator, Startup, axis, drive_limits, sdo, sim};
 use crate::library::{self, Library, LoadError, Match};
 
 /// What all devices share: where ESI files are, those read so far, and the cycle.
@@ -202,6 +202,10 @@ pub(crate) fn check(
     ) {
         homing.add_to(&mut chosen.startup);
     }
+    if let (Some(chosen), Some(Some(axis))) = (chosen.as_mut(), &axis) {
+        drive_limits::check(axis, &raw.sdo, chosen, p);
+        further_axes(chosen);
+    }
     let sim = raw.sim.take().map(|sim| {
         let axis = match (&raw.axis, &axis) {
             (None, _) => Err(()),
@@ -232,6 +236,29 @@ pub(crate) fn check(
         sim: sim.unwrap_or_default(),
         line: p.line(&raw.span),
     })
+}
+
+/// Says which axes of a drive stay without power.
+fn further_axes(selection: &mut esi::Selection) {
+    let axes = selection.layout.rx.iter().filter_map(further_axis);
+    let controlwords = axes.filter(|(_, object)| *object == 0x6040);
+    let notes: Vec<String> = controlwords
+        .map(|(n, _)| {
+            format!(
+                "axis {} of the drive (Controlword 0x{:04x}) is not used: its outputs stay zero, it gets no power",
+                n + 1,
+                0x6040 + n * 0x800
+            )
+        })
+        .collect();
+    selection.notes.extend(notes);
+}
+
+/// Of an object of a further axis of a drive: which axis, counted from 0, and the same object of the first
+/// (CiA 402: 0x800 apart, eight axes).
+pub(crate) fn further_axis(field: &esi::layout::Field) -> Option<(u16, u16)> {
+    let n = field.index.checked_sub(0x6000)? / 0x800;
+    (1..8).contains(&n).then_some((n, field.index - n * 0x800))
 }
 
 /// Which revisions may stand for the ESI's: its own alone, where nothing is said.

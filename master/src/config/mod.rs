@@ -12,6 +12,7 @@
 //! | `startup.rs` | whether they are verified, or skipped where the device holds them |
 //! | `axis.rs` | limits; units in `axis/scale.rs`, loops, guards and homing in `axis/control.rs` |
 //! | `adopt.rs` | what the drive itself says of its units |
+//! | `drive_limits.rs` | what the drive itself allows |
 //! | `sim.rs` | what only the simulated bus needs: connections, clocks |
 //! | `units.rs` | the names of units of positions |
 //! | `gateway.rs` | the network behind a simulated gateway |
@@ -29,6 +30,7 @@ mod describe;
 mod device;
 #[cfg(test)]
 mod documented;
+pub(crate) mod drive_limits;
 pub mod duration;
 mod fields;
 mod gateway;
@@ -47,6 +49,8 @@ mod units;
 
 pub use adopt::{Adopted, UnitProblem};
 pub(crate) use axis::is_maxon;
+pub(crate) use device::further_axis;
+pub use drive_limits::LimitConflict;
 pub use problem::{ConfigError, Problem, nearest};
 pub use signal::{AxisRef, InputRef, NameError, OutputRef};
 pub use startup::{Startup, StartupWay};
@@ -100,7 +104,7 @@ pub struct Bus {
     pub op_timeout_ns: u64,
     /// How long a drive may take to Operation enabled.
     pub enable_timeout_ns: u64,
-    /// SyncManager and PDI watchdog of every SubDevice.
+    /// Of the process data of every SubDevice.
     pub watchdog_ns: u64,
     /// A SubDevice whose clock differs more from the reference (0x092C) is reported.
     pub clock_window_ns: u64,
@@ -109,6 +113,20 @@ pub struct Bus {
     pub link: BackEnd,
     /// Keys that the file has, each with its line; the others are defaults.
     pub written: Vec<(&'static str, u32)>,
+}
+
+impl Bus {
+    /// Of register 0x0400: (2498 + 2) × 40 ns, so that watchdogs count in 100 µs.
+    pub const WATCHDOG_DIVIDER: u16 = 2498;
+    /// Of register 0x0410, in 100 µs: the reset value. Another MainDevice may have left another one.
+    pub const PDI_WATCHDOG: u16 = 1000;
+
+    /// Of register 0x0420, in 100 µs.
+    #[must_use]
+    pub fn process_data_watchdog(&self) -> u16 {
+        let ticks = u16::try_from(self.watchdog_ns / 100_000);
+        ticks.unwrap_or(u16::MAX).max(1)
+    }
 }
 
 impl Default for Bus {

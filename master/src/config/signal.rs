@@ -8,12 +8,14 @@ use toml::Spanned;
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
 use super::steps::Known;
-use super::{DeviceConfig, Machine, Signal};
+use super::{DeviceConfig, Machine, Signal, further_axis};
 
 /// Axes write these themselves (CiA 402, ETG.6010).
 const AXIS_OUTPUTS: [u16; 11] = [
     0x6040, 0x6060, 0x6071, 0x607a, 0x6081, 0x6083, 0x6084, 0x60b1, 0x60b2, 0x60b8, 0x60ff,
 ];
+/// It adds to the target position, and the axis leaves it at zero.
+const POSITION_OFFSET: u16 = 0x60b0;
 
 /// Whether a signal comes in or goes out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -235,9 +237,22 @@ fn one(wanted: &str, way: Way, index: usize, device: &DeviceConfig) -> Result<Si
         let message = format!("`{}` has {} bits", signal.name, field.bit_len);
         return Err(wrong(message, "numbers have 64 bits at most".to_owned()));
     }
-    if way == Way::Out && device.axis.is_some() && AXIS_OUTPUTS.contains(&field.index) {
-        let message = format!("`{}` is written by the axis itself", signal.name);
-        return Err(wrong(message, "give the axis a command instead".to_owned()));
+    if way == Way::Out && device.axis.is_some() {
+        let refused = match further_axis(field) {
+            Some((_, same)) if AXIS_OUTPUTS.contains(&same) || same == POSITION_OFFSET => {
+                Some("belongs to an axis of the drive that is not used")
+            }
+            Some(_) => None,
+            None if field.index == POSITION_OFFSET => {
+                Some("adds to the axis' target, past its limits")
+            }
+            None if AXIS_OUTPUTS.contains(&field.index) => Some("is written by the axis itself"),
+            None => None,
+        };
+        if let Some(why) = refused {
+            let message = format!("`{}` {why}", signal.name);
+            return Err(wrong(message, "give the axis a command instead".to_owned()));
+        }
     }
     Ok(signal)
 }

@@ -8,6 +8,7 @@ use ecaxis_axis::{Mode, Refused, State, Trip};
 
 use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
+use crate::config::LimitConflict;
 use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::session::{EmergencyReport, StepRef};
@@ -76,7 +77,12 @@ pub enum RunError {
         report: Box<DriveReport>,
     },
     #[error("{device}: {trip}")]
-    Trip { device: DeviceRef, trip: Trip },
+    Trip {
+        device: DeviceRef,
+        trip: Trip,
+        /// The drive's own limits that the machine file exceeds.
+        limits: Vec<LimitConflict>,
+    },
     #[error(
         "{}: {cycles} cycles in a row {}",
         lost(group.as_deref()), lost_note(*answered, *wkc)
@@ -265,6 +271,8 @@ pub struct DriveReport {
     pub emergencies: Vec<EmergencyReport>,
     /// Of its diagnosis history (0x10F3), newest first.
     pub history: Vec<DiagnosisMessage>,
+    /// Its own limits that the machine file exceeds.
+    pub limits: Vec<LimitConflict>,
 }
 
 impl fmt::Display for DriveReport {

@@ -474,6 +474,7 @@ fn of_one_device(error: &RunError, evidence: &Evidence) -> Option<Cause> {
         RunError::Trip {
             device,
             trip: Trip::FollowingError { .. },
+            ..
         } => interpolation(device, error, evidence),
         RunError::DriveFault {
             device,
@@ -618,7 +619,7 @@ fn short(error: &RunError) -> String {
             device.name,
             al_status_text(*code)
         ),
-        RunError::Trip { device, trip } => format!("`{}`: {trip}", device.name),
+        RunError::Trip { device, trip, .. } => format!("`{}`: {trip}", device.name),
         RunError::BusLost {
             answered: true,
             cycles,

@@ -11,6 +11,7 @@ use ecaxis_axis::{AxisStatus, State, Trip};
 use super::{Supervisor, history};
 use crate::bringup::al;
 use crate::clock::{self, Nanos};
+use crate::config::LimitConflict;
 use crate::rt::feed::FeedState;
 use crate::rt::guard::StopCause;
 use crate::rt::handover::{Order, Snapshot};
@@ -84,6 +85,7 @@ impl Supervisor {
             StopCause::Trip { axis, trip } => RunError::Trip {
                 device: self.device_of(axis),
                 trip,
+                limits: self.exceeded_limits(axis),
             },
             StopCause::BusLost {
                 cycles,
@@ -233,6 +235,12 @@ impl Supervisor {
         looks
     }
 
+    /// The limits of an axis' drive that the machine file exceeds.
+    fn exceeded_limits(&self, axis: usize) -> Vec<LimitConflict> {
+        let device = self.axes.get(axis).and_then(|&at| self.bus.devices.get(at));
+        device.map_or(Vec::new(), |device| device.limits.clone())
+    }
+
     /// What a device that has failed says of it. Best effort: the machine stops meanwhile.
     async fn report(&mut self, axis: usize, since: Nanos) -> Box<DriveReport> {
         let device = self.axes.get(axis).copied().unwrap_or(usize::MAX);
@@ -247,6 +255,7 @@ impl Supervisor {
         Box::new(DriveReport {
             emergencies: self.log.last_of(&self.axis_name(axis), since),
             history,
+            limits: self.exceeded_limits(axis),
         })
     }
 

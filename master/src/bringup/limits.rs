@@ -1,0 +1,90 @@
+//! What a drive itself allows, asked after its start-up SDOs and its units: a limit of the machine
+//! file beyond it is warned of. What would add to every target is set to zero.
+
+use ecaxis_esi::StartupSdo;
+
+use super::{BringUpError, BusDevice, Step, device};
+use crate::config::DeviceConfig;
+use crate::config::drive_limits::{OFFSETS, speed_unit};
+use crate::mailbox::{CoeClient, ObjectAddress, SdoError, Wire};
+
+pub(super) async fn compare(
+    wire: &impl Wire,
+    config: &DeviceConfig,
+    device: &mut BusDevice,
+    progress: &mut dyn FnMut(Step),
+) -> Result<(), BringUpError> {
+    let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
+        return Ok(());
+    };
+    let failed = |source| BringUpError::ReadLimits {
+        device: device.at.clone(),
+        source,
+    };
+    let selection = &config.selection;
+    let dictionary = &selection.dictionary;
+    // A drive is asked only for what its ESI has, if that has a dictionary.
+    let exists =
+        |index, sub| dictionary.objects.is_empty() || dictionary.item(index, sub).is_some();
+    let axis = device
+        .adopted
+        .as_ref()
+        .map_or(axis, |adopted| &adopted.setup);
+    let mut held = Vec::new();
+    for (index, sub) in axis.limit_objects() {
+        if exists(index, sub)
+            && let Some(data) = read(wire, coe, index, sub).await.map_err(failed)?
+        {
+            held.push(((index, sub), data));
+        }
+    }
+    let drive = |index, sub| {
+        let mut all = held.iter();
+        let found = all.find(|(object, _)| *object == (index, sub))?;
+        Some(found.1.clone())
+    };
+    for conflict in axis.exceeded(drive, speed_unit(selection)) {
+        progress(Step::Warning(format!("{}: {conflict}", device.at)));
+        device.limits.push(conflict);
+    }
+    for index in OFFSETS {
+        // Those in the process data are written every cycle.
+        if !exists(index, 0) || selection.layout.rx_field(index, 0).is_some() {
+            continue;
+        }
+        let found = read(wire, coe, index, 0).await.map_err(failed)?;
+        let Some(data) = found.filter(|data| data.iter().any(|byte| *byte != 0)) else {
+            continue;
+        };
+        let zero = StartupSdo {
+            transition: "PS",
+            index,
+            sub: 0,
+            complete_access: false,
+            data: vec![0; data.len()],
+            name: String::new(),
+            origin: "no offset to the axis' targets".to_owned(),
+        };
+        device::download(wire, &device.at, coe, &zero).await?;
+        progress(Step::Warning(format!(
+            "{}: {} was not zero and adds to every target: it is zero now",
+            device.at,
+            ObjectAddress { index, sub: 0 }
+        )));
+    }
+    Ok(())
+}
+
+/// `None` where the drive does not have it, or does not let it be read.
+async fn read(
+    wire: &impl Wire,
+    coe: &mut CoeClient,
+    index: u16,
+    sub: u8,
+) -> Result<Option<Vec<u8>>, SdoError> {
+    match coe.upload(wire, index, sub, false).await {
+        Ok(data) => Ok(Some(data)),
+        Err(SdoError::Abort { .. }) => Ok(None),
+        Err(error) => Err(error),
+    }
+}

@@ -1,0 +1,105 @@
+//! The watchdogs of a SubDevice (ETG.1000.4, tables 52 to 56): a drive whose outputs do not come
+//! leaves Op by itself. What a drive's watchdog consists of is read back: without it, nothing stops
+//! the drive when this computer dies.
+
+use super::device::{SYNC_MANAGER, SYNC_MANAGER_SIZE};
+use super::{BringUpError, BusDevice, Step};
+use crate::config::{Bus, DeviceConfig};
+use crate::mailbox::{Wire, WireError};
+
+const DIVIDER: u16 = 0x0400;
+const PDI: u16 = 0x0410;
+const PROCESS_DATA: u16 = 0x0420;
+/// ControlByte of a SyncManager, and its bit 6: writing its area triggers the watchdog.
+const CONTROL: u16 = 4;
+const TRIGGER: u8 = 0x40;
+
+const STEP: &str = "setting the watchdogs";
+
+/// Writes the watchdogs' times and reads them back.
+///
+/// # Errors
+/// An axis' device does not hold its divider, its process data time or its trigger.
+pub(super) async fn set(
+    wire: &impl Wire,
+    bus: &Bus,
+    config: &DeviceConfig,
+    device: &BusDevice,
+    progress: &mut dyn FnMut(Step),
+) -> Result<(), BringUpError> {
+    let has_axis = config.axis.is_some();
+    let outputs = &config.selection.layout.outputs;
+    let is_watched = outputs.iter().any(|sm| sm.control_byte & TRIGGER != 0);
+    for (register, what, value) in [
+        (DIVIDER, "the watchdogs' divider", Bus::WATCHDOG_DIVIDER),
+        (PDI, "the PDI watchdog's time", Bus::PDI_WATCHDOG),
+        (
+            PROCESS_DATA,
+            "the process data watchdog's time",
+            bus.process_data_watchdog(),
+        ),
+    ] {
+        let wanted = value.to_le_bytes();
+        let at = device.at.station;
+        let written = wire.write(at, register, &wanted).await;
+        written.map_err(|source| lost(device, source))?;
+        let found: Option<[u8; 2]> = read(wire, device, register).await?;
+        let differs = BringUpError::Watchdog {
+            device: device.at.clone(),
+            what,
+            register,
+            wanted: format!("0x{value:04x}"),
+            found: found.map_or("nothing".to_owned(), |found| {
+                format!("0x{:04x}", u16::from_le_bytes(found))
+            }),
+        };
+        if found == Some(wanted) {
+            continue;
+        }
+        // The PDI watchdog reports a hung processor and stops nothing.
+        if has_axis && register != PDI {
+            return Err(differs);
+        }
+        // A controller without these registers watches nothing; one that nothing triggers neither.
+        if found.is_some() && is_watched {
+            progress(Step::Warning(differs.to_string()));
+        }
+    }
+    if !has_axis {
+        return Ok(());
+    }
+    for sm in outputs {
+        let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm.sm) + CONTROL;
+        let found: Option<[u8; 1]> = read(wire, device, register).await?;
+        if found.is_none_or(|[control]| control & TRIGGER == 0) {
+            return Err(BringUpError::Watchdog {
+                device: device.at.clone(),
+                what: "the watchdog trigger of its outputs (bit 6 of the ControlByte)",
+                register,
+                wanted: format!("0x{:02x}", sm.control_byte),
+                found: found.map_or("nothing".to_owned(), |[control]| format!("0x{control:02x}")),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// `None` where the device has no such register.
+async fn read<const N: usize>(
+    wire: &impl Wire,
+    device: &BusDevice,
+    register: u16,
+) -> Result<Option<[u8; N]>, BringUpError> {
+    let mut data = [0; N];
+    let answered = wire.read(device.at.station, register, &mut data).await;
+    let answered = answered.map_err(|source| lost(device, source))?;
+    Ok((answered == 1).then_some(data))
+}
+
+fn lost(device: &BusDevice, source: WireError) -> BringUpError {
+    BringUpError::Wire {
+        device: device.at.clone(),
+        step: STEP,
+        source,
+    }
+}
