@@ -143,7 +143,7 @@ const TRIALS: &[Trial] = &[
         "panic in the cycle",
         Event::Library(Injected::Cycle { times: 1 }),
         Some(1),
-        0,
+        2,
     ),
     trial(
         "panic in the cycle and its stop",
