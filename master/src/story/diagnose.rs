@@ -147,11 +147,11 @@ impl Class {
     fn said_by_device(evidence: &Evidence) -> Self {
         let Lateness { missed, longest } = evidence.lateness();
         let late = missed > 0 || longest > evidence.cycle_ns;
-        if late || evidence.without_data() > evidence.cycle_ns || evidence.stop.is_none() {
-            Self::Bus
-        } else {
-            Self::Device
-        }
+        let seen = late
+            || evidence.without_data() > evidence.cycle_ns
+            || evidence.other_frames() > 0
+            || evidence.stop.is_none();
+        if seen { Self::Bus } else { Self::Device }
     }
 
     /// The watchdog can only have expired by itself where no process data came for about as long.
@@ -167,15 +167,14 @@ impl Class {
     }
 
     fn of_change(error: &StateError, evidence: &Evidence) -> Self {
-        // As a device does that somebody else has sent elsewhere.
-        const INVALID_CHANGE: u16 = 0x0011;
+        // Invalid state change, and no mailbox set up: as of a device that was sent to Init on its way.
+        const SENT_ELSEWHERE: [u16; 2] = [0x0011, 0x0016];
         let others = evidence.other_frames() > 0;
         match error {
             StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
-            StateError::Refused {
-                code: INVALID_CHANGE,
-                ..
-            } if others => Self::Bus,
+            StateError::Refused { code, .. } if others && SENT_ELSEWHERE.contains(code) => {
+                Self::Bus
+            }
             StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code, evidence),
             StateError::Timeout { wanted, actual, .. } => {
                 if others && *wanted == AlState::Op && *actual != AlState::SafeOp {
