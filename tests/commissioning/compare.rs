@@ -30,7 +30,7 @@ serial   = 1002
 mode     = "csp"
 
 [device.axis]
-unit    = "mm"
+unit    = "turn"
 encoder = 2000
 limits  = { velocity = 10.0, acceleration = 100.0 }
 
@@ -41,7 +41,7 @@ position = 3
 mode     = "csp"
 
 [device.axis]
-unit    = "mm"
+unit    = "turn"
 encoder = 2000
 limits  = { velocity = 10.0, acceleration = 100.0 }
 
@@ -356,8 +356,8 @@ fn policies() {
 fn parameters_on_request() {
     let bench = bench();
     let text = MACHINE.replace(
-        "mode     = \"csp\"\n\n[device.axis]\nunit    = \"mm\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
-        "mode     = \"csp\"\nsdo      = [{ index = 0x6065, value = 1234 }]\n\n[device.axis]\nunit    = \"mm\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
+        "mode     = \"csp\"\n\n[device.axis]\nunit    = \"turn\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
+        "mode     = \"csp\"\nsdo      = [{ index = 0x6065, value = 1234 }]\n\n[device.axis]\nunit    = \"turn\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
     );
     assert_ne!(text, MACHINE);
     bench.write("machine.toml", &text);

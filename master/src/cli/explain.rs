@@ -124,7 +124,7 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
     });
     let watchdog = duration::show(bus.watchdog_ns);
     let registers = format!(
-        "of the process data: 0x0420 = {}, 0x0400 = {}; of the PDI: 0x0410 = {}",
+        "0x0420 = {}, 0x0400 = {}; of the PDI: 0x0410 = {}",
         bus.process_data_watchdog(),
         Bus::WATCHDOG_DIVIDER,
         Bus::PDI_WATCHDOG,

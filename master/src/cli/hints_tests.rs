@@ -124,7 +124,7 @@ fn every_failure_says_what_next() {
             FAILED,
             "is `eth9` the right interface?",
         ),
-        (bring_up(missing), FAILED, "behind the last one found"),
+        (bring_up(missing), FAILED, "the first one missing"),
         (
             start_up(0x0609_0030, "bus.cycle"),
             FAILED,

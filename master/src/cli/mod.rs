@@ -58,7 +58,8 @@ Examples:
   ecaxis help run                    the options of a verb, with examples
 
 Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
-line is wrong, 130 interrupted. NO_COLOR=1 switches colours off, CLICOLOR_FORCE=1 on.";
+line is wrong, 130 interrupted.
+NO_COLOR=1 switches colours off, CLICOLOR_FORCE=1 on.";
 
 /// An EtherCAT master for CiA 402 drives in the cyclic synchronous modes.
 #[derive(Debug, Parser)]

@@ -243,7 +243,9 @@ impl Engine {
         self.answer = self.exchange.answer();
         self.count();
         let adjust = self.follow_clock();
-        if self.guarding {
+        if !self.guarding {
+            self.exchange.share_datagrams();
+        } else {
             self.watch_bus();
             let heartbeat = &self.end.heartbeat;
             if self.supervisor.is_silent(heartbeat, self.timing.cycle_ns) {

@@ -302,6 +302,11 @@ impl Exchange {
         self.late.get(device).copied().unwrap_or(false)
     }
 
+    /// Devices share datagrams again: wrong working counters are expected.
+    pub fn share_datagrams(&mut self) {
+        self.separate_cycles = 0;
+    }
+
     /// What the diagnostic slot has found, in the order of the members.
     #[must_use]
     pub fn diagnoses(&self) -> &[Diagnosis] {

@@ -3,10 +3,11 @@
 //! One thread owns the link. In real time it becomes the real-time thread and a second one runs
 //! the supervisor beside it; in virtual time it does both in turn, so that a run can be repeated.
 
+use std::io::Write as _;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::thread;
 
@@ -49,6 +50,11 @@ use turn::Turned;
 
 /// Stack of the thread that owns the link; ethercrab's futures hold its tables by value.
 const STACK: usize = 16 * 1024 * 1024;
+
+/// The thread that owns the link.
+const RT_THREAD: &str = "ecaxis-rt";
+/// Panics of that thread that are reported.
+const REPORTED_PANICS: u32 = 10;
 
 /// How a machine is run.
 #[derive(Debug, Clone)]
@@ -184,10 +190,11 @@ fn start(
     instead: Instead,
     link: Option<Box<dyn Link>>,
 ) -> Outcome {
+    report_panics_briefly();
     let (progress, told) = channel();
     let stopped = Arc::clone(&stop);
     let owner = thread::Builder::new()
-        .name("ecaxis-rt".to_owned())
+        .name(RT_THREAD.to_owned())
         .stack_size(STACK)
         .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, instead, link));
     let owner = match owner {
@@ -207,6 +214,22 @@ fn start(
         .join()
         .unwrap_or_else(|panic| RunError::Panicked(panic_text(&*panic)).into());
     observed.map_or_else(|panic| resume_unwind(panic), |()| outcome)
+}
+
+/// A panic of the real-time thread is one line, and no backtrace: looking up its symbols takes longer than the drives' watchdogs.
+fn report_panics_briefly() {
+    static ONCE: std::sync::Once = std::sync::Once::new();
+    static REPORTED: AtomicU32 = AtomicU32::new(0);
+    ONCE.call_once(|| {
+        let hook = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            if thread::current().name() != Some(RT_THREAD) {
+                hook(panic);
+            } else if REPORTED.fetch_add(1, Ordering::Relaxed) < REPORTED_PANICS {
+                let _ = writeln!(std::io::stderr(), "{RT_THREAD}: {panic}");
+            }
+        }));
+    });
 }
 
 pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {

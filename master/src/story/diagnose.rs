@@ -177,7 +177,9 @@ impl Class {
             }
             StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code, evidence),
             StateError::Timeout { wanted, actual, .. } => {
-                if others && *wanted == AlState::Op && *actual != AlState::SafeOp {
+                // No bring-up leaves a device in Init.
+                let moved = *wanted == AlState::Op && *actual != AlState::SafeOp;
+                if others && (moved || *actual == AlState::Init) {
                     Self::Bus
                 } else {
                     Self::Device

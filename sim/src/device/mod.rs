@@ -317,7 +317,8 @@ impl SimDevice {
             };
             drive.coast();
         }
-        self.drive_mut().is_some_and(|drive| drive.velocity_rev_s() != 0.0)
+        self.drive_mut()
+            .is_some_and(|drive| drive.velocity_rev_s() != 0.0)
     }
 
     /// Everything volatile is lost; objects return to their defaults.

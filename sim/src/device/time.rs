@@ -78,7 +78,11 @@ impl SimDevice {
     fn run(&mut self, now: Nanos) -> Run {
         if !self.powered {
             let turns = self.coast(now);
-            return Run::Until(if turns { now.saturating_add(1) } else { Nanos::MAX });
+            return Run::Until(if turns {
+                now.saturating_add(1)
+            } else {
+                Nanos::MAX
+            });
         }
         let mut local = self.esc.clock.local(now);
         loop {

@@ -237,8 +237,8 @@ fn guards(axis: &AxisSetup, table: &mut Table) {
     let (stop, origin) = match config.stop_timeout_s {
         Some(timeout) => (time(timeout), "`stop_timeout`"),
         None => (
-            format!("{} from full speed, longer while it slows down", time(full)),
-            "ramp, jerk and 1 s",
+            format!("{} from full speed", time(full)),
+            "ramp and 1 s; longer while it slows",
         ),
     };
     table.row(["stop time-out", &stop, origin]);

@@ -10,7 +10,7 @@ use super::Table;
 pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
     let stop = &machine.stop;
     let by_drive = match stop.bus_lost {
-        StopMethod::Ramp | StopMethod::QuickStop => "the drive's quick stop",
+        StopMethod::Ramp | StopMethod::QuickStop => "the drives' quick stop",
         StopMethod::DisableVoltage => "no power",
     };
     let conditions = stop.emergency.iter().map(|c| machine.condition(c));
@@ -19,7 +19,7 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
         all => all.join(", or "),
     };
     let lost = format!(
-        "{} cycles long: axes that answer stop within their limits, the others by {by_drive}",
+        "{} cycles: {by_drive}; if they answer, a ramp",
         machine.bus.lost_frames
     );
     let mut table = Table::new(&["when", "what happens", "key"]);

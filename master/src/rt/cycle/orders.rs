@@ -140,11 +140,14 @@ impl Engine {
             return false;
         };
         // What follows from another group's failure is no failure of this one.
+        let failure = |group: &Group| group.stop().and_then(|stop| stop.failure);
+        let before = failure(group);
         let first = if method.is_none() || group.stop().is_none() {
             group.begin(cause, self.next)
         } else {
             false
         };
+        let failed = before.is_none() && failure(group).is_some();
         let method = method.unwrap_or_else(|| group.method(cause));
         for slot in self.axes.iter_mut().filter(|slot| slot.group == index) {
             if cause == StopCause::EmergencyStop {
@@ -153,6 +156,11 @@ impl Engine {
                 slot.axis.stop_by(method);
             }
             slot.feed.end();
+        }
+        if failed {
+            self.history.stopping(Anchor::Failure);
+            let cycle = self.stats.counters.cycles;
+            self.report(Event::Stopping { cycle, cause });
         }
         first
     }

@@ -27,7 +27,12 @@ pub(super) struct Plain {
     rest: Vec<(i64, Nanos)>,
     /// From full speed to rest.
     slowest_s: f64,
+    /// Panics since.
+    panics: u32,
 }
+
+/// A link that panics so often carries nothing any more.
+const MOST_PANICS: u32 = 100;
 
 impl Plain {
     #[allow(
@@ -44,6 +49,7 @@ impl Plain {
             since: None,
             rest: vec![(i64::MAX, 0); axes.len()],
             slowest_s: times.fold(0.0, f64::max),
+            panics: 0,
         }
     }
 }
@@ -81,7 +87,9 @@ impl Engine {
 
     /// `true`: it panicked.
     fn catch(&mut self, work: impl FnOnce(&mut Self)) -> bool {
-        catch_unwind(AssertUnwindSafe(|| work(self))).is_err()
+        let panicked = catch_unwind(AssertUnwindSafe(|| work(self))).is_err();
+        self.plain.panics += u32::from(panicked);
+        panicked
     }
 
     fn plain_cycle(&mut self) {
@@ -92,6 +100,7 @@ impl Engine {
         self.catch(|engine| engine.answer = engine.exchange.answer());
         let mut ended = true;
         self.catch(|engine| ended = engine.write_plain_words(woke));
+        ended |= self.plain.panics > MOST_PANICS;
         self.catch(|engine| engine.exchange.stage());
         self.catch(|engine| engine.publish_plain(woke, ended));
         self.catch(|engine| {
