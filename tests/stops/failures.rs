@@ -23,6 +23,9 @@ const COUNTS: f64 = 2000.0;
 const REGION: usize = 13;
 const LOGICAL_BASE: usize = 0x1_0000;
 
+/// Data of datagrams by logical address.
+type Logical = BTreeMap<usize, Vec<u8>>;
+
 /// One cycle of one axis: what its drive received, and what it answered if the answer came.
 #[derive(Debug, Clone, Copy)]
 struct Cycle {
@@ -41,7 +44,7 @@ struct Answer {
 }
 
 /// Logical reads and writes of a frame, by logical address, and writes of AL control.
-fn datagrams(frame: &[u8]) -> (BTreeMap<usize, Vec<u8>>, Vec<(u16, u8)>) {
+fn datagrams(frame: &[u8]) -> (Logical, Vec<(u16, u8)>) {
     let (mut logical, mut al_control) = (BTreeMap::new(), Vec::new());
     let mut at = 16;
     while at + 12 <= frame.len() {
@@ -64,7 +67,7 @@ fn datagrams(frame: &[u8]) -> (BTreeMap<usize, Vec<u8>>, Vec<(u16, u8)>) {
     (logical, al_control)
 }
 
-fn bytes(map: &BTreeMap<usize, Vec<u8>>, axis: usize) -> Option<&[u8]> {
+fn bytes(map: &Logical, axis: usize) -> Option<&[u8]> {
     let at = LOGICAL_BASE + axis * REGION;
     let (start, data) = map.range(..=at).next_back()?;
     data.get(at - start..at - start + REGION)

@@ -456,5 +456,5 @@ fn an_answer_256_cycles_old_is_late() {
         exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
     }
     assert_eq!(exchange.receive(&first), Received::Late);
-    assert_eq!(exchange.answer().inputs_fresh, false);
+    assert!(!exchange.answer().inputs_fresh);
 }

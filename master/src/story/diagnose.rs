@@ -236,7 +236,10 @@ fn other_main_device(error: &RunError, evidence: &Evidence, class: Class) -> Opt
         device
             .look
             .al_status
-            .is_some_and(|status| status & AL_ERROR == 0 && status != OP)
+            // In Init it has refused what was asked of it since.
+            .is_some_and(|status| {
+                status & AL_ERROR == 0 && status != OP || status & !AL_ERROR == INIT
+            })
             && device.look.station != Some(0)
     };
     let sent = evidence
