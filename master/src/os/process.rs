@@ -128,6 +128,9 @@ mod tests {
 
     #[test]
     fn a_thread_is_told_its_page_faults_and_waits() {
+        // Another test of this process may have locked its memory, which is then there without a fault.
+        // SAFETY: no pointers.
+        unsafe { libc::munlockall() };
         let before = ThreadUse::now().unwrap();
         let mut memory = vec![0_u8; 16 << 20];
         for byte in memory.iter_mut().step_by(4096) {
