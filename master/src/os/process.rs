@@ -128,9 +128,6 @@ mod tests {
 
     #[test]
     fn a_thread_is_told_its_page_faults_and_waits() {
-        // Another test of this process may have locked its memory, which is then there without a fault.
-        // SAFETY: no pointers.
-        unsafe { libc::munlockall() };
         let before = ThreadUse::now().unwrap();
         let mut memory = vec![0_u8; 16 << 20];
         for byte in memory.iter_mut().step_by(4096) {
@@ -139,8 +136,12 @@ mod tests {
         std::hint::black_box(&memory);
         std::thread::sleep(std::time::Duration::from_millis(1));
         let used = ThreadUse::now().unwrap().since(before);
+        // Another test of this process may have locked its memory, which is then there without a fault.
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let locked = status.lines().find(|line| line.starts_with("VmLck:"));
+        let locked = !locked.is_some_and(|line| line.contains(" 0 kB"));
         // Huge pages take 512 of them at once.
-        assert!(used.minor_faults >= 8, "{used:?}");
+        assert!(used.minor_faults >= 8 || locked, "{used:?}");
         assert!(used.voluntary_switches >= 1, "{used:?}");
     }
 }

@@ -48,7 +48,7 @@ impl Supervisor {
             }
             StopCause::FollowLost { axis } => RunError::FollowLost {
                 device: self.device_of(axis),
-                cause: self.cause_of_others(axis, snapshot).await,
+                cause: self.cause_of_others(axis, group, snapshot).await,
                 reason: match snapshot.feeds.get(axis) {
                     Some(FeedState::Refused(reason)) => reason.to_string(),
                     Some(FeedState::Lost(why)) => (*why).to_owned(),
@@ -133,9 +133,16 @@ impl Supervisor {
     }
 
     /// What has stopped a group in which an axis may have followed another.
-    async fn cause_of_others(&mut self, axis: usize, snapshot: &Snapshot) -> Option<Arc<RunError>> {
-        // The machine's stop is looked at first; the group's may be of the same cycle. Explained in a box: it may explain this one.
-        Box::pin(self.tell_of_groups(snapshot)).await;
+    async fn cause_of_others(
+        &mut self,
+        axis: usize,
+        group: Option<usize>,
+        snapshot: &Snapshot,
+    ) -> Option<Arc<RunError>> {
+        // The machine's stop is looked at first; a group's may be of the same cycle. In a box, because it explains stops, too.
+        if group.is_none() {
+            Box::pin(self.tell_of_groups(snapshot)).await;
+        }
         let own = self.group_of(axis);
         let mut others = self.stopped.iter().rev();
         let last = others.find(|stop| !stop.released && stop.group != own)?;

@@ -4,6 +4,8 @@ use std::sync::Arc;
 
 use super::Supervisor;
 use crate::config::{Action, Step};
+use crate::rt::groups::GroupStatus;
+use crate::rt::guard::StopCause;
 use crate::rt::handover::Snapshot;
 use crate::session::{GroupStop, Progress, RunError};
 use crate::story::Witnessed;
@@ -43,7 +45,12 @@ impl Supervisor {
 
     /// What has become of groups since the last look.
     pub(super) async fn tell_of_groups(&mut self, snapshot: &Snapshot) {
-        for (group, now) in snapshot.groups.iter().enumerate() {
+        // A group that can no longer follow another one is explained by what stopped that.
+        let follows = |now: &GroupStatus| matches!(now.stopped, Some(StopCause::FollowLost { .. }));
+        let groups = snapshot.groups.iter().enumerate();
+        let mut groups: Vec<_> = groups.collect();
+        groups.sort_by_key(|(_, now)| follows(now));
+        for (group, now) in groups {
             let last = self.stopped.iter_mut().rev().find(|s| s.group == group);
             let told = last.as_ref().map_or(0, |last| last.number);
             let over = now.stopped.is_none() || now.stops != told;
