@@ -21,7 +21,7 @@ fn with_eeprom_of<T: Send + 'static>(
     image: Vec<u8>,
     work: impl AsyncFnOnce(&mut Located) -> T + Send + 'static,
 ) -> (T, Vec<u8>) {
-    let there = thread::Builder::new().stack_size(64 << 20).spawn(move || {
+    let there = thread::Builder::new().stack_size(16 << 20).spawn(move || {
         Clock::Virtual.enter();
         let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
         let machine = config::load(&demo).expect("a machine");

@@ -35,7 +35,7 @@ pub mod station;
 mod tests;
 
 /// Stack of the thread that carries the frames; futures here hold whole frames by value.
-const STACK: usize = 64 * 1024 * 1024;
+const STACK: usize = 16 * 1024 * 1024;
 
 /// What went wrong with a device that was taken as it was found.
 #[derive(Debug, thiserror::Error)]

@@ -49,7 +49,7 @@ pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
 use turn::Turned;
 
 /// Stack of the thread that owns the link; ethercrab's futures hold its tables by value.
-const STACK: usize = 64 * 1024 * 1024;
+const STACK: usize = 16 * 1024 * 1024;
 
 /// The thread that owns the link.
 const RT_THREAD: &str = "ecaxis-rt";
