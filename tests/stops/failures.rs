@@ -9,7 +9,7 @@ use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, Waker};
 
-use super::common::{faults, machine, run_badly, run_well, virtual_time};
+use super::common::{faults, machine, run, run_badly, run_well, virtual_time};
 use super::record;
 use ecaxis::clock::Nanos;
 use ecaxis::link::sim::SimLink;
@@ -338,6 +338,31 @@ fn what_fails_while_the_machine_comes_to_rest_fails_the_run() {
         assert!(error.contains(words), "{script}: {error}");
         assert!(!error.contains("obey"), "{error}");
     }
+}
+
+/// The bus is lost in the very cycles in which the machine is told to stop: whichever comes first, the run has failed.
+#[test]
+fn a_failure_beside_the_end_of_a_run_fails_it() {
+    let text = BUS.to_owned()
+        + &drive("a0", 0, "csp", "velocity = 50.0, acceleration = 50.0", "")
+        + "[[step]]\ndwell = \"10s\"\n";
+    let mut failed = 0;
+    for ms in 620..780 {
+        let script = format!("[[fault]]\nkind = \"frame-loss\"\nat = \"{ms}ms\"\ncount = 50\n");
+        let options = Options {
+            limit: Some(500_000_000),
+            ..faults(&script)
+        };
+        let (outcome, _) = run(machine(&text), options);
+        let summary = outcome.summary.expect("a summary");
+        let failure = summary.events.iter().find(|event| event.failure);
+        assert!(
+            failure.is_none() || outcome.result.is_err(),
+            "{script}: {failure:?}"
+        );
+        failed += u32::from(failure.is_some());
+    }
+    assert!(failed > 10, "the script misses the end of the run");
 }
 
 /// One rule for lost frames and for missing devices.

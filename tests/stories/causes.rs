@@ -186,3 +186,20 @@ fn a_group_that_was_not_reset() {
         assert!(error.contains("was not reset"), "{error}");
     }
 }
+
+/// A cable or a supply that fails while the segment is counted: the scan's own words say neither which device nor what.
+#[test]
+fn a_device_that_is_gone_during_the_scan_is_named() {
+    for (script, name) in [
+        (fault("link-break", "0.2ms", "device = 1\nport = 0"), "`a1`"),
+        (fault("power-off", "2.5ms", "device = 2"), "`a2`"),
+        (
+            fault("power-off", "10ms", "for = \"1.4ms\"\ndevice = 1"),
+            "`a1`",
+        ),
+    ] {
+        let story = story(machine(&axes(3)), faults(&script));
+        let headline = &story.headline;
+        assert!(headline.contains(name), "{script}: {headline}");
+    }
+}

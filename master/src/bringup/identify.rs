@@ -5,7 +5,7 @@ use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
 use super::{BringUpError, DeviceRef, Group, Step, al, scan_error};
-use crate::config::{Locator, Machine};
+use crate::config::{DeviceConfig, Locator, Machine};
 use crate::mailbox::WireError;
 use crate::wire::Datagrams;
 
@@ -57,16 +57,22 @@ pub(super) async fn explain_scan(
     let Ok(count) = answering(wire).await else {
         return BringUpError::NoAnswer;
     };
-    let mut behind = None;
+    let (mut behind, mut unaddressed) = (None, None);
     for position in 0..count {
         let station = FIRST_STATION.saturating_add(position);
-        let Ok(Some((status, code))) = al::read_status(wire, station).await else {
-            continue;
-        };
         let device = DeviceRef {
             name: name_at(machine, position),
             position,
             station,
+        };
+        let (status, code) = match al::read_status(wire, station).await {
+            Ok(Some(read)) => read,
+            // It is counted, and has no station address: it has lost it since.
+            Ok(None) => {
+                unaddressed.get_or_insert(device);
+                continue;
+            }
+            Err(_) => continue,
         };
         let actual = al::AlState::from_status(status);
         if status & al::ERROR != 0 && (code != 0 || !al::emulated(wire, station).await) {
@@ -80,6 +86,19 @@ pub(super) async fn explain_scan(
         if actual != al::AlState::PreOp && behind.is_none() {
             behind = Some((device, actual));
         }
+    }
+    if let Some(device) = unaddressed {
+        let wanted = al::AlState::PreOp;
+        return BringUpError::State(al::StateError::Gone { device, wanted });
+    }
+    let missing = positions(machine).filter(|(position, _)| *position >= count);
+    let missing: Vec<_> = missing.map(named).collect();
+    if !missing.is_empty() {
+        return BringUpError::Missing {
+            expected: machine.devices.len(),
+            found: usize::from(count),
+            missing,
+        };
     }
     match (error, behind) {
         (Error::Timeout(TimeoutError::StateTransition), Some((device, actual))) => {
@@ -209,15 +228,7 @@ pub(super) async fn assign(
 /// Devices at positions that are not on the bus. One that is missing in the middle of a tree moves those behind it: where the others
 /// are of the models that the file names, in its order, those are missing that lack between them, and the last ones otherwise.
 fn missing_devices(machine: &Machine, found: &[Present]) -> Vec<String> {
-    let mut expected: Vec<_> = machine
-        .devices
-        .iter()
-        .filter_map(|config| match config.at {
-            Locator::Position(position) => Some((position, config)),
-            Locator::Alias(_) | Locator::Id(_) => None,
-        })
-        .collect();
-    expected.sort_by_key(|(position, _)| *position);
+    let expected: Vec<_> = positions(machine).collect();
     let models = |identity: &Identity| (identity.vendor, identity.product);
     let wanted = expected
         .iter()
@@ -228,9 +239,25 @@ fn missing_devices(machine: &Machine, found: &[Present]) -> Vec<String> {
         .collect();
     let missing = lacking(&wanted.collect::<Vec<_>>(), &there);
     let missing = missing.into_iter().filter_map(|index| expected.get(index));
-    missing
-        .map(|(position, config)| format!("`{}` (position {position})", config.name))
-        .collect()
+    missing.copied().map(named).collect()
+}
+
+/// Devices that the file tells by their position, in the order of the segment.
+fn positions(machine: &Machine) -> impl Iterator<Item = (u16, &DeviceConfig)> {
+    let mut devices: Vec<_> = machine
+        .devices
+        .iter()
+        .filter_map(|config| match config.at {
+            Locator::Position(position) => Some((position, config)),
+            Locator::Alias(_) | Locator::Id(_) => None,
+        })
+        .collect();
+    devices.sort_by_key(|(position, _)| *position);
+    devices.into_iter()
+}
+
+fn named((position, config): (u16, &DeviceConfig)) -> String {
+    format!("`{}` (position {position})", config.name)
 }
 
 /// Of `wanted`, those that `there` lacks.

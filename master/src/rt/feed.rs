@@ -54,7 +54,7 @@ const ROUNDING: f64 = 1e-6;
 const RING: &str = "the axes would follow each other";
 const NO_MASTER: &str = "the axis that is followed has no power, or searches its home";
 /// A line goes on from where it was held up; points by time are past.
-const HELD_UP: &str = "lost frames held the axis up, and its time is past";
+pub(crate) const HELD_UP: &str = "lost frames held the axis up, and its time is past";
 const NO_PARTNER: &str = "an axis of the same line has stopped";
 const SLIPS: &str = "the axis cannot follow within its limits";
 

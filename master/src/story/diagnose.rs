@@ -138,6 +138,7 @@ impl Class {
                 },
                 _ => Self::Device,
             },
+            RunError::FollowLost { reason, .. } if reason == crate::rt::feed::HELD_UP => Self::Bus,
             RunError::PhaseNotLocked { .. } | RunError::ClockNotSettled { .. } => Self::Timing,
             _ => Self::Device,
         }

@@ -144,7 +144,7 @@ impl Supervisor {
             self.order(Order::Stop).await;
             self.witness(error).await;
         }
-        let back = self.wind_down().await;
+        let back = self.wind_down(result.is_err()).await;
         if result.is_ok() {
             result = back;
         }
@@ -381,11 +381,11 @@ impl Supervisor {
         }
     }
 
-    /// Axes to rest, power off, and the segment back to Init, as far as it still answers.
-    async fn wind_down(&mut self) -> Result<(), RunError> {
+    /// Axes to rest, power off, and the segment back to Init, as far as it still answers. `failed`: the run has an error already.
+    async fn wind_down(&mut self, failed: bool) -> Result<(), RunError> {
         self.tell(Progress::Stopping);
         self.order(Order::Stop).await;
-        let result = self.await_rest().await;
+        let result = self.await_rest(failed).await;
         let stations = self.stations();
         if let Some(witnessed) = &mut self.witnessed {
             look::again(&self.wire, &stations, &mut witnessed.looks).await;
@@ -393,7 +393,6 @@ impl Supervisor {
             self.witness(error).await;
         }
         self.pass_events_on();
-        self.order(Order::Unguard).await;
         let stopped = |device: usize| self.is_stopped(self.machine.group_of(device));
         let devices = self.bus.addresses().into_iter().enumerate();
         let (stopped, others): (Vec<_>, Vec<_>) = devices.partition(|(device, _)| stopped(*device));
@@ -436,29 +435,40 @@ impl Supervisor {
     }
 
     /// Until nothing more can be done to stop any axis. Each axis sees to it in bounded time.
-    async fn await_rest(&mut self) -> Result<(), RunError> {
+    async fn await_rest(&mut self, failed: bool) -> Result<(), RunError> {
         loop {
             clock::delay(TICK).await;
-            let snapshot = self.outer.snapshots.read().clone();
-            let gone = self.outer.orders.is_abandoned();
-            if !gone && (snapshot.stopping.is_none() || !snapshot.stop_ended) {
-                continue;
+            let snapshot = self.outer.snapshots.read();
+            let ended = snapshot.stopping.is_some() && snapshot.stop_ended;
+            if ended || self.outer.orders.is_abandoned() {
+                break;
             }
-            if let Some(failure) = snapshot.failure {
-                return Err(self.explain_stop(failure, None, &snapshot).await);
-            }
-            // What has not answered for long has been reported if its group was stopped.
-            let mut axes = snapshot.axes.iter().enumerate();
-            let powered = axes.find(|(axis, status)| {
-                status.state.has_power() && !self.is_stopped(self.group_of(*axis))
-            });
-            return match powered {
-                Some((axis, status)) => Err(RunError::NotDisabled {
-                    device: self.device_of(axis),
-                    state: status.state,
-                }),
-                None => Ok(()),
-            };
+        }
+        // What the cycle finds up to here is a failure of this run.
+        self.order(Order::Unguard).await;
+        while self.outer.snapshots.read().orders_taken < self.orders_given
+            && !self.outer.orders.is_abandoned()
+        {
+            clock::delay(TICK).await;
+        }
+        let snapshot = self.outer.snapshots.read().clone();
+        // The machine may have stopped by itself when it was asked to.
+        let unsaid = snapshot.stopping.filter(|_| !failed);
+        let mut causes = snapshot.failure.into_iter().chain(unsaid);
+        if let Some(failure) = causes.find(StopCause::is_failure) {
+            return Err(self.explain_stop(failure, None, &snapshot).await);
+        }
+        // What has not answered for long has been reported if its group was stopped.
+        let mut axes = snapshot.axes.iter().enumerate();
+        let powered = axes.find(|(axis, status)| {
+            status.state.has_power() && !self.is_stopped(self.group_of(*axis))
+        });
+        match powered {
+            Some((axis, status)) => Err(RunError::NotDisabled {
+                device: self.device_of(axis),
+                state: status.state,
+            }),
+            None => Ok(()),
         }
     }
 

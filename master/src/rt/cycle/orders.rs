@@ -52,7 +52,10 @@ impl Engine {
                 }
             }
             Order::Guard => self.guarding = true,
-            Order::Unguard => self.guarding = false,
+            Order::Unguard => {
+                self.guarding = false;
+                self.axes.iter_mut().for_each(AxisSlot::disarm);
+            }
             Order::Stop => self.stop(None, StopCause::Requested),
             Order::ErrorCode { axis, code } => {
                 if let Some(slot) = self.axes.get_mut(axis) {
