@@ -211,11 +211,11 @@ impl Axis {
             self.judge();
         } else {
             self.stale_cycles = self.stale_cycles.saturating_add(1);
-            self.undelivered_cycles = if inputs.late {
-                1 + u32::from(self.config.answers_late)
-            } else {
-                self.undelivered_cycles.saturating_add(1)
-            };
+            self.undelivered_cycles = self.undelivered_cycles.saturating_add(1);
+            if inputs.late {
+                let under_way = 1 + u32::from(self.config.answers_late);
+                self.undelivered_cycles = self.undelivered_cycles.min(under_way);
+            }
             self.watch.lost(self.sent_before);
         }
         self.actual.pass(dt_s);

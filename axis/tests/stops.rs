@@ -363,3 +363,27 @@ fn late_replies_ramp_the_targets_down() {
     assert_eq!(axis.status().trip, None);
     assert!(step >= 79, "goes on: {step}");
 }
+
+/// With pipelined answers: a late answer in the first stale cycle leaves the two cycles that are planned blind.
+#[test]
+fn a_late_reply_takes_nothing_from_the_cycles_planned_blind() {
+    let mut axis = enabled(AxisConfig {
+        answers_late: 1,
+        ..config(Mode::Csp)
+    });
+    axis.command(to(4000.0)).unwrap();
+    let mut position = 0;
+    for _ in 0..300 {
+        follow(&mut axis, &mut position);
+    }
+    for late in [true, false] {
+        let stale = Inputs {
+            fresh: false,
+            late,
+            ..inputs(0x1237, position, 8)
+        };
+        let target = axis.step(&stale, DT).target_position;
+        assert_eq!(target - position, 80);
+        position = target;
+    }
+}
