@@ -186,22 +186,18 @@ impl Axis {
         };
         let standing = stop.standing_s >= SETTLE_S;
         let timeout_set = self.config.stop_timeout_s.is_some();
-        self.goal = if standing && !stop.stays {
+        let late = stop.elapsed_s > stop.timeout_s && (timeout_set || stop.unslowed_s > UNSLOWED_S);
+        if standing && !stop.stays {
             if self.brake_state.open {
                 self.brake_state = BrakeState::default();
             }
             if self.brake_state.since_s >= self.config.brake.engage_s {
                 (stop.removing_power, stop.elapsed_s) = (true, 0.0);
             }
-            PowerGoal::Stopping(stop)
-        } else if !standing
-            && stop.elapsed_s > stop.timeout_s
-            && (timeout_set || stop.unslowed_s > UNSLOWED_S)
-        {
-            PowerGoal::Stopping(self.harder(stop))
-        } else {
-            PowerGoal::Stopping(stop)
-        };
+        } else if !standing && late {
+            stop = self.harder(stop);
+        }
+        self.goal = PowerGoal::Stopping(stop);
     }
 
     /// At the time-out. An axis that still moves has failed to stop; torque alone stops none.
@@ -251,14 +247,12 @@ impl Axis {
         let PowerGoal::Stopping(stop) = self.goal else {
             return None;
         };
-        let over =
-            stop.removing_power && stop.elapsed_s > POWER_OFF_S && stop.unslowed_s > POWER_OFF_S;
-        let phase = match (stop.removing_power, self.stale_cycles == 0) {
-            _ if over && self.stale_cycles == 0 => StopPhase::PowerKept,
-            _ if over => StopPhase::Silent,
-            (true, _) => StopPhase::RemovingPower,
-            (false, _) if stop.standing_s >= SETTLE_S => StopPhase::Standstill,
-            (false, _) => StopPhase::Decelerating,
+        let phase = match stop.removing_power {
+            true if stop.is_over() && self.stale_cycles == 0 => StopPhase::PowerKept,
+            true if stop.is_over() => StopPhase::Silent,
+            true => StopPhase::RemovingPower,
+            false if stop.standing_s >= SETTLE_S => StopPhase::Standstill,
+            false => StopPhase::Decelerating,
         };
         Some(StopStatus {
             method: stop.method,
