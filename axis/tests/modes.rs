@@ -114,6 +114,31 @@ fn a_move_goes_on_through_a_switch() {
     assert_eq!(status.final_error_counts, Some(0));
 }
 
+/// A cycle too early or too late is a step of 0.06 mm. The command may come before the inputs or after them.
+#[test]
+fn a_position_begins_where_the_axis_will_be() {
+    for before_the_inputs in [false, true] {
+        let mut rig = enabled(plain(Mode::Csv, SLOW));
+        rig.axis.command(run_at(60.0)).unwrap();
+        rig.until(|s| s.in_target, 2000);
+        let switch = Command::SetMode(Mode::Csp);
+        if before_the_inputs {
+            rig.axis.command(switch).unwrap();
+        } else {
+            let inputs = rig.drive.inputs();
+            rig.drive.cycle(&rig.out, DT);
+            rig.axis.observe(&inputs, DT);
+            rig.axis.command(switch).unwrap();
+            rig.out = rig.axis.act();
+        }
+        for _ in 0..20 {
+            let status = rig.run(1);
+            assert!(status.following_error.abs() < 0.02, "{status:?}");
+        }
+        assert_eq!(rig.axis.status().mode, Mode::Csp);
+    }
+}
+
 /// A mode without a loop cannot carry out a move: it comes to rest, from the velocity or torque that there is.
 #[test]
 fn into_modes_without_loops() {

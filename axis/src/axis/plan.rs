@@ -2,6 +2,7 @@
 
 use super::{Axis, AxisConfig, Control};
 use crate::cia402::{Mode, ModeStatus};
+use crate::loops::bounded;
 use crate::setpoint::{
     Goal, Hold, JerkLimited, Motion, MotionLimits, Order, Ramp, Setpoint, SetpointError, Trapezoid,
 };
@@ -80,21 +81,32 @@ impl Axis {
         }
     }
 
-    /// Where the axis is now, by what it reports and the dead time, moving at `velocity`.
+    /// The set-point of the cycle before, had it been what the axis does: by what it reports and the dead time, at
+    /// `velocity`. To be advanced from.
     pub(super) fn tracked(&self, velocity: f64) -> Motion {
-        let limit = self.config.limits.velocity;
-        let velocity = velocity.max(-limit).min(limit);
+        let velocity = bounded(velocity, self.config.limits.velocity);
+        // What is reported now shows the set-point of this cycle after the dead time.
+        let late_s = self.config.dead_time_s - self.dt_s;
         Motion {
-            position: self.actual.position() + velocity * self.config.dead_time_s,
+            position: self.actual.position() + velocity * late_s,
             velocity,
             acceleration: 0.0,
+        }
+    }
+
+    /// The set-point of this cycle, where it is what the axis does.
+    fn following(&self) -> Motion {
+        let before = self.tracked(self.drift());
+        Motion {
+            position: before.position + before.velocity * self.dt_s,
+            ..before
         }
     }
 
     /// The motion where none is commanded: as it turns out. A mode that is being switched to will take it over.
     fn uncommanded(&self) -> Motion {
         if self.switch.is_some() {
-            self.tracked(self.drift())
+            self.following()
         } else {
             Motion::at(self.actual.position())
         }
@@ -166,7 +178,7 @@ impl Axis {
         match self.plan {
             // The new mode shows, and the drive does not follow in it yet.
             _ if grip == Control::Position && self.switch.is_some() && !self.follows_now() => {
-                self.motion = self.tracked(self.drift());
+                self.motion = self.following();
             }
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
             Plan::Jerk(ref mut source) => self.motion = source.advance(before, dt_s),

@@ -57,8 +57,8 @@ impl Axis {
         if self.config.control(to) == super::Control::Position
             && self.grip() == super::Control::Velocity
         {
-            // Where the axis is now is where the position set-point begins.
-            self.motion.position = self.tracked(self.motion.velocity).position;
+            // Where the axis is in the next cycle is where the position set-point begins.
+            self.interrupted = true;
         }
         self.switch = Some(Switch {
             from: self.mode,
