@@ -243,9 +243,7 @@ impl Engine {
         self.answer = self.exchange.answer();
         self.count();
         let adjust = self.follow_clock();
-        if !self.guarding {
-            self.exchange.share_datagrams();
-        } else {
+        if self.guarding {
             self.watch_bus();
             let heartbeat = &self.end.heartbeat;
             if self.supervisor.is_silent(heartbeat, self.timing.cycle_ns) {

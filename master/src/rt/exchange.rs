@@ -166,6 +166,8 @@ pub struct Exchange {
     form_of: [u8; 256],
     /// Cycles for which each device still has a datagram of its own.
     separate_cycles: u16,
+    /// Devices are in Op: a wrong counter says that one is missing.
+    op_expected: bool,
     /// Devices as the image lies.
     order: Vec<usize>,
     evidence: Vec<Evidence>,
@@ -243,6 +245,7 @@ impl Exchange {
             forms,
             form_of: [0; 256],
             separate_cycles: 0,
+            op_expected: false,
             order,
             evidence: vec![Evidence::Unknown; members.len()],
             late: vec![false; members.len()],
@@ -302,9 +305,10 @@ impl Exchange {
         self.late.get(device).copied().unwrap_or(false)
     }
 
-    /// Devices share datagrams again: wrong working counters are expected.
-    pub fn share_datagrams(&mut self) {
-        self.separate_cycles = 0;
+    /// On their way to Op and back, devices answer one after the other, and share their datagrams. Those
+    /// that have datagrams of their own keep them until all answer.
+    pub fn expect_op(&mut self, expected: bool) {
+        self.op_expected = expected;
     }
 
     /// What the diagnostic slot has found, in the order of the members.
@@ -554,7 +558,7 @@ impl Exchange {
                 self.inputs[datagram.image..datagram.image + data.len()].copy_from_slice(data);
             }
         }
-        if ambiguous || (self.separate_cycles > 0 && !all_right) {
+        if (ambiguous && self.op_expected) || (self.separate_cycles > 0 && !all_right) {
             self.separate_cycles = SEPARATE_CYCLES;
         }
         let mut answer = Answer {

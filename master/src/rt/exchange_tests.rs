@@ -378,6 +378,7 @@ fn a_frame_that_is_lost_concerns_its_groups() {
 fn a_missing_device_leaves_the_evidence_of_the_others_alone() {
     for mode in [Mode::SameCycle, Mode::Pipelined] {
         let mut exchange = exchange(&[axis(0); 3], mode);
+        exchange.expect_op(true);
         let missing_second = |exchange: &mut Exchange, input: u8| {
             let mut frame = reflect(exchange, 0, input);
             let form = exchange.flights[exchange.staged].form;

@@ -51,9 +51,13 @@ impl Engine {
                     signal.set(self.exchange.outputs_mut(), value);
                 }
             }
-            Order::Guard => self.guarding = true,
+            Order::Guard => {
+                self.guarding = true;
+                self.exchange.expect_op(true);
+            }
             Order::Unguard => {
                 self.guarding = false;
+                self.exchange.expect_op(false);
                 self.axes.iter_mut().for_each(AxisSlot::disarm);
             }
             Order::Stop => self.stop(None, StopCause::Requested),
