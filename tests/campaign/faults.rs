@@ -14,13 +14,22 @@ pub enum Effect {
     Open,
 }
 
+/// A moment of a run without faults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Moment {
+    /// The change of 0x6060 of this number.
+    ModeChange(usize),
+    /// The run begins to stop.
+    Stop,
+}
+
 #[derive(Debug, Clone)]
 pub struct Fault {
     pub kind: &'static str,
     /// Seconds since the first frame; 0: from the start.
     pub at: f64,
-    /// `at` counts from the change of 0x6060 of this number, in a run without faults.
-    pub after_mode_change: Option<usize>,
+    /// What `at` counts from, in a run without faults; `None`: the first frame.
+    pub after: Option<Moment>,
     pub lasts: Option<f64>,
     /// Keys of its kind, as TOML.
     pub keys: Vec<(&'static str, String)>,
@@ -33,7 +42,7 @@ impl Fault {
         Self {
             kind,
             at,
-            after_mode_change: None,
+            after: None,
             lasts: None,
             keys: Vec::new(),
             device: None,

@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 
-use super::faults::{Effect, Fault, script};
+use super::faults::{Effect, Fault, Moment, script};
 use super::random::Random;
 use super::scenes;
 use super::view::{Axis, CSP, CST, CSV, Machine, PP, PV};
@@ -361,19 +361,19 @@ impl Draft {
 }
 
 impl Plan {
-    /// The plan with its faults placed at these changes of mode, in seconds; those of changes that
-    /// never come are left out.
-    pub fn placed(&self, changes: &[f64]) -> Self {
+    /// The plan with its faults placed at these changes of mode and this stop, in seconds; those of
+    /// moments that never come are left out.
+    pub fn placed(&self, changes: &[f64], stop: Option<f64>) -> Self {
         let mut plan = self.clone();
-        plan.faults
-            .retain_mut(|fault| match fault.after_mode_change {
-                Some(number) => {
-                    let change = changes.get(number).map(|change| change + fault.at);
-                    fault.at = change.unwrap_or_default();
-                    change.is_some()
-                }
-                None => true,
-            });
+        plan.faults.retain_mut(|fault| {
+            let moment = match fault.after {
+                Some(Moment::ModeChange(number)) => changes.get(number).copied(),
+                Some(Moment::Stop) => stop,
+                None => Some(0.0),
+            };
+            fault.at += moment.unwrap_or_default();
+            moment.is_some()
+        });
         plan.fault_script = script(plan.seed, &plan.faults);
         plan
     }

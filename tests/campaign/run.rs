@@ -23,6 +23,8 @@ pub struct Outcome {
     pub headline: String,
     /// Whether the report names a fault of the script; `None` where that is not asked.
     pub right: Option<bool>,
+    /// When the run began to stop, from the first cycle on.
+    pub stop_s: Option<f64>,
     pub seconds: f64,
     pub cycles: usize,
 }
@@ -38,17 +40,13 @@ fn esi() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi")
 }
 
-/// The plan as it is run: faults that strike at a change of mode get their times from a run
-/// without faults.
+/// The plan as it is run: faults that strike at a change of mode or at the end get their times from
+/// a run without faults.
 pub fn placed(plan: &Plan, folder: &Path) -> Plan {
-    if plan
-        .faults
-        .iter()
-        .all(|fault| fault.after_mode_change.is_none())
-    {
+    if plan.faults.iter().all(|fault| fault.after.is_none()) {
         return plan.clone();
     }
-    run(&plan.placed(&[]), folder);
+    let outcome = run(&plan.placed(&[], None), folder);
     let recording = std::fs::read(folder.join("run.pcapng")).unwrap_or_default();
     let packets = pcapng::packets(&recording).unwrap_or_default();
     let wire = wire::read(&packets, &layouts(plan));
@@ -61,7 +59,9 @@ pub fn placed(plan: &Plan, folder: &Path) -> Plan {
         mode(&pair[0]).is_some() && mode(&pair[1]).is_some() && mode(&pair[0]) != mode(&pair[1])
     });
     let times: Vec<f64> = changes.map(|pair| pair[1].at as f64 * 1e-9).collect();
-    plan.placed(&times)
+    let first = wire.cycles.first().map(|cycle| cycle.at as f64 * 1e-9);
+    let stop = outcome.stop_s.zip(first).map(|(stop, first)| first + stop);
+    plan.placed(&times, stop)
 }
 
 /// Runs the plan in the folder and judges it.
@@ -138,6 +138,7 @@ pub fn run(plan: &Plan, folder: &Path) -> Outcome {
     let wire = wire::read(&packets, &layouts(plan));
     (outcome.seconds, outcome.cycles) = (wire.seconds, wire.cycles.len());
     let report = verdict::report(outcome.exit, &result, &mut outcome);
+    outcome.stop_s = report.stop_s;
     outcome
         .findings
         .append(&mut judge::judge(&plan.machine, &wire, &report));

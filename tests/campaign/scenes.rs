@@ -1,7 +1,7 @@
 //! Situations in which a stop, a mode change or a fault can go wrong. Each draws a machine, a
 //! program and the faults that strike it; times, sizes and phases are at random.
 
-use super::faults::{Effect, Fault};
+use super::faults::{Effect, Fault, Moment};
 use super::generate::{Draft, Wanted, mode_name};
 use super::view::{CSP, CST, CSV, PP, PV};
 
@@ -9,7 +9,7 @@ use super::view::{CSP, CST, CSV, PP, PV};
 pub type Scene = (&'static str, fn(&mut Draft));
 
 /// Every scene; mode changes have the most phases to meet.
-pub const SCENES: [Scene; 15] = [
+pub const SCENES: [Scene; 16] = [
     ("anything", anything),
     ("two-faults", two_faults),
     ("device-missing", device_missing),
@@ -20,6 +20,7 @@ pub const SCENES: [Scene; 15] = [
     ("mode-changes", mode_changes),
     ("late-replies", late_replies),
     ("fault-while-stopping", fault_while_stopping),
+    ("fault-at-the-end", fault_at_the_end),
     ("short-break", short_break),
     ("other-mode", other_mode),
     ("groups", groups),
@@ -352,7 +353,7 @@ fn mode_changes(draft: &mut Draft) {
             .random
             .pick(if close { &[3, 3, 4, 5] } else { &[1, 2, 3, 5] });
         let mut fault = Fault::new("frame-loss", after * cycle, Effect::None);
-        fault.after_mode_change = Some(change);
+        fault.after = Some(Moment::ModeChange(change));
         draft.fault(fault.key("count", count));
         after += f64::from(
             count
@@ -424,6 +425,18 @@ fn fault_while_stopping(draft: &mut Draft) {
             .strike("drive-fault", at, 0, Effect::Open)
             .key("code", "0x3220"),
     };
+    draft.fault(fault);
+}
+
+/// A bus that falls silent, so that it counts as lost about when the run has come to its end.
+fn fault_at_the_end(draft: &mut Draft) {
+    draft.drive(Wanted::default());
+    draft.turn(0.3);
+    draft.ends_at = 0.9;
+    let cycle = draft.seconds();
+    let cycles = draft.machine.lost_frames as f64 + draft.random.between(-6.0, 6.0);
+    let mut fault = Fault::new("silent", -cycles * cycle, Effect::Open).lasting(0.3);
+    fault.after = Some(Moment::Stop);
     draft.fault(fault);
 }
 

@@ -79,6 +79,12 @@ pub fn check(plan: &Plan, wire: &Wire, report: &Report, result: &Value, outcome:
         .collect();
     let said = outcome.error.clone();
     if report.exit == 0 {
+        if !report.text.is_empty() {
+            let detail = format!("exit 0, and {}", report.text.trim());
+            outcome
+                .findings
+                .push(finding("exit-0-with-failure", detail));
+        }
         // Struck while it was powered, and long before the end of the run.
         let sure = |effect: Effect| effect == Effect::Failure;
         if let Some(fault) = plan
