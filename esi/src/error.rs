@@ -42,6 +42,16 @@ impl EsiError {
     }
 }
 
+impl EsiProblem {
+    /// It costs the element alone: the text around it can be read, and nobody asks for more than a computer has.
+    pub(crate) fn is_of_one_element(&self) -> bool {
+        matches!(
+            self,
+            Self::Missing { .. } | Self::Number { .. } | Self::HexBytes { .. }
+        )
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EsiProblem {
     #[error("not well-formed XML: {0}")]

@@ -52,7 +52,10 @@ pub fn lint(file: &EsiFile) -> Vec<Finding> {
     let mut effort = 0usize;
     for warning in &file.warnings {
         found.all.push(Finding {
-            severity: Severity::Warning,
+            severity: match warning.left_out {
+                true => Severity::Error,
+                false => Severity::Warning,
+            },
             file: warning.file.clone(),
             position: warning.position,
             path: warning.path.clone(),

@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use ecaxis_esi::{Choice, EsiError, EsiFile, EsiProblem, Mode, parse, select, sii};
+use ecaxis_esi::{
+    Choice, DeviceQuery, EsiError, EsiFile, EsiProblem, Mode, find_device, parse, select, sii,
+};
 use proptest::prelude::*;
 
 fn own(name: &str) -> String {
@@ -109,9 +111,119 @@ fn what_a_layout_needs_must_be_there() {
             "hexadecimal",
         ),
     ] {
-        let error = refused(&device(inside)).to_string();
-        assert!(error.contains(part), "{error}");
+        let message = match parse(device(inside).as_bytes()) {
+            Err(error) => error.to_string(),
+            Ok(file) => {
+                let problem = file.warnings.iter().find(|warning| warning.left_out);
+                problem.expect(inside).message.clone()
+            }
+        };
+        assert!(message.contains(part), "{message}");
     }
+}
+
+fn left_out(file: &EsiFile) -> Vec<(u32, u32, &str)> {
+    let lost = file.warnings.iter().filter(|warning| warning.left_out);
+    lost.map(|w| (w.position.line, w.position.column, w.path.as_str()))
+        .collect()
+}
+
+/// One device a line, from line 2.
+fn devices(insides: &[&str]) -> String {
+    let mut text = "<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices>".to_owned();
+    for (n, inside) in insides.iter().enumerate() {
+        text += &format!("\n<Device><Type ProductCode=\"{n}\">T{n}</Type>{inside}</Device>");
+    }
+    text + "</Devices></Descriptions></EtherCATInfo>"
+}
+
+#[test]
+fn a_broken_device_costs_itself() {
+    const SM: &str = "EtherCATInfo/Descriptions/Devices/Device[2]/Sm[1]";
+    const DEVICE: &str = "EtherCATInfo/Descriptions/Devices/Device[2]";
+    for (broken, column, path) in [
+        ("<Sm StartAddress=\"lots\">Outputs</Sm>", 40, SM),
+        ("<Sm StartAddress=1>Outputs</Sm>", 40, SM),
+        (
+            "<Name>a</Nam>",
+            47,
+            "EtherCATInfo/Descriptions/Devices/Device[2]/Name",
+        ),
+        ("</Sm>", 40, DEVICE),
+        ("< >", 40, DEVICE),
+    ] {
+        let text = devices(&["", broken, ""]);
+        let file = parse(text.as_bytes()).unwrap();
+        let names: Vec<_> = file.devices.iter().map(|d| d.type_name.as_str()).collect();
+        assert_eq!(names, ["T0", "T2"], "{broken}");
+        assert_eq!(left_out(&file), [(3, column, path)], "{broken}");
+        assert!(
+            file.devices
+                .iter()
+                .all(|device| device.identity.vendor == 1)
+        );
+        derive_all(&file);
+        let query = DeviceQuery {
+            name: Some("T1"),
+            ..DeviceQuery::default()
+        };
+        let error = find_device(&file, &query).unwrap_err().to_string();
+        let place = format!("; a device is left out, 3:{column} {path}: ");
+        assert!(error.contains(&place), "{error}");
+    }
+}
+
+#[test]
+fn a_broken_pdo_costs_itself_and_is_noted() {
+    const PDO: &str = "<Index>#x1600</Index><Entry><Index>#x7000</Index><BitLen>8</BitLen></Entry>";
+    let text = device(&format!(
+        "<Sm StartAddress=\"#x1100\" ControlByte=\"#x64\" Enable=\"1\">Outputs</Sm>\n\
+         <RxPdo Sm=\"0\">{PDO}</RxPdo>\n<RxPdo Sm=\"0\"><Index>none</Index></RxPdo>\n\
+         <TxPdo><Entry/></TxPdo>"
+    ));
+    let file = parse(text.as_bytes()).unwrap();
+    let at = "EtherCATInfo/Descriptions/Devices/Device[1]";
+    let (rx, tx) = (
+        format!("{at}/RxPdo[2]/Index"),
+        format!("{at}/TxPdo[1]/Entry[1]"),
+    );
+    assert_eq!(left_out(&file), [(4, 15, rx.as_str()), (5, 8, tx.as_str())]);
+    let selection = select(&file, &file.devices[0], &Choice::default()).unwrap();
+    assert_eq!(selection.rx.len(), 1);
+    assert_eq!(selection.notes.len(), 2, "{:?}", selection.notes);
+}
+
+#[test]
+fn lines_may_end_with_cr_alone() {
+    let text = devices(&["", "<Sm/>"]).replace('\n', "\r");
+    let file = parse(text.as_bytes()).unwrap();
+    assert_eq!(
+        left_out(&file).first().map(|at| (at.0, at.1)),
+        Some((3, 40))
+    );
+}
+
+#[test]
+fn numbers_with_two_prefixes() {
+    for (written, value) in [("#x0x6041", 0x6041), ("0x6041", 0x6041), ("#X6041", 0x6041)] {
+        let pdo = format!(
+            "<TxPdo><Index>#x1a00</Index><Entry><Index>{written}</Index><BitLen>16</BitLen></Entry></TxPdo>"
+        );
+        let file = parse(device(&pdo).as_bytes()).unwrap();
+        assert_eq!(file.devices[0].tx_pdos[0].entries[0].index, value);
+    }
+}
+
+#[test]
+fn absurd_sizes_are_refused_at_once() {
+    for size in ["4294967296", "#x100000000", "99999999999999999999999999"] {
+        let text = device(&format!("<Eeprom><ByteSize>{size}</ByteSize></Eeprom>"));
+        let error = refused(&text).to_string();
+        assert!(error.contains(size), "{error}");
+    }
+    let text = device("<Eeprom><ByteSize>4294967295</ByteSize></Eeprom>");
+    let error = refused(&text).to_string();
+    assert!(error.contains("ByteSize"), "{error}");
 }
 
 #[test]

@@ -37,23 +37,6 @@ pub struct Position {
     pub column: u32,
 }
 
-impl Position {
-    /// What stands here in a text that began at `from`, where the same text begins at `to`.
-    pub(crate) fn moved(self, from: Self, to: Self) -> Self {
-        let line = self.line.saturating_sub(from.line);
-        let column = match line {
-            0 => to
-                .column
-                .saturating_add(self.column.saturating_sub(from.column)),
-            _ => self.column,
-        };
-        Self {
-            line: to.line.saturating_add(line),
-            column,
-        }
-    }
-}
-
 impl fmt::Display for Position {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}:{}", self.line, self.column)
@@ -69,7 +52,7 @@ pub struct EsiFile {
     pub modules: Vec<Module>,
     /// `InfoReference`: other files, usually of root `EtherCATModule`, that hold further modules.
     pub references: Vec<String>,
-    /// What was odd but could be read all the same.
+    /// What was odd, and what could not be read and was left out.
     pub warnings: Vec<Warning>,
 }
 
@@ -80,6 +63,8 @@ pub struct Warning {
     pub position: Position,
     /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
     pub path: String,
+    /// It could not be read and is not in the model; `false`: it was odd and read all the same.
+    pub left_out: bool,
     pub message: String,
 }
 

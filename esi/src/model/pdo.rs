@@ -74,16 +74,6 @@ impl Pdo {
         self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
     }
 
-    /// As it is where the same text stands at another place.
-    pub(crate) fn move_to(&mut self, position: Position) {
-        let from = std::mem::replace(&mut self.position, position);
-        if from != position {
-            for entry in &mut self.entries {
-                entry.position = entry.position.moved(from, position);
-            }
-        }
-    }
-
     /// Bytes in memory, nearly.
     pub(crate) fn size(&self) -> usize {
         let entries = self.entries.iter();

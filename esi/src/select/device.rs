@@ -3,7 +3,7 @@
 use std::fmt;
 
 use super::SelectError;
-use crate::model::{Device, EsiFile};
+use crate::model::{Device, EsiFile, Warning};
 
 /// What is known about a device; `None` matches everything.
 #[derive(Debug, Clone, Copy, Default)]
@@ -71,6 +71,7 @@ pub fn find_device<'a>(
         return Err(SelectError::NoSuchDevice {
             query: query.to_string(),
             available,
+            unreadable: unreadable(file),
         });
     };
     if matching
@@ -84,6 +85,26 @@ pub fn find_device<'a>(
         });
     }
     Ok(newest)
+}
+
+/// What of the file's devices could not be read, and took its device with it.
+fn unreadable(file: &EsiFile) -> String {
+    let of = |warning: &Warning, device: &Device| {
+        let rest = warning.path.strip_prefix(device.path.as_str());
+        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+    };
+    let lost = file.warnings.iter().filter(|warning| {
+        warning.left_out
+            && warning.path.contains("/Devices/Device[")
+            && !file.devices.iter().any(|device| of(warning, device))
+    });
+    lost.map(|w| {
+        format!(
+            "; a device is left out, {} {}: {}",
+            w.position, w.path, w.message
+        )
+    })
+    .collect()
 }
 
 fn list<'a>(devices: impl Iterator<Item = &'a Device>) -> String {

@@ -8,8 +8,13 @@ use crate::model::Position;
 pub enum SelectError {
     #[error("the ESI file describes no device")]
     NoDevices,
-    #[error("no device in the ESI file matches {query}; it contains {available}")]
-    NoSuchDevice { query: String, available: String },
+    #[error("no device in the ESI file matches {query}; it contains {available}{unreadable}")]
+    NoSuchDevice {
+        query: String,
+        available: String,
+        /// Devices that were left out, with the reason.
+        unreadable: String,
+    },
     #[error("{query} matches several devices: {available}")]
     Ambiguous { query: String, available: String },
     #[error("{device} offers no mode {mode}; the ESI offers {offered}")]

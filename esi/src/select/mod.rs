@@ -22,6 +22,7 @@ use crate::layout::Layout;
 use crate::mode::Mode;
 use crate::model::{
     Device, Dictionary, Direction, EsiFile, Identity, InitCmd, Module, Object, Pdo, Position,
+    Warning,
 };
 use crate::startup::{self, StartupSdo};
 
@@ -97,6 +98,17 @@ pub struct SelectedModule {
     pub pdos: Vec<u16>,
 }
 
+/// What of an element of the file could not be read.
+fn left_out(file: &EsiFile, path: &str) -> Vec<String> {
+    let within = |warning: &&Warning| {
+        let rest = warning.path.strip_prefix(path);
+        warning.left_out && rest.is_some_and(|rest| rest.starts_with('/'))
+    };
+    let lost = file.warnings.iter().filter(within);
+    lost.map(|w| format!("{} {} is left out: {}", w.position, w.path, w.message))
+        .collect()
+}
+
 /// Decides everything about one device.
 pub fn select(
     file: &EsiFile,
@@ -108,8 +120,10 @@ pub fn select(
             device: device.name.clone(),
         });
     }
-    let mut notes = Vec::new();
     let placed = module::choose(&file.modules, device, choice.mode, choice.modules)?;
+    let paths = placed.iter().map(|placed| &placed.module.path);
+    let paths = std::iter::once(&device.path).chain(paths);
+    let mut notes: Vec<_> = paths.flat_map(|path| left_out(file, path)).collect();
     let dictionary = merged(device, &placed);
     let dc_mode = dc::choose(
         device,

@@ -1,7 +1,6 @@
 //! `Dictionary/DataTypes`, as written.
 
 use std::collections::HashMap;
-use std::rc::Rc;
 
 use super::cursor::{Cursor, Element};
 use super::object::{self, Flags};
@@ -12,7 +11,7 @@ use crate::model::Text;
 #[derive(Default)]
 pub(super) struct DataTypes {
     /// With what `Cursor::at` makes a position of.
-    by_name: HashMap<Text, (usize, Rc<Named>)>,
+    by_name: HashMap<Text, (usize, Named)>,
 }
 
 /// A type and its name.
@@ -107,9 +106,12 @@ pub(super) fn read<'a>(
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| {
         if el.name == "DataType" {
-            let named = c.memoised(el, |memos| &mut memos.types, data_type)?;
-            let name = named.0.clone();
-            types.by_name.entry(name).or_insert((el.offset(), named));
+            let read = data_type(c, el);
+            let read = read.map(|named| {
+                let name = named.0.clone();
+                types.by_name.entry(name).or_insert((el.offset(), named));
+            });
+            return c.leave_out(el, read);
         }
         Ok(())
     })?;
@@ -121,7 +123,7 @@ pub(super) fn read<'a>(
     Ok(())
 }
 
-fn data_type<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<Named>, EsiError> {
+fn data_type<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Named, EsiError> {
     let mut name = Text::default();
     let mut data_type = DataType::default();
     c.children(element, |c, el| {
@@ -130,18 +132,12 @@ fn data_type<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<Named>,
             "BaseType" => data_type.base = c.content(el)?.into(),
             "BitSize" => data_type.bit_size = c.number(el, "BitSize")?,
             "ArrayInfo" => data_type.arrays.push(array_info(c, el)?),
-            "SubItem" => {
-                let take = |_: &mut Cursor<'a>, _: &Element<'a>, item| {
-                    data_type.sub_items.push(item);
-                    Ok(())
-                };
-                c.memoised_all(el, |memos| &mut memos.type_items, sub_item, take)?;
-            }
+            "SubItem" => data_type.sub_items.push(sub_item(c, el)?),
             _ => {}
         }
         Ok(())
     })?;
-    Ok(Rc::new((name, data_type)))
+    Ok((name, data_type))
 }
 
 fn array_info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<ArrayInfo, EsiError> {
@@ -167,7 +163,7 @@ fn sub_item<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<SubItem, Es
             "Type" => item.type_name = c.content(el)?.into(),
             "BitSize" => item.bit_size = c.number(el, "BitSize")?,
             "BitOffs" => item.bit_offset = c.optional_number(el, "BitOffs")?,
-            "Flags" => item.flags = c.memoised(el, |memos| &mut memos.flags, object::flags)?,
+            "Flags" => item.flags = object::flags(c, el)?,
             _ => {}
         }
         Ok(())

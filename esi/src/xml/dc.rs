@@ -10,18 +10,19 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Vec<
     let mut modes = Vec::new();
     c.children(element, |c, el| {
         if el.name == "OpMode" {
-            let mut mode = c.memoised(el, |memos| &mut memos.dc_modes, op_mode)?;
-            mode.position = c.position(el);
-            modes.push(mode);
+            let read = op_mode(c, el).map(|mode| modes.push(mode));
+            return c.leave_out(el, read);
         }
         Ok(())
     })?;
     Ok(modes)
 }
 
-/// Its place aside.
 fn op_mode<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<DcMode, EsiError> {
-    let mut mode = DcMode::default();
+    let mut mode = DcMode {
+        position: c.position(element),
+        ..DcMode::default()
+    };
     let mut descriptions = Names::default();
     c.children(element, |c, el| {
         match el.name {

@@ -1,8 +1,11 @@
 //! `Eeprom`.
 
 use super::cursor::{Cursor, Element};
-use crate::error::EsiError;
+use crate::error::{EsiError, EsiProblem};
 use crate::model::{Eeprom, EepromCategory};
+
+/// Word 0x3E of an image holds the size, in units of 128 bytes less one.
+const MAX_BYTES: u32 = 0x1_0000 * 128;
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Eeprom, EsiError> {
     let mut eeprom = Eeprom {
@@ -11,7 +14,14 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Eepr
     };
     c.children(element, |c, el| {
         match el.name {
-            "ByteSize" => eeprom.byte_size = c.number(el, "ByteSize")?,
+            "ByteSize" => {
+                eeprom.byte_size = c.number(el, "ByteSize")?;
+                if eeprom.byte_size > MAX_BYTES {
+                    let limit = usize::try_from(MAX_BYTES).unwrap_or(usize::MAX);
+                    let what = "the bytes of an EEPROM (ByteSize)";
+                    return Err(c.error_at(el, EsiProblem::TooLarge { what, limit }));
+                }
+            }
             "ConfigData" => eeprom.config_data = c.hex_bytes(el, "ConfigData")?,
             "BootStrap" => eeprom.bootstrap = c.hex_bytes(el, "BootStrap")?,
             "Data" => eeprom.image = c.hex_bytes(el, "Data")?,

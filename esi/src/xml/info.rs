@@ -72,10 +72,11 @@ fn descriptions<'a>(
             Ok(())
         }),
         "Devices" => c.children(el, |c, el| {
-            if el.name == "Device" {
-                file.devices.push(device::read(c, el)?);
+            if el.name != "Device" {
+                return Ok(());
             }
-            Ok(())
+            let read = device::read(c, el).map(|device| file.devices.push(device));
+            c.leave_out_damaged(el, read)
         }),
         "Modules" => modules(c, el, file),
         _ => Ok(()),
@@ -103,11 +104,20 @@ fn modules<'a>(
     file: &mut EsiFile,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| {
-        if el.name == "Module" {
-            file.modules.push(module::read(c, el)?);
+        if el.name != "Module" {
+            return Ok(());
         }
-        Ok(())
+        one_module(c, el, file)
     })
+}
+
+fn one_module<'a>(
+    c: &mut Cursor<'a>,
+    element: &Element<'a>,
+    file: &mut EsiFile,
+) -> Result<(), EsiError> {
+    let read = module::read(c, element).map(|module| file.modules.push(module));
+    c.leave_out_damaged(element, read)
 }
 
 /// The modules stand directly below the root or inside `Modules`; some files have a `Vendor`, some have none.
@@ -119,7 +129,7 @@ fn modules_alone<'a>(
     c.children(root, |c, el| {
         match el.name {
             "Vendor" => file.vendor = read_vendor(c, el)?,
-            "Module" => file.modules.push(module::read(c, el)?),
+            "Module" => one_module(c, el, file)?,
             "Modules" => modules(c, el, file)?,
             "Descriptions" => descriptions(c, el, file)?,
             _ => {}

@@ -4,6 +4,8 @@ use std::cell::{Cell, RefCell};
 
 pub(super) struct Lines<'a> {
     text: &'a [u8],
+    /// What ends a line: CR where a file has no LF.
+    end: u8,
     /// Line ends before each block, and characters since the last of them; grows with the offsets asked for, while
     /// what is counted was just read.
     before: RefCell<Vec<(u32, u32)>>,
@@ -15,8 +17,13 @@ const BLOCK: usize = 4096;
 
 impl<'a> Lines<'a> {
     pub fn new(text: &'a str) -> Self {
+        let text = text.as_bytes();
         Self {
-            text: text.as_bytes(),
+            text,
+            end: match memchr::memchr(b'\n', text) {
+                Some(_) => b'\n',
+                None => b'\r',
+            },
             before: RefCell::new(vec![(0, 0)]),
             last: Cell::default(),
         }
@@ -41,40 +48,27 @@ impl<'a> Lines<'a> {
         }
         while before.len() * BLOCK <= offset {
             let end = before.len() * BLOCK;
-            known = passed(known, &self.text[from..end]);
+            known = self.passed(known, &self.text[from..end]);
             before.push(known);
             from = end;
         }
-        passed(known, &self.text[from..offset])
+        self.passed(known, &self.text[from..offset])
     }
-}
 
-/// Lines and characters behind `bytes`.
-fn passed((lines, characters): (u32, u32), bytes: &[u8]) -> (u32, u32) {
-    let small = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
-    // A character is counted by its first byte.
-    let count = |bytes: &[u8]| {
-        let first = |byte: &&u8| **byte & 0xc0 != 0x80;
-        small(bytes.iter().filter(first).count())
-    };
-    match memchr::memrchr(b'\n', bytes) {
-        None => (lines, characters.saturating_add(count(bytes))),
-        Some(last) => {
-            let ends = line_ends(&bytes[..=last]);
-            (lines.saturating_add(small(ends)), count(&bytes[last + 1..]))
+    /// Lines and characters behind `bytes`.
+    fn passed(&self, (lines, characters): (u32, u32), bytes: &[u8]) -> (u32, u32) {
+        let small = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+        // A character is counted by its first byte.
+        let count = |bytes: &[u8]| {
+            let first = |byte: &&u8| **byte & 0xc0 != 0x80;
+            small(bytes.iter().filter(first).count())
+        };
+        match memchr::memrchr(self.end, bytes) {
+            None => (lines, characters.saturating_add(count(bytes))),
+            Some(last) => {
+                let ends = memchr::memchr_iter(self.end, &bytes[..=last]).count();
+                (lines.saturating_add(small(ends)), count(&bytes[last + 1..]))
+            }
         }
     }
-}
-
-/// In pieces of a fixed length, of which the compiler counts many bytes at once.
-fn line_ends(bytes: &[u8]) -> usize {
-    const PIECE: usize = 192;
-    let count = |piece: &[u8; PIECE]| {
-        let ends = piece.iter().map(|byte| u8::from(*byte == b'\n'));
-        usize::from(ends.sum::<u8>())
-    };
-    let (pieces, rest) = bytes.as_chunks();
-    let mut last = [0; PIECE];
-    last[..rest.len()].copy_from_slice(rest);
-    pieces.iter().map(count).sum::<usize>() + count(&last)
 }

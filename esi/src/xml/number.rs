@@ -1,4 +1,4 @@
-//! Number and byte literals of ETG.2000: `#x1a00`, `0x1A00`, `6656`, `-5`; `0A1b`.
+//! Number and byte literals of ETG.2000: `#x1a00`, `0x1A00`, `#x0x1a00`, `6656`, `-5`; `0A1b`.
 
 /// Wide enough for every value that an ESI can hold, unsigned or signed.
 pub(super) fn number(text: &str) -> Option<i128> {
@@ -12,6 +12,8 @@ pub(super) fn number(text: &str) -> Option<i128> {
         None => (false, text.strip_prefix('+').unwrap_or(text)),
     };
     let (digits, radix) = match digits.as_bytes() {
+        // Written by a tool that adds its own prefix.
+        [b'#', b'x' | b'X', b'0', b'x' | b'X', digits @ ..] => (digits, 16),
         [b'#' | b'0', b'x' | b'X', digits @ ..] => (digits, 16),
         digits => (digits, 10),
     };

@@ -1,7 +1,6 @@
 //! `Dictionary/Objects`, as written.
 
 use std::borrow::Cow;
-use std::rc::Rc;
 
 use super::cursor::{Cursor, Element};
 use super::number::{boolean, number};
@@ -20,7 +19,7 @@ pub(super) struct RawObject<'a> {
 }
 
 /// Name and values of a subindex.
-pub(super) type SubItem<'a> = Rc<(Cow<'a, str>, Info<'a>)>;
+pub(super) type SubItem<'a> = (Cow<'a, str>, Info<'a>);
 
 /// Default and range of an object or of one of its subindices; literals are read when the type is known.
 #[derive(Default)]
@@ -49,18 +48,20 @@ pub(super) struct Flags {
 pub(super) fn read<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
-    objects: &mut Vec<(Position, Rc<RawObject<'a>>)>,
+    objects: &mut Vec<(Position, RawObject<'a>)>,
 ) -> Result<(), EsiError> {
     c.children(element, |c, el| {
         if el.name == "Object" {
-            let object = c.memoised(el, |memos| &mut memos.objects, object)?;
-            objects.push((c.position(el), object));
+            let position = c.position(el);
+            let read = object(c, el);
+            let read = read.map(|object| objects.push((position, object)));
+            return c.leave_out(el, read);
         }
         Ok(())
     })
 }
 
-fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<RawObject<'a>>, EsiError> {
+fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<RawObject<'a>, EsiError> {
     let mut names = Names::default();
     let mut index = None;
     let mut object = RawObject {
@@ -82,7 +83,7 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<RawObject<
             "Type" => object.type_name = c.content(el)?.into(),
             "BitSize" => object.bit_size = c.number(el, "BitSize")?,
             "Info" => object.info = info(c, el)?,
-            "Flags" => object.flags = c.memoised(el, |memos| &mut memos.flags, flags)?,
+            "Flags" => object.flags = flags(c, el)?,
             _ => {}
         }
         Ok(())
@@ -96,7 +97,7 @@ fn object<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Rc<RawObject<
         )
     })?;
     object.name = names.take().into();
-    Ok(Rc::new(object))
+    Ok(object)
 }
 
 fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info<'a>, EsiError> {
@@ -117,11 +118,7 @@ fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info<'a>, EsiEr
             "SubItem" => {
                 // Most have that many.
                 out.sub_items.reserve(16);
-                let take = |_: &mut Cursor<'a>, _: &Element<'a>, item| {
-                    out.sub_items.push(item);
-                    Ok(())
-                };
-                c.memoised_all(el, |memos| &mut memos.object_items, sub_item, take)?;
+                out.sub_items.push(sub_item(c, el)?);
             }
             _ => {}
         }
@@ -141,7 +138,7 @@ fn sub_item<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<SubItem<'a>
         }
         Ok(())
     })?;
-    Ok(Rc::new((names.take(), inner)))
+    Ok((names.take(), inner))
 }
 
 pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Flags, EsiError> {

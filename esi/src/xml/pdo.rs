@@ -4,14 +4,14 @@ use super::cursor::{Cursor, Element};
 use super::text::Names;
 use crate::address;
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, Position, SlotDependence, Text};
+use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, SlotDependence, Text};
 
 /// A frame carries 11888 bits.
 const MAX_ENTRIES: usize = 12_000;
 /// There are 512 mapping objects for each direction.
 const MAX_PDOS: usize = 2048;
 
-/// Reads one more PDO of a device or module.
+/// Reads one more PDO of a device or module; one that cannot be read is left out.
 pub(super) fn append<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
@@ -27,23 +27,8 @@ pub(super) fn append<'a>(
             },
         ));
     }
-    // Before those of its entries: lines are counted forward.
-    let position = c.position(element);
-    let mut pdo = match direction {
-        Direction::Rx => c.memoised(element, |memos| &mut memos.rx_pdos, rx)?,
-        Direction::Tx => c.memoised(element, |memos| &mut memos.tx_pdos, tx)?,
-    };
-    pdo.move_to(position);
-    to.push(pdo);
-    Ok(())
-}
-
-fn rx<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Pdo, EsiError> {
-    read(c, element, Direction::Rx)
-}
-
-fn tx<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Pdo, EsiError> {
-    read(c, element, Direction::Tx)
+    let read = read(c, element, direction).map(|pdo| to.push(pdo));
+    c.leave_out(element, read)
 }
 
 fn read<'a>(
@@ -84,17 +69,7 @@ fn read<'a>(
             "ExcludedSm" => pdo.excluded_sm.push(c.number(el, "excluded SyncManager")?),
             "Entry" => {
                 room(c, el, &pdo.entries)?;
-                return c.memoised_all(
-                    el,
-                    |memos| &mut memos.entries,
-                    entry,
-                    |c, el, mut entry| {
-                        room(c, el, &pdo.entries)?;
-                        entry.position = c.position(el);
-                        pdo.entries.push(entry);
-                        Ok(())
-                    },
-                );
+                pdo.entries.push(entry(c, el)?);
             }
             _ => {}
         }
@@ -129,10 +104,9 @@ fn oversampling<'a>(
     }))
 }
 
-/// Its place aside.
 fn entry<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Entry, EsiError> {
     let mut entry = Entry {
-        position: Position::default(),
+        position: c.position(element),
         index: 0,
         sub: 0,
         bit_len: 0,

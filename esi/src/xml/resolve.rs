@@ -279,7 +279,7 @@ fn record_items<'t, 'a>(
 fn assign_infos<'t, 'a>(slots: &mut [Slot<'t, 'a>], infos: &'t [SubItem<'a>]) {
     let mut next = 0;
     for info in infos {
-        let (name, _) = &**info;
+        let (name, _) = info;
         let mut rest = slots.iter().skip(next);
         let named = rest.position(|slot| !name.is_empty() && *slot.name == **name);
         let place = next.saturating_add(named.unwrap_or(0));

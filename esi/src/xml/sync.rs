@@ -2,7 +2,7 @@
 
 use super::cursor::{Cursor, Element};
 use crate::error::{EsiError, EsiProblem};
-use crate::model::{Fmmu, FmmuUse, Position, SmUse, SyncManager, SyncUnit};
+use crate::model::{Fmmu, FmmuUse, SmUse, SyncManager, SyncUnit};
 
 pub(super) fn fmmu<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fmmu, EsiError> {
     Ok(Fmmu {
@@ -39,10 +39,6 @@ pub(super) fn assignment<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
 ) -> Result<Assignment, EsiError> {
-    c.memoised(element, |memos| &mut memos.assignments, read_assignment)
-}
-
-fn read_assignment<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Assignment, EsiError> {
     let mut oversampling = Vec::new();
     let number = c.attribute_number(element, "No")?;
     let mut pdos = Vec::new();
@@ -62,16 +58,6 @@ pub(super) fn sync_manager<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
 ) -> Result<SyncManager, EsiError> {
-    let mut sm = c.memoised(element, |memos| &mut memos.sync_managers, read_sync_manager)?;
-    sm.position = c.position(element);
-    Ok(sm)
-}
-
-/// Its place aside.
-fn read_sync_manager<'a>(
-    c: &mut Cursor<'a>,
-    element: &Element<'a>,
-) -> Result<SyncManager, EsiError> {
     let start_address = c.attribute_number(element, "StartAddress")?;
     let Some(start_address) = start_address else {
         return Err(c.error_at(
@@ -88,7 +74,7 @@ fn read_sync_manager<'a>(
         _ => c.attribute_number(element, "Enable")?,
     };
     let mut sm = SyncManager {
-        position: Position::default(),
+        position: c.position(element),
         usage: SmUse::Other,
         start_address,
         default_size: c

@@ -21,7 +21,7 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "a module without an identity",
         |text| replace(&text, r##"<Type ModuleIdent="#x6300000C">"##, "<Type>"),
-        ("refused", At::Nth(2, "<Module>")),
+        ("error", At::Nth(2, "<Module>")),
         "EtherCATInfo/Descriptions/Modules/Module[2]",
         "ModuleIdent is missing",
     ),
@@ -48,7 +48,7 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "4294967296 instances of a slot",
         |text| instances(&text, "4294967296"),
-        ("refused", At::First("<Slot ")),
+        ("error", At::First("<Slot ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Slots/Slot[1]",
         r##"MinInstances "4294967296""##,
     ),
@@ -89,14 +89,14 @@ pub const MUTATIONS: &[Mutation] = &[
                 r##"SlotPdoIncrement="#x10000""##,
             )
         },
-        ("refused", At::First("<Slots ")),
+        ("error", At::First("<Slots ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Slots",
         r##"SlotPdoIncrement "#x10000""##,
     ),
     row(
         "InitCmd data that is no data",
         |text| replace_in(&text, "<InitCmd>", "<Data>01", "<Data>0x1"),
-        ("refused", At::First("<Data>0x1")),
+        ("error", At::First("<Data>0x1")),
         "EtherCATInfo/Descriptions/Modules/Module[1]/Mailbox/CoE/InitCmd[1]/Data",
         "not a sequence of hexadecimal bytes",
     ),
@@ -109,7 +109,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 "<Objects><Object><Index>#x4000</Index><Type>HUGE</Type><BitSize>4294967295</BitSize></Object>",
             )
         },
-        ("refused", At::First("<Object><Index>#x4000")),
+        ("error", At::First("<Object><Index>#x4000")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Profile/Dictionary",
         "an object's bits exceed 8388608",
     ),
@@ -151,7 +151,7 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "an array of 4294967296 elements",
         |text| replace(&text, "<Elements>16<", "<Elements>4294967296<"),
-        ("refused", At::First("<Elements>")),
+        ("error", At::First("<Elements>")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Profile/Dictionary/DataTypes/DataType[7]/ArrayInfo/Elements",
         r##"Elements "4294967296""##,
     ),

@@ -26,14 +26,14 @@ pub const MUTATIONS: &[Mutation] = &[
                 "<Entry>",
             )
         },
-        ("refused", At::First("<Entry>")),
+        ("error", At::First("<Entry>")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]/Entry[1]",
         "Entry/Index is missing",
     ),
     row(
         "a PDO without an index",
         |text| replace_in(&text, "<RxPdo ", "<Index>#x1602</Index>", ""),
-        ("refused", At::Nth(3, "<RxPdo ")),
+        ("error", At::Nth(3, "<RxPdo ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[3]",
         "PDO Index is missing",
     ),
@@ -60,14 +60,14 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "a bit length beyond 16 bits",
         |text| replace(&text, "<BitLen>16</BitLen>", "<BitLen>65536</BitLen>"),
-        ("refused", At::First("<BitLen>")),
+        ("error", At::First("<BitLen>")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]/Entry[1]/BitLen",
         r##""65536" is not a number that fits"##,
     ),
     row(
         "a negative bit length",
         |text| replace(&text, "<BitLen>16</BitLen>", "<BitLen>-16</BitLen>"),
-        ("refused", At::First("<BitLen>")),
+        ("error", At::First("<BitLen>")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]/Entry[1]/BitLen",
         r##""-16""##,
     ),
@@ -81,7 +81,7 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "a subindex of 256",
         |text| replace(&text, "<SubIndex>0</SubIndex>", "<SubIndex>256</SubIndex>"),
-        ("refused", At::First("<SubIndex>256")),
+        ("error", At::First("<SubIndex>256")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]/Entry[1]/SubIndex",
         r##""256""##,
     ),
@@ -107,7 +107,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 r##"<RxPdo Fixed="false" Sm="300""##,
             )
         },
-        ("refused", At::Nth(1, "<RxPdo ")),
+        ("error", At::Nth(1, "<RxPdo ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]",
         r##"Sm "300""##,
     ),
@@ -133,7 +133,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 &"<TxPdo><Index>#x1a00</Index></TxPdo>".repeat(3000),
             )
         },
-        ("refused", At::Nth(2049, "<TxPdo")),
+        ("error", At::Nth(2049, "<TxPdo")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/TxPdo[2049]",
         "the PDOs of one direction exceed 2048",
     ),
@@ -146,7 +146,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 &"<Entry><Index>0</Index></Entry>".repeat(20_000),
             )
         },
-        ("refused", At::Nth(12001, "<Entry>")),
+        ("error", At::Nth(12001, "<Entry>")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[1]/Entry[12001]",
         "a PDO's entries exceed 12000",
     ),
@@ -160,7 +160,7 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "a SyncManager without an address",
         |text| replace(&text, r##" StartAddress="#x1060""##, ""),
-        ("refused", At::Nth(3, "<Sm ")),
+        ("error", At::Nth(3, "<Sm ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]",
         "StartAddress is missing",
     ),

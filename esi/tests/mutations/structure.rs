@@ -67,7 +67,7 @@ pub const MUTATIONS: &[Mutation] = &[
         |text| replace(&text, "<Fmmu>Outputs", "<!- - <Fmmu>Outputs"),
         ("refused", At::First("<!- -")),
         "EtherCATInfo/Descriptions/Devices/Device[1]",
-        "not well-formed",
+        "ends inside a tag or a comment",
     ),
     row(
         "another root",
@@ -92,7 +92,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 r##"ProductCode="#x6950000G""##,
             )
         },
-        ("refused", At::First("<Type ProductCode")),
+        ("error", At::First("<Type ProductCode")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Type",
         r##"ProductCode "#x6950000G""##,
     ),
@@ -113,7 +113,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 "<CycleTimeSync0 Factor=\"1\">99999999999999999999",
             )
         },
-        ("refused", At::First("<CycleTimeSync0")),
+        ("error", At::First("<CycleTimeSync0")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Dc/OpMode[1]/CycleTimeSync0",
         "time in nanoseconds",
     ),
@@ -154,7 +154,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 "",
             )
         },
-        ("refused", At::First("<Device ")),
+        ("error", At::First("<Device ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]",
         "Device/Type is missing",
     ),
@@ -168,7 +168,7 @@ pub const MUTATIONS: &[Mutation] = &[
     row(
         "an unknown entity in an attribute",
         |text| replace(&text, r##"Physics="YY""##, r##"Physics="&lol;""##),
-        ("refused", At::First("<Device ")),
+        ("error", At::First("<Device ")),
         "EtherCATInfo/Descriptions/Devices/Device[1]",
         "attribute Physics",
     ),
@@ -181,7 +181,7 @@ pub const MUTATIONS: &[Mutation] = &[
                 &(0..100).map(|n| format!("<level{n}>")).collect::<String>(),
             )
         },
-        ("refused", At::First("<level59>")),
+        ("error", At::First("<level59>")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/level0/level1/level2/level3/level4/level5/level6/level7/level8/level9/level10/level11/level12/level13/level14/level15/level16/level17/level18/level19/level20/level21/level22/level23/level24/level25/level26/level27/level28/level29/level30/level31/level32/level33/level34/level35/level36/level37/level38/level39/level40/level41/level42/level43/level44/level45/level46/level47/level48/level49/level50/level51/level52/level53/level54/level55/level56/level57/level58/level59",
         "nested deeper than 64",
     ),
@@ -238,7 +238,7 @@ pub const MUTATIONS: &[Mutation] = &[
             )
             .replace("#x69500000", "#x")
         },
-        ("refused", At::First("<Type ProductCode")),
+        ("error", At::First("<Type ProductCode")),
         "EtherCATInfo/Descriptions/Devices/Device[1]/Type",
         "ProductCode \"#x\"",
     ),

@@ -96,6 +96,7 @@ pub fn load(path: &Path) -> Result<esi::EsiFile, LoadError> {
             }
             Err(problem) => file.warnings.push(esi::Warning {
                 file: None,
+                left_out: true,
                 position: esi::Position { line: 1, column: 1 },
                 path: "EtherCATInfo/InfoReference".to_owned(),
                 message: format!("{name:?}: {problem}"),

@@ -31,6 +31,7 @@ impl<'a> Cursor<'a> {
                 file: None,
                 position: self.at(self.within().offset),
                 path: self.current_path(),
+                left_out: false,
                 message,
             });
         }

@@ -10,8 +10,7 @@ mod problems;
 mod values;
 
 use super::lines::Lines;
-use super::memo::{Memo, Memos};
-use super::scan::{Malformed, Piece, Scanner};
+use super::scan::{Malformed, Piece, Scanner, local_name};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Position, Warning};
 use path::{NUMBERED, shorten};
@@ -29,8 +28,9 @@ pub(super) struct Cursor<'a> {
     /// The element on top of the stack was written `<…/>`.
     ends_at_once: bool,
     spent: usize,
-    memos: Memos<'a>,
     pub warnings: Vec<Warning>,
+    /// The first problem that cost an element.
+    pub first_left_out: Option<EsiError>,
 }
 
 #[derive(Default)]
@@ -79,8 +79,8 @@ impl<'a> Cursor<'a> {
             top: Level::default(),
             ends_at_once: false,
             spent: 0,
-            memos: Memos::new(),
             warnings: Vec::new(),
+            first_left_out: None,
         }
     }
 
@@ -125,61 +125,41 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// What `read` makes of the element, taken from the memo where the same text was read before. `read` must make the
-    /// same of the same text wherever it stands, so without positions; what it warns of is told each time.
-    pub fn memoised<T: Clone>(
+    /// An element that cannot be read is left out, and what follows it is read; `Err` where the text behind it cannot be.
+    pub fn leave_out(
         &mut self,
         element: &Element<'a>,
-        memo: for<'m> fn(&'m mut Memos<'a>) -> &'m mut Memo<'a, T>,
-        read: impl FnOnce(&mut Self, &Element<'a>) -> Result<T, EsiError>,
-    ) -> Result<T, EsiError> {
-        if self.ends_at_once {
-            return read(self, element);
-        }
-        let rest = self.scanner.rest(element.offset);
-        let Some((key, known)) = memo(&mut self.memos).find(rest, element.depth) else {
-            return read(self, element);
+        read: Result<(), EsiError>,
+    ) -> Result<(), EsiError> {
+        let Err(error) = read else {
+            return Ok(());
         };
-        let end = element.offset + key.length();
-        if let Some(known) = known {
-            self.scanner.go_to(end);
-            self.depth -= 1;
-            return Ok(known.clone());
+        if !error.problem().is_of_one_element() {
+            return Err(error);
         }
-        let warned = self.warnings.len();
-        let value = read(self, element)?;
-        // The end that was found may have stood in a comment.
-        if self.scanner.offset() == end && self.warnings.len() == warned {
-            memo(&mut self.memos).put(key, value.clone());
-        }
-        Ok(value)
+        self.left_out(&error);
+        self.finish(element.depth)
     }
 
-    /// Like [`Self::memoised`], for an element and those behind it as long as they follow each other as they did
-    /// before; each is taken with its place.
-    pub fn memoised_all<T: Clone>(
+    /// As [`Self::leave_out`]; where the text itself is damaged, it is read on behind the next end tag of that name.
+    pub fn leave_out_damaged(
         &mut self,
         element: &Element<'a>,
-        memo: for<'m> fn(&'m mut Memos<'a>) -> &'m mut Memo<'a, T>,
-        read: impl FnOnce(&mut Self, &Element<'a>) -> Result<T, EsiError>,
-        mut take: impl FnMut(&mut Self, &Element<'a>, T) -> Result<(), EsiError>,
+        read: Result<(), EsiError>,
     ) -> Result<(), EsiError> {
-        let value = self.memoised(element, memo, read)?;
-        take(self, element, value)?;
-        let mut next = *element;
-        next.attributes = "";
-        while self.depth + 1 == element.depth {
-            next.offset = self.scanner.next_offset();
-            let rest = self.scanner.rest(next.offset);
-            let Some((length, value)) = memo(&mut self.memos).find_expected(rest, next.depth)
-            else {
-                break;
-            };
-            let value = value.clone();
-            self.scanner.go_to(next.offset + length);
-            next.number = self.count(next.name);
-            take(self, &next, value)?;
-        }
+        let Err(error) = self.leave_out(element, read) else {
+            return Ok(());
+        };
+        let level = self.stack.get(element.depth.saturating_sub(1));
+        let end = format!("</{}>", level.map_or("", |level| level.qualified));
+        let from = self.scanner.offset().max(element.offset);
+        let Some(at) = memchr::memmem::find(self.scanner.rest(from), end.as_bytes()) else {
+            return Err(error);
+        };
+        self.left_out(&error);
+        self.scanner.begin_at(from + at + end.len());
+        self.ends_at_once = false;
+        self.depth = element.depth.saturating_sub(1);
         Ok(())
     }
 
@@ -208,14 +188,8 @@ impl<'a> Cursor<'a> {
             self.depth = self.depth.saturating_sub(1);
             return Ok(Token::End);
         }
-        let open = self.within().qualified;
-        match self.scanner.next_tag(open).transpose() {
-            None => {
-                self.depth = self.depth.saturating_sub(1);
-                Ok(Token::End)
-            }
-            Some(piece) => self.take(piece),
-        }
+        let piece = self.scanner.next_tag();
+        self.take(piece)
     }
 
     #[inline(always)]
@@ -223,13 +197,12 @@ impl<'a> Cursor<'a> {
         match piece {
             Ok(Piece::Start {
                 name,
-                local,
                 attributes,
                 offset,
                 empty,
             }) => {
                 self.ends_at_once = empty;
-                let element = self.open((name, local), attributes, offset);
+                let element = self.open((name, local_name(name)), attributes, offset);
                 element.map(Token::Start)
             }
             Ok(Piece::End { name, offset }) => self.close(name, offset),
@@ -238,7 +211,7 @@ impl<'a> Cursor<'a> {
             Ok(Piece::Eof) => Ok(Token::Eof),
             Err(Malformed { offset, what }) => {
                 let problem = match what {
-                    Some(what) => EsiProblem::Syntax(what.to_owned()),
+                    Some(what) => EsiProblem::Syntax(what),
                     None => EsiProblem::TruncatedTag,
                 };
                 Err(EsiError::new(self.at(offset), self.current_path(), problem))

@@ -24,9 +24,24 @@ impl<'a> Cursor<'a> {
                 file: None,
                 position,
                 path,
+                left_out: false,
                 message,
             });
         }
+    }
+
+    /// Tells of what could not be read.
+    pub fn left_out(&mut self, error: &EsiError) {
+        if self.warnings.len() < MAX_WARNINGS {
+            self.warnings.push(Warning {
+                file: None,
+                position: error.position(),
+                path: error.path().to_owned(),
+                left_out: true,
+                message: error.problem().to_string(),
+            });
+        }
+        self.first_left_out.get_or_insert_with(|| error.clone());
     }
 
     /// Accounts for `bytes` of data built from what stands at `position`.

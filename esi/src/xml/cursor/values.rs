@@ -17,17 +17,6 @@ impl<'a> Cursor<'a> {
 
     /// The same, borrowed where it stands in the file in one piece.
     pub fn content(&mut self, element: &Element<'a>) -> Result<Cow<'a, str>, EsiError> {
-        if self.depth == element.depth
-            && !self.ends_at_once
-            && let Some((text, plain)) = self.scanner.text_to_end(self.within().qualified)
-        {
-            let content = match plain {
-                true => Cow::Borrowed(text),
-                false => line_ends(self.expanded(text)),
-            };
-            self.depth -= 1;
-            return Ok(content);
-        }
         let mut content = Cow::Borrowed("");
         while self.depth >= element.depth {
             let part = match self.token()? {
@@ -109,7 +98,7 @@ impl<'a> Cursor<'a> {
             return Ok(None);
         }
         let value = scan::attribute(element.attributes, name)
-            .map_err(|problem| self.error_at(element, EsiProblem::Syntax(problem.to_owned())))?;
+            .map_err(|problem| self.error_at(element, EsiProblem::Syntax(problem.to_string())))?;
         let Some(raw) = value else {
             return Ok(None);
         };
@@ -117,7 +106,7 @@ impl<'a> Cursor<'a> {
             .bytes()
             .any(|byte| matches!(byte, b'&' | b'\t' | b'\r' | b'\n'));
         if plain {
-            return Ok(Some(Cow::Borrowed(raw)));
+            return Ok(Some(raw));
         }
         let spaced = raw.replace("\r\n", " ").replace(['\t', '\r', '\n'], " ");
         let mut unknown = None;

@@ -134,8 +134,9 @@ impl Which {
 
     /// The device that a plain number counts to, from 1 as in element paths. What is called so goes first.
     fn number_of<'e>(&self, file: &'e EsiFile, text: &str) -> Option<&'e Device> {
-        let at = text.parse::<usize>().ok()?.checked_sub(1)?;
-        let device = file.devices.get(at)?;
+        let place = format!("/Device[{}]", text.parse::<usize>().ok()?);
+        let mut devices = file.devices.iter();
+        let device = devices.find(|device| device.path.ends_with(&place))?;
         let called = |device: &Device| device.type_name == text || device.name == text;
         let fits = self
             .product
@@ -152,11 +153,16 @@ impl Which {
         };
         let path = self.file.display();
         match (error, &self.device) {
-            (SelectError::NoSuchDevice { query, .. }, Some(name)) => {
+            (
+                SelectError::NoSuchDevice {
+                    query, unreadable, ..
+                },
+                Some(name),
+            ) => {
                 let mut types: Vec<&str> = file.devices.iter().map(|d| &*d.type_name).collect();
                 types.dedup();
                 let count = counted(file.devices.len(), "device");
-                let failure = failure(format!("none of its {count} matches {query}"));
+                let failure = failure(format!("none of its {count} matches {query}{unreadable}"));
                 match nearest(name, types.iter().copied()) {
                     Some(known) => failure.hint(format!("did you mean `{known}`?")),
                     None if types.len() <= 12 => {
