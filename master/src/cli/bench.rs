@@ -48,7 +48,7 @@ pub(crate) struct Args {
     /// When a cycle takes its answers: same-cycle or pipelined (one cycle later)
     #[arg(long, value_name = "HOW", value_parser = exchange)]
     exchange: Option<Exchange>,
-    /// How frames are taken from the interface: ring, packet, or xdp where the build has it
+    /// How frames are taken from the interface: ring or packet
     #[arg(long, value_name = "HOW", value_parser = link)]
     link: Option<BackEnd>,
     /// Spin so long before each release; auto: as long as needed; 0us: sleep only

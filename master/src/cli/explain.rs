@@ -94,8 +94,6 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         let meaning = match bus.link {
             BackEnd::Ring => "frames are taken from memory that the kernel shares",
             BackEnd::Packet => "frames are taken by system calls",
-            #[cfg(feature = "xdp")]
-            BackEnd::Xdp => "frames are taken before the network stack sees them",
         };
         row(["link", bus.link.name(), meaning]);
     }

@@ -270,16 +270,11 @@ fn awake(idle: &Spanned<String>, has_cpu: bool, p: &mut Problems<'_>) -> Option<
 fn back_end(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<BackEnd> {
     let found = BackEnd::ALL.iter().find(|b| b.name() == name.get_ref());
     if found.is_none() {
-        let hint = if name.get_ref() == "xdp" {
-            "this build is without it: `cargo install ecaxis --features xdp`; "
-        } else {
-            ""
-        };
         let names: Vec<_> = BackEnd::ALL.iter().map(|b| format!("\"{b}\"")).collect();
         p.add_hint(
             name.span(),
             format!("unknown link `{}`", name.get_ref()),
-            format!("{hint}there are {}", names.join(" and ")),
+            format!("there are {}", names.join(" and ")),
         );
     }
     found.copied()

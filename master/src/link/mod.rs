@@ -2,7 +2,6 @@
 //!
 //! - [`interface`]: what a network interface must be;
 //! - [`ring`], [`packet`]: a network interface, through mapped memory or a plain socket;
-//! - `xdp`: a network interface before the network stack (feature `xdp`);
 //! - [`claim`]: one program an interface;
 //! - [`sift`]: which of an interface's frames are ours;
 //! - [`sim`]: the simulated bus in this process;
@@ -25,8 +24,6 @@ pub mod replay;
 pub mod ring;
 pub mod sift;
 pub mod sim;
-#[cfg(feature = "xdp")]
-pub mod xdp;
 
 pub use crate::clock::Nanos;
 pub use claim::open_alone;
@@ -87,19 +84,10 @@ pub enum BackEnd {
     Ring,
     /// By system calls: [`packet::PacketLink`].
     Packet,
-    /// Before the network stack: `xdp::XdpLink`.
-    #[cfg(feature = "xdp")]
-    Xdp,
 }
 
 impl BackEnd {
-    /// Every one that this build has.
-    pub const ALL: &[Self] = &[
-        Self::Ring,
-        Self::Packet,
-        #[cfg(feature = "xdp")]
-        Self::Xdp,
-    ];
+    pub const ALL: &[Self] = &[Self::Ring, Self::Packet];
 
     /// As the machine file has it.
     #[must_use]
@@ -107,8 +95,6 @@ impl BackEnd {
         match self {
             Self::Ring => "ring",
             Self::Packet => "packet",
-            #[cfg(feature = "xdp")]
-            Self::Xdp => "xdp",
         }
     }
 }
@@ -138,8 +124,6 @@ pub fn open(nic: &str, back_end: BackEnd) -> Result<(Box<dyn Link>, Vec<Concern>
             Err(error) => return Err(error),
         },
         BackEnd::Packet => Box::new(packet::PacketLink::open(nic)?),
-        #[cfg(feature = "xdp")]
-        BackEnd::Xdp => Box::new(xdp::XdpLink::open(nic)?),
     };
     Ok((link, concerns))
 }

@@ -4,21 +4,16 @@
 //! - [`packet`]: AF_PACKET sockets;
 //! - [`ethtool`]: questions to a network driver;
 //! - [`ring`]: the memory that the kernel puts received frames into;
-//! - `xdp`, `bpf`: AF_XDP sockets, and the program that leads frames to them (feature `xdp`);
 //! - [`process`]: what the kernel counts for a thread, and the heap's settings;
 //! - [`signal`]: which signals the process ignores.
 
 #![allow(unsafe_code, reason = "this is the place for it")]
 
-#[cfg(feature = "xdp")]
-pub mod bpf;
 pub mod ethtool;
 pub mod packet;
 pub mod process;
 pub mod ring;
 pub mod signal;
-#[cfg(feature = "xdp")]
-pub mod xdp;
 
 use std::io;
 
