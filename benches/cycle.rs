@@ -1,4 +1,4 @@
-//! What a cycle costs: the whole turn against simulated drives, and the axes alone.
+//! The cost of a cycle: the whole cycle with simulated drives, and the axes alone.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -10,10 +10,10 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use ecaxis::clock::Clock;
 use ecaxis::config;
 use ecaxis::rt::cycle::Engine;
-use ecaxis::session::{Job, Options};
+use ecaxis::session::{Options, RunBuilder};
 use ecaxis_axis::{Axis, AxisConfig, Command, Inputs, Limits, Mode, Scale};
 
-/// A machine of `count` CSP axes at 1 ms.
+/// Returns a machine of `count` CSP axes at 1 ms.
 fn machine(count: usize) -> String {
     let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
     for i in 0..count {
@@ -26,7 +26,8 @@ fn machine(count: usize) -> String {
     text
 }
 
-/// Send, walk through the simulated segment with its drives, receive, check, step, stage, publish.
+/// Measures a cycle: send, pass through the simulated segment and its drives, receive, check, step,
+/// stage, publish.
 fn whole_cycle(c: &mut Criterion) {
     let mut group = c.benchmark_group("cycle_with_simulated_drives");
     for count in [2, 16] {
@@ -39,7 +40,7 @@ fn whole_cycle(c: &mut Criterion) {
         options.clock.enter();
         let (progress, _told) = channel();
         let stop = Arc::new(AtomicBool::new(false));
-        let job = Job {
+        let job = RunBuilder {
             machine: &Arc::new(machine),
             options: &options,
             stop,
@@ -56,7 +57,7 @@ fn whole_cycle(c: &mut Criterion) {
     group.finish();
 }
 
-/// State machine, trapezoid, limits and supervision of 100 axes in motion.
+/// Measures state machine, trapezoid, limits and supervision of 100 axes in motion.
 fn step_axes(c: &mut Criterion) {
     let scale = Scale::new(2000.0, 1.0).expect("a valid scale");
     let limits = Limits {

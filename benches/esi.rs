@@ -1,9 +1,9 @@
-//! Reading ESI files against lxml building its tree of the same file, in turns in the same run; the peak of memory;
-//! and what a library of known files adds to the start of the program. On a machine that others use too only the
-//! ratios mean anything, and those of processor time more than those of the clock.
+//! Compares the reading of ESI files with lxml's tree builder, alternating in the same run. Also
+//! measures peak memory, and the start of the program with a library of ESI files. On a shared
+//! machine only the ratios are meaningful, best those of processor time.
 //!
-//! Files come from `ECAXIS_FIXTURES` or `../shared/fixtures`. lxml is asked through the Python named by
-//! `ECAXIS_PYTHON`, else `python3`; without it our own times stand alone.
+//! Files come from `ECAXIS_FIXTURES` or `../shared/fixtures`. lxml runs in the Python of
+//! `ECAXIS_PYTHON`, else `python3`. Without lxml, only the times of ecaxis are printed.
 
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
@@ -12,11 +12,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use ecaxis::library;
+use ecaxis::esi_library;
 use rustix::time::{ClockId, clock_gettime};
 
 const ROUNDS: usize = 21;
-/// What the second argument asks a process of this benchmark for.
+/// The argument that makes this process measure its peak memory for one file.
 const PEAK: &str = "--peak-of";
 
 fn main() {
@@ -55,7 +55,7 @@ fn collect(folder: &Path, files: &mut Vec<(u64, PathBuf)>) {
     }
 }
 
-/// Both from the file's path to their result, the release of the result not counted.
+/// Measures both from the file's path to the result, without the release of the result.
 fn against_lxml(files: &[(u64, PathBuf)], mut lxml: Option<&mut Lxml>) {
     println!("\nreading a file, median (least) of {ROUNDS} turns");
     println!(
@@ -66,7 +66,7 @@ fn against_lxml(files: &[(u64, PathBuf)], mut lxml: Option<&mut Lxml>) {
         let (mut ours, mut theirs) = (Turns::default(), Turns::default());
         for _ in 0..ROUNDS {
             let (start, busy) = (Instant::now(), processor_time());
-            let file = library::load(path);
+            let file = esi_library::load(path);
             ours.add(start.elapsed(), processor_time() - busy);
             drop(file);
             if let Some(lxml) = &mut lxml {
@@ -111,7 +111,7 @@ impl Turns {
     }
 }
 
-/// Of this process, whatever else the machine does.
+/// Returns the processor time of this process, independent of other load.
 fn processor_time() -> Duration {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     Duration::new(
@@ -130,7 +130,7 @@ fn median(times: &mut [Duration]) -> (Duration, Duration) {
     (times[times.len() / 2], times[0])
 }
 
-/// lxml in a process of its own, so that neither side pays for the other's interpreter or heap.
+/// lxml in a separate process, so that neither side includes the other's interpreter or heap.
 struct Lxml {
     _child: Child,
     orders: ChildStdin,
@@ -162,7 +162,7 @@ impl Lxml {
         })
     }
 
-    /// Time by the clock and processor time.
+    /// Returns wall-clock time and processor time.
     fn parse(&mut self, path: &Path) -> (Duration, Duration) {
         writeln!(self.orders, "{}", path.display()).expect("lxml still listens");
         let mut answer = String::new();
@@ -175,7 +175,7 @@ impl Lxml {
     }
 }
 
-/// The most memory that a process has held which does nothing but load one file.
+/// Prints the peak memory of a process that only loads one file.
 fn memory(files: &[(u64, PathBuf)]) {
     println!("\npeak of memory while a file is loaded, in a process of its own");
     for (bytes, path) in files {
@@ -196,7 +196,7 @@ fn memory(files: &[(u64, PathBuf)]) {
 }
 
 fn peak_of(path: &Path) {
-    let file = library::load(path).expect("a fixture");
+    let file = esi_library::load(path).expect("a fixture");
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
     let kib = peak.map_or("", |rest| rest.trim().trim_end_matches(" kB"));
@@ -204,7 +204,8 @@ fn peak_of(path: &Path) {
     drop(file);
 }
 
-/// The whole program with every file known against the same with an empty folder.
+/// Compares the whole program with every file in its library to the same program with an empty
+/// folder.
 fn library_start(fixtures: &Path, count: usize) {
     let cache = tempfile::tempdir().expect("a temporary folder");
     let empty = tempfile::tempdir().expect("a temporary folder");

@@ -1,5 +1,5 @@
-"""lxml's side of benches/esi.rs: for each path on stdin, the nanoseconds that it takes to build the file's tree: by the
-clock, and of processor time."""
+"""The lxml part of benches/esi.rs. For each path on stdin, prints the time to build the file's tree in ns:
+wall-clock time and processor time."""
 
 import sys
 import time

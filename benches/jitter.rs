@@ -1,9 +1,9 @@
-//! Wake-up lateness of the cycle's clock beside cyclictest, in turns in one run: spinning as long as it needs, plain
-//! sleeping, and both on a CPU that is kept awake. Same class, priority, CPU and interval for all. On a computer that others use,
-//! too, only the ratios mean anything.
+//! Compares the wake-up lateness of the cycle's clock with cyclictest, alternating in one run:
+//! spinning as long as needed, plain sleep, and both on a CPU that is kept awake. Class, priority,
+//! CPU and interval are the same for all. On a shared computer only the ratios are meaningful.
 //!
-//! `cargo bench --bench jitter -- [CPU [SECONDS [hog]]]`: which CPU (default 1), seconds a round (default 2), and whether
-//! something keeps the other CPUs busy.
+//! `cargo bench --bench jitter -- [CPU [SECONDS [hog]]]`: the CPU (default 1), the seconds per
+//! round (default 2), and `hog` to keep the other CPUs busy.
 
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
@@ -12,16 +12,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use ecaxis::bench::wakeup::{Cyclictest, Wakeups};
 use ecaxis::clock::Nanos;
-use ecaxis::rt::awake::Awake;
-use ecaxis::rt::exchange::Mode;
-use ecaxis::rt::margin::{Margin, Spin};
-use ecaxis::rt::stats::{Percentiles, Times};
-use ecaxis::rt::thread::{self, Held};
+use ecaxis::rt::exchange::ExchangeMode;
+use ecaxis::rt::spin::{Spin, SpinWindow};
+use ecaxis::rt::stats::{LatencyHistogram, Percentiles};
+use ecaxis::sys::idle_spinner::IdleSpinner;
+use ecaxis::sys::rt_thread::{self, CpuWakeGuard};
 
 const PRIORITY: u8 = 80;
 const ROUNDS: u32 = 3;
 
-fn row(name: &str, p: &Percentiles, beside: &Percentiles, cpu: Option<f64>) {
+fn row(name: &str, p: &Percentiles, during: &Percentiles, cpu: Option<f64>) {
     let ratio = |a: u64, b: u64| a as f64 / b.max(1) as f64;
     println!(
         "{name:<22} {:>8.2} {:>8.2} {:>8.2} {:>9.2}   {:>6.3} {:>6.3} {:>6.3}   {}",
@@ -29,16 +29,16 @@ fn row(name: &str, p: &Percentiles, beside: &Percentiles, cpu: Option<f64>) {
         p.p99_ns as f64 / 1e3,
         p.p99_9_ns as f64 / 1e3,
         p.max_ns as f64 / 1e3,
-        ratio(p.p50_ns, beside.p50_ns),
-        ratio(p.p99_ns, beside.p99_ns),
-        ratio(p.p99_9_ns, beside.p99_9_ns),
+        ratio(p.p50_ns, during.p50_ns),
+        ratio(p.p99_ns, during.p99_ns),
+        ratio(p.p99_9_ns, during.p99_9_ns),
         cpu.map_or(String::new(), |cpu| format!("{cpu:.1} %")),
     );
 }
 
 fn measure(cycle: Nanos, cpu: usize, seconds: u32, awake: bool) {
     let cycles = seconds * u32::try_from(1_000_000_000 / cycle).unwrap_or(1_000);
-    let spinner = awake.then(|| Awake::start(cpu));
+    let spinner = awake.then(|| IdleSpinner::start(cpu));
     if let Some(Err(denied)) = &spinner {
         println!("note: {denied}");
         return;
@@ -48,9 +48,13 @@ fn measure(cycle: Nanos, cpu: usize, seconds: u32, awake: bool) {
         priority: PRIORITY,
         cpu: Some(cpu),
     };
-    let (mut theirs, mut auto, mut plain) = (Times::new(), Wakeups::default(), Wakeups::default());
-    let mut margin = Margin::new(Spin::Auto, cycle, Mode::SameCycle);
-    let mut sleeping = Margin::new(Spin::For(0), cycle, Mode::SameCycle);
+    let (mut theirs, mut auto, mut plain) = (
+        LatencyHistogram::new(),
+        Wakeups::default(),
+        Wakeups::default(),
+    );
+    let mut margin = SpinWindow::new(Spin::Auto, cycle, ExchangeMode::SameCycle);
+    let mut sleeping = SpinWindow::new(Spin::For(0), cycle, ExchangeMode::SameCycle);
     for _ in 0..ROUNDS {
         if let Err(error) = reference.round(cycles, &mut theirs) {
             println!("note: {error}");
@@ -75,19 +79,19 @@ fn measure(cycle: Nanos, cpu: usize, seconds: u32, awake: bool) {
         "p99",
         "p99.9",
     );
-    let beside = theirs.summary();
+    let during = theirs.summary();
     let load = |w: &Wakeups| Some(w.used.load_percent(w.wall_ns));
-    row("cyclictest", &beside, &beside, None);
+    row("cyclictest", &during, &during, None);
     row(
         "sleep, then spin",
         &auto.lateness.summary(),
-        &beside,
+        &during,
         load(&auto),
     );
     row(
         "sleep alone",
         &plain.lateness.summary(),
-        &beside,
+        &during,
         load(&plain),
     );
 }
@@ -109,15 +113,15 @@ fn main() {
         .map(|other| {
             let stop = Arc::clone(&stop);
             std::thread::spawn(move || {
-                let _ = thread::pin(other);
+                let _ = rt_thread::pin(other);
                 while !stop.load(Ordering::Relaxed) {
                     std::hint::spin_loop();
                 }
             })
         })
         .collect();
-    let (_held, mut denied) = Held::take(None);
-    denied.extend(thread::prepare(PRIORITY, Some(cpu)));
+    let (_held, mut denied) = CpuWakeGuard::take(None);
+    denied.extend(rt_thread::become_realtime(PRIORITY, Some(cpu)));
     for denied in denied {
         println!("note: {denied}");
     }

@@ -1,8 +1,10 @@
-//! Transfers beside the cycle, over a veth pair (root): drives on the simulated bus, in a process of its own, are asked for ten objects each
-//! over and over, in turns with runs in which nobody asks. What the real-time thread does is compared.
+//! Mailbox transfers during cyclic operation, over a veth pair (root). The simulated bus runs in a
+//! separate process, and ten objects of each drive are read repeatedly. Runs with and without
+//! transfers alternate, and the activity of the real-time thread is compared.
 //!
-//! `cargo bench -p ecaxis --bench mailboxes [-- AXES ASKED SECONDS ROUNDS]`; 8 8 10 3 if nothing is said. With 0 rounds there is one with traffic,
-//! and programs beside it that keep a processor and the memory busy. Without root it says so and ends.
+//! `cargo bench -p ecaxis --bench mailboxes [-- AXES ASKED SECONDS ROUNDS]`; the default is 8 8 10
+//! 3. With 0 rounds, one run has transfers and additional programs that load a processor and the
+//! memory. Without root, the benchmark prints a note and ends.
 
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
@@ -18,10 +20,10 @@ use std::thread::JoinHandle;
 use ecaxis::bench::veth::VethPair;
 use ecaxis::config;
 use ecaxis::mailbox::Mailboxes;
-use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::rt::controller::{Controller, CycleContext};
 use ecaxis::session::{self, Observer, Options, Progress, Summary};
 
-/// Identity, state, position and settings, as a commissioning tool would look at them.
+/// Identity, state, position and settings, as a commissioning tool reads them.
 const OBJECTS: [(u16, u8); 10] = [
     (0x1018, 1),
     (0x1018, 2),
@@ -41,10 +43,10 @@ struct Counts {
     failed: AtomicU64,
 }
 
-/// Cycles after which the real-time thread has everything that it will need.
+/// The number of cycles after which the real-time thread has allocated all its memory.
 const SETTLED: u64 = 1_000;
 
-/// What the real-time thread allocates or frees once it has settled.
+/// Allocations and frees of the real-time thread after this time.
 struct Meter {
     cycles: u64,
     before: u64,
@@ -52,7 +54,7 @@ struct Meter {
 }
 
 impl Controller for Meter {
-    fn cycle(&mut self, _: &mut Cycle<'_>) {
+    fn cycle(&mut self, _: &mut CycleContext<'_>) {
         let so_far = counting::allocations();
         self.cycles += 1;
         if self.cycles == SETTLED {
@@ -63,7 +65,7 @@ impl Controller for Meter {
     }
 }
 
-/// Asks the first devices as long as the run lasts.
+/// Reads the objects of the first devices during the run.
 struct Asking {
     devices: usize,
     counts: Arc<Counts>,
@@ -96,7 +98,7 @@ async fn ask(mailboxes: Mailboxes, devices: usize, counts: Arc<Counts>) {
         let mailbox = mailboxes.device(&name).expect("one of them");
         let counts = Arc::clone(&counts);
         tasks.spawn(async move {
-            // Until the run is over, when nobody serves any more.
+            // The loop ends when the run is over and requests fail.
             let mut in_a_row = 0;
             while in_a_row < OBJECTS.len() {
                 for (index, sub) in OBJECTS {
@@ -114,10 +116,10 @@ async fn ask(mailboxes: Mailboxes, devices: usize, counts: Arc<Counts>) {
     while tasks.join_next().await.is_some() {}
 }
 
-/// Ends with this.
-struct Beside(Child);
+/// A process that is killed when this value is dropped.
+struct Background(Child);
 
-impl Drop for Beside {
+impl Drop for Background {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -138,8 +140,8 @@ fn machine(nic: &str, axes: usize) -> String {
     text
 }
 
-/// Arithmetic without end, and memory taken, written and given back.
-fn load() -> Vec<Beside> {
+/// Starts endless arithmetic, and repeated allocation, writing and release of memory.
+fn load() -> Vec<Background> {
     let arithmetic = "while :; do :; done";
     let memory = "while :; do head -c 200000000 /dev/zero | tail -n 1 > /dev/null; done";
     let start = |script| {
@@ -147,7 +149,7 @@ fn load() -> Vec<Beside> {
             .args(["-c", script])
             .stdin(Stdio::null())
             .spawn();
-        Beside(child.expect("a shell"))
+        Background(child.expect("a shell"))
     };
     [arithmetic, memory].map(start).into()
 }
@@ -223,7 +225,7 @@ fn main() {
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn();
-    let _bus = Beside(bus.expect("taskset starts the bus"));
+    let _bus = Background(bus.expect("taskset starts the bus"));
     std::thread::sleep(std::time::Duration::from_secs(1));
     println!("{axes} drives at 1 ms, {asked} of them asked; {rounds} rounds of {seconds} s each");
     println!(

@@ -1,8 +1,8 @@
-//! How fast simulated drives run: segments in Op at 1 kHz with every axis in motion, on one core, as
-//! multiples of real time.
+//! The speed of simulated drives: segments in Op at 1 kHz with every axis in motion, on one core,
+//! as multiples of real time.
 //!
 //! Each millisecond, frames with FRMW of the system time, LRW of all process data and BRD of the AL
-//! status go through the segment; a MainDevice of a few lines turns Statuswords into Controlwords and
+//! status pass through the segment. A minimal MainDevice derives Controlwords from Statuswords and
 //! moves the targets of CSP.
 
 #![allow(clippy::print_stdout, reason = "the figures are what it is for")]
@@ -16,19 +16,19 @@ use std::time::{Duration, Instant};
 use common::{Bus, SAFEOP};
 use ecaxis_esi::model::{EsiFile, Pdo};
 use ecaxis_sim::frame::{self, FrameBuilder};
-use ecaxis_sim::{DeviceOptions, PlantParams, SimDevice, Transit};
+use ecaxis_sim::{DeviceOptions, FrameOutcome, PlantParams, SimDevice};
 
 const CYCLE_NS: u64 = 1_000_000;
 const CSP: u32 = 0x0e0a_0008;
-/// Bytes of process data in one datagram; a frame takes 1498.
+/// The bytes of process data in one datagram; a frame holds 1498.
 const DATAGRAM: usize = 1400;
 const ENABLED: u16 = 0x27;
 
 struct Machine {
     bus: Bus,
-    /// Process data of every drive, outputs and inputs in the same place.
+    /// The process data of all drives, with outputs and inputs at the same place.
     image: Vec<u8>,
-    /// Of one drive.
+    /// The length of one drive's data.
     len: usize,
     frame: Vec<u8>,
     origins: Vec<i32>,
@@ -41,7 +41,7 @@ fn bytes(pdos: &[Pdo]) -> usize {
 }
 
 impl Machine {
-    /// In Op, clocks running, axes enabled.
+    /// Creates the segment in Op, with running clocks and enabled axes.
     fn new(file: &EsiFile, drives: u16) -> Self {
         let device = file.devices.first().expect("a device");
         let devices = (0..drives).map(|n| {
@@ -116,7 +116,7 @@ impl Machine {
                 .build();
             let now = start + 200_000 * n;
             let transit = self.bus.segment.transit(&mut self.frame, now);
-            assert!(matches!(transit, Transit::Back { .. }));
+            assert!(matches!(transit, FrameOutcome::Back { .. }));
             let mut datagram = frame::next(&self.frame, None).expect("a datagram");
             if n == 0 {
                 datagram = frame::next(&self.frame, Some(&datagram)).expect("another");
@@ -124,7 +124,7 @@ impl Machine {
             self.image[part..end].copy_from_slice(&self.frame[datagram.data]);
         }
         self.bus.now = start + CYCLE_NS;
-        // Half a turn to and fro in half a second.
+        // Half a turn forth and back in half a second.
         let phase = f64::from(self.cycle) * std::f64::consts::TAU / 500.0;
         #[expect(clippy::cast_possible_truncation)]
         let way = (1000.0 * (1.0 - phase.cos())) as i32;
@@ -148,7 +148,7 @@ impl Machine {
         }
     }
 
-    /// Every axis enabled and turning.
+    /// True if every axis is enabled and turns.
     fn moves(&self) -> bool {
         (0..self.origins.len()).all(|n| {
             let drive = self.bus.segment.device(n).and_then(SimDevice::drive);
@@ -157,8 +157,8 @@ impl Machine {
     }
 }
 
-/// What this thread has had of the core so far: what other programs take does not count. Without Linux's
-/// account of it, wall-clock time.
+/// Returns the core time of this thread, without the time of other programs. Without Linux's
+/// accounting, returns wall-clock time.
 fn core_time(start: Instant) -> Duration {
     std::fs::read_to_string("/proc/thread-self/schedstat")
         .ok()
@@ -166,7 +166,8 @@ fn core_time(start: Instant) -> Duration {
         .map_or_else(|| start.elapsed(), Duration::from_nanos)
 }
 
-/// Simulated by real time: the best of some runs, as what shares caches with it only slows it down.
+/// Returns simulated time divided by real time: the best of several runs, because shared caches
+/// only slow a run down.
 fn times_real_time(machine: &mut Machine, cycles: u32) -> f64 {
     let (mut best, started) = (Duration::MAX, Instant::now());
     for _ in 0..20 {
@@ -181,7 +182,7 @@ fn times_real_time(machine: &mut Machine, cycles: u32) -> f64 {
 }
 
 fn main() {
-    // `cargo test --benches` only wants to see that it runs.
+    // `cargo test --benches` only checks that the benchmark runs.
     let short = !std::env::args().any(|argument| argument == "--bench");
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi/EPOS4.xml");
     let file = std::fs::read(path).expect("the project's own ESI file");

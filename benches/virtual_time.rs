@@ -1,8 +1,8 @@
-//! How fast virtual time goes: `ecaxis run --sim --virtual` with 2, 8, 32 and 100 CSP drives in motion at 1 ms, in machine seconds per second
-//! of CPU time, from the start of the program to its end.
+//! The speed of virtual time: `ecaxis run --sim --virtual` with 2, 8, 32 and 100 CSP drives in
+//! motion at 1 ms. The result is in machine seconds per second of CPU time, for the whole process.
 //!
-//! `cargo bench -p ecaxis --bench virtual_time [-- OTHER]`; with the path of another ecaxis program it runs in turns with this one, and the
-//! ratio of both is printed.
+//! `cargo bench -p ecaxis --bench virtual_time [-- OTHER]`: with the path of another ecaxis
+//! program, both programs alternate, and their ratio is printed.
 
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
@@ -10,11 +10,11 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
 
-/// Drives, and machine seconds of one run.
+/// The number of drives, and the machine seconds of one run.
 const MACHINES: [(usize, u32); 4] = [(2, 300), (8, 120), (32, 30), (100, 10)];
 const ROUNDS: usize = 3;
 
-/// So many drives that move to and fro without an end.
+/// Returns a machine with this number of drives that move forth and back endlessly.
 fn machine(drives: usize) -> String {
     let esi = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi/EPOS4.xml");
     let mut file = String::from("repeat = 1000000\n[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
@@ -35,17 +35,17 @@ fn machine(drives: usize) -> String {
     file
 }
 
-/// CPU time of all children that have ended, in ticks of the kernel's clock, 100 a second.
+/// Returns the CPU time of all ended children in kernel clock ticks, 100 per second.
 fn children_ticks() -> u64 {
     let stat = std::fs::read_to_string("/proc/self/stat").expect("Linux");
-    // Behind the name, which is in parentheses: fields 16 and 17 (proc(5)).
+    // Fields 16 and 17 after the name in parentheses (proc(5)).
     let (_, fields) = stat.rsplit_once(')').expect("a name");
     let fields: Vec<&str> = fields.split_whitespace().collect();
     let ticks = |n: usize| fields[n - 3].parse::<u64>().expect("a number");
     ticks(16) + ticks(17)
 }
 
-/// Machine seconds per second of CPU time.
+/// Returns machine seconds per second of CPU time.
 fn speed(program: &Path, file: &Path, seconds: u32) -> f64 {
     let before = children_ticks();
     let output = Command::new(program)
@@ -66,7 +66,7 @@ fn speed(program: &Path, file: &Path, seconds: u32) -> f64 {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    // `cargo test --benches` only wants to see that it runs.
+    // `cargo test --benches` only checks that the benchmark runs.
     let short = !arguments.iter().any(|a| a == "--bench");
     let other = arguments.iter().find(|a| !a.starts_with('-'));
     let own = Path::new(env!("CARGO_BIN_EXE_ecaxis"));

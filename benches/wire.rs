@@ -1,22 +1,23 @@
-//! What a frame to and fro costs over each back-end, in turns in one run, on a veth pair whose other end answers after 30 µs.
-//! The software's share is the round trip less these 30 µs. Needs root and two CPUs.
+//! The round-trip cost of a frame over each socket kind, alternating in one run, on a veth pair
+//! whose other end answers after 30 µs. The software's share is the round trip minus these 30 µs.
+//! Requires root and two CPUs.
 //!
-//! `cargo bench --bench wire -- [MILLISECONDS]`: of a round (default 1000).
+//! `cargo bench --bench wire -- [MILLISECONDS]`: the duration of a round (default 1000).
 
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
 use ecaxis::bench::exchange::Exchanges;
-use ecaxis::bench::reflector::{Pace, Reflector};
+use ecaxis::bench::reflector::{Reflector, ReplyTiming};
 use ecaxis::bench::veth::VethPair;
-use ecaxis::link::{self, BackEnd};
-use ecaxis::rt::exchange::Mode;
-use ecaxis::rt::margin::{Margin, Spin};
-use ecaxis::rt::thread::{self, Held};
+use ecaxis::link::{self, SocketKind};
+use ecaxis::rt::exchange::ExchangeMode;
+use ecaxis::rt::spin::{Spin, SpinWindow};
+use ecaxis::sys::rt_thread::{self, CpuWakeGuard};
 
 const PRIORITY: u8 = 80;
 const ROUNDS: usize = 6;
 const HOLD_NS: u64 = 30_000;
-/// Of datagrams: 192 bytes of process data and what is around them.
+/// The bytes of the datagrams: 192 bytes of process data and their headers.
 const DATA: u16 = 230;
 
 fn main() {
@@ -29,31 +30,32 @@ fn main() {
             return;
         }
     };
-    let (_held, mut denied) = Held::take(None);
-    denied.extend(thread::prepare(PRIORITY, Some(1)));
+    let (_held, mut denied) = CpuWakeGuard::take(None);
+    denied.extend(rt_thread::become_realtime(PRIORITY, Some(1)));
     for denied in denied {
         println!("note: {denied}");
     }
     for cycle in [1_000_000_u64, 250_000, 125_000] {
         let rate = 1_000_000_000 / cycle;
-        let pace = Pace {
+        let pace = ReplyTiming {
             hold: HOLD_NS,
-            // Up again well before the next frame.
+            // The thread wakes up well before the next frame.
             rest: cycle / 3,
         };
         let reflector = Reflector::start(&pair.b, pace, Some(0)).expect("the other end answers");
         let cycles = u32::try_from(u64::from(round_ms) * rate / 1_000).unwrap_or(1_000);
-        let mut results = vec![Exchanges::default(); BackEnd::ALL.len()];
+        let mut results = vec![Exchanges::default(); SocketKind::ALL.len()];
         for round in 0..ROUNDS {
-            // Another one begins each time.
-            for turn in 0..BackEnd::ALL.len() {
-                let which = (turn + round) % BackEnd::ALL.len();
-                let (back_end, result) = (&BackEnd::ALL[which], &mut results[which]);
-                // One at a time: the kernel copies every frame for each that is open.
+            // Each round starts with another socket kind.
+            for turn in 0..SocketKind::ALL.len() {
+                let which = (turn + round) % SocketKind::ALL.len();
+                let (back_end, result) = (&SocketKind::ALL[which], &mut results[which]);
+                // Only one socket is open at a time, because the kernel copies every frame for each
+                // open socket.
                 let (mut link, concerns) =
                     link::open(&pair.a, *back_end).expect("an interface of ours");
                 assert_eq!(concerns, [], "it is this back-end that is measured");
-                let mut margin = Margin::new(Spin::For(20_000), cycle, Mode::SameCycle);
+                let mut margin = SpinWindow::new(Spin::For(20_000), cycle, ExchangeMode::SameCycle);
                 let done = result.round(link.as_mut(), DATA, cycle, &mut margin, cycles);
                 done.expect("the link works");
             }
@@ -63,7 +65,7 @@ fn main() {
              {:<8} {:>9} {:>9} {:>9} {:>12} {:>11} {:>12} {:>6}",
             "link", "p50 µs", "p99", "p99.9", "software p50", "CPU µs/cycle", "switches", "lost"
         );
-        for (back_end, result) in BackEnd::ALL.iter().zip(&results) {
+        for (back_end, result) in SocketKind::ALL.iter().zip(&results) {
             let p = result.round_trip.summary();
             let us = |ns: u64| ns as f64 / 1e3;
             println!(

@@ -1,13 +1,13 @@
-//! A control loop of one's own in the cycle: `x` swings like a pendulum, `y` mirrors it, and a lamp is on
-//! while `x` is right of the middle. Five swings, then the machine is brought to rest.
+//! A user-defined control loop in the cycle: `x` swings like a pendulum, `y` mirrors `x`, and a
+//! lamp is on while `x` is right of the middle. After five swings, the machine comes to rest.
 //!
 //! ```sh
 //! cargo run --example controller                      # on the simulated bus
 //! cargo run --example controller -- machine.toml      # with axes x and y and an output
 //! ```
 //!
-//! The controller gives set-points and reads actual values; enabling, limits, supervision, lost frames and the way back to
-//! rest are as in every other run.
+//! The controller gives set-points and reads actual values. Enabling, limits, supervision, lost
+//! frames and the stop work as in every other run.
 
 #![allow(
     clippy::print_stdout,
@@ -23,10 +23,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use ecaxis::config::{self, AxisRef, OutputRef};
-use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::rt::controller::{Controller, CycleContext};
 use ecaxis::session::{self, Observer, Options, Progress, SignalReport};
 
-/// In user units, seconds and swings.
+/// In user units; the other constants are in seconds and swings.
 const AMPLITUDE: f64 = 20.0;
 const PERIOD_S: f64 = 1.0;
 const SWINGS: f64 = 5.0;
@@ -35,13 +35,13 @@ struct Pendulum {
     x: AxisRef,
     y: AxisRef,
     lamp: OutputRef,
-    /// Where both stood when the swinging began, and how long ago that was.
+    /// The start positions of both axes, once the swinging has started.
     start: Option<[f64; 2]>,
     elapsed_s: f64,
 }
 
 impl Controller for Pendulum {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         let (x, y) = (machine.axis(self.x), machine.axis(self.y));
         if machine.stopping() || !(x.ready && y.ready) {
             return;
@@ -51,12 +51,13 @@ impl Controller for Pendulum {
             .get_or_insert([x.target_position, y.target_position]);
         self.elapsed_s += machine.dt_s();
         let turns = self.elapsed_s / PERIOD_S;
-        // From rest to rest: the swing grows in its first period and fades in its last.
+        // The motion starts and ends at rest: the swing grows in its first period and decays in its
+        // last.
         let swell = turns.min(SWINGS - turns).clamp(0.0, 1.0);
         let swell = swell * swell * (3.0 - 2.0 * swell);
         let to_x = x_start + AMPLITUDE * swell * (TAU * turns).sin();
         let to_y = y_start - (to_x - x_start);
-        // Refused is what the limits do not allow; that axis brakes then, and the set-points have left it behind.
+        // A set-point beyond the limits is rejected, and its axis brakes.
         let refused =
             machine.set_point(self.x, to_x).is_err() || machine.set_point(self.y, to_y).is_err();
         machine.set(self.lamp, f64::from(u8::from(x.position > x_start)));
@@ -74,7 +75,7 @@ impl Observer for Print {
     }
 }
 
-/// `eprintln!` panics where nobody reads it any more.
+/// Prints a line; unlike `eprintln!`, does not panic if stderr is closed.
 fn say(text: &str) {
     let _ = writeln!(io::stderr(), "{text}");
 }
@@ -98,7 +99,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         elapsed_s: 0.0,
     };
     let stop = Arc::new(AtomicBool::new(false));
-    // Ctrl-C, SIGTERM and a terminal that closes bring the axes to rest.
+    // Ctrl-C, SIGTERM and a closing terminal bring the axes to rest.
     session::stop_on_signals(Arc::clone(&stop), |report| match report {
         SignalReport::StopRepeated => std::process::exit(1),
         report => say(&report.to_string()),

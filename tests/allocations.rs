@@ -1,5 +1,5 @@
-//! Counts what the real-time path allocates: nothing, in 100,000 cycles with a lost frame and a
-//! drive fault among them.
+//! Counts allocations of the real-time path: none in 100,000 cycles, which include a lost frame and
+//! a drive fault.
 
 mod common;
 
@@ -14,12 +14,12 @@ use std::task::{Context, Poll, Waker};
 use common::{axes, faults, load, machine, virtual_time};
 use ecaxis::clock::{self, Clock, Nanos};
 use ecaxis::config::{AxisRef, Machine};
-use ecaxis::link::capture::{Dir, Mode, Recorder};
+use ecaxis::link::capture::{Dir, Recorder, WriterMode};
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
 use ecaxis::mailbox::DeviceMailbox;
-use ecaxis::rt::controller::{Controller, Cycle};
-use ecaxis::rt::cycle::{Engine, Remains};
-use ecaxis::session::{Job, Options, Prepared, Progress, RunError};
+use ecaxis::rt::controller::{Controller, CycleContext};
+use ecaxis::rt::cycle::{Engine, EngineReport};
+use ecaxis::session::{Options, Prepared, Progress, RunBuilder, RunError};
 use ecaxis_axis::Command;
 
 thread_local! {
@@ -27,11 +27,11 @@ thread_local! {
     static COUNT: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Counts allocations, reallocations and frees of a thread while it is metered.
+/// Counts allocations, reallocations and frees of metered threads.
 struct Counting;
 
 fn count() {
-    // A thread that is being torn down has no more counters, and is not metered.
+    // A thread in teardown has no counters left and is not metered.
     let _ = METERED.try_with(|metered| {
         if metered.get() {
             let _ = COUNT.try_with(|count| count.set(count.get() + 1));
@@ -39,23 +39,23 @@ fn count() {
     });
 }
 
-// SAFETY: every call is passed on unchanged to the system's allocator.
+// SAFETY: every call goes unchanged to the system allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller upholds the contract.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
         count();
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller upholds the contract.
         unsafe { System.dealloc(ptr, layout) }
     }
 
     unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
         count();
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller upholds the contract.
         unsafe { System.realloc(ptr, layout, new_size) }
     }
 }
@@ -63,7 +63,8 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// The simulated bus stands for the wire and the devices; what it allocates is not the cycle's.
+/// The simulated bus stands for the wire and the devices. Its allocations do not count for the
+/// cycle.
 #[derive(Debug)]
 struct Unmetered(Box<dyn Link>);
 
@@ -89,7 +90,7 @@ impl Link for Unmetered {
 }
 
 #[test]
-fn the_counter_counts() {
+fn the_counter_counts_allocations() {
     METERED.set(true);
     let boxed = std::hint::black_box(Box::new(1));
     METERED.set(false);
@@ -97,13 +98,13 @@ fn the_counter_counts() {
     assert_eq!(COUNT.get(), 1);
 }
 
-/// The bus above is unmetered, and so is what records it; the recorder of a real-time run is not the
-/// bus's, so it is metered here.
+/// The bus and its recorder above are unmetered. The recorder of a real-time run is not part of the
+/// bus, so this test meters it.
 #[test]
-fn recording_beside_the_cycle_allocates_nothing() {
+fn recording_in_the_cycle_allocates_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.pcapng");
-    let mut recorder = Recorder::create(&path, Mode::Background, None).expect("a recording");
+    let mut recorder = Recorder::create(&path, WriterMode::Background, None).expect("a recording");
     let frame = [0x5a; MAX_FRAME];
     COUNT.set(0);
     METERED.set(true);
@@ -121,29 +122,31 @@ fn recording_beside_the_cycle_allocates_nothing() {
 
 type Ended = Option<Result<(), RunError>>;
 
-/// Turns the cycle with the supervisor beside it; what the cycles allocated, what remains, how the supervisor ended.
+/// Runs the cycle with its supervisor. Returns the allocations of the cycles, the bytes still
+/// allocated, and the supervisor's result.
 fn metered(
     machine: Machine,
     options: &Options,
     controller: Option<Box<dyn Controller>>,
     cycles: u64,
-) -> (u64, Remains, Ended) {
+) -> (u64, EngineReport, Ended) {
     let (counted, remains, ended, _) = metered_among_users(machine, options, controller, cycles, 0);
     (counted, remains, ended)
 }
 
-/// Likewise, while the mailboxes of the first devices are read over and over; how many transfers that were.
+/// Same as `metered`, with repeated mailbox reads of the first devices. Returns the number of
+/// transfers as well.
 fn metered_among_users(
     machine: Machine,
     options: &Options,
     controller: Option<Box<dyn Controller>>,
     cycles: u64,
     asked: usize,
-) -> (u64, Remains, Ended, u64) {
+) -> (u64, EngineReport, Ended, u64) {
     options.clock.enter();
-    let (progress, told) = channel();
+    let (progress, reported) = channel();
     let stop = Arc::new(AtomicBool::new(false));
-    let job = Job {
+    let job = RunBuilder {
         machine: &Arc::new(machine),
         options,
         stop,
@@ -156,7 +159,7 @@ fn metered_among_users(
     } = job.prepare().expect("comes up");
     parts.link = Box::new(Unmetered(parts.link));
     let mut engine = Engine::new(parts);
-    let mut beside = pin!(supervisor.run());
+    let mut during = pin!(supervisor.run());
     let mut context = Context::from_waker(Waker::noop());
     let mut result = None;
     let done = Cell::new(0);
@@ -168,11 +171,11 @@ fn metered_among_users(
         engine.cycle();
         METERED.set(false);
         if result.is_none()
-            && let Poll::Ready((_, ended)) = beside.as_mut().poll(&mut context)
+            && let Poll::Ready((_, ended)) = during.as_mut().poll(&mut context)
         {
             result = Some(ended);
         }
-        for said in told.try_iter() {
+        for said in reported.try_iter() {
             if let Progress::Mailboxes(mailboxes) = said {
                 let names = mailboxes.names().take(asked);
                 let each = names.filter_map(|name| mailboxes.device(name).ok());
@@ -182,10 +185,10 @@ fn metered_among_users(
         users.retain_mut(|user| user.as_mut().poll(&mut context).is_pending());
     }
     drop(users);
-    (COUNT.get(), engine.into_remains(), result, done.get())
+    (COUNT.get(), engine.finish(), result, done.get())
 }
 
-/// Reads what is expedited and what takes several messages, until nobody answers.
+/// Reads expedited and segmented objects until mailbox access closes.
 fn reading(mailbox: DeviceMailbox, done: &Cell<u64>) -> Pin<Box<dyn Future<Output = ()> + '_>> {
     Box::pin(async move {
         for (index, sub) in [(0x6041, 0), (0x1008, 0), (0x6064, 0)].into_iter().cycle() {
@@ -228,7 +231,7 @@ fn a_hundred_thousand_cycles_allocate_nothing() {
 }
 
 #[test]
-fn transfers_beside_the_cycle_cost_it_no_allocation() {
+fn mailbox_transfers_cause_no_allocation_in_the_cycle() {
     let options = Options {
         repeat: Some(1_000_000),
         ..virtual_time()
@@ -237,10 +240,10 @@ fn transfers_beside_the_cycle_cost_it_no_allocation() {
     let (counted, remains, _, done) = metered_among_users(bus, &options, None, 20_000, 3);
     assert!(done > 1_000, "{done} transfers");
     assert_eq!(remains.stats.counters.wkc_errors, 0);
-    assert_eq!(counted, 0, "allocations beside {done} transfers");
+    assert_eq!(counted, 0, "allocations during {done} transfers");
 }
 
-/// Mode switches, homing, profiles, lines, gears, tables, waves, inputs and outputs.
+/// Covers mode switches, homing, profiles, lines, gears, tables, waves, inputs and outputs.
 #[test]
 fn programs_of_every_kind_allocate_nothing() {
     for file in [
@@ -259,7 +262,7 @@ fn programs_of_every_kind_allocate_nothing() {
 struct Swing(AxisRef, f64);
 
 impl Controller for Swing {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         if machine.axis(self.0).ready {
             self.1 += machine.dt_s();
             let _ = machine.set_point(self.0, 5.0 - 5.0 * self.1.cos());
@@ -280,7 +283,7 @@ fn a_controller_is_called_without_an_allocation() {
 struct Stalls(AxisRef, u32);
 
 impl Controller for Stalls {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         if !machine.axis(self.0).ready {
             return;
         }
@@ -294,9 +297,9 @@ impl Controller for Stalls {
     }
 }
 
-/// Nor does what makes up for cycles that were left out.
+/// The handling of skipped cycles does not allocate either.
 #[test]
-fn stalling_allocates_nothing() {
+fn skipped_cycles_allocate_nothing() {
     let machine = load("controller.toml");
     let x = machine.axis("x").expect("an axis");
     let controller = Box::new(Stalls(x, 0));
@@ -307,7 +310,7 @@ fn stalling_allocates_nothing() {
     assert_eq!(counted, 0);
 }
 
-/// What stops a machine stops it without an allocation, too: an emergency, a gear that is lost, the bus; and a group.
+/// Stops of the machine do not allocate either: an emergency, a lost gear, a lost bus, and a group.
 #[test]
 fn stopping_allocates_nothing() {
     let gear =

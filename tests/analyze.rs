@@ -1,6 +1,7 @@
-//! `ecaxis analyze` on recordings of real buses and of our own runs, whole, cut and damaged; and recordings as a bus (replay).
+//! `ecaxis analyze` on recordings of real buses and of ecaxis runs: complete, cut and damaged. Also
+//! recordings as a bus (replay).
 //!
-//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes what is kept in `tests/snapshots/analyze` anew; the difference then wants reviewing.
+//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes `tests/snapshots/analyze` again; review the difference.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
@@ -16,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use common::{axes, fixture, load, machine, root, run, run_well, virtual_time};
-use ecaxis::analyze::{self, Known, Report};
+use ecaxis::analyze::{self, Context, Report};
 use ecaxis::config::Machine;
 use ecaxis::recording::Reader;
 use ecaxis::recording::frame::{Content, Frame, content};
@@ -43,12 +44,12 @@ fn captures() -> Vec<PathBuf> {
     all.flatten().collect()
 }
 
-fn analyzed(bytes: &[u8], known: Known) -> Report {
+fn analyzed(bytes: &[u8], known: Context) -> Report {
     analyze::analyze(vec![Reader::new(bytes)], None, known)
 }
 
 fn of_file(path: &Path) -> Report {
-    analyzed(&std::fs::read(path).expect("readable"), Known::default())
+    analyzed(&std::fs::read(path).expect("readable"), Context::default())
 }
 
 fn ecaxis(arguments: &[&str]) -> Output {
@@ -64,7 +65,7 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).expect("UTF-8")
 }
 
-/// A run in virtual time, and its recording.
+/// Runs a machine in virtual time and returns its recording.
 fn recorded(folder: &Path, machine: Machine, options: Options) -> PathBuf {
     let path = folder.join("run.pcapng");
     let options = Options {
@@ -76,7 +77,7 @@ fn recorded(folder: &Path, machine: Machine, options: Options) -> PathBuf {
 }
 
 #[test]
-fn the_story_of_every_capture() {
+fn analyze_matches_the_snapshot_of_every_capture() {
     let update = std::env::var_os("ECAXIS_UPDATE_SNAPSHOTS").is_some();
     let mut differ = Vec::new();
     for path in captures() {
@@ -106,7 +107,7 @@ fn the_story_of_every_capture() {
 }
 
 #[test]
-fn our_own_run_tells_its_story() {
+fn analyze_reports_bring_up_cycle_and_motion_of_an_own_run() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let options = Options {
         repeat: Some(1),
@@ -114,7 +115,7 @@ fn our_own_run_tells_its_story() {
     };
     let path = recorded(folder.path(), load("demo.toml"), options);
     let bytes = std::fs::read(&path).expect("the recording");
-    let report = analyzed(&bytes, Known::default().with_machine(&load("demo.toml")));
+    let report = analyzed(&bytes, Context::default().with_machine(&load("demo.toml")));
     let names: Vec<_> = report
         .devices
         .iter()
@@ -135,7 +136,7 @@ fn our_own_run_tells_its_story() {
     };
     assert_eq!((mailboxes.command, mailboxes.bytes), ("LRD", 2));
     assert_eq!((mailboxes.usual_wkc, mailboxes.lost), (Some(2), 0));
-    // SYNC0's millisecond, and the reference clock is 18 ppm fast.
+    // The cycle of SYNC0 is 1 ms, and the reference clock is 18 ppm fast.
     assert!(cycle.cycle_ns.abs_diff(999_982) < 200, "{cycle:?}");
     assert_eq!((cycle.usual_wkc, cycle.lost), (Some(6), 0));
     assert!(
@@ -184,8 +185,8 @@ fn our_own_run_tells_its_story() {
     }
     assert_eq!(report.axes.len(), 2);
 
-    // The recording shows the PDOs by itself: without the file only names and units are missing.
-    let alone = analyzed(&bytes, Known::default());
+    // The recording contains the PDOs. Without the machine file, only names and units are missing.
+    let alone = analyzed(&bytes, Context::default());
     let counts: Vec<_> = alone
         .axes
         .iter()
@@ -221,9 +222,9 @@ fn well_formed(html: &str) {
 }
 
 #[test]
-fn faults_stand_out() {
+fn analyze_reports_injected_faults() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let told = |script: &str| {
+    let reported = |script: &str| {
         let path = folder.path().join("run.pcapng");
         let options = Options {
             record: Some(path.clone()),
@@ -233,7 +234,7 @@ fn faults_stand_out() {
         assert!(outcome.result.is_err(), "a fault that stops the machine");
         of_file(&path)
     };
-    let report = told(
+    let report = reported(
         "[[fault]]\nkind = \"frame-loss\"\nat = \"1s\"\ncount = 2\n\
          [[fault]]\nkind = \"drive-fault\"\nat = \"1500ms\"\ndevice = 1\ncode = 0x3210\n",
     );
@@ -253,8 +254,9 @@ fn faults_stand_out() {
     };
     assert!(faulted(1) && !faulted(0));
 
-    let report =
-        told("[[fault]]\nkind = \"refuse-state\"\ndevice = 0\nstate = \"safeop\"\ncode = 0x001e\n");
+    let report = reported(
+        "[[fault]]\nkind = \"refuse-state\"\ndevice = 0\nstate = \"safeop\"\ncode = 0x001e\n",
+    );
     let first = &report.trouble[0];
     assert!(
         first.contains("PreOp with error 0x001e, invalid input configuration"),
@@ -272,7 +274,7 @@ fn faults_stand_out() {
         "{page}"
     );
 
-    let report = told(
+    let report = reported(
         "[[fault]]\nkind = \"sdo-abort\"\ndevice = 1\nindex = 0x6060\nsub = 0\ncode = 0x06090030\n",
     );
     let first = &report.trouble[0];
@@ -293,7 +295,7 @@ fn faults_stand_out() {
     );
 }
 
-/// A pcap of the packets that `keep` wants.
+/// Returns a pcap of the packets that `keep` accepts.
 fn filtered(bytes: &[u8], keep: impl Fn(&Frame) -> bool) -> Vec<u8> {
     let mut reader = Reader::new(bytes);
     let mut file = Vec::new();
@@ -317,9 +319,9 @@ fn filtered(bytes: &[u8], keep: impl Fn(&Frame) -> bool) -> Vec<u8> {
     file
 }
 
-/// A recording that lacks the start-up SDOs does not show what PDOs carry.
+/// A recording without the start-up SDOs does not show the PDO contents.
 #[test]
-fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
+fn missing_pdo_contents_come_from_the_machine_file_or_esi_files() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let once = Options {
         repeat: Some(1),
@@ -334,10 +336,10 @@ fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
             .any(|d| !d.command.is_logical() && d.ado() >= 0x1000)
     };
     let without = filtered(&bytes, |frame| !mailbox(frame));
-    let alone = analyzed(&without, Known::default());
+    let alone = analyzed(&without, Context::default());
     assert!(alone.transfers.is_empty() && alone.axes.is_empty());
-    let whole = analyzed(&bytes, Known::default());
-    let known = Known::default().with_machine(&load("demo.toml"));
+    let whole = analyzed(&bytes, Context::default());
+    let known = Context::default().with_machine(&load("demo.toml"));
     let report = analyzed(&without, known);
     let moved = |report: &Report| -> Vec<_> {
         report
@@ -348,7 +350,7 @@ fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
     };
     assert_eq!(moved(&report), moved(&whole));
     let library = analyze::library(&root().join("configs/esi")).expect("our ESI files");
-    let by_esi = analyzed(&without, Known::default().with_library(library));
+    let by_esi = analyzed(&without, Context::default().with_library(library));
     let names: Vec<_> = by_esi
         .devices
         .iter()
@@ -356,10 +358,10 @@ fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
         .collect();
     assert_eq!(names, ["EPOS4", "IDX"]);
 
-    // Each direction alone still tells its part.
+    // Each direction alone still yields its part of the report.
     let answers = analyzed(
         &filtered(&bytes, |frame| frame.source[0] & 2 != 0),
-        Known::default(),
+        Context::default(),
     );
     assert_eq!(
         (answers.file.sent, answers.file.without_request),
@@ -372,7 +374,7 @@ fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
     assert_eq!(answers.cycle[0].wkc, whole.cycle[0].wkc);
     let requests = analyzed(
         &filtered(&bytes, |frame| frame.source[0] & 2 == 0),
-        Known::default(),
+        Context::default(),
     );
     assert!(
         requests.trouble[0].contains("no frame came back"),
@@ -383,7 +385,7 @@ fn what_a_recording_lacks_comes_from_the_machine_file_or_esi_files() {
 }
 
 #[test]
-fn what_cannot_be_analyzed_is_told() {
+fn analyze_rejects_unusable_input_with_a_reason() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let file = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);
@@ -413,7 +415,7 @@ fn what_cannot_be_analyzed_is_told() {
 }
 
 #[test]
-fn parts_of_a_recording_are_one() {
+fn parts_of_a_recording_are_joined() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let options = Options {
         record_limit: Some(2_000_000),
@@ -423,7 +425,7 @@ fn parts_of_a_recording_are_one() {
     let first = recorded(folder.path(), load("demo.toml"), options);
     let parts = ecaxis::link::capture::parts_of(&first).expect("a folder");
     assert_eq!(parts.len(), 3);
-    // As a shell sorts them, the first is the last.
+    // In shell sort order, the first part is the last argument.
     let mut arguments: Vec<&str> = parts.iter().filter_map(|path| path.to_str()).collect();
     arguments.push(first.to_str().expect("UTF-8"));
     arguments.push("--json");

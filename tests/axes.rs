@@ -1,5 +1,5 @@
-//! Axes as a whole on the simulated bus: moves in every mode, loads, switching in motion. The status of each cycle is looked
-//! at, and what was on the wire.
+//! Whole axes on the simulated bus: moves in every mode, loads, mode switches in motion. The tests
+//! check the status of each cycle and the process data on the wire.
 
 #![allow(clippy::print_stdout, reason = "what was measured")]
 
@@ -15,7 +15,7 @@ use ecaxis_axis::{AxisStatus, Command, Mode};
 
 /// The axes of `tuned.toml` with their counts per turn.
 const AXES: [(&str, f64); 2] = [("x", 2000.0), ("y", 4096.0)];
-/// Their limits.
+/// The limits of both axes.
 const VELOCITY: f64 = 50.0;
 const ACCELERATION: f64 = 400.0;
 const FOLLOWING_ERROR: f64 = 0.5;
@@ -24,14 +24,14 @@ fn largest(cycles: &[AxisStatus], of: impl Fn(&AxisStatus) -> f64) -> f64 {
     cycles.iter().map(|s| of(s).abs()).fold(0.0, f64::max)
 }
 
-/// The largest difference from one cycle to the next.
+/// Returns the largest difference between consecutive cycles.
 fn step(cycles: &[AxisStatus], of: impl Fn(&AxisStatus) -> f64) -> f64 {
     let steps = cycles.windows(2).map(|w| (of(&w[1]) - of(&w[0])).abs());
     steps.fold(0.0, f64::max)
 }
 
 #[test]
-fn hundred_turns_end_within_a_count_in_each_mode_that_positions() {
+fn position_modes_end_a_move_of_a_hundred_turns_within_a_count() {
     for (axis, counts) in AXES {
         for mode in [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp] {
             let acts = [script::mode(mode), move_to(100.0, 1.0), Act::Dwell(1.0)];
@@ -56,8 +56,9 @@ fn hundred_turns_end_within_a_count_in_each_mode_that_positions() {
     }
 }
 
-/// `tuned.toml` with a bring-up that is longer by a few SDOs. The drives' control cycle of 0.4 ms then begins elsewhere between two
-/// frames, so that a cycle of 1 ms shows two or three of them: what a position loop here sees, and what is reported, depends on it.
+/// Returns `tuned.toml` with `later` additional start-up SDOs. They shift the phase between the
+/// drives' control cycle of 0.4 ms and the bus cycle of 1 ms. A bus cycle then contains two or
+/// three control cycles, which affects position loops in the MainDevice and the reported values.
 fn tuned(later: usize) -> Machine {
     let mut machine = load("tuned.toml");
     for device in &mut machine.devices {
@@ -68,12 +69,13 @@ fn tuned(later: usize) -> Machine {
     machine
 }
 
-/// Both places of the control cycle are among these.
+/// These values include both phases of the control cycle.
 const LATER: [usize; 3] = [0, 4, 7];
 
-/// Velocities have no target to end at: after 100 turns the axis is stopped, and a position is asked for then.
+/// Velocity modes have no target position. After 100 turns, the test stops the axis and then
+/// commands a position.
 #[test]
-fn hundred_turns_at_the_velocity_of_the_profile() {
+fn velocity_mode_reaches_a_hundred_turns() {
     for ((axis, counts), later) in AXES.into_iter().flat_map(|axis| LATER.map(|l| (axis, l))) {
         let acts = [
             script::mode(Mode::Pv),
@@ -93,14 +95,14 @@ fn hundred_turns_at_the_velocity_of_the_profile() {
             "{axis}, {later} SDOs more, PV: {off:.2} turns/s off 40, stopped at {:.2}, at the end {last:.1} counts",
             trace.at_end_of(4).position
         );
-        // 0.40 and 0.57, by the place of the control cycle.
+        // 0.40 and 0.57, depending on the phase of the control cycle.
         assert!(off < 0.7, "{axis}: {off}");
         assert!(trace.at_end_of(4).velocity.abs() < 0.1, "{axis}");
         assert!(last.abs() <= 1.0, "{axis}: {last}");
     }
 }
 
-/// A fifth of rated torque comes and goes while the axis holds its position.
+/// A load of a fifth of the rated torque is switched on and off while the axis holds its position.
 #[test]
 fn loops_in_the_master_hold_against_a_load() {
     const SETTLED_S: f64 = 0.3;
@@ -124,7 +126,7 @@ fn loops_in_the_master_hold_against_a_load() {
                 .map(|s| (s.position - 10.0).abs() * counts)
                 .collect();
             let torque = |s: &AxisStatus| s.torque;
-            // Torque says when the load was there.
+            // The torque shows the time of the load.
             let loaded: Vec<usize> = (0..held.len())
                 .filter(|&k| torque(&held[k]) > 10.0)
                 .collect();
@@ -140,7 +142,7 @@ fn loops_in_the_master_hold_against_a_load() {
                 let peak = off[from..to].iter().copied().fold(0.0, f64::max);
                 ((last - from) as f64 * trace.dt_s, peak)
             };
-            // From a little before the torque answers.
+            // The interval starts shortly before the torque responds.
             let (on, peak_on) = settled(begin.saturating_sub(50), end.saturating_sub(50));
             let (gone, peak_gone) = settled(end.saturating_sub(50), held.len());
             let before = off[..begin.saturating_sub(50)]
@@ -164,18 +166,18 @@ fn little(bytes: &[u8], at: usize, size: usize) -> i64 {
     value << (64 - bits) >> (64 - bits)
 }
 
-/// The largest steps of targets on the wire while their mode is in force, in the drive's units.
+/// The largest target steps on the wire in their active mode, in drive units.
 #[derive(Debug, Default)]
 struct Wire {
-    /// As 0x6061 showed them.
+    /// The modes in 0x6061.
     modes: Vec<i64>,
     position: i64,
     velocity: i64,
-    /// From the torque reported to the first target.
+    /// The difference from the reported torque to the first target torque.
     first_torque: i64,
 }
 
-/// The axis at `place` of `tuned.toml`; each has half of the process image.
+/// Reads the axis at `place` of `tuned.toml`. Each axis has half of the process image.
 fn on_the_wire(recording: &Path, place: usize) -> Wire {
     let mut wire = Wire::default();
     let mut before: Option<(i64, i64, i64)> = None;
@@ -189,7 +191,7 @@ fn on_the_wire(recording: &Path, place: usize) -> Wire {
             continue;
         }
         if let Some((mode, last_position, last_velocity)) = before {
-            // Also across the switch: the new mode's target was there before.
+            // Includes the switch itself, because the new mode's target was already mapped.
             match (mode, shown) {
                 (8, 8) => wire.position = wire.position.max((position - last_position).abs()),
                 (9, 9) => wire.velocity = wire.velocity.max((velocity - last_velocity).abs()),
@@ -209,9 +211,9 @@ fn on_the_wire(recording: &Path, place: usize) -> Wire {
     wire
 }
 
-/// CSP → CSV → CST → CSP within one move.
+/// The modes CSP → CSV → CST → CSP within one move.
 #[test]
-fn modes_are_switched_in_motion_without_a_step() {
+fn mode_switches_in_motion_cause_no_step() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     for (axis, later) in ["x", "y"]
         .into_iter()
@@ -264,7 +266,8 @@ fn modes_are_switched_in_motion_without_a_step() {
                 largest(around, |s| s.following_error),
                 largest(&around[..20], |s| s.following_error)
             );
-            // Into CSP 0.9 to 1.0 or 1.4 to 1.5, by the place of the control cycle.
+            // Switches into CSP give 0.9 to 1.0 or 1.4 to 1.5, depending on the phase of the
+            // control cycle.
             assert!(off < 1.5, "{axis} to {name}: {off}");
         }
         let end = trace.at_end_of(7);
@@ -275,9 +278,10 @@ fn modes_are_switched_in_motion_without_a_step() {
         let counts = if axis == "x" { 2000.0 } else { 4096.0 };
         assert_eq!(wire.modes, [8, 9, 10, 8]);
         assert!(wire.position as f64 <= VELOCITY * dt * counts + 1.0);
-        // The set-point's change and the position loop's, each within the limit; in rpm.
+        // The steps of the set-point and of the position loop, each within the limit; in rpm.
         assert!(wire.velocity as f64 <= 2.0 * ACCELERATION * dt * 60.0 + 2.0);
-        // The first torque is the one that was there, but for one cycle of the loop: 2 or 59 ‰, by the place of the control cycle.
+        // The first torque equals the actual torque except for one cycle of the loop: 2 or 59 ‰,
+        // depending on the phase of the control cycle.
         assert!(wire.first_torque <= 65, "{wire:?}");
     }
 }

@@ -1,5 +1,5 @@
-//! `ecaxis bench`: what it measures with, and what it says. Nothing here asserts a time: the machine that runs the tests is
-//! nobody's measure.
+//! `ecaxis bench`: its instruments and its report. No test asserts a time, because timing depends
+//! on the test machine.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
@@ -12,20 +12,20 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use ecaxis::bench::bus::{Bus, Counts, Hold, Mischief, Options};
+use ecaxis::bench::bus::{Bus, Counts, FaultInjection, Options, ReplyDelay};
+use ecaxis::bench::fixture::{self, Setup};
 use ecaxis::bench::in_process::InProcess;
-use ecaxis::bench::rig::{self, Setup};
-use ecaxis::bench::turn::{self, Measured, Thread};
+use ecaxis::bench::measure::{self, Measured, Thread};
 use ecaxis::bench::veth::{VethPair, leftovers};
 use ecaxis::config::Exchange;
-use ecaxis::link::capture::{Mode, Recorder};
-use ecaxis::link::recorded::Recorded;
-use ecaxis::link::{self, BackEnd, Link};
-use ecaxis::rt::margin::Spin;
+use ecaxis::link::capture::{Recorder, WriterMode};
+use ecaxis::link::tee::CapturingLink;
+use ecaxis::link::{self, Link, SocketKind};
+use ecaxis::rt::spin::Spin;
 use ecaxis_sim::frame::{self, Command};
 use wire::over_a_pair;
 
-/// Two real-time threads on two processors leave no room for another two.
+/// Two real-time threads on two processors leave no capacity for a second bench.
 static ALONE: Mutex<()> = Mutex::new(());
 
 fn alone() -> MutexGuard<'static, ()> {
@@ -36,9 +36,9 @@ fn exists(nic: &str) -> bool {
     Path::new("/sys/class/net").join(nic).exists()
 }
 
-fn options(cycle_ns: u64, mischief: Mischief) -> Options {
+fn options(cycle_ns: u64, mischief: FaultInjection) -> Options {
     Options {
-        hold: Hold::Fixed(30_000),
+        hold: ReplyDelay::Fixed(30_000),
         cycle_ns,
         mischief,
         priority: 40,
@@ -59,7 +59,7 @@ fn setup(axes: usize, cycle_ns: u64) -> Setup {
 fn thread(time: Duration) -> Thread {
     Thread {
         priority: 41,
-        // With one processor there is no other for the bus; then its replies are late, which is counted, too.
+        // With one processor, the bus shares it. Its replies are then late and are counted as late.
         cpu: Some(std::thread::available_parallelism().map_or(0, |n| n.get() - 1)),
         time,
     }
@@ -67,8 +67,8 @@ fn thread(time: Duration) -> Thread {
 
 fn run(link: Box<dyn Link>, setup: Setup, bus: Option<&Bus>, time: Duration) -> Measured {
     let _alone = alone();
-    let (parts, outer) = rig::parts(setup, link).expect("few axes");
-    turn::rig(
+    let (parts, outer) = fixture::parts(setup, link).expect("few axes");
+    measure::rig(
         parts,
         outer,
         setup,
@@ -80,10 +80,10 @@ fn run(link: Box<dyn Link>, setup: Setup, bus: Option<&Bus>, time: Duration) -> 
     .expect("not interrupted")
 }
 
-/// Axes over a pair of interfaces.
-fn over_veth(pair: &VethPair, mischief: Mischief, link: BackEnd) -> (Measured, Counts) {
+/// Runs axes over a pair of interfaces.
+fn over_veth(pair: &VethPair, mischief: FaultInjection, link: SocketKind) -> (Measured, Counts) {
     let setup = setup(3, 4_000_000);
-    let segment = rig::segment(setup.axes).expect("few axes");
+    let segment = fixture::segment(setup.axes).expect("few axes");
     let bus = Bus::on(pair, segment, options(setup.cycle_ns, mischief)).expect("answers");
     let (link, _) = link::open(&pair.a, link).expect("opens");
     let measured = run(link, setup, Some(&bus), Duration::from_secs(2));
@@ -92,13 +92,17 @@ fn over_veth(pair: &VethPair, mischief: Mischief, link: BackEnd) -> (Measured, C
 }
 
 #[test]
-fn a_pair_is_out_of_sight_at_one_end_and_gone_in_the_end() {
+fn a_veth_pair_hides_one_end_and_is_removed_after_use() {
     over_a_pair(|pair| {
         let (near, far) = (pair.a.clone(), pair.b.clone());
         assert!(exists(&near) && exists(&far));
-        let segment = rig::segment(1).expect("one axis");
-        let bus =
-            Bus::on(&pair, segment, options(1_000_000, Mischief::default())).expect("answers");
+        let segment = fixture::segment(1).expect("one axis");
+        let bus = Bus::on(
+            &pair,
+            segment,
+            options(1_000_000, FaultInjection::default()),
+        )
+        .expect("answers");
         assert!(exists(&near));
         assert!(!exists(&far), "in the bus's own network namespace");
         assert!(!leftovers().contains(&near), "its process lives");
@@ -113,10 +117,10 @@ fn a_pair_is_out_of_sight_at_one_end_and_gone_in_the_end() {
 }
 
 #[test]
-fn axes_move_over_every_back_end() {
-    for back_end in BackEnd::ALL {
+fn axes_move_over_every_socket_kind() {
+    for back_end in SocketKind::ALL {
         over_a_pair(|pair| {
-            let (measured, bus) = over_veth(&pair, Mischief::default(), *back_end);
+            let (measured, bus) = over_veth(&pair, FaultInjection::default(), *back_end);
             let counters = measured.stats.counters;
             assert!(counters.cycles > 0, "{back_end}");
             assert_eq!(counters.wkc_errors, 0, "{back_end} {counters:?}");
@@ -128,29 +132,29 @@ fn axes_move_over_every_back_end() {
     }
 }
 
-/// A reply that comes after its deadline is counted, and never stops the loop.
+/// A reply after its deadline is counted and never stops the loop.
 #[test]
 fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
     let every = NonZeroU64::new(7).expect("not zero");
     over_a_pair(|pair| {
-        let late = Mischief {
+        let late = FaultInjection {
             late_every: Some((every, 6_000_000)),
-            ..Mischief::default()
+            ..FaultInjection::default()
         };
-        let (measured, bus) = over_veth(&pair, late, BackEnd::Ring);
+        let (measured, bus) = over_veth(&pair, late, SocketKind::Ring);
         let counters = measured.stats.counters;
         assert!(bus.delayed > 10, "{bus:?}");
         assert!(counters.late_frames > 10, "{counters:?}");
         assert!(counters.lost_frames >= counters.late_frames / 2);
-        // One in seven is late; most of the others are in time even on a busy machine.
+        // One reply in seven is late; most others are in time even on a busy machine.
         assert!(counters.cycles > 2 * counters.lost_frames, "{counters:?}");
     });
     over_a_pair(|pair| {
-        let dropped = Mischief {
+        let dropped = FaultInjection {
             drop_every: Some(every),
-            ..Mischief::default()
+            ..FaultInjection::default()
         };
-        let (measured, bus) = over_veth(&pair, dropped, BackEnd::Ring);
+        let (measured, bus) = over_veth(&pair, dropped, SocketKind::Ring);
         let counters = measured.stats.counters;
         assert!(bus.dropped > 10, "{bus:?}");
         assert!(counters.lost_frames > 10, "{counters:?}");
@@ -158,16 +162,16 @@ fn late_and_dropped_replies_are_counted_and_the_loop_goes_on() {
     });
 }
 
-/// Bytes of every frame sent, by what a recording says of them.
+/// Returns the bytes of every sent frame from a recording.
 fn recorded_frames(axes: usize) -> Vec<Vec<u8>> {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("bench.pcapng");
-    let segment = rig::segment(axes).expect("fits");
-    let recorder = Recorder::create(&path, Mode::Inline, None).expect("a recording");
-    let link = InProcess::new(segment, Hold::Fixed(1_000));
-    let link = Box::new(Recorded::new(Box::new(link), recorder, 0));
+    let segment = fixture::segment(axes).expect("fits");
+    let recorder = Recorder::create(&path, WriterMode::Inline, None).expect("a recording");
+    let link = InProcess::new(segment, ReplyDelay::Fixed(1_000));
+    let link = Box::new(CapturingLink::new(Box::new(link), recorder, 0));
     let setup = setup(axes, 2_000_000);
-    let (parts, outer) = rig::parts(setup, link).expect("fits");
+    let (parts, outer) = fixture::parts(setup, link).expect("fits");
     let _alone = alone();
     let mut engine = ecaxis::rt::cycle::Engine::new(parts);
     for _ in 0..700 {
@@ -175,7 +179,7 @@ fn recorded_frames(axes: usize) -> Vec<Vec<u8>> {
     }
     drop(outer);
     engine
-        .into_remains()
+        .finish()
         .link
         .finish()
         .expect("written")
@@ -203,9 +207,10 @@ fn sent(path: &Path) -> Vec<Vec<u8>> {
     frames
 }
 
-/// Twelve bytes each way per axis, one frame a cycle: what the design allows, as captured.
+/// Process data are 12 bytes per axis in each direction, and each cycle has one frame. The expected
+/// bytes come from a capture.
 #[test]
-fn a_cycle_is_one_frame_of_no_more_bytes_than_it_needs() {
+fn a_cycle_is_one_frame_without_superfluous_bytes() {
     for (axes, most) in [(8, 158), (32, 446), (100, 1262)] {
         let frames = recorded_frames(axes);
         assert_eq!(frames.len(), 700, "one a cycle");
@@ -236,8 +241,8 @@ fn a_cycle_is_one_frame_of_no_more_bytes_than_it_needs() {
 #[test]
 fn axes_move_in_process() {
     let setup = setup(5, 1_000_000);
-    let segment = rig::segment(setup.axes).expect("few axes");
-    let link = Box::new(InProcess::new(segment, Hold::Wire));
+    let segment = fixture::segment(setup.axes).expect("few axes");
+    let link = Box::new(InProcess::new(segment, ReplyDelay::Wire));
     let measured = run(link, setup, None, Duration::from_millis(300));
     let counters = measured.stats.counters;
     assert!(counters.cycles > 0);
@@ -246,13 +251,13 @@ fn axes_move_in_process() {
 }
 
 #[test]
-fn an_interrupt_ends_a_bench_before_anything_moves() {
+fn an_interrupt_ends_a_bench_before_motion() {
     let setup = setup(1, 1_000_000);
-    let segment = rig::segment(1).expect("one axis");
-    let link = Box::new(InProcess::new(segment, Hold::Wire));
-    let (parts, outer) = rig::parts(setup, link).expect("one axis");
+    let segment = fixture::segment(1).expect("one axis");
+    let link = Box::new(InProcess::new(segment, ReplyDelay::Wire));
+    let (parts, outer) = fixture::parts(setup, link).expect("one axis");
     let stop = Arc::new(AtomicBool::new(true));
-    let ended = turn::rig(
+    let ended = measure::rig(
         parts,
         outer,
         setup,
@@ -264,6 +269,6 @@ fn an_interrupt_ends_a_bench_before_anything_moves() {
 }
 
 #[test]
-fn the_most_axes_fit_a_bus() {
-    assert!(rig::segment(rig::MOST_AXES).is_ok());
+fn the_maximum_number_of_axes_fits_a_bus() {
+    assert!(fixture::segment(fixture::MOST_AXES).is_ok());
 }

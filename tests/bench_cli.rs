@@ -1,4 +1,4 @@
-//! `ecaxis bench` from outside: what it prints and writes, and what it leaves behind. No time is asserted.
+//! `ecaxis bench` as a process: its output, its files, and its clean-up. No time is asserted.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
@@ -34,7 +34,7 @@ fn text(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn json_has_everything_with_its_unit() {
+fn json_contains_every_value_with_its_unit() {
     let folder = tempfile::tempdir().expect("a folder");
     let page = folder.path().join("report.html");
     let page = page.to_str().expect("UTF-8");
@@ -82,7 +82,7 @@ fn json_has_everything_with_its_unit() {
     well_formed(&std::fs::read_to_string(page).expect("written"));
 }
 
-/// XML through and through, complete in itself.
+/// Checks that the page is well-formed XML without external references.
 fn well_formed(page: &str) {
     use quick_xml::events::Event;
     let mut reader = quick_xml::Reader::from_str(page);
@@ -104,7 +104,7 @@ fn well_formed(page: &str) {
         }
     }
     assert_eq!(open, 0);
-    // Lateness, release to input, work; the phase where it locked.
+    // The charts: lateness, release to input, work; also the phase if it locked.
     assert!(charts >= 3, "{charts}");
     assert!(paths >= 2 * 3, "{paths}");
     for elsewhere in ["src=", "href=", "url(", "@import"] {
@@ -121,20 +121,20 @@ fn the_table_fits_a_terminal() {
     for line in table.lines() {
         assert!(line.chars().count() <= 80, "{line}");
     }
-    for told in [
+    for reported in [
         "Wake-up lateness",
         "Release to input",
         "Work",
         "p99.9",
         "Counted",
     ] {
-        assert!(table.contains(told), "{told} in {table}");
+        assert!(table.contains(reported), "{reported} in {table}");
     }
 }
 
-/// A machine file's simulated bus goes through the whole of a session.
+/// A machine file's simulated bus runs through a whole session.
 #[test]
-fn a_machine_file_on_its_simulated_bus() {
+fn bench_runs_a_machine_file_on_its_simulated_bus() {
     let line = "--machine configs/demo.toml --sim --seconds 1 --json";
     let output = run(&line.split(' ').collect::<Vec<_>>());
     assert!(output.status.success(), "{}", text(&output.stderr));
@@ -145,7 +145,7 @@ fn a_machine_file_on_its_simulated_bus() {
 }
 
 #[test]
-fn bad_command_lines_end_with_2() {
+fn invalid_command_lines_exit_with_2() {
     for line in [
         "--cycle 1",
         "--against nothing-of-the-kind",
@@ -157,9 +157,9 @@ fn bad_command_lines_end_with_2() {
         "--enable",
     ] {
         let output = run(&line.split(' ').collect::<Vec<_>>());
-        let told = text(&output.stderr);
-        assert_eq!(output.status.code(), Some(2), "{line}: {told}");
-        assert!(told.contains("error: "), "{told}");
+        let reported = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{line}: {reported}");
+        assert!(reported.contains("error: "), "{reported}");
     }
 }
 
@@ -183,7 +183,7 @@ fn soon(what: impl Fn() -> bool) -> bool {
     true
 }
 
-/// Whatever ends a bench, its interfaces go with it.
+/// Every end of a bench removes its interfaces.
 #[test]
 fn a_bench_leaves_no_interface_behind() {
     wire::over_a_pair(|_| {

@@ -1,5 +1,5 @@
-//! A brake that an output of another device opens: in which cycle the output changes, before and after what the drive gets.
-//! Read from the recording; virtual time.
+//! A brake on an output of another device: the cycle in which the output changes, relative to the
+//! drive's Controlword. Read from the recording; virtual time.
 
 mod common;
 
@@ -10,13 +10,13 @@ use ecaxis::session::Options;
 use ecaxis_sim::faults::FaultScript;
 use pcap_file::pcapng::{Block, PcapNgReader};
 
-/// Cycles of 1 ms.
+/// In cycles of 1 ms.
 const RELEASE: usize = 80;
 const ENGAGE: usize = 120;
-/// Process data of an axis of our own ESI, 12 bytes out and 13 in, share their place.
+/// An axis of the project's ESI has 12 bytes out and 13 bytes in, at the same place of the image.
 const REGION: usize = 13;
 
-/// Two axes and eight outputs; the first one opens the brake of `a0`.
+/// Returns a machine of two axes and eight outputs. The first output opens the brake of `a0`.
 fn braked() -> String {
     let text = axes(2).replacen(
         "encoder = 2000\n",
@@ -27,7 +27,7 @@ fn braked() -> String {
     text.replacen("\n[[step]]", &format!("{io}\n[[step]]"), 1)
 }
 
-/// One cycle on the wire: what `a0` and the outputs got, and what `a0` answered.
+/// One cycle on the wire: outputs of `a0` and of the I/O device, and the answer of `a0`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Seen {
     open: bool,
@@ -75,7 +75,7 @@ fn cycles(recording: &Path) -> Vec<Seen> {
     seen
 }
 
-/// Runs the machine; what was on the wire, and whether the run did all it should.
+/// Runs the machine. Returns the process data on the wire and whether the run succeeded.
 fn recorded(name: &str, script: &str) -> (Vec<Seen>, bool) {
     let path =
         std::env::temp_dir().join(format!("ecaxis-brake-{}-{name}.pcapng", std::process::id()));
@@ -91,7 +91,8 @@ fn recorded(name: &str, script: &str) -> (Vec<Seen>, bool) {
     (seen, outcome.result.is_ok())
 }
 
-/// Closed until the drive is enabled, and open so long before the first motion.
+/// Checks that the brake is closed until the drive is enabled, and opens `RELEASE` cycles before
+/// the first motion. Returns the cycle in which it opens.
 #[track_caller]
 fn opens_before_motion(seen: &[Seen]) -> usize {
     let enabled = seen.iter().position(|s| s.enabled()).expect("enabled");
@@ -107,7 +108,8 @@ fn opens_before_motion(seen: &[Seen]) -> usize {
     open
 }
 
-/// The cycle in which the brake closes for good, the first without an order to keep power, and whether the axis stood.
+/// Returns the cycle in which the brake finally closes, the first cycle without a power command,
+/// and whether the axis stood.
 #[track_caller]
 fn closes(seen: &[Seen]) -> (usize, usize, bool) {
     let closed = seen.iter().rposition(|s| s.open).expect("open") + 1;
@@ -120,7 +122,7 @@ fn closes(seen: &[Seen]) -> (usize, usize, bool) {
 }
 
 #[test]
-fn the_brake_opens_after_power_and_closes_before_it_goes() {
+fn the_brake_opens_after_power_and_closes_before_power_off() {
     let (seen, done) = recorded("program", "");
     assert!(done);
     let open = opens_before_motion(&seen);
@@ -130,7 +132,7 @@ fn the_brake_opens_after_power_and_closes_before_it_goes() {
         off >= closed + ENGAGE,
         "closed in cycle {closed}, no power in {off}"
     );
-    // Once open, and never in between.
+    // The brake stays open between these cycles.
     assert!(seen[open..closed].iter().all(|s| s.open));
     let rest = &seen[closed];
     assert!(seen[closed..off].iter().all(|s| s.target == rest.target));
@@ -143,7 +145,7 @@ fn a_fault_of_its_drive_closes_the_brake_at_once() {
     assert!(!done);
     opens_before_motion(&seen);
     let (closed, ..) = closes(&seen);
-    // Fault reaction active, or Fault.
+    // The state is Fault reaction active or Fault.
     let fault = seen
         .iter()
         .position(|s| s.statusword & 0x4f == 0x08 || s.statusword & 0x4f == 0x0f);

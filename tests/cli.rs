@@ -1,4 +1,4 @@
-//! The binary as a user meets it: exit codes, and messages that name the trouble.
+//! The binary from the user's view: exit codes and messages that name the problem.
 
 mod common;
 #[path = "cli/complaints.rs"]
@@ -18,9 +18,9 @@ fn ecaxis(arguments: &[&str]) -> Output {
         .expect("the binary runs")
 }
 
-/// Runs `check` or `run` on a machine file given as text.
+/// Runs `check` or `run` on a machine file with the given text.
 fn with_file(verb: &str, text: &str, more: &[&str]) -> (i32, String) {
-    // Beside the other machine files, because paths in a machine file are relative to it.
+    // The file is next to the other machine files, because its paths are relative to their folder.
     let file = tempfile::Builder::new()
         .prefix("test-")
         .suffix(".toml")
@@ -44,25 +44,25 @@ fn fails((code, text): (i32, String), expected: i32, parts: &[&str]) {
 }
 
 #[test]
-fn a_key_nobody_knows() {
+fn check_rejects_an_unknown_key() {
     let text = axes(1).replace("cycle =", "cicle =");
     fails(with_file("check", &text, &[]), 2, &["cicle", "cycle", "^"]);
 }
 
 #[test]
-fn a_misspelt_unit_of_time() {
+fn check_rejects_a_misspelt_unit_of_time() {
     let text = axes(1).replace("\"1ms\"", "\"1mss\"");
     fails(with_file("check", &text, &[]), 2, &["1mss", "ms"]);
 }
 
 #[test]
-fn an_esi_file_that_is_not_there() {
+fn check_rejects_a_missing_esi_file() {
     let text = axes(1).replace("esi/EPOS4.xml", "esi/EPOS5.xml");
     fails(with_file("check", &text, &[]), 2, &["EPOS5.xml"]);
 }
 
 #[test]
-fn a_truncated_esi_file() {
+fn check_rejects_a_truncated_esi_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let whole = std::fs::read(root().join("configs/esi/EPOS4.xml")).expect("our ESI");
     let cut = folder.path().join("cut.xml");
@@ -72,7 +72,7 @@ fn a_truncated_esi_file() {
 }
 
 #[test]
-fn a_mode_the_esi_does_not_offer() {
+fn check_rejects_a_mode_that_the_esi_does_not_offer() {
     let text = axes(1).replace("\"csp\"", "\"cxp\"");
     fails(with_file("check", &text, &[]), 2, &["cxp", "csp"]);
     let text = axes(1)
@@ -82,19 +82,19 @@ fn a_mode_the_esi_does_not_offer() {
 }
 
 #[test]
-fn a_cycle_that_0x60c2_cannot_express() {
+fn check_rejects_a_cycle_that_0x60c2_cannot_express() {
     let text = axes(1).replace("\"1ms\"", "\"333333ns\"");
     fails(with_file("check", &text, &[]), 2, &["0x60C2"]);
 }
 
 #[test]
-fn an_interface_that_does_not_exist() {
+fn run_rejects_a_missing_interface() {
     let output = with_file("run", &axes(1), &["--nic", "nonet7"]);
     fails(output, 2, &["nonet7", "does not exist"]);
 }
 
 #[test]
-fn every_problem_of_a_file_at_once() {
+fn check_reports_every_problem_of_a_file() {
     let text = axes(2)
         .replace("cycle =", "cicle =")
         .replace("name = \"a1\"", "name = \"a0\"")
@@ -107,7 +107,7 @@ fn every_problem_of_a_file_at_once() {
 }
 
 #[test]
-fn errors_on_the_command_line() {
+fn invalid_command_lines_are_rejected() {
     assert_eq!(ecaxis(&["run", "--cycles"]).status.code(), Some(2));
     assert_eq!(
         ecaxis(&["run", "configs/no-such.toml"]).status.code(),
@@ -119,7 +119,7 @@ fn errors_on_the_command_line() {
     );
 }
 
-/// The objects of a PDO table, in order: lines like `2.0  32  0x607a:00  DINT …`.
+/// Returns the objects of a PDO table in order, from lines such as `2.0  32  0x607a:00  DINT …`.
 fn printed_objects(text: &str) -> Vec<(u16, u8, u16)> {
     text.lines()
         .filter_map(|line| {
@@ -161,7 +161,7 @@ fn explain_prints_the_modules_pdo_contents() {
     assert_eq!(printed_objects(&text), expected, "{text}");
 }
 
-/// Runs the demonstration in virtual time against a fault script.
+/// Runs the demonstration in virtual time with a fault script.
 fn with_faults(script: &str) -> (i32, String) {
     let file = tempfile::NamedTempFile::new().expect("a temporary file");
     std::fs::write(file.path(), script).expect("written");
@@ -174,7 +174,7 @@ fn with_faults(script: &str) -> (i32, String) {
 }
 
 #[test]
-fn every_failure_of_the_bus_has_its_code_device_step_cause_and_hint() {
+fn every_bus_failure_has_code_device_step_cause_and_hint() {
     let fault = |line: &str| format!("[[fault]]\n{line}\n");
     for (script, parts) in [
         (fault("kind = \"silent\""), &["no SubDevice answers"][..]),
@@ -218,7 +218,7 @@ fn every_failure_of_the_bus_has_its_code_device_step_cause_and_hint() {
 }
 
 #[test]
-fn an_esi_file_of_another_device() {
+fn check_rejects_an_esi_file_of_another_device() {
     let text = axes(1).replace("EPOS4.xml", "IO8.xml");
     fails(
         with_file("check", &text, &[]),
@@ -263,7 +263,7 @@ fn help_of_every_verb_fits_80_columns_and_has_examples() {
 }
 
 #[test]
-fn shells_get_their_completions() {
+fn completions_exist_for_every_shell() {
     for (shell, parts) in [
         ("bash", &["complete -F _ecaxis", "--faults"][..]),
         ("zsh", &["#compdef ecaxis", "--faults"]),
@@ -280,7 +280,7 @@ fn shells_get_their_completions() {
 }
 
 #[test]
-fn the_manual_has_a_page_for_every_verb() {
+fn man_writes_a_page_for_every_verb() {
     let folder = tempfile::tempdir().expect("a folder");
     let man = folder.path().join("man1");
     let path = man.to_str().expect("UTF-8");
@@ -307,14 +307,14 @@ fn the_manual_has_a_page_for_every_verb() {
         one.stdout, kept,
         "the page on stdout is the one in the folder"
     );
-    // A file stands in the way.
+    // A file blocks the output folder.
     let refused = ecaxis(&["man", "--out", &format!("{path}/ecaxis.1")]);
     assert_eq!(refused.status.code(), Some(2));
     assert!(text(&refused.stderr).contains("cannot write"));
 }
 
 #[test]
-fn colours_only_where_they_are_wanted() {
+fn colours_appear_only_on_request() {
     let stderr = |variables: &[(&str, &str)]| {
         let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
             .args(["check", "configs/no-such.toml"])
@@ -335,7 +335,7 @@ fn colours_only_where_they_are_wanted() {
     assert_eq!(stderr(&both), plain, "NO_COLOR wins");
 }
 
-/// A short recording, and whatever else a verb may destroy.
+/// A short recording, and other files that a verb might overwrite.
 struct Files(tempfile::TempDir);
 
 impl Files {
@@ -363,19 +363,19 @@ impl Files {
         assert!(output.status.success(), "{output:?}");
     }
 
-    /// What is refused leaves the file as it was.
+    /// Checks that a rejected command leaves the file unchanged.
     #[track_caller]
     fn keeps(&self, name: &str, line: &[&str], parts: &[&str]) {
         let before = self.read(name);
         let output = ecaxis(line);
-        let told = (output.status.code().unwrap_or(-1), text(&output.stderr));
-        fails(told, 2, parts);
+        let reported = (output.status.code().unwrap_or(-1), text(&output.stderr));
+        fails(reported, 2, parts);
         assert!(self.read(name) == before, "{line:?}");
     }
 }
 
 #[test]
-fn firmware_records_over_nothing_but_recordings() {
+fn firmware_overwrites_only_recordings() {
     let files = Files::new();
     let (notes, program) = (files.at("notes.txt"), files.at("new.bin"));
     let sample = [
@@ -413,7 +413,7 @@ fn firmware_records_over_nothing_but_recordings() {
         &line,
         &["--record", "new.bin is the firmware file"],
     );
-    // Without a machine file, too: nothing is opened before.
+    // The check also applies without a machine file, before any file is opened.
     let bare = [
         "firmware",
         "info",
@@ -425,9 +425,9 @@ fn firmware_records_over_nothing_but_recordings() {
         &notes,
     ];
     files.keeps("notes.txt", &bare, &refused);
-    // Over an old one.
+    // An old recording may be overwritten.
     files.records("ok.pcapng", &[]);
-    // What is made for the simulated bus is kept, too.
+    // Outputs for the simulated bus are protected as well.
     files.keeps(
         "notes.txt",
         &[&sample[..5], &[&notes]].concat(),
@@ -436,7 +436,7 @@ fn firmware_records_over_nothing_but_recordings() {
 }
 
 #[test]
-fn reports_are_written_over_nothing_but_reports() {
+fn reports_overwrite_only_reports() {
     let files = Files::new();
     files.records("night2.pcapng", &[]);
     let (ok, night, notes) = (
@@ -450,7 +450,7 @@ fn reports_are_written_over_nothing_but_reports() {
         "= help: name a new file",
     ];
     files.keeps("ok.pcapng", &["analyze", &ok, "--html", &ok], &recording);
-    // A shell's pattern in the place of one name.
+    // A shell pattern expands to several names instead of one.
     let line = ["analyze", "--html", &ok, &night];
     files.keeps("ok.pcapng", &line, &["--html", "is not a report (HTML)"]);
     std::fs::hard_link(&ok, files.at("hard")).expect("linked");
@@ -478,11 +478,15 @@ fn reports_are_written_over_nothing_but_reports() {
         "configs/demo.toml",
         "--sim",
         "--virtual",
-        "--story",
+        "--fault-report",
         &notes,
     ];
-    files.keeps("notes.txt", &story, &["--story", "is not a fault story"]);
-    // The figures of a bench, and its report; before anything is measured.
+    files.keeps(
+        "notes.txt",
+        &story,
+        &["--fault-report", "is not a fault report"],
+    );
+    // Figures and report of a bench are checked before the measurement.
     let both = [
         "bench",
         "--sim",
@@ -500,5 +504,42 @@ fn reports_are_written_over_nothing_but_reports() {
     ] {
         let line = ["bench", "--sim", "--seconds", "1", option, &notes];
         files.keeps("notes.txt", &line, &[option, what]);
+    }
+}
+
+/// Each package may use only these packages of the workspace.
+#[test]
+fn packages_depend_in_one_direction() {
+    let allowed: [(&str, &[&str]); 5] = [
+        ("ecat", &[]),
+        ("esi", &[]),
+        ("axis", &[]),
+        ("sim", &["ecaxis-esi"]),
+        (
+            "master",
+            &["ecaxis-ecat", "ecaxis-esi", "ecaxis-axis", "ecaxis-sim"],
+        ),
+    ];
+    let root = root();
+    let read = |path: &str| -> toml::Table {
+        let text = std::fs::read_to_string(root.join(path)).expect("a manifest");
+        text.parse().expect("TOML")
+    };
+    let members = read("Cargo.toml")["workspace"]["members"].clone();
+    assert_eq!(
+        members,
+        toml::Value::from(allowed.map(|(folder, _)| folder).to_vec())
+    );
+    for (folder, allowed) in allowed {
+        let manifest = read(&format!("{folder}/Cargo.toml"));
+        let none = toml::Table::new();
+        let dependencies = manifest.get("dependencies").and_then(|d| d.as_table());
+        for name in dependencies.unwrap_or(&none).keys() {
+            let ours = name.starts_with("ecaxis");
+            assert!(
+                !ours || allowed.contains(&name.as_str()),
+                "{folder} uses {name}"
+            );
+        }
     }
 }

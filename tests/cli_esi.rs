@@ -1,6 +1,7 @@
-//! `ecaxis esi …` as a user meets it: what each verb prints of our own files, and how it refuses others.
+//! `ecaxis esi …` from the user's view: the output of each verb for the project's files, and error
+//! messages.
 //!
-//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes what is kept in `tests/snapshots/esi` anew; the difference then wants reviewing.
+//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes `tests/snapshots/esi` again; review the difference.
 
 mod common;
 
@@ -21,7 +22,7 @@ fn esi(arguments: &[&str]) -> Output {
         .expect("the binary runs")
 }
 
-/// Exit code, standard output and standard error.
+/// Returns exit code, standard output and standard error.
 fn ran(arguments: &[&str]) -> (i32, String, String) {
     let output = esi(arguments);
     let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).expect("UTF-8");
@@ -48,9 +49,9 @@ fn refused(arguments: &[&str], parts: &[&str]) {
 const EPOS4: &str = "configs/esi/EPOS4.xml";
 const TERMINALS: &str = "configs/esi/terminals.xml";
 
-/// Everything that is printed, as it was reviewed.
+/// The whole output matches the reviewed snapshots.
 #[test]
-fn what_is_printed_of_our_own_files() {
+fn esi_output_matches_the_snapshots() {
     let update = std::env::var_os("ECAXIS_UPDATE_SNAPSHOTS").is_some();
     let mut differ = Vec::new();
     for (name, arguments) in [
@@ -81,7 +82,7 @@ fn what_is_printed_of_our_own_files() {
 }
 
 #[test]
-fn every_verb_of_every_own_file_for_programs() {
+fn esi_json_works_for_every_verb_and_own_file() {
     for file in ["EPOS4", "IDX", "IO8", "gateway", "terminals"] {
         let path = format!("configs/esi/{file}.xml");
         let shown = json(&["show", &path, "--json"], 0);
@@ -101,7 +102,7 @@ fn every_verb_of_every_own_file_for_programs() {
 }
 
 #[test]
-fn an_image_and_what_is_changed_in_it() {
+fn esi_compares_an_image_with_its_changed_copy() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let image = folder.path().join("an image.bin");
     let path = image.to_str().expect("UTF-8");
@@ -126,7 +127,7 @@ fn an_image_and_what_is_changed_in_it() {
 }
 
 #[test]
-fn what_cannot_be_read() {
+fn esi_rejects_unreadable_files() {
     for verb in ["list", "show", "check", "objects"] {
         refused(&[verb, "nothere.xml"], &["nothere.xml"]);
         refused(&[verb], &["Usage"]);
@@ -147,7 +148,7 @@ fn what_cannot_be_read() {
 }
 
 #[test]
-fn which_device() {
+fn esi_selects_a_device_by_its_options() {
     refused(
         &["objects", TERMINALS],
         &["describes 7 devices", "--device", "esi list"],
@@ -165,9 +166,9 @@ fn which_device() {
     }
 }
 
-/// A finding stands in the file that it is about, under the path that the reader gives it.
+/// A finding names the file that contains the problem and its path in that file.
 #[test]
-fn findings_of_modules_in_another_file() {
+fn findings_of_modules_name_the_referenced_file() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let write = |name: &str, text: &str| {
         let path = folder.path().join(name);
@@ -202,9 +203,9 @@ fn findings_of_modules_in_another_file() {
     assert_eq!(found["findings"][1]["file"], "modules.XML");
 }
 
-/// Also on names with spaces; what their makers wrote is not kept here.
+/// File names with spaces are accepted. The vendor files' contents are not stored in snapshots.
 #[test]
-fn files_of_makers() {
+fn esi_reads_vendor_files() {
     let Some(folder) = fixture("esi") else { return };
     let one = |path: &str| folder.join(path).to_str().expect("UTF-8").to_owned();
     let inputs = one("beckhoff/Beckhoff EL1xxx.xml");
@@ -213,7 +214,7 @@ fn files_of_makers() {
     assert!(out.contains("155 devices"), "{out}");
     refused(&["objects", &inputs], &["155 devices"]);
 
-    // Two of its clock modes have one name; what they are for tells them apart.
+    // Two clock modes of this device have the same name; their descriptions differ.
     let device = ["--device", "EL1262", "--revision", "0x30000"];
     let (_, out, _) = ran(&[&["show", &inputs], &device[..]].concat());
     let named: Vec<&str> = out.lines().filter(|l| l.starts_with("  DcSync ")).collect();

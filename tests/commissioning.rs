@@ -1,7 +1,9 @@
-//! From an unknown bus to a running machine: `scan`, `scan --write`, `check`, `run`, `compare`, as a user meets them.
+//! From an unknown bus to a running machine: `scan`, `scan --write`, `check`, `run` and `compare`
+//! from the user's view.
 //!
-//! What docs/first-steps.md shows is run, once on the simulated bus in the process and once over a veth pair (which needs root).
-//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes what is kept in `tests/snapshots/scan` anew; the difference then wants reviewing.
+//! The tests run the commands of docs/first-steps.md twice: on the simulated bus in the process,
+//! and over a veth pair (requires root). `ECAXIS_UPDATE_SNAPSHOTS=1` writes `tests/snapshots/scan`
+//! again; review the difference.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 

@@ -1,4 +1,4 @@
-//! A user's own controller in the cycle, guarded like everything else.
+//! A user-defined controller in the cycle, supervised like other motion.
 
 mod common;
 
@@ -8,9 +8,9 @@ use std::sync::{Arc, Mutex, atomic::AtomicBool};
 use common::{Heard, faults, load, virtual_time};
 use ecaxis::clock::{self, Clock};
 use ecaxis::config::{AxisRef, InputRef, Machine, OutputRef};
-use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::rt::controller::{Controller, CycleContext};
 use ecaxis::session::{Options, Outcome, RunError, run_with};
-use ecaxis_axis::{Command, Refused};
+use ecaxis_axis::{Command, CommandError};
 
 fn control(machine: Machine, controller: impl Controller + 'static) -> Outcome {
     control_with(virtual_time(), machine, controller)
@@ -28,8 +28,8 @@ fn control_with(
 
 struct Closure<F>(F);
 
-impl<F: FnMut(&mut Cycle<'_>) + Send> Controller for Closure<F> {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+impl<F: FnMut(&mut CycleContext<'_>) + Send> Controller for Closure<F> {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         (self.0)(machine);
     }
 }
@@ -54,7 +54,7 @@ fn bench() -> (Machine, Names) {
 }
 
 #[test]
-fn names_that_mean_nothing_are_explained() {
+fn unknown_names_are_explained() {
     let (mut machine, _) = bench();
     let wrong = [
         machine.axis("z").map(|_| ()),
@@ -77,16 +77,16 @@ fn names_that_mean_nothing_are_explained() {
     assert_eq!(said, expected);
 }
 
-/// Set-points cycle by cycle, a command, an output, and the input that copies it.
+/// Covers set-points in each cycle, a command, an output, and the input that copies it.
 #[test]
-fn it_moves_axes_and_reads_and_sets_signals() {
+fn a_controller_moves_axes_and_reads_and_sets_signals() {
     let (machine, names) = bench();
     let reached = Arc::new(AtomicU64::new(0));
-    let told = Arc::clone(&reached);
+    let reported = Arc::clone(&reached);
     let mut elapsed = 0.0;
     let outcome = control(
         machine,
-        Closure(move |machine: &mut Cycle<'_>| {
+        Closure(move |machine: &mut CycleContext<'_>| {
             if machine.stopping() || !machine.axis(names.x).ready || !machine.axis(names.y).ready {
                 return;
             }
@@ -103,7 +103,7 @@ fn it_moves_axes_and_reads_and_sets_signals() {
             let x = 5.0 - 5.0 * (elapsed * std::f64::consts::PI).cos();
             machine.set_point(names.x, x).expect("within the limits");
             if elapsed >= 1.0 && machine.axis(names.y).in_target {
-                told.store(machine.input(names.seen).to_bits(), Ordering::Relaxed);
+                reported.store(machine.input(names.seen).to_bits(), Ordering::Relaxed);
                 machine.finish();
             }
         }),
@@ -119,19 +119,19 @@ fn it_moves_axes_and_reads_and_sets_signals() {
     assert_eq!(f64::from_bits(reached.load(Ordering::Relaxed)), 1.0);
 }
 
-/// A computer that stalls leaves cycles out. The drives stand at their last targets meanwhile, and do not find themselves at
-/// full speed again.
+/// A stalling computer skips cycles. The drives stop at their last targets, so motion must restart
+/// from rest.
 #[test]
-fn motion_goes_on_from_rest_after_cycles_that_were_left_out() {
+fn motion_restarts_from_rest_after_skipped_cycles() {
     const SPEED: f64 = 50.0;
     const STALL: u64 = 40_000_000;
     let (machine, names) = bench();
     let seen = Arc::new(Mutex::new(Vec::new()));
-    let told = Arc::clone(&seen);
+    let reported = Arc::clone(&seen);
     let mut cycles = 0;
     let outcome = control(
         machine,
-        Closure(move |machine: &mut Cycle<'_>| {
+        Closure(move |machine: &mut CycleContext<'_>| {
             let status = machine.axis(names.x);
             if machine.stopping() || !status.ready {
                 return;
@@ -152,7 +152,7 @@ fn motion_goes_on_from_rest_after_cycles_that_were_left_out() {
                 _ => {}
             }
             if cycles >= 100 {
-                told.lock().expect("no panic").push(status);
+                reported.lock().expect("no panic").push(status);
             }
         }),
     );
@@ -166,7 +166,7 @@ fn motion_goes_on_from_rest_after_cycles_that_were_left_out() {
         let change = status.target_velocity - before;
         assert!(change <= 2.5 + 1e-6, "cycle {n}: {change} mm/s");
         let way = status.target_position - seen[n].target_position;
-        // The first takes back what was never sent.
+        // The first step returns to the last transmitted target.
         let most = status.target_velocity * 0.001 + 1e-6;
         assert!(way <= most, "cycle {n}: {way} mm");
         assert_eq!(status.trip, None);
@@ -175,22 +175,22 @@ fn motion_goes_on_from_rest_after_cycles_that_were_left_out() {
     assert_eq!(before, SPEED);
 }
 
-/// One frame in twenty is lost. A controller is told in each of these cycles, and in no other, how old what it sees is.
+/// One frame in twenty is lost. The controller sees stale inputs exactly in these cycles.
 #[test]
-fn inputs_are_stale_in_exactly_the_cycles_that_are_lost() {
+fn inputs_are_stale_exactly_in_cycles_with_lost_frames() {
     let script = "seed = 5\n[[fault]]\nkind = \"frame-loss\"\nprobability = 0.05\nat = \"2s\"\n";
     let (mut machine, names) = bench();
     machine.bus.lost_frames = 8;
     let seen = Arc::new(Mutex::new(Vec::new()));
-    let told = Arc::clone(&seen);
+    let reported = Arc::clone(&seen);
     let outcome = control_with(
         faults(script),
         machine,
-        Closure(move |machine: &mut Cycle<'_>| {
+        Closure(move |machine: &mut CycleContext<'_>| {
             let status = machine.axis(names.x);
             if machine.in_op() {
-                let mut told = told.lock().expect("no panic");
-                told.push((machine.fresh(), status));
+                let mut reported = reported.lock().expect("no panic");
+                reported.push((machine.fresh(), status));
             }
             if status.ready && !machine.stopping() && status.target_velocity == 0.0 {
                 let command = Command::Velocity {
@@ -226,23 +226,23 @@ fn inputs_are_stale_in_exactly_the_cycles_that_are_lost() {
     assert!(moved > 3_000, "it moves all the while: {moved}");
 }
 
-/// A set-point that jumps never reaches the wire.
+/// A set-point step never reaches the wire.
 #[test]
-fn a_jump_is_refused_and_the_axis_brakes() {
+fn a_set_point_jump_is_rejected_and_the_axis_brakes() {
     let (machine, names) = bench();
     let refused = Arc::new(AtomicU64::new(0));
-    let told = Arc::clone(&refused);
+    let reported = Arc::clone(&refused);
     let mut cycles = 0;
     let outcome = control(
         machine,
-        Closure(move |machine: &mut Cycle<'_>| {
+        Closure(move |machine: &mut CycleContext<'_>| {
             if cycles == 500 || !machine.axis(names.x).ready {
                 return;
             }
             cycles += 1;
             for wrong in [30.0, f64::NAN, f64::INFINITY, -1e300] {
                 if machine.set_point(names.x, wrong).is_err() {
-                    told.fetch_add(1, Ordering::Relaxed);
+                    reported.fetch_add(1, Ordering::Relaxed);
                 }
             }
             if cycles == 500 {
@@ -257,12 +257,12 @@ fn a_jump_is_refused_and_the_axis_brakes() {
 }
 
 #[test]
-fn a_panic_stops_the_machine_within_its_limits() {
+fn a_controller_panic_stops_the_machine_within_its_limits() {
     let (machine, names) = bench();
     let mut moving = 0;
     let outcome = control(
         machine,
-        Closure(move |machine: &mut Cycle<'_>| {
+        Closure(move |machine: &mut CycleContext<'_>| {
             if !machine.axis(names.x).ready {
                 return;
             }
@@ -281,26 +281,27 @@ fn a_panic_stops_the_machine_within_its_limits() {
     let error = outcome.result.expect_err("it panicked");
     assert!(matches!(error, RunError::Controller), "{error:?}");
     let x = &outcome.summary.expect("the cycle has run").axes[0];
-    // 0.1 s at 2500 mm/s² and as long to rest: 12.5 mm and as much again.
+    // 0.1 s at 2500 mm/s², and the same time to rest: twice 12.5 mm.
     assert!((20.0..30.0).contains(&x.final_position), "{x:?}");
     assert_eq!((&x.fault, &x.trip), (&None, &None));
 }
 
 #[test]
-fn a_stopping_machine_takes_no_orders() {
+fn a_stopping_machine_rejects_commands() {
     let (machine, names) = bench();
     let answer = Arc::new(AtomicU64::new(0));
-    let told = Arc::clone(&answer);
+    let reported = Arc::clone(&answer);
     let outcome = control(
         machine,
-        Closure(move |machine: &mut Cycle<'_>| {
+        Closure(move |machine: &mut CycleContext<'_>| {
             if machine.axis(names.x).ready {
                 machine.finish();
             }
             if machine.stopping() {
-                let refused = machine.command(names.x, Command::Enable) == Err(Refused::Stopping)
-                    && machine.set_point(names.x, 0.0) == Err(Refused::Stopping);
-                told.fetch_add(u64::from(refused), Ordering::Relaxed);
+                let refused = machine.command(names.x, Command::Enable)
+                    == Err(CommandError::Stopping)
+                    && machine.set_point(names.x, 0.0) == Err(CommandError::Stopping);
+                reported.fetch_add(u64::from(refused), Ordering::Relaxed);
             }
         }),
     );

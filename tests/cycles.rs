@@ -1,11 +1,11 @@
-//! The shortest and longest cycles, on the simulated bus in virtual time.
+//! The shortest and longest cycle times, on the simulated bus in virtual time.
 
 mod common;
 
 use common::{axes, machine, root, run_badly, run_well, virtual_time};
 use ecaxis::config;
 
-/// The machine of `axes` with another cycle, and lost frames so many that the watchdog is not met.
+/// Returns the machine of `axes` with another cycle.
 fn at(cycle: &str) -> String {
     axes(2).replace("\"1ms\"", &format!("\"{cycle}\""))
 }
@@ -24,7 +24,7 @@ fn moves(text: &str, cycle_ns: u64) {
     }
     let phase = summary.dc_phase_error.expect("distributed clocks");
     assert!(phase.count > 0, "frames keep in phase with SYNC0");
-    // 80 turns and back at 50 turns/s and 500 turns/s²: 1.7 s each, plus the way to Op and to rest.
+    // 80 turns and back at 50 turns/s and 500 turns/s²: 1.7 s each, plus bring-up and stop.
     assert!(
         (3.4..10.0).contains(&summary.machine_seconds),
         "{}",
@@ -33,18 +33,18 @@ fn moves(text: &str, cycle_ns: u64) {
 }
 
 #[test]
-fn four_kilohertz() {
+fn axes_move_at_four_kilohertz() {
     moves(&at("250us"), 250_000);
 }
 
 #[test]
-fn fifty_hertz() {
-    // A drive at 50 turns/s is a turn behind what it is told every 20 ms.
+fn axes_move_at_fifty_hertz() {
+    // A drive at 50 turns/s lags one turn behind a target that changes every 20 ms.
     let text = at("20ms").replace("following_error = 1.0", "following_error = 4.0");
     moves(&text, 20_000_000);
 }
 
-/// A cycle that 0x60C2 cannot hold is refused, except for drives that have no such object.
+/// A cycle that 0x60C2 cannot express is rejected, except for drives without this object.
 fn moves_without_interpolation_time(cycle: &str, cycle_ns: u64, refused: &str) {
     let text = at(cycle);
     let path = root().join("configs/test.toml");
@@ -62,22 +62,22 @@ fn moves_without_interpolation_time(cycle: &str, cycle_ns: u64, refused: &str) {
     );
 }
 
-/// 62.5 µs is 625 times 10⁻⁷ s, and 0x60C2 has 8 bits for the 625.
+/// 62.5 µs is 625 × 10⁻⁷ s, and 0x60C2 has only 8 bits for the value 625.
 #[test]
-fn sixteen_kilohertz() {
+fn sixteen_kilohertz_requires_drives_without_0x60c2() {
     let refused = "62500 ns cannot be written to 0x60C2 (value 0..100 times a power of ten); nearest are 62 µs and 63 µs";
     moves_without_interpolation_time("62.5us", 62_500, refused);
 }
 
-/// 125 µs would fit, but this drive's file allows 100 at most.
+/// 125 µs is expressible, but this drive's file allows 100 at most.
 #[test]
-fn eight_kilohertz() {
+fn eight_kilohertz_requires_drives_without_0x60c2() {
     let refused = "125000 ns cannot be written to 0x60C2 (value 0..100 times a power of ten); nearest are 120 µs and 130 µs";
     moves_without_interpolation_time("125us", 125_000, refused);
 }
 
 #[test]
-fn a_cycle_too_short_for_its_frames_is_a_lost_bus_and_not_a_hang() {
+fn a_cycle_shorter_than_its_frames_is_reported_as_lost_bus() {
     // 30 axes need more than three quarters of 50 µs on the wire.
     let text = axes(30).replace("\"1ms\"", "\"50us\"");
     let (error, summary) = run_badly(machine(&text), virtual_time());

@@ -1,6 +1,6 @@
-//! `ecaxis doctor` on computers that are known: fabricated ones, and this one.
+//! `ecaxis doctor` on known computers: simulated ones, and the test computer.
 //!
-//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes what is kept in `tests/snapshots/doctor` anew; the difference then wants reviewing.
+//! `ECAXIS_UPDATE_SNAPSHOTS=1` writes `tests/snapshots/doctor` again; review the difference.
 
 #![allow(clippy::print_stdout, reason = "says why a test does not run")]
 
@@ -10,9 +10,9 @@ mod machines;
 use std::path::Path;
 use std::process::Command;
 
-use ecaxis::doctor::wakeup::{WakeUp, Way};
+use ecaxis::doctor::wakeup::{WaitMethod, WakeUp};
 use ecaxis::doctor::{Report, Severity, examine};
-use ecaxis::rt::thread::Denied;
+use ecaxis::sys::rt_thread::RtSetupError;
 use machines::Machine;
 
 fn ids(report: &Report) -> Vec<String> {
@@ -20,7 +20,7 @@ fn ids(report: &Report) -> Vec<String> {
     all.map(|f| format!("{} {}", f.severity, f.id)).collect()
 }
 
-/// Compares the whole text with the one that was reviewed.
+/// Compares the whole text with its reviewed snapshot.
 #[track_caller]
 fn reviewed(name: &str, report: &Report) {
     let text = report.to_string();
@@ -38,7 +38,7 @@ fn reviewed(name: &str, report: &Report) {
 }
 
 #[test]
-fn ten_computers() {
+fn doctor_matches_the_snapshots_of_ten_computers() {
     let table: &[(&str, Machine, &[&str])] = &[
         ("ideal", machines::ideal(), &[]),
         (
@@ -137,7 +137,7 @@ fn ten_computers() {
 }
 
 #[test]
-fn nonsense_in_every_file_is_survived() {
+fn doctor_survives_invalid_contents_in_every_file() {
     let long = "9".repeat(3 << 20);
     for nonsense in [
         "".as_bytes(),
@@ -160,7 +160,7 @@ fn nonsense_in_every_file_is_survived() {
 }
 
 #[test]
-fn nonsense_in_one_file_changes_no_more_than_that_file_tells() {
+fn invalid_contents_of_one_file_affect_only_its_findings() {
     let machine = machines::desktop();
     let root = tempfile::tempdir().expect("a folder");
     let host = machine.write(root.path());
@@ -182,9 +182,9 @@ fn nonsense_in_one_file_changes_no_more_than_that_file_tells() {
     assert_eq!(examined().findings.len(), usual);
 }
 
-/// One thing about the ideal computer's card is changed.
+/// Each case changes one property of the ideal computer's network card.
 #[test]
-fn cards() {
+fn doctor_reports_each_network_card_problem() {
     type Change = fn(&mut Machine);
     let table: &[(&str, Change)] = &[
         ("bad nic-down", |m| {
@@ -259,9 +259,9 @@ fn cards() {
     }
 }
 
-/// One thing about the rest of the ideal computer is changed.
+/// Each case changes one other property of the ideal computer.
 #[test]
-fn settings() {
+fn doctor_reports_each_system_setting_problem() {
     type Change = fn(&mut Machine);
     let none: &[&str] = &[];
     let table: &[(&[&str], Change)] = &[
@@ -282,17 +282,17 @@ fn settings() {
         (&["warning idle-states"], |m| {
             m.idle(4, &[("C6", 85, false)])
         }),
-        // Somebody holds the CPUs awake.
+        // Another process keeps the CPUs awake.
         (none, |m| {
             m.idle(4, &[("C6", 85, false)]);
             m.file("dev/cpu_dma_latency", 0_i32.to_ne_bytes());
         }),
-        // The program will.
+        // The program keeps the CPUs awake.
         (none, |m| {
             m.idle(4, &[("C6", 85, false)]);
             m.file("dev/cpu_dma_latency", 2_000_000_000_i32.to_ne_bytes());
         }),
-        // It must not; but spinning covers it.
+        // The program must not keep the CPUs awake, but spinning has the same effect.
         (none, |m| {
             m.idle(4, &[("C6", 50, false)]);
             m.file("dev/cpu_dma_latency/x", "");
@@ -301,7 +301,7 @@ fn settings() {
             m.idle(4, &[("C6", 50, false)]);
             m.intent.cycle_ns = 250_000;
         }),
-        // The limits of the user do instead of capabilities.
+        // User limits replace capabilities.
         (none, |m| {
             m.rights(1000, machines::NET_RAW, "95", "unlimited")
         }),
@@ -311,7 +311,7 @@ fn settings() {
         (&["warning rights"], |m| {
             m.rights(1000, machines::NET_RAW | machines::SYS_NICE, "0", "65536")
         }),
-        // From Linux 6.12 on the setting throttles groups alone, and there are none.
+        // Since Linux 6.12 the setting throttles only groups, and this computer has no groups.
         (none, |m| {
             m.file("proc/sys/kernel/sched_rt_runtime_us", "950000");
             m.file(
@@ -341,10 +341,10 @@ fn settings() {
 }
 
 #[test]
-fn refused_although_the_rights_are_there() {
+fn doctor_reports_calls_that_fail_despite_sufficient_rights() {
     let mut machine = machines::ideal();
     machine.file("boot/config-6.12.9-rt-amd64", "CONFIG_RT_GROUP_SCHED=y\n");
-    let refused = Denied::Priority {
+    let refused = RtSetupError::Priority {
         priority: 80,
         reason: "Operation not permitted".to_owned(),
     };
@@ -354,15 +354,15 @@ fn refused_although_the_rights_are_there() {
     });
     let report = machine.examined();
     assert_eq!(ids(&report), ["bad rights"]);
-    let mend = format!("{:?}", report.findings[0].mend);
-    assert!(mend.contains("rt_group_sched=0"), "{mend}");
-    // Where a right is missing anyway, that alone is told.
+    let fix = format!("{:?}", report.findings[0].fix);
+    assert!(fix.contains("rt_group_sched=0"), "{fix}");
+    // If a right is missing, only the missing right is reported.
     machine.rights(1000, machines::NET_RAW | machines::IPC_LOCK, "0", "0");
     assert_eq!(machine.examined().count(Severity::Bad), 1);
 }
 
 fn measured(too_late: u64) -> WakeUp {
-    let mut way = Way::default();
+    let mut way = WaitMethod::default();
     way.lateness.count = 1_500;
     way.lateness.max_ns = 300_000;
     way.too_late = too_late;
@@ -380,7 +380,7 @@ fn measured(too_late: u64) -> WakeUp {
 }
 
 #[test]
-fn late_wake_ups() {
+fn doctor_reports_late_wake_ups() {
     for (too_late, expected) in [
         (0, &[][..]),
         (1, &["note wake-up"]),
@@ -409,9 +409,9 @@ fn ecaxis(arguments: &[&str]) -> (Option<i32>, String, String) {
     )
 }
 
-/// What is told of this computer against an own look at it.
+/// Compares the findings on the test computer with direct reads.
 #[test]
-fn this_computer() {
+fn doctor_matches_the_test_computer() {
     let (code, text, stderr) = ecaxis(&["doctor", "--seconds", "0", "--json"]);
     let report: serde_json::Value = serde_json::from_str(&text).expect("JSON");
     let found = |id: &str| {
@@ -462,8 +462,8 @@ fn this_computer() {
             // A kernel since 6.12 without groups does not throttle.
             if let Some(throttling) = found("throttling") {
                 let ms = runtime.parse::<f64>().expect("a number") / 1e3;
-                let told = throttling["found"].as_str().expect("text");
-                assert!(told.contains(&format!("{ms} ms")), "{told}");
+                let reported = throttling["found"].as_str().expect("text");
+                assert!(reported.contains(&format!("{ms} ms")), "{reported}");
             }
         }
     }
@@ -481,7 +481,7 @@ fn this_computer() {
 }
 
 #[test]
-fn an_interface_that_does_not_exist_and_one_that_does() {
+fn doctor_checks_an_existing_and_a_missing_interface() {
     let (code, text, stderr) = ecaxis(&["doctor", "nonet7", "--seconds", "0"]);
     assert_eq!(code, Some(2));
     assert_eq!(text, "");
@@ -496,7 +496,7 @@ fn an_interface_that_does_not_exist_and_one_that_does() {
 }
 
 #[test]
-fn a_machine_file_says_what_is_intended() {
+fn doctor_uses_the_settings_of_a_machine_file() {
     let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
     let file = demo.to_str().expect("UTF-8");
     let (_, text, _) = ecaxis(&["doctor", "--machine", file, "--seconds", "0", "--json"]);

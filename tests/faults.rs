@@ -1,11 +1,11 @@
-//! What goes wrong on a bus, and what the machine does and says then. Simulated, virtual time.
+//! Bus faults, and the machine's reactions and messages. Simulated, virtual time.
 
 mod common;
 
 use common::{axes, faults, machine, run, run_badly, run_well, virtual_time};
 use ecaxis::session::Options;
 
-/// The error must name every one of these.
+/// Checks that the error contains all parts.
 #[track_caller]
 fn says(text: &str, parts: &[&str]) {
     for part in parts {
@@ -14,15 +14,16 @@ fn says(text: &str, parts: &[&str]) {
 }
 
 #[test]
-fn nobody_answers() {
+fn a_silent_bus_is_reported() {
     let (error, summary) = run_badly(machine(&axes(2)), faults("[[fault]]\nkind = \"silent\"\n"));
     says(&error, &["no SubDevice answers"]);
     assert!(summary.is_none());
 }
 
-/// A device without a processor shows AL control in AL status, with the bit of an acknowledgement that the MainDevice wrote.
+/// A device without a processor copies AL control to AL status, including the acknowledge bit of
+/// the MainDevice.
 #[test]
-fn a_bus_that_is_silent_for_a_while_has_refused_nothing() {
+fn a_temporarily_silent_bus_is_not_reported_as_a_rejected_state() {
     let io = "[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 0\n";
     let text = axes(1).replace("position = 0\n", "position = 1\n");
     let text = text.replacen("[[device]]", &format!("{io}[[device]]"), 1);
@@ -36,7 +37,7 @@ fn a_bus_that_is_silent_for_a_while_has_refused_nothing() {
 }
 
 #[test]
-fn one_sub_device_too_few() {
+fn a_missing_sub_device_is_reported() {
     let (error, _) = run_badly(
         machine(&axes(2)),
         faults("[[fault]]\nkind = \"absent\"\ndevice = 1\n"),
@@ -45,7 +46,7 @@ fn one_sub_device_too_few() {
 }
 
 #[test]
-fn another_device_than_the_esi_describes() {
+fn a_device_that_differs_from_the_esi_is_rejected() {
     let script = "[[fault]]\nkind = \"identity\"\ndevice = 1\nproduct = 0x1234\n";
     let (error, _) = run_badly(machine(&axes(2)), faults(script));
     says(
@@ -55,7 +56,7 @@ fn another_device_than_the_esi_describes() {
 }
 
 #[test]
-fn a_start_up_sdo_is_aborted() {
+fn an_aborted_startup_sdo_stops_bring_up() {
     let script =
         "[[fault]]\nkind = \"sdo-abort\"\ndevice = 1\nindex = 0x6060\nsub = 0\ncode = 0x06090030\n";
     let (error, _) = run_badly(machine(&axes(2)), faults(script));
@@ -63,7 +64,7 @@ fn a_start_up_sdo_is_aborted() {
 }
 
 #[test]
-fn safe_op_is_refused() {
+fn a_rejected_safe_op_stops_bring_up() {
     let script =
         "[[fault]]\nkind = \"refuse-state\"\ndevice = 0\nstate = \"safeop\"\ncode = 0x001e\n";
     let (error, _) = run_badly(machine(&axes(2)), faults(script));
@@ -71,14 +72,14 @@ fn safe_op_is_refused() {
 }
 
 #[test]
-fn op_is_refused() {
+fn a_rejected_op_stops_bring_up() {
     let script = "[[fault]]\nkind = \"refuse-state\"\ndevice = 1\nstate = \"op\"\ncode = 0x002c\n";
     let (error, _) = run_badly(machine(&axes(2)), faults(script));
     says(&error, &["`a1`", "Op", "0x002c"]);
 }
 
 #[test]
-fn a_drive_never_reaches_operation_enabled() {
+fn a_drive_without_operation_enabled_is_reported() {
     let script = "[[fault]]\nkind = \"stuck\"\ndevice = 0\nstate = \"switch-on-disabled\"\n";
     let (error, summary) = run_badly(machine(&axes(2)), faults(script));
     says(
@@ -96,15 +97,15 @@ fn a_drive_never_reaches_operation_enabled() {
 }
 
 #[test]
-fn a_drive_faults_in_motion_and_the_others_stop_within_their_limits() {
+fn a_drive_fault_in_motion_stops_the_others_within_their_limits() {
     let script = "[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"1.5s\"\ncode = 0x8611\n";
     let (error, summary) = run_badly(machine(&axes(3)), faults(script));
     says(&error, &["`a1`", "drive fault", "0x8611"]);
     let summary = summary.expect("the cycle ran");
     for axis in [&summary.axes[0], &summary.axes[2]] {
         assert!(axis.was_enabled);
-        // A ramp from 50 turns a second at 500 turns/s² takes 2.5 turns; following it to the end
-        // leaves the axis on its set-point.
+        // A ramp from 50 turns/s at 500 turns/s² takes 2.5 turns. An axis on its ramp stays at its
+        // set-point.
         assert!(
             axis.final_error_counts.is_none_or(|e| e.abs() < 200),
             "{axis:?}"
@@ -150,14 +151,14 @@ fn a_lost_bus_stops_the_machine() {
 }
 
 #[test]
-fn lost_frames_during_bring_up_are_repeated() {
+fn lost_frames_during_bring_up_are_retried() {
     let script =
         "seed = 3\n[[fault]]\nkind = \"frame-loss\"\nprobability = 0.01\nfor = \"300ms\"\n";
     run_well(machine(&axes(2)), faults(script));
 }
 
 #[test]
-fn a_move_that_the_machine_ends_early_is_still_a_controlled_stop() {
+fn a_time_limit_during_a_move_causes_a_controlled_stop() {
     let options = Options {
         limit: Some(300_000_000),
         ..virtual_time()
@@ -171,14 +172,15 @@ fn a_move_that_the_machine_ends_early_is_still_a_controlled_stop() {
     );
 }
 
-/// One frame in twenty is lost, of any kind, all the time: nothing trips below `lost_frames`, and every loss is known.
+/// One frame in twenty is lost. No supervision trips below `lost_frames`, and every loss is
+/// counted.
 #[test]
-fn a_bus_that_loses_frames_all_the_time_still_moves_its_axes() {
+fn a_bus_with_continuous_frame_loss_moves_its_axes() {
     for seed in 1..=8 {
         let script =
             format!("seed = {seed}\n[[fault]]\nkind = \"frame-loss\"\nprobability = 0.05\n");
         let text = axes(3).replace("cycle =", "lost_frames = 8\ncycle =");
-        // At two fifths of the limit, as one that is to catch up needs room.
+        // The speed is two fifths of the limit, because a delayed axis needs reserve to catch up.
         let text = text.replace("\nmove =", "\nspeed = 0.4\nmove =");
         let options = Options {
             repeat: Some(2),
@@ -205,9 +207,9 @@ fn a_bus_that_loses_frames_all_the_time_still_moves_its_axes() {
     }
 }
 
-/// A cycle later, and otherwise the same.
+/// A pipelined exchange delays data by a cycle; all else is equal.
 #[test]
-fn a_pipelined_exchange_moves_axes_as_well() {
+fn a_pipelined_exchange_moves_axes() {
     let text = axes(2).replace("cycle =", "exchange = \"pipelined\"\ncycle =");
     let summary = run_well(machine(&text), virtual_time());
     for axis in &summary.axes {
@@ -218,9 +220,10 @@ fn a_pipelined_exchange_moves_axes_as_well() {
     }
     let counters = summary.counters;
     assert_eq!((counters.lost_frames, counters.late_frames), (0, 0));
-    assert_eq!(summary.round_trip.count, 0, "nobody waits");
+    assert_eq!(summary.round_trip.count, 0, "no waiting");
 
-    // A reply that takes longer than a cycle, but not two, is in time; longer ones are late, and stop nothing.
+    // A reply delay of more than one cycle but less than two is in time. A longer delay is late,
+    // but causes no stop.
     for (delay, late) in [("900us", false), ("2500us", true)] {
         let script = format!(
             "[[fault]]\nkind = \"frame-delay\"\nat = \"1.5s\"\ncount = 2\ndelay = \"{delay}\"\n"
@@ -248,9 +251,9 @@ fn a_pipelined_exchange_moves_axes_as_well() {
     );
 }
 
-/// What led to the end is told in order; a run of the same is one line.
+/// Events before the stop are reported in order; repeated events share one line.
 #[test]
-fn the_cycle_remembers_what_led_to_a_stop() {
+fn the_cycle_records_the_events_before_a_stop() {
     let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\nprobability = 1.0\n";
     let (_, summary) = run_badly(machine(&axes(2)), faults(script));
     let events = summary.expect("the cycle ran").events;
@@ -289,7 +292,7 @@ fn errors_are_counted_at_the_port_that_sees_them() {
 }
 
 #[test]
-fn a_clock_outside_its_window_is_warned_of() {
+fn a_clock_outside_its_window_causes_a_warning() {
     let text = axes(2).replace("\n[[step]]", "[device.sim]\njitter = \"400ns\"\n\n[[step]]");
     let text = text.replacen("[device.sim]\njitter = \"400ns\"\n", "", 1);
     let warned = |window: &str| {

@@ -1,5 +1,5 @@
-//! Firmware updates of simulated drives in virtual time: both ways, and everything that can break them off. Whatever happens, the same command succeeds
-//! afterwards.
+//! Firmware updates of simulated drives in virtual time: both methods, and every interruption.
+//! After each interruption, the same command succeeds.
 
 #[path = "firmware/cli.rs"]
 mod cli;
@@ -9,36 +9,36 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::load;
+use ecaxis::acyclic::enumerate::DeviceSelector;
+use ecaxis::acyclic::{DatagramClient, device, mailbox, run_on_link};
 use ecaxis::bringup::{AlState, al};
 use ecaxis::clock::Clock;
 use ecaxis::config::Locator;
 use ecaxis::firmware::{
-    self, BOOT_LOADER, Cause, Done, Examined, Expected, FirmwareError, Left, Order, ReadBack, Runs,
-    START_TIMEOUT, Step, Told, Via,
+    self, BOOT_LOADER, Cause, DeviceIdentity, Expected, FinalDeviceState, FirmwareError, ReadBack,
+    RunningProgram, START_TIMEOUT, Step, UpdateMethod, UpdateProgress, UpdateReport, UpdateRequest,
 };
 use ecaxis::link::sim::SimLink;
 use ecaxis::link::{Link, LinkError, MAX_FRAME, Nanos};
-use ecaxis::mailbox::{FoeError, SdoError, Wire};
-use ecaxis::service::station::Which;
-use ecaxis::service::{Datagrams, carry, device, mailbox};
+use ecaxis::mailbox::{FoeError, MailboxTransport, SdoError};
 use ecaxis::session::simulated_bus;
 use ecaxis_sim::{
     DeviceOptions, FaultScript, FirmwareHeader, FirmwareOptions, Segment, SegmentOptions, SimDevice,
 };
 
-/// The simulated bus with a switch for one device's power.
+/// The simulated bus with a power switch for one device.
 #[derive(Debug)]
 struct Switched {
     link: SimLink,
     position: usize,
     off: Arc<AtomicBool>,
-    /// Datagrams that wrote to 0x0500: whose the EEPROM is.
+    /// The number of datagrams that wrote to 0x0500 (EEPROM access).
     claims: usize,
 }
 
 impl Link for Switched {
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError> {
-        // The first datagram of each: FPWR, and its register.
+        // The first datagram: FPWR to register 0x0500.
         let claim = frame.get(16) == Some(&5) && frame.get(20..22) == Some(&[0x00, 0x05]);
         self.claims += usize::from(claim);
         let on = !self.off.load(Ordering::Relaxed);
@@ -55,13 +55,13 @@ impl Link for Switched {
     }
 }
 
-/// A bus that stays as it is from one command to the next.
+/// A bus that keeps its state between commands.
 struct Bench {
     link: Switched,
     off: Arc<AtomicBool>,
-    /// The user ends the next update.
+    /// The user's cancellation of the next update.
     stop: Arc<AtomicBool>,
-    /// Of whom everything here is.
+    /// The position of the device under test.
     position: u16,
     expected: Expected,
 }
@@ -106,7 +106,7 @@ fn demo() -> Segment {
     simulated_bus(&load("demo.toml"), 1, None, None).expect("a bus")
 }
 
-/// The new firmware's header of the demonstration's devices.
+/// Returns the header of the new firmware for a device of the demonstration.
 fn header(position: u16) -> FirmwareHeader {
     FirmwareHeader {
         vendor: 0xe0a,
@@ -120,7 +120,7 @@ fn header(position: u16) -> FirmwareHeader {
     }
 }
 
-/// A good firmware file of so many bytes.
+/// Returns a valid firmware file with this length.
 fn file(position: u16, len: usize) -> Vec<u8> {
     let program: Vec<u8> = (0..len - 32)
         .map(|n| (n * 31 + n / 251 + n / 65_521) as u8)
@@ -136,23 +136,23 @@ impl Bench {
             .expect("a device")
     }
 
-    fn examine(&mut self) -> Examined {
-        let which = Which::Position(self.position);
+    fn examine(&mut self) -> DeviceIdentity {
+        let which = DeviceSelector::Position(self.position);
         let work = async move |wire| firmware::examine(&wire, which, "x").await;
         let stop = AtomicBool::new(false);
-        let done = carry(&mut self.link, Clock::Virtual, &stop, work);
+        let done = run_on_link(&mut self.link, Clock::Virtual, &stop, work);
         done.expect("carried").expect("examined")
     }
 
-    /// What the command does.
+    /// Runs the update as the command does.
     fn update(
         &mut self,
-        via: Via,
+        via: UpdateMethod,
         file: &[u8],
-        tell: &mut dyn FnMut(Told),
-    ) -> Result<Done, FirmwareError> {
-        let (which, expected) = (Which::Position(self.position), self.expected);
-        let order = Order {
+        report: &mut dyn FnMut(UpdateProgress),
+    ) -> Result<UpdateReport, FirmwareError> {
+        let (which, expected) = (DeviceSelector::Position(self.position), self.expected);
+        let order = UpdateRequest {
             via,
             file: file.to_vec(),
             name: "new.bin".to_owned(),
@@ -161,10 +161,10 @@ impl Bench {
         };
         let work = async move |wire| {
             let before = firmware::examine(&wire, which, "x").await?;
-            firmware::update(&wire, &before, expected, &order, tell).await
+            firmware::update(&wire, &before, expected, &order, report).await
         };
         let stop = Arc::clone(&self.stop);
-        let done = carry(&mut self.link, Clock::Virtual, &stop, work).expect("carried");
+        let done = run_on_link(&mut self.link, Clock::Virtual, &stop, work).expect("carried");
         self.stop.store(false, Ordering::Relaxed);
         done
     }
@@ -175,14 +175,14 @@ impl Bench {
         self.link.link.segment_mut().power(position, on);
     }
 
-    /// The same command, and what it must lead to.
+    /// Runs the same command, which must succeed.
     #[track_caller]
-    fn succeeds(&mut self, via: Via, file: &[u8]) -> Done {
+    fn succeeds(&mut self, via: UpdateMethod, file: &[u8]) -> UpdateReport {
         let done = match self.update(via, file, &mut |_| {}) {
             Ok(done) => done,
             Err(error) => panic!("{via}: {error}"),
         };
-        assert_eq!(done.after.runs(), Runs::Program);
+        assert_eq!(done.after.runs(), RunningProgram::Program);
         let device = self.device();
         assert_eq!(device.firmware(), Some(file), "{via}");
         assert!(!device.is_stopped());
@@ -191,11 +191,11 @@ impl Bench {
     }
 }
 
-/// The ways of the device at a position.
-fn ways(position: u16) -> &'static [Via] {
+/// Returns the update methods of the device at a position.
+fn ways(position: u16) -> &'static [UpdateMethod] {
     match position {
-        0 => &[Via::Foe, Via::Program],
-        _ => &[Via::Foe],
+        0 => &[UpdateMethod::Foe, UpdateMethod::Program],
+        _ => &[UpdateMethod::Foe],
     }
 }
 
@@ -204,27 +204,27 @@ fn number(bytes: Option<Vec<u8>>) -> Option<u32> {
 }
 
 #[test]
-fn a_mebibyte_by_both_ways_with_progress() {
+fn a_mebibyte_is_updated_by_both_methods_with_progress() {
     for position in [0, 1] {
         for &via in ways(position) {
             on_a_bus(demo, position, move |bench| {
                 let before = bench.examine();
-                assert_eq!(before.runs(), Runs::Program);
+                assert_eq!(before.runs(), RunningProgram::Program);
                 assert_eq!(before.sii.identity.revision, 0x0001_0000);
                 let file = file(position, 1 << 20);
                 let (mut moved, mut steps, mut busy) = (Vec::new(), Vec::new(), 0);
-                let mut tell = |told| match told {
-                    Told::Moved { done, of } => {
+                let mut report = |reported| match reported {
+                    UpdateProgress::Moved { done, of } => {
                         assert_eq!(of, 1 << 20);
                         moved.push(done);
                     }
-                    Told::Busy { done, entire } => {
+                    UpdateProgress::Busy { done, entire } => {
                         assert!(done <= entire);
                         busy += 1;
                     }
-                    Told::Step(step) => steps.push(step),
+                    UpdateProgress::Step(step) => steps.push(step),
                 };
-                let done = match bench.update(via, &file, &mut tell) {
+                let done = match bench.update(via, &file, &mut report) {
                     Ok(done) => done,
                     Err(error) => panic!("{via}: {error}"),
                 };
@@ -232,19 +232,19 @@ fn a_mebibyte_by_both_ways_with_progress() {
                 assert!(moved[..=sent].is_sorted());
                 assert!(sent > 1000, "progress in {sent} parts");
                 match via {
-                    Via::Foe => {
+                    UpdateMethod::Foe => {
                         assert!(busy > 10, "erasing and programming take their time");
                         assert_eq!(done.read_back, ReadBack::Same);
                         assert_eq!(moved.last(), Some(&(1 << 20)), "read back");
                     }
-                    Via::Program => {
+                    UpdateMethod::Program => {
                         assert!(matches!(done.read_back, ReadBack::Refused(_)));
                     }
                 }
                 assert_eq!(steps.last(), Some(&Step::Check));
                 assert!(done.took.as_secs() >= 1 && done.took.as_secs() < 600);
 
-                // What it says now, by its EEPROM and its objects.
+                // The new identity in EEPROM and objects.
                 assert_eq!(done.after.sii.identity.revision, 0x0002_0000);
                 assert_eq!(done.after.sii.serial, before.sii.serial);
                 let spoken = done.after.spoken.as_ref().expect("it speaks");
@@ -256,7 +256,7 @@ fn a_mebibyte_by_both_ways_with_progress() {
                 assert_eq!(device.firmware(), Some(&file[..]));
                 assert_eq!(number(device.object(0x1018, 3)), Some(0x0002_0000));
 
-                // It outlives the power, and can be done again.
+                // The new firmware survives a power cycle and can be updated again.
                 bench.power(false);
                 bench.power(true);
                 assert_eq!(bench.examine().sii.identity.revision, 0x0002_0000);
@@ -267,20 +267,24 @@ fn a_mebibyte_by_both_ways_with_progress() {
 }
 
 #[test]
-fn power_lost_at_forty_percent() {
-    // Without the first on the bus no frame comes back; without the second they do.
-    for (position, via) in [(0, Via::Foe), (0, Via::Program), (1, Via::Foe)] {
+fn an_update_succeeds_after_power_loss_at_forty_percent() {
+    // Without the first device, no frames come back; without the second, frames come back.
+    for (position, via) in [
+        (0, UpdateMethod::Foe),
+        (0, UpdateMethod::Program),
+        (1, UpdateMethod::Foe),
+    ] {
         on_a_bus(demo, position, move |bench| {
             let file = file(position, 200_000);
             let off = Arc::clone(&bench.off);
-            let mut tell = |told| {
-                if let Told::Moved { done, of } = told
+            let mut report = |reported| {
+                if let UpdateProgress::Moved { done, of } = reported
                     && done * 100 >= of * 40
                 {
                     off.store(true, Ordering::Relaxed);
                 }
             };
-            let error = bench.update(via, &file, &mut tell).expect_err("no power");
+            let error = bench.update(via, &file, &mut report).expect_err("no power");
             let FirmwareError::Failed {
                 step, cause, left, ..
             } = &error
@@ -288,7 +292,7 @@ fn power_lost_at_forty_percent() {
                 panic!("{error}")
             };
             match via {
-                Via::Foe => {
+                UpdateMethod::Foe => {
                     assert_eq!(*step, Step::Send);
                     let gone = match position {
                         0 => matches!(cause, Cause::Foe(FoeError::Wire { .. })),
@@ -296,7 +300,7 @@ fn power_lost_at_forty_percent() {
                     };
                     assert!(gone, "{error}");
                 }
-                Via::Program => {
+                UpdateMethod::Program => {
                     assert_eq!(*step, Step::Download);
                     assert!(
                         matches!(cause, Cause::Sdo(SdoError::Wire { .. })),
@@ -304,13 +308,13 @@ fn power_lost_at_forty_percent() {
                     );
                 }
             }
-            assert_eq!(*left, Left::Silent);
+            assert_eq!(*left, FinalDeviceState::Silent);
 
-            // The device comes back with its boot loader alone.
+            // Only the boot loader of the device starts.
             bench.power(true);
             let found = bench.examine();
             assert!(bench.device().is_stopped());
-            assert_eq!(found.runs(), Runs::BootLoader);
+            assert_eq!(found.runs(), RunningProgram::BootLoader);
             let spoken = found.spoken.expect("it speaks");
             assert_eq!(spoken.device_type, Some(BOOT_LOADER));
             assert_eq!(
@@ -328,26 +332,30 @@ fn power_lost_at_forty_percent() {
 }
 
 #[test]
-fn who_ends_an_update_leaves_no_device_in_bootstrap() {
-    for (position, via) in [(0, Via::Foe), (0, Via::Program), (1, Via::Foe)] {
+fn a_cancelled_update_leaves_no_device_in_bootstrap() {
+    for (position, via) in [
+        (0, UpdateMethod::Foe),
+        (0, UpdateMethod::Program),
+        (1, UpdateMethod::Foe),
+    ] {
         on_a_bus(demo, position, move |bench| {
             let file = file(position, 200_000);
-            // At once, in the middle of it, and when all is there.
+            // Cancels at the start, in the middle, and at the end.
             for percent in [0, 40, 100] {
                 let stop = Arc::clone(&bench.stop);
-                let mut tell = |told| {
-                    if let Told::Moved { done, of } = told
+                let mut report = |reported| {
+                    if let UpdateProgress::Moved { done, of } = reported
                         && done * 100 >= of * percent
                     {
                         stop.store(true, Ordering::Relaxed);
                     }
                 };
-                let error = bench.update(via, &file, &mut tell).expect_err("ended");
+                let error = bench.update(via, &file, &mut report).expect_err("ended");
                 let FirmwareError::Failed { cause, left, .. } = &error else {
                     panic!("{error}")
                 };
                 assert!(matches!(cause, Cause::Interrupted), "{error}");
-                let init = Left::In {
+                let init = FinalDeviceState::In {
                     state: AlState::Init,
                     code: 0,
                 };
@@ -364,7 +372,7 @@ fn who_ends_an_update_leaves_no_device_in_bootstrap() {
     }
 }
 
-/// A device that has a mailbox and no process data, so that it is in Op without a cycle.
+/// A device with a mailbox but without process data is in Op without a cycle.
 fn without_process_data() -> Segment {
     let esi = std::fs::read_to_string(common::root().join("tests/judges/esi/mailbox.xml"));
     let mut text = esi.expect("the judges' ESI");
@@ -388,19 +396,19 @@ fn without_process_data() -> Segment {
 }
 
 #[test]
-fn the_eeprom_of_a_device_that_runs_is_not_taken_from_it() {
+fn the_eeprom_of_a_running_device_stays_assigned_to_it() {
     on_a_bus(without_process_data, 0, |bench| {
         bench.expected = Expected::default();
         let state = |bench: &Bench| bench.device().al_state().to_string();
         for wanted in [AlState::PreOp, AlState::SafeOp, AlState::Op] {
             let name = &wanted.to_string();
             let never = AtomicBool::new(false);
-            let work = async |wire: Datagrams| {
+            let work = async |wire: DatagramClient| {
                 let at = device::locate(&wire, Locator::Position(0), None).await;
                 let (found, at) = at.expect("located");
                 if found.state == AlState::Init {
                     let sii = device::information(&wire, &found, &at).await.expect("read");
-                    mailbox::lend(&wire, &at, &sii).await.expect("in PreOp");
+                    mailbox::open(&wire, &at, &sii).await.expect("in PreOp");
                     wire.write(at.station, 0x0500, &[1]).await.expect("lent");
                 } else {
                     let devices = std::slice::from_ref(&at);
@@ -408,7 +416,7 @@ fn the_eeprom_of_a_device_that_runs_is_not_taken_from_it() {
                     changed.unwrap_or_else(|error| panic!("{error}"));
                 }
             };
-            carry(&mut bench.link, Clock::Virtual, &never, work).expect("carried");
+            run_on_link(&mut bench.link, Clock::Virtual, &never, work).expect("carried");
             assert_eq!(state(bench), *name);
             bench.link.claims = 0;
             let found = bench.examine();
@@ -423,21 +431,21 @@ fn the_eeprom_of_a_device_that_runs_is_not_taken_from_it() {
         };
         let file = header.file(&[7; 5000]);
         let error = bench
-            .update(Via::Foe, &file, &mut |_| {})
+            .update(UpdateMethod::Foe, &file, &mut |_| {})
             .expect_err("driven");
         assert!(matches!(error, FirmwareError::Driven { .. }), "{error}");
         assert_eq!((bench.link.claims, state(bench).as_str()), (0, "Op"));
 
-        // One that nobody drives gives it up for an update, and in Init.
+        // A device without an active MainDevice releases its EEPROM in Init for an update.
         let never = AtomicBool::new(false);
-        let back = async |wire: Datagrams| {
+        let back = async |wire: DatagramClient| {
             let at = device::locate(&wire, Locator::Position(0), None).await;
             let devices = [at.expect("located").1];
             al::change_state(&wire, &devices, AlState::PreOp, START_TIMEOUT).await
         };
-        let back = carry(&mut bench.link, Clock::Virtual, &never, back).expect("carried");
+        let back = run_on_link(&mut bench.link, Clock::Virtual, &never, back).expect("carried");
         back.unwrap_or_else(|error| panic!("{error}"));
-        let done = bench.update(Via::Foe, &file, &mut |_| {});
+        let done = bench.update(UpdateMethod::Foe, &file, &mut |_| {});
         done.unwrap_or_else(|error| panic!("{error}"));
         assert!(bench.link.claims > 0);
         assert!(!bench.examine().in_use);
@@ -446,31 +454,31 @@ fn the_eeprom_of_a_device_that_runs_is_not_taken_from_it() {
 }
 
 #[test]
-fn what_one_way_left_half_done_the_other_completes() {
+fn an_update_left_incomplete_by_one_method_completes_by_the_other() {
     on_a_bus(demo, 0, |bench| {
         let file = file(0, 50_000);
         let off = Arc::clone(&bench.off);
-        let mut tell = |told| {
-            if let Told::Moved { done: 20_000.., .. } = told {
+        let mut report = |reported| {
+            if let UpdateProgress::Moved { done: 20_000.., .. } = reported {
                 off.store(true, Ordering::Relaxed);
             }
         };
         bench
-            .update(Via::Foe, &file, &mut tell)
+            .update(UpdateMethod::Foe, &file, &mut report)
             .expect_err("no power");
         bench.power(true);
-        // The other way works, too.
-        bench.succeeds(Via::Program, &file);
-        bench.succeeds(Via::Foe, &file);
+        // The other method works as well.
+        bench.succeeds(UpdateMethod::Program, &file);
+        bench.succeeds(UpdateMethod::Foe, &file);
     });
 }
 
 #[test]
-fn a_wrong_file_is_refused_and_the_right_one_taken_afterwards() {
+fn a_wrong_file_is_rejected_and_the_right_one_accepted_afterwards() {
     let good = file(0, 60_000);
     let mut damaged = good.clone();
     damaged[50_000] ^= 1;
-    // Device codes over FoE and by SDO, and whether the old program is still there.
+    // Error codes over FoE and by SDO, and whether the old program remains.
     for (what, wrong, foe, sdo, keeps) in [
         ("noise", vec![0x5a; 60_000], 0x8010, 0x0609_0030, true),
         ("short", vec![0x45; 20], 0x8010, 0x0609_0030, true),
@@ -491,25 +499,25 @@ fn a_wrong_file_is_refused_and_the_right_one_taken_afterwards() {
                     panic!("{what}: {error}")
                 };
                 let state = match (via, cause) {
-                    (Via::Foe, Cause::Foe(error)) => {
+                    (UpdateMethod::Foe, Cause::Foe(error)) => {
                         assert_eq!(error.code(), Some(foe), "{what}: {error}");
                         AlState::Bootstrap
                     }
-                    (Via::Program, Cause::Sdo(error)) => {
+                    (UpdateMethod::Program, Cause::Sdo(error)) => {
                         assert_eq!(error.abort_code(), Some(sdo), "{what}: {error}");
                         AlState::PreOp
                     }
                     _ => panic!("{what}: {error}"),
                 };
-                assert_eq!(*left, Left::In { state, code: 0 }, "{what}");
+                assert_eq!(*left, FinalDeviceState::In { state, code: 0 }, "{what}");
                 let stopped = bench.device().is_stopped();
-                assert_eq!(stopped, via == Via::Program, "{what}");
-                // It can be used as it was, unless its program has been cleared.
+                assert_eq!(stopped, via == UpdateMethod::Program, "{what}");
+                // The device works as before, unless its program was erased.
                 bench.power(false);
                 bench.power(true);
-                let runs = match keeps && via == Via::Foe {
-                    true => Runs::Program,
-                    false => Runs::BootLoader,
+                let runs = match keeps && via == UpdateMethod::Foe {
+                    true => RunningProgram::Program,
+                    false => RunningProgram::BootLoader,
                 };
                 assert_eq!(bench.examine().runs(), runs, "{what}");
                 bench.succeeds(via, &good);
@@ -519,7 +527,7 @@ fn a_wrong_file_is_refused_and_the_right_one_taken_afterwards() {
 }
 
 #[test]
-fn another_device_than_is_meant_is_not_touched() {
+fn a_device_of_another_type_is_not_changed() {
     on_a_bus(demo, 0, |bench| {
         let good = file(0, 5000);
         let meant = bench.expected;
@@ -542,7 +550,7 @@ fn another_device_than_is_meant_is_not_touched() {
             bench.expected = expected;
             let mut touched = false;
             let error = bench
-                .update(Via::Foe, &good, &mut |_| touched = true)
+                .update(UpdateMethod::Foe, &good, &mut |_| touched = true)
                 .expect_err("another device");
             assert!(matches!(error, FirmwareError::Identity { .. }), "{error}");
             assert!(error.to_string().contains(part), "{error}");
@@ -552,28 +560,29 @@ fn another_device_than_is_meant_is_not_touched() {
             assert_eq!(device.firmware(), None);
         }
         bench.expected = meant;
-        // Also while its program is stopped, when it shows only half of its product code.
-        bench.succeeds(Via::Program, &good);
+        // The check also works while the program is stopped, when the device shows only half of its
+        // product code.
+        bench.succeeds(UpdateMethod::Program, &good);
     });
     on_a_bus(demo, 1, |bench| {
         let error = bench
-            .update(Via::Program, &file(1, 5000), &mut |_| {})
+            .update(UpdateMethod::Program, &file(1, 5000), &mut |_| {})
             .expect_err("no 0x1F51");
         assert!(
             matches!(
                 error,
                 FirmwareError::NotOffered {
-                    via: Via::Program,
+                    via: UpdateMethod::Program,
                     ..
                 }
             ),
             "{error}"
         );
-        bench.succeeds(Via::Foe, &file(1, 5000));
+        bench.succeeds(UpdateMethod::Foe, &file(1, 5000));
     });
 }
 
-/// One EPOS4 whose program memory is slow.
+/// One EPOS4 with slow program memory.
 fn slow(firmware: FirmwareOptions) -> impl FnOnce() -> Segment + Send + 'static {
     move || {
         let machine = load("demo.toml");
@@ -588,13 +597,13 @@ fn slow(firmware: FirmwareOptions) -> impl FnOnce() -> Segment + Send + 'static 
 }
 
 #[test]
-fn a_busy_device_is_waited_for_but_not_for_ever() {
+fn a_busy_device_is_awaited_for_a_limited_time() {
     let patient = FirmwareOptions {
         erase_ns: 100_000_000_000,
         ..FirmwareOptions::default()
     };
     on_a_bus(slow(patient), 0, |bench| {
-        let done = bench.succeeds(Via::Foe, &file(0, 5000));
+        let done = bench.succeeds(UpdateMethod::Foe, &file(0, 5000));
         assert!(done.took.as_secs() >= 100);
     });
     let endless = FirmwareOptions {
@@ -604,7 +613,7 @@ fn a_busy_device_is_waited_for_but_not_for_ever() {
     on_a_bus(slow(endless), 0, |bench| {
         let good = file(0, 5000);
         let error = bench
-            .update(Via::Foe, &good, &mut |_| {})
+            .update(UpdateMethod::Foe, &good, &mut |_| {})
             .expect_err("busy");
         let FirmwareError::Failed {
             cause: Cause::Foe(FoeError::Busy { entire: 100, .. }),
@@ -616,14 +625,14 @@ fn a_busy_device_is_waited_for_but_not_for_ever() {
         };
         assert_eq!(
             *left,
-            Left::In {
+            FinalDeviceState::In {
                 state: AlState::Bootstrap,
                 code: 0
             }
         );
-        bench.succeeds(Via::Foe, &good);
+        bench.succeeds(UpdateMethod::Foe, &good);
     });
-    // Clearing may take twenty seconds, no more.
+    // Erasing may take up to twenty seconds.
     let slow_clear = FirmwareOptions {
         erase_ns: 30_000_000_000,
         ..FirmwareOptions::default()
@@ -631,7 +640,7 @@ fn a_busy_device_is_waited_for_but_not_for_ever() {
     on_a_bus(slow(slow_clear), 0, |bench| {
         let good = file(0, 5000);
         let error = bench
-            .update(Via::Program, &good, &mut |_| {})
+            .update(UpdateMethod::Program, &good, &mut |_| {})
             .expect_err("not cleared");
         assert!(
             matches!(
@@ -643,12 +652,12 @@ fn a_busy_device_is_waited_for_but_not_for_ever() {
             ),
             "{error}"
         );
-        bench.succeeds(Via::Foe, &good);
+        bench.succeeds(UpdateMethod::Foe, &good);
     });
 }
 
 #[test]
-fn a_file_beyond_the_program_memory() {
+fn a_file_larger_than_the_program_memory_is_rejected() {
     let small = FirmwareOptions {
         capacity: 4000,
         ..FirmwareOptions::default()
@@ -672,7 +681,7 @@ fn a_file_beyond_the_program_memory() {
 }
 
 #[test]
-fn lost_frames_cost_time_and_nothing_else() {
+fn lost_frames_only_delay_an_update() {
     for &via in ways(0) {
         on_a_bus(demo, 0, move |bench| {
             let script = "seed = 7\n[[fault]]\nkind = \"frame-loss\"\nprobability = 0.002\n\

@@ -1,4 +1,4 @@
-//! What stops together and what goes on: `[[stop.group]]` over a whole run.
+//! Stops of single groups: `[[stop.group]]` over a whole run.
 
 mod common;
 
@@ -10,17 +10,17 @@ use ecaxis::config::Machine;
 use ecaxis::session::Progress;
 use ecaxis_axis::State;
 
-/// `z` first, so that a cable that breaks behind it leaves it alone; `x` and `y` are the gantry.
+/// `z` is first on the bus, so a cable break behind `z` affects only the gantry of `x` and `y`.
 const AXES: [&str; 3] = ["z", "x", "y"];
 const GANTRY: &str = "\n[[stop.group]]\nname = \"gantry\"\naxes = [\"x\", \"y\"]\n";
 const ALONE: &str = "outside = \"continue\"\n";
-/// Before the first fault, `x` and `y` turn, and `z` is on its way.
+/// Before the first fault, `x` and `y` turn, and `z` is moving.
 const TURN: &str = "\n[[step]]\nenable = true\n\n[[step]]\nvelocity = { x = 10.0, y = 10.0 }\n\n[[step]]\nmove = { z = 80.0 }\n";
 const BACK: &str = "\n[[step]]\nmove = { z = 0.0 }\n";
 const FAULT: &str = "[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"1.5s\"\ncode = 0x8611\n";
 const BREAK: &str = "[[fault]]\nkind = \"link-break\"\ndevice = 1\nport = 0\nat = \"1.5s\"\n";
 
-/// `keys` are added to the axis of this name.
+/// Returns the machine with `keys` added to the named axis.
 fn bench(keys: &[(&str, &str)], rest: &str) -> String {
     let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
     for (position, name) in AXES.iter().enumerate() {
@@ -55,7 +55,7 @@ fn says(text: &str, parts: &[&str]) {
 const CAUSE: [&str; 4] = ["`x`", "group `gantry`", "drive fault", "0x8611"];
 
 #[test]
-fn a_fault_in_a_group_stops_it_and_nothing_else() {
+fn a_fault_in_a_group_stops_only_that_group() {
     let (outcome, heard) = common::run(alone(&format!("{TURN}{BACK}")), faults(FAULT));
     outcome.result.expect("the rest goes on");
     let summary = outcome.summary.expect("the cycle has run");
@@ -69,7 +69,7 @@ fn a_fault_in_a_group_stops_it_and_nothing_else() {
         "{x:?}"
     );
     assert_eq!((&y.fault, &y.trip), (&None, &None));
-    // A ramp that is followed to its end leaves the axis on its set-point.
+    // An axis that completes its ramp stays at its set-point.
     assert!((y.final_position - y.target_position).abs() < 0.1, "{y:?}");
     assert_eq!(y.final_state, State::SwitchOnDisabled.to_string());
     let [stop] = &summary.group_stops[..] else {
@@ -77,16 +77,16 @@ fn a_fault_in_a_group_stops_it_and_nothing_else() {
     };
     assert_eq!((stop.group.as_str(), stop.released), ("gantry", false));
     says(&stop.cause, &["`x`", "drive fault", "0x8611"]);
-    let told = heard
+    let reported = heard
         .0
         .iter()
         .filter(|p| matches!(p, Progress::GroupStopped { .. }));
-    assert_eq!(told.count(), 1);
+    assert_eq!(reported.count(), 1);
 }
 
-/// A script must not take what went on without a group of its axes for a finished run.
+/// A script must not treat a run without one of its groups as successful.
 #[test]
-fn a_run_that_ends_without_one_of_its_groups_is_no_success() {
+fn a_run_that_ends_without_one_of_its_groups_fails() {
     let folder = tempfile::tempdir().expect("a folder");
     let esi = common::root().join("configs/esi");
     let fault = folder.path().join("fault.toml");
@@ -103,18 +103,18 @@ fn a_run_that_ends_without_one_of_its_groups_is_no_success() {
             .args([&fault, &file])
             .output()
             .expect("the binary runs");
-        let told = String::from_utf8_lossy(&run.stderr);
-        assert_eq!(run.status.code(), Some(code), "{told}");
+        let reported = String::from_utf8_lossy(&run.stderr);
+        assert_eq!(run.status.code(), Some(code), "{reported}");
         let report: serde_json::Value = serde_json::from_slice(&run.stdout).expect("JSON");
         assert_eq!(report["ok"], code == 0);
         let error = "error: the group `gantry` has stopped and was not reset: `x`";
-        assert_eq!(told.contains(error), code == 1, "{told}");
+        assert_eq!(reported.contains(error), code == 1, "{reported}");
     }
 }
 
-/// The machine stops as without groups, unless it is told to go on.
+/// The machine stops as without groups, unless `outside` is `continue`.
 #[test]
-fn a_group_whose_outside_stops_takes_the_machine_along() {
+fn a_group_whose_outside_stops_stops_the_machine() {
     for groups in ["", GANTRY] {
         let text = bench(&[], &format!("{groups}{TURN}{BACK}"));
         let (error, summary) = run_badly(machine(&text), faults(FAULT));
@@ -130,7 +130,7 @@ fn a_group_whose_outside_stops_takes_the_machine_along() {
 }
 
 #[test]
-fn a_step_that_needs_a_stopped_axis_fails_with_what_stopped_it() {
+fn a_step_for_a_stopped_axis_fails_with_the_cause_of_the_stop() {
     for (step, device) in [
         ("move = { x = 0.0 }", "`x`"),
         ("move = { z = 0.0, y = 0.0 }", "`y`"),
@@ -146,7 +146,7 @@ fn a_step_that_needs_a_stopped_axis_fails_with_what_stopped_it() {
             assert_ne!(axis.final_state, "Operation enabled");
         }
     }
-    // In the middle of it.
+    // The stop occurs during the step.
     let (error, _) = run_badly(
         alone("\n[[step]]\nmove = { z = 80.0, x = 80.0 }\n"),
         faults(FAULT),
@@ -168,18 +168,18 @@ fn reset_and_enable_bring_a_group_back() {
         );
     }
     assert!(summary.group_stops[0].released);
-    let told = heard
+    let reported = heard
         .0
         .iter()
         .filter(|p| matches!(p, Progress::GroupReleased { .. }));
-    assert_eq!(told.count(), 1);
-    // What was not reset is not enabled, whoever is.
+    assert_eq!(reported.count(), 1);
+    // Without a reset, an axis is not enabled, even if others are.
     let early = back.replace("[\"x\"]", "[\"y\"]");
     let (error, _) = run_badly(alone(&format!("{TURN}{early}")), faults(FAULT));
     says(&error, &CAUSE);
 }
 
-/// A fault that the drive's axis resets by itself needs no step for it, but power does.
+/// A drive fault with automatic reset needs no reset step, but power needs an enable step.
 #[test]
 fn an_automatic_reset_leaves_the_power_to_the_program() {
     let steps = format!(
@@ -193,7 +193,7 @@ fn an_automatic_reset_leaves_the_power_to_the_program() {
             .final_error_counts
             .is_some_and(|e| e.abs() <= 1)
     );
-    // Without the dwell and without the step it stays without power.
+    // Without the dwell and the step, the axis stays without power.
     let summary = run_well(
         machine(&bench(&keys, &format!("{GANTRY}{ALONE}{TURN}{BACK}"))),
         faults(FAULT),
@@ -206,7 +206,7 @@ fn an_automatic_reset_leaves_the_power_to_the_program() {
 }
 
 #[test]
-fn a_cable_that_breaks_takes_its_group_alone() {
+fn a_broken_cable_stops_only_its_group() {
     for way in ["quick-stop", "no-power"] {
         let text = bench(
             &[],
@@ -227,9 +227,9 @@ fn a_cable_that_breaks_takes_its_group_alone() {
     }
 }
 
-/// Shorter than the drives' watchdogs: they are still in Op.
+/// The break is shorter than the drives' watchdogs, so they stay in Op.
 #[test]
-fn a_group_that_was_lost_comes_back_when_it_answers_again() {
+fn a_lost_group_returns_when_it_answers_again() {
     let back = "\n[[step]]\nreset = [\"x\", \"y\"]\n\n[[step]]\nenable = [\"x\", \"y\"]\n\n[[step]]\nmove = { x = 1.0, y = 1.0 }\n";
     let short = BREAK.replace("at =", "for = \"20ms\"\nat =");
     let summary = run_well(alone(&format!("{TURN}{back}")), faults(&short));
@@ -240,13 +240,13 @@ fn a_group_that_was_lost_comes_back_when_it_answers_again() {
             .iter()
             .all(|a| a.final_error_counts.is_some_and(|e| e.abs() <= 1))
     );
-    // While it is gone, it does not.
+    // While the group is lost, the step fails.
     let (error, _) = run_badly(alone(&format!("{TURN}{back}")), faults(BREAK));
     says(&error, &["step 5", "group `gantry`", "no longer answers"]);
 }
 
 #[test]
-fn the_whole_bus_takes_all_groups() {
+fn a_lost_bus_stops_all_groups() {
     let silent = "[[fault]]\nkind = \"silent\"\nat = \"1.5s\"\n";
     let (error, summary) = run_badly(alone(&format!("{TURN}{BACK}")), faults(silent));
     says(&error, &["the bus is lost", "without an answer"]);
@@ -255,7 +255,7 @@ fn the_whole_bus_takes_all_groups() {
 }
 
 #[test]
-fn devices_without_an_axis_are_the_machine_s_unless_a_group_has_them() {
+fn devices_without_an_axis_belong_to_the_machine_unless_a_group_lists_them() {
     let io = "\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 3\n";
     let gone = "[[fault]]\nkind = \"power-off\"\ndevice = 3\nat = \"1.5s\"\n";
     let text = bench(&[], &format!("{io}{GANTRY}{ALONE}{TURN}{BACK}"));
@@ -289,16 +289,16 @@ fn an_emergency_and_the_end_stop_every_group() {
     }
 }
 
-/// What a gear follows is in a stopped group: the follower stops with its own.
+/// A gear's leader is in a stopped group, so the follower stops with its own group.
 #[test]
-fn a_follower_in_another_group_is_lost_in_that() {
+fn a_follower_of_a_stopped_group_stops_with_its_own_group() {
     let steps = "\n[[step]]\ngear = { z = { to = \"x\" } }\n\n[[step]]\nvelocity = { x = 10.0, y = 10.0 }\n\n[[step]]\ndwell = \"2s\"\n";
     let (error, _) = run_badly(alone(steps), faults(FAULT));
     says(&error, &["`z`", "follows no longer"]);
     let line = "\n[[step]]\nline = { x = 80.0, z = 80.0 }\n";
     let (_, summary) = run_badly(alone(line), faults(FAULT));
     let summary = summary.expect("the cycle has run");
-    // Not on to the end of the line alone.
+    // It does not continue alone to the end of the line.
     assert!(
         summary.axes[0].final_position < 70.0,
         "{:?}",
@@ -316,9 +316,9 @@ fn a_follower_in_another_group_is_lost_in_that() {
     says(&summary.group_stops[1].cause, &["`z`", "follows no longer"]);
 }
 
-/// A ramp gets the time it takes, whatever other groups would need.
+/// A ramp takes its own time, independent of other groups.
 #[test]
-fn a_gentle_axis_of_the_group_comes_to_rest_on_its_ramp() {
+fn a_slow_axis_of_the_group_completes_its_ramp() {
     let limits = "limits = { position = [-1000.0, 1000.0], velocity = 40.0, acceleration = 5.0, torque = 100.0, following_error = 1.0 }";
     let steps = "\n[[step]]\nvelocity = { y = 40.0 }\n\n[[step]]\nmove = { z = 80.0 }\n\n[[step]]\ndwell = \"10s\"\n";
     let text = bench(&[("y", limits)], &format!("{GANTRY}{ALONE}{steps}"));
@@ -331,9 +331,9 @@ fn a_gentle_axis_of_the_group_comes_to_rest_on_its_ramp() {
     assert_eq!(summary.group_stops.len(), 1);
 }
 
-/// A group that cannot be stopped is not one to go on without.
+/// The machine must not continue if a group cannot be stopped.
 #[test]
-fn a_drive_of_the_group_that_does_not_let_go_stops_the_machine() {
+fn a_group_drive_that_stays_enabled_stops_the_machine() {
     let stuck =
         "[[fault]]\nkind = \"stuck\"\ndevice = 2\nat = \"1.4s\"\nstate = \"operation-enabled\"\n";
     let steps = format!("{TURN}\n[[step]]\ndwell = \"1min\"\n");
@@ -350,7 +350,7 @@ fn a_drive_of_the_group_that_does_not_let_go_stops_the_machine() {
     );
 }
 
-/// A trip is acknowledged at once; a step behind the reset finds the group back.
+/// A trip is acknowledged at once, so a step after the reset finds the group ready.
 #[test]
 fn a_trip_is_reset_like_a_fault() {
     let blocked = "[[fault]]\nkind = \"blocked\"\ndevice = 1\nat = \"1.5s\"\nfor = \"200ms\"\n";
@@ -358,7 +358,7 @@ fn a_trip_is_reset_like_a_fault() {
     let summary = run_well(alone(&format!("{TURN}{back}")), faults(blocked));
     says(&summary.group_stops[0].cause, &["`x`", "following error"]);
     assert!(summary.group_stops[0].released);
-    // While the group still stops: the step waits for it.
+    // The step waits while the group still stops.
     let steps = "\n[[step]]\nenable = true\n\n[[step]]\nvelocity = { x = 10.0, y = 10.0 }\n\n[[step]]\ndwell = \"1.3s\"\n";
     let mut well = 0;
     for ms in (1000..1700).step_by(50) {
@@ -366,7 +366,7 @@ fn a_trip_is_reset_like_a_fault() {
         let (outcome, _) = common::run(alone(&format!("{steps}{back}")), faults(&blocked));
         match outcome.result {
             Ok(()) => well += 1,
-            // It came after the reset.
+            // The trip occurred after the reset.
             Err(error) => says(&error.to_string(), &["group `gantry`", "following error"]),
         }
     }
@@ -374,7 +374,7 @@ fn a_trip_is_reset_like_a_fault() {
 }
 
 #[test]
-fn the_sample_goes_on_without_its_gantry() {
+fn the_sample_continues_without_its_gantry() {
     let summary = run_well(load("groups.toml"), virtual_time());
     assert!(summary.group_stops.is_empty());
     let summary = run_well(load("groups.toml"), faults(FAULT));

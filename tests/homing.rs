@@ -1,4 +1,5 @@
-//! Homing on the simulated bus: every method along a track, what a failure says, and the way back to cyclic set-points.
+//! Homing on the simulated bus: every method on a track, failures, and the return to cyclic
+//! set-points.
 
 #![allow(clippy::print_stdout, reason = "what was measured")]
 
@@ -11,10 +12,10 @@ use ecaxis::session::Options;
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, HomingError, Mode};
 
-/// Where home is called.
+/// The position of home.
 const HOME: f64 = 3.0;
 
-/// One axis that homes by `homing` along `track`.
+/// Returns a machine with one axis that homes with `homing` on `track`.
 fn bench(esi: &str, encoder: u32, homing: &str, track: &str) -> Machine {
     machine(&format!(
         r#"
@@ -39,7 +40,8 @@ track = {{ {track} }}
     ))
 }
 
-/// Where the axis says it is changes by so much besides its motion: the new origin. Turns.
+/// Returns the change of the axis position that is not motion: the offset of the new origin, in
+/// turns.
 fn shift(cycles: &[AxisStatus], dt_s: f64) -> f64 {
     let moved = |w: &[AxisStatus]| w[1].position - w[0].position - w[1].velocity * dt_s;
     let jumps = cycles.windows(2).map(moved);
@@ -53,8 +55,9 @@ fn homing_of(trace: &Trace, act: usize) -> HomingStatus {
 }
 
 #[test]
-fn every_method_finds_its_place_and_goes_on_in_csp() {
-    // Limit switches 6 turns away, home from 2 to 2.5, index at 0.25 of every turn; or mechanical ends 8 turns away.
+fn every_homing_method_finds_its_position_and_returns_to_csp() {
+    // Limit switches at ±6 turns, home from 2 to 2.5, index at 0.25 of each turn; or mechanical
+    // stops at ±8 turns.
     const SWITCHES: &str =
         "negative_limit = -6.0, positive_limit = 6.0, home = [2.0, 2.5], index = 0.25";
     const ENDS: &str = "ends = [-8.0, 8.0], index = 0.25";
@@ -87,7 +90,7 @@ fn every_method_finds_its_place_and_goes_on_in_csp() {
                 &format!("method = {method}{threshold}"),
                 track,
             );
-            // Away from whatever it has just found.
+            // Moves away from the switch or stop that was found.
             let away = if place > 0.0 { HOME - 2.0 } else { HOME + 2.0 };
             let acts = [
                 home(30.0),
@@ -103,7 +106,7 @@ fn every_method_finds_its_place_and_goes_on_in_csp() {
                 "{esi} {method}"
             );
             let found = HOME - shift(trace.of(0), trace.dt_s);
-            // Back in CSP: what is commanded and what is reported stay where they are.
+            // After the return to CSP, commanded and reported positions stay unchanged.
             let back = trace.of(0).iter().rposition(|s| s.mode == Mode::Hm);
             let since =
                 &trace.cycles[trace.began[0] + back.expect("it was homing") + 1..trace.began[2]];
@@ -132,9 +135,9 @@ fn every_method_finds_its_place_and_goes_on_in_csp() {
     }
 }
 
-/// A search of 100 turns.
+/// The search covers 100 turns.
 #[test]
-fn a_limit_switch_a_hundred_turns_away() {
+fn homing_finds_a_limit_switch_a_hundred_turns_away() {
     for (esi, encoder) in [("EPOS4", 2000), ("IDX", 4096)] {
         let machine = bench(esi, encoder, "method = 17", "negative_limit = -100.0");
         let trace = perform_well(machine, "x", &[home(30.0), Act::Dwell(0.2)], virtual_time());
@@ -149,7 +152,7 @@ fn a_limit_switch_a_hundred_turns_away() {
     }
 }
 
-/// What leaves for the drive in 0x607A, in each cycle from before homing to after it.
+/// Checks 0x607A in each cycle from before homing to after it.
 #[test]
 fn the_target_on_the_wire_follows_homing_without_a_jump() {
     let folder = tempfile::tempdir().expect("a temporary folder");
@@ -176,7 +179,7 @@ fn the_target_on_the_wire_follows_homing_without_a_jump() {
         let (target, actual) = (int(sent, 3), int(came, 3));
         let (asked, shown) = (sent[2], came[2]);
         homed |= shown == 6;
-        // CSP is asked for or in force: its target counts.
+        // The target of CSP counts if CSP is requested or active.
         if let Some((last, known)) = before.filter(|_| homed && (asked == 8 || shown == 8)) {
             commanded += 1;
             step = step.max((target - last).abs());
@@ -196,12 +199,12 @@ fn the_target_on_the_wire_follows_homing_without_a_jump() {
     );
     assert!(homed && commanded > 400);
     assert!(worst <= 2, "{worst}");
-    // 50 turns/s in a millisecond.
+    // The limit of 50 turns/s gives 100 counts per millisecond.
     assert!(step <= 100, "{step}");
 }
 
 #[test]
-fn a_home_switch_that_is_not_there_says_step_device_and_what_to_do() {
+fn a_missing_home_switch_is_reported_with_step_device_and_hint() {
     let text = "homing = { method = 23, search = 5.0, timeout = \"2s\" }\n[[step]]\ndwell = \"10ms\"\n[[step]]\nhome = [\"x\"]\n";
     let head = r#"
 [bus]
@@ -233,10 +236,11 @@ limits = { velocity = 50.0, acceleration = 500.0, following_error = 0.5 }
 }
 
 #[test]
-fn ways_not_to_find_home() {
+fn homing_fails_without_its_switch_or_index() {
     let limits = "negative_limit = -3.0, positive_limit = 3.0";
     let rows = [
-        // Between the limit switches is no home switch: the drive gives up after the second.
+        // No home switch exists between the limit switches, so the drive stops after the second
+        // limit switch.
         ("method = 23", limits, HomingError::Drive),
         // The wrong switch comes first.
         (
@@ -244,7 +248,7 @@ fn ways_not_to_find_home() {
             "negative_limit = -90.0",
             HomingError::Timeout { timeout_s: 5.0 },
         ),
-        // No index pulse within two turns.
+        // No index pulse occurs within two turns.
         ("method = 34", "index = false", HomingError::Drive),
     ];
     for (homing, track, expected) in rows {
@@ -266,7 +270,7 @@ fn ways_not_to_find_home() {
     }
 }
 
-/// Halt, as in the application notes' way to stop it.
+/// The stop uses Halt, as in the application notes.
 #[test]
 fn a_stop_ends_homing() {
     let machine = bench("EPOS4", 2000, "method = 17", "negative_limit = -90.0");
@@ -294,9 +298,9 @@ fn the_example_homes_to_the_index() {
     assert_eq!(summary.axes[0].final_error_counts, Some(0), "{summary:?}");
 }
 
-/// What can be known before the bus is touched is said then, at its place in the file.
+/// Errors that are detectable without the bus are reported with their position in the file.
 #[test]
-fn a_homing_that_cannot_be_is_refused_with_the_file() {
+fn an_impossible_homing_is_rejected_with_the_file() {
     let mapped = "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\"]\npdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\"]";
     let no_display =
         "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\"]\npdo.tx = [\"0x6041\", \"0x6064\"]";

@@ -1,5 +1,5 @@
-//! A machine in somebody's hands: the dead-man rule, the speeds, what stops and comes back, under virtual time; and `ecaxis jog`
-//! as it is met with lines and in a terminal.
+//! Manual operation of a machine: the dead-man rule, speeds, stops and resets, in virtual time.
+//! Also `ecaxis jog` with lines and in a terminal.
 
 mod common;
 
@@ -13,26 +13,29 @@ mod lines;
 mod terminal;
 
 use common::{axes, faults, machine, virtual_time};
-use ecaxis::supervise::manual::{Doing, LET_GO, MOST_SPEED, News, Presence, Request, Turn, View};
+use ecaxis::supervise::jog::{
+    Activity, HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
+    View,
+};
 use ecaxis_axis::{Mode, State, Trip};
 use hands::{Seen, by_hand, here, request};
 
-/// Of the machines of `common::axes`: turns a second, and a second squared.
+/// Limits of the machines of `common::axes`, in turns/s and turns/s².
 const VELOCITY: f64 = 50.0;
 const ACCELERATION: f64 = 500.0;
 const CYCLE_S: f64 = 0.001;
-const LET_GO_S: f64 = LET_GO as f64 * 1e-9;
+const LET_GO_S: f64 = HOLD_TO_RUN_TIMEOUT as f64 * 1e-9;
 
-/// Enables axis 0, then leaves the rest to `then`, with the seconds since it was ready.
+/// Enables axis 0, then calls `then` with the seconds since the axis was ready.
 fn once_enabled(
-    mut then: impl FnMut(&View<'_>, f64) -> Option<Turn> + Send + 'static,
-) -> impl FnMut(&View<'_>, f64) -> Turn + Send + 'static {
+    mut then: impl FnMut(&View<'_>, f64) -> Option<OperatorInput> + Send + 'static,
+) -> impl FnMut(&View<'_>, f64) -> OperatorInput + Send + 'static {
     let mut ready = None;
     move |view, now| {
         let axis = &view.snapshot.axes[0];
         if ready.is_none() && !axis.ready {
             return match view.hands[0].doing {
-                Doing::Nothing => request(Request::Enable { axis: 0 }),
+                Activity::Nothing => request(Request::Enable { axis: 0 }),
                 _ => here(),
             };
         }
@@ -41,14 +44,14 @@ fn once_enabled(
     }
 }
 
-/// The commanded velocity and its changes within the limits of what is done by hand, in every cycle that was seen.
+/// Checks that the commanded velocity and its changes stay within the jog limits in every cycle.
 #[track_caller]
 fn within_limits(seen: &[Seen], axis: usize) {
     for pair in seen.windows(2) {
         let [before, now] = [&pair[0].axes[axis], &pair[1].axes[axis]];
         let velocity = now.target_velocity.abs();
         assert!(
-            velocity <= MOST_SPEED * VELOCITY * 1.000_001,
+            velocity <= MAX_MANUAL_SPEED * VELOCITY * 1.000_001,
             "{velocity} turns/s at {} s",
             pair[1].time_s
         );
@@ -64,7 +67,7 @@ fn within_limits(seen: &[Seen], axis: usize) {
 }
 
 #[test]
-fn an_axis_that_is_let_go_brakes() {
+fn a_released_axis_brakes() {
     let velocity = 0.1 * VELOCITY;
     let (outcome, seen) = by_hand(
         machine(&axes(1)),
@@ -84,28 +87,28 @@ fn an_axis_that_is_let_go_brakes() {
         .filter(|s| s.axes[0].target_velocity == velocity);
     let slows = full.clone().next_back().expect("at full speed").time_s;
     let stands = seen.iter().rfind(moving).expect("it jogs").time_s;
-    // Asked for during a second.
+    // The request lasts one second.
     let held = slows - first;
     assert!((held - (1.0 + LET_GO_S)).abs() < 0.02, "{held} s at speed");
     let braking = stands - slows;
     assert!(braking <= velocity / ACCELERATION + 0.005, "{braking} s");
     let news: Vec<_> = seen.iter().flat_map(|s| s.news.clone()).collect();
-    let told = [
-        News::Done {
+    let reported = [
+        JogEvent::Done {
             axis: 0,
-            what: Doing::Enabling,
+            what: Activity::Enabling,
         },
-        News::LetGo { axis: 0 },
-        News::Done {
+        JogEvent::LetGo { axis: 0 },
+        JogEvent::Done {
             axis: 0,
-            what: Doing::Stopping,
+            what: Activity::Stopping,
         },
     ];
-    assert_eq!(news, told);
+    assert_eq!(news, reported);
 }
 
 #[test]
-fn who_is_away_moves_nothing_and_what_moves_brakes() {
+fn an_absent_operator_starts_nothing_and_stops_all_motion() {
     for jogs in [true, false] {
         let (outcome, seen) = by_hand(
             machine(&axes(1)),
@@ -123,7 +126,7 @@ fn who_is_away_moves_nothing_and_what_moves_brakes() {
                 let mut turn = match since {
                     0.0 if !jogs => request(go),
                     ..2.0 if jogs => request(jog),
-                    // A move that is asked for from afar, too.
+                    // A move requested by an absent operator is rejected as well.
                     0.8..0.9 => request(go),
                     ..3.0 => here(),
                     _ => return None,
@@ -131,7 +134,7 @@ fn who_is_away_moves_nothing_and_what_moves_brakes() {
                 if (0.5..1.0).contains(&since) {
                     turn.presence = Presence::Away;
                 }
-                // Nothing more is asked for by who has come back.
+                // The returned operator sends no request.
                 if since >= 1.0 {
                     turn.requests.clear();
                 }
@@ -152,7 +155,7 @@ fn who_is_away_moves_nothing_and_what_moves_brakes() {
 }
 
 #[test]
-fn who_leaves_in_motion_leaves_a_machine_at_rest() {
+fn an_operator_who_leaves_in_motion_leaves_a_machine_at_rest() {
     let (outcome, seen) = by_hand(
         machine(&axes(2)),
         virtual_time(),
@@ -160,7 +163,7 @@ fn who_leaves_in_motion_leaves_a_machine_at_rest() {
             0.0 => Some(request(Request::MoveBy {
                 axis: 0,
                 distance: 80.0,
-                speed: MOST_SPEED,
+                speed: MAX_MANUAL_SPEED,
             })),
             ..0.5 => Some(here()),
             _ => None,
@@ -171,18 +174,18 @@ fn who_leaves_in_motion_leaves_a_machine_at_rest() {
     let last = &seen.last().expect("seen").axes[0];
     assert_eq!(
         last.target_velocity,
-        MOST_SPEED * VELOCITY,
+        MAX_MANUAL_SPEED * VELOCITY,
         "in the middle of it"
     );
     let summary = outcome.summary.expect("a summary");
     assert_eq!(summary.counters.wkc_errors, 0);
-    // 12.5 turns a second for nearly half a second, and braking within the limits.
+    // 12.5 turns/s for nearly half a second, then deceleration within the limits.
     let end = summary.axes[0].final_position;
     assert!((5.0..8.0).contains(&end), "stands at {end}");
 }
 
 #[test]
-fn nothing_faster_than_a_quarter_is_taken() {
+fn jog_rejects_more_than_a_quarter_of_the_speed_limit() {
     let jog = |velocity| Request::Jog { axis: 0, velocity };
     let by = |speed| Request::MoveBy {
         axis: 0,
@@ -190,11 +193,11 @@ fn nothing_faster_than_a_quarter_is_taken() {
         speed,
     };
     let all = [
-        jog(MOST_SPEED * VELOCITY * 1.001),
+        jog(MAX_MANUAL_SPEED * VELOCITY * 1.001),
         jog(-VELOCITY),
         jog(f64::NAN),
         jog(f64::INFINITY),
-        by(MOST_SPEED * 1.001),
+        by(MAX_MANUAL_SPEED * 1.001),
         by(0.0),
         by(-0.1),
         by(f64::NAN),
@@ -219,7 +222,7 @@ fn nothing_faster_than_a_quarter_is_taken() {
         machine(&axes(1)),
         virtual_time(),
         once_enabled(move |view, since| {
-            if since == 0.0 || view.news.iter().any(News::bad) {
+            if since == 0.0 || view.news.iter().any(JogEvent::is_failure) {
                 return next.next().map(request);
             }
             (since < 5.0).then(here)
@@ -228,19 +231,19 @@ fn nothing_faster_than_a_quarter_is_taken() {
     outcome.result.expect("leaving is no failure");
     assert!(seen.iter().all(|s| s.axes[0].target_velocity == 0.0));
     let refused = seen.iter().flat_map(|s| &s.news);
-    let refused = refused.filter(|news| matches!(news, News::Refused { .. }));
+    let refused = refused.filter(|news| matches!(news, JogEvent::Refused { .. }));
     assert_eq!(refused.count(), all.len());
 }
 
 #[test]
-fn a_refusal_does_not_make_the_rule_forget() {
+fn a_rejected_request_keeps_the_dead_man_rule_active() {
     let (outcome, seen) = by_hand(
         machine(&axes(1)),
         virtual_time(),
         once_enabled(|_, since| {
             let mut turn = here();
             if since == 0.0 {
-                // The second is taken before the refusal of the first is heard of.
+                // The second request is accepted before the rejection of the first is reported.
                 turn.requests = vec![
                     Request::MoveTo {
                         axis: 0,
@@ -268,8 +271,8 @@ fn a_refusal_does_not_make_the_rule_forget() {
 }
 
 #[test]
-fn a_range_is_kept_however_long_the_key_is_held() {
-    let velocity = MOST_SPEED * VELOCITY;
+fn jog_stays_within_the_range_while_the_key_is_held() {
+    let velocity = MAX_MANUAL_SPEED * VELOCITY;
     let (outcome, seen) = by_hand(
         machine(&axes(1)),
         virtual_time(),
@@ -323,7 +326,7 @@ fn a_fault_stops_all_axes_and_is_reset() {
     within_limits(&seen, 0);
     let faulty = seen.iter().position(|s| s.axes[1].fault.is_some());
     let faulty = faulty.expect("a fault");
-    // Axis 0 stops with it, loses its power, and both come back.
+    // Axis 0 stops too and loses its power; both axes are enabled again later.
     let after = &seen[faulty..];
     let off = after
         .iter()
@@ -339,7 +342,7 @@ fn a_fault_stops_all_axes_and_is_reset() {
 }
 
 #[test]
-fn an_emergency_stop_takes_the_power_and_wants_a_reset() {
+fn an_emergency_stop_removes_power_and_requires_a_reset() {
     for reset in [true, false] {
         let mut phase = 0;
         let (outcome, seen) = by_hand(
@@ -361,7 +364,7 @@ fn an_emergency_stop_takes_the_power_and_wants_a_reset() {
                         assert!(!axis.enabled && axis.trip == Some(Trip::EmergencyStop));
                         (3, request(Request::Enable { axis: 0 }))
                     }
-                    3 if view.news.iter().any(News::bad) => {
+                    3 if view.news.iter().any(JogEvent::is_failure) => {
                         assert!(!axis.enabled);
                         let enable = Request::Reset { axis: 0 };
                         (if reset { 4 } else { 6 }, request(enable))
@@ -386,7 +389,7 @@ fn an_emergency_stop_takes_the_power_and_wants_a_reset() {
     }
 }
 
-/// An axis that can be homed and switched to CSV.
+/// An axis that supports homing and a switch to CSV.
 const VERSATILE: &str = r#"
 [bus]
 nic = "sim"
@@ -408,7 +411,7 @@ track = { negative_limit = -6.0, positive_limit = 6.0, home = [2.0, 2.5], index 
 "#;
 
 #[test]
-fn an_axis_is_homed_and_switched() {
+fn jog_homes_an_axis_and_switches_its_mode() {
     let plan = [
         Request::Home { axis: 0 },
         Request::MoveTo {
@@ -440,19 +443,19 @@ fn an_axis_is_homed_and_switched() {
     outcome.result.expect("leaving is no failure");
     within_limits(&seen, 0);
     let news = seen.iter().flat_map(|s| s.news.clone());
-    let done: Vec<News> = news
-        .filter(|news| !matches!(news, News::LetGo { .. }))
+    let done: Vec<JogEvent> = news
+        .filter(|news| !matches!(news, JogEvent::LetGo { .. }))
         .collect();
     let done: Vec<String> = done.iter().map(ToString::to_string).collect();
     assert_eq!(done, ["enabled", "homed", "is there", "in CSV", "stopped"]);
     let last = &seen.last().expect("seen").axes[0];
     assert!(last.homed && last.mode == Mode::Csv);
-    // 2 turns a second for 0.3 s, and what beginning and braking take.
+    // 2 turns/s for 0.3 s, plus acceleration and deceleration.
     assert!((5.5..6.0).contains(&last.position), "{}", last.position);
 }
 
 #[test]
-fn homing_ends_when_nobody_is_there() {
+fn homing_ends_without_an_operator() {
     let (outcome, seen) = by_hand(
         machine(VERSATILE),
         virtual_time(),
@@ -481,7 +484,7 @@ fn homing_ends_when_nobody_is_there() {
 }
 
 #[test]
-fn whatever_is_asked_for_at_random_stays_within_the_limits() {
+fn random_requests_stay_within_the_limits() {
     for seed in 1..=12_u64 {
         // xorshift
         let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
@@ -498,7 +501,7 @@ fn whatever_is_asked_for_at_random_stays_within_the_limits() {
                 return hands::gone();
             }
             for (axis, hand) in view.hands.iter().enumerate() {
-                let jogs = matches!(hand.doing, Doing::Jogging { .. });
+                let jogs = matches!(hand.doing, Activity::Jogging { .. });
                 let long = now - last_jog[axis] > LET_GO_S + 0.003;
                 assert!(!(jogs && long), "seed {seed}: still jogs at {now} s");
             }
@@ -514,7 +517,7 @@ fn whatever_is_asked_for_at_random_stays_within_the_limits() {
                 let part = dice(1000) as f64 / 500.0 - 1.0;
                 let again = match dice(60) {
                     0..10 => {
-                        let velocity = part * 2.0 * MOST_SPEED * VELOCITY;
+                        let velocity = part * 2.0 * MAX_MANUAL_SPEED * VELOCITY;
                         last_jog[axis] = now;
                         Request::Jog { axis, velocity }
                     }

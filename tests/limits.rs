@@ -1,5 +1,5 @@
-//! What bounds a drive from outside its set-points: the process data watchdog, the drive's own
-//! limits, and the outputs that no axis drives. Read from the wire.
+//! Limits of a drive besides its set-points: the process data watchdog, the drive's own limits, and
+//! outputs without an axis. Read from the wire.
 
 mod common;
 
@@ -17,7 +17,7 @@ const LRW: u8 = 12;
 /// One datagram of a frame.
 #[derive(Debug, Clone)]
 struct Datagram {
-    /// Otherwise it came back.
+    /// True for a sent frame, false for a received one.
     sent: bool,
     command: u8,
     register: u16,
@@ -54,7 +54,7 @@ fn datagrams(recording: &Path) -> Vec<Datagram> {
     all
 }
 
-/// A machine on ESI files of its own, which last as long as the folder.
+/// A machine with ESI files in a temporary folder.
 struct Bench {
     folder: tempfile::TempDir,
 }
@@ -66,7 +66,7 @@ impl Bench {
         Self { folder }
     }
 
-    /// A file of `configs/esi`, changed.
+    /// Writes a changed copy of a file of `configs/esi`.
     fn esi(&self, name: &str, change: impl Fn(String) -> String) {
         let text = std::fs::read_to_string(root().join("configs/esi").join(name));
         let changed = change(text.expect("an ESI file"));
@@ -110,7 +110,7 @@ dwell = "3s"
 "#;
 
 #[test]
-fn an_axis_has_a_watchdog_whatever_its_esi_says() {
+fn an_axis_has_a_watchdog_with_any_esi() {
     let bench = Bench::new();
     bench.esi("SV1.xml", |text| {
         let changed = text.replace("ControlByte=\"#x64\"", "ControlByte=\"#x24\"");
@@ -135,7 +135,7 @@ fn an_axis_has_a_watchdog_whatever_its_esi_says() {
         let back = back.unwrap_or_else(|| panic!("0x{register:04x} is not read back"));
         assert_eq!(back.data, value.to_le_bytes());
     }
-    // Once frames come back, the drive itself has left Op, by its watchdog.
+    // When frames return, the drive has left Op because of its watchdog.
     let states = |register: u16| {
         let read = all.iter().filter(move |d| !d.sent && d.working_counter > 0);
         read.filter(move |d| d.register <= register && register - d.register < 0x30)
@@ -153,7 +153,8 @@ fn an_axis_has_a_watchdog_whatever_its_esi_says() {
     assert!(expired.contains(&1), "expirations in 0x0442: {expired:?}");
 }
 
-/// An axis of 2000 counts a turn on `configs/esi/EPOS4.xml`, with more keys of its device.
+/// Returns an axis of 2000 counts per turn on `configs/esi/EPOS4.xml`, with additional keys of its
+/// device.
 fn epos4(device: &str, limits: &str) -> String {
     format!(
         r#"
@@ -180,7 +181,7 @@ fn same(text: String) -> String {
     text
 }
 
-/// The default of one of the ESI's objects, behind its index.
+/// Replaces the default of one of the ESI's objects, after its index.
 fn default(text: &str, index: &str, from: &str, to: &str) -> String {
     let at = text
         .find(&format!("<Index>#x{index}</Index>"))
@@ -192,7 +193,7 @@ fn default(text: &str, index: &str, from: &str, to: &str) -> String {
 }
 
 #[test]
-fn a_limit_beyond_what_an_sdo_allows_is_refused() {
+fn a_limit_above_a_startup_sdo_is_rejected() {
     let bench = Bench::new();
     bench.esi("EPOS4.xml", same);
     let wide = "position = [-20.0, 20.0], velocity = 40.0, acceleration = 200.0, torque = 120.0, following_error = 0.5";
@@ -225,16 +226,16 @@ fn a_limit_beyond_what_an_sdo_allows_is_refused() {
         let error = bench.parse(&epos4(&format!("sdo = [{sdo}]"), wide));
         let error = error.expect_err(sdo);
         assert!(error.contains(expected), "{sdo}: {error}");
-        // What the drive allows is fine.
+        // Limits within the drive's limits are accepted.
         let narrow = "position = [-0.9, 0.9], velocity = 9.0, acceleration = 90.0, torque = 99.0, following_error = 0.4";
         bench.machine(&epos4(&format!("sdo = [{sdo}]"), narrow));
     }
 }
 
 #[test]
-fn a_drive_that_allows_less_than_the_file_is_warned_of() {
+fn a_drive_limit_below_the_file_limit_causes_a_warning() {
     let bench = Bench::new();
-    // The simulated motor's own 0x6080 is 6000 rpm.
+    // The 0x6080 of the simulated motor is 6000 rpm.
     bench.esi("EPOS4.xml", |text| default(&text, "6065", "2000", "400"));
     let limits =
         "position = [-20.0, 20.0], velocity = 1000.0, acceleration = 200.0, following_error = 0.5";
@@ -261,7 +262,7 @@ fn a_drive_that_allows_less_than_the_file_is_warned_of() {
 }
 
 #[test]
-fn an_axis_that_its_drive_holds_back_is_told_which_limit_does() {
+fn a_trip_names_the_drive_limit_that_held_the_axis_back() {
     let bench = Bench::new();
     bench.esi("EPOS4.xml", same);
     let limits = "velocity = 150.0, acceleration = 1500.0, following_error = 0.5";
@@ -289,7 +290,7 @@ fn an_axis_that_its_drive_holds_back_is_told_which_limit_does() {
     }
 }
 
-/// The outputs of a device as they left, cycle by cycle.
+/// Returns the sent outputs of a device, cycle by cycle.
 fn outputs(recording: &Path) -> Vec<Vec<u8>> {
     let all = datagrams(recording).into_iter();
     let sent = all.filter(|d| d.sent && d.command == LRW);
@@ -300,7 +301,7 @@ const OFFSET_AND_SECOND_AXIS: &str = "\
 pdo.rx = [\"0x6040\", \"0x607A\", \"0x60B0\", \"0x6840\", \"0x68FF\"]\n\
 pdo.tx = [\"0x6041\", \"0x6061\", \"0x6064\"]";
 
-/// A drive that holds an offset, and power and a velocity for a second axis.
+/// Returns a drive with an offset, and with power and velocity for a second axis.
 fn two_axes(text: String) -> String {
     let object = |index: &str, name: &str, kind: &str, bits: u8, value: u32| {
         format!(
@@ -319,7 +320,7 @@ const LIMITS: &str =
     "position = [-10.0, 10.0], velocity = 10.0, acceleration = 50.0, following_error = 1.0";
 
 #[test]
-fn offsets_and_the_outputs_of_a_second_axis_stay_zero() {
+fn offsets_and_outputs_of_a_second_axis_stay_zero() {
     let bench = Bench::new();
     bench.esi("EPOS4.xml", two_axes);
     let text = epos4(OFFSET_AND_SECOND_AXIS, LIMITS);
@@ -342,7 +343,7 @@ fn offsets_and_the_outputs_of_a_second_axis_stay_zero() {
 }
 
 #[test]
-fn what_adds_to_every_target_is_refused_or_set_to_zero() {
+fn offsets_of_targets_are_rejected_or_set_to_zero() {
     let bench = Bench::new();
     bench.esi("EPOS4.xml", two_axes);
     for index in ["0x60B0", "0x60B1", "0x60B2"] {
@@ -356,14 +357,14 @@ fn what_adds_to_every_target_is_refused_or_set_to_zero() {
         assert!(error.contains("adds to every target"), "{error}");
         bench.machine(&sdo(0));
     }
-    // Held by the drive, and not in its process data.
+    // The drive holds the offset, but the object is not in its process data.
     let (options, path) = bench.record(virtual_time());
     let (outcome, heard) = run(bench.machine(&epos4("", LIMITS)), options);
     outcome.result.expect("nothing moves");
     let warnings = heard.warnings();
     let warned = |w: &String| w.contains("0x60b0:00 (Position offset)");
     assert!(warnings.iter().any(warned), "{warnings:?}");
-    // An expedited download of 0 to 0x60B0, as the drive's mailbox got it.
+    // An expedited download of 0 to 0x60B0, as in the drive's mailbox.
     let download = [0x23, 0xb0, 0x60, 0x00, 0, 0, 0, 0];
     let all = datagrams(&path);
     let mut written = all.iter().filter(|d| d.sent && d.command == FPWR);
@@ -371,7 +372,7 @@ fn what_adds_to_every_target_is_refused_or_set_to_zero() {
 }
 
 #[test]
-fn interpolation_time_is_the_cycle_wherever_csp_or_csv_can_be_reached() {
+fn interpolation_time_equals_the_cycle_if_csp_or_csv_is_possible() {
     let bench = Bench::new();
     bench.esi("EPOS4.xml", same);
     let csp = "pdo.rx = [\"0x6040\", \"0x6060\", \"0x607A\", \"0x6071\"]\n\
@@ -408,7 +409,7 @@ fn terminals(count: usize) -> String {
 }
 
 #[test]
-fn more_than_128_devices_come_up_and_more_than_512_are_refused() {
+fn bring_up_supports_more_than_128_devices_and_rejects_more_than_512() {
     let bench = Bench::new();
     bench.esi("IO8.xml", same);
     let (outcome, _) = run(bench.machine(&terminals(130)), virtual_time());

@@ -1,4 +1,4 @@
-//! The back-ends of a network interface on the two ends of a veth pair. Needs root.
+//! The socket kinds of a network interface at the two ends of a veth pair. Requires root.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
@@ -9,27 +9,27 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use ecaxis::bench::reflector::{Pace, Reflector};
+use ecaxis::bench::reflector::{Reflector, ReplyTiming};
 use ecaxis::bench::veth::VethPair;
-use ecaxis::link::{self, BackEnd, Concern, Link, LinkError, LinkStats, MAX_FRAME};
-use ecaxis::os::packet::{PacketSocket, interface_index};
+use ecaxis::link::{self, Link, LinkError, LinkStats, MAX_FRAME, NicWarning, SocketKind};
+use ecaxis::sys::packet::{PacketSocket, interface_index};
 use wire::over_a_pair;
 
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Sending alone; any will do.
+/// The EtherType for sending.
 const ETHERCAT: u16 = 0x88a4;
 
-fn open(nic: &str, back_end: BackEnd) -> Box<dyn Link> {
+fn open(nic: &str, back_end: SocketKind) -> Box<dyn Link> {
     let (link, concerns) = link::open(nic, back_end).expect("an interface of ours opens");
     assert_eq!(
         concerns,
         [],
-        "the kernel gives a ring, and nobody else uses the interface"
+        "the kernel gives a ring, and no other program uses the interface"
     );
     link
 }
 
-/// A frame of ours with so many bytes of datagrams, the first of them as given.
+/// Returns a frame of ecaxis with `len` bytes of datagrams; the first byte is `first`.
 fn frame(len: u16, first: u8) -> Vec<u8> {
     let mut frame = vec![0xff; 6];
     frame.extend([0x10, 0x10, 0x10, 0x10, 0x00, 0x20]);
@@ -40,7 +40,7 @@ fn frame(len: u16, first: u8) -> Vec<u8> {
     frame
 }
 
-/// The next frame within patience.
+/// Returns the next frame, or `None` after a timeout.
 fn receive(link: &mut dyn Link) -> Option<Vec<u8>> {
     let start = Instant::now();
     let mut buf = [0; MAX_FRAME];
@@ -53,24 +53,24 @@ fn receive(link: &mut dyn Link) -> Option<Vec<u8>> {
     None
 }
 
-/// Something else on the wire that sends what it likes.
+/// Returns another participant on the wire that sends arbitrary frames.
 fn intruder(nic: &str) -> PacketSocket {
     let socket = PacketSocket::new().expect("root may");
-    // Nothing sends this EtherType, so that nothing is received.
+    // No frame has this EtherType, so the socket receives nothing.
     let index = interface_index(nic).expect("an interface of ours");
     socket.bind(index, 0x88b5).expect("bound");
     socket
 }
 
 #[test]
-fn every_length_comes_back_the_same_over_both() {
+fn frames_of_every_length_return_over_both_socket_kinds() {
     over_a_pair(|pair| {
-        let _reflector = Reflector::start(&pair.b, Pace::default(), None).expect("answers");
+        let _reflector = Reflector::start(&pair.b, ReplyTiming::default(), None).expect("answers");
         let lengths = [12_u16, 44, 45, 100, 486, 1000, 1498];
         let mut all = Vec::new();
-        for back_end in BackEnd::ALL {
+        for back_end in SocketKind::ALL {
             let mut link = open(&pair.a, *back_end);
-            // More frames than the ring has slots.
+            // Sends more frames than the ring has slots.
             for turn in 0..100_u8 {
                 for len in lengths {
                     let sent = frame(len, turn);
@@ -84,12 +84,12 @@ fn every_length_comes_back_the_same_over_both() {
             }
             assert_eq!(link.stats(), LinkStats::default(), "{back_end}");
         }
-        assert_eq!(all.len(), 100 * lengths.len() * BackEnd::ALL.len());
+        assert_eq!(all.len(), 100 * lengths.len() * SocketKind::ALL.len());
     });
 }
 
 #[test]
-fn what_is_not_ours_is_counted_and_passed_over() {
+fn foreign_frames_are_counted_and_skipped() {
     over_a_pair(|pair| {
         let tagged = |vlan: u16| {
             let mut bytes = frame(44, 0);
@@ -101,20 +101,21 @@ fn what_is_not_ours_is_counted_and_passed_over() {
             bytes[at] = to;
             bytes
         };
-        for back_end in BackEnd::ALL {
+        for back_end in SocketKind::ALL {
             let mut link = open(&pair.a, *back_end);
             let intruder = intruder(&pair.b);
             let inject = |bytes: &[u8]| intruder.send(bytes).expect("sent");
             inject(&tagged(5));
             inject(&tagged(4094));
-            // Another MainDevice, another receiver, another kind of EtherCAT frame.
+            // Frames of another MainDevice, for another receiver, and of another EtherCAT frame
+            // type.
             inject(&changed(6, 0x50));
             inject(&changed(0, 0x01));
             inject(&changed(15, 0x40));
-            // Not of the EtherType: the kernel does not even show it.
+            // With another EtherType, the kernel does not deliver the frame.
             inject(&changed(12, 0x08));
             inject(&frame(44, 0)[..40]);
-            // A header alone is the least that the kernel sends.
+            // The shortest frame that the kernel sends: a header alone.
             inject(&frame(44, 0)[..14]);
             inject(&frame(44, 7));
             let got = receive(link.as_mut()).expect("the last one is ours");
@@ -131,16 +132,16 @@ fn what_is_not_ours_is_counted_and_passed_over() {
     });
 }
 
-/// A machine that somebody else drives is left to him: nothing at all is sent.
+/// If another MainDevice drives the segment, the link sends nothing.
 #[test]
-fn where_another_main_device_is_heard_no_machine_begins() {
+fn a_machine_does_not_start_next_to_another_main_device() {
     let root = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
     over_a_pair(|pair| {
         let intruder = intruder(&pair.b);
         let ended = AtomicBool::new(false);
-        let told = std::thread::scope(|scope| {
+        let reported = std::thread::scope(|scope| {
             scope.spawn(|| {
-                // As SOEM sends them.
+                // Frames as SOEM sends them.
                 let mut bytes = frame(44, 0);
                 bytes[6..12].fill(0x01);
                 while !ended.load(Ordering::Relaxed) {
@@ -149,7 +150,13 @@ fn where_another_main_device_is_heard_no_machine_begins() {
                 }
             });
             let run = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
-                .args(["run", "configs/demo.toml", "--no-story", "--nic", &pair.a])
+                .args([
+                    "run",
+                    "configs/demo.toml",
+                    "--no-fault-report",
+                    "--nic",
+                    &pair.a,
+                ])
                 .current_dir(root)
                 .output();
             ended.store(true, Ordering::Relaxed);
@@ -161,8 +168,8 @@ fn where_another_main_device_is_heard_no_machine_begins() {
             "error: another MainDevice drives the segment on `{}`: ",
             pair.a
         );
-        assert!(told.contains(&error), "{told}");
-        assert!(told.contains("= help: two of them"), "{told}");
+        assert!(reported.contains(&error), "{reported}");
+        assert!(reported.contains("= help: two of them"), "{reported}");
         let sent = format!("/sys/class/net/{}/statistics/tx_packets", pair.a);
         let sent = std::fs::read_to_string(sent).expect("Linux");
         assert_eq!(sent.trim(), "0", "frames went out");
@@ -170,16 +177,16 @@ fn where_another_main_device_is_heard_no_machine_begins() {
 }
 
 #[test]
-fn nobody_looks_and_the_kernel_counts_what_finds_no_room() {
+fn an_overflow_of_the_receive_buffer_is_counted_by_the_kernel() {
     over_a_pair(|pair| {
-        for back_end in BackEnd::ALL.iter().filter(|b| **b != BackEnd::Packet) {
+        for back_end in SocketKind::ALL.iter().filter(|b| **b != SocketKind::Packet) {
             overflow(&pair, *back_end);
         }
     });
 }
 
-/// Rings of 256 frames.
-fn overflow(pair: &VethPair, back_end: BackEnd) {
+/// Sends more than the rings of 256 frames can hold.
+fn overflow(pair: &VethPair, back_end: SocketKind) {
     let mut link = open(&pair.a, back_end);
     let intruder = intruder(&pair.b);
     for n in 0..400_u32 {
@@ -187,7 +194,7 @@ fn overflow(pair: &VethPair, back_end: BackEnd) {
     }
     let mut buf = [0; MAX_FRAME];
     let mut seen = 0_u64;
-    // What the kernel has still to deliver comes later.
+    // The kernel delivers pending frames later.
     let start = Instant::now();
     while seen + link.stats().dropped < 400 && start.elapsed() < PATIENCE {
         seen += u64::from(link.recv(&mut buf).expect("receives").is_some());
@@ -195,17 +202,17 @@ fn overflow(pair: &VethPair, back_end: BackEnd) {
     let dropped = link.stats().dropped;
     assert!(dropped > 0 && seen > 0);
     assert_eq!(seen + dropped, 400);
-    // And it goes on.
+    // Reception continues afterwards.
     intruder.send(&frame(44, 9)).expect("sent");
     assert_eq!(receive(link.as_mut()).expect("a frame")[16], 9);
     assert_eq!(link.stats().dropped, dropped);
 }
 
 #[test]
-fn an_interface_that_goes_down_is_an_error_until_it_is_up_again() {
+fn an_interface_that_is_down_is_an_error_until_it_is_up_again() {
     over_a_pair(|pair| {
-        let _reflector = Reflector::start(&pair.b, Pace::default(), None).expect("answers");
-        for back_end in BackEnd::ALL {
+        let _reflector = Reflector::start(&pair.b, ReplyTiming::default(), None).expect("answers");
+        for back_end in SocketKind::ALL {
             let mut link = open(&pair.a, *back_end);
             let mut buf = [0; MAX_FRAME];
             pair.set(&pair.a, false).expect("goes down");
@@ -215,14 +222,14 @@ fn an_interface_that_goes_down_is_an_error_until_it_is_up_again() {
                     Err(LinkError::Send(_)) => refused += 1,
                     other => panic!("{back_end}: {other:?}"),
                 }
-                // Once told, or never; in no case does it wait.
+                // The error appears once or never; the call must not block.
                 let _ = link.recv(&mut buf);
             }
             assert_eq!(refused, 100);
             pair.set(&pair.a, true).expect("goes up");
             let start = Instant::now();
             let answer = loop {
-                // The first one may still tell of the past.
+                // The first call may still report the earlier error.
                 let _ = link.send(&frame(44, 2));
                 std::thread::sleep(Duration::from_millis(1));
                 match link.recv(&mut buf) {
@@ -236,14 +243,14 @@ fn an_interface_that_goes_down_is_an_error_until_it_is_up_again() {
 }
 
 #[test]
-fn an_interface_with_an_address_is_told_of() {
+fn an_interface_with_an_ip_address_is_reported() {
     over_a_pair(|pair| {
         let added = Command::new("ip")
             .args(["addr", "add", "192.0.2.7/30", "dev", &pair.a])
             .status();
         assert!(added.expect("ip runs").success());
-        let (_, concerns) = link::open(&pair.a, BackEnd::Ring).expect("it opens all the same");
-        let expected = Concern::Addresses {
+        let (_, concerns) = link::open(&pair.a, SocketKind::Ring).expect("it opens all the same");
+        let expected = NicWarning::Addresses {
             nic: pair.a.clone(),
             addresses: vec!["192.0.2.7".parse().expect("an address")],
         };

@@ -1,4 +1,4 @@
-//! Devices that know no LRW, beside one that does, on the whole bus.
+//! Devices without LRW next to a device with LRW, on the whole bus.
 
 mod common;
 
@@ -15,7 +15,7 @@ const LRD: u8 = 10;
 const LWR: u8 = 11;
 const LRW: u8 = 12;
 
-/// Three drives that move; those that are named know no LRW, as their own ESI file says.
+/// Returns three drives that move; the ESI files of the named ones exclude LRW.
 fn bus(folder: &Path, without: &[&str], exchange: &str) -> Machine {
     let esi = std::fs::read_to_string(root().join("configs/esi/EPOS4.xml")).expect("an ESI file");
     let type_ = "<Type ProductCode=\"#x45500004\"";
@@ -40,7 +40,8 @@ fn bus(folder: &Path, without: &[&str], exchange: &str) -> Machine {
     config::parse(&folder.join("m.toml"), &text).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// The working counters with which each logical command came back, of each cyclic frame; datagrams of one command added up.
+/// Returns the working counters of each logical command per cyclic frame. Datagrams of one command
+/// are added up.
 fn logical(recording: &Path) -> Vec<BTreeMap<u8, u16>> {
     let bytes = std::fs::read(recording).expect("the recording");
     let mut reader = PcapNgReader::new(bytes.as_slice()).expect("pcapng");
@@ -73,9 +74,9 @@ fn logical(recording: &Path) -> Vec<BTreeMap<u8, u16>> {
 }
 
 #[test]
-fn each_device_is_reached_as_it_can_be() {
-    // LRW counts 1 for reading and 2 for writing each device, LRD and LWR 1. In every other cycle an LRD brings the status of
-    // all three mailboxes.
+fn each_device_is_reached_by_a_supported_command() {
+    // LRW counts 1 for reading and 2 for writing per device, LRD and LWR count 1. In every second
+    // cycle, an LRD reads the status of all three mailboxes.
     const STATUS: u16 = 3;
     for (without, expected) in [
         (&[][..], vec![(LRD, 0), (LRW, 9)]),
@@ -104,7 +105,7 @@ fn each_device_is_reached_as_it_can_be() {
                     "{axis:?}"
                 );
             }
-            // The half in the middle is in Op.
+            // The middle half of the frames is in Op.
             let frames = logical(&recording);
             let middle = &frames[frames.len() / 4..frames.len() / 4 * 3];
             assert!(middle.len() > 300, "{}", middle.len());
@@ -129,9 +130,10 @@ fn each_device_is_reached_as_it_can_be() {
     }
 }
 
-/// Whoever leaves is missed by the working counter of its own datagrams, when that of the others is right.
+/// A missing device is detected by the working counter of its own datagrams, even if the other
+/// counters are correct.
 #[test]
-fn a_device_without_lrw_that_leaves_stops_the_machine() {
+fn a_missing_device_without_lrw_stops_the_machine() {
     for without in ["x", "z"] {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let script = "[[fault]]\nkind = \"absent\"\ndevice = 2\nat = \"1200ms\"\n";

@@ -1,4 +1,5 @@
-//! Mailboxes beside the cycle: emergencies from bring-up to the end, transfers by whoever asks.
+//! Mailboxes during cyclic operation: emergencies from bring-up to the end, and transfers of
+//! several callers.
 
 mod common;
 
@@ -27,19 +28,22 @@ fn script(times: &[(&str, u32, u16)]) -> String {
     each.collect()
 }
 
-/// The devices of `configs/`, whose mailbox states are in the process image, and one without.
+/// Returns the devices of `configs/` with mailbox status in the process image, and the same devices
+/// without it.
 fn with_and_without_status_fmmu() -> [(&'static str, String); 2] {
     let with = axes(2);
     let without = with.replace("esi/EPOS4.xml", "NO_STATUS");
     [("with status FMMU", with), ("without", without)]
 }
 
-/// With the demonstration drive's ESI without its third FMMU as `NO_STATUS`.
+/// Parses a machine file. `NO_STATUS` stands for the demonstration drive's ESI without its third
+/// FMMU.
 fn parsed(text: &str) -> (ecaxis::config::Machine, tempfile::TempDir) {
     with_esi(text, "NO_STATUS", "<Fmmu>MBoxState</Fmmu>", "")
 }
 
-/// `name` in the machine file is the demonstration drive's ESI with something else in it, in a folder of its own.
+/// Parses a machine file in which `name` is a changed copy of the demonstration drive's ESI, in a
+/// temporary folder.
 fn with_esi(
     text: &str,
     name: &str,
@@ -57,7 +61,7 @@ fn with_esi(
 }
 
 #[test]
-fn every_emergency_is_told_once_from_bring_up_to_the_end() {
+fn every_emergency_is_reported_once_from_bring_up_to_the_end() {
     let sent = [
         ("5ms", 0, 0x1000),
         ("60ms", 0, 0x1001),
@@ -74,24 +78,24 @@ fn every_emergency_is_told_once_from_bring_up_to_the_end() {
         outcome
             .result
             .unwrap_or_else(|error| panic!("{way}: {error}"));
-        let told: Vec<_> = emergencies(&heard)
+        let reported: Vec<_> = emergencies(&heard)
             .iter()
             .map(|report| (report.device.clone(), report.emergency.code))
             .collect();
-        // In Init nobody sends emergencies; the first is lost in any case.
+        // Devices in Init send no emergencies, so the first one is lost.
         let mut expected: Vec<_> = sent[1..]
             .iter()
             .map(|&(_, device, code)| (format!("a{device}"), code))
             .collect();
-        let mut sorted = told.clone();
+        let mut sorted = reported.clone();
         sorted.sort();
         expected.sort();
-        assert_eq!(sorted, expected, "{way}: {told:?}");
+        assert_eq!(sorted, expected, "{way}: {reported:?}");
         let summary = outcome.summary.expect("a summary");
-        assert_eq!(summary.emergencies.len(), told.len(), "{way}");
+        assert_eq!(summary.emergencies.len(), reported.len(), "{way}");
         assert_eq!(summary.more_emergencies, 0);
         let codes = summary.emergencies.iter().map(|line| line.code);
-        assert!(codes.eq(told.iter().map(|(_, code)| *code)));
+        assert!(codes.eq(reported.iter().map(|(_, code)| *code)));
         for line in &summary.emergencies {
             let in_bring_up = line.at_s < 0.0;
             assert_eq!(line.dc_time_ns.is_none(), in_bring_up, "{way}: {line:?}");
@@ -102,29 +106,32 @@ fn every_emergency_is_told_once_from_bring_up_to_the_end() {
 }
 
 #[test]
-fn emergencies_are_stamped_when_they_come() {
+fn emergencies_have_the_time_of_their_arrival() {
     let script = script(&[("1500ms", 1, 0x5000), ("1750ms", 1, 0x5001)]);
     let many = ("thirty status FMMUs", axes(30));
     for (way, text) in with_and_without_status_fmmu().into_iter().chain([many]) {
         let (machine, _folder) = parsed(&text);
         let (outcome, heard) = common::run(machine, faults(&script));
         outcome.result.expect("emergencies alone stop nothing");
-        let told = emergencies(&heard);
-        let [first, second] = told[..] else {
-            panic!("{way}: {told:?}")
+        let reported = emergencies(&heard);
+        let [first, second] = reported[..] else {
+            panic!("{way}: {reported:?}")
         };
         let apart = |a: u64, b: u64| (b - a).abs_diff(250_000_000);
-        // Every second cycle of 1 ms is for mailboxes: eight of them at once, or one.
-        assert!(apart(first.at, second.at) < 30_000_000, "{way}: {told:?}");
+        // Every second cycle of 1 ms serves mailboxes: eight at once, or one.
+        assert!(
+            apart(first.at, second.at) < 30_000_000,
+            "{way}: {reported:?}"
+        );
         let (Some(a), Some(b)) = (first.dc_time, second.dc_time) else {
-            panic!("{way}: {told:?}")
+            panic!("{way}: {reported:?}")
         };
-        assert!(apart(a, b) < 30_000_000, "{way}: {told:?}");
+        assert!(apart(a, b) < 30_000_000, "{way}: {reported:?}");
     }
 }
 
 #[test]
-fn the_report_of_a_fault_has_what_the_drive_said() {
+fn a_fault_report_contains_the_emergency_of_the_drive() {
     let script = "[[fault]]\nkind = \"drive-fault\"\nat = \"1.5s\"\ndevice = 1\ncode = 0x7320\n";
     let (outcome, _) = common::run(machine(&axes(2)), faults(script));
     let Err(RunError::DriveFault { code, report, .. }) = &outcome.result else {
@@ -142,7 +149,7 @@ fn the_report_of_a_fault_has_what_the_drive_said() {
 }
 
 #[test]
-fn a_device_that_keeps_a_history_is_asked_for_it_when_it_faults() {
+fn the_diagnosis_history_of_a_faulty_device_is_read() {
     let text = axes(2).replace("esi/EPOS4.xml", "KEEPS");
     let coe = "<CoE SdoInfo=\"1\" PdoAssign=\"1\"";
     let (machine, _folder) = with_esi(&text, "KEEPS", coe, &format!("{coe} DiagHistory=\"1\""));
@@ -159,7 +166,7 @@ fn a_device_that_keeps_a_history_is_asked_for_it_when_it_faults() {
     let Err(RunError::DriveFault { report, .. }) = &outcome.result else {
         panic!("{:?}", outcome.result)
     };
-    // The device keeps eight: the two newest lie at the beginning, the third at the end.
+    // The device keeps eight messages: the two newest are at the start, the third is at the end.
     let codes: Vec<_> = report.history.iter().map(|m| m.code).collect();
     assert_eq!(codes, [0x7320_e800, 0x6108_e800, 0x6107_e800]);
     assert!(report.history.iter().all(|m| m.time > 0), "{report:?}");
@@ -167,7 +174,8 @@ fn a_device_that_keeps_a_history_is_asked_for_it_when_it_faults() {
     assert!(text.contains("0x7320e800"), "{text}");
 }
 
-/// Hands the mailboxes to a user on a thread with a tokio runtime of its own, and ends the run when the user is done.
+/// Gives the mailboxes to a user on a thread with its own tokio runtime, and ends the run when the
+/// user is done.
 struct WithUser<F> {
     user: Option<F>,
     stop: Arc<AtomicBool>,
@@ -197,7 +205,7 @@ where
     }
 }
 
-/// However the user ends.
+/// Ends the run when dropped, however the user ends.
 struct EndsTheRun(Arc<AtomicBool>);
 
 impl Drop for EndsTheRun {
@@ -206,7 +214,7 @@ impl Drop for EndsTheRun {
     }
 }
 
-/// Runs a machine of so many axes, without moving them, for as long as a user needs; an hour at most.
+/// Runs a machine with this number of axes at rest until the user is done, at most one hour.
 fn with_user<F>(axis_count: usize, options: Options, user: F) -> (Outcome, Heard)
 where
     F: AsyncFnOnce(Mailboxes) + Send + 'static,
@@ -230,7 +238,7 @@ where
 }
 
 #[test]
-fn users_read_and_write_beside_the_cycle() {
+fn users_read_and_write_in_cyclic_operation() {
     const VENDOR: [u8; 4] = 0x0e0a_u32.to_le_bytes();
     let (outcome, _) = with_user(3, virtual_time(), async |mailboxes| {
         assert!(mailboxes.names().eq(["a0", "a1", "a2"]));
@@ -241,7 +249,7 @@ fn users_read_and_write_beside_the_cycle() {
                 let value = (value + round).to_le_bytes();
                 mailbox.download(0x6065, 0, &value).await.expect("written");
                 assert_eq!(mailbox.upload(0x6065, 0).await, Ok(value.to_vec()));
-                // These drives know no complete access.
+                // These drives do not support complete access.
                 let whole = mailbox.upload_complete(0x1018, 0).await;
                 assert!(matches!(whole, Err(MailboxError::Sdo { .. })), "{whole:?}");
             }
@@ -268,7 +276,7 @@ fn users_read_and_write_beside_the_cycle() {
         };
         assert_eq!(code, 0x0601_0002);
     });
-    outcome.result.expect("nobody was disturbed");
+    outcome.result.expect("an undisturbed run");
     let summary = outcome.summary.expect("a summary");
     assert_eq!(
         summary.counters.lost_frames + summary.counters.wkc_errors,
@@ -276,9 +284,9 @@ fn users_read_and_write_beside_the_cycle() {
     );
 }
 
-/// Each is polled once and dropped: some wait in the queue, some are under way.
+/// Each future is polled once and dropped, some in the queue, some during their transfer.
 #[test]
-fn dropped_futures_leave_nothing_behind() {
+fn dropped_futures_leave_no_transfer_behind() {
     let (outcome, _) = with_user(1, virtual_time(), async |mailboxes| {
         let mailbox = mailboxes.device("a0").expect("it is there");
         for round in 0..40_u64 {
@@ -292,11 +300,11 @@ fn dropped_futures_leave_nothing_behind() {
             }
         }
     });
-    outcome.result.expect("nobody was disturbed");
+    outcome.result.expect("an undisturbed run");
 }
 
 #[test]
-fn transfers_go_on_among_emergencies() {
+fn transfers_continue_during_emergencies() {
     let sent: Vec<(String, u16)> = (0..60)
         .map(|n| (format!("{}ms", 600 + 7 * n), 0x9000 + n))
         .collect();
@@ -312,10 +320,10 @@ fn transfers_go_on_among_emergencies() {
             mailbox.download(0x6065, 0, &value).await.expect("written");
             assert_eq!(mailbox.upload(0x6065, 0).await, Ok(value.to_vec()));
         }
-        // The script goes on for a second.
+        // The script continues for a second.
         tokio::time::sleep(std::time::Duration::from_millis(300)).await;
     });
-    outcome.result.expect("nobody was disturbed");
+    outcome.result.expect("an undisturbed run");
     let codes: Vec<u16> = emergencies(&heard)
         .iter()
         .map(|r| r.emergency.code)
@@ -324,15 +332,15 @@ fn transfers_go_on_among_emergencies() {
 }
 
 #[test]
-fn nobody_is_asked_when_the_run_is_over() {
+fn mailbox_access_fails_after_the_run() {
     let kept = Arc::new(std::sync::Mutex::new(None));
     let keeps = Arc::clone(&kept);
     with_user(1, virtual_time(), async move |mailboxes| {
-        *keeps.lock().expect("nobody panics with it") = Some(mailboxes);
+        *keeps.lock().expect("no panic while it is locked") = Some(mailboxes);
     });
     let mailboxes = kept
         .lock()
-        .expect("nobody panics with it")
+        .expect("no panic while it is locked")
         .take()
         .expect("kept");
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -342,7 +350,7 @@ fn nobody_is_asked_when_the_run_is_over() {
     assert_eq!(asked, Err(MailboxError::Closed { name: "a0".into() }));
 }
 
-/// The devices of `axes` with something of their own in each table.
+/// Returns the devices of `axes` with additional keys in each table.
 fn with_start_up(more: &str) -> ecaxis::config::Machine {
     let text = axes(2);
     let mode = "mode = \"csp\"\n";
@@ -351,7 +359,7 @@ fn with_start_up(more: &str) -> ecaxis::config::Machine {
 }
 
 #[test]
-fn start_up_sdos_that_a_device_holds_are_left_out() {
+fn startup_sdos_that_a_device_already_holds_are_skipped() {
     for (more, leaves_out) in [
         ("", false),
         ("startup = { skip_equal = true }", true),
@@ -361,36 +369,36 @@ fn start_up_sdos_that_a_device_holds_are_left_out() {
         outcome
             .result
             .unwrap_or_else(|error| panic!("{more}: {error}"));
-        let told = heard.0.iter().filter_map(|progress| match progress {
+        let reported = heard.0.iter().filter_map(|progress| match progress {
             Progress::Step(Step::Held { device, held, of }) => Some((device.as_str(), *held, *of)),
             _ => None,
         });
-        let told: Vec<_> = told.collect();
-        let devices: Vec<_> = told.iter().map(|(device, ..)| *device).collect();
+        let reported: Vec<_> = reported.collect();
+        let devices: Vec<_> = reported.iter().map(|(device, ..)| *device).collect();
         assert_eq!(
             devices,
             if leaves_out { vec!["a0", "a1"] } else { vec![] },
             "{more}"
         );
-        for (_, held, of) in told {
+        for (_, held, of) in reported {
             assert!(0 < held && held < of, "{more}: {held} of {of}");
         }
     }
 }
 
 #[test]
-fn a_start_up_sdo_that_is_not_held_stops_bring_up_where_it_is_verified() {
+fn a_startup_sdo_that_is_not_stored_stops_bring_up_with_verification() {
     let script = "[[fault]]\nkind = \"sdo-ignored\"\ndevice = 1\nindex = 0x6065\nsub = 0\n";
     let sdo = "sdo = [{ index = 0x6065, value = 5678 }]";
     let (outcome, _) = common::run(with_start_up(sdo), faults(script));
-    outcome.result.expect("nobody looks");
+    outcome.result.expect("a run without observers");
     let verified = sdo.replace(" }", ", verify = true }");
     let (outcome, _) = common::run(with_start_up(&verified), faults(script));
-    let told = outcome
+    let reported = outcome
         .result
         .expect_err("it holds another value")
         .to_string();
     for part in ["`a1`", "0x6065", "Following error window", "0x0000162e"] {
-        assert!(told.contains(part), "{part}: {told}");
+        assert!(reported.contains(part), "{part}: {reported}");
     }
 }

@@ -1,4 +1,5 @@
-//! Parameters and EEPROMs of simulated devices: through the library in virtual time, and as a user meets `ecaxis sdo` and `ecaxis eeprom`.
+//! Parameters and EEPROMs of simulated devices: through the library in virtual time, and through
+//! `ecaxis sdo` and `ecaxis eeprom`.
 
 #[path = "parameters/cli.rs"]
 mod cli;
@@ -8,40 +9,40 @@ use std::sync::atomic::AtomicBool;
 use std::thread;
 
 use common::{fixture, machine, root};
+use ecaxis::acyclic::eeprom::{Eeprom, EepromAccess};
+use ecaxis::acyclic::image::{with_alias, write};
+use ecaxis::acyclic::{DatagramClient, Registers, ServiceError, device, mailbox, run_on_link};
 use ecaxis::bringup::{AlState, al, bring_up};
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, Locator, Machine};
 use ecaxis::link::sim::SimLink;
-use ecaxis::mailbox::desk::Listen;
-use ecaxis::mailbox::{CoeClient, Emergencies, FoeClient, ObjectList, Wire};
-use ecaxis::parameters::collect::{Collected, collect};
+use ecaxis::mailbox::worker::EmergencySink;
+use ecaxis::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
 use ecaxis::parameters::compare::compare;
 use ecaxis::parameters::dump::Dump;
 use ecaxis::parameters::restore::restore;
-use ecaxis::parameters::rules::is_setting;
-use ecaxis::parameters::{DataType, Kind, items, learn};
+use ecaxis::parameters::restore_order::is_setting;
+use ecaxis::parameters::upload::{UploadResult, collect};
+use ecaxis::parameters::{DataType, Kind, dictionary, items};
 use ecaxis::rt::image::{plan, process_data};
-use ecaxis::service::eeprom::{Claim, Eeprom};
-use ecaxis::service::image::{with_alias, write};
-use ecaxis::service::{Datagrams, Registers, ServiceError, carry, device, mailbox};
 use ecaxis::session::simulated_bus;
 use ecaxis_esi::Dictionary;
 use ecaxis_sim::FirmwareHeader;
 
-/// Hears no emergencies.
+/// Ignores emergencies.
 #[derive(Debug)]
 struct Deaf;
 
-impl Listen for Deaf {
+impl EmergencySink for Deaf {
     fn listen(&self, _: &str, _: &Emergencies) {}
 }
 
-/// Futures here hold whole frames by value.
+/// The stack size; futures in these tests hold whole frames by value.
 const STACK: usize = 16 << 20;
 
 type Work<T> = Box<dyn FnOnce(&mut SimLink) -> T + Send>;
 
-/// Something done on a machine's simulated bus, in virtual time, between one power-on and the next.
+/// Runs operations on a machine's simulated bus in virtual time, with a power cycle between them.
 fn on<T: Send + 'static>(machine: Machine, works: Vec<Work<T>>) -> Vec<T> {
     let there = thread::Builder::new().stack_size(STACK).spawn(move || {
         Clock::Virtual.enter();
@@ -61,13 +62,13 @@ fn on<T: Send + 'static>(machine: Machine, works: Vec<Work<T>>) -> Vec<T> {
     there.expect("a thread").join().expect("no panic")
 }
 
-fn carried<T>(link: &mut SimLink, work: impl AsyncFnOnce(Datagrams) -> T) -> T {
-    carry(link, Clock::Virtual, &AtomicBool::new(false), work).expect("carried")
+fn carried<T>(link: &mut SimLink, work: impl AsyncFnOnce(DatagramClient) -> T) -> T {
+    run_on_link(link, Clock::Virtual, &AtomicBool::new(false), work).expect("carried")
 }
 
-/// A piece of work on one device's mailbox.
+/// Runs an operation on one device's mailbox.
 async fn with_device<T>(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     position: u16,
     work: impl AsyncFnOnce(&mut CoeClient) -> T,
 ) -> T {
@@ -84,8 +85,8 @@ async fn with_device<T>(
     done.expect("a mailbox")
 }
 
-/// 64 KiB, in segments.
-async fn large_object_there_and_back(coe: &mut CoeClient, wire: &Datagrams) {
+/// Transfers 64 KiB in segments in both directions.
+async fn large_object_there_and_back(coe: &mut CoeClient, wire: &DatagramClient) {
     let data: Vec<u8> = (0..65_536_u32).map(|n| (n * 7 + n / 251) as u8).collect();
     let written = coe.download(wire, 0x2100, 0, false, &data).await;
     written.expect("written");
@@ -93,12 +94,13 @@ async fn large_object_there_and_back(coe: &mut CoeClient, wire: &Datagrams) {
     assert!(back == data, "{} bytes", back.len());
 }
 
-/// A device with mailboxes of 48 bytes: 440 objects and more, one of 64 KiB, a record of 60 entries.
+/// Returns a device with mailboxes of 48 bytes and more than 440 objects, including one of 64 KiB
+/// and a record of 60 entries.
 fn large() -> (tempfile::TempDir, Machine) {
     large_with(|esi| esi)
 }
 
-/// Likewise, described otherwise.
+/// Same as `large`, with a changed ESI.
 fn large_with(change: impl FnOnce(String) -> String) -> (tempfile::TempDir, Machine) {
     let folder = tempfile::tempdir().expect("a folder");
     let esi = root().join("tests/judges/esi/mailbox.xml");
@@ -154,7 +156,7 @@ fn large_with(change: impl FnOnce(String) -> String) -> (tempfile::TempDir, Mach
 }
 
 #[test]
-fn a_small_mailbox_carries_what_is_large() {
+fn a_small_mailbox_transfers_large_objects() {
     let (_folder, machine) = large();
     let described = machine.devices[0].selection.dictionary.clone();
     let work = Box::new(move |link: &mut SimLink| {
@@ -163,7 +165,7 @@ fn a_small_mailbox_carries_what_is_large() {
                 assert_eq!((coe.layout().out_len, coe.layout().in_len), (48, 48));
                 large_object_there_and_back(coe, &wire).await;
 
-                // The record, in one piece and in parts.
+                // Reads the record with complete access and by subindex.
                 let whole = coe.upload(&wire, 0x3000, 0, true).await.expect("read");
                 let (count, entries) = whole.split_at(2);
                 assert_eq!((count, entries.len()), (&[60, 0][..], 240));
@@ -174,7 +176,7 @@ fn a_small_mailbox_carries_what_is_large() {
                     assert_eq!(u32::from_le_bytes(*entry), u32::from(n) * 1000);
                 }
 
-                // The list, and what every object is.
+                // Reads the object list and the description of every object.
                 let list = coe
                     .object_list(&wire, ObjectList::All)
                     .await
@@ -184,11 +186,11 @@ fn a_small_mailbox_carries_what_is_large() {
                     .await
                     .expect("there")
                     .1;
-                let mut told = (0, 0);
-                let mut progress = |done, all| told = (done, all);
-                let own = learn::dictionary(coe, &wire, &at, &mut progress).await;
+                let mut reported = (0, 0);
+                let mut progress = |done, all| reported = (done, all);
+                let own = dictionary::dictionary(coe, &wire, &at, &mut progress).await;
                 let own = own.expect("a dictionary");
-                assert_eq!(told, (list.len() - 1, list.len()));
+                assert_eq!(reported, (list.len() - 1, list.len()));
                 same(&described, &own);
             })
             .await;
@@ -197,9 +199,9 @@ fn a_small_mailbox_carries_what_is_large() {
     on(machine, vec![work]);
 }
 
-/// The largest there are: one datagram of a full frame.
+/// The maximum mailbox size: one datagram of a full frame.
 #[test]
-fn mailboxes_as_long_as_a_frame_carry_everything() {
+fn frame_sized_mailboxes_transfer_everything() {
     let (_folder, machine) = large_with(|esi| {
         let long = esi.replace("DefaultSize=\"48\"", "DefaultSize=\"1486\"");
         let boot = "<BootStrap>0010000100160001</BootStrap>";
@@ -265,14 +267,14 @@ fn mailboxes_as_long_as_a_frame_carry_everything() {
     on(machine, vec![work]);
 }
 
-/// What the ESI says the device says, too.
+/// Checks that the device's own description equals that of the ESI.
 fn same(described: &Dictionary, own: &Dictionary) {
     for (object, item) in items(described) {
         let at = format!("{:#06x}:{:02}", object.index, item.sub);
-        let told = own
+        let reported = own
             .object(object.index)
             .unwrap_or_else(|| panic!("{at} is missing"));
-        assert_eq!(told.name, object.name, "{at}");
+        assert_eq!(reported.name, object.name, "{at}");
         let found = own.item(object.index, item.sub);
         let found = found.unwrap_or_else(|| panic!("{at} is missing"));
         if !item.name.is_empty() {
@@ -281,15 +283,15 @@ fn same(described: &Dictionary, own: &Dictionary) {
         assert_eq!(found.access, item.access, "{at}");
         let types =
             [item, found].map(|i| DataType::named(&i.type_name, i.bit_len).expect("a type"));
-        let [expected, told] = types;
-        assert_eq!(told.kind, expected.kind, "{at}");
+        let [expected, reported] = types;
+        assert_eq!(reported.kind, expected.kind, "{at}");
         if expected.bits <= 0xffff {
-            assert_eq!(told.bits, expected.bits, "{at}");
+            assert_eq!(reported.bits, expected.bits, "{at}");
         }
     }
 }
 
-/// Two drives of a kind.
+/// Returns two drives of one type.
 fn twins(esi: &str) -> Machine {
     let drive = |name: &str, position: u32| {
         format!(
@@ -303,7 +305,7 @@ fn twins(esi: &str) -> Machine {
     ))
 }
 
-async fn everything(wire: &Datagrams, position: u16, dictionary: &Dictionary) -> Collected {
+async fn everything(wire: &DatagramClient, position: u16, dictionary: &Dictionary) -> UploadResult {
     let at = device::locate(wire, Locator::Position(position), None)
         .await
         .expect("there")
@@ -315,14 +317,14 @@ async fn everything(wire: &Datagrams, position: u16, dictionary: &Dictionary) ->
     .await
 }
 
-/// Changes what can be changed, keeps it in a file, brings it to the other drive.
+/// Changes every changeable setting, saves it in a file, and restores it to the other drive.
 fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
     let dictionary = machine.devices[0].selection.dictionary.clone();
     let work = Box::new(move |link: &mut SimLink| {
         carried(link, async |wire| {
             let before = everything(&wire, 0, &dictionary).await;
             assert_eq!(before.refused, []);
-            // Every setting that takes another value gets one; PDO lists get shorter.
+            // Changes every setting that accepts another value; PDO lists become shorter.
             let mut changed = 0;
             with_device(&wire, 0, async |coe| {
                 for list in [0x1c12, 0x1c13] {
@@ -369,14 +371,14 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
             })
             .await;
             assert!(restored.complete(), "{restored:?}");
-            // Elements beyond a shorter list's count are not written.
+            // Elements beyond the count of a shorter list are not written.
             let meant = differ.iter().filter(|difference| difference.left.is_some());
             assert_eq!(restored.written, meant.count(), "{restored:?}");
 
             let right = everything(&wire, 1, &dictionary).await;
             let differ_now = compare(&dump.parameters, &right.parameters, false);
             assert_eq!(differ_now, []);
-            // Once more there is nothing to do.
+            // A second restore has nothing to write.
             let again = with_device(&wire, 1, async |coe| {
                 let file = &dump.parameters;
                 let done = restore(coe, &wire, &at, &dictionary, file, &mut |_, _| {}).await;
@@ -391,13 +393,13 @@ fn from_one_to_the_other(machine: Machine) -> (usize, usize) {
 }
 
 #[test]
-fn the_settings_of_one_drive_become_those_of_another() {
+fn the_settings_of_one_drive_are_restored_to_another() {
     let (differed, written) = from_one_to_the_other(twins("esi/EPOS4.xml"));
     assert!(differed >= 15 && written >= 15, "{differed} {written}");
 }
 
 #[test]
-fn also_with_the_makers_own_description() {
+fn settings_are_restored_with_the_vendor_esi_as_well() {
     let Some(esi) = fixture("esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
         return;
     };
@@ -407,7 +409,7 @@ fn also_with_the_makers_own_description() {
 }
 
 #[test]
-fn an_alias_that_is_written_counts_after_the_next_power_on() {
+fn a_written_alias_applies_after_the_next_power_on() {
     let text = std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demo");
     let demo = machine(&text);
     let by_alias = machine(&text.replacen("position = 0", "alias = 1001", 1));
@@ -417,7 +419,7 @@ fn an_alias_that_is_written_counts_after_the_next_power_on() {
                 .await
                 .expect("there")
                 .1;
-            let eeprom = Eeprom::claim(&wire, &at, "writing", Claim::IfFree)
+            let eeprom = Eeprom::claim(&wire, &at, "writing", EepromAccess::IfFree)
                 .await
                 .expect("free");
             let mut image = eeprom.image(&mut |_, _| {}).await.expect("an image");
@@ -428,7 +430,7 @@ fn an_alias_that_is_written_counts_after_the_next_power_on() {
                 .expect("written");
             // The alias and the checksum.
             assert_eq!(words, 2);
-            // Not before the device is switched on again.
+            // The new alias does not apply before the next power-on.
             let found = device::locate(&wire, Locator::Alias(1001), None).await;
             assert!(
                 matches!(found, Err(ServiceError::NotFound { .. })),
@@ -453,14 +455,15 @@ fn an_alias_that_is_written_counts_after_the_next_power_on() {
 }
 
 #[test]
-fn a_device_in_init_goes_back_there_with_its_eeprom_lent_as_before() {
+fn a_device_in_init_returns_to_init_with_its_eeprom_assignment() {
     let work = Box::new(|link: &mut SimLink| {
         carried(link, async |wire| {
-            // As other MainDevices leave it behind: with its EEPROM lent to the device.
+            // Other MainDevices leave the device in this state: Init, with its EEPROM assigned to
+            // the PDI.
             let at = device::locate(&wire, Locator::Position(0), None).await;
             let station = at.expect("there").1.station;
             wire.write(station, 0x0500, &[1]).await.expect("written");
-            let state = async |wire: &Datagrams| {
+            let state = async |wire: &DatagramClient| {
                 let at = device::locate(wire, Locator::Position(0), None).await;
                 at.expect("there").0.state
             };

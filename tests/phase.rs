@@ -1,5 +1,5 @@
-//! How well the release of frames keeps its place against SYNC0, as the simulated drives see it: when a frame's outputs
-//! come, against their own SYNC0 pulses.
+//! The phase of frames relative to SYNC0 as the simulated drives see it: the arrival of a frame's
+//! outputs relative to the drive's own SYNC0 pulses.
 
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to see")]
 
@@ -18,13 +18,13 @@ use ecaxis::link::sim::SimLink;
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
 use ecaxis::rt::cycle::Engine;
 use ecaxis::rt::phase::{Gains, Phase};
-use ecaxis::session::{Job, Prepared, Progress, simulated_bus};
+use ecaxis::session::{Prepared, Progress, RunBuilder, simulated_bus};
 
 const DRIVES: usize = 3;
 const SECOND: Nanos = 1_000_000_000;
 
-/// Of one drive and frame: when, how long after its last SYNC0, the system time of the reference's SYNC0, and how much later than there
-/// frames come.
+/// One frame at one drive: the arrival, the time since its last SYNC0, the reference system time of
+/// that SYNC0, and the frame delay relative to the reference.
 #[derive(Debug, Clone, Copy)]
 struct Arrival {
     at: Nanos,
@@ -34,7 +34,7 @@ struct Arrival {
     delay: i64,
 }
 
-/// The simulated bus, whose drives are asked after every cyclic frame.
+/// The simulated bus, whose drives are evaluated after every cyclic frame.
 #[derive(Debug)]
 struct Asked {
     bus: SimLink,
@@ -80,7 +80,7 @@ impl Link for Asked {
 fn drives(cycle: &str, offset_ms: u64) -> String {
     let mut text = format!("[bus]\ncycle = \"{cycle}\"\n");
     for n in 0..DRIVES {
-        // The first is the reference clock.
+        // The first drive is the reference clock.
         let clock = if n == 0 {
             format!("drift_ppm = 80.0\njitter = \"2us\"\noffset = \"{offset_ms}us\"")
         } else {
@@ -95,11 +95,11 @@ fn drives(cycle: &str, offset_ms: u64) -> String {
     text
 }
 
-/// How far frames came from where they were to come.
+/// The deviations of frames from their intended phase.
 struct Kept {
-    /// From the first cyclic frame to the lock.
+    /// The time from the first cyclic frame to the lock.
     locked_after: Option<Nanos>,
-    /// Nanoseconds, of all drives, from 2 s on, in order of size.
+    /// The deviations in ns of all drives from 2 s on, sorted.
     deviations: Vec<i64>,
 }
 
@@ -120,9 +120,9 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
         bus: SimLink::new(bus),
         arrivals: Arc::clone(&arrivals),
     };
-    let (progress, told) = channel();
+    let (progress, reported) = channel();
     let stop = Arc::new(AtomicBool::new(false));
-    let job = Job {
+    let job = RunBuilder {
         machine: &Arc::new(machine),
         options: &options,
         stop,
@@ -136,14 +136,14 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
     let plan = supervisor.bus.dc.expect("a reference clock");
     parts.phase = Some(Phase::with_gains(&plan, gains));
     let mut engine = Engine::new(parts);
-    let mut beside = pin!(supervisor.run());
+    let mut during = pin!(supervisor.run());
     let mut context = Context::from_waker(Waker::noop());
     let start = clock::now();
     let mut locked_after = None;
     while clock::now() < start + seconds * SECOND {
         engine.cycle();
-        assert!(beside.as_mut().poll(&mut context).is_pending());
-        for progress in told.try_iter() {
+        assert!(during.as_mut().poll(&mut context).is_pending());
+        for progress in reported.try_iter() {
             if matches!(progress, Progress::PhaseLocked) {
                 locked_after = Some(clock::now() - start);
             }
@@ -169,7 +169,7 @@ fn keep(cycle: &str, seed: u64, gains: Gains, seconds: u64) -> Kept {
 }
 
 #[test]
-fn frames_keep_their_place_against_a_drifting_and_jittering_reference() {
+fn frames_keep_their_phase_to_a_drifting_and_jittering_reference() {
     for cycle in ["1ms", "250us", "4ms"] {
         for seed in 1..=4 {
             let kept = keep(cycle, seed, Gains::DEFAULT, 12);

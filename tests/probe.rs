@@ -1,4 +1,5 @@
-//! Probing on the simulated bus: what the drive's touch probe captures is where the track has its edge, whatever the axis does.
+//! Touch probes on the simulated bus: the captured position equals the edge on the track for any
+//! motion of the axis.
 
 mod common;
 
@@ -43,7 +44,7 @@ fn step(probe: &str) -> String {
     format!("[[step]]\nprobe = {{ feeler = {{ {probe} }} }}\nspeed = 0.2\n")
 }
 
-/// Runs one probing step: the summary, with what it has found.
+/// Runs one probing step. Returns the summary and the captured position.
 fn probed(more: &str, track: &str, steps: &str) -> (Summary, f64) {
     let summary = run_well(machine(&axis(more, track, steps)), virtual_time());
     let [found] = summary.probes.as_slice() else {
@@ -54,11 +55,11 @@ fn probed(more: &str, track: &str, steps: &str) -> (Summary, f64) {
 }
 
 #[test]
-fn edges_are_captured_to_the_count() {
+fn probe_captures_edges_to_the_count() {
     let inverted = format!("invert = true\n{RANGE}");
     let shifted = format!("offset = 7.0\n{RANGE}");
     let both = "{ probe1 = [10.0, 12.0], probe2 = [20.0, 21.0] }";
-    // A falling edge is the first count behind.
+    // A falling edge is the first count after the switch.
     let rows = [
         (RANGE, both, "to = 50.0", 10.0),
         (RANGE, both, "to = 50.0, edge = \"rising\", input = 1", 10.0),
@@ -101,7 +102,7 @@ fn edges_are_captured_to_the_count() {
             "to = 50.0",
             10.0,
         ),
-        // The input is on when the search begins.
+        // The input is on when the search starts.
         (
             RANGE,
             "{ start = 11.0, probe1 = [10.0, 12.0] }",
@@ -116,7 +117,7 @@ fn edges_are_captured_to_the_count() {
             "{probe}: {position}, not {expected}"
         );
         let axis = &summary.axes[0];
-        // At rest behind the edge, long before the end of the search.
+        // The axis stops behind the edge, long before the end of the search.
         let behind = (axis.target_position - expected).abs();
         assert!(behind > 0.1 && behind < 3.0, "{probe}: {axis:?}");
         assert_eq!(
@@ -127,9 +128,9 @@ fn edges_are_captured_to_the_count() {
     }
 }
 
-/// However fast the axis passes, what is captured is the place itself; how far it runs on is another matter.
+/// The captured position is independent of the speed; only the overrun differs.
 #[test]
-fn what_is_captured_does_not_depend_on_the_speed() {
+fn captured_positions_do_not_depend_on_the_speed() {
     let mut overrun = 0.0;
     for speed in [0.01, 0.1, 0.5, 1.0] {
         let text = format!("[[step]]\nprobe = {{ feeler = {{ to = 60.0 }} }}\nspeed = {speed}\n");
@@ -137,7 +138,8 @@ fn what_is_captured_does_not_depend_on_the_speed() {
         assert!((position - 25.0).abs() < COUNT / 2.0, "{speed}: {position}");
         let beyond = summary.axes[0].target_position - position;
         assert!(beyond > overrun, "{speed}: {beyond} after {overrun}");
-        // A stop from v with a takes v²/2a; the edge is seen two cycles late at most, the set-point leads by one or two.
+        // A stop from v with a takes v²/2a. The edge is detected two cycles late at most, and the
+        // set-point leads by one or two cycles.
         let velocity = 250.0 * speed;
         let most = velocity * velocity / 5000.0 + 0.006 * velocity + 0.01;
         assert!(beyond < most, "{speed}: {beyond}, at most {most}");
@@ -146,7 +148,7 @@ fn what_is_captured_does_not_depend_on_the_speed() {
 }
 
 #[test]
-fn places_on_a_modulo_axis_are_told_wrapped_and_counted_on() {
+fn modulo_axes_report_captured_positions_wrapped_and_continuous() {
     let round = format!("modulo = 36.0\nway = \"positive\"\n{ENDLESS}");
     let track = "{ start = 30.0, probe1 = [40.0, 41.0] }";
     let (outcome, Heard(heard)) = run(
@@ -165,10 +167,10 @@ fn places_on_a_modulo_axis_are_told_wrapped_and_counted_on() {
         found.to_string(),
         "`feeler`: rising edge of input 1 at 4.0000 mm"
     );
-    let told = heard
+    let reported = heard
         .iter()
         .filter(|p| matches!(p, Progress::Captured { run: 1, capture } if capture == found));
-    assert_eq!(told.count(), 1);
+    assert_eq!(reported.count(), 1);
     let axis = &summary.axes[0];
     assert!(
         axis.final_place.is_some_and(|p| p > 4.0 && p < 7.0),
@@ -178,7 +180,7 @@ fn places_on_a_modulo_axis_are_told_wrapped_and_counted_on() {
 }
 
 #[test]
-fn the_example_finds_the_same_place_every_time() {
+fn the_example_finds_the_same_position_every_time() {
     let summary = run_well(load("probe.toml"), virtual_time());
     let found: Vec<_> = summary
         .probes
@@ -196,9 +198,9 @@ fn the_example_finds_the_same_place_every_time() {
     assert!((found[2].3 - 410.0).abs() < 0.03, "{found:?}");
 }
 
-/// Also where the drive goes by itself, and where the position loop is here.
+/// Covers profile modes of the drive and a position loop in the MainDevice.
 #[test]
-fn probing_in_other_modes() {
+fn probe_works_in_other_modes() {
     let looped = format!("csv = {{ kv = 20.0 }}\n{RANGE}");
     for mode in ["pp", "csv"] {
         let steps = format!(
@@ -215,8 +217,8 @@ fn probing_in_other_modes() {
 }
 
 #[test]
-fn an_edge_that_does_not_come_fails_the_step() {
-    for (track, probe, told) in [
+fn a_missing_edge_fails_the_step() {
+    for (track, probe, reported) in [
         (
             "{}",
             "to = 50.0",
@@ -232,7 +234,7 @@ fn an_edge_that_does_not_come_fails_the_step() {
             "to = 50.0, edge = \"falling\"",
             "no falling edge",
         ),
-        // On already.
+        // The input is already on.
         (
             "{ start = 11.0, probe1 = [10.0, 12.0] }",
             "to = 50.0",
@@ -248,7 +250,7 @@ fn an_edge_that_does_not_come_fails_the_step() {
         let (error, summary) = run_badly(machine(&text), virtual_time());
         assert!(error.starts_with("step 1 (line "), "{error}");
         assert!(
-            error.contains("`feeler`") && error.contains(told),
+            error.contains("`feeler`") && error.contains(reported),
             "{probe}: {error}"
         );
         let axis = &summary.expect("the cycle has run").axes[0];
@@ -258,7 +260,7 @@ fn an_edge_that_does_not_come_fails_the_step() {
 
 /// Edges of an earlier search do not count.
 #[test]
-fn each_search_begins_anew() {
+fn each_search_ignores_earlier_edges() {
     let steps = format!(
         "{}{}",
         step("to = 50.0"),

@@ -1,4 +1,5 @@
-//! The program's steps on the simulated bus: power, inputs and outputs, repetition, and what is said when one fails.
+//! The program's steps on the simulated bus: power, inputs and outputs, repetition, and error
+//! messages of failed steps.
 
 mod common;
 
@@ -41,22 +42,23 @@ position = 2
 "#;
 
 fn steps(heard: &Heard) -> Vec<String> {
-    let told = heard.0.iter();
-    told.filter_map(|progress| match progress {
-        Progress::Program { step, .. } => Some(step.number.clone()),
-        _ => None,
-    })
-    .collect()
+    let reported = heard.0.iter();
+    reported
+        .filter_map(|progress| match progress {
+            Progress::Program { step, .. } => Some(step.number.clone()),
+            _ => None,
+        })
+        .collect()
 }
 
-/// Runs the steps, and gives the result with the numbers of the steps that began.
+/// Runs the steps. Returns the result, the numbers of the started steps, and the summary.
 fn program(text: &str) -> (Result<(), RunError>, Vec<String>, ecaxis::session::Summary) {
     let (outcome, heard) = run(machine(&format!("{HEAD}{text}")), virtual_time());
     let summary = outcome.summary.expect("the cycle has run");
     (outcome.result, steps(&heard), summary)
 }
 
-/// An axis at constant velocity never stands: a switch of modes does not wait for that.
+/// An axis at constant velocity never stands, so a mode switch must not wait for standstill.
 #[test]
 fn a_mode_step_at_constant_velocity_does_not_wait() {
     let endless = HEAD.replace("position = [-60.0, 60.0], ", "").replace(
@@ -80,14 +82,14 @@ fn a_mode_step_at_constant_velocity_does_not_wait() {
     };
     let without = cycles("");
     for modes in ["csv", "csv csp", "pv csp", "csv pv csp"] {
-        // A second of simulated time is long for what takes a few cycles.
+        // A mode switch takes a few cycles, far less than a second of simulated time.
         assert!(cycles(modes) < without + 1000, "{modes}");
     }
 }
 
-/// The drive samples its position with its own loop, 2.5 times a cycle.
+/// The drive samples its position in its own loop, 2.5 times per cycle.
 #[test]
-fn a_reported_position_is_followed_up_to_the_velocity_limit() {
+fn a_gear_follows_a_reported_position_up_to_the_velocity_limit() {
     for speed in [0.3, 0.5, 0.7, 0.9] {
         let text = format!(
             "[[step]]\ngear = {{ y = {{ to = \"x\", actual = true }} }}\n\
@@ -100,7 +102,7 @@ fn a_reported_position_is_followed_up_to_the_velocity_limit() {
 }
 
 #[test]
-fn the_example_does_everything_in_order() {
+fn the_example_runs_all_steps_in_order() {
     let (outcome, heard) = run(load("program.toml"), virtual_time());
     outcome.result.expect("runs");
     assert_eq!(
@@ -151,14 +153,15 @@ dwell = "300ms"
 }
 
 #[test]
-fn only_the_axes_that_are_named_get_power() {
+fn only_named_axes_are_enabled() {
     let (result, _, summary) = program("[[step]]\nenable = \"y\"\n[[step]]\ndwell = \"20ms\"\n");
     result.expect("runs");
     let enabled: Vec<_> = summary.axes.iter().map(|a| a.was_enabled).collect();
     assert_eq!(enabled, [false, true]);
 }
 
-/// What can be seen in the file is refused there; a program that is repeated from the command line is not.
+/// Errors visible in the file are rejected with the file. A repetition from the command line is
+/// checked during the run.
 #[test]
 fn a_move_of_an_axis_without_power_fails_its_step() {
     let text =
@@ -185,7 +188,7 @@ fn a_move_of_an_axis_without_power_fails_its_step() {
 }
 
 #[test]
-fn an_input_that_does_not_come_ends_the_program_with_its_name() {
+fn a_missing_input_fails_the_program_with_its_name() {
     let (result, ran, _) = program(
         r#"
 [[step]]
@@ -206,7 +209,7 @@ dwell = "1s"
 }
 
 #[test]
-fn process_data_of_a_drive_can_be_waited_for() {
+fn a_step_can_wait_for_process_data_of_a_drive() {
     let (result, ran, _) = program(
         r#"
 [[step]]
@@ -219,9 +222,9 @@ disable = true
     assert_eq!(ran, ["1", "2"]);
 }
 
-/// An endless loop of steps that take no time would keep the machine from being stopped.
+/// An endless loop of steps without duration must not prevent a stop of the machine.
 #[test]
-fn steps_that_take_no_time_let_the_cycle_turn() {
+fn steps_without_duration_let_the_cycle_run() {
     let mut options = virtual_time();
     options.limit = Some(50_000_000);
     let text = format!("{HEAD}[[step]]\nset = {{ io.\"Output 1\" = true }}\n");
@@ -236,7 +239,7 @@ fn steps_that_take_no_time_let_the_cycle_turn() {
 }
 
 #[test]
-fn lines_gears_tables_and_waves() {
+fn program_runs_lines_gears_tables_and_waves() {
     let (outcome, heard) = run(load("together.toml"), virtual_time());
     outcome.result.expect("runs");
     assert_eq!(steps(&heard).len(), 8);
@@ -255,10 +258,10 @@ fn lines_gears_tables_and_waves() {
     );
 }
 
-/// A line goes on where lost frames have held it up. A drive that loses its targets at full speed, 250 mm/s, overshoots by 2.7 mm:
-/// more than the 2.0 of the file.
+/// A line continues after a delay by lost frames. A drive that loses its targets at full speed, 250
+/// mm/s, overshoots by 2.7 mm, which exceeds the 2.0 of the file.
 #[test]
-fn lost_frames_hold_a_line_up() {
+fn lost_frames_delay_a_line() {
     for (speed, following_error) in [(0.4, "2.0"), (1.0, "3.0")] {
         a_line_is_held_up(speed, following_error);
     }
@@ -290,7 +293,7 @@ fn a_line_is_held_up(speed: f64, following_error: &str) {
 }
 
 #[test]
-fn a_gear_stays_engaged_until_the_follower_is_told_otherwise() {
+fn a_gear_stays_engaged_until_another_command_for_the_follower() {
     let (result, _, summary) = program(
         r#"
 [[step]]
@@ -316,9 +319,9 @@ dwell = "300ms"
     );
 }
 
-/// A position that jumps, because home was found, must not take another axis along.
+/// Homing changes the leader's position, which must not move the follower.
 #[test]
-fn what_is_followed_cannot_search_its_home_nor_lose_its_power() {
+fn a_leader_can_neither_home_nor_lose_power() {
     let text = HEAD.replacen(
         "following_error = 2.0 }",
         "following_error = 2.0 }\nhoming = { method = 37, position = 7.0 }",
@@ -370,9 +373,9 @@ fn a_follower_that_cannot_follow_stops_the_machine() {
     assert!(x.final_position < 49.0, "stopped on the way: {x:?}");
 }
 
-/// What goes by time cannot wait for lost frames: it must not count as done.
+/// Time-based motion cannot wait for lost frames, so the step must not count as done.
 #[test]
-fn lost_frames_in_a_table_or_a_wave_fail_the_step() {
+fn lost_frames_in_a_table_or_wave_fail_the_step() {
     for step in [
         "table = { x = \"points.csv\" }",
         "sine = { x = { amplitude = 2.0, frequency = 2.0, periods = 4 } }",
@@ -392,7 +395,8 @@ fn lost_frames_in_a_table_or_a_wave_fail_the_step() {
     }
 }
 
-/// The cycles after which the targets of `x` and `y` stay as they are while they are enabled, on the wire.
+/// Returns the cycles after which the targets of `x` and `y` on the wire stay constant while
+/// enabled.
 fn last_changes(step: &str) -> [usize; 2] {
     let fine = HEAD.replace("encoder = 2000", "encoder = 1000000").replace(
         "mode = \"csp\"\n",
@@ -417,9 +421,9 @@ fn last_changes(step: &str) -> [usize; 2] {
     })
 }
 
-/// The last micrometres of a slow move are less than a count a cycle.
+/// The last micrometres of a slow move are less than a count per cycle.
 #[test]
-fn axes_that_are_to_arrive_together_do() {
+fn axes_of_a_line_arrive_together() {
     let step = "[[step]]\nmove = { x = 50.0, y = -3.0 }\n";
     let [x, y] = last_changes(step);
     assert!(x > y + 50, "each as fast as it can: {x}, {y}");
@@ -433,10 +437,10 @@ fn axes_that_are_to_arrive_together_do() {
     }
 }
 
-/// In the file's units; a place on the turn where the axis comes round.
+/// Positions are in the file's units; a modulo axis reports a position within its period.
 #[test]
-fn a_target_that_is_not_reached_is_told_in_its_unit() {
-    // Between two counts, and the window is narrower than one.
+fn an_unreached_target_is_reported_in_its_unit() {
+    // The target is between two counts, and the window is narrower than a count.
     let modulo = HEAD
         .replacen("position = [-60.0, 60.0], ", "", 1)
         .replacen("unit = \"mm\"", "unit = \"deg\"\nmodulo = 360.0", 1)

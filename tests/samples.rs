@@ -9,7 +9,8 @@ use common::{Heard, load, run, virtual_time};
 use ecaxis::session::{AxisLine, Progress, Summary};
 use ecaxis_axis::{Command, Mode};
 
-/// Runs one of the samples; what was reported, a line a second, and the steps that began.
+/// Runs one of the samples. Returns the summary, the reported lines (one per second), and the
+/// started steps.
 fn sample(name: &str) -> (Summary, Vec<AxisLine>, Vec<String>) {
     let (outcome, Heard(heard)) = run(load(&format!("samples/{name}.toml")), virtual_time());
     if let Err(error) = outcome.result {
@@ -39,31 +40,33 @@ fn largest(lines: &[AxisLine], of: impl Fn(&AxisLine) -> f64) -> f64 {
 }
 
 #[test]
-fn csp_ten_turns_and_back() {
+fn csp_moves_ten_turns_and_back() {
     let (summary, _, steps) = sample("csp");
     let repeated = ["4.1", "4.2", "4.3", "4.4"];
     assert_eq!(steps, [&["1", "2", "3"][..], &repeated, &repeated].concat());
     let axis = &summary.axes[0];
     assert_eq!(axis.final_error_counts, Some(0), "{axis:?}");
     assert_eq!(axis.target_position, 0.0);
-    // Ten turns at 25 turns/s and 150 turns/s² take 0.567 s; two there, two back, and 1.4 s of dwell.
+    // Ten turns at 25 turns/s and 150 turns/s² take 0.567 s: two moves there, two back, and 1.4 s
+    // of dwell.
     assert!((summary.machine_seconds - 3.7).abs() < 1.5, "{summary:?}");
 }
 
 #[test]
-fn homing_to_the_switch_and_the_index_below_it() {
+fn homing_finds_the_switch_and_the_index_below_it() {
     let (summary, lines, _) = sample("homing");
     let axis = &summary.axes[0];
     assert_eq!(
         (axis.target_position, axis.final_error_counts),
         (0.0, Some(0))
     );
-    // The switch begins at 4.0, the index below it lies at 3.1: at 100 rpm that takes 2.4 s, and 0.9 turns at 10 rpm 5.4 s.
+    // The switch starts at 4.0, and the index below it is at 3.1. This takes 2.4 s at 100 rpm, and
+    // 5.4 s for 0.9 turns at 10 rpm.
     assert!(largest(&lines, |l| l.position) > 3.0, "{lines:?}");
 }
 
 #[test]
-fn ppm_absolute_and_relative() {
+fn ppm_moves_absolutely_and_relatively() {
     let (summary, lines, steps) = sample("ppm");
     assert_eq!(steps, ["1", "2", "3", "4", "5"]);
     let axis = &summary.axes[0];
@@ -76,7 +79,7 @@ fn ppm_absolute_and_relative() {
 }
 
 #[test]
-fn pvm_runs_turns_round_and_halts() {
+fn pvm_reverses_and_halts() {
     let (_, lines, _) = sample("pvm");
     let velocities: Vec<f64> = lines.iter().map(|l| l.velocity).collect();
     for wanted in [16.667, -16.667] {
@@ -89,7 +92,7 @@ fn pvm_runs_turns_round_and_halts() {
 }
 
 #[test]
-fn csv_runs_turns_round_and_stands() {
+fn csv_reverses_and_stops() {
     let (_, lines, _) = sample("csv");
     let velocities: Vec<f64> = lines.iter().map(|l| l.velocity).collect();
     for wanted in [16.667, -16.667] {
@@ -101,7 +104,7 @@ fn csv_runs_turns_round_and_stands() {
 }
 
 #[test]
-fn cst_speeds_up_and_lets_go() {
+fn cst_accelerates_and_coasts() {
     let (_, lines, _) = sample("cst");
     assert!(
         lines.iter().any(|l| (l.torque - 10.0).abs() < 0.5),
@@ -110,7 +113,7 @@ fn cst_speeds_up_and_lets_go() {
     assert!(largest(&lines, |l| l.velocity) > 20.0, "{lines:?}");
 }
 
-/// What stops each of the drive's own profiles half way: halt.
+/// Halt stops the drive's own profiles half way.
 #[test]
 fn ppm_and_pvm_stop_by_halt() {
     let acts = [
@@ -123,7 +126,7 @@ fn ppm_and_pvm_stop_by_halt() {
         Act::Above(5.0),
         Act::Do(Command::Stop),
         Act::Dwell(0.5),
-        // It does not go on with the old target, but to a new one.
+        // The axis does not continue to the old target, but to a new one.
         move_to(1.0, 0.5),
     ];
     let trace = perform_well(load("samples/ppm.toml"), "x", &acts, virtual_time());

@@ -1,4 +1,5 @@
-//! What signals do to a run whose axis moves, with real processes. The axis is judged by the recording.
+//! Effects of signals on a run with a moving axis, with real processes. The recording shows the
+//! motion.
 
 mod common;
 
@@ -8,13 +9,13 @@ use std::process::{Command, Output, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
-use common::wire::{Told, calmly};
+use common::wire::{ProgramOutput, retry_if_host_stalled};
 use common::{axes, root, script};
 use rustix::process::Signal;
 
-/// Set-points change by so much a cycle at most: 5 turns a second of 2000 counts, and rounding.
+/// The maximum set-point change per cycle: 5 turns/s of 2000 counts, plus rounding.
 const STEP: i32 = 11;
-/// After this long in its step the axis moves.
+/// The axis moves after this time in its step.
 const IN_MOTION: Duration = Duration::from_millis(400);
 
 struct Bench {
@@ -22,7 +23,8 @@ struct Bench {
 }
 
 impl Bench {
-    /// An axis that moves for half a minute, on a bus that a stalling test computer does not break.
+    /// Creates an axis that moves for half a minute, on a bus that tolerates a stalling test
+    /// computer.
     fn new() -> Self {
         let bench = Self {
             folder: tempfile::tempdir().expect("a folder"),
@@ -50,7 +52,8 @@ impl Bench {
         self.path(name).display().to_string()
     }
 
-    /// `ecaxis run` of this axis; by a shell where `before` is what the shell does first.
+    /// Returns the command for `ecaxis run` with this axis. With `before`, a shell runs that text
+    /// first.
     fn command(&self, before: &str, more: &[&str]) -> Command {
         let mut command = Command::new("sh");
         command
@@ -65,19 +68,19 @@ impl Bench {
         command
     }
 
-    fn run(&self, before: &str, more: &[&str]) -> Told {
+    fn run(&self, before: &str, more: &[&str]) -> ProgramOutput {
         let _ = std::fs::remove_file(self.recording());
-        Told::start(&mut self.command(before, more))
+        ProgramOutput::start(&mut self.command(before, more))
     }
 }
 
-/// Until its axis moves.
-fn moving(run: &mut Told) {
+/// Waits until the axis moves.
+fn moving(run: &mut ProgramOutput) {
     run.says("step 1: ");
     sleep(IN_MOTION);
 }
 
-/// Its exit code, and its result.
+/// Returns exit code and result.
 #[track_caller]
 fn ended(output: &Output) -> (i32, serde_json::Value, String) {
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -107,14 +110,14 @@ fn interrupted(output: &Output, recording: Option<&Path>) {
 }
 
 #[test]
-fn interrupt_terminate_and_hang_up_stop_a_run_in_motion() {
-    calmly(|| {
+fn signals_stop_a_run_in_motion() {
+    retry_if_host_stalled(|| {
         let bench = Bench::new();
         for signals in [
             &[Signal::INT][..],
             &[Signal::TERM],
             &[Signal::HUP],
-            // As timeout(1) does, and as a terminal that closes may do.
+            // timeout(1) does this, and so may a closing terminal.
             &[Signal::TERM, Signal::TERM],
             &[Signal::HUP, Signal::HUP],
         ] {
@@ -130,8 +133,8 @@ fn interrupt_terminate_and_hang_up_stop_a_run_in_motion() {
 }
 
 #[test]
-fn a_run_interrupted_in_bring_up_or_at_rest_exits_likewise() {
-    calmly(|| {
+fn an_interrupted_run_in_bring_up_or_at_rest_has_the_same_exit_code() {
+    retry_if_host_stalled(|| {
         let bench = Bench::new();
         for (line, more) in [
             ("scanning", &[][..]),
@@ -148,8 +151,8 @@ fn a_run_interrupted_in_bring_up_or_at_rest_exits_likewise() {
 }
 
 #[test]
-fn signals_that_stop_nothing() {
-    calmly(|| {
+fn ignored_signals_do_not_stop_a_run() {
+    retry_if_host_stalled(|| {
         let bench = Bench::new();
         for (before, signals) in [
             ("trap '' HUP;", &[Signal::HUP][..]),
@@ -180,10 +183,10 @@ fn signals_that_stop_nothing() {
     });
 }
 
-/// The terminal or the program that reads is gone: nothing is said any more, and the machine goes on.
+/// The terminal or the reading program has ended: output stops, and the machine continues.
 #[test]
-fn a_run_without_readers_goes_on() {
-    calmly(|| {
+fn a_run_without_readers_continues() {
+    retry_if_host_stalled(|| {
         let bench = Bench::new();
         let _ = std::fs::remove_file(bench.recording());
         let mut command = bench.command("", &["--for", "2s", "-vv"]);
@@ -196,10 +199,11 @@ fn a_run_without_readers_goes_on() {
     });
 }
 
-/// The drive does not leave Operation enabled: what failed goes before what was interrupted. The second signal leaves at once.
+/// The drive stays in Operation enabled, so the exit code reports the failure instead of the
+/// interruption. A second signal ends the program at once.
 #[test]
-fn a_stop_that_fails_is_a_failure() {
-    calmly(|| {
+fn a_failed_stop_exits_as_a_failure() {
+    retry_if_host_stalled(|| {
         let bench = Bench::new();
         let stuck =
             "[[fault]]\nkind = \"stuck\"\ndevice = 0\nat = \"1s\"\nstate = \"operation-enabled\"\n";
@@ -223,15 +227,16 @@ fn a_stop_that_fails_is_a_failure() {
     });
 }
 
-/// The library's own stop, and an observer that panics: the axis comes to rest before the process ends.
+/// With the library's own stop, and with an observer that panics, the axis comes to rest before the
+/// process ends.
 #[test]
 fn the_example_stops_at_a_signal() {
-    calmly(|| {
+    retry_if_host_stalled(|| {
         let Some(example) = example() else { return };
         for (signal, code) in [(Signal::TERM, 130), (Signal::HUP, 130)] {
             let mut command = Command::new(&example);
             command.stdin(Stdio::null()).stdout(Stdio::null());
-            let mut run = Told::start(&mut command);
+            let mut run = ProgramOutput::start(&mut command);
             run.says("Enabled");
             sleep(IN_MOTION);
             run.signal(signal);
@@ -244,7 +249,7 @@ fn the_example_stops_at_a_signal() {
     });
 }
 
-/// `examples/controller`, which cargo builds together with the tests.
+/// Returns `examples/controller`, which cargo builds together with the tests.
 fn example() -> Option<PathBuf> {
     let binary = Path::new(env!("CARGO_BIN_EXE_ecaxis"));
     let example = binary.parent()?.join("examples/controller");

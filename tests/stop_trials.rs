@@ -1,7 +1,9 @@
-//! How drives in motion come to rest, whatever happens to the program, the host or the bus: over a veth pair (root), judged by what the
-//! simulated drives do (`ecaxis sim --trace`). Prints for each trial the time to standstill and the means.
+//! Stops of drives in motion after failures of the program, the host or the bus: over a veth pair
+//! (root), judged by the motion of the simulated drives (`ecaxis sim --trace`). Prints the time to
+//! standstill and the means of each trial.
 //!
-//! `ECAXIS_TRIALS=20` repeats every trial; `ECAXIS_TRIAL=TEXT` takes only those whose name contains the text.
+//! `ECAXIS_TRIALS=20` repeats every trial. `ECAXIS_TRIAL=TEXT` runs only trials whose name contains
+//! the text.
 
 #![allow(clippy::print_stdout, reason = "prints a table")]
 
@@ -22,18 +24,18 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use common::root;
-use common::wire::{Told, over_a_pair};
+use common::wire::{ProgramOutput, over_a_pair};
 use ecaxis::bench::veth::VethPair;
 use library::{Injected, Library};
 use rustix::process::Signal;
 use trace::{Stop, Table, Trace};
 
-/// Turns per second of both axes.
+/// The speed of both axes in turns/s.
 const SPEED: f64 = 20.0;
-/// Longer than every stop may take.
+/// A timeout longer than every permitted stop.
 const PATIENCE: Duration = Duration::from_secs(6);
 
-/// Two drives, one of them in CSP and one in CSV, and an I/O block behind them.
+/// Two drives, one in CSP and one in CSV, and an I/O block behind them.
 const MACHINE: &str = r#"
 [bus]
 nic = "sim"
@@ -72,31 +74,32 @@ velocity = { csp = SPEED, csv = SPEED }
 dwell = "10min"
 "#;
 
-/// What happens in motion.
+/// The event during motion.
 #[derive(Debug, Clone, Copy)]
 enum Event {
-    /// To the process that drives the axes.
+    /// A signal to the process that drives the axes.
     Signal(Signal),
-    /// Ignored; the machine is stopped by SIGTERM afterwards.
+    /// An ignored signal; SIGTERM stops the machine afterwards.
     Ignored(Signal),
-    /// The fault script begins; the axes stop by themselves.
+    /// The fault script starts, and the axes stop by themselves.
     Fault,
-    /// The fault script begins and stops nothing; SIGTERM does, afterwards.
+    /// The fault script starts but stops nothing; SIGTERM stops the machine afterwards.
     Tolerated,
-    /// The thread beside the cycle does not run any more.
+    /// The thread next to the cycle is frozen.
     Frozen,
-    /// In the process of this test, through the library.
+    /// A panic in the process of this test, through the library.
     Library(Injected),
 }
 
 struct Trial {
     name: &'static str,
     event: Event,
-    /// Of the script's only fault, from the event on.
+    /// The script's only fault, which starts with the event.
     fault: Option<&'static str>,
-    /// What the program exits with; `None`: it is killed.
+    /// The program's exit code; `None`: it is killed.
     exit: Option<i32>,
-    /// So many drives, from the first, are reached by frames and stop by set-points.
+    /// The number of drives, from the first, that are still reached by frames and stop by
+    /// set-points.
     ramped: usize,
 }
 
@@ -130,7 +133,7 @@ const TRIALS: &[Trial] = &[
         Some(130),
         2,
     ),
-    // It goes on with SIGCONT, when the axes stand.
+    // SIGCONT follows when the axes are at rest.
     trial("SIGSTOP", Event::Signal(Signal::STOP), Some(1), 0),
     trial("frozen mailbox thread", Event::Frozen, Some(1), 2),
     trial(
@@ -198,14 +201,14 @@ const TRIALS: &[Trial] = &[
 
 /// The simulated bus of a trial.
 struct Bus {
-    process: Told,
+    process: ProgramOutput,
     trace: Trace,
 }
 
 struct Bench<'p> {
     pair: &'p VethPair,
     folder: tempfile::TempDir,
-    /// Both ends spin with real-time priority: each has a processor of its own, where there are two.
+    /// True if both ends have separate processors. Both spin with real-time priority.
     apart: bool,
 }
 
@@ -262,7 +265,7 @@ impl<'p> Bench<'p> {
             std::fs::write(self.path("f.toml"), format!("[[fault]]\n{fault}")).expect("written");
             command.args(["--faults", "f.toml", "--faults-on-signal"]);
         }
-        let mut process = Told::start(&mut command);
+        let mut process = ProgramOutput::start(&mut command);
         process.says("answer");
         Bus {
             process,
@@ -270,9 +273,15 @@ impl<'p> Bench<'p> {
         }
     }
 
-    fn run(&self) -> Told {
+    fn run(&self) -> ProgramOutput {
         let mut command = self.ecaxis(false);
-        Told::start(command.args(["run", "m.toml", "--no-story", "--nic", &self.pair.b]))
+        ProgramOutput::start(command.args([
+            "run",
+            "m.toml",
+            "--no-fault-report",
+            "--nic",
+            &self.pair.b,
+        ]))
     }
 
     fn perform(&self, trial: &Trial, bus: &mut Bus) -> Stop {
@@ -312,11 +321,16 @@ impl<'p> Bench<'p> {
             run.signal(Signal::CONT);
         }
         let output = run.end();
-        let told = String::from_utf8_lossy(&output.stderr);
+        let reported = String::from_utf8_lossy(&output.stderr);
         if trial.exit.is_some() {
-            assert_eq!(output.status.code(), trial.exit, "{}: {told}", trial.name);
+            assert_eq!(
+                output.status.code(),
+                trial.exit,
+                "{}: {reported}",
+                trial.name
+            );
         }
-        // Nothing turns again, whatever the program did before it ended.
+        // No axis turns again, whatever the program did before it ended.
         bus.trace.stays(stop)
     }
 }
@@ -332,7 +346,8 @@ fn chosen() -> Vec<&'static Trial> {
     each.collect()
 }
 
-/// Over a pair of interfaces and a bus of its own. `None` where there can be none, or the computer gave no fair try.
+/// Runs a trial over its own interface pair and bus. Returns `None` without interfaces, or if the
+/// computer stalled in every try.
 fn perform(trial: &Trial) -> Option<Stop> {
     let done = RefCell::new(None);
     over_a_pair(|pair| {

@@ -1,11 +1,11 @@
-//! How a machine comes to rest, whatever ends its motion: by the set-points that reach the drives,
-//! read from the recording, and by what the run says in the end.
+//! Stops of a machine for every cause: the set-points that reach the drives, read from the
+//! recording, and the final report of the run.
 
 mod common;
 #[path = "stops/failures.rs"]
 mod failures;
 
-use common::wire::calmly;
+use common::wire::retry_if_host_stalled;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,17 +15,18 @@ use ecaxis::config::Machine;
 use ecaxis::session::{self, Observer, Options, Progress, RunError, Summary};
 use pcap_file::pcapng::{Block, PcapNgReader};
 
-/// Counts per turn, and the fastest set-point change a cycle of 1 ms may bring at 50 turns a second.
+/// Counts per turn. STEP is the largest set-point change in a cycle of 1 ms at 50 turns/s.
 const COUNTS: i64 = 2000;
 const STEP: i64 = 50 * COUNTS / 1000;
 /// The same at the speed of [`patient`].
 const SLOW_STEP: i64 = STEP * 2 / 5;
 const OPERATION_ENABLED: u16 = 0x0f;
 
-/// What reached the drives in one cycle: Controlword and target position of each axis.
+/// The data of one cycle that reached the drives: Controlword and target position of each axis.
 type Outputs = Vec<(u16, i32)>;
 
-/// Process data of the cyclic frames on the wire, sent (`true`) and come back: the data of their LRW datagrams in a row.
+/// Returns process data of the cyclic frames on the wire, sent (`true`) and received. The data of
+/// their LRW datagrams are concatenated.
 fn cyclic_frames(recording: &Path) -> Vec<(bool, Vec<u8>)> {
     const LRW: u8 = 12;
     let file = std::fs::File::open(recording).expect("the recording");
@@ -52,7 +53,7 @@ fn cyclic_frames(recording: &Path) -> Vec<(bool, Vec<u8>)> {
     frames
 }
 
-/// The process data of the cyclic frames that came back, as it left: what the drives took.
+/// Returns the sent process data of the cyclic frames that came back, which the drives received.
 fn delivered_bytes(recording: &Path) -> Vec<Vec<u8>> {
     let mut last_sent = None;
     let mut cycles = Vec::new();
@@ -66,7 +67,8 @@ fn delivered_bytes(recording: &Path) -> Vec<Vec<u8>> {
     cycles
 }
 
-/// Controlword and target position of every axis in CSP of our own ESI: 12 bytes out, 13 in.
+/// Returns Controlword and target position of every axis in CSP of the project's ESI: 12 bytes out,
+/// 13 in.
 fn delivered(recording: &Path, axes: usize) -> Vec<Outputs> {
     const REGION: usize = 13;
     let axis = |data: &[u8], i: usize| {
@@ -81,7 +83,7 @@ fn delivered(recording: &Path, axes: usize) -> Vec<Outputs> {
         .collect()
 }
 
-/// Largest change of an enabled axis' target between two frames that reached it.
+/// Returns the largest change of an enabled axis' target between two frames that reached the drive.
 fn largest_step(cycles: &[Outputs], axis: usize) -> i64 {
     cycles
         .windows(2)
@@ -102,8 +104,8 @@ fn record(options: Options, folder: &tempfile::TempDir) -> (Options, std::path::
     )
 }
 
-/// Axes whose bus rides through 20 lost frames. They move at two fifths of their limit: a drive that
-/// loses its targets at full speed overshoots so far that its way back would trip the supervision.
+/// Returns axes with a tolerance of 20 lost frames. They move at two fifths of their limit: a drive
+/// that loses its targets at full speed overshoots, and its way back would trip the supervision.
 fn patient(count: usize) -> Machine {
     let text = axes(count).replace("cycle =", "lost_frames = 20\ncycle =");
     machine(&text.replace("\nmove =", "\nspeed = 0.4\nmove ="))
@@ -141,7 +143,7 @@ fn no_set_point_jumps_after_a_burst_of_lost_frames() {
 }
 
 #[test]
-fn a_device_that_drops_out_takes_no_power_for_granted() {
+fn a_device_that_drops_out_is_not_enabled_when_it_returns() {
     let folder = tempfile::tempdir().expect("a folder");
     let script = "[[fault]]\nkind = \"absent\"\ndevice = 1\nat = \"1.5s\"\n";
     let (options, path) = record(faults(script), &folder);
@@ -177,7 +179,7 @@ fn a_device_that_drops_out_takes_no_power_for_granted() {
 }
 
 #[test]
-fn a_bus_that_comes_back_finds_no_axis_enabled() {
+fn a_returning_bus_enables_no_axis() {
     let folder = tempfile::tempdir().expect("a folder");
     let script = "[[fault]]\nkind = \"frame-loss\"\nat = \"1.5s\"\ncount = 40\n";
     let (options, path) = record(faults(script), &folder);
@@ -196,7 +198,7 @@ fn a_bus_that_comes_back_finds_no_axis_enabled() {
 #[test]
 fn a_fault_while_the_machine_stops_fails_the_run() {
     let text = axes(2).replace("acceleration = 500.0", "acceleration = 25.0");
-    // Two seconds of ramp: at 1.2 s the axes move, at 1.6 s they are being stopped.
+    // With a ramp of two seconds, the axes move at 1.2 s and stop at 1.6 s.
     let options = Options {
         limit: Some(1_000_000_000),
         ..faults("[[fault]]\nkind = \"drive-fault\"\ndevice = 1\nat = \"1.6s\"\ncode = 0x7305\n")
@@ -209,7 +211,7 @@ fn a_fault_while_the_machine_stops_fails_the_run() {
 }
 
 #[test]
-fn a_drive_that_does_not_let_go_fails_the_run() {
+fn a_drive_that_stays_enabled_fails_the_run() {
     let script =
         "[[fault]]\nkind = \"stuck\"\ndevice = 1\nat = \"1.5s\"\nstate = \"operation-enabled\"\n";
     let (error, summary) = run_badly(machine(&axes(2)), faults(script));
@@ -221,8 +223,8 @@ fn a_drive_that_does_not_let_go_fails_the_run() {
 }
 
 #[test]
-fn a_gentle_machine_gets_the_time_its_ramp_takes() {
-    // From 40 turns a second at 5 turns/s²: 8 s, longer than any fixed patience.
+fn a_machine_with_a_long_ramp_completes_its_stop() {
+    // From 40 turns/s at 5 turns/s²: 8 s, longer than any fixed time-out.
     let text = axes(1)
         .replace("acceleration = 500.0", "acceleration = 5.0")
         .replace("[-100.0, 100.0]", "[-2000.0, 2000.0]")
@@ -257,19 +259,19 @@ fn a_fault_from_before_the_run_is_reset_once() {
 }
 
 #[test]
-fn an_emergency_in_motion_is_told_and_stops_nothing() {
+fn an_emergency_in_motion_is_reported_and_stops_nothing() {
     let script = "[[fault]]\nkind = \"emergency\"\ndevice = 1\nat = \"1.5s\"\ncode = 0x5000\n";
     let (outcome, heard) = common::run(machine(&axes(2)), faults(script));
     outcome.result.expect("an emergency alone is no fault");
     let warnings = heard.warnings();
-    let told = warnings
+    let reported = warnings
         .iter()
         .filter(|w| w.contains("`a1`") && w.contains("0x5000"))
         .count();
-    assert_eq!(told, 1, "{warnings:?}");
+    assert_eq!(reported, 1, "{warnings:?}");
 }
 
-/// Stops the run as a user would, when something has happened.
+/// Stops the run like a user, when an event has occurred.
 struct Interrupter<F> {
     stop: Arc<AtomicBool>,
     when: F,
@@ -296,7 +298,7 @@ fn interrupted(when: impl FnMut(&Progress) -> bool) -> (Option<Summary>, Result<
 
 #[test]
 fn an_interruption_in_motion_brings_the_axes_to_rest() {
-    calmly(|| {
+    retry_if_host_stalled(|| {
         let in_motion = |progress: &Progress| matches!(progress, Progress::Status(status) if status.axes[0].position > 5.0);
         let (summary, result) = interrupted(in_motion);
         result.expect("an orderly stop");
@@ -323,7 +325,7 @@ fn an_interruption_during_bring_up_ends_it() {
 }
 
 #[test]
-fn a_bound_that_nobody_drives_keeps_the_drives_own_value() {
+fn a_torque_limit_without_an_axis_keeps_the_value_of_the_drive() {
     let folder = tempfile::tempdir().expect("a folder");
     let (options, path) = record(
         Options {
@@ -345,7 +347,7 @@ fn a_bound_that_nobody_drives_keeps_the_drives_own_value() {
     }
 }
 
-/// An input of the machine file stops everything by the shortest way.
+/// An input of the machine file stops all axes by the shortest method.
 #[test]
 fn an_emergency_input_stops_all_axes() {
     let text = axes(2)
@@ -375,7 +377,7 @@ emergency = { io."Input 2" = true }
 }
 
 #[test]
-fn the_other_axes_stop_as_the_file_says() {
+fn the_other_axes_stop_by_the_configured_method() {
     let fault = "[[fault]]\nkind = \"drive-fault\"\ndevice = 0\nat = \"1s\"\ncode = 0x2310\n";
     let mut ways = Vec::new();
     for way in ["ramp", "quick-stop", "no-power"] {
@@ -385,16 +387,17 @@ fn the_other_axes_stop_as_the_file_says() {
         ways.push(summary.axes[1].final_position);
         assert_ne!(summary.axes[1].final_state, "Operation enabled");
     }
-    // A ramp is followed to its end with power; the last position with power is then the farthest.
+    // A ramp ends with power on, so its last position with power is the farthest.
     assert!(ways[0] > ways[2] && ways[1] > ways[2] - 1e-9, "{ways:?}");
 }
 
-/// The way to rest is shortened, whatever it began as.
+/// An emergency shortens a stop that is already in progress.
 #[test]
-fn an_emergency_counts_while_the_machine_is_stopping_already() {
+fn an_emergency_shortens_a_stop_in_progress() {
     let slow = axes(1).replacen("acceleration = 500.0", "acceleration = 10.0", 1)
         + "\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 1\n";
-    // At the time limit the axis moves fast; then the input is on since the first step, but only seen as an emergency late.
+    // At the time limit the axis moves fast. The input is on since the first step, but counts as an
+    // emergency only late.
     let stop = "\n[stop]\nemergency = { a0.\"0x6064\" = { above = 20000 } }\n";
     let mut options = virtual_time();
     options.limit = Some(1_900_000_000);
@@ -415,10 +418,10 @@ fn an_emergency_counts_while_the_machine_is_stopping_already() {
     );
 }
 
-/// The way out is fine, the way back is not: the drives go on hearing. From the last answer to the frame that orders the quick stop there
-/// are `lost_frames` cycles and one more, in which that frame is sent.
+/// Only replies are lost, so the drives still receive frames. The quick stop is sent `lost_frames`
+/// + 1 cycles after the last answer.
 #[test]
-fn a_lost_bus_is_stopped_within_a_cycle_of_the_limit() {
+fn a_lost_bus_causes_a_stop_within_a_cycle_of_the_limit() {
     const QUICK_STOP: u16 = 0x0004;
     for limit in [1_usize, 2, 3, 7] {
         let folder = tempfile::tempdir().expect("a folder");

@@ -1,4 +1,4 @@
-//! Drives that count otherwise than the machine file says: what is taken from them, what is refused, what is warned of.
+//! Drives with units other than those of the machine file: adopted values, rejections and warnings.
 
 mod common;
 
@@ -30,7 +30,7 @@ const MOVE: &str = "\n[[step]]\nmove = { x = 3.0 }\n";
 const VELOCITY_UNIT: &str = "<Info><DefaultValue>#x00B44700</DefaultValue></Info>";
 const BEFORE_0X60A8: &str = "<Object>\n                <Index>#x60A8</Index>";
 
-/// A machine whose ESI file, which its simulated drive is made of as well, has been changed.
+/// Returns a machine with a changed ESI file, which also defines its simulated drive.
 fn with_esi(from: &str, to: &str, text: &str) -> Machine {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("esi")).expect("a folder");
@@ -47,7 +47,7 @@ fn with_esi(from: &str, to: &str, text: &str) -> Machine {
     }
 }
 
-/// The drive has one object more.
+/// Adds an object to the drive.
 fn with_object(object: &str, text: &str) -> Machine {
     let object =
         format!("<Object>{object}<Flags><Access>rw</Access></Flags></Object>{BEFORE_0X60A8}");
@@ -60,8 +60,8 @@ fn polarity(value: &str) -> String {
     )
 }
 
-/// Runs well; what was taken over from the drive, and warnings.
-fn told(machine: Machine) -> (Vec<String>, Vec<String>) {
+/// Runs the machine. Returns the values adopted from the drive, and the warnings.
+fn messages(machine: Machine) -> (Vec<String>, Vec<String>) {
     let (outcome, heard) = run(machine, virtual_time());
     if let Err(error) = outcome.result {
         panic!("{error}; {:?}", heard.warnings());
@@ -75,15 +75,15 @@ fn told(machine: Machine) -> (Vec<String>, Vec<String>) {
 }
 
 #[test]
-fn what_a_drive_says_as_the_file_does_is_no_news() {
+fn matching_drive_units_cause_no_message() {
     let text = format!("{HEAD}{AXIS}{MOVE}");
-    assert_eq!(told(machine(&text)), (vec![], vec![]));
+    assert_eq!(messages(machine(&text)), (vec![], vec![]));
     let said = text.replace("encoder =", "velocity_unit = \"rpm\"\nencoder =");
-    assert_eq!(told(machine(&said)), (vec![], vec![]));
+    assert_eq!(messages(machine(&said)), (vec![], vec![]));
 }
 
 #[test]
-fn a_velocity_unit_that_the_file_says_and_the_drive_does_not_is_refused() {
+fn a_velocity_unit_that_differs_from_the_drive_is_rejected() {
     let text =
         format!("{HEAD}{AXIS}{MOVE}").replace("encoder =", "velocity_unit = \"mrpm\"\nencoder =");
     let (error, summary) = run_badly(machine(&text), virtual_time());
@@ -95,16 +95,16 @@ fn a_velocity_unit_that_the_file_says_and_the_drive_does_not_is_refused() {
 }
 
 #[test]
-fn a_velocity_unit_that_the_file_writes_is_the_drives_and_accelerations_keep_theirs() {
+fn a_written_velocity_unit_applies_to_the_drive_but_not_to_accelerations() {
     let sdo = "mode = \"csp\"\nsdo = [{ index = 0x60A9, value = 0xFDB44700 }]";
     let text = format!("{HEAD}{AXIS}{MOVE}").replace("mode = \"csp\"", sdo);
-    assert_eq!(told(machine(&text)), (vec![], vec![]));
+    assert_eq!(messages(machine(&text)), (vec![], vec![]));
 }
 
 #[test]
-fn an_assumed_velocity_unit_gives_way_to_the_drives() {
+fn an_assumed_velocity_unit_is_replaced_by_that_of_the_drive() {
     let text = format!("{HEAD}{AXIS}{MOVE}");
-    let (taken, warnings) = told(with_esi(VELOCITY_UNIT, "", &text));
+    let (taken, warnings) = messages(with_esi(VELOCITY_UNIT, "", &text));
     assert_eq!(
         taken,
         ["x: velocities in rpm, as the drive says in 0x60A9, not in counts/s"]
@@ -113,20 +113,20 @@ fn an_assumed_velocity_unit_gives_way_to_the_drives() {
 }
 
 #[test]
-fn a_velocity_is_the_drives_unit_of_velocity_times_what_it_should_be() {
+fn the_drive_velocity_unit_scales_velocities() {
     let text =
         format!("{HEAD}{AXIS}\n[[step]]\nvelocity = {{ x = 10.0 }}\n[[step]]\ndwell = \"1s\"\n")
             .replace("\"csp\"", "\"csv\"");
     for machine in [machine(&text), with_esi(VELOCITY_UNIT, "", &text)] {
         let summary = run_well(machine, virtual_time());
-        // 20 ms to speed, a second at 10 turns/s; then the same again to rest.
+        // 20 ms to speed, a second at 10 turns/s, and the same again to rest.
         let position = summary.axes[0].final_position;
         assert!((9.5..11.0).contains(&position), "{position}");
     }
 }
 
 #[test]
-fn another_encoder_is_refused() {
+fn a_different_encoder_resolution_is_rejected() {
     let encoder = "<Index>#x608F</Index><Name>Position encoder resolution</Name><Type>DT608F</Type><BitSize>80</BitSize><Info>\
         <SubItem><Name>Highest</Name><Info><DefaultValue>2</DefaultValue></Info></SubItem>\
         <SubItem><Name>Increments</Name><Info><DefaultValue>4096</DefaultValue></Info></SubItem>\
@@ -157,9 +157,9 @@ fn another_encoder_is_refused() {
 }
 
 #[test]
-fn a_drive_that_inverts_is_warned_of_and_one_that_inverts_half_is_refused() {
+fn an_inverting_drive_causes_a_warning_and_a_partly_inverting_one_is_rejected() {
     let text = format!("{HEAD}{AXIS}{MOVE}");
-    let (_, warnings) = told(with_object(&polarity("192"), &text));
+    let (_, warnings) = messages(with_object(&polarity("192"), &text));
     let [warning] = warnings.as_slice() else {
         panic!("{warnings:?}")
     };
@@ -172,7 +172,7 @@ fn a_drive_that_inverts_is_warned_of_and_one_that_inverts_half_is_refused() {
 }
 
 #[test]
-fn torques_in_newton_metres_are_of_the_motor_that_the_drive_knows() {
+fn torques_in_newton_metres_use_the_motor_data_of_the_drive() {
     let text =
         format!("{HEAD}{AXIS}\n[[step]]\ntorque = {{ x = 0.005 }}\n[[step]]\ndwell = \"50ms\"\n")
             .replace("\"csp\"", "\"cst\"")
@@ -182,7 +182,7 @@ fn torques_in_newton_metres_are_of_the_motor_that_the_drive_knows() {
     let setup = machine.devices[0].axis.as_ref().expect("an axis");
     assert_eq!(setup.torque.rated, Some(0.1), "as the ESI says");
     assert!((setup.config.limits.torque - 50.0).abs() < 1e-9);
-    let (taken, warnings) = told(machine);
+    let (taken, warnings) = messages(machine);
     let [taken] = taken.as_slice() else {
         panic!("{taken:?}")
     };
@@ -195,7 +195,7 @@ fn torques_in_newton_metres_are_of_the_motor_that_the_drive_knows() {
 }
 
 #[test]
-fn a_modulo_axis_goes_its_way() {
+fn a_modulo_axis_follows_its_direction() {
     for (way, targets, end) in [
         ("shortest", &[350.0, 80.0][..], 80.0),
         ("shortest", &[350.0], -10.0),
@@ -214,7 +214,7 @@ fn a_modulo_axis_goes_its_way() {
         }
         let summary = run_well(machine(&text), virtual_time());
         let position = summary.axes[0].target_position;
-        // 6000 counts a turn of the table.
+        // 6000 counts per turn of the table.
         assert!(
             (position - end).abs() < 0.1,
             "{way} {targets:?}: {position}"
@@ -224,9 +224,9 @@ fn a_modulo_axis_goes_its_way() {
 
 const VENDOR: &str = "#x00000E0A";
 
-/// A maxon drive's 0x3001:05 is 37 mNm/A here, and its rated torque 0.1184 Nm.
+/// In this test, a maxon drive's 0x3001:05 is 37 mNm/A, and its rated torque is 0.1184 Nm.
 #[test]
-fn a_maxon_drive_knows_its_motors_torque_constant() {
+fn a_maxon_drive_provides_its_torque_constant() {
     let axis = AXIS
         .replace("encoder", "torque_unit = \"A\"\nencoder")
         .replace("following_error = 0.5", "torque = 3.0");
@@ -262,7 +262,7 @@ fn a_maxon_drive_knows_its_motors_torque_constant() {
     let said = text
         .replace("x = 0.4", "x = 0.1")
         .replace("encoder", "torque_constant = 0.05\nencoder");
-    let (_, warnings) = told(with_esi(VENDOR, "#x000000FB", &said));
+    let (_, warnings) = messages(with_esi(VENDOR, "#x000000FB", &said));
     assert!(
         warnings
             .iter()

@@ -1,4 +1,4 @@
-//! Two processes, the simulated bus and the master, on the two ends of a veth pair. Needs root.
+//! Two processes, the simulated bus and the MainDevice, at the ends of a veth pair. Requires root.
 
 #![allow(clippy::print_stdout, reason = "what was counted")]
 
@@ -8,13 +8,13 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use common::root;
-use common::wire::{Told, over_a_pair};
+use common::wire::{ProgramOutput, over_a_pair};
 use ecaxis::bench::veth::VethPair;
-use ecaxis::link::BackEnd;
+use ecaxis::link::SocketKind;
 
-/// The demo's bus on one end of the pair, and the machine file for the other.
+/// The demo's bus at one end of the pair, and the machine file for the other end.
 struct Served {
-    _bus: Told,
+    _bus: ProgramOutput,
     file: tempfile::NamedTempFile,
 }
 
@@ -24,8 +24,8 @@ fn ecaxis() -> Command {
     command
 }
 
-/// A thread that spins with real-time priority leaves nothing to another on its processor, and the scheduler may let them
-/// share one for seconds.
+/// A spinning real-time thread blocks other threads on its processor, and the scheduler may keep
+/// two on one processor for seconds.
 fn on_cpu_0() -> Command {
     let mut command = Command::new("taskset");
     command.args(["-c", "0", env!("CARGO_BIN_EXE_ecaxis")]);
@@ -39,10 +39,11 @@ fn can_be_kept_apart() -> bool {
         && taskset.is_ok_and(|output| output.status.success())
 }
 
-/// With `more` in the file's [bus].
+/// Serves the bus, with `more` in the file's [bus].
 fn serve(pair: &VethPair, more: &str) -> Served {
     let apart = can_be_kept_apart();
-    // The demo, but patient: a busy test machine may hold either process up for long, and both ends share its processors.
+    // The demo with higher tolerances: a busy test machine may stall either process, and both ends
+    // share its processors.
     let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demo");
     let file = tempfile::Builder::new()
         .prefix("test-veth-")
@@ -55,19 +56,19 @@ fn serve(pair: &VethPair, more: &str) -> Served {
     let path = file.path().to_str().expect("a path in UTF-8");
     let mut command = if apart { on_cpu_0() } else { ecaxis() };
     command.args(["sim", path, "--nic", &pair.a]);
-    let mut bus = Told::start(command.stdout(Stdio::null()));
+    let mut bus = ProgramOutput::start(command.stdout(Stdio::null()));
     bus.says("answer");
     Served { _bus: bus, file }
 }
 
 #[test]
-fn the_demo_over_a_real_interface() {
+fn the_demo_runs_over_a_real_interface() {
     over_a_pair(|pair| {
         let served = serve(&pair, "");
         let file = served.file.path().to_str().expect("a path in UTF-8");
 
         let output = ecaxis()
-            .args(["run", file, "--nic", &pair.b, "--no-story", "--json"])
+            .args(["run", file, "--nic", &pair.b, "--no-fault-report", "--json"])
             .output()
             .expect("the binary runs");
         let errors = String::from_utf8_lossy(&output.stderr);
@@ -96,16 +97,17 @@ fn the_demo_over_a_real_interface() {
     });
 }
 
-/// The cable is pulled and put back while the axes move: lost cycles, link errors, and on it goes.
+/// The cable is disconnected and reconnected while the axes move: cycles are lost, link errors are
+/// counted, and the run continues.
 #[test]
-fn an_interface_goes_down_and_up_again_while_the_machine_runs() {
+fn a_run_survives_an_interface_that_goes_down_and_up() {
     over_a_pair(|pair| {
-        for link in BackEnd::ALL {
+        for link in SocketKind::ALL {
             let served = serve(&pair, &format!("link = \"{link}\""));
             let file = served.file.path().to_str().expect("a path in UTF-8");
             let mut command = ecaxis();
-            command.args(["run", file, "--nic", &pair.b, "--no-story", "--json"]);
-            let mut run = Told::start(command.stdout(Stdio::piped()));
+            command.args(["run", file, "--nic", &pair.b, "--no-fault-report", "--json"]);
+            let mut run = ProgramOutput::start(command.stdout(Stdio::piped()));
             run.says("run 1, step 1: ");
             pair.set(&pair.b, false).expect("down");
             std::thread::sleep(Duration::from_millis(100));
@@ -129,9 +131,10 @@ fn an_interface_goes_down_and_up_again_while_the_machine_runs() {
     });
 }
 
-/// What works on one device of a bus that a machine drives neither takes its frames nor leaves it in the dark.
+/// A firmware command on a bus with a running machine neither takes its frames nor hides the cause
+/// from the user.
 #[test]
-fn firmware_beside_a_machine_disturbs_nothing() {
+fn firmware_commands_do_not_disturb_a_running_machine() {
     over_a_pair(|pair| {
         let served = serve(&pair, "");
         let file = served.file.path().to_str().expect("a path in UTF-8");
@@ -141,36 +144,36 @@ fn firmware_beside_a_machine_disturbs_nothing() {
             file,
             "--nic",
             &pair.b,
-            "--no-story",
+            "--no-fault-report",
             "--json",
             "--for",
             "10min",
         ]);
-        let mut run = Told::start(command.stdout(Stdio::piped()));
+        let mut run = ProgramOutput::start(command.stdout(Stdio::piped()));
         run.says("run 1, step 1: ");
-        let beside = |arguments: &[&str]| {
+        let during = |arguments: &[&str]| {
             let arguments = [arguments, &["--nic", &pair.b]].concat();
             let output = ecaxis().args(arguments).output().expect("the binary runs");
-            let told = String::from_utf8_lossy(&output.stderr).into_owned();
-            (output.status.code(), told)
+            let reported = String::from_utf8_lossy(&output.stderr).into_owned();
+            (output.status.code(), reported)
         };
-        let another = "another MainDevice is at work on this bus";
+        let another = "another MainDevice is active on this bus";
         for _ in 0..3 {
-            let (code, told) = beside(&["firmware", "info", file, "x"]);
-            assert_eq!(code, Some(0), "{told}");
-            assert!(told.contains(another), "{told}");
+            let (code, reported) = during(&["firmware", "info", file, "x"]);
+            assert_eq!(code, Some(0), "{reported}");
+            assert!(reported.contains(another), "{reported}");
         }
-        let (code, told) = beside(&["firmware", "info", "--position", "0"]);
-        assert!(code == Some(0) && told.contains(another), "{told}");
+        let (code, reported) = during(&["firmware", "info", "--position", "0"]);
+        assert!(code == Some(0) && reported.contains(another), "{reported}");
         let program = "Cargo.toml";
-        let (code, told) = beside(&["firmware", "update", file, "x", program, "--yes"]);
-        assert_eq!(code, Some(1), "{told}");
-        // Before it has asked anything: the interface is the machine's.
-        assert!(told.contains("another ecaxis (pid "), "{told}");
+        let (code, reported) = during(&["firmware", "update", file, "x", program, "--yes"]);
+        assert_eq!(code, Some(1), "{reported}");
+        // The command fails before its first request, because the machine owns the interface.
+        assert!(reported.contains("another ecaxis (pid "), "{reported}");
         for command in [&["store", file, "x"][..], &["defaults", file, "x", "--yes"]] {
-            let (code, told) = beside(&[&["sdo"], command].concat());
-            assert_eq!(code, Some(1), "{told}");
-            assert!(told.contains("is in Op: parameters are"), "{told}");
+            let (code, reported) = during(&[&["sdo"], command].concat());
+            assert_eq!(code, Some(1), "{reported}");
+            assert!(reported.contains("is in Op: parameters are"), "{reported}");
         }
 
         run.interrupt();
@@ -184,9 +187,10 @@ fn firmware_beside_a_machine_disturbs_nothing() {
     });
 }
 
-/// Ctrl-C in the middle of an update: no device is left in Bootstrap, and it is told what was under way.
+/// Ctrl-C in the middle of an update leaves no device in Bootstrap and reports the interrupted
+/// step.
 #[test]
-fn an_update_that_the_user_ends_leaves_its_device_in_init() {
+fn a_cancelled_update_leaves_its_device_in_init() {
     over_a_pair(|pair| {
         let served = serve(&pair, "");
         let file = served.file.path().to_str().expect("a path in UTF-8");
@@ -200,18 +204,18 @@ fn an_update_that_the_user_ends_leaves_its_device_in_init() {
         let update = ["firmware", "update", file, "x", program, "--yes", "--nic"];
         let mut command = ecaxis();
         command.args(update).arg(&pair.b);
-        let mut update = Told::start(command.stdout(Stdio::null()));
+        let mut update = ProgramOutput::start(command.stdout(Stdio::null()));
         update.says("sending the file");
         update.interrupt();
         let output = update.end();
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(130), "{told}");
+        let reported = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(130), "{reported}");
         for part in [
             "`x` (position 0",
             "sending the file: interrupted; the device is in Init",
             "the same command tries again",
         ] {
-            assert!(told.contains(part), "`{part}` is not in:\n{told}");
+            assert!(reported.contains(part), "`{part}` is not in:\n{reported}");
         }
         let info = ["firmware", "info", file, "x", "--json", "--nic", &pair.b];
         let output = run(&info);

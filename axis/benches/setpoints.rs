@@ -4,7 +4,9 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ecaxis_axis::group::{Line, LineAxis};
-use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, Order, Setpoint, Trapezoid};
+use ecaxis_axis::setpoint::{
+    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, Trapezoid,
+};
 
 const DT: f64 = 0.001;
 const AXES: usize = 100;
@@ -16,7 +18,7 @@ const LIMITS: MotionLimits = MotionLimits {
 };
 
 fn far(target: f64) -> JerkLimited {
-    let order = Order::within(Goal::Position(target), LIMITS);
+    let order = MoveRequest::within(Goal::Position(target), LIMITS);
     JerkLimited::new(order, Motion::at(0.0), DT).expect("a move")
 }
 
@@ -84,7 +86,7 @@ fn cycles(c: &mut Criterion) {
 
 fn plans(c: &mut Criterion) {
     let mut group = c.benchmark_group("plan_jerk_limited_move");
-    let order = |target| Order::within(Goal::Position(target), LIMITS);
+    let order = |target| MoveRequest::within(Goal::Position(target), LIMITS);
     let mut moving = far(50.0);
     let mut motion = Motion::at(0.0);
     for _ in 0..180 {

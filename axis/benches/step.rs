@@ -57,7 +57,7 @@ fn looped(mode: Mode) -> AxisConfig {
     }
 }
 
-/// One axis and a drive that does at once what it is told.
+/// One axis and a drive that follows each command at once.
 struct Rig {
     axis: Axis,
     inputs: Inputs,

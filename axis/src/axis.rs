@@ -1,71 +1,76 @@
-//! One axis: commands in, guarded set-points out, supervision in between.
+//! One axis: commands in, limited set-points out, supervision in between.
 //!
-//! The order of a cycle is that of [`Axis::step`]: read the inputs, judge them, decide where the power goes, advance the
-//! set-point, guard it, close the loops. A command only changes what the next cycle does. Targets follow actual values in
-//! every cycle in which the drive is not enabled by us, so that enabling never starts with a step.
+//! [`Axis::step`] first reads and supervises the inputs. Then it runs stop, mode switch, homing and
+//! power state machine. Finally it advances the set-point, limits it and closes the loops.
 //!
-//! There is one set-point, in user units, whatever the mode. A mode is a law by which it becomes the drive's targets; so a
-//! switch of modes changes the law and leaves the set-point where it is.
+//! A command only affects the next cycle. While the drive is not enabled by this axis, targets
+//! follow actual values. So enabling never starts with a step of the target.
 //!
-//! | file | |
+//! All modes share one set-point in user units. The control law of a mode converts the set-point to
+//! the drive's targets. A mode switch changes the control law and keeps the set-point.
+//!
+//! | file | contents |
 //! |---|---|
-//! | `config`, `io` | what an axis is made with; what it gets and gives in a cycle |
-//! | `command` | what may be ordered, and when it is refused |
-//! | `plan` | where the set-point goes |
-//! | `law` | from the set-point to the drive's targets |
-//! | `switch` | from one mode to another |
+//! | `config`, `io` | configuration; inputs and outputs of one cycle |
+//! | `command` | commands and the checks that reject them |
+//! | `plan` | advances the set-point |
+//! | `control_law` | converts the set-point to the drive's targets |
+//! | `mode_switch` | switches between modes |
 //! | `home` | homing |
-//! | `stop` | where the power goes, and the way to standstill |
-//! | `actual`, `supervise` | what the drive reports, and what is made of it |
-//! | `blind` | lost frames, and cycles that were left out |
-//! | `report` | the status |
+//! | `stop` | power, stops, brake, automatic fault reset |
+//! | `feedback` | values reported by the drive |
+//! | `supervision` | supervision of these values; final limits of the set-point |
+//! | `lost_frames` | lost frames and skipped cycles |
+//! | `report` | status |
 
-use crate::cia402::{self, Controlword, Memory, Mode, Power, Progress, Request, State, Statusword};
-use crate::probe::Probes;
-use crate::profile::Profile;
+use crate::cia402::{
+    self, Controlword, Mode, Power, PowerProgress, PowerState, Request, State, Statusword,
+};
+use crate::profile_mode::Profile;
 use crate::setpoint::Motion;
-use crate::status::{DriveFault, Refused, Trip};
+use crate::status::{CommandError, DriveFault, Trip};
+use crate::touch_probe::Probes;
 use crate::units::Counts;
 
-mod actual;
-mod blind;
 mod command;
 mod config;
+mod control_law;
+mod feedback;
 mod home;
 mod io;
-mod law;
+mod lost_frames;
+mod mode_switch;
 mod plan;
 mod report;
 mod stop;
-mod supervise;
-mod switch;
+mod supervision;
 
 pub use command::Command;
 pub use config::{AxisConfig, ConfigError};
 pub use io::{Inputs, Outputs};
 
-use actual::Actual;
-use config::Control;
-use home::Home;
-use law::Given;
+use config::ControlledQuantity;
+use control_law::LoopState;
+use feedback::Actual;
+use home::HomingRun;
+use mode_switch::Switch;
 use plan::Plan;
 use stop::PowerGoal;
-use switch::Switch;
 
-/// Less is no cycle at all; it would only make quotients overflow.
+/// Shorter cycle times count as 0: they would make quotients overflow.
 const SHORTEST_CYCLE_S: f64 = 1e-6;
 
-/// Longest cycle taken at face value. A longer one would be a jump of the set-point, not a cycle.
+/// Longest accepted cycle. A longer one would let the set-point jump.
 const LONGEST_CYCLE_S: f64 = 0.1;
 
 #[derive(Debug, Clone)]
 pub struct Axis {
     config: AxisConfig,
-    /// The mode whose targets count.
+    /// The active mode; its targets apply.
     mode: Mode,
     switch: Option<Switch>,
     switch_failed: Option<Mode>,
-    memory: Memory,
+    memory: PowerState,
     statusword: Statusword,
     state: State,
     mode_display: Option<i8>,
@@ -74,40 +79,41 @@ pub struct Axis {
     reset: bool,
     reset_failed: bool,
     actual: Actual,
-    /// Set-points come from `plan`; otherwise they follow `actual`.
+    /// True while set-points come from `plan`. Otherwise they follow `actual`.
     active: bool,
     plan: Plan,
     motion: Motion,
-    given: Given,
-    fixed: law::Fixed,
+    given: LoopState,
+    fixed: control_law::DerivedConstants,
     profile: Profile,
-    home: Home,
+    home: HomingRun,
     probes: Probes,
     probe_mapped: bool,
     brake_state: stop::BrakeState,
     resets: stop::Resets,
-    /// In target, and at rest, for so long.
+    /// Times in seconds for which the axis has been in target and at rest.
     settled_s: f64,
     rested_s: f64,
-    /// The set-point's position as of the last cycle; the actual one where no position is commanded.
+    /// The commanded position of the last cycle; the actual position if no position is commanded.
     sent: Counts,
     sent_before: Counts,
     dt_s: f64,
-    /// Of the inputs of this cycle.
+    /// True if the inputs of this cycle are fresh.
     fresh: bool,
-    watch: supervise::Watch,
+    watch: supervision::SupervisionState,
     held_by_range: bool,
     guarded_cycles: u32,
     stale_cycles: u32,
-    /// Answers still to come that are older than a gap in the cycle.
+    /// Number of answers still expected from before a gap in the cycle.
     overdue: u8,
     /// Cycles since the last frame that is known to have reached the drive.
     undelivered_cycles: u32,
-    /// Fresh cycles in a row without Statusword bit 12.
+    /// Consecutive fresh cycles without Statusword bit 12.
     unfollowed_cycles: u8,
-    /// Nothing was planned for some cycles: the set-point goes on from what the drive has done meanwhile.
+    /// True after cycles without a plan: the set-point continues from the drive's position and
+    /// velocity.
     interrupted: bool,
-    /// Set-point for this cycle from outside.
+    /// External set-point of this cycle.
     fed: Option<Motion>,
     fault: Option<DriveFault>,
     trip: Option<Trip>,
@@ -117,7 +123,7 @@ impl Axis {
     pub fn new(config: AxisConfig) -> Result<Self, ConfigError> {
         config.check()?;
         Ok(Self {
-            memory: Memory::new(),
+            memory: PowerState::new(),
             statusword: Statusword::empty(),
             state: State::NotReadyToSwitchOn,
             mode_display: None,
@@ -132,10 +138,10 @@ impl Axis {
             switch_failed: None,
             plan: Plan::braking(&config, config.mode),
             motion: Motion::default(),
-            given: Given::default(),
-            fixed: law::Fixed::new(&config),
+            given: LoopState::default(),
+            fixed: control_law::DerivedConstants::new(&config),
             profile: Profile::new(),
-            home: Home::default(),
+            home: HomingRun::default(),
             probes: Probes::new(),
             probe_mapped: false,
             brake_state: stop::BrakeState::default(),
@@ -146,7 +152,7 @@ impl Axis {
             sent_before: Counts::default(),
             dt_s: 0.0,
             fresh: false,
-            watch: supervise::Watch::default(),
+            watch: supervision::SupervisionState::default(),
             held_by_range: false,
             guarded_cycles: 0,
             stale_cycles: 0,
@@ -166,7 +172,8 @@ impl Axis {
         &self.config
     }
 
-    /// Adds the drive's error code to the fault that is being reported; ignored where none is. The first code stays. RT: O(1).
+    /// Adds the drive's error code to the reported fault. Ignored without a fault; the first code
+    /// remains. RT: O(1).
     pub fn note_error_code(&mut self, code: u16) {
         if let Some(fault) = &mut self.fault
             && code != 0
@@ -175,28 +182,33 @@ impl Axis {
         }
     }
 
-    /// Takes a command for the next cycle, or refuses it and changes nothing. RT: O(1), never blocks or allocates.
-    pub fn command(&mut self, command: Command) -> Result<(), Refused> {
+    /// Accepts a command for the next cycle, or rejects it and changes nothing. RT: O(1), never
+    /// blocks or allocates.
+    pub fn command(&mut self, command: Command) -> Result<(), CommandError> {
         self.take(command)
     }
 
-    /// The set-point's position in the coming cycle, from outside: for groups, streams and controllers of one's own. To be
-    /// called before every [`Axis::step`], or between its halves; after a cycle without it the axis decelerates and holds. Refused, and so
-    /// decelerated, where it steps further than the velocity limit allows, changes the velocity by more than the acceleration
-    /// limit allows, or leaves the range. RT: O(1), never blocks or allocates.
-    pub fn set_point(&mut self, position: f64) -> Result<(), Refused> {
+    /// Sets the position of the next cycle from outside: for groups, streams and user controllers.
+    ///
+    /// Call it before every [`Axis::step`], or between [`Axis::observe`] and [`Axis::act`]. After a
+    /// cycle without a call the axis decelerates and holds.
+    ///
+    /// Rejects a position outside the range, and a step that exceeds the velocity or acceleration
+    /// limit. After a rejected position the axis decelerates. RT: O(1), never blocks or allocates.
+    pub fn set_point(&mut self, position: f64) -> Result<(), CommandError> {
         self.take_set_point(position)
     }
 
-    /// One cycle of `dt_s` seconds (the nominal cycle time, 1 µs to 0.1 s; what is not is cut down to it, or no time at all).
-    /// RT: O(1), never blocks or allocates.
+    /// Runs one cycle of `dt_s` seconds, the nominal cycle time (1 µs to 0.1 s). A longer time is
+    /// cut to 0.1 s; a shorter or invalid one counts as 0. RT: O(1), never blocks or allocates.
     pub fn step(&mut self, inputs: &Inputs, dt_s: f64) -> Outputs {
         self.observe(inputs, dt_s);
         self.act()
     }
 
-    /// The first half of [`Axis::step`]: takes the inputs in and judges them, so that [`Axis::status`] is of this cycle and
-    /// commands can answer it. RT: O(1), never blocks or allocates.
+    /// Runs the first half of [`Axis::step`]: reads and supervises the inputs. Afterwards
+    /// [`Axis::status`] shows this cycle, and commands can react to it. RT: O(1), never blocks or
+    /// allocates.
     pub fn observe(&mut self, inputs: &Inputs, dt_s: f64) {
         let dt_s = if dt_s >= SHORTEST_CYCLE_S {
             dt_s.min(LONGEST_CYCLE_S)
@@ -208,7 +220,7 @@ impl Axis {
         self.overdue = self.overdue.saturating_sub(1);
         if self.fresh {
             self.read(inputs);
-            self.judge();
+            self.supervise();
         } else {
             self.stale_cycles = self.stale_cycles.saturating_add(1);
             self.undelivered_cycles = self.undelivered_cycles.saturating_add(1);
@@ -221,7 +233,8 @@ impl Axis {
         self.actual.pass(dt_s);
     }
 
-    /// The second half: from the inputs and commands to the outputs. RT: O(1), never blocks or allocates.
+    /// Runs the second half of [`Axis::step`]: computes the outputs from inputs and commands. RT:
+    /// O(1), never blocks or allocates.
     pub fn act(&mut self) -> Outputs {
         let (fresh, dt_s) = (self.fresh, self.dt_s);
         self.settle_stop(fresh, dt_s);
@@ -234,10 +247,10 @@ impl Axis {
         }
         let sent = self.sent;
         if !self.active {
-            self.follow();
-        } else if self.frozen() {
+            self.track_actual();
+        } else if self.setpoint_frozen() {
             self.freeze();
-        } else if self.stale_cycles > blind::RIDE_THROUGH_CYCLES {
+        } else if self.stale_cycles > lost_frames::RIDE_THROUGH_CYCLES {
             self.slow_down(dt_s);
         } else {
             self.advance(fresh, dt_s);
@@ -246,7 +259,7 @@ impl Axis {
         self.settle_brake();
         self.fed = None;
         self.sent_before = sent;
-        self.dwell(dt_s);
+        self.update_settling_times(dt_s);
         self.outputs()
     }
 
@@ -255,7 +268,7 @@ impl Axis {
         self.undelivered_cycles = 0;
         self.statusword = Statusword::from_bits_retain(inputs.statusword);
         self.mode_display = inputs.mode_display;
-        // Homing moves the origin.
+        // Homing shifts the position origin.
         let fastest = if self.mode == Mode::Hm {
             self.config.limits.velocity * 2.0
         } else {
@@ -270,7 +283,7 @@ impl Axis {
                 let near = actual.counts().unwrap_or_default();
                 Some(scale.position_to_user(near.unwrap_next(raw)).0)
             });
-            // Homing has a way of its own.
+            // The homing sequence stops the axis itself.
             if stop && !self.home.running() {
                 self.stop();
             }
@@ -281,7 +294,7 @@ impl Axis {
     }
 
     fn switch_power(&mut self, fresh: bool, dt_s: f64) {
-        let blind = self.blind();
+        let blind = self.lacks_position();
         let power = match self.goal {
             PowerGoal::On if !blind => Power::Enabled,
             PowerGoal::On | PowerGoal::Off => Power::Disabled,
@@ -291,45 +304,49 @@ impl Axis {
             power,
             reset_fault: self.reset,
             hold: !self.mode_confirmed(),
-            no_return: self.config.quick_stop.is_some_and(|option| !option.stays()),
+            without_transition_16: self.config.quick_stop.is_some_and(|option| !option.stays()),
         };
-        // While frames are lost, no time passes for the drive's state and the reset pulses.
+        // While frames are lost, timers of the drive's state and of reset pulses stand still.
         let dt_s = if fresh { dt_s } else { 0.0 };
         let (memory, step) = cia402::step_in(self.memory, self.state, request, dt_s);
         self.memory = memory;
         self.controlword = step.controlword;
-        if step.progress == Progress::ResetFailed {
+        if step.progress == PowerProgress::ResetFailed {
             self.reset = false;
             self.reset_failed = true;
             self.goal = PowerGoal::Off;
         }
     }
 
-    /// There is nothing a position set-point could follow.
-    fn blind(&self) -> bool {
-        self.config.control(self.mode) == Control::Position && self.actual.counts().is_none()
+    /// True if a position set-point is required and no position is reported.
+    fn lacks_position(&self) -> bool {
+        self.config.control(self.mode) == ControlledQuantity::Position
+            && self.actual.counts().is_none()
     }
 
     fn update_active(&mut self) {
         let possible = self.state == State::OperationEnabled
             && self.mode_confirmed()
             && self.reported_to_follow()
-            && !self.blind();
+            && !self.lacks_position();
         if !possible {
             self.active = false;
             self.end_switch();
         } else if !self.active && self.goal == PowerGoal::On {
             self.active = true;
-            self.follow();
-            self.watch = supervise::Watch::starting_at(self.actual.position(), &self.config.limits);
+            self.track_actual();
+            self.watch = supervision::SupervisionState::starting_at(
+                self.actual.position(),
+                &self.config.limits,
+            );
         }
     }
 
-    /// Targets are what the drive reports: no step when it is enabled, whenever that is.
-    fn follow(&mut self) {
+    /// Sets the targets to the reported values, so that enabling causes no step.
+    fn track_actual(&mut self) {
         self.sent = self.actual.counts().unwrap_or_default();
         self.motion = Motion::at(self.config.scale.position_to_user(self.sent).0);
-        self.given = Given::default();
+        self.given = LoopState::default();
         self.profile = Profile::new();
         self.plan = Plan::braking(&self.config, self.mode);
         self.held_by_range = false;

@@ -1,4 +1,5 @@
-//! What an axis may never exceed. Checked once by [`Limits::check`]; afterwards the guard in [`crate::axis`] relies on it.
+//! Limits of an axis. [`Limits::check`] checks them once; afterwards [`crate::axis`] relies on
+//! them.
 
 use crate::scale::Scale;
 use crate::setpoint::MotionLimits;
@@ -6,18 +7,20 @@ use crate::units::UserVelocity;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Lowest and highest position, user units. `None`: endless.
+    /// Lowest and highest position, user units. `None`: unlimited.
     pub position: Option<[f64; 2]>,
-    /// User units per second.
+    /// Highest velocity, user units per second.
     pub velocity: f64,
-    /// User units per second².
+    /// Highest acceleration, user units per second².
     pub acceleration: f64,
-    /// User units per second³, for jerk-limited moves. `None`: full acceleration within [`Limits::JERK_TIME_S`].
+    /// Jerk of jerk-limited moves, user units per second³. `None`: the acceleration limit is
+    /// reached within [`Limits::JERK_TIME_S`].
     pub jerk: Option<f64>,
-    /// Percent of rated torque.
+    /// Highest torque, percent of rated torque.
     pub torque: f64,
-    /// Largest difference between commanded and reported position, user units. The reported position is a few cycles old, so
-    /// this includes a few cycles of velocity. `None`: not supervised here.
+    /// Largest difference between commanded and reported position, user units. The reported
+    /// position is a few cycles old, so the limit must include the way of a few cycles. `None`: the
+    /// following error is not supervised here.
     pub following_error: Option<f64>,
 }
 
@@ -28,7 +31,7 @@ pub enum LimitError {
     #[error("position range [{low}, {high}] is empty or not finite")]
     EmptyRange { low: f64, high: f64 },
     #[error(
-        "position range [{low}, {high}] is {counts:e} counts wide, more than the 2^31 a drive can tell apart"
+        "position range [{low}, {high}] is {counts:e} counts wide, more than the 2^31 a drive can distinguish"
     )]
     RangeTooWide { low: f64, high: f64, counts: f64 },
     #[error("velocity limit {velocity} units/s is {raw:e} {unit}, more than 32 bits hold")]
@@ -42,16 +45,17 @@ pub enum LimitError {
 }
 
 impl Limits {
-    /// How long a jerk-limited move takes to reach full acceleration where no jerk is given, seconds.
+    /// Time in seconds in which a jerk-limited move reaches full acceleration if no jerk is
+    /// configured.
     pub const JERK_TIME_S: f64 = 0.05;
 
-    /// The jerk limit in force, user units per second³.
+    /// Returns the effective jerk limit, user units per second³.
     #[must_use]
     pub fn jerk(&self) -> f64 {
         self.jerk.unwrap_or(self.acceleration / Self::JERK_TIME_S)
     }
 
-    /// Velocity, acceleration and jerk.
+    /// Returns velocity, acceleration and jerk.
     #[must_use]
     pub fn motion(&self) -> MotionLimits {
         MotionLimits {
@@ -86,7 +90,7 @@ impl Limits {
             }
         }
         let raw = self.velocity / scale.velocity_resolution();
-        // Headroom, so that an over-velocity still has a value of its own.
+        // Headroom: an over-velocity must still have a distinct raw value.
         if scale
             .velocity_to_raw(UserVelocity(self.velocity * 1.5))
             .0
@@ -107,8 +111,8 @@ impl Limits {
         Ok(())
     }
 
-    /// How far the reported position may leave the range before the axis is stopped: the following error's window, or 1 % of
-    /// the range.
+    /// Returns how far the reported position may leave the range before the axis trips. This is the
+    /// following error limit, or 1 % of the range.
     #[must_use]
     pub fn position_margin(&self) -> f64 {
         let range = self.position.map_or(0.0, |[low, high]| high - low);
@@ -130,7 +134,7 @@ mod tests {
     };
 
     #[test]
-    fn good_and_bad() {
+    fn limits_are_checked_row_by_row() {
         let scale = Scale::new(2000.0, 5.0).unwrap();
         assert_eq!(GOOD.check(&scale), Ok(()));
         let bad = [

@@ -1,16 +1,16 @@
-//! Between the drive's integers and the user's units.
+//! Conversion between the drive's integers and the user's units.
 //!
-//! A [`Scale`] is checked when it is built; afterwards no conversion fails: values outside the wire's range saturate, and
-//! everything is rounded to nearest.
+//! The constructors check a [`Scale`]; afterwards no conversion fails. Values outside the range of
+//! the wire type saturate. All conversions round to nearest.
 
 mod drive_unit;
+mod drive_units;
 mod modulo;
-mod offered;
 mod torque;
 
 pub use drive_unit::{AccelerationBase, AccelerationUnit, INCREMENTS, VelocityBase, VelocityUnit};
-pub use modulo::Way;
-pub use offered::{Contradiction, Offered, same_motor};
+pub use drive_units::{DriveUnits, UnitMismatch, same_motor};
+pub use modulo::ModuloDirection;
 pub use torque::TorqueScale;
 
 use crate::units::{
@@ -41,36 +41,37 @@ pub enum ScaleError {
     Unusable { counts_per_unit: f64 },
 }
 
-/// One axis's conversions. `position = ±counts / counts_per_unit + offset`.
+/// The conversions of one axis. `position = ±counts / counts_per_unit + offset`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scale {
     counts_per_turn: f64,
     units_per_turn: f64,
     velocity_unit: VelocityUnit,
-    /// `None`: of the velocity unit, per second.
+    /// `None`: the velocity unit, per second.
     acceleration_unit: Option<AccelerationUnit>,
     invert: bool,
     offset: f64,
     modulo: Option<f64>,
-    // Derived; the sign of `invert` is in both.
+    // Derived values. `invert` negates the first two.
     counts_per_unit: f64,
     raw_velocity_per_unit: f64,
     raw_acceleration_per_unit: f64,
 }
 
-/// From the encoder to what the machine moves, as drives describe it.
+/// The path from the encoder to the machine part, in the terms of the drive's objects.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Drivetrain {
-    /// Encoder increments, after quadrature, and the motor turns they belong to (0x608F).
+    /// Encoder increments (after quadrature) per motor turns (0x608F).
     pub encoder: [u32; 2],
-    /// Motor turns and the turns of the driving shaft they make (0x6091).
+    /// Motor turns per turns of the driving shaft (0x6091).
     pub gear: [u32; 2],
     /// User units per turn of the driving shaft.
     pub feed: f64,
 }
 
 impl Scale {
-    /// `counts_per_turn`: encoder counts per motor turn (after quadrature). `units_per_turn`: user units per motor turn, gear included.
+    /// Builds a scale. `counts_per_turn`: encoder counts per motor turn, after quadrature.
+    /// `units_per_turn`: user units per motor turn, gear included.
     pub fn new(counts_per_turn: f64, units_per_turn: f64) -> Result<Self, ScaleError> {
         for (what, value) in [
             ("encoder counts per turn", counts_per_turn),
@@ -118,21 +119,22 @@ impl Scale {
         self.derived()
     }
 
-    /// Where 0x60AA is another unit than that of 0x60A9 per second.
+    /// Sets the unit of 0x60AA if it differs from the unit of 0x60A9 per second.
     #[must_use]
     pub fn with_acceleration_unit(mut self, unit: AccelerationUnit) -> Self {
         self.acceleration_unit = Some(unit);
         self.derived()
     }
 
-    /// Positive user direction is the drive's negative one (position, velocity and torque).
+    /// Inverts the direction if `invert` is set: positive user direction is negative drive
+    /// direction (position, velocity and torque).
     #[must_use]
     pub fn with_invert(mut self, invert: bool) -> Self {
         self.invert = invert;
         self.derived()
     }
 
-    /// User position at count 0.
+    /// Sets the user position at count 0.
     pub fn with_offset(mut self, offset: f64) -> Result<Self, ScaleError> {
         if !offset.is_finite() {
             return Err(ScaleError::Offset { value: offset });
@@ -141,7 +143,7 @@ impl Scale {
         Ok(self)
     }
 
-    /// With the offset that makes `counts` the position `position`: what homing finds.
+    /// Sets the offset so that `counts` is the position `position`, as found by homing.
     pub fn homed(self, counts: Counts, position: UserUnits) -> Result<Self, ScaleError> {
         self.with_offset(position.0 - counts.0 as f64 / self.counts_per_unit)
     }
@@ -163,7 +165,7 @@ impl Scale {
         if self.invert { -1.0 } else { 1.0 }
     }
 
-    /// Always positive.
+    /// Returns encoder counts per user unit. The result is always positive.
     #[must_use]
     pub fn counts_per_unit(&self) -> f64 {
         self.counts_per_unit.abs()
@@ -200,13 +202,13 @@ impl Scale {
         self.offset
     }
 
-    /// A length of so many counts, without offset or sign.
+    /// Returns the length of `counts` in user units, without offset or sign.
     #[must_use]
     pub fn units_of_counts(&self, counts: f64) -> f64 {
         counts / self.counts_per_unit()
     }
 
-    /// The smallest step of the drive's velocity, in user units per second.
+    /// Returns the smallest step of the drive's velocity, user units per second.
     #[must_use]
     pub fn velocity_resolution(&self) -> f64 {
         1.0 / self.raw_velocity_per_unit.abs()
@@ -217,7 +219,8 @@ impl Scale {
         UserUnits(counts.0 as f64 / self.counts_per_unit + self.offset)
     }
 
-    /// The positions that an axis without a range of its own takes: beyond 1e15 counts, f64 does not distinguish two of them.
+    /// Returns the valid positions of an axis without a configured range. Beyond 1e15 counts, f64
+    /// does not represent every count.
     #[must_use]
     pub fn range(&self) -> [f64; 2] {
         let far = self.units_of_counts(1e15);
@@ -239,7 +242,7 @@ impl Scale {
         RawVelocity(round_i32(velocity.0 * self.raw_velocity_per_unit))
     }
 
-    /// In the unit of 0x60AA; direction does not matter to an acceleration.
+    /// Converts an acceleration from the unit of 0x60AA. The direction does not matter.
     #[must_use]
     pub fn acceleration_to_user(&self, raw: RawAcceleration) -> UserAcceleration {
         UserAcceleration(f64::from(raw.0) / self.raw_acceleration_per_unit)
@@ -250,7 +253,7 @@ impl Scale {
         let raw = (acceleration.0 * self.raw_acceleration_per_unit)
             .abs()
             .round();
-        // `as` saturates floats, and maps NaN to 0.
+        // `as` saturates floats and maps NaN to 0.
         RawAcceleration(raw as u32)
     }
 
@@ -265,7 +268,7 @@ impl Scale {
     }
 }
 
-// `as` from float to integer saturates and maps NaN to 0, which is what the two below rely on.
+// `as` from float to integer saturates and maps NaN to 0. Both functions below rely on this.
 
 fn round_i64(value: f64) -> i64 {
     value.round() as i64

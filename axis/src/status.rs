@@ -1,128 +1,133 @@
-//! What an axis tells: its status, why it stopped, why it refused.
+//! The status of an axis, its trips, and the reasons for a rejected command.
 
 use core::fmt;
 
 use crate::cia402::{Mode, ModeStatus, State, Statusword, describe};
 use crate::homing::HomingError;
-use crate::probe::ProbeStatus;
 use crate::setpoint::SetpointError;
 use crate::supervision::StopMethod;
+use crate::touch_probe::ProbeStatus;
 
-/// Everything about one axis in one cycle, in user units. `Copy`, so that it can go into a snapshot.
+/// The status of one axis in one cycle, in user units. `Copy`, so that a snapshot can contain it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisStatus {
-    /// The mode whose targets count.
+    /// The active mode; its targets apply.
     pub mode: Mode,
-    /// The mode on its way: 0x6060 is written, 0x6061 does not show it yet.
+    /// The mode of a pending switch: 0x6060 is written, 0x6061 does not show it yet.
     pub switching: Option<Mode>,
-    /// The last mode that was commanded did not show in time; the axis has stayed in `mode`.
+    /// The last commanded mode, if 0x6061 did not show it in time. The axis has stayed in `mode`.
     pub switch_failed: Option<Mode>,
-    /// From the last fresh Statusword.
+    /// The power state in the last fresh Statusword.
     pub state: State,
     pub time_in_state_s: f64,
     pub statusword: u16,
-    /// As put into the last outputs.
+    /// The Controlword of the last outputs.
     pub controlword: u16,
-    /// Operation enabled, mode confirmed, set-points come from here. Before that, targets follow actual values.
+    /// True in Operation enabled with confirmed mode: the axis generates the set-points. Before
+    /// that, targets follow actual values.
     pub enabled: bool,
-    /// Motion commands are taken: `enabled`, neither disabling nor stopping for good, and the brake is open.
+    /// True while motion commands are accepted: `enabled`, not stopping and not being disabled,
+    /// brake open.
     pub ready: bool,
-    /// 0x6061 shows `mode` or `switching`, or is not mapped.
+    /// True if 0x6061 shows `mode` or `switching`, or is not mapped.
     pub mode_confirmed: bool,
-    /// The set-point is still changing, or waits for lost frames before it goes on.
+    /// True while the set-point changes, or waits because of lost frames.
     pub moving: bool,
-    /// The set-point has arrived, and so has the axis (position: within the target window; velocity: within the velocity
-    /// window).
+    /// True if set-point and axis have reached the target. Position: within the target window.
+    /// Velocity: within the velocity window.
     pub in_target: bool,
-    /// Commanded and reported velocity are near zero.
+    /// True while commanded and reported velocity are near zero.
     pub at_rest: bool,
-    /// Reported position. 0 until one was reported.
+    /// Reported position. 0 until the first report.
     pub position: f64,
-    /// Reported velocity, or the filtered difference of positions where velocity is not mapped.
+    /// Reported velocity; without a mapped velocity the filtered difference of positions.
     pub velocity: f64,
     /// Reported torque in percent of rated torque.
     pub torque: f64,
-    /// As commanded in this cycle.
+    /// Commanded position of this cycle.
     pub target_position: f64,
     pub target_velocity: f64,
     pub target_acceleration: f64,
     pub target_torque: f64,
-    /// Commanded (in the cycle before, and by what of the dead time is longer) minus reported position.
+    /// Commanded minus reported position. The commanded position is the one of a dead time ago, at
+    /// least one cycle.
     pub following_error: f64,
-    /// Largest amount since enabling.
+    /// Largest absolute following error since enabling.
     pub max_following_error: f64,
-    /// Target minus reported position once a position move's set-point has arrived.
+    /// Target minus reported position, once the set-point of a position move has arrived.
     pub final_error_counts: Option<i64>,
-    /// A commanded velocity is held back so that the axis can stop before the end of its range.
+    /// True while a commanded velocity is reduced so that the axis can stop inside its range.
     pub held_by_range: bool,
-    /// Cycles in which the last guard had to change a set-point. Stays 0 unless something here is wrong.
+    /// Cycles in which the final limiter changed a set-point. A value above 0 indicates a planning
+    /// error in this crate.
     pub guarded_cycles: u32,
     /// Cycles since the last fresh inputs.
     pub stale_cycles: u32,
-    /// Why enabling does not go on.
-    pub waiting: Option<Waiting>,
+    /// The condition that blocks enabling.
+    pub waiting: Option<EnableBlocker>,
     pub probes: [ProbeStatus; 2],
-    /// Automatic fault resets since the last one by command.
+    /// Automatic fault resets since the last [`crate::Command::ResetFault`], or since the axis was
+    /// last enabled for a minute.
     pub resets_tried: u8,
     pub homing: HomingStatus,
-    /// Home was found, and not searched anew since.
+    /// True if home was found and no homing has started since.
     pub homed: bool,
-    /// The drive's first fault since the last reset.
+    /// The first fault of the drive since the last reset.
     pub fault: Option<DriveFault>,
-    /// Why the axis stopped itself, first cause since the last reset.
+    /// The first trip since the last reset.
     pub trip: Option<Trip>,
-    /// A stop that is to end without power, or in Quick stop active.
+    /// The active stop that ends without power or in Quick stop active.
     pub stop: Option<StopStatus>,
-    /// Statusword bit 11: the drive limits what it is commanded.
+    /// Statusword bit 11: the drive limits the commanded value.
     pub internal_limit: bool,
-    /// Reset pulses are being sent.
+    /// True while fault reset pulses are sent.
     pub resetting: bool,
-    /// The last reset did not help.
+    /// True if the fault remained after the last reset.
     pub reset_failed: bool,
 }
 
 impl AxisStatus {
-    /// The Statusword's bits, remote and voltage enabled among them.
+    /// Returns the Statusword, including bits such as remote and voltage enabled.
     #[must_use]
     pub const fn word(&self) -> Statusword {
         Statusword::from_bits_retain(self.statusword)
     }
 
-    /// What the Statusword says in the mode that counts.
+    /// Returns the mode-specific bits of the Statusword, decoded for the active mode.
     #[must_use]
     pub const fn mode_status(&self) -> ModeStatus {
         self.word().in_mode(self.mode)
     }
 }
 
-/// A stop under way.
+/// An active stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StopStatus {
     pub method: StopMethod,
     pub phase: StopPhase,
-    /// Since the method was chosen; from the removal of the power on, since that.
+    /// Time since the method was chosen, or since the removal of power was requested.
     pub elapsed_s: f64,
-    /// When a harder method takes over.
+    /// Time in seconds after which a harder method takes over.
     pub timeout_s: f64,
 }
 
-/// How far a stop is.
+/// The phase of a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum StopPhase {
     Decelerating,
     /// The axis stands; the brake closes.
     Standstill,
-    /// The drive was told to remove the power and has not reported it yet.
+    /// Removal of power was requested; the drive has not confirmed it.
     RemovingPower,
-    /// The drive still reports power, long after its removal was requested.
+    /// The drive still reports power long after the request to remove it.
     PowerKept,
-    /// The drive has not been heard since, for as long.
+    /// No answer from the drive has arrived for as long after the request.
     Silent,
 }
 
-/// Why an axis that is to be enabled is not ready yet.
+/// The reason why an axis is not ready although it is to be enabled.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum Waiting {
+pub enum EnableBlocker {
     #[error("no position is reported (0x6064)")]
     Position,
     #[error("the drive is not controlled from here: Statusword bit 9 (remote) is not set")]
@@ -135,15 +140,15 @@ pub enum Waiting {
     Follows { mode: Mode },
     #[error("the brake is opening")]
     Brake,
-    /// And says nothing about why.
+    /// The drive gives no reason.
     #[error("the drive stays in {state}")]
     Drive { state: State },
 }
 
-/// The last homing.
+/// The state of the last homing.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum HomingStatus {
-    /// There was none.
+    /// No homing has started.
     #[default]
     None,
     Running,
@@ -151,11 +156,12 @@ pub enum HomingStatus {
     Failed(HomingError),
 }
 
-/// A fault the drive reported.
+/// A fault reported by the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DriveFault {
     pub statusword: u16,
-    /// 0x603F or an emergency's code, if someone told ([`crate::Axis::note_error_code`]).
+    /// The code from 0x603F or from an emergency message, if known
+    /// ([`crate::Axis::note_error_code`]).
     pub code: Option<u16>,
 }
 
@@ -168,7 +174,7 @@ impl fmt::Display for DriveFault {
     }
 }
 
-/// Why an axis stopped itself. Values in user units.
+/// The reason why an axis stopped itself. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Trip {
     #[error("following error {error:.4} exceeds {limit:.4}")]
@@ -177,7 +183,7 @@ pub enum Trip {
     PositionLimit { position: f64, low: f64, high: f64 },
     #[error("velocity {velocity:.4} exceeds 1.2 × the limit of {limit:.4}")]
     OverVelocity { velocity: f64, limit: f64 },
-    #[error("the drive left Operation enabled for {state} without being told to")]
+    #[error("the drive left Operation enabled for {state} without a command")]
     PowerLost { state: State },
     #[error("torque {torque:.1} % has been above {limit:.1} % for {time_s} s")]
     OverTorque {
@@ -207,9 +213,9 @@ pub enum Trip {
     ModeLost { expected: Mode, display: Mode },
 }
 
-/// Why a command was not taken. Nothing has changed. Values in user units.
+/// The reason why a command was rejected. A rejected command changes nothing. Values in user units.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum Refused {
+pub enum CommandError {
     #[error("the bus is not in Op yet")]
     NotInOp,
     #[error("the axis follows something else; stop it first")]

@@ -1,33 +1,35 @@
-//! What is supervised besides the limits, what a trip does, and how faults are reset.
+//! Supervision in addition to the limits, reaction to a trip, brake, and fault reset.
 
-/// Besides [`crate::Limits`]. The default supervises nothing more, and stops by quick stop.
+/// Supervision in addition to [`crate::Limits`]. The default adds nothing and stops by quick stop.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Supervision {
-    /// What a trip does. Where the drive does not follow set-points, a ramp becomes a quick stop.
+    /// Reaction to a trip. If the drive does not follow set-points, a ramp becomes a quick stop.
     pub reaction: StopMethod,
-    /// What [`crate::Command::EmergencyStop`] does.
+    /// Stop method of [`crate::Command::EmergencyStop`].
     pub emergency: StopMethod,
-    /// Reported torque that may not last.
+    /// Highest permanent torque. `None`: not supervised.
     pub torque: Option<TorqueWatch>,
-    /// Largest reported acceleration, user units/s², filtered over 10 ms and for five cycles in a row.
+    /// Largest reported acceleration, user units/s². The value is filtered over 10 ms and must be
+    /// exceeded in five consecutive cycles.
     pub acceleration: Option<f64>,
-    /// The axis stands when its reported velocity is this small, user units/s. `None`: 1 % of the velocity limit.
+    /// Reported velocity up to which the axis stands still, user units/s. `None`: 1 % of the
+    /// velocity limit.
     pub standstill: Option<f64>,
-    /// How long the axis must be within the target window before it is in target, seconds.
+    /// Time in seconds that the axis must be within the target window before it is in target.
     pub target_dwell_s: f64,
-    /// How long it must stand before it is at rest, seconds.
+    /// Time in seconds that the axis must stand still before it is at rest.
     pub standstill_dwell_s: f64,
 }
 
-/// How an axis is brought to rest before its power is removed, gentlest first.
+/// The method that stops an axis before its power is removed, gentlest first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub enum StopMethod {
     /// Set-points within the limits of the axis.
     Ramp,
-    /// The drive's quick stop (0x605A, 0x6085).
+    /// Quick stop of the drive (0x605A, 0x6085).
     #[default]
     QuickStop,
-    /// No power at once; the axis coasts, or its brake stops it.
+    /// Immediate removal of power; the axis coasts, or its brake stops it.
     DisableVoltage,
 }
 
@@ -41,33 +43,33 @@ impl core::fmt::Display for StopMethod {
     }
 }
 
-/// Torque above a limit for a time.
+/// A torque limit that may be exceeded for a limited time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TorqueWatch {
-    /// Of rated torque.
+    /// Percent of rated torque.
     pub percent: f64,
     pub time_s: f64,
 }
 
-/// How long a brake takes. Without one both are 0.
+/// Brake times. Without a brake both are 0.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Brake {
-    /// From Operation enabled to the first motion; the axis holds meanwhile.
+    /// Time from Operation enabled to the first motion; the axis holds its position meanwhile.
     pub release_s: f64,
-    /// From rest to the loss of power; the axis holds meanwhile.
+    /// Time from standstill to the removal of power; the axis holds its position meanwhile.
     pub engage_s: f64,
 }
 
-/// Who resets a drive's fault. Power stays off after a reset until it is asked for.
+/// Trigger of a fault reset. After a reset, power stays off until the next enable command.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum FaultReset {
-    /// [`crate::Command::ResetFault`] alone.
+    /// Only [`crate::Command::ResetFault`].
     #[default]
     Manual,
     Automatic {
-        /// Resets that are tried without a command in between.
+        /// Number of automatic resets without a command in between.
         tries: u8,
-        /// From the fault to the reset, seconds.
+        /// Time from the fault to the reset, seconds.
         delay_s: f64,
     },
 }

@@ -1,23 +1,25 @@
-//! Quantities as types, where a mix-up would move a machine by the wrong amount.
+//! Newtypes for quantities of the drive and of the user. They prevent a mix-up that would move a
+//! machine by the wrong amount.
 //!
-//! Two sides: what the drive counts ([`Counts`], [`RawVelocity`], [`RawAcceleration`], [`PerMille`]) and what the user
-//! thinks in ([`UserUnits`], [`UserVelocity`], [`UserAcceleration`], [`Percent`]). [`crate::Scale`] is the only way across; a torque in
-//! [`NewtonMetres`] or [`Amperes`] goes through [`crate::scale::TorqueScale`] first.
+//! Drive side: [`Counts`], [`RawVelocity`], [`RawAcceleration`], [`PerMille`]. User side:
+//! [`UserUnits`], [`UserVelocity`], [`UserAcceleration`], [`Percent`]. [`crate::Scale`] is the only
+//! conversion between both sides. [`crate::scale::TorqueScale`] first converts a torque in
+//! [`NewtonMetres`] or [`Amperes`] to [`Percent`].
 
-/// Position in encoder counts, unwrapped: it goes on where the drive's 32-bit value wraps.
+/// Position in encoder counts, unwrapped: the value continues where the drive's 32-bit value wraps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Counts(pub i64);
 
 impl Counts {
-    /// As the drive sees it: modulo 2³².
+    /// Returns the position as the drive counts it: modulo 2³².
     #[must_use]
     pub const fn wrapped(self) -> i32 {
         let [a, b, c, d, ..] = self.0.to_le_bytes();
         i32::from_le_bytes([a, b, c, d])
     }
 
-    /// The position nearest to `self` whose wrapped value is `raw`. Right as long as the axis moves less than 2³¹ counts
-    /// between two readings.
+    /// Returns the position nearest to `self` whose wrapped value is `raw`. The result is correct
+    /// if the axis moves less than 2³¹ counts between two readings.
     #[must_use]
     pub fn unwrap_next(self, raw: i32) -> Self {
         let moved = raw.wrapping_sub(self.wrapped());
@@ -25,15 +27,15 @@ impl Counts {
     }
 }
 
-/// Velocity as it is on the wire, in the unit of 0x60A9.
+/// Velocity as transmitted, in the unit of 0x60A9.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct RawVelocity(pub i32);
 
-/// Acceleration as it is on the wire, in the unit of 0x60AA.
+/// Acceleration as transmitted, in the unit of 0x60AA.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct RawAcceleration(pub u32);
 
-/// Torque as it is on the wire: thousandths of the motor's rated torque (0x6076).
+/// Torque as transmitted: thousandths of the motor's rated torque (0x6076).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct PerMille(pub i16);
 
@@ -41,11 +43,11 @@ pub struct PerMille(pub i16);
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
 pub struct UserUnits(pub f64);
 
-/// User units per second.
+/// Velocity in user units per second.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
 pub struct UserVelocity(pub f64);
 
-/// User units per second².
+/// Acceleration in user units per second².
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
 pub struct UserAcceleration(pub f64);
 
@@ -57,7 +59,7 @@ pub struct Percent(pub f64);
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
 pub struct NewtonMetres(pub f64);
 
-/// Current that makes torque.
+/// Torque-producing current.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Default)]
 pub struct Amperes(pub f64);
 

@@ -1,10 +1,10 @@
-//! Getting power on and off: no step at the moment of enabling, no power nobody asked for.
+//! Switching power on and off: no step when the axis is enabled, and no power without a request.
 
 mod common;
 
 use common::{Drive, LIMITS, Rig, axis, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, ConfigError, Inputs, Limits, Mode, Refused, State, Trip,
+    Axis, AxisConfig, Command, CommandError, ConfigError, Inputs, Limits, Mode, State, Trip,
 };
 
 #[test]
@@ -20,10 +20,10 @@ fn nothing_happens_without_a_command() {
 }
 
 #[test]
-fn targets_follow_until_enabled_and_start_where_the_axis_is() {
+fn targets_follow_actual_values_until_enabled() {
     for start in [0, 123_456, i32::MAX - 3, i32::MIN] {
         let mut rig = Rig::new(axis(Mode::Csp), Drive::at(start));
-        // Someone turns the shaft.
+        // An external force turns the shaft.
         rig.drive.velocity = 40_000.0;
         rig.axis.command(Command::Enable).unwrap();
         loop {
@@ -54,7 +54,7 @@ fn disable_decelerates_first() {
     rig.axis.command(go).unwrap();
     rig.run(200);
     rig.axis.command(Command::Disable).unwrap();
-    assert_eq!(rig.axis.command(go), Err(Refused::Stopping));
+    assert_eq!(rig.axis.command(go), Err(CommandError::Stopping));
     let mut braking = 0;
     while rig.cycle().enabled {
         braking += 1;
@@ -65,17 +65,20 @@ fn disable_decelerates_first() {
     );
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 10);
     assert_eq!((status.trip, status.fault), (None, None));
-    // And back.
+    // Enable again.
     rig.axis.command(Command::Enable).unwrap();
     rig.until(|s| s.ready, 20);
 }
 
 #[test]
-fn enabling_again_while_the_power_goes_is_refused() {
+fn enable_is_rejected_while_power_is_removed() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.axis.command(Command::Disable).unwrap();
     rig.cycle();
-    assert_eq!(rig.axis.command(Command::Enable), Err(Refused::Stopping));
+    assert_eq!(
+        rig.axis.command(Command::Enable),
+        Err(CommandError::Stopping)
+    );
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 120);
     assert_eq!(status.trip, None);
 }
@@ -97,7 +100,7 @@ fn quick_stop_holds_then_enables_again() {
     rig.until(|s| s.state == State::QuickStopActive, 5);
     assert!(matches!(
         rig.axis.command(Command::Enable),
-        Err(Refused::StillMoving { .. })
+        Err(CommandError::StillMoving { .. })
     ));
     let status = rig.run(500);
     assert_eq!(status.state, State::QuickStopActive);
@@ -109,7 +112,7 @@ fn quick_stop_holds_then_enables_again() {
 }
 
 #[test]
-fn quick_stop_that_ends_disabled() {
+fn quick_stop_may_end_disabled() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.drive.quick_stop_stays = false;
     rig.axis.command(Command::QuickStop).unwrap();
@@ -139,10 +142,10 @@ fn a_fault_disables_until_reset_and_enabled() {
     assert_eq!(fault.code, Some(0x8611));
     assert!(fault.to_string().contains("following error"));
     assert_eq!(status.trip, None, "a drive fault is not a trip");
-    // Enable alone does not reset.
+    // Enable alone does not reset the fault.
     assert!(matches!(
         rig.axis.command(Command::Enable),
-        Err(Refused::Faulted(_))
+        Err(CommandError::Faulted(_))
     ));
     rig.run(300);
     assert_eq!((rig.drive.state, rig.drive.resets), (State::Fault, 0));
@@ -160,7 +163,7 @@ fn a_fault_disables_until_reset_and_enabled() {
 }
 
 #[test]
-fn reset_and_enable_in_one_breath() {
+fn reset_and_enable_work_in_the_same_cycle() {
     let mut rig = Rig::of(Mode::Csv);
     rig.drive.state = State::Fault;
     rig.run(5);
@@ -170,7 +173,7 @@ fn reset_and_enable_in_one_breath() {
 }
 
 #[test]
-fn a_fault_that_stays() {
+fn permanent_fault_reports_a_failed_reset() {
     let mut rig = Rig::of(Mode::Csp);
     rig.drive.state = State::Fault;
     rig.drive.stubborn = true;
@@ -182,14 +185,14 @@ fn a_fault_that_stays() {
     assert!(!status.resetting && status.fault.is_some());
     rig.run(1000);
     assert_eq!(rig.drive.resets, 3);
-    // Another try is possible.
+    // A second attempt is possible.
     rig.drive.stubborn = false;
     rig.axis.command(Command::ResetFault).unwrap();
     rig.until(|s| s.state == State::SwitchOnDisabled, 200);
 }
 
 #[test]
-fn losing_power_unasked_is_a_trip() {
+fn power_loss_without_request_trips() {
     for state in [
         State::SwitchOnDisabled,
         State::SwitchedOn,
@@ -208,7 +211,7 @@ fn losing_power_unasked_is_a_trip() {
         );
         assert!(matches!(
             rig.axis.command(Command::Enable),
-            Err(Refused::Tripped(_))
+            Err(CommandError::Tripped(_))
         ));
         rig.axis.command(Command::ResetFault).unwrap();
         rig.axis.command(Command::Enable).unwrap();
@@ -240,14 +243,14 @@ fn no_motion_until_the_mode_is_confirmed() {
     };
     assert_eq!(
         rig.axis.command(go),
-        Err(Refused::ModeNotConfirmed {
+        Err(CommandError::ModeNotConfirmed {
             expected: Mode::Csp,
             display: Mode::Pp
         })
     );
     rig.until(|s| s.ready, 3);
     rig.axis.command(go).unwrap();
-    // And a mode that changes under way stops the axis.
+    // A mode that changes during operation stops the axis.
     rig.run(20);
     let mut inputs = rig.drive.inputs();
     inputs.mode_display = Some(6);
@@ -275,7 +278,7 @@ fn csp_without_a_position_gets_no_power() {
 }
 
 #[test]
-fn stale_words_decide_nothing() {
+fn stale_statuswords_are_ignored() {
     let mut rig = Rig::enabled(Mode::Csp);
     let mut inputs = rig.drive.inputs();
     inputs.statusword = 0x0218;
@@ -284,13 +287,13 @@ fn stale_words_decide_nothing() {
     assert_eq!(out.controlword, 0x000F);
     assert_eq!(rig.axis.status().fault, None);
     assert_eq!(rig.axis.status().stale_cycles, 1);
-    // But a command is obeyed.
+    // A command still takes effect.
     rig.axis.command(Command::QuickStop).unwrap();
     assert_eq!(rig.axis.step(&inputs, common::DT).controlword, 0x0002);
 }
 
 #[test]
-fn configurations_that_cannot_work() {
+fn invalid_configurations_are_rejected() {
     for mode in [Mode::Hm, Mode::Unknown(-1), Mode::Unknown(0)] {
         assert_eq!(
             Axis::new(AxisConfig::new(mode, scale(), LIMITS)).err(),

@@ -1,16 +1,17 @@
-//! The loops in the master, and what they follow: moves, velocities, set-points from outside, jerk-limited moves.
+//! Position loops in the master, with moves, velocities, external set-points and jerk-limited
+//! moves.
 
 mod common;
 
 use common::{DEAD_TIME_S, DT, Drive, LIMITS, Rig, looped};
 use ecaxis_axis::{
-    Axis, AxisConfig, AxisStatus, Command, ConfigError, FeedForward, Limits, Loops, Mode,
-    PositionPid, Refused, VelocityLoop,
+    Axis, AxisConfig, AxisStatus, Command, CommandError, ConfigError, FeedForward, Limits, Loops,
+    Mode, PositionPid, VelocityLoop,
 };
 
 const COUNTS_PER_UNIT: f64 = 400.0;
 
-/// This drive's torque at the limit of [`LIMITS`] would not do 2000 mm/s².
+/// Lower limits: with torque at the limit of [`LIMITS`] this drive would not reach 2000 mm/s².
 const SLOW: Limits = Limits {
     position: None,
     velocity: 200.0,
@@ -74,7 +75,7 @@ fn a_velocity_works_in_every_mode_with_a_position_loop() {
         rig.axis.command(run_at(20.0)).unwrap();
         let status = rig.until(|s| s.in_target, 1000);
         assert!((status.velocity - 20.0).abs() < 1.0, "{mode}");
-        // And it stops inside the range.
+        // The axis stops inside the range.
         let status = rig.until(|s| s.held_by_range && s.at_rest, 5000);
         assert_eq!((status.trip, status.guarded_cycles), (None, 0));
         assert!((status.position - 50.0).abs() < 0.02, "{}", status.position);
@@ -107,7 +108,7 @@ fn the_velocity_loop_holds_against_a_drift() {
 }
 
 #[test]
-fn offsets_feed_forward_in_csp_alone() {
+fn offsets_feed_forward_only_in_csp() {
     let config = AxisConfig {
         loops: Loops {
             csp: FeedForward {
@@ -151,9 +152,9 @@ fn offsets_feed_forward_in_csp_alone() {
     assert_eq!(before, -30 * 12_000);
 }
 
-/// Set-points from outside: as they are, or not at all.
+/// External set-points are accepted unchanged or rejected.
 #[test]
-fn set_points_from_outside() {
+fn external_set_points_are_accepted_or_rejected() {
     for mode in CYCLIC {
         let mut rig = enabled(looped(mode, SLOW));
         let start = rig.axis.status().target_position;
@@ -164,32 +165,32 @@ fn set_points_from_outside() {
             assert_eq!(status.target_position, wave(k));
             assert_eq!((status.trip, status.guarded_cycles), (None, 0));
         }
-        // None: within limits to rest.
+        // Without a set-point the axis decelerates within its limits.
         let velocity = rig.axis.status().target_velocity;
         assert!(velocity.abs() > 5.0);
         let after = rig.cycle().target_velocity;
         assert!((after.abs() - (velocity.abs() - 0.1)).abs() < 1e-9);
         rig.until(|s| s.in_target && s.at_rest, 2000);
-        // Too far, too sudden, no number.
+        // Too far, too sudden, NaN.
         let here = rig.axis.status().target_position;
         assert!(matches!(
             rig.axis.set_point(here + 0.201),
-            Err(Refused::Step { .. })
+            Err(CommandError::Step { .. })
         ));
         assert!(matches!(
             rig.axis.set_point(here + 0.001),
-            Err(Refused::Jump { .. })
+            Err(CommandError::Jump { .. })
         ));
         assert!(matches!(
             rig.axis.set_point(f64::NAN),
-            Err(Refused::NotFinite { .. })
+            Err(CommandError::NotFinite { .. })
         ));
         assert_eq!(rig.cycle().target_position, here);
     }
 }
 
 #[test]
-fn set_points_from_outside_stop_with_the_frames() {
+fn external_set_points_end_with_lost_frames() {
     let mut rig = enabled(looped(Mode::Csp, SLOW));
     for _ in 0..2 {
         rig.cycle_with(false);
@@ -198,11 +199,11 @@ fn set_points_from_outside_stop_with_the_frames() {
     }
     rig.cycle_with(false);
     let here = rig.axis.status().target_position;
-    assert_eq!(rig.axis.set_point(here), Err(Refused::FramesLost));
+    assert_eq!(rig.axis.set_point(here), Err(CommandError::FramesLost));
 }
 
 #[test]
-fn the_dead_time_is_no_following_error() {
+fn dead_time_is_not_a_following_error() {
     let config = AxisConfig {
         dead_time_s: 0.0,
         ..looped(Mode::Csp, SLOW)
@@ -220,9 +221,9 @@ fn the_dead_time_is_no_following_error() {
     assert_eq!(DEAD_TIME_S, 0.002);
 }
 
-/// A drive that kept its velocity over lost frames is not made to go back.
+/// A drive that kept its velocity over lost frames does not move back.
 #[test]
-fn lost_frames_in_a_velocity_loop() {
+fn velocity_loop_does_not_move_back_after_lost_frames() {
     for mode in [Mode::Csv, Mode::Cst] {
         let limits = Limits {
             following_error: None,
@@ -237,7 +238,7 @@ fn lost_frames_in_a_velocity_loop() {
                     fresh: false,
                     ..rig.drive.inputs()
                 };
-                // The frame out gets through to nobody, the motor turns on.
+                // The frame is lost, and the motor keeps turning.
                 rig.drive.position += rig.drive.velocity * DT;
                 rig.out = rig.axis.step(&inputs, DT);
             }
@@ -252,7 +253,7 @@ fn lost_frames_in_a_velocity_loop() {
 }
 
 #[test]
-fn loops_that_cannot_work() {
+fn invalid_loops_are_rejected() {
     let good = looped(Mode::Csp, SLOW);
     let with = |loops| AxisConfig { loops, ..good };
     let csv = |kv, feed_forward| {
@@ -296,9 +297,10 @@ fn loops_that_cannot_work() {
     }
 }
 
-/// In every mode with a position loop, redirected and stopped under way: velocity, acceleration and jerk stay within limits.
+/// In every mode with a position loop, with redirections and stops: velocity, acceleration and jerk
+/// keep their limits.
 #[test]
-fn jerk_limited_moves() {
+fn jerk_limited_moves_keep_the_limits_in_every_mode() {
     const JERK: f64 = 2000.0;
     for mode in CYCLIC {
         let limits = Limits {
@@ -330,7 +332,7 @@ fn jerk_limited_moves() {
         assert!(steepest > 0.9 * JERK, "uses what it may");
         rig.axis.command(to(-50.0)).unwrap();
         watch(&mut before, &mut rig, 900);
-        // What adds to the speed ends at once, whatever the jerk.
+        // An acceleration that increases the speed ends at once, with any jerk limit.
         rig.axis.command(Command::Stop).unwrap();
         let speed = rig.axis.status().target_velocity.abs();
         before = rig.cycle();
@@ -347,9 +349,9 @@ fn jerk_limited_moves() {
     }
 }
 
-/// Frames that were lost leave it where the drive stands; it goes on from there.
+/// Lost frames interrupt the move where the drive stands; the move continues from there.
 #[test]
-fn a_jerk_limited_move_with_lost_frames() {
+fn jerk_limited_move_continues_after_lost_frames() {
     let config = AxisConfig {
         jerk_limited: true,
         ..looped(Mode::Csp, LIMITS)

@@ -1,4 +1,5 @@
-//! Frames that are lost: how far the set-point runs ahead of a drive that holds the last one it got, and how it goes on.
+//! Lost frames: how far the set-point runs ahead of a drive that holds its last target, and how the
+//! motion continues.
 
 mod common;
 
@@ -9,7 +10,7 @@ use proptest::prelude::*;
 const COUNTS_PER_UNIT: f64 = 400.0;
 const MRPM_PER_UNIT: f64 = 12_000.0;
 
-/// Good cycles, then lost ones.
+/// Number of good cycles, then of lost cycles.
 type Burst = (u32, u32);
 
 const fn go(position: f64, speed: f64, ramp: f64) -> Command {
@@ -46,13 +47,13 @@ fn enabled(mode: Mode, limits: Limits) -> Rig {
     rig
 }
 
-/// Not limited in position, nor tripping on a velocity that the motor keeps while nobody looks.
+/// No position range, and no trip on the velocity that the motor keeps without supervision.
 const ENDLESS: Limits = Limits {
     position: None,
     ..LIMITS
 };
 
-/// One cycle. What reached the drive in it, if anything did.
+/// Runs one cycle. Returns the status, and the outputs that reached the drive, if any.
 fn cycle(rig: &mut Rig, delivered: bool) -> (AxisStatus, Option<Outputs>) {
     let out = rig.out;
     if !delivered
@@ -62,17 +63,17 @@ fn cycle(rig: &mut Rig, delivered: bool) -> (AxisStatus, Option<Outputs>) {
         rig.drive.position += rig.drive.velocity * DT;
     }
     let status = rig.cycle_with(delivered);
-    // A motor that is behind its target does not catch up faster than it can turn.
+    // A motor that lags behind its target does not catch up faster than its maximum speed.
     let most = LIMITS.velocity * COUNTS_PER_UNIT;
     rig.drive.velocity = rig.drive.velocity.clamp(-most, most);
     (status, delivered.then_some(out))
 }
 
-/// The bound of every step that a CSP drive gets to see.
+/// Bounds of every step in the targets that a CSP drive receives.
 #[derive(Debug)]
 struct Seen {
     target: i32,
-    /// Counts per cycle, over the `over` cycles since the delivery before; 0 over 0 at rest.
+    /// Counts per cycle over the `over` cycles since the previous delivery; both 0 at rest.
     velocity: f64,
     over: f64,
     lost: u32,
@@ -104,7 +105,8 @@ impl Seen {
         if self.lost > 2 {
             (self.velocity, self.over) = (0.0, 0.0);
         } else {
-            // Means over neighbouring spans differ by no more than the way between their middles allows.
+            // Means over neighbouring intervals differ by at most the acceleration between their
+            // middles.
             let velocity = step / over;
             let change = (velocity - self.velocity).abs();
             let steepest = LIMITS.acceleration * DT * DT * COUNTS_PER_UNIT;
@@ -122,7 +124,7 @@ impl Seen {
 }
 
 fn csp(moves: &[(Command, u32)], bursts: &[Burst], last: f64) -> Result<(), TestCaseError> {
-    // Tight: half a cycle of velocity more than what the delay alone makes.
+    // Tight: half a cycle of velocity more than the delay alone causes.
     let limits = Limits {
         following_error: Some(0.5),
         ..LIMITS
@@ -171,7 +173,8 @@ fn csp(moves: &[(Command, u32)], bursts: &[Burst], last: f64) -> Result<(), Test
     Ok(())
 }
 
-/// Velocity or torque as delivered never changes by more than three cycles of ramp, and not at all while nothing gets through.
+/// The delivered velocity or torque changes by at most three cycles of ramp, and not at all while
+/// frames are lost.
 fn ramps(
     mode: Mode,
     commands: &[(Command, u32)],
@@ -248,12 +251,12 @@ proptest! {
     #![proptest_config(config())]
 
     #[test]
-    fn positions(moves in moves(), bursts in bursts(), last in -50.0..=50.0f64) {
+    fn positions_keep_their_steps_after_lost_frames(moves in moves(), bursts in bursts(), last in -50.0..=50.0f64) {
         csp(&moves, &bursts, last)?;
     }
 
     #[test]
-    fn velocities(
+    fn velocities_keep_their_ramp_after_lost_frames(
         commands in waits(prop_oneof![(-200.0..=200.0f64).prop_map(run_at), Just(Command::Stop)]),
         bursts in bursts(),
     ) {
@@ -261,7 +264,7 @@ proptest! {
     }
 
     #[test]
-    fn torques(
+    fn torques_keep_their_ramp_after_lost_frames(
         commands in waits(prop_oneof![(-100.0..=100.0f64).prop_map(push), Just(Command::Stop)]),
         bursts in bursts(),
     ) {
@@ -269,9 +272,9 @@ proptest! {
     }
 }
 
-/// Every length of a burst at every point of one move: speeding up, cruising, slowing down, landing.
+/// Every burst length at every point of one move: acceleration, cruise, deceleration, arrival.
 #[test]
-fn every_burst_everywhere() {
+fn move_survives_every_burst_at_every_point() {
     for good in 1..360 {
         for lost in [1, 2, 3, 4, 19, 100] {
             let bursts = [(good, lost), (1, 0)];
@@ -307,7 +310,7 @@ fn one_or_two_lost_frames_change_nothing() {
     }
 }
 
-/// The move that goes on is the one that was asked for: its goal, its speed, its ramp.
+/// The continued move has the requested goal, speed and ramp.
 #[test]
 fn a_frozen_move_keeps_its_speed_and_ramp() {
     let mut rig = Rig::enabled(Mode::Csp);
@@ -331,7 +334,7 @@ fn a_frozen_move_keeps_its_speed_and_ramp() {
 }
 
 #[test]
-fn commands_while_frozen() {
+fn commands_are_accepted_while_frames_are_lost() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.axis.command(to(50.0)).unwrap();
     rig.run(200);
@@ -339,14 +342,14 @@ fn commands_while_frozen() {
         rig.cycle_with(false);
     }
     let held = rig.out.target_position;
-    // A stop forgets the move; there is nothing left to slow down.
+    // A stop discards the move; nothing remains to decelerate.
     let mut stopped = rig.clone();
     stopped.axis.command(Command::Stop).unwrap();
     stopped.cycle_with(false);
     let status = stopped.run(100);
     assert!(status.ready && !status.moving && status.trip.is_none());
     assert_eq!(stopped.out.target_position, held);
-    // Another move waits like the first.
+    // Another move waits in the same way.
     rig.axis.command(to(-10.0)).unwrap();
     assert!(rig.cycle_with(false).moving);
     assert_eq!(rig.out.target_position, held);
@@ -354,9 +357,9 @@ fn commands_while_frozen() {
     assert_eq!(rig.out.target_position, -4000);
 }
 
-/// A stop or a disable that was under way ends where the set-point is.
+/// A stop or disable interrupted by lost frames ends at the present set-point.
 #[test]
-fn braking_is_cut_short() {
+fn braking_ends_where_frames_are_lost() {
     for command in [Command::Stop, Command::Disable] {
         let mut rig = Rig::enabled(Mode::Csp);
         rig.axis.command(to(50.0)).unwrap();
@@ -406,12 +409,13 @@ fn under_way(mode: Mode) -> Rig {
     rig
 }
 
-/// "Shutdown" or "disable voltage".
+/// Returns true for "shutdown" and "disable voltage".
 const fn no_power(out: &Outputs) -> bool {
     matches!(out.controlword, 0x0006 | 0x0000)
 }
 
-/// Seconds without a fresh cycle until the Controlword is neither "enable operation" nor "quick stop".
+/// Returns the seconds without a fresh cycle until the Controlword is neither "enable operation"
+/// nor "quick stop".
 fn until_no_power(rig: &mut Rig, again: &[Command]) -> f64 {
     for cycles in 1..10_000 {
         for &command in again {
@@ -426,8 +430,9 @@ fn until_no_power(rig: &mut Rig, again: &[Command]) -> f64 {
 }
 
 #[test]
-fn power_goes_in_bounded_time_if_nothing_comes_back() {
-    // By set-points and by quick stop: each from full speed, with a second for the drive and one to notice.
+fn power_is_removed_in_bounded_time_without_answers() {
+    // By set-points and by quick stop: each from full speed, with one second margin and 0.1 s to
+    // settle.
     const BOUND: f64 = 2.0 * (1.0 + 0.1 + 2.0 * DT);
     for mode in [Mode::Csp, Mode::Csv, Mode::Cst] {
         let both = [Command::QuickStop, Command::Disable];
@@ -444,7 +449,7 @@ fn power_goes_in_bounded_time_if_nothing_comes_back() {
                     rig.run(after);
                     let seconds = until_no_power(&mut rig, again);
                     assert!(seconds <= BOUND, "{mode} {commands:?}: {seconds} s");
-                    // And it stays so, whatever is asked of it again.
+                    // Power stays off after further commands.
                     for _ in 0..5000 {
                         for &command in again {
                             let _ = rig.axis.command(command);
@@ -458,7 +463,7 @@ fn power_goes_in_bounded_time_if_nothing_comes_back() {
     }
 }
 
-/// An axis that stood when the frames went has nothing to wait for.
+/// An axis at rest when the frames are lost does not wait.
 #[test]
 fn a_standing_axis_is_disabled_at_once() {
     let mut rig = Rig::new(axis(Mode::Csp), Drive::at(0));
@@ -474,10 +479,10 @@ fn a_standing_axis_is_disabled_at_once() {
     assert_eq!(rig.out.controlword, 0x0006);
 }
 
-/// The drive got the new mode amid lost frames, and goes to the target that came with it: the set-point goes on from there, wherever the
-/// motor is by then.
+/// The drive received the new mode during lost frames and moves to the target sent with it. The
+/// set-point continues from there, wherever the motor is by then.
 #[test]
-fn csp_that_is_entered_amid_lost_frames_goes_on_from_the_target_sent() {
+fn csp_entered_during_lost_frames_continues_from_the_sent_target() {
     let most = LIMITS.velocity * DT * COUNTS_PER_UNIT + 1.0;
     for delivered in 1..4 {
         for lost in 3..12 {
@@ -497,7 +502,7 @@ fn csp_that_is_entered_amid_lost_frames_goes_on_from_the_target_sent() {
                 for n in 0..lost + 50 {
                     let before = rig.out;
                     if n == lost {
-                        // Somebody pushes it.
+                        // An external force pushes the motor.
                         rig.drive.velocity = knocked * LIMITS.velocity * COUNTS_PER_UNIT;
                     }
                     let (status, _) = cycle(&mut rig, n >= lost);

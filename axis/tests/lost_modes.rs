@@ -1,4 +1,4 @@
-//! Frames that are lost while modes are switched: nobody knows what the drive has got of it.
+//! Lost frames during a mode switch: the axis does not know whether the drive has received it.
 
 mod common;
 
@@ -10,7 +10,7 @@ use ecaxis_axis::{Axis, AxisConfig, AxisStatus, Command, Limits, Mode, Modes, Ou
 const COUNTS_PER_UNIT: f64 = 400.0;
 const MRPM_PER_UNIT: f64 = 12_000.0;
 const SPEED: f64 = 100.0;
-/// In one cycle at [`SPEED`], counts.
+/// Counts per cycle at [`SPEED`].
 const WAY: f64 = SPEED * DT * COUNTS_PER_UNIT;
 
 const ENDLESS: Limits = Limits {
@@ -21,13 +21,13 @@ const ENDLESS: Limits = Limits {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Lost {
     Nothing,
-    /// On the way out: the drive gets nothing.
+    /// The frame to the drive is lost: the drive receives nothing.
     Frame,
-    /// On the way back.
+    /// The answer is lost.
     Answer,
 }
 
-/// The drive with what it has got: it turns on, or stands at its last target.
+/// Advances the drive with its last outputs: it keeps moving, or stands at its last target.
 fn alone(drive: &mut Drive) {
     if drive.state == State::OperationEnabled && drive.mode == Mode::Csp.code() {
         drive.velocity = 0.0;
@@ -35,14 +35,14 @@ fn alone(drive: &mut Drive) {
     drive.position += drive.velocity * DT;
 }
 
-/// A rig whose drive takes modes over some cycles after it has got them.
+/// A rig whose drive changes its mode some cycles after it received the request.
 struct Line {
     rig: Rig,
     modes: VecDeque<i8>,
 }
 
 impl Line {
-    /// At [`SPEED`] in a mode.
+    /// Returns a rig that moves at [`SPEED`] in the mode of `config`.
     fn under_way(config: AxisConfig, late: usize) -> Self {
         let mode = config.mode;
         let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
@@ -50,7 +50,7 @@ impl Line {
         rig.until(|s| s.ready, 100);
         let velocity = Command::Velocity {
             velocity: SPEED,
-            // A torque that the motor has.
+            // A torque that the motor reaches.
             ramp: if mode == Mode::Cst { 0.1 } else { 1.0 },
         };
         rig.axis.command(velocity).unwrap();
@@ -60,7 +60,7 @@ impl Line {
         Self { rig, modes }
     }
 
-    /// One cycle. What the drive got.
+    /// Runs one cycle. Returns the status and the outputs that reached the drive.
     fn cycle(&mut self, lost: Lost) -> (AxisStatus, Option<Outputs>) {
         let rig = &mut self.rig;
         let mut inputs = rig.drive.inputs();
@@ -79,7 +79,7 @@ impl Line {
     }
 }
 
-/// Into CSP, with so many cycles between the order and those that are lost.
+/// Switches to CSP; `delivered` cycles later, `lost` frames or answers are lost.
 fn into_csp(from: Mode, late: usize, delivered: u32, lost: u32, what: Lost, most: f64) {
     let case = format!("{from}, {late} late, {delivered} delivered, {lost} of {what:?} lost");
     let mut line = Line::under_way(all(from, ENDLESS), late);
@@ -115,9 +115,9 @@ fn into_csp(from: Mode, late: usize, delivered: u32, lost: u32, what: Lost, most
     assert!(at_speed, "{case}: {}", status.target_velocity);
 }
 
-/// A drive that turned all the while does not jump back to a target from before.
+/// A drive that kept moving does not jump back to an old target.
 #[test]
-fn csp_that_did_not_get_through() {
+fn csp_request_in_lost_frames_does_not_jump() {
     for from in [Mode::Csv, Mode::Pv, Mode::Cst] {
         for delivered in 0..4 {
             for lost in 1..30 {
@@ -127,9 +127,9 @@ fn csp_that_did_not_get_through() {
     }
 }
 
-/// It has the mode, and nobody knows.
+/// The drive has the mode, and the axis does not know it.
 #[test]
-fn csp_whose_answers_did_not_get_through() {
+fn csp_request_with_lost_answers_does_not_jump() {
     for from in [Mode::Csv, Mode::Pv, Mode::Cst] {
         for delivered in 0..4 {
             for lost in 1..30 {
@@ -139,9 +139,9 @@ fn csp_whose_answers_did_not_get_through() {
     }
 }
 
-/// A drive that takes its time meets both modes in turn, and is not believed at once.
+/// A slow drive receives both modes in turn; its first displays do not count.
 #[test]
-fn csp_of_a_drive_that_changes_over_late() {
+fn csp_of_a_slow_drive_does_not_jump() {
     for late in 1..8 {
         for lost in 1..20 {
             into_csp(Mode::Csv, late, 0, lost, Lost::Answer, 12.0 * WAY);
@@ -161,7 +161,7 @@ fn out_of_csp(config: AxisConfig, delivered: u32, lost: u32) {
             Lost::Nothing
         };
         let drive = &line.rig.drive;
-        // What a drive stands at, it stands at.
+        // A drive at standstill stays there.
         let stands = now != Lost::Frame && n == delivered + lost && drive.mode == Mode::Csp.code();
         let before = if stands { 0.0 } else { drive.velocity };
         let (status, got) = line.cycle(now);
@@ -182,9 +182,9 @@ fn out_of_csp(config: AxisConfig, delivered: u32, lost: u32) {
     assert!((status.velocity - SPEED).abs() < 0.5, "{case}");
 }
 
-/// A drive that has left CSP keeps the velocity it got, and is not stopped in one cycle.
+/// A drive that has left CSP keeps its last velocity and does not stop in one cycle.
 #[test]
-fn csv_that_was_reached_goes_on() {
+fn csv_keeps_its_velocity_after_lost_frames() {
     let plain = AxisConfig {
         modes: Modes::only(Mode::Csp).with(Mode::Csv),
         ..AxisConfig::new(Mode::Csp, scale(), ENDLESS)
@@ -198,9 +198,9 @@ fn csv_that_was_reached_goes_on() {
     }
 }
 
-/// Neither a mode that is held back nor one that is shown runs out of time.
+/// Neither a pending mode nor a displayed mode times out.
 #[test]
-fn a_mode_that_is_held_back_has_its_time() {
+fn pending_mode_does_not_time_out() {
     let config = AxisConfig {
         mode_time_s: 0.006,
         ..all(Mode::Csv, ENDLESS)

@@ -1,6 +1,8 @@
-//! A machine that everything happens to: random commands, faults, mode changes and lost frames, checked in every cycle.
+//! Random simulation of a machine: commands, faults, mode switches and lost frames, checked in
+//! every cycle.
 //!
-//! `cargo test` runs a bounded part; `ECAXIS_MACHINE_SECONDS` asks for more, `ECAXIS_SEED` for one run alone.
+//! `cargo test` runs a bounded part; `ECAXIS_MACHINE_SECONDS` requests more, `ECAXIS_SEED` a single
+//! run.
 
 #![allow(clippy::print_stdout, reason = "how much was simulated")]
 
@@ -15,10 +17,11 @@ use ecaxis_axis::{
 const COUNTS_PER_UNIT: f64 = 400.0;
 const MRPM_PER_UNIT: f64 = 12_000.0;
 
-/// Machine-seconds of one seed.
+/// Simulated seconds per seed.
 const RUN_S: f64 = 10.0;
 
-/// Trip until no power: a ramp or the drive's halt, the wait for lost frames, the brake, and a few cycles.
+/// Longest time from trip to power off: a ramp or the drive's halt, the wait for lost frames, the
+/// brake, a few cycles.
 const STOPPED_WITHIN_S: f64 = 2.0 * (1.0 + 0.2 + 0.1) + 3.0 * 0.1 + 0.05 + 0.01;
 
 /// splitmix64.
@@ -33,7 +36,7 @@ impl Dice {
         z ^ (z >> 31)
     }
 
-    /// One in `n`.
+    /// Returns true once in `n` calls on average.
     fn one_in(&mut self, n: u64) -> bool {
         self.next().is_multiple_of(n)
     }
@@ -46,7 +49,7 @@ impl Dice {
         low + (self.next() >> 11) as f64 / (1u64 << 53) as f64 * (high - low)
     }
 
-    /// Mostly within limits, now and then any bits at all.
+    /// Returns a number that is mostly within limits, and sometimes any bit pattern.
     fn number(&mut self, most: f64) -> f64 {
         if self.one_in(20) {
             f64::from_bits(self.next())
@@ -165,20 +168,20 @@ fn command(dice: &mut Dice, mode: Mode) -> Command {
     }
 }
 
-/// What was seen in the cycle before, and what is still owed.
+/// Values of the previous cycle, and pending obligations.
 struct Checker {
     config: AxisConfig,
-    /// Somebody asked for power, and nobody for its end.
+    /// True while power is requested.
     asked: bool,
     ending: bool,
     before: (AxisStatus, Outputs),
-    /// Counts per cycle.
+    /// Target step of the previous cycle, counts.
     step_before: f64,
-    /// Power must be gone by then.
+    /// Time by which power must be off.
     deadline_s: Option<f64>,
 }
 
-/// What the drive acts on: the mode it may be in, by what the axis tells.
+/// Returns the modes that the drive may be in, according to the status.
 fn in_force(status: &AxisStatus) -> [Option<Mode>; 2] {
     [Some(status.mode), status.switching]
 }
@@ -195,7 +198,7 @@ impl Checker {
         }
     }
 
-    /// What is sent after cycles that were left out goes on from rest.
+    /// Checks that targets after skipped cycles continue from rest.
     fn left_out(&mut self, axis: &Axis, out: Outputs) {
         let (was, sent) = self.before;
         self.before = (axis.status(), out);
@@ -236,7 +239,7 @@ impl Checker {
 
         let held = status.enabled && was.enabled;
         let frozen = held && status.stale_cycles > 2;
-        // A goal is no set-point: the drive finds its own way to it.
+        // A goal is not a set-point: the drive plans its own motion.
         let goals = matches!(status.mode, Mode::Pp | Mode::Pv);
         if frozen && !goals {
             let targets = |out: &Outputs| match status.mode {
@@ -252,7 +255,7 @@ impl Checker {
         let live = |mode: Mode| {
             held && in_force(&status).contains(&Some(mode)) && in_force(&was).contains(&Some(mode))
         };
-        // The same law before and now.
+        // The same control law in the previous cycle and in this one.
         let steady = |mode: Mode| held && status.mode == mode && was.mode == mode;
 
         let step = f64::from(out.target_position.wrapping_sub(sent.target_position));
@@ -295,7 +298,7 @@ impl Checker {
                 && f64::from(out.profile_acceleration) <= limits.acceleration * MRPM_PER_UNIT + 1.0,
             "profile above the limits",
         )?;
-        // A mode that was switched to begins where its targets were while it was awaited.
+        // A new mode starts where its targets were during the switch.
         let entered = |mode: Mode| held && status.mode == mode && was.switching == Some(mode);
         if entered(Mode::Csp) {
             let most = limits.velocity * DT * COUNTS_PER_UNIT + 1.0;
@@ -332,7 +335,7 @@ impl Checker {
                 "bits of a mode without power",
             )?;
         }
-        // Following, or the very cycle of enabling: exactly what was reported.
+        // While following, and in the cycle of enabling: exactly the reported position.
         if !held && inputs.fresh && (status.mode == Mode::Csp || !status.enabled) {
             ensure(
                 Some(out.target_position) == inputs.position,
@@ -341,7 +344,7 @@ impl Checker {
         }
         ensure(
             out.controlword & 0x0F == 0x0F || out.controlword & 0x0170 == 0,
-            "bits of a mode beside another command",
+            "bits of a mode next to another command",
         )?;
         ensure(
             out.brake_open || !status.ready,
@@ -464,10 +467,10 @@ fn run(seed: u64, sum: &mut Sum) -> Result<(), String> {
         if lost == 0 {
             rig.drive.cycle(&rig.out, DT);
         } else if turns(&rig.drive) {
-            // The motor turns on.
+            // The motor keeps turning.
             rig.drive.position += rig.drive.velocity * DT;
         }
-        // A motor that catches up does not do so faster than it can turn.
+        // A motor that catches up does not exceed its maximum speed.
         let most = 1.1 * LIMITS.velocity * COUNTS_PER_UNIT;
         rig.drive.velocity = rig.drive.velocity.clamp(-most, most);
         lost = lost.saturating_sub(1);
@@ -489,7 +492,7 @@ fn run(seed: u64, sum: &mut Sum) -> Result<(), String> {
 }
 
 #[test]
-fn whatever_happens() {
+fn axis_keeps_its_promises_in_random_runs() {
     let asked = |name: &str| {
         std::env::var(name)
             .ok()
@@ -515,7 +518,7 @@ fn whatever_happens() {
         sum.trips,
         sum.faults,
     );
-    // It is worth something only if the axis is often enabled and much happens to it.
+    // The simulation is only meaningful if the axis is often enabled and many events occur.
     assert!(share > 0.3, "{share}");
     for count in [
         sum.taken,

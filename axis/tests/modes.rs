@@ -1,13 +1,15 @@
-//! Switching modes, at rest and in motion.
+//! Mode switches, at rest and in motion.
 
 mod common;
 
 use common::{DT, Drive, LIMITS, Rig, looped, scale};
-use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Loops, Mode, Modes, Refused, State, Trip};
+use ecaxis_axis::{
+    Axis, AxisConfig, Command, CommandError, Limits, Loops, Mode, Modes, State, Trip,
+};
 
 const COUNTS_PER_UNIT: f64 = 400.0;
 
-/// This drive's torque at the limit of [`LIMITS`] would not do 2000 mm/s².
+/// Lower limits: with torque at the limit of [`LIMITS`] this drive would not reach 2000 mm/s².
 const SLOW: Limits = Limits {
     position: None,
     velocity: 200.0,
@@ -24,7 +26,7 @@ fn enabled(config: AxisConfig) -> Rig {
     rig
 }
 
-/// The same modes without loops.
+/// The same modes without position loops.
 fn plain(mode: Mode, limits: Limits) -> AxisConfig {
     AxisConfig {
         loops: Loops::default(),
@@ -47,9 +49,9 @@ const fn run_at(velocity: f64) -> Command {
     }
 }
 
-/// In motion, at constant velocity, once around: neither the set-point nor what the drive makes of it steps.
+/// At constant velocity through all modes: neither the set-point nor the drive's motion steps.
 #[test]
-fn once_around_in_motion() {
+fn velocity_continues_through_all_modes() {
     for delay in [0, 1, 7, 40] {
         let mut rig = enabled(looped(Mode::Csp, SLOW));
         rig.drive.mode_delay = Some(delay);
@@ -68,7 +70,7 @@ fn once_around_in_motion() {
             rig.axis.command(Command::SetMode(mode)).unwrap();
             assert_eq!(
                 rig.axis.command(to(0.0)),
-                Err(Refused::Switching { to: mode })
+                Err(CommandError::Switching { to: mode })
             );
             for _ in 0..300 {
                 let real = rig.drive.position;
@@ -79,7 +81,7 @@ fn once_around_in_motion() {
                     "{mode}: set-point steps by {step}"
                 );
                 let moved = (rig.drive.position - real) / COUNTS_PER_UNIT / DT;
-                // One cycle of the acceleration limit, and rounding to counts.
+                // One cycle of the acceleration limit, plus rounding to counts.
                 let most = SLOW.acceleration * DT + 2.0 / COUNTS_PER_UNIT / DT;
                 assert!(
                     (moved - velocity).abs() <= most,
@@ -114,9 +116,10 @@ fn a_move_goes_on_through_a_switch() {
     assert_eq!(status.final_error_counts, Some(0));
 }
 
-/// A cycle too early or too late is a step of 0.06 mm. The command may come before the inputs or after them.
+/// One cycle too early or too late would be a step of 0.06 mm. The command may arrive before or
+/// after the inputs.
 #[test]
-fn a_position_begins_where_the_axis_will_be() {
+fn position_starts_where_the_axis_will_be() {
     for before_the_inputs in [false, true] {
         let mut rig = enabled(plain(Mode::Csv, SLOW));
         rig.axis.command(run_at(60.0)).unwrap();
@@ -139,9 +142,10 @@ fn a_position_begins_where_the_axis_will_be() {
     }
 }
 
-/// A mode without a loop cannot carry out a move: it comes to rest, from the velocity or torque that there is.
+/// A mode without a position loop cannot execute a move: the axis decelerates from its velocity or
+/// torque.
 #[test]
-fn into_modes_without_loops() {
+fn modes_without_loops_end_a_move() {
     let mut rig = enabled(plain(Mode::Csp, SLOW));
     rig.axis.command(to(80.0)).unwrap();
     rig.run(500);
@@ -154,12 +158,12 @@ fn into_modes_without_loops() {
     );
     assert!(matches!(
         rig.axis.command(to(0.0)),
-        Err(Refused::WrongMode { .. })
+        Err(CommandError::WrongMode { .. })
     ));
     rig.axis.command(run_at(30.0)).unwrap();
     rig.until(|s| s.in_target, 500);
 
-    // Torque starts with the torque that the drive has, and goes away.
+    // The torque starts at the drive's torque and decreases.
     let mut inputs = rig.drive.inputs();
     rig.axis.command(Command::SetMode(Mode::Cst)).unwrap();
     inputs.torque = Some(150);
@@ -176,7 +180,7 @@ fn into_modes_without_loops() {
     rig.run(20);
     assert_eq!(rig.out.target_torque, 0);
 
-    // Back to positions, still turning: from where the axis is, at its velocity, to rest.
+    // Back to positions in motion: from the present position and velocity to rest.
     rig.axis.command(Command::SetMode(Mode::Csp)).unwrap();
     let mut last = rig.drive.position;
     let mut velocity = rig.drive.velocity / COUNTS_PER_UNIT;
@@ -208,7 +212,7 @@ fn a_stop_ends_a_torque_at_the_position_it_led_to() {
     rig.axis.command(Command::Stop).unwrap();
     let status = rig.cycle();
     assert!((status.target_velocity - status.velocity).abs() < 1.0);
-    // The acceleration changes sign, and the torque with it; the integral starts where it was.
+    // Acceleration and torque change their sign; the integral keeps its start value.
     assert!((status.target_torque - torque_before).abs() <= 0.4 * SLOW.acceleration + 1.0);
     let status = rig.until(|s| s.in_target && s.at_rest, 2000);
     assert_eq!(status.trip, None);
@@ -216,7 +220,7 @@ fn a_stop_ends_a_torque_at_the_position_it_led_to() {
 }
 
 #[test]
-fn a_mode_that_does_not_show_leaves_the_old_one() {
+fn mode_that_is_not_displayed_keeps_the_old_mode() {
     let mut rig = enabled(looped(Mode::Csp, SLOW));
     rig.axis.command(to(80.0)).unwrap();
     rig.run(100);
@@ -232,7 +236,7 @@ fn a_mode_that_does_not_show_leaves_the_old_one() {
     );
     assert_eq!((status.mode, rig.out.mode), (Mode::Csp, 8));
     rig.until(|s| s.in_target, 3000);
-    // Another try may do better.
+    // A second attempt may succeed.
     rig.drive.mode_delay = Some(3);
     rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
     let status = rig.until(|s| s.mode == Mode::Csv, 20);
@@ -240,7 +244,7 @@ fn a_mode_that_does_not_show_leaves_the_old_one() {
 }
 
 #[test]
-fn a_third_mode_is_a_trip() {
+fn third_mode_trips() {
     let mut rig = enabled(looped(Mode::Csp, SLOW));
     rig.axis.command(Command::SetMode(Mode::Csv)).unwrap();
     let mut inputs = rig.drive.inputs();
@@ -256,12 +260,12 @@ fn a_third_mode_is_a_trip() {
 }
 
 #[test]
-fn modes_are_refused_with_a_reason() {
+fn rejected_modes_give_a_reason() {
     let mut rig = enabled(AxisConfig::new(Mode::Csp, scale(), SLOW));
     for mode in [Mode::Csv, Mode::Unknown(-3), Mode::Unknown(0)] {
         assert_eq!(
             rig.axis.command(Command::SetMode(mode)),
-            Err(Refused::ModeNotOffered { mode })
+            Err(CommandError::ModeNotOffered { mode })
         );
     }
     assert_eq!(rig.axis.command(Command::SetMode(Mode::Csp)), Ok(()));
@@ -271,12 +275,12 @@ fn modes_are_refused_with_a_reason() {
     rig.axis.step(&inputs, DT);
     assert_eq!(
         rig.axis.command(Command::SetMode(Mode::Csv)),
-        Err(Refused::NoModeDisplay)
+        Err(CommandError::NoModeDisplay)
     );
     rig.axis.command(Command::QuickStop).unwrap();
     assert_eq!(
         rig.axis.command(Command::SetMode(Mode::Csv)),
-        Err(Refused::Stopping)
+        Err(CommandError::Stopping)
     );
 }
 
@@ -294,7 +298,7 @@ fn a_mode_may_be_chosen_before_enabling() {
 }
 
 #[test]
-fn power_lost_during_a_switch() {
+fn fault_during_a_switch_ends_the_switch() {
     let mut rig = enabled(looped(Mode::Csp, SLOW));
     rig.axis.command(run_at(60.0)).unwrap();
     rig.run(500);
@@ -313,7 +317,7 @@ fn power_lost_during_a_switch() {
 }
 
 #[test]
-fn no_voltage_at_once() {
+fn disable_voltage_acts_at_once() {
     let mut rig = enabled(looped(Mode::Csp, SLOW));
     rig.axis.command(run_at(60.0)).unwrap();
     rig.run(300);

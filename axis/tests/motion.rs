@@ -1,9 +1,11 @@
-//! Moves, velocities and torques, and what is refused.
+//! Moves, velocities, torques, and rejected commands.
 
 mod common;
 
 use common::{DT, Drive, LIMITS, Rig, scale};
-use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Refused, Scale, State, VelocityUnit};
+use ecaxis_axis::{
+    Axis, AxisConfig, Command, CommandError, Limits, Mode, Scale, State, VelocityUnit,
+};
 
 const fn to(position: f64) -> Command {
     Command::MoveTo {
@@ -38,7 +40,7 @@ fn following_error_is_a_few_cycles_of_velocity() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.axis.command(to(50.0)).unwrap();
     let status = rig.until(|s| s.in_target && s.at_rest, 1000);
-    // 200 mm/s and the cycle between the command and its report.
+    // 200 mm/s, and the cycle between the command and its report.
     assert!(
         (0.19..0.61).contains(&status.max_following_error),
         "{}",
@@ -69,7 +71,7 @@ fn speed_and_ramp_are_fractions() {
 }
 
 #[test]
-fn reversal_and_stop() {
+fn csp_reverses_and_stops() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.axis.command(to(50.0)).unwrap();
     rig.run(250);
@@ -100,7 +102,7 @@ fn two_lost_frames_do_not_stop_the_trajectory() {
     assert_eq!((status.stale_cycles, status.trip), (0, None));
 }
 
-/// The targets of lost frames never reached the drive: that it is behind them is not its fault.
+/// Lost targets never reached the drive: its lag behind them is not a following error.
 #[test]
 fn lost_frames_are_not_a_following_error() {
     let mut rig = Rig::enabled(Mode::Csp);
@@ -113,7 +115,7 @@ fn lost_frames_are_not_a_following_error() {
     assert!(status.following_error > 0.5 && status.trip.is_none());
     let status = rig.until(|s| s.in_target, 1000);
     assert!(status.max_following_error < 0.61);
-    // Nor does losing every other frame hide a blocked motor.
+    // Alternating lost frames do not hide a blocked motor.
     rig.axis.command(to(-50.0)).unwrap();
     rig.drive.blocked = true;
     for cycle in 0..300 {
@@ -123,7 +125,7 @@ fn lost_frames_are_not_a_following_error() {
 }
 
 #[test]
-fn across_the_end_of_32_bits() {
+fn positions_continue_across_the_end_of_32_bits() {
     let scale = Scale::new(2000.0, 5.0)
         .unwrap()
         .with_velocity_unit(VelocityUnit::MILLI_RPM);
@@ -143,7 +145,7 @@ fn across_the_end_of_32_bits() {
 }
 
 #[test]
-fn inverted_axis_with_offset() {
+fn inverted_axis_applies_its_offset() {
     let scale = scale().with_invert(true).with_offset(10.0).unwrap();
     let axis = Axis::new(AxisConfig::new(Mode::Csp, scale, LIMITS)).unwrap();
     let mut rig = Rig::new(axis, Drive::at(0));
@@ -195,7 +197,7 @@ fn csv_stops_inside_its_range() {
         status.position
     );
     assert!(status.target_velocity.abs() < 0.5);
-    // And out again.
+    // And out of the range again.
     rig.axis
         .command(Command::Velocity {
             velocity: -10.0,
@@ -222,7 +224,7 @@ fn cst_ramps_and_stops() {
     rig.axis.command(Command::Stop).unwrap();
     rig.until(|s| s.in_target, 30);
     assert_eq!(rig.out.target_torque, 0);
-    // No ramp asked for: as steep as configured, 1000 % per second.
+    // Without a ramp: the configured slope, 1000 % per second.
     rig.axis
         .command(Command::Torque {
             percent: -5.0,
@@ -234,12 +236,12 @@ fn cst_ramps_and_stops() {
 }
 
 #[test]
-fn refusals_say_why_and_change_nothing() {
+fn rejected_commands_give_a_reason_and_change_nothing() {
     let mut rig = Rig::of(Mode::Csp);
     rig.run(5);
     assert_eq!(
         rig.axis.command(to(1.0)),
-        Err(Refused::NotEnabled {
+        Err(CommandError::NotEnabled {
             state: State::SwitchOnDisabled
         })
     );
@@ -299,14 +301,14 @@ fn refusals_say_why_and_change_nothing() {
     let mut rig = Rig::enabled(Mode::Csv);
     assert!(matches!(
         rig.axis.command(to(1.0)),
-        Err(Refused::WrongMode { .. })
+        Err(CommandError::WrongMode { .. })
     ));
     assert!(matches!(
         rig.axis.command(Command::Velocity {
             velocity: -201.0,
             ramp: 1.0
         }),
-        Err(Refused::TooFast { limit: 200.0, .. })
+        Err(CommandError::TooFast { limit: 200.0, .. })
     ));
     let mut rig = Rig::enabled(Mode::Cst);
     assert!(matches!(
@@ -314,13 +316,13 @@ fn refusals_say_why_and_change_nothing() {
             percent: 100.1,
             ramp_s: 0.0
         }),
-        Err(Refused::TooMuchTorque { limit: 100.0, .. })
+        Err(CommandError::TooMuchTorque { limit: 100.0, .. })
     ));
     assert!(matches!(
         rig.axis.command(Command::Torque {
             percent: 1.0,
             ramp_s: -1.0
         }),
-        Err(Refused::Negative { .. })
+        Err(CommandError::Negative { .. })
     ));
 }

@@ -1,4 +1,4 @@
-//! Nothing an axis does in a cycle allocates: commands, refusals, faults and trips included.
+//! The cycle of an axis allocates nothing, including commands, rejections, faults and trips.
 
 mod common;
 mod counting;

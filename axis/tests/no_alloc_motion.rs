@@ -1,12 +1,13 @@
-//! Nothing that set-points and lines do in a cycle allocates: planning, refusing and going on after lost frames included.
+//! The cycle of set-points and lines allocates nothing, including planning, rejections and
+//! continuation after lost frames.
 
 mod counting;
 
 use counting::allocations;
 use ecaxis_axis::group::{Line, LineAxis};
 use ecaxis_axis::setpoint::{
-    Engage, Gear, GearConfig, Goal, Interpolation, JerkLimited, Knot, Motion, MotionLimits, Order,
-    Playback, PositionWave, Setpoint, Shape, Stream, StreamConfig, Table, Wave,
+    Gear, GearConfig, GearInMode, Goal, Interpolation, JerkLimited, Knot, Motion, MotionLimits,
+    MoveRequest, Playback, PositionWave, Setpoint, Shape, Stream, StreamConfig, Table, Wave,
 };
 
 const DT: f64 = 0.001;
@@ -17,7 +18,7 @@ const LIMITS: MotionLimits = MotionLimits {
     jerk: 40_000.0,
 };
 
-/// Runs for a second of machine time, losing frames now and then.
+/// Runs one simulated second with occasional lost frames.
 fn run(mut source: impl FnMut(u32, Motion) -> Motion, start: Motion) -> Motion {
     let mut motion = start;
     for cycle in 0..1000 {
@@ -29,7 +30,7 @@ fn run(mut source: impl FnMut(u32, Motion) -> Motion, start: Motion) -> Motion {
     motion
 }
 
-/// How many allocations `f` makes; that it did something is seen from where it ends.
+/// Returns the number of allocations in `f`. The final motion shows that `f` moved.
 fn counted(f: impl FnOnce() -> Motion) -> u64 {
     let before = allocations();
     let motion = f();
@@ -39,11 +40,11 @@ fn counted(f: impl FnOnce() -> Motion) -> u64 {
 }
 
 #[test]
-fn moves() {
+fn moves_do_not_allocate() {
     let made = counted(|| {
-        let order = |target| Order {
+        let order = |target| MoveRequest {
             range: Some([-60.0, 60.0]),
-            ..Order::within(Goal::Position(target), LIMITS)
+            ..MoveRequest::within(Goal::Position(target), LIMITS)
         };
         let mut source = JerkLimited::new(order(50.0), Motion::at(0.0), DT).unwrap();
         let mut refused = 0;
@@ -67,7 +68,7 @@ fn moves() {
 }
 
 #[test]
-fn lines() {
+fn lines_do_not_allocate() {
     let made = counted(|| {
         let axis = LineAxis {
             from: Motion::at(0.0),
@@ -97,7 +98,7 @@ fn lines() {
 }
 
 #[test]
-fn waves_streams_and_gears() {
+fn waves_streams_and_gears_do_not_allocate() {
     let made = counted(|| {
         let new = |shape| {
             let wave = Wave::new(shape, 2.0, 3.0, 2, DT).unwrap();
@@ -128,7 +129,7 @@ fn waves_streams_and_gears() {
                 if cycle % 2 == 0 {
                     let _ = stream.push(point);
                 }
-                // Refused: too far away.
+                // Rejected: too far away.
                 let far = stream.push(Knot {
                     position: 1e6,
                     velocity: 0.0,
@@ -143,7 +144,7 @@ fn waves_streams_and_gears() {
     let made = counted(|| {
         let config = GearConfig {
             ratio: 0.5,
-            engage: Engage::At { offset: 3.0 },
+            engage: GearInMode::At { offset: 3.0 },
             smoothing_s: 0.01,
             limits: LIMITS,
             range: Some([-50.0, 50.0]),
@@ -158,7 +159,7 @@ fn waves_streams_and_gears() {
 }
 
 #[test]
-fn tables() {
+fn tables_do_not_allocate() {
     let table = Table::parse("0,0\n0.5,10\n0.9,5", Interpolation::Cubic).unwrap();
     table.check(LIMITS, None, 0.0, DT).unwrap();
     let made = counted(|| {

@@ -1,10 +1,10 @@
-//! The drive's own profiles: PP, PV, homing; into them and out of them.
+//! Profiles of the drive: PP, PV, homing, and the switches into and out of these modes.
 
 mod common;
 
 use common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, HomingError, HomingStatus, Limits, Mode, Refused, State, Trip,
+    Axis, AxisConfig, Command, CommandError, HomingError, HomingStatus, Limits, Mode, State, Trip,
 };
 
 const COUNTS_PER_UNIT: f64 = 400.0;
@@ -39,7 +39,7 @@ const fn run_at(velocity: f64) -> Command {
 const HOME: Command = Command::Home { timeout_s: 5.0 };
 
 #[test]
-fn a_profile_position_move() {
+fn profile_position_move_arrives() {
     let mut rig = enabled(Mode::Pp);
     rig.axis.command(go(40.0, 0.5, 0.25)).unwrap();
     let mut words = vec![];
@@ -67,7 +67,7 @@ fn a_profile_position_move() {
         (status.final_error_counts, status.target_position),
         (Some(0), 40.0)
     );
-    // Relative, from where the last one ended.
+    // Relative to the end of the last move.
     rig.axis
         .command(Command::MoveBy {
             distance: -10.0,
@@ -111,7 +111,7 @@ fn a_profile_position_move_is_halted_and_replaced() {
 }
 
 #[test]
-fn a_set_point_nobody_takes_is_a_trip() {
+fn set_point_without_acknowledgement_trips() {
     let mut rig = enabled(Mode::Pp);
     rig.drive.deaf = true;
     rig.axis.command(go(40.0, 1.0, 1.0)).unwrap();
@@ -120,7 +120,7 @@ fn a_set_point_nobody_takes_is_a_trip() {
 }
 
 #[test]
-fn a_profile_velocity() {
+fn profile_velocity_is_reached_and_stopped() {
     let mut rig = enabled(Mode::Pv);
     rig.axis.command(run_at(60.0)).unwrap();
     rig.cycle();
@@ -139,11 +139,11 @@ fn a_profile_velocity() {
     rig.until(|s| s.in_target && s.velocity < -58.0, 300);
     assert!(matches!(
         rig.axis.command(run_at(201.0)),
-        Err(Refused::TooFast { .. })
+        Err(CommandError::TooFast { .. })
     ));
     assert!(matches!(
         rig.axis.command(go(0.0, 1.0, 1.0)),
-        Err(Refused::WrongMode { .. })
+        Err(CommandError::WrongMode { .. })
     ));
 }
 
@@ -162,9 +162,9 @@ fn a_profile_velocity_stops_inside_the_range() {
     }
 }
 
-/// The velocity goes on through PV, CSP and CSV; nothing steps by more than a cycle's acceleration.
+/// The velocity continues through PV, CSP and CSV; no step exceeds the acceleration of one cycle.
 #[test]
-fn a_velocity_goes_on_in_and_out_of_pv() {
+fn velocity_continues_into_and_out_of_pv() {
     for delay in [0, 5, 30] {
         let mut rig = enabled(Mode::Csp);
         rig.drive.mode_delay = Some(delay);
@@ -207,7 +207,7 @@ fn modes_that_brake_by_themselves_are_entered_at_rest() {
     for command in [Command::SetMode(Mode::Pp), HOME] {
         assert!(matches!(
             rig.axis.command(command),
-            Err(Refused::StillMoving { .. })
+            Err(CommandError::StillMoving { .. })
         ));
     }
     rig.axis.command(Command::Stop).unwrap();
@@ -222,13 +222,13 @@ fn modes_that_brake_by_themselves_are_entered_at_rest() {
     assert_eq!((rig.out.target_position, status.trip), (held, None));
     assert_eq!(
         rig.axis.command(Command::SetMode(Mode::Hm)),
-        Err(Refused::ModeNotOffered { mode: Mode::Hm })
+        Err(CommandError::ModeNotOffered { mode: Mode::Hm })
     );
 }
 
-/// The origin moves; the set-point does not jump.
+/// The origin shifts and the set-point does not jump.
 #[test]
-fn homing_and_on_in_the_cyclic_mode() {
+fn homing_returns_to_the_cyclic_mode() {
     for (mode, home_is) in [
         (Mode::Csp, 0.0),
         (Mode::Csp, 1_000_000.0),
@@ -241,7 +241,10 @@ fn homing_and_on_in_the_cyclic_mode() {
             rig.drive.home_is = home_is;
             rig.drive.mode_delay = Some(3);
             rig.axis.command(HOME).unwrap();
-            assert_eq!(rig.axis.command(go(1.0, 1.0, 1.0)), Err(Refused::Homing));
+            assert_eq!(
+                rig.axis.command(go(1.0, 1.0, 1.0)),
+                Err(CommandError::Homing)
+            );
             let mut done = None;
             for cycle in 0..2000 {
                 let mut inputs = rig.drive.inputs();
@@ -252,7 +255,8 @@ fn homing_and_on_in_the_cyclic_mode() {
                 rig.out = rig.axis.step(&inputs, DT);
                 let status = rig.axis.status();
                 assert_eq!(status.trip, None, "{mode}");
-                // Whenever positions count, they are where the axis is; but it moves in PID mode.
+                // While positions apply, they equal the actual position; in PID mode the axis
+                // moves.
                 if rig.out.mode == 8 {
                     assert_eq!(Some(rig.out.target_position), inputs.position);
                 }
@@ -273,9 +277,10 @@ fn homing_and_on_in_the_cyclic_mode() {
     }
 }
 
-/// After turns beyond 32 bits the position after homing is the drive's, not some turns of the counter further.
+/// After more turns than 32 bits hold, the position after homing is the drive's position, without
+/// additional turns.
 #[test]
-fn homing_forgets_the_turns_before() {
+fn homing_discards_earlier_turns() {
     let mut rig = Rig::new(
         Axis::new(all(Mode::Csp, ENDLESS)).unwrap(),
         Drive::at(i32::MAX - 100),
@@ -292,7 +297,7 @@ fn homing_forgets_the_turns_before() {
 }
 
 #[test]
-fn home_switch_never_found() {
+fn homing_without_a_switch_times_out() {
     let mut rig = enabled(Mode::Csp);
     rig.drive.home_at = None;
     rig.axis.command(Command::Home { timeout_s: 0.5 }).unwrap();
@@ -313,8 +318,8 @@ fn home_switch_never_found() {
 }
 
 #[test]
-fn homing_errors_and_aborts() {
-    // The drive's error.
+fn homing_reports_errors_and_aborts() {
+    // A homing error of the drive.
     let mut rig = enabled(Mode::Csv);
     rig.drive.homing_error = true;
     rig.axis.command(HOME).unwrap();
@@ -346,7 +351,7 @@ fn homing_errors_and_aborts() {
     rig.axis.command(Command::Disable).unwrap();
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 500);
     assert!(matches!(status.homing, HomingStatus::Failed(_)));
-    // No homing mode.
+    // Homing mode is not available.
     let mut rig = enabled(Mode::Csp);
     rig.drive.mode_delay = None;
     rig.axis.command(HOME).unwrap();
@@ -356,7 +361,7 @@ fn homing_errors_and_aborts() {
         HomingStatus::Failed(HomingError::ModeRefused)
     );
     assert!(status.ready && status.mode == Mode::Csp);
-    // Nonsense.
+    // Invalid time limits.
     for timeout_s in [0.0, -1.0, f64::NAN, f64::INFINITY] {
         assert!(rig.axis.command(Command::Home { timeout_s }).is_err());
     }
@@ -366,13 +371,13 @@ fn homing_errors_and_aborts() {
     rig.until(|s| s.ready, 20);
     assert_eq!(
         rig.axis.command(HOME),
-        Err(Refused::ModeNotOffered { mode: Mode::Hm })
+        Err(CommandError::ModeNotOffered { mode: Mode::Hm })
     );
 }
 
-/// Frames that are lost in the middle of it change nothing but the time it takes.
+/// Lost frames during homing only change its duration.
 #[test]
-fn homing_and_moves_with_lost_frames() {
+fn homing_and_moves_survive_lost_frames() {
     for mode in [Mode::Csp, Mode::Pp] {
         let mut rig = enabled(mode);
         rig.axis.command(HOME).unwrap();

@@ -1,4 +1,4 @@
-//! Random commands, faults, Statuswords and lost frames: what holds in every cycle, whatever happens.
+//! Random commands, faults, Statuswords and lost frames: properties that hold in every cycle.
 
 mod common;
 
@@ -10,9 +10,9 @@ use proptest::prelude::*;
 enum Event {
     Command(Command),
     Fault,
-    /// For one cycle the drive shows this instead of its own word.
+    /// The drive shows this word for one cycle.
     Word(u16),
-    /// The drive really changes state by itself.
+    /// The drive changes its state without a request.
     Jump(State),
     Lose(u8),
     Block(bool),
@@ -70,7 +70,7 @@ fn mode() -> impl Strategy<Value = Mode> {
     prop::sample::select(vec![Mode::Csp, Mode::Csv, Mode::Cst])
 }
 
-/// Has anybody asked for power, and not asked for its end? A model of nothing but that.
+/// Model of the requested power only.
 #[derive(Debug, Default)]
 struct Asked {
     power: bool,
@@ -83,7 +83,7 @@ struct Checker {
     before: Outputs,
     velocity_before: f64,
     planned_before: f64,
-    /// In the cycle before, the set-point was the axis's own and not the actual value.
+    /// True if the set-point of the previous cycle was the axis's own and not the actual value.
     enabled_before: bool,
     /// Half the position range; wider for an axis that was enabled outside it.
     range: f64,
@@ -116,7 +116,7 @@ impl Checker {
             prop_assert_eq!(out.target_torque, 0);
         }
         let held = status.enabled && self.enabled_before;
-        // Too many lost frames: nothing moves, and in CSP what follows starts from rest.
+        // Too many lost frames: targets are constant, and in CSP the motion continues from rest.
         let frozen = held && status.stale_cycles > 2;
         if frozen {
             let targets =
@@ -128,7 +128,7 @@ impl Checker {
                 self.velocity_before = 0.0;
             }
         }
-        // What was planned, before rounding to counts: to the last digit.
+        // The plan before rounding to counts, with full precision.
         let planned = (status.target_velocity - self.planned_before).abs();
         let most = LIMITS.acceleration * DT * (1.0 + 1e-6);
         prop_assert!(!held || planned <= most, "velocity changed by {planned}");
@@ -168,7 +168,7 @@ impl Checker {
         if !status.enabled {
             prop_assert_eq!((out.target_velocity, out.target_torque), (0, 0));
         }
-        // Following, or the very cycle of enabling: exactly what was reported.
+        // While following, and in the cycle of enabling: exactly the reported position.
         if !held && inputs.fresh && (!status.enabled || !self.enabled_before) {
             prop_assert_eq!(Some(out.target_position), inputs.position);
         }
@@ -232,7 +232,7 @@ fn scenario(mode: Mode, events: &[(Event, u8)]) -> Result<u32, TestCaseError> {
             checker.check(&rig, &inputs)?;
             let status = rig.axis.status();
             enabled_cycles += u32::from(status.ready);
-            // A fault or a trip ends the wish; so does braking for a disable that has come to its end.
+            // A fault or a trip ends the request; so does the end of deceleration for a disable.
             let ended = status.fault.is_some() && !status.resetting || status.trip.is_some();
             if ended || checker.asked.end && !status.enabled {
                 checker.asked.power = false;
@@ -258,9 +258,9 @@ proptest! {
         scenario(mode, &events)?;
     }
 
-    /// Inputs without any sense, commands without any sense, time without any sense.
+    /// Random inputs, commands and times.
     #[test]
-    fn nothing_panics(
+    fn random_inputs_do_not_panic(
         mode in mode(),
         cycles in prop::collection::vec(
             (any::<u16>(), any::<Option<i32>>(), any::<Option<i32>>(), any::<Option<i16>>(), any::<Option<i8>>(),
@@ -288,9 +288,9 @@ proptest! {
     }
 }
 
-/// The scenarios above are worth something only if the axis is often enabled in them.
+/// The scenarios above are only meaningful if the axis is often enabled in them.
 #[test]
-fn a_plain_scenario_gets_somewhere() {
+fn plain_scenario_is_mostly_enabled() {
     let go = |position| {
         Event::Command(Command::MoveTo {
             position,

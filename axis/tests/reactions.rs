@@ -1,11 +1,13 @@
-//! What a trip does, emergency stops, brakes, automatic resets, why enabling waits, dwell times, touch probes.
+//! Reactions to trips, emergency stops, brakes, automatic resets, enable blockers, dwell times,
+//! touch probes.
 
 mod common;
 
 use common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Brake, Command, Edge, FaultReset, Inputs, Limits, Mode, Probe, ProbeStatus,
-    QuickStopOption, Refused, Source, State, StopMethod, Supervision, TorqueWatch, Trip, Waiting,
+    Axis, AxisConfig, Brake, Command, CommandError, Edge, EnableBlocker, FaultReset, Inputs,
+    Limits, Mode, Probe, ProbeStatus, QuickStopOption, Source, State, StopMethod, Supervision,
+    TorqueWatch, Trip,
 };
 
 const ENDLESS: Limits = Limits {
@@ -38,7 +40,7 @@ const fn run_at(velocity: f64) -> Command {
     }
 }
 
-/// The first Controlword after the trip, and the cycles until power is gone.
+/// The first Controlword after the trip, and the number of cycles until power is off.
 #[test]
 fn reactions_row_by_row() {
     for (reaction, first, least, most) in [
@@ -59,7 +61,7 @@ fn reactions_row_by_row() {
         ));
         rig.axis.command(run_at(100.0)).unwrap();
         rig.until(|s| s.in_target, 200);
-        // The drive reports a torque that lasts.
+        // The drive reports a permanent torque.
         let mut cycles = 0;
         let status = loop {
             let mut inputs = rig.drive.inputs();
@@ -88,14 +90,14 @@ fn reactions_row_by_row() {
         assert!((least..=most).contains(&cycles), "{reaction:?}: {cycles}");
         assert!(matches!(
             rig.axis.command(Command::Enable),
-            Err(Refused::Tripped(_))
+            Err(CommandError::Tripped(_))
         ));
     }
 }
 
 /// A drive that has left its mode does not follow a ramp.
 #[test]
-fn a_ramp_is_no_reaction_to_a_lost_mode() {
+fn ramp_becomes_quick_stop_if_the_mode_is_lost() {
     let mut rig = enabled(supervised(
         Mode::Csv,
         Supervision {
@@ -112,7 +114,7 @@ fn a_ramp_is_no_reaction_to_a_lost_mode() {
 }
 
 #[test]
-fn emergency_stop() {
+fn emergency_stop_takes_the_configured_method() {
     for (emergency, word) in [
         (StopMethod::QuickStop, 0x0002),
         (StopMethod::DisableVoltage, 0x0000),
@@ -139,7 +141,7 @@ fn emergency_stop() {
         rig.axis.command(Command::ResetFault).unwrap();
         rig.axis.command(Command::Enable).unwrap();
         rig.until(|s| s.ready, 20);
-        // On the way up, and without power.
+        // While enabling, and without power.
         let mut rig = Rig::new(Axis::new(config).unwrap(), Drive::at(0));
         rig.axis.command(Command::EmergencyStop).unwrap();
         assert!(rig.axis.command(Command::Enable).is_err());
@@ -155,7 +157,7 @@ fn emergency_stop() {
 }
 
 #[test]
-fn a_steep_change_of_velocity() {
+fn over_acceleration_trips() {
     let supervision = Supervision {
         acceleration: Some(3000.0),
         ..Supervision::default()
@@ -189,7 +191,7 @@ fn a_steep_change_of_velocity() {
 }
 
 #[test]
-fn a_brake_opens_before_motion_and_closes_before_the_power_goes() {
+fn brake_opens_before_motion_and_closes_before_power_is_removed() {
     let config = AxisConfig {
         brake: Brake {
             release_s: 0.05,
@@ -202,8 +204,11 @@ fn a_brake_opens_before_motion_and_closes_before_the_power_goes() {
     rig.axis.command(Command::Enable).unwrap();
     let status = rig.until(|s| s.enabled, 20);
     assert!(rig.out.brake_open && !status.ready);
-    assert_eq!(status.waiting, Some(Waiting::Brake));
-    assert_eq!(rig.axis.command(run_at(1.0)), Err(Refused::BrakeOpening));
+    assert_eq!(status.waiting, Some(EnableBlocker::Brake));
+    assert_eq!(
+        rig.axis.command(run_at(1.0)),
+        Err(CommandError::BrakeOpening)
+    );
     // The load sinks; the set-point holds.
     let held = rig.out.target_position;
     let mut cycles = 0;
@@ -223,13 +228,13 @@ fn a_brake_opens_before_motion_and_closes_before_the_power_goes() {
     }
     assert!((30..=34).contains(&closing), "{closing}");
     rig.run(5);
-    // A fault closes it at once.
+    // A fault closes the brake at once.
     rig.axis.command(Command::Enable).unwrap();
     rig.until(|s| s.ready, 200);
     rig.drive.fault();
     rig.run(2);
     assert!(!rig.out.brake_open);
-    // After a quick stop it closes at rest, and then the power goes.
+    // After a quick stop the brake closes at rest, and then power is removed.
     rig.axis.command(Command::ResetFault).unwrap();
     rig.axis.command(Command::Enable).unwrap();
     rig.until(|s| s.ready, 500);
@@ -265,7 +270,7 @@ fn automatic_resets_are_bounded_and_give_no_power() {
         (rig.drive.state, rig.out.controlword),
         (State::SwitchOnDisabled, 0)
     );
-    // One that stays: one more try of three pulses, then it is left to a command.
+    // A permanent fault: one more attempt of three pulses, then only commands reset it.
     rig.drive.stubborn = true;
     rig.drive.fault();
     rig.run(5000);
@@ -276,7 +281,7 @@ fn automatic_resets_are_bounded_and_give_no_power() {
     rig.axis.command(Command::ResetFault).unwrap();
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 200);
     assert_eq!(status.resets_tried, 0);
-    // Without it nothing happens by itself.
+    // Without the configuration there is no automatic reset.
     let mut rig = enabled(all(Mode::Csp, ENDLESS));
     rig.drive.fault();
     rig.run(5000);
@@ -284,9 +289,9 @@ fn automatic_resets_are_bounded_and_give_no_power() {
 }
 
 #[test]
-fn why_enabling_does_not_go_on() {
+fn enable_blockers_are_reported() {
     let mut rig = rig(all(Mode::Csp, ENDLESS));
-    assert_eq!(rig.run(200).waiting, None, "nobody asked");
+    assert_eq!(rig.run(200).waiting, None, "no request");
     rig.axis.command(Command::Enable).unwrap();
     let stuck = |rig: &mut Rig, inputs: Inputs| {
         for _ in 0..110 {
@@ -297,11 +302,11 @@ fn why_enabling_does_not_go_on() {
     let base = rig.drive.inputs();
     let with = |statusword| Inputs { statusword, ..base };
     for (inputs, waiting) in [
-        (with(0x0050), Some(Waiting::Remote)),
-        (with(0x0221), Some(Waiting::Voltage)),
+        (with(0x0050), Some(EnableBlocker::Remote)),
+        (with(0x0221), Some(EnableBlocker::Voltage)),
         (
             with(0x0231),
-            Some(Waiting::Drive {
+            Some(EnableBlocker::Drive {
                 state: State::ReadyToSwitchOn,
             }),
         ),
@@ -310,7 +315,7 @@ fn why_enabling_does_not_go_on() {
                 mode_display: Some(3),
                 ..with(0x0237)
             },
-            Some(Waiting::Mode {
+            Some(EnableBlocker::Mode {
                 expected: Mode::Csp,
                 display: Mode::Pv,
             }),
@@ -326,14 +331,14 @@ fn why_enabling_does_not_go_on() {
         ..with(0x0233)
     };
     blind.step(&inputs, DT);
-    assert_eq!(blind.status().waiting, Some(Waiting::Position));
+    assert_eq!(blind.status().waiting, Some(EnableBlocker::Position));
     let status = rig.until(|s| s.ready, 200);
     assert_eq!(status.waiting, None);
     assert!(status.word().contains(ecaxis_axis::Statusword::REMOTE));
 }
 
 #[test]
-fn dwell_times() {
+fn dwell_times_delay_in_target_and_at_rest() {
     let supervision = Supervision {
         target_dwell_s: 0.1,
         standstill_dwell_s: 0.2,
@@ -361,7 +366,7 @@ fn dwell_times() {
     }
     assert!((98..=104).contains(&target.unwrap()), "{target:?}");
     assert!((198..=206).contains(&rest.unwrap()), "{rest:?}");
-    // A push out of the window starts it again.
+    // A push out of the window restarts the dwell time.
     let mut inputs = rig.drive.inputs();
     inputs.position = inputs.position.map(|p| p + 100);
     rig.axis.step(&inputs, DT);
@@ -371,7 +376,7 @@ fn dwell_times() {
 }
 
 #[test]
-fn quick_stop_option_without_return() {
+fn quick_stop_option_without_transition_16_skips_it() {
     for (code, word) in [(2, 0x0000), (6, 0x000F)] {
         let config = AxisConfig {
             quick_stop: Some(QuickStopOption(code)),
@@ -396,7 +401,7 @@ fn a_touch_probe_captures_once_in_user_units() {
         source: Source::Input,
         stop: false,
     };
-    assert_eq!(rig.axis.command(arm), Err(Refused::NoProbe));
+    assert_eq!(rig.axis.command(arm), Err(CommandError::NoProbe));
     let step = |rig: &mut Rig, status: u16, latched: i32| {
         let inputs = Inputs {
             touch_probe_status: Some(status),
@@ -477,7 +482,7 @@ fn an_edge_stops_the_axis_in_the_cycle_that_shows_it() {
 }
 
 #[test]
-fn supervision_that_cannot_work() {
+fn invalid_supervision_is_rejected() {
     let good = AxisConfig::new(Mode::Csp, scale(), LIMITS);
     let with = |supervision| AxisConfig {
         supervision,

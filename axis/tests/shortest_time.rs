@@ -1,24 +1,24 @@
-//! Jerk-limited moves against an independent judge: rsruckig, whose moves take the shortest time there is.
+//! Jerk-limited moves compared with rsruckig, whose moves have the shortest possible time.
 
-use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, Order};
+use ecaxis_axis::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest};
 use proptest::prelude::*;
 use rsruckig::prelude::{InputParameter, Ruckig, ThrowErrorHandler, Trajectory};
 
-/// Our moves leave a millionth of every limit to rounding.
+/// The planner reserves a millionth of every limit for rounding.
 const PLANNED: f64 = 1.0 - 1e-6;
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: ProptestConfig::default().cases.max(2000), failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn as_short_as_it_can_be(
+    fn jerk_limited_moves_take_the_shortest_time(
         velocity in 1.0..200.0f64, acceleration in 20.0..2000.0f64, jerk in 200.0..40_000.0f64,
         moving in any::<bool>(), part in (-1.0..1.0f64, -0.999..0.999f64), target in -100.0..100.0f64,
     ) {
         let mut start = (0.0, 0.0);
         if moving {
             start.0 = velocity * part.0;
-            // No more than can be taken back before the velocity limit.
+            // At most the acceleration that can end before the velocity limit.
             let headroom = velocity - start.0 * part.1.signum();
             start.1 = part.1 * acceleration.min((2.0 * jerk * headroom).sqrt());
         }
@@ -35,7 +35,7 @@ proptest! {
             .map_err(|error| TestCaseError::reject(error.to_string()))?;
         let limits = MotionLimits { velocity, acceleration, jerk }.scaled(1.0 / PLANNED);
         let motion = Motion { position: 0.0, velocity: start.0, acceleration: start.1 };
-        let ours = JerkLimited::new(Order::within(Goal::Position(target), limits), motion, 0.0).unwrap();
+        let ours = JerkLimited::new(MoveRequest::within(Goal::Position(target), limits), motion, 0.0).unwrap();
         let (ours, shortest) = (ours.duration_s(), judge.get_duration());
         prop_assert!((ours - shortest).abs() <= shortest * 1e-6, "{} {}", ours, shortest);
     }

@@ -1,11 +1,11 @@
-//! How an axis comes to rest: what the drive receives, in which order, until it has no power.
+//! Stops: the sequence of outputs that the drive receives until it has no power.
 
 mod common;
 
 use common::{DT, LIMITS, axis, scale};
 use ecaxis_axis::{
-    Axis, AxisConfig, Command, Inputs, Limits, Mode, Outputs, Refused, StopMethod, StopPhase, Trip,
-    Waiting,
+    Axis, AxisConfig, Command, CommandError, EnableBlocker, Inputs, Limits, Mode, Outputs,
+    StopMethod, StopPhase, Trip,
 };
 
 const FREE: Limits = Limits {
@@ -82,7 +82,7 @@ fn targets_stay_at_actual_values_until_bit_12() {
         for word in [0x0240, 0x0231, 0x0233, 0x0237, 0x0237] {
             axis.step(&inputs(word, 0, display), DT);
         }
-        // The drive moves by itself, as for its commutation.
+        // The drive moves by itself, for example for commutation.
         for n in 0..200 {
             let out = axis.step(&inputs(0x0237, n * 5, display), DT);
             let targets = (out.target_position, out.target_velocity, out.target_torque);
@@ -91,16 +91,16 @@ fn targets_stay_at_actual_values_until_bit_12() {
         }
         let status = axis.status();
         assert_eq!((status.ready, status.enabled), (false, false));
-        assert_eq!(status.waiting, Some(Waiting::Follows { mode }));
+        assert_eq!(status.waiting, Some(EnableBlocker::Follows { mode }));
         assert!(matches!(
             axis.command(command),
-            Err(Refused::NotEnabled { .. })
+            Err(CommandError::NotEnabled { .. })
         ));
         let out = axis.step(&inputs(0x1237, 1000, display), DT);
         assert_eq!(out.target_position, 1000, "no step");
         assert!(axis.status().ready);
         axis.command(command).unwrap();
-        // A drive that does not serve the bit.
+        // A drive that does not support the bit.
         let mut axis = Axis::new(AxisConfig {
             follows_bit: false,
             ..config(mode)
@@ -122,7 +122,7 @@ fn bit_12_that_is_lost_in_motion_is_a_trip() {
     for _ in 0..100 {
         position = axis.step(&inputs(0x1237, position, 8), DT).target_position;
     }
-    // A drive that limits a step clears it for a cycle or two.
+    // A drive that limits a step clears the bit for one or two cycles.
     for _ in 0..9 {
         position = axis.step(&inputs(0x0237, position, 8), DT).target_position;
     }
@@ -135,7 +135,7 @@ fn bit_12_that_is_lost_in_motion_is_a_trip() {
     assert_eq!(out.controlword, 0x0002);
     let trip = Some(Trip::NotFollowing { mode: Mode::Csp });
     assert_eq!(axis.status().trip, trip);
-    // At rest the targets follow actual values until it is there again.
+    // At rest the targets follow actual values until the bit is set again.
     let mut axis = enabled(config(Mode::Csp));
     for _ in 0..10 {
         axis.step(&inputs(0x0237, 0, 8), DT);
@@ -149,7 +149,7 @@ fn bit_12_that_is_lost_in_motion_is_a_trip() {
     assert!(axis.status().ready);
 }
 
-/// Switched on is held until 0x6061 shows the mode.
+/// The drive stays in Switched on until 0x6061 shows the mode.
 #[test]
 fn operation_is_enabled_in_the_mode_that_shows() {
     let mut axis = axis(Mode::Csp);
@@ -168,14 +168,14 @@ fn operation_is_enabled_in_the_mode_that_shows() {
     for _ in 0..200 {
         axis.step(&inputs(0x0233, 0, 10), DT);
     }
-    let waiting = Waiting::Mode {
+    let waiting = EnableBlocker::Mode {
         expected: Mode::Csp,
         display: Mode::Cst,
     };
     assert_eq!(axis.status().waiting, Some(waiting));
 }
 
-/// Power is removed at standstill, however long the drive's ramp takes.
+/// Power is removed at standstill, with any duration of the drive's ramp.
 #[test]
 fn a_long_quick_stop_keeps_its_power() {
     let mut axis = enabled(config(Mode::Csv));
@@ -200,7 +200,8 @@ fn a_long_quick_stop_keeps_its_power() {
     assert_eq!(axis.status().trip, None);
 }
 
-/// A drive that does not decelerate, and a time-out of the configuration: no voltage, and that is a trip.
+/// A drive that does not decelerate within a configured time-out: the voltage is removed, and the
+/// axis trips.
 #[test]
 fn a_stop_that_fails_is_a_trip() {
     for (timeout, decelerates, least, most) in
@@ -260,8 +261,8 @@ fn follow(axis: &mut Axis, position: &mut i32) -> Outputs {
     out
 }
 
-/// Whatever move is interrupted: the stop uses the limits of the axis, never gains speed, and takes its time before it
-/// becomes harder.
+/// Every interrupted move: the stop uses the limits of the axis, never gains speed, and gets enough
+/// time before it becomes harder.
 #[test]
 fn a_stop_uses_the_limits_of_the_axis() {
     for (jerk, ramp) in [
@@ -324,7 +325,8 @@ fn a_stop_uses_the_limits_of_the_axis() {
     }
 }
 
-/// Replies that come too late prove that targets arrive: they ramp down, and go on with the next one that is in time.
+/// Late replies prove that targets arrive: targets ramp down, and the motion continues with the
+/// next reply in time.
 #[test]
 fn late_replies_ramp_the_targets_down() {
     let mut axis = enabled(config(Mode::Csp));
@@ -364,9 +366,10 @@ fn late_replies_ramp_the_targets_down() {
     assert!(step >= 79, "goes on: {step}");
 }
 
-/// With pipelined answers: a late answer in the first stale cycle leaves the two cycles that are planned blind.
+/// With pipelined answers: a late answer in the first stale cycle leaves both cycles that are
+/// planned without an answer.
 #[test]
-fn a_late_reply_takes_nothing_from_the_cycles_planned_blind() {
+fn late_reply_keeps_the_cycles_planned_without_an_answer() {
     let mut axis = enabled(AxisConfig {
         answers_late: 1,
         ..config(Mode::Csp)

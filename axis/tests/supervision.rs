@@ -1,9 +1,9 @@
-//! When an axis stops itself, and that it says why.
+//! Trips of an axis and their reported causes.
 
 mod common;
 
 use common::{DT, Drive, LIMITS, Rig, axis, scale};
-use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Refused, State, Trip};
+use ecaxis_axis::{Axis, AxisConfig, Command, CommandError, Limits, Mode, State, Trip};
 
 const fn to(position: f64) -> Command {
     Command::MoveTo {
@@ -13,7 +13,7 @@ const fn to(position: f64) -> Command {
     }
 }
 
-/// Enabled, without a position range.
+/// Returns an enabled axis without a position range.
 fn endless(mode: Mode) -> Rig {
     let limits = Limits {
         position: None,
@@ -40,7 +40,7 @@ fn blocked_motor_trips_on_following_error() {
     assert_eq!(rig.out.controlword, 0x0002, "quick stop in the same cycle");
     assert!(matches!(
         rig.axis.command(to(0.0)),
-        Err(Refused::Tripped(_))
+        Err(CommandError::Tripped(_))
     ));
     let status = rig.until(|s| s.state == State::SwitchOnDisabled, 120);
     assert!(status.max_following_error > 1.0);
@@ -48,7 +48,7 @@ fn blocked_motor_trips_on_following_error() {
         matches!(status.trip, Some(Trip::FollowingError { .. })),
         "first cause stays"
     );
-    // Acknowledge, enable, go.
+    // Acknowledge, enable, move.
     rig.drive.blocked = false;
     rig.axis.command(Command::ResetFault).unwrap();
     rig.axis.command(Command::Enable).unwrap();
@@ -70,7 +70,7 @@ fn a_drive_that_ignores_quick_stop_loses_its_power() {
 }
 
 #[test]
-fn pushed_out_of_its_range() {
+fn axis_pushed_out_of_its_range_trips() {
     let mut rig = Rig::enabled(Mode::Csv);
     rig.drive.position = 20_300.0;
     assert_eq!(rig.cycle().trip, None, "inside the margin");
@@ -92,7 +92,7 @@ fn an_axis_outside_its_range_can_be_driven_back() {
     assert_eq!(rig.run(100).trip, None);
     assert!(matches!(
         rig.axis.command(to(55.0)),
-        Err(Refused::OutsideRange { .. })
+        Err(CommandError::OutsideRange { .. })
     ));
     rig.axis.command(to(40.0)).unwrap();
     let status = rig.until(|s| s.in_target, 1000);
@@ -100,7 +100,7 @@ fn an_axis_outside_its_range_can_be_driven_back() {
 }
 
 #[test]
-fn over_velocity_in_torque_mode() {
+fn over_velocity_in_torque_mode_trips() {
     let mut rig = endless(Mode::Cst);
     rig.axis
         .command(Command::Torque {
@@ -132,7 +132,7 @@ fn one_wild_reading_is_not_over_velocity() {
 }
 
 #[test]
-fn velocity_without_a_velocity_object() {
+fn velocity_is_derived_without_a_velocity_object() {
     let mut rig = Rig::enabled(Mode::Csp);
     rig.axis.command(to(50.0)).unwrap();
     for _ in 0..200 {

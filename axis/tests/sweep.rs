@@ -1,4 +1,5 @@
-//! All 65,536 Statuswords × every command × every mode, from an idle and from an enabled axis, and in the middle of things.
+//! All 65,536 Statuswords × every command × every mode: idle, enabled, and during a move, a mode
+//! switch or a homing.
 
 mod common;
 
@@ -80,10 +81,10 @@ fn no_power_without_a_command() {
     }
 }
 
-/// An enabled axis that sees any word: bits for power only where the word says that there is power, targets at the actual
-/// position in every other state.
+/// An enabled axis with any Statusword: power bits are sent only in Operation enabled; otherwise
+/// targets equal the actual position.
 #[test]
-fn power_is_not_sought_again() {
+fn lost_power_is_not_requested_again() {
     for mode in MODES {
         let mut rig = idle(mode);
         rig.axis.command(Command::Enable).unwrap();
@@ -111,9 +112,9 @@ fn power_is_not_sought_again() {
     }
 }
 
-/// In the middle of a profile move, of a switch of modes and of a homing.
+/// During a profile move, a mode switch and a homing.
 #[test]
-fn any_word_in_the_middle_of_things() {
+fn any_word_during_a_move_switch_or_homing_is_handled() {
     let under_way = |mode: Mode, command: Command, cycles: u32| {
         let mut rig = idle(mode);
         rig.axis.command(Command::Enable).unwrap();
@@ -150,7 +151,7 @@ fn any_word_in_the_middle_of_things() {
                     assert_eq!(out.controlword & POWERING, 0, "{statusword:#06x}");
                     assert_eq!(out.controlword & 0x0170, 0, "{statusword:#06x}");
                 }
-                // "Attained" alone ends nothing unless homing had begun.
+                // "Attained" alone has no effect before homing has started.
                 assert!(!status.homed || rig.drive.mode == Mode::Hm.code());
             }
         }

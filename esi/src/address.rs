@@ -1,8 +1,9 @@
-//! Index and subindex as everybody here shows and takes them.
+//! Index and subindex of an object, with their text form.
 
 use std::fmt;
 
-/// An object's place: `0x60c2:01`. Both are hexadecimal, so `0x1600:10` is the sixteenth entry.
+/// Index and subindex of an object, shown as `0x60c2:01`. Both are hexadecimal: `0x1600:10` is the
+/// sixteenth entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Address {
     pub index: u16,
@@ -21,7 +22,7 @@ pub fn address(index: u16, sub: u8) -> Address {
 }
 
 impl Address {
-    /// What is written behind the colon: one or two hexadecimal digits, with or without 0x.
+    /// Parses the text after the colon: one or two hexadecimal digits, with or without `0x`.
     #[must_use]
     pub fn sub_of(text: &str) -> Option<u8> {
         let text = text.trim();
@@ -38,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_subindex_is_read_as_it_is_shown() {
+    fn address_text_round_trips_for_every_subindex() {
         for sub in 0..=u8::MAX {
             let shown = address(0x1600, sub).to_string();
             let (index, behind) = shown.split_once(':').unwrap();

@@ -1,15 +1,15 @@
-//! What can be wrong with an ESI file.
+//! Errors in an ESI file.
 
 use crate::model::Position;
 
-/// The file cannot be used. Displays as `line:column path: what`.
+/// An ESI file cannot be used. Displays as `line:column path: problem`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{} {}: {}", .0.position, .0.path, .0.problem)]
-pub struct EsiError(Box<Fault>);
+pub struct EsiError(Box<ErrorInner>);
 
-/// In a box, because every step of the reader may return one and hardly any does.
+/// Boxed to keep results small: every step of the reader may return an error, and few do.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Fault {
+struct ErrorInner {
     position: Position,
     path: String,
     problem: EsiProblem,
@@ -17,20 +17,20 @@ struct Fault {
 
 impl EsiError {
     pub(crate) fn new(position: Position, path: String, problem: EsiProblem) -> Self {
-        Self(Box::new(Fault {
+        Self(Box::new(ErrorInner {
             position,
             path,
             problem,
         }))
     }
 
-    /// Line and column of the element at fault.
+    /// Returns line and column of the faulty element.
     #[must_use]
     pub fn position(&self) -> Position {
         self.0.position
     }
 
-    /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
+    /// Returns the element path, such as `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
     #[must_use]
     pub fn path(&self) -> &str {
         &self.0.path
@@ -43,7 +43,8 @@ impl EsiError {
 }
 
 impl EsiProblem {
-    /// It costs the element alone: the text around it can be read, and nobody asks for more than a computer has.
+    /// True if the problem invalidates one element only: the surrounding text is readable, and no
+    /// limit is exceeded.
     pub(crate) fn is_of_one_element(&self) -> bool {
         matches!(
             self,

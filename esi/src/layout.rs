@@ -1,52 +1,53 @@
-//! Where each mapped object lies: PDOs of one SyncManager are packed bit by bit in the order of assignment,
-//! each SyncManager starts at a byte.
+//! Bit offsets of mapped objects. PDOs of one SyncManager are packed bit by bit in assignment
+//! order. Each SyncManager starts at a byte.
 
 use crate::model::{Device, FmmuUse, Pdo, SmUse};
 use crate::select::SelectError;
 
-/// Terminals map registers into their process data: outputs at 0x0F00, system and latch times from 0x0910 on.
-/// What lies below configures the controller itself.
+/// The lowest register that process data may use. Terminals map registers: outputs at 0x0F00,
+/// system and latch times from 0x0910. Registers below configure the controller itself.
 const FIRST_ADDRESS: u16 = 0x0900;
 const ADDRESS_SPACE: u32 = 0x1_0000;
-/// Where process memory starts.
+/// Start of the process memory.
 const PROCESS_MEMORY: u16 = 0x1000;
 
-/// The process data of one device.
+/// The process data layout of one device.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Layout {
-    /// By SyncManager number; couplers have several in one direction.
+    /// Sorted by SyncManager number. Couplers have several SyncManagers in one direction.
     pub outputs: Vec<SmLayout>,
     pub inputs: Vec<SmLayout>,
     pub rx: Vec<Field>,
     pub tx: Vec<Field>,
 }
 
-/// One process data SyncManager.
+/// The layout of one process data SyncManager.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SmLayout {
     pub sm: u8,
     pub start_address: u16,
     pub control_byte: u8,
-    /// Bytes.
+    /// The length in bytes.
     pub len: u16,
-    /// The FMMU that the ESI intends for it.
+    /// The FMMU that the ESI assigns to this SyncManager.
     pub fmmu: Option<u8>,
 }
 
 impl SmLayout {
-    /// Three buffers, of which each side always has one.
+    /// True for three-buffer mode, in which each side always owns one buffer.
     fn is_buffered(&self) -> bool {
         self.start_address >= PROCESS_MEMORY && self.control_byte & 0x03 == 0
     }
 }
 
-/// One mapped object; gaps have no field.
+/// One mapped object. Gaps have no `Field`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Field {
     pub pdo: u16,
     pub index: u16,
     pub sub: u8,
-    /// From the start of this direction's process data of the device, over all its SyncManagers.
+    /// The offset from the start of the device's process data in this direction, across all
+    /// SyncManagers.
     pub bit_offset: u32,
     pub bit_len: u16,
     pub name: String,
@@ -54,7 +55,7 @@ pub struct Field {
 }
 
 impl Layout {
-    /// `rx` and `tx` in the order of assignment, each with its SyncManager.
+    /// Lays out `rx` and `tx`. Both are in assignment order, and each PDO names its SyncManager.
     pub fn new(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Result<Self, SelectError> {
         let (outputs, rx) = direction(device, rx, FmmuUse::Outputs)?;
         let (inputs, tx) = direction(device, tx, FmmuUse::Inputs)?;
@@ -65,7 +66,7 @@ impl Layout {
             tx,
         };
         layout.check_addresses(device)?;
-        // Digital I/O controllers without a processor latch single bytes and need no buffers.
+        // Digital I/O controllers without a processor latch single bytes and do not need buffers.
         if device.mailbox.is_some() {
             layout.check_memory()?;
         }
@@ -96,7 +97,8 @@ impl Layout {
             .find(|field| field.index == index && field.sub == sub)
     }
 
-    /// Every SyncManager in use, the mailbox's as well, has its memory.
+    /// Checks that the memory of each used SyncManager is valid, including the mailbox
+    /// SyncManagers.
     fn check_addresses(&self, device: &Device) -> Result<(), SelectError> {
         let has_mailbox = device.mailbox.is_some();
         let used = |number: u8| {
@@ -128,7 +130,7 @@ impl Layout {
         Ok(())
     }
 
-    /// A buffered SyncManager occupies three times its length of the device's memory.
+    /// Checks the device memory. A buffered SyncManager occupies three times its length.
     fn check_memory(&self) -> Result<(), SelectError> {
         let all = || self.outputs.iter().chain(&self.inputs);
         for sm in all().filter(|sm| sm.is_buffered()) {

@@ -1,13 +1,13 @@
-//! EtherCAT SubDevice Information: bytes in, data out. No I/O, no clock, no unsafe.
+//! EtherCAT SubDevice Information (ESI): bytes in, data out. No I/O, no clock, no unsafe.
 //!
 //! - [`Address`]: index and subindex of an object
-//! - [`model`]: what an ESI file says, as data; every origin of a derived value keeps its line
-//! - [`parse`] (`xml/`): the file's bytes → model
+//! - [`model`]: the contents of an ESI file; the origin of each derived value keeps its line
+//! - [`parse`] (`xml/`): file bytes → model
 //! - [`select`](mod@select): the user's choice of device, module, PDOs and DC mode
 //! - [`layout`]: that choice → bit offsets
 //! - [`startup`]: that choice → the SDOs to send before SafeOp
 //! - [`sii`]: the EEPROM image, from an ESI device or from bytes
-//! - [`lint`](mod@lint): what is wrong with a file that can be read
+//! - [`lint`](mod@lint): problems in a readable file
 
 #![forbid(unsafe_code)]
 
@@ -29,8 +29,8 @@ pub use lint::{Finding, Severity, lint};
 pub use mode::{Mode, UnknownMode};
 pub use model::*;
 pub use select::{
-    Choice, DcSettings, DeviceQuery, EntryRef, SelectError, SelectedModule, Selection, UserSdo,
-    find_device, offered_modes, select,
+    DcSettings, DeviceQuery, EntryRef, SelectError, SelectOptions, SelectedModule, Selection,
+    UserSdo, find_device, offered_modes, select,
 };
 pub use startup::StartupSdo;
 pub use xml::parse;

@@ -1,26 +1,27 @@
-//! What is wrong with a file that can be read: contradictions between its elements, and devices that nobody could
-//! configure from it.
+//! Problems in a readable file: contradictions between its elements, and devices without a usable
+//! configuration.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use crate::address;
 use crate::model::{Device, Direction, EsiFile, InitCmd, Module, ObjectItem, Pdo, Position, SmUse};
-use crate::select::{Choice, SelectError, offered_modes, select};
+use crate::select::{SelectError, SelectOptions, offered_modes, select};
 
-/// A usual bus cycle, for what depends on one.
+/// A typical bus cycle, for checks that depend on the cycle time.
 const CYCLE_NS: u64 = 1_000_000;
-/// Places for modules, over all devices of a file; a device without slots is one.
+/// The maximum number of module places over all devices of a file. A device without slots counts as
+/// one place.
 const MAX_EFFORT: usize = 20_000;
 const MAX_PLACES: u64 = 254;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Severity {
-    /// A device, or a mode of it, cannot be used.
+    /// A device or one of its modes cannot be used.
     Error,
-    /// Something contradicts something else, and one of the two was taken.
+    /// Two elements contradict each other; the reader used one of them.
     Warning,
-    /// Nothing is wrong, but a user should know.
+    /// Information for the user; the file is correct.
     Note,
 }
 
@@ -37,18 +38,18 @@ impl fmt::Display for Severity {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     pub severity: Severity,
-    /// Name of the file, where it is one that the file at hand refers to.
+    /// The name of the referenced file; `None`: the finding is in the main file.
     pub file: Option<String>,
     pub position: Position,
-    /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[2]`.
+    /// Element path, such as `EtherCATInfo/Descriptions/Devices/Device[1]/RxPdo[2]`.
     pub path: String,
     pub message: String,
 }
 
-/// Everything that is odd about a file, the reader's warnings included, in file order.
+/// Returns all findings of a file in file order, including the reader's warnings.
 #[must_use]
 pub fn lint(file: &EsiFile) -> Vec<Finding> {
-    let mut found = Found::default();
+    let mut found = FindingBuilder::default();
     let mut effort = 0usize;
     for warning in &file.warnings {
         found.all.push(Finding {
@@ -90,7 +91,7 @@ pub fn lint(file: &EsiFile) -> Vec<Finding> {
     found.all
 }
 
-/// What a choice has to go through.
+/// Returns the number of module places that a selection visits.
 fn places(device: &Device) -> usize {
     let slots = device.slots.iter().flat_map(|slots| &slots.slots);
     let instances = slots.map(|slot| slot.max_instances.max(slot.min_instances).clamp(1, 254));
@@ -101,13 +102,13 @@ fn places(device: &Device) -> usize {
 }
 
 #[derive(Default)]
-struct Found {
+struct FindingBuilder {
     all: Vec<Finding>,
-    /// Of what is looked at.
+    /// The file under inspection.
     file: Option<String>,
 }
 
-impl Found {
+impl FindingBuilder {
     fn add(&mut self, severity: Severity, position: Position, path: &str, message: String) {
         self.all.push(Finding {
             severity,
@@ -123,7 +124,7 @@ impl Found {
     }
 }
 
-fn device(found: &mut Found, path: &str, device: &Device) {
+fn device(found: &mut FindingBuilder, path: &str, device: &Device) {
     pdos(found, path, device, &device.rx_pdos, "RxPdo");
     pdos(found, path, device, &device.tx_pdos, "TxPdo");
     if let Some(coe) = device.mailbox.as_ref().and_then(|m| m.coe.as_ref()) {
@@ -174,7 +175,7 @@ fn device(found: &mut Found, path: &str, device: &Device) {
     objects(found, path, device);
 }
 
-fn module(found: &mut Found, path: &str, file: &EsiFile, module: &Module) {
+fn module(found: &mut FindingBuilder, path: &str, file: &EsiFile, module: &Module) {
     let first = file
         .modules
         .iter()
@@ -193,7 +194,7 @@ fn module(found: &mut Found, path: &str, file: &EsiFile, module: &Module) {
     }
 }
 
-fn pdos(found: &mut Found, path: &str, device: &Device, list: &[Pdo], kind: &str) {
+fn pdos(found: &mut FindingBuilder, path: &str, device: &Device, list: &[Pdo], kind: &str) {
     for (n, pdo) in list.iter().enumerate() {
         let path = format!("{path}/{kind}[{}]", n + 1);
         self::pdo(found, &path, pdo, list);
@@ -225,7 +226,7 @@ fn pdos(found: &mut Found, path: &str, device: &Device, list: &[Pdo], kind: &str
     }
 }
 
-fn pdo(found: &mut Found, path: &str, pdo: &Pdo, list: &[Pdo]) {
+fn pdo(found: &mut FindingBuilder, path: &str, pdo: &Pdo, list: &[Pdo]) {
     let first = list.iter().find(|other| other.index == pdo.index);
     if let Some(first) = first.filter(|first| first.position != pdo.position) {
         let message = format!(
@@ -259,7 +260,7 @@ fn pdo(found: &mut Found, path: &str, pdo: &Pdo, list: &[Pdo]) {
     }
 }
 
-fn commands(found: &mut Found, path: &str, device: &Device, commands: &[InitCmd]) {
+fn commands(found: &mut FindingBuilder, path: &str, device: &Device, commands: &[InitCmd]) {
     for (n, command) in commands.iter().enumerate() {
         let path = format!("{path}/Mailbox/CoE/InitCmd[{}]", n + 1);
         let what = address(command.index, command.sub);
@@ -298,7 +299,7 @@ fn is_text(item: &ObjectItem) -> bool {
     item.type_name.contains("STRING") || item.type_name.contains("ARRAY")
 }
 
-fn objects(found: &mut Found, path: &str, device: &Device) {
+fn objects(found: &mut FindingBuilder, path: &str, device: &Device) {
     let mut first: BTreeMap<u16, Position> = BTreeMap::new();
     for (n, object) in device.dictionary.objects.iter().enumerate() {
         let path = format!("{path}/Profile/Dictionary/Objects/Object[{}]", n + 1);
@@ -317,12 +318,12 @@ fn objects(found: &mut Found, path: &str, device: &Device) {
     }
 }
 
-/// The default and every mode that is offered come to a layout.
-fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
+/// Checks that the default configuration and each offered mode produce a layout.
+fn usable(found: &mut FindingBuilder, path: &str, file: &EsiFile, device: &Device) {
     let has_pdos = !device.rx_pdos.is_empty() || !device.tx_pdos.is_empty();
-    let choice = Choice {
+    let choice = SelectOptions {
         cycle_ns: CYCLE_NS,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let mut refuse = |severity, what: &str, error: &SelectError| {
         let (position, path) = match error.element() {
@@ -336,7 +337,7 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
             found.add(Severity::Error, device.position, path, error.to_string());
             return;
         }
-        // Modules are the user's to name; nothing is wrong with the file.
+        // The file is correct: the user must name the modules.
         Err(error @ SelectError::ModuleNeeded { .. }) => {
             refuse(Severity::Note, "its default configuration", &error);
             return;
@@ -348,7 +349,7 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
         _ => {}
     }
     for mode in offered_modes(file, device) {
-        let choice = Choice {
+        let choice = SelectOptions {
             mode: Some(mode),
             ..choice
         };
@@ -358,7 +359,7 @@ fn usable(found: &mut Found, path: &str, file: &EsiFile, device: &Device) {
     }
 }
 
-/// The path of an element of the device or of a module, as the reader tells it.
+/// Returns the path of an element of the device or of a module, as the reader formats it.
 fn within(file: &EsiFile, device: &Device, position: Position, element: &str) -> String {
     let path = &device.path;
     let found = match element {
@@ -391,7 +392,7 @@ fn within(file: &EsiFile, device: &Device, position: Position, element: &str) ->
     found.unwrap_or_else(|| format!("{path}/{element}"))
 }
 
-fn doubled_devices(found: &mut Found, file: &EsiFile) {
+fn doubled_devices(found: &mut FindingBuilder, file: &EsiFile) {
     let mut first: BTreeMap<(u32, u32, u32), Position> = BTreeMap::new();
     for device in &file.devices {
         let id = device.identity;

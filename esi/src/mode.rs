@@ -1,4 +1,4 @@
-//! CiA 402 modes of operation as a machine builder names them.
+//! CiA 402 modes of operation and their names.
 
 use std::fmt;
 use std::str::FromStr;
@@ -29,7 +29,7 @@ impl Mode {
         Self::Cst,
     ];
 
-    /// The value of 0x6060.
+    /// Returns the value of 0x6060.
     #[must_use]
     pub fn code(self) -> i8 {
         match self {
@@ -59,7 +59,7 @@ impl Mode {
         }
     }
 
-    /// The set-point object that outputs must carry; homing has none.
+    /// Returns the set-point object that the outputs must contain. Homing has none.
     #[must_use]
     pub fn target_object(self) -> Option<u16> {
         match self {
@@ -70,7 +70,7 @@ impl Mode {
         }
     }
 
-    /// The actual value that inputs should carry.
+    /// Returns the actual value object that the inputs should contain.
     #[must_use]
     pub fn actual_object(self) -> u16 {
         match self {
@@ -80,13 +80,13 @@ impl Mode {
         }
     }
 
-    /// Set-points every cycle: CSP, CSV, CST.
+    /// True for modes with a set-point in every cycle: CSP, CSV and CST.
     #[must_use]
     pub fn is_cyclic(self) -> bool {
         matches!(self, Self::Csp | Self::Csv | Self::Cst)
     }
 
-    /// Whether a maker's label means this mode: `CSP Mode`, `PPM`, `csp - axis`.
+    /// True if a vendor's label names this mode, such as `CSP Mode`, `PPM` or `csp - axis`.
     pub(crate) fn is_named_in(self, label: &str) -> bool {
         label
             .split(|c: char| !c.is_ascii_alphanumeric())
@@ -123,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_and_names_round_trip() {
+    fn mode_codes_and_names_round_trip() {
         for mode in Mode::ALL {
             assert_eq!(Mode::from_code(mode.code()), Some(mode));
             assert_eq!(mode.to_string().parse(), Ok(mode));
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn makers_labels() {
+    fn mode_is_recognised_in_vendor_labels() {
         assert!(Mode::Csp.is_named_in("CSP Mode"));
         assert!(Mode::Pp.is_named_in("PPM Mode"));
         assert!(Mode::Csv.is_named_in("csv,csp - axis"));

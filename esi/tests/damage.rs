@@ -1,9 +1,11 @@
-//! Whatever a file contains: an error with a position or a usable result, never a panic, never unbounded memory.
+//! Any file content yields an error with a position or a usable result. It never causes a panic or
+//! unbounded memory use.
 
 use std::path::Path;
 
 use ecaxis_esi::{
-    Choice, DeviceQuery, EsiError, EsiFile, EsiProblem, Mode, find_device, parse, select, sii,
+    DeviceQuery, EsiError, EsiFile, EsiProblem, Mode, SelectOptions, find_device, parse, select,
+    sii,
 };
 use proptest::prelude::*;
 
@@ -16,7 +18,7 @@ fn own(name: &str) -> String {
     .unwrap()
 }
 
-/// An ESI file around the inside of one device.
+/// Returns an ESI file with one device that contains `inside`.
 fn device(inside: &str) -> String {
     format!(
         "<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices><Device Physics=\"YY\">\n\
@@ -28,17 +30,17 @@ fn refused(text: &str) -> EsiError {
     parse(text.as_bytes()).unwrap_err()
 }
 
-/// Everything that is derived from a file that was accepted must hold as well.
+/// Derives everything from an accepted file and checks that nothing panics.
 fn derive_all(file: &EsiFile) {
     for device in &file.devices {
         for mode in [None, Some(Mode::Csp), Some(Mode::Csv), Some(Mode::Cst)] {
             let _ = select(
                 file,
                 device,
-                &Choice {
+                &SelectOptions {
                     mode,
                     cycle_ns: 1_000_000,
-                    ..Choice::default()
+                    ..SelectOptions::default()
                 },
             );
         }
@@ -48,7 +50,7 @@ fn derive_all(file: &EsiFile) {
 }
 
 #[test]
-fn errors_name_place_path_and_reason() {
+fn errors_name_position_path_and_reason() {
     let error = refused(&device(
         "\n<Sm StartAddress=\"#x1000\"/>\n  <Sm StartAddress=\"#x11000\">Inputs</Sm>",
     ));
@@ -65,7 +67,7 @@ fn errors_name_place_path_and_reason() {
 }
 
 #[test]
-fn not_an_esi_file() {
+fn parse_rejects_files_that_are_not_esi() {
     assert!(matches!(refused("").problem(), EsiProblem::Empty));
     assert!(matches!(refused("plain text").problem(), EsiProblem::Empty));
     assert!(matches!(
@@ -89,7 +91,7 @@ fn not_an_esi_file() {
 }
 
 #[test]
-fn what_a_layout_needs_must_be_there() {
+fn parse_rejects_elements_without_layout_data() {
     for (inside, part) in [
         (
             "<RxPdo><Entry><Index>1</Index></Entry></RxPdo>",
@@ -128,7 +130,7 @@ fn left_out(file: &EsiFile) -> Vec<(u32, u32, &str)> {
         .collect()
 }
 
-/// One device a line, from line 2.
+/// Returns a file with one device per line, from line 2.
 fn devices(insides: &[&str]) -> String {
     let mut text = "<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices>".to_owned();
     for (n, inside) in insides.iter().enumerate() {
@@ -138,7 +140,7 @@ fn devices(insides: &[&str]) -> String {
 }
 
 #[test]
-fn a_broken_device_costs_itself() {
+fn a_broken_device_is_skipped_alone() {
     const SM: &str = "EtherCATInfo/Descriptions/Devices/Device[2]/Sm[1]";
     const DEVICE: &str = "EtherCATInfo/Descriptions/Devices/Device[2]";
     for (broken, column, path) in [
@@ -174,7 +176,7 @@ fn a_broken_device_costs_itself() {
 }
 
 #[test]
-fn a_broken_pdo_costs_itself_and_is_noted() {
+fn a_broken_pdo_is_skipped_alone_with_a_warning() {
     const PDO: &str = "<Index>#x1600</Index><Entry><Index>#x7000</Index><BitLen>8</BitLen></Entry>";
     let text = device(&format!(
         "<Sm StartAddress=\"#x1100\" ControlByte=\"#x64\" Enable=\"1\">Outputs</Sm>\n\
@@ -188,13 +190,13 @@ fn a_broken_pdo_costs_itself_and_is_noted() {
         format!("{at}/TxPdo[1]/Entry[1]"),
     );
     assert_eq!(left_out(&file), [(4, 15, rx.as_str()), (5, 8, tx.as_str())]);
-    let selection = select(&file, &file.devices[0], &Choice::default()).unwrap();
+    let selection = select(&file, &file.devices[0], &SelectOptions::default()).unwrap();
     assert_eq!(selection.rx.len(), 1);
     assert_eq!(selection.notes.len(), 2, "{:?}", selection.notes);
 }
 
 #[test]
-fn lines_may_end_with_cr_alone() {
+fn parse_accepts_cr_as_line_end() {
     let text = devices(&["", "<Sm/>"]).replace('\n', "\r");
     let file = parse(text.as_bytes()).unwrap();
     assert_eq!(
@@ -204,7 +206,7 @@ fn lines_may_end_with_cr_alone() {
 }
 
 #[test]
-fn numbers_with_two_prefixes() {
+fn parse_accepts_numbers_with_two_prefixes() {
     for (written, value) in [("#x0x6041", 0x6041), ("0x6041", 0x6041), ("#X6041", 0x6041)] {
         let pdo = format!(
             "<TxPdo><Index>#x1a00</Index><Entry><Index>{written}</Index><BitLen>16</BitLen></Entry></TxPdo>"
@@ -227,7 +229,7 @@ fn absurd_sizes_are_refused_at_once() {
 }
 
 #[test]
-fn a_bit_length_of_zero_is_remarked() {
+fn a_bit_length_of_zero_causes_a_warning() {
     let text = device(
         "<RxPdo Sm=\"0\"><Index>#x1600</Index><Entry><Index>#x7000</Index><BitLen>0</BitLen></Entry></RxPdo>",
     );
@@ -237,7 +239,7 @@ fn a_bit_length_of_zero_is_remarked() {
 }
 
 #[test]
-fn nesting_ends_somewhere() {
+fn nesting_depth_is_limited() {
     let deep = format!("{}{}", "<a>".repeat(100_000), "</a>".repeat(100_000));
     assert!(matches!(
         refused(&device(&deep)).problem(),
@@ -275,7 +277,7 @@ fn dictionary(types: &str, objects: &str) -> String {
 }
 
 #[test]
-fn a_few_bytes_of_file_cannot_ask_for_gigabytes() {
+fn a_small_file_cannot_allocate_gigabytes() {
     let object = "<Object><Index>1</Index><Type>BIG</Type><BitSize>8000000</BitSize></Object>";
     let error = refused(&dictionary("", &object.repeat(1_000)));
     assert!(
@@ -301,7 +303,7 @@ fn a_few_bytes_of_file_cannot_ask_for_gigabytes() {
 }
 
 #[test]
-fn types_that_refer_to_themselves_end() {
+fn circular_types_are_resolved_in_finite_time() {
     let types = "<DataType><Name>A</Name><BaseType>B</BaseType></DataType><DataType><Name>B</Name><BaseType>A</BaseType></DataType>";
     let file =
         parse(dictionary(types, "<Object><Index>1</Index><Type>A</Type></Object>").as_bytes())
@@ -310,7 +312,7 @@ fn types_that_refer_to_themselves_end() {
 }
 
 #[test]
-fn oddities_of_a_dictionary_are_warnings() {
+fn inconsistent_dictionaries_cause_warnings() {
     let object = "<Object><Index>#x2000</Index><Name>N</Name><Type>USINT</Type><BitSize>8</BitSize>\
                   <Info><DefaultValue>300</DefaultValue><MinValue>x</MinValue></Info></Object>";
     let file = parse(dictionary("", object).as_bytes()).unwrap();
@@ -339,7 +341,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, cases: 64, ..ProptestConfig::default() })]
 
     #[test]
-    fn no_bytes_make_it_panic(bytes in prop::collection::vec(any::<u8>(), 0..512)) {
+    fn parse_never_panics_on_any_bytes(bytes in prop::collection::vec(any::<u8>(), 0..512)) {
         let _ = parse(&bytes);
     }
 
@@ -355,7 +357,7 @@ proptest! {
         }
     }
 
-    /// Well-formed, but every number may be anything.
+    /// The text is well-formed, but every number may have any value.
     #[test]
     fn changed_numbers_never_panic(which in 0..3usize, seed in any::<u64>(), values in prop::collection::vec(any::<u32>(), 1..40)) {
         let text = own(["EPOS4.xml", "IDX.xml", "IO8.xml"][which]);
@@ -381,7 +383,7 @@ proptest! {
         }
     }
 
-    /// Fields lie inside their SyncManagers and do not overlap, whatever is mapped.
+    /// Fields lie inside their SyncManagers and do not overlap, for any mapping.
     #[test]
     fn fields_never_overlap(lengths in prop::collection::vec((0..3u8, 1..64u16, any::<bool>()), 0..40)) {
         let mut pdos = String::new();
@@ -394,7 +396,7 @@ proptest! {
         }
         let sms = "<Sm StartAddress=\"#x1000\">Inputs</Sm>".repeat(3);
         let file = parse(device(&format!("{sms}{pdos}")).as_bytes()).unwrap();
-        let selection = select(&file, &file.devices[0], &Choice::default()).unwrap();
+        let selection = select(&file, &file.devices[0], &SelectOptions::default()).unwrap();
         let layout = &selection.layout;
         let mut end = 0;
         for field in &layout.tx {

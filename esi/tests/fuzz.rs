@@ -1,8 +1,8 @@
-//! Whatever a file contains, all that is made of it holds: no panic, fields inside their SyncManagers, start-up
-//! commands in order, EEPROM images that can be read again. Seeds are the small files of the fuzz corpus, one for each
+//! Properties for any file content: no panic, fields inside their SyncManagers, start-up commands
+//! in order, and readable EEPROM images. Seeds are the small files of the fuzz corpus, one per
 //! feature.
 //!
-//! `ECAXIS_FUZZ_FILES` says how many files to try, `ECAXIS_FUZZ_SEED` where to begin:
+//! `ECAXIS_FUZZ_FILES` sets the number of files, `ECAXIS_FUZZ_SEED` the first seed:
 //! `ECAXIS_FUZZ_FILES=1000000 cargo test --release -p ecaxis-esi --test fuzz -- --nocapture`
 
 #![allow(clippy::print_stdout)]
@@ -38,9 +38,9 @@ fn from_env(key: &str, otherwise: u64) -> u64 {
     text.map_or(otherwise, |text| text.parse().expect("a number"))
 }
 
-/// A seed that is not read shows nothing.
+/// Checks the seeds themselves, because an unreadable seed tests nothing.
 #[test]
-fn every_seed_comes_all_the_way() {
+fn every_seed_passes_all_steps() {
     for (name, bytes) in corpus() {
         let file = parse(&bytes).unwrap_or_else(|error| panic!("{name}: {error}"));
         assert!(
@@ -59,7 +59,7 @@ fn every_seed_comes_all_the_way() {
 }
 
 #[test]
-fn changed_seeds_hold() {
+fn changed_seeds_keep_all_properties() {
     let (count, seed) = (
         from_env("ECAXIS_FUZZ_FILES", 20_000),
         from_env("ECAXIS_FUZZ_SEED", 1),
@@ -83,7 +83,7 @@ fn changed_seeds_hold() {
         }
     }
     println!("{reached:?}");
-    // Changes that leave nothing to read try nothing.
+    // Most changed files must stay readable; otherwise the test checks too little.
     assert!(count == 1 || reached.read * 5 > count, "{reached:?}");
     assert!(count == 1 || reached.selected > count, "{reached:?}");
 }

@@ -1,9 +1,9 @@
-//! The process data of every device of every recorded vendor file, for each choice that its ESI offers, as reviewed
-//! against the XML and kept in `snapshots/`.
+//! The process data of every device of every recorded vendor file, for each choice in its ESI. The
+//! snapshots in `snapshots/` are reviewed against the XML.
 //!
-//! `ECAXIS_UPDATE_SNAPSHOTS=1 cargo test -p ecaxis-esi --test layouts` writes them anew; the difference then wants
-//! the same review. Only numbers are kept: a device is its identity and line, a module its identity, an OpMode or
-//! assignment its place in the file.
+//! `ECAXIS_UPDATE_SNAPSHOTS=1 cargo test -p ecaxis-esi --test layouts` writes the snapshots again.
+//! The difference then needs the same review. Snapshots contain only numbers: a device is its
+//! identity and line, a module its identity, an OpMode or assignment its index in the file.
 
 #![allow(clippy::print_stdout)]
 
@@ -15,9 +15,9 @@ mod text;
 
 use std::path::{Path, PathBuf};
 
-use ecaxis_esi::{Choice, EsiFile, SelectError, Severity, lint, parse, select};
+use ecaxis_esi::{EsiFile, SelectError, SelectOptions, Severity, lint, parse, select};
 
-/// Files with more devices get a line and a digest for each choice.
+/// Files with more devices get one line with a digest per choice.
 const MANY_DEVICES: usize = 12;
 const UPDATE: &str = "ECAXIS_UPDATE_SNAPSHOTS";
 
@@ -41,7 +41,7 @@ fn snapshot_of(path: &Path) -> PathBuf {
 }
 
 #[test]
-fn every_layout_is_the_reviewed_one() {
+fn every_layout_matches_its_reviewed_snapshot() {
     let files = common::files("esi", &["xml"]);
     let update = std::env::var_os(UPDATE).is_some();
     let mut wrong = Vec::new();
@@ -74,16 +74,16 @@ fn every_layout_is_the_reviewed_one() {
     }
 }
 
-/// A drive that speaks SoE alone is refused with a reason, by the choice and by the check of its file.
+/// A drive with SoE only is rejected with a reason, by the selection and by the lint of its file.
 #[test]
-fn drives_that_speak_soe_alone_are_refused() {
+fn soe_only_drives_are_rejected() {
     let Some(bytes) = common::read("esi/beckhoff/Beckhoff AX5xxx.xml") else {
         return;
     };
     let file: EsiFile = parse(&bytes).unwrap();
     assert_eq!(file.devices.len(), 147);
     for device in &file.devices {
-        let error = select(&file, device, &Choice::default()).unwrap_err();
+        let error = select(&file, device, &SelectOptions::default()).unwrap_err();
         assert!(matches!(error, SelectError::SoeOnly { .. }), "{error}");
     }
     let findings = lint(&file);

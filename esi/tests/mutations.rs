@@ -1,8 +1,8 @@
-//! A drive's ESI file, damaged in one place each time: an error or a finding at that very place, no panic, and bounded
-//! memory and work.
+//! A drive's ESI file with one damage at a time. Each damage yields an error or a finding at its
+//! position, without a panic and with bounded memory and time.
 //!
-//! `cargo test -p ecaxis-esi --test mutations -- --nocapture` prints what each one says, its peak of memory and time.
-//! One test in this binary, because it measures its own process.
+//! `cargo test -p ecaxis-esi --test mutations -- --nocapture` prints message, peak memory and time
+//! of each damage. This binary has one test, because the test measures its own process.
 
 #![allow(clippy::print_stdout)]
 
@@ -21,10 +21,10 @@ mod table;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use ecaxis_esi::{Choice, lint, offered_modes, parse, select, sii};
+use ecaxis_esi::{SelectOptions, lint, offered_modes, parse, select, sii};
 use table::{Mutation, Says};
 
-/// Longer and a thread counts as hanging, on the slowest machine.
+/// A thread that runs longer counts as hanging, even on a slow machine.
 const HANG: Duration = Duration::from_secs(120);
 const MAX_PEAK: usize = 200 << 20;
 
@@ -37,7 +37,7 @@ struct Said {
     text: String,
 }
 
-/// Everything that is made of a file, on a thread of its own.
+/// Derives everything from a file, on a separate thread.
 fn examine(bytes: Vec<u8>) -> (Vec<Said>, Duration) {
     let (done, result) = mpsc::channel();
     let started = Instant::now();
@@ -62,14 +62,14 @@ fn all(bytes: &[u8]) -> Vec<Said> {
         }
     };
     for device in file.devices.iter().take(3) {
-        let choice = Choice {
+        let choice = SelectOptions {
             cycle_ns: 1_000_000,
-            ..Choice::default()
+            ..SelectOptions::default()
         };
         let _ = select(&file, device, &choice);
         for mode in offered_modes(&file, device) {
             let mode = Some(mode);
-            let _ = select(&file, device, &Choice { mode, ..choice });
+            let _ = select(&file, device, &SelectOptions { mode, ..choice });
         }
         let image = sii::emit(device, &file.modules, &sii::SiiOptions::default());
         sii::parse(&image).expect("an emitted image can be read");
@@ -90,7 +90,7 @@ fn all(bytes: &[u8]) -> Vec<Said> {
         .collect()
 }
 
-/// Line and column of a place of the text, found without the reader.
+/// Returns line and column of a byte offset, computed without the reader.
 fn place(text: &str, at: usize) -> (u32, u32) {
     let before = &text[..at];
     let line = before.matches('\n').count() + 1;
@@ -135,7 +135,7 @@ fn check(mutation: &Mutation, original: &str) -> Result<(String, usize, Duration
 }
 
 #[test]
-fn each_damage_is_told_at_its_place() {
+fn each_damage_is_reported_at_its_position() {
     let Some(bytes) = common::read(common::EPOS4) else {
         return;
     };
@@ -177,7 +177,7 @@ fn each_damage_is_told_at_its_place() {
     );
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert!(mutations.len() >= 30);
-    // Damage must not make work out of proportion; absolute times depend on the machine.
+    // Damage must not cause disproportionate work. Absolute times depend on the machine.
     assert!(
         longest < 100 * undamaged,
         "{longest:?} against {undamaged:?}"

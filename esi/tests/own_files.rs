@@ -1,9 +1,9 @@
-//! The ESI files that come with ecaxis say what they should, without a warning.
+//! The ESI files of ecaxis have the expected contents and cause no warnings.
 
 use std::path::Path;
 
 use ecaxis_esi::{
-    Choice, DeviceQuery, EsiFile, Mode, SelectError, Selection, Writable, find_device,
+    DeviceQuery, EsiFile, Mode, SelectError, SelectOptions, Selection, Writable, find_device,
     offered_modes, parse, select, sii,
 };
 
@@ -23,10 +23,10 @@ fn choose(file: &EsiFile, mode: Option<Mode>) -> Selection {
     select(
         file,
         device,
-        &Choice {
+        &SelectOptions {
             mode,
             cycle_ns: 1_000_000,
-            ..Choice::default()
+            ..SelectOptions::default()
         },
     )
     .unwrap()
@@ -81,7 +81,7 @@ fn epos4_modes_are_modules() {
         (value(&csp, 0x60c2, 1), value(&csp, 0x60c2, 2)),
         (Some(vec![1]), Some(vec![0xfd]))
     );
-    // Without a wish the slot's default module is taken.
+    // Without a mode, the slot's default module applies.
     assert_eq!(choose(&file, None).modules[0].type_name, "CSP");
 }
 
@@ -104,7 +104,7 @@ fn idx_modes_are_pdo_sets() {
             value(&selection, 0x1c12, 1),
             Some(rx.to_le_bytes().to_vec())
         );
-        // SM-synchronous stands first in the file; a synchronous mode wants the clock all the same.
+        // SM-synchronous is first in the file, but a synchronous mode requires the clock.
         assert_eq!(selection.dc.as_ref().unwrap().name, "DC");
         let cleared = (0x1600u16..0x1604).filter(|pdo| *pdo != rx);
         assert!(
@@ -117,7 +117,7 @@ fn idx_modes_are_pdo_sets() {
 }
 
 #[test]
-fn io8_is_bits_without_a_mailbox() {
+fn io8_maps_bits_without_a_mailbox() {
     let selection = choose(&file("IO8.xml"), None);
     assert!(selection.startup.is_empty() && selection.dc.is_none());
     assert_eq!(
@@ -134,7 +134,7 @@ fn io8_is_bits_without_a_mailbox() {
 }
 
 #[test]
-fn their_images_fit_their_eeproms() {
+fn own_images_fit_their_eeproms() {
     for name in ["EPOS4.xml", "IDX.xml", "IO8.xml"] {
         let file = file(name);
         let image = sii::emit(&file.devices[0], &file.modules, &sii::SiiOptions::default());
@@ -167,20 +167,20 @@ fn a_read_only_mode_is_not_written() {
 }
 
 #[test]
-fn sync_managers_must_lie_in_a_device_s_memory() {
+fn sync_managers_must_lie_in_device_memory() {
     let with = |sm: usize, start: u16| {
         let mut file = file("IDX.xml");
         file.devices[0].sync_managers[sm].start_address = start;
-        let choice = Choice {
+        let choice = SelectOptions {
             mode: Some(Mode::Csp),
             cycle_ns: 1_000_000,
-            ..Choice::default()
+            ..SelectOptions::default()
         };
         let position = file.devices[0].sync_managers[sm].position;
         (select(&file, &file.devices[0], &choice), position)
     };
     let fits = choose(&file("IDX.xml"), Some(Mode::Csp)).layout.outputs[0].len;
-    // Three buffers, and the last byte of the address space.
+    // Three buffers that end at the last byte of the address space.
     let last = u16::try_from(0x1_0000 - 3 * u32::from(fits)).unwrap();
     assert!(with(2, last).0.is_ok());
     for (sm, start) in [(2, last + 1), (2, 0x0800), (0, 0xfff0), (1, 0x0120)] {
@@ -196,7 +196,7 @@ fn sync_managers_must_lie_in_a_device_s_memory() {
 }
 
 #[test]
-fn profiles_of_devices_and_modules_stand_in_the_profile_or_in_a_channel() {
+fn profile_number_is_read_from_profile_or_channel() {
     let file = |device: &str, module: &str| {
         let text = format!(
             "<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices><Device>\
@@ -220,9 +220,9 @@ fn profiles_of_devices_and_modules_stand_in_the_profile_or_in_a_channel() {
     );
 }
 
-/// More than a byte can count is cut short; the device itself will refuse it.
+/// Counts above 255 are cut; the device itself rejects such an image.
 #[test]
-fn three_hundred_of_everything() {
+fn image_cuts_counts_above_a_byte() {
     let mut file = file("IDX.xml");
     let device = &mut file.devices[0];
     let sm = device.sync_managers[2].clone();
@@ -231,10 +231,10 @@ fn three_hundred_of_everything() {
     let mut entry = device.rx_pdos[0].entries[0].clone();
     entry.bit_len = 1;
     device.rx_pdos[0].entries.resize(300, entry);
-    let choice = Choice {
+    let choice = SelectOptions {
         mode: Some(Mode::Csp),
         cycle_ns: 1_000_000,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let selection = select(&file, &file.devices[0], &choice).unwrap();
     assert_eq!(value(&selection, 0x1600, 0), Some(vec![255]));
@@ -243,7 +243,7 @@ fn three_hundred_of_everything() {
 }
 
 #[test]
-fn what_is_kept_set_and_measured_is_told_of_every_object() {
+fn dictionary_keeps_backup_setting_and_unit_of_each_object() {
     let file = file("../../tests/judges/esi/mailbox.xml");
     let dictionary = &file.devices[0].dictionary;
     for (index, backup, setting, unit) in [
@@ -252,7 +252,7 @@ fn what_is_kept_set_and_measured_is_told_of_every_object() {
         (0x2025, false, false, 0),
     ] {
         let item = dictionary.item(index, 0).unwrap();
-        let told = (item.backup, item.setting, item.unit);
-        assert_eq!(told, (backup, setting, unit), "0x{index:04x}");
+        let reported = (item.backup, item.setting, item.unit);
+        assert_eq!(reported, (backup, setting, unit), "0x{index:04x}");
     }
 }

@@ -1,4 +1,4 @@
-//! From a vendor's file and a choice to layout and start-up list.
+//! From a vendor file and a choice to layout and start-up list.
 
 #![allow(clippy::print_stdout)]
 
@@ -9,8 +9,8 @@ mod eni;
 mod modules;
 
 use ecaxis_esi::{
-    Choice, DeviceQuery, EntryRef, EsiFile, Mode, SelectError, Selection, StartupSdo, UserSdo,
-    find_device, offered_modes, parse, select,
+    DeviceQuery, EntryRef, EsiFile, Mode, SelectError, SelectOptions, Selection, StartupSdo,
+    UserSdo, find_device, offered_modes, parse, select,
 };
 
 const MS: u64 = 1_000_000;
@@ -19,19 +19,19 @@ fn file(path: &str) -> Option<EsiFile> {
     common::read(path).map(|bytes| parse(&bytes).unwrap())
 }
 
-fn choose(file: &EsiFile, choice: &Choice) -> Result<Selection, SelectError> {
+fn choose(file: &EsiFile, choice: &SelectOptions) -> Result<Selection, SelectError> {
     select(file, find_device(file, &DeviceQuery::default())?, choice)
 }
 
-fn for_mode(mode: Mode) -> Choice<'static> {
-    Choice {
+fn for_mode(mode: Mode) -> SelectOptions<'static> {
+    SelectOptions {
         mode: Some(mode),
         cycle_ns: MS,
-        ..Choice::default()
+        ..SelectOptions::default()
     }
 }
 
-/// Index, subindex and value, as app notes and ENI files write them.
+/// Returns index, subindex and value, as in application notes and ENI files.
 fn written(startup: &[StartupSdo]) -> Vec<(u16, u8, u64)> {
     startup
         .iter()
@@ -43,9 +43,9 @@ fn written(startup: &[StartupSdo]) -> Vec<(u16, u8, u64)> {
         .collect()
 }
 
-/// The sequence of the maker's own set-up example, with this module's objects.
+/// The sequence of the vendor's set-up example, with the objects of this module.
 #[test]
-fn epos4_csp_starts_as_its_maker_shows() {
+fn epos4_csp_starts_like_the_vendor_example() {
     let Some(file) = file(common::EPOS4) else {
         return;
     };
@@ -108,14 +108,14 @@ fn epos4_csp_starts_as_its_maker_shows() {
         (dc.assign_activate, dc.sync0_cycle_ns, dc.sync1_cycle_ns),
         (0x300, 1_000_000, 0)
     );
-    // 0x60A9 is the device's, 0x60C2 and 0x6065 are the module's.
+    // 0x60A9 belongs to the device, 0x60C2 and 0x6065 to the module.
     for index in [0x60a9, 0x60c2, 0x6065] {
         assert!(csp.dictionary.object(index).is_some(), "0x{index:04x}");
     }
 }
 
 #[test]
-fn epos4_torque_mode_writes_no_interpolation_time_but_zero() {
+fn epos4_torque_mode_writes_only_zero_as_interpolation_time() {
     let Some(file) = file(common::EPOS4) else {
         return;
     };
@@ -127,7 +127,7 @@ fn epos4_torque_mode_writes_no_interpolation_time_but_zero() {
 }
 
 #[test]
-fn epos4_refuses_what_it_does_not_offer() {
+fn epos4_rejects_unsupported_choices() {
     let Some(file) = file(common::EPOS4) else {
         return;
     };
@@ -141,19 +141,19 @@ fn epos4_refuses_what_it_does_not_offer() {
         offered_modes(&file, device),
         [Mode::Pp, Mode::Pv, Mode::Csp, Mode::Csv, Mode::Cst]
     );
-    let odd = Choice {
+    let odd = SelectOptions {
         cycle_ns: 125_000,
         ..for_mode(Mode::Csp)
     };
     let error = choose(&file, &odd).unwrap_err().to_string();
     assert!(error.contains("120 µs and 130 µs"), "{error}");
-    let dc = Choice {
+    let dc = SelectOptions {
         dc_mode: Some("fast"),
         ..for_mode(Mode::Csp)
     };
     let error = choose(&file, &dc).unwrap_err().to_string();
     assert!(error.contains("\"Synchron\""), "{error}");
-    let dc = Choice {
+    let dc = SelectOptions {
         dc_mode: Some("synchron"),
         ..for_mode(Mode::Csp)
     };
@@ -161,7 +161,7 @@ fn epos4_refuses_what_it_does_not_offer() {
 }
 
 #[test]
-fn own_entries_replace_the_module_s() {
+fn user_entries_replace_module_entries() {
     let Some(file) = file(common::EPOS4) else {
         return;
     };
@@ -170,7 +170,7 @@ fn own_entries_replace_the_module_s() {
         [entry(0x6040), entry(0x607a)],
         [entry(0x6041), entry(0x6064)],
     );
-    let own = Choice {
+    let own = SelectOptions {
         rx: Some(&rx),
         tx: Some(&tx),
         ..for_mode(Mode::Csp)
@@ -206,7 +206,7 @@ fn own_entries_replace_the_module_s() {
     let without_target = [entry(0x6040)];
     let error = choose(
         &file,
-        &Choice {
+        &SelectOptions {
             rx: Some(&without_target),
             ..own
         },
@@ -219,7 +219,7 @@ fn own_entries_replace_the_module_s() {
     let unmappable = [entry(0x6041), entry(0x6064), entry(0x1008)];
     let error = choose(
         &file,
-        &Choice {
+        &SelectOptions {
             tx: Some(&unmappable),
             ..own
         },
@@ -232,7 +232,7 @@ fn own_entries_replace_the_module_s() {
     let unknown = [entry(0x6041), entry(0x6064), entry(0x5fff)];
     let error = choose(
         &file,
-        &Choice {
+        &SelectOptions {
             tx: Some(&unknown),
             ..own
         },
@@ -245,7 +245,7 @@ fn own_entries_replace_the_module_s() {
     let many = [entry(0x6040); 13];
     let error = choose(
         &file,
-        &Choice {
+        &SelectOptions {
             rx: Some(&many),
             ..own
         },
@@ -258,7 +258,7 @@ fn own_entries_replace_the_module_s() {
 }
 
 #[test]
-fn the_user_s_sdos_come_last_and_must_fit() {
+fn user_sdos_come_last_and_must_have_the_right_size() {
     let Some(file) = file(common::EPOS4) else {
         return;
     };
@@ -274,7 +274,7 @@ fn the_user_s_sdos_come_last_and_must_fit() {
     let fits = [window];
     let selection = choose(
         &file,
-        &Choice {
+        &SelectOptions {
             sdo: &fits,
             ..for_mode(Mode::Csp)
         },
@@ -287,7 +287,7 @@ fn the_user_s_sdos_come_last_and_must_fit() {
     );
     let error = choose(
         &file,
-        &Choice {
+        &SelectOptions {
             sdo: &[short],
             ..for_mode(Mode::Csp)
         },
@@ -306,9 +306,9 @@ fn the_user_s_sdos_come_last_and_must_fit() {
     );
 }
 
-/// Fixed PDOs that exclude each other: the mode decides which is assigned, nothing is mapped.
+/// Fixed PDOs exclude each other: the mode selects the assigned PDO, and no mapping is written.
 #[test]
-fn elmo_modes_pick_their_fixed_pdo() {
+fn elmo_modes_select_their_fixed_pdo() {
     let Some(file) = file("esi/elmo/Elmo_ECAT_00010420_V11.xml") else {
         return;
     };
@@ -355,9 +355,9 @@ fn elmo_modes_pick_their_fixed_pdo() {
     assert!(error.contains("0x00030925"), "{error}");
 }
 
-/// An InitCmd that sets 8 must not win over the user's mode.
+/// An InitCmd that sets mode 8 must not override the user's mode.
 #[test]
-fn a_device_s_own_mode_command_yields_to_the_choice() {
+fn a_device_mode_command_yields_to_the_user_mode() {
     let Some(file) = file("esi/stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml") else {
         return;
     };
@@ -378,16 +378,16 @@ fn a_device_s_own_mode_command_yields_to_the_choice() {
     );
 }
 
-/// No vendor file's default may be refused, but for drives that speak SoE alone.
+/// The default of each vendor file is accepted, except for drives with SoE only.
 #[test]
-fn every_device_can_be_taken_as_it_is() {
+fn every_device_is_selectable_with_its_defaults() {
     let mut devices = 0;
     for path in common::files("esi", &["xml"]) {
         let file = parse(&std::fs::read(&path).unwrap()).unwrap();
         for device in &file.devices {
-            let choice = Choice {
+            let choice = SelectOptions {
                 cycle_ns: MS,
-                ..Choice::default()
+                ..SelectOptions::default()
             };
             match select(&file, device, &choice) {
                 Ok(selection) => {
@@ -428,9 +428,9 @@ fn a_coupler_terminal_has_bits_and_no_sdos() {
     let selection = select(
         &file,
         device,
-        &Choice {
+        &SelectOptions {
             cycle_ns: MS,
-            ..Choice::default()
+            ..SelectOptions::default()
         },
     )
     .unwrap();
@@ -442,9 +442,10 @@ fn a_coupler_terminal_has_bits_and_no_sdos() {
     assert!(selection.startup.is_empty());
 }
 
-/// Elmo's InitCmd sets 2 for its own 2 ms; the drive must learn the cycle of this bus.
+/// Elmo's InitCmd sets 2 for its default cycle of 2 ms. The drive must receive the cycle of this
+/// bus.
 #[test]
-fn a_device_s_own_interpolation_time_yields_to_the_bus_cycle() {
+fn a_device_interpolation_time_yields_to_the_bus_cycle() {
     let Some(file) = file("esi/elmo/Elmo_ECAT_00010420_V11.xml") else {
         return;
     };
@@ -453,7 +454,7 @@ fn a_device_s_own_interpolation_time_yields_to_the_bus_cycle() {
         coe.is_some_and(|coe| coe.init_cmds.iter().any(|cmd| cmd.index == 0x60c2))
     };
     let device = file.devices.iter().find(commanded).unwrap();
-    let fast = Choice {
+    let fast = SelectOptions {
         cycle_ns: MS / 4,
         ..for_mode(Mode::Csp)
     };
@@ -468,19 +469,19 @@ fn a_device_s_own_interpolation_time_yields_to_the_bus_cycle() {
         notes.filter(|note| note.contains("0x60c2:01")).count()
     };
     assert_eq!(left_out(&selection), 1, "{:?}", selection.notes);
-    // Where nothing follows from the cycle, the maker's value stays.
-    let any = Choice {
+    // If no value follows from the cycle, the vendor's value stays.
+    let any = SelectOptions {
         cycle_ns: MS / 4,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let selection = select(&file, device, &any).unwrap();
     assert!(written(&selection.startup).contains(&(0x60c2, 1, 2)));
     assert_eq!(left_out(&selection), 0);
 }
 
-/// One `ChannelInfo` per axis is another way to say that it is a drive.
+/// One `ChannelInfo` per axis also declares a drive.
 #[test]
-fn the_profile_may_stand_in_a_channel() {
+fn the_drive_profile_may_be_in_a_channel() {
     for path in [
         "esi/stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml",
         "esi/inovance/SV660_EOE_1Axis_V9.12.xml",

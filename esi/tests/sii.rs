@@ -1,4 +1,4 @@
-//! EEPROM images: recorded ones can be read, ours can be read back.
+//! EEPROM images: recorded images parse, and emitted images parse to the same contents.
 
 #![allow(clippy::print_stdout)]
 
@@ -20,7 +20,7 @@ fn every_recorded_image_parses() {
     for path in common::files("sii", &["bin", "hex", "sii"]) {
         let bytes = std::fs::read(&path).unwrap();
         if bytes.first() == Some(&b':') {
-            continue; // Intel HEX, the same bytes stand beside it.
+            continue; // Intel HEX; the .bin file contains the same bytes.
         }
         let sii = sii::parse(&bytes).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         assert!(sii.identity.vendor != 0, "{}", path.display());
@@ -35,7 +35,7 @@ fn every_recorded_image_parses() {
 }
 
 #[test]
-fn a_digital_output_terminal() {
+fn image_of_a_digital_output_terminal_has_the_recorded_contents() {
     let Some(sii) = image("sii/ethercrab/el2004-eeprom-dump.bin") else {
         return;
     };
@@ -61,7 +61,7 @@ fn a_digital_output_terminal() {
 }
 
 #[test]
-fn a_servo_drive() {
+fn image_of_a_servo_drive_has_the_recorded_contents() {
     let Some(sii) = image("sii/ethercrab/akd.hex") else {
         return;
     };
@@ -97,7 +97,7 @@ fn a_servo_drive() {
 }
 
 #[test]
-fn the_vendor_drive_s_image_reads_back() {
+fn image_of_the_vendor_drive_reads_back() {
     let Some(bytes) = common::read(common::EPOS4) else {
         return;
     };
@@ -124,7 +124,7 @@ fn the_vendor_drive_s_image_reads_back() {
         (sii.mailbox.send_offset, sii.mailbox.send_size),
         (0x1030, 48)
     );
-    // The file gives no sizes; the default module (CSP) maps 17 bytes each way.
+    // The file contains no sizes; the default module (CSP) maps 17 bytes in each direction.
     let lengths: Vec<u16> = sii.sync_managers.iter().map(|sm| sm.len).collect();
     assert_eq!(lengths, [48, 48, 17, 17]);
     let assigned: Vec<u16> = sii
@@ -161,9 +161,9 @@ fn every_device_of_every_vendor_gets_an_image() {
     }
 }
 
-/// As makers' images have it: registers that a SyncManager stands for have PDOs, but no length of their own.
+/// Vendor images list PDOs for registers behind a virtual SyncManager, but no length.
 #[test]
-fn virtual_pdos_are_listed_in_their_places() {
+fn virtual_pdos_are_listed_in_file_order() {
     let xml = br##"<EtherCATInfo><Vendor><Id>1</Id></Vendor><Descriptions><Devices><Device>
         <Type ProductCode="#x1">Oversampler</Type><Name>Oversampler</Name>
         <Sm StartAddress="#x1000" ControlByte="#x20" Enable="1">Inputs</Sm>
@@ -390,17 +390,17 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn what_is_emitted_reads_back(sii in any_image()) {
+    fn emitted_images_read_back(sii in any_image()) {
         prop_assert_eq!(sii::parse(&sii.to_bytes()), Ok(sii));
     }
 
     #[test]
-    fn no_bytes_make_it_panic(bytes in prop::collection::vec(any::<u8>(), 0..1024)) {
+    fn parse_never_panics_on_any_bytes(bytes in prop::collection::vec(any::<u8>(), 0..1024)) {
         let _ = sii::parse(&bytes);
     }
 
     #[test]
-    fn no_damage_makes_it_panic(sii in any_image(), cuts in prop::collection::vec((any::<u16>(), any::<u8>()), 1..8), end in any::<u16>()) {
+    fn parse_never_panics_on_damaged_images(sii in any_image(), cuts in prop::collection::vec((any::<u16>(), any::<u8>()), 1..8), end in any::<u16>()) {
         let mut bytes = sii.to_bytes();
         for (at, value) in cuts {
             let at = usize::from(at) % bytes.len();

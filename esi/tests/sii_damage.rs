@@ -1,4 +1,4 @@
-//! Damaged EEPROM images: an error or a warning tells the byte and the category, and nothing panics.
+//! Damaged EEPROM images: an error or a warning names offset and category, and nothing panics.
 
 #![allow(clippy::print_stdout)]
 
@@ -17,7 +17,7 @@ const TX_PDO: u16 = 50;
 const RX_PDO: u16 = 51;
 const DC: u16 = 60;
 
-/// A drive's.
+/// Returns the image of a drive.
 fn whole() -> Vec<u8> {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/esi/EPOS4.xml");
     let file = parse(&std::fs::read(path).unwrap()).unwrap();
@@ -32,7 +32,7 @@ fn put(image: &mut [u8], at: usize, value: u16) {
     image[at..at + 2].copy_from_slice(&value.to_le_bytes());
 }
 
-/// Where the head of a category stands; 0xffff is the end mark.
+/// Returns the offset of a category's header; 0xffff is the end mark.
 fn head(image: &[u8], kind: u16) -> usize {
     let mut at = 0x80;
     while word(image, at) != kind {
@@ -41,7 +41,7 @@ fn head(image: &[u8], kind: u16) -> usize {
     at
 }
 
-/// Where its data stand.
+/// Returns the offset of a category's data.
 fn data(image: &[u8], kind: u16) -> usize {
     head(image, kind) + 4
 }
@@ -50,7 +50,7 @@ fn insert(image: &mut Vec<u8>, at: usize, bytes: &[u8]) {
     image.splice(at..at, bytes.iter().copied());
 }
 
-/// What was done, and a part of what is said.
+/// The damage, its implementation, and a part of the message.
 type Case = (&'static str, fn(&mut Vec<u8>), &'static str);
 
 const CASES: &[Case] = &[
@@ -286,7 +286,7 @@ fn said(image: &[u8]) -> Vec<String> {
 }
 
 #[test]
-fn damage_is_told_with_its_place() {
+fn damage_is_reported_with_its_position() {
     assert_eq!(said(&whole()), Vec::<String>::new());
     for (what, damage, expected) in CASES {
         let mut image = whole();
@@ -306,9 +306,9 @@ fn damage_is_told_with_its_place() {
     assert!(CASES.len() >= 30);
 }
 
-/// Wherever an image is cut, and whatever byte of it is wrong.
+/// Checks every cut and every wrong byte.
 #[test]
-fn no_cut_and_no_byte_makes_it_panic() {
+fn parse_never_panics_on_cuts_and_wrong_bytes() {
     let image = whole();
     let used = head(&image, 0xffff) + 2;
     for end in 0..used {
@@ -324,14 +324,15 @@ fn no_cut_and_no_byte_makes_it_panic() {
     }
 }
 
-/// Whatever lengths and numbers an image claims, reading it takes no more than a few times its length.
+/// Reading takes at most a few times the image's length in memory, for any lengths and counts in
+/// the image.
 #[test]
-fn no_claim_takes_much_memory() {
+fn parse_needs_bounded_memory_for_any_counts() {
     const LIMIT: usize = 64 << 20;
     let mut long = whole();
     let end = head(&long, 0xffff);
     long.truncate(end);
-    // As long as an EEPROM can be, full of categories that claim the most.
+    // An image of maximum size, full of categories with maximum counts.
     for kind in (1..=DC).cycle() {
         if long.len() + 4 + 2 * 0xff > 512 << 10 {
             break;
@@ -354,7 +355,7 @@ fn no_claim_takes_much_memory() {
 }
 
 #[test]
-fn no_emitted_image_has_anything_odd() {
+fn emitted_images_have_no_warnings() {
     for path in common::files("esi", &["xml"]) {
         let file = parse(&std::fs::read(&path).unwrap()).unwrap();
         for device in &file.devices {
@@ -364,14 +365,14 @@ fn no_emitted_image_has_anything_odd() {
     }
 }
 
-/// A false alarm on what devices really have would be ours.
+/// A warning about values that real devices contain would be a false alarm.
 #[test]
-fn recorded_images_have_one_oddity() {
+fn recorded_images_have_one_warning() {
     let mut odd = Vec::new();
     for path in common::files("sii", &["bin", "hex", "sii"]) {
         let bytes = std::fs::read(&path).unwrap();
         if bytes.first() == Some(&b':') {
-            continue; // Intel HEX, the same bytes stand beside it.
+            continue; // Intel HEX; the .bin file contains the same bytes.
         }
         let name = path.file_name().unwrap().to_string_lossy();
         odd.extend(said(&bytes).iter().map(|line| format!("{name}: {line}")));

@@ -1,4 +1,4 @@
-//! Every recorded vendor file can be read, and the drive we know best is read exactly.
+//! Every recorded vendor file parses; the contents of the EPOS4 file are checked in detail.
 
 #![allow(clippy::print_stdout)]
 
@@ -60,9 +60,9 @@ fn every_bus_dump_parses() {
     }
 }
 
-/// Counted and read off in the file by hand.
+/// The expected values were read from the file by hand.
 #[test]
-fn the_epos4_file_exactly() {
+fn the_epos4_file_is_read_exactly() {
     let Some(bytes) = common::read(common::EPOS4) else {
         return;
     };
@@ -179,7 +179,7 @@ fn the_epos4_file_exactly() {
             op: false
         }
     );
-    // Subindices 2 and 3 do not exist; the gap stays a gap.
+    // Subindices 2 and 3 do not exist and stay missing.
     let restore: Vec<_> = device
         .dictionary
         .object(0x1011)

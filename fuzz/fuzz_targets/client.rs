@@ -1,5 +1,5 @@
-//! The mailbox clients against a device that may say anything: SDO transfers, SDO Information, files. Whatever it says, each
-//! question comes to its end.
+//! The mailbox clients with a device that may send anything: SDO transfers, SDO Information, files.
+//! Each request must end.
 #![no_main]
 
 use std::cell::{Cell, RefCell};
@@ -20,14 +20,14 @@ const LAYOUT: MailboxLayout = MailboxLayout {
     out_sm: 0,
     in_sm: 1,
 };
-/// SyncManager 1, status; and its bit "mailbox full".
+/// The status register of SyncManager 1, and its bit "mailbox full".
 const STATUS: u16 = 0x080d;
 const FULL: u8 = 0x08;
-/// What no question needs.
+/// More datagrams than any request needs.
 const DATAGRAMS: u32 = 2_000_000;
 const INDEX: u16 = 0x2000;
 
-/// Says the messages of the input, one after the other.
+/// A device that sends the messages of the input in order.
 struct Device<'a> {
     rest: RefCell<&'a [u8]>,
     now: Cell<u64>,
@@ -44,7 +44,8 @@ impl Device<'_> {
         );
     }
 
-    /// A length, what kind of message, its bytes. Above 0x7f the kind is a header of six bytes that may lie.
+    /// Writes the next message: length, kind and bytes. A kind above 0x7f is followed by a header
+    /// of six bytes that may be wrong.
     fn say(&self, mailbox: &mut [u8]) {
         mailbox.fill(0);
         let mut rest = self.rest.borrow_mut();
@@ -117,7 +118,7 @@ fuzz_target!(|input: &[u8]| {
     };
     let mut coe = CoeClient::new(LAYOUT);
     let mut foe = FoeClient::new(LAYOUT);
-    // Two questions, so that what the first leaves behind meets the second.
+    // Two requests, so that the second one runs with the remains of the first.
     for question in [questions & 0x0f, questions >> 4] {
         match question {
             0 => drop(now(coe.upload(&device, INDEX, 1, false))),

@@ -1,4 +1,4 @@
-//! An ESI file, and all that is made of it: choices, layouts, start-up lists, EEPROM images.
+//! An ESI file and everything derived from it: choices, layouts, start-up lists, EEPROM images.
 #![no_main]
 
 #[path = "../../esi/tests/fuzz/walk.rs"]

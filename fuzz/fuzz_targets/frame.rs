@@ -1,4 +1,4 @@
-//! Frames to a bus in Op, each behind its length and the microseconds to wait after it.
+//! Frames to a bus in Op, each with its length and the microseconds to wait after it.
 #![no_main]
 
 #[path = "../../sim/tests/common/mod.rs"]

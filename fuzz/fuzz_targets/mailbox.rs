@@ -1,4 +1,4 @@
-//! Mailbox messages to a drive and to a device that is mailbox above all.
+//! Mailbox messages to a drive and to a device that consists mainly of a mailbox.
 #![no_main]
 
 #[path = "../../sim/tests/common/mod.rs"]
@@ -12,7 +12,7 @@ use ecaxis_sim::frame::FrameBuilder;
 use hostile::{Hostile, exchange};
 use libfuzzer_sys::fuzz_target;
 
-/// Station and mailboxes of the drive and of the other.
+/// Station and mailbox addresses of the drive and of the other device.
 const TARGETS: [(u16, u16, u16); 2] = [(0x1001, 0x1000, 0x1040), (0x1003, 0x1000, 0x1600)];
 const LEN: usize = 48;
 
@@ -31,7 +31,7 @@ fuzz_target!(|data: &[u8]| {
                 continue;
             };
             let mut mailbox = vec![0; LEN];
-            // A length that lies comes with the highest bit of the type's byte.
+            // With the highest bit of the type byte, the length in the header is wrong.
             let claimed = if kind & 0x80 == 0 { body.len() } else { 0xffff };
             mailbox[..2].copy_from_slice(&(claimed as u16).to_le_bytes());
             mailbox[5] = kind & 0x7f;

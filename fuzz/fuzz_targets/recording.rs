@@ -1,4 +1,4 @@
-//! A recording, and all that is told of it: the report as JSON and as a page.
+//! A recording and its analysis: the report as JSON and as a page.
 #![no_main]
 
 use ecaxis::analyze::{Known, analyze, html};

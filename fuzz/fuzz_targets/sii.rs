@@ -1,4 +1,4 @@
-//! An EEPROM image, made into a device that is then attacked.
+//! An EEPROM image for a simulated device, which then receives arbitrary frames.
 #![no_main]
 
 #[path = "../../sim/tests/common/mod.rs"]

@@ -1,7 +1,7 @@
-//! The session's clock: monotonic time, or virtual time that only moves when somebody waits.
+//! The session's clock: monotonic time, or virtual time that advances only by waiting.
 //!
-//! Also ethercrab's time source. Without its `std` feature ethercrab asks embassy-time for the
-//! time; nothing is ever scheduled there, because every executor here polls.
+//! This module is also ethercrab's time source. Without its `std` feature, ethercrab reads the time
+//! from embassy-time. No wake-up is ever scheduled there, because every executor here polls.
 
 use std::cell::Cell;
 use std::future::poll_fn;
@@ -16,24 +16,24 @@ pub type Nanos = u64;
 
 const NANOS_PER_SECOND: u64 = 1_000_000_000;
 
-/// Where virtual time starts. Not zero, so that a clock read before the start would show.
+/// The start of virtual time. It is not zero, so that a clock read before the start is visible.
 const VIRTUAL_EPOCH: Nanos = NANOS_PER_SECOND;
 
 thread_local! {
-    /// Virtual time of this thread; `None` where time is real.
+    /// The virtual time of this thread; `None` where time is real.
     static VIRTUAL: Cell<Option<Nanos>> = const { Cell::new(None) };
 }
 
-/// Which time a session runs in.
+/// The time base of a session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Clock {
     /// `CLOCK_MONOTONIC`.
     Real,
-    /// Advances by waiting alone; one thread does everything.
+    /// Advances only by waiting; one thread does all the work.
     Virtual,
 }
 
-/// The time of the thread's clock. RT: no system call beyond the clock.
+/// Returns the time of the thread's clock. RT: reads the clock, no other system call.
 #[must_use]
 pub fn now() -> Nanos {
     VIRTUAL.get().unwrap_or_else(monotonic)
@@ -55,8 +55,8 @@ impl Clock {
         });
     }
 
-    /// Sleeps until `spin` before `t`, then spins. Returns how late the sleep itself ended, `None` where there was nothing
-    /// to sleep or time is virtual. RT: blocks on the clock only.
+    /// Sleeps until `spin` before `t`, then spins. Returns how late the sleep ended; `None` if it
+    /// did not sleep or time is virtual. RT: blocks on the clock only.
     pub fn sleep_until(self, t: Nanos, spin: Nanos) -> Option<Nanos> {
         match self {
             Self::Virtual => {
@@ -87,7 +87,7 @@ impl Clock {
         }
     }
 
-    /// One turn of a waiting loop that wants to look again at `next` at the latest. RT.
+    /// One iteration of a polling loop that must poll again at `next` at the latest. RT.
     pub fn relax(self, next: Nanos) {
         match self {
             Self::Virtual => VIRTUAL.set(VIRTUAL.get().map(|now| now.max(next))),
@@ -96,7 +96,7 @@ impl Clock {
     }
 }
 
-/// Completes once the clock has moved on by `duration`.
+/// Completes once the clock has advanced by `duration`.
 pub async fn delay(duration: Duration) {
     let until = now().saturating_add(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX));
     poll_fn(|_| {
@@ -128,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sleep_tells_how_late_it_ended() {
+    fn sleep_until_returns_its_lateness() {
         let t = now() + 50_000_000;
         assert!(Clock::Real.sleep_until(t, 1_000_000).is_some());
         assert!(now() >= t);
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn virtual_time_moves_by_waiting_alone() {
+    fn virtual_time_advances_only_by_waiting() {
         std::thread::spawn(|| {
             Clock::Virtual.enter();
             let start = now();

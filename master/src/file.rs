@@ -1,5 +1,5 @@
-//! Files that are read whole. A name may lead to a device without an end or to a pipe without a writer, so only regular files
-//! are read, up to a size that the caller knows.
+//! Reads whole files. A name may lead to an endless device or to a pipe without a writer. Therefore
+//! only regular files are read, up to a size that the caller sets.
 
 use std::fs::File;
 use std::io::{Error, ErrorKind, Read, Result};
@@ -10,7 +10,7 @@ use std::path::Path;
 /// # Errors
 /// Fails if the file cannot be read, is not a regular file, or is longer.
 pub fn read(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
-    // Before it is opened: to open a pipe waits for its writer.
+    // Checked before opening: opening a pipe waits for its writer.
     let metadata = std::fs::metadata(path)?;
     if metadata.is_dir() {
         return Err(ErrorKind::IsADirectory.into());
@@ -19,7 +19,7 @@ pub fn read(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
         return Err(Error::new(ErrorKind::InvalidInput, "not a regular file"));
     }
     let mut bytes = Vec::new();
-    // The length may be another one by now, and files in /proc say 0.
+    // The length may have changed since, and files in /proc report 0.
     let taken = File::open(path)?.take(max_bytes.saturating_add(1));
     let read = { taken }.read_to_end(&mut bytes)?;
     if u64::try_from(read).is_ok_and(|read| read <= max_bytes) {
@@ -29,10 +29,10 @@ pub fn read(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
     Err(Error::new(ErrorKind::FileTooLarge, message))
 }
 
-/// Reads a text as [`read`] reads bytes.
+/// Reads a UTF-8 text file of at most `max_bytes` bytes.
 ///
 /// # Errors
-/// As [`read`], and where the bytes are not UTF-8.
+/// Fails like [`read`], and if the bytes are not UTF-8.
 pub fn read_text(path: &Path, max_bytes: u64) -> Result<String> {
     let bytes = read(path, max_bytes)?;
     String::from_utf8(bytes).map_err(|error| Error::new(ErrorKind::InvalidData, error))
@@ -52,7 +52,7 @@ mod tests {
         let len = std::fs::metadata(this).unwrap().len();
         assert_eq!(kind(this, len - 1), Err(ErrorKind::FileTooLarge));
         assert_eq!(kind(this, len).map(|bytes| bytes.len() as u64), Ok(len));
-        // Its metadata say 0.
+        // Its metadata report a length of 0.
         assert!(kind("/proc/self/stat", 1).is_err());
         assert!(kind("/proc/self/stat", 4096).is_ok_and(|bytes| !bytes.is_empty()));
     }

@@ -1,6 +1,6 @@
 //! Bit-packed copies, least significant bit first, as FMMUs and PDOs use them.
 
-/// Copies `len` bits. Bits outside stay as they are; what does not fit either slice is left out.
+/// Copies `len` bits and keeps all other bits. Bits outside either slice are skipped.
 pub(crate) fn copy(to: &mut [u8], to_bit: usize, from: &[u8], from_bit: usize, len: usize) {
     if (to_bit | from_bit | len).is_multiple_of(8) {
         let n = len / 8;
@@ -37,7 +37,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn moves_exactly_the_bits_asked_for(
+        fn copy_moves_exactly_the_requested_bits(
             to in prop::array::uniform8(any::<u8>()), from in prop::array::uniform8(any::<u8>()),
             to_bit in 0usize..32, from_bit in 0usize..32, len in 0usize..32,
         ) {
@@ -55,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn stops_at_the_end_of_either_slice() {
+    fn copy_stops_at_the_end_of_either_slice() {
         let mut out = [0; 2];
         copy(&mut out, 8, &[0xff, 0xff], 0, 16);
         assert_eq!(out, [0, 0xff]);

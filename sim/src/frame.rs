@@ -4,13 +4,13 @@ use std::ops::Range;
 
 /// EtherType of EtherCAT.
 pub const ETHERTYPE: u16 = 0x88a4;
-/// Destination, source, EtherType.
+/// Bytes of destination, source and EtherType.
 const ETHERNET_HEADER: usize = 14;
 const ETHERCAT_HEADER: usize = 2;
 const DATAGRAM_HEADER: usize = 10;
 const WKC: usize = 2;
 
-/// ETG.1000.4, datagram commands.
+/// Datagram commands (ETG.1000.4).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
     Nop,
@@ -28,7 +28,7 @@ pub enum Command {
     Lrw,
     Armw,
     Frmw,
-    /// Passes unprocessed.
+    /// A command that SubDevices pass on unprocessed.
     Unknown(u8),
 }
 
@@ -56,7 +56,7 @@ impl Command {
     }
 }
 
-/// One datagram inside a frame, as offsets, so that the frame itself stays the only copy.
+/// One datagram inside a frame, stored as offsets. The frame remains the only copy of the data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Datagram {
     pub command: Command,
@@ -65,7 +65,7 @@ pub struct Datagram {
 }
 
 impl Datagram {
-    /// Position or station address.
+    /// Returns the position or station address.
     #[must_use]
     pub fn adp(&self, frame: &[u8]) -> u16 {
         read_u16(frame, self.header + 2).unwrap_or(0)
@@ -75,13 +75,13 @@ impl Datagram {
         write_u16(frame, self.header + 2, adp);
     }
 
-    /// Physical address inside the SubDevice.
+    /// Returns the physical address inside the SubDevice.
     #[must_use]
     pub fn ado(&self, frame: &[u8]) -> u16 {
         read_u16(frame, self.header + 4).unwrap_or(0)
     }
 
-    /// Logical address of LRD, LWR and LRW.
+    /// Returns the logical address of LRD, LWR and LRW.
     #[must_use]
     pub fn logical(&self, frame: &[u8]) -> u32 {
         u32::from(self.adp(frame)) | u32::from(self.ado(frame)) << 16
@@ -97,13 +97,13 @@ impl Datagram {
         write_u16(frame, self.data.end, wkc);
     }
 
-    /// ECAT event request, ORed by every SubDevice.
+    /// ORs `irq` into the ECAT event request, as every SubDevice does.
     pub fn or_irq(&self, frame: &mut [u8], irq: u16) {
         let old = read_u16(frame, self.header + 8).unwrap_or(0);
         write_u16(frame, self.header + 8, old | irq);
     }
 
-    /// Concerns the SubDevice at one station address and no other.
+    /// True for commands that address exactly one station address.
     #[must_use]
     pub fn is_to_station(&self) -> bool {
         matches!(self.command, Command::Fprd | Command::Fpwr | Command::Fprw)
@@ -125,8 +125,8 @@ fn write_u16(frame: &mut [u8], at: usize, value: u16) {
     }
 }
 
-/// Offset of the first datagram and the end of the last one, if this is a type 1 EtherCAT frame
-/// whose datagrams all lie inside it.
+/// Returns the offset of the first datagram and the end of the last one. `None` unless this is a
+/// type 1 EtherCAT frame whose datagrams all lie inside the frame.
 fn bounds(frame: &[u8]) -> Option<(usize, usize)> {
     if frame.get(12..14)? != ETHERTYPE.to_be_bytes() {
         return None;
@@ -148,14 +148,14 @@ fn parse_one(frame: &[u8], at: usize, end: usize) -> Option<Datagram> {
     (start + len + WKC <= end).then_some(datagram)
 }
 
-/// What a SubDevice makes of a frame.
+/// The classification of a frame by a SubDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// Well-formed, of type 1.
+    /// A well-formed EtherCAT frame of type 1.
     EtherCat,
-    /// Has EtherCAT's EtherType, but its datagrams do not fit together.
+    /// A frame with the EtherType of EtherCAT and inconsistent datagrams.
     Malformed,
-    /// Another protocol.
+    /// A frame of another protocol.
     Foreign,
 }
 
@@ -178,8 +178,8 @@ pub fn kind(frame: &[u8]) -> Kind {
     }
 }
 
-/// Sets the circulating bit (bit 14 of the length) in every datagram; false where the first has it
-/// already.
+/// Sets the circulating bit (bit 14 of the length) in every datagram. Returns false if the first
+/// datagram already has the bit.
 pub fn circulate(frame: &mut [u8]) -> bool {
     const CIRCULATING: u16 = 0x4000;
     let mut datagram = next(frame, None);
@@ -194,7 +194,7 @@ pub fn circulate(frame: &mut [u8]) -> bool {
     true
 }
 
-/// The datagram that starts a frame or follows `previous`.
+/// Returns the datagram that starts a frame or follows `previous`.
 #[must_use]
 pub fn next(frame: &[u8], previous: Option<&Datagram>) -> Option<Datagram> {
     let (start, end) = bounds(frame)?;
@@ -205,13 +205,13 @@ pub fn next(frame: &[u8], previous: Option<&Datagram>) -> Option<Datagram> {
     }
 }
 
-/// Nanoseconds the frame occupies a 100 Mbit/s wire, with preamble, padding, FCS and gap.
+/// Returns the ns that the frame occupies a 100 Mbit/s wire, with preamble, padding, FCS and gap.
 #[must_use]
 pub fn wire_time(len: usize) -> u64 {
     (u64::try_from(len).unwrap_or(0).max(60) + 24) * 80
 }
 
-/// Builds frames; for tests, tools and faults, the simulated devices never need it.
+/// Builds frames for tests, tools and faults. The simulated devices do not use the builder.
 #[derive(Debug, Clone)]
 pub struct FrameBuilder {
     frame: Vec<u8>,
@@ -225,7 +225,7 @@ impl Default for FrameBuilder {
 }
 
 impl FrameBuilder {
-    /// With another source address than most MainDevices have.
+    /// Starts a frame with this source address.
     #[must_use]
     pub fn from_source(source: [u8; 6]) -> Self {
         let mut frame = vec![0xff; 6];

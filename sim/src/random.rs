@@ -1,6 +1,6 @@
-//! Seeded randomness: the same seed gives the same run.
+//! Seeded randomness: the same seed reproduces a run.
 
-/// splitmix64.
+/// The splitmix64 generator.
 #[derive(Debug, Clone)]
 pub(crate) struct Random(u64);
 
@@ -17,7 +17,7 @@ impl Random {
     }
 
     pub(crate) fn chance(&mut self, probability: f64) -> bool {
-        // 53 bits: exactly representable.
+        // An `f64` represents 53 bits exactly.
         ((self.next() >> 11) as f64) < probability * (1_u64 << 53) as f64
     }
 }

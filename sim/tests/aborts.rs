@@ -31,7 +31,7 @@ fn bus_of(device: &Device) -> Bus {
     bus
 }
 
-/// An SDO request as it stands, up to eight bytes; what comes back.
+/// Sends a raw SDO request of up to eight bytes.
 fn raw(bus: &mut Bus, request: &[u8]) -> Result<(), Refusal> {
     let mut payload = vec![0, 0x20];
     payload.extend_from_slice(request);
@@ -230,7 +230,7 @@ const ROWS: [Row; 27] = [
 ];
 
 #[test]
-fn a_device_gives_every_abort_that_it_can_have_a_reason_for() {
+fn device_sends_every_abort_with_a_cause() {
     for (code, what, provoke) in ROWS {
         assert_eq!(provoke(), Err(Abort(code)), "{what}");
     }
@@ -243,7 +243,7 @@ fn a_device_gives_every_abort_that_it_can_have_a_reason_for() {
 }
 
 #[test]
-fn the_rest_of_the_table_comes_from_a_script() {
+fn remaining_aborts_come_from_a_fault_script() {
     for code in [
         0x0604_0047_u32,
         0x0606_0000,
@@ -261,7 +261,7 @@ fn the_rest_of_the_table_comes_from_a_script() {
 }
 
 #[test]
-fn numbers_keep_to_their_ranges_whatever_their_type() {
+fn number_ranges_hold_for_every_type() {
     let mut bus = bus();
     let (value, high, low) = (
         Err(Abort(0x0609_0030)),
@@ -290,13 +290,13 @@ fn numbers_keep_to_their_ranges_whatever_their_type() {
 }
 
 #[test]
-fn an_abort_ends_the_transfer() {
+fn abort_ends_the_transfer() {
     let mut bus = bus();
-    // By the device.
+    // An abort by the device.
     raw(&mut bus, &START_UPLOAD).unwrap();
     assert_eq!(raw(&mut bus, &[0x70]), Err(Abort(0x0503_0000)));
     assert_eq!(raw(&mut bus, &[0x60]), Err(Abort(0x0504_0001)));
-    // By the client: without an answer.
+    // An abort by the client has no answer.
     raw(&mut bus, &START_UPLOAD).unwrap();
     bus.send_mailbox(S, 3, &[0, 0x20, 0x80, 0, 0x20, 0, 0, 0, 4, 5]);
     bus.wait(1_000_000);
@@ -305,7 +305,7 @@ fn an_abort_ends_the_transfer() {
 }
 
 #[test]
-fn a_new_request_replaces_a_transfer_under_way() {
+fn new_request_replaces_an_active_transfer() {
     let mut bus = bus();
     raw(&mut bus, &START_UPLOAD).unwrap();
     raw(&mut bus, &START_DOWNLOAD).unwrap();

@@ -10,7 +10,7 @@ use common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::FrameBuilder;
 use ecaxis_sim::gateway::{Epos, GatewayOptions, NodeOptions, PdoLink};
-use ecaxis_sim::{DeviceOptions, Transit};
+use ecaxis_sim::{DeviceOptions, FrameOutcome};
 
 struct Counting;
 
@@ -22,17 +22,17 @@ fn count() {
     COUNT.with(|c| c.set(c.get().map(|n| n + 1)));
 }
 
-// SAFETY: passes everything on to the system allocator.
+// SAFETY: forwards every call to the system allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();
-        // SAFETY: the caller's promises are passed on.
+        // SAFETY: the caller upholds the contract of `GlobalAlloc`.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         count();
-        // SAFETY: the caller's promises are passed on.
+        // SAFETY: the caller upholds the contract of `GlobalAlloc`.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -40,7 +40,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Makes a drive of the device: the drive creates the objects it needs itself.
+/// Turns the device into a drive. The drive adds the objects that it needs.
 fn as_drive(mut device: Device) -> Device {
     device.profile = Some(402);
     device
@@ -74,7 +74,7 @@ fn cycling_does_not_allocate() {
     for n in 1..2_000 {
         bytes.copy_from_slice(&template);
         let result = bus.segment.transit(&mut bytes, bus.now + n * 1_000_000);
-        if result == Transit::Lost {
+        if result == FrameOutcome::Lost {
             break;
         }
     }

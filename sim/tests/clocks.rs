@@ -4,7 +4,7 @@ mod common;
 
 use common::*;
 use ecaxis_sim::frame::FrameBuilder;
-use ecaxis_sim::{DeviceOptions, Transit};
+use ecaxis_sim::{DeviceOptions, FrameOutcome};
 
 const CYCLE: u64 = 1_000_000;
 
@@ -22,7 +22,7 @@ fn four_drifting() -> Bus {
     bus
 }
 
-/// Latches receive times, works out delays and writes offsets, as any MainDevice does.
+/// Latches receive times, computes delays and writes offsets, as every MainDevice does.
 fn measure(bus: &mut Bus) -> Vec<u32> {
     assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 4);
     let mut delays = Vec::new();
@@ -67,7 +67,7 @@ fn frmw(bus: &mut Bus, seconds: u64) {
 }
 
 #[test]
-fn delays_come_out_of_the_receive_times() {
+fn delays_follow_from_the_receive_times() {
     let mut bus = four_drifting();
     // 500 ns through a device and 25 ns along a cable.
     for (measured, expected) in measure(&mut bus).into_iter().zip([0, 525, 1050, 1575]) {
@@ -93,14 +93,14 @@ fn clocks_lock_under_frmw_and_drift_apart_without() {
         let difference = bus.read(station, 0x92c, 4);
         assert!(u32::from_le_bytes(difference.try_into().unwrap()) & 0x7fff_ffff < 100);
     }
-    // Learnt rates last a while; a restarted loop runs on the bare crystal.
+    // Learnt rates last for a while. A restarted loop runs at the bare crystal's rate.
     bus.datagram(8, 0, 0x930, &[0, 0x10]);
     bus.wait(1_000_000_000);
     assert!(spread(&bus) > 80_000, "{} ns", spread(&bus));
 }
 
 #[test]
-fn rarer_frames_lock_as_well() {
+fn clocks_lock_with_rare_frames() {
     let mut bus = four_drifting();
     measure(&mut bus);
     for _ in 0..500 {
@@ -123,7 +123,7 @@ fn activate(bus: &mut Bus, station: u16, start: u64) {
 }
 
 #[test]
-fn sync0_pulses_together_from_the_start_time_on() {
+fn sync0_pulses_are_simultaneous_from_the_start_time() {
     let mut bus = four_drifting();
     measure(&mut bus);
     frmw(&mut bus, 3);
@@ -156,7 +156,7 @@ fn sync0_pulses_together_from_the_start_time_on() {
 }
 
 #[test]
-fn a_start_time_in_the_past_never_starts_and_refuses_op() {
+fn start_time_in_the_past_never_starts_sync0_and_refuses_op() {
     let mut bus = four_drifting();
     measure(&mut bus);
     to_preop_with_sms(&mut bus, 0x1001);
@@ -164,7 +164,7 @@ fn a_start_time_in_the_past_never_starts_and_refuses_op() {
     bus.to(0x1001, SAFEOP);
     bus.wait(100_000_000);
     assert_eq!(bus.segment.device(0).unwrap().sync0_count(), 0);
-    // The device cannot know: it waits for a pulse until its patience is over.
+    // The device cannot detect this; it waits for a pulse until a time-out.
     assert_eq!(bus.request(0x1001, 8), (4, 0));
     bus.wait(4_900_000_000);
     assert_eq!(bus.read_u16(0x1001, 0x130), 4);
@@ -229,7 +229,7 @@ fn outputs_take_effect_and_inputs_are_latched_at_sync0() {
     assert_eq!(bus.logical(12, 0, &[1, 0, 2, 0]), (vec![1, 0, 2, 0], 3));
 }
 
-/// Parts per million, nanoseconds at power-on.
+/// Crystal deviation in ppm, and system time at power-on in ns.
 const EIGHT: [(f64, u64); 8] = [
     (12.0, 5_000),
     (50.0, 7_000_000),
@@ -241,7 +241,8 @@ const EIGHT: [(f64, u64); 8] = [
     (29.0, 4_294_967_000),
 ];
 
-/// A bus whose MainDevice is this test: it measures delays, sets offsets and sends the reference's time on.
+/// A bus with this test as its MainDevice: it measures delays, sets offsets and distributes the
+/// reference time.
 struct Eight {
     bus: Bus,
     next: u64,
@@ -276,7 +277,7 @@ impl Eight {
 
     fn set_up(&mut self) {
         let bus = &mut self.bus;
-        // Delays are averaged over several measurements, as time stamps may be noisy.
+        // Delays are averaged over several measurements, because time stamps may be noisy.
         let mut spans = [0_u64; 8];
         for _ in 0..16 {
             assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 8);
@@ -300,11 +301,11 @@ impl Eight {
             let local = u64::from_le_bytes(bus.read(station, 0x918, 8).try_into().unwrap());
             bus.write(station, 0x920, &epoch.wrapping_sub(local).to_le_bytes());
         }
-        assert_eq!(bus.datagram(8, 0, 0x930, &[0, 0x10]).1, 8, "filters anew");
+        assert_eq!(bus.datagram(8, 0, 0x930, &[0, 0x10]).1, 8, "restarts");
         self.next = (bus.now / CYCLE + 1) * CYCLE;
     }
 
-    /// One cycle: the reference's time, and what the others think of it.
+    /// Runs one cycle: distributes the reference time and returns each device's 0x092C.
     fn cycle(&mut self) -> Vec<u32> {
         self.bus.now = self.next;
         self.next += CYCLE;
@@ -326,7 +327,8 @@ impl Eight {
         differences
     }
 
-    /// System times of all devices at one instant of true time, from the reference's.
+    /// Returns the system times of all devices at one instant of true time, relative to the
+    /// reference.
     fn apart(&self) -> Vec<i64> {
         let time = |n| self.device(n).system_time(self.bus.now).unwrap();
         (0..8)
@@ -339,7 +341,8 @@ impl Eight {
         apart.iter().max().unwrap() - apart.iter().min().unwrap()
     }
 
-    /// Largest difference in true time between the pulses of one cycle, over the pulses logged.
+    /// Returns the largest difference in true time between the pulses of one cycle, over the logged
+    /// pulses.
     fn pulses_apart(&self) -> u64 {
         let logs: Vec<Vec<u64>> = (0..8)
             .map(|n| self.device(n).sync0_log().collect())
@@ -363,11 +366,11 @@ impl Eight {
     }
 }
 
-/// The clocks have this long to lock.
+/// The time until the clocks must be locked.
 const LOCK_MS: u64 = 1_000;
 
-/// Ten seconds of system times at 1 kHz; after the time to lock: (largest 0x092C, largest true difference, largest
-/// difference of pulses).
+/// Distributes system time at 1 kHz for ten seconds. Returns, after the time to lock, the largest
+/// 0x092C, true difference and difference of pulses.
 fn ten_seconds(eight: &mut Eight) -> (u32, i64, u64) {
     const MS: u64 = 10_000;
     let (mut worst, mut apart, mut pulses) = (0, 0, 0);
@@ -381,7 +384,7 @@ fn ten_seconds(eight: &mut Eight) -> (u32, i64, u64) {
         if ms == 3_000 {
             eight.start_sync0();
         }
-        // The log keeps 64 pulses: every pulse is looked at.
+        // The log keeps 64 pulses; reading it every 60 cycles covers every pulse.
         if ms > 3_300 && ms % 60 == 0 {
             pulses = pulses.max(eight.pulses_apart());
         }
@@ -390,19 +393,19 @@ fn ten_seconds(eight: &mut Eight) -> (u32, i64, u64) {
 }
 
 #[test]
-fn eight_clocks_lock_fire_together_and_part_at_their_crystals_rates() {
+fn eight_clocks_lock_and_drift_at_their_crystal_rates() {
     let mut eight = Eight::new(0);
     let (worst, apart, pulses) = ten_seconds(&mut eight);
     assert!(worst < 100, "0x092C: {worst} ns");
     assert!(apart < 100, "clocks: {apart} ns");
     assert!(pulses < 200, "SYNC0: {pulses} ns");
 
-    // Without system times the clocks go on at the rates they have learnt.
+    // Without system times the clocks continue at their learnt rates.
     eight.bus.wait(1_000_000_000);
     let spread = eight.spread();
     assert!(spread < 300, "{spread} ns after a second without FRMW");
 
-    // Without what was learnt each runs at its crystal's rate.
+    // Without the learnt rates each clock runs at its crystal's rate.
     assert_eq!(eight.bus.datagram(8, 0, 0x930, &[0, 0x10]).1, 8);
     let before = eight.apart();
     eight.bus.wait(1_000_000_000);
@@ -416,7 +419,7 @@ fn eight_clocks_lock_fire_together_and_part_at_their_crystals_rates() {
 }
 
 #[test]
-fn eight_clocks_with_noisy_time_stamps_lock_as_well() {
+fn eight_clocks_lock_with_noisy_time_stamps() {
     let mut eight = Eight::new(10);
     let (worst, apart, pulses) = ten_seconds(&mut eight);
     assert!(worst < 100 && apart < 100, "{worst} ns, {apart} ns");
@@ -437,18 +440,18 @@ fn run() -> Vec<u8> {
             .datagram(4, 0x1003, 0x910, &[0; 8])
             .build();
         match bus.segment.transit(&mut bytes, bus.now + n * CYCLE) {
-            Transit::Back { at, .. } => {
+            FrameOutcome::Back { at, .. } => {
                 seen.extend(bytes);
                 seen.extend(at.to_le_bytes());
             }
-            Transit::Lost => seen.push(0xee),
+            FrameOutcome::Lost => seen.push(0xee),
         }
     }
     seen
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bytes() {
+fn runs_with_the_same_seed_are_equal() {
     assert!(run() == run());
 }
 
@@ -460,8 +463,8 @@ fn frames_queue_up_on_the_wire() {
             .datagram(7, 0, 0x1e00, &vec![0; len])
             .build();
         match bus.segment.transit(&mut bytes, bus.now) {
-            Transit::Back { at, .. } => at - bus.now,
-            Transit::Lost => panic!("lost"),
+            FrameOutcome::Back { at, .. } => at - bus.now,
+            FrameOutcome::Lost => panic!("lost"),
         }
     };
     // 84 byte times; out through four devices and back: 4 + 3 times 500 ns, 8 cables.

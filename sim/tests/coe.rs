@@ -1,4 +1,4 @@
-//! The SDO server, as seen over the wire.
+//! The SDO server, accessed over the wire.
 
 mod common;
 
@@ -16,7 +16,7 @@ fn preop() -> Bus {
 }
 
 #[test]
-fn values_go_both_ways_in_every_transfer_type() {
+fn values_transfer_in_both_directions_in_every_transfer_type() {
     let mut bus = preop();
     assert_eq!(bus.upload(S, 0x1018, 1).unwrap(), 0x333u32.to_le_bytes());
     assert_eq!(bus.upload(S, 0x2001, 0).unwrap(), [0x34, 0x12]);
@@ -34,7 +34,7 @@ fn values_go_both_ways_in_every_transfer_type() {
 }
 
 #[test]
-fn segments_end_anywhere() {
+fn segmented_transfers_may_end_at_any_byte() {
     // 48-byte mailboxes carry 32 bytes first and 39 in each segment; the last may hold 1 to 39.
     for tail in [1u32, 6, 7, 8, 39] {
         let mut device = coe_device();
@@ -61,14 +61,14 @@ fn complete_access_pads_subindex_0() {
     assert_eq!(bus.upload(S, 0x2004, 2).unwrap(), [8, 7, 6, 5]);
     assert_eq!(bus.upload(S, 0x2004, 3).unwrap(), [4, 3]);
     assert_eq!(bus.upload_with(S, 0x50, 0x2004, 2), Err(Abort(0x0601_0000)));
-    // A mapping in one go: count, padding, two entries.
+    // A mapping in one transfer: count, padding, two entries.
     let map = [2, 0, 0x10, 2, 0x10, 0x70, 0x10, 1, 0x10, 0x70];
     bus.download_with(S, 0x10, 0x1600, 0, &map).unwrap();
     assert_eq!(bus.upload_with(S, 0x50, 0x1600, 0).unwrap(), map);
 }
 
 #[test]
-fn refusals_carry_the_standards_codes() {
+fn refusals_carry_the_standard_abort_codes() {
     let mut bus = preop();
     assert_eq!(bus.upload(S, 0x5555, 0), Err(Abort(0x0602_0000)));
     assert_eq!(bus.upload(S, 0x2004, 9), Err(Abort(0x0609_0011)));
@@ -103,7 +103,7 @@ fn refusals_carry_the_standards_codes() {
 }
 
 #[test]
-fn pdo_mapping_is_checked_like_the_dictionary_says() {
+fn pdo_mapping_is_checked_against_the_dictionary() {
     let mut bus = preop();
     let entry = |index: u16, sub: u8, bits: u8| {
         (u32::from(index) << 16 | u32::from(sub) << 8 | u32::from(bits)).to_le_bytes()
@@ -163,7 +163,7 @@ fn octets() -> Vec<u8> {
 }
 
 #[test]
-fn long_objects_pass_mailboxes_of_every_size() {
+fn long_objects_transfer_with_every_mailbox_size() {
     for len in [16, 17, 23, 24, 48, 128, 256, 510, 511, 1024, 1486] {
         let mut bus = mailbox_bus(len, DeviceOptions::default());
         assert_eq!(bus.upload(S, 0x2000, 0).unwrap(), octets(), "{len} bytes");
@@ -173,9 +173,9 @@ fn long_objects_pass_mailboxes_of_every_size() {
     }
 }
 
-/// Requests and answers byte by byte, as the standard's tables have them.
+/// Requests and answers byte by byte, as in the standard's tables.
 #[test]
-fn every_transfer_type_has_the_bytes_of_the_standard() {
+fn transfer_types_match_the_standard_byte_by_byte() {
     let mut bus = mailbox_bus(16, DeviceOptions::default());
     let mut sdo = |request: &[u8]| {
         let mut payload = vec![0, 0x20];
@@ -201,13 +201,13 @@ fn every_transfer_type_has_the_bytes_of_the_standard() {
         sdo(&[0x2b, 0x26, 0x20, 0, 5, 0, 0, 0]),
         [0x60, 0x26, 0x20, 0, 0, 0, 0, 0]
     );
-    // Size not indicated: the object's own.
+    // Size not indicated: the object's own size applies.
     assert_eq!(
         sdo(&[0x22, 0x26, 0x20, 0, 6, 0, 9, 9]),
         [0x60, 0x26, 0x20, 0, 0, 0, 0, 0]
     );
     assert_eq!(sdo(&[0x40, 0x26, 0x20, 0, 0, 0, 0, 0])[4..6], [6, 0]);
-    // Four bytes by normal transfer, and five: too many for one mailbox of 16.
+    // Four bytes by normal transfer, then five: too many for one mailbox of 16.
     let five = sdo(&[0x40, 0x08, 0x10, 0, 0, 0, 0, 0]);
     assert_eq!(five, [0x41, 0x08, 0x10, 0, 13, 0, 0, 0]);
     assert_eq!(sdo(&[0x60, 0, 0, 0, 0, 0, 0, 0]), *b"\x00Mailbox");
@@ -223,7 +223,7 @@ fn every_transfer_type_has_the_bytes_of_the_standard() {
     );
     assert_eq!(sdo(b"\x00segment"), [0x20, 0, 0, 0, 0, 0, 0, 0]);
     assert_eq!(sdo(b"\x13ed one\0"), [0x30, 0, 0, 0, 0, 0, 0, 0]);
-    // Without the announcement of a size.
+    // Without an announced size.
     assert_eq!(sdo(&[0x20, 2, 0x20, 0, 0, 0, 0, 0])[0], 0x60);
     assert_eq!(sdo(b"\x00ABCDEFG")[0], 0x20);
     assert_eq!(sdo(b"\x1dH\0\0\0\0\0\0")[0], 0x30);
@@ -237,13 +237,14 @@ fn complete_access_spans_bits_and_gaps() {
     let all = [7, 0, 0x0b, 0x34, 0x12, 0, 0xfe, 0xff, 0xff, 0xff, 0x06];
     assert_eq!(bus.upload_with(S, 0x50, 0x2010, 0).unwrap(), all);
     assert_eq!(bus.upload_with(S, 0x50, 0x2010, 1).unwrap(), all[2..]);
-    // What cannot be written keeps its value, gaps keep nothing.
+    // Read-only items keep their value; gaps store nothing.
     let written = [0xff, 0xff, 0xf4, 0x78, 0x56, 0xff, 1, 0, 0, 0, 0x01];
     bus.download_with(S, 0x10, 0x2010, 0, &written).unwrap();
     let now = [7, 0, 0x04, 0x78, 0x56, 0, 1, 0, 0, 0, 0x05];
     assert_eq!(bus.upload_with(S, 0x50, 0x2010, 0).unwrap(), now);
     assert_eq!(bus.upload(S, 0x2010, 2).unwrap(), [2]);
-    // An end between two items leaves the rest alone; one inside an item writes nothing.
+    // A download that ends between two items leaves the rest unchanged. One that ends inside an
+    // item writes nothing.
     bus.download_with(S, 0x10, 0x2010, 1, &[0x01, 0, 0])
         .unwrap();
     assert_eq!(
@@ -255,7 +256,7 @@ fn complete_access_spans_bits_and_gaps() {
     assert_eq!(bus.upload(S, 0x2010, 1).unwrap(), [1]);
     let long = bus.download_with(S, 0x10, 0x2010, 0, &[0; 12]);
     assert_eq!(long, Err(Abort(0x0607_0012)));
-    // An array, a variable, an object of nothing but constants.
+    // An array, a variable, an object of constants only.
     let words = bus.upload_with(S, 0x50, 0x2011, 0).unwrap();
     assert_eq!((words.len(), &words[..6]), (18, &[8, 0, 1, 1, 2, 2][..]));
     assert_eq!(bus.upload_with(S, 0x50, 0x2025, 0).unwrap(), [0xfe, 0xca]);
@@ -271,7 +272,7 @@ fn complete_access_spans_bits_and_gaps() {
 }
 
 #[test]
-fn a_list_written_whole_must_hold_what_it_counts() {
+fn complete_access_write_must_match_its_count() {
     let mut bus = mailbox_bus(48, DeviceOptions::default());
     assert_eq!(
         bus.download_with(S, 0x10, 0x1c12, 0, &[1, 0]),
@@ -288,7 +289,7 @@ fn a_list_written_whole_must_hold_what_it_counts() {
 }
 
 #[test]
-fn texts_end_where_they_end() {
+fn texts_end_at_their_length() {
     let mut bus = mailbox_bus(48, DeviceOptions::default());
     assert_eq!(bus.upload(S, 0x2002, 0).unwrap(), *b"text");
     bus.download(S, 0x2002, 0, b"a longer text, of 33 characters..")
@@ -299,7 +300,7 @@ fn texts_end_where_they_end() {
 }
 
 #[test]
-fn stored_parameters_outlive_a_power_cycle_until_defaults_are_restored() {
+fn stored_parameters_survive_a_power_cycle_until_restored() {
     let mut bus = mailbox_bus(48, DeviceOptions::default());
     let cycle = |bus: &mut Bus, command: Option<(u16, &[u8])>| {
         if let Some((index, signature)) = command {
@@ -326,7 +327,7 @@ fn stored_parameters_outlive_a_power_cycle_until_defaults_are_restored() {
 }
 
 #[test]
-fn a_mapping_entry_is_32_bits_long_whatever_the_dictionary_says() {
+fn mapping_entry_is_always_32_bits_long() {
     let mut device = coe_device();
     let entry = device.rx_pdos[0].entries[0].mapping();
     let mut object = device.dictionary.objects[0].clone();

@@ -1,5 +1,5 @@
-//! Every datagram command: addressing, data and exact working counters (ETG.1000.4, 5.4; Beckhoff ESC data sheet,
-//! section I, tables 5 to 7).
+//! Every datagram command: addressing, data and exact working counters (ETG.1000.4, 5.4; Beckhoff
+//! ESC data sheet, section I, tables 5 to 7).
 
 mod common;
 
@@ -7,13 +7,13 @@ use common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
 
 const DEVICES: u16 = 3;
-/// Output and input SyncManager, RAM that nobody guards, and a place without anything.
+/// Output and input SyncManager, RAM without a SyncManager, and an address without memory.
 const WRITE_ONLY: u16 = 0x1000;
 const READ_ONLY: u16 = 0x1100;
 const BOTH: u16 = 0x13e0;
 const NEITHER: u16 = 0x0e00;
 
-/// Three terminals in SafeOp with 16 bits out and in.
+/// Returns three terminals in SafeOp with 16 bits out and in.
 fn terminals() -> Bus {
     let mut bus = Bus::new((0..DEVICES).map(|_| sim(&io_device())).collect());
     assert_eq!(bus.address_all(), DEVICES);
@@ -32,11 +32,11 @@ enum Kind {
     Read,
     Write,
     ReadWrite,
-    /// Read where addressed, written everywhere else.
+    /// Reads from the addressed device, writes to all others.
     ReadMultipleWrite,
 }
 
-/// (code, kind, address that reaches the second device, how many devices it addresses)
+/// (code, kind, address that reaches the second device, number of addressed devices)
 const PHYSICAL: [(u8, Kind, u16, u16); 12] = [
     (1, Kind::Read, 0xffff, 1),
     (2, Kind::Write, 0xffff, 1),
@@ -87,15 +87,15 @@ fn physical_commands_count_reads_and_writes_that_succeed() {
 }
 
 #[test]
-fn nobody_is_addressed_nobody_counts_but_read_multiple_write() {
+fn unaddressed_devices_count_only_read_multiple_write() {
     let mut bus = terminals();
     for (code, kind, adp, _) in PHYSICAL {
-        // Nobody is there; broadcasts do not look at the address.
-        let nobody = if adp == 0xffff { 5 } else { 0x7777 };
+        // No device has this address. Broadcasts ignore the address.
+        let no_one = if adp == 0xffff { 5 } else { 0x7777 };
         let broadcast = matches!(code, 7..=9);
         let addressed = if broadcast { DEVICES } else { 0 };
         assert_eq!(
-            bus.datagram(code, nobody, BOTH, &[1, 2]).1,
+            bus.datagram(code, no_one, BOTH, &[1, 2]).1,
             expected(kind, addressed, true, true),
             "{kind:?} {code}"
         );
@@ -103,7 +103,7 @@ fn nobody_is_addressed_nobody_counts_but_read_multiple_write() {
 }
 
 #[test]
-fn logical_commands_count_once_a_device_and_direction() {
+fn logical_commands_count_once_per_device_and_direction() {
     // (read, write) FMMUs of the three devices; working counters of LRD, LWR, LRW.
     let rows = [
         ([(true, false); 3], [3, 0, 3]),
@@ -121,18 +121,18 @@ fn logical_commands_count_once_a_device_and_direction() {
             }
             if read {
                 bus.fmmu(station, 1, at, 2, READ_ONLY, 1);
-                // A second one, elsewhere: still one read.
+                // A second FMMU elsewhere still counts as one read.
                 bus.fmmu(station, 2, at + 4, 2, BOTH, 1);
             }
         }
         let counters = [10, 11, 12].map(|code| bus.logical(code, 0x10, &[0; 48]).1);
         assert_eq!(counters, expected, "{fmmus:?}");
-        assert_eq!(bus.logical(12, 0x1000, &[0; 8]).1, 0, "nobody is there");
+        assert_eq!(bus.logical(12, 0x1000, &[0; 8]).1, 0, "no device is mapped");
     }
 }
 
 #[test]
-fn a_read_and_a_write_of_one_place_exchange() {
+fn read_write_commands_exchange_data() {
     let mut bus = terminals();
     bus.write(0x1002, BOTH, &[0x11, 0x22]);
     let rows = [(3, 0xffff), (6, 0x1002)];
@@ -145,18 +145,18 @@ fn a_read_and_a_write_of_one_place_exchange() {
         assert_eq!(bus.read(0x1002, BOTH, 2), [0x33, 0x44]);
         bus.write(0x1002, BOTH, &[0x11, 0x22]);
     }
-    // BRW: what all of them had, and what was in the datagram.
+    // BRW: the previous values of all devices, ORed with the datagram's data.
     bus.datagram(8, 0, BOTH, &[0x10, 0]);
     bus.write(0x1003, BOTH, &[0x02, 0]);
     assert_eq!(bus.datagram(9, 0, BOTH, &[0x80, 0]), (vec![0x92, 0], 9));
-    // What a device has ORed in before, the next one is told to write.
+    // Each device writes the value that the devices before it have ORed together.
     assert_eq!(bus.read(0x1001, BOTH, 1), [0x80]);
     assert_eq!(bus.read(0x1002, BOTH, 1), [0x90]);
     assert_eq!(bus.read(0x1003, BOTH, 1), [0x90]);
 }
 
 #[test]
-fn a_read_write_offset_parts_the_two_places() {
+fn read_write_offset_separates_the_addresses() {
     let mut bus = terminals();
     bus.write(0x1002, 0x108, &[8, 0]);
     bus.write(0x1002, BOTH, &[1, 2]);
@@ -170,13 +170,13 @@ fn a_read_write_offset_parts_the_two_places() {
 }
 
 #[test]
-fn read_multiple_write_carries_a_value_onwards() {
+fn read_multiple_write_carries_a_value_to_later_devices() {
     let mut bus = terminals();
     bus.write(0x1001, BOTH, &[0xaa]);
     bus.write(0x1002, BOTH, &[0xbb]);
     for (code, adp) in [(13, 0xffff), (14, 0x1002)] {
         assert_eq!(bus.datagram(code, adp, BOTH, &[0x77]), (vec![0xbb], 3));
-        // In front of the one that is read the datagram's own byte is written.
+        // Devices before the one that is read write the datagram's own byte.
         let values = [0x1001, 0x1002, 0x1003].map(|s| bus.read(s, BOTH, 1)[0]);
         assert_eq!(values, [0x77, 0xbb, 0xbb]);
         bus.write(0x1003, BOTH, &[0]);
@@ -214,7 +214,7 @@ fn position_addresses_count_up_and_others_stay() {
 }
 
 #[test]
-fn commands_without_a_meaning_pass_untouched() {
+fn undefined_commands_pass_unchanged() {
     let mut bus = terminals();
     for code in [0, 15, 16, 0x80, 0xff] {
         let request = FrameBuilder::default()
@@ -227,9 +227,9 @@ fn commands_without_a_meaning_pass_untouched() {
 }
 
 #[test]
-fn one_accessible_byte_is_enough() {
+fn datagram_counts_with_one_accessible_byte() {
     let mut bus = terminals();
-    // (address, length, reads, writes): over the ends of registers, SyncManagers and memory.
+    // (address, length, reads, writes): across the ends of registers, SyncManagers and memory.
     let rows = [
         (0x0008, 4, 1, 0),
         (0x000a, 4, 0, 0),
@@ -253,9 +253,9 @@ fn one_accessible_byte_is_enough() {
 }
 
 #[test]
-fn bytes_that_are_not_accessible_stay_as_they_were() {
+fn inaccessible_bytes_stay_unchanged() {
     let mut bus = terminals();
-    // The outputs are not read, the RAM behind them is.
+    // The outputs are not readable, the RAM behind them is.
     bus.write(0x1001, 0x1006, &[5, 6]);
     let (data, wkc) = bus.datagram(4, 0x1001, WRITE_ONLY, &[0xee; 8]);
     assert_eq!(
@@ -265,7 +265,7 @@ fn bytes_that_are_not_accessible_stay_as_they_were() {
 }
 
 #[test]
-fn registers_change_when_the_frame_has_been_received() {
+fn registers_change_at_the_end_of_the_frame() {
     let mut bus = terminals();
     let bytes = bus
         .frame(

@@ -1,4 +1,4 @@
-//! Registers, working counters, FMMUs, EEPROM and states, as seen over the wire.
+//! Registers, working counters, FMMUs, EEPROM and states, accessed over the wire.
 
 mod common;
 
@@ -14,10 +14,10 @@ fn three_io() -> Bus {
 }
 
 #[test]
-fn every_command_counts_as_the_standard_says() {
+fn commands_count_as_in_the_standard() {
     let mut bus = three_io();
     let position = 0u16.wrapping_sub(1);
-    // (command, address, expected working counter); 0x0e00 is no register, 0x13e0 is free RAM.
+    // (command, address, expected working counter); 0x0e00 is not a register, 0x13e0 is free RAM.
     let ram = [
         (0, 0, 0),
         (1, position, 1),
@@ -54,13 +54,13 @@ fn read_only_registers_do_not_count_writes() {
     let mut bus = three_io();
     assert_eq!(bus.datagram(8, 0, 0x130, &[0, 0]).1, 0);
     assert_eq!(bus.datagram(9, 0, 0x130, &[0, 0]).1, 3);
-    // Distributed clocks not in use: nothing but receive times.
+    // Without distributed clocks only the receive times exist.
     assert_eq!(bus.datagram(8, 0, 0x900, &[0; 4]).1, 3);
     assert_eq!(bus.datagram(7, 0, 0x910, &[0; 8]).1, 0);
 }
 
 #[test]
-fn a_broadcast_read_ors_and_positions_count_up() {
+fn broadcast_read_ors_and_position_counts_up() {
     let mut bus = three_io();
     bus.write(0x1001, 0x13e0, &[0x01]);
     bus.write(0x1003, 0x13e0, &[0x80]);
@@ -69,7 +69,7 @@ fn a_broadcast_read_ors_and_positions_count_up() {
         .frame(FrameBuilder::default().datagram(1, 5, 0, &[0]).build())
         .unwrap();
     assert_eq!(bytes[18..20], 8u16.to_le_bytes());
-    // The reply is told from the request by its source address.
+    // The changed source address distinguishes the reply from the request.
     assert_eq!(bytes[6], 0x12);
 }
 
@@ -109,11 +109,11 @@ fn information_registers_describe_the_controller() {
 }
 
 #[test]
-fn a_closed_port_cuts_the_line() {
+fn closed_port_cuts_the_line() {
     let mut bus = three_io();
     bus.write(0x1001, 0x101, &[0x0c]);
     assert_eq!(bus.datagram(7, 0, 0, &[0]).1, 1);
-    // Closed, though there is a link.
+    // Closed although there is a link.
     assert_eq!(bus.read_u16(0x1001, 0x110), 0x5e33);
     bus.write(0x1001, 0x101, &[0]);
     bus.datagram(7, 0, 0, &[0]);
@@ -154,7 +154,7 @@ fn bits_of_several_devices_share_a_logical_byte() {
     let values = [0x1001, 0x1002, 0x1003].map(|s| bus.read(s, 0x13e0, 1)[0]);
     assert_eq!(values, [0xf3, 0xd3, 0xe3]);
     assert_eq!(bus.logical(10, 0x1_0000, &[0]), (vec![0b10_01_11], 3));
-    // LRW: read first, then what arrived is written; 3 for each device.
+    // LRW: read first, then write; 3 for each device.
     assert_eq!(
         bus.logical(12, 0x1_0000, &[0b01_10_00]),
         (vec![0b10_01_11], 9)
@@ -164,7 +164,7 @@ fn bits_of_several_devices_share_a_logical_byte() {
 }
 
 #[test]
-fn the_eeprom_is_read_and_written_through_registers() {
+fn eeprom_is_accessible_through_registers() {
     let options = DeviceOptions {
         alias: 0x1234,
         serial: 99,
@@ -198,7 +198,7 @@ fn the_eeprom_is_read_and_written_through_registers() {
     assert_eq!(write(&mut bus, 1) & 0xe000, 0);
     assert_eq!(bus.segment.device(0).unwrap().sii()[8..10], [0x78, 0x56]);
 
-    // The device's side owns it: the interface does not answer writes.
+    // The device owns the EEPROM: the interface ignores writes.
     bus.write(0x1001, 0x500, &[1]);
     assert_eq!(bus.datagram(5, 0x1001, 0x502, &[0, 1, 0, 0, 0, 0]).1, 0);
     bus.write(0x1001, 0x500, &[0]);
@@ -206,7 +206,7 @@ fn the_eeprom_is_read_and_written_through_registers() {
 }
 
 #[test]
-fn states_change_only_as_the_table_allows() {
+fn states_change_only_by_standard_transitions() {
     let mut bus = Bus::new(vec![sim(&coe_device())]);
     bus.address_all();
     let s = 0x1001;
@@ -290,7 +290,7 @@ fn inputs_mirror_outputs_unless_they_are_set() {
 }
 
 #[test]
-fn the_watchdog_takes_an_operating_device_to_safe_op() {
+fn watchdog_takes_a_device_from_op_to_safe_op() {
     let mut bus = io_in_op();
     bus.logical(12, 0x1000, &[1, 2]);
     bus.wait(99_000_000);
@@ -308,7 +308,7 @@ fn the_watchdog_takes_an_operating_device_to_safe_op() {
 }
 
 #[test]
-fn disabling_a_sync_manager_in_op_is_an_error() {
+fn disabling_a_sync_manager_in_op_raises_an_error() {
     let mut bus = io_in_op();
     bus.write(0x1001, 0x806, &[0]);
     bus.wait(1_000_000);
@@ -319,7 +319,7 @@ fn disabling_a_sync_manager_in_op_is_an_error() {
 }
 
 #[test]
-fn an_absent_device_ends_the_line_and_comes_back_in_init() {
+fn absent_device_ends_the_line_and_returns_in_init() {
     let mut bus = three_io();
     let script = "[[fault]]\nat = \"1s\"\nfor = \"1s\"\ndevice = 1\nkind = \"absent\"\n";
     bus.segment.set_faults(FaultScript::parse(script).unwrap());
@@ -343,7 +343,7 @@ fn an_absent_device_ends_the_line_and_comes_back_in_init() {
 }
 
 #[test]
-fn frames_get_lost_as_the_script_says() {
+fn frames_are_lost_as_scripted() {
     let mut bus = three_io();
     let script = "[[fault]]\nkind = \"frame-loss\"\ncount = 2\n";
     bus.segment.set_faults(FaultScript::parse(script).unwrap());
@@ -380,7 +380,7 @@ fn random_devices() -> Bus {
 
 proptest! {
     #[test]
-    fn random_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn segment_survives_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let mut bus = random_devices();
         let len = bytes.len();
         if let Some(back) = bus.frame(bytes) {
@@ -389,7 +389,7 @@ proptest! {
     }
 
     #[test]
-    fn random_datagrams_never_panic(
+    fn segment_survives_random_datagrams(
         datagrams in prop::collection::vec(
             (0u8..16, prop_oneof![Just(0u16), Just(0x1001), Just(0x1002), any::<u16>()],
              prop_oneof![0u16..0x1400, any::<u16>()],
@@ -400,7 +400,7 @@ proptest! {
         for (command, adp, ado, data) in datagrams {
             let frame = FrameBuilder::default().datagram(command, adp, ado, &data).build();
             let len = frame.len();
-            // Who opens a port without a link loses frames.
+            // A datagram that opens a port without a link loses frames.
             if let Some(back) = bus.frame(frame) {
                 prop_assert_eq!(back.len(), len);
             }
@@ -410,7 +410,7 @@ proptest! {
 }
 
 #[test]
-fn a_smaller_chip_lacks_the_upper_units_and_reads_four_bytes() {
+fn smaller_chip_lacks_the_upper_units_and_reads_four_bytes() {
     let options = DeviceOptions {
         esc: Some(EscInfo::LAN9252),
         ..DeviceOptions::default()
@@ -441,7 +441,7 @@ fn a_smaller_chip_lacks_the_upper_units_and_reads_four_bytes() {
 }
 
 #[test]
-fn the_application_takes_its_time_with_state_changes() {
+fn application_delays_state_changes() {
     let options = DeviceOptions {
         state_change_ns: 5_000_000,
         ..DeviceOptions::default()
@@ -456,7 +456,7 @@ fn the_application_takes_its_time_with_state_changes() {
 }
 
 #[test]
-fn the_application_reads_al_control_sooner_than_it_follows_it() {
+fn application_reads_al_control_before_it_follows() {
     let options = DeviceOptions {
         state_change_ns: 4_000_000,
         ..DeviceOptions::default()
@@ -464,7 +464,7 @@ fn the_application_reads_al_control_sooner_than_it_follows_it() {
     let mut bus = Bus::new(vec![sim_with(&coe_device(), options)]);
     bus.address_all();
     bus.start_mailboxes(0x1001);
-    // As SOEM reconfigures a device: Init, which it is in already, and at once PreOp.
+    // SOEM reconfigures a device like this: Init, the present state, then PreOp at once.
     bus.write(0x1001, 0x120, &[INIT, 0]);
     bus.wait(500_000);
     assert_eq!(bus.datagram(5, 0x1001, 0x120, &[PREOP, 0]).1, 0, "unread");
@@ -477,7 +477,7 @@ fn the_application_reads_al_control_sooner_than_it_follows_it() {
 }
 
 #[test]
-fn an_error_does_not_swallow_a_request() {
+fn error_does_not_drop_a_request() {
     let mut bus = Bus::new(vec![sim(&coe_device())]);
     bus.address_all();
     bus.preop(0x1001);
@@ -486,7 +486,7 @@ fn an_error_does_not_swallow_a_request() {
     bus.to(0x1001, SAFEOP);
     bus.write(0x1001, 0x1100, &[0; 4]);
     bus.to(0x1001, OP);
-    // The watchdog of 100 ms expires between a request and its reading.
+    // The watchdog of 100 ms expires after a request and before the device reads it.
     let now = bus.now;
     bus.write(0x1001, 0x1100, &[0; 4]);
     bus.wait(99_980_000 - (bus.now - now));

@@ -1,22 +1,22 @@
-//! Propagation delays as a MainDevice works them out (Beckhoff ESC hardware data sheet, section I,
-//! 9.1.2: topology from DL status, delays from the receive times of each port) against those that
-//! the simulator knows.
+//! Propagation delays as a MainDevice computes them, against the simulator's own. Topology comes
+//! from DL status, delays from the receive times of each port (Beckhoff ESC hardware data sheet,
+//! section I, 9.1.2).
 
 mod common;
 
 use common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::network::topology::media;
-use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice, Topology, Wish};
+use ecaxis_sim::{DeviceOptions, PortRequest, Segment, SegmentOptions, SimDevice, Topology};
 
-/// The order in which frames pass ports.
+/// The order in which frames pass the ports.
 const ORDER: [usize; 4] = [0, 3, 1, 2];
 
 struct Found {
-    /// Open ports in the order frames pass them, port 0 first.
+    /// Open ports in the order in which frames pass them, port 0 first.
     open: Vec<usize>,
     times: [u32; 4],
-    /// Parent, and the how manieth of its open ports leads here.
+    /// The parent, and the index of its open port that leads here.
     parent: Option<(usize, usize)>,
 }
 
@@ -24,7 +24,7 @@ impl Found {
     fn last(&self) -> usize {
         *self.open.last().unwrap()
     }
-    /// From the first receive time to the last.
+    /// The time from the first receive time to the last.
     fn inner(&self) -> i64 {
         self.between(0, self.last())
     }
@@ -45,7 +45,7 @@ fn scan(bus: &mut Bus) -> Vec<Found> {
         let open = |port: &usize| status >> (8 + 2 * port) & 3 == 2;
         let open: Vec<usize> = ORDER.into_iter().filter(open).collect();
         assert_eq!(open.first(), Some(&0));
-        // The deepest device before it that still has a port without a branch.
+        // The deepest earlier device that still has a port without a branch.
         let parent = (0..found.len()).rev().find_map(|p| {
             let branches = found
                 .iter()
@@ -62,9 +62,11 @@ fn scan(bus: &mut Bus) -> Vec<Found> {
     found
 }
 
-/// Twice the time to each device's processing unit from that of the first, so that nothing is rounded.
+/// Returns twice the time from the first device's processing unit to each device's. Doubling avoids
+/// rounding.
 fn twice_the_delays(found: &[Found], t_diff: i64) -> Vec<i64> {
-    // From a device's port 0 to the processing unit of its child behind the nth open port, and back.
+    // The time from port 0 of a device to the processing unit of its child at the nth open port,
+    // and back.
     let mut down = vec![0_i64; found.len()];
     let mut whole = vec![0_i64; found.len()];
     for (n, device) in found.iter().enumerate() {
@@ -74,7 +76,7 @@ fn twice_the_delays(found: &[Found], t_diff: i64) -> Vec<i64> {
         let parent = &found[p];
         let round = parent.between(parent.open[nth - 1], parent.open[nth]);
         let both = round - device.inner();
-        // Out of the parent, and out of the child on the way back, the processing unit is passed or not.
+        // The correction depends on which directions pass the processing unit of parent and child.
         let leaves_processed = nth == 1;
         let returns_processed = device.open.len() == 1;
         let correction = match (leaves_processed, returns_processed) {
@@ -110,16 +112,16 @@ fn device(physics: &str, ppm: f64, t_diff: u64) -> SimDevice {
     sim_with(&device, options)
 }
 
-fn check(physics: &[&str], wishes: &[Option<Wish>], t_diff: u64) -> Vec<u64> {
+fn check(physics: &[&str], requests: &[Option<PortRequest>], t_diff: u64) -> Vec<u64> {
     let ppm = [30.0, -40.0, 0.0, 50.0, -7.0];
     let devices: Vec<SimDevice> = physics
         .iter()
         .zip(ppm.into_iter().cycle())
         .map(|(physics, ppm)| device(physics, ppm, t_diff))
         .collect();
-    let mut topology = Topology::connect(&media(&devices), wishes).unwrap();
+    let mut topology = Topology::connect(&media(&devices), requests).unwrap();
     for n in 0..devices.len() {
-        // No two cables alike.
+        // All cables have different lengths.
         topology = topology.with_cable(n, 10 + 37 * n as u64);
     }
     let segment = Segment::with_topology(devices, topology, SegmentOptions::default());
@@ -130,7 +132,7 @@ fn check(physics: &[&str], wishes: &[Option<Wish>], t_diff: u64) -> Vec<u64> {
     for (n, twice) in delays.iter().enumerate() {
         let first = bus.segment.delay_ns(0).unwrap();
         let expected = bus.segment.delay_ns(n).unwrap() - first;
-        // Receive times are whole nanoseconds; drift over some microseconds is less than one.
+        // Receive times are whole nanoseconds. Drift over some microseconds is below 1 ns.
         let off = (twice / 2).abs_diff(expected as i64);
         assert!(
             off <= 2 + n as u64 / 2,
@@ -142,30 +144,30 @@ fn check(physics: &[&str], wishes: &[Option<Wish>], t_diff: u64) -> Vec<u64> {
 }
 
 #[test]
-fn on_a_line() {
+fn delays_match_on_a_line() {
     let truth = check(&["YY", "YY", "YY", "YY"], &[], 0);
     assert_eq!(truth, [0, 547, 1131, 1752]);
     check(&["YY"; 20], &[], 40);
 }
 
 #[test]
-fn at_a_coupler_with_terminals_and_devices_behind_it() {
+fn delays_match_behind_a_coupler() {
     check(&["YKY", "KK", "KK", "KK"], &[], 20);
     check(&["YKY", "KK", "KK", "YY", "YY"], &[], 20);
     check(&["YY", "YKY", "KK", "YKY", "KK", "KK", "YY"], &[], 40);
 }
 
 #[test]
-fn in_a_tree() {
-    let wish = |after, port| Some(Wish { after, port });
+fn delays_match_in_a_tree() {
+    let request = |after, port| Some(PortRequest { after, port });
     let star = [
         None,
-        wish(0, Some(3)),
-        wish(1, None),
-        wish(2, None),
-        wish(0, Some(1)),
-        wish(0, Some(2)),
-        wish(5, None),
+        request(0, Some(3)),
+        request(1, None),
+        request(2, None),
+        request(0, Some(1)),
+        request(0, Some(2)),
+        request(5, None),
     ];
     let physics = ["YYYY", "YY", "YY", "YY", "YY", "YY", "YY"];
     check(&physics, &star, 0);
@@ -173,24 +175,25 @@ fn in_a_tree() {
     // A star behind a star.
     let nested = [
         None,
-        wish(0, Some(3)),
-        wish(1, Some(3)),
-        wish(1, Some(2)),
-        wish(0, Some(1)),
-        wish(0, Some(2)),
+        request(0, Some(3)),
+        request(1, Some(3)),
+        request(1, Some(2)),
+        request(0, Some(1)),
+        request(0, Some(2)),
     ];
     check(&["YYYY", "YYYY", "YY", "YY", "YY", "YY"], &nested, 40);
 }
 
 #[test]
-fn a_main_device_that_ignores_the_processing_unit_is_off_by_half_of_it_per_device() {
+fn ignoring_the_processing_unit_shifts_delays_by_half_of_it_per_device() {
     let devices = (0..4).map(|_| device("YY", 0.0, 40)).collect();
     let mut bus = Bus::new(devices);
     let found = scan(&mut bus);
     let delays = twice_the_delays(&found, 0);
     let first = bus.segment.delay_ns(0).unwrap();
     let off = (0..4).map(|n| (bus.segment.delay_ns(n).unwrap() - first) as i64 - delays[n] / 2);
-    // The last device returns through its processing unit too, so that its own hop is measured right.
+    // The last device returns through its processing unit too, so its own hop is measured
+    // correctly.
     assert_eq!(off.collect::<Vec<_>>(), [0, 20, 40, 40]);
 }
 
@@ -205,17 +208,18 @@ fn closed_ports_keep_their_receive_time() {
     let after = bus.read(0x1001, 0x900, 16);
     assert_ne!(before[..4], after[..4]);
     assert_eq!(before[4..], after[4..]);
-    // Port 0 is where the processing unit got it: 0x0918 says the same in 64 bits.
+    // The processing unit received the frame at port 0: 0x0918 holds the same time in 64 bits.
     assert_eq!(bus.read(0x1001, 0x918, 8)[..4], after[..4]);
 }
 
 #[test]
-fn a_smaller_receive_fifo_passes_frames_on_sooner() {
+fn smaller_receive_fifo_forwards_frames_sooner() {
     let mut bus = Bus::new(["YKY", "KK", "YY"].map(|p| device(p, 0.0, 0)).to_vec());
     bus.address_all();
     let drive = bus.segment.delay_ns(2).unwrap();
     bus.write(0x1001, 0x102, &[0]);
-    // Twice through the coupler: in at an MII port, 40 ns less, then at an E-bus port, 50 ns less.
+    // The frame passes the coupler twice: in at an MII port, 40 ns less, then at an E-bus port, 50
+    // ns less.
     assert_eq!(drive - bus.segment.delay_ns(2).unwrap(), 90);
     bus.write(0x1001, 0x102, &[3]);
     assert_eq!(drive - bus.segment.delay_ns(2).unwrap(), 60);

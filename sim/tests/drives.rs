@@ -1,6 +1,7 @@
-//! Two drives from a vendor's ESI file: brought to Op, enabled and moved, and what a cycle costs.
+//! Two drives from a vendor's ESI file: brought to Op, enabled and moved, and the computing time of
+//! a cycle.
 
-#![allow(clippy::print_stderr, reason = "the cost of a cycle is worth seeing")]
+#![allow(clippy::print_stderr, reason = "prints the computing time of a cycle")]
 
 mod common;
 
@@ -8,13 +9,13 @@ use std::time::Instant;
 
 use common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
-use ecaxis_sim::{DeviceOptions, FaultScript, PlantParams, SimDevice, Transit};
+use ecaxis_sim::{DeviceOptions, FaultScript, FrameOutcome, PlantParams, SimDevice};
 
 const EPOS4: &str = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml";
 const CYCLE: u64 = 1_000_000;
 const CSP: u32 = 0x6800_000c;
 
-/// Two EPOS4 in Op with distributed clocks; (output bytes, input bytes) of each.
+/// Returns two EPOS4 in Op with distributed clocks, and (output bytes, input bytes) of each.
 fn two_drives() -> Option<(Bus, usize, usize)> {
     let file = ecaxis_esi::parse(&fixture(EPOS4)?).unwrap();
     let device = &file.devices[0];
@@ -70,7 +71,7 @@ fn two_drives() -> Option<(Bus, usize, usize)> {
     Some((bus, out, inp))
 }
 
-/// FRMW and one LRW per drive; returns the inputs.
+/// Sends FRMW and one LRW per drive; returns the inputs.
 fn cyclic(outputs: &[Vec<u8>; 2]) -> Vec<u8> {
     FrameBuilder::default()
         .datagram(14, 0x1001, 0x910, &[0; 8])
@@ -126,7 +127,7 @@ fn two_drives_enable_and_follow_their_targets() {
         let moved = position - [1000, -500][axis];
         assert!((2_900..3_010).contains(&moved), "axis {axis} moved {moved}");
     }
-    // The watchdog ends it: SafeOp with an error, an emergency, no torque.
+    // The watchdog expires: SafeOp with an error, an emergency, no torque.
     bus.wait(200_000_000);
     assert_eq!(
         (bus.read_u16(0x1002, 0x130), bus.read_u16(0x1002, 0x134)),
@@ -138,7 +139,7 @@ fn two_drives_enable_and_follow_their_targets() {
 }
 
 #[test]
-fn a_drive_fault_sends_an_emergency_and_shows_in_the_statusword() {
+fn drive_fault_sends_an_emergency_and_sets_the_statusword() {
     let Some((mut bus, ..)) = two_drives() else {
         return;
     };
@@ -152,7 +153,7 @@ fn a_drive_fault_sends_an_emergency_and_shows_in_the_statusword() {
 }
 
 #[test]
-fn another_module_brings_its_own_pdos() {
+fn module_selects_its_pdos() {
     let Some((mut bus, ..)) = two_drives() else {
         return;
     };
@@ -166,9 +167,9 @@ fn another_module_brings_its_own_pdos() {
     assert!(bus.download(0x1001, 0xf030, 1, &unknown).is_err());
 }
 
-/// Prints what a cycle of two drives costs; only judged where the build is optimised.
+/// Prints the computing time of a cycle of two drives. Only an optimised build must meet the limit.
 #[test]
-fn a_cycle_of_two_drives_is_far_faster_than_real_time() {
+fn cycle_of_two_drives_is_far_faster_than_real_time() {
     let Some((mut bus, out, inp)) = two_drives() else {
         return;
     };
@@ -180,7 +181,7 @@ fn a_cycle_of_two_drives_is_far_faster_than_real_time() {
     for n in 1..=cycles {
         bytes.copy_from_slice(&template);
         let sent = bus.segment.transit(&mut bytes, bus.now + n * CYCLE);
-        assert!(matches!(sent, Transit::Back { .. }));
+        assert!(matches!(sent, FrameOutcome::Back { .. }));
     }
     let each = begin.elapsed().as_nanos() as u64 / cycles;
     eprintln!("{each} ns per cycle of two drives");

@@ -1,4 +1,4 @@
-//! The EEPROM behind 0x0500–0x050F and what the controller takes from it: alias, configuration.
+//! The EEPROM behind 0x0500–0x050F, and the values that the controller loads: alias, configuration.
 
 mod common;
 
@@ -18,7 +18,7 @@ fn drive_like() -> Bus {
     one(sim(&coe_device()))
 }
 
-/// Several datagrams in one frame; their working counters.
+/// Sends several datagrams in one frame. Returns their working counters.
 fn together(bus: &mut Bus, datagrams: &[(u8, u16, &[u8])]) -> Vec<u16> {
     let frame = datagrams
         .iter()
@@ -43,7 +43,7 @@ fn crc(bytes: &[u8]) -> u8 {
     })
 }
 
-/// Gives a command, waits, and returns the status.
+/// Issues a command, waits, and returns the status.
 fn command(bus: &mut Bus, command: u8, word: u32) -> u16 {
     let mut request = vec![0, command];
     request.extend_from_slice(&word.to_le_bytes());
@@ -71,7 +71,7 @@ fn power_cycle(bus: &mut Bus) {
 }
 
 #[test]
-fn while_busy_the_interface_shows_its_command_and_takes_nothing() {
+fn busy_eeprom_interface_shows_its_command_and_ignores_writes() {
     let mut bus = drive_like();
     bus.write(S, 0x502, &[0, 1, 8, 0, 0, 0]);
     assert_eq!(bus.read_u16(S, 0x502) & 0x8700, 0x8100);
@@ -84,7 +84,7 @@ fn while_busy_the_interface_shows_its_command_and_takes_nothing() {
 }
 
 #[test]
-fn the_write_enable_bit_is_valid_in_its_own_frame() {
+fn write_enable_bit_is_valid_only_in_its_frame() {
     let mut bus = drive_like();
     let enable: (u8, u16, &[u8]) = (5, 0x502, &[1]);
     let write: (u8, u16, &[u8]) = (5, 0x503, &[2, 4, 0, 0, 0]);
@@ -111,7 +111,7 @@ fn the_write_enable_bit_is_valid_in_its_own_frame() {
 }
 
 #[test]
-fn the_eeprom_belongs_to_the_maindevice_or_to_the_device() {
+fn eeprom_is_owned_by_the_maindevice_or_the_device() {
     let mut bus = drive_like();
     let claim = |bus: &mut Bus, claim| {
         let device = bus.segment.device_mut(0).unwrap();
@@ -127,7 +127,7 @@ fn the_eeprom_belongs_to_the_maindevice_or_to_the_device() {
     assert!(!claim(&mut bus, false));
     assert_eq!(bus.datagram(5, S, 0x502, &[0, 1, 0, 0, 0, 0]).1, 1);
     bus.wait(1_000_000);
-    // One that does not let go is forced to.
+    // A device that does not release the EEPROM is forced to.
     bus.write(S, 0x500, &[1]);
     assert!(claim(&mut bus, true));
     bus.write(S, 0x500, &[2]);
@@ -143,7 +143,7 @@ fn the_eeprom_belongs_to_the_maindevice_or_to_the_device() {
 }
 
 #[test]
-fn a_reload_takes_a_sound_configuration_over() {
+fn reload_applies_a_valid_configuration() {
     let mut bus = drive_like();
     assert_eq!(bus.read_u16(S, 0x982), 0);
     write_word(&mut bus, 2, 0x1234);
@@ -157,7 +157,7 @@ fn a_reload_takes_a_sound_configuration_over() {
 }
 
 #[test]
-fn a_device_with_a_bad_checksum_is_a_bare_controller_until_it_is_mended() {
+fn device_with_a_bad_checksum_stays_unconfigured_until_it_is_fixed() {
     let mut bus = drive_like();
     write_word(&mut bus, 7, 0);
     power_cycle(&mut bus);
@@ -176,7 +176,7 @@ fn a_device_with_a_bad_checksum_is_a_bare_controller_until_it_is_mended() {
     assert_eq!(bus.datagram(4, S, 0x0f80, &[0; 16]).1, 1, "but user RAM");
     bus.write(S, 0x120, &[2, 0]);
     bus.wait(1_000_000_000);
-    assert_eq!(bus.read_u16(S, 0x130), 1, "nobody answers");
+    assert_eq!(bus.read_u16(S, 0x130), 1, "no application answers");
     let crc = crc(&bus.segment.device(0).unwrap().sii()[..14]);
     write_word(&mut bus, 7, u16::from(crc));
     assert_eq!(command(&mut bus, 4, 0) & 0x1800, 0);
@@ -191,7 +191,7 @@ fn a_device_with_a_bad_checksum_is_a_bare_controller_until_it_is_mended() {
 }
 
 #[test]
-fn an_alias_comes_from_the_eeprom_and_counts_when_enabled() {
+fn alias_is_loaded_from_the_eeprom_and_used_when_enabled() {
     let options = DeviceOptions {
         alias: 0x0abc,
         ..DeviceOptions::default()
@@ -211,7 +211,7 @@ fn an_alias_comes_from_the_eeprom_and_counts_when_enabled() {
     assert_eq!(bus.datagram(14, 0x0abc, 0x918, &[0; 8]).1, 1, "FRMW reads");
     bus.write(S, 0x103, &[0]);
     assert_eq!(alias_answers(&mut bus), 0);
-    // A new one in the EEPROM is taken at the next power-on, not at a reload.
+    // A new alias in the EEPROM takes effect at the next power-on, not at a reload.
     write_word(&mut bus, 4, 0x0def);
     let crc = crc(&bus.segment.device(0).unwrap().sii()[..14]);
     write_word(&mut bus, 7, u16::from(crc));

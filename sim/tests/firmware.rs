@@ -1,5 +1,5 @@
-//! The boot loader of simulated devices: program control (CiA 302-3) row by row, what is left of a device without its program, and what
-//! outlives the power. No client has a part in this.
+//! The boot loader of simulated devices: program control (CiA 302-3) row by row, a device without
+//! its program, and persistence over a power cycle. The tests use no client.
 
 mod common;
 
@@ -29,7 +29,7 @@ const HEADER: FirmwareHeader = FirmwareHeader {
     version: *b"2.00",
 };
 
-/// The EPOS4 of the demonstration, in PreOp.
+/// Returns the EPOS4 of the demonstration, in PreOp.
 fn drive() -> Bus {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/esi/EPOS4.xml");
     let esi = ecaxis_esi::parse(&std::fs::read(path).unwrap()).unwrap();
@@ -61,7 +61,7 @@ fn control(bus: &mut Bus, command: u8) -> Result<(), Refusal> {
     bus.download(S, 0x1f51, 1, &[command])
 }
 
-/// An order that restarts the processor: nobody answers, then or later.
+/// Sends a command that restarts the processor. It is not answered.
 fn order(bus: &mut Bus, command: u8) {
     bus.send_mailbox(S, 3, &[0, 0x20, 0x2f, 0x51, 0x1f, 1, command, 0, 0, 0]);
     for _ in 0..100 {
@@ -95,7 +95,7 @@ fn program_control_row_by_row() {
     assert_eq!(control(&mut bus, STOP), Ok(()), "it is stopped already");
     assert_eq!(control(&mut bus, RESET), abort(WRONG_STATE));
     assert_eq!(control(&mut bus, 4), abort(VALUE));
-    // Only a cleared memory takes a program.
+    // Only a cleared memory accepts a program.
     let file = HEADER.file(&[1; 500]);
     assert_eq!(bus.download(S, 0x1f50, 1, &file), abort(WRONG_STATE));
     // The old program is still there.
@@ -128,7 +128,7 @@ fn program_control_row_by_row() {
 }
 
 #[test]
-fn what_is_left_without_a_program() {
+fn device_without_a_program_stays_in_the_boot_loader() {
     let mut bus = drive();
     order(&mut bus, STOP);
     for (index, sub, expected) in [
@@ -147,7 +147,7 @@ fn what_is_left_without_a_program() {
     assert_eq!(refused, (0x12, NO_VALID_FIRMWARE));
     let acknowledged = bus.request(S, u16::from(PREOP) | 0x10);
     assert_eq!(acknowledged, (u16::from(PREOP), 0));
-    // Stopped is not cleared: it starts with its program.
+    // Stopped but not cleared: the device starts with its program.
     assert!(bus.segment.device(0).unwrap().is_stopped());
     power_cycle(&mut bus);
     assert!(!bus.segment.device(0).unwrap().is_stopped());
@@ -169,7 +169,7 @@ fn what_is_left_without_a_program() {
 }
 
 #[test]
-fn outside_preop_the_program_is_left_alone() {
+fn program_control_needs_preop() {
     let mut bus = drive();
     bus.to(S, INIT);
     bus.send_mailbox(S, 3, &[0, 0x20, 0x2f, 0x51, 0x1f, 1, STOP, 0, 0, 0]);
@@ -181,9 +181,10 @@ fn outside_preop_the_program_is_left_alone() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(60))]
-    /// Whatever is written to it, in whatever order: it answers afterwards, and a program that runs is one that it accepted.
+    /// Commands in any order: the device answers afterwards, and runs only a program that it has
+    /// accepted.
     #[test]
-    fn orders_in_any_order(orders in prop::collection::vec((0u8..6, 0usize..4), 1..12)) {
+    fn device_survives_program_commands_in_any_order(orders in prop::collection::vec((0u8..6, 0usize..4), 1..12)) {
         let files = [HEADER.file(&[3; 100]), HEADER.file(&[]), vec![0; 60], Vec::new()];
         let mut bus = drive();
         for (command, file) in orders {

@@ -1,7 +1,7 @@
-//! Every device of every ESI file at hand becomes a SubDevice that a MainDevice takes from Init to Op
-//! without having seen the ESI.
+//! Every device of every available ESI file becomes a SubDevice. A MainDevice takes it from Init to
+//! Op without the ESI.
 
-#![allow(clippy::print_stderr, reason = "tests say what they did")]
+#![allow(clippy::print_stderr, reason = "prints the number of devices")]
 
 mod common;
 mod main_device;
@@ -27,7 +27,7 @@ fn files(folder: &Path, out: &mut Vec<PathBuf>) {
 }
 
 #[test]
-fn every_device_reaches_op() {
+fn every_fixture_device_reaches_op() {
     if fixture("README.md").is_none() {
         return;
     }
@@ -37,13 +37,13 @@ fn every_device_reaches_op() {
 }
 
 #[test]
-fn so_does_every_device_of_our_own() {
+fn every_project_device_reaches_op() {
     let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi");
     let count = sweep(&own);
     assert!(count >= 12, "{count}");
 }
 
-/// Takes each device of all files of a folder to Op; how many they are.
+/// Takes each device of all files of a folder to Op. Returns their number.
 fn sweep(folder: &Path) -> usize {
     let mut paths = Vec::new();
     files(folder, &mut paths);

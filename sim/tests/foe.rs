@@ -37,7 +37,7 @@ fn boot(foe: FoeOptions) -> Bus {
     bus
 }
 
-/// The mailboxes of Bootstrap are those of the EEPROM's words 0x14 to 0x17.
+/// Goes to Bootstrap with the mailboxes of EEPROM words 0x14 to 0x17.
 fn to_boot(bus: &mut Bus) {
     bus.to(S, INIT);
     let sii = bus.segment.device(0).unwrap().sii();
@@ -53,7 +53,7 @@ fn disable_mailboxes(bus: &mut Bus) {
     bus.write(S, 0x80e, &[0]);
 }
 
-/// What the device says.
+/// The device's answer.
 #[derive(Debug, PartialEq)]
 enum Said {
     Data(u32, Vec<u8>),
@@ -109,7 +109,7 @@ fn read(bus: &mut Bus, name: &str, password: u32) -> Result<Vec<u8>, u32> {
     unreachable!()
 }
 
-/// Sends a packet again while the device is busy; how often it was.
+/// Writes a file, and repeats packets while the device is busy. Returns the number of repetitions.
 fn write(bus: &mut Bus, name: &str, password: u32, file: &[u8]) -> Result<u32, u32> {
     let full = usize::from(bus.mailboxes[0].1) - 12;
     let mut busy = 0;
@@ -118,7 +118,7 @@ fn write(bus: &mut Bus, name: &str, password: u32, file: &[u8]) -> Result<u32, u
         Said::Error(code) => return Err(code),
         other => panic!("{other:?}"),
     }
-    // A file that fills its last packet is followed by an empty one.
+    // An empty packet follows a file that fills its last packet.
     for (packet, at) in (1..).zip((0..=file.len()).step_by(full)) {
         let data = &file[at..file.len().min(at + full)];
         loop {
@@ -138,7 +138,7 @@ fn bytes(len: usize) -> Vec<u8> {
 }
 
 #[test]
-fn files_of_every_length_come_back_as_they_were_written() {
+fn files_of_every_length_read_back_equal() {
     // 48-byte mailboxes carry 36 bytes of a file.
     for mailbox in [16, 48, 256, 1486] {
         let mut bus = bus(mailbox, FoeOptions::default());
@@ -154,7 +154,7 @@ fn files_of_every_length_come_back_as_they_were_written() {
 }
 
 #[test]
-fn bootstrap_has_its_own_mailboxes_and_nothing_but_files() {
+fn bootstrap_has_its_own_mailboxes_and_only_foe() {
     let mut bus = boot(FoeOptions::default());
     assert_eq!(bus.mailboxes, [(0x1000, 256), (0x1600, 256)]);
     let firmware = bytes(5000);
@@ -198,7 +198,7 @@ fn firmware_is_written_in_bootstrap_while_flash_is_erased() {
 }
 
 #[test]
-fn refusals_row_by_row() {
+fn foe_refusals_row_by_row() {
     let options = FoeOptions {
         password: 0x1234,
         read_only: vec!["serial".into()],
@@ -228,7 +228,7 @@ fn refusals_row_by_row() {
     assert_eq!(write(&mut bus, "f", p, &bytes(90)), Err(DISK_FULL));
     assert_eq!(read(&mut bus, "f", p), Ok(bytes(89)), "the old one stays");
     assert_eq!(write(&mut bus, "g", p, &[]), Err(DISK_FULL));
-    // What comes at the wrong time, and what is no opcode at all.
+    // Opcodes at the wrong time, and invalid opcodes.
     for opcode in [0, 3, 4, 6, 7, 255] {
         assert_eq!(
             say(&mut bus, opcode, 1, &[]),
@@ -241,7 +241,7 @@ fn refusals_row_by_row() {
 }
 
 #[test]
-fn a_wrong_packet_number_ends_the_transfer() {
+fn wrong_packet_number_ends_the_transfer() {
     let mut bus = bus(48, FoeOptions::default());
     assert_eq!(say(&mut bus, 2, 0, b"f"), Said::Ack(0));
     assert_eq!(say(&mut bus, 3, 1, &bytes(36)), Said::Ack(1));
@@ -257,7 +257,7 @@ fn a_wrong_packet_number_ends_the_transfer() {
 }
 
 #[test]
-fn a_client_that_is_busy_gets_the_packet_again() {
+fn busy_client_gets_the_packet_again() {
     let mut bus = bus(48, FoeOptions::default());
     bus.segment.device_mut(0).unwrap().put_file("f", &bytes(40));
     let file = bytes(40);
@@ -271,7 +271,7 @@ fn a_client_that_is_busy_gets_the_packet_again() {
         assert_eq!(say(&mut bus, 6, 0, &[]), Said::Data(1, first));
         assert_eq!(say(&mut bus, 4, 1, &[]), Said::Data(2, file[36..].to_vec()));
         assert_eq!(say(&mut bus, 6, 0, &[]), Said::Data(2, file[36..].to_vec()));
-        // Either the last acknowledgement or giving up ends it.
+        // The last acknowledgement or an abort ends the transfer.
         assert_eq!(say(&mut bus, 5, 0x8000, &[]), Said::Nothing);
     }
     assert_eq!(
@@ -286,7 +286,7 @@ fn a_client_that_is_busy_gets_the_packet_again() {
 }
 
 #[test]
-fn a_transfer_ends_with_the_state_and_files_outlive_the_power() {
+fn transfer_ends_on_state_change_and_files_survive_a_power_cycle() {
     let mut bus = bus(48, FoeOptions::default());
     write(&mut bus, "kept", 0, b"kept").unwrap();
     assert_eq!(say(&mut bus, 2, 0, b"half"), Said::Ack(0));
@@ -304,7 +304,7 @@ fn a_transfer_ends_with_the_state_and_files_outlive_the_power() {
 }
 
 #[test]
-fn only_devices_whose_esi_has_it_know_file_access() {
+fn file_access_needs_the_esi_flag() {
     let mut device = mailbox_device();
     device.mailbox.as_mut().unwrap().foe = false;
     for (has_foe, expected) in [(None, 0), (Some(true), FOE)] {
@@ -327,7 +327,7 @@ fn only_devices_whose_esi_has_it_know_file_access() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
     #[test]
-    fn what_is_written_is_read(
+    fn written_files_read_back_equal(
         mailbox in 16u16..300, busy_every in 0u32..4,
         file in prop::collection::vec(any::<u8>(), 0..2000), name in "[a-zA-Z0-9._-]{1,4}",
     ) {

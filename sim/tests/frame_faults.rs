@@ -1,10 +1,10 @@
-//! What the fault script does to frames and devices: corruption, duplication, delay, exchange.
+//! Effects of the fault script on frames and devices: corruption, duplication, delay, exchange.
 
 mod common;
 
 use common::*;
 use ecaxis_sim::frame::FrameBuilder;
-use ecaxis_sim::{DeviceOptions, FaultScript, Transit};
+use ecaxis_sim::{DeviceOptions, FaultScript, FrameOutcome};
 
 const MS: u64 = 1_000_000;
 
@@ -19,13 +19,13 @@ fn brd() -> Vec<u8> {
     FrameBuilder::default().datagram(7, 0, 0, &[0]).build()
 }
 
-/// RX errors of each port, then forwarded errors, then those of the processing unit.
+/// Returns RX errors of each port, then forwarded errors, then those of the processing unit.
 fn errors(bus: &Bus, device: usize) -> Vec<u8> {
     let esc = bus.segment.device(device).unwrap().esc();
     esc.bytes(0x300, 13).to_vec()
 }
 
-/// As [`errors`], from what is not zero.
+/// Returns the counters of [`errors`] from those that are not zero.
 fn counters(counts: &[(usize, u8)]) -> Vec<u8> {
     let mut counters = vec![0; 13];
     for (at, count) in counts {
@@ -35,7 +35,7 @@ fn counters(counts: &[(usize, u8)]) -> Vec<u8> {
 }
 
 #[test]
-fn a_corrupted_frame_is_found_by_one_device_and_counted_by_those_behind_it() {
+fn corrupted_frame_is_counted_by_the_detecting_device_and_those_behind_it() {
     // Data sheet section I, table 50: an RX error at port 0 counts in 0x0300, 0x0301 and 0x030C, a
     // forwarded one in 0x0308 and 0x030C.
     let mut bus = line(
@@ -44,14 +44,14 @@ fn a_corrupted_frame_is_found_by_one_device_and_counted_by_those_behind_it() {
     );
     let write = FrameBuilder::default().datagram(8, 0, 0x102, &[5]).build();
     assert_eq!(bus.frame(write), None);
-    // On the way back it comes in at ports 1.
+    // On the way back the frame enters at port 1.
     assert_eq!(errors(&bus, 0), counters(&[(9, 1)]));
     assert_eq!(
         errors(&bus, 1),
         counters(&[(0, 1), (1, 1), (9, 1), (12, 1)])
     );
     assert_eq!(errors(&bus, 2), counters(&[(8, 1), (12, 1)]));
-    // Only the device in front of the error has taken what it carried.
+    // Only the device before the error has applied the frame.
     let written = |n| bus.segment.device(n).unwrap().esc().bytes(0x102, 1)[0];
     assert_eq!([0, 1, 2].map(written), [5, 7, 7]);
     assert!(bus.frame(brd()).is_some(), "the next one is whole");
@@ -60,7 +60,7 @@ fn a_corrupted_frame_is_found_by_one_device_and_counted_by_those_behind_it() {
 }
 
 #[test]
-fn an_error_on_the_way_back_hurts_no_device() {
+fn error_on_the_return_path_affects_no_device() {
     let mut bus = line(
         3,
         "[[fault]]\nkind = \"frame-corrupt\"\ncount = 1\ndevice = 1\nport = 1\n",
@@ -75,7 +75,7 @@ fn an_error_on_the_way_back_hurts_no_device() {
 }
 
 #[test]
-fn corruption_anywhere_finds_every_place() {
+fn random_corruption_hits_every_cable() {
     let mut bus = line(
         3,
         "seed = 3\n[[fault]]\nkind = \"frame-corrupt\"\nprobability = 1.0\n",
@@ -83,7 +83,8 @@ fn corruption_anywhere_finds_every_place() {
     for _ in 0..200 {
         assert_eq!(bus.frame(brd()), None);
     }
-    // Six cables passed by a frame; one is the MainDevice's own and nobody's error.
+    // A frame passes six cables. The last cable leads to the MainDevice; no device counts its
+    // errors.
     let found: Vec<u8> = (0..3)
         .flat_map(|n| [errors(&bus, n)[0], errors(&bus, n)[2]])
         .collect();
@@ -99,10 +100,10 @@ fn corruption_anywhere_finds_every_place() {
 }
 
 #[test]
-fn a_frame_comes_back_twice() {
+fn duplicated_frame_returns_twice() {
     let mut bus = line(2, "[[fault]]\nkind = \"frame-duplicate\"\ncount = 1\n");
     let mut send = || bus.segment.transit(&mut brd(), bus.now + MS);
-    let Transit::Back {
+    let FrameOutcome::Back {
         at,
         again: Some(again),
         ..
@@ -111,38 +112,38 @@ fn a_frame_comes_back_twice() {
         panic!("once");
     };
     assert_eq!(again - at, 6_720, "behind the first one");
-    assert!(matches!(send(), Transit::Back { again: None, .. }));
+    assert!(matches!(send(), FrameOutcome::Back { again: None, .. }));
 }
 
 #[test]
-fn a_delayed_frame_is_overtaken() {
+fn delayed_frame_is_overtaken() {
     let mut bus = line(
         2,
         "[[fault]]\nkind = \"frame-delay\"\ncount = 1\ndelay = \"200us\"\n",
     );
     let mut back = |after: u64| match bus.segment.transit(&mut brd(), bus.now + after) {
-        Transit::Back { at, .. } => at - bus.now,
-        Transit::Lost => panic!("lost"),
+        FrameOutcome::Back { at, .. } => at - bus.now,
+        FrameOutcome::Lost => panic!("lost"),
     };
     let (first, second) = (back(0), back(50_000));
     assert_eq!(first, second - 50_000 + 200_000);
 }
 
 #[test]
-fn faults_of_frames_last_as_long_as_they_are_to() {
+fn frame_faults_last_for_their_duration() {
     let mut bus = line(
         1,
         "[[fault]]\nat = \"10ms\"\nfor = \"10ms\"\nkind = \"frame-duplicate\"\nprobability = 1\n",
     );
     let twice = [5, 15, 25].map(|ms| {
         let transit = bus.segment.transit(&mut brd(), ms * MS);
-        matches!(transit, Transit::Back { again: Some(_), .. })
+        matches!(transit, FrameOutcome::Back { again: Some(_), .. })
     });
     assert_eq!(twice, [false, true, false]);
 }
 
 #[test]
-fn another_device_takes_a_place_and_gives_it_back() {
+fn replaced_device_is_restored() {
     let mut bus = line(
         3,
         "[[fault]]\nat = \"10ms\"\nfor = \"10ms\"\nkind = \"swap\"\ndevice = 1\n\
@@ -159,7 +160,7 @@ fn another_device_takes_a_place_and_gives_it_back() {
     let number = |sub| device.object(0x1018, sub).unwrap();
     assert_eq!(number(2), 0x999_u32.to_le_bytes());
     assert_eq!(number(4), 77_u32.to_le_bytes());
-    // Its neighbours lost the link for a moment.
+    // The neighbours lost the link for a moment.
     let lost = |n: usize| {
         bus.segment
             .device(n)
@@ -179,7 +180,7 @@ fn another_device_takes_a_place_and_gives_it_back() {
 }
 
 #[test]
-fn a_new_device_has_no_alias_unless_it_is_given_one() {
+fn replacement_device_has_no_alias_by_default() {
     for (line, alias) in [("", 0), ("alias = 0x1234\n", 0x1234_u16)] {
         let options = DeviceOptions {
             alias: 0x55,
@@ -199,7 +200,7 @@ fn a_new_device_has_no_alias_unless_it_is_given_one() {
 }
 
 #[test]
-fn a_power_cut_starts_a_device_anew() {
+fn power_cut_restarts_a_device() {
     let mut bus = line(
         1,
         "[[fault]]\nat = \"1ms\"\nfor = \"1ms\"\nkind = \"power-off\"\n",
@@ -211,7 +212,7 @@ fn a_power_cut_starts_a_device_anew() {
     assert_eq!(bus.segment.device(0).unwrap().station_address(), 0);
 }
 
-/// From port 0 to port 1 by the receive times, over many latches.
+/// Returns the times from port 0 to port 1 by the receive times, over many latches.
 fn trips(jitter: u32, seed: u64) -> Vec<i64> {
     let options = DeviceOptions {
         clock_jitter_ns: jitter,
@@ -234,7 +235,7 @@ fn trips(jitter: u32, seed: u64) -> Vec<i64> {
 }
 
 #[test]
-fn receive_times_jitter_as_far_as_they_are_to() {
+fn receive_times_jitter_within_the_option() {
     assert!(trips(0, 1).iter().all(|trip| *trip == 1_050));
     let jittery = trips(20, 1);
     let (least, most) = (jittery.iter().min().unwrap(), jittery.iter().max().unwrap());
@@ -247,7 +248,7 @@ fn receive_times_jitter_as_far_as_they_are_to() {
     assert_ne!(trips(20, 2), jittery);
 }
 
-/// Everything seen of a bus where everything goes wrong.
+/// Returns all observations of a bus with many faults.
 fn everything() -> Vec<u8> {
     let script = "seed = 11\n\
         [[fault]]\nkind = \"frame-loss\"\nprobability = 0.05\n\
@@ -273,6 +274,6 @@ fn everything() -> Vec<u8> {
 }
 
 #[test]
-fn whatever_goes_wrong_goes_wrong_again() {
+fn fault_runs_are_reproducible() {
     assert!(everything() == everything());
 }

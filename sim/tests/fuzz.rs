@@ -1,9 +1,10 @@
-//! Whatever arrives, the simulator neither panics nor hangs nor answers with a wrong length.
+//! Random input: the simulator neither panics nor hangs nor returns a wrong length.
 //!
-//! `ECAXIS_FUZZ_FRAMES` says how many random frames to send, e.g. 10 million:
-//! `ECAXIS_FUZZ_FRAMES=10000000 cargo test --release -p ecaxis-sim --test fuzz frames -- --nocapture`
+//! `ECAXIS_FUZZ_FRAMES` sets the number of random frames, e.g. 10 million:
+//! `ECAXIS_FUZZ_FRAMES=10000000 cargo test --release -p ecaxis-sim --test fuzz frames --
+//! --nocapture`
 
-#![allow(clippy::print_stderr, reason = "how much was tried is worth seeing")]
+#![allow(clippy::print_stderr, reason = "prints the number of attacks")]
 
 mod common;
 #[path = "common/hostile/mod.rs"]
@@ -13,7 +14,7 @@ use ecaxis_sim::{DeviceOptions, FaultScript, SimDevice, Topology};
 use hostile::{Dice, Hostile};
 use proptest::prelude::*;
 
-/// A bus that was attacked so often is rebuilt.
+/// The bus is rebuilt after this number of attacks.
 const ROUNDS: u64 = 500;
 
 #[test]
@@ -33,12 +34,12 @@ fn random_frames_come_back_whole() {
         "{frames} random frames: {} answered, {} with a working counter, {} with a device in Op, {} buses",
         hostile.answered, hostile.processed, hostile.in_op, hostile.rebuilt,
     );
-    // An attack that nobody notices tries nothing.
+    // Frames that no device processes test nothing.
     assert!(hostile.processed > frames / 4);
     assert!(hostile.in_op > frames / 4);
 }
 
-/// Words that stand at the right places of a script, and some that do not.
+/// Keys and words of a script, valid and invalid.
 const KEYS: &[&str] = &[
     "at",
     "for",
@@ -118,7 +119,7 @@ fn value(dice: &mut Dice) -> String {
     }
 }
 
-/// A script whose faults have the keys that belong to their kind more often than not.
+/// Returns a script whose faults mostly have the keys of their kind.
 fn script(dice: &mut Dice) -> String {
     let mut text = String::new();
     if dice.percent(50) {
@@ -141,7 +142,7 @@ fn script(dice: &mut Dice) -> String {
     text
 }
 
-/// What may be run on the bus.
+/// Returns the script if the bus can run it.
 fn runnable(text: &str, bus: &Topology) -> Option<FaultScript> {
     let script = FaultScript::parse(text).ok()?;
     script.check(bus).ok()?;
@@ -172,13 +173,13 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_text_is_a_fault_script_or_an_error(text in ".{0,200}") {
+    fn fault_script_parser_survives_any_text(text in ".{0,200}") {
         let _ = FaultScript::parse(&text);
     }
 
-    /// The image of one of our devices with some bytes changed, cut or lengthened.
+    /// Changes, cuts or extends the EEPROM image of one of the project's devices.
     #[test]
-    fn any_eeprom_image_is_a_device_or_an_error(
+    fn eeprom_parser_survives_any_image(
         of in 0_usize..8,
         seed in any::<u64>(),
         changes in prop::collection::vec((0_usize..600, any::<u8>()), 0..20),

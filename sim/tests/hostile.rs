@@ -1,4 +1,4 @@
-//! What no message may cause, whoever sends it.
+//! Invariants that no mailbox message may break.
 
 mod common;
 
@@ -9,7 +9,7 @@ use proptest::prelude::*;
 const S: u16 = 0x1001;
 const UPLOAD: [u8; 10] = [0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0];
 
-/// A message that looks more or less like a request.
+/// A message that resembles a request more or less.
 fn any_message() -> impl Strategy<Value = (Vec<u8>, Option<u16>)> {
     let index = prop_oneof![
         Just(0x2000u16),
@@ -79,9 +79,9 @@ fn any_message() -> impl Strategy<Value = (Vec<u8>, Option<u16>)> {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
-    /// Whatever is written, answers come one by one with a length that is theirs, and the device goes on answering.
+    /// Answers come one by one with a correct length, and the device continues to answer.
     #[test]
-    fn no_message_makes_a_device_panic_hang_or_lie_about_a_length(
+    fn mailbox_survives_any_message_with_correct_lengths(
         len in prop_oneof![Just(16u16), Just(48), 16u16..=1486],
         boot in any::<bool>(),
         messages in prop::collection::vec((any_message(), any::<u8>(), 0usize..4), 1..40),
@@ -103,7 +103,7 @@ proptest! {
             let claimed = wrong_len.unwrap_or(payload.len() as u16).to_le_bytes();
             let kind = content[0] & 0x0f | header & 0xf0;
             let whole = message(room, [claimed[0], claimed[1], 0, 0, u8::from(header & 7 == 0), kind], payload);
-            // Not taken while the device holds the MainDevice back.
+            // The device refuses the write while too many answers wait to be fetched.
             bus.datagram(5, S, 0x1000, &whole);
             bus.wait(400_000);
             for _ in 0..fetches {
@@ -114,7 +114,7 @@ proptest! {
                 }
             }
         }
-        // Once all is fetched it still answers, in Bootstrap by a refusal.
+        // When all answers are fetched the device answers again, in Bootstrap with a refusal.
         for _ in 0..10_000 {
             bus.wait(400_000);
             if bus.fetch_raw(S).is_none() && bus.read(S, 0x805, 1)[0] & 8 == 0 {

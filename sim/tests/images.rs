@@ -1,6 +1,6 @@
 //! Every published EEPROM image becomes a SubDevice that a MainDevice takes from Init to Op.
 
-#![allow(clippy::print_stderr, reason = "tests say what they did")]
+#![allow(clippy::print_stderr, reason = "prints a line per image")]
 
 mod common;
 mod main_device;
@@ -15,7 +15,7 @@ fn climb(image: &[u8]) -> Result<String, String> {
     let mut bus = Bus::new(vec![sim]);
     bus.address_all();
     let (learned, mapped) = main_device::bring_up(&mut bus, S)?;
-    // The end mark is the last that the MainDevice reads.
+    // The MainDevice reads up to the end mark.
     let read = learned.image.len().min(image.len()) - 8;
     if learned.image[..read] != image[..read] {
         return Err("the EEPROM reads differently".into());
@@ -39,7 +39,7 @@ fn every_image_reaches_op() {
     let (mut count, mut problems) = (0, Vec::new());
     for path in paths {
         let image = std::fs::read(&path).unwrap();
-        // One of them is Intel HEX text of another.
+        // One file is Intel HEX text of another.
         if image.starts_with(b":") {
             continue;
         }

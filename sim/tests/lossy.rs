@@ -1,5 +1,5 @@
-//! A mailbox behind a wire that loses frames: with the counters and repetitions of the mailbox's data link layer
-//! (ETG.1000.4 §5.6) nothing is executed twice and nothing is missed.
+//! A mailbox behind a wire that loses frames. With the counters and repetitions of the mailbox's
+//! data link layer (ETG.1000.4 §5.6) every request is executed exactly once.
 
 mod common;
 
@@ -10,11 +10,11 @@ use ecaxis_sim::{DeviceOptions, FaultScript};
 const S: u16 = 0x1001;
 const LEN: u16 = 48;
 
-/// A MainDevice that repeats.
+/// A MainDevice that repeats lost frames.
 struct Client {
     bus: Bus,
     request: u8,
-    /// Counter of the last message read.
+    /// The counter of the last message read.
     seen: u8,
     toggle: u8,
     emergencies: Vec<u16>,
@@ -35,7 +35,7 @@ impl Client {
         }
     }
 
-    /// `None`: the frame got lost, on the way there or back.
+    /// Sends a frame once. Returns `None` if it is lost in either direction.
     fn once(&mut self, command: u8, ado: u16, data: &[u8]) -> Option<(Vec<u8>, u16)> {
         let request = FrameBuilder::default().datagram(command, S, ado, data);
         let bytes = self.bus.frame(request.build())?;
@@ -43,7 +43,7 @@ impl Client {
         Some((bytes[d.data.clone()].to_vec(), d.wkc(&bytes)))
     }
 
-    /// A register may be read as often as need be.
+    /// Reads a register until an answer arrives.
     fn register(&mut self, ado: u16) -> u8 {
         (0..1000)
             .find_map(|_| self.once(4, ado, &[0]))
@@ -127,11 +127,11 @@ fn script(seed: u64) -> String {
 }
 
 #[test]
-fn a_file_and_every_emergency_pass_a_wire_that_loses_a_quarter_of_its_frames() {
+fn mailbox_delivers_a_file_and_every_emergency_with_25_percent_frame_loss() {
     let file: Vec<u8> = (0..3000).map(|n: u32| (n * 31 + n / 251) as u8).collect();
     for seed in 1..=5 {
         let mut client = Client::new(&script(seed));
-        // Packet numbers tell a data packet that is executed twice, or not at all.
+        // Packet numbers reveal a data packet that is executed twice or not at all.
         assert_eq!(client.exchange(4, b"\x02\0\0\0\0\0f"), [4, 0, 0, 0, 0, 0]);
         for (packet, data) in (1_u32..).zip(file.chunks(36)) {
             let mut payload = vec![3, 0];

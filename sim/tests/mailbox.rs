@@ -1,4 +1,4 @@
-//! Mailboxes as such: headers and their errors, counters, repetitions, order.
+//! The mailbox protocol: headers and their errors, counters, repetitions, order.
 
 mod common;
 
@@ -22,14 +22,14 @@ fn with(mailbox: MailboxOptions) -> DeviceOptions {
     }
 }
 
-/// A CoE message with this counter.
+/// Returns a CoE message with this counter.
 fn counted(counter: u8, payload: &[u8]) -> Vec<u8> {
     let len = payload.len() as u8;
     message(48, [len, 0, 0, 0, 0, 3 | counter << 4], payload)
 }
 
 #[test]
-fn a_mailbox_is_locked_until_it_is_emptied() {
+fn mailbox_is_locked_until_it_is_read() {
     let mut bus = preop();
     let upload = [0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0];
     assert_eq!(bus.fetch(S), None, "nothing to read");
@@ -54,7 +54,7 @@ fn a_mailbox_is_locked_until_it_is_emptied() {
 }
 
 #[test]
-fn an_fmmu_shows_that_a_reply_waits() {
+fn fmmu_shows_a_waiting_reply() {
     let mut bus = preop();
     // Bit 3 of 0x080D at bit 2 of logical 0x500.
     bus.write(
@@ -71,7 +71,7 @@ fn an_fmmu_shows_that_a_reply_waits() {
 }
 
 #[test]
-fn in_init_mailboxes_are_not_served() {
+fn mailboxes_are_not_served_in_init() {
     let mut bus = Bus::new(vec![sim(&coe_device())]);
     bus.address_all();
     bus.sm(S, 0, 0x1000, 48, 0x26);
@@ -85,7 +85,7 @@ fn in_init_mailboxes_are_not_served() {
 }
 
 #[test]
-fn going_back_to_init_forgets_the_mailbox() {
+fn return_to_init_clears_the_mailbox() {
     let mut bus = preop();
     bus.send_mailbox(S, 3, &[0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0]);
     bus.wait(1_000_000);
@@ -98,7 +98,7 @@ fn going_back_to_init_forgets_the_mailbox() {
 }
 
 #[test]
-fn a_lost_reply_is_repeated_on_request() {
+fn lost_reply_is_repeated_on_request() {
     let mut bus = preop();
     let first = bus.mailbox(S, 3, &[0, 0x20, 0x40, 3, 0x20, 0, 0, 0, 0, 0]);
     for toggle in [2, 0] {
@@ -170,7 +170,7 @@ fn header_errors_row_by_row() {
 }
 
 #[test]
-fn priorities_are_no_error() {
+fn mailbox_priorities_are_accepted() {
     let mut bus = preop();
     bus.write(S, 0x1000, &message(48, [10, 0, 0, 0, 0xc0, 3], &UPLOAD));
     bus.wait(1_000_000);
@@ -178,9 +178,10 @@ fn priorities_are_no_error() {
 }
 
 #[test]
-fn whoever_never_fetches_is_told_and_then_held_back() {
+fn client_that_never_fetches_gets_an_error_and_is_then_blocked() {
     let mut bus = preop();
-    // One answer in the mailbox, three behind it, the complaint, and a request that stays where it is.
+    // One answer in the mailbox, three in the queue, the error message, and a request that stays in
+    // the mailbox.
     for n in 0..6 {
         bus.send_mailbox(S, 3, &UPLOAD);
         bus.wait(1_000_000);
@@ -202,7 +203,7 @@ fn whoever_never_fetches_is_told_and_then_held_back() {
     assert_eq!(kinds.iter().collect::<Vec<_>>(), expected);
 }
 
-/// Segmented upload: executing a segment request twice would be a toggle error.
+/// Starts a segmented upload. Executing a segment request twice would be a toggle error.
 fn first_segment(bus: &mut Bus) -> Vec<u8> {
     bus.write(
         S,
@@ -215,19 +216,19 @@ fn first_segment(bus: &mut Bus) -> Vec<u8> {
 }
 
 #[test]
-fn a_repeated_request_is_executed_once_and_answered_until_it_is_fetched() {
+fn repeated_request_is_executed_once_and_answered_until_fetched() {
     let mut bus = preop();
     let request = first_segment(&mut bus);
     bus.write(S, 0x1000, &request);
     assert_eq!(bus.datagram(5, S, 0x1000, &request).1, 0, "not fetched yet");
     bus.wait(1_000_000);
-    // The answer lies in the mailbox: the repetition changes nothing.
+    // The answer is in the mailbox: the repetition changes nothing.
     bus.write(S, 0x1000, &request);
     bus.wait(1_000_000);
     let answer = bus.fetch_raw(S).unwrap();
     assert_eq!(bus.fetch_raw(S), None);
     assert_eq!(answer[8], 0, "first segment");
-    // The answer was fetched and got lost: it comes again as it was, counter included.
+    // The answer was fetched and lost: the device sends it again unchanged, including the counter.
     for _ in 0..3 {
         bus.write(S, 0x1000, &request);
         bus.wait(1_000_000);
@@ -244,7 +245,7 @@ fn a_repeated_request_is_executed_once_and_answered_until_it_is_fetched() {
 }
 
 #[test]
-fn an_answer_read_after_the_repetition_was_written_does_not_come_twice() {
+fn answer_read_after_the_repetition_is_sent_once() {
     let mut bus = preop();
     let request = first_segment(&mut bus);
     bus.write(S, 0x1000, &request);
@@ -256,7 +257,7 @@ fn an_answer_read_after_the_repetition_was_written_does_not_come_twice() {
 }
 
 #[test]
-fn another_request_under_the_last_counter_is_dropped() {
+fn different_request_with_the_last_counter_is_dropped() {
     let mut bus = preop();
     bus.write(S, 0x1000, &counted(5, &UPLOAD));
     bus.wait(1_000_000);
@@ -271,7 +272,7 @@ fn another_request_under_the_last_counter_is_dropped() {
 }
 
 #[test]
-fn without_a_counter_nothing_is_a_repetition() {
+fn requests_without_a_counter_are_never_repetitions() {
     let mut bus = preop();
     first_segment(&mut bus);
     let request = counted(0, &[0, 0x20, 0x60, 0, 0, 0, 0, 0, 0, 0]);
@@ -287,7 +288,7 @@ fn without_a_counter_nothing_is_a_repetition() {
 }
 
 #[test]
-fn a_request_repeated_while_the_device_works_on_it_is_answered_once() {
+fn request_repeated_during_processing_is_answered_once() {
     let options = MailboxOptions {
         processing_ns: 20_000_000,
         ..MailboxOptions::default()
@@ -327,7 +328,7 @@ fn answers_and_emergencies_share_a_counter_from_1_to_7() {
 }
 
 #[test]
-fn what_was_not_fetched_follows_what_is_repeated() {
+fn unfetched_message_follows_the_repeated_one() {
     let mut bus = preop();
     bus.send_mailbox(S, 3, &UPLOAD);
     bus.wait(1_000_000);
@@ -345,7 +346,7 @@ fn what_was_not_fetched_follows_what_is_repeated() {
 }
 
 #[test]
-fn a_repeat_request_before_any_message_finds_nothing() {
+fn repeat_request_before_any_message_has_no_effect() {
     let mut bus = preop();
     bus.write(S, 0x80e, &[3]);
     bus.wait(1_000_000);
@@ -353,7 +354,7 @@ fn a_repeat_request_before_any_message_finds_nothing() {
 }
 
 #[test]
-fn emergencies_wait_in_order_and_the_last_ones_are_lost() {
+fn full_emergency_queue_drops_the_newest() {
     let mut bus = preop();
     let script: String = (0..20)
         .map(|n| {
@@ -368,7 +369,7 @@ fn emergencies_wait_in_order_and_the_last_ones_are_lost() {
     bus.wait(30_000_000);
     bus.send_mailbox(S, 3, &UPLOAD);
     bus.wait(1_000_000);
-    // One in the mailbox, sixteen behind it.
+    // One in the mailbox, sixteen in the queue.
     for n in 0..17 {
         let (kind, emergency) = bus.fetch(S).unwrap();
         assert_eq!((kind, &emergency[..4]), (3, &[0, 0x10, n, 0x81][..]));
@@ -378,7 +379,7 @@ fn emergencies_wait_in_order_and_the_last_ones_are_lost() {
 }
 
 #[test]
-fn a_transfer_outlives_safe_op_but_not_init() {
+fn transfer_survives_safe_op_but_not_init() {
     let mut bus = mailbox_bus(48, DeviceOptions::default());
     let start = [0, 0x20, 0x40, 0, 0x20, 0, 0, 0, 0, 0];
     let segment = |toggle: u8| [0, 0x20, 0x60 | toggle, 0, 0, 0, 0, 0, 0, 0];
@@ -396,7 +397,7 @@ fn a_transfer_outlives_safe_op_but_not_init() {
 }
 
 #[test]
-fn a_mailbox_is_served_in_every_state_but_init() {
+fn mailbox_is_served_in_every_state_except_init() {
     let mut bus = mailbox_bus(64, DeviceOptions::default());
     bus.sm(S, 2, 0x1c00, 6, 0x64);
     bus.sm(S, 3, 0x1d00, 6, 0x20);

@@ -1,4 +1,4 @@
-//! Process RAM: SyncManagers that guard it, FMMUs that lead to it, as seen over the wire.
+//! Process RAM: SyncManagers that protect it, FMMUs that map it, accessed over the wire.
 
 mod common;
 
@@ -10,7 +10,7 @@ const S: u16 = 0x1001;
 const OUT: u16 = 0x1000;
 const IN: u16 = 0x1100;
 
-/// A terminal with 16 bits out and in, in this state.
+/// Returns a terminal with 16 bits out and in, in this state.
 fn terminal(state: u8) -> Bus {
     let mut bus = Bus::new(vec![sim(&io_device())]);
     bus.address_all();
@@ -35,7 +35,7 @@ fn set_input(bus: &mut Bus, value: [i64; 2]) {
 }
 
 #[test]
-fn inputs_read_in_two_frames_belong_together() {
+fn inputs_read_in_two_frames_are_consistent() {
     let mut bus = terminal(OP);
     set_input(&mut bus, [1, 2]);
     assert_eq!(bus.read(S, IN, 2), [1, 2]);
@@ -52,7 +52,7 @@ fn inputs_read_in_two_frames_belong_together() {
 }
 
 #[test]
-fn outputs_written_in_two_frames_count_together() {
+fn outputs_written_in_two_frames_are_consistent() {
     let mut bus = terminal(OP);
     let outputs = |bus: &Bus| bus.segment.device(0).unwrap().outputs();
     bus.write(S, OUT, &[1, 2]);
@@ -67,7 +67,7 @@ fn outputs_written_in_two_frames_count_together() {
 }
 
 #[test]
-fn the_status_names_the_buffer_written_last() {
+fn sync_manager_status_shows_the_last_written_buffer() {
     let mut bus = terminal(SAFEOP);
     let buffer = |bus: &mut Bus| bus.read(S, 0x805, 1)[0] >> 4 & 3;
     assert_eq!(buffer(&mut bus), 3, "none");
@@ -77,12 +77,12 @@ fn the_status_names_the_buffer_written_last() {
             buffer(&mut bus)
         })
         .collect();
-    // Nobody fetches outputs in SafeOp: the writer has two buffers to itself.
+    // The device does not fetch outputs in SafeOp, so the writer alternates between two buffers.
     assert_eq!(seen, [0, 1, 0, 1]);
 }
 
 #[test]
-fn below_safe_op_the_device_keeps_its_process_data_closed() {
+fn process_data_is_closed_below_safe_op() {
     let mut bus = terminal(PREOP);
     for at in [OUT, IN] {
         assert_eq!(bus.datagram(4, S, at, &[0; 2]).1, 0);
@@ -95,7 +95,7 @@ fn below_safe_op_the_device_keeps_its_process_data_closed() {
 }
 
 #[test]
-fn a_disabled_sync_manager_leaves_plain_memory() {
+fn disabled_sync_manager_leaves_plain_memory() {
     let mut bus = Bus::new(vec![sim(&coe_device())]);
     bus.address_all();
     bus.write(S, 0x800, &[0, 0x10, 16, 0, 0x26, 0, 0, 0]);
@@ -114,7 +114,7 @@ fn a_disabled_sync_manager_leaves_plain_memory() {
 }
 
 #[test]
-fn an_enabled_sync_manager_takes_no_configuration() {
+fn enabled_sync_manager_ignores_configuration_writes() {
     let mut bus = terminal(SAFEOP);
     let before = bus.read(S, 0x800, 8);
     assert_eq!(bus.datagram(5, S, 0x800, &[0, 0x11, 4, 0, 0]).1, 0);
@@ -129,7 +129,7 @@ fn an_enabled_sync_manager_takes_no_configuration() {
 }
 
 #[test]
-fn of_overlapping_sync_managers_the_lower_number_counts() {
+fn overlapping_sync_managers_use_the_lower_number() {
     let mut bus = Bus::new(vec![sim(&coe_device())]);
     bus.address_all();
     // Written 0x1000–0x100f, read 0x1008–0x1017.
@@ -142,9 +142,9 @@ fn of_overlapping_sync_managers_the_lower_number_counts() {
 }
 
 #[test]
-fn bits_map_wherever_they_start_and_end() {
+fn fmmu_maps_bits_at_any_start_and_end() {
     let mut bus = terminal(SAFEOP);
-    // 14 bits from logical 0x10011.3 to 0x10013.0 at 0x13e1.1 to 0x13e2.6, the data sheet's example.
+    // The data sheet's example: 14 bits, logical 0x10011.3 to 0x10013.0, at 0x13e1.1 to 0x13e2.6.
     let fmmu = |kind| [0x11, 0, 1, 0, 3, 0, 3, 0, 0xe1, 0x13, 1, kind, 1, 0, 0, 0];
     bus.write(S, 0x600, &fmmu(3));
     bus.write(S, 0x13e0, &[0xff; 4]);
@@ -159,7 +159,7 @@ fn bits_map_wherever_they_start_and_end() {
     assert_eq!(bus.read(S, 0x13e0, 4), [0xff, 0xc1, 0xbf, 0xff]);
     assert_eq!(bus.logical(11, 0x1_0010, &[0xff]).1, 0, "in front of it");
     assert_eq!(bus.logical(11, 0x1_0014, &[0xff]).1, 0, "behind it");
-    // Deactivated, or for nothing.
+    // Deactivated, or without a direction.
     bus.write(S, 0x60c, &[0]);
     assert_eq!(bus.logical(12, 0x1_0010, &[0; 5]).1, 0);
     bus.write(S, 0x600, &fmmu(0));
@@ -167,7 +167,7 @@ fn bits_map_wherever_they_start_and_end() {
 }
 
 #[test]
-fn one_fmmu_may_span_several_sync_managers() {
+fn fmmu_may_span_several_sync_managers() {
     let mut bus = Bus::new(vec![sim(&coe_device())]);
     bus.address_all();
     bus.preop(S);
@@ -196,19 +196,19 @@ fn registers_can_be_mapped() {
     assert_eq!(bus.logical(10, 0, &[0]), (vec![0x20], 1));
     assert!(bus.fetch(S).is_some());
     assert_eq!(bus.logical(10, 0, &[0]), (vec![0], 1));
-    // Written registers take effect like any other; bits that are not mapped keep their value.
+    // Mapped register writes take effect like any other; unmapped bits keep their value.
     let divider = [8, 0, 0, 0, 1, 0, 0, 3, 0, 4, 4, 2, 1, 0, 0, 0];
     bus.write(S, 0x610, &divider);
     assert_eq!(bus.logical(11, 8, &[0x05]).1, 1);
     assert_eq!(bus.read_u16(S, 0x400), 0x0952);
-    // Read-only ones do not count.
+    // Read-only registers do not count.
     let status = [9, 0, 0, 0, 1, 0, 0, 7, 0x30, 1, 0, 2, 1, 0, 0, 0];
     bus.write(S, 0x610, &status);
     assert_eq!(bus.logical(11, 9, &[8]).1, 0);
 }
 
 #[test]
-fn of_fmmus_for_one_byte_the_lower_number_counts() {
+fn overlapping_fmmus_use_the_lower_number() {
     let mut bus = terminal(SAFEOP);
     bus.write(S, 0x13e0, &[1, 2, 3, 4]);
     bus.fmmu(S, 0, 0x100, 2, 0x13e0, 1);
@@ -217,7 +217,7 @@ fn of_fmmus_for_one_byte_the_lower_number_counts() {
 }
 
 #[test]
-fn digital_output_registers_and_user_ram_are_memory_in_front_of_process_ram() {
+fn digital_output_registers_and_user_ram_count_accesses() {
     let mut bus = terminal(INIT);
     for (at, len, reads, writes) in [
         (0x0f00, 4, 1, 1),
@@ -231,7 +231,7 @@ fn digital_output_registers_and_user_ram_are_memory_in_front_of_process_ram() {
         let counters = [4, 5].map(|code| bus.datagram(code, S, at, &zeros).1);
         assert_eq!(counters, [reads, writes], "0x{at:04x}");
     }
-    // A single byte of outputs under a SyncManager, as simple output terminals have it.
+    // A single byte of outputs with a SyncManager, as in simple output terminals.
     let mut device = io_device();
     device.eeprom.config_data = vec![4, 1, 0, 0x44];
     let mut bus = Bus::new(vec![sim(&device)]);
@@ -243,9 +243,9 @@ fn digital_output_registers_and_user_ram_are_memory_in_front_of_process_ram() {
 }
 
 proptest! {
-    /// Whatever SyncManagers and FMMUs are set to, answers keep their length and the device its memory.
+    /// With any SyncManager and FMMU settings, answers keep their length and the device its memory.
     #[test]
-    fn any_configuration_is_survived(
+    fn memory_survives_any_configuration(
         sms in prop::collection::vec(any::<[u8; 8]>(), 4),
         fmmus in prop::collection::vec(any::<[u8; 16]>(), 3),
         accesses in prop::collection::vec(
@@ -256,7 +256,7 @@ proptest! {
         let mut bus = Bus::new(vec![sim(&coe_device())]);
         bus.address_all();
         for (n, r) in (0..).zip(&sms) {
-            // Enabled, and somewhere near the memory there is.
+            // Enabled, and near the end of the memory.
             let r = [r[0], r[1] & 0x1f, r[2], r[3] & 0x0f, r[4], 0, 1, 0];
             bus.datagram(5, S, 0x800 + n * 8, &r);
         }

@@ -1,4 +1,4 @@
-//! A drive's behaviour as its MainDevice sees it over the bus.
+//! A drive's behaviour over the bus, as its MainDevice sees it.
 
 mod common;
 
@@ -9,7 +9,7 @@ use ecaxis_sim::{DeviceOptions, PlantParams, SimDevice, Track};
 const EPOS4: &str = "esi/maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml";
 const VALUE_RANGE: u32 = 0x0609_0030;
 
-/// The smallest dictionary, and what every drive adds to it.
+/// The smallest dictionary, with the objects that every drive adds.
 fn drive() -> SimDevice {
     let mut device = coe_device();
     device.profile = Some(402);
@@ -17,7 +17,7 @@ fn drive() -> SimDevice {
 }
 
 #[test]
-fn option_codes_outside_the_standards_tables_are_refused() {
+fn option_codes_outside_the_standard_are_refused() {
     let mut bus = Bus::new(vec![drive()]);
     bus.address_all();
     bus.preop(0x1001);
@@ -53,7 +53,7 @@ fn option_codes_outside_the_standards_tables_are_refused() {
 }
 
 #[test]
-fn an_epos4_lists_its_homing_methods() {
+fn epos4_lists_its_homing_methods() {
     let Some(xml) = fixture(EPOS4) else {
         return;
     };
@@ -95,10 +95,10 @@ fn inputs_and_outputs_are_wired_to_the_device() {
 
 const STATION: u16 = 0x1001;
 const CYCLE: u64 = 1_000_000;
-/// Process data of the CSP module, either way.
+/// The process data size of the CSP module in each direction.
 const BYTES: u16 = 17;
 
-/// An EPOS4 with the CSP module's process data, a MainDevice that exchanges them every millisecond.
+/// An EPOS4 with the CSP module, and a MainDevice that exchanges process data every millisecond.
 struct Axis {
     bus: Bus,
     outputs: Outputs,
@@ -124,7 +124,7 @@ struct Inputs {
 }
 
 impl Axis {
-    /// In SafeOp.
+    /// Returns the axis in SafeOp.
     fn new(track: Track) -> Option<Self> {
         let file = ecaxis_esi::parse(&fixture(EPOS4)?).unwrap();
         let options = DeviceOptions {
@@ -175,7 +175,7 @@ impl Axis {
         (0..n).for_each(|_| self.cycle());
     }
 
-    /// Op, and Operation enabled in the mode asked for.
+    /// Goes to Op, and to Operation enabled in the requested mode.
     fn enable(&mut self) {
         self.cycle();
         self.bus.request(STATION, 8);
@@ -196,7 +196,7 @@ impl Axis {
 }
 
 #[test]
-fn process_data_count_only_in_op() {
+fn process_data_acts_only_in_op() {
     let Some(mut axis) = Axis::new(Track::default()) else {
         return;
     };
@@ -223,7 +223,7 @@ fn process_data_count_only_in_op() {
 }
 
 #[test]
-fn an_axis_homes_on_its_limit_switch_and_goes_on_in_csp() {
+fn axis_homes_on_its_limit_switch_and_continues_in_csp() {
     let Some(mut axis) = Axis::new(Track {
         negative_limit: Some(-7000),
         index: Some(300),
@@ -289,9 +289,9 @@ fn an_axis_homes_on_its_limit_switch_and_goes_on_in_csp() {
     );
 }
 
-/// At 100 counts a millisecond a whole control cycle would be 40 counts.
+/// At 100 counts per millisecond a whole control cycle would be 40 counts.
 #[test]
-fn a_touch_probe_latches_where_the_axis_was_when_its_wire_changed() {
+fn touch_probe_latches_the_position_at_the_edge() {
     let Some(mut axis) = Axis::new(Track::default()) else {
         return;
     };
@@ -320,7 +320,7 @@ fn a_touch_probe_latches_where_the_axis_was_when_its_wire_changed() {
         let device = axis.device();
         assert!(device.set_digital_input(at, input::TOUCH_PROBE_1, true));
         run(&mut axis, 3);
-        // The axis moves evenly: from the position at a later millisecond back to that moment.
+        // The axis moves at constant speed: extrapolate from a later position back to the edge.
         let now = axis.bus.now;
         axis.bus.segment.advance(now);
         let position = axis.device().drive().unwrap().position_counts();

@@ -1,4 +1,4 @@
-//! Links, loops and the way of frames: line, tree and ring, whole, broken and healed.
+//! Links, loops and the path of frames: line, tree and ring, whole, broken and healed.
 
 mod common;
 
@@ -7,7 +7,7 @@ use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::network::topology::media;
 use ecaxis_sim::{
-    FaultScript, Nic, SecondPort, Segment, SegmentOptions, SimDevice, Topology, Transit,
+    FaultScript, FrameOutcome, Nic, SecondPort, Segment, SegmentOptions, SimDevice, Topology,
 };
 
 const MS: u64 = 1_000_000;
@@ -35,20 +35,20 @@ fn faults(bus: &mut Bus, script: &str) {
     bus.segment.set_faults(FaultScript::parse(script).unwrap());
 }
 
-/// How many devices a broadcast reaches; `None` where it does not come back.
+/// Returns the number of devices that a broadcast reaches; `None` if it does not come back.
 fn count(bus: &mut Bus) -> Option<u16> {
     let bytes = FrameBuilder::default().datagram(7, 0, 0, &[0]).build();
     let bytes = bus.frame(bytes)?;
     Some(frame::next(&bytes, None).unwrap().wkc(&bytes))
 }
 
-/// Register contents from the device's own side, reachable or not.
+/// Returns register contents from the device's side, reachable or not.
 fn register(bus: &Bus, device: usize, at: u16, len: u16) -> Vec<u8> {
     let device = bus.segment.device(device).unwrap();
     device.esc().bytes(at, len).to_vec()
 }
 
-/// Loop and communication of each port, 0x0111.
+/// Returns loop and communication of each port, 0x0111.
 fn loops(bus: &Bus, device: usize) -> u8 {
     register(bus, device, 0x111, 1)[0]
 }
@@ -58,7 +58,7 @@ fn lost_links(bus: &Bus, device: usize) -> Vec<u8> {
 }
 
 #[test]
-fn dl_status_shows_what_each_port_leads_to() {
+fn dl_status_shows_link_and_loop_of_each_port() {
     // Data sheet section II, table 2: two bits a port, 01 closed without link, 10 open with link.
     let mut line = bus(&["YY", "YY", "YY"]);
     line.address_all();
@@ -76,18 +76,18 @@ fn dl_status_shows_what_each_port_leads_to() {
 
 #[test]
 fn frames_reach_devices_in_processing_order() {
-    // Star of a four-port device: branches at ports 3, 1 and 2, the first of them two deep.
+    // Star of a four-port device: branches at ports 3, 1 and 2, the first of them two devices deep.
     let devices = ["YYYY", "YY", "YY", "YY", "YY"].map(with_physics);
     let media = media(&devices);
-    let wish = |after, port| Some(ecaxis_sim::Wish { after, port });
-    let wishes = [
+    let request = |after, port| Some(ecaxis_sim::PortRequest { after, port });
+    let requests = [
         None,
-        wish(0, Some(3)),
-        wish(1, None),
-        wish(0, Some(1)),
-        wish(0, Some(2)),
+        request(0, Some(3)),
+        request(1, None),
+        request(0, Some(1)),
+        request(0, Some(2)),
     ];
-    let topology = Topology::connect(&media, &wishes).unwrap();
+    let topology = Topology::connect(&media, &requests).unwrap();
     let segment = Segment::with_topology(devices.to_vec(), topology, SegmentOptions::default());
     let mut bus = Bus::over(segment);
     assert_eq!(bus.address_all(), 5);
@@ -95,12 +95,12 @@ fn frames_reach_devices_in_processing_order() {
         let device = bus.segment.device(usize::from(n)).unwrap();
         assert_eq!(device.station_address(), 0x1001 + n);
     }
-    // All four ports of the middle are open with a link.
+    // All four ports of the centre are open with a link.
     assert_eq!(loops(&bus, 0), 0xaa);
 }
 
 #[test]
-fn a_broken_link_ends_the_line_and_a_healed_one_continues_it() {
+fn broken_link_ends_the_line_until_it_heals() {
     let mut bus = bus(&["YY"; 4]);
     bus.address_all();
     bus.write(0x1002, 0x200, &[0x04, 0]);
@@ -109,18 +109,18 @@ fn a_broken_link_ends_the_line_and_a_healed_one_continues_it() {
         "[[fault]]\nat = \"10ms\"\nfor = \"10ms\"\nkind = \"link-break\"\ndevice = 2\n",
     );
     assert_eq!(count(&mut bus), Some(4));
-    // What is pending since the links came up.
+    // The event has been pending since the links came up.
     assert_eq!(bus.read_u16(0x1002, 0x110), 0x5a33);
     bus.wait(11 * MS);
     assert_eq!(count(&mut bus), Some(2));
-    // Both ends see it, each at its own port, and count it once.
+    // Both ends detect it, each at its own port, and count it once.
     assert_eq!(loops(&bus, 1), 0x56);
     assert_eq!(loops(&bus, 2), 0x59);
     assert_eq!(lost_links(&bus, 1), [0, 1, 0, 0]);
     assert_eq!(lost_links(&bus, 2), [1, 0, 0, 0]);
     assert_eq!(lost_links(&bus, 0), [0; 4]);
     assert_eq!(lost_links(&bus, 3), [0; 4]);
-    // The change is an event in every frame until DL status is read.
+    // The change sets the event in every frame until DL status is read.
     let event = |bus: &mut Bus| {
         let frame = FrameBuilder::default().datagram(7, 0, 0, &[0]).build();
         let frame = bus.frame(frame).unwrap();
@@ -133,7 +133,7 @@ fn a_broken_link_ends_the_line_and_a_healed_one_continues_it() {
     assert_eq!(count(&mut bus), Some(4));
     assert_eq!(loops(&bus, 1), 0x5a);
     assert_eq!(lost_links(&bus, 1), [0, 1, 0, 0]);
-    // It kept its power, and with it its station address.
+    // The device kept its power, and so its station address.
     assert_eq!(bus.read_u16(0x1003, 0x10), 0x1003);
     // Any value clears the counters of all ports.
     bus.write(0x1002, 0x310, &[0x7f]);
@@ -141,7 +141,7 @@ fn a_broken_link_ends_the_line_and_a_healed_one_continues_it() {
 }
 
 #[test]
-fn either_end_of_a_cable_names_it() {
+fn cable_is_identified_by_either_end() {
     for (device, port) in [(1, 0), (0, 1)] {
         let mut bus = bus(&["YY", "YY"]);
         let script =
@@ -152,7 +152,7 @@ fn either_end_of_a_cable_names_it() {
 }
 
 #[test]
-fn a_branch_goes_without_the_others() {
+fn cut_branch_leaves_the_others_reachable() {
     let mut bus = bus(&["YKY", "KK", "KK", "YY", "YY"]);
     bus.address_all();
     assert!(bus.segment.plug(1, 0, false));
@@ -166,7 +166,7 @@ fn a_branch_goes_without_the_others() {
 }
 
 #[test]
-fn a_device_without_power_comes_back_in_init() {
+fn device_returns_in_init_after_power_loss() {
     let mut bus = bus(&["YY"; 3]);
     bus.address_all();
     bus.preop(0x1002);
@@ -181,8 +181,8 @@ fn a_device_without_power_comes_back_in_init() {
     assert_eq!(lost_links(&bus, 2), [1, 0, 0, 0]);
     bus.wait(10 * MS);
     assert_eq!(count(&mut bus), Some(3));
-    // Registers are those of power-on, the EEPROM's contents are back, its neighbour never noticed more
-    // than the link.
+    // Registers have their power-on values and the EEPROM is loaded again. Its neighbour saw only
+    // the lost link.
     let fresh = bus.segment.device(1).unwrap();
     assert_eq!(fresh.station_address(), 0);
     assert_eq!(fresh.al_state(), ecaxis_sim::AlState::Init);
@@ -192,7 +192,7 @@ fn a_device_without_power_comes_back_in_init() {
 }
 
 #[test]
-fn the_e_bus_feeds_what_is_behind_it() {
+fn e_bus_powers_the_devices_behind_it() {
     let mut bus = bus(&["YKY", "KK", "YY"]);
     bus.address_all();
     bus.segment.power(0, false);
@@ -200,12 +200,12 @@ fn the_e_bus_feeds_what_is_behind_it() {
     let stations: Vec<u16> = (0..3)
         .map(|n| bus.segment.device(n).unwrap().station_address())
         .collect();
-    // The drive at the second socket has a supply of its own.
+    // The drive at the second socket has its own supply.
     assert_eq!(stations, [0, 0, 0x1003]);
 }
 
 #[test]
-fn an_unplugged_main_device_is_a_lost_link_of_the_first_device() {
+fn unplugged_main_device_counts_as_lost_link_of_the_first_device() {
     let mut bus = bus(&["YY", "YY"]);
     faults(
         &mut bus,
@@ -221,7 +221,7 @@ fn an_unplugged_main_device_is_a_lost_link_of_the_first_device() {
 }
 
 #[test]
-fn another_device_takes_a_place() {
+fn swapped_device_takes_the_position() {
     let mut bus = bus(&["YY"; 3]);
     bus.address_all();
     let old = bus.segment.swap(1, sim(&io_device())).unwrap();
@@ -229,7 +229,7 @@ fn another_device_takes_a_place() {
     assert_eq!(bus.segment.device(1).unwrap().name(), "IO16");
     assert_eq!(count(&mut bus), Some(3));
     assert_eq!(bus.read(0x1003, 0x310, 4), [1, 0, 0, 0]);
-    // One without a second socket ends the line.
+    // A device without a second socket ends the line.
     bus.segment.swap(1, with_physics("Y"));
     assert_eq!(count(&mut bus), Some(2));
     bus.segment.swap(1, old);
@@ -239,7 +239,7 @@ fn another_device_takes_a_place() {
 }
 
 #[test]
-fn a_loop_closed_by_command_cuts_the_line_and_auto_opens_it() {
+fn closed_loop_cuts_the_line_until_auto() {
     let mut bus = bus(&["YY"; 3]);
     bus.address_all();
     // Port 1 closed.
@@ -253,7 +253,7 @@ fn a_loop_closed_by_command_cuts_the_line_and_auto_opens_it() {
 }
 
 #[test]
-fn a_loop_setting_takes_effect_when_the_frame_is_over() {
+fn loop_setting_takes_effect_after_the_frame() {
     let mut bus = bus(&["YY"; 3]);
     let close = FrameBuilder::default()
         .datagram(2, 0, 0x101, &[0x0c])
@@ -267,7 +267,7 @@ fn a_loop_setting_takes_effect_when_the_frame_is_over() {
 }
 
 #[test]
-fn an_open_port_without_a_link_loses_frames() {
+fn open_port_without_a_link_loses_frames() {
     let mut bus = bus(&["YY"; 2]);
     bus.address_all();
     assert_eq!(bus.datagram(5, 0x1002, 0x101, &[0x08]).1, 1);
@@ -276,10 +276,10 @@ fn an_open_port_without_a_link_loses_frames() {
 }
 
 #[test]
-fn temporary_loop_settings_last_a_second() {
+fn temporary_loop_settings_last_one_second() {
     let mut bus = bus(&["YY"; 2]);
     bus.address_all();
-    // Bit 1: temporary. Port 1 of the last device open without a link.
+    // Bit 1: temporary. Port 1 of the last device is open without a link.
     bus.write(0x1002, 0x100, &[0x03, 0x08]);
     assert_eq!(count(&mut bus), None);
     bus.wait(900 * MS);
@@ -287,7 +287,7 @@ fn temporary_loop_settings_last_a_second() {
     bus.wait(200 * MS);
     assert_eq!(count(&mut bus), Some(2));
     assert_eq!(register(&bus, 1, 0x100, 2), [0x01, 0x00]);
-    // Written twice, it is still the first setting that comes back.
+    // A second temporary setting does not change the setting that is restored.
     bus.write(0x1001, 0x100, &[0x03, 0x0c]);
     bus.write(0x1001, 0x100, &[0x03, 0x0c]);
     bus.wait(1_100 * MS);
@@ -305,7 +305,7 @@ fn auto_close_waits_for_a_command() {
     assert_eq!(lost_links(&bus, 0), [0, 1, 0, 0]);
     assert_eq!(count(&mut bus), Some(1));
     assert_eq!(register(&bus, 0, 0x110, 2), [0x33, 0x5e]);
-    // A link that goes while the port waits is not counted.
+    // A lost link at a waiting port is not counted.
     bus.segment.plug(1, 0, false);
     bus.segment.plug(1, 0, true);
     assert_eq!(lost_links(&bus, 0), [0, 1, 0, 0]);
@@ -314,20 +314,20 @@ fn auto_close_waits_for_a_command() {
 }
 
 #[test]
-fn a_frame_at_an_auto_close_port_opens_it() {
+fn auto_close_port_opens_on_a_frame() {
     let mut bus = bus(&["YY"; 3]);
     bus.address_all();
     // Port 0 of the second device.
     bus.write(0x1002, 0x101, &[0x01]);
     bus.segment.plug(1, 0, false);
     bus.segment.plug(1, 0, true);
-    // The first frame is not let in, but opens the port for the next.
+    // The port drops the first frame and opens for the next.
     assert_eq!(count(&mut bus), None);
     assert_eq!(count(&mut bus), Some(3));
 }
 
 #[test]
-fn with_every_loop_closed_port_0_stays_reachable() {
+fn port_0_stays_reachable_with_every_loop_closed() {
     let mut bus = bus(&["YY"; 2]);
     bus.address_all();
     bus.write(0x1001, 0x101, &[0xff]);
@@ -338,7 +338,7 @@ fn with_every_loop_closed_port_0_stays_reachable() {
 }
 
 #[test]
-fn other_protocols_end_unless_they_are_let_through() {
+fn other_protocols_are_dropped_unless_enabled() {
     let mut bus = bus(&["YY"; 2]);
     bus.address_all();
     let arp = || {
@@ -350,7 +350,7 @@ fn other_protocols_end_unless_they_are_let_through() {
     bus.write(0x1001, 0x100, &[0]);
     assert_eq!(bus.frame(arp()), None, "the second device destroys it");
     bus.write(0x1002, 0x100, &[0]);
-    // Then nothing is marked either.
+    // The source address is not marked either.
     assert_eq!(bus.frame(arp()), Some(arp()));
     let frame = FrameBuilder::default().datagram(7, 0, 0, &[0]).build();
     assert_eq!(bus.frame(frame).unwrap()[6], 0x10);
@@ -369,7 +369,7 @@ fn malformed_frames_pass_and_are_counted() {
     assert_eq!(bus.read(0x1002, 0x30c, 1), [0]);
 }
 
-fn send(segment: &mut Segment, nic: Nic, now: u64) -> (Transit, u16, bool) {
+fn send(segment: &mut Segment, nic: Nic, now: u64) -> (FrameOutcome, u16, bool) {
     let mut bytes = FrameBuilder::default()
         .datagram(7, 0, 0x130, &[0; 2])
         .build();
@@ -378,28 +378,28 @@ fn send(segment: &mut Segment, nic: Nic, now: u64) -> (Transit, u16, bool) {
     (transit, datagram.wkc(&bytes), bytes[23] & 0x40 != 0)
 }
 
-fn back_at(transit: Transit) -> Option<Nic> {
+fn back_at(transit: FrameOutcome) -> Option<Nic> {
     match transit {
-        Transit::Back { nic, .. } => Some(nic),
-        Transit::Lost => None,
+        FrameOutcome::Back { nic, .. } => Some(nic),
+        FrameOutcome::Lost => None,
     }
 }
 
 #[test]
-fn a_whole_ring_carries_frames_from_one_port_to_the_other() {
+fn whole_ring_carries_frames_from_port_to_port() {
     let mut segment = ring(4, SecondPort::Listens);
     let (transit, wkc, _) = send(&mut segment, Nic::Primary, 0);
     assert_eq!((back_at(transit), wkc), (Some(Nic::Secondary), 4));
-    // The other way round it meets no processing unit.
+    // In the other direction no frame passes a processing unit.
     let (transit, wkc, _) = send(&mut segment, Nic::Secondary, 0);
     assert_eq!((back_at(transit), wkc), (Some(Nic::Primary), 0));
-    // No port is closed but those that are not there.
+    // Only the ports that do not exist are closed.
     let last = segment.device(3).unwrap().esc().bytes(0x111, 1);
     assert_eq!(last, [0x5a]);
 }
 
 #[test]
-fn a_broken_ring_serves_every_device_from_one_side_or_the_other() {
+fn broken_ring_reaches_every_device_from_one_side() {
     for broken in 0..=4_usize {
         let mut segment = ring(4, SecondPort::Listens);
         if broken == 4 {
@@ -418,14 +418,14 @@ fn a_broken_ring_serves_every_device_from_one_side_or_the_other() {
         );
         assert_eq!(usize::from(reached), broken);
         assert_eq!(usize::from(others), 4 - broken);
-        // Beyond the break the first device has lost its port 0 and marks what passes.
+        // Beyond the break the first device has lost its port 0 and marks passing frames.
         assert!(!circulating);
         assert_eq!(marked, broken < 4);
     }
 }
 
 #[test]
-fn a_frame_that_circulates_is_destroyed() {
+fn circulating_frame_is_destroyed() {
     let mut segment = ring(2, SecondPort::Listens);
     segment.plug(0, 0, false);
     let mut bytes = FrameBuilder::default()
@@ -434,22 +434,23 @@ fn a_frame_that_circulates_is_destroyed() {
     let once = segment.transit_from(Nic::Secondary, &mut bytes, 0);
     assert_eq!(back_at(once), Some(Nic::Secondary));
     let again = segment.transit_from(Nic::Secondary, &mut bytes, 0);
-    assert_eq!(again, Transit::Lost);
+    assert_eq!(again, FrameOutcome::Lost);
     let datagram = frame::next(&bytes, None).unwrap();
     assert_eq!(datagram.wkc(&bytes), 2, "processed once only");
 }
 
 #[test]
-fn a_ring_that_reflects_looks_like_a_line_to_one_port() {
+fn reflecting_ring_behaves_like_a_line() {
     let mut segment = ring(3, SecondPort::Reflects);
     let (transit, wkc, _) = send(&mut segment, Nic::Primary, 0);
     assert_eq!((back_at(transit), wkc), (Some(Nic::Primary), 3));
     segment.plug(2, 1, false);
     let (transit, wkc, _) = send(&mut segment, Nic::Primary, 0);
     assert_eq!((back_at(transit), wkc), (Some(Nic::Primary), 3));
-    // Broken in front, everything is out of reach: nobody is there to send from the second port.
-    assert_eq!(send(&mut segment, Nic::Secondary, 0).0, Transit::Lost);
+    // A break in front of the first device cuts off all devices: a reflecting second port sends no
+    // frames.
+    assert_eq!(send(&mut segment, Nic::Secondary, 0).0, FrameOutcome::Lost);
     segment.plug(2, 1, true);
     segment.plug(0, 0, false);
-    assert_eq!(send(&mut segment, Nic::Primary, 0).0, Transit::Lost);
+    assert_eq!(send(&mut segment, Nic::Primary, 0).0, FrameOutcome::Lost);
 }

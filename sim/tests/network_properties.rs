@@ -1,4 +1,4 @@
-//! Any network, whatever is done to it.
+//! Random networks under random operations.
 
 mod common;
 
@@ -6,7 +6,7 @@ use common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::network::topology::media;
-use ecaxis_sim::{Nic, SecondPort, Segment, SegmentOptions, SimDevice, Topology, Transit};
+use ecaxis_sim::{FrameOutcome, Nic, SecondPort, Segment, SegmentOptions, SimDevice, Topology};
 use proptest::prelude::*;
 
 const PHYSICS: [&str; 8] = ["YY", "KK", "YKY", "YYYY", "KYKY", "YY K", "K KY", "Y"];
@@ -21,7 +21,7 @@ fn devices(kinds: &[usize]) -> Vec<SimDevice> {
     kinds.iter().map(with_physics).collect()
 }
 
-/// The devices as far as there are ports for them, as a ring where one can be closed.
+/// Returns the devices as far as ports suffice, as a ring where one can be closed.
 fn network(kinds: &[usize], ring: Option<SecondPort>) -> Segment {
     let devices = devices(kinds);
     let media = media(&devices);
@@ -39,14 +39,14 @@ fn network(kinds: &[usize], ring: Option<SecondPort>) -> Segment {
     Segment::with_topology(devices[..n].to_vec(), topology, SegmentOptions::default())
 }
 
-/// A broadcast from a port: where it came out, and how many devices it met.
+/// Sends a broadcast from a port. Returns the port where it came out, and the number of devices.
 fn broadcast(segment: &mut Segment, nic: Nic, now: u64) -> (Option<Nic>, usize) {
     let mut bytes = FrameBuilder::default().datagram(7, 0, 0, &[0]).build();
     let came = segment.transit_from(nic, &mut bytes, now);
     let met = usize::from(frame::next(&bytes, None).unwrap().wkc(&bytes));
     match came {
-        Transit::Back { nic, .. } => (Some(nic), met),
-        Transit::Lost => (None, met),
+        FrameOutcome::Back { nic, .. } => (Some(nic), met),
+        FrameOutcome::Lost => (None, met),
     }
 }
 
@@ -81,7 +81,7 @@ fn ring() -> impl Strategy<Value = Option<SecondPort>> {
     ]
 }
 
-/// Devices that links connect with the MainDevice's first port, by flooding.
+/// Finds the devices with a link to the MainDevice's first port, by flooding.
 fn connected(segment: &Segment, plugged: &[[bool; 4]], powered: &[bool]) -> Vec<bool> {
     let n = segment.len();
     let mut reached = vec![false; n];
@@ -110,7 +110,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn whatever_is_done_every_frame_has_an_end(
+    fn every_frame_ends_after_any_operations(
         kinds in prop::collection::vec(0..PHYSICS.len(), 1..9),
         ring in ring(),
         deeds in prop::collection::vec(deed(), 1..60),
@@ -147,8 +147,8 @@ proptest! {
                 }
             }
         }
-        // A frame reaches the devices whose delay is known before it: it may itself open a port that closed
-        // by itself, for those after it.
+        // A frame reaches the devices whose delay is known before it. It may itself open an
+        // auto-closed port for the devices after it.
         segment.advance(now);
         let known = (0..segment.len()).filter(|n| segment.delay_ns(*n).is_some()).count();
         let (_, met) = broadcast(&mut segment, Nic::Primary, now);
@@ -156,7 +156,7 @@ proptest! {
     }
 
     #[test]
-    fn a_tree_reaches_what_links_and_power_let_it(
+    fn tree_reaches_every_linked_and_powered_device(
         kinds in prop::collection::vec(0..PHYSICS.len(), 1..9),
         deeds in prop::collection::vec((0..9_usize, 0..4_u8, any::<bool>(), any::<bool>()), 0..12),
     ) {
@@ -191,7 +191,7 @@ proptest! {
     }
 
     #[test]
-    fn one_break_leaves_no_device_of_a_ring_without_a_frame(
+    fn ring_with_one_break_reaches_every_device(
         n in 1..9_usize,
         broken in prop::option::of(0..10_usize),
     ) {

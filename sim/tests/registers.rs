@@ -19,7 +19,7 @@ fn drive_like() -> Bus {
     one(sim(&coe_device()))
 }
 
-/// Several datagrams in one frame; their working counters.
+/// Sends several datagrams in one frame. Returns their working counters.
 fn together(bus: &mut Bus, datagrams: &[(u8, u16, &[u8])]) -> Vec<u16> {
     let frame = datagrams
         .iter()
@@ -36,7 +36,7 @@ fn together(bus: &mut Bus, datagrams: &[(u8, u16, &[u8])]) -> Vec<u16> {
     counters
 }
 
-/// The IRQ field of a datagram that touches nothing.
+/// Returns the IRQ field of a datagram without effect.
 fn irq(bus: &mut Bus) -> u16 {
     let bytes = bus
         .frame(FrameBuilder::default().datagram(0, 0, 0, &[0]).build())
@@ -45,7 +45,7 @@ fn irq(bus: &mut Bus) -> u16 {
 }
 
 #[test]
-fn protected_registers_are_written_in_the_frame_that_enables_them() {
+fn protected_registers_accept_writes_in_the_enabling_frame() {
     let mut bus = drive_like();
     let divider: (u8, u16, &[u8]) = (5, 0x400, &[1, 2]);
     let ram: (u8, u16, &[u8]) = (5, 0x1e00, &[1]);
@@ -78,7 +78,7 @@ fn three_frames_with_res_reset_the_controller() {
             [progress]
         );
     }
-    // A frame in between starts it anew.
+    // Another frame in between restarts the sequence.
     assert_eq!(bus.read(S, 0x40, 1), [2]);
     bus.write(S, 0x40, b"S");
     assert_eq!(bus.read_u16(S, 0x130), 2);
@@ -96,7 +96,7 @@ fn three_frames_with_res_reset_the_controller() {
 }
 
 #[test]
-fn events_reach_the_irq_field_through_the_mask_and_leave_when_read() {
+fn events_set_the_masked_irq_field_until_read() {
     let mut bus = drive_like();
     assert_eq!(bus.read_u16(S, 0x210), 0x0004, "DL status since power-on");
     assert_eq!(irq(&mut bus), 0, "masked");
@@ -105,7 +105,7 @@ fn events_reach_the_irq_field_through_the_mask_and_leave_when_read() {
     bus.read(S, 0x111, 1);
     assert_eq!(irq(&mut bus), 0, "any byte of it acknowledges");
     bus.preop(S);
-    // Reading AL status is what `preop` did last.
+    // `preop` has read AL status last.
     assert_eq!(irq(&mut bus), 0);
     bus.write(S, 0x120, &[1]);
     bus.wait(1_000_000);
@@ -116,7 +116,7 @@ fn events_reach_the_irq_field_through_the_mask_and_leave_when_read() {
     assert_eq!(irq(&mut bus), 0);
     bus.write(S, 0x120, &[0x11]);
     bus.wait(1_000_000);
-    assert_eq!(irq(&mut bus), 0, "the same state is no change");
+    assert_eq!(irq(&mut bus), 0, "the state did not change");
 }
 
 #[test]
@@ -133,9 +133,9 @@ fn events_of_all_devices_are_ored() {
 }
 
 #[test]
-fn sync_managers_show_in_the_event_registers_they_are_told_to() {
+fn sync_managers_set_their_enabled_event_registers() {
     let mut bus = drive_like();
-    // Bit 4 of the control byte: tell the MainDevice; bit 5: tell the device.
+    // Bit 4 of the control byte enables the ECAT event, bit 5 the PDI event.
     bus.sm(S, 0, 0x1000, 48, 0x36);
     bus.sm(S, 1, 0x1030, 48, 0x32);
     bus.to(S, PREOP);
@@ -158,7 +158,7 @@ fn sync_managers_show_in_the_event_registers_they_are_told_to() {
 }
 
 #[test]
-fn the_device_is_told_of_al_control_and_of_sync_manager_changes() {
+fn device_sees_al_control_and_sync_manager_events() {
     let mut bus = drive_like();
     bus.write(S, 0x120, &[1, 0]);
     assert_eq!(bus.read(S, 0x220, 1)[0] & 1, 1);
@@ -184,7 +184,7 @@ fn terminal_in_op(control: u8) -> Bus {
 }
 
 #[test]
-fn the_process_data_watchdog_follows_divider_and_time() {
+fn process_data_watchdog_follows_divider_and_time() {
     // (divider, time, nanoseconds until it expires)
     for (divider, time, ns) in [
         (0x09c2_u16, 10_u16, 1_000_000),
@@ -208,7 +208,7 @@ fn the_process_data_watchdog_follows_divider_and_time() {
 }
 
 #[test]
-fn a_watchdog_of_zero_or_a_sync_manager_that_does_not_trigger_never_expires() {
+fn watchdog_of_zero_or_without_trigger_never_expires() {
     let mut bus = terminal_in_op(0x44);
     bus.write(S, 0x1000, &[1, 2]);
     bus.write(S, 0x420, &[0, 0]);
@@ -236,7 +236,7 @@ fn watchdog_counters_stop_at_255_and_are_cleared_by_any_write() {
 }
 
 #[test]
-fn a_crashed_application_lets_its_own_watchdog_expire() {
+fn crashed_application_lets_its_pdi_watchdog_expire() {
     let mut bus = drive_like();
     bus.preop(S);
     bus.write(S, 0x200, &[0x04, 0]);
@@ -263,7 +263,7 @@ fn a_crashed_application_lets_its_own_watchdog_expire() {
 }
 
 #[test]
-fn errors_are_acknowledged_or_left_for_init() {
+fn errors_end_by_acknowledge_or_init() {
     let mut bus = drive_like();
     bus.preop(S);
     assert_eq!(bus.request(S, 8), (0x12, 0x11));
@@ -294,11 +294,15 @@ fn bootstrap_is_entered_from_init_and_left_to_init() {
     assert_eq!(bus.request(S, 0x14), (0x13, 0x11));
     assert_eq!(bus.request(S, 1), (1, 0));
     let mut bus = drive_like();
-    assert_eq!(bus.request(S, 3), (0x11, 0x13), "there is no Bootstrap");
+    assert_eq!(
+        bus.request(S, 3),
+        (0x11, 0x13),
+        "Bootstrap is not supported"
+    );
 }
 
 #[test]
-fn a_device_identifies_itself_while_asked_to() {
+fn device_shows_its_identification_on_request() {
     let options = DeviceOptions {
         alias: 77,
         ..DeviceOptions::default()
@@ -310,7 +314,7 @@ fn a_device_identifies_itself_while_asked_to() {
     assert_eq!(bus.request(S, 0x28), (0x12, 0x11), "an error goes first");
 }
 
-/// A terminal whose controller answers for it (bit 8 of the EEPROM's first word).
+/// Returns a terminal with device emulation (bit 8 of the EEPROM's first word).
 fn emulated() -> Device {
     let mut device = io_device();
     device.eeprom.config_data = vec![4, 1, 0, 0x44];
@@ -318,7 +322,7 @@ fn emulated() -> Device {
 }
 
 #[test]
-fn a_controller_that_answers_for_its_device_copies_what_it_is_told() {
+fn device_emulation_copies_al_control_to_al_status() {
     let mut bus = one(sim(&emulated()));
     for control in [0x0002_u16, 0x0008, 0x0011, 0x0004, 0x0001, 0x0007, 0x0014] {
         bus.write(S, 0x120, &control.to_le_bytes());
@@ -329,7 +333,7 @@ fn a_controller_that_answers_for_its_device_copies_what_it_is_told() {
         );
         assert_eq!(bus.read_u16(S, 0x134), 0);
     }
-    // Nobody closes SyncManagers, and nobody minds the watchdog.
+    // With device emulation no application closes SyncManagers or reacts to the watchdog.
     bus.write(S, 0x120, &[1, 0]);
     bus.sm(S, 0, 0x1000, 2, 0x44);
     assert_eq!(bus.datagram(5, S, 0x1000, &[1, 2]).1, 1);

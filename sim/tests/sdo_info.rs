@@ -1,4 +1,4 @@
-//! SDO Information (ETG.1000.6 §5.6.3): a device described by itself must be the device of its ESI.
+//! SDO Information (ETG.1000.6 §5.6.3): a device's own description must match its ESI.
 
 mod common;
 
@@ -12,7 +12,7 @@ fn bus(len: u16) -> Bus {
     mailbox_bus(len, DeviceOptions::default())
 }
 
-/// Sends a request and puts the fragments together; the abort code of an SDO Info error.
+/// Sends a request and joins the fragments. Returns the abort code of an SDO Info error.
 fn ask(bus: &mut Bus, opcode: u8, body: &[u8]) -> Result<Vec<u8>, u32> {
     let mut payload = vec![0, 0x80, opcode, 0, 0, 0];
     payload.extend_from_slice(body);
@@ -70,7 +70,7 @@ fn entry(bus: &mut Bus, index: u16, sub: u8, asked: u8) -> Result<Entry, u32> {
 }
 
 #[test]
-fn every_object_of_the_esi_is_listed_and_described() {
+fn esi_objects_are_listed_and_described() {
     let device = mailbox_device();
     for len in [16, 18, 48, 1486] {
         let mut bus = bus(len);
@@ -125,7 +125,7 @@ fn every_object_of_the_esi_is_listed_and_described() {
 }
 
 #[test]
-fn the_five_lists_have_the_lengths_that_list_0_tells() {
+fn object_lists_have_the_lengths_of_list_0() {
     let mut bus = bus(48);
     let lengths = list(&mut bus, 0).unwrap();
     let lists: Vec<_> = (1..=5).map(|kind| list(&mut bus, kind).unwrap()).collect();
@@ -140,7 +140,7 @@ fn the_five_lists_have_the_lengths_that_list_0_tells() {
 }
 
 #[test]
-fn object_types_are_those_of_the_standard() {
+fn object_types_match_the_standard() {
     let mut bus = bus(48);
     for (index, data_type) in [
         (0x1000_u16, 0x07_u16),
@@ -171,7 +171,7 @@ fn object_types_are_those_of_the_standard() {
 }
 
 #[test]
-fn values_are_told_where_they_are_asked_for_and_known() {
+fn entry_descriptions_contain_requested_known_values() {
     let mut bus = bus(48);
     let all = entry(&mut bus, 0x2020, 0, 0x7f).unwrap();
     assert_eq!(all.info, 0x7f);
@@ -191,7 +191,7 @@ fn values_are_told_where_they_are_asked_for_and_known() {
         (gap.info, &gap.rest[..4]),
         (0x10, &(-2_i32).to_le_bytes()[..])
     );
-    // The default is the maker's, not the present value.
+    // The default value is the vendor's, not the present value.
     bus.download(S, 0x2020, 0, &[7, 0, 0, 0]).unwrap();
     assert_eq!(entry(&mut bus, 0x2020, 0, 0x10).unwrap().rest[..4], [0; 4]);
     let no_unit = entry(&mut bus, 0x2021, 0, 0x7f).unwrap();
@@ -221,10 +221,10 @@ fn refusals_are_sdo_information_errors() {
 }
 
 #[test]
-fn a_new_request_takes_the_place_of_fragments_that_nobody_fetches() {
+fn new_request_replaces_unfetched_fragments() {
     let mut bus = bus(16);
     bus.mailbox(S, 3, &[0, 0x80, 1, 0, 0, 0, 1, 0]);
-    // The second fragment lies in the mailbox; the others never get there.
+    // The second fragment is in the mailbox; the others are never sent.
     bus.send_mailbox(S, 3, &[0, 0x80, 3, 0, 0, 0, 0x25, 0x20]);
     bus.wait(1_000_000);
     assert_eq!(bus.fetch(S).unwrap().1[2], 0x82);
@@ -232,7 +232,7 @@ fn a_new_request_takes_the_place_of_fragments_that_nobody_fetches() {
 }
 
 #[test]
-fn the_esis_flag_decides_unless_an_option_does() {
+fn esi_flag_enables_sdo_info_unless_an_option_overrides_it() {
     let list = [0, 0x80, 1, 0, 0, 0, 1, 0];
     for (esi, option, expected) in [
         (false, None, 0),

@@ -1,19 +1,19 @@
-//! What an ESI offers for a drive becomes a simulated drive, in every cyclic mode.
+//! The drives of an ESI become simulated drives, in every cyclic mode.
 
-#![allow(clippy::print_stderr, reason = "tests say what they did")]
+#![allow(clippy::print_stderr, reason = "prints the tested drives")]
 
 mod common;
 
 use common::*;
 use ecaxis_esi::model::{Device, Entry, EsiFile};
-use ecaxis_esi::{Choice, Mode, offered_modes, select};
+use ecaxis_esi::{Mode, SelectOptions, offered_modes, select};
 use ecaxis_sim::{DeviceOptions, SimDevice};
 
-fn choice(mode: Mode) -> Choice<'static> {
-    Choice {
+fn choice(mode: Mode) -> SelectOptions<'static> {
+    SelectOptions {
         mode: Some(mode),
         cycle_ns: 1_000_000,
-        ..Choice::default()
+        ..SelectOptions::default()
     }
 }
 
@@ -43,7 +43,7 @@ fn esi_files() -> Vec<(String, EsiFile)> {
 }
 
 #[test]
-fn drives_that_say_so_in_a_channel() {
+fn drives_are_detected_by_channel_profile() {
     for path in [
         "esi/stepperonline/STEPPERONLINE_A6_Servo_V0.02.xml",
         "esi/inovance/SV660_EOE_1Axis_V9.12.xml",
@@ -60,7 +60,7 @@ fn drives_that_say_so_in_a_channel() {
 }
 
 #[test]
-fn every_drive_in_every_cyclic_mode_it_offers() {
+fn drives_move_in_every_cyclic_mode_they_offer() {
     if fixture("README.md").is_none() {
         return;
     }
@@ -106,10 +106,10 @@ fn every_drive_in_every_cyclic_mode_it_offers() {
     assert!(drives >= 10 && chosen >= 25, "{drives}, {chosen}");
 }
 
-/// No profile number, no dictionary entry for it: the PDOs show that it is a drive. A torque limit that the
-/// process data brings acts from the first cycle, also as zero.
+/// No profile number and no dictionary entry for it: the PDOs identify the drive. A mapped torque
+/// limit acts from the first cycle, also with the value zero.
 #[test]
-fn a_drive_known_by_its_pdos_obeys_a_torque_limit_of_zero() {
+fn drive_detected_by_its_pdos_obeys_a_torque_limit_of_zero() {
     const S: u16 = 0x1001;
     let mut device = coe_device();
     let entries = |entries: &mut Vec<Entry>, list: &[(u16, u16)]| {

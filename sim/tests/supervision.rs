@@ -1,4 +1,4 @@
-//! A device that works by SYNC0: outputs that come too late, SYNC0 that stays away, frames that stop.
+//! A device with SYNC0: late outputs, a missing SYNC0, missing frames.
 
 mod common;
 
@@ -12,7 +12,7 @@ const CYCLE: u64 = 1_000_000;
 const CYCLIC_VELOCITY: u8 = 9;
 const PROFILE_VELOCITY: u8 = 3;
 
-/// 0x10F1:02 and the two entries of 0x1C32 that tell of it.
+/// Returns a drive with 0x10F1:02 and the two entries of 0x1C32 for late outputs.
 fn drive(limit: u8) -> SimDevice {
     let mut device = coe_device();
     device.profile = Some(402);
@@ -44,7 +44,7 @@ fn drive(limit: u8) -> SimDevice {
     sim(&device)
 }
 
-/// In Op by SYNC0, one process data frame in the middle of every cycle so far.
+/// Returns a bus in Op with SYNC0 and one process data frame in the middle of every cycle so far.
 fn in_op(limit: u8) -> Bus {
     let mut bus = Bus::new(vec![drive(limit)]);
     bus.address_all();
@@ -67,7 +67,7 @@ fn in_op(limit: u8) -> Bus {
     bus
 }
 
-/// One cycle each, with a process data frame or without.
+/// Runs one cycle each, with a process data frame or without.
 fn run(bus: &mut Bus, frames: &[bool]) {
     for frame in frames {
         let next = bus.now + CYCLE;
@@ -79,7 +79,7 @@ fn run(bus: &mut Bus, frames: &[bool]) {
     }
 }
 
-/// AL status and code.
+/// Returns AL status and code.
 fn status(bus: &mut Bus) -> (u16, u16) {
     let now = bus.now;
     let status = (bus.read_u16(STATION, 0x130), bus.read_u16(STATION, 0x134));
@@ -92,10 +92,10 @@ fn object(bus: &Bus, index: u16, sub: u8) -> Vec<u8> {
     device.object(index, sub).unwrap()
 }
 
-/// Each missing frame counts three, each that comes takes one off.
+/// Each missing frame adds three to the counter, each received frame subtracts one.
 #[test]
 fn missing_outputs_end_op_above_the_limit_of_0x10f1() {
-    // Limit; frames that come (+) and do not (-); whether it is still in Op.
+    // Limit; received (+) and missing (-) frames; true if still in Op.
     let rows = [
         (4, "-", true),
         (4, "--", false),
@@ -134,24 +134,24 @@ fn op_is_entered_again_after_an_acknowledge() {
     bus.write(STATION, 0x120, &8_u16.to_le_bytes());
     run(&mut bus, &[true; 5]);
     assert_eq!(status(&mut bus), (8, 0));
-    // Nothing is left of the errors before.
+    // The earlier errors no longer count.
     run(&mut bus, &[false, true, true, true]);
     assert_eq!(status(&mut bus), (8, 0));
 }
 
-/// What takes the device out of Op.
+/// The cause for leaving Op.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Loss {
     Outputs,
     /// The MainDevice switches SYNC0 off.
     Sync0Off,
-    /// A single shot is all that is left of it.
+    /// SYNC0 becomes a single shot.
     Sync0Stays,
     Frames,
     Request,
 }
 
-/// The mode, written and enabled over SDO.
+/// Writes the mode and enables the drive over SDO.
 fn enable(bus: &mut Bus, mode: u8) {
     bus.download(STATION, 0x6060, 0, &[mode]).unwrap();
     for word in [0x06_u16, 0x07, 0x0f] {
@@ -164,7 +164,7 @@ fn enable(bus: &mut Bus, mode: u8) {
 }
 
 #[test]
-fn each_loss_has_its_al_status_code_and_its_emergency() {
+fn sync_losses_have_their_al_status_code_and_emergency() {
     // In a cyclic mode, in a profile mode.
     let rows = [
         (Loss::Outputs, 0x1a, 0x8250, 0x8180),
@@ -176,7 +176,7 @@ fn each_loss_has_its_al_status_code_and_its_emergency() {
     for (loss, code, cyclic, profile) in rows {
         for (mode, emergency) in [(CYCLIC_VELOCITY, cyclic), (PROFILE_VELOCITY, profile)] {
             let what = format!("{loss:?} in mode {mode}");
-            // The mailbox takes longer than a cycle: supervised only from now on.
+            // The mailbox takes longer than a cycle, so supervision starts only here.
             let mut bus = in_op(0);
             enable(&mut bus, mode);
             if loss == Loss::Outputs {

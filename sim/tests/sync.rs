@@ -1,4 +1,4 @@
-//! SYNC0, SYNC1, latches and the registers of the clock, as seen over the wire.
+//! SYNC0, SYNC1, latches and the clock registers, accessed over the wire.
 
 mod common;
 
@@ -8,7 +8,7 @@ use ecaxis_sim::{DeviceOptions, EscInfo};
 const S: u16 = 0x1001;
 const MS: u64 = 1_000_000;
 
-/// One device whose system time is true time, near enough.
+/// Returns a device whose system time is about true time.
 fn clock() -> Bus {
     clock_of(None)
 }
@@ -27,7 +27,7 @@ fn u64_at(bus: &mut Bus, at: u16) -> u64 {
     u64::from_le_bytes(bus.read(S, at, 8).try_into().unwrap())
 }
 
-/// SYNC0 and SYNC1 cycle times and the start.
+/// Sets SYNC0 and SYNC1 cycle times and the start time.
 fn set(bus: &mut Bus, cycles: [u32; 2], start: u64) {
     let cycles = cycles.map(u32::to_le_bytes).concat();
     bus.write(S, 0x9a0, &cycles);
@@ -40,7 +40,7 @@ fn pulses(bus: &Bus) -> [Vec<u64>; 2] {
 }
 
 #[test]
-fn both_outputs_and_their_next_times() {
+fn sync_outputs_show_their_next_times() {
     let mut bus = clock();
     set(&mut bus, [1_000_000, 1_500_000], 20 * MS);
     assert_eq!(u64_at(&mut bus, 0x990), 20 * MS);
@@ -60,7 +60,7 @@ fn both_outputs_and_their_next_times() {
 }
 
 #[test]
-fn outputs_are_switched_one_by_one() {
+fn sync_outputs_switch_separately() {
     for (activation, expected) in [
         (0x01, [0, 0]),
         (0x03, [5, 0]),
@@ -80,7 +80,7 @@ fn outputs_are_switched_one_by_one() {
 }
 
 #[test]
-fn a_single_shot_is_one_pulse() {
+fn single_shot_is_one_pulse() {
     let mut bus = clock();
     set(&mut bus, [0, 0], 20 * MS);
     bus.write(S, 0x981, &[3]);
@@ -95,7 +95,7 @@ fn a_single_shot_is_one_pulse() {
 }
 
 #[test]
-fn writing_the_start_time_may_activate() {
+fn start_time_write_may_activate() {
     let mut bus = clock();
     bus.write(S, 0x9a0, &1_000_000_u32.to_le_bytes());
     bus.write(S, 0x981, &[0x0a]);
@@ -103,7 +103,7 @@ fn writing_the_start_time_may_activate() {
     assert_eq!(bus.read(S, 0x981, 1), [0x0b]);
     bus.wait(25_500_000 - bus.now);
     assert_eq!(pulses(&bus)[0].len(), 6);
-    // 32 bits, completed from the present time.
+    // A start time of 32 bits is completed from the present time.
     bus.wait(5_000_000_000);
     bus.write(S, 0x981, &[0]);
     bus.write(S, 0x981, &[0x1a]);
@@ -115,14 +115,14 @@ fn writing_the_start_time_may_activate() {
 }
 
 #[test]
-fn an_implausible_start_time_starts_at_once_and_says_so() {
+fn implausible_start_time_starts_at_once_and_is_reported() {
     let mut bus = clock();
     bus.wait(100 * MS);
     set(&mut bus, [1_000_000, 0], 50 * MS);
     bus.write(S, 0x981, &[0x23]);
     assert_eq!(bus.read(S, 0x984, 1)[0] & 4, 4);
     assert!(!pulses(&bus)[0].is_empty());
-    // A chip without the enhanced activation knows none of this.
+    // A chip without the enhanced activation does not support this.
     let mut bus = clock_of(Some(EscInfo::ET1100));
     bus.wait(100 * MS);
     set(&mut bus, [1_000_000, 0], 50 * MS);
@@ -134,7 +134,7 @@ fn an_implausible_start_time_starts_at_once_and_says_so() {
 }
 
 #[test]
-fn a_debug_pulse_is_one_pulse_now() {
+fn debug_pulse_is_one_immediate_pulse() {
     let mut bus = clock();
     bus.write(S, 0x981, &[0x86]);
     assert_eq!(bus.read(S, 0x981, 1), [0x06]);
@@ -143,7 +143,7 @@ fn a_debug_pulse_is_one_pulse_now() {
 }
 
 #[test]
-fn in_acknowledge_mode_a_crashed_application_gets_one_pulse() {
+fn acknowledge_mode_gives_a_crashed_application_one_pulse() {
     // No pulse length in the EEPROM: acknowledge mode.
     let mut bus = clock();
     set(&mut bus, [1_000_000, 0], 20 * MS);
@@ -164,7 +164,7 @@ fn in_acknowledge_mode_a_crashed_application_gets_one_pulse() {
 }
 
 #[test]
-fn the_cyclic_unit_may_belong_to_the_device() {
+fn cyclic_unit_is_assignable_to_the_device() {
     let mut bus = clock();
     // (0x0980, address, length, accepted from the MainDevice)
     for (control, at, len, accepted) in [
@@ -188,7 +188,7 @@ fn the_cyclic_unit_may_belong_to_the_device() {
             "0x0980 = 0x{control:02x}, 0x{at:04x}"
         );
     }
-    // Assigned and activated with one datagram, as AssignActivate has it.
+    // Assigned and activated with one datagram, as AssignActivate does.
     bus.write(S, 0x980, &[0, 0]);
     set(&mut bus, [1_000_000, 0], 20 * MS);
     bus.write(S, 0x980, &[1, 3]);
@@ -197,7 +197,7 @@ fn the_cyclic_unit_may_belong_to_the_device() {
 }
 
 #[test]
-fn times_are_frozen_with_their_first_byte() {
+fn clock_times_freeze_at_their_first_byte() {
     let mut bus = clock();
     set(&mut bus, [1_000_000, 500_000], 20 * MS);
     bus.write(S, 0x981, &[7]);
@@ -258,7 +258,7 @@ fn latches_take_the_time_of_edges() {
 }
 
 #[test]
-fn a_latch_unit_of_the_device_tells_the_device() {
+fn latch_unit_of_the_device_sets_pdi_events() {
     let mut bus = clock();
     bus.write(S, 0x9a8, &[1]);
     bus.write(S, 0x980, &[0x10]);
@@ -280,7 +280,7 @@ fn a_latch_unit_of_the_device_tells_the_device() {
 }
 
 #[test]
-fn sync_manager_accesses_leave_their_time() {
+fn sync_manager_accesses_store_their_time() {
     let mut bus = clock();
     bus.write(S, 0x800, &[0, 0x10, 48, 0, 0x26, 0, 0x41, 0]);
     bus.sm(S, 1, 0x1030, 48, 0x22);
@@ -291,7 +291,7 @@ fn sync_manager_accesses_leave_their_time() {
 }
 
 #[test]
-fn receive_times_are_taken_at_ports_by_bwr_and_fpwr_only() {
+fn port_receive_times_latch_only_on_bwr_and_fpwr() {
     let mut bus = clock();
     // (command, address, taken at the port, taken at the processing unit)
     for (command, address, port, unit) in [
@@ -313,7 +313,7 @@ fn receive_times_are_taken_at_ports_by_bwr_and_fpwr_only() {
 }
 
 #[test]
-fn a_clock_of_32_bits_lacks_the_upper_halves_and_wraps() {
+fn clock_of_32_bits_lacks_the_upper_halves_and_wraps() {
     let narrow = EscInfo {
         features: EscInfo::LAN9252.features & !0x0008,
         ..EscInfo::LAN9252
@@ -324,7 +324,7 @@ fn a_clock_of_32_bits_lacks_the_upper_halves_and_wraps() {
         assert_eq!(bus.datagram(4, S, at, &[0; 4]).1, 0, "0x{at:04x}");
     }
     assert_eq!(bus.read(S, 0x910, 8)[4..], [0; 4]);
-    // A start time that has gone by comes again after 4.3 s.
+    // A past start time recurs after 4.3 s.
     bus.wait(100 * MS);
     bus.write(S, 0x9a0, &1_000_000_u32.to_le_bytes());
     bus.write(S, 0x990, &(50 * MS as u32).to_le_bytes());
@@ -337,7 +337,7 @@ fn a_clock_of_32_bits_lacks_the_upper_halves_and_wraps() {
 }
 
 #[test]
-fn a_start_time_beyond_everything_hangs_nothing() {
+fn huge_start_time_does_not_hang() {
     let mut bus = clock();
     for (cycle, start) in [
         (1, 20 * MS),

@@ -25,7 +25,7 @@ fn chain(file: &EsiFile, names: &[&str]) -> Bus {
     bus
 }
 
-/// One bit FMMU: `bits` from bit `bit` of a logical byte to bit 0 of `physical`.
+/// Sets a bit FMMU: `bits` from bit `bit` of a logical byte to bit 0 of `physical`.
 fn bit_fmmu(bus: &mut Bus, station: u16, logical: u32, bit: u8, bits: u8, physical: u16, kind: u8) {
     let [l0, l1, l2, l3] = logical.to_le_bytes();
     let [p0, p1] = physical.to_le_bytes();
@@ -34,7 +34,7 @@ fn bit_fmmu(bus: &mut Bus, station: u16, logical: u32, bit: u8, bits: u8, physic
     bus.write(station, 0x600, &r);
 }
 
-/// Everything to Op; terminals get the SyncManager of their kind.
+/// Takes all devices to Op; terminals get the SyncManager of their kind.
 fn operate(bus: &mut Bus, names: &[&str]) {
     for (station, name) in (0x1001..).zip(names) {
         match name.as_bytes() {
@@ -57,7 +57,7 @@ fn outputs(bus: &Bus, position: usize) -> Vec<i64> {
 }
 
 #[test]
-fn each_of_ours_reaches_op_with_its_bits() {
+fn project_terminals_reach_op_with_their_bits() {
     let file = ours();
     for (name, outputs, inputs) in [
         ("CP0", 0, 0),
@@ -116,15 +116,12 @@ fn inputs_are_sampled_when_the_frame_arrives() {
     operate(&mut bus, &["DI8"]);
     let terminal = bus.segment.device_mut(0).unwrap();
     assert!(terminal.set_input(0x6070, 1, 1));
-    assert!(
-        !terminal.set_input(0x6080, 1, 1),
-        "there is no ninth channel"
-    );
+    assert!(!terminal.set_input(0x6080, 1, 1), "only eight channels");
     assert_eq!(bus.logical(10, 0x1_0000, &[0]), (vec![0x80], 1));
 }
 
 #[test]
-fn outputs_rest_outside_op_and_when_the_watchdog_expires() {
+fn outputs_are_off_outside_op_and_after_watchdog_expiry() {
     let mut bus = chain(&ours(), &["DO8"]);
     bus.sm(0x1001, 0, 0x0f00, 1, 0x44);
     bus.fmmu(0x1001, 0, 0x1_0000, 1, 0x0f00, 2);
@@ -142,7 +139,7 @@ fn outputs_rest_outside_op_and_when_the_watchdog_expires() {
     assert_eq!(on(&bus), 7);
     bus.wait(2_000_000);
     assert_eq!(on(&bus), 0, "100 ms without process data");
-    // Nobody is there who could leave Op.
+    // With device emulation no application can leave Op.
     assert_eq!(
         (bus.read_u16(0x1001, 0x130), bus.read_u16(0x1001, 0x134)),
         (8, 0)
@@ -155,9 +152,10 @@ fn outputs_rest_outside_op_and_when_the_watchdog_expires() {
     assert_eq!(on(&bus), 0);
 }
 
-/// As EK1100, EL1004 and EL2828 do in recordings: AL status is AL control, acknowledge bit and all.
+/// AL status copies AL control including the acknowledge bit, as recordings of EK1100, EL1004 and
+/// EL2828 show.
 #[test]
-fn an_emulated_device_says_what_it_is_told() {
+fn device_emulation_copies_al_control_with_acknowledge() {
     let mut bus = chain(&ours(), &["CP0", "DO8"]);
     for station in [0x1001, 0x1002] {
         for (control, state) in [
@@ -177,7 +175,7 @@ fn an_emulated_device_says_what_it_is_told() {
 }
 
 #[test]
-fn a_makers_coupler_and_terminals() {
+fn vendor_coupler_and_terminals_exchange_bits() {
     let read = |path| Some(ecaxis_esi::parse(&fixture(path)?).unwrap());
     let (Some(couplers), Some(terminals)) = (
         read("esi/beckhoff/Beckhoff EK11xx.xml"),

@@ -1,13 +1,13 @@
-//! Nothing that is in a file may be more than a remark.
+//! Any file content causes at most a remark.
 
-use ecaxis::analyze::{self, Known};
+use ecaxis::analyze::{self, Context};
 use ecaxis::session::Options;
 use proptest::prelude::*;
 
 use super::common::{axes, machine, virtual_time};
 use super::{analyzed, captures, of_file, recorded, well_formed};
 
-/// The first part of a run, configuration and some cycles.
+/// The first part of a run: configuration and some cycles.
 fn sample() -> &'static [u8] {
     static SAMPLE: std::sync::OnceLock<Vec<u8>> = std::sync::OnceLock::new();
     SAMPLE.get_or_init(|| {
@@ -24,18 +24,18 @@ fn sample() -> &'static [u8] {
 }
 
 fn survives(bytes: &[u8]) {
-    let report = analyzed(bytes, Known::default());
+    let report = analyzed(bytes, Context::default());
     well_formed(&analyze::html("x", &report));
     serde_json::to_string(&report).expect("JSON");
 }
 
 #[test]
-fn every_capture_cut_anywhere() {
+fn every_capture_may_be_cut_anywhere() {
     let mut tried = 0;
     for path in captures() {
         let bytes = std::fs::read(&path).expect("readable");
         let whole = of_file(&path);
-        // Every byte of short ones and of the ends, some of the others.
+        // Cuts short captures at every byte, longer captures at about 60 places and near the end.
         let step = if bytes.len() < 2_000 {
             1
         } else {
@@ -43,10 +43,10 @@ fn every_capture_cut_anywhere() {
         };
         let ends = (0..bytes.len())
             .step_by(step)
-            // Seven and four have nothing in common: blocks are padded to four.
+            // Blocks are padded to four bytes, and steps of seven reach all offsets within a block.
             .chain((bytes.len() - 120..bytes.len()).step_by(7));
         for end in ends {
-            let report = analyzed(&bytes[..end], Known::default());
+            let report = analyzed(&bytes[..end], Context::default());
             assert!(report.file.ethercat_frames <= whole.file.ethercat_frames);
             assert!(report.devices.len() <= whole.devices.len(), "cut at {end}");
             tried += 1;
@@ -59,7 +59,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(96))]
 
     #[test]
-    fn damage_is_a_remark(
+    fn damage_causes_at_most_a_remark(
         cut in 0_usize..120_000,
         flips in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..60),
         noise in prop::collection::vec(any::<u8>(), 0..300),
@@ -76,9 +76,9 @@ proptest! {
         survives(&bytes);
     }
 
-    /// Sound files with hostile frames: what is inside is noise.
+    /// The files are valid, but the frames contain noise.
     #[test]
-    fn hostile_frames(seed in prop::collection::vec(any::<(u8, u16, u16, Vec<u8>, u16)>(), 1..40)) {
+    fn hostile_frames_cause_at_most_a_remark(seed in prop::collection::vec(any::<(u8, u16, u16, Vec<u8>, u16)>(), 1..40)) {
         let mut file = Vec::new();
         for word in [0xa1b2_3c4d_u32, 0x0004_0002, 0, 0, 65_535, 1] {
             file.extend(word.to_le_bytes());
@@ -90,7 +90,7 @@ proptest! {
                 let mut frame = vec![0xff; 6];
                 frame.extend([way, 1, 1, 1, 1, 1, 0x88, 0xa4]);
                 frame.extend((0x1000 | (len + 12)).to_le_bytes());
-                // Registers and mailboxes that mean something are met more often than not.
+                // Prefers registers and mailboxes that the analysis interprets.
                 let ado = [0x10, 0x120, 0x130, 0x502, 0x508, 0x600, 0x800, 0x910, 0x92c, 0x1000, 0x1800, *ado];
                 frame.extend([command % 16, n as u8]);
                 frame.extend((adp % 4).to_le_bytes());

@@ -1,4 +1,4 @@
-//! A recording in the place of a bus.
+//! A recording replaces the bus.
 
 use ecaxis::session::{Options, Progress};
 
@@ -11,17 +11,17 @@ fn moved(options: Options) -> (String, Vec<String>) {
         panic!("{error}; {:?}", heard.warnings());
     }
     let mut summary = serde_json::to_value(outcome.summary.expect("a summary")).expect("JSON");
-    // Of the recording itself.
+    // These keys describe the recording itself.
     for key in ["recorded_frames", "recorded_frames_dropped"] {
         summary.as_object_mut().expect("an object").remove(key);
     }
-    let told = heard
+    let reported = heard
         .0
         .iter()
         .filter(|progress| !matches!(progress, Progress::Status(_)));
     (
         summary.to_string(),
-        told.map(|progress| format!("{progress:?}")).collect(),
+        reported.map(|progress| format!("{progress:?}")).collect(),
     )
 }
 
@@ -37,7 +37,7 @@ fn a_replayed_run_has_the_same_outcome() {
         record: Some(path.clone()),
         ..once.clone()
     });
-    // Recorded again, the replay has the same bytes at the same times.
+    // A recording of the replay has the same bytes at the same times.
     let again = folder.path().join("again.pcapng");
     let second = moved(Options {
         replay: Some(path.clone()),
@@ -51,7 +51,7 @@ fn a_replayed_run_has_the_same_outcome() {
 }
 
 #[test]
-fn a_run_that_deviates_is_told_where() {
+fn a_replay_reports_where_the_run_deviates() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let once = Options {
         repeat: Some(1),
@@ -62,26 +62,27 @@ fn a_run_that_deviates_is_told_where() {
         replay: Some(path.clone()),
         ..once.clone()
     };
-    // Another target: the same frames with other set-points. Axes that do not obey are noticed.
+    // Another target gives the same frames with other set-points. The supervision notices axes that
+    // do not follow.
     let text =
         std::fs::read_to_string(root().join("configs/demo.toml")).expect("the demonstration");
     let other = machine(&text.replace("x = 50.0, y = 50.0", "x = 40.0, y = 50.0"));
     let (outcome, heard) = run(other, replay());
     assert!(outcome.result.is_err());
-    let told = heard.warnings().join("\n");
+    let reported = heard.warnings().join("\n");
     assert!(
-        told.contains("of the data is 0x") && told.contains("frame "),
-        "{told}"
+        reported.contains("of the data is 0x") && reported.contains("frame "),
+        "{reported}"
     );
-    // More devices than were there: the recording ends, or has something else; nothing hangs.
+    // With more devices than in the recording, the replay ends or deviates, but does not hang.
     let (outcome, heard) = run(machine(&axes(3)), replay());
     let error = outcome
         .result
         .expect_err("the recording has two devices")
         .to_string();
-    let told = heard.warnings().join("\n");
-    assert!(told.contains("recording"), "{error}\n{told}");
-    // A recording without answers is none.
+    let reported = heard.warnings().join("\n");
+    assert!(reported.contains("recording"), "{error}\n{reported}");
+    // A recording without replies is rejected.
     let empty = folder.path().join("empty.pcapng");
     std::fs::write(&empty, b"\n\r\r\n").expect("written");
     let (outcome, _) = run(

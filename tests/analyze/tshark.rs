@@ -1,4 +1,5 @@
-//! What is told of each capture against somebody else's dissector; where it is not installed, the test is skipped.
+//! Compares the analysis of each capture with tshark's dissector. Without tshark, the test is
+//! skipped.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -13,10 +14,10 @@ struct Dissected {
     at_ns: u64,
     answer: bool,
     command: u8,
-    /// Register, or logical address.
+    /// A register or logical address.
     address: u32,
     wkc: u16,
-    /// Of the frame.
+    /// The source address of the frame.
     source: String,
 }
 
@@ -77,16 +78,16 @@ fn dissected(path: &Path) -> Option<Vec<Dissected>> {
     Some(found)
 }
 
-/// Device count, states, SDO transfers, cycle time and working counters, by somebody else's dissector.
+/// Compares device count, states, SDO transfers, cycle time and working counters.
 #[test]
-fn every_capture_as_tshark_shows_it() {
+fn every_capture_agrees_with_tshark() {
     for path in captures() {
         let name = path.display();
         let report = of_file(&path);
         let Some(seen) = dissected(&path) else {
             return;
         };
-        // Frames: a datagram's time and source tell frames apart well enough where there is one at a time.
+        // Frames: with one frame in flight, a datagram's time and source identify its frame.
         let sources: BTreeSet<&str> = seen.iter().map(|d| &*d.source).collect();
         assert!(sources.len() <= 2, "{name}: {sources:?}");
 
@@ -99,7 +100,7 @@ fn every_capture_as_tshark_shows_it() {
             assert_eq!(report.devices.len(), usize::from(count), "{name}: devices");
         }
 
-        // Process data: how often, working counters, and the median interval.
+        // Process data: count, working counters, and median interval.
         let mut groups: BTreeMap<u32, (Vec<u64>, BTreeMap<u16, u64>)> = BTreeMap::new();
         for d in seen.iter().filter(|d| (10..=12).contains(&d.command)) {
             let group = groups.entry(d.address).or_default();
@@ -130,7 +131,7 @@ fn every_capture_as_tshark_shows_it() {
     }
 }
 
-/// Every state that some device is seen in, by reads of AL status.
+/// Compares every reported state of the devices, from reads of AL status.
 fn states_as_tshark(path: &Path, report: &Report) {
     let filter = "ecat.ado == 0x130 && (eth.src[0] & 2)";
     let fields = [
@@ -163,7 +164,7 @@ fn states_as_tshark(path: &Path, report: &Report) {
         let [commands, registers, stations, counters, states] = parts[..] else {
             panic!("{line}");
         };
-        // Where every datagram is such a read, states belong to stations one by one.
+        // If every datagram is such a read, states belong to single stations.
         let all = |list: &str, wanted: &str| list.split(',').all(|one| one == wanted);
         if !all(commands, "0x04") || !all(registers, "0x0130") || !all(counters, "1") {
             continue;
@@ -198,9 +199,9 @@ fn states_as_tshark(path: &Path, report: &Report) {
     }
 }
 
-/// Objects in the order in which they were asked for.
+/// Compares the transferred objects in request order.
 fn transfers_as_tshark(path: &Path, report: &Report) {
-    // Initiating requests: downloads and uploads, but no segments.
+    // Initiate requests only: downloads and uploads, no segments.
     let filter = "ecat_mailbox.coe.sdoccsid || ecat_mailbox.coe.sdoccsiu";
     let both = format!("({filter}) && !(eth.src[0] & 2)");
     let fields = [
@@ -226,7 +227,7 @@ fn transfers_as_tshark(path: &Path, report: &Report) {
     let mut expected = Vec::new();
     for line in tshark(&arguments).unwrap_or_default().lines() {
         let parts: Vec<&str> = line.split('|').collect();
-        // 1: download, 2: upload.
+        // 1 is a download, 2 an upload.
         expected.push((
             number(parts[0]) as u16,
             number(parts[1]) as u8,

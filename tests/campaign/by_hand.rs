@@ -1,4 +1,4 @@
-//! Recordings made by hand, byte by byte: one drive behind a first device, in one LRW.
+//! Recordings assembled byte by byte: one drive behind a first device, in one LRW.
 
 /// The cycle in ns.
 pub const CYCLE: u64 = 1_000_000;
@@ -6,10 +6,10 @@ pub const OUTPUTS: [u16; 5] = [0x6040, 0x6060, 0x607a, 0x60ff, 0x6071];
 pub const INPUTS: [u16; 3] = [0x6041, 0x6061, 0x6064];
 const STATION: u16 = 0x1001;
 const LOGICAL: u32 = 0x0001_0000;
-/// Outputs are longer than inputs.
+/// Inputs and outputs share this length; the outputs are the longer ones.
 const BYTES: usize = 13;
 
-/// One cycle of one drive: what it is sent, and what it answers; `None`: the frame is lost.
+/// One cycle of one drive: its outputs and its answer. `None`: the frame is lost.
 #[derive(Debug, Clone, Copy)]
 pub struct Row {
     pub controlword: u16,
@@ -18,7 +18,7 @@ pub struct Row {
     pub velocity: i32,
     pub torque: i16,
     pub answer: Option<(u16, i8, i32)>,
-    /// From the frame to its reply, in ns.
+    /// The time from the frame to its reply, in ns.
     pub back: u64,
     /// Another device on the bus does not answer.
     pub incomplete: bool,
@@ -78,10 +78,10 @@ fn register(station: u16, register: u16) -> u32 {
     u32::from(station) | u32::from(register) << 16
 }
 
-/// The recording of these rows, with AL control writes at the end of some cycles.
+/// Returns the recording of these rows, with AL control writes at the end of some cycles.
 pub fn recording(rows: &[Row], al_control: &[(usize, u8)]) -> Vec<u8> {
     let mut file = Vec::new();
-    // Section header and interface, of which nothing is read.
+    // Section header and interface; the reader ignores their contents.
     file.extend([0x0a, 0x0d, 0x0d, 0x0a, 12, 0, 0, 0, 12, 0, 0, 0]);
     file.extend([1, 0, 0, 0, 12, 0, 0, 0, 12, 0, 0, 0]);
     let minus_one = u32::from(1u16.wrapping_neg()) | 0x0010 << 16;

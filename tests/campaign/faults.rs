@@ -1,23 +1,23 @@
-//! Fault scripts: what goes wrong, when, and what a report may say of it (`docs/network.md`, "Fault
-//! scripts").
+//! Fault scripts: the fault, its time, and the permitted texts of its report (`docs/network.md`,
+//! "Fault scripts").
 
 use std::fmt::Write as _;
 
-/// What a run makes of a fault.
+/// The effect of a fault on a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effect {
-    /// Nothing that the file does not allow for: the run goes on.
+    /// The configuration tolerates the fault: the run goes on.
     None,
-    /// The run fails, if the fault strikes while its axes are powered.
+    /// The run fails if its axes are powered at the time of the fault.
     Failure,
-    /// Either, by what else is going on.
+    /// Both results are possible, depending on other events.
     Open,
 }
 
 /// A moment of a run without faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Moment {
-    /// The change of 0x6060 of this number.
+    /// The n-th change of 0x6060.
     ModeChange(usize),
     /// The run begins to stop.
     Stop,
@@ -28,10 +28,10 @@ pub struct Fault {
     pub kind: &'static str,
     /// Seconds since the first frame; 0: from the start.
     pub at: f64,
-    /// What `at` counts from, in a run without faults; `None`: the first frame.
+    /// The reference of `at`, taken from a run without faults; `None`: the first frame.
     pub after: Option<Moment>,
     pub lasts: Option<f64>,
-    /// Keys of its kind, as TOML.
+    /// The keys of this fault kind, as TOML.
     pub keys: Vec<(&'static str, String)>,
     pub device: Option<(u16, String)>,
     pub effect: Effect,
@@ -72,7 +72,8 @@ impl Fault {
             .map(|of| of.1.as_str())
     }
 
-    /// Whether a report can be about this fault: its cause by name, or its headline and error.
+    /// True if a report may describe this fault: by the name of its cause, or by its headline and
+    /// error.
     pub fn explains(&self, report: &Words) -> bool {
         let text = &report.text;
         let named = self
@@ -116,20 +117,20 @@ impl Fault {
     }
 }
 
-/// What a report says, in its own words.
+/// The relevant texts of a report.
 #[derive(Debug, Clone, Default)]
 pub struct Words {
     pub text: String,
-    /// The kind of cause of its story, or nothing.
+    /// The kind of cause in the fault report, or empty.
     pub cause: String,
 }
 
-/// Times of a script, in ms.
+/// Formats a script time in ms.
 fn ms(seconds: f64) -> String {
     format!("{:.3}ms", seconds * 1e3)
 }
 
-/// The script as the user writes it.
+/// Returns the script as TOML text.
 pub fn script(seed: u64, faults: &[Fault]) -> String {
     let mut text = format!("seed = {}\n", seed % 1_000_000);
     for fault in faults {

@@ -8,7 +8,7 @@ use super::random::Random;
 use super::scenes;
 use super::view::{Axis, CSP, CST, CSV, Machine, PP, PV};
 
-/// A run to be made, and what the judge knows of it.
+/// A planned run with the facts that the judge needs.
 #[derive(Debug, Clone)]
 pub struct Plan {
     pub seed: u64,
@@ -17,19 +17,19 @@ pub struct Plan {
     pub faults: Vec<Fault>,
     /// `--for`, in seconds.
     pub ends_at: f64,
-    /// The machine file itself is a reason to fail.
+    /// The machine file itself may cause a failure.
     pub may_fail: bool,
     pub machine_file: String,
     pub fault_script: String,
 }
 
-/// A drive of `configs/esi`: its default process data, and what its velocities are in.
+/// A drive of `configs/esi`: its default process data and its velocity unit.
 #[derive(Debug, Clone, Copy)]
 struct DriveKind {
     esi: &'static str,
-    /// Process data of one's own choice can be mapped.
+    /// User-defined process data can be mapped.
     free: bool,
-    /// 0x60A9: rpm, or counts/s.
+    /// 0x60A9: rpm, otherwise counts/s.
     rpm: bool,
     encoder: u32,
 }
@@ -58,28 +58,28 @@ const EVERY_MODE: [u16; 8] = [
     0x6040, 0x6060, 0x607a, 0x60ff, 0x6071, 0x6081, 0x6083, 0x6084,
 ];
 const INPUTS: [u16; 5] = [0x6041, 0x6061, 0x6064, 0x606c, 0x6077];
-/// Of the SV1, fixed in its ESI.
+/// The outputs of the SV1, fixed in its ESI.
 const SV1_OUTPUTS: [u16; 4] = [0x6040, 0x607a, 0x60ff, 0x6071];
 const SV1_INPUTS: [u16; 5] = [0x6041, 0x6064, 0x606c, 0x6077, 0x6061];
 
-/// A machine that grows, its program and its faults.
+/// A machine under construction, with program and faults.
 pub struct Draft {
     pub random: Random,
     pub machine: Machine,
     pub faults: Vec<Fault>,
     pub ends_at: f64,
     pub may_fail: bool,
-    /// Names of I/O devices, by position.
+    /// Names of I/O devices by position.
     pub passive: Vec<(u16, String)>,
     devices: String,
     pub stop: String,
-    /// `on_emergency` of the axes to come.
+    /// `on_emergency` of axes that are added later.
     pub on_emergency: &'static str,
     pub steps: String,
     next_position: u16,
 }
 
-/// What a scene wants of an axis; the rest is at random.
+/// The requirements of a scene for an axis; other properties are random.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Wanted {
     pub mode: Option<i8>,
@@ -91,7 +91,7 @@ pub struct Wanted {
     pub jerk_s: Option<f64>,
     /// Quick stop deceleration 0x6085 in rpm/s.
     pub quick_stop: Option<u32>,
-    /// A start-up SDO of the user's own.
+    /// A user-defined start-up SDO.
     pub sdo: Option<(u16, i32)>,
     /// Without a range.
     pub endless: bool,
@@ -127,7 +127,7 @@ impl Draft {
 
     pub fn drive(&mut self, wanted: Wanted) -> usize {
         let random = &mut self.random;
-        // The SV1 has a range of its own, and no objects for what a scene may want.
+        // The SV1 has its own range and lacks the objects that a scene may require.
         let free = wanted.every_mode || wanted.quick_stop.is_some() || wanted.sdo.is_some();
         let kind = if free || wanted.endless {
             random.pick(&[EPOS4, EPOS4, IDX])
@@ -287,13 +287,13 @@ impl Draft {
         let _ = write!(self.steps, "\n[[step]]\n{lines}\n");
     }
 
-    /// Turns every axis, and goes on until the run ends.
+    /// Turns every axis until the run ends.
     pub fn turn(&mut self, share: f64) {
         self.run_up(share);
         self.step("dwell = \"60s\"");
     }
 
-    /// Steps that turn every axis at this share of its velocity limit, as far as its range goes.
+    /// Adds steps that turn every axis at this share of its velocity limit, within its range.
     pub fn run_up(&mut self, share: f64) {
         let mut moves = Vec::new();
         for axis in self.machine.axes.clone() {
@@ -327,7 +327,7 @@ impl Draft {
         self.faults.push(fault);
     }
 
-    /// A fault of one device, by its position.
+    /// Creates a fault of the device at a position.
     pub fn strike(&mut self, kind: &'static str, at: f64, position: u16, effect: Effect) -> Fault {
         Fault::new(kind, at, effect).device(position, &self.name(position))
     }
@@ -361,8 +361,8 @@ impl Draft {
 }
 
 impl Plan {
-    /// The plan with its faults placed at these changes of mode and this stop, in seconds; those of
-    /// moments that never come are left out.
+    /// Returns the plan with fault times from the mode changes and the stop, in seconds. Faults
+    /// without a matching event are dropped.
     pub fn placed(&self, changes: &[f64], stop: Option<f64>) -> Self {
         let mut plan = self.clone();
         plan.faults.retain_mut(|fault| {
@@ -389,7 +389,7 @@ pub fn mode_name(mode: i8) -> &'static str {
     }
 }
 
-/// Of EPOS4 and IDX, in their ESI's modules and PDOs for each mode.
+/// The outputs of EPOS4 and IDX in the modules and PDOs of their ESI, by mode.
 fn default_outputs(mode: i8) -> &'static [u16] {
     match mode {
         CSV => &[0x6040, 0x60ff, 0x60b2],
@@ -398,7 +398,7 @@ fn default_outputs(mode: i8) -> &'static [u16] {
     }
 }
 
-/// The plan that follows from a seed; every tenth or so is of each scene.
+/// Returns the plan for a seed. Each scene gets about a tenth of the seeds.
 pub fn plan(seed: u64, only: Option<&str>) -> Plan {
     let mut draft = Draft::new(seed);
     let scenes: Vec<_> = scenes::SCENES

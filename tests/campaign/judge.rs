@@ -1,33 +1,33 @@
-//! Judges a run: what reached the drives, and whether exit code and report say so.
+//! Judges a run: the data that reached the drives, and whether exit code and report match.
 
 use super::rules;
 use super::stops;
 use super::view::{Machine, Moment, moments};
 use super::wire::{Inputs, Wire};
 
-/// One rule broken.
+/// One violated rule.
 #[derive(Debug, Clone)]
 pub struct Finding {
     pub rule: &'static str,
     pub axis: String,
-    /// Where it was broken first.
+    /// The cycle of the first violation.
     pub cycle: usize,
     /// Seconds since the first packet.
     pub at: f64,
     pub detail: String,
-    /// How often it was broken.
+    /// The number of violations.
     pub count: usize,
 }
 
-/// What the program said at the end, as its users read it.
+/// The program's final output, as the user reads it.
 #[derive(Debug, Clone, Default)]
 pub struct Report {
     pub exit: i32,
     /// The error and the failures among the events.
     pub text: String,
-    /// Seconds of the cycle, as the report counts them, of the stop that it reports.
+    /// The start of the reported stop, in seconds of cycle time as in the report.
     pub stop_s: Option<f64>,
-    /// That stop was a failure.
+    /// True if the stop was a failure.
     pub failed: bool,
 }
 
@@ -37,7 +37,7 @@ impl Report {
     }
 }
 
-/// Where the findings of one axis are collected.
+/// Collects the findings of one axis.
 pub struct Findings<'a> {
     pub list: Vec<Finding>,
     axis: &'a str,
@@ -62,7 +62,7 @@ impl Findings<'_> {
         });
     }
 
-    /// What the drive answered to these outputs, whenever that came back.
+    /// Returns the drive's answer to these outputs, at any delay.
     pub fn answer(&self, moment: &Moment) -> Option<Inputs> {
         self.answers[moment.cycle]
     }

@@ -37,7 +37,7 @@ use tally::Tally;
 /// Runs of `cargo test`: more than ten machine-minutes, the same every time.
 const RUNS: u64 = 300;
 const THREADS: usize = 2;
-/// A right cause is asked of so many failed runs in a hundred.
+/// The required percentage of failed runs whose report contains a correct cause.
 const RIGHT_CAUSES: usize = 99;
 
 fn asked<T: std::str::FromStr>(variable: &str) -> Option<T> {

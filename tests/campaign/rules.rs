@@ -1,5 +1,5 @@
-//! What may never reach a drive, in any cycle and whatever happens. Each rule names the document it
-//! follows from.
+//! Data that must never reach a drive, in any cycle and after any fault. Each rule names its
+//! document.
 
 use super::judge::{Finding, Findings};
 use super::view::{Axis, CSP, CST, CSV, Machine, Moment};
@@ -9,7 +9,8 @@ use super::wire::Inputs;
 const LOOP_SHARE: f64 = 2.0;
 /// `torque_slope`: percent of the torque limit a second (`docs/axis.md`); 100 % in 0.1 s.
 const TORQUE_SLOPE: f64 = 10.0;
-/// Cycles that a set-point runs on without an answer (`docs/architecture.md`, "A lost frame").
+/// The number of cycles that a set-point continues without an answer (`docs/architecture.md`, "A
+/// lost frame").
 const RUNS_ON: usize = 2;
 
 pub fn check(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
@@ -29,11 +30,11 @@ pub fn check(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
     gaps(machine, axis, moments, findings);
 }
 
-/// Controlword: a command is sent only where a transition leads from the state that was reported
-/// last (IEC 61800-7-201, table 27 and figure 11).
+/// Controlword: a command is sent only in a state from which it causes a transition, as last
+/// reported (IEC 61800-7-201, table 27 and figure 11).
 fn controlword(moment: &Moment, findings: &mut Findings<'_>) {
     let word = moment.sent.controlword;
-    // The newest reports may have come too late to be taken.
+    // The newest reports may have come too late for this cycle.
     let reports: Vec<Inputs> = moment
         .recent()
         .iter()
@@ -98,7 +99,7 @@ fn mode_before_operation(
 /// (`docs/architecture.md`, "An axis never surprises").
 fn at_rest_before_operation(axis: &Axis, moment: &Moment, findings: &mut Findings<'_>) {
     let reports = moment.recent();
-    // Bit 9: what is sent is processed.
+    // Bit 9: the drive processes the target.
     let moves = |report: &Inputs| {
         let remote = report.statusword & 0x0200 != 0;
         report.is_operation_enabled() || report.is_quick_stop() || !remote
@@ -154,7 +155,7 @@ fn drive_follows(axis: &Axis, moment: &Moment, findings: &mut Findings<'_>) {
     }
 }
 
-/// Limits of the file (`docs/machine-file.md`, "Limits": what is commanded never exceeds them).
+/// Commanded values never exceed the limits of the file (`docs/machine-file.md`, "Limits").
 fn limits(axis: &Axis, moment: &Moment, findings: &mut Findings<'_>) {
     let sent = &moment.sent;
     let velocity = axis.velocity * axis.velocity_scale + 1.0;
@@ -186,7 +187,8 @@ fn limits(axis: &Axis, moment: &Moment, findings: &mut Findings<'_>) {
     }
 }
 
-/// The mode in force for certain: asked for in this cycle and the one before, shown, and enabled.
+/// Returns the mode that is definitely active: requested in two consecutive cycles, displayed, and
+/// enabled.
 fn in_force(axis: &Axis, pair: &[Moment]) -> Option<i8> {
     let [before, now] = pair else { return None };
     let asked = now.asked(axis);
@@ -208,10 +210,10 @@ fn step(pair: &[Moment]) -> Option<i64> {
     )
 }
 
-/// In CSP a target steps by no more than velocity × cycle, and a step changes by no more than
-/// acceleration × cycle² (`docs/axis.md`, "What holds on the wire"). The exception: a set-point
-/// freezes where nothing has come back for more than two cycles (`docs/architecture.md`, "A lost
-/// frame"). Answers that come late are answers.
+/// In CSP a target steps by at most velocity × cycle, and a step changes by at most acceleration ×
+/// cycle² (`docs/axis.md`, "What holds on the wire"). The exception: a set-point freezes after more
+/// than two cycles without an answer (`docs/architecture.md`, "A lost frame"). Late answers count
+/// as answers.
 fn positions(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
     let most = axis.velocity_step(machine) + 1.0;
     let change = axis.acceleration_step(machine) + 2.0;
@@ -246,8 +248,8 @@ fn positions(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut 
     }
 }
 
-/// In CSV the velocity changes by no more than acceleration × cycle, twice as much with a position
-/// loop (`docs/axis.md`, "What holds on the wire").
+/// In CSV the velocity changes by at most acceleration × cycle, and by twice as much with a
+/// position loop (`docs/axis.md`, "What holds on the wire").
 fn velocities(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
     let share = if axis.loops { LOOP_SHARE } else { 1.0 };
     let change = axis.acceleration * axis.velocity_scale * machine.seconds() * share + 1.5;
@@ -282,8 +284,8 @@ fn torques(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Fi
     }
 }
 
-/// Targets stay in `limits.position`, widened to where the axis was when it was enabled or driven
-/// in another mode (`docs/machine-file.md`, "Limits").
+/// Targets stay in `limits.position`. The range widens to the axis position at the time of enabling
+/// or of motion in another mode (`docs/machine-file.md`, "Limits").
 fn range(axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
     let Some((low, high)) = axis.range else {
         return;
@@ -306,9 +308,9 @@ fn range(axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
     }
 }
 
-/// What a drive in CSP holds is the target of the last frame that reached it. The next one that
-/// reaches it is at most three steps away, however many were lost meanwhile
-/// (`docs/architecture.md`, "A lost frame"), also where the mode asked for changed and came back.
+/// A drive in CSP holds the target of the last received frame. The next received target is at most
+/// three steps away, after any number of lost frames (`docs/architecture.md`, "A lost frame"). This
+/// also applies if the requested mode changed and came back.
 fn gaps(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findings<'_>) {
     let step = axis.velocity_step(machine);
     let most = RUNS_ON + machine.answer_to_outputs();
@@ -323,7 +325,7 @@ fn gaps(machine: &Machine, axis: &Axis, moments: &[Moment], findings: &mut Findi
         }
         let takes_csp = now.asked(axis) == CSP && now.is_operation_enabled();
         if !takes_csp {
-            // It may have left CSP, and then turned on.
+            // The drive may have left CSP and turned since.
             if findings
                 .answer(now)
                 .is_some_and(|answer| answer.mode != Some(CSP))

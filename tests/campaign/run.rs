@@ -12,7 +12,7 @@ use super::verdict;
 use super::view::{self, Axis};
 use super::wire::{self, DriveLayout};
 
-/// Real time of a run; much longer than any takes.
+/// The limit of real time for a run; much longer than any run takes.
 const PATIENCE: Duration = Duration::from_secs(300);
 
 #[derive(Debug, Clone, Default)]
@@ -21,9 +21,9 @@ pub struct Outcome {
     pub exit: i32,
     pub error: String,
     pub headline: String,
-    /// Whether the report names a fault of the script; `None` where that is not asked.
+    /// True if the report names a fault of the script; `None`: not checked.
     pub right: Option<bool>,
-    /// When the run began to stop, from the first cycle on.
+    /// The start of the stop, counted from the first cycle.
     pub stop_s: Option<f64>,
     pub seconds: f64,
     pub cycles: usize,
@@ -40,8 +40,8 @@ fn esi() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/esi")
 }
 
-/// The plan as it is run: faults that strike at a change of mode or at the end get their times from
-/// a run without faults.
+/// Returns the plan with all fault times. The times of mode changes and of the stop come from a run
+/// without faults.
 pub fn placed(plan: &Plan, folder: &Path) -> Plan {
     if plan.faults.iter().all(|fault| fault.after.is_none()) {
         return plan.clone();
@@ -50,7 +50,7 @@ pub fn placed(plan: &Plan, folder: &Path) -> Plan {
     let recording = std::fs::read(folder.join("run.pcapng")).unwrap_or_default();
     let packets = pcapng::packets(&recording).unwrap_or_default();
     let wire = wire::read(&packets, &layouts(plan));
-    // The mode of an axis that is asked for Operation enabled.
+    // The mode of an axis while Operation enabled is requested.
     let mode = |cycle: &wire::Cycle| {
         let sent = cycle.drives.first()?.as_ref()?.sent;
         sent.mode.filter(|_| sent.controlword & 0x0f == 0x0f)
@@ -83,7 +83,7 @@ pub fn run(plan: &Plan, folder: &Path) -> Outcome {
             "--sim",
             "--virtual",
             "--json",
-            "--no-story",
+            "--no-fault-report",
         ])
         .args(["--faults", "faults.toml", "--record", "run.pcapng"])
         .args(["--seed", &plan.seed.to_string()])
@@ -155,7 +155,7 @@ fn layouts(plan: &Plan) -> Vec<DriveLayout> {
     plan.machine.axes.iter().map(layout).collect()
 }
 
-/// What the drive of a finding received and reported around it, a line a cycle.
+/// Formats the data of a finding's drive around that cycle, one line per cycle.
 pub fn around(plan: &Plan, folder: &Path, finding: &Finding) -> String {
     let recording = std::fs::read(folder.join("run.pcapng")).unwrap_or_default();
     let packets = pcapng::packets(&recording).unwrap_or_default();

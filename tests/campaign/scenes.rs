@@ -1,14 +1,14 @@
-//! Situations in which a stop, a mode change or a fault can go wrong. Each draws a machine, a
-//! program and the faults that strike it; times, sizes and phases are at random.
+//! Situations in which a stop, a mode change or a fault is critical. Each scene generates a
+//! machine, a program and faults; times, sizes and phases are random.
 
 use super::faults::{Effect, Fault, Moment};
 use super::generate::{Draft, Wanted, mode_name};
 use super::view::{CSP, CST, CSV, PP, PV};
 
-/// A name, and what draws it.
+/// A name and its generator.
 pub type Scene = (&'static str, fn(&mut Draft));
 
-/// Every scene; mode changes have the most phases to meet.
+/// All scenes. Mode changes appear most often, because they have the most phases.
 pub const SCENES: [Scene; 16] = [
     ("anything", anything),
     ("two-faults", two_faults),
@@ -28,10 +28,10 @@ pub const SCENES: [Scene; 16] = [
     ("no-fault", no_fault),
 ];
 
-/// From the first frame to motion: bring-up and enabling take less than this.
+/// An upper bound of the time from the first frame to motion: bring-up and enabling.
 const MOVES_BY_S: f64 = 0.6;
 
-/// Drives and I/O devices in any order; at least one drive.
+/// Adds drives and I/O devices in any order, with at least one drive.
 fn devices(draft: &mut Draft, wanted: Wanted) {
     let drives = draft.random.pick(&[1, 1, 2, 2, 3]);
     let others = draft.random.pick(&[0, 0, 1, 2]);
@@ -47,7 +47,7 @@ fn devices(draft: &mut Draft, wanted: Wanted) {
     }
 }
 
-/// A program of moves, turns and mode changes that succeeds where nothing strikes it.
+/// Adds a program of moves, turns and mode changes that succeeds without faults.
 fn program(draft: &mut Draft) {
     let axes = draft.machine.axes.clone();
     for _ in 0..2 + draft.random.below(3) {
@@ -175,7 +175,7 @@ fn anything(draft: &mut Draft) {
     }
 }
 
-/// The second fault within 50 ms of the first.
+/// Adds a second fault within 50 ms of the first.
 fn two_faults(draft: &mut Draft) {
     devices(
         draft,
@@ -190,14 +190,14 @@ fn two_faults(draft: &mut Draft) {
     for after in [0.0, draft.random.between(0.0, 0.05)] {
         let mut fault = random_fault(draft, at + after);
         if fault.kind == "frame-loss" {
-            // Two bursts can be one that is too long.
+            // Two bursts may merge into one that is too long.
             fault.effect = Effect::Open;
         }
         draft.fault(fault);
     }
 }
 
-/// Something on the bus disappears while an axis that needs long to stop turns.
+/// A device disappears while an axis with a long stop turns.
 fn device_missing(draft: &mut Draft) {
     let mode = draft.random.pick(&[CSP, CSV, CSV]);
     let ramp_s = draft.random.pick(&[0.3, 1.0, 2.2]);
@@ -230,7 +230,7 @@ fn device_missing(draft: &mut Draft) {
     draft.fault(fault);
 }
 
-/// A limit of jerk that takes as long as the ramp, and a stop while the axis gains speed.
+/// A jerk limit that takes as long as the ramp, and a stop during acceleration.
 fn jerk(draft: &mut Draft) {
     let ramp_s = draft.random.pick(&[0.3, 0.5, 1.0]);
     let jerk_s = draft.random.pick(&[0.2, 0.5, 2.0]);
@@ -259,7 +259,7 @@ fn jerk(draft: &mut Draft) {
     draft.step(&format!("move = {{ {} = {goal:?} }}", axis.name));
 }
 
-/// The end of the run in a jerk-limited move at a gentle ramp.
+/// The run ends in a jerk-limited move with a long ramp.
 fn gentle_ramp(draft: &mut Draft) {
     let jerk_s = draft.random.pick(&[0.05, 0.2]);
     let wanted = Wanted {
@@ -280,8 +280,8 @@ fn gentle_ramp(draft: &mut Draft) {
     draft.ends_at = draft.random.between(0.3, 1.5) * 0.1 / ramp;
 }
 
-/// A drive that needs seconds for its quick stop, which another drive's fault or its own following
-/// error asks of it.
+/// A drive with a quick stop of several seconds, caused by another drive's fault or by its own
+/// following error.
 fn slow_quick_stop(draft: &mut Draft) {
     let quick_stop = draft.random.pick(&[200, 500, 1000]);
     let wanted = Wanted {
@@ -300,8 +300,8 @@ fn slow_quick_stop(draft: &mut Draft) {
     draft.fault(fault.key("code", "0x3220"));
 }
 
-/// A change to another mode and back, in motion where both allow it, with bursts of lost frames
-/// shorter than `lost_frames` at every phase of it.
+/// A mode change and the change back, in motion if both modes allow it. Bursts of lost frames,
+/// shorter than `lost_frames`, occur at every phase.
 fn mode_changes(draft: &mut Draft) {
     draft.machine.lost_frames = 10;
     let modes = [
@@ -338,8 +338,8 @@ fn mode_changes(draft: &mut Draft) {
     draft.step("dwell = \"60s\"");
     draft.ends_at = 0.8;
     let cycle = draft.seconds();
-    // One change alone: bursts shift those after it. The second burst strikes while the axis still
-    // gets over the first.
+    // Only one change, because bursts shift later changes. The second burst occurs while the axis
+    // still recovers from the first.
     let change = if to == CSP {
         0
     } else {
@@ -364,7 +364,7 @@ fn mode_changes(draft: &mut Draft) {
     }
 }
 
-/// Replies that come back after the cycle has stopped waiting, or twice.
+/// Replies that arrive after the cycle has stopped waiting, or twice.
 fn late_replies(draft: &mut Draft) {
     draft.machine.lost_frames = 20;
     draft.machine.pipelined = false;
@@ -391,7 +391,7 @@ fn late_replies(draft: &mut Draft) {
     }
 }
 
-/// A fault while the machine comes to rest at the end of its time.
+/// A fault during the stop at the end of the run.
 fn fault_while_stopping(draft: &mut Draft) {
     let ramp_s = draft.random.pick(&[0.8, 1.2]);
     let wanted = Wanted {
@@ -428,7 +428,7 @@ fn fault_while_stopping(draft: &mut Draft) {
     draft.fault(fault);
 }
 
-/// A bus that falls silent, so that it counts as lost about when the run has come to its end.
+/// A bus that fails at the end of the run, so that both events nearly coincide.
 fn fault_at_the_end(draft: &mut Draft) {
     draft.drive(Wanted::default());
     draft.turn(0.3);
@@ -440,7 +440,7 @@ fn fault_at_the_end(draft: &mut Draft) {
     draft.fault(fault);
 }
 
-/// A cable that is broken for fewer cycles than `lost_frames`.
+/// A link break for fewer cycles than `lost_frames`.
 fn short_break(draft: &mut Draft) {
     draft.machine.lost_frames = 20;
     devices(
@@ -460,7 +460,7 @@ fn short_break(draft: &mut Draft) {
     draft.fault(fault.key("port", 0).lasting(lasts));
 }
 
-/// A drive that shows another mode than the one that is wanted.
+/// A drive that displays a mode other than the requested one.
 fn other_mode(draft: &mut Draft) {
     let mode = draft.random.pick(&[CSP, CSV]);
     let other = draft.random.pick(&[CST, CSP, CSV, PV]);
@@ -486,7 +486,7 @@ fn other_mode(draft: &mut Draft) {
     draft.ends_at = 0.8;
 }
 
-/// A group without which the machine stops or goes on.
+/// A group whose stop either stops the machine or not.
 fn groups(draft: &mut Draft) {
     let wanted = Wanted {
         mode: Some(CSP),
@@ -518,7 +518,7 @@ fn groups(draft: &mut Draft) {
     draft.fault(fault);
 }
 
-/// An emergency stop by an input, which the simulated terminal copies from its output.
+/// An emergency stop by an input. The simulated terminal copies the input from its output.
 fn emergency(draft: &mut Draft) {
     let io = draft.io();
     let name = draft.name(io);
@@ -546,7 +546,7 @@ fn emergency(draft: &mut Draft) {
     }
 }
 
-/// The end of the run in any phase of motion, with nothing that goes wrong.
+/// The run ends in any phase of motion, without a fault.
 fn no_fault(draft: &mut Draft) {
     devices(draft, Wanted::default());
     program(draft);

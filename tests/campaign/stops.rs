@@ -1,21 +1,21 @@
-//! How motion ends: rules about what happens from the moment in which something stops an axis.
+//! The end of motion: rules for the time after a stop of an axis.
 
 use super::judge::{Findings, Report};
 use super::view::{Axis, CSP, CST, CSV, Machine, Moment};
 use super::wire::Wire;
 
-/// Cycles from what is seen to the outputs that obey it.
+/// The cycles from the cause to the outputs that respond to it.
 const REACTION: usize = 2;
-/// Counts a cycle by which whole counts differ from a smooth motion.
+/// The rounding error in counts per cycle.
 const ROUNDING: i64 = 2;
 /// An axis turns from this share of its velocity limit on; standstill is 1 %
 /// (`docs/machine-file.md`, `supervise.standstill`).
 const TURNS: f64 = 0.05;
-/// Beyond the ramp itself: settling (0.1 s, `docs/motion.md`, "Groups") and dead time.
+/// Additional time after the ramp: settling (0.1 s, `docs/motion.md`, "Groups") and dead time.
 const SETTLES_S: f64 = 0.15;
 const OP: u8 = 8;
 
-/// Why and from which cycle on an axis has to come to rest.
+/// The reason for a stop and its first cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stop {
     pub cycle: usize,
@@ -29,7 +29,7 @@ fn earlier(one: Option<Stop>, other: Option<Stop>) -> Option<Stop> {
     }
 }
 
-/// What is seen of one drive that stops its group: a fault while it was enabled, or no process data
+/// Finds the cause by which one drive stops its group: a fault while enabled, or no process data
 /// for `lost_frames` cycles (`docs/motion.md`, "Groups").
 fn seen(machine: &Machine, view: &[Moment]) -> Option<Stop> {
     let mut enabled = false;
@@ -53,8 +53,8 @@ fn seen(machine: &Machine, view: &[Moment]) -> Option<Stop> {
     None
 }
 
-/// The stop of the machine: seen on the wire, or reported by the run (the end of its time, a step
-/// that failed).
+/// Finds the stop of the machine: on the wire, or reported by the run (end of its time, failed
+/// step).
 pub fn machine_stop(
     machine: &Machine,
     wire: &Wire,
@@ -157,7 +157,7 @@ fn speeds(
     }
 }
 
-/// A stop takes the file's limits: velocity / acceleration + acceleration / jerk
+/// A stop uses the limits of the file: velocity / acceleration + acceleration / jerk
 /// (`docs/machine-file.md`, "Limits").
 fn duration(
     machine: &Machine,
@@ -215,8 +215,8 @@ fn enabled_again(axis: &Axis, view: &[Moment], stop: Stop, findings: &mut Findin
     }
 }
 
-/// Power stays until a drive that answers is at rest; otherwise the run fails and names the drive.
-/// A quick stop at speed on a bus that answers fails the run as well (`docs/stops.md`).
+/// Power stays until a responding drive is at rest; otherwise the run fails and names the drive. A
+/// quick stop at speed on a responding bus fails the run as well (`docs/stops.md`).
 fn power(
     machine: &Machine,
     axis: &Axis,
@@ -288,8 +288,8 @@ fn op_left(
     }
 }
 
-/// A drive of which nothing came back for `lost_frames` cycles is no longer asked for Operation
-/// enabled (`docs/machine-file.md`, `stop.bus_lost`).
+/// Operation enabled is no longer requested from a drive without answers for `lost_frames` cycles
+/// (`docs/machine-file.md`, `stop.bus_lost`).
 fn silence(machine: &Machine, view: &[Moment], findings: &mut Findings<'_>) {
     let most = machine.lost_frames + REACTION;
     let silent = |moment: &&Moment| moment.silent > most && moment.requests_operation();
@@ -299,7 +299,7 @@ fn silence(machine: &Machine, view: &[Moment], findings: &mut Findings<'_>) {
     }
 }
 
-/// A fault of an enabled drive, or its silence while it turned, fails the run, also while it stops
+/// The run fails if an enabled drive faults, or stops responding while it turns, even during a stop
 /// (`docs/architecture.md`, "A run", 5; README "Exit codes").
 fn reported(
     machine: &Machine,
@@ -329,7 +329,7 @@ fn reported(
     }
 }
 
-/// No power at the end (`docs/architecture.md`, "A run", 5).
+/// All drives are without power at the end (`docs/architecture.md`, "A run", 5).
 fn end(view: &[Moment], findings: &mut Findings<'_>) {
     if let Some(last) = view.last().filter(|last| last.requests_operation()) {
         let detail = format!("last Controlword {:04x}", last.sent.controlword);

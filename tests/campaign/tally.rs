@@ -1,4 +1,4 @@
-//! Figures of a campaign.
+//! Statistics of a campaign.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,7 +6,7 @@ use std::fmt;
 use super::generate::Plan;
 use super::run::Outcome;
 
-/// Findings of one rule that are printed.
+/// The maximum number of printed findings per rule.
 const SHOWN: usize = 8;
 
 #[derive(Debug, Default)]
@@ -19,14 +19,14 @@ pub struct Tally {
     pub right: usize,
     /// Runs whose report names no fault of the script.
     pub wrong: Vec<String>,
-    /// Runs that broke a rule, by rule.
+    /// Runs with violations, by rule.
     pub broken: BTreeMap<&'static str, Vec<String>>,
 }
 
 impl Tally {
     pub fn add(&mut self, plan: &Plan, outcome: Outcome) {
         self.runs += 1;
-        // A run that ended at once counts a little, so that the campaign ends.
+        // A run that ends at once counts a little, so that the campaign ends.
         self.seconds += outcome.seconds.max(0.1);
         self.cycles += outcome.cycles;
         *self.exits.entry(outcome.exit).or_default() += 1;

@@ -1,5 +1,5 @@
-//! The judge has to fail where it should: recordings made by hand, byte by byte, each with one rule
-//! broken, and one with none.
+//! Tests of the judge with recordings assembled byte by byte: one with no violation, and one with a
+//! single violation per rule.
 
 use super::by_hand::{CYCLE, INPUTS, OUTPUTS, Row, recording};
 use super::judge::{Finding, Report, judge};
@@ -9,8 +9,8 @@ use super::wire::{self, DriveLayout};
 
 const ENABLED: u16 = 0x1237;
 
-/// A machine of one drive with 2000 counts a turn, 50 turn/s, 500 turn/s², at 1 ms: a step of 100
-/// counts, a change of 1 count.
+/// Returns a machine of one drive with 2000 counts per turn, 50 turn/s, 500 turn/s², at 1 ms. This
+/// gives a step of 100 counts and a change of 1 count per cycle.
 fn machine() -> Machine {
     Machine {
         cycle_ns: CYCLE,
@@ -38,8 +38,8 @@ fn machine() -> Machine {
     }
 }
 
-/// A drive that is enabled, gains speed to `speed` counts a cycle, turns, comes to rest and loses
-/// power: what `recording` makes of it breaks no rule.
+/// Returns the rows of a drive that is enabled, accelerates to `speed` counts per cycle, turns,
+/// stops and loses power. Its recording violates no rule.
 fn story(speed: i32) -> Vec<Row> {
     let row = |controlword, position, statusword, actual| Row {
         controlword,
@@ -79,12 +79,12 @@ fn story(speed: i32) -> Vec<Row> {
     rows
 }
 
-/// First cycle in which the drive turns at its greatest speed.
+/// Returns the first cycle at the greatest speed.
 fn turning(speed: i32) -> usize {
     10 + speed as usize + 5
 }
 
-/// First cycle in which it brakes.
+/// Returns the first cycle of deceleration.
 fn braking(speed: i32) -> usize {
     10 + speed as usize + 20
 }
@@ -97,7 +97,7 @@ struct Case {
 }
 
 impl Case {
-    /// Full of motion, without a fault.
+    /// Creates a case with motion and without faults.
     fn new(speed: i32) -> Self {
         Self {
             machine: machine(),
@@ -134,14 +134,14 @@ impl Case {
         assert!(findings.is_empty(), "{findings:#?}");
     }
 
-    /// The run failed, and its report names the axis.
+    /// Marks the run as failed, with a report that names the axis.
     fn failed(mut self) -> Self {
         self.report.exit = 1;
         self.report.text = "`x` (position 1): drive fault".to_string();
         self
     }
 
-    /// The axis in CSV: velocities in the place of steps, 60 for each 1000 counts a second.
+    /// Converts the axis to CSV: velocities instead of steps, 60 per 1000 counts/s.
     fn in_csv(mut self) -> Self {
         self.machine.axes[0].mode = CSV;
         let mut last = self.rows[0].position;
@@ -159,14 +159,14 @@ impl Case {
 }
 
 #[test]
-fn a_run_as_it_should_be_breaks_no_rule() {
+fn judge_accepts_a_correct_run() {
     Case::new(40).is_clean();
     Case::new(100).is_clean();
     Case::new(40).in_csv().is_clean();
 }
 
 #[test]
-fn a_step_above_the_velocity_limit() {
+fn judge_finds_a_step_above_the_velocity_limit() {
     Case::new(103).breaks("csp-step");
     let mut jump = Case::new(40);
     for row in &mut jump.rows[turning(40)..] {
@@ -177,7 +177,7 @@ fn a_step_above_the_velocity_limit() {
 }
 
 #[test]
-fn a_freeze_without_and_with_a_reason() {
+fn judge_accepts_a_freeze_only_with_a_reason() {
     let freeze = |answered: bool, back: u64| {
         let mut case = Case::new(40);
         case.machine.lost_frames = 10;
@@ -189,7 +189,7 @@ fn a_freeze_without_and_with_a_reason() {
                 row.answer = None;
             }
         }
-        // The set-point freezes after two cycles, and starts from rest.
+        // The set-point freezes after two cycles and starts from rest.
         let mut position = held;
         for (number, row) in case.rows[from + 3..].iter_mut().enumerate() {
             let step = (number as i32 - 3).clamp(0, 10);
@@ -211,19 +211,19 @@ fn a_freeze_without_and_with_a_reason() {
 }
 
 #[test]
-fn a_target_far_from_what_the_drive_got_before_a_gap() {
+fn judge_finds_a_target_far_from_the_last_one_before_a_gap() {
     let mut case = Case::new(100);
     case.machine.lost_frames = 10;
     let from = turning(100);
     for row in &mut case.rows[from..from + 5] {
         row.answer = None;
     }
-    // It ran on over the whole gap.
+    // The set-point continued over the whole gap.
     case.breaks("csp-gap");
 }
 
 #[test]
-fn csp_taken_back_and_asked_for_again_far_away() {
+fn judge_finds_a_far_target_after_csp_is_requested_again() {
     let mut case = Case::new(40);
     case.machine.lost_frames = 10;
     let from = turning(40);
@@ -237,14 +237,14 @@ fn csp_taken_back_and_asked_for_again_far_away() {
 }
 
 #[test]
-fn a_velocity_that_jumps() {
+fn judge_finds_a_velocity_step() {
     let mut case = Case::new(40).in_csv();
     case.rows[turning(40)].velocity += 100;
     case.breaks("csv-acceleration");
 }
 
 #[test]
-fn targets_above_the_limits() {
+fn judge_finds_targets_above_the_limits() {
     let mut velocity = Case::new(10).in_csv();
     velocity.rows[turning(10)].velocity = 3002;
     velocity.breaks("limit");
@@ -257,7 +257,7 @@ fn targets_above_the_limits() {
 }
 
 #[test]
-fn targets_before_operation() {
+fn judge_finds_targets_before_operation_enabled() {
     let mut position = Case::new(10);
     position.rows[3].position = 501;
     position.breaks("target-before-operation");
@@ -267,7 +267,7 @@ fn targets_before_operation() {
 }
 
 #[test]
-fn a_controlword_without_its_state() {
+fn judge_finds_a_controlword_in_the_wrong_state() {
     let mut early = Case::new(10);
     early.rows[2].controlword = 0x0f;
     early.breaks("controlword");
@@ -283,7 +283,7 @@ fn a_controlword_without_its_state() {
 }
 
 #[test]
-fn operation_is_requested_in_another_mode() {
+fn judge_finds_operation_requested_in_another_mode() {
     let mut case = Case::new(10);
     for row in &mut case.rows[..8] {
         row.answer = row.answer.map(|of| (of.0, 10, of.2));
@@ -292,7 +292,7 @@ fn operation_is_requested_in_another_mode() {
 }
 
 #[test]
-fn a_drive_that_does_not_follow() {
+fn judge_finds_a_target_while_the_drive_does_not_follow() {
     let mut case = Case::new(40);
     for row in &mut case.rows {
         row.answer = row.answer.map(|of| (of.0 & !0x1000, of.1, 500));
@@ -301,8 +301,8 @@ fn a_drive_that_does_not_follow() {
 }
 
 #[test]
-fn speed_gained_after_a_stop() {
-    // The stop comes while the axis gains speed, and it goes on doing so.
+fn judge_finds_speed_gained_after_a_stop() {
+    // The stop starts during acceleration, and the acceleration continues.
     let mut reported = Case::new(40);
     reported.report.stop_s = Some(0.020);
     reported.breaks("speed-gained-after-stop");
@@ -315,9 +315,9 @@ fn speed_gained_after_a_stop() {
 }
 
 #[test]
-fn a_stop_that_takes_longer_than_its_ramp() {
+fn judge_finds_a_stop_longer_than_its_ramp() {
     let mut case = Case::new(40);
-    // Far too long for 0.1 s of ramp, 0.05 s of jerk and 0.15 s to settle.
+    // Longer than 0.1 s of ramp, 0.05 s of jerk and 0.15 s of settling.
     let row = case.rows[turning(40)];
     let rest = case.rows.split_off(turning(40));
     for number in 1..400 {
@@ -338,7 +338,7 @@ fn a_stop_that_takes_longer_than_its_ramp() {
 }
 
 #[test]
-fn enabled_again_after_a_stop() {
+fn judge_finds_a_drive_enabled_again_after_a_stop() {
     let mut case = Case::new(40);
     case.report.stop_s = Some(braking(40) as f64 * 1e-3);
     let last = case.rows.len() - 1;
@@ -351,7 +351,7 @@ fn enabled_again_after_a_stop() {
     case.breaks("enabled-after-stop");
 }
 
-/// The drive's quick stop from full speed, at one count a cycle, until `cut`.
+/// Returns the drive's quick stop from full speed, at one count per cycle, until `cut`.
 fn quick_stop(cut: usize) -> Case {
     let mut case = Case::new(40);
     case.rows.truncate(turning(40));
@@ -374,7 +374,7 @@ fn quick_stop(cut: usize) -> Case {
 }
 
 #[test]
-fn power_cut_while_the_drive_turns() {
+fn judge_finds_power_off_while_the_drive_turns() {
     let mut cut = quick_stop(10);
     cut.report.exit = 1;
     cut.report.text = "`io` (position 2): no longer answers".to_string();
@@ -386,12 +386,12 @@ fn power_cut_while_the_drive_turns() {
 }
 
 #[test]
-fn a_quick_stop_at_speed_without_a_failure() {
+fn judge_finds_a_quick_stop_at_speed_without_a_failure() {
     quick_stop(55).breaks("quick-stop-without-failure");
 }
 
 #[test]
-fn op_left_while_the_drive_turns() {
+fn judge_finds_op_left_while_the_drive_turns() {
     let mut case = Case::new(40);
     case.report.exit = 1;
     case.al_control = vec![(turning(40), 4)];
@@ -401,7 +401,7 @@ fn op_left_while_the_drive_turns() {
 }
 
 #[test]
-fn enabled_on_a_silent_bus() {
+fn judge_finds_a_drive_enabled_on_a_silent_bus() {
     let mut case = Case::new(40).failed();
     let from = turning(40);
     for row in &mut case.rows[from..] {
@@ -411,14 +411,14 @@ fn enabled_on_a_silent_bus() {
 }
 
 #[test]
-fn power_at_the_end() {
+fn judge_finds_power_at_the_end() {
     let mut case = Case::new(40);
     case.rows.truncate(turning(40));
     case.breaks("power-at-the-end");
 }
 
 #[test]
-fn failures_that_are_not_reported() {
+fn judge_finds_unreported_failures() {
     let mut fault = Case::new(40);
     let from = turning(40);
     for (number, row) in fault.rows[from..].iter_mut().enumerate() {
@@ -435,15 +435,15 @@ fn failures_that_are_not_reported() {
 }
 
 #[test]
-fn a_device_that_does_not_answer_is_not_taken_for_its_outputs() {
+fn judge_does_not_read_outputs_as_inputs_of_a_missing_device() {
     let mut case = Case::new(40);
-    // Another device is missing: the working counter is wrong, and the drive's inputs are there.
+    // Another device is missing: the working counter is wrong, but the drive's inputs are valid.
     let from = turning(40);
     for row in &mut case.rows[from..from + 1] {
         row.incomplete = true;
     }
     case.is_clean();
-    // Nothing was filled in: the bytes came back as they were sent.
+    // The device wrote nothing: the bytes came back unchanged.
     let row = &mut case.rows[from];
     row.answer = Some((row.controlword, row.mode, row.position));
     let file = recording(&case.rows, &[]);

@@ -1,4 +1,4 @@
-//! Whether exit code and fault report fit the script.
+//! Checks that exit code and fault report match the script.
 
 use serde_json::Value;
 
@@ -26,7 +26,7 @@ fn text<'a>(value: &'a Value, path: &str) -> &'a str {
         .unwrap_or_default()
 }
 
-/// Takes from the result what its user reads.
+/// Extracts the user-visible texts from the result.
 pub fn report(exit: i32, result: &Value, outcome: &mut Outcome) -> Report {
     outcome.error = text(result, "/error").to_string();
     outcome.headline = text(result, "/story/headline").to_string();
@@ -69,7 +69,7 @@ pub fn check(plan: &Plan, wire: &Wire, report: &Report, result: &Value, outcome:
         let first = wire.cycles.first()?;
         Some(first.at as f64 * 1e-9 + seconds)
     });
-    // What ended the run as it should does not explain a failure; what struck later may.
+    // The cause of a regular end does not explain a failure; a later fault may.
     let until = stopped_at.filter(|_| report.failed).unwrap_or(wire.seconds);
     let until = until + 2.0 * plan.machine.seconds();
     let struck: Vec<_> = plan
@@ -85,7 +85,7 @@ pub fn check(plan: &Plan, wire: &Wire, report: &Report, result: &Value, outcome:
                 .findings
                 .push(finding("exit-0-with-failure", detail));
         }
-        // Struck while it was powered, and long before the end of the run.
+        // The fault occurred while the drive was powered, and long before the end of the run.
         let sure = |effect: Effect| effect == Effect::Failure;
         if let Some(fault) = plan
             .faults

@@ -1,4 +1,4 @@
-//! What one drive received, next to what its MainDevice could know at that moment.
+//! The data that one drive received, and the data that its MainDevice could know at that time.
 
 use super::wire::{Cycle, Inputs, Outputs, Wire};
 
@@ -9,7 +9,7 @@ pub const CST: i8 = 10;
 pub const PP: i8 = 1;
 pub const PV: i8 = 3;
 
-/// Reports that are kept: outputs may follow any of the last ones.
+/// The number of kept reports: outputs may follow any of the last ones.
 const RECENT: usize = 4;
 
 /// The machine as the generator wrote it.
@@ -28,7 +28,7 @@ pub struct Axis {
     pub mode: i8,
     pub outputs: Vec<u16>,
     pub inputs: Vec<u16>,
-    /// Counts a unit, and what 0x60FF and 0x6083 hold for a unit/s and a unit/s².
+    /// Counts per unit, and the values of 0x60FF and 0x6083 for one unit/s and one unit/s².
     pub counts: f64,
     pub velocity_scale: f64,
     pub acceleration_scale: f64,
@@ -38,23 +38,23 @@ pub struct Axis {
     pub jerk: f64,
     pub torque: f64,
     pub range: Option<(f64, f64)>,
-    /// A position loop over 0x60FF or 0x6071.
+    /// True with a position loop over 0x60FF or 0x6071.
     pub loops: bool,
-    /// A key of the file or a fault of the script lets the axis lose power while it turns.
+    /// A key of the file or a fault of the script may remove power while the axis turns.
     pub may_lose_power: bool,
-    /// A torque of the script acts on the shaft.
+    /// The script applies a torque to the shaft.
     pub disturbed: bool,
-    /// In a group without which the others go on.
+    /// The axis is in a group that stops alone.
     pub alone: bool,
 }
 
 impl Axis {
-    /// Counts a cycle at the velocity limit.
+    /// Returns the counts per cycle at the velocity limit.
     pub fn velocity_step(&self, machine: &Machine) -> f64 {
         self.velocity * self.counts * machine.seconds()
     }
 
-    /// Change of that a cycle at the acceleration limit.
+    /// Returns the change of the step per cycle at the acceleration limit.
     pub fn acceleration_step(&self, machine: &Machine) -> f64 {
         self.acceleration * self.counts * machine.seconds().powi(2)
     }
@@ -65,12 +65,12 @@ impl Machine {
         self.cycle_ns as f64 * 1e-9
     }
 
-    /// Cycles from an answer to the outputs that can follow from it.
+    /// Returns the cycles from an answer to the first outputs that may depend on it.
     pub fn answer_to_outputs(&self) -> usize {
         if self.pipelined { 2 } else { 1 }
     }
 
-    /// When an answer is late: the cycle waits for three quarters of its length
+    /// True if an answer is in time: the cycle waits for three quarters of its length
     /// (`docs/architecture.md`, "The life of a cycle").
     fn is_in_time(&self, cycle: &Cycle, back: u64) -> bool {
         let later = if self.pipelined { self.cycle_ns } else { 0 };
@@ -78,24 +78,25 @@ impl Machine {
     }
 }
 
-/// Outputs of one cycle and what was known when they left.
+/// The outputs of one cycle and the knowledge at the time of sending.
 #[derive(Debug, Clone, Copy)]
 pub struct Moment {
     pub cycle: usize,
     pub at: u64,
     pub sent: Outputs,
-    /// The last reports, newest first; the first `heard` of them are there.
+    /// The last reports, newest first; only the first `heard` are valid.
     recent: [Inputs; RECENT],
     heard: usize,
-    /// The last report that came in time.
+    /// The last report in time.
     pub in_time: Option<Inputs>,
-    /// Cycles since the last answer that came in time; 0: fresh.
+    /// Cycles since the last answer in time; 0: fresh.
     pub age: usize,
-    /// Cycles in a row from which nothing has come back, not even late.
+    /// Consecutive cycles without any answer, even a late one.
     pub silent: usize,
-    /// Whole cycles that were left out in front of this one.
+    /// Whole cycles that were skipped before this one.
     pub left_out: usize,
-    /// Reported speed, in counts a cycle: the least of the last three, 0 where they disagree.
+    /// The reported speed in counts per cycle: the least of the last three, 0 if their signs
+    /// differ.
     pub speed: f64,
 }
 
@@ -144,7 +145,7 @@ impl Inputs {
     }
 }
 
-/// Every cycle in which the drive was in the process data.
+/// Returns every cycle in which the drive was in the process data.
 pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
     let mut moments: Vec<Moment> = Vec::new();
     let delay = machine.answer_to_outputs();
@@ -160,7 +161,7 @@ pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
                 }
                 _ => age += 1,
             }
-            // Outputs are made when the cycle before has stopped waiting.
+            // The MainDevice computes outputs when the previous cycle has stopped waiting.
             let made = cycle.at.saturating_sub(machine.cycle_ns * 6 / 25);
             silent = silent_cycles(wire, drive, due, made, silent);
             late_reports(wire, drive, due, cycle.at, &mut reports);
@@ -194,7 +195,7 @@ pub fn moments(machine: &Machine, wire: &Wire, drive: usize) -> Vec<Moment> {
 }
 
 fn silent_cycles(wire: &Wire, drive: usize, due: usize, now: u64, before: usize) -> usize {
-    // One answer that came late ends the silence from its cycle on.
+    // A late answer ends the silence from its cycle on.
     (0..=before)
         .find(|back| {
             let answer = due
@@ -207,7 +208,7 @@ fn silent_cycles(wire: &Wire, drive: usize, due: usize, now: u64, before: usize)
         .unwrap_or(before + 1)
 }
 
-/// Takes in what came back late, once.
+/// Adds each late report once.
 fn late_reports(
     wire: &Wire,
     drive: usize,

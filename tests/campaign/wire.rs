@@ -1,7 +1,7 @@
-//! From frames to what each drive received and reported, cycle by cycle: EtherCAT datagrams and
-//! working counters (ETG.1000.4, 5.4), FMMUs (ETG.1000.4, 6.6), AL control (ETG.1000.4, 6.1).
-//! Addresses come from the writes to FMMUs in the recording; the order of the objects from the
-//! machine that the generator wrote.
+//! Converts frames to the data that each drive received and reported, cycle by cycle: EtherCAT
+//! datagrams and working counters (ETG.1000.4, 5.4), FMMUs (ETG.1000.4, 6.6), AL control
+//! (ETG.1000.4, 6.1). Addresses come from the recorded writes to FMMUs. The object order comes from
+//! the generated machine.
 
 use std::collections::BTreeMap;
 
@@ -18,12 +18,12 @@ const AL_CONTROL: u16 = 0x0120;
 const FMMUS: u16 = 0x0600;
 const FMMU_BYTES: usize = 16;
 const FMMU_REGISTERS: usize = 16 * FMMU_BYTES;
-/// Process data lies behind the registers; FMMUs to registers carry mailbox status.
+/// Process data lies above the registers; FMMUs to registers carry mailbox status.
 const PROCESS_RAM: u16 = 0x1000;
-/// Bytes in front of the first datagram: Ethernet and EtherCAT header.
+/// The bytes before the first datagram: Ethernet and EtherCAT header.
 const HEADERS: usize = 16;
 
-/// What the judge knows of a drive in front of the recording.
+/// The judge's knowledge of a drive before it reads the recording.
 #[derive(Debug, Clone)]
 pub struct DriveLayout {
     pub position: u16,
@@ -31,7 +31,7 @@ pub struct DriveLayout {
     pub inputs: Vec<u16>,
 }
 
-/// The objects of the outputs, as they were sent.
+/// The output objects as sent.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Outputs {
     pub controlword: u16,
@@ -44,7 +44,7 @@ pub struct Outputs {
     pub profile_deceleration: Option<u32>,
 }
 
-/// The objects of the inputs, as the device filled them in.
+/// The input objects as the device wrote them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Inputs {
     pub statusword: u16,
@@ -55,7 +55,7 @@ pub struct Inputs {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Exchange {
     pub sent: Outputs,
-    /// What the device answered, and when the reply was read.
+    /// The device's answer and the time at which the reply was read.
     pub heard: Option<(u64, Inputs)>,
 }
 
@@ -63,11 +63,11 @@ pub struct Exchange {
 pub struct Cycle {
     /// Time since the first packet, in ns.
     pub at: u64,
-    /// When the last of its frames came back.
+    /// The time at which the last of its frames came back.
     pub back: Option<u64>,
-    /// Every device has answered with its full share of the working counter.
+    /// True if every device added its full working counter.
     pub complete: bool,
-    /// In the order of the drives; `None` while a drive is not in the process data.
+    /// The exchanges in drive order; `None` while a drive is not in the process data.
     pub drives: Vec<Option<Exchange>>,
 }
 
@@ -75,7 +75,7 @@ pub struct Cycle {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AlRequest {
     pub at: u64,
-    /// `None`: every device.
+    /// The position; `None`: every device.
     pub position: Option<u16>,
     pub state: u8,
 }
@@ -84,7 +84,7 @@ pub struct AlRequest {
 pub struct Wire {
     pub cycles: Vec<Cycle>,
     pub al_requests: Vec<AlRequest>,
-    /// Sent frames that are not EtherCAT as ETG.1000.4 has it.
+    /// The times of sent frames that violate ETG.1000.4.
     pub malformed: Vec<u64>,
     pub duplicates: usize,
     pub seconds: f64,
@@ -100,7 +100,7 @@ struct Datagram<'a> {
 }
 
 impl Datagram<'_> {
-    /// The first half of the address: position or station.
+    /// Returns the first half of the address: position or station.
     fn device(&self) -> u16 {
         self.address as u16
     }
@@ -142,7 +142,7 @@ fn datagrams(frame: &[u8]) -> Option<Vec<Datagram<'_>>> {
     }
 }
 
-/// A piece of the logical address space that an FMMU of a device maps.
+/// A section of the logical address space that an FMMU of a device maps.
 #[derive(Debug, Clone, Copy)]
 struct Region {
     logical: u32,
@@ -162,7 +162,7 @@ struct Regions {
     inputs: Option<Region>,
 }
 
-/// What a cyclic frame carried, until its reply comes.
+/// The contents of a cyclic frame until its reply comes.
 struct Pending {
     cycle: usize,
     source: u8,
@@ -175,16 +175,16 @@ struct Reader<'a> {
     wire: Wire,
     stations: BTreeMap<u16, u16>,
     fmmus: BTreeMap<u16, [u8; FMMU_REGISTERS]>,
-    /// Of every device in the process data, by position.
+    /// The regions of every device in the process data, by position.
     regions: BTreeMap<u16, Regions>,
     pending: Vec<Pending>,
     answered: Vec<(u8, u8, usize)>,
-    /// Logical addresses of the current cycle's datagrams.
+    /// The logical addresses of the current cycle's datagrams.
     addresses: Vec<(u8, u32)>,
     cycle_complete: bool,
 }
 
-/// How many cycles a reply may be late and still be known by its index.
+/// The maximum delay in cycles at which a reply is matched by its index.
 const LATEST: usize = 200;
 
 /// Reads the recording of a machine with these drives.
@@ -272,7 +272,7 @@ impl Reader<'_> {
                 .any(|of| covers(of.outputs) || covers(of.inputs))
     }
 
-    /// What sets the bus up: station addresses, FMMUs, states.
+    /// Processes bring-up data: station addresses, FMMUs, states.
     fn acyclic(&mut self, at: u64, datagrams: &[Datagram<'_>]) {
         for datagram in datagrams {
             let (device, register) = (datagram.device(), datagram.register());
@@ -311,8 +311,8 @@ impl Reader<'_> {
         }
     }
 
-    /// Takes over what the FMMUs of a station map (ETG.1000.4, table 56: logical start address,
-    /// length, physical start address at 8, read 1 and write 2 at 11, enable at 12).
+    /// Reads the FMMUs of a station (ETG.1000.4, table 56: logical start address, length, physical
+    /// start address at 8, read 1 and write 2 at 11, enable at 12).
     fn map(&mut self, station: u16) {
         let (Some(&position), Some(held)) = (self.stations.get(&station), self.fmmus.get(&station))
         else {
@@ -337,7 +337,8 @@ impl Reader<'_> {
         self.regions.insert(position, regions);
     }
 
-    /// A write counts 2 in an LRW, everything else 1 (ETG.1000.4, 5.4.1.2).
+    /// Returns the expected working counter. A write counts 2 in an LRW, everything else 1
+    /// (ETG.1000.4, 5.4.1.2).
     fn expected_counter(&self, datagram: &Datagram<'_>) -> u16 {
         let covers = |region: Option<Region>| region.is_some_and(|of| of.of(datagram).is_some());
         let share = |of: &Regions| {
@@ -378,7 +379,7 @@ impl Reader<'_> {
                 let (Some(bytes), Some(as_sent)) = (region.of(datagram), region.of(sent)) else {
                     continue;
                 };
-                // A device that did not answer leaves the bytes as they were sent.
+                // A missing device leaves the bytes as sent.
                 if datagram.command == LWR || !full && bytes == as_sent {
                     continue;
                 }
@@ -410,7 +411,7 @@ impl Reader<'_> {
     }
 }
 
-/// Bytes of an object of CiA 402 (IEC 61800-7-201, table 1).
+/// Returns the size in bytes of a CiA 402 object (IEC 61800-7-201, table 1).
 fn size(object: u16) -> usize {
     match object {
         0x6060 | 0x6061 => 1,
@@ -419,7 +420,7 @@ fn size(object: u16) -> usize {
     }
 }
 
-/// The objects in front of each other, with their bytes.
+/// Splits the data into its objects.
 fn objects<'a>(
     layout: &'a [u16],
     bytes: &'a [u8],

@@ -1,11 +1,12 @@
-//! What is said where somebody made a mistake, and what does not work out: exit code, and words that help.
+//! Exit codes and messages for user mistakes and failed operations.
 
 use std::path::Path;
 
 use super::common::root;
 use super::{ecaxis, text};
 
-/// Code, stdout and stderr of a command line, its words at blanks; `~` stands for a folder of one's own.
+/// Runs a command line, split at blanks; `~` stands for a temporary folder. Returns exit code,
+/// stdout and stderr.
 fn ran(line: &str, folder: &Path) -> (i32, String, String) {
     let folder = folder.to_str().expect("UTF-8");
     let words: Vec<String> = line.split(' ').map(|w| w.replace('~', folder)).collect();
@@ -16,7 +17,7 @@ fn ran(line: &str, folder: &Path) -> (i32, String, String) {
 }
 
 #[test]
-fn mistakes_have_their_code_and_say_what_to_do() {
+fn mistakes_have_an_exit_code_and_a_hint() {
     let folder = tempfile::tempdir().expect("a folder");
     let write = |name: &str, bytes: &[u8]| {
         std::fs::write(folder.path().join(name), bytes).expect("written");
@@ -30,7 +31,7 @@ fn mistakes_have_their_code_and_say_what_to_do() {
     write("nonsense.toml", nonsense.as_bytes());
 
     for (line, code, parts) in [
-        // A file that was named and is not there, is none, or cannot be written.
+        // Files that are missing, of the wrong type, or not writable.
         (
             "run configs/demo.toml --replay ~/none.pcapng",
             2,
@@ -72,7 +73,7 @@ fn mistakes_have_their_code_and_say_what_to_do() {
             2,
             &["empty.bin is empty"],
         ),
-        // What was named and is refused.
+        // Named items that are rejected.
         (
             "sdo read configs/demo.toml x 0x6064 0x5fff 0x6041 --sim",
             1,
@@ -132,7 +133,7 @@ fn mistakes_have_their_code_and_say_what_to_do() {
         "sdo read configs/demo.toml x 0x6064 0x5fff 0x6041 --sim",
         folder.path(),
     );
-    assert!(out.contains("0x6041:00"), "the others are told:\n{out}");
+    assert!(out.contains("0x6041:00"), "the others are reported:\n{out}");
     let (_, _, err) = ran("check ~/typo.toml", folder.path());
     assert!(!err.contains("duplicate"), "only what is the cause:\n{err}");
     let (_, _, err) = ran("check ~/nonsense.toml", folder.path());
@@ -141,7 +142,7 @@ fn mistakes_have_their_code_and_say_what_to_do() {
     assert!(err.matches(".toml").count() <= 5, "{err}");
 }
 
-/// Both devices are called something else.
+/// Both devices have other names.
 const TYPO: &str = r#"
 [bus]
 cycle = "1ms"
@@ -165,9 +166,9 @@ encoder = 2000
 limits = { velocity = 10.0, acceleration = 100.0 }
 "#;
 
-/// Log lines may be asked for on either side of what a verb is to do.
+/// `--verbose` is accepted before and after the verb.
 #[test]
-fn verbose_stands_anywhere() {
+fn verbose_is_accepted_anywhere() {
     let folder = tempfile::tempdir().expect("a folder");
     for line in [
         "sdo -v read configs/demo.toml x 0x6064 --sim",
@@ -180,7 +181,7 @@ fn verbose_stands_anywhere() {
     }
 }
 
-/// Subindices are hexadecimal wherever they are read or shown.
+/// Subindices are hexadecimal in every input and output.
 #[test]
 fn subindices_are_hexadecimal() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -206,9 +207,9 @@ fn subindices_are_hexadecimal() {
     assert_eq!(read("0x1018:01"), Some(1));
 }
 
-/// A recording has nothing that could be mended.
+/// A failed replay gives no advice for repairs, because a recording is not repairable.
 #[test]
-fn a_replay_that_cannot_go_on() {
+fn a_replay_that_deviates_gives_no_repair_hint() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = "run configs/demo.toml --sim --virtual --repeat 1";
     let (code, _, err) = ran(&format!("{run} --record ~/whole.pcapng"), folder.path());
@@ -242,7 +243,7 @@ fn a_replay_that_cannot_go_on() {
         assert!(!err.contains("check power"), "{line}: {err}");
         assert!(err.matches("deviat").count() <= 2, "{line}: {err}");
     }
-    // Nor is a recording of another machine taken for the file's.
+    // A recording of another machine does not match the file either.
     let (_, _, err) = ran(
         "analyze ~/whole.pcapng --machine configs/commissioning.toml",
         folder.path(),
@@ -255,9 +256,9 @@ fn a_replay_that_cannot_go_on() {
     assert_eq!(err, "");
 }
 
-/// What the last thing that was heard of an axis is, is not what it is at the end.
+/// The last known position is not the final position.
 #[test]
-fn an_axis_that_is_not_heard_has_no_final_position() {
+fn an_axis_without_answers_has_no_final_position() {
     let folder = tempfile::tempdir().expect("a folder");
     let script = "[[fault]]\nkind = \"power-off\"\nat = \"1s\"\ndevice = 1\n";
     std::fs::write(folder.path().join("off.toml"), script).expect("written");
@@ -275,7 +276,7 @@ fn an_axis_that_is_not_heard_has_no_final_position() {
     let json: serde_json::Value = serde_json::from_str(&out).expect("JSON");
     let heard = json["summary"]["axes"][1]["last_heard_s"].as_f64();
     assert!(heard.is_some_and(|s| s < 1.0), "{heard:?}");
-    // Who was heard to the end has no such time.
+    // Axes with answers until the end have no such time.
     let (_, out, _) = ran(
         "run configs/demo.toml --sim --virtual --repeat 1 --json",
         folder.path(),
@@ -285,7 +286,7 @@ fn an_axis_that_is_not_heard_has_no_final_position() {
 }
 
 #[test]
-fn parts_of_a_percent_are_told() {
+fn fractions_of_a_percent_are_reported() {
     let folder = tempfile::tempdir().expect("a folder");
     let (code, out, _) = ran("explain configs/demo.toml", folder.path());
     assert_eq!(code, 0);
@@ -293,11 +294,14 @@ fn parts_of_a_percent_are_told() {
         let (before, _) = line.split_once(" %")?;
         before.rsplit(' ').next().map(str::to_owned)
     };
-    let told: Vec<String> = out
+    let reported: Vec<String> = out
         .lines()
         .filter(|l| l.contains("µs"))
         .filter_map(percent)
         .collect();
-    assert!(told.len() >= 2, "{out}");
-    assert!(told.iter().all(|number| number.contains('.')), "{told:?}");
+    assert!(reported.len() >= 2, "{out}");
+    assert!(
+        reported.iter().all(|number| number.contains('.')),
+        "{reported:?}"
+    );
 }

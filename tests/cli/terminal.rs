@@ -1,13 +1,14 @@
-//! What stands on a terminal of 80 columns.
+//! Output on a terminal with 80 columns.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
-use crate::common::wire::calmly;
+use crate::common::wire::retry_if_host_stalled;
 use std::process::{Command, Stdio};
 
 use super::common::root;
 
-/// The program's whole output, stdout and stderr as they come, and its exit code. `None`, with the reason printed, where there is no `script`.
+/// Returns the exit code and the whole output, stdout and stderr interleaved. Prints the reason and
+/// returns `None` without `script`.
 fn on_terminal(arguments: &str) -> Option<(i32, String)> {
     let there = Command::new("script").arg("--version").output().is_ok();
     assert!(
@@ -33,7 +34,7 @@ fn on_terminal(arguments: &str) -> Option<(i32, String)> {
     Some((output.status.code().expect("an exit code"), text))
 }
 
-/// Without escape sequences; each way back to the line's beginning begins another.
+/// Removes escape sequences. Each carriage return starts a new line.
 fn lines(text: &str) -> Vec<String> {
     let mut plain = String::new();
     let mut rest = text.chars();
@@ -100,15 +101,16 @@ fn no_line_is_wider_than_the_terminal() {
     }
 }
 
-/// Emergencies, warnings and what Ctrl-C says each have lines of their own, beside the one that is written over.
+/// Emergencies, warnings and the Ctrl-C message have their own lines, separate from the transient
+/// status line.
 #[test]
-fn lines_that_stay_do_not_mix_with_the_one_that_passes() {
-    calmly(|| {
+fn permanent_lines_do_not_mix_with_the_status_line() {
+    retry_if_host_stalled(|| {
         let folder = tempfile::tempdir().expect("a folder");
         let faults = folder.path().join("emergency.toml");
         let script = "[[fault]]\nkind = \"emergency\"\nat = \"1s\"\ndevice = 1\ncode = 0x8611\n";
         std::fs::write(&faults, script).expect("written");
-        // A computer that is busy with tests stalls for longer than a machine may.
+        // A test computer under load stalls for longer than a machine tolerates.
         let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
         let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
         let esi = root().join("configs/esi");
@@ -124,7 +126,7 @@ fn lines_that_stay_do_not_mix_with_the_one_that_passes() {
             return;
         };
         let lines = lines(&text);
-        // The summary lists them once more.
+        // The summary repeats these lines.
         let meanwhile = lines
             .iter()
             .take_while(|line| !line.contains("complete run"));
@@ -134,7 +136,7 @@ fn lines_that_stay_do_not_mix_with_the_one_that_passes() {
             these.copied().collect()
         };
         let [emergency] = having("0x8611")[..] else {
-            panic!("not told once:\n{text}");
+            panic!("not reported once:\n{text}");
         };
         assert!(emergency.starts_with("warning: `y`: "), "{emergency}");
         assert_eq!(

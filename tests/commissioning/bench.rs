@@ -1,4 +1,4 @@
-//! A folder with machine files and ESI files, and the program run in it.
+//! Runs the program in a folder with machine files and ESI files.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -7,13 +7,13 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// A folder of its own, with copies of our ESI files in `esi`.
+/// A temporary folder with copies of the project's ESI files in `esi`.
 #[derive(Debug)]
 pub struct Bench {
     folder: tempfile::TempDir,
 }
 
-/// How a command ended.
+/// The result of a command.
 #[derive(Debug)]
 pub struct Ran {
     pub code: i32,
@@ -45,7 +45,7 @@ impl Bench {
         std::fs::read_to_string(self.path().join(name)).expect("a text file")
     }
 
-    /// One of `configs`, under another name.
+    /// Copies one of `configs` under another name.
     pub fn copy(&self, config: &str, name: &str) {
         let text = std::fs::read_to_string(root().join("configs").join(config));
         self.write(name, &text.expect("one of our files"));
@@ -71,7 +71,7 @@ impl Bench {
         }
     }
 
-    /// What is printed where all goes well.
+    /// Runs a command that must succeed and returns its output.
     #[track_caller]
     pub fn well(&self, arguments: &[&str]) -> String {
         let ran = self.ecaxis(arguments);
@@ -80,7 +80,7 @@ impl Bench {
     }
 }
 
-/// Compares a text with the one that was reviewed.
+/// Compares a text with its reviewed snapshot.
 #[track_caller]
 pub fn reviewed(name: &str, now: &str) {
     let kept = root().join(format!("tests/snapshots/scan/{name}"));
@@ -92,7 +92,7 @@ pub fn reviewed(name: &str, now: &str) {
     assert!(expected == now, "{} differs, now:\n{now}", kept.display());
 }
 
-/// Every line fits a terminal.
+/// Checks that every line fits a terminal.
 #[track_caller]
 pub fn fits(text: &str) {
     for line in text.lines() {

@@ -1,10 +1,10 @@
-//! `ecaxis compare`: every kind of difference is named, and `--apply` makes a file without mistakes of it.
+//! `ecaxis compare` names every kind of difference, and `--apply` produces a valid file.
 
 use serde_json::Value;
 
 use crate::bench::{Bench, reviewed};
 
-/// A machine with everything that may differ.
+/// A machine with every property that may differ.
 const MACHINE: &str = r#"# The machine at the window.
 
 [bus]
@@ -57,7 +57,7 @@ esi      = "esi/IO8.xml"
 alias    = 20
 
 [stop]
-emergency = { doors."Channel 1" = false }   # somebody is inside
+emergency = { doors."Channel 1" = false }   # a person is inside
 
 [[stop.group]]
 name    = "table"
@@ -81,15 +81,15 @@ dwell = "10ms"
 
 struct Case {
     name: &'static str,
-    /// Kinds, as JSON has them.
+    /// The kinds of differences in JSON.
     kinds: &'static [&'static str],
-    /// In what is told.
-    told: &'static [&'static str],
-    /// From the machine file to that of the other bus.
+    /// Texts that the output must contain.
+    reported: &'static [&'static str],
+    /// Converts the machine file to that of the other bus.
     other: fn(&str) -> String,
 }
 
-/// The text of one [[device]].
+/// Returns the text of one [[device]].
 fn section<'t>(text: &'t str, name: &str) -> &'t str {
     let from = text.find(&format!("[[device]]\nname     = \"{name}\""));
     let rest = &text[from.expect("the device")..];
@@ -113,19 +113,19 @@ fn cases() -> Vec<Case> {
         Case {
             name: "missing",
             kinds: &["missing"],
-            told: &["`y` (position 3) is missing: no IDX is left on the bus for it"],
+            reported: &["`y` (position 3) is missing: no IDX is left on the bus for it"],
             other: |text| without(text, "y").replace("position = 4", "position = 3"),
         },
         Case {
             name: "missing-alias",
             kinds: &["missing"],
-            told: &["`lamp` (alias 20) is missing"],
+            reported: &["`lamp` (alias 20) is missing"],
             other: |text| without(text, "lamp"),
         },
         Case {
             name: "added",
             kinds: &["added"],
-            told: &["position 2 is not in the file: SV1, "],
+            reported: &["position 2 is not in the file: SV1, "],
             other: |text| {
                 let text = only_devices(text)
                     .replace("position = 4", "position = 5")
@@ -138,7 +138,7 @@ fn cases() -> Vec<Case> {
         Case {
             name: "swapped",
             kinds: &["swapped"],
-            told: &["`x` and `y` are swapped: `x` is at position 3, `y` at position 2"],
+            reported: &["`x` and `y` are swapped: `x` is at position 3, `y` at position 2"],
             other: |text| {
                 only_devices(text)
                     .replace("position = 3", "position = 99")
@@ -149,25 +149,25 @@ fn cases() -> Vec<Case> {
         Case {
             name: "revision",
             kinds: &["revision"],
-            told: &["`y` (position 3) has revision 0x00010007, its ESI describes 0x00010000"],
+            reported: &["`y` (position 3) has revision 0x00010007, its ESI describes 0x00010000"],
             other: |text| only_devices(text).replace("esi/IDX.xml", "newer/IDX.xml"),
         },
         Case {
             name: "alias",
             kinds: &["alias"],
-            told: &["`lamp`: nobody has alias 20; the IO8 at position 5 has alias 21"],
+            reported: &["`lamp`: no device has alias 20; the IO8 at position 5 has alias 21"],
             other: |text| only_devices(text).replace("alias    = 20", "alias    = 21"),
         },
         Case {
             name: "serial",
             kinds: &["serial"],
-            told: &["`x` (position 2) has serial number 4711, the file says 1002"],
+            reported: &["`x` (position 2) has serial number 4711, the file says 1002"],
             other: |text| only_devices(text).replace("serial   = 1002", "serial   = 4711"),
         },
         Case {
             name: "modules",
             kinds: &["modules"],
-            told: &[
+            reported: &[
                 "`block` (position 4) holds the modules [OUT8, OUT8], the file says [IN8, OUT8]",
             ],
             other: |text| only_devices(text).replace("[\"IN8\", \"OUT8\"]", "[\"OUT8\", \"OUT8\"]"),
@@ -175,7 +175,7 @@ fn cases() -> Vec<Case> {
         Case {
             name: "replaced",
             kinds: &["missing", "added"],
-            told: &[
+            reported: &[
                 "`doors` (position 1) is missing",
                 "position 1 is not in the file: DO8",
             ],
@@ -195,7 +195,7 @@ fn bench() -> Bench {
 }
 
 #[test]
-fn equal_buses_are_as_in_the_file() {
+fn compare_reports_equal_buses_as_equal() {
     let bench = bench();
     let compare = ["compare", "machine.toml", "--sim", "machine.toml"];
     let ran = bench.ecaxis(&compare);
@@ -209,13 +209,13 @@ fn equal_buses_are_as_in_the_file() {
     let json = bench.well(&[&compare[..], &["--json"]].concat());
     let json: Value = serde_json::from_str(&json).expect("JSON");
     assert_eq!(json["equal"], true);
-    // Nothing to be applied leaves every byte.
+    // Without differences, `--apply` changes no byte.
     bench.well(&[&compare[..], &["--apply"]].concat());
     assert_eq!(bench.read("machine.toml"), MACHINE);
 }
 
 #[test]
-fn every_difference_is_named_and_can_be_applied() {
+fn compare_names_and_applies_every_difference() {
     let bench = bench();
     for case in cases() {
         let name = case.name;
@@ -224,7 +224,7 @@ fn every_difference_is_named_and_can_be_applied() {
         let compare = ["compare", "machine.toml", "--sim", "other.toml"];
         let ran = bench.ecaxis(&compare);
         assert_eq!(ran.code, 1, "{name}: {}{}", ran.out, ran.err);
-        for part in case.told {
+        for part in case.reported {
             assert!(
                 ran.out.contains(part),
                 "{name}: `{part}` is not in:\n{}",
@@ -272,9 +272,10 @@ fn every_difference_is_named_and_can_be_applied() {
     }
 }
 
-/// What became of the program and of places is told where it is marked and where nothing is left to be marked.
+/// Consequences for the program and for positions are reported, both for marked and for removed
+/// parts of the file.
 #[test]
-fn what_goes_with_a_device_is_told() {
+fn compare_reports_consequences_for_program_and_positions() {
     let bench = bench();
     bench.write("machine.toml", MACHINE);
     bench.write(
@@ -286,13 +287,13 @@ fn what_goes_with_a_device_is_told() {
     assert_eq!(ran.code, 0, "{}", ran.err);
     for part in [
         "`block` has `position = 3` now, it was 4",
-        "step 3.1 is taken out",
-        "machine.toml is as the bus now",
-        "2 lines are marked \"CHECK:\" and want a look",
+        "step 3.1 is removed",
+        "machine.toml matches the bus now",
+        "2 lines are marked \"CHECK:\" and need a check",
     ] {
         assert!(ran.err.contains(part), "`{part}` is not in:\n{}", ran.err);
     }
-    // A serial number alone leaves nothing to be looked at.
+    // A serial number alone has no consequences to check.
     bench.write("machine.toml", MACHINE);
     let other = only_devices(MACHINE).replace("serial   = 1002", "serial   = 4711");
     bench.write("other.toml", &other);
@@ -301,9 +302,9 @@ fn what_goes_with_a_device_is_told() {
     assert!(!ran.err.contains("CHECK"), "{}", ran.err);
 }
 
-/// What `identity` takes is no difference, and brings the bus up.
+/// A deviation that `identity` permits is not a difference, and the bus comes up.
 #[test]
-fn policies() {
+fn identity_policies_permit_deviations() {
     let bench = bench();
     for (policy, newer, older) in [
         ("equal", false, false),
@@ -351,9 +352,9 @@ fn policies() {
     );
 }
 
-/// Start-up SDOs that the device does not hold yet.
+/// `--parameters` reports start-up SDOs with values that the device does not hold.
 #[test]
-fn parameters_on_request() {
+fn compare_reports_parameters_on_request() {
     let bench = bench();
     let text = MACHINE.replace(
         "mode     = \"csp\"\n\n[device.axis]\nunit    = \"turn\"\nencoder = 2000\nlimits  = { velocity = 10.0, acceleration = 100.0 }\n\n[[device]]\nname     = \"y\"",
@@ -367,14 +368,14 @@ fn parameters_on_request() {
     assert_eq!(ran.code, 1, "{}", ran.err);
     let expected = "`x` (position 2): 0x6065:00 Following error window is 2000 (0x000007d0), start-up writes 1234 (0x000004d2)";
     assert!(ran.out.lines().any(|line| line == expected), "{}", ran.out);
-    // They are no part of the topology.
+    // Parameters are not part of the topology.
     let ran = bench.ecaxis(&[&compare[..], &["--parameters", "--apply"]].concat());
     assert_eq!(ran.code, 1);
     assert_eq!(bench.read("machine.toml"), text);
 }
 
 #[test]
-fn another_machine_altogether() {
+fn compare_reports_another_machine() {
     let bench = bench();
     bench.copy("commissioning.toml", "other.toml");
     let text = "[bus]\ncycle = \"1ms\"\n\n[[device]]\nname = \"io\"\nesi = \"esi/IO8.xml\"\nposition = 0\n";
@@ -396,12 +397,13 @@ fn another_machine_altogether() {
     assert_eq!(bench.read("machine.toml"), text);
 }
 
-/// Of a bus that somebody drives nothing is known that is behind a mailbox: neither `scan --write` nor `compare` says more than it knows.
+/// While another MainDevice drives the bus, mailbox data are unavailable. `scan --write` and
+/// `compare` report them as unknown.
 #[test]
-fn what_was_not_asked_is_not_known() {
+fn unread_mailbox_data_are_reported_as_unknown() {
     crate::wire::over_a_pair(|pair| {
         let bench = bench();
-        // A terminal whose controller keeps the state that it was led to by somebody.
+        // The terminal's controller keeps the state that another MainDevice requested.
         let _served = crate::story::serve_file(&bench, &pair, "machine.toml");
         crate::story::led_to_safe_op(&pair, 1);
         let compare = ["compare", "machine.toml", "--nic", &pair.b];

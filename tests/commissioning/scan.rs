@@ -11,7 +11,7 @@ fn bench() -> Bench {
 }
 
 #[test]
-fn what_is_printed() {
+fn scan_output_matches_the_snapshots() {
     let bench = bench();
     for (name, arguments) in [
         ("tables.txt", &["scan", "--sim", "bench.toml"][..]),
@@ -29,7 +29,7 @@ fn what_is_printed() {
 }
 
 #[test]
-fn as_json() {
+fn scan_json_contains_every_device() {
     let bench = bench();
     let out = bench.well(&["scan", "--sim", "bench.toml", "--ask", "--json"]);
     let seen: Value = serde_json::from_str(&out).expect("JSON");
@@ -54,7 +54,7 @@ fn as_json() {
     assert_eq!(devices[5]["drive"], true);
     assert_eq!(devices[8]["drive"], false);
     assert!(devices[1]["answers"].is_null(), "no mailbox");
-    // Every cable takes its time.
+    // Every cable has a delay.
     let delays: Vec<_> = devices
         .iter()
         .filter_map(|d| d["delay_ns"].as_u64())
@@ -62,9 +62,9 @@ fn as_json() {
     assert!(delays.len() > 3 && delays.is_sorted(), "{delays:?}");
 }
 
-/// The coupler takes receive times but has no clock; the first drive's is the reference of the others.
+/// The coupler has receive times but no clock. The clock of the first drive is the reference.
 #[test]
-fn drives_behind_a_coupler_without_a_clock_keep_time() {
+fn drives_behind_a_coupler_without_a_clock_are_synchronised() {
     let bench = bench();
     let out = bench.well(&["run", "bench.toml", "--virtual", "--json"]);
     let run: Value = serde_json::from_str(&out).expect("JSON");
@@ -73,7 +73,7 @@ fn drives_behind_a_coupler_without_a_clock_keep_time() {
 }
 
 #[test]
-fn a_file_that_is_there_stays() {
+fn scan_write_keeps_an_existing_file() {
     let bench = bench();
     bench.write("mine.toml", "# mine\n");
     let write = ["scan", "--sim", "bench.toml", "--write", "mine.toml"];
@@ -89,9 +89,9 @@ fn a_file_that_is_there_stays() {
     assert!(bench.read("mine.toml").contains("[[device]]"));
 }
 
-/// What is written is a file without mistakes, and of the bus that it was made from.
+/// The written file is valid and matches its bus.
 #[test]
-fn every_bus_of_ours_can_be_written_down() {
+fn scan_write_describes_every_bus_of_the_project() {
     let bench = Bench::new();
     for config in [
         "commissioning",
@@ -124,9 +124,9 @@ fn every_bus_of_ours_can_be_written_down() {
     }
 }
 
-/// Without its ESI file a device is written down all the same, and the file says what is missing.
+/// A device without ESI file is written as well, and the file names the missing ESI.
 #[test]
-fn a_device_that_nothing_describes() {
+fn scan_write_includes_a_device_without_esi() {
     let bench = bench();
     std::fs::create_dir(bench.path().join("few")).expect("a folder");
     bench.write("few/EPOS4.xml", &bench.read("esi/EPOS4.xml"));
@@ -153,7 +153,7 @@ fn a_device_that_nothing_describes() {
 }
 
 #[test]
-fn wrong_arguments() {
+fn scan_rejects_wrong_arguments() {
     let bench = bench();
     for (arguments, expected) in [
         (&["scan"][..], "<IF>"),
@@ -175,9 +175,9 @@ fn wrong_arguments() {
     }
 }
 
-/// Modules, an alias, a newer firmware than its ESI: what becomes of it in the file.
+/// Covers modules, an alias, and a firmware newer than its ESI.
 #[test]
-fn what_a_written_file_says() {
+fn scan_write_records_modules_alias_and_newer_firmware() {
     let bench = Bench::new();
     let esi = bench.read("esi/EPOS4.xml");
     let newer = esi.replace("RevisionNo=\"#x00010000\"", "RevisionNo=\"#x00010005\"");
@@ -225,12 +225,12 @@ position = 3
         "--write",
         "machine.toml",
     ];
-    let told = bench.well(&arguments);
-    assert!(told.contains("4 devices"), "{told}");
+    let reported = bench.well(&arguments);
+    assert!(reported.contains("4 devices"), "{reported}");
     let text = bench.read("machine.toml");
     reviewed("modules.toml", &text);
     bench.well(&["check", "machine.toml"]);
-    // It finds the bus that it was made from, and this one has the newer firmware.
+    // The file matches its own bus, and this bus has the newer firmware.
     let compared = bench.well(&["compare", "machine.toml", "--sim", "bench.toml"]);
     assert_eq!(compared, "as in the file\n");
     let run = ["run", "machine.toml", "--virtual", "--for", "100ms"];

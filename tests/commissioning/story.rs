@@ -1,23 +1,23 @@
-//! What docs/first-steps.md shows is what happens.
+//! The commands in docs/first-steps.md produce the output shown there.
 
 use std::path::Path;
 use std::process::Stdio;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
+use ecaxis::acyclic::{DatagramClient, run_on_link};
 use ecaxis::bench::veth::VethPair;
 use ecaxis::clock::Clock;
-use ecaxis::link::{self, BackEnd};
-use ecaxis::mailbox::Wire;
-use ecaxis::service::{Datagrams, carry};
+use ecaxis::link::{self, SocketKind};
+use ecaxis::mailbox::MailboxTransport;
 
 use crate::bench::{Bench, root};
-use crate::wire::{Told, over_a_pair};
+use crate::wire::{ProgramOutput, over_a_pair};
 
-/// The interface of the document.
+/// The interface in the document.
 const NIC: &str = "enp3s0";
 
-/// A command of the document and what it shows of its output: `…` stands for anything.
+/// A command of the document with its output; `…` matches any text.
 struct Shown {
     command: String,
     output: String,
@@ -44,7 +44,7 @@ fn shown() -> Vec<Shown> {
     all
 }
 
-/// Whether a text is as it is shown.
+/// True if a text matches the shown output.
 fn is_shown(shown: &str, text: &str) -> bool {
     let mut parts = shown.split('…');
     let Some(mut rest) = parts.next().and_then(|first| text.strip_prefix(first)) else {
@@ -60,12 +60,12 @@ fn is_shown(shown: &str, text: &str) -> bool {
         };
         rest = &rest[at + part.len()..];
     }
-    // Behind a line of its own that stands for many, nothing may follow as well.
+    // A line with only `…` stands for many lines, or for none at the end.
     rest.ends_with(last) || *last == "\n"
 }
 
 #[test]
-fn what_stands_for_anything() {
+fn ellipsis_matches_any_text() {
     for (shown, text, expected) in [
         ("a\n", "a\n", true),
         ("a\n", "b\n", false),
@@ -80,8 +80,9 @@ fn what_stands_for_anything() {
     }
 }
 
-/// Runs every command of the document, in its order and in one folder. `as_here` turns a command into one that can be run here, `as_there` its
-/// output into what the document would show; `after` comes after each command.
+/// Runs every command of the document in order, in one folder. `as_here` converts a command for
+/// this environment. `as_there` converts its output to that of the document. `after` runs after
+/// each command.
 fn follow(
     bench: &Bench,
     as_here: impl Fn(&str) -> String,
@@ -141,28 +142,29 @@ fn first_steps_on_the_simulated_bus() {
     follow(&bench, as_here, as_there, |_| {});
 }
 
-/// The simulated bus of another process.
-fn serve(bench: &Bench, pair: &VethPair) -> Told {
+/// Runs the simulated bus in another process.
+fn serve(bench: &Bench, pair: &VethPair) -> ProgramOutput {
     serve_file(bench, pair, "bench.toml")
 }
 
-pub fn serve_file(bench: &Bench, pair: &VethPair, file: &str) -> Told {
+pub fn serve_file(bench: &Bench, pair: &VethPair, file: &str) -> ProgramOutput {
     let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
     command.args(["sim", file, "--nic", &pair.a]);
-    let mut served = Told::start(command.stdout(Stdio::null()));
+    let mut served = ProgramOutput::start(command.stdout(Stdio::null()));
     served.says("answer");
     served
 }
 
-/// Leads a device whose controller takes every state to SafeOp, as another master would have left it.
+/// Brings a device whose controller accepts every state to SafeOp, as another MainDevice would
+/// leave it.
 pub fn led_to_safe_op(pair: &VethPair, position: u16) {
-    let (mut link, _) = link::open(&pair.b, BackEnd::default()).expect("the interface");
+    let (mut link, _) = link::open(&pair.b, SocketKind::default()).expect("the interface");
     let stop = AtomicBool::new(false);
-    let led = carry(
+    let led = run_on_link(
         link.as_mut(),
         Clock::Real,
         &stop,
-        async |wire: Datagrams| {
+        async |wire: DatagramClient| {
             for state in [2, 4] {
                 let took = wire.write_at(position, 0x0120, &[state, 0]).await;
                 assert_eq!(took.expect("an answer"), 1);
@@ -173,7 +175,7 @@ pub fn led_to_safe_op(pair: &VethPair, position: u16) {
     led.expect("carried");
 }
 
-/// On a test machine both ends of the wire share processors, and either may be held up for long.
+/// Both ends of the wire share processors on a test machine, and either may stall for long.
 fn patient(text: &str) -> String {
     assert!(text.contains("lost_frames = 20"), "{text}");
     text.replace(
@@ -182,9 +184,9 @@ fn patient(text: &str) -> String {
     )
 }
 
-/// A machine that runs on the same interface goes on as if nobody looked.
+/// A machine on the same interface continues undisturbed.
 #[test]
-fn a_running_machine_is_left_alone() {
+fn scan_leaves_a_running_machine_alone() {
     over_a_pair(|pair| {
         let bench = bench();
         bench.write("machine.toml", &patient(&bench.read("bench.toml")));
@@ -192,9 +194,9 @@ fn a_running_machine_is_left_alone() {
         let mut command = bench.command(env!("CARGO_BIN_EXE_ecaxis"));
         command.args(["run", "machine.toml", "--nic", &pair.b]);
         command.args(["--no-enable", "--for", "8s", "--json"]);
-        let mut run = Told::start(command.stdout(Stdio::piped()));
+        let mut run = ProgramOutput::start(command.stdout(Stdio::piped()));
         run.says("all SubDevices in Op");
-        // Nobody else takes the bus from under it.
+        // A second program cannot take over the bus.
         for second in [
             &["run", "machine.toml", "--nic", &pair.b, "--for", "1s"][..],
             &[
@@ -236,7 +238,8 @@ fn first_steps_over_a_real_interface() {
         let bench = bench();
         let _served = serve(&bench, &pair);
         let as_here = |command: &str| command.replace(NIC, &pair.b);
-        // A busy test machine is no computer for a cycle of a millisecond: it warns, and it is late.
+        // A busy test machine is not suitable for a cycle of a millisecond: it warns, and cycles
+        // are late.
         let as_there = |text: &str| {
             let lines = text.lines().filter(|line| !line.starts_with("warning: "));
             let lines = lines.filter(|line| !line.starts_with("  = help: "));
@@ -252,9 +255,9 @@ fn first_steps_over_a_real_interface() {
     });
 }
 
-/// A run leaves no sign of itself: what a scan writes after it is what it wrote before.
+/// A run leaves no traces: scans before and after it write the same file.
 #[test]
-fn a_run_leaves_a_quiet_bus() {
+fn a_run_leaves_the_bus_unchanged() {
     over_a_pair(|pair| {
         let bench = bench();
         let _served = serve(&bench, &pair);
@@ -264,7 +267,7 @@ fn a_run_leaves_a_quiet_bus() {
         let ran = bench.ecaxis(&["scan", &pair.b, "--write", "after.toml"]);
         assert_eq!((ran.code, ran.err.as_str()), (0, ""));
         assert_eq!(bench.read("after.toml"), bench.read("before.toml"));
-        // Everything was asked, though devices have forgotten the 0x6060 of the run.
+        // All parameters were compared, even though devices have reset the 0x6060 of the run.
         let ran = bench.ecaxis(&["compare", "machine.toml", "--parameters", "--json"]);
         let json: serde_json::Value = serde_json::from_str(&ran.out).expect("JSON");
         assert_eq!(json["not_compared"], serde_json::json!([]), "{json:#}");

@@ -1,4 +1,4 @@
-//! What the whole-bus tests share: machines as text, runs under virtual time, the fixtures.
+//! Helpers for whole-bus tests: machines as text, runs in virtual time, fixtures.
 
 #![allow(dead_code, reason = "every test binary uses a part")]
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
@@ -15,7 +15,7 @@ use ecaxis::config::{self, Machine};
 use ecaxis::session::{self, Observer, Options, Outcome, Progress, Summary};
 use ecaxis_sim::FaultScript;
 
-/// The workspace's root.
+/// Returns the root of the workspace.
 pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("..")
@@ -23,7 +23,7 @@ pub fn root() -> PathBuf {
         .expect("the workspace exists")
 }
 
-/// A machine file given as text; paths in it are relative to `configs/`.
+/// Parses a machine file given as text; its paths are relative to `configs/`.
 pub fn machine(text: &str) -> Machine {
     match config::parse(&root().join("configs/test.toml"), text) {
         Ok(machine) => machine,
@@ -31,7 +31,7 @@ pub fn machine(text: &str) -> Machine {
     }
 }
 
-/// One of the machine files of the project.
+/// Loads one of the project's machine files.
 pub fn load(name: &str) -> Machine {
     match config::load(&root().join("configs").join(name)) {
         Ok(machine) => machine,
@@ -39,8 +39,8 @@ pub fn load(name: &str) -> Machine {
     }
 }
 
-/// A third-party file to test against. `None`, with the reason printed, where it is absent; on CI
-/// that is a failure.
+/// Returns a third-party file for tests. If it is missing, prints the reason and returns `None`; on
+/// CI this is a failure.
 pub fn fixture(path: &str) -> Option<PathBuf> {
     let folder = std::env::var_os("ECAXIS_FIXTURES")
         .map_or_else(|| root().join("../shared/fixtures"), PathBuf::from);
@@ -70,7 +70,7 @@ impl Observer for Heard {
 }
 
 impl Heard {
-    /// With what devices reported unasked.
+    /// Returns all warnings, including unsolicited device reports.
     pub fn warnings(&self) -> Vec<String> {
         self.0
             .iter()
@@ -109,7 +109,7 @@ pub fn run(machine: Machine, options: Options) -> (Outcome, Heard) {
     (outcome, heard)
 }
 
-/// Runs a machine that must do its whole program.
+/// Runs a machine that must complete its whole program.
 pub fn run_well(machine: Machine, options: Options) -> Summary {
     let (outcome, heard) = run(machine, options);
     if let Err(error) = outcome.result {
@@ -118,7 +118,7 @@ pub fn run_well(machine: Machine, options: Options) -> Summary {
     outcome.summary.expect("a summary")
 }
 
-/// Runs a machine that must fail; the error's text, and the summary if the cycle ran.
+/// Runs a machine that must fail. Returns the error text, and the summary if the cycle ran.
 pub fn run_badly(machine: Machine, options: Options) -> (String, Option<Summary>) {
     let (outcome, _) = run(machine, options);
     match outcome.result {
@@ -127,7 +127,8 @@ pub fn run_badly(machine: Machine, options: Options) -> (String, Option<Summary>
     }
 }
 
-/// A machine of `count` CSP axes `a0`, `a1` … at 1 ms that move 80 turns and back, 1.7 s each.
+/// Returns a machine of `count` CSP axes `a0`, `a1`, … at 1 ms that move 80 turns and back, 1.7 s
+/// each.
 pub fn axes(count: usize) -> String {
     let mut text = String::from("[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n");
     for i in 0..count {

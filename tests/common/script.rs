@@ -1,10 +1,10 @@
-//! Commands one after the other through a [`Controller`], with the axis' status of every cycle kept.
+//! Runs commands in sequence through a [`Controller`] and records the axis status of every cycle.
 
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 use ecaxis::config::{AxisRef, Machine};
-use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::rt::controller::{Controller, CycleContext};
 use ecaxis::session::{Options, Outcome, run_with};
 use ecaxis_axis::cia402::Mode;
 use ecaxis_axis::status::HomingStatus;
@@ -12,21 +12,21 @@ use ecaxis_axis::{AxisStatus, Command};
 
 use super::Heard;
 
-/// One thing after the other.
+/// One act of a script.
 #[derive(Debug, Clone, Copy)]
 pub enum Act {
-    /// And wait until it is done.
+    /// Sends the command and waits until it is done.
     Do(Command),
-    /// The next one at once.
+    /// Sends the command and continues at once.
     Begin(Command),
-    /// So many seconds.
+    /// Waits for this time in seconds.
     Dwell(f64),
-    /// Until the reported position is beyond this one.
+    /// Waits until the reported position is beyond this one.
     Above(f64),
     Below(f64),
 }
 
-/// The status of every cycle since the axis was ready, and where in it each act began.
+/// The status of every cycle since the axis was ready, and the start cycle of each act.
 #[derive(Debug, Default)]
 pub struct Trace {
     pub cycles: Vec<AxisStatus>,
@@ -35,7 +35,7 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// The cycles of an act, from the one in which it began to the one in which it turned out to be over.
+    /// Returns the cycles of an act, from its start to the cycle that detected its end.
     pub fn of(&self, act: usize) -> &[AxisStatus] {
         let end = self.began.get(act + 1).map(|next| next + 1);
         &self.cycles[self.began[act]..end.unwrap_or(self.cycles.len())]
@@ -84,7 +84,7 @@ impl Script {
             Act::Dwell(seconds) => elapsed as f64 * dt_s >= seconds,
             Act::Above(position) => status.position > position,
             Act::Below(position) => status.position < position,
-            // What the axis says in the cycle of the command is of the time before it.
+            // The status in the cycle of the command still describes the time before it.
             Act::Do(_) if elapsed < 2 => false,
             Act::Do(Command::SetMode(mode)) => status.mode == mode && status.switching.is_none(),
             Act::Do(Command::Home { .. }) => {
@@ -99,12 +99,12 @@ impl Script {
 }
 
 impl Controller for Script {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         let status = machine.axis(self.axis);
         if machine.stopping() || (!status.ready && self.next == 0) {
             return;
         }
-        let mut trace = self.trace.lock().expect("nobody panics with it");
+        let mut trace = self.trace.lock().expect("no panic while it is locked");
         trace.dt_s = machine.dt_s();
         trace.cycles.push(status);
         let elapsed = machine.number() - self.since;
@@ -132,7 +132,7 @@ impl Controller for Script {
     }
 }
 
-/// Runs the acts on the machine's axis of this name. A limit of time keeps what never ends from hanging.
+/// Runs the acts on the named axis of the machine. A time limit stops endless scripts.
 pub fn perform(machine: Machine, axis: &str, acts: &[Act], options: Options) -> (Outcome, Trace) {
     let axis = machine.axis(axis).expect("an axis");
     let trace = Arc::new(Mutex::new(Trace::default()));
@@ -150,11 +150,11 @@ pub fn perform(machine: Machine, axis: &str, acts: &[Act], options: Options) -> 
     let stop = Arc::new(AtomicBool::new(false));
     let mut heard = Heard::default();
     let outcome = run_with(machine, options, stop, &mut heard, Box::new(script));
-    let mut kept = trace.lock().expect("nobody panics with it");
+    let mut kept = trace.lock().expect("no panic while it is locked");
     (outcome, std::mem::take(&mut kept))
 }
 
-/// As [`perform`]; every act must come to its end.
+/// Same as [`perform`], but every act must complete.
 pub fn perform_well(machine: Machine, axis: &str, acts: &[Act], options: Options) -> Trace {
     let (outcome, trace) = perform(machine, axis, acts, options);
     if let Err(error) = outcome.result {
@@ -165,8 +165,7 @@ pub fn perform_well(machine: Machine, axis: &str, acts: &[Act], options: Options
     trace
 }
 
-/// What the cycle wrote and read on the wire, taken from a recording: the process image of each cycle, as it left and as
-/// it came back.
+/// Returns the process image of each cycle from a recording, as sent and as received.
 pub fn process_images(recording: &std::path::Path) -> Vec<(Vec<u8>, Vec<u8>)> {
     use pcap_file::pcapng::{Block, PcapNgReader};
     const LRW: u8 = 12;
@@ -180,7 +179,8 @@ pub fn process_images(recording: &std::path::Path) -> Vec<(Vec<u8>, Vec<u8>)> {
         };
         let frame = packet.data.as_ref();
         let mut at = 16;
-        // Datagrams: command, index, address, length with "more" in bit 15, interrupt; data; working counter.
+        // Datagram layout: command, index, address, length with "more" in bit 15, interrupt; data;
+        // working counter.
         while let Some(header) = frame.get(at..at + 10) {
             let length = u16::from_le_bytes([header[6], header[7]]);
             let size = usize::from(length & 0x7ff);
@@ -202,8 +202,9 @@ pub fn process_images(recording: &std::path::Path) -> Vec<(Vec<u8>, Vec<u8>)> {
     images
 }
 
-/// Judges the first axis of a recording, a drive of `configs/esi` in CSP: it moved, no set-point changed faster than `step` counts
-/// a cycle, it stood before its Controlword took the power, and its power was taken in the end.
+/// Checks the first axis of a recording, a drive of `configs/esi` in CSP. The axis moved, and no
+/// set-point changed by more than `step` counts per cycle. It stood before its Controlword removed
+/// the power, and the power was off at the end.
 #[track_caller]
 pub fn comes_to_rest(recording: &std::path::Path, step: i32) {
     const POWERED: u16 = 0x000f;

@@ -1,4 +1,4 @@
-//! Pairs of virtual interfaces, and programs on their ends.
+//! Pairs of virtual interfaces, and programs at their ends.
 
 #![allow(dead_code, reason = "every test binary uses a part")]
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
@@ -12,28 +12,28 @@ use std::time::{Duration, Instant};
 use ecaxis::bench::veth::VethPair;
 use rustix::process::{Pid, Signal, kill_process};
 
-#[path = "calm.rs"]
-mod calm;
+#[path = "retry_on_stall.rs"]
+mod retry_on_stall;
 
-pub use calm::calmly;
+pub use retry_on_stall::retry_if_host_stalled;
 
-/// Much longer than anything takes.
+/// A timeout much longer than any operation.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Two of them would take each other's processors.
+/// Concurrent tests would compete for processors.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-/// A test over a pair of interfaces: alone, and judged where the computer let it run.
+/// Runs a test over a pair of interfaces, exclusively, with retries after stalls.
 pub fn over_a_pair(test: impl Fn(VethPair)) {
     let _alone = ONE_AT_A_TIME.lock();
-    calmly(|| {
+    retry_if_host_stalled(|| {
         if let Some(pair) = pair() {
             test(pair);
         }
     });
 }
 
-/// `None`, with the reason printed, where interfaces may not be created.
+/// Prints the reason and returns `None` if interfaces cannot be created.
 fn pair() -> Option<VethPair> {
     match VethPair::new() {
         Ok(pair) => Some(pair),
@@ -47,14 +47,14 @@ fn pair() -> Option<VethPair> {
     }
 }
 
-/// A program whose messages are read while it runs, and which ends with this.
-pub struct Told {
+/// A running program whose messages are read. Dropping this value ends the program.
+pub struct ProgramOutput {
     child: Child,
     lines: Receiver<String>,
     heard: String,
 }
 
-impl Told {
+impl ProgramOutput {
     pub fn start(command: &mut Command) -> Self {
         let mut child = command.stderr(Stdio::piped()).spawn().expect("it starts");
         let messages = BufReader::new(child.stderr.take().expect("piped"));
@@ -74,12 +74,12 @@ impl Told {
         }
     }
 
-    /// Its process.
+    /// Returns the process ID.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
 
-    /// Until a message says this.
+    /// Waits until a message contains this text.
     #[track_caller]
     pub fn says(&mut self, text: &str) {
         let began = Instant::now();
@@ -101,7 +101,7 @@ impl Told {
         }
     }
 
-    /// As Ctrl-C does.
+    /// Sends SIGINT, like Ctrl-C.
     pub fn interrupt(&self) {
         self.signal(Signal::INT);
     }
@@ -110,12 +110,12 @@ impl Told {
         kill_process(Pid::from_child(&self.child), signal).expect("it runs");
     }
 
-    /// Whether it still runs.
+    /// True while the program runs.
     pub fn runs(&mut self) -> bool {
         matches!(self.child.try_wait(), Ok(None))
     }
 
-    /// What it leaves, with all of its messages.
+    /// Waits for the exit and returns the output with all messages.
     pub fn end(mut self) -> Output {
         let stdout = self.child.stdout.take();
         let stdout = stdout.map(std::io::read_to_string).transpose();
@@ -130,7 +130,7 @@ impl Told {
     }
 }
 
-impl Drop for Told {
+impl Drop for ProgramOutput {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();

@@ -1,4 +1,4 @@
-//! Computers as the kernel would describe them, in folders.
+//! Computers as folders with the files of the kernel.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -6,13 +6,13 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
 use ecaxis::doctor::ethtool::{Answers, Coalescing, EnergyEfficient};
-use ecaxis::doctor::{Host, Intent, Report, Tried, examine};
+use ecaxis::doctor::{Host, Measurements, Report, RunProfile, examine};
 
 pub struct Machine {
     files: BTreeMap<String, Vec<u8>>,
     links: BTreeMap<String, String>,
-    pub intent: Intent,
-    pub tried: Tried,
+    pub intent: RunProfile,
+    pub tried: Measurements,
 }
 
 const CPU: &str = "sys/devices/system/cpu";
@@ -25,8 +25,8 @@ impl Machine {
         Self {
             files: BTreeMap::new(),
             links: BTreeMap::new(),
-            intent: Intent::new(PathBuf::from("/usr/local/bin/ecaxis")),
-            tried: Tried::default(),
+            intent: RunProfile::new(PathBuf::from("/usr/local/bin/ecaxis")),
+            tried: Measurements::default(),
         }
     }
 
@@ -47,7 +47,7 @@ impl Machine {
         self
     }
 
-    /// Takes files and folders away.
+    /// Removes files and folders.
     pub fn without(&mut self, prefix: &str) -> &mut Self {
         self.files.retain(|path, _| !path.starts_with(prefix));
         self.links.retain(|path, _| !path.starts_with(prefix));
@@ -76,7 +76,7 @@ impl Machine {
         examine(&self.write(root.path()), &self.intent, self.tried.clone())
     }
 
-    /// A process of one thread; `policy` is 0 for an ordinary one, 1 for SCHED_FIFO.
+    /// Adds a process with one thread. `policy` is 0 for SCHED_OTHER and 1 for SCHED_FIFO.
     pub fn process(&mut self, id: u32, name: &str, kernel: bool, policy: u32, priority: u32) {
         let flags = if kernel { 0x0020_8040 } else { 0x0040_0000 };
         let nothing = "0 ".repeat(30);
@@ -105,7 +105,7 @@ impl Machine {
         }
     }
 
-    /// States by name, wake-up time in µs, and whether they are switched off.
+    /// Adds idle states: name, exit latency in µs, and whether the state is disabled.
     pub fn idle(&mut self, cpus: u32, states: &[(&str, u32, bool)]) {
         for cpu in 0..cpus {
             for (n, (name, latency, disabled)) in states.iter().enumerate() {
@@ -161,7 +161,7 @@ impl Machine {
         self.intent.nic = Some(name.to_owned());
     }
 
-    /// A command line, a release and a configuration of a Debian kernel.
+    /// Adds command line, release and configuration of a Debian kernel.
     fn kernel(&mut self, release: &str, built: &str, command_line: &str, config: &str) {
         self.files(&[
             ("proc/sys/kernel/osrelease", release),
@@ -203,7 +203,7 @@ impl Machine {
     }
 }
 
-/// Everything as the guide says. Nothing may be found.
+/// A computer that follows the guide; doctor must find nothing.
 pub fn ideal() -> Machine {
     let mut m = Machine::new();
     m.kernel(
@@ -255,7 +255,7 @@ pub fn ideal() -> Machine {
     m
 }
 
-/// As it comes from the shop.
+/// A desktop with factory settings.
 pub fn desktop() -> Machine {
     let mut m = ideal();
     m.kernel(
@@ -275,7 +275,7 @@ pub fn desktop() -> Machine {
             "Filename Type Size Used Priority\n/dev/sda2 partition 8000000 0 -2",
         ),
         ("run/NetworkManager/devices/3", "[device]\nmanaged=true"),
-        // A folder is not to be written, not even by root.
+        // A folder is not writable as a file, not even by root.
         ("dev/cpu_dma_latency/x", ""),
     ]);
     m.governor(8, "powersave");
@@ -307,7 +307,7 @@ pub fn desktop() -> Machine {
     m
 }
 
-/// A guest with two CPUs and a card of the host's.
+/// A guest with two CPUs and a virtual network card.
 pub fn virtual_machine() -> Machine {
     let mut m = ideal();
     m.kernel(
@@ -340,14 +340,14 @@ pub fn virtual_machine() -> Machine {
         driver: Some("virtio_net".to_owned()),
         ..Answers::default()
     });
-    // Its configuration is found in one place only.
+    // The configuration exists in one place only.
     let gz = gzip(b"CONFIG_PREEMPT_NONE=y\nCONFIG_PREEMPT_DYNAMIC=y\nCONFIG_RT_GROUP_SCHED=y\n");
     m.file("proc/config.gz", gz);
     m.intent.cpu = None;
     m
 }
 
-/// One stored block (RFC 1951, 3.2.4).
+/// Encodes one stored block (RFC 1951, 3.2.4).
 fn gzip(text: &[u8]) -> Vec<u8> {
     let len = u16::try_from(text.len()).unwrap();
     let mut bytes = vec![0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3, 1];
@@ -357,7 +357,7 @@ fn gzip(text: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Docker's rights, on a host that is as it should be.
+/// Docker's rights on a correctly configured host.
 pub fn container() -> Machine {
     let mut m = ideal();
     m.file(".dockerenv", "");
@@ -424,7 +424,7 @@ pub fn no_sys() -> Machine {
     m
 }
 
-/// Every file of a desktop says something else.
+/// A desktop with the given contents in every file.
 pub fn malformed(with: &[u8]) -> Machine {
     let mut m = desktop();
     for path in m.paths() {
@@ -446,7 +446,7 @@ pub fn laptop() -> Machine {
     m
 }
 
-/// A realtime kernel on which everything meets on one CPU.
+/// A realtime kernel with all load on one CPU.
 pub fn crowded() -> Machine {
     let mut m = ideal();
     m.interrupts(

@@ -1,4 +1,4 @@
-//! `ecaxis firmware` as a user meets it.
+//! `ecaxis firmware` from the user's view.
 
 use std::path::Path;
 use std::process::Command;
@@ -24,7 +24,7 @@ fn ran(arguments: &[&str]) -> (i32, String, String) {
     )
 }
 
-/// `firmware update` of a device of the demonstration, simulated.
+/// Runs `firmware update` for a simulated device of the demonstration.
 fn update(device: &str, file: &Path, more: &[&str]) -> (i32, String, String) {
     let file = file.to_str().expect("UTF-8");
     let words = ["update", MACHINE, device, file, "--sim", "--virtual"];
@@ -55,7 +55,7 @@ fn sample(folder: &Path, device: &str) -> std::path::PathBuf {
 }
 
 #[test]
-fn from_a_sample_to_a_drive_that_runs_it() {
+fn an_update_from_a_sample_file_runs_on_the_drive() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = sample(folder.path(), "x");
 
@@ -104,7 +104,7 @@ fn from_a_sample_to_a_drive_that_runs_it() {
 }
 
 #[test]
-fn every_failure_has_its_code_device_step_cause_and_hint() {
+fn every_update_failure_has_code_device_step_cause_and_hint() {
     let folder = tempfile::tempdir().expect("a folder");
     let (x, y) = (sample(folder.path(), "x"), sample(folder.path(), "y"));
     let empty = folder.path().join("empty.bin");

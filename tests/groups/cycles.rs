@@ -1,13 +1,13 @@
-//! Cycle by cycle, as a controller sees it.
+//! Group stops cycle by cycle, as a controller sees them.
 
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 use ecaxis::config::{AxisRef, Machine};
-use ecaxis::rt::controller::{Controller, Cycle};
-use ecaxis::rt::guard::StopCause;
+use ecaxis::rt::bus_monitor::StopCause;
+use ecaxis::rt::controller::{Controller, CycleContext};
 use ecaxis::session::{Options, Outcome, run_with};
-use ecaxis_axis::{AxisStatus, Command, Refused, State};
+use ecaxis_axis::{AxisStatus, Command, CommandError, State};
 use proptest::prelude::*;
 
 use crate::common::{Heard, faults, machine};
@@ -15,25 +15,25 @@ use crate::{ALONE, AXES, BREAK, FAULT, GANTRY, alone, bench};
 
 struct Closure<F>(F);
 
-impl<F: FnMut(&mut Cycle<'_>) + Send> Controller for Closure<F> {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+impl<F: FnMut(&mut CycleContext<'_>) + Send> Controller for Closure<F> {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         (self.0)(machine);
     }
 }
 
-/// The status of every axis, in the order of [`AXES`], and which are stopped, in every cycle.
+/// The status of every axis in the order of [`AXES`], and whether it is stopped, for each cycle.
 type Trace = Vec<[(AxisStatus, bool); 3]>;
 
 fn trace(
     machine: Machine,
     options: Options,
-    mut act: impl FnMut(&mut Cycle<'_>, &[AxisRef; 3], usize) + Send + 'static,
+    mut act: impl FnMut(&mut CycleContext<'_>, &[AxisRef; 3], usize) + Send + 'static,
 ) -> (Outcome, Trace) {
     let axes = AXES.map(|name| machine.axis(name).expect("an axis"));
     let kept = Arc::new(Mutex::new(Trace::default()));
     let trace = Arc::clone(&kept);
-    let controller = move |machine: &mut Cycle<'_>| {
-        let mut trace = trace.lock().expect("nobody panics with it");
+    let controller = move |machine: &mut CycleContext<'_>| {
+        let mut trace = trace.lock().expect("no panic while it is locked");
         let ready = axes.iter().all(|&axis| machine.axis(axis).ready);
         if machine.stopping() || (trace.is_empty() && !ready) {
             return;
@@ -49,7 +49,7 @@ fn trace(
         &mut Heard::default(),
         Box::new(Closure(controller)),
     );
-    let trace = std::mem::take(&mut *kept.lock().expect("nobody panics with it"));
+    let trace = std::mem::take(&mut *kept.lock().expect("no panic while it is locked"));
     (outcome, trace)
 }
 
@@ -60,9 +60,9 @@ fn turn(velocity: f64) -> Command {
     }
 }
 
-/// `z` swings on set-points of its own, cycle by cycle, and does not notice.
+/// The set-points of `z` continue in each cycle during the stop.
 #[test]
-fn a_controller_sees_the_stop_and_brings_the_group_back() {
+fn a_controller_sees_the_stop_and_resets_the_group() {
     let (outcome, trace) = trace(alone(""), faults(FAULT), |machine, &[z, x, y], cycle| {
         let at = cycle as f64 * 1e-3;
         let swing = 5.0 - 5.0 * (at * 2.0).cos();
@@ -78,12 +78,15 @@ fn a_controller_sees_the_stop_and_brings_the_group_back() {
                     Some(StopCause::DriveFault { axis: 1 })
                 ));
                 assert_eq!(machine.stopped(z), None);
-                assert_eq!(machine.command(y, turn(1.0)), Err(Refused::GroupStopped));
+                assert_eq!(
+                    machine.command(y, turn(1.0)),
+                    Err(CommandError::GroupStopped)
+                );
                 assert_eq!(
                     machine.command(y, Command::Enable),
-                    Err(Refused::GroupStopped)
+                    Err(CommandError::GroupStopped)
                 );
-                assert_eq!(machine.set_point(y, 0.0), Err(Refused::GroupStopped));
+                assert_eq!(machine.set_point(y, 0.0), Err(CommandError::GroupStopped));
                 machine
                     .command(x, Command::ResetFault)
                     .expect("to be reset");
@@ -114,9 +117,9 @@ fn a_controller_sees_the_stop_and_brings_the_group_back() {
     }
 }
 
-/// The inputs of the others stay fresh while a group is lost, and set-points go on.
+/// While a group is lost, the other groups have fresh inputs and continue.
 #[test]
-fn only_the_lost_group_is_stale() {
+fn only_the_lost_group_has_stale_inputs() {
     let (outcome, trace) = trace(alone(""), faults(BREAK), |machine, &[z, x, _], cycle| {
         if cycle == 1 {
             machine.command(x, turn(10.0)).expect("x is ready");
@@ -138,16 +141,17 @@ fn only_the_lost_group_is_stale() {
         if x.0.stale_cycles > 2 {
             assert!(x.1 && y.1 && !z.1);
         }
-        // A drive that comes back is not enabled by what it finds: after `lost_frames` of 3, and the frame that says so.
+        // A returning drive must not be enabled by its outputs: the enable command ends after
+        // `lost_frames` (3) cycles and one more frame.
         if x.0.stale_cycles > 4 {
             assert_eq!(x.0.controlword & 0x0008, 0);
         }
     }
 }
 
-/// A brake closes before the power goes.
+/// A brake closes before power-off.
 #[test]
-fn a_brake_gets_its_time_in_a_group() {
+fn a_group_stop_waits_for_the_brake() {
     let keys = [("y", "brake = { release = \"50ms\", engage = \"300ms\" }")];
     let text = bench(&keys, &format!("{GANTRY}{ALONE}"));
     let (outcome, trace) = trace(machine(&text), faults(FAULT), |machine, _, cycle| {
@@ -160,7 +164,7 @@ fn a_brake_gets_its_time_in_a_group() {
         .iter()
         .filter(|cycle| cycle[2].1 && cycle[2].0.enabled)
         .count();
-    // At rest already: 100 ms to settle, 300 ms for the brake.
+    // The axis is already at rest: 100 ms to settle, 300 ms for the brake.
     assert!((380..500).contains(&held), "{held}");
 }
 
@@ -188,7 +192,7 @@ fn script(events: &[(Kind, usize, u64)]) -> String {
     script
 }
 
-/// Four machine-seconds each.
+/// The number of cases, with four machine-seconds each.
 fn cases() -> u32 {
     let seconds = std::env::var("ECAXIS_MACHINE_SECONDS").ok();
     let seconds = seconds.and_then(|s| s.parse::<u32>().ok());
@@ -198,8 +202,8 @@ fn cases() -> u32 {
 proptest! {
     #![proptest_config(ProptestConfig { cases: cases(), failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// After whatever happens to one axis, all axes of its group are at rest or without power in the time their limits allow; the machine goes
-    /// on as long as only the group is struck.
+    /// After any fault of one axis, all axes of its group are at rest or without power within the
+    /// time of their limits. The machine continues if only the group is affected.
     #[test]
     fn a_group_comes_to_rest_in_time(
         events in proptest::collection::vec(
@@ -224,7 +228,8 @@ proptest! {
         });
         prop_assert!(outcome.result.is_ok(), "{:?}", outcome.result);
         prop_assert!(trace.len() >= 4000);
-        // 80 ms from 40 turns a second, 100 ms to settle; a quick stop that a blocked shaft or lost frames hold up is given two seconds.
+        // 80 ms from 40 turns/s, and 100 ms to settle. A quick stop delayed by a blocked shaft or
+        // lost frames has two seconds.
         let mut stopped_for = 0;
         for [z, x, y] in trace.iter().take(4000) {
             prop_assert!(!z.1 && z.0.enabled && z.0.stale_cycles == 0);

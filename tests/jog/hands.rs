@@ -1,39 +1,39 @@
-//! Operators made of closures, and what they have seen.
+//! Operators made of closures, and a record of the cycles that they saw.
 
 use std::fmt;
 use std::sync::{Arc, Mutex};
 
 use ecaxis::config::Machine;
 use ecaxis::session::{self, Options, Outcome};
-use ecaxis::supervise::manual::{News, Operator, Presence, Request, Turn, View};
+use ecaxis::supervise::jog::{JogEvent, Operator, OperatorInput, Presence, Request, View};
 use ecaxis_axis::AxisStatus;
 
 use super::common::Heard;
 
-/// One turn.
+/// One cycle.
 #[derive(Debug, Clone)]
 pub struct Seen {
-    /// Of the cycle, since the first.
+    /// The time of the cycle since the first cycle.
     pub time_s: f64,
     pub axes: Vec<AxisStatus>,
-    pub news: Vec<News>,
+    pub news: Vec<JogEvent>,
 }
 
-pub fn here() -> Turn {
-    Turn::default()
+pub fn here() -> OperatorInput {
+    OperatorInput::default()
 }
 
-pub fn request(request: Request) -> Turn {
-    Turn {
+pub fn request(request: Request) -> OperatorInput {
+    OperatorInput {
         requests: vec![request],
-        ..Turn::default()
+        ..OperatorInput::default()
     }
 }
 
-pub fn gone() -> Turn {
-    Turn {
+pub fn gone() -> OperatorInput {
+    OperatorInput {
         presence: Presence::Gone,
-        ..Turn::default()
+        ..OperatorInput::default()
     }
 }
 
@@ -49,8 +49,8 @@ impl<F> fmt::Debug for Plan<F> {
     }
 }
 
-impl<F: FnMut(&View<'_>, f64) -> Turn + Send> Operator for Plan<F> {
-    fn turn(&mut self, view: &View<'_>) -> Turn {
+impl<F: FnMut(&View<'_>, f64) -> OperatorInput + Send> Operator for Plan<F> {
+    fn turn(&mut self, view: &View<'_>) -> OperatorInput {
         let began = *self.began.get_or_insert(view.now);
         let time_s = (view.now - began) as f64 * 1e-9;
         self.seen.lock().expect("no panic").push(Seen {
@@ -62,11 +62,11 @@ impl<F: FnMut(&View<'_>, f64) -> Turn + Send> Operator for Plan<F> {
     }
 }
 
-/// Runs a machine in the hands of `plan`, which is given the seconds since its first turn.
+/// Runs a machine with the operator `plan`, which receives the seconds since its first call.
 pub fn by_hand(
     machine: Machine,
     options: Options,
-    plan: impl FnMut(&View<'_>, f64) -> Turn + Send + 'static,
+    plan: impl FnMut(&View<'_>, f64) -> OperatorInput + Send + 'static,
 ) -> (Outcome, Vec<Seen>) {
     let seen = Arc::new(Mutex::new(Vec::new()));
     let operator = Box::new(Plan {
@@ -75,7 +75,8 @@ pub fn by_hand(
         seen: Arc::clone(&seen),
     });
     let mut heard = Heard::default();
-    let outcome = session::run_by_hand(machine, options, Arc::default(), &mut heard, operator);
+    let outcome =
+        session::run_with_operator(machine, options, Arc::default(), &mut heard, operator);
     let seen = std::mem::take(&mut *seen.lock().expect("no panic"));
     (outcome, seen)
 }

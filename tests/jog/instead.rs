@@ -1,13 +1,14 @@
-//! What takes the place of a jog, and what is refused: nothing runs on that nobody watches, and everything is told.
+//! Requests that replace a jog, and rejected requests: unattended motion stops, and every rejection
+//! is reported.
 
-use ecaxis::supervise::manual::{Doing, News, Presence, Request, Turn, View};
+use ecaxis::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 use ecaxis_axis::Mode;
 
 use super::common::{axes, machine, virtual_time};
 use super::hands::{Seen, by_hand, gone, here, request};
 use super::{LET_GO_S, VERSATILE, once_enabled, within_limits};
 
-/// Jogs for a quarter of a second, asks for something else once, and for nothing any more.
+/// Jogs for a quarter of a second, sends one other request, then sends no requests.
 fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Seen>) {
     const LAST: f64 = 0.25;
     let mut asked = false;
@@ -37,9 +38,9 @@ fn replaced_by(file: &str, instead: Request, presence: Presence) -> (f64, Vec<Se
     (stands, seen)
 }
 
-/// What takes the place of a jog, or is refused in its place, does not let it run on with nobody holding a key.
+/// A request that replaces a jog, or is rejected, must not let the axis move on without a held key.
 #[test]
-fn what_replaces_a_jog_does_not_make_the_rule_forget() {
+fn a_request_that_replaces_a_jog_keeps_the_dead_man_rule_active() {
     let speed = 0.1;
     let others = [
         Request::Enable { axis: 0 },
@@ -60,11 +61,11 @@ fn what_replaces_a_jog_does_not_make_the_rule_forget() {
         },
         Request::Home { axis: 0 },
     ];
-    // In the second there are a range, no homing and no other mode: there it is all refused.
+    // The second machine has a range but no homing and no other mode, so it rejects each request.
     for file in [VERSATILE, &axes(1)] {
         for instead in others {
             for presence in [Presence::Here, Presence::Away] {
-                // The versatile one has no range that would refuse it.
+                // The versatile machine has no range, so it accepts these moves.
                 let goes = matches!(instead, Request::MoveBy { .. } | Request::MoveTo { .. });
                 if goes && file == VERSATILE && presence == Presence::Here {
                     continue;
@@ -79,9 +80,9 @@ fn what_replaces_a_jog_does_not_make_the_rule_forget() {
     }
 }
 
-/// A move that takes over from a jog in the same cycle does not brake first.
+/// A move that replaces a jog in the same cycle starts without braking.
 #[test]
-fn a_move_takes_over_from_a_jog() {
+fn a_move_continues_from_a_jog() {
     let instead = Request::MoveTo {
         axis: 0,
         position: 20.0,
@@ -104,22 +105,22 @@ fn a_move_takes_over_from_a_jog() {
     }
 }
 
-fn both(request: impl Fn(usize) -> Request) -> Turn {
-    Turn {
+fn both(request: impl Fn(usize) -> Request) -> OperatorInput {
+    OperatorInput {
         requests: [0, 1].map(request).to_vec(),
-        ..Turn::default()
+        ..OperatorInput::default()
     }
 }
 
-/// The same with axes 0 and 1.
+/// Same as `once_enabled` for axes 0 and 1.
 fn both_enabled(
-    mut then: impl FnMut(&View<'_>, f64) -> Option<Turn> + Send + 'static,
-) -> impl FnMut(&View<'_>, f64) -> Turn + Send + 'static {
+    mut then: impl FnMut(&View<'_>, f64) -> Option<OperatorInput> + Send + 'static,
+) -> impl FnMut(&View<'_>, f64) -> OperatorInput + Send + 'static {
     let mut ready = None;
     move |view, now| {
         if ready.is_none() && !view.snapshot.axes.iter().all(|axis| axis.ready) {
             return match view.hands[0].doing {
-                Doing::Nothing if now < 0.01 => both(|axis| Request::Enable { axis }),
+                Activity::Nothing if now < 0.01 => both(|axis| Request::Enable { axis }),
                 _ => here(),
             };
         }
@@ -128,9 +129,9 @@ fn both_enabled(
     }
 }
 
-/// Two axes are refused what was asked of them at once: each is told.
+/// Requests for two axes are rejected at once; both rejections are reported.
 #[test]
-fn every_refusal_is_told() {
+fn every_rejection_is_reported() {
     let far = |axis| Request::MoveTo {
         axis,
         position: 1000.0,
@@ -147,16 +148,17 @@ fn every_refusal_is_told() {
     );
     outcome.result.expect("leaving is no failure");
     let news = seen.iter().flat_map(|s| s.news.clone());
-    let news: Vec<News> = news
-        .skip_while(|news| matches!(news, News::Done { .. }))
+    let news: Vec<JogEvent> = news
+        .skip_while(|news| matches!(news, JogEvent::Done { .. }))
         .collect();
-    let refused = |axis| matches!(&news[axis], News::Refused { axis: told, .. } if *told == axis);
+    let refused =
+        |axis| matches!(&news[axis], JogEvent::Refused { axis: reported, .. } if *reported == axis);
     assert!(news.len() == 2 && refused(0) && refused(1), "{news:?}");
 }
 
-/// Homing that is refused is over, and whoever waits for it waits no longer.
+/// A rejected homing counts as finished, so that no caller waits for it.
 #[test]
-fn homing_that_is_not_begun_is_over() {
+fn rejected_homing_counts_as_finished() {
     let second = VERSATILE.replace(r#"name = "x""#, r#"name = "y""#);
     let second = second.replace("position = 0\n", "position = 1\n");
     let (_, second) = second.split_once("[[device]]").expect("a device");
@@ -183,6 +185,6 @@ fn homing_that_is_not_begun_is_over() {
     );
     outcome.result.expect("leaving is no failure");
     let news = seen.iter().flat_map(|s| &s.news);
-    let refused = news.filter(|news| matches!(news, News::Refused { .. }));
+    let refused = news.filter(|news| matches!(news, JogEvent::Refused { .. }));
     assert_eq!(refused.count(), 2);
 }

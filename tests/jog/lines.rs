@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::common::root;
 
-/// Exit code, standard output and standard error.
+/// Returns exit code, standard output and standard error.
 fn script(lines: &str, more: &[&str]) -> (i32, String, String) {
     let mut child = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
         .args(["jog", "configs/demo.toml", "--sim", "--lines", "--virtual"])
@@ -19,7 +19,7 @@ fn script(lines: &str, more: &[&str]) -> (i32, String, String) {
         .spawn()
         .expect("the binary runs");
     let mut stdin = child.stdin.take().expect("a pipe");
-    // It may have left at a line that is wrong.
+    // The program may exit at an invalid line.
     let _ = stdin.write_all(lines.as_bytes());
     drop(stdin);
     let output = child.wait_with_output().expect("it ends");
@@ -45,14 +45,14 @@ quit
     let (code, out, err) = script(lines, &[]);
     assert_eq!(code, 0, "{err}");
     let (status, news): (Vec<&str>, Vec<&str>) = out.lines().partition(|l| l.contains("CSP"));
-    let told = [
+    let reported = [
         "x: enabled",
         "y: enabled",
         "y: is there",
         "x: is there",
         "x: disabled",
     ];
-    assert_eq!(news, told);
+    assert_eq!(news, reported);
     for (line, begins, place) in [
         (0, "x: Operation enabled, CSP, ", 10.0),
         (1, "y: Operation enabled, CSP, ", -5.0),
@@ -68,7 +68,7 @@ quit
 }
 
 #[test]
-fn a_jog_lasts_as_long_as_it_is_asked_for() {
+fn a_jog_lasts_for_its_requested_time() {
     let jog = "jog x 10\nwait 100ms\n".repeat(10);
     let lines = format!("enable x\nwait\n{jog}wait\nstatus\n");
     let (code, out, err) = script(&lines, &["--json"]);
@@ -79,7 +79,7 @@ fn a_jog_lasts_as_long_as_it_is_asked_for() {
         .collect();
     let what: Vec<_> = answers.iter().filter_map(|a| a["what"].as_str()).collect();
     assert_eq!(what, ["enabled", "let go, brakes", "stopped"]);
-    // A second, and what it takes until it is missed.
+    // One second, plus the time until the missing request is detected.
     let status = answers
         .iter()
         .find(|a| a["axis"] == "x" && a["state"].is_string());
@@ -90,7 +90,7 @@ fn a_jog_lasts_as_long_as_it_is_asked_for() {
 }
 
 #[test]
-fn a_script_ends_at_the_first_line_that_goes_wrong() {
+fn a_script_ends_at_the_first_failing_line() {
     for (lines, code, parts) in [
         (
             "wiggle x\nenable\n",
@@ -109,7 +109,7 @@ fn a_script_ends_at_the_first_line_that_goes_wrong() {
             &["`move` takes the name of an axis and a number"],
         ),
         ("jog x NaN\n", 2, &["`NaN` is not a number"]),
-        ("mode x warp\n", 2, &["`warp` is no mode", "csp"]),
+        ("mode x warp\n", 2, &["`warp` is not a mode", "csp"]),
         ("speed 26\n", 2, &["up to 25"]),
         ("wait 5\n", 2, &["unit"]),
         (
@@ -143,7 +143,7 @@ fn a_script_ends_at_the_first_line_that_goes_wrong() {
 }
 
 #[test]
-fn the_end_of_the_input_is_the_end_of_the_run() {
+fn the_end_of_input_ends_the_run() {
     for lines in ["", "# nothing\n\n", "enable x\nwait\njog x 10\n"] {
         let (code, _, err) = script(lines, &[]);
         assert_eq!(code, 0, "{lines:?}: {err}");

@@ -1,8 +1,8 @@
-//! `ecaxis jog` in a terminal, driven through tmux; and where there is none.
+//! `ecaxis jog` in a terminal, driven through tmux, and without a terminal.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says why")]
 
-use crate::common::wire::calmly;
+use crate::common::wire::retry_if_host_stalled;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread::sleep;
@@ -11,11 +11,11 @@ use std::time::{Duration, Instant};
 use super::common::root;
 use super::common::script::comes_to_rest;
 
-/// Much longer than anything takes.
+/// A timeout much longer than any operation.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
-fn without_a_terminal_it_says_what_else_there_is() {
+fn jog_without_a_terminal_names_the_alternative() {
     let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
         .args(["jog", "configs/demo.toml", "--sim"])
         .current_dir(root())
@@ -25,24 +25,24 @@ fn without_a_terminal_it_says_what_else_there_is() {
     assert_eq!(output.status.code(), Some(2));
     let text = String::from_utf8_lossy(&output.stderr);
     assert!(
-        text.contains("no terminal") && text.contains("--lines"),
+        text.contains("not a terminal") && text.contains("--lines"),
         "{text}"
     );
     assert!(output.stdout.is_empty());
 }
 
-/// A session of tmux, 80 × 24, with a server of its own.
+/// A tmux session of 80 × 24 with its own server.
 struct Tmux {
     folder: tempfile::TempDir,
 }
 
 impl Tmux {
-    /// `None`, with the reason printed, where there is no tmux.
+    /// Prints the reason and returns `None` without tmux.
     fn new(arguments: &str) -> Option<Self> {
         Self::after("", arguments)
     }
 
-    /// With something that the shell does first.
+    /// Same as `new`, with a shell command before.
     fn after(before: &str, arguments: &str) -> Option<Self> {
         let there = Command::new("tmux").arg("-V").output().is_ok();
         assert!(there || std::env::var_os("CI").is_none(), "no tmux on CI");
@@ -51,7 +51,7 @@ impl Tmux {
             return None;
         }
         let folder = tempfile::tempdir().expect("a folder");
-        // A computer that is busy with tests stalls for longer than a machine may.
+        // A test computer under load stalls for longer than a machine tolerates.
         let demo = std::fs::read_to_string(root().join("configs/demo.toml")).expect("our file");
         let calm = demo.replace("lost_frames = 20", "watchdog = \"6s\"\nlost_frames = 1000");
         let esi = root().join("configs/esi");
@@ -100,7 +100,7 @@ impl Tmux {
         self.ask(&[&["send-keys"], keys].concat());
     }
 
-    /// Until the screen shows it.
+    /// Waits until the screen shows the text.
     #[track_caller]
     fn shows(&self, what: impl Fn(&str) -> bool, text: &str) -> String {
         let began = Instant::now();
@@ -114,7 +114,7 @@ impl Tmux {
         }
     }
 
-    /// Keys, and once more where a computer that stalls has let go of them.
+    /// Sends keys, and repeats them if a stalled computer has lost them.
     #[track_caller]
     fn again(&self, keys: &[&str], what: impl Fn(&str) -> bool) {
         for _ in 0..5 {
@@ -140,7 +140,7 @@ impl Tmux {
         std::fs::read_to_string(path).unwrap_or_default()
     }
 
-    /// The process itself.
+    /// Returns the process ID of jog.
     fn pid(&self) -> String {
         let shell = self.ask(&["display-message", "-p", "#{pane_pid}"]);
         let shell = shell.trim();
@@ -149,10 +149,10 @@ impl Tmux {
         children.trim().to_owned()
     }
 
-    /// It has ended with this code, and the terminal is as it was.
+    /// Checks that jog has ended with this code, and that the terminal is restored.
     #[track_caller]
     fn left(&self, code: &str) {
-        // Not a word of the summary before.
+        // The output before this marker contains no part of the summary.
         let screen = self.says("all-is-done");
         assert_eq!(self.file("code").trim(), code, "{screen}");
         assert!(!self.file("before").is_empty());
@@ -170,7 +170,7 @@ impl Drop for Tmux {
     }
 }
 
-/// What the row of an axis shows of its position.
+/// Returns the position that the row of an axis shows.
 fn position(screen: &str, axis: &str) -> Option<f64> {
     let row = screen.lines().find(|line| {
         let mut words = line.trim_start_matches([' ', '>']).split_whitespace();
@@ -182,12 +182,12 @@ fn position(screen: &str, axis: &str) -> Option<f64> {
 
 #[test]
 fn a_machine_is_driven_from_a_terminal() {
-    calmly(|| {
+    retry_if_host_stalled(|| {
         let Some(tmux) = Tmux::new("") else { return };
         tmux.says("x no power");
         tmux.keys(&["e"]);
         tmux.says("x holds");
-        // One key moves nothing; the second one in time does, and not for long.
+        // A single key press moves nothing. A second press in time starts a short motion.
         tmux.again(&["Right"], |screen| screen.contains("keep holding"));
         let before = position(&tmux.screen(), "x").expect("a position");
         assert!(before.abs() < 0.01, "{before}");
@@ -195,7 +195,7 @@ fn a_machine_is_driven_from_a_terminal() {
             let far = position(screen, "x").is_some_and(|x| x > 1.0);
             far && screen.contains("x: let go, brakes") && screen.contains("x holds")
         });
-        // A position that is typed; and one that is out of reach.
+        // Typed positions: one within the range and one outside.
         tmux.keys(&["+"]);
         tmux.again(&["m", "-", "1", "2", ".", "5", "Enter"], |screen| {
             position(screen, "x") == Some(-12.5)
@@ -208,7 +208,7 @@ fn a_machine_is_driven_from_a_terminal() {
         tmux.keys(&["Down", "e"]);
         tmux.says("y holds");
         tmux.again(&["."], |screen| position(screen, "y") >= Some(1.0));
-        // A long way, and a hand that slips.
+        // A long move, interrupted by an accidental key.
         tmux.keys(&["-", "-", "m", "5", "0", "Enter"]);
         tmux.says("y moves to 50 mm");
         tmux.keys(&["z"]);
@@ -226,8 +226,8 @@ fn a_machine_is_driven_from_a_terminal() {
 }
 
 #[test]
-fn a_signal_ends_it_in_order() {
-    calmly(|| {
+fn a_signal_stops_the_machine_and_restores_the_terminal() {
+    retry_if_host_stalled(|| {
         for signal in ["-TERM", "-HUP"] {
             let Some(tmux) = Tmux::new("") else { return };
             tmux.says("x no power");
@@ -242,10 +242,11 @@ fn a_signal_ends_it_in_order() {
     });
 }
 
-/// The shell ends with its terminal, and SIGHUP follows; or it stays, and jog sees that nobody can type any more.
+/// Either the shell ends with its terminal and SIGHUP follows, or the shell stays and jog detects
+/// the closed terminal.
 #[test]
-fn a_terminal_that_closes_ends_it_in_order() {
-    calmly(|| {
+fn a_closed_terminal_stops_the_machine() {
+    retry_if_host_stalled(|| {
         for before in ["", "trap : HUP;"] {
             let Some(tmux) = Tmux::after(before, "--record r.pcapng") else {
                 return;
@@ -265,15 +266,15 @@ fn a_terminal_that_closes_ends_it_in_order() {
             if !before.is_empty() {
                 assert_eq!(tmux.file("code").trim(), "130");
             }
-            // A quarter of 250 mm/s at most, of 400 counts a millimetre, and rounding.
+            // At most a quarter of 250 mm/s, with 400 counts/mm, plus rounding.
             comes_to_rest(&tmux.folder.path().join("r.pcapng"), 26);
         }
     });
 }
 
 #[test]
-fn leaving_before_the_bus_is_up_is_possible() {
-    calmly(|| {
+fn jog_can_be_left_before_the_bus_is_up() {
+    retry_if_host_stalled(|| {
         let Some(tmux) = Tmux::new("") else { return };
         tmux.says("EMERGENCY STOP");
         tmux.keys(&["q"]);
@@ -282,7 +283,7 @@ fn leaving_before_the_bus_is_up_is_possible() {
 }
 
 #[test]
-fn a_file_that_is_wrong_leaves_the_terminal_alone() {
+fn an_invalid_file_leaves_the_terminal_unchanged() {
     let Some(tmux) = Tmux::new("--faults nowhere.toml") else {
         return;
     };

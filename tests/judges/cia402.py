@@ -13,7 +13,7 @@ STATES = [
     ("Fault reaction active", 0x4F, 0x0F),
     ("Fault", 0x4F, 0x08),
 ]
-# The Controlword that leads one state nearer to Operation enabled.
+# The Controlword of the next transition towards Operation enabled.
 TOWARDS_ENABLED = {
     "Switch on disabled": 0x06,
     "Ready to switch on": 0x07,

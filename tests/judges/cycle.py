@@ -1,4 +1,4 @@
-"""Cyclic exchange at 1 kHz by pysoem, and the way of a whole bus to Op."""
+"""Cyclic exchange at 1 kHz through pysoem, and the bring-up of a whole bus to Op."""
 
 import contextlib
 import gc
@@ -20,15 +20,15 @@ def state_name(state):
 
 
 class Cycle:
-    """Exchanges process data once a millisecond and counts what comes back."""
+    """Exchanges process data once a millisecond and counts the replies."""
 
     def __init__(self, master, expected):
         self.master = master
         self.expected = expected
         self.good = 0
-        # No answer in time: the computer stalled, or the frame is lost.
+        # No reply in time: the computer stalled, or the frame was lost.
         self.missed = 0
-        # An answer with another working counter.
+        # A reply with a wrong working counter.
         self.wrong = {}
         self._next = time.monotonic_ns()
 
@@ -39,7 +39,7 @@ class Cycle:
         if wait > 0:
             time.sleep(wait / 1e9)
         elif wait < -PERIOD:
-            # Cycles that are over are left out, not made up for.
+            # Missed cycles are skipped, not repeated.
             self._next = time.monotonic_ns()
         self.master.send_processdata()
         wkc = self.master.receive_processdata(2_000)
@@ -59,7 +59,7 @@ class Cycle:
         gc.enable()
 
     def until(self, condition, seconds):
-        """Cycles until `condition()` holds; False if it takes more of them."""
+        """Runs cycles until `condition()` holds. Returns False after the maximum number of cycles."""
         for _ in range(round(seconds * 1e9 / PERIOD)):
             self.once()
             if condition():
@@ -75,7 +75,7 @@ class Cycle:
 
 @contextlib.contextmanager
 def real_time():
-    """The priority a MainDevice has; below what the kernel needs, and above the simulated bus."""
+    """Sets the priority of a MainDevice: below the kernel threads and above the simulated bus."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(75))
     except OSError as error:
@@ -83,7 +83,7 @@ def real_time():
     try:
         yield
     finally:
-        # What is built or read between two buses has no right to it.
+        # Work between two buses runs without this priority.
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
@@ -93,14 +93,14 @@ def states(master):
 
 
 def reach(master, state, timeout_us=PATIENCE_US):
-    """Requests a state of all and waits for it; True if every one is there."""
+    """Requests a state of all devices and waits for it. Returns True if every device reaches it."""
     master.state = state
     master.write_state()
     return master.state_check(state, timeout_us) == state
 
 
 def to_op(master, expected):
-    """From PreOp, mapped, to Op, with process data all the while. The cycle goes on."""
+    """Leads mapped devices from PreOp to Op with continuous process data. The cycle continues afterwards."""
     if not reach(master, pysoem.SAFEOP_STATE):
         return None
     cycle = Cycle(master, expected)
@@ -109,7 +109,7 @@ def to_op(master, expected):
     master.write_state()
 
     def in_op():
-        # `state_check` sends a frame of its own; not in every cycle.
+        # `state_check` sends an additional frame, so it does not run in every cycle.
         return cycle.good % 10 == 0 and master.state_check(pysoem.OP_STATE, 0) == pysoem.OP_STATE
 
     return cycle if cycle.until(in_op, 10) else None

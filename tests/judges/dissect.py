@@ -1,4 +1,4 @@
-"""What Wireshark's dissector, through tshark, thinks of a recording."""
+"""Checks a recording with Wireshark's dissector, through tshark."""
 
 import shutil
 import subprocess
@@ -13,7 +13,7 @@ def available():
 
 
 def dissect(path):
-    """(frames, dissected as EtherCAT, malformed, Counter of the expert's remarks)."""
+    """Returns (frames, dissected as EtherCAT, malformed, Counter of expert messages)."""
     fields = ["frame.protocols", "_ws.malformed", "_ws.expert.severity", "_ws.expert.message"]
     command = ["tshark", "-n", "-r", str(path), "-T", "fields", "-E", "aggregator=|"]
     for name in fields:

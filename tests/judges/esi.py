@@ -1,4 +1,4 @@
-"""What an ESI file says of a device, read without any of ecaxis' code."""
+"""Reads a device's description from an ESI file, without code of ecaxis."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -31,7 +31,7 @@ class Device:
 
     @property
     def wkc(self):
-        """What it adds to an LRW's working counter in Op: 2 for outputs, 1 for inputs."""
+        """The device's share of an LRW's working counter in Op: 2 for outputs, 1 for inputs."""
         return (2 if self.rx_bits else 0) + (1 if self.tx_bits else 0)
 
     def offset(self, index, direction="tx"):
@@ -81,7 +81,7 @@ def default_data(path, index):
 
 
 def objects(path, type_name):
-    """{index: (name, [(sub, name, bits)])} of a device's dictionary; items that are arrays are left out."""
+    """Returns {index: (name, [(sub, name, bits)])} of a device's dictionary. Array items are skipped."""
     root = ElementTree.parse(path).getroot()
     for device in root.iter("Device"):
         if (device.findtext("Type") or "").strip() == type_name:

@@ -1,4 +1,4 @@
-"""EtherCAT frames out of a pcapng file, each request with its answer."""
+"""Reads EtherCAT frames from a pcapng file and pairs each request with its reply."""
 
 import struct
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Datagram:
 
 @dataclass
 class Exchange:
-    """A request and what became of it; `answer` is None where nothing came back."""
+    """A request with its reply; `answer` is None for a lost frame."""
 
     number: int
     request: list
@@ -30,7 +30,7 @@ class Exchange:
 
 
 def blocks(raw):
-    """(type, body) of every block of a little-endian section."""
+    """Yields (type, body) of every block of a little-endian section."""
     if struct.unpack_from("<I", raw, 8)[0] != 0x1A2B3C4D:
         raise ValueError("not a little-endian pcapng file")
     at = 0
@@ -52,7 +52,7 @@ def frames(raw):
 
 
 def datagrams(frame):
-    """The datagrams of an EtherCAT frame; every length in it has to be right."""
+    """Returns the datagrams of an EtherCAT frame. Fails if a length is wrong."""
     (header,) = struct.unpack_from("<H", frame, 14)
     if header >> 12 != 1 or 16 + (header & 0x7FF) > len(frame):
         raise ValueError("EtherCAT header")
@@ -87,7 +87,7 @@ def exchanges(path):
             found.append(exchange)
             pending.setdefault(key, []).append(exchange)
         elif pending.get(key):
-            # An answer overtakes no other: what was asked the same way before is lost.
+            # Replies arrive in order, so earlier identical requests are lost.
             pending[key].pop(0).answer = content
         else:
             stray += 1

@@ -1,10 +1,10 @@
-"""Named checks: each says what is asserted, and one that fails does not hide the next."""
+"""Named checks. Each check names its assertion, and checks after a failed one still run."""
 
 import time
 
 
 class Stop(Exception):
-    """What follows makes no sense any more."""
+    """The remaining checks of the section cannot run."""
 
 
 class Report:
@@ -22,7 +22,7 @@ class Report:
         print(f"     {text}", flush=True)
 
     def check(self, name, ok, detail=""):
-        """Asserts `ok`; `detail` explains a failure, and is worth reading otherwise."""
+        """Asserts `ok`. `detail` explains a failure, or gives the result of a passed check."""
         if ok:
             self.passed += 1
         else:
@@ -36,7 +36,7 @@ class Report:
         return self.check(name, False, f"{show(got)}, not {show(expected)}")
 
     def need(self, name, ok, detail=""):
-        """A check without which the rest of the section makes no sense."""
+        """A check that the rest of the section requires."""
         if not self.check(name, ok, detail):
             raise Stop(name)
 
@@ -48,7 +48,7 @@ class Report:
         return len(self.failed) == mark[1]
 
     def forget(self, mark):
-        """What was checked since is no verdict."""
+        """Discards the checks since `mark`."""
         self.passed = mark[0]
         del self.failed[mark[1] :]
 

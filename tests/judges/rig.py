@@ -1,4 +1,4 @@
-"""What the judges sit at: a veth pair, `ecaxis sim` on one end of it, a recorder on the other."""
+"""The test rig: a veth pair, `ecaxis sim` at one end, a recorder at the other."""
 
 import contextlib
 import ctypes.util
@@ -19,11 +19,11 @@ PREFIX = "ecj"
 
 
 class Skip(Exception):
-    """This computer cannot do it; nothing is wrong with the program."""
+    """This computer cannot run the test; the program has not failed."""
 
 
 def fixture(path):
-    """A third-party file to test against; on CI it has to be there."""
+    """Returns a third-party file for tests. On CI a missing file is a failure."""
     folder = pathlib.Path(os.environ.get("ECAXIS_FIXTURES") or ROOT / "../shared/fixtures")
     file = (folder / path).resolve()
     if file.exists():
@@ -41,10 +41,10 @@ def ip(*arguments):
 
 @contextlib.contextmanager
 def veth_pair(letters="ab"):
-    """Names of two connected interfaces, removed afterwards, however this ends."""
+    """Yields the names of two connected interfaces, which are always removed afterwards."""
     if os.geteuid() != 0:
         raise Skip("a veth pair needs root")
-    # What a killed run left behind.
+    # Interfaces of an earlier, killed run.
     for name in os.listdir("/sys/class/net"):
         left = re.fullmatch(rf"{PREFIX}(\d+)[a-z]", name)
         if left and not os.path.exists(f"/proc/{left[1]}"):
@@ -56,7 +56,7 @@ def veth_pair(letters="ab"):
         raise Skip(f"no veth pair can be made: {error}") from None
     try:
         for nic in (a, b):
-            # No address resolution or router solicitation of the host's on this wire.
+            # The host sends no address resolution or router solicitation on this wire.
             with contextlib.suppress(OSError):
                 pathlib.Path(f"/proc/sys/net/ipv6/conf/{nic}/disable_ipv6").write_text("1")
             ip("link", "set", nic, "up")
@@ -72,12 +72,12 @@ def veth_pair(letters="ab"):
 
 
 def target():
-    """Where cargo builds."""
+    """Returns the target folder of cargo."""
     return (ROOT / pathlib.Path(os.environ.get("CARGO_TARGET_DIR") or "target")).resolve()
 
 
 def binary():
-    """The program under test: ECAXIS, or what cargo builds."""
+    """Returns the program under test: ECAXIS, or the one built by cargo."""
     given = os.environ.get("ECAXIS")
     if given:
         return pathlib.Path(given).resolve()
@@ -88,7 +88,7 @@ def binary():
 
 
 class Machine:
-    """A machine file, and what its ESI files say of each device."""
+    """A machine file with the ESI description of each device."""
 
     def __init__(self):
         self.devices = []
@@ -130,7 +130,7 @@ def drive(machine, name, path, type_name):
 
 @contextlib.contextmanager
 def process(arguments, **more):
-    """A child that does not outlive the block, nor this process."""
+    """A child process that ends with the block or with this process."""
     libc = ctypes.CDLL(ctypes.util.find_library("c") or "libc.so.6")
     die_with_parent = lambda: libc.prctl(1, signal.SIGKILL)  # noqa: E731 PR_SET_PDEATHSIG
     child = subprocess.Popen(arguments, text=True, preexec_fn=die_with_parent, **more)
@@ -143,7 +143,7 @@ def process(arguments, **more):
 
 
 class Served:
-    """A bus that is being served; after `end`, its exit code and output."""
+    """A running simulated bus; after `end`, its exit code and output."""
 
     def __init__(self, child, errors):
         self.child = child
@@ -151,7 +151,7 @@ class Served:
         self.output = None
 
     def strike(self):
-        """The fault script begins now."""
+        """Starts the fault script."""
         self.child.send_signal(signal.SIGUSR1)
 
     def end(self):
@@ -167,13 +167,13 @@ class Served:
 
 @contextlib.contextmanager
 def served(program, machine, nic, faults=None, options=()):
-    """`ecaxis sim` with this machine on the interface, answering already."""
+    """Runs `ecaxis sim` with this machine on the interface, and waits until it answers."""
     with tempfile.TemporaryDirectory(prefix="ecaxis-judge-") as folder:
         command = [str(program), "sim", str(machine.write(folder)), "--nic", nic, *options]
         if faults:
             script = pathlib.Path(folder) / "faults.toml"
             script.write_text(faults)
-            # A script that ran from the start would strike a slow computer in bring-up.
+            # On a slow computer, a script from the start would affect bring-up.
             command += ["--faults", str(script), "--faults-on-signal"]
         errors = pathlib.Path(folder) / "errors"
         with errors.open("w") as err, process(command, stdout=subprocess.PIPE, stderr=err) as child:
@@ -193,13 +193,13 @@ def packets(nic, way):
 
 @contextlib.contextmanager
 def recorded(nic, path, steady):
-    """Every frame on the interface, both ways, as pcapng."""
+    """Records every frame on the interface in both directions, as pcapng."""
     command = [sys.executable, str(HERE / "recorder.py"), nic, str(path)]
     with process(command, stdout=subprocess.PIPE) as child:
         child.stdout.readline()
         owed = packets(nic, "tx") - packets(nic, "rx")
         yield
-        # Every answer is to come, and to be written.
+        # Waits until every reply is received and written.
         deadline = time.monotonic() + 10
         while steady and packets(nic, "tx") - packets(nic, "rx") > owed and time.monotonic() < deadline:
             time.sleep(0.05)

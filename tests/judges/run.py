@@ -26,7 +26,7 @@ from watch import Watch
 SECTIONS = ["bringup", "overlap", "mailbox", "parameters", "operation", "faults", "ring", "gateway", "ethercrab", "eeproms", "recordings"]
 
 TRIES = 3
-# Of a section's time: where every try lost more than this, there is nothing to judge.
+# The maximum stalled share of a section's time. If every try exceeds it, the section has no result.
 TOO_MUCH = 0.1
 
 
@@ -36,7 +36,7 @@ def main():
     parser.add_argument("--keep", help="folder that keeps the recordings")
     parser.add_argument("--all", action="store_true", help="every device of every ESI file, not samples")
     arguments = parser.parse_args()
-    # `finally` blocks are to run, and the interfaces to go, however this ends.
+    # SIGTERM must run the `finally` blocks, which remove the interfaces.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     report = Report()
     try:
@@ -64,11 +64,11 @@ def run(arguments, report):
         folder.mkdir(parents=True, exist_ok=True)
         bench = sections.Bench(program, *nics, folder, report, arguments.all)
         for name in arguments.sections or SECTIONS:
-            calmly(name, lambda section=getattr(sections, name): section(bench), report)
+            retry_if_host_stalled(name, lambda section=getattr(sections, name): section(bench), report)
 
 
-def calmly(name, section, report):
-    """A section that fails while the computer stands still is repeated; without a fair try it is left out."""
+def retry_if_host_stalled(name, section, report):
+    """Repeats a section that fails while the computer stalls. Without a valid try, the section is skipped."""
     fair = False
     for left in reversed(range(TRIES)):
         before = report.mark()

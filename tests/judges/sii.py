@@ -1,4 +1,4 @@
-"""What a device's EEPROM has to say (ETG.2010), from its ESI file, read without any of ecaxis' code."""
+"""The expected EEPROM contents of a device (ETG.2010), from its ESI file, read without code of ecaxis."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -52,9 +52,9 @@ class Device:
     ebus: int = 0
     # PDOs that exist only once its modules are configured over CoE.
     of_modules: bool = False
-    # PDOs that only the dictionary tells: not read here.
+    # PDOs that exist only in the dictionary: not read here.
     in_dictionary: bool = False
-    # What a machine file has to name because no module is the default.
+    # Modules that a machine file must name, because no module is the default.
     modules: list = field(default_factory=list)
 
     @property
@@ -65,7 +65,7 @@ class Device:
         return sum(pdo.bits for pdo in self.rx + self.tx if pdo.sm == number)
 
     def sm_length(self, number):
-        """As the file says; where it leaves it open, what the default PDOs need."""
+        """The size in the file; without it, the size of the default PDOs."""
         _, length, _, enable, _ = self.sms[number]
         if length is None:
             return 0 if enable & VIRTUAL else -(-self.sm_bits(number) // 8)
@@ -77,7 +77,7 @@ def flag(element, attribute):
 
 
 def text(element, tag):
-    """The English one of several languages, otherwise the first."""
+    """Returns the English name of several, otherwise the first."""
     found = element.findall(tag)
     english = [e for e in found if e.get("LcId") == ENGLISH]
     chosen = (english or found or [None])[0]
@@ -90,7 +90,7 @@ def value(element, tag, default=0):
 
 
 def pdos(owner, tag, shift=0, object_shift=0):
-    """With the indices that a module has in its slot."""
+    """Returns the PDOs with the indices that a module has in its slot."""
     found = []
     for element in owner.findall(tag):
         index = element.find("Index")
@@ -220,7 +220,7 @@ def devices(path):
 
 
 def same_text(expected, got, limit):
-    """EEPROMs hold ASCII; what stands for anything else is the maker's business."""
+    """EEPROMs hold ASCII; the replacement of other characters is up to the vendor."""
     expected = expected[:limit]
     pairs = zip(expected, got)
     return len(expected) == len(got) and all(a == b or not (" " <= a <= "~") for a, b in pairs)

@@ -10,7 +10,7 @@ import rig
 
 INCLUDES = ["oshw/linux", "osal/linux", "oshw", "osal", "soem", "test/linux/slaveinfo"]
 SOURCES = ["osal/linux/osal.c", "oshw/linux/*.c", "soem/*.c"]
-# The cache of one EEPROM; reading on, SOEM finds nothing.
+# The size of SOEM's cache of one EEPROM; SOEM finds nothing beyond it.
 CACHED = 4096
 PATIENCE_US = 5_000_000
 TIMEOUTS = re.compile(r"(#define EC_TIMEOUT(?:RET|SAFE|EEP|TXM) +)\d+")
@@ -21,7 +21,7 @@ def requirement():
 
 
 def sources(folder, python):
-    """pysoem as its authors publish it, SOEM included."""
+    """Returns the published sources of pysoem, including SOEM."""
     done = folder / "patched"
     if not done.exists():
         fresh = folder / "fresh"
@@ -37,7 +37,7 @@ def sources(folder, python):
         text = main.read_text()
         assert "    &ec_DCtime, " in text
         main.write_text(text.replace("    &ec_DCtime, ", "    0, 0, &ec_DCtime, "))
-        # An answer that is given up is taken for that of the next question; this computer may stall.
+        # SOEM takes a late reply for that of the next request, and this computer may stall.
         header = soem / "soem/ethercattype.h"
         text, count = TIMEOUTS.subn(rf"\g<1>{PATIENCE_US}", header.read_text())
         assert count == 4
@@ -48,7 +48,7 @@ def sources(folder, python):
 
 
 def program(python):
-    """The reader, compiled where cargo compiles."""
+    """Compiles the reader into the target folder of cargo."""
     folder = rig.target() / f"judges-{requirement()}"
     soem = sources(folder, python)
     built = folder / "eeprom"

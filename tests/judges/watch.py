@@ -1,5 +1,5 @@
-"""Whether the computer let the judges work: a virtual machine's host, or a neighbour, takes processors
-away for tens of milliseconds at a time, and what was late then says nothing about the program."""
+"""Detects stalls of the computer. A virtual machine's host or a neighbour may take processors away for
+tens of milliseconds; delays in this time say nothing about the program."""
 
 import ctypes
 import ctypes.util
@@ -10,9 +10,9 @@ import struct
 import time
 
 EVERY = 0.001
-# A wake-up later than this was held up.
+# A later wake-up counts as a stall.
 LATE = 0.002
-# Above every thread of the program: what keeps the watch from running is not its.
+# Above every thread of the program, so that none of them delays the watch.
 PRIORITY = 95
 
 

@@ -114,7 +114,7 @@ class Device:
             yield (base + 7, base + 7, False), known
 
     def register(self, start, length, write):
-        """Whether any byte of a register access counts."""
+        """True if any byte of a register access counts."""
         hits = lambda table: any(  # noqa: E731
             first < start + length and start <= last and (may or not write)
             for first, last, may in table
@@ -176,12 +176,12 @@ class Device:
         return best
 
     def touch(self, start, data, wkc):
-        """The MainDevice has written; `wkc` tells whether it arrived."""
+        """The MainDevice has written; `wkc` shows whether the write arrived."""
         for n in self.sm_range:
             r = self.sm(n)
             first, size = int.from_bytes(r[0:2], "little"), int.from_bytes(r[2:4], "little")
             if size and first <= start < first + size and start >= 0x1000:
-                # The device empties it when it likes.
+                # The device may empty it at any time.
                 self.full[n] = None
         if start >= 0x1000 or not wkc:
             return
@@ -199,7 +199,7 @@ class Device:
             self.states |= {self.asked}
         for n in self.sm_range:
             if start <= 0x806 + 8 * n < start + len(data):
-                # Enabling empties it; what the device then puts in is its own affair.
+                # Enabling empties the mailbox; the device may then fill it.
                 self.full[n] = False if self.outbox(n) else None
 
     def learn(self, start, data):
@@ -276,7 +276,7 @@ class Walk:
         return sum(p[0] for p in parts), sum(p[1] for p in parts)
 
     def follow(self, d, answer):
-        """What the devices have become by this datagram; `answer` is None where none came."""
+        """Updates the devices' states for this datagram; `answer` is None for a lost frame."""
         targets = self.addressed(d)
         wkc = None if answer is None else answer.wkc - d.wkc
         if d.command in (APWR, FPWR, BWR, APRW, FPRW, BRW):

@@ -1,11 +1,11 @@
-//! `ecaxis sdo` and `ecaxis eeprom` as a user meets them.
+//! `ecaxis sdo` and `ecaxis eeprom` from the user's view.
 
 use std::path::Path;
 use std::process::Command;
 
 use crate::common::root;
 
-/// Exit code, standard output and standard error.
+/// Returns exit code, standard output and standard error.
 fn ran(folder: &Path, arguments: &[&str]) -> (i32, String, String) {
     let output = Command::new(env!("CARGO_BIN_EXE_ecaxis"))
         .args(arguments)
@@ -24,7 +24,7 @@ fn demo() -> String {
 }
 
 #[test]
-fn values_on_the_command_line() {
+fn sdo_reads_and_writes_values_of_every_type() {
     let folder = tempfile::tempdir().expect("a folder");
     let demo = demo();
     let sdo = |words: &[&str], more: &[&str]| {
@@ -50,18 +50,18 @@ fn values_on_the_command_line() {
             "0x6065:00 Following error window (bytes) = d0 07 00 00\n",
         ),
     ] {
-        let (code, told, err) = sdo(words, &[]);
-        assert_eq!((code, told.as_str()), (0, out), "{words:?}: {err}");
+        let (code, reported, err) = sdo(words, &[]);
+        assert_eq!((code, reported.as_str()), (0, out), "{words:?}: {err}");
         assert!(
-            told.lines().all(|line| line.chars().count() <= 80),
-            "{told}"
+            reported.lines().all(|line| line.chars().count() <= 80),
+            "{reported}"
         );
     }
-    let (code, told, err) = sdo(&["read", "0x1018"], &[]);
+    let (code, reported, err) = sdo(&["read", "0x1018"], &[]);
     assert_eq!(code, 0, "{err}");
-    assert!(told.contains("0x1018:01  UDINT"), "{told}");
-    let (code, told, _) = sdo(&["read", "0x1018:1"], &["--json"]);
-    let json: serde_json::Value = serde_json::from_str(&told).expect("JSON");
+    assert!(reported.contains("0x1018:01  UDINT"), "{reported}");
+    let (code, reported, _) = sdo(&["read", "0x1018:1"], &["--json"]);
+    let json: serde_json::Value = serde_json::from_str(&reported).expect("JSON");
     assert_eq!((code, &json[0]["hex"]), (0, &"0x00000e0a".into()));
     for (words, code, part) in [
         (
@@ -87,8 +87,8 @@ fn values_on_the_command_line() {
         ),
         (&["restore", "missing.toml"], 2, "cannot read missing.toml"),
     ] {
-        let (ended, told, err) = sdo(words, &[]);
-        assert_eq!((ended, told.as_str()), (code, ""), "{words:?}: {err}");
+        let (ended, reported, err) = sdo(words, &[]);
+        assert_eq!((ended, reported.as_str()), (code, ""), "{words:?}: {err}");
         assert!(err.contains(part), "{words:?}: `{part}` is not in:\n{err}");
     }
     let (code, _, err) = ran(
@@ -97,19 +97,19 @@ fn values_on_the_command_line() {
     );
     assert_eq!(code, 2);
     assert!(err.contains("no device is called `z`"), "{err}");
-    let (code, told, _) = sdo(&["store"], &[]);
-    assert_eq!((code, told.as_str()), (0, ""));
+    let (code, reported, _) = sdo(&["store"], &[]);
+    assert_eq!((code, reported.as_str()), (0, ""));
     assert_eq!(sdo(&["defaults"], &["--yes", "--json"]).0, 0);
     for more in [&[][..], &["--json"]] {
-        let (code, told, err) = sdo(&["defaults"], more);
-        assert_eq!((code, told.as_str()), (2, ""), "{err}");
-        assert!(err.contains("nothing was written: say `--yes`"), "{err}");
+        let (code, reported, err) = sdo(&["defaults"], more);
+        assert_eq!((code, reported.as_str()), (2, ""), "{err}");
+        assert!(err.contains("nothing was written: add `--yes`"), "{err}");
         assert!(err.contains("`ecaxis sdo dump` keeps"), "{err}");
     }
 }
 
 #[test]
-fn a_file_of_parameters_on_the_command_line() {
+fn sdo_saves_and_restores_a_parameter_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let demo = demo();
     let run = |words: &[&str]| ran(folder.path(), words);
@@ -144,14 +144,14 @@ fn a_file_of_parameters_on_the_command_line() {
     let (code, out, err) = run(&["sdo", "restore", &demo, "x", "y.toml", "--sim", "--json"]);
     let json: serde_json::Value = serde_json::from_str(&out).expect("JSON");
     assert_eq!((code, &json["written"]), (0, &1.into()), "{out}{err}");
-    // Another product.
+    // The file belongs to another product.
     let (code, _, err) = run(&["sdo", "restore", &demo, "y", "x.toml", "--sim"]);
     assert_eq!(code, 1);
     assert!(err.contains("--other-device"), "{err}");
 }
 
 #[test]
-fn the_list_is_the_same_by_the_esi_and_by_the_device() {
+fn the_object_list_is_the_same_from_esi_and_device() {
     let folder = tempfile::tempdir().expect("a folder");
     let demo = demo();
     let list = |more: &[&str]| {
@@ -173,7 +173,7 @@ fn the_list_is_the_same_by_the_esi_and_by_the_device() {
 }
 
 #[test]
-fn eeproms_on_the_command_line() {
+fn eeprom_reads_compares_and_writes_images() {
     let folder = tempfile::tempdir().expect("a folder");
     let demo = demo();
     let run = |words: &[&str]| {
@@ -190,7 +190,7 @@ fn eeproms_on_the_command_line() {
     assert_eq!(run(&["verify"]), (0, String::new(), String::new()));
     assert_eq!(run(&["verify", "x.bin"]).0, 0);
     assert_eq!(run(&["read", "general.bin", "--category", "30"]).0, 0);
-    // All that the chip holds, and it differs behind the image's end alone.
+    // The whole chip differs from the image only after the image's end.
     assert_eq!(run(&["read", "all.bin", "--all"]).0, 0);
     let all = std::fs::read(at("all.bin")).expect("the chip");
     assert!(all.len() > image.len() && all.starts_with(&image));
@@ -201,9 +201,9 @@ fn eeproms_on_the_command_line() {
     std::fs::write(at("end.bin"), other).expect("written");
     let (code, out, _) = run(&["verify", "end.bin"]);
     let last = all.len() - 1;
-    let told = format!("1 bytes are not those of end.bin, the first at 0x{last:04x}\n");
-    assert_eq!((code, out), (1, told));
-    // More than the chip holds.
+    let reported = format!("1 bytes are not those of end.bin, the first at 0x{last:04x}\n");
+    assert_eq!((code, out), (1, reported));
+    // The file is longer than the chip.
     std::fs::write(at("long.bin"), [&all[..], &[0xff; 100]].concat()).expect("written");
     let (code, out, _) = run(&["verify", "long.bin"]);
     assert_eq!(code, 1);
@@ -217,15 +217,15 @@ fn eeproms_on_the_command_line() {
             .is_empty()
     );
 
-    // Not without being told so, and not what is not sound or is another's.
+    // Rejected: writes without confirmation, damaged images, and images of other devices.
     let refused = |words: &[&str], code: i32, part: &str| {
         let (ended, out, err) = run(words);
         assert_eq!((ended, out.as_str()), (code, ""), "{words:?}: {err}");
         assert!(err.contains(part), "{words:?}: {err}");
         assert!(!at("kept.bin").exists());
     };
-    refused(&["alias", "1001"], 2, "nothing was written: say `--yes`");
-    refused(&["write", "x.bin"], 2, "nothing was written: say `--yes`");
+    refused(&["alias", "1001"], 2, "nothing was written: add `--yes`");
+    refused(&["write", "x.bin"], 2, "nothing was written: add `--yes`");
     refused(&["alias", "70000", "--yes"], 2, "a number of 16 bits");
     refused(&["read", "x.bin"], 2, "x.bin exists already");
     refused(
@@ -238,7 +238,7 @@ fn eeproms_on_the_command_line() {
         other[place] ^= 1;
         std::fs::write(at(name), other).expect("written");
     };
-    // A part with which nothing of the image could be read.
+    // A category that makes the rest of the image unreadable.
     let entries = [0x00, 0x1a, 255, 3, 0, 0, 0, 0];
     std::fs::write(at("absurd.bin"), entries).expect("written");
     let line = [
@@ -288,14 +288,14 @@ fn eeproms_on_the_command_line() {
         err.contains("2 words written") && err.contains("switched on again"),
         "{err}"
     );
-    // The name was chosen from the device's.
+    // The file name is derived from the device's name.
     let name = format!("eeprom-x-{}-1.bin", sii.serial);
     assert_eq!(std::fs::read(at(&name)).expect("kept"), image);
 }
 
-/// A disk without room: half a backup is worse than none.
+/// The disk is full: an incomplete backup must not remain.
 #[test]
-fn a_file_that_cannot_be_written_to_its_end_is_not_left_behind() {
+fn an_incomplete_file_is_removed() {
     let folder = tempfile::tempdir().expect("a folder");
     let program = env!("CARGO_BIN_EXE_ecaxis");
     let line = format!(

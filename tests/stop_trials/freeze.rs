@@ -1,4 +1,4 @@
-//! Stops one thread of another process, and nothing else of it: ptrace(2).
+//! Stops a single thread of another process with ptrace(2).
 
 #![allow(unsafe_code, reason = "ptrace has no safe form")]
 
@@ -6,14 +6,14 @@ use std::io;
 use std::marker::PhantomData;
 use std::ptr::null_mut;
 
-/// A thread that does not run until this is dropped, by the thread that has made it.
+/// A stopped thread. It runs again when this value is dropped by the thread that created it.
 pub(super) struct Frozen {
     thread: libc::pid_t,
-    /// Who traces it must let it go.
+    /// Only the tracing thread may release the traced thread.
     _here: PhantomData<*const ()>,
 }
 
-/// Freezes the process's thread of this name.
+/// Stops the process's thread of this name.
 #[track_caller]
 pub(super) fn thread(process: u32, name: &str) -> Frozen {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).expect("it runs");
@@ -55,7 +55,7 @@ pub(super) fn thread(process: u32, name: &str) -> Frozen {
 
 impl Drop for Frozen {
     fn drop(&mut self) {
-        // SAFETY: the request takes no pointers; a thread that has ended makes it fail.
+        // SAFETY: the request takes no pointers; it fails if the thread has ended.
         unsafe {
             libc::ptrace(
                 libc::PTRACE_DETACH,

@@ -8,21 +8,21 @@ use std::time::{Duration, Instant};
 
 use ecaxis::config::{self, AxisRef, Machine, Nic};
 use ecaxis::link::{self, Link, LinkError, LinkStats, MAX_FRAME, capture::RecordStats};
-use ecaxis::rt::controller::{Controller, Cycle};
+use ecaxis::rt::controller::{Controller, CycleContext};
 use ecaxis::session::{self, Options};
 use ecaxis_axis::Command;
 
 use super::SPEED;
 use super::common::Heard;
 
-/// A run that has failed has ended by then.
+/// A timeout by which a failed run has ended.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Where it panics.
+/// The location of the panic.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Injected {
     Controller,
-    /// While a frame is sent, so often.
+    /// During the transmission of a frame, this number of times.
     Cycle {
         times: usize,
     },
@@ -30,7 +30,7 @@ pub(super) enum Injected {
 
 pub(super) struct Library {
     stop: Arc<AtomicBool>,
-    /// Panics that are still to come, once they have begun.
+    /// The number of remaining panics, once they have started.
     panics: Arc<AtomicUsize>,
     times: usize,
     run: Option<JoinHandle<bool>>,
@@ -61,7 +61,7 @@ impl Library {
         self.panics.store(self.times, Ordering::Relaxed);
     }
 
-    /// Whether the run has failed.
+    /// Waits for the end. Returns true if the run has failed.
     #[track_caller]
     pub fn end(mut self) -> bool {
         let run = self.run.take().expect("once");
@@ -119,7 +119,7 @@ struct Turning {
 }
 
 impl Controller for Turning {
-    fn cycle(&mut self, machine: &mut Cycle<'_>) {
+    fn cycle(&mut self, machine: &mut CycleContext<'_>) {
         let ready = self.axes.iter().all(|axis| machine.axis(*axis).ready);
         if machine.stopping() || !ready {
             return;
@@ -136,7 +136,7 @@ impl Controller for Turning {
     }
 }
 
-/// Panics in place of sending frames.
+/// Panics instead of sending frames.
 #[derive(Debug)]
 struct Panicking {
     link: Box<dyn Link>,
@@ -161,8 +161,8 @@ impl Link for Panicking {
         self.link.stats()
     }
 
-    fn remarks(&mut self) -> Vec<String> {
-        self.link.remarks()
+    fn notices(&mut self) -> Vec<String> {
+        self.link.notices()
     }
 
     fn finish(self: Box<Self>) -> std::io::Result<Option<RecordStats>> {

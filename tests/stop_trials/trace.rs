@@ -1,4 +1,4 @@
-//! What the simulated drives did, and what brought them to rest.
+//! The motion of the simulated drives, and the means that stopped them.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -12,32 +12,32 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::PATIENCE;
 
-/// Turns per second; the simulator itself takes this for standing.
+/// The standstill threshold in turns/s, as in the simulator.
 const STANDS: f64 = 0.1;
-/// An axis stands once it has for so long.
+/// The time at rest after which an axis counts as standing.
 const SETTLED_NS: u64 = 200_000_000;
-/// Outputs that are older come no more; a busy computer is late by milliseconds.
+/// Older outputs no longer arrive; a busy computer is late by milliseconds.
 const LATE_NS: u64 = 10_000_000;
-/// The means that every stop begins with where a drive can be reached.
+/// The first means of every stop of a reachable drive.
 pub(super) const SET_POINTS: &str = "set-points";
-/// Bring-up, with every start-up SDO.
+/// The maximum time of bring-up with every start-up SDO.
 const BRING_UP: Duration = Duration::from_secs(30);
 
 #[derive(Debug, Clone)]
 struct Sample {
     at: u64,
     device: usize,
-    /// Empty: without power.
+    /// The reported state; empty: without power.
     al: String,
     al_code: u16,
-    /// Frames still bring it outputs.
+    /// True while frames deliver outputs.
     commanded: bool,
     statusword: u16,
     velocity: f64,
 }
 
 impl Sample {
-    /// `None` for what is no drive.
+    /// Parses a line; `None` for devices other than drives.
     fn parse(line: &str) -> Option<Self> {
         let mut fields = line.split(',');
         let mut next = || fields.next();
@@ -56,7 +56,7 @@ impl Sample {
         })
     }
 
-    /// What acts on the motor now.
+    /// Returns the means that acts on the motor at this time.
     fn means(&self) -> &'static str {
         let is = |mask, value| self.statusword & mask == value;
         if self.al.is_empty() {
@@ -78,13 +78,13 @@ impl Sample {
     }
 }
 
-/// How one drive came to rest.
+/// The stop of one drive.
 #[derive(Debug)]
 pub(super) struct DriveStop {
     device: usize,
     ms: f64,
     stands_since: u64,
-    /// Each that took a twentieth of the speed or more, in the order in which they came.
+    /// Each means that reduced the speed by at least a twentieth, in order of occurrence.
     means: Vec<&'static str>,
 }
 
@@ -94,7 +94,7 @@ pub(super) struct Stop {
     drives: Vec<DriveStop>,
 }
 
-/// The trace of a simulated bus, as far as it has been written.
+/// The trace of a simulated bus, as far as it is written.
 pub(super) struct Trace {
     reader: BufReader<File>,
     line: String,
@@ -110,7 +110,7 @@ impl Trace {
         }
     }
 
-    /// On the trace's clock.
+    /// Returns the time on the trace's clock.
     pub fn now(&self) -> u64 {
         let now = clock_gettime(ClockId::Monotonic);
         u64::try_from(now.tv_sec).expect("after boot") * 1_000_000_000
@@ -119,7 +119,7 @@ impl Trace {
 
     fn read(&mut self) {
         while self.reader.read_line(&mut self.line).expect("a trace") > 0 {
-            // The rest of it is still to be written.
+            // The rest of the line is not written yet.
             if !self.line.ends_with('\n') {
                 return;
             }
@@ -128,7 +128,7 @@ impl Trace {
         }
     }
 
-    /// Samples of one drive from a time on.
+    /// Returns samples of one drive from a time on.
     fn since(&self, device: usize, at: u64) -> impl DoubleEndedIterator<Item = &Sample> {
         let first = self.samples.partition_point(|sample| sample.at < at);
         self.samples[first..]
@@ -154,7 +154,7 @@ impl Trace {
         }
     }
 
-    /// Until all drives have turned at this speed for a while.
+    /// Waits until all drives have turned at this speed for a while.
     #[track_caller]
     pub fn await_speed(&mut self, speed: f64) {
         self.wait(BRING_UP, "drive turns", |trace| {
@@ -166,7 +166,8 @@ impl Trace {
         });
     }
 
-    /// Until all drives stand. None of them gains speed before; those before `ramped` get set-points until they stand.
+    /// Waits until all drives stand. No drive may accelerate before that. Drives before `ramped`
+    /// must receive set-points until they stand.
     #[track_caller]
     pub fn await_standstill(&mut self, began: u64, ramped: usize) -> Stop {
         self.wait(PATIENCE, "standstill", |trace| {
@@ -220,7 +221,7 @@ impl Trace {
         }
     }
 
-    /// Nothing has turned again up to now.
+    /// Checks that no drive has turned again up to now.
     #[track_caller]
     pub fn stays(&mut self, stop: Stop) -> Stop {
         sleep(Duration::from_millis(100));
@@ -238,7 +239,7 @@ impl Trace {
     }
 }
 
-/// One row a trial and drive.
+/// A table with one row per trial and drive.
 #[derive(Default)]
 pub(super) struct Table(Vec<Row>);
 

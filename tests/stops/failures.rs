@@ -1,4 +1,4 @@
-//! What drives receive in failures, in order, until they stand: read from the recording alone.
+//! Outputs that drives receive during failures until they stand, read from the recording only.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -15,35 +15,35 @@ use ecaxis::clock::Nanos;
 use ecaxis::link::sim::SimLink;
 use ecaxis::link::{Link, LinkError, MAX_FRAME};
 use ecaxis::rt::cycle::Engine;
-use ecaxis::session::{Job, Options, RunError, simulated_bus};
+use ecaxis::session::{Options, RunBuilder, RunError, simulated_bus};
 use pcap_file::pcapng::{Block, PcapNgReader};
 
 const COUNTS: f64 = 2000.0;
-/// Bytes of an axis of our own EPOS4.xml in the image.
+/// The bytes of an axis of the project's EPOS4.xml in the image.
 const REGION: usize = 13;
 const LOGICAL_BASE: usize = 0x1_0000;
 
-/// Data of datagrams by logical address.
+/// The data of datagrams by logical address.
 type Logical = BTreeMap<usize, Vec<u8>>;
 
-/// One cycle of one axis: what its drive received, and what it answered if the answer came.
+/// One cycle of one axis: the outputs that its drive received, and the inputs if the reply arrived.
 #[derive(Debug, Clone, Copy)]
 struct Cycle {
     controlword: u16,
     target: i32,
     answer: Option<Answer>,
-    /// An AL control request for a state below Op has gone to its station before.
+    /// True if an AL control request for a state below Op was sent to its station before.
     left_op: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Answer {
     statusword: u16,
-    /// Motor turns per second.
+    /// The motor speed in turns/s.
     speed: f64,
 }
 
-/// Logical reads and writes of a frame, by logical address, and writes of AL control.
+/// Returns logical reads and writes of a frame by logical address, and writes of AL control.
 fn datagrams(frame: &[u8]) -> (Logical, Vec<(u16, u8)>) {
     let (mut logical, mut al_control) = (BTreeMap::new(), Vec::new());
     let mut at = 16;
@@ -73,7 +73,8 @@ fn bytes(map: &Logical, axis: usize) -> Option<&[u8]> {
     data.get(at - start..at - start + REGION)
 }
 
-/// Every cycle of an axis that is a device of our own EPOS4.xml in CSP, the `axis`th of the image.
+/// Returns every cycle of the `axis`th device of the image, a drive of the project's EPOS4.xml in
+/// CSP.
 fn cycles(recording: &Path, axis: usize, mode: u8) -> Vec<Cycle> {
     let file = std::fs::File::open(recording).expect("the recording");
     let mut reader = PcapNgReader::new(file).expect("pcapng");
@@ -119,7 +120,8 @@ fn cycles(recording: &Path, axis: usize, mode: u8) -> Vec<Cycle> {
 const CSP: u8 = 8;
 const CSV: u8 = 9;
 
-/// The drive was decelerated until it stood, then lost its power, then left Op: at its own speeds.
+/// Checks that the drive decelerated to standstill at its own limits, then lost its power, then
+/// left Op.
 fn comes_to_rest(cycles: &[Cycle], fastest: f64) {
     let speeds = cycles
         .iter()
@@ -153,7 +155,8 @@ fn comes_to_rest(cycles: &[Cycle], fastest: f64) {
     );
 }
 
-/// Largest change of the step of an enabled axis' target, and largest step, in turns/s and turns/s².
+/// Returns the largest step of an enabled axis' target and the largest change of the step, in
+/// turns/s and turns/s².
 fn steepest(cycles: &[Cycle], dt: f64) -> (f64, f64) {
     let mut worst = (0.0f64, 0.0f64);
     for three in cycles.windows(3) {
@@ -180,7 +183,8 @@ fn drive(name: &str, position: usize, mode: &str, limits: &str, more: &str) -> S
 const BUS: &str = "[bus]\nnic = \"sim\"\ncycle = \"1ms\"\n";
 const GENTLE: &str = "velocity = 50.0, acceleration = 20.0, torque = 100.0";
 
-/// An I/O block disappears: the drive answers on, so it is brought to rest by set-points; the cause names the block.
+/// An I/O block disappears. The drive still responds, so set-points bring it to rest, and the cause
+/// names the block.
 #[test]
 fn a_missing_io_block_does_not_shorten_the_stop_of_a_drive() {
     for exchange in ["same-cycle", "pipelined"] {
@@ -203,7 +207,7 @@ fn a_missing_io_block_does_not_shorten_the_stop_of_a_drive() {
     }
 }
 
-/// One of two drives disappears: the other one is brought to rest within its limits.
+/// One of two drives disappears; the other comes to rest within its limits.
 #[test]
 fn a_missing_drive_does_not_shorten_the_stop_of_another() {
     let text = BUS.to_owned()
@@ -225,7 +229,7 @@ fn a_missing_drive_does_not_shorten_the_stop_of_another() {
     assert!(speed <= 50.5, "{speed}");
 }
 
-/// A drive's quick stop takes as long as its ramp (0x6085) does.
+/// A drive's quick stop takes as long as its ramp (0x6085).
 #[test]
 fn a_long_quick_stop_ends_at_standstill() {
     let sdo = "sdo = [{ index = 0x6085, value = 500 }]\n";
@@ -243,7 +247,8 @@ fn a_long_quick_stop_ends_at_standstill() {
     assert!(quick > 4500, "45 turns/s at 500 rpm/s: {quick} cycles");
 }
 
-/// Another drive faults while a jerk-limited axis accelerates: it gains no speed any more.
+/// Another drive faults while a jerk-limited axis accelerates. The axis must not accelerate
+/// further.
 #[test]
 fn no_axis_gains_speed_after_a_stop() {
     let text = BUS.to_owned()
@@ -280,9 +285,9 @@ fn no_axis_gains_speed_after_a_stop() {
     }
 }
 
-/// The time-out of a stop accounts for the jerk.
+/// The time-out of a stop includes the jerk.
 #[test]
-fn a_jerk_limited_stop_takes_its_time() {
+fn a_jerk_limited_stop_has_a_sufficient_time_out() {
     let text = BUS.to_owned()
         + &drive(
             "a0",
@@ -309,9 +314,10 @@ fn a_jerk_limited_stop_takes_its_time() {
     }
 }
 
-/// Frames lost, and a device that loses its power, while the machine comes to rest: failures of their own.
+/// Lost frames, and a device without power, while the machine comes to rest: both are failures of
+/// the run.
 #[test]
-fn what_fails_while_the_machine_comes_to_rest_fails_the_run() {
+fn a_failure_during_the_stop_fails_the_run() {
     let text = BUS.to_owned()
         + &drive("a0", 0, "csp", "velocity = 50.0, acceleration = 50.0", "")
         + IO
@@ -340,9 +346,10 @@ fn what_fails_while_the_machine_comes_to_rest_fails_the_run() {
     }
 }
 
-/// The bus is lost in the very cycles in which the machine is told to stop: whichever comes first, the run has failed.
+/// The bus is lost in the same cycles in which the machine is ordered to stop. The run fails in any
+/// order of the two events.
 #[test]
-fn a_failure_beside_the_end_of_a_run_fails_it() {
+fn a_failure_at_the_end_of_a_run_fails_it() {
     let text = BUS.to_owned()
         + &drive("a0", 0, "csp", "velocity = 50.0, acceleration = 50.0", "")
         + "[[step]]\ndwell = \"10s\"\n";
@@ -365,9 +372,9 @@ fn a_failure_beside_the_end_of_a_run_fails_it() {
     assert!(failed > 10, "the script misses the end of the run");
 }
 
-/// One rule for lost frames and for missing devices.
+/// The same rule applies to lost frames and to missing devices.
 #[test]
-fn a_short_link_break_is_ridden_through() {
+fn a_short_link_break_is_tolerated() {
     let text = format!("{BUS}lost_frames = 20\n")
         + &drive(
             "x",
@@ -393,7 +400,7 @@ fn a_short_link_break_is_ridden_through() {
     }
 }
 
-/// Ten replies come 0.8 ms late, all delivered: targets ramp down and up again.
+/// Ten replies arrive 0.8 ms late but complete; targets ramp down and up again.
 #[test]
 fn late_replies_are_not_lost_replies() {
     let text = format!("{BUS}lost_frames = 20\n")
@@ -414,9 +421,10 @@ fn late_replies_are_not_lost_replies() {
     assert!(acceleration <= 500.0 + 2.0 / COUNTS * 1e6, "{acceleration}");
 }
 
-/// Two bursts of lost frames while CSV changes to CSP in motion, at every place: no step beyond the limit.
+/// Two bursts of lost frames during a change from CSV to CSP in motion, at every phase: no step
+/// exceeds the limit.
 #[test]
-fn csv_to_csp_amid_two_bursts() {
+fn csv_to_csp_during_two_bursts_keeps_the_limits() {
     for place in 0..12 {
         let text = format!("{BUS}lost_frames = 5\n")
             + &drive(
@@ -430,7 +438,8 @@ fn csv_to_csp_amid_two_bursts() {
             + "csv = { kv = 30.0, feed_forward = 1.0 }\n\
                [[step]]\nvelocity = { a0 = 15.0 }\n[[step]]\nmode = { a0 = \"csv\" }\n[[step]]\ndwell = \"100ms\"\n\
                [[step]]\nmode = { a0 = \"csp\" }\n[[step]]\ndwell = \"200ms\"\n";
-        // The change begins some time after the first velocity is reached; every place is met by one of them.
+        // The change starts some time after the first velocity is reached, so the bursts cover
+        // every phase.
         let folder = tempfile::tempdir().expect("a folder");
         let (options, path) = record(virtual_time(), &folder);
         run_well(machine(&text), options);
@@ -449,7 +458,7 @@ fn csv_to_csp_amid_two_bursts() {
     }
 }
 
-/// 0x6060 of each cyclic frame of one axis with position and velocity mapped.
+/// Returns 0x6060 of each cyclic frame of one axis with position and velocity mapped.
 fn cycles_by_mode(path: &Path) -> Vec<u8> {
     images(path, true).iter().map(|data| data[10]).collect()
 }
@@ -471,7 +480,7 @@ fn images(path: &Path, sent: bool) -> Vec<Vec<u8>> {
     images
 }
 
-/// Largest step between targets that the drive shows to be in CSP for, in turns/s.
+/// Returns the largest step between targets while the drive displays CSP, in turns/s.
 fn steepest_csp(path: &Path) -> (f64, f64) {
     let (sent, back) = (images(path, true), images(path, false));
     let int = |data: &[u8]| i32::from_le_bytes(data[2..6].try_into().expect("four"));
@@ -487,7 +496,8 @@ fn steepest_csp(path: &Path) -> (f64, f64) {
     (0.0, worst)
 }
 
-/// A link whose `send` panics at one frame, or at that and a later one. Keeps what drive 0 was sent and what it answered.
+/// A link whose `send` panics at one frame, or also at a later one. Records outputs and answers of
+/// drive 0.
 #[derive(Debug)]
 struct Panicking {
     bus: SimLink,
@@ -536,7 +546,8 @@ impl Link for Panicking {
     }
 }
 
-/// A panic in the cycle stops the machine like any other failure; a second one by quick stop.
+/// A panic in the cycle stops the machine like any other failure; a second panic causes a quick
+/// stop.
 #[test]
 fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
     for (panics, quick) in [(&[2500][..], false), (&[2500, 2520][..], true)] {
@@ -555,7 +566,7 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
             seen: Arc::clone(&seen),
         };
         let (progress, _told) = channel();
-        let job = Job {
+        let job = RunBuilder {
             machine: &Arc::new(machine),
             options: &options,
             stop: Arc::new(AtomicBool::new(false)),
@@ -564,7 +575,7 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
         };
         let prepared = job.prepare_on(Box::new(link)).expect("comes up");
         let mut engine = Engine::new(prepared.parts);
-        let mut beside = pin!(prepared.supervisor.run());
+        let mut during = pin!(prepared.supervisor.run());
         let mut context = Context::from_waker(Waker::noop());
         let mut result = None;
         let hook = std::panic::take_hook();
@@ -575,7 +586,7 @@ fn a_panic_in_the_cycle_brings_the_axes_to_rest() {
             }
             engine.cycle();
             if result.is_none()
-                && let Poll::Ready(done) = beside.as_mut().poll(&mut context)
+                && let Poll::Ready(done) = during.as_mut().poll(&mut context)
             {
                 result = Some(done);
             }

@@ -1,52 +1,56 @@
 //! Commands: checked completely before anything changes.
 
 use super::stop::{PowerGoal, Resets};
-use super::{Axis, Control, Plan};
+use super::{Axis, ControlledQuantity, Plan};
 use crate::cia402::{Mode, State};
-use crate::probe::{Edge, Probe, Source};
-use crate::profile::Goal;
+use crate::profile_mode::Goal;
 use crate::setpoint::{self, Ramp, Trapezoid};
-use crate::status::Refused;
+use crate::status::CommandError;
 use crate::supervision::StopMethod;
+use crate::touch_probe::{Edge, Probe, Source};
 use crate::units::{Counts, UserUnits};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Command {
-    /// Take the drive to Operation enabled. Does not reset a fault.
+    /// Takes the drive to Operation enabled. Does not reset a fault.
     Enable,
-    /// Decelerate, then take the power away.
+    /// Decelerates, then removes the power.
     Disable,
-    /// Acknowledge a trip, and reset the drive's fault if it is in one.
+    /// Acknowledges a trip, and resets the fault of a drive in Fault.
     ResetFault,
-    /// Decelerate with the limit acceleration and hold; stays enabled. In CST without a position loop: torque to zero.
+    /// Decelerates with the limit acceleration and holds; the axis stays enabled. In CST without a
+    /// position loop: reduces the torque to zero.
     Stop,
-    /// The drive's own quick stop; it then stays in Quick stop active if its option code says so.
+    /// Triggers the drive's quick stop. The drive stays in Quick stop active if its option code
+    /// (0x605A) says so.
     QuickStop,
-    /// No power at once, without deceleration: the axis coasts, or its brake stops it.
+    /// Removes the power at once, without deceleration: the axis coasts, or its brake stops it.
     DisableVoltage,
-    /// The shortest way to no motion: quick stop or no voltage, as configured; no power until it is reset and enabled again.
+    /// Stops as fast as configured: quick stop or disable voltage. The axis stays without power
+    /// until it is reset and enabled again.
     EmergencyStop,
-    /// Capture the position of the next edge, once.
+    /// Captures the position of the next edge, once.
     ArmProbe {
         probe: Probe,
         edge: Edge,
         source: Source,
-        /// As by [`Command::Stop`], in the very cycle that shows the edge. An axis that is given set-points goes on with them.
+        /// Stops like [`Command::Stop`] in the cycle that shows the edge. An axis with external
+        /// set-points continues with them.
         stop: bool,
     },
     DisarmProbe {
         probe: Probe,
     },
-    /// Switch the mode of operation, also in motion. Where the new mode can do what the set-point is about, it goes on
-    /// with it; otherwise it comes to rest.
+    /// Switches the mode of operation, also in motion. The motion continues if the new mode
+    /// supports it; otherwise the axis decelerates to rest.
     SetMode(Mode),
-    /// Homing by the drive, with the method and parameters that it has. The axis must stand; afterwards it is back in its
-    /// mode. [`Command::Stop`] aborts it.
+    /// Starts homing by the drive, with the method and parameters stored there. The axis must stand
+    /// still. Afterwards the axis returns to its mode. [`Command::Stop`] aborts homing.
     Home {
-        /// For the search, seconds.
+        /// Time limit of the search, seconds.
         timeout_s: f64,
     },
-    /// In CSP and PP, and where a position loop is configured in CSV and CST.
+    /// Moves to a position. In CSP and PP, and in CSV and CST with a position loop.
     MoveTo {
         position: f64,
         /// Fraction of the velocity limit, above 0 and at most 1.
@@ -54,7 +58,7 @@ pub enum Command {
         /// Fraction of the acceleration limit, above 0 and at most 1.
         ramp: f64,
     },
-    /// From where the set-point is; otherwise as [`Command::MoveTo`].
+    /// Moves by a distance from the set-point; otherwise like [`Command::MoveTo`].
     MoveBy {
         distance: f64,
         /// Fraction of the velocity limit, above 0 and at most 1.
@@ -62,26 +66,26 @@ pub enum Command {
         /// Fraction of the acceleration limit, above 0 and at most 1.
         ramp: f64,
     },
-    /// In CSV, CSP, PV, and CST with a position loop.
+    /// Sets a target velocity. In CSV, CSP, PV, and CST with a position loop.
     Velocity {
         velocity: f64,
         /// Fraction of the acceleration limit, above 0 and at most 1.
         ramp: f64,
     },
-    /// In CST.
+    /// Sets a target torque. In CST.
     Torque {
-        /// Of rated torque.
+        /// Percent of rated torque.
         percent: f64,
-        /// Seconds from the present torque to the new one; never steeper than `torque_slope`.
+        /// Time from the present to the new torque in seconds. `torque_slope` limits the slope.
         ramp_s: f64,
     },
 }
 
-/// Quotients of differences of f64s that were within a limit may be a little beyond it.
+/// Tolerance: differences of f64 positions within a limit may exceed it by rounding.
 const SET_POINT_ROUNDING: f64 = 1.0 + 1e-6;
 
 impl Axis {
-    pub(super) fn take(&mut self, command: Command) -> Result<(), Refused> {
+    pub(super) fn take(&mut self, command: Command) -> Result<(), CommandError> {
         match command {
             Command::Enable => self.enable(),
             Command::Disable => {
@@ -111,7 +115,7 @@ impl Axis {
                 stop,
             } => {
                 if !self.probe_mapped {
-                    return Err(Refused::NoProbe);
+                    return Err(CommandError::NoProbe);
                 }
                 self.probes.arm(probe, edge, source, stop);
                 Ok(())
@@ -144,28 +148,28 @@ impl Axis {
         }
     }
 
-    fn enable(&mut self) -> Result<(), Refused> {
+    fn enable(&mut self) -> Result<(), CommandError> {
         if let Some(trip) = self.trip {
-            return Err(Refused::Tripped(trip));
+            return Err(CommandError::Tripped(trip));
         }
         if let Some(fault) = self.fault
             && !self.reset
         {
-            return Err(Refused::Faulted(fault));
+            return Err(CommandError::Faulted(fault));
         }
         match self.goal {
             PowerGoal::Stopping(stop) if stop.removes_power() => {
-                // What the drive answers to the removal would look like a loss of power.
+                // Otherwise the drive's confirmation would look like a loss of power.
                 if self.active {
-                    return Err(Refused::Stopping);
+                    return Err(CommandError::Stopping);
                 }
             }
             PowerGoal::Stopping(stop) => {
                 if !stop.stays || self.state == State::OperationEnabled {
-                    return Err(Refused::Stopping);
+                    return Err(CommandError::Stopping);
                 }
-                if !self.standing() {
-                    return Err(Refused::StillMoving {
+                if !self.at_standstill() {
+                    return Err(CommandError::StillMoving {
                         velocity: self.actual.velocity(),
                     });
                 }
@@ -187,63 +191,63 @@ impl Axis {
         }
     }
 
-    /// Motion is taken only from an axis that is enabled and is to stay so.
-    pub(super) fn check_ready(&self) -> Result<(), Refused> {
+    /// Rejects motion unless the axis is enabled and stays enabled.
+    pub(super) fn check_ready(&self) -> Result<(), CommandError> {
         if let Some(trip) = self.trip {
-            return Err(Refused::Tripped(trip));
+            return Err(CommandError::Tripped(trip));
         }
         if let Some(fault) = self.fault {
-            return Err(Refused::Faulted(fault));
+            return Err(CommandError::Faulted(fault));
         }
         if self.home.running() {
-            return Err(Refused::Homing);
+            return Err(CommandError::Homing);
         }
         if let Some(switch) = self.switch {
-            return Err(Refused::Switching { to: switch.to });
+            return Err(CommandError::Switching { to: switch.to });
         }
         if matches!(self.state, State::SwitchedOn | State::OperationEnabled)
             && let Some(display) = self.mode_display
             && !self.mode_confirmed()
         {
-            return Err(Refused::ModeNotConfirmed {
+            return Err(CommandError::ModeNotConfirmed {
                 expected: self.mode,
                 display: Mode::from_code(display),
             });
         }
         if !self.active {
-            return Err(Refused::NotEnabled { state: self.state });
+            return Err(CommandError::NotEnabled { state: self.state });
         }
         if self.goal != PowerGoal::On {
-            return Err(Refused::Stopping);
+            return Err(CommandError::Stopping);
         }
         if self.braked() {
-            return Err(Refused::BrakeOpening);
+            return Err(CommandError::BrakeOpening);
         }
         Ok(())
     }
 
-    /// Is the axis in a mode that takes this?
+    /// Rejects `command` unless the active mode supports it.
     fn check_control(
         &self,
         command: &'static str,
         needs: Mode,
-        possible: impl Fn(Control, Mode) -> bool,
-    ) -> Result<(), Refused> {
+        possible: impl Fn(ControlledQuantity, Mode) -> bool,
+    ) -> Result<(), CommandError> {
         if self.mode == needs || possible(self.config.control(self.mode), self.mode) {
             return Ok(());
         }
-        Err(Refused::WrongMode {
+        Err(CommandError::WrongMode {
             command,
             needs,
             mode: self.mode,
         })
     }
 
-    fn set_mode(&mut self, to: Mode) -> Result<(), Refused> {
-        // Homing is a sequence, not a mode to stay in.
+    fn set_mode(&mut self, to: Mode) -> Result<(), CommandError> {
+        // Homing is a sequence and not a permanent mode.
         let possible = matches!(to, Mode::Csp | Mode::Csv | Mode::Cst | Mode::Pp | Mode::Pv);
         if !possible || !(self.config.modes.contains(to) || to == self.config.mode) {
-            return Err(Refused::ModeNotOffered { mode: to });
+            return Err(CommandError::ModeNotOffered { mode: to });
         }
         if !self.active {
             self.mode = to;
@@ -260,18 +264,18 @@ impl Axis {
         Ok(())
     }
 
-    /// Where a relative move starts.
+    /// Returns the start position of a relative move.
     fn move_start(&self) -> f64 {
         match self.profile.goal() {
             Some(goal) if self.mode == Mode::Pp && self.profile.reached() => goal.target,
-            _ if self.grip() == Control::Position => self.motion.position,
+            _ if self.controlled_quantity() == ControlledQuantity::Position => self.motion.position,
             _ => self.actual.position(),
         }
     }
 
-    fn move_to(&mut self, position: f64, speed: f64, ramp: f64) -> Result<(), Refused> {
+    fn move_to(&mut self, position: f64, speed: f64, ramp: f64) -> Result<(), CommandError> {
         self.check_control("a move", Mode::Csp, |c, mode| {
-            c == Control::Position || mode == Mode::Pp
+            c == ControlledQuantity::Position || mode == Mode::Pp
         })?;
         finite("position", position)?;
         fraction("speed", speed)?;
@@ -280,7 +284,7 @@ impl Axis {
         let scale = &self.config.scale;
         let [low, high] = limits.position.unwrap_or(scale.range());
         if !(low..=high).contains(&position) {
-            return Err(Refused::OutsideRange {
+            return Err(CommandError::OutsideRange {
                 position,
                 low,
                 high,
@@ -288,12 +292,12 @@ impl Axis {
         }
         self.check_ready()?;
         if self.mode == Mode::Pp {
-            // The drive goes there by itself, and it counts 32 bits.
+            // The drive plans this move itself, with 32-bit positions.
             let Counts(counts) = scale.position_to_counts(UserUnits(position));
             if i32::try_from(counts).is_err() {
                 let [low, high] = [i32::MIN, i32::MAX]
                     .map(|end| scale.position_to_user(Counts(i64::from(end))).0);
-                return Err(Refused::OutsideRange {
+                return Err(CommandError::OutsideRange {
                     position,
                     low: low.min(high),
                     high: high.max(low),
@@ -331,15 +335,18 @@ impl Axis {
         Ok(())
     }
 
-    fn run_at(&mut self, velocity: f64, ramp: f64) -> Result<(), Refused> {
+    fn run_at(&mut self, velocity: f64, ramp: f64) -> Result<(), CommandError> {
         self.check_control("a velocity", Mode::Csv, |c, mode| {
-            matches!(c, Control::Position | Control::Velocity) || mode == Mode::Pv
+            matches!(
+                c,
+                ControlledQuantity::Position | ControlledQuantity::Velocity
+            ) || mode == Mode::Pv
         })?;
         finite("velocity", velocity)?;
         fraction("ramp", ramp)?;
         let limits = self.config.limits;
         if velocity.abs() > limits.velocity {
-            return Err(Refused::TooFast {
+            return Err(CommandError::TooFast {
                 velocity,
                 limit: limits.velocity,
             });
@@ -361,13 +368,15 @@ impl Axis {
         Ok(())
     }
 
-    /// The set-point of the next cycle, from outside.
-    pub(super) fn take_set_point(&mut self, position: f64) -> Result<(), Refused> {
-        self.check_control("a set-point", Mode::Csp, |c, _| c == Control::Position)?;
+    /// Accepts the external set-point of the next cycle.
+    pub(super) fn take_set_point(&mut self, position: f64) -> Result<(), CommandError> {
+        self.check_control("a set-point", Mode::Csp, |c, _| {
+            c == ControlledQuantity::Position
+        })?;
         finite("position", position)?;
         self.check_ready()?;
-        if self.frozen() {
-            return Err(Refused::FramesLost);
+        if self.setpoint_frozen() {
+            return Err(CommandError::FramesLost);
         }
         self.engage();
         let limits = self.config.limits;
@@ -376,19 +385,19 @@ impl Axis {
         let velocity = step / self.dt_s;
         let most = limits.velocity * self.dt_s;
         if step.abs() > most * SET_POINT_ROUNDING {
-            return Err(Refused::Step { step, most });
+            return Err(CommandError::Step { step, most });
         }
         let change = velocity - before.velocity;
         let most = limits.acceleration * self.dt_s;
-        // No cycle yet: not a number.
+        // Before the first cycle `change` is NaN.
         if change.is_nan() || change.abs() > most * SET_POINT_ROUNDING {
-            return Err(Refused::Jump { change, most });
+            return Err(CommandError::Jump { change, most });
         }
         if let Some([low, high]) = limits.position {
-            // From outside its range an axis may come back.
+            // An axis outside its range may return into it.
             let [low, high] = [low.min(before.position), high.max(before.position)];
             if !(low..=high).contains(&position) {
-                return Err(Refused::OutsideRange {
+                return Err(CommandError::OutsideRange {
                     position,
                     low,
                     high,
@@ -396,26 +405,26 @@ impl Axis {
             }
         }
         self.fed = Some(before.then(position, velocity, self.dt_s));
-        self.plan = Plan::Fed;
+        self.plan = Plan::External;
         Ok(())
     }
 
-    fn push(&mut self, percent: f64, ramp_s: f64) -> Result<(), Refused> {
+    fn push(&mut self, percent: f64, ramp_s: f64) -> Result<(), CommandError> {
         self.check_control("a torque", Mode::Cst, |_, _| false)?;
         finite("torque", percent)?;
         finite("ramp time", ramp_s)?;
         if ramp_s < 0.0 {
-            return Err(Refused::Negative {
+            return Err(CommandError::Negative {
                 what: "ramp time",
                 value: ramp_s,
             });
         }
         let limit = self.config.limits.torque;
         if percent.abs() > limit {
-            return Err(Refused::TooMuchTorque { percent, limit });
+            return Err(CommandError::TooMuchTorque { percent, limit });
         }
         self.check_ready()?;
-        // Division by zero is infinitely steep, and then the configured slope is the smaller one.
+        // A division by zero gives infinity; then the configured slope applies.
         let asked = (percent - self.given.torque).abs() / ramp_s;
         let slope = if asked > 0.0 {
             asked.min(self.config.torque_slope)
@@ -430,19 +439,19 @@ impl Axis {
     }
 }
 
-fn finite(what: &'static str, value: f64) -> Result<(), Refused> {
+fn finite(what: &'static str, value: f64) -> Result<(), CommandError> {
     if value.is_finite() {
         Ok(())
     } else {
-        Err(Refused::NotFinite { what, value })
+        Err(CommandError::NotFinite { what, value })
     }
 }
 
-fn fraction(what: &'static str, value: f64) -> Result<(), Refused> {
+fn fraction(what: &'static str, value: f64) -> Result<(), CommandError> {
     finite(what, value)?;
     if value > 0.0 && value <= 1.0 {
         Ok(())
     } else {
-        Err(Refused::NotAFraction { what, value })
+        Err(CommandError::NotAFraction { what, value })
     }
 }

@@ -1,49 +1,55 @@
-//! What an axis is made with, and what of that cannot work.
+//! Configuration of an axis and its checks.
 
 use crate::cia402::{Mode, Modes, QuickStopOption};
 use crate::limits::{LimitError, Limits};
-use crate::loops::Loops;
+use crate::position_loop::Loops;
 use crate::scale::Scale;
 use crate::supervision::{Brake, FaultReset, Supervision};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxisConfig {
-    /// Until another one is commanded: any but homing.
+    /// The mode after start; any mode except homing.
     pub mode: Mode,
-    /// What may be switched to besides `mode`: the modes whose targets are mapped.
+    /// Further modes that may be switched to: those with mapped targets.
     pub modes: Modes,
     pub scale: Scale,
     pub limits: Limits,
-    /// A move is in target when the reported position is this near, user units.
+    /// Distance from the target up to which a move is in target, user units.
     pub target_window: f64,
-    /// Steepest change of a commanded torque, percent per second; also how a stop takes torque away.
+    /// Steepest change of a commanded torque, percent per second. A stop reduces the torque with
+    /// this slope.
     pub torque_slope: f64,
-    /// Moves keep the jerk limit, too ([`Limits::jerk`]), and [`super::Command::Stop`] ends them so. Otherwise they are trapezoids.
+    /// True: moves and [`super::Command::Stop`] also keep the jerk limit ([`Limits::jerk`]). False:
+    /// they are trapezoidal.
     pub jerk_limited: bool,
     pub loops: Loops,
-    /// From a set-point's leaving here until a reported position can show it, seconds: the wire both ways, the drive's
-    /// interpolation and its lag. Set-point and reported position are compared over this time, in every mode.
+    /// Time in seconds from sending a set-point until a reported position can show it. It includes
+    /// both transmissions, the drive's interpolation and its lag. In every mode, set-point and
+    /// reported position are compared over this time.
     pub dead_time_s: f64,
-    /// Cycles by which inputs are older than those of the frame that went out last: 0 where each cycle takes the answer to its
-    /// own frame.
+    /// Number of cycles by which inputs are older than those of the last sent frame. 0: each cycle
+    /// uses the answer to its own frame.
     pub answers_late: u8,
-    /// How long 0x6061 may take to show the mode that was commanded, seconds.
+    /// Time in seconds within which 0x6061 must show the commanded mode.
     pub mode_time_s: f64,
-    /// 0x605A, where it is known: without transition 16 an axis is enabled again by way of Switch on disabled.
+    /// The drive's 0x605A, if known. Without transition 16 the axis is enabled again via Switch on
+    /// disabled.
     pub quick_stop: Option<QuickStopOption>,
     pub supervision: Supervision,
     pub brake: Brake,
     pub fault_reset: FaultReset,
-    /// When a stop becomes harder, seconds. `None`: calculated from speed, acceleration and jerk, and later where the axis
-    /// still slows down.
+    /// Time in seconds after which a stop becomes harder. `None`: calculated from speed,
+    /// acceleration and jerk, and extended while the axis still slows down.
     pub stop_timeout_s: Option<f64>,
-    /// The drive serves Statusword bit 12 (drive follows command value) in CSP, CSV and CST.
+    /// True if the drive supports Statusword bit 12 (drive follows command value) in CSP, CSV and
+    /// CST.
     pub follows_bit: bool,
 }
 
 impl AxisConfig {
-    /// With a target window of a tenth of the following error limit (ten counts where there is none, never below two), full
-    /// torque in 0.1 s, no other mode, no loops, no dead time, and a second to switch modes.
+    /// Builds a configuration with defaults. The target window is a tenth of the following error
+    /// limit (without limit: ten counts), at least two counts. Full torque takes 0.1 s and a mode
+    /// switch at most 1 s. There is no further mode, no position loop and no dead time.
     #[must_use]
     pub fn new(mode: Mode, scale: Scale, limits: Limits) -> Self {
         let window = limits
@@ -140,12 +146,13 @@ impl AxisConfig {
         Ok(())
     }
 
-    /// When a stop from this speed becomes harder, seconds: what the ramp takes, with its jerk, and a second for the drive.
+    /// Returns the time in seconds after which a stop from `speed` becomes harder: ramp time with
+    /// jerk, dead time, and one second.
     #[must_use]
     pub fn stop_time_s(&self, mode: Mode, speed: f64) -> f64 {
         let limits = &self.limits;
         let ramp_s = match self.control(mode) {
-            Control::Torque => limits.torque / self.torque_slope,
+            ControlledQuantity::Torque => limits.torque / self.torque_slope,
             _ if self.jerk_limited => {
                 speed / limits.acceleration + limits.acceleration / limits.jerk()
             }
@@ -155,36 +162,36 @@ impl AxisConfig {
         self.stop_timeout_s.unwrap_or(calculated_s).min(LONGEST_S)
     }
 
-    /// What can be commanded in a mode.
-    pub(super) const fn control(&self, mode: Mode) -> Control {
+    /// Returns the quantity that commands control in `mode`.
+    pub(super) const fn control(&self, mode: Mode) -> ControlledQuantity {
         match mode {
-            Mode::Csv if self.loops.csv.is_none() => Control::Velocity,
-            Mode::Cst if self.loops.cst.is_none() => Control::Torque,
-            Mode::Pp | Mode::Pv | Mode::Hm => Control::Drive,
-            _ => Control::Position,
+            Mode::Csv if self.loops.csv.is_none() => ControlledQuantity::Velocity,
+            Mode::Cst if self.loops.cst.is_none() => ControlledQuantity::Torque,
+            Mode::Pp | Mode::Pv | Mode::Hm => ControlledQuantity::Drive,
+            _ => ControlledQuantity::Position,
         }
     }
 }
 
-/// Longer is no dead time.
+/// Longest accepted dead time.
 const LONGEST_DEAD_TIME_S: f64 = 0.1;
 
-/// Added to the time that a deceleration takes: settling, a drive that follows late.
+/// Margin added to the deceleration time, for settling and for the drive's lag.
 const STOP_MARGIN_S: f64 = 1.0;
 
-/// An hour is longer than any dwell, delay or brake.
+/// Longest accepted dwell, delay and brake time.
 const LONGEST_S: f64 = 3600.0;
 
-/// What of the set-point counts in a mode.
+/// The quantity that the set-point controls in a mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Control {
-    /// Position, and so velocity.
+pub(super) enum ControlledQuantity {
+    /// Position, and with it velocity.
     Position,
-    /// Velocity; the position is what it turns out to be.
+    /// Velocity; the position follows from the motion.
     Velocity,
-    /// Torque; the motion is what it turns out to be.
+    /// Torque; the motion follows from it.
     Torque,
-    /// Nothing: the drive makes its own.
+    /// None: the drive generates its own motion.
     Drive,
 }
 

@@ -1,20 +1,20 @@
-//! Homing: the sequence's orders carried out, and the new position taken over.
+//! Homing: executes the requests of the sequence and applies the new position.
 
-use super::{Axis, Control};
+use super::{Axis, ControlledQuantity};
 use crate::cia402::{Mode, ModeCommand, ModeStatus};
-use crate::homing::{HomingError, Order, Outcome, Seen, Sequence};
-use crate::status::{HomingStatus, Refused};
+use crate::homing::{HomingError, HomingInputs, HomingOutputs, Outcome, Sequence};
+use crate::status::{CommandError, HomingStatus};
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Home {
+pub(super) struct HomingRun {
     sequence: Option<Sequence>,
-    order: Option<Order>,
+    order: Option<HomingOutputs>,
     pub(super) status: HomingStatus,
-    /// Home was found, and not searched anew since.
+    /// True if home was found and no homing has started since.
     pub(super) homed: bool,
 }
 
-impl Home {
+impl HomingRun {
     pub(super) const fn running(&self) -> bool {
         self.sequence.is_some()
     }
@@ -41,22 +41,22 @@ impl Home {
 }
 
 impl Axis {
-    pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), Refused> {
+    pub(super) fn home(&mut self, timeout_s: f64) -> Result<(), CommandError> {
         if !timeout_s.is_finite() {
-            return Err(Refused::NotFinite {
+            return Err(CommandError::NotFinite {
                 what: "time limit",
                 value: timeout_s,
             });
         }
         if timeout_s <= 0.0 {
-            return Err(Refused::Negative {
+            return Err(CommandError::Negative {
                 what: "time limit",
                 value: timeout_s,
             });
         }
         self.check_switch(Mode::Hm)?;
         self.switch_failed = None;
-        self.home = Home {
+        self.home = HomingRun {
             sequence: Some(Sequence::new(self.mode, timeout_s)),
             order: None,
             status: HomingStatus::Running,
@@ -65,7 +65,7 @@ impl Axis {
         Ok(())
     }
 
-    /// Once a cycle, after the mode.
+    /// Advances the homing sequence, once per cycle and after the mode switch.
     pub(super) fn settle_homing(&mut self, fresh: bool, dt_s: f64) {
         let Some(sequence) = self.home.sequence else {
             return;
@@ -85,13 +85,13 @@ impl Axis {
         let ModeStatus::Hm(state) = self.statusword.in_mode(Mode::Hm) else {
             return;
         };
-        let seen = Seen {
+        let seen = HomingInputs {
             mode: self.mode,
             mode_failed: self.switch.is_none()
                 && ordered.is_some()
                 && self.switch_failed == ordered,
             state,
-            standing: self.standing(),
+            standing: self.at_standstill(),
             fresh,
         };
         let before = sequence.attained();
@@ -116,26 +116,26 @@ impl Axis {
         }
     }
 
-    /// Everything that speaks against a switch to this mode now.
-    pub(super) fn check_switch(&self, to: Mode) -> Result<(), Refused> {
+    /// Checks all conditions for a switch to mode `to`.
+    pub(super) fn check_switch(&self, to: Mode) -> Result<(), CommandError> {
         if !(self.config.modes.contains(to) || to == self.config.mode) {
-            return Err(Refused::ModeNotOffered { mode: to });
+            return Err(CommandError::ModeNotOffered { mode: to });
         }
         self.check_ready()?;
         if to == self.mode {
             return Ok(());
         }
         if self.mode_display.is_none() {
-            return Err(Refused::NoModeDisplay);
+            return Err(CommandError::NoModeDisplay);
         }
         let control = self.config.control(to);
-        if control == Control::Position && self.actual.counts().is_none() {
-            return Err(Refused::NoPosition { mode: to });
+        if control == ControlledQuantity::Position && self.actual.counts().is_none() {
+            return Err(CommandError::NoPosition { mode: to });
         }
-        // Nobody knows how these would brake.
+        // The deceleration is unknown in these modes.
         let rest = matches!(to, Mode::Pp | Mode::Hm);
-        if rest && !(self.setpoint_at_rest() && self.standing()) {
-            return Err(Refused::StillMoving {
+        if rest && !(self.setpoint_at_rest() && self.at_standstill()) {
+            return Err(CommandError::StillMoving {
                 velocity: self.actual.velocity(),
             });
         }

@@ -1,10 +1,11 @@
-//! Where the set-point goes.
+//! The plan of an axis: it advances the set-point.
 
-use super::{Axis, AxisConfig, Control};
+use super::{Axis, AxisConfig, ControlledQuantity};
 use crate::cia402::{Mode, ModeStatus};
-use crate::loops::bounded;
+use crate::position_loop::bounded;
 use crate::setpoint::{
-    Goal, Hold, JerkLimited, Motion, MotionLimits, Order, Ramp, Setpoint, SetpointError, Trapezoid,
+    Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Ramp, Setpoint, SetpointError,
+    Trapezoid,
 };
 use crate::units::UserUnits;
 
@@ -19,73 +20,77 @@ pub(super) enum Plan {
     Jerk(JerkLimited),
     Velocity(Ramp),
     Torque(Ramp),
-    /// The drive's own profile, or homing.
-    Drive,
-    /// From outside, anew in every cycle; a cycle without one ends it.
-    Fed,
+    /// A profile of the drive, or homing.
+    DriveProfile,
+    /// External set-points, one per cycle; a cycle without one ends the plan.
+    External,
 }
 
 impl Plan {
-    /// To rest, in the way of a mode.
+    /// Returns the plan that decelerates to rest in `mode`.
     pub(super) fn braking(config: &AxisConfig, mode: Mode) -> Self {
         let slope = config.limits.acceleration;
         match config.control(mode) {
-            Control::Position => Self::Hold(Hold {
+            ControlledQuantity::Position => Self::Hold(Hold {
                 acceleration: slope,
             }),
-            Control::Velocity => Self::Velocity(Ramp { target: 0.0, slope }),
-            Control::Drive => Self::Drive,
-            Control::Torque => Self::Torque(Ramp {
+            ControlledQuantity::Velocity => Self::Velocity(Ramp { target: 0.0, slope }),
+            ControlledQuantity::Drive => Self::DriveProfile,
+            ControlledQuantity::Torque => Self::Torque(Ramp {
                 target: 0.0,
                 slope: config.torque_slope,
             }),
         }
     }
 
-    /// Can a mode of this kind carry it out?
-    pub(super) fn fits(&self, control: Control) -> bool {
+    /// Returns true if a mode with this controlled quantity can execute the plan.
+    pub(super) fn fits(&self, control: ControlledQuantity) -> bool {
         match self {
-            Self::Hold(_) | Self::Move(_) | Self::Jerk(_) | Self::Fed => {
-                control == Control::Position
+            Self::Hold(_) | Self::Move(_) | Self::Jerk(_) | Self::External => {
+                control == ControlledQuantity::Position
             }
-            Self::Velocity(_) => matches!(control, Control::Position | Control::Velocity),
-            Self::Torque(_) | Self::Drive => false,
+            Self::Velocity(_) => matches!(
+                control,
+                ControlledQuantity::Position | ControlledQuantity::Velocity
+            ),
+            Self::Torque(_) | Self::DriveProfile => false,
         }
     }
 }
 
 impl Axis {
-    /// What is commanded now: a mode with a position loop takes a torque, too, and while modes are switched the position is
-    /// commanded already if the new one needs it.
-    pub(super) fn grip(&self) -> Control {
+    /// Returns the commanded quantity. A mode with a position loop also accepts a torque. During a
+    /// switch, the position is commanded as soon as the new mode requires it.
+    pub(super) fn controlled_quantity(&self) -> ControlledQuantity {
         match self.plan {
-            Plan::Torque(_) => return Control::Torque,
-            Plan::Drive => return Control::Drive,
+            Plan::Torque(_) => return ControlledQuantity::Torque,
+            Plan::DriveProfile => return ControlledQuantity::Drive,
             _ => {}
         }
         let now = self.config.control(self.mode);
         let next = self.switch.map(|switch| self.config.control(switch.to));
-        if next == Some(Control::Position) {
-            Control::Position
+        if next == Some(ControlledQuantity::Position) {
+            ControlledQuantity::Position
         } else {
             now
         }
     }
 
-    /// The velocity that the axis turns out to have; noise is none.
-    pub(super) fn drift(&self) -> f64 {
-        if self.standing() {
+    /// Returns the actual velocity; 0 within the standstill window.
+    pub(super) fn held_velocity(&self) -> f64 {
+        if self.at_standstill() {
             0.0
         } else {
             self.actual.velocity()
         }
     }
 
-    /// The set-point of the cycle before, had it been what the axis does: by what it reports and the dead time, at
-    /// `velocity`. To be advanced from.
-    pub(super) fn tracked(&self, velocity: f64) -> Motion {
+    /// Returns the previous set-point that matches the reported position at `velocity`, dead time
+    /// included. The next advance starts from it.
+    pub(super) fn motion_at_actual(&self, velocity: f64) -> Motion {
         let velocity = bounded(velocity, self.config.limits.velocity);
-        // What is reported now shows the set-point of this cycle after the dead time.
+        // The position reported now corresponds to the set-point of this cycle, one dead time
+        // later.
         let late_s = self.config.dead_time_s - self.dt_s;
         Motion {
             position: self.actual.position() + velocity * late_s,
@@ -94,16 +99,17 @@ impl Axis {
         }
     }
 
-    /// The set-point of this cycle, where it is what the axis does.
+    /// Returns the set-point of this cycle that matches the actual motion.
     fn following(&self) -> Motion {
-        let before = self.tracked(self.drift());
+        let before = self.motion_at_actual(self.held_velocity());
         Motion {
             position: before.position + before.velocity * self.dt_s,
             ..before
         }
     }
 
-    /// The motion where none is commanded: as it turns out. A mode that is being switched to will take it over.
+    /// Returns the actual motion, for plans that do not command one. During a switch it includes
+    /// the velocity, for the new mode.
     fn uncommanded(&self) -> Motion {
         if self.switch.is_some() {
             self.following()
@@ -112,15 +118,17 @@ impl Axis {
         }
     }
 
-    /// Before a position or velocity is commanded where a torque was: from what the axis does, with the torque it has.
+    /// Prepares a position or velocity command after a torque: starts from the actual motion and
+    /// torque.
     pub(super) fn engage(&mut self) {
-        if self.active && self.grip() == Control::Torque {
-            self.motion = self.tracked(self.drift());
+        if self.active && self.controlled_quantity() == ControlledQuantity::Torque {
+            self.motion = self.motion_at_actual(self.held_velocity());
             self.given.take_over();
         }
     }
 
-    /// A plan of bounded jerk from here; `part` of the acceleration and the jerk are used unless that would lead too far.
+    /// Returns a jerk-limited plan from here. `part`: fraction of acceleration and jerk; more is
+    /// used if the motion would otherwise overshoot.
     pub(super) fn jerk_limited(
         &self,
         goal: Goal,
@@ -128,8 +136,8 @@ impl Axis {
         part: f64,
     ) -> Result<JerkLimited, SetpointError> {
         let limits = &self.config.limits;
-        let motion = if self.grip() == Control::Torque {
-            self.tracked(self.drift())
+        let motion = if self.controlled_quantity() == ControlledQuantity::Torque {
+            self.motion_at_actual(self.held_velocity())
         } else {
             self.motion
         };
@@ -138,7 +146,7 @@ impl Axis {
             acceleration: limits.acceleration,
             jerk: limits.jerk(),
         };
-        let order = Order {
+        let order = MoveRequest {
             goal,
             limits: MotionLimits {
                 velocity,
@@ -156,28 +164,31 @@ impl Axis {
         }
     }
 
-    /// To rest, from whatever is going on.
+    /// Decelerates to rest, with any active plan.
     pub(super) fn brake(&mut self) {
         self.home.abort();
         let braking = Plan::braking(&self.config, self.mode);
-        if braking == Plan::Drive {
+        if braking == Plan::DriveProfile {
             self.profile.halt();
         }
-        if !matches!(braking, Plan::Torque(_) | Plan::Drive) {
+        if !matches!(braking, Plan::Torque(_) | Plan::DriveProfile) {
             self.engage();
         }
         self.plan = braking;
     }
 
-    /// RT: O(1).
+    /// Advances the set-point by one cycle. RT: O(1).
     pub(super) fn advance(&mut self, fresh: bool, dt_s: f64) {
-        self.go_on();
+        self.resume_after_loss();
         let before = self.motion;
-        let grip = self.grip();
-        self.held_by_range &= matches!(self.plan, Plan::Velocity(_) | Plan::Drive);
+        let grip = self.controlled_quantity();
+        self.held_by_range &= matches!(self.plan, Plan::Velocity(_) | Plan::DriveProfile);
         match self.plan {
-            // The new mode shows, and the drive does not follow in it yet.
-            _ if grip == Control::Position && self.switch.is_some() && !self.follows_now() => {
+            // The drive shows the new mode but does not follow in it yet.
+            _ if grip == ControlledQuantity::Position
+                && self.switch.is_some()
+                && !self.follows_now() =>
+            {
                 self.motion = self.following();
             }
             Plan::Hold(hold) => self.motion = hold.advance(before, dt_s),
@@ -188,7 +199,7 @@ impl Axis {
                 self.given.torque = ramp.advance(self.given.torque, dt_s);
                 self.motion = self.uncommanded();
             }
-            Plan::Drive => {
+            Plan::DriveProfile => {
                 if fresh
                     && let ModeStatus::Pp {
                         target_reached,
@@ -203,7 +214,7 @@ impl Axis {
                 }
                 self.motion = self.uncommanded();
             }
-            Plan::Fed => match self.fed {
+            Plan::External => match self.fed {
                 Some(motion) => self.motion = motion,
                 None => {
                     let hold = Hold {
@@ -214,24 +225,24 @@ impl Axis {
                 }
             },
         }
-        self.guard(grip, before, dt_s);
+        self.clamp_setpoint(grip, before, dt_s);
         self.send_position(grip);
     }
 
-    /// The set-point's position as the drive gets it; the actual one where no position is commanded.
-    pub(super) fn send_position(&mut self, grip: Control) {
-        self.sent = if grip == Control::Position {
+    /// Stores the commanded position in counts; the actual position if no position is commanded.
+    pub(super) fn send_position(&mut self, grip: ControlledQuantity) {
+        self.sent = if grip == ControlledQuantity::Position {
             let position = UserUnits(self.motion.position);
             self.config.scale.position_to_counts(position)
         } else {
             self.actual.counts().unwrap_or_default()
         };
-        if grip == Control::Velocity {
+        if grip == ControlledQuantity::Velocity {
             self.motion.position = self.config.scale.position_to_user(self.sent).0;
         }
     }
 
-    /// PV: a velocity that leads out of the range is halted where the drive can still stop inside it.
+    /// PV: halts a velocity that leads out of the range, while the drive can still stop inside it.
     fn halt_inside_range(&mut self) {
         let (Mode::Pv, Some(goal), Some([low, high])) =
             (self.mode, self.profile.goal(), self.config.limits.position)
@@ -240,7 +251,7 @@ impl Axis {
         };
         let velocity = self.actual.velocity();
         let late_s = self.config.dead_time_s + 2.0 * self.dt_s;
-        // A halt brakes with the limit, which is then in 0x6084.
+        // A halt decelerates with the limit acceleration, which 0x6084 then contains.
         let braking = 2.0 * self.config.limits.acceleration;
         let way = velocity * (velocity.abs() / braking + late_s);
         let end = self.actual.position() + way;
@@ -254,7 +265,7 @@ impl Axis {
     fn run(&mut self, ramp: Ramp, before: Motion, dt_s: f64) -> Motion {
         let [lowest, highest] = self.allowed_by_range();
         let asked = ramp.advance(before.velocity, dt_s);
-        // Braking for the end of the range may be steeper than the ramp that was asked for.
+        // Braking at the end of the range may be steeper than the requested ramp.
         let wanted = asked.min(highest).max(lowest);
         self.held_by_range = wanted != asked || ramp.target > highest || ramp.target < lowest;
         let steepest = Ramp {
@@ -265,25 +276,25 @@ impl Axis {
         before.then(before.position + velocity * dt_s, velocity, dt_s)
     }
 
-    /// The drive's profile has come to its end, as far as it can be told.
+    /// Returns true if the drive's profile has ended, as far as it reports it.
     fn profile_arrived(&self) -> bool {
         match (self.mode, self.profile.goal()) {
             (Mode::Pp, Some(_)) => !self.profile.pending(),
             (Mode::Pp, None) if self.profile.pending() => false,
             (Mode::Pv, Some(goal)) => self.velocity_reached(goal.target),
-            _ => !self.home.running() && self.standing(),
+            _ => !self.home.running() && self.at_standstill(),
         }
     }
 
     pub(super) fn setpoint_at_rest(&self) -> bool {
         match self.plan {
             Plan::Torque(_) => self.given.torque == 0.0,
-            Plan::Drive => !self.home.running() && self.standing(),
+            Plan::DriveProfile => !self.home.running() && self.at_standstill(),
             _ => self.motion.velocity == 0.0,
         }
     }
 
-    /// The set-point has nowhere left to go.
+    /// Returns true if the set-point has reached its goal.
     pub(super) fn setpoint_arrived(&self) -> bool {
         match self.plan {
             Plan::Hold(hold) => hold.finished(self.motion),
@@ -291,8 +302,8 @@ impl Axis {
             Plan::Jerk(ref source) => source.finished(self.motion),
             Plan::Velocity(ramp) => self.motion.velocity == ramp.target,
             Plan::Torque(ramp) => self.given.torque == ramp.target,
-            Plan::Drive => self.profile_arrived(),
-            Plan::Fed => self.motion.velocity == 0.0,
+            Plan::DriveProfile => self.profile_arrived(),
+            Plan::External => self.motion.velocity == 0.0,
         }
     }
 }

@@ -1,16 +1,17 @@
-//! The status: everything about the axis in one cycle.
+//! The status of an axis in one cycle.
 
 use super::stop::PowerGoal;
 use super::{Axis, Plan};
 use crate::cia402::{Mode, State, Statusword};
-use crate::status::{AxisStatus, Waiting};
+use crate::status::{AxisStatus, EnableBlocker};
 use crate::units::{Counts, UserUnits};
 
-/// A state that lasts longer on the way to Operation enabled is not passed through but stuck in.
+/// Longest time in seconds in a state on the way to Operation enabled. After it the axis reports
+/// why it waits.
 const PASSING_S: f64 = 0.1;
 
 impl Axis {
-    /// RT: O(1).
+    /// Returns the status of this cycle. RT: O(1).
     #[must_use]
     pub fn status(&self) -> AxisStatus {
         let arrived = self.active && self.setpoint_arrived();
@@ -74,11 +75,11 @@ impl Axis {
 
     fn rests(&self) -> bool {
         let commanded = self.setpoint_at_rest() || matches!(self.plan, Plan::Torque(_));
-        commanded && self.standing()
+        commanded && self.at_standstill()
     }
 
-    /// At the end of a cycle: for how long the axis has been where it is to be.
-    pub(super) fn dwell(&mut self, dt_s: f64) {
+    /// Updates the times in target and at rest, at the end of a cycle.
+    pub(super) fn update_settling_times(&mut self, dt_s: f64) {
         let watch = &self.config.supervision;
         if watch.target_dwell_s == 0.0 && watch.standstill_dwell_s == 0.0 {
             return;
@@ -91,17 +92,17 @@ impl Axis {
         self.rested_s = time(self.rests(), self.rested_s);
     }
 
-    fn waiting(&self) -> Option<Waiting> {
+    fn waiting(&self) -> Option<EnableBlocker> {
         if self.goal != PowerGoal::On {
             return None;
         }
         if self.active {
-            return self.braked().then_some(Waiting::Brake);
+            return self.braked().then_some(EnableBlocker::Brake);
         }
-        if self.blind() {
-            return Some(Waiting::Position);
+        if self.lacks_position() {
+            return Some(EnableBlocker::Position);
         }
-        // On the way up each state lasts a few cycles.
+        // While enabling, each state lasts a few cycles.
         if self.memory.in_state_s() < PASSING_S {
             return None;
         }
@@ -111,33 +112,33 @@ impl Axis {
             (State::SwitchedOn | State::OperationEnabled, Some(display))
                 if !self.mode_confirmed() =>
             {
-                Waiting::Mode {
+                EnableBlocker::Mode {
                     expected: self.mode,
                     display: Mode::from_code(display),
                 }
             }
             (State::OperationEnabled, _) if !self.reported_to_follow() => {
-                Waiting::Follows { mode: self.mode }
+                EnableBlocker::Follows { mode: self.mode }
             }
-            _ if !word.contains(Statusword::REMOTE) => Waiting::Remote,
-            _ if !word.contains(Statusword::VOLTAGE_ENABLED) => Waiting::Voltage,
-            _ => Waiting::Drive { state },
+            _ if !word.contains(Statusword::REMOTE) => EnableBlocker::Remote,
+            _ if !word.contains(Statusword::VOLTAGE_ENABLED) => EnableBlocker::Voltage,
+            _ => EnableBlocker::Drive { state },
         })
     }
 
-    /// The axis is where the set-point has arrived.
+    /// True if the axis has arrived at the target of the set-point.
     fn reached(&self) -> bool {
         match self.plan {
             Plan::Velocity(ramp) => self.velocity_reached(ramp.target),
             Plan::Torque(_) => true,
-            Plan::Drive => match (self.mode, self.profile.goal()) {
+            Plan::DriveProfile => match (self.mode, self.profile.goal()) {
                 (Mode::Pp, Some(goal)) => {
                     let error = goal.target - self.actual.position();
                     self.profile.reached() && error.abs() <= self.config.target_window
                 }
                 _ => true,
             },
-            Plan::Hold(_) | Plan::Move(_) | Plan::Jerk(_) | Plan::Fed => {
+            Plan::Hold(_) | Plan::Move(_) | Plan::Jerk(_) | Plan::External => {
                 let error = self.motion.position - self.actual.position();
                 error.abs() <= self.config.target_window
             }

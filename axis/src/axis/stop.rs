@@ -1,30 +1,32 @@
-//! The power of an axis, and the one way to take it away: decelerate → standstill → power off.
+//! Power and stops. Power is removed in one order only: decelerate → standstill → power off.
 //!
-//! A stop has one method and one timer. The method only becomes harder: set-points (`Ramp`), the drive's quick stop
-//! (`QuickStop`), no voltage (`DisableVoltage`). It becomes harder by a command, where the drive no longer follows
-//! set-points, and at the time-out, unless the axis still slows down and the configuration sets no time-out.
+//! A stop has one method and one timer. The method only becomes harder: set-points (`Ramp`), quick
+//! stop of the drive (`QuickStop`), no voltage (`DisableVoltage`). It becomes harder by a command,
+//! if the drive no longer follows set-points, and at the time-out. Without a configured time-out,
+//! an axis that still slows down gets more time.
 //!
-//! The time-out follows from the speed at the beginning, the acceleration limit and, with jerk limits, the jerk. Time
-//! passes whether frames are lost or not, so power goes in bounded time even if no frame ever comes back.
+//! The time-out follows from the initial speed, the acceleration limit and, with jerk limits, the
+//! jerk. The timer also runs while frames are lost, so power is removed in bounded time even
+//! without any further answer.
 
-use super::{Axis, Control, Plan};
+use super::{Axis, ControlledQuantity, Plan};
 use crate::cia402::{Power, State};
-use crate::setpoint::{Goal, JerkLimited, Motion, MotionLimits, Order};
+use crate::setpoint::{Goal, JerkLimited, Motion, MotionLimits, MoveRequest};
 use crate::status::{StopPhase, StopStatus, Trip};
 use crate::supervision::{FaultReset, StopMethod};
 
-/// How long an axis stands before its power goes: its error settles meanwhile.
+/// Time in seconds that an axis stands before its power is removed: its following error settles.
 const SETTLE_S: f64 = 0.1;
-/// After the time-out, an axis that has not become slower for this long does not decelerate.
+/// After the time-out, an axis that has not slowed down for this long is not decelerating.
 const UNSLOWED_S: f64 = 1.0;
-/// A drive that reports power this long after its removal was requested does not obey.
+/// A drive that still reports power this long after the request does not obey.
 const POWER_OFF_S: f64 = 3.0;
-/// An axis that has been enabled this long without a fault has all its automatic resets again.
+/// After this time enabled without a fault, all automatic resets are available again.
 const FORGET_S: f64 = 60.0;
-/// Longer than any brake or stop takes; keeps sums finite.
+/// Longer than any brake or stop time; keeps sums finite.
 const LONGEST_S: f64 = 3600.0;
 
-/// Where the power of the axis is to be.
+/// The requested power of the axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum PowerGoal {
     Off,
@@ -32,24 +34,24 @@ pub(super) enum PowerGoal {
     Stopping(Stop),
 }
 
-/// A stop under way.
+/// An active stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Stop {
     pub(super) method: StopMethod,
-    /// The drive stays in Quick stop active; its power is not removed.
+    /// True: the drive stays in Quick stop active and keeps its power.
     pub(super) stays: bool,
     removing_power: bool,
     elapsed_s: f64,
     timeout_s: f64,
-    /// The axis has been standing for so long.
+    /// Time in seconds for which the axis has been standing.
     standing_s: f64,
-    /// Lowest speed reported so far, and for how long there was no lower one.
+    /// Lowest reported speed, and the time in seconds since it last fell.
     slowest: f64,
     unslowed_s: f64,
 }
 
 impl Stop {
-    /// What the power state machine is to do.
+    /// Returns the request to the power state machine.
     pub(super) fn power(self) -> Power {
         match (self.removing_power, self.method) {
             (true, StopMethod::DisableVoltage) => Power::Off,
@@ -63,22 +65,22 @@ impl Stop {
         self.removing_power
     }
 
-    /// The drive has had its time to remove the power, and does not slow the axis down.
+    /// True if the time to remove the power has passed and the axis does not slow down.
     fn is_over(&self) -> bool {
         self.removing_power && self.elapsed_s > POWER_OFF_S && self.unslowed_s > POWER_OFF_S
     }
 }
 
-/// The brake, as far as it is known here.
+/// The commanded state of the brake.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct BrakeState {
-    /// It is to be open.
+    /// True if the brake is to be open.
     pub(super) open: bool,
-    /// For so long it has been open, or, at rest, closed.
+    /// Time in seconds since the brake was commanded open or closed.
     since_s: f64,
 }
 
-/// Automatic fault resets.
+/// State of automatic fault resets.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Resets {
     pub(super) tried: u8,
@@ -87,7 +89,7 @@ pub(super) struct Resets {
 }
 
 impl Axis {
-    /// Brings the axis to rest and removes its power; a stop under way is only made harder. RT: O(1).
+    /// Stops the axis and removes its power. An active stop only becomes harder. RT: O(1).
     pub fn stop_by(&mut self, method: StopMethod) {
         self.begin_stop(method, false);
     }
@@ -103,7 +105,7 @@ impl Axis {
                 stop.stays &= stays;
                 return;
             }
-            // The drive has no power to move with.
+            // Without power the drive cannot move.
             PowerGoal::On if !self.state.has_power() && !self.active => {
                 self.goal = PowerGoal::Off;
                 return;
@@ -122,7 +124,8 @@ impl Axis {
         }
     }
 
-    /// The drive follows what is sent: it has power, the mode shows, and it says so (Statusword bit 12).
+    /// True if the drive follows set-points: it has power, shows the mode and sets Statusword bit
+    /// 12.
     pub(super) fn follows_set_points(&self) -> bool {
         self.active
             && self.state == State::OperationEnabled
@@ -145,12 +148,12 @@ impl Axis {
         }
     }
 
-    /// From one cycle to the next. Also while frames are lost.
+    /// Advances a stop by one cycle, also while frames are lost.
     pub(super) fn settle_stop(&mut self, fresh: bool, dt_s: f64) {
         self.brake_state.since_s = (self.brake_state.since_s + dt_s).min(LONGEST_S);
         let mut stop = match self.goal {
             PowerGoal::Stopping(stop) => stop,
-            // A drive that was being enabled as its power was no longer wanted.
+            // The drive became enabled after the request to remove its power.
             PowerGoal::Off if fresh && self.state == State::OperationEnabled => Stop {
                 removing_power: true,
                 ..self.new_stop(StopMethod::QuickStop)
@@ -179,7 +182,7 @@ impl Axis {
             StopMethod::Ramp => self.setpoint_at_rest(),
             _ => self.state == State::QuickStopActive,
         };
-        stop.standing_s = if commanded && self.standing() {
+        stop.standing_s = if commanded && self.at_standstill() {
             stop.standing_s + dt_s
         } else {
             0.0
@@ -200,11 +203,12 @@ impl Axis {
         self.goal = PowerGoal::Stopping(stop);
     }
 
-    /// At the time-out. An axis that still moves has failed to stop; torque alone stops none.
+    /// Selects the next harder method at the time-out. An axis that still moves has failed to stop,
+    /// except with a torque ramp.
     fn harder(&mut self, stop: Stop) -> Stop {
-        let expected =
-            stop.method == StopMethod::Ramp && self.config.control(self.mode) == Control::Torque;
-        if !expected && self.stale_cycles == 0 && !self.standing() {
+        let expected = stop.method == StopMethod::Ramp
+            && self.config.control(self.mode) == ControlledQuantity::Torque;
+        if !expected && self.stale_cycles == 0 && !self.at_standstill() {
             self.trip.get_or_insert(Trip::NotStopped {
                 velocity: self.actual.velocity(),
                 time_s: stop.elapsed_s,
@@ -221,7 +225,7 @@ impl Axis {
         }
     }
 
-    /// The drive's fault: its reaction brakes, and it removes the power by itself.
+    /// Handles a fault of the drive: its fault reaction brakes, and it removes the power itself.
     pub(super) fn stop_by_fault(&mut self) {
         self.goal = if self.state.has_power() {
             let stop = self.new_stop(StopMethod::QuickStop);
@@ -234,7 +238,8 @@ impl Axis {
         };
     }
 
-    /// Nothing more can be done to stop the axis: it has no power, keeps it against the request, or is not heard. RT: O(1).
+    /// Returns true if the stop cannot do more. The axis has no power, or does not slow down long
+    /// after the request. RT: O(1).
     #[must_use]
     pub fn stop_ended(&self) -> bool {
         match self.goal {
@@ -262,13 +267,14 @@ impl Axis {
         })
     }
 
-    /// [`super::Command::Stop`], and how a stop by set-points begins: with the limits of the axis, whatever was used
-    /// before. The speed falls from the first cycle on: an acceleration that adds to it ends at once.
+    /// Stops with the limits of the axis instead of those of the plan ([`super::Command::Stop`] and
+    /// stops by set-points). The speed falls from the first cycle on: an acceleration that
+    /// increases it ends at once.
     pub(super) fn stop(&mut self) {
         let braking = matches!(self.plan, Plan::Hold(_));
         if self.config.jerk_limited
             && !braking
-            && self.grip() == Control::Position
+            && self.controlled_quantity() == ControlledQuantity::Position
             && let Some(plan) = self.jerk_limited_stop()
         {
             self.home.abort();
@@ -281,7 +287,7 @@ impl Axis {
     fn jerk_limited_stop(&self) -> Option<JerkLimited> {
         let limits = self.config.limits.motion();
         let motion = self.motion;
-        let order = Order {
+        let order = MoveRequest {
             goal: Goal::Velocity(0.0),
             limits,
             ceiling: limits,
@@ -302,7 +308,8 @@ impl Axis {
         JerkLimited::new(order, start, self.dt_s).ok()
     }
 
-    /// After the power: an axis that is enabled has its brake opened, one without power has it closed.
+    /// Updates the brake after the power state: opens it when the axis is enabled, closes it
+    /// without power.
     pub(super) fn settle_brake(&mut self) {
         let powered = matches!(self.state, State::OperationEnabled | State::QuickStopActive);
         if self.active && self.goal == PowerGoal::On && !self.brake_state.open {
@@ -315,12 +322,12 @@ impl Axis {
         }
     }
 
-    /// The brake has not opened yet.
+    /// True until the brake has opened.
     pub(super) fn braked(&self) -> bool {
         !self.brake_state.open || self.brake_state.since_s < self.config.brake.release_s
     }
 
-    /// Resets a fault by itself, if that is configured and not tried too often.
+    /// Resets a fault automatically, if configured and attempts remain.
     pub(super) fn settle_reset(&mut self, dt_s: f64) {
         let FaultReset::Automatic { tries, delay_s } = self.config.fault_reset else {
             return;
@@ -347,8 +354,8 @@ impl Axis {
     }
 }
 
-/// The deceleration that a stop may begin with: none that adds to the speed, and none that would turn the axis round
-/// before the jerk limit has taken it away.
+/// Returns the initial deceleration of a stop. An acceleration that increases the speed becomes 0.
+/// A deceleration is bounded so that the jerk limit can end it before the axis reverses.
 fn taken_over(motion: Motion, limits: MotionLimits) -> f64 {
     if motion.acceleration * motion.velocity >= 0.0 {
         return 0.0;

@@ -1,61 +1,61 @@
-//! The bits that mean something else in every mode: 4–6 and 8 of the Controlword; 10, 12 and 13 of the Statusword
-//! (CiA 402-2, the tables of each mode).
+//! Mode-specific bits: 4–6 and 8 of the Controlword; 10, 12 and 13 of the Statusword (CiA 402-2,
+//! tables of each mode).
 
 use super::mode::Mode;
 use super::words::{Controlword, Statusword};
 
-/// What a Statusword says in its mode.
+/// The mode-specific bits of a Statusword.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ModeStatus {
     Pp {
-        /// Bit 10. With halt: stands.
+        /// Bit 10. With halt: the axis stands.
         target_reached: bool,
-        /// Bit 12: the set-point was taken.
+        /// Bit 12: the drive has accepted the set-point.
         acknowledged: bool,
         /// Bit 13.
         following_error: bool,
     },
     Pv {
-        /// Bit 10. With halt: stands.
+        /// Bit 10. With halt: the axis stands.
         target_reached: bool,
         /// Bit 12.
         zero_speed: bool,
-        /// Bit 13: the largest slippage is reached.
+        /// Bit 13: maximum slippage reached.
         slipping: bool,
     },
     Hm(HomingState),
     Csp {
-        /// Bit 12: the target position counts.
+        /// Bit 12: the drive follows the target position.
         follows: bool,
         /// Bit 13.
         following_error: bool,
     },
     Csv {
-        /// Bit 12: the target velocity counts.
+        /// Bit 12: the drive follows the target velocity.
         follows: bool,
     },
     Cst {
-        /// Bit 12: the target torque counts.
+        /// Bit 12: the drive follows the target torque.
         follows: bool,
     },
-    /// No meaning is known.
+    /// A mode without known bits.
     Other,
 }
 
-/// Bits 13, 12 and 10 while homing.
+/// Homing state: bits 13, 12 and 10.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum HomingState {
     /// 000.
     InProgress,
     /// 001: not started or interrupted.
     NotStarted,
-    /// 010: the home position is found, the axis still on its way.
+    /// 010: home found, the axis still moves to its target.
     AttainedNotReached,
     /// 011.
     Completed,
-    /// 100: and the axis still moves.
+    /// 100: the axis still moves.
     ErrorMoving,
-    /// 101: and the axis stands.
+    /// 101: the axis stands.
     ErrorStanding,
     /// 11x.
     Reserved,
@@ -77,7 +77,7 @@ impl HomingState {
 }
 
 impl Statusword {
-    /// Bits 10, 12 and 13 by the mode that 0x6061 shows.
+    /// Decodes bits 10, 12 and 13 for the mode that 0x6061 shows.
     #[must_use]
     pub const fn in_mode(self, mode: Mode) -> ModeStatus {
         let reached = self.contains(Self::TARGET_REACHED);
@@ -114,16 +114,16 @@ impl Statusword {
     }
 }
 
-/// What a Controlword asks in its mode.
+/// The mode-specific bits of a Controlword.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ModeCommand {
-    /// All of the bits are 0; so always in the cyclic modes.
+    /// All bits are 0, as in all cyclic modes.
     #[default]
     Nothing,
     Pp {
         /// Bit 4, acts on its rising edge.
         new_set_point: bool,
-        /// Bit 5: do not finish the set-point under way first.
+        /// Bit 5: replace the active set-point instead of finishing it first.
         change_at_once: bool,
         /// Bit 6.
         relative: bool,
@@ -135,7 +135,7 @@ pub enum ModeCommand {
         halt: bool,
     },
     Hm {
-        /// Bit 4: homing goes on as long as it is 1.
+        /// Bit 4: homing continues while it is 1.
         start: bool,
         /// Bit 8.
         halt: bool,
@@ -152,7 +152,7 @@ impl Controlword {
     /// Bit 6 in PP.
     pub const RELATIVE: Self = Self::from_bits_retain(1 << 6);
 
-    /// With the bits of a mode set; what was in them is kept.
+    /// Replaces the mode-specific bits by those of `command`. Other bits remain.
     #[must_use]
     pub fn with(self, command: ModeCommand) -> Self {
         let set = |bit: Self, on: bool| if on { bit } else { Self::empty() };
@@ -267,9 +267,9 @@ mod tests {
         assert_eq!(word(0x3400).in_mode(Mode::Unknown(-1)), ModeStatus::Other);
     }
 
-    /// Only the named bits matter, and none of them is in the state.
+    /// Only the named bits affect the mode state, and none of them affects the power state.
     #[test]
-    fn no_other_bit_matters() {
+    fn other_bits_do_not_affect_the_mode_status() {
         for bits in 0..=u16::MAX {
             let word = Statusword::from_bits_retain(bits);
             let bare = Statusword::from_bits_retain(bits & 0x3400);

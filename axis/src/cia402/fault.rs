@@ -1,17 +1,18 @@
-//! Error codes (0x603F, and the first word of an emergency): CiA 301/402 classes, and maxon EPOS4 and IDX codes.
+//! Error codes (0x603F, and the first word of an emergency): CiA 301/402 classes, maxon EPOS4 and
+//! IDX codes.
 //!
-//! The text says what failed; the hint says what to look at first.
+//! The text describes the fault; the hint names the first thing to check.
 
-/// What a code means.
+/// The description of an error code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Description {
     pub text: &'static str,
     pub hint: &'static str,
-    /// The code itself is listed; otherwise the text is that of its class.
+    /// True if the code is listed. Otherwise the text describes its class.
     pub exact: bool,
 }
 
-/// Text and hint for any code. Codes that are not listed get the text of their class.
+/// Returns text and hint of any code. A code that is not listed gets the text of its class.
 #[must_use]
 pub fn describe(code: u16) -> Description {
     let exact = CODES
@@ -142,7 +143,7 @@ const CODES: &[(u16, &str, &str)] = &[
     (0xFF24, "auto tuning: sensor signal", "check the encoder cable"),
 ];
 
-/// Mask, value; the first row that fits.
+/// Mask and value; the first matching row applies.
 #[rustfmt::skip]
 const CLASSES: &[(u16, u16, &str, &str)] = &[
     (0xFF00, 0x0000, "error reset or no error", "nothing to do"),
@@ -182,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn listed_classed_unknown() {
+    fn codes_get_their_own_or_their_class_text() {
         assert_eq!(describe(0x8611).text, "following error");
         assert!(describe(0x8611).exact);
         assert_eq!(describe(0x2399).text, "current error");
@@ -192,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn every_code_has_words() {
+    fn every_code_has_text_and_hint() {
         for code in 0..=u16::MAX {
             let d = describe(code);
             assert!(!d.text.is_empty() && !d.hint.is_empty());

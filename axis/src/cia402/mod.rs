@@ -1,6 +1,6 @@
-//! CiA 402 (IEC 61800-7-201): the words, the power state machine, the modes and the error codes.
+//! CiA 402 (IEC 61800-7-201): Controlword, Statusword, power state machine, modes and error codes.
 //!
-//! Everything is a table or a pure function of a table. Words and codes this crate does not know survive as themselves.
+//! Every item is a table or a pure function of a table. Unknown words and codes keep their value.
 
 pub mod bits;
 pub mod fault;
@@ -15,5 +15,5 @@ pub use fault::{Description, describe};
 pub use mode::{Mode, Modes};
 pub use option::{Deceleration, HaltOption, QuickStopOption};
 pub use state::State;
-pub use step::{Memory, Power, Progress, Request, Step, step, step_in};
+pub use step::{Power, PowerProgress, PowerState, Request, Step, step, step_in};
 pub use words::{Controlword, Statusword};

@@ -16,7 +16,7 @@ pub enum Mode {
     Csv,
     /// Cyclic synchronous torque.
     Cst,
-    /// Vendor modes (negative), none (0) and modes not used here.
+    /// Vendor modes (negative), no mode (0) and modes not supported here.
     Unknown(i8),
 }
 
@@ -63,14 +63,14 @@ impl fmt::Display for Mode {
     }
 }
 
-/// A set of the modes that have a name here.
+/// A set of modes, without [`Mode::Unknown`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Modes(u8);
 
 impl Modes {
     pub const NONE: Self = Self(0);
 
-    /// [`Mode::Unknown`] is in no set.
+    /// Returns the set with one mode. [`Mode::Unknown`] gives the empty set.
     #[must_use]
     pub const fn only(mode: Mode) -> Self {
         Self::NONE.with(mode)
@@ -104,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sets() {
+    fn mode_sets_contain_their_modes() {
         let set = Modes::only(Mode::Csp).with(Mode::Hm);
         for code in i8::MIN..=i8::MAX {
             let mode = Mode::from_code(code);

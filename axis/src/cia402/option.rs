@@ -1,19 +1,19 @@
-//! Option codes: how a drive stops (0x605A quick stop, 0x605D halt; CiA 402-2).
+//! Option codes for stops of the drive (0x605A quick stop, 0x605D halt; CiA 402-2).
 
 use core::fmt;
 
-/// What brings the axis to rest.
+/// The deceleration of a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Deceleration {
     /// No torque; the axis coasts.
     Coast,
-    /// 0x6084; in homing 0x609A.
+    /// 0x6084; during homing 0x609A.
     SlowDownRamp,
     /// 0x6085.
     QuickStopRamp,
     CurrentLimit,
     VoltageLimit,
-    /// Codes below zero are the manufacturer's, others are reserved.
+    /// Codes below zero are vendor-specific, others are reserved.
     Other(i16),
 }
 
@@ -34,7 +34,8 @@ impl QuickStopOption {
         }
     }
 
-    /// The drive stays in Quick stop active, from where transition 16 leads back; otherwise it goes on to Switch on disabled.
+    /// Returns true if the drive stays in Quick stop active, where transition 16 is possible.
+    /// Otherwise the drive continues to Switch on disabled.
     #[must_use]
     pub const fn stays(self) -> bool {
         matches!(self.0, 5..=8)

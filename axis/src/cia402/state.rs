@@ -1,4 +1,4 @@
-//! The power state, read from the Statusword by the standard's mask/value table.
+//! The power state, decoded from the Statusword with the mask/value table of the standard.
 
 use core::fmt;
 
@@ -15,7 +15,7 @@ pub enum State {
     QuickStopActive,
     FaultReactionActive,
     Fault,
-    /// A Statusword that the table does not list, kept whole.
+    /// A Statusword that the table does not list; contains all bits.
     Unknown(u16),
 }
 
@@ -23,7 +23,7 @@ impl State {
     #[must_use]
     pub const fn from_statusword(word: Statusword) -> Self {
         let bits = word.bits();
-        // Bits 0–3, 5 and 6; bit 5 (quick stop) matters in half of the states.
+        // Bits 0–3, 5 and 6. Bit 5 (quick stop) matters only in half of the states.
         match bits & 0x6F {
             0x00 | 0x20 => Self::NotReadyToSwitchOn,
             0x40 | 0x60 => Self::SwitchOnDisabled,
@@ -37,7 +37,7 @@ impl State {
         }
     }
 
-    /// The drive can move its axis.
+    /// Returns true if the drive can move the axis.
     #[must_use]
     pub const fn has_power(self) -> bool {
         matches!(
@@ -46,7 +46,7 @@ impl State {
         )
     }
 
-    /// Fault or on the way into it.
+    /// Returns true in Fault and Fault reaction active.
     #[must_use]
     pub const fn is_fault(self) -> bool {
         matches!(self, Self::Fault | Self::FaultReactionActive)
@@ -73,7 +73,8 @@ impl fmt::Display for State {
 mod tests {
     use super::*;
 
-    /// The standard's table: mask, value, state. The rows exclude each other, so their order does not matter.
+    /// The table of the standard: mask, value, state. The rows exclude each other, so their order
+    /// does not matter.
     const TABLE: [(u16, u16, State); 8] = [
         (0x4F, 0x00, State::NotReadyToSwitchOn),
         (0x4F, 0x40, State::SwitchOnDisabled),
@@ -98,9 +99,9 @@ mod tests {
         State::from_statusword(Statusword::from_bits_retain(bits))
     }
 
-    /// Words as drives send them: voltage enabled, remote and vendor bits included.
+    /// Words from real drives, with voltage enabled, remote and vendor bits.
     #[test]
-    fn words_seen_on_real_buses() {
+    fn words_of_real_drives_are_decoded() {
         for (bits, expected) in [
             (0x0000, State::NotReadyToSwitchOn),
             (0x0240, State::SwitchOnDisabled),

@@ -1,48 +1,51 @@
-//! The power state machine as one pure function: what to send so that the drive goes where it is wanted.
+//! The power state machine as a pure function: computes the Controlword that takes the drive to the
+//! requested power.
 //!
-//! [`controlword`] is the table (state × wish × waiting time → command). [`step`] adds what a table cannot hold: how long the
-//! drive has been where it is, and the pulse train of a fault reset.
+//! [`controlword`] is the table (state × requested power × waiting time → command). [`step`] adds
+//! state that a table cannot hold: the time in the present state, and the pulse train of a fault
+//! reset.
 //!
-//! Of the standard's transitions 0–16 the drive makes 0, 1, 13 and 14 on its own. Disabling uses 8 rather than 5 and 9:
-//! "disable operation" (5) is the same word as "switch on" (3), so a drive that has already fallen back to Ready to switch on
-//! would be switched on by it; 9 is for [`Power::Off`] alone. So without [`Power::Enabled`] neither bit 0 nor bit 3 is ever sent.
+//! Of the transitions 0–16, the drive makes 0, 1, 13 and 14 itself. Disabling uses 8 instead of 5
+//! and 9. "Disable operation" (5) is the same word as "switch on" (3). It would switch on a drive
+//! that has fallen back to Ready to switch on. 9 is only for [`Power::Off`]. So bits 0 and 3 are
+//! only sent for [`Power::Enabled`].
 
 use super::state::State;
 use super::words::{Controlword, Statusword};
 
-/// Where the drive's power is wanted.
+/// The requested power of the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Power {
     #[default]
     Disabled,
     Enabled,
     QuickStop,
-    /// Disabled the shortest way: no voltage, whatever the axis is doing.
+    /// Removes the voltage at once, in any state.
     Off,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Request {
     pub power: Power,
-    /// Send fault reset pulses while the drive is in Fault.
+    /// Sends fault reset pulses while the drive is in Fault.
     pub reset_fault: bool,
-    /// The drive's quick stop option code has no transition 16.
-    pub no_return: bool,
-    /// Operation is not enabled yet: an enabled drive is taken as far as Switched on.
+    /// The drive's quick stop option code does not allow transition 16.
+    pub without_transition_16: bool,
+    /// Takes the drive only as far as Switched on.
     pub hold: bool,
 }
 
-/// What the state machine remembers between cycles.
+/// The state of the power state machine between cycles.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Memory {
+pub struct PowerState {
     state: State,
     power: Power,
     in_state_s: f64,
     waited_s: f64,
-    reset: Reset,
+    reset: FaultResetPulse,
 }
 
-impl Memory {
+impl PowerState {
     #[must_use]
     pub const fn new() -> Self {
         Self {
@@ -50,7 +53,7 @@ impl Memory {
             power: Power::Disabled,
             in_state_s: 0.0,
             waited_s: 0.0,
-            reset: Reset::Idle,
+            reset: FaultResetPulse::Idle,
         }
     }
 
@@ -59,30 +62,30 @@ impl Memory {
         self.state
     }
 
-    /// Seconds since the drive entered its present state.
+    /// Returns the time in seconds since the drive entered its present state.
     #[must_use]
     pub const fn in_state_s(&self) -> f64 {
         self.in_state_s
     }
 }
 
-impl Default for Memory {
+impl Default for PowerState {
     fn default() -> Self {
         Self::new()
     }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Progress {
-    /// The drive is where it is wanted.
+pub enum PowerProgress {
+    /// The drive has the requested power.
     Reached,
-    /// On the way.
+    /// The drive is not yet in the requested state.
     Pending,
-    /// In Fault or on the way into it, and no reset was asked for.
+    /// The drive is in Fault or Fault reaction active, and no reset is requested.
     Faulted,
     /// Reset pulses are being sent.
     ResettingFault,
-    /// All pulses were sent and the fault is still there.
+    /// All pulses were sent and the fault remains.
     ResetFailed,
 }
 
@@ -90,13 +93,13 @@ pub enum Progress {
 pub struct Step {
     pub state: State,
     pub controlword: Controlword,
-    pub progress: Progress,
+    pub progress: PowerProgress,
 }
 
-/// Bit 7 acts on its rising edge, so it is low for a while, high for a while, and low again. Counted in cycles too, so that
-/// a cycle longer than the pulse still gives an edge.
+/// Bit 7 acts on its rising edge: it is low, then high, then low again, each for a minimum time.
+/// Cycles count as well, so that a cycle longer than the pulse still creates an edge.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Reset {
+enum FaultResetPulse {
     Idle,
     Low { sent: u8, elapsed_s: f64 },
     High { sent: u8, elapsed_s: f64 },
@@ -106,22 +109,25 @@ enum Reset {
 const RESET_HALF_PERIOD_S: f64 = 0.05;
 const RESET_PULSES: u8 = 3;
 
-/// How long transition 16 (Quick stop active → Operation enabled) is tried. Drives whose quick stop option code does not
-/// allow it are then taken through Switch on disabled.
+/// Time in seconds for which transition 16 (Quick stop active → Operation enabled) is tried.
+/// Afterwards the drive goes through Switch on disabled, because its quick stop option code does
+/// not allow transition 16.
 const QUICK_STOP_RETURN_S: f64 = 0.5;
 
-/// Longer than any machine runs; keeps the sums finite.
+/// Longer than the lifetime of any machine; keeps sums finite.
 const LONGEST_WAIT_S: f64 = 1e9;
 
-/// The command for a drive in `state` whose power is wanted as `power` and has been for `waited_s`, fault reset aside.
+/// Returns the command for a drive in `state`, without the fault reset. `power` has been requested
+/// for `waited_s` seconds.
 #[must_use]
 pub fn controlword(state: State, power: Power, waited_s: f64) -> Controlword {
     match (state, power) {
-        // 14 is the drive's own. Shutdown rather than disable voltage: nothing that could cut its braking ramp short.
+        // The drive makes 14 itself. Shutdown, because disable voltage could cut its braking ramp
+        // short.
         (State::FaultReactionActive, _) => Controlword::SHUTDOWN_COMMAND,
         (_, Power::Off) => Controlword::DISABLE_VOLTAGE_COMMAND, // 7, 9, 10, 12
 
-        // 0, 1: the drive's own.
+        // The drive makes 0 and 1 itself.
         (State::NotReadyToSwitchOn, _) => Controlword::DISABLE_VOLTAGE_COMMAND,
 
         (State::SwitchOnDisabled, Power::Enabled) => Controlword::SHUTDOWN_COMMAND, // 2
@@ -154,17 +160,28 @@ pub fn controlword(state: State, power: Power, waited_s: f64) -> Controlword {
     }
 }
 
-/// One cycle. Pure: the same arguments give the same answer. Any `dt_s` is accepted; what is not a positive number is no time.
+/// Runs one cycle. Pure: the same arguments give the same result. Accepts any `dt_s`; a value that
+/// is not a positive number counts as 0.
 #[must_use]
-pub fn step(memory: Memory, statusword: Statusword, request: Request, dt_s: f64) -> (Memory, Step) {
+pub fn step(
+    memory: PowerState,
+    statusword: Statusword,
+    request: Request,
+    dt_s: f64,
+) -> (PowerState, Step) {
     step_in(memory, State::from_statusword(statusword), request, dt_s)
 }
 
-/// [`step`] for a state that has been read already.
+/// Runs [`step`] with an already decoded state.
 #[must_use]
-pub fn step_in(mut memory: Memory, state: State, request: Request, dt_s: f64) -> (Memory, Step) {
+pub fn step_in(
+    mut memory: PowerState,
+    state: State,
+    request: Request,
+    dt_s: f64,
+) -> (PowerState, Step) {
     let dt_s = if dt_s > 0.0 { dt_s } else { 0.0 };
-    // Nearly every cycle of a machine's life.
+    // The fast path of nearly all cycles.
     let running = matches!(
         (state, memory.state, request.power, memory.power),
         (
@@ -177,11 +194,11 @@ pub fn step_in(mut memory: Memory, state: State, request: Request, dt_s: f64) ->
     if running {
         memory.in_state_s = (memory.in_state_s + dt_s).min(LONGEST_WAIT_S);
         memory.waited_s = (memory.waited_s + dt_s).min(LONGEST_WAIT_S);
-        memory.reset = Reset::Idle;
+        memory.reset = FaultResetPulse::Idle;
         let step = Step {
             state,
             controlword: Controlword::ENABLE_OPERATION_COMMAND,
-            progress: Progress::Reached,
+            progress: PowerProgress::Reached,
         };
         return (memory, step);
     }
@@ -197,16 +214,16 @@ pub fn step_in(mut memory: Memory, state: State, request: Request, dt_s: f64) ->
     let reset = if state == State::Fault && request.reset_fault {
         memory.reset.next(dt_s)
     } else {
-        Reset::Idle
+        FaultResetPulse::Idle
     };
-    let memory = Memory {
+    let memory = PowerState {
         state,
         power: request.power,
         in_state_s: since(same_state, memory.in_state_s),
         waited_s: since(same_wait, memory.waited_s),
         reset,
     };
-    let waited_s = if request.no_return {
+    let waited_s = if request.without_transition_16 {
         QUICK_STOP_RETURN_S
     } else {
         memory.waited_s
@@ -215,15 +232,15 @@ pub fn step_in(mut memory: Memory, state: State, request: Request, dt_s: f64) ->
     if request.hold && state == State::SwitchedOn && request.power == Power::Enabled {
         word = Controlword::SWITCH_ON_COMMAND;
     }
-    if matches!(reset, Reset::High { .. }) {
+    if matches!(reset, FaultResetPulse::High { .. }) {
         word |= Controlword::FAULT_RESET_COMMAND;
     }
     let progress = match reset {
-        Reset::Failed => Progress::ResetFailed,
-        Reset::Low { .. } | Reset::High { .. } => Progress::ResettingFault,
-        Reset::Idle if state.is_fault() => Progress::Faulted,
-        Reset::Idle if reached(state, request.power) => Progress::Reached,
-        Reset::Idle => Progress::Pending,
+        FaultResetPulse::Failed => PowerProgress::ResetFailed,
+        FaultResetPulse::Low { .. } | FaultResetPulse::High { .. } => PowerProgress::ResettingFault,
+        FaultResetPulse::Idle if state.is_fault() => PowerProgress::Faulted,
+        FaultResetPulse::Idle if reached(state, request.power) => PowerProgress::Reached,
+        FaultResetPulse::Idle => PowerProgress::Pending,
     };
     (
         memory,
@@ -239,12 +256,12 @@ const fn reached(state: State, power: Power) -> bool {
     match power {
         Power::Disabled | Power::Off => matches!(state, State::SwitchOnDisabled),
         Power::Enabled => matches!(state, State::OperationEnabled),
-        // A drive whose quick stop option code ends in transition 12 has done what was asked, too.
+        // A drive whose quick stop ends with transition 12 has also reached the request.
         Power::QuickStop => matches!(state, State::QuickStopActive | State::SwitchOnDisabled),
     }
 }
 
-impl Reset {
+impl FaultResetPulse {
     fn next(self, dt_s: f64) -> Self {
         match self {
             Self::Idle => Self::Low {

@@ -1,8 +1,8 @@
-//! The transitions row by row against a drive that knows them all, then every Statusword × every request.
+//! The transitions row by row against a reference drive, then every Statusword × every request.
 
 use super::*;
 
-/// A drive of the book: the standard's transition table, by number.
+/// A reference drive: the transition table of the standard, by number.
 fn drive(state: State, word: Controlword, edge_of_bit_7: bool) -> Option<(u8, State)> {
     let w = word.bits() & 0x000F;
     let is = |mask: u16, value: u16| w & mask == value;
@@ -58,13 +58,13 @@ fn request(power: Power) -> Request {
     }
 }
 
-/// Every state × every request: the word, and the transition it causes.
+/// Every state × every request: the Controlword and the resulting transition.
 #[test]
 fn table_row_by_row() {
     use Power::{Disabled, Enabled, Off, QuickStop};
     use State::*;
     let rows = [
-        // 0 and 1 happen inside the drive.
+        // The drive makes 0 and 1 itself.
         (NotReadyToSwitchOn, Disabled, 0x0000, None),
         (NotReadyToSwitchOn, Enabled, 0x0000, None),
         (NotReadyToSwitchOn, QuickStop, 0x0000, None),
@@ -83,7 +83,7 @@ fn table_row_by_row() {
         (QuickStopActive, Disabled, 0x0000, Some(12)),
         (QuickStopActive, Enabled, 0x000F, Some(16)),
         (QuickStopActive, QuickStop, 0x0002, None),
-        // 13 is a fault; 14 happens inside the drive whatever is sent.
+        // 13 is a fault; the drive makes 14 itself, with any Controlword.
         (FaultReactionActive, Disabled, 0x0006, Some(14)),
         (FaultReactionActive, Enabled, 0x0006, Some(14)),
         (FaultReactionActive, QuickStop, 0x0006, Some(14)),
@@ -100,7 +100,7 @@ fn table_row_by_row() {
         (Fault, Off, 0x0000, None),
     ];
     for (state, power, bits, transition) in rows {
-        let (_, out) = step(Memory::new(), word_of(state), request(power), 0.001);
+        let (_, out) = step(PowerState::new(), word_of(state), request(power), 0.001);
         assert_eq!(out.state, state);
         assert_eq!(out.controlword.bits(), bits, "{state} × {power:?}");
         let taken = drive(state, out.controlword, false).map(|(number, _)| number);
@@ -108,9 +108,9 @@ fn table_row_by_row() {
     }
 }
 
-/// Steps until nothing changes; returns the transitions taken.
+/// Steps until nothing changes. Returns the transitions and the final state.
 fn walk(mut state: State, power: Power, allow_16: bool) -> (Vec<u8>, State) {
-    let mut memory = Memory::new();
+    let mut memory = PowerState::new();
     let mut taken = vec![];
     for _ in 0..2000 {
         let (next, out) = step(memory, word_of(state), request(power), 0.001);
@@ -126,7 +126,7 @@ fn walk(mut state: State, power: Power, allow_16: bool) -> (Vec<u8>, State) {
 }
 
 #[test]
-fn ladders() {
+fn transitions_lead_to_each_requested_power() {
     use Power::{Disabled, Enabled, QuickStop};
     use State::*;
     for (from, power, path, end) in [
@@ -140,7 +140,7 @@ fn ladders() {
     ] {
         assert_eq!(walk(from, power, true), (path, end), "{from} {power:?}");
     }
-    // A drive without transition 16 is taken the long way round.
+    // A drive without transition 16 takes the longer path.
     assert_eq!(
         walk(QuickStopActive, Enabled, false),
         (vec![12, 2, 3, 4], OperationEnabled)
@@ -148,25 +148,25 @@ fn ladders() {
 }
 
 #[test]
-fn an_option_code_without_return() {
+fn option_code_without_transition_16_skips_it() {
     let ask = Request {
         power: Power::Enabled,
-        no_return: true,
+        without_transition_16: true,
         ..Request::default()
     };
     let word = word_of(State::QuickStopActive);
-    let (_, out) = step(Memory::new(), word, ask, 0.001);
+    let (_, out) = step(PowerState::new(), word, ask, 0.001);
     let way = drive(State::QuickStopActive, out.controlword, false);
     assert_eq!(way, Some((12, State::SwitchOnDisabled)));
 }
 
-/// Runs a reset against a drive that stays in Fault until it has seen `edges` rising edges.
-fn reset_run(edges: u32, dt_s: f64) -> (u32, Progress, Controlword) {
-    let mut memory = Memory::new();
+/// Runs a reset with a drive that stays in Fault until it has seen `edges` rising edges.
+fn reset_run(edges: u32, dt_s: f64) -> (u32, PowerProgress, Controlword) {
+    let mut memory = PowerState::new();
     let mut seen = 0;
     let mut before = Controlword::FAULT_RESET;
     let mut state = State::Fault;
-    let mut last = (Progress::Pending, before);
+    let mut last = (PowerProgress::Pending, before);
     for _ in 0..10_000 {
         let ask = Request {
             power: Power::Disabled,
@@ -188,16 +188,24 @@ fn reset_run(edges: u32, dt_s: f64) -> (u32, Progress, Controlword) {
     (seen, last.0, last.1)
 }
 
-/// Transition 15: an edge, dropped again, and no more than three of them.
+/// Transition 15: at most three edges, each followed by a low bit.
 #[test]
 fn fault_reset_is_a_bounded_train_of_edges() {
     let low = Controlword::DISABLE_VOLTAGE_COMMAND;
     for dt_s in [0.000_25, 0.001, 0.01, 0.2] {
-        assert_eq!(reset_run(1, dt_s), (1, Progress::Reached, low), "{dt_s}");
-        assert_eq!(reset_run(3, dt_s), (3, Progress::Reached, low), "{dt_s}");
+        assert_eq!(
+            reset_run(1, dt_s),
+            (1, PowerProgress::Reached, low),
+            "{dt_s}"
+        );
+        assert_eq!(
+            reset_run(3, dt_s),
+            (3, PowerProgress::Reached, low),
+            "{dt_s}"
+        );
         assert_eq!(
             reset_run(u32::MAX, dt_s),
-            (3, Progress::ResetFailed, low),
+            (3, PowerProgress::ResetFailed, low),
             "{dt_s}"
         );
     }
@@ -205,7 +213,7 @@ fn fault_reset_is_a_bounded_train_of_edges() {
 
 #[test]
 fn fault_without_reset_stays_low() {
-    let mut memory = Memory::new();
+    let mut memory = PowerState::new();
     for _ in 0..1000 {
         let (next, out) = step(
             memory,
@@ -215,7 +223,7 @@ fn fault_without_reset_stays_low() {
         );
         memory = next;
         assert_eq!(out.controlword.bits(), 0);
-        assert_eq!(out.progress, Progress::Faulted);
+        assert_eq!(out.progress, PowerProgress::Faulted);
     }
 }
 
@@ -227,30 +235,30 @@ fn a_second_reset_request_starts_over() {
         ..Request::default()
     };
     let fault = word_of(State::Fault);
-    let mut memory = Memory::new();
+    let mut memory = PowerState::new();
     for _ in 0..10 {
         memory = step(memory, fault, ask(true), 0.1).0;
     }
     assert_eq!(
         step(memory, fault, ask(true), 0.1).1.progress,
-        Progress::ResetFailed
+        PowerProgress::ResetFailed
     );
     memory = step(memory, fault, ask(false), 0.1).0;
     assert_eq!(
         step(memory, fault, ask(true), 0.1).1.progress,
-        Progress::ResettingFault
+        PowerProgress::ResettingFault
     );
 }
 
 #[test]
-fn time_in_state() {
-    let mut memory = Memory::new();
+fn time_in_state_restarts_with_the_state() {
+    let mut memory = PowerState::new();
     let word = word_of(State::SwitchedOn);
     for _ in 0..=1000 {
         memory = step(memory, word, request(Power::Disabled), 0.001).0;
     }
     assert!((memory.in_state_s() - 1.0).abs() < 1e-9);
-    // Another request does not change how long the drive has been where it is.
+    // Another request does not change the time in the state.
     memory = step(memory, word, request(Power::Enabled), 0.001).0;
     assert!(memory.in_state_s() > 1.0);
     memory = step(
@@ -263,9 +271,10 @@ fn time_in_state() {
     assert_eq!(memory.in_state_s(), 0.0);
 }
 
-/// All 65,536 Statuswords × every request × odd times: no panic, and no power without being asked.
+/// All 65,536 Statuswords × every request × unusual times: no panic, and no power without a
+/// request.
 #[test]
-fn exhaustive_sweep() {
+fn no_word_gets_power_without_request() {
     let powering = Controlword::SWITCH_ON | Controlword::ENABLE_OPERATION;
     for bits in 0..=u16::MAX {
         let word = Statusword::from_bits_retain(bits);
@@ -274,10 +283,10 @@ fn exhaustive_sweep() {
                 let ask = Request {
                     power,
                     reset_fault,
-                    no_return: bits & 1 == 0,
+                    without_transition_16: bits & 1 == 0,
                     hold: false,
                 };
-                let mut memory = Memory::new();
+                let mut memory = PowerState::new();
                 for dt_s in [0.001, 0.06, 0.6, f64::NAN, -1.0, f64::INFINITY] {
                     let (next, out) = step(memory, word, ask, dt_s);
                     memory = next;

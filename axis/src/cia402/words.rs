@@ -1,4 +1,4 @@
-//! Controlword (0x6040) and Statusword (0x6041). Unnamed bits survive: build them with `from_bits_retain`.
+//! Controlword (0x6040) and Statusword (0x6041). `from_bits_retain` keeps unnamed bits.
 
 use bitflags::bitflags;
 
@@ -11,16 +11,17 @@ bitflags! {
         const OPERATION_ENABLED = 1 << 2;
         const FAULT = 1 << 3;
         const VOLTAGE_ENABLED = 1 << 4;
-        /// Low active: set means that no quick stop is active.
+        /// Active low: set if no quick stop is active.
         const QUICK_STOP = 1 << 5;
         const SWITCH_ON_DISABLED = 1 << 6;
         const WARNING = 1 << 7;
         const REMOTE = 1 << 9;
         const TARGET_REACHED = 1 << 10;
         const INTERNAL_LIMIT_ACTIVE = 1 << 11;
-        /// In the cyclic synchronous modes: the drive follows the command value. See [`super::bits`] for other modes.
+        /// In the cyclic synchronous modes: the drive follows the command value. Other modes: see
+        /// [`super::bits`].
         const FOLLOWS_COMMAND = 1 << 12;
-        /// In CSP: the drive's own following error. See [`super::bits`] for other modes.
+        /// In CSP: following error of the drive. Other modes: see [`super::bits`].
         const FOLLOWING_ERROR = 1 << 13;
         const _ = !0;
     }
@@ -32,24 +33,24 @@ bitflags! {
     pub struct Controlword: u16 {
         const SWITCH_ON = 1 << 0;
         const ENABLE_VOLTAGE = 1 << 1;
-        /// Low active: cleared means quick stop.
+        /// Active low: a cleared bit requests quick stop.
         const QUICK_STOP = 1 << 2;
         const ENABLE_OPERATION = 1 << 3;
         /// Acts on its rising edge.
         const FAULT_RESET = 1 << 7;
-        /// In PP, PV and HM; elsewhere by 0x605D.
+        /// In PP, PV and HM. Otherwise 0x605D applies.
         const HALT = 1 << 8;
         const _ = !0;
     }
 }
 
-// The standard's commands.
+// The commands of the standard.
 impl Controlword {
     /// Transitions 7, 9, 10, 12.
     pub const DISABLE_VOLTAGE_COMMAND: Self = Self::empty();
     /// Transitions 2, 6, 8.
     pub const SHUTDOWN_COMMAND: Self = Self::ENABLE_VOLTAGE.union(Self::QUICK_STOP);
-    /// Transition 3; in Operation enabled the same word means "disable operation", transition 5.
+    /// Transition 3. In Operation enabled, the same word is "disable operation", transition 5.
     pub const SWITCH_ON_COMMAND: Self = Self::SHUTDOWN_COMMAND.union(Self::SWITCH_ON);
     /// Transitions 4, 16.
     pub const ENABLE_OPERATION_COMMAND: Self =

@@ -1,17 +1,20 @@
 //! A straight line through the positions of several axes.
 //!
-//! Synchronous arrival alone does not make a line: axes that reach their limits at different times leave it by millimetres. So there is
-//! one profile, of the way along the line from 0 to 1, under limits that leave every axis within its own.
+//! Synchronous arrival alone does not give a line: axes that reach their limits at different times
+//! deviate by millimetres. So all axes share one profile of the path parameter from 0 to 1. Its
+//! limits keep every axis within its own limits.
 
-use crate::setpoint::{Goal, JerkLimited, Motion, MotionLimits, Order, Setpoint, SetpointError};
+use crate::setpoint::{
+    Goal, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError,
+};
 
-/// One axis' part of a line.
+/// The part of one axis in a line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineAxis {
-    /// The set-point now, at rest.
+    /// The present set-point, at rest.
     pub from: Motion,
     pub target: f64,
-    /// What this axis may use for it.
+    /// Limits of this axis on the line.
     pub limits: MotionLimits,
     pub range: Option<[f64; 2]>,
 }
@@ -19,20 +22,20 @@ pub struct LineAxis {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error("axis {axis} of the line: {error}")]
 pub struct LineError {
-    /// Index in the slice given to [`Line::plan`].
+    /// Index in the slice passed to [`Line::plan`].
     pub axis: usize,
     #[source]
     pub error: SetpointError,
 }
 
-/// The profile that all axes of a line share.
+/// The profile shared by all axes of a line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Line {
     path: JerkLimited,
 }
 
 impl Line {
-    /// All axes at rest; a line cannot begin anywhere else. O(axes), no allocation.
+    /// Plans a line. All axes must be at rest. O(axes), no allocation.
     pub fn plan(axes: &[LineAxis]) -> Result<Self, LineError> {
         let unbounded = MotionLimits {
             velocity: f64::INFINITY,
@@ -63,7 +66,7 @@ impl Line {
         } else {
             (0.0, limits)
         };
-        let order = Order::within(Goal::Position(1.0), limits);
+        let order = MoveRequest::within(Goal::Position(1.0), limits);
         let path = JerkLimited::new(order, Motion::at(start), 0.0).map_err(|error| LineError {
             axis: slowest,
             error,
@@ -71,10 +74,10 @@ impl Line {
         Ok(Self { path })
     }
 
-    /// The source for one axis: the one that `axis` was in the plan.
+    /// Returns the source for one axis; `axis` must be an element of the plan.
     #[must_use]
-    pub fn along(&self, axis: &LineAxis) -> Along {
-        Along {
+    pub fn along(&self, axis: &LineAxis) -> LinePath {
+        LinePath {
             path: self.path,
             at: Motion::at(if self.path.duration_s() > 0.0 {
                 0.0
@@ -93,7 +96,7 @@ impl Line {
     }
 }
 
-/// For a line of no length.
+/// Limits of a line of length zero.
 const UNIT: MotionLimits = MotionLimits {
     velocity: 1.0,
     acceleration: 1.0,
@@ -101,36 +104,37 @@ const UNIT: MotionLimits = MotionLimits {
 };
 
 impl LineAxis {
-    /// The length of the way.
+    /// Checks the part of this axis and returns the length of its way.
     fn check(&self) -> Result<f64, SetpointError> {
         self.limits.check()?;
-        let order = Order {
+        let order = MoveRequest {
             range: self.range,
-            ..Order::within(Goal::Position(self.target), self.limits)
+            ..MoveRequest::within(Goal::Position(self.target), self.limits)
         };
         let velocity = self.from.velocity;
         if velocity != 0.0 {
             return Err(SetpointError::NotAtRest { velocity });
         }
-        // Finds what is not a number, and a target outside the range.
+        // Detects NaN and a target outside the range.
         JerkLimited::new(order, Motion::at(self.from.position), 0.0)?;
         Ok((self.target - self.from.position).abs())
     }
 }
 
-/// One axis on a line. All axes of it advance in the same cycles by the same `dt_s`, and are stopped and sent on in the same cycle.
+/// One axis on a line. All axes of a line advance in the same cycles by the same `dt_s`. They are
+/// stopped and continued in the same cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Along {
+pub struct LinePath {
     path: JerkLimited,
-    /// On the path: 0 at the start, 1 at the target.
+    /// State on the path: 0 at the start, 1 at the target.
     at: Motion,
     start: f64,
     target: f64,
     last: Motion,
 }
 
-impl Along {
-    /// How far, from 0 to 1.
+impl LinePath {
+    /// Returns the progress, from 0 to 1.
     #[must_use]
     pub const fn progress(&self) -> f64 {
         self.at.position
@@ -141,7 +145,7 @@ impl Along {
         self.target
     }
 
-    /// The target, unless it is to stop before.
+    /// Returns the target; `None` if the line stops before it.
     #[must_use]
     pub const fn destination(&self) -> Option<f64> {
         match self.path.order().goal {
@@ -150,19 +154,19 @@ impl Along {
         }
     }
 
-    /// This axis' part of the acceleration that the line may brake with.
+    /// Returns this axis's part of the line's deceleration.
     #[must_use]
     pub const fn braking(&self) -> f64 {
         self.path.used().acceleration * (self.target - self.start).abs()
     }
 
-    /// Brakes on the line, with the limits the line was planned with.
+    /// Decelerates on the line, with the limits of the plan.
     pub fn stop(&mut self, dt_s: f64) {
         self.redirect(Goal::Velocity(0.0), 1.0, dt_s);
     }
 
-    /// On to the end after a stop, or at another speed: a fraction of the planned velocity, above 0 and at most 1; anything else changes
-    /// nothing.
+    /// Continues to the target after a stop, or changes the speed: a fraction of the planned
+    /// velocity, above 0 and at most 1. Other values change nothing.
     pub fn go_on(&mut self, speed: f64, dt_s: f64) {
         if speed > 0.0 && speed <= 1.0 {
             self.redirect(Goal::Position(1.0), speed, dt_s);
@@ -171,23 +175,24 @@ impl Along {
 
     fn redirect(&mut self, goal: Goal, speed: f64, dt_s: f64) {
         let planned = self.path.order().ceiling;
-        let order = Order {
+        let order = MoveRequest {
             limits: MotionLimits {
                 velocity: planned.velocity * speed,
                 ..planned
             },
-            ..Order {
+            ..MoveRequest {
                 ceiling: planned,
-                ..Order::within(goal, planned)
+                ..MoveRequest::within(goal, planned)
             }
         };
-        // Refused only where no number comes out; then the line goes on as it was.
+        // Fails only on non-finite numbers; the line then continues unchanged.
         if let Ok(path) = self.path.redirect(order, self.at, dt_s) {
             self.path = path;
         }
     }
 
-    /// The axis was held up. The others of the line were too, and find the same.
+    /// Restarts from `motion` after an interruption. The other axes of the line were interrupted as
+    /// well and compute the same.
     fn take_up(&mut self, motion: Motion) {
         let way = self.target - self.start;
         if way == 0.0 {
@@ -201,7 +206,7 @@ impl Along {
     }
 }
 
-impl Setpoint for Along {
+impl Setpoint for LinePath {
     /// RT: O(1).
     fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
@@ -221,7 +226,7 @@ impl Setpoint for Along {
         self.last
     }
 
-    /// Arrived, or stopped on the way.
+    /// True at the target, or after a stop on the way.
     fn finished(&self, _: Motion) -> bool {
         self.path.finished(self.at)
     }

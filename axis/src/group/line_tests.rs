@@ -35,10 +35,10 @@ fn six() -> [LineAxis; 6] {
     ]
 }
 
-/// One axis and what the sequence of its positions shows.
+/// One axis and the derivatives of its positions.
 struct Follower {
     axis: LineAxis,
-    source: Along,
+    source: LinePath,
     motion: Motion,
     differences: Motion,
 }
@@ -59,7 +59,7 @@ impl Follower {
         let acceleration = (velocity - self.differences.velocity) / DT;
         let jerk = (acceleration - self.differences.acceleration) / DT;
         let limits = self.axis.limits;
-        // Positions have 1e-14 × 100.
+        // Positions are rounded to 1e-14 × 100.
         prop_assert!(velocity.abs() <= limits.velocity + 1e-9);
         prop_assert!(acceleration.abs() <= limits.acceleration + 1e-6);
         prop_assert!(jerk.abs() <= limits.jerk + 1e-3);
@@ -74,7 +74,8 @@ impl Follower {
     }
 }
 
-/// Farthest from the line, in user units, as the nearest point on it is found from all positions.
+/// Largest distance from the line, in user units. The reference is the nearest point on the line to
+/// all positions.
 fn deviation(followers: &[Follower]) -> f64 {
     let way = |f: &Follower| f.axis.target - f.axis.from.position;
     let gone = |f: &Follower| f.motion.position - f.axis.from.position;
@@ -105,13 +106,13 @@ fn six_axes_arrive_in_the_same_cycle_on_a_straight_line() {
     for f in &followers {
         assert!(f.motion.stands_at(f.axis.target));
     }
-    // As fast as the one with the longest way at 180: 198/180 + 180/2222 + 2222/32400.
+    // As fast as the axis with the longest way, at 180: 198/180 + 180/2222 + 2222/32400.
     assert!((f64::from(cycles) * DT - line.duration_s()).abs() <= 2.0 * DT);
     assert!(line.duration_s() < 2.2);
 }
 
 #[test]
-fn only_from_rest_and_within_every_range() {
+fn line_starts_at_rest_and_keeps_every_range() {
     let mut axes = six();
     axes[2].target = 100.1;
     let error = Line::plan(&axes).unwrap_err();
@@ -141,7 +142,7 @@ fn only_from_rest_and_within_every_range() {
 }
 
 #[test]
-fn a_line_of_no_length_is_done() {
+fn line_of_zero_length_is_finished() {
     let axes = [axis(1.0, 1.0, LIMITS), axis(2.0, 2.0, LIMITS)];
     for axes in [&axes[..], &[]] {
         let line = Line::plan(axes).unwrap();
@@ -158,7 +159,7 @@ fn a_line_of_no_length_is_done() {
 enum Event {
     Stop,
     GoOn(f64),
-    /// Frames are lost, all axes stand.
+    /// Frames are lost; all axes stand.
     Freeze,
 }
 
@@ -171,9 +172,10 @@ fn event() -> impl Strategy<Value = Event> {
 }
 
 proptest! {
-    /// Stopped, sent on at another speed and held up at any time: on the line, within the limits, together.
+    /// Stops, new speeds and interruptions at any time: the axes stay on the line, within the
+    /// limits, in step.
     #[test]
-    fn whatever_happens(events in prop::collection::vec((event(), 0u32..300), 0..8)) {
+    fn axes_stay_on_the_line_after_any_event(events in prop::collection::vec((event(), 0u32..300), 0..8)) {
         let axes = six();
         let line = Line::plan(&axes).unwrap();
         let mut followers = axes.map(|axis| Follower::new(&line, axis));

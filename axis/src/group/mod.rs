@@ -1,15 +1,16 @@
 //! Several axes together.
 //!
-//! | module | what lives there |
+//! | module | contents |
 //! |---|---|
-//! | `line` | [`Line`]: a straight line through all axes' positions, on one profile |
-//! | `together` | [`arrive_together`]: moves of their own that take the same time |
+//! | `line` | [`Line`]: a straight line through the positions of all axes, with one profile |
+//! | `together` | [`arrive_together`]: separate moves that take the same time |
 //!
-//! Nothing here owns an axis. A line hands each axis a set-point source of its own ([`Along`]); all of them make the same
-//! calculation, to the last bit, so the axes stay together without speaking to each other in the cycle. No allocation anywhere.
+//! This module owns no axis. A line gives each axis its own set-point source ([`LinePath`]). All
+//! sources compute bit-identical results, so the axes stay synchronous without communication in the
+//! cycle. Nothing allocates.
 
 mod line;
 mod together;
 
-pub use line::{Along, Line, LineAxis, LineError};
+pub use line::{Line, LineAxis, LineError, LinePath};
 pub use together::arrive_together;

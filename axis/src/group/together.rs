@@ -1,23 +1,26 @@
-//! Moves of several axes that end together, each on its own way.
+//! Moves of several axes that end together, each with its own profile.
 //!
-//! For axes that have nothing to do with each other geometrically; a straight line is [`super::Line`]'s.
+//! Use it for axes without a geometric relation. [`super::Line`] plans a straight line.
 
 use crate::setpoint::{JerkLimited, SetpointError};
 
-/// Makes all `moves` last as long as the longest of them, so that they arrive in the same cycle; returns how long, in seconds.
-/// Before their first cycle, after which they are to advance in the same cycles.
+/// Stretches all `moves` to the duration of the longest, so that they arrive in the same cycle.
+/// Returns the duration in seconds.
 ///
-/// An axis at rest goes its way more slowly. One in motion is given a lower velocity; where no velocity fits, because it could only
-/// arrive earlier or much later, it stops first. Then all of them may take longer than the longest did.
+/// Call it before the first cycle of the moves; afterwards they must advance in the same cycles.
 ///
-/// O(moves²) at worst, some 100 µs for every move from motion: not for the cycle. No allocation. On an error the moves are unchanged or
-/// already good in themselves.
+/// An axis at rest moves more slowly. An axis in motion gets a lower velocity. If no velocity fits,
+/// because the axis would arrive too early or much too late, it stops first. Then the common
+/// duration may exceed the longest move.
+///
+/// O(moves²) in the worst case, some 100 µs for every move from motion: do not call it in the
+/// cycle. No allocation. On an error, each move is unchanged or valid.
 pub fn arrive_together(moves: &mut [JerkLimited]) -> Result<f64, SetpointError> {
     let mut duration = moves
         .iter()
         .map(JerkLimited::duration_s)
         .fold(0.0, f64::max);
-    // Each round lengthens the time for one more axis that then fits any longer time.
+    // Each iteration extends the duration for one more axis, which then fits any longer duration.
     for _ in 0..=moves.len() {
         let late = moves
             .iter()
@@ -40,7 +43,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::setpoint::{Goal, Motion, MotionLimits, Order, Setpoint};
+    use crate::setpoint::{Goal, Motion, MotionLimits, MoveRequest, Setpoint};
 
     const DT: f64 = 0.001;
 
@@ -55,9 +58,9 @@ mod tests {
     }
 
     proptest! {
-        /// From rest and from motion: all arrive in the same cycle, within their limits.
+        /// From rest and from motion: all axes arrive in the same cycle, within their limits.
         #[test]
-        fn same_cycle(
+        fn moves_arrive_in_the_same_cycle(
             axes in prop::collection::vec((limits(), -50.0..50.0f64, -1.0..1.0f64, any::<bool>()), 1..8),
         ) {
             let motions: Vec<Motion> = axes.iter().map(|(limits, _, velocity, moving)| Motion {
@@ -65,7 +68,7 @@ mod tests {
                 ..Motion::at(0.0)
             }).collect();
             let mut moves: Vec<JerkLimited> = axes.iter().zip(&motions).map(|((limits, target, ..), motion)| {
-                JerkLimited::new(Order::within(Goal::Position(*target), *limits), *motion, DT).unwrap()
+                JerkLimited::new(MoveRequest::within(Goal::Position(*target), *limits), *motion, DT).unwrap()
             }).collect();
             let longest = moves.iter().map(JerkLimited::duration_s).fold(0.0, f64::max);
             let duration = arrive_together(&mut moves).unwrap();

@@ -1,10 +1,11 @@
-//! Homing through the drive (mode 6): how it is asked for, and what it is to do.
+//! Homing by the drive (mode 6): handshake and parameters.
 //!
-//! [`Sequence`] is the handshake, the same for every method. [`Homing`] is the set of parameters that goes into the drive's
-//! objects before (0x6098, 0x6099, 0x609A, 0x607C; maxon: 0x30B0, 0x30B1, 0x30B2).
+//! [`Sequence`] is the handshake, which is the same for all methods. [`Homing`] contains the
+//! parameters to write before homing: 0x6098, 0x6099, 0x609A, 0x607C; maxon: 0x30B0, 0x30B1,
+//! 0x30B2.
 
 mod parameters;
-mod sequence;
+mod state_machine;
 
 pub use parameters::{Homing, HomingObject, METHODS, Method, Needs, ParameterError, method};
-pub use sequence::{HomingError, Order, Outcome, Seen, Sequence};
+pub use state_machine::{HomingError, HomingInputs, HomingOutputs, Outcome, Sequence};

@@ -1,21 +1,21 @@
-//! What a homing is to do: method, speeds and offsets, and the objects that they go into.
+//! Homing parameters: method, speeds and offsets, and the objects that contain them.
 
 use crate::limits::Limits;
 use crate::scale::Scale;
 use crate::units::{UserAcceleration, UserUnits, UserVelocity};
 
-/// What a method needs to be connected.
+/// The equipment that a method requires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Needs {
     pub negative_limit: bool,
     pub positive_limit: bool,
     pub home_switch: bool,
     pub index: bool,
-    /// A mechanical end to run into (0x30B2).
+    /// A mechanical stop (0x30B2).
     pub obstacle: bool,
 }
 
-/// One homing method (0x6098).
+/// A homing method (0x6098).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Method {
     pub code: i8,
@@ -66,7 +66,8 @@ const fn row(code: i8, text: &'static str, needs: Needs) -> Method {
     Method { code, text, needs }
 }
 
-/// The methods of CiA 402-2 (0x6098; 15, 16, 31 and 32 are reserved) and maxon's (negative), by code.
+/// The methods of CiA 402-2 (0x6098; 15, 16, 31 and 32 are reserved) and of maxon (negative),
+/// sorted by code.
 #[rustfmt::skip]
 pub const METHODS: &[Method] = &[
     row(-4, "mechanical end in negative direction", OBSTACLE),
@@ -107,29 +108,29 @@ pub const METHODS: &[Method] = &[
     row(37, "where the axis is", NOTHING),
 ];
 
-/// A method by its code. A drive may know fewer.
+/// Returns the method with this code. A drive may support fewer methods.
 #[must_use]
 pub fn method(code: i8) -> Option<&'static Method> {
     let at = METHODS.binary_search_by_key(&code, |m| m.code).ok()?;
     METHODS.get(at)
 }
 
-/// Parameters of a homing in user units. `None`: the drive's own setting stays.
+/// Homing parameters in user units. `None`: the drive keeps its own setting.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Homing {
     /// 0x6098.
     pub method: i8,
-    /// Towards the switch or the mechanical end, 0x6099:01.
+    /// Velocity to the switch or the mechanical stop, 0x6099:01.
     pub search_velocity: Option<f64>,
-    /// Off the switch and to the index, 0x6099:02.
+    /// Velocity off the switch and to the index, 0x6099:02.
     pub zero_velocity: Option<f64>,
     /// 0x609A.
     pub acceleration: Option<f64>,
-    /// How far the axis goes on from the place found, maxon's 0x30B1.
+    /// Distance of a final move away from the home position, maxon's 0x30B1.
     pub distance: Option<f64>,
-    /// What the position is there. maxon: 0x30B0; others: 0x607C, whose sign is the vendor's choice.
+    /// Position after homing. maxon: 0x30B0; others: 0x607C, whose sign depends on the vendor.
     pub position: Option<f64>,
-    /// Current that tells a mechanical end, milliamperes, maxon's 0x30B2.
+    /// Current threshold that detects a mechanical stop, milliamperes, maxon's 0x30B2.
     pub threshold_ma: Option<u16>,
 }
 
@@ -156,12 +157,12 @@ pub enum ParameterError {
     Counts { what: &'static str, value: f64 },
     #[error("{what} of {value} is less than the drive's smallest step")]
     TooSmall { what: &'static str, value: f64 },
-    #[error("homing method {0} runs into a mechanical end and needs the current that tells it")]
+    #[error("homing method {0} runs into a mechanical end and needs the current that shows it")]
     NoThreshold(i8),
 }
 
 impl Homing {
-    /// The method, and the drive's own settings.
+    /// Returns parameters with this method and the drive's own settings otherwise.
     #[must_use]
     pub const fn by(method: i8) -> Self {
         Self {
@@ -191,7 +192,7 @@ impl Homing {
             if !(value > 0.0 && value <= limit) {
                 return Err(ParameterError::Outside { what, value, limit });
             }
-            // Rounded to nothing, it would never arrive.
+            // A speed rounded to 0 would never reach home.
             if value < resolution * 0.5 {
                 return Err(ParameterError::TooSmall { what, value });
             }
@@ -212,8 +213,9 @@ impl Homing {
         Ok(())
     }
 
-    /// What to write before the first homing; `maxon`: 0x30B0 instead of 0x607C. Values are in the drive's units and
-    /// direction; of a checked set of parameters they fit.
+    /// Returns the objects to write before the first homing. `maxon`: writes 0x30B0 instead of
+    /// 0x607C. Values have the drive's units and direction. Checked parameters never exceed the
+    /// value range.
     pub fn objects(
         &self,
         scale: &Scale,
@@ -231,7 +233,7 @@ impl Homing {
         let velocity = |v: f64| i64::from(scale.velocity_to_raw(UserVelocity(v)).0).abs();
         let acceleration = |a: f64| i64::from(scale.acceleration_to_raw(UserAcceleration(a)).0);
         let position = |p: f64| scale.position_to_counts(UserUnits(p)).0;
-        // A length has the axis's direction, but not its offset.
+        // A distance has the direction of the axis but not its offset.
         let distance = |d: f64| scale.position_to_counts(UserUnits(d + scale.offset())).0;
         [
             object(0x6098, 0, 1, Some(i64::from(self.method))),
@@ -268,14 +270,14 @@ mod tests {
     }
 
     #[test]
-    fn methods_are_sorted_and_those_of_the_standard() {
+    fn methods_are_sorted_and_match_the_standard() {
         assert!(METHODS.windows(2).all(|m| m[0].code < m[1].code));
         for code in i8::MIN..=i8::MAX {
             let standard = matches!(code, 1..=14 | 17..=30 | 33..=35 | 37);
             let maxon = matches!(code, -4..=-1);
             assert_eq!(method(code).is_some(), standard || maxon, "{code}");
             if let Some(method) = method(code) {
-                // 1 to 14 and 33, 34 look for the index; 17 to 30 are the same without.
+                // 1 to 14, 33 and 34 search for the index; 17 to 30 are the same without it.
                 let index = matches!(code, -2 | -1 | 1..=14 | 33 | 34);
                 assert_eq!(method.needs.index, index, "{code}");
             }
@@ -327,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn parameters_that_cannot_work() {
+    fn invalid_parameters_are_rejected() {
         let base = Homing::by(1);
         for homing in [
             Homing::by(0),

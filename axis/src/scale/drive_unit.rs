@@ -1,21 +1,22 @@
-//! What the drive's integers count, as 0x60A9 and 0x60AA tell it in the codes of CiA 303-2.
+//! The units of the drive's integers: 0x60A9 and 0x60AA in the codes of CiA 303-2.
 
 use core::fmt;
 
 // Notation indices.
 const REVOLUTION: u8 = 0xB4;
 const INCREMENT: u8 = 0xB5;
-/// Revolutions per minute in one.
+/// Revolutions per minute in one code.
 const RPM: u8 = 0xC0;
 const PER_SECOND: u8 = 0x03;
 const PER_MINUTE: u8 = 0x47;
 const PER_SECOND_SQUARED: u8 = 0x57;
 const PREFIXES: core::ops::RangeInclusive<i8> = -9..=9;
 
-/// Encoder increments, the value of 0x60A8 that [`crate::units::Counts`] needs.
+/// The value of 0x60A8 for encoder increments, which [`crate::units::Counts`] requires.
 pub const INCREMENTS: u32 = write((INCREMENT, 0), 0);
 
-/// Numerator in bits 16–23, denominator in bits 8–15, signed power of ten in bits 24–31.
+/// Splits a code: numerator in bits 16–23, denominator in bits 8–15, signed power of ten in bits
+/// 24–31.
 fn read(code: u32) -> Option<((u8, u8), i8)> {
     let [reserved, denominator, numerator, prefix] = code.to_le_bytes();
     let prefix = i8::from_le_bytes([prefix]);
@@ -27,7 +28,7 @@ const fn write((numerator, denominator): (u8, u8), prefix: i8) -> u32 {
     u32::from_le_bytes([0, denominator, numerator, prefix])
 }
 
-/// What a velocity counts: encoder increments or turns of the motor.
+/// The base unit of a velocity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum VelocityBase {
     CountsPerSecond,
@@ -35,7 +36,7 @@ pub enum VelocityBase {
     TurnsPerMinute,
 }
 
-/// The unit of the drive's velocity objects, as 0x60A9 tells it: `10^prefix × base`.
+/// The unit of the drive's velocity objects (0x60A9): `10^prefix × base`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct VelocityUnit {
     base: VelocityBase,
@@ -55,7 +56,7 @@ impl VelocityUnit {
         Self { base, prefix: 0 }
     }
 
-    /// Reads the value of 0x60A9. `None` for a unit that is not a velocity of counts or turns.
+    /// Decodes the value of 0x60A9. Returns `None` for a unit other than counts or turns per time.
     #[must_use]
     pub fn from_si_code(code: u32) -> Option<Self> {
         let (fraction, prefix) = read(code)?;
@@ -68,7 +69,7 @@ impl VelocityUnit {
         Some(Self { base, prefix })
     }
 
-    /// The value of 0x60A9 that means this unit.
+    /// Returns the value of 0x60A9 for this unit.
     #[must_use]
     pub const fn si_code(self) -> u32 {
         let fraction = match self.base {
@@ -84,13 +85,13 @@ impl VelocityUnit {
         self.base
     }
 
-    /// Power of ten.
+    /// Returns the power of ten.
     #[must_use]
     pub const fn prefix(self) -> i8 {
         self.prefix
     }
 
-    /// How many of this unit one turn per second is.
+    /// Returns the value of one turn per second in this unit.
     pub(super) fn per_turn_per_second(self, counts_per_turn: f64) -> f64 {
         let base = match self.base {
             VelocityBase::CountsPerSecond => counts_per_turn,
@@ -102,7 +103,7 @@ impl VelocityUnit {
 }
 
 impl Default for VelocityUnit {
-    /// What a drive without 0x60A9 is taken to use.
+    /// The unit assumed for a drive without 0x60A9.
     fn default() -> Self {
         Self::COUNTS_PER_SECOND
     }
@@ -123,7 +124,7 @@ impl fmt::Display for VelocityUnit {
     }
 }
 
-/// What an acceleration counts.
+/// The base unit of an acceleration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum AccelerationBase {
     CountsPerSecondSquared,
@@ -131,7 +132,7 @@ pub enum AccelerationBase {
     TurnsPerMinutePerSecond,
 }
 
-/// The unit of the drive's acceleration objects, as 0x60AA tells it: `10^prefix × base`.
+/// The unit of the drive's acceleration objects (0x60AA): `10^prefix × base`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct AccelerationUnit {
     base: AccelerationBase,
@@ -148,7 +149,7 @@ impl AccelerationUnit {
         prefix: 0,
     };
 
-    /// Reads the value of 0x60AA. `None` for a unit that is not an acceleration of counts or turns.
+    /// Decodes the value of 0x60AA. Returns `None` for a unit other than counts or turns per time².
     #[must_use]
     pub fn from_si_code(code: u32) -> Option<Self> {
         let (fraction, prefix) = read(code)?;
@@ -161,7 +162,7 @@ impl AccelerationUnit {
         Some(Self { base, prefix })
     }
 
-    /// The value of 0x60AA that means this unit.
+    /// Returns the value of 0x60AA for this unit.
     #[must_use]
     pub const fn si_code(self) -> u32 {
         let fraction = match self.base {
@@ -172,7 +173,7 @@ impl AccelerationUnit {
         write(fraction, self.prefix)
     }
 
-    /// How many of this unit one turn per second² is.
+    /// Returns the value of one turn per second² in this unit.
     pub(super) fn per_turn_per_second_squared(self, counts_per_turn: f64) -> f64 {
         let base = match self.base {
             AccelerationBase::CountsPerSecondSquared => counts_per_turn,
@@ -184,7 +185,7 @@ impl AccelerationUnit {
 }
 
 impl From<VelocityUnit> for AccelerationUnit {
-    /// That velocity per second.
+    /// The velocity unit per second.
     fn from(unit: VelocityUnit) -> Self {
         Self {
             base: match unit.base {

@@ -1,26 +1,27 @@
-//! Axes that come round: turntables, conveyors, spindles.
+//! Modulo axes: turntables, conveyors, spindles.
 //!
-//! Positions go on counting; a modulo only says which of them are the same place, and which way leads there.
+//! Positions are not reduced. The modulo defines which positions are equivalent, and a
+//! [`ModuloDirection`] selects one of them.
 
 use super::{Scale, ScaleError};
 use crate::units::UserUnits;
 
-/// Which way to a place on a modulo axis.
+/// The direction to a target on a modulo axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Way {
-    /// To the nearest such position; of two equally near ones, forwards.
+pub enum ModuloDirection {
+    /// To the nearest equivalent position; forwards if two are equally near.
     #[default]
     Shortest,
-    /// Forwards, less than one turn.
+    /// Forwards, less than one modulo length.
     Positive,
-    /// Backwards, less than one turn.
+    /// Backwards, less than one modulo length.
     Negative,
-    /// The position itself, however many turns away.
+    /// To the given position, across any number of turns.
     AsGiven,
 }
 
 impl Scale {
-    /// Positions that differ by `length` user units are the same place.
+    /// Sets the modulo: positions that differ by `length` user units are equivalent.
     pub fn with_modulo(mut self, length: f64) -> Result<Self, ScaleError> {
         let counts = length * self.counts_per_unit();
         if !(2.0..=2f64.powi(31)).contains(&counts) {
@@ -30,28 +31,29 @@ impl Scale {
         Ok(self)
     }
 
-    /// User units that come round to the same place. `None`: not a modulo axis.
+    /// Returns the modulo length in user units. `None`: not a modulo axis.
     #[must_use]
     pub const fn modulo(&self) -> Option<f64> {
         self.modulo
     }
 
-    /// The place, from 0 to below the modulo; on other axes the position itself.
+    /// Returns the position reduced to 0 ≤ position < modulo. On other axes this is the position
+    /// itself.
     #[must_use]
     pub fn place(&self, position: UserUnits) -> UserUnits {
         let Some(length) = self.modulo else {
             return position;
         };
         let place = position.0.rem_euclid(length);
-        // A hair below zero is rounded up to the length itself.
+        // A value slightly below zero rounds up to the length itself.
         UserUnits(if place < length { place } else { 0.0 })
     }
 
-    /// The position for which an axis at `from` sets out when it is sent to `to`.
+    /// Returns the absolute target of an axis at `from` that moves to `to`.
     ///
-    /// A place less than half a count away is where the axis stands: it does not turn once round to get there.
+    /// If the target is less than half a count away, the axis does not move a full turn.
     #[must_use]
-    pub fn destination(&self, from: UserUnits, to: UserUnits, way: Way) -> UserUnits {
+    pub fn destination(&self, from: UserUnits, to: UserUnits, way: ModuloDirection) -> UserUnits {
         let Some(length) = self.modulo else {
             return to;
         };
@@ -59,15 +61,15 @@ impl Scale {
         let forwards = (self.place(to).0 - self.place(from).0).rem_euclid(length);
         let standing = forwards < half_a_count || length - forwards < half_a_count;
         let by = match way {
-            Way::AsGiven => return to,
+            ModuloDirection::AsGiven => return to,
             _ if standing && forwards > length / 2.0 => forwards - length,
             _ if standing => forwards,
-            Way::Positive => forwards,
-            Way::Negative => forwards - length,
-            Way::Shortest if forwards <= length / 2.0 => forwards,
-            Way::Shortest => forwards - length,
+            ModuloDirection::Positive => forwards,
+            ModuloDirection::Negative => forwards - length,
+            ModuloDirection::Shortest if forwards <= length / 2.0 => forwards,
+            ModuloDirection::Shortest => forwards - length,
         };
-        // Of all positions at that place, written as whole turns and the place, so that nothing adds up over turns.
+        // Whole turns plus the reduced position: rounding errors do not accumulate over turns.
         let turns = ((from.0 + by - self.place(to).0) / length).round();
         UserUnits(turns.mul_add(length, self.place(to).0))
     }

@@ -7,7 +7,7 @@ fn epos(unit: VelocityUnit) -> Scale {
 }
 
 #[test]
-fn si_codes() {
+fn velocity_units_follow_the_si_codes() {
     for (code, unit, text) in [
         (0x00B4_4700, VelocityUnit::RPM, "rpm"),
         (0xFDB4_4700, VelocityUnit::MILLI_RPM, "mrpm"),
@@ -22,14 +22,14 @@ fn si_codes() {
         VelocityUnit::from_si_code(0xFEB4_4700).unwrap().to_string(),
         "10^-2 rpm"
     );
-    // An acceleration, a position, nonsense.
+    // An acceleration, a position, invalid codes.
     for code in [0x00C0_0300, 0x00B5_0000, 0, u32::MAX, 0x80B4_4700] {
         assert_eq!(VelocityUnit::from_si_code(code), None, "{code:#010x}");
     }
 }
 
 #[test]
-fn velocity_in_each_unit() {
+fn velocities_convert_in_each_unit() {
     // 5 mm per turn: 200 mm/s is 40 turns/s.
     for (unit, raw) in [
         (VelocityUnit::RPM, 2400),
@@ -55,7 +55,7 @@ fn velocity_in_each_unit() {
 }
 
 #[test]
-fn rounds_to_nearest() {
+fn positions_round_to_nearest() {
     let scale = Scale::new(1.0, 1.0).unwrap();
     for (user, counts) in [(0.4, 0), (0.6, 1), (-0.4, 0), (-0.6, -1), (2.5, 3)] {
         assert_eq!(scale.position_to_counts(UserUnits(user)), Counts(counts));
@@ -64,7 +64,7 @@ fn rounds_to_nearest() {
 }
 
 #[test]
-fn inversion_and_offset() {
+fn scale_applies_inversion_and_offset() {
     let scale = epos(VelocityUnit::RPM)
         .with_invert(true)
         .with_offset(10.0)
@@ -78,7 +78,7 @@ fn inversion_and_offset() {
 }
 
 #[test]
-fn nonsense_is_refused() {
+fn invalid_scales_are_rejected() {
     for (counts, units) in [
         (0.0, 1.0),
         (-1.0, 1.0),
@@ -124,7 +124,7 @@ proptest! {
 }
 
 #[test]
-fn acceleration_units() {
+fn acceleration_units_follow_the_si_codes() {
     for (code, text, raw) in [
         // 5 mm per turn of 2000 counts: 200 mm/s² is 40 turns/s².
         (0x00C0_0300, "rpm/s", 2400),
@@ -140,18 +140,18 @@ fn acceleration_units() {
         let back = scale.acceleration_to_user(RawAcceleration(raw));
         assert!((back.0 - 200.0).abs() < 1e-9);
     }
-    // Velocities, a position, nonsense.
+    // Velocities, a position, invalid codes.
     for code in [0x00B4_4700, 0x00B4_0300, 0x00B5_0000, 0, u32::MAX] {
         assert_eq!(AccelerationUnit::from_si_code(code), None, "{code:#010x}");
     }
-    // Without one, the velocity's per second.
+    // The default is the velocity unit per second.
     let unit = epos(VelocityUnit::RPM).acceleration_unit();
     assert_eq!(unit, AccelerationUnit::RPM_PER_SECOND);
 }
 
 #[test]
-fn a_drivetrain() {
-    // An encoder of 500 lines, a gear of 66:5, a spindle of 2 mm.
+fn scale_follows_the_drivetrain() {
+    // An encoder with 500 lines, a gear 66:5, a spindle with 2 mm lead.
     let drivetrain = Drivetrain {
         encoder: [2000, 1],
         gear: [66, 5],
@@ -159,9 +159,9 @@ fn a_drivetrain() {
     };
     let scale = Scale::of_drivetrain(&drivetrain).unwrap();
     assert_eq!(scale.counts_per_turn(), 2000.0);
-    // Five turns of the shaft: 66 of the motor.
+    // Five turns of the shaft are 66 turns of the motor.
     assert_eq!(scale.position_to_counts(UserUnits(10.0)), Counts(132_000));
-    // 2^20 increments on three turns.
+    // 2^20 increments per three turns.
     let resolver = Scale::of_drivetrain(&Drivetrain {
         encoder: [1 << 20, 3],
         gear: [1, 1],
@@ -202,7 +202,7 @@ fn a_drivetrain() {
 }
 
 #[test]
-fn torque_in_newton_metres_and_amperes() {
+fn torque_converts_from_newton_metres_and_amperes() {
     use crate::units::{Amperes, NewtonMetres};
 
     // 118.4 mNm, 26.3 mNm/A.
@@ -242,10 +242,10 @@ fn torque_in_newton_metres_and_amperes() {
     }
 }
 
-/// A turntable of 360°, from where to where, and at what position that is.
+/// A turntable of 360°: start, target, expected absolute position.
 #[test]
-fn ways_round() {
-    use Way::{AsGiven, Negative, Positive, Shortest};
+fn modulo_directions_row_by_row() {
+    use ModuloDirection::{AsGiven, Negative, Positive, Shortest};
     let scale = Scale::new(3600.0, 360.0)
         .unwrap()
         .with_modulo(360.0)
@@ -266,7 +266,7 @@ fn ways_round() {
         (180.0, 0.0, Shortest, 360.0),
         (0.0, 725.0, Positive, 5.0),
         (0.0, 725.0, AsGiven, 725.0),
-        // There already, but for the rounding to counts.
+        // Already at the target within the rounding to counts.
         (89.96, 90.0, Negative, 90.0),
         (90.04, 90.0, Positive, 90.0),
         (359.97, 0.0, Negative, 360.0),
@@ -291,19 +291,20 @@ fn ways_round() {
     }
 }
 
-fn way() -> impl Strategy<Value = Way> {
+fn way() -> impl Strategy<Value = ModuloDirection> {
     prop::sample::select(vec![
-        Way::Shortest,
-        Way::Positive,
-        Way::Negative,
-        Way::AsGiven,
+        ModuloDirection::Shortest,
+        ModuloDirection::Positive,
+        ModuloDirection::Negative,
+        ModuloDirection::AsGiven,
     ])
 }
 
 proptest! {
-    /// The destination is the place asked for, not farther than the way says, and where the axis stands already it stays.
+    /// The destination is equivalent to the target and within the bounds of the direction. An axis
+    /// at the target stays there.
     #[test]
-    fn destinations(
+    fn modulo_destinations_reach_the_target(
         counts in -(1i64 << 36)..(1i64 << 36), to in -1e4..1e4f64, way in way(),
         per_turn in 100.0..1e6f64, units in 0.1..1e3f64, modulo in 0.5..2e3f64, offset in -1e3..1e3f64,
     ) {
@@ -317,16 +318,16 @@ proptest! {
         prop_assert!(apart.min((modulo - apart).abs()) <= rounding, "{:?}", destination);
         let by = destination.0 - from.0;
         match way {
-            Way::Shortest => prop_assert!(by.abs() <= modulo / 2.0 + rounding),
-            Way::Positive => prop_assert!((-count..modulo + rounding).contains(&by)),
-            Way::Negative => prop_assert!((-modulo - rounding..=count).contains(&by)),
-            Way::AsGiven => prop_assert_eq!(destination.0, to),
+            ModuloDirection::Shortest => prop_assert!(by.abs() <= modulo / 2.0 + rounding),
+            ModuloDirection::Positive => prop_assert!((-count..modulo + rounding).contains(&by)),
+            ModuloDirection::Negative => prop_assert!((-modulo - rounding..=count).contains(&by)),
+            ModuloDirection::AsGiven => prop_assert_eq!(destination.0, to),
         }
     }
 
-    /// A turntable sent on by a third of a turn, in the same direction for ever, does not drift by a count.
+    /// Repeated moves by a third of a turn do not drift by one count.
     #[test]
-    fn no_drift(gear in prop::sample::select(vec![[3u32, 1u32], [7, 3], [66, 5], [1, 7]]), turns in 1i64..10_000_000) {
+    fn modulo_moves_do_not_drift(gear in prop::sample::select(vec![[3u32, 1u32], [7, 3], [66, 5], [1, 7]]), turns in 1i64..10_000_000) {
         let drivetrain = Drivetrain { encoder: [2048, 1], gear, feed: 360.0 };
         let scale = Scale::of_drivetrain(&drivetrain).unwrap().with_modulo(360.0).unwrap();
         let [motor, shaft] = gear.map(i128::from);
@@ -335,7 +336,7 @@ proptest! {
         let mut at = UserUnits(turns as f64 * 360.0);
         for thirds in 1..=3i128 {
             let place = UserUnits([0.0, 120.0, 240.0][(thirds % 3) as usize]);
-            at = scale.destination(at, place, Way::Positive);
+            at = scale.destination(at, place, ModuloDirection::Positive);
             let Counts(counts) = scale.position_to_counts(at);
             prop_assert!((i128::from(counts) - exact(before + thirds)).abs() <= i128::from(gear == [1, 7]) , "{} {}", counts, exact(before + thirds));
             at = scale.position_to_user(Counts(counts));
@@ -343,14 +344,14 @@ proptest! {
     }
 
     #[test]
-    fn homed_where_it_is_said_to_be(counts in -(1i64 << 40)..(1i64 << 40), position in -1e6..1e6f64, invert: bool) {
+    fn homing_sets_the_given_position(counts in -(1i64 << 40)..(1i64 << 40), position in -1e6..1e6f64, invert: bool) {
         let scale = epos(VelocityUnit::RPM).with_invert(invert).homed(Counts(counts), UserUnits(position)).unwrap();
         prop_assert_eq!(scale.position_to_counts(UserUnits(position)), Counts(counts));
         prop_assert!((scale.position_to_user(Counts(counts)).0 - position).abs() < 1e-5);
     }
 
     #[test]
-    fn any_numbers(numbers in prop::array::uniform4(any::<f64>()), ratios in prop::array::uniform4(any::<u32>()), counts: i64, way in way()) {
+    fn any_number_gives_a_scale_or_an_error(numbers in prop::array::uniform4(any::<f64>()), ratios in prop::array::uniform4(any::<u32>()), counts: i64, way in way()) {
         let [a, b, c, d] = numbers;
         let [e, f, g, h] = ratios;
         let drivetrain = Drivetrain { encoder: [e, f], gear: [g, h], feed: a };
@@ -360,8 +361,8 @@ proptest! {
             let _ = scale.place(UserUnits(c));
             let _ = scale.position_to_counts(scale.destination(UserUnits(c), UserUnits(d), way));
             let _ = scale.position_to_user(Counts(counts));
-            let offered = Offered { encoder_resolution: Some([e, f]), gear_ratio: Some([g, h]), position_unit: Some(e), velocity_unit: Some(f),
-                acceleration_unit: Some(g), rated_torque: Some(h), ..Offered::default() };
+            let offered = DriveUnits { encoder_resolution: Some([e, f]), gear_ratio: Some([g, h]), position_unit: Some(e), velocity_unit: Some(f),
+                acceleration_unit: Some(g), rated_torque: Some(h), ..DriveUnits::default() };
             for found in offered.contradictions(&scale, Some(e)) {
                 prop_assert!(!found.to_string().is_empty());
             }

@@ -1,9 +1,9 @@
-//! Torque in what the user thinks in. On the wire it is per thousand of the motor's rated torque (0x6076).
+//! Torque in user units. The drive uses thousandths of the motor's rated torque (0x6076).
 
 use super::ScaleError;
 use crate::units::{Amperes, NewtonMetres, Percent};
 
-/// What is known of a motor. The torque is the motor's own, before any gear.
+/// Torque parameters of a motor. The torque is the motor's, before any gear.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TorqueScale {
     rated: Option<f64>,
@@ -11,7 +11,8 @@ pub struct TorqueScale {
 }
 
 impl TorqueScale {
-    /// `rated` torque (0x6076) in Nm, torque `constant` in Nm/A; either may be unknown.
+    /// `rated`: rated torque (0x6076) in Nm. `constant`: torque constant in Nm/A. Both may be
+    /// unknown.
     pub fn new(rated: Option<f64>, constant: Option<f64>) -> Result<Self, ScaleError> {
         for (what, value) in [("rated torque", rated), ("torque constant", constant)] {
             if let Some(value) = value

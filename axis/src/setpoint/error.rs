@@ -1,11 +1,11 @@
-//! Why a set-point is refused before its first cycle.
+//! Reasons to reject a set-point before its first cycle.
 
 use super::{Motion, MotionLimits};
 
-/// Beyond this, user units are no lengths any more, and products of them leave f64's range.
+/// Largest accepted position. Products of larger positions could exceed the range of f64.
 const FARTHEST: f64 = 1e15;
 
-/// What limits may be, so that no quotient or product of them overflows.
+/// Accepted range of limits, so that no quotient or product overflows.
 const USABLE: core::ops::RangeInclusive<f64> = 1e-12..=1e15;
 
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -64,7 +64,7 @@ pub(crate) fn usable(what: &'static str, value: f64) -> Result<(), SetpointError
 }
 
 impl MotionLimits {
-    /// Every one a number that can be reckoned with.
+    /// Checks that all limits are in the usable range.
     pub fn check(&self) -> Result<(), SetpointError> {
         usable("velocity limit", self.velocity)?;
         usable("acceleration limit", self.acceleration)?;

@@ -1,23 +1,25 @@
-//! One axis after another: follower = ratio × master + offset.
+//! Electronic gear: follower = ratio × master + offset.
 //!
-//! The master is what its axis commands or reports, as the caller likes. While engaged, the follower is where it is to be in every cycle,
-//! exactly, as long as its own limits allow it; where they do not, at first or because the master jumps, it catches up within them.
-//! With smoothing the follower is there on average: reported positions are noisy, and noise is not followed.
+//! The caller chooses the master position, commanded or reported. While engaged, the follower is
+//! exactly at its ideal position in every cycle, within its own limits. If the limits do not allow
+//! this, at the start or after a jump of the master, it catches up within them. With smoothing, the
+//! follower is at its ideal position on average: it does not follow the noise of reported
+//! positions.
 
 use super::error::{position, usable};
 use super::{Motion, MotionLimits, SetpointError, braking_velocity};
 
-/// Braking is planned with this part of the acceleration; the rest is for rounding.
+/// Fraction of the acceleration used to plan braking. The rest covers rounding.
 const PLANNED: f64 = 1.0 - 1e-4;
 
-/// What of the acceleration limit is for catching up. The rest is for following meanwhile.
+/// Fraction of the acceleration limit for catching up. The rest is for following meanwhile.
 const CATCHING_UP: f64 = 0.5;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Engage {
-    /// With the offset that both have now: only the velocity has to be caught up with.
+pub enum GearInMode {
+    /// With the present offset: the follower only has to reach the velocity.
     Here,
-    /// With this offset, in the follower's units: the way there is caught up with, too.
+    /// With this offset in the follower's units: the follower also catches up with the position.
     At { offset: f64 },
 }
 
@@ -25,20 +27,23 @@ pub enum Engage {
 pub struct GearConfig {
     /// Follower's units per master's unit; negative for opposite directions.
     pub ratio: f64,
-    pub engage: Engage,
-    /// Time constant with which the master's velocity is smoothed, seconds; 0 for none. Reported positions come in whole counts, and their
-    /// differences would otherwise exceed the follower's acceleration. A master at rest or at constant velocity is followed without lag.
-    /// With smoothing, the follower is engaged as long as it is near on average: what is left of the noise may ask for more than
-    /// its acceleration.
+    pub engage: GearInMode,
+    /// Time constant in seconds that smooths the master's velocity; 0: no smoothing.
+    ///
+    /// Reported positions are whole counts, and their differences would exceed the follower's
+    /// acceleration. A master at rest or at constant velocity is followed without lag. With
+    /// smoothing, the follower counts as engaged while it is near on average, because the remaining
+    /// noise may exceed its acceleration.
     pub smoothing_s: f64,
     pub limits: MotionLimits,
     pub range: Option<[f64; 2]>,
 }
 
-/// The longest smoothing, seconds.
+/// The longest smoothing time, seconds.
 const SMOOTHEST_S: f64 = 10.0;
 
-/// Takes over from any motion; any other source takes over from it. To disengage is to give the follower another source.
+/// Follows a master axis. Takes over from any motion, and any other source takes over from it. To
+/// disengage, give the follower another source.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gear {
     ratio: f64,
@@ -46,18 +51,18 @@ pub struct Gear {
     limits: MotionLimits,
     range: Option<[f64; 2]>,
     smoothing_s: f64,
-    /// The master, smoothed.
+    /// The smoothed master.
     master: Motion,
-    /// Where the follower was to be in the last cycle.
+    /// Ideal position of the follower in the last cycle.
     ideal: f64,
-    /// How far the follower is from there, averaged over the smoothing time.
+    /// Distance from the ideal position, averaged over the smoothing time.
     behind: f64,
     engaged: bool,
     slips: u32,
 }
 
 impl Gear {
-    /// `master` and `motion` (the follower's set-point) as they are now.
+    /// `master` and `motion` (the follower's set-point) are the present motions.
     pub fn new(config: GearConfig, master: Motion, motion: Motion) -> Result<Self, SetpointError> {
         usable("gear ratio", config.ratio.abs())?;
         config.limits.check()?;
@@ -70,8 +75,8 @@ impl Gear {
             });
         }
         let offset = match config.engage {
-            Engage::Here => motion.position - config.ratio * master.position,
-            Engage::At { offset } => offset,
+            GearInMode::Here => motion.position - config.ratio * master.position,
+            GearInMode::At { offset } => offset,
         };
         position("gear offset", offset)?;
         let ideal = config.ratio * master.position + offset;
@@ -90,7 +95,7 @@ impl Gear {
         })
     }
 
-    /// The follower is where it is to be; with smoothing, but for the noise.
+    /// Returns true if the follower is at its ideal position; with smoothing, on average.
     #[must_use]
     pub const fn engaged(&self) -> bool {
         self.engaged
@@ -101,14 +106,14 @@ impl Gear {
         self.offset
     }
 
-    /// How many times it was engaged and could not follow.
+    /// Returns how many times the engaged follower could not follow.
     #[must_use]
-    pub const fn slips(&self) -> u32 {
+    pub const fn lag_cycles(&self) -> u32 {
         self.slips
     }
 
-    /// One cycle on from `motion`; `master` is where the master is at its end. What is not a number leaves the master where it was.
-    /// RT: O(1).
+    /// Advances one cycle from `motion`. `master` is the master's motion at the end of the cycle. A
+    /// value that is not finite leaves the master unchanged. RT: O(1).
     #[must_use]
     pub fn advance(&mut self, master: Motion, motion: Motion, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
@@ -128,12 +133,12 @@ impl Gear {
         let braking = self.limits.acceleration * CATCHING_UP * PLANNED;
         let closing = braking_velocity(left.abs(), braking, dt_s);
         let wanted = if self.smoothing_s > 0.0 {
-            // What is left of the noise is averaged out, not followed.
+            // The remaining noise is averaged and not followed.
             let closing = closing.min(left.abs() / self.smoothing_s);
             self.ratio * self.master.velocity + closing.copysign(left)
         } else {
             let velocity = (self.ideal - before) / dt_s;
-            // Exactly there, at the velocity that keeps it there.
+            // Exactly at the ideal position, with a velocity that keeps it there.
             let needed = (self.ideal - motion.position) / dt_s;
             let possible = (slowest..=fastest).contains(&needed);
             let change = self.limits.acceleration * CATCHING_UP * dt_s;
@@ -143,7 +148,7 @@ impl Gear {
             }
             velocity + closing.copysign(left)
         };
-        // Not `clamp`: it panics on bounds that are not numbers.
+        // Not `clamp`: it panics if a bound is NaN.
         let velocity = wanted.max(slowest).min(fastest);
         let next = motion.then(motion.position + velocity * dt_s, velocity, dt_s);
         self.engaged = self.follows(next, was_engaged, dt_s);
@@ -153,7 +158,8 @@ impl Gear {
         next
     }
 
-    /// Whether the follower of a smoothed master is as near as smoothing and noise let it be.
+    /// Returns true if the follower is engaged. With smoothing it must be as near as smoothing and
+    /// noise allow.
     fn follows(&mut self, next: Motion, was_engaged: bool, dt_s: f64) -> bool {
         let limits = &self.limits;
         if self.smoothing_s == 0.0 {
@@ -161,14 +167,14 @@ impl Gear {
         }
         let kept = (-dt_s / self.smoothing_s).exp();
         self.behind = self.behind * kept + (self.ideal - next.position) * (1.0 - kept);
-        // A master that accelerates with the follower's limit is ahead by half of it: the smoothed velocity is late by
-        // twice the smoothing time.
+        // A master that accelerates with the follower's limit is ahead by half of this distance.
+        // The smoothed velocity lags by twice the smoothing time.
         let near = self.behind.abs() <= 4.0 * limits.acceleration * self.smoothing_s.powi(2);
         let relative = (self.ratio * self.master.velocity - next.velocity).abs();
         near && (was_engaged || relative <= limits.acceleration * self.smoothing_s)
     }
 
-    /// An α-β filter, critically damped.
+    /// Updates the smoothed master: an α-β filter, critically damped.
     fn track(&mut self, master: Motion, dt_s: f64) {
         if self.smoothing_s == 0.0 {
             self.master = master;
@@ -186,7 +192,8 @@ impl Gear {
         };
     }
 
-    /// Lowest and highest velocity of this cycle: within the limits, and such that the follower can still stop in its range.
+    /// Returns the lowest and highest velocity of this cycle, within the limits and such that the
+    /// follower can stop in its range.
     fn possible(&self, motion: Motion, dt_s: f64) -> [f64; 2] {
         let limits = &self.limits;
         let change = limits.acceleration * dt_s;
@@ -199,7 +206,7 @@ impl Gear {
             fastest = fastest.min(up.max(motion.velocity - change));
             slowest = slowest.max((-down).min(motion.velocity + change));
         }
-        // Faster than the limit when it took over: it can only brake.
+        // The motion was faster than the limit at the take-over: it can only brake.
         if slowest > fastest {
             if motion.velocity > 0.0 {
                 fastest = slowest;

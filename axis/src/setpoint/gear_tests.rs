@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
-use super::super::sequence::Sequence;
-use super::super::{Goal, JerkLimited, Order, Setpoint};
+use super::super::test_support::Sequence;
+use super::super::{Goal, JerkLimited, MoveRequest, Setpoint};
 use super::*;
 
 const DT: f64 = 0.001;
@@ -12,7 +12,7 @@ const LIMITS: MotionLimits = MotionLimits {
     jerk: 40_000.0,
 };
 
-fn config(ratio: f64, engage: Engage) -> GearConfig {
+fn config(ratio: f64, engage: GearInMode) -> GearConfig {
     GearConfig {
         ratio,
         engage,
@@ -22,10 +22,10 @@ fn config(ratio: f64, engage: Engage) -> GearConfig {
     }
 }
 
-/// A master at 50, a follower at rest: it accelerates, catches up with what it missed, and stays.
+/// A master at 50 and a follower at rest: the follower accelerates, catches up and stays engaged.
 #[test]
-fn engages_with_a_moving_master() {
-    for engage in [Engage::Here, Engage::At { offset: 100.0 }] {
+fn gear_engages_with_a_moving_master() {
+    for engage in [GearInMode::Here, GearInMode::At { offset: 100.0 }] {
         let mut master = Motion {
             velocity: 50.0,
             ..Motion::at(10.0)
@@ -45,19 +45,28 @@ fn engages_with_a_moving_master() {
                 assert_eq!(engaged_at, None);
             }
         }
-        // 100/1000 s to brake relatively, and the way, at 100 faster at most.
-        let most = if engage == Engage::Here { 250 } else { 1200 };
+        // 100/1000 s to reach the relative velocity; then the distance, at most 100 faster.
+        let most = if engage == GearInMode::Here {
+            250
+        } else {
+            1200
+        };
         assert!(
             engaged_at.is_some_and(|cycle| cycle < most),
             "{engaged_at:?}"
         );
-        assert_eq!(gear.slips(), 0);
+        assert_eq!(gear.lag_cycles(), 0);
     }
 }
 
 #[test]
-fn a_jump_of_the_master_is_caught_up_with() {
-    let mut gear = Gear::new(config(1.0, Engage::Here), Motion::at(0.0), Motion::at(0.0)).unwrap();
+fn gear_catches_up_after_a_jump_of_the_master() {
+    let mut gear = Gear::new(
+        config(1.0, GearInMode::Here),
+        Motion::at(0.0),
+        Motion::at(0.0),
+    )
+    .unwrap();
     let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
     for cycle in 0..1000 {
         let master = Motion::at(if cycle < 10 { 0.0 } else { 20.0 });
@@ -67,19 +76,19 @@ fn a_jump_of_the_master_is_caught_up_with() {
         assert!(sequence.motion.position <= 20.0 + 1e-9);
     }
     assert!(gear.engaged() && sequence.motion.stands_at(20.0));
-    assert_eq!(gear.slips(), 1);
-    // What is no number does not move it.
+    assert_eq!(gear.lag_cycles(), 1);
+    // A NaN does not move the follower.
     let next = gear.advance(Motion::at(f64::NAN), sequence.motion, DT);
     assert!(next.stands_at(20.0));
 }
 
 #[test]
-fn a_reported_master_is_smoothed() {
+fn gear_smooths_a_reported_master() {
     // 0.0025 per count, in whole counts: 2.5 per second and cycle, an acceleration of 2500.
     let mut gear = Gear::new(
         GearConfig {
             smoothing_s: 0.02,
-            ..config(1.0, Engage::Here)
+            ..config(1.0, GearInMode::Here)
         },
         Motion {
             velocity: 33.3,
@@ -101,14 +110,14 @@ fn a_reported_master_is_smoothed() {
         }
     }
     assert!(gear.engaged());
-    assert_eq!(gear.slips(), 0);
+    assert_eq!(gear.lag_cycles(), 0);
     assert!(worst < 0.0025, "{worst}");
 }
 
-/// A drive samples its position with its own loop: two or three of its cycles in one of the bus. Half of the bus cycles say too
-/// much, half too little, and the more so the faster the master is.
+/// A drive samples its position in its own loop: two or three of its cycles per bus cycle. Half of
+/// the bus cycles report too long a way, half too short. The error grows with the velocity.
 #[test]
-fn a_master_sampled_by_its_own_loop_is_followed_up_to_the_velocity_limit() {
+fn gear_follows_a_master_sampled_by_its_own_loop() {
     const SAMPLE: f64 = 0.0004;
     for part in [0.2, 0.45, 0.6, 0.8, 0.95] {
         for acceleration in [300.0, 2000.0] {
@@ -120,14 +129,14 @@ fn a_master_sampled_by_its_own_loop_is_followed_up_to_the_velocity_limit() {
             let config = GearConfig {
                 smoothing_s: 0.01,
                 limits,
-                ..config(1.0, Engage::Here)
+                ..config(1.0, GearInMode::Here)
             };
             let start = Motion {
                 velocity,
                 ..Motion::at(0.0)
             };
             let mut gear = Gear::new(config, start, start).unwrap();
-            // Every cycle's velocity, acceleration and jerk are judged.
+            // `sequence` checks velocity and acceleration in every cycle.
             let mut sequence = Sequence::from(start, limits, DT);
             let (mut apart, mut worst) = (0, 0.0f64);
             for cycle in 1..4000 {
@@ -141,24 +150,24 @@ fn a_master_sampled_by_its_own_loop_is_followed_up_to_the_velocity_limit() {
                 }
             }
             assert_eq!(apart, 0, "{part} {acceleration}");
-            // What a sample can be late, and what the smoothing leaves of it.
+            // The delay of one sample, reduced by the smoothing.
             assert!(worst <= 1.5 * SAMPLE * velocity, "{part}: {worst}");
         }
     }
 }
 
-/// A master far beyond the follower's range, either way, and back.
+/// A master far beyond both ends of the follower's range, and back.
 #[test]
-fn stops_at_the_end_of_the_range() {
+fn gear_stops_at_the_end_of_the_range() {
     for sign in [1.0, -1.0] {
         let config = GearConfig {
             range: Some([-10.0, 10.0]),
-            ..config(sign, Engage::Here)
+            ..config(sign, GearInMode::Here)
         };
         let mut gear = Gear::new(config, Motion::at(0.0), Motion::at(0.0)).unwrap();
         let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
         for cycle in 0..3000 {
-            // To 90 and back at once, with steps of the velocity to catch up with.
+            // To 90 and back without a pause, with velocity steps to catch up with.
             let master = f64::from((cycle - 1000i32).abs().min(900)) * -0.1 + 90.0;
             sequence
                 .then(gear.advance(Motion::at(master), sequence.motion, DT))
@@ -170,29 +179,29 @@ fn stops_at_the_end_of_the_range() {
             }
         }
         assert!(gear.engaged() && sequence.motion.stands_at(0.0));
-        assert!(gear.slips() >= 1);
+        assert!(gear.lag_cycles() >= 1);
     }
 }
 
 #[test]
-fn nonsense_is_refused() {
+fn gear_rejects_invalid_configurations() {
     let at = Motion::at(0.0);
     for ratio in [0.0, f64::NAN, f64::INFINITY, 1e-300] {
-        assert!(Gear::new(config(ratio, Engage::Here), at, at).is_err());
+        assert!(Gear::new(config(ratio, GearInMode::Here), at, at).is_err());
     }
     for value in [f64::NAN, 1e300] {
-        assert!(Gear::new(config(1.0, Engage::At { offset: value }), at, at).is_err());
-        assert!(Gear::new(config(1.0, Engage::Here), Motion::at(value), at).is_err());
-        assert!(Gear::new(config(1.0, Engage::Here), at, Motion::at(value)).is_err());
+        assert!(Gear::new(config(1.0, GearInMode::At { offset: value }), at, at).is_err());
+        assert!(Gear::new(config(1.0, GearInMode::Here), Motion::at(value), at).is_err());
+        assert!(Gear::new(config(1.0, GearInMode::Here), at, Motion::at(value)).is_err());
         let smoothed = GearConfig {
             smoothing_s: value,
-            ..config(1.0, Engage::Here)
+            ..config(1.0, GearInMode::Here)
         };
         assert!(Gear::new(smoothed, at, at).is_err());
     }
     assert!(
         Gear::new(
-            config(1e12, Engage::At { offset: 0.0 }),
+            config(1e12, GearInMode::At { offset: 0.0 }),
             Motion::at(1e12),
             at
         )
@@ -201,25 +210,25 @@ fn nonsense_is_refused() {
 }
 
 proptest! {
-    /// A master that goes anywhere, jumps and stops; engaged and given up at any time. Never beyond a limit, never outside the range, and
-    /// exactly there once the master stands.
+    /// A master with arbitrary moves, jumps and stops; engaged and disengaged at any time. The
+    /// follower keeps limits and range, and reaches its ideal position once the master stands.
     #[test]
-    fn keeps_the_limits(
+    fn gear_keeps_the_limits(
         ratio in prop_oneof![-3.0..-0.1f64, 0.1..3.0f64], absolute in prop::option::of(-30.0..30.0f64), ranged in any::<bool>(),
         smoothing_s in prop::sample::select(vec![0.0, 0.01]),
         moves in prop::collection::vec((-15.0..15.0f64, 0u32..400, prop::option::weighted(0.1, -5.0..5.0f64)), 1..8),
         velocity in -150.0..150.0f64,
     ) {
         let range = ranged.then_some([-60.0, 60.0]);
-        let engage = absolute.map_or(Engage::Here, |offset| Engage::At { offset });
+        let engage = absolute.map_or(GearInMode::Here, |offset| GearInMode::At { offset });
         let mut master = Motion::at(0.0);
-        let mut source = JerkLimited::new(Order::within(Goal::Position(0.0), LIMITS), master, DT).unwrap();
+        let mut source = JerkLimited::new(MoveRequest::within(Goal::Position(0.0), LIMITS), master, DT).unwrap();
         let start = Motion { velocity, ..Motion::at(5.0) };
         let mut gear = Gear::new(GearConfig { range, smoothing_s, ..config(ratio, engage) }, master, start).unwrap();
         let mut sequence = Sequence::from(start, LIMITS, DT);
         for (target, cycles, jump) in moves.into_iter().chain([(1.0, 6000, None)]) {
             master.position += jump.unwrap_or(0.0);
-            source = source.redirect(Order::within(Goal::Position(target), LIMITS), master, DT).unwrap();
+            source = source.redirect(MoveRequest::within(Goal::Position(target), LIMITS), master, DT).unwrap();
             for _ in 0..cycles {
                 master = source.advance(master, DT);
                 sequence.then(gear.advance(master, sequence.motion, DT))?;
@@ -238,11 +247,11 @@ proptest! {
     }
 
     #[test]
-    fn any_numbers(
+    fn gear_stays_finite_with_any_number(
         ratio: f64, offset: f64, smoothing_s in 0.0..1.0f64,
         cycles in prop::collection::vec((any::<f64>(), any::<f64>(), any::<f64>()), 1..20),
     ) {
-        let config = GearConfig { smoothing_s, ..config(ratio, Engage::At { offset }) };
+        let config = GearConfig { smoothing_s, ..config(ratio, GearInMode::At { offset }) };
         if let Ok(mut gear) = Gear::new(config, Motion::at(0.0), Motion::at(0.0)) {
             let mut motion = Motion::at(0.0);
             for (position, velocity, dt) in cycles {

@@ -1,4 +1,4 @@
-//! Stand still; brake first if moving.
+//! Standstill; a moving axis brakes first.
 
 use super::{Motion, Ramp, Setpoint};
 
@@ -8,7 +8,7 @@ pub struct Hold {
 }
 
 impl Hold {
-    /// RT: O(1).
+    /// Advances one cycle. RT: O(1).
     #[must_use]
     pub fn advance(self, motion: Motion, dt_s: f64) -> Motion {
         let velocity = Ramp {
@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn brakes_then_holds() {
+    fn hold_brakes_then_stands() {
         let hold = Hold {
             acceleration: 100.0,
         };
@@ -57,7 +57,7 @@ mod tests {
             motion = next;
         }
         assert_eq!(motion.velocity, 0.0);
-        // v²/2a = 0.5, less half a cycle.
+        // v²/2a = 0.5, minus half a cycle.
         assert!((motion.position - 0.5).abs() < 0.006);
     }
 }

@@ -1,43 +1,46 @@
 //! Set-points, advanced one cycle at a time, in user units.
 //!
-//! A [`Motion`] is where the set-point is; a [`Setpoint`] says where it goes next:
+//! A [`Motion`] is the present set-point; a [`Setpoint`] advances it:
 //!
-//! | source | what it does |
+//! | source | motion |
 //! |---|---|
 //! | [`Hold`] | brakes, then stands |
 //! | [`Trapezoid`] | to a position, with bounded velocity and acceleration |
-//! | [`JerkLimited`] | to a position, or to a velocity, with bounded jerk as well |
-//! | [`crate::group::Along`] | to a position, on a straight line with other axes |
+//! | [`JerkLimited`] | to a position or a velocity, with bounded jerk as well |
+//! | [`crate::group::LinePath`] | to a position, on a straight line with other axes |
 //! | [`PositionWave`] | sine and square waves for commissioning |
-//! | [`Stream`] | through points that arrive while it moves |
+//! | [`Stream`] | through points that arrive during the motion |
 //! | [`Playback`] | through the points of a [`Table`] |
-//! | [`Gear`] | after another axis |
+//! | [`Gear`] | follows another axis |
 //!
-//! [`Source`] is any of those that need nothing but the motion. [`Ramp`] is for a single value: velocity in CSV, torque in CST. [`Hold`], [`Trapezoid`] and [`Ramp`] remember neither a start nor a time;
-//! the others follow a plan, and make a new one when they find the axis elsewhere than they left it. So any of them can take over in any
+//! [`Source`] is any of the sources that need only the motion. [`Ramp`] is for a single value:
+//! velocity in CSV, torque in CST.
+//!
+//! [`Hold`], [`Trapezoid`] and [`Ramp`] store neither a start nor a time. The others follow a plan,
+//! and plan again if `motion` differs from their last result. So each of them can take over in any
 //! cycle, at any velocity, without a jump.
 //!
-//! The velocity of a cycle is the step the position makes in it, divided by its length. So velocity and acceleration, as seen
-//! in the sequence of positions that reaches the drive, are what the plans bound, exactly.
+//! The velocity of a cycle is its change of position divided by its duration. So the plans bound
+//! exactly the velocity and acceleration of the positions sent to the drive.
 
 mod error;
 mod gear;
 mod hold;
 mod jerk;
 mod ramp;
-#[cfg(test)]
-mod sequence;
 mod source;
 mod spline;
 mod stream;
 mod table;
+#[cfg(test)]
+mod test_support;
 mod trapezoid;
 mod wave;
 
 pub use error::SetpointError;
-pub use gear::{Engage, Gear, GearConfig};
+pub use gear::{Gear, GearConfig, GearInMode};
 pub use hold::Hold;
-pub use jerk::{Goal, JerkLimited, Order};
+pub use jerk::{Goal, JerkLimited, MoveRequest};
 pub use ramp::Ramp;
 pub use source::Source;
 pub use spline::{Interpolation, Knot};
@@ -47,18 +50,18 @@ pub use trapezoid::Trapezoid;
 pub(crate) use trapezoid::braking_velocity;
 pub use wave::{PositionWave, Shape, Wave};
 
-/// A set-point: position, the velocity at which it was reached, and how that changed.
+/// A set-point: position, mean velocity of the last cycle, and its acceleration.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
     pub position: f64,
-    /// The last cycle's step divided by its length.
+    /// The last cycle's change of position divided by its duration.
     pub velocity: f64,
-    /// The last cycle's change of velocity divided by its length.
+    /// The last cycle's change of velocity divided by its duration.
     pub acceleration: f64,
 }
 
 impl Motion {
-    /// Standing still.
+    /// Returns a standstill at `position`.
     #[must_use]
     pub const fn at(position: f64) -> Self {
         Self {
@@ -68,13 +71,14 @@ impl Motion {
         }
     }
 
-    /// There and not moving.
+    /// Returns true at exactly `position` with velocity 0.
     #[must_use]
     pub fn stands_at(self, position: f64) -> bool {
         self.position == position && self.velocity == 0.0
     }
 
-    /// One cycle later: `position` was reached at `velocity`. The acceleration follows.
+    /// Returns the motion one cycle later, at `position` with `velocity`. Computes the
+    /// acceleration.
     #[must_use]
     pub fn then(self, position: f64, velocity: f64, dt_s: f64) -> Self {
         let acceleration = (velocity - self.velocity) / dt_s;
@@ -90,7 +94,7 @@ impl Motion {
     }
 }
 
-/// What a jerk-limited motion may use, user units per second, second² and second³.
+/// Limits of a jerk-limited motion, user units per second, second² and second³.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionLimits {
     pub velocity: f64,
@@ -99,7 +103,7 @@ pub struct MotionLimits {
 }
 
 impl MotionLimits {
-    /// Each multiplied by `factor`.
+    /// Returns the limits multiplied by `factor`.
     #[must_use]
     pub fn scaled(self, factor: f64) -> Self {
         Self {
@@ -110,12 +114,12 @@ impl MotionLimits {
     }
 }
 
-/// Where the set-point goes next.
+/// A source of set-points.
 pub trait Setpoint {
-    /// One cycle of `dt_s` seconds on from `motion`, which is what the cycle before returned or what the caller has made of
-    /// it: a source that finds another motion than its own goes on from there. RT: O(1).
+    /// Advances one cycle of `dt_s` seconds from `motion`. `motion` is the result of the previous
+    /// cycle, or the caller's modification of it; a source then continues from there. RT: O(1).
     fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion;
 
-    /// Nothing is left to do: further cycles would neither move nor change the velocity.
+    /// Returns true if further cycles would change neither position nor velocity.
     fn finished(&self, motion: Motion) -> bool;
 }

@@ -1,14 +1,14 @@
-//! A value that goes to its target at no more than a slope: velocity in CSV, torque in CST.
+//! A value that approaches its target with bounded slope: velocity in CSV, torque in CST.
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ramp {
     pub target: f64,
-    /// Per second.
+    /// Change per second.
     pub slope: f64,
 }
 
 impl Ramp {
-    /// RT: O(1). Lands exactly on the target.
+    /// Advances one cycle; ends exactly on the target. RT: O(1).
     #[must_use]
     pub fn advance(self, value: f64, dt_s: f64) -> f64 {
         let most = self.slope * dt_s;
@@ -29,7 +29,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn never_steeper_and_arrives(start in -1e3..1e3f64, target in -1e3..1e3f64, slope in 1.0..1e5f64) {
+        fn ramp_keeps_its_slope_and_arrives(start in -1e3..1e3f64, target in -1e3..1e3f64, slope in 1.0..1e5f64) {
             let ramp = Ramp { target, slope };
             let mut value = start;
             for _ in 0..2_100_000 {

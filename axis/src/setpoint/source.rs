@@ -1,21 +1,21 @@
-//! Any source that needs nothing but the motion, as one type.
+//! One type for all sources that need only the motion.
 
 use super::{Goal, Hold, JerkLimited, Motion, PositionWave, Setpoint, Trapezoid};
-use crate::group::Along;
+use crate::group::LinePath;
 
-/// For an axis to hold whatever it follows. The sources that need something else in each cycle stand beside it: a
-/// [`super::Stream`] its buffer, a [`super::Playback`] its table, a [`super::Gear`] its master.
+/// Any source of an axis that needs only the motion. Sources with further inputs are separate:
+/// [`super::Stream`] (buffer), [`super::Playback`] (table), [`super::Gear`] (master).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Source {
     Hold(Hold),
     Trapezoid(Trapezoid),
     JerkLimited(JerkLimited),
-    Line(Along),
+    Line(LinePath),
     Wave(PositionWave),
 }
 
 impl Source {
-    /// Where it ends, if it is on its way to a position.
+    /// Returns the target of a source that moves to a position.
     #[must_use]
     pub const fn target(&self) -> Option<f64> {
         match self {
@@ -29,7 +29,8 @@ impl Source {
         }
     }
 
-    /// The acceleration it may brake with, which a successor must not be given less of: see [`Trapezoid::taking_over`].
+    /// Returns the acceleration reserved for braking. A successor must not get less: see
+    /// [`Trapezoid::taking_over`].
     #[must_use]
     pub const fn braking(&self) -> f64 {
         match self {

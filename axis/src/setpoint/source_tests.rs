@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
-use super::super::sequence::Sequence;
-use super::super::{MotionLimits, Order, Shape, Wave};
+use super::super::test_support::Sequence;
+use super::super::{MotionLimits, MoveRequest, Shape, Wave};
 use super::*;
 use crate::group::{Line, LineAxis};
 
@@ -19,7 +19,7 @@ enum Next {
     Trapezoid(f64, f64),
     Jerk(f64, f64),
     Velocity(f64, f64),
-    /// These two from rest only; from motion they are refused, and the axis goes on with what it has.
+    /// Only from rest: from motion they are rejected, and the axis continues with its source.
     Line(f64),
     Wave(f64, bool),
     LostFrames,
@@ -46,9 +46,9 @@ fn take(next: Next, now: Source, motion: Motion) -> Option<Source> {
         jerk: LIMITS.jerk * part,
     };
     let jerk = |goal, part| {
-        let order = Order {
+        let order = MoveRequest {
             ceiling: LIMITS,
-            ..Order::within(goal, limits(part))
+            ..MoveRequest::within(goal, limits(part))
         };
         let made = match now {
             Source::JerkLimited(source) => source.redirect(order, motion, DT),
@@ -97,10 +97,10 @@ fn take(next: Next, now: Source, motion: Motion) -> Option<Source> {
 }
 
 proptest! {
-    /// Any source after any other, in any cycle: velocity and acceleration never exceed the limits, and what is on its way to a position
-    /// gets there.
+    /// Any source after any other, in any cycle: velocity and acceleration keep the limits, and a
+    /// move reaches its target.
     #[test]
-    fn any_after_any(changes in prop::collection::vec((next(), 0u32..400), 1..12)) {
+    fn any_source_takes_over_from_any_other(changes in prop::collection::vec((next(), 0u32..400), 1..12)) {
         let mut source = Source::Hold(Hold { acceleration: LIMITS.acceleration });
         let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
         for (next, cycles) in changes {

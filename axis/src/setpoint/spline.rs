@@ -1,8 +1,9 @@
-//! The way between two given points: a cubic through positions and velocities. A straight one is the cubic whose velocities are its slope.
+//! Interpolation between two points: a cubic through positions and velocities, or a straight
+//! segment.
 
 use super::{MotionLimits, SetpointError};
 
-/// A point to pass, and how fast.
+/// A point to pass, and the velocity there.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Knot {
     pub position: f64,
@@ -11,8 +12,8 @@ pub struct Knot {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interpolation {
-    /// Constant velocity from point to point; the velocities given with points are not used. Every change of velocity happens within
-    /// one cycle, and must be possible within one.
+    /// Constant velocity from point to point; given velocities are ignored. Each change of velocity
+    /// happens in one cycle and must be possible in one.
     Linear,
     /// A cubic through positions and velocities.
     Cubic,
@@ -29,7 +30,7 @@ pub(crate) struct Piece {
 }
 
 impl Piece {
-    /// `time` above 0.
+    /// Creates a cubic; `time` must be above 0.
     pub(crate) fn new(from: Knot, to: Knot, time: f64) -> Self {
         let slope = (to.position - from.position) / time;
         Self {
@@ -41,7 +42,7 @@ impl Piece {
         }
     }
 
-    /// At constant velocity.
+    /// Creates a piece with constant velocity.
     pub(crate) fn straight(from: f64, to: f64, time: f64) -> Self {
         let velocity = (to - from) / time;
         let knot = |position| Knot { position, velocity };
@@ -81,7 +82,7 @@ impl Piece {
         t > 0.0 && t < self.time
     }
 
-    /// Velocity, acceleration and positions on the whole way.
+    /// Checks velocity, acceleration and position of the whole piece.
     pub(crate) fn check(
         &self,
         limits: MotionLimits,
@@ -119,7 +120,7 @@ impl Piece {
     }
 }
 
-/// A change of velocity within one cycle.
+/// Checks a change of velocity within one cycle.
 pub(crate) fn check_corner(
     before: f64,
     after: f64,
@@ -129,7 +130,7 @@ pub(crate) fn check_corner(
     steep((after - before) / dt_s, acceleration)
 }
 
-/// Standing at the end of a way that arrives there with `velocity`.
+/// Checks that the axis can stand at the end of a piece that ends with `velocity`.
 pub(crate) fn check_end(
     interpolation: Interpolation,
     velocity: f64,
@@ -138,13 +139,13 @@ pub(crate) fn check_end(
 ) -> Result<(), SetpointError> {
     match interpolation {
         Interpolation::Linear => check_corner(velocity, 0.0, acceleration, dt_s),
-        // It may arrive braking as hard as it can, and has nothing left for a step.
+        // A cubic may end with full deceleration, which leaves no room for a velocity step.
         Interpolation::Cubic if velocity == 0.0 => Ok(()),
         Interpolation::Cubic => Err(SetpointError::NotAtRest { velocity }),
     }
 }
 
-/// A stop with the limit acceleration at any cycle after `knot`.
+/// Checks that a stop with the limit acceleration after `knot` stays in the range.
 pub(crate) fn check_stop(
     knot: Knot,
     acceleration: f64,

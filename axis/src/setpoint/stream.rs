@@ -1,8 +1,9 @@
-//! Set-points through points that arrive while the axis moves.
+//! Set-points from points that arrive during the motion.
 //!
-//! Points lie a fixed time apart; each is checked against the one before when it arrives, the way between them included, so that nothing
-//! in the buffer can exceed a limit later. When the points run out, the axis decelerates with its limit and stands, and says so: what comes
-//! next must start from there.
+//! Points have a fixed time distance. Each arriving point is checked together with the piece from
+//! the previous point. So no point in the buffer can exceed a limit later. When the points run out,
+//! the axis decelerates with its limit and stands. The state is then [`StreamState::Underrun`], and
+//! the next motion must start from there.
 
 use super::error::{finite, usable};
 use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
@@ -11,35 +12,36 @@ use super::{Hold, Knot, Motion, MotionLimits, Setpoint, SetpointError};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StreamConfig {
     pub interpolation: Interpolation,
-    /// From one point to the next, seconds.
+    /// Time from one point to the next, seconds.
     pub interval_s: f64,
-    /// Starts to move when so many points are there, or the last one is.
+    /// Number of points that start the motion; the last point also starts it.
     pub prefill: usize,
     pub limits: MotionLimits,
     pub range: Option<[f64; 2]>,
-    /// The cycle.
+    /// Cycle time, seconds.
     pub dt_s: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StreamState {
-    /// For the first points.
+    /// Waits for the first points.
     Waiting,
     Moving,
-    /// The last point is passed.
+    /// The last point has been passed.
     Ended,
-    /// The points ran out before the last one was told, or the axis was held up: it brakes, then stands. Nothing more is accepted.
+    /// The points ran out before [`Stream::close`], or the axis was interrupted: it brakes, then
+    /// stands. Further points are rejected.
     Underrun,
 }
 
-/// A buffer of `N` points and what is made of them. It lies where it is declared; nothing is allocated.
+/// A buffer of `N` points and its interpolation. Stored inline, without allocation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stream<const N: usize> {
     config: StreamConfig,
     buffer: [Piece; N],
     first: usize,
     filled: usize,
-    /// The last point accepted, and how fast it is reached.
+    /// The last accepted point, with the velocity there.
     newest: Knot,
     closed: bool,
     state: StreamState,
@@ -48,11 +50,11 @@ pub struct Stream<const N: usize> {
 }
 
 impl<const N: usize> Stream<N> {
-    /// From where `motion` stands.
+    /// Creates a stream that starts at the standstill `motion`.
     pub fn new(config: StreamConfig, motion: Motion) -> Result<Self, SetpointError> {
         usable("interval", config.interval_s)?;
         usable("cycle time", config.dt_s)?;
-        // With several points in a cycle, several changes of velocity would fall into it.
+        // Several points in a cycle would add several changes of velocity in it.
         if config.interval_s < config.dt_s * (1.0 - 1e-9) {
             return Err(SetpointError::NoTime);
         }
@@ -79,7 +81,8 @@ impl<const N: usize> Stream<N> {
         })
     }
 
-    /// Accepts the point `interval_s` after the one before, or refuses it and changes nothing. RT: O(1).
+    /// Accepts the point `interval_s` after the previous one, or rejects it and changes nothing.
+    /// RT: O(1).
     pub fn push(&mut self, point: Knot) -> Result<(), SetpointError> {
         if self.closed || self.state == StreamState::Underrun {
             return Err(SetpointError::Ended);
@@ -96,8 +99,8 @@ impl<const N: usize> Stream<N> {
         Ok(())
     }
 
-    /// No more points: at the last one the axis is to stand. Refused, and not closed, if it would arrive there too fast to; on a cubic,
-    /// with any velocity.
+    /// Ends the stream: the axis stands at the last point. Fails, without closing, if the axis
+    /// would be too fast there. A cubic must end with velocity 0.
     pub fn close(&mut self) -> Result<(), SetpointError> {
         let config = &self.config;
         check_end(
@@ -115,7 +118,7 @@ impl<const N: usize> Stream<N> {
         self.state
     }
 
-    /// Places that are left.
+    /// Returns the number of points that still fit into the buffer.
     #[must_use]
     pub const fn free(&self) -> usize {
         N.saturating_sub(self.filled)
@@ -151,7 +154,7 @@ impl<const N: usize> Stream<N> {
         }
     }
 
-    /// The position after `dt_s` more, or `None` when there is none.
+    /// Returns the position after a further `dt_s`, or `None` if the points have run out.
     fn pass(&mut self, dt_s: f64) -> Option<f64> {
         self.elapsed += dt_s;
         while self.filled > 0 {

@@ -1,6 +1,6 @@
 use proptest::prelude::*;
 
-use super::super::sequence::Sequence;
+use super::super::test_support::Sequence;
 use super::*;
 
 const DT: f64 = 0.001;
@@ -33,7 +33,7 @@ fn sine(k: u32) -> Knot {
 }
 
 #[test]
-fn follows_its_points() {
+fn stream_follows_its_points() {
     let mut stream = Stream::<16>::new(config(Interpolation::Cubic), Motion::at(0.0)).unwrap();
     let mut sequence = Sequence::from(Motion::at(0.0), LIMITS, DT);
     let mut next = 1;
@@ -55,7 +55,7 @@ fn follows_its_points() {
         }
         sequence.then(stream.advance(sequence.motion, DT)).unwrap();
         cycles += 1;
-        // A point every tenth cycle.
+        // One point every tenth cycle.
         if cycles % 10 == 0 && cycles < 1000 {
             let expected = sine(cycles / 10).position;
             assert!(
@@ -70,7 +70,7 @@ fn follows_its_points() {
 }
 
 #[test]
-fn waits_for_the_first_points_and_counts_places() {
+fn stream_waits_for_its_first_points() {
     let mut stream = Stream::<4>::new(config(Interpolation::Cubic), Motion::at(0.0)).unwrap();
     for k in 1..=2 {
         stream.push(sine(k)).unwrap();
@@ -89,7 +89,7 @@ fn waits_for_the_first_points_and_counts_places() {
 }
 
 #[test]
-fn points_that_break_a_limit_change_nothing() {
+fn stream_rejects_points_that_break_a_limit() {
     let new = |interpolation| Stream::<16>::new(config(interpolation), Motion::at(49.0)).unwrap();
     type Refusal = fn(&SetpointError) -> bool;
     let knot = |position, velocity| Knot { position, velocity };
@@ -129,7 +129,7 @@ fn points_that_break_a_limit_change_nothing() {
         assert!(refusal(&error), "{point:?}: {error}");
         assert_eq!(stream, before);
     }
-    // Where a stop after it would leave the range.
+    // A stop after this point would leave the range.
     let mut stream = new(Interpolation::Cubic);
     stream.push(knot(49.095, 19.0)).unwrap();
     stream.push(knot(49.38, 38.0)).unwrap();
@@ -138,7 +138,7 @@ fn points_that_break_a_limit_change_nothing() {
         matches!(error, SetpointError::LeavesRange { .. }),
         "{error}"
     );
-    // No end in motion.
+    // A stream cannot end in motion.
     assert!(stream.close().is_err());
     let mut bad = config(Interpolation::Linear);
     bad.interval_s = 0.0005;
@@ -155,7 +155,7 @@ fn points_that_break_a_limit_change_nothing() {
 
 #[derive(Debug, Clone, Copy)]
 enum Event {
-    /// By so much of a limit, at so much of another.
+    /// Fractions of two limits.
     Push(f64, f64),
     Run(u8),
     HoldUp,
@@ -172,9 +172,10 @@ fn event() -> impl Strategy<Value = Event> {
 }
 
 proptest! {
-    /// Whatever is pushed at whatever time, run dry or held up at any moment: within limits and range, and at rest in the end.
+    /// Any points at any time, with underruns and interruptions: limits and range hold, and the
+    /// axis stands in the end.
     #[test]
-    fn keeps_the_limits(
+    fn stream_keeps_the_limits(
         cubic in any::<bool>(), interval in prop::sample::select(vec![0.001, 0.0015, 0.004, 0.01]),
         events in prop::collection::vec(event(), 1..200), start in -50.0..50.0f64,
     ) {
@@ -186,7 +187,7 @@ proptest! {
         for event in events.into_iter().chain([Event::Run(200)]) {
             match event {
                 Event::Push(a, b) => {
-                    // Near what is possible: a change of velocity within one interval.
+                    // Near the limit: a change of velocity within one interval.
                     let change = LIMITS.acceleration * if cubic { interval } else { DT };
                     let velocity = newest.velocity + a * change;
                     let mean = if cubic { (velocity + newest.velocity) / 2.0 * (1.0 + 0.01 * b) } else { velocity };

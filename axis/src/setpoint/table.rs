@@ -1,13 +1,13 @@
-//! Set-points from a table of times, positions and perhaps velocities.
+//! Set-points from a table of times, positions and optional velocities.
 //!
-//! [`Table::parse`] turns text into a table and allocates; [`Table::check`] judges all of it against an axis before the first cycle; a
-//! [`Playback`] follows it and allocates nothing.
+//! [`Table::parse`] converts text to a table and allocates. [`Table::check`] checks the whole table
+//! for an axis before the first cycle. A [`Playback`] follows the table without allocation.
 
 use super::error::position;
 use super::spline::{Interpolation, Piece, check_corner, check_end, check_stop};
 use super::{Hold, Knot, Motion, MotionLimits, SetpointError};
 
-/// What is wrong, and in which line of the text (from 1).
+/// A problem and its line in the text, counted from 1.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct TableError {
@@ -35,17 +35,17 @@ pub enum TableProblem {
     Motion(#[from] SetpointError),
 }
 
-/// Rows of a table; 60 MB of pieces.
+/// Maximum number of rows; their pieces need 60 MB.
 const MOST_ROWS: usize = 1_000_000;
 
-/// Fields quoted in errors are no longer than this.
+/// Maximum length of fields quoted in errors.
 const QUOTED: usize = 40;
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
     interpolation: Interpolation,
     pieces: Box<[Piece]>,
-    /// Of each piece's end.
+    /// Line of the end of each piece.
     lines: Box<[usize]>,
     first_line: usize,
 }
@@ -59,9 +59,10 @@ struct Row {
 }
 
 impl Table {
-    /// Reads rows of time (seconds), position and perhaps velocity, in user units, separated by commas, semicolons or blanks; empty lines
-    /// and what follows `#` do not count, nor does a first row that begins with a word. Without velocities a cubic takes them from the
-    /// neighbouring rows, and zero at both ends.
+    /// Reads rows of time (seconds), position and optional velocity, in user units. Commas,
+    /// semicolons or blanks separate the fields. Empty lines, text after `#`, and a first row that
+    /// begins with a word are ignored. Without velocities, a cubic derives them from the
+    /// neighbouring rows, with zero at both ends.
     pub fn parse(text: &str, interpolation: Interpolation) -> Result<Self, TableError> {
         let rows = rows(text)?;
         let [first, .., _] = rows.as_slice() else {
@@ -95,7 +96,7 @@ impl Table {
         })
     }
 
-    /// Where it begins and where it ends.
+    /// Returns the first and the last position.
     #[must_use]
     pub fn ends(&self) -> [f64; 2] {
         let first = self.pieces.first().map(|piece| piece.from().position);
@@ -108,20 +109,21 @@ impl Table {
         self.pieces.iter().map(Piece::time).sum()
     }
 
-    /// Rows.
+    /// Returns the number of rows.
     #[must_use]
     pub fn len(&self) -> usize {
         self.pieces.len() + 1
     }
 
-    /// A table has two rows at least.
+    /// Returns false: a table has at least two rows.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         false
     }
 
-    /// Every velocity, acceleration and position, and a stop at any time, against what the axis may do; `offset` is added to all
-    /// positions. A velocity step at a row must be possible within the cycle `dt_s`.
+    /// Checks velocities, accelerations, positions and a stop at any time against the limits of the
+    /// axis. `offset` is added to all positions. A velocity step at a row must be possible within
+    /// the cycle `dt_s`.
     pub fn check(
         &self,
         limits: MotionLimits,
@@ -143,7 +145,7 @@ impl Table {
             .pieces
             .first()
             .map_or(0.0, |piece| piece.from().velocity);
-        // A start is an end seen backwards.
+        // A start is an end with reversed time.
         check_end(self.interpolation, before, acceleration, dt_s).map_err(at(self.first_line))?;
         for (piece, &line) in self.pieces.iter().zip(&self.lines) {
             if piece.time() < dt_s * (1.0 - 1e-9) {
@@ -205,7 +207,7 @@ fn rows(text: &str) -> Result<Vec<Row>, TableError> {
     Ok(rows)
 }
 
-/// Commas and semicolons separate, with blanks around them or not; where there are none, blanks do.
+/// Splits at commas and semicolons, with optional blanks; without commas and semicolons, at blanks.
 fn fields(text: &str) -> impl Iterator<Item = &str> {
     let marked = text.contains([',', ';']);
     text.split(move |c: char| {
@@ -250,7 +252,7 @@ fn row(line: usize, fields: &[&str]) -> Result<Row, TableProblem> {
     })
 }
 
-/// As given, or of the parabola through each row and its neighbours.
+/// Returns the given velocities, or those of the parabola through each row and its neighbours.
 fn velocities(rows: &[Row]) -> Vec<f64> {
     let neighbours = rows.windows(3).map(|rows| match *rows {
         [a, b, c] => {
@@ -270,7 +272,7 @@ fn velocities(rows: &[Row]) -> Vec<f64> {
         .collect()
 }
 
-/// Follows a table that has been checked.
+/// Follows a checked table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Playback {
     acceleration: f64,
@@ -289,8 +291,8 @@ enum State {
 }
 
 impl Playback {
-    /// From where `motion` stands, which is the table's first position and `offset`. O(1); [`Table::check`] is the caller's, outside the
-    /// cycle.
+    /// Creates a playback at the standstill `motion`, which must be at the table's first position
+    /// plus `offset`. O(1). The caller must have run [`Table::check`] outside the cycle.
     pub fn new(
         table: &Table,
         motion: Motion,
@@ -319,13 +321,14 @@ impl Playback {
         })
     }
 
-    /// The axis was held up on the way; since then it stands.
+    /// Returns true if the axis was interrupted; it stands since then.
     #[must_use]
     pub fn interrupted(&self) -> bool {
         self.state == State::Interrupted
     }
 
-    /// One cycle on; `table` is the one this was made for. RT: O(rows passed in one cycle).
+    /// Advances one cycle. `table` must be the table passed to [`Playback::new`]. RT: O(rows passed
+    /// in one cycle).
     #[must_use]
     pub fn advance(&mut self, table: &Table, motion: Motion, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {

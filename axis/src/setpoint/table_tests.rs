@@ -1,6 +1,6 @@
 use proptest::prelude::*;
 
-use super::super::sequence::Sequence;
+use super::super::test_support::Sequence;
 use super::*;
 
 const DT: f64 = 0.001;
@@ -36,7 +36,7 @@ fn run(table: &Table) -> (u32, Motion) {
 }
 
 #[test]
-fn reads_and_follows() {
+fn table_is_parsed_and_followed() {
     let table = Table::parse(UP_AND_DOWN, Interpolation::Cubic).unwrap();
     assert_eq!(
         (table.len(), table.duration_s(), table.ends()),
@@ -122,7 +122,7 @@ fn the_whole_table_is_checked_before_the_first_cycle() {
 }
 
 #[test]
-fn begins_where_the_axis_stands() {
+fn playback_starts_at_the_position_of_the_axis() {
     let table = Table::parse(UP_AND_DOWN, Interpolation::Cubic).unwrap();
     assert_eq!(
         Playback::new(&table, Motion::at(1.0), LIMITS, 0.0),
@@ -140,9 +140,10 @@ fn begins_where_the_axis_stands() {
 }
 
 proptest! {
-    /// A table that passes its check keeps the limits in every cycle; held up on the way, it stops within them.
+    /// A checked table keeps the limits in every cycle; after an interruption the axis stops within
+    /// them.
     #[test]
-    fn keeps_the_limits(
+    fn playback_keeps_the_limits(
         steps in prop::collection::vec((0.001..0.3f64, -1.0..1.0f64), 1..30), cubic in any::<bool>(),
         held_up in prop::option::of(0u32..2000),
     ) {
@@ -158,7 +159,7 @@ proptest! {
             text += &format!("{}, 0", time + 0.2);
             Table::parse(&text, interpolation).unwrap()
         };
-        // As large as is allowed, but for a factor of two.
+        // As large as allowed, within a factor of two.
         let mut size = 20.0;
         while table(size).check(LIMITS, range, 0.0, DT).is_err() {
             size /= 2.0;
@@ -183,7 +184,7 @@ proptest! {
     }
 
     #[test]
-    fn any_text(text in "[-0-9eE.,; \t\n#a-zNI+]{0,200}", noise in ".{0,100}") {
+    fn any_text_is_parsed_or_rejected(text in "[-0-9eE.,; \t\n#a-zNI+]{0,200}", noise in ".{0,100}") {
         for text in [&text, &noise] {
             if let Ok(table) = Table::parse(text, Interpolation::Cubic)
                 && table.check(LIMITS, None, 0.0, DT).is_ok()

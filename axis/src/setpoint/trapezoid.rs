@@ -1,12 +1,13 @@
 //! A move to a position with bounded velocity and acceleration.
 //!
-//! Each cycle asks one question: how fast may this cycle be, so that braking by the same amount in every following cycle ends
-//! exactly on the target? The continuous rule √(2·a·d) overshoots by up to a cycle, so the sum over cycles is inverted instead.
+//! Each cycle takes the highest velocity from which braking by the same amount in every following
+//! cycle ends exactly on the target. The continuous rule √(2·a·d) overshoots by up to one cycle, so
+//! the sum over cycles is inverted instead.
 
 use super::{Motion, Setpoint};
 
-/// Braking is planned with this part of the acceleration. Rounding makes some cycles a hair too fast; with nothing in reserve
-/// that could only add up, and end beyond the target.
+/// Fraction of the acceleration used to plan braking. Rounding makes some cycles slightly too fast;
+/// without a reserve the errors would add up and end beyond the target.
 const PLANNED: f64 = 1.0 - 1e-4;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -14,12 +15,14 @@ pub struct Trapezoid {
     pub target: f64,
     pub velocity: f64,
     pub acceleration: f64,
-    /// Used where `acceleration` would overshoot: what the move that was interrupted could brake with. Never below it.
+    /// Deceleration used if `acceleration` would overshoot: the reserve of the interrupted move.
+    /// Never below `acceleration`.
     pub braking: f64,
 }
 
 impl Trapezoid {
-    /// Takes over from `motion`, which an earlier plan could stop with `earlier` and the axis with `limit`.
+    /// Takes over from `motion`. The earlier plan could stop it with `earlier`; the axis allows
+    /// `limit`.
     #[must_use]
     pub fn taking_over(mut self, motion: Motion, earlier: f64, limit: f64, dt_s: f64) -> Self {
         self.braking = self.acceleration;
@@ -37,7 +40,7 @@ impl Trapezoid {
         self
     }
 
-    /// RT: O(1).
+    /// Advances one cycle. RT: O(1).
     #[must_use]
     pub fn advance(self, motion: Motion, dt_s: f64) -> Motion {
         if dt_s <= 0.0 {
@@ -46,7 +49,8 @@ impl Trapezoid {
         let left = self.target - motion.position;
         let brake = braking_velocity(left.abs(), self.acceleration * PLANNED, dt_s);
         let wanted = brake.min(self.velocity).copysign(left);
-        // More than the gentle deceleration only where that would overshoot: too fast for the distance, or going away.
+        // More than the requested deceleration only if it would overshoot: too fast for the
+        // distance, or moving away.
         let too_fast = motion.velocity * left <= 0.0
             || motion.velocity.abs() > brake + self.acceleration * dt_s;
         let slowing = if too_fast {
@@ -69,7 +73,7 @@ impl Trapezoid {
         motion.then(position, velocity, dt_s)
     }
 
-    /// On the target and standing.
+    /// Returns true at the target and at rest.
     #[must_use]
     pub fn finished(&self, motion: Motion) -> bool {
         motion.stands_at(self.target)
@@ -86,7 +90,8 @@ impl Setpoint for Trapezoid {
     }
 }
 
-/// From `from` towards `to`: away from zero by at most `faster`, towards zero by at most `slower`, and not both in one cycle.
+/// Returns the velocity from `from` towards `to`. It changes by at most `faster` away from zero and
+/// at most `slower` towards zero, and never both in one cycle.
 fn approach(from: f64, to: f64, faster: f64, slower: f64) -> f64 {
     let away_from_zero = from == 0.0 || (from * to > 0.0 && to.abs() > from.abs());
     if away_from_zero {
@@ -101,7 +106,7 @@ fn approach(from: f64, to: f64, faster: f64, slower: f64) -> f64 {
     }
     let slowed = from - slower.copysign(from);
     if from * to > 0.0 {
-        // Same direction, slower: no further than asked.
+        // Same direction, slower: at most down to `to`.
         if (to - from).abs() <= slower {
             to
         } else {
@@ -114,10 +119,12 @@ fn approach(from: f64, to: f64, faster: f64, slower: f64) -> f64 {
     }
 }
 
-/// The highest velocity of this cycle from which braking by `acceleration` in every cycle after it ends at `distance`.
+/// Returns the highest velocity of this cycle from which braking by `acceleration` in every
+/// following cycle ends at `distance`.
 ///
-/// Starting with v and losing δ = a·dt per cycle, the way is dt·Σ(v − kδ), k = 0…n with n = ⌊v/δ⌋. In units of δ·dt that is
-/// x = (n+1)·u − n(n+1)/2 with u = v/δ: piecewise linear, so it is inverted piece by piece.
+/// Starting with v and losing δ = a·dt per cycle, the way is dt·Σ(v − kδ), k = 0…n with n = ⌊v/δ⌋.
+/// In units of δ·dt this is x = (n+1)·u − n(n+1)/2 with u = v/δ. It is piecewise linear and
+/// inverted piece by piece.
 pub(crate) fn braking_velocity(distance: f64, acceleration: f64, dt_s: f64) -> f64 {
     let delta = acceleration * dt_s;
     let x = distance / (delta * dt_s);
@@ -125,7 +132,8 @@ pub(crate) fn braking_velocity(distance: f64, acceleration: f64, dt_s: f64) -> f
         let n = (((1.0 + 8.0 * x).sqrt() - 1.0) * 0.5).floor();
         delta * (x + n * (n + 1.0) * 0.5) / (n + 1.0)
     } else {
-        // So many cycles that the sum is the integral; infinite or undefined where the acceleration is nothing.
+        // With so many cycles the sum equals the integral. The result is not finite if the
+        // acceleration is 0.
         let velocity = (2.0 * acceleration * distance).sqrt() - delta;
         if velocity.is_finite() {
             velocity.max(0.0)

@@ -13,7 +13,7 @@ fn plain(target: f64, velocity: f64, acceleration: f64) -> Trapezoid {
     }
 }
 
-/// Runs until finished; checks every cycle. Returns cycles and the final motion.
+/// Runs until finished and checks every cycle. Returns the number of cycles and the final motion.
 fn run(plan: Trapezoid, start: Motion, limit: f64, dt: f64) -> (u32, Motion) {
     let mut motion = start;
     for cycle in 0..5_000_000 {
@@ -36,7 +36,7 @@ fn run(plan: Trapezoid, start: Motion, limit: f64, dt: f64) -> (u32, Motion) {
     panic!("not finished: {plan:?} from {start:?} at {motion:?}");
 }
 
-/// The sum the inversion comes from.
+/// Returns the sum that `braking_velocity` inverts.
 fn way_to_stop(velocity: f64, acceleration: f64, dt: f64) -> f64 {
     let mut v = velocity;
     let mut way = 0.0;
@@ -59,7 +59,7 @@ fn braking_velocity_inverts_the_sum() {
             );
         }
     }
-    // Hopeless numbers give a number.
+    // Extreme inputs give finite results.
     for (d, a, dt) in [
         (1e300, 1e-300, 1e-3),
         (0.0, 0.0, 0.0),
@@ -71,8 +71,8 @@ fn braking_velocity_inverts_the_sum() {
 }
 
 #[test]
-fn takes_as_long_as_it_should() {
-    // 100 mm at 200 mm/s and 2000 mm/s²: 0.1 s up, 0.4 s cruise, 0.1 s down.
+fn trapezoid_takes_the_calculated_time() {
+    // 100 mm at 200 mm/s and 2000 mm/s²: 0.1 s acceleration, 0.4 s constant, 0.1 s deceleration.
     let (cycles, end) = run(plain(50.0, 200.0, 2000.0), Motion::at(-50.0), 2000.0, DT);
     assert!((600..=603).contains(&cycles), "{cycles}");
     assert!(end.stands_at(50.0));
@@ -82,14 +82,14 @@ fn takes_as_long_as_it_should() {
 }
 
 #[test]
-fn already_there() {
+fn trapezoid_at_its_target_stays() {
     let (cycles, _) = run(plain(3.0, 1.0, 1.0), Motion::at(3.0), 1.0, DT);
     assert_eq!(cycles, 0);
 }
 
 #[test]
-fn a_gentler_successor_does_not_overshoot() {
-    // At full speed 5 before the end, the same target again with a tenth of the ramp.
+fn trapezoid_with_lower_acceleration_does_not_overshoot() {
+    // At full speed 5 before the target: the same target again with a tenth of the acceleration.
     let motion = Motion {
         position: 35.0,
         velocity: 200.0,
@@ -104,7 +104,7 @@ fn a_gentler_successor_does_not_overshoot() {
 }
 
 #[test]
-fn no_time_no_change() {
+fn trapezoid_without_time_does_not_move() {
     let motion = Motion {
         position: 1.0,
         velocity: 2.0,
@@ -114,9 +114,9 @@ fn no_time_no_change() {
 }
 
 proptest! {
-    /// From rest: never beyond the target, never above the velocity, exactly on the target in the end.
+    /// From rest: keeps the velocity, never passes the target, and ends exactly on it.
     #[test]
-    fn from_rest(
+    fn trapezoid_from_rest_keeps_its_limits(
         start in -1e3..1e3f64, way in -200.0..200.0f64, velocity in 2.0..1e3f64, acceleration in 5.0..1e5f64,
         dt in prop::sample::select(vec![0.000_25, 0.001, 0.004]),
     ) {
@@ -134,9 +134,10 @@ proptest! {
         prop_assert!(f64::from(cycles) * dt <= time + 6.0 * dt);
     }
 
-    /// New targets at any time: acceleration holds, and what the first move could stop within, the second does.
+    /// New targets at any time: the acceleration limit holds, and the second move stops where the
+    /// first could.
     #[test]
-    fn interrupted(
+    fn trapezoid_takes_over_at_any_time(
         first in -50.0..50.0f64, second in -50.0..50.0f64, after in 0u32..700,
         speeds in (0.01..1.0f64, 0.01..1.0f64), ramps in (0.02..1.0f64, 0.02..1.0f64),
     ) {

@@ -1,14 +1,14 @@
 //! Sine and square waves for commissioning.
 //!
-//! A sine grows from nothing during one more period before those asked for, and fades during one after them; so it starts and
-//! ends at rest, without a step even of the acceleration. A square wave of positions goes from one to the other with
-//! jerk-limited moves, and back to the middle in the end.
+//! A sine fades in during one additional period and fades out during another. So it starts and ends
+//! at rest, without a step of the acceleration. A square wave of positions consists of jerk-limited
+//! moves, and ends in the middle.
 
 use core::f64::consts::TAU;
 
 use super::error::{position, usable};
 use super::spline::within;
-use super::{Goal, Hold, JerkLimited, Motion, MotionLimits, Order, Setpoint, SetpointError};
+use super::{Goal, Hold, JerkLimited, Motion, MotionLimits, MoveRequest, Setpoint, SetpointError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
@@ -16,25 +16,27 @@ pub enum Shape {
     Square,
 }
 
-/// A value that swings about zero: a velocity, a torque, or what a [`PositionWave`] adds to a position.
+/// A value that oscillates about zero: a velocity, a torque, or the offset of a [`PositionWave`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wave {
     shape: Shape,
     amplitude: f64,
     frequency: f64,
     periods: f64,
-    /// Since the start, in periods.
+    /// Periods since the start.
     phase: f64,
 }
 
-/// While it grows or fades, a sine's derivatives reach so many times those of the steady wave (2π, 4π², 8π³ per period).
+/// Factors by which a sine's derivatives grow while it fades in or out. The steady derivatives are
+/// 2π, 4π² and 8π³ per period.
 const FADING: [f64; 3] = [1.0, 1.1122, 1.3286];
 
-/// Fewer cycles in a period are no sine any more.
+/// Minimum number of cycles per period of a sine.
 const CYCLES_PER_PERIOD: f64 = 10.0;
 
 impl Wave {
-    /// `amplitude` either way from zero, `frequency` in Hz, whole `periods` (1 to 2³² − 1); `dt_s` is the cycle.
+    /// Creates a wave: `amplitude` to each side of zero, `frequency` in Hz, whole `periods` (1 to
+    /// 2³² − 1). `dt_s` is the cycle time.
     pub fn new(
         shape: Shape,
         amplitude: f64,
@@ -61,7 +63,7 @@ impl Wave {
         })
     }
 
-    /// The highest first, second and third derivative of a sine.
+    /// Returns the highest first, second and third derivative of a sine.
     #[must_use]
     pub fn slopes(&self) -> [f64; 3] {
         let omega = TAU * self.frequency;
@@ -85,7 +87,7 @@ impl Wave {
         self.phase >= self.length()
     }
 
-    /// One cycle on. RT: O(1). A square wave's value steps; what takes it must ramp.
+    /// Advances one cycle. RT: O(1). The value of a square wave steps; its user must apply a ramp.
     pub fn advance(&mut self, dt_s: f64) -> f64 {
         self.phase = (self.phase + self.frequency * dt_s.max(0.0)).min(self.length());
         if self.finished() {
@@ -109,7 +111,7 @@ impl Wave {
     }
 }
 
-/// From 0 to 1, with velocity and acceleration zero at both ends.
+/// Returns a smooth step from 0 to 1, with velocity and acceleration zero at both ends.
 fn smooth(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * x * (10.0 + x * (6.0 * x - 15.0))
@@ -137,8 +139,8 @@ pub struct PositionWave {
 }
 
 impl PositionWave {
-    /// About where `motion` stands. Refused where a limit would be exceeded, or the range left, at any time; a square wave also
-    /// where half a period is too short for the way.
+    /// Creates a wave about the standstill `motion`. Fails if it would exceed a limit or leave the
+    /// range. A square wave also fails if half a period is too short for its moves.
     pub fn new(
         wave: Wave,
         motion: Motion,
@@ -182,13 +184,14 @@ impl PositionWave {
                 State::Sine
             }
             Shape::Square => {
-                let order = |target| Order::within(Goal::Position(target), limits);
+                let order = |target| MoveRequest::within(Goal::Position(target), limits);
                 let swing = JerkLimited::new(
                     order(centre + wave.amplitude),
                     Motion::at(centre - wave.amplitude),
                     dt_s,
                 )?;
-                // The end of a move takes a cycle more, and half periods need not be whole cycles.
+                // The end of a move takes one more cycle, and half periods need not be whole
+                // cycles.
                 if swing.duration_s() + 2.0 * dt_s > 0.5 / wave.frequency {
                     return Err(SetpointError::NoTime);
                 }
@@ -209,7 +212,7 @@ impl PositionWave {
         &self.limits
     }
 
-    /// The axis was held up on the way; since then it stands.
+    /// Returns true if the axis was interrupted; it stands since then.
     #[must_use]
     pub fn interrupted(&self) -> bool {
         self.state == State::Interrupted
@@ -233,7 +236,7 @@ impl Setpoint for PositionWave {
             }
             State::Square(source) => {
                 let target = self.centre + self.wave.advance(dt_s);
-                let order = Order::within(Goal::Position(target), self.limits);
+                let order = MoveRequest::within(Goal::Position(target), self.limits);
                 if source.order().goal != order.goal
                     && let Ok(next) = source.redirect(order, motion, dt_s)
                 {

@@ -11,7 +11,7 @@ const LIMITS: MotionLimits = MotionLimits {
 };
 
 #[test]
-fn the_slopes_are_the_highest_and_no_higher() {
+fn wave_slopes_are_the_highest_reached() {
     let mut wave = Wave::new(Shape::Sine, 3.0, 1.0, 2, 1e-5).unwrap();
     let promised = wave.slopes();
     let dt = 1e-3 / 16.0;
@@ -39,7 +39,7 @@ fn the_slopes_are_the_highest_and_no_higher() {
 }
 
 #[test]
-fn counts_its_periods() {
+fn wave_counts_its_periods() {
     let mut wave = Wave::new(Shape::Sine, 1.0, 5.0, 7, DT).unwrap();
     let (mut tops, mut before, mut rising, mut full) = (0, 0.0, false, 0.0f64);
     while !wave.finished() {
@@ -51,7 +51,7 @@ fn counts_its_periods() {
         rising = value > before;
         before = value;
     }
-    // One more while it grows; of the one while it fades the top lies before the last fade.
+    // One more top while fading in. The top while fading out lies before the last fade.
     assert_eq!(tops, 9);
     assert!((full - 1.0).abs() < 1e-3);
     assert_eq!(before, 0.0);
@@ -66,7 +66,7 @@ fn counts_its_periods() {
 }
 
 #[test]
-fn what_exceeds_a_limit_is_refused() {
+fn wave_that_exceeds_a_limit_is_rejected() {
     let sine = |amplitude, frequency| Wave::new(Shape::Sine, amplitude, frequency, 3, DT).unwrap();
     let new = |wave, range| PositionWave::new(wave, Motion::at(0.0), LIMITS, range, DT);
     assert!(new(sine(5.0, 2.0), Some([-5.0, 5.0])).is_ok());
@@ -109,9 +109,10 @@ fn what_exceeds_a_limit_is_refused() {
 }
 
 proptest! {
-    /// Every wave that is accepted keeps the limits in every cycle, and ends where it began; held up on the way, it stops.
+    /// Every accepted wave keeps the limits in every cycle and ends at its start. After an
+    /// interruption the axis stops.
     #[test]
-    fn keeps_the_limits(
+    fn wave_keeps_the_limits(
         square in any::<bool>(), amplitude in 0.01..50.0f64, frequency in 0.1..20.0f64, periods in 1u32..4,
         held_up in prop::option::of(0u32..2000),
     ) {

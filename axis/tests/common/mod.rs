@@ -1,4 +1,5 @@
-//! A drive of the book for these tests: the standard's transitions, an ideal motor, one cycle of delay each way.
+//! Reference drive for these tests: transitions of the standard, an ideal motor, one cycle of delay
+//! in each direction.
 
 #![allow(dead_code)]
 
@@ -37,21 +38,23 @@ pub struct Drive {
     pub position: f64,
     pub velocity: f64,
     pub torque: i16,
-    /// Quick stop option code 6 (stays in Quick stop active) or 2 (goes on to Switch on disabled).
+    /// Quick stop option code 6 (stays in Quick stop active) or 2 (continues to Switch on
+    /// disabled).
     pub quick_stop_stays: bool,
     /// The motor does not move.
     pub blocked: bool,
-    /// Faults that come back at once after a reset.
+    /// Faults return at once after a reset.
     pub stubborn: bool,
     pub resets: u32,
-    /// Cycles from a mode on the wire to the mode in force and displayed. `None`: it never changes again.
+    /// Cycles from a received mode until it is active and displayed. `None`: it never changes
+    /// again.
     pub mode_delay: Option<u32>,
     mode_waits: u32,
-    /// What the load pushes with in torque mode, per mille.
+    /// Torque of the load in torque mode, per mille.
     pub load: f64,
-    /// Where the home switch is, counts before homing. `None`: never found.
+    /// Position of the home switch, counts before homing. `None`: never found.
     pub home_at: Option<f64>,
-    /// What the position becomes there.
+    /// Position after homing, counts.
     pub home_is: f64,
     pub homing_error: bool,
     /// Never acknowledges a set-point.
@@ -127,7 +130,7 @@ impl Drive {
         }
     }
 
-    /// PP, PV and HM. `rose`: bit 4 did.
+    /// PP, PV and HM. `rose`: rising edge of bit 4.
     fn profile(&mut self, out: &Outputs, rose: bool, dt: f64) {
         let halt = out.controlword & 0x100 != 0;
         let start = out.controlword & 0x10 != 0;
@@ -208,7 +211,7 @@ impl Drive {
         self.state = State::FaultReactionActive;
     }
 
-    /// Takes the outputs and moves for one cycle.
+    /// Receives the outputs and moves for one cycle.
     pub fn cycle(&mut self, out: &Outputs, dt: f64) {
         let rose = out.controlword & !self.controlword & 0x10 != 0;
         let edge = out.controlword & !self.controlword & 0x80 != 0;
@@ -260,7 +263,8 @@ impl Drive {
                 8 => {
                     let step = out.target_position.wrapping_sub(self.raw_position());
                     self.position += f64::from(step);
-                    // After lost frames the set-point steps; a real motor would not have that velocity.
+                    // After lost frames the set-point steps; a real motor would not reach that
+                    // velocity.
                     self.velocity = ((self.position - before) / dt).clamp(-100_000.0, 100_000.0);
                 }
                 9 => {
@@ -284,10 +288,10 @@ impl Drive {
     }
 }
 
-/// From the axis's step to the inputs that show it, in this rig.
+/// Time from the step of the axis to the inputs that show it, in this rig.
 pub const DEAD_TIME_S: f64 = 2.0 * DT;
 
-/// All cyclic modes, with loops that fit [`Drive`].
+/// All cyclic modes, with loops tuned for [`Drive`].
 pub fn looped(mode: Mode, limits: Limits) -> AxisConfig {
     AxisConfig {
         modes: Modes::only(Mode::Csp).with(Mode::Csv).with(Mode::Cst),
@@ -310,7 +314,7 @@ pub fn looped(mode: Mode, limits: Limits) -> AxisConfig {
     }
 }
 
-/// Every mode.
+/// All modes.
 pub fn all(mode: Mode, limits: Limits) -> AxisConfig {
     let looped = looped(mode, limits);
     AxisConfig {
@@ -319,7 +323,8 @@ pub fn all(mode: Mode, limits: Limits) -> AxisConfig {
     }
 }
 
-/// An axis and its drive, with one cycle of delay from the drive's inputs to the outputs' effect.
+/// An axis and its drive, with one cycle of delay from the drive's inputs to the effect of the
+/// outputs.
 #[derive(Debug, Clone)]
 pub struct Rig {
     pub axis: Axis,
@@ -343,7 +348,7 @@ impl Rig {
         Self::new(axis(mode), Drive::at(0))
     }
 
-    /// A rig whose axis is enabled.
+    /// Returns a rig with an enabled axis.
     pub fn enabled(mode: Mode) -> Self {
         let mut rig = Self::of(mode);
         rig.axis.command(Command::Enable).unwrap();

@@ -1,4 +1,4 @@
-//! The system's allocator, counting what each thread asks of it.
+//! A global allocator that counts the requests of each thread.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -13,8 +13,8 @@ fn count() {
     ALLOCATIONS.with(|n| n.set(n.get() + 1));
 }
 
-// SAFETY: every call is passed on unchanged to the system's allocator; counting touches only a const-initialised
-// thread-local without a destructor, which does not allocate.
+// SAFETY: every call is passed unchanged to the system's allocator. Counting only accesses a
+// const-initialised thread-local without a destructor, which does not allocate.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();
@@ -24,7 +24,8 @@ unsafe impl GlobalAlloc for Counting {
 
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
         count();
-        // SAFETY: `at` came from `alloc` above, that is, from the system's allocator, with this layout.
+        // SAFETY: `at` came from `alloc` above and so from the system's allocator, with this
+        // layout.
         unsafe { System.dealloc(at, layout) }
     }
 }
@@ -32,7 +33,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// Allocations and frees by this thread, so far.
+/// Returns the number of allocations and frees of this thread so far.
 pub fn allocations() -> u64 {
     ALLOCATIONS.with(Cell::get)
 }

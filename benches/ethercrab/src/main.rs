@@ -1,9 +1,11 @@
-//! ethercrab's stock io_uring task, as its example `io-uring` uses it, exchanging process data in the rhythm of a cycle:
+//! Exchanges process data cyclically with ethercrab's stock io_uring task, as in its example
+//! `io-uring`:
 //!
 //! `bench-ethercrab --nic IF --bytes N --cycle-ns N --cycles N --cpu N --priority N`
 //!
-//! One LRW of so many bytes a cycle, and nothing beside it: less than the frame of `ecaxis bench`, which carries the clock, AL
-//! status and a diagnostic read as well. Prints what `ecaxis bench --against` reads.
+//! Each cycle sends one LRW of N bytes and nothing else. The frame of `ecaxis bench` is longer: it
+//! also carries the clock, AL status and a diagnostic read. The output is the input of `ecaxis
+//! bench --against`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::env;
@@ -15,13 +17,14 @@ use ethercrab::std::tx_rx_task_io_uring;
 use ethercrab::{Command, MainDevice, MainDeviceConfig, PduStorage, RetryBehaviour, Timeouts};
 use futures_lite::future::block_on;
 
-/// Where `ecaxis bench` maps its process data.
+/// The logical address at which `ecaxis bench` maps its process data.
 const LOGICAL: u32 = 0x0001_0000;
-/// Before the task listens.
+/// The time until the task listens.
 const START: Duration = Duration::from_millis(200);
-/// Not counted: first frames, first pages.
+/// The number of ignored cycles, which include first frames and first page accesses.
 const WARM_UP: u64 = 200;
-/// A reply that takes longer is lost. ethercrab's task ends when one comes after its time, so it is given long.
+/// The timeout after which a reply counts as lost. It is long, because ethercrab's task ends when a
+/// reply arrives after its timeout.
 const PATIENCE: Duration = Duration::from_millis(500);
 
 static STORAGE: PduStorage<16, { PduStorage::element_size(1486) }> = PduStorage::new();
@@ -87,7 +90,7 @@ async fn turn(maindevice: &MainDevice<'_>, data: &[u8], cycle: u64, cycles: u64)
         if n >= WARM_UP {
             *lateness.entry(woke.saturating_sub(next)).or_insert(0_u64) += 1;
             match answer {
-                // From its wake-up on: how late that was is told beside it.
+                // Measured from the wake-up; the lateness of the wake-up is reported separately.
                 Ok(_) => {
                     *round_trips
                         .entry(back.saturating_sub(woke))
@@ -131,7 +134,7 @@ fn pairs(histogram: &BTreeMap<u64, u64>) -> String {
 fn now() -> u64 {
     // SAFETY: all-zero is a valid timespec.
     let mut t: libc::timespec = unsafe { std::mem::zeroed() };
-    // SAFETY: `t` takes what the call writes.
+    // SAFETY: `t` is valid for writes.
     unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &raw mut t) };
     u64::try_from(t.tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(t.tv_nsec).unwrap_or(0)
 }
@@ -141,7 +144,8 @@ fn sleep_until(t: u64) {
         tv_sec: libc::time_t::try_from(t / 1_000_000_000).unwrap_or(libc::time_t::MAX),
         tv_nsec: libc::c_long::try_from(t % 1_000_000_000).unwrap_or(0),
     };
-    // SAFETY: `request` lives through the call; what would remain is not asked for.
+    // SAFETY: `request` lives through the call, and a null pointer for the remaining time is
+    // allowed.
     unsafe {
         libc::clock_nanosleep(
             libc::CLOCK_MONOTONIC,
@@ -153,11 +157,11 @@ fn sleep_until(t: u64) {
 }
 
 fn lock_memory() {
-    // SAFETY: no pointers.
+    // SAFETY: the call takes no pointers.
     unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) };
 }
 
-/// As far as that is permitted, like `ecaxis bench`.
+/// Sets CPU and priority as far as permitted, like `ecaxis bench`.
 fn become_real_time(cpu: usize, priority: i32) {
     // SAFETY: all-zero is a valid set, and `cpu` is checked against its size.
     unsafe {
@@ -173,7 +177,7 @@ fn become_real_time(cpu: usize, priority: i32) {
     }
 }
 
-/// Of the whole process.
+/// Resource usage of the whole process.
 #[derive(Clone, Copy)]
 struct Usage {
     cpu_ns: u64,
@@ -187,7 +191,7 @@ impl Usage {
     fn now() -> Self {
         // SAFETY: all-zero is a valid rusage.
         let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
-        // SAFETY: `usage` takes what the call writes.
+        // SAFETY: `usage` is valid for writes.
         unsafe { libc::getrusage(libc::RUSAGE_SELF, &raw mut usage) };
         let count = |n: libc::c_long| u64::try_from(n).unwrap_or(0);
         let nanos = |t: libc::timeval| {

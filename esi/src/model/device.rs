@@ -1,4 +1,4 @@
-//! A device: who it is, which revisions it stands for, what it says of itself.
+//! A device: its identity, the revisions that it covers, and its properties.
 
 use std::fmt;
 
@@ -33,33 +33,34 @@ pub struct Device {
     pub identity: Identity,
     /// Text of `Type`, e.g. `EPOS4`.
     pub type_name: String,
-    /// English `Name` where there are several (LcId 1033), else the first.
+    /// The English `Name` (LcId 1033) if there are several, otherwise the first.
     pub name: String,
     /// Every `Name`, in file order.
     pub names: Vec<LocalName>,
     pub group: String,
-    /// Not meant to be offered for choice: `Invisible`.
+    /// `Invisible`: configurators do not offer this device.
     pub invisible: bool,
-    /// `HideType`: revisions that this device takes the place of.
+    /// `HideType`: revisions that this device replaces.
     pub hides: Vec<HiddenType>,
-    /// `CheckRevisionNo`: which revisions on the bus may stand for this one.
+    /// `CheckRevisionNo`: the revisions on the bus that this device description accepts.
     pub revision_check: RevisionCheck,
     /// `UseLrdLwr`: the device cannot process LRW.
     pub use_lrd_lwr: bool,
     pub info: Info,
-    /// `Physics`: one letter a port, Y = MII/EBUS as the device has it (`"YY"`, `"YKKY"`).
+    /// `Physics`: one letter per port, Y = MII, K = E-bus (`"YY"`, `"YKKY"`).
     pub physics: String,
-    /// `Profile/ProfileNo` or `Profile/ChannelInfo/ProfileNo`: 402 for drives, 5001 for modular devices.
+    /// `Profile/ProfileNo` or `Profile/ChannelInfo/ProfileNo`: 402 for drives, 5001 for modular
+    /// devices.
     pub profile: Option<u32>,
     pub fmmus: Vec<Fmmu>,
     pub sync_managers: Vec<SyncManager>,
     pub sync_units: Vec<SyncUnit>,
     pub rx_pdos: Vec<Pdo>,
     pub tx_pdos: Vec<Pdo>,
-    /// `AlternativeSmMapping`: PDO assignments by name.
+    /// `AlternativeSmMapping`: named PDO assignments.
     pub sm_mappings: Vec<SmMapping>,
     pub mailbox: Option<Mailbox>,
-    /// `Dc/OpMode`, in file order; the first is the default.
+    /// `Dc/OpMode` in file order. The first one is the default.
     pub dc_modes: Vec<DcMode>,
     pub slots: Option<Slots>,
     pub dictionary: Dictionary,
@@ -69,14 +70,14 @@ pub struct Device {
 }
 
 impl Device {
-    /// SERCOS over EtherCAT without CoE: IDNs decide about its process data.
+    /// True for SoE (SERCOS over EtherCAT) without CoE, where IDNs define the process data.
     #[must_use]
-    pub fn speaks_soe_alone(&self) -> bool {
+    pub fn is_soe_only(&self) -> bool {
         let mailbox = self.mailbox.as_ref();
         mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none())
     }
 
-    /// The SyncManager through which its mailbox is read.
+    /// Returns the SyncManager through which the MainDevice reads the mailbox.
     #[must_use]
     pub fn mailbox_in(&self) -> Option<u8> {
         self.mailbox.as_ref()?;
@@ -84,7 +85,8 @@ impl Device {
         u8::try_from(all.position(|sm| sm.usage == SmUse::MBoxIn)?).ok()
     }
 
-    /// The FMMU that brings the status of that SyncManager into the process image (`Fmmu` of `MBoxState`), and the SyncManager.
+    /// Returns the FMMU that maps the mailbox status into the process image (`Fmmu` of
+    /// `MBoxState`), and the SyncManager whose status it maps.
     #[must_use]
     pub fn mailbox_status_fmmu(&self) -> Option<(u8, u8)> {
         let sm = self.mailbox_in()?;
@@ -94,17 +96,18 @@ impl Device {
     }
 }
 
-/// `HideType`. Where no product code is written, the device's own is meant.
+/// `HideType`. Without a product code in the file, the device's own product code applies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct HiddenType {
     pub product: Option<u32>,
     pub revision: u32,
 }
 
-/// How a revision on the bus (`found`) is compared with the ESI's; ETG.2000, `CheckRevisionNo`.
+/// Rule to compare a revision on the bus (`found`) with that of the ESI; ETG.2000,
+/// `CheckRevisionNo`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum RevisionCheck {
-    /// The file says nothing: equal or newer is what configurators take.
+    /// The file contains no rule. Configurators accept an equal or newer revision.
     #[default]
     Unstated,
     None,
@@ -117,7 +120,7 @@ pub enum RevisionCheck {
 }
 
 impl RevisionCheck {
-    /// Whether a device of revision `found` may stand for an ESI of revision `described`.
+    /// True if a device of revision `found` matches an ESI of revision `described`.
     #[must_use]
     pub fn accepts(self, described: u32, found: u32) -> bool {
         let [low, high] = [|r: u32| r & 0xffff, |r: u32| r >> 16];
@@ -137,7 +140,7 @@ impl RevisionCheck {
     }
 }
 
-/// `Info`. Times in milliseconds; `None`: the file says nothing.
+/// `Info`. Times in ms; `None`: not in the file.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Info {
     /// Init → PreOp and Init → Bootstrap.
@@ -150,7 +153,7 @@ pub struct Info {
     pub mailbox_request_timeout_ms: Option<u32>,
     pub mailbox_response_timeout_ms: Option<u32>,
     pub identification: Identification,
-    /// What the device takes from the E-bus, mA; negative: supplies.
+    /// The E-bus current that the device consumes, in mA. Negative: the device supplies current.
     pub ebus_current_ma: Option<i32>,
     pub ports: Vec<Port>,
     pub dpram_bytes: Option<u32>,
@@ -158,14 +161,14 @@ pub struct Info {
     pub fmmu_count: Option<u32>,
 }
 
-/// Where explicit device identification (a switch, a number set by the user) can be read.
+/// The source of the explicit device identification (a switch, or a number that the user sets).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum Identification {
     #[default]
     No,
-    /// AL control bit 5 asks, 0x0134 answers.
+    /// AL control bit 5 requests the identification; register 0x0134 contains it.
     Reg134,
-    /// In this register or input.
+    /// This register or input contains the identification.
     Ado(u16),
 }
 
@@ -186,14 +189,14 @@ pub enum PortKind {
     EBus,
 }
 
-/// `DiagMessage`: the text behind a text id of the diagnosis history (0x10F3).
+/// `DiagMessage`: the text of a text ID in the diagnosis history (0x10F3).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DiagMessage {
     pub text_id: u16,
     pub text: String,
 }
 
-/// `ESC`: register values that the maker wants set in Init.
+/// `ESC`: register values that the vendor requires in Init.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct InitialRegisters {
     pub reg0108: Option<u16>,
@@ -204,17 +207,17 @@ pub struct InitialRegisters {
 
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Eeprom {
-    /// Bytes.
+    /// The size in bytes.
     pub byte_size: u32,
-    /// Words 0–6 of the SII (PDI control, configuration …), as written.
+    /// Words 0–6 of the SII (PDI control, configuration, …), as in the file.
     pub config_data: Vec<u8>,
     /// Words 0x14–0x17: bootstrap mailbox offsets and sizes.
     pub bootstrap: Vec<u8>,
-    /// Further categories that the maker wants in the image.
+    /// Further categories that the vendor adds to the image.
     pub categories: Vec<EepromCategory>,
-    /// `Data`: the whole image, where the file has that instead of its parts.
+    /// `Data`: the whole image, if the file contains it instead of its parts.
     pub image: Vec<u8>,
-    /// The image belongs to the device's processor; a MainDevice hands it over.
+    /// The device's processor owns the image. The MainDevice assigns EEPROM access to the PDI.
     pub assign_to_pdi: bool,
 }
 
@@ -223,6 +226,6 @@ pub struct Eeprom {
 pub struct EepromCategory {
     pub number: u16,
     pub data: Vec<u8>,
-    /// What the device holds is kept when an image is written.
+    /// Writing an image keeps the category that the device already contains.
     pub preserve: bool,
 }

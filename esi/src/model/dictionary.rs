@@ -2,7 +2,7 @@
 
 use super::{Bytes, Position, SlotDependence, Text};
 
-/// Objects in file order, types resolved: every readable subindex is an item of its object.
+/// Objects in file order with resolved types. Each readable subindex is an item of its object.
 #[derive(Debug, Clone, Default)]
 pub struct Dictionary {
     pub objects: Vec<Object>,
@@ -35,14 +35,14 @@ pub struct Object {
     pub depends_on: SlotDependence,
     pub name: Text,
     pub code: ObjectCode,
-    /// Name of the type as the file writes it.
+    /// The type name as in the file.
     pub type_name: Text,
-    /// Subindex 0 first. A simple variable has exactly one item, with subindex 0.
+    /// The items, subindex 0 first. A simple variable has exactly one item, with subindex 0.
     pub items: Vec<ObjectItem>,
 }
 
 impl Object {
-    /// Bytes in memory, nearly.
+    /// Returns the approximate memory use in bytes.
     pub(crate) fn size(&self) -> usize {
         let items = self.items.iter().map(|item| {
             let range = [&item.min, &item.max].into_iter().flatten();
@@ -60,23 +60,24 @@ impl Object {
 pub struct ObjectItem {
     pub sub: u8,
     pub name: Text,
-    /// Base type name (`USINT`, `DINT`, `STRING(5)`, `ARRAY [0..15] OF BYTE`).
+    /// The base type name (`USINT`, `DINT`, `STRING(5)`, `ARRAY [0..15] OF BYTE`).
     pub type_name: Text,
     pub bit_len: u32,
-    /// Offset inside the object as complete access sees it, subindex 0 padded to 16 bits.
+    /// The bit offset inside the object for complete access, where subindex 0 is padded to 16 bits.
     pub bit_offset: u32,
-    /// Little-endian, exactly `bit_len.div_ceil(8)` bytes; zero where the file gives no default.
+    /// The default in little-endian order, exactly `bit_len.div_ceil(8)` bytes. Zero if the file
+    /// has no default.
     pub default: Bytes,
     pub has_default: bool,
     pub min: Option<Bytes>,
     pub max: Option<Bytes>,
     pub access: Access,
     pub pdo_mapping: PdoMapping,
-    /// `Backup`: kept over a power cycle once parameters are stored.
+    /// `Backup`: the drive keeps the value over a power cycle once parameters are stored.
     pub backup: bool,
-    /// `Setting`: belongs to what a machine configures at start-up.
+    /// `Setting`: the machine configures the object at start-up.
     pub setting: bool,
-    /// `Unit`, coded as in ETG.1004; 0 where the file gives none.
+    /// `Unit`, coded as in ETG.1004; 0 if the file has none.
     pub unit: u32,
 }
 
@@ -99,7 +100,7 @@ impl Default for Access {
 pub enum Writable {
     Never,
     Always,
-    /// `WriteRestrictions` name the states in which it may be written.
+    /// `WriteRestrictions` list the states that allow writing.
     Only {
         pre_op: bool,
         safe_op: bool,

@@ -1,4 +1,4 @@
-//! Mailbox protocols and the start-up commands that belong to them.
+//! Mailbox protocols and their start-up commands.
 
 use super::{Position, SlotDependence};
 
@@ -16,9 +16,9 @@ pub struct Mailbox {
 #[derive(Debug, Clone, Default)]
 pub struct Coe {
     pub sdo_info: bool,
-    /// PDO assignment (0x1C12/0x1C13) may be written.
+    /// The PDO assignment (0x1C12/0x1C13) is writable.
     pub pdo_assign: bool,
-    /// PDO contents (0x16xx/0x1Axx) may be written.
+    /// The PDO contents (0x16xx/0x1Axx) are writable.
     pub pdo_config: bool,
     pub pdo_upload: bool,
     pub complete_access: bool,
@@ -27,22 +27,23 @@ pub struct Coe {
     pub init_cmds: Vec<InitCmd>,
 }
 
-/// `InitCmd`: an SDO download that the device's maker wants sent at a transition.
+/// `InitCmd`: an SDO download that the vendor requires at a state transition.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InitCmd {
     pub position: Position,
-    /// `IP`, `PS`, `SO` …; one command may name several.
+    /// `IP`, `PS`, `SO`, …; one command may have several.
     pub transitions: Vec<String>,
     pub index: u16,
     pub depends_on: SlotDependence,
     pub sub: u8,
     pub complete_access: bool,
-    /// The user may not change it.
+    /// The user may not change this command.
     pub fixed: bool,
-    /// A device's command that a module's own for the same object replaces.
+    /// A module's command for the same object replaces this command of the device.
     pub overwritten_by_module: bool,
     pub data: Vec<u8>,
-    /// `AdaptAutomatically`: the data follow the configuration; what is written here is that of the maker's default.
+    /// `AdaptAutomatically`: the data follow the configuration. The data in the file belong to the
+    /// vendor's default.
     pub adapts: bool,
     pub comment: String,
 }

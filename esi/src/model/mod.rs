@@ -1,36 +1,37 @@
-//! What an ESI file says, as data. Names follow ETG.2000; every element that can be the origin of a
-//! derived value keeps the line it stands on.
+//! The contents of an ESI file as data. Names follow ETG.2000. Each element that can be the origin
+//! of a derived value keeps its line.
 //!
-//! * `device`: identity, revisions, what the device says of itself, EEPROM
+//! * `device`: identity, revisions, properties, EEPROM
 //! * `sync`: FMMUs, SyncManagers, sync units, DC operation modes
 //! * `pdo`: PDOs and their entries
 //! * `mailbox`: protocols and InitCmds
-//! * `slots`: slots and the modules that go there
-//! * `dictionary`: objects, types resolved
-//! * `text`: names and types that many of them share; `bytes`: values of objects
+//! * `slots`: slots and their modules
+//! * `dictionary`: objects with resolved types
+//! * `shared_str`: names and types that many elements share
+//! * `small_bytes`: values of objects
 
-mod bytes;
 mod device;
 mod dictionary;
 mod mailbox;
 mod pdo;
+mod shared_str;
 mod slots;
+mod small_bytes;
 mod sync;
-mod text;
 
 use std::fmt;
 
-pub use bytes::Bytes;
 pub use device::*;
 pub use dictionary::*;
 pub use mailbox::*;
 pub use pdo::*;
-pub(crate) use slots::Place;
+pub use shared_str::Text;
+pub(crate) use slots::SlotPosition;
 pub use slots::*;
+pub use small_bytes::Bytes;
 pub use sync::*;
-pub use text::Text;
 
-/// Where in the file an element starts.
+/// The position in the file at which an element starts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Position {
     pub line: u32,
@@ -50,20 +51,22 @@ pub struct EsiFile {
     pub groups: Vec<Group>,
     pub devices: Vec<Device>,
     pub modules: Vec<Module>,
-    /// `InfoReference`: other files, usually of root `EtherCATModule`, that hold further modules.
+    /// `InfoReference`: other files, usually with root `EtherCATModule`, that contain further
+    /// modules.
     pub references: Vec<String>,
-    /// What was odd, and what could not be read and was left out.
+    /// Inconsistent elements, and unreadable elements that the reader skipped.
     pub warnings: Vec<Warning>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Warning {
-    /// Name of the file, where it is one that the file at hand refers to.
+    /// The name of the referenced file; `None`: the warning is in the main file.
     pub file: Option<String>,
     pub position: Position,
-    /// Element path, `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
+    /// Element path, such as `EtherCATInfo/Descriptions/Devices/Device[1]/Sm[3]`.
     pub path: String,
-    /// It could not be read and is not in the model; `false`: it was odd and read all the same.
+    /// True if the element is unreadable and missing in the model. False if the reader kept an
+    /// inconsistent element.
     pub left_out: bool,
     pub message: String,
 }
@@ -74,7 +77,7 @@ pub struct Vendor {
     pub name: String,
 }
 
-/// `Group`: how a configurator sorts devices; [`Device::group`] names its `Type`.
+/// `Group`: a group of devices in a configurator. [`Device::group`] contains its `Type`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {
     pub type_name: String,
@@ -84,7 +87,7 @@ pub struct Group {
 /// A name in one language.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LocalName {
-    /// Windows locale, 1033 English, 1031 German.
+    /// Windows locale: 1033 English, 1031 German.
     pub lcid: Option<u32>,
     pub text: String,
 }

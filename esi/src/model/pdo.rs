@@ -16,36 +16,36 @@ pub struct Pdo {
     pub direction: Direction,
     pub index: u16,
     pub name: String,
-    /// SyncManager it is assigned to by default; `None`: not in the default assignment.
+    /// The SyncManager of the default assignment; `None`: not assigned by default.
     pub sm: Option<u8>,
     pub su: Option<u8>,
-    /// SyncManagers that it may not be assigned to.
+    /// SyncManagers to which this PDO may not be assigned.
     pub excluded_sm: Vec<u8>,
-    /// The contents cannot be changed.
+    /// The contents are not changeable.
     pub fixed: bool,
     pub mandatory: bool,
     pub virtual_: bool,
-    /// A slot's module replaces this PDO's contents.
+    /// The module in a slot replaces this PDO's contents.
     pub overwritten_by_module: bool,
-    /// In a module: the index counts on by the slot's increment.
+    /// In a module: the slot number shifts the index.
     pub depends_on: SlotDependence,
     pub oversampling: Option<Oversampling>,
     pub exclude: Vec<Excluded>,
     pub entries: Vec<Entry>,
 }
 
-/// `OSFac` …: one cycle brings several samples of the PDO.
+/// `OSFac` …: one cycle contains several samples of the PDO.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Oversampling {
-    /// Samples where the OpMode does not say how many.
+    /// The number of samples if the OpMode does not define it.
     pub factor: u16,
     pub max: Option<u16>,
-    /// By how much the entries' indices count on from one sample to the next, the PDO's own by 1. 0: the samples
-    /// stand in one PDO.
+    /// The index step of the entries from one sample to the next; the PDO's own step is 1. 0: all
+    /// samples are in one PDO.
     pub index_increment: u16,
 }
 
-/// A PDO that cannot be assigned beside this one.
+/// A PDO that cannot be assigned together with this one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Excluded {
     pub index: u16,
@@ -61,7 +61,7 @@ impl From<u16> for Excluded {
     }
 }
 
-/// Which of a slot's increments an index in a module counts on by.
+/// The slot increments that shift an index in a module.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct SlotDependence {
     pub slot: bool,
@@ -74,7 +74,7 @@ impl Pdo {
         self.entries.iter().map(|e| u32::from(e.bit_len)).sum()
     }
 
-    /// Bytes in memory, nearly.
+    /// Returns the approximate memory use in bytes.
     pub(crate) fn size(&self) -> usize {
         let entries = self.entries.iter();
         let entries = entries.map(|e| size_of::<Entry>() + e.name.len() + e.data_type.len());
@@ -86,7 +86,7 @@ impl Pdo {
     }
 }
 
-/// A mapped object, or a gap where `index` is 0.
+/// A mapped object; `index` 0: a gap.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
     pub position: Position,
@@ -94,7 +94,7 @@ pub struct Entry {
     pub sub: u8,
     pub bit_len: u16,
     pub name: Text,
-    /// ETG.2000 base type name (`UINT`, `DINT`, `BOOL` …), empty for a gap.
+    /// The ETG.2000 base type name (`UINT`, `DINT`, `BOOL`, …); empty for a gap.
     pub data_type: Text,
     pub depends_on: SlotDependence,
 }
@@ -105,15 +105,15 @@ impl Entry {
         self.index == 0
     }
 
-    /// The UDINT that stands in 0x16xx/0x1Axx for this entry: index, subindex, bit length.
-    /// Entries longer than 255 bits keep the low byte of their length.
+    /// Returns the UDINT for 0x16xx/0x1Axx: index, subindex and bit length. Entries longer than 255
+    /// bits keep the low byte of their length.
     #[must_use]
     pub fn mapping(&self) -> u32 {
         u32::from(self.index) << 16 | u32::from(self.sub) << 8 | u32::from(self.bit_len & 0xff)
     }
 }
 
-/// `AlternativeSmMapping`: the PDOs of each SyncManager under a name.
+/// `AlternativeSmMapping`: a named list of the PDOs of each SyncManager.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SmMapping {
     pub position: Position,
@@ -121,8 +121,8 @@ pub struct SmMapping {
     pub path: String,
     pub name: String,
     pub default: bool,
-    /// (SyncManager, its PDOs in order). A SyncManager that is not named keeps its default.
+    /// (SyncManager, its PDOs in order). A SyncManager that is not listed keeps its default.
     pub sync_managers: Vec<(u8, Vec<u16>)>,
-    /// (PDO, samples in a cycle), for those that it assigns.
+    /// (PDO, samples per cycle), only for PDOs with a factor in the mapping.
     pub oversampling: Vec<(u16, u16)>,
 }

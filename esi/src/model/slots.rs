@@ -1,4 +1,4 @@
-//! Slots, and the modules that go there.
+//! Slots and their modules.
 
 use super::{Dictionary, InitCmd, Object, Pdo, Position, SlotDependence};
 
@@ -7,14 +7,14 @@ pub struct Slots {
     pub position: Position,
     pub max_count: Option<u32>,
     pub increments: Increments,
-    /// 0xF030 must be written with the configured module identities.
+    /// The MainDevice must write the configured module identities to 0xF030.
     pub download_module_ident_list: bool,
     pub slots: Vec<Slot>,
-    /// `ModulePdoGroup`, by its number, which modules name.
+    /// `ModulePdoGroup`, sorted by the number that modules refer to.
     pub pdo_groups: Vec<ModulePdoGroup>,
 }
 
-/// By how much indices of a module count on from one slot, or slot group, to the next.
+/// The index steps of a module from one slot or slot group to the next.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Increments {
     pub pdo: u16,
@@ -23,11 +23,11 @@ pub struct Increments {
     pub group_index: u16,
 }
 
-/// Modules of one group share a PDO whose length is padded.
+/// Modules of one group share a PDO. Padding aligns the data of each module.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ModulePdoGroup {
     pub name: String,
-    /// Bytes; modules' data start at a multiple of it.
+    /// The alignment of module data in bytes.
     pub alignment: u32,
     pub rx_pdo: Option<u16>,
     pub tx_pdo: Option<u16>,
@@ -41,12 +41,12 @@ pub struct Slot {
     pub group: Option<u32>,
     pub min_instances: u32,
     pub max_instances: u32,
-    /// Where the slot has its own instead of [`Slots::increments`].
+    /// The slot's own value instead of [`Slots::increments`].
     pub pdo_increment: Option<u16>,
     pub index_increment: Option<u16>,
-    /// (module identity, is the default)
+    /// (module identity, true for the default)
     pub module_idents: Vec<(u32, bool)>,
-    /// `ModuleClass`: every module of one of these classes fits.
+    /// `ModuleClass`: the slot accepts each module of these classes.
     pub module_classes: Vec<String>,
 }
 
@@ -55,30 +55,30 @@ pub struct Module {
     pub position: Position,
     /// Element path, as in [`super::Warning`].
     pub path: String,
-    /// Name of the file, where it is another than that of the devices.
+    /// The name of the module's file if it differs from the file of the devices.
     pub file: Option<String>,
     pub ident: u32,
     pub class: Option<String>,
-    /// Number of the [`ModulePdoGroup`].
+    /// The number of the [`ModulePdoGroup`].
     pub pdo_group: Option<u32>,
     pub type_name: String,
     pub name: String,
-    /// As [`Device::profile`].
+    /// Same as [`Device::profile`](super::Device::profile).
     pub profile: Option<u32>,
     pub rx_pdos: Vec<Pdo>,
     pub tx_pdos: Vec<Pdo>,
     pub init_cmds: Vec<InitCmd>,
-    /// `DcOpModeName`: which OpMode of the device the module wants.
+    /// `DcOpModeName`: the OpMode of the device that the module requires.
     pub dc_mode: Option<String>,
     pub dictionary: Dictionary,
 }
 
 impl Module {
-    /// The module as it is at a place: indices that depend on the slot count on. Places are counted from 0 over all
-    /// slots and their instances.
+    /// Returns the module as plugged at `place`, with slot-dependent indices shifted. Places count
+    /// from 0 over all slots and their instances.
     #[must_use]
     pub fn at(&self, slots: &Slots, slot: &Slot, place: usize) -> Self {
-        let place = Place::new(slots, slot, place);
+        let place = SlotPosition::new(slots, slot, place);
         let mut module = self.without_objects_at(&place);
         let objects = place.objects(self).map(|(index, object)| Object {
             index,
@@ -88,7 +88,7 @@ impl Module {
         module
     }
 
-    /// Bytes in memory, nearly.
+    /// Returns the approximate memory use in bytes.
     pub(crate) fn size(&self) -> usize {
         let pdos = self.rx_pdos.iter().chain(&self.tx_pdos).map(Pdo::size);
         let commands = self.init_cmds.iter().map(|cmd| {
@@ -105,8 +105,9 @@ impl Module {
             .fold(size_of::<Self>() + names, usize::saturating_add)
     }
 
-    /// The same as [`Self::at`] without its dictionary, which [`Place::objects`] tells: it is long, and there are many places.
-    pub(crate) fn without_objects_at(&self, place: &Place) -> Self {
+    /// Same as [`Self::at`] without the dictionary, which [`SlotPosition::objects`] provides.
+    /// Dictionaries are long, and a device may have many places.
+    pub(crate) fn without_objects_at(&self, place: &SlotPosition) -> Self {
         let mut module = Self {
             rx_pdos: self.rx_pdos.clone(),
             tx_pdos: self.tx_pdos.clone(),
@@ -136,15 +137,15 @@ impl Module {
     }
 }
 
-/// Where a module goes, for the indices that it has there.
+/// The place of a module, which determines its indices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Place {
+pub(crate) struct SlotPosition {
     number: u16,
     group: u16,
     steps: Increments,
 }
 
-impl Place {
+impl SlotPosition {
     pub fn new(slots: &Slots, slot: &Slot, number: usize) -> Self {
         let group = slot.group.and_then(|group| u16::try_from(group).ok());
         Self {
@@ -158,7 +159,7 @@ impl Place {
         }
     }
 
-    /// A module's objects as they are here.
+    /// Returns a module's objects with their indices at this place.
     pub fn objects<'m>(&self, module: &'m Module) -> impl Iterator<Item = (u16, &'m Object)> {
         let place = *self;
         let objects = module.dictionary.objects.iter();

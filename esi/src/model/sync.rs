@@ -2,13 +2,13 @@
 
 use super::Position;
 
-/// One `Fmmu` element; its place in `Device::fmmus` is its number.
+/// One `Fmmu` element. Its index in `Device::fmmus` is its number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Fmmu {
     pub usage: FmmuUse,
-    /// The SyncManager it is for, where the file says so.
+    /// The SyncManager of this FMMU, if the file has one.
     pub sm: Option<u8>,
-    /// Its sync unit, by number.
+    /// The number of its sync unit.
     pub su: Option<u8>,
     pub op_only: bool,
 }
@@ -43,19 +43,20 @@ pub enum SmUse {
     Other,
 }
 
-/// One `Sm` element; its place in `Device::sync_managers` is its number.
+/// One `Sm` element. Its index in `Device::sync_managers` is its number.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SyncManager {
     pub position: Position,
     pub usage: SmUse,
     pub start_address: u16,
-    /// Bytes; 0 where the file gives none.
+    /// The size in bytes; 0 if the file has none.
     pub default_size: u16,
     pub min_size: Option<u16>,
     pub max_size: Option<u16>,
     pub control_byte: u8,
     pub enable: bool,
-    /// Not a SyncManager of the chip: process data at a register, reached by an FMMU alone.
+    /// Not a SyncManager of the controller: process data at a register, accessible through an FMMU
+    /// only.
     pub virtual_: bool,
     /// Enabled in Op only.
     pub op_only: bool,
@@ -63,7 +64,7 @@ pub struct SyncManager {
     pub watchdog: Option<bool>,
 }
 
-/// `Dc/OpMode`. Times in nanoseconds.
+/// `Dc/OpMode`. Times in ns.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DcMode {
     pub position: Position,
@@ -73,22 +74,23 @@ pub struct DcMode {
     pub assign_activate: u16,
     pub sync0: SyncTime,
     pub sync1: SyncTime,
-    /// PDOs that the mode assigns: (SyncManager, PDOs in order), empty where it leaves them alone.
+    /// PDOs that the mode assigns: (SyncManager, PDOs in order). Empty if the mode keeps the
+    /// assignment.
     pub sync_managers: Vec<(u8, Vec<u16>)>,
-    /// (PDO, samples in a cycle), for those that it assigns.
+    /// (PDO, samples per cycle), only for PDOs that the mode assigns.
     pub oversampling: Vec<(u16, u16)>,
 }
 
-/// Cycle and shift of one SYNC signal as written; `Factor` relates it to the bus cycle.
+/// Cycle and shift of one SYNC signal as in the file. `Factor` relates the signal to the bus cycle.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SyncTime {
-    /// Absolute cycle in nanoseconds; 0: derive from the factor.
+    /// The absolute cycle in ns; 0: derived from the factor.
     pub cycle_ns: i64,
-    /// > 0: bus cycle × factor, < 0: bus cycle ÷ |factor|, 0: none.
+    /// > 0: bus cycle × factor; < 0: bus cycle ÷ |factor|; 0: none.
     pub factor: i32,
     pub shift_ns: i64,
     pub shift_factor: i32,
-    /// `Input="1"`: shift relative to the input event.
+    /// `Input="1"`: the shift is relative to the input event.
     pub shift_input: bool,
 }
 

@@ -1,9 +1,9 @@
-//! Which DC operation mode, and its times at this bus cycle.
+//! DC operation mode and its times for this bus cycle.
 
 use super::SelectError;
 use crate::model::{DcMode, Device, Position, SyncTime};
 
-/// What goes into the DC registers of one device.
+/// The DC register values of one device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DcSettings {
     pub name: String,
@@ -19,11 +19,11 @@ pub struct DcSettings {
 const SYNC0: u16 = 0x0200;
 const SYNC1: u16 = 0x0400;
 
-/// The OpMode that applies; `None`: the ESI has none, or the user wants none. One whose AssignActivate is 0 means no
-/// distributed clock.
+/// Returns the OpMode that applies; `None`: the ESI has none, or the user disabled DC.
+/// AssignActivate 0 means no distributed clock.
 ///
-/// Without a wish a module's `DcOpModeName` decides; a synchronous drive takes the first OpMode that activates
-/// the clock, wherever it stands in the list; other devices take the first.
+/// Without a user's choice, a module's `DcOpModeName` decides. Otherwise a synchronous drive uses
+/// the first OpMode that activates the clock, and other devices use the first OpMode.
 pub(super) fn choose<'a>(
     device: &'a Device,
     wanted: Option<&str>,
@@ -77,7 +77,7 @@ pub(super) fn settings(mode: &DcMode, cycle_ns: u64) -> Result<DcSettings, Selec
         what,
     };
     let bus = i128::from(cycle_ns);
-    // A SYNC signal that is activated and has neither cycle nor factor follows the bus.
+    // An active SYNC signal without cycle and factor uses the bus cycle.
     let sync0 = match cycle(mode.sync0, bus) {
         0 if mode.assign_activate & SYNC0 != 0 => bus,
         cycle => cycle,
@@ -112,7 +112,7 @@ fn shift(time: SyncTime, base: i128) -> i128 {
     i128::from(time.shift_ns) + scaled(time.shift_factor, base)
 }
 
-/// ETG.2000: a positive factor multiplies, a negative one divides.
+/// ETG.2000: a positive factor multiplies, a negative factor divides.
 fn scaled(factor: i32, base: i128) -> i128 {
     match i128::from(factor) {
         0 => 0,

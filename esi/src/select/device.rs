@@ -1,14 +1,14 @@
-//! Which device of a file is meant.
+//! Finds a device in a file.
 
 use std::fmt;
 
 use super::SelectError;
 use crate::model::{Device, EsiFile, Warning};
 
-/// What is known about a device; `None` matches everything.
+/// The known properties of a device; `None` matches every device.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct DeviceQuery<'a> {
-    /// `Type` or `Name` of the device, upper and lower case alike.
+    /// `Type` or `Name` of the device, case-insensitive.
     pub name: Option<&'a str>,
     pub product: Option<u32>,
     pub revision: Option<u32>,
@@ -33,7 +33,8 @@ impl fmt::Display for DeviceQuery<'_> {
     }
 }
 
-/// The one device that `query` describes; of several revisions of one product the newest.
+/// Returns the device that matches `query`. If several revisions of one product match, returns the
+/// newest.
 pub fn find_device<'a>(
     file: &'a EsiFile,
     query: &DeviceQuery<'_>,
@@ -87,7 +88,7 @@ pub fn find_device<'a>(
     Ok(newest)
 }
 
-/// What of the file's devices could not be read, and took its device with it.
+/// Returns the read errors that removed whole devices from the file.
 fn unreadable(file: &EsiFile) -> String {
     let of = |warning: &Warning, device: &Device| {
         let rest = warning.path.strip_prefix(device.path.as_str());

@@ -1,4 +1,4 @@
-//! Why a choice does not fit the ESI file.
+//! Reasons why a choice does not fit the ESI file.
 
 use crate::address;
 use crate::mode::Mode;
@@ -12,7 +12,7 @@ pub enum SelectError {
     NoSuchDevice {
         query: String,
         available: String,
-        /// Devices that were left out, with the reason.
+        /// Skipped devices with the reason.
         unreadable: String,
     },
     #[error("{query} matches several devices: {available}")]
@@ -183,7 +183,7 @@ pub enum SelectError {
         sm: u8,
         position: Position,
         start: u16,
-        /// Bytes, with all buffers.
+        /// The length in bytes, with all buffers.
         len: u32,
     },
     #[error(
@@ -214,7 +214,7 @@ pub enum SelectError {
 }
 
 impl SelectError {
-    /// The element at fault, where it is another than the device itself: its place and name.
+    /// Returns position and name of the faulty element, if it is not the device itself.
     #[must_use]
     pub fn element(&self) -> Option<(Position, &'static str)> {
         match self {

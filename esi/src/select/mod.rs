@@ -1,16 +1,17 @@
-//! The user's choice applied to what the ESI offers: device, module, PDOs and DC mode.
+//! Applies the user's choice to the ESI: device, module, PDOs and DC mode.
 //!
-//! `device` finds the device in the file, `module` fills the slot, `pdo` assigns PDOs, `own` fills one as the user
-//! wants it, `samples` repeats
-//! what is oversampled, `dc` picks the OpMode; [`select`] puts them together with layout and start-up list. Nothing here talks to a device.
+//! `device` finds the device in the file. `module` fills the slots. `pdo` assigns PDOs, and
+//! `custom_pdo` handles user-defined contents. `oversampling` repeats oversampled PDOs. `dc`
+//! selects the OpMode. [`select`] combines these results with layout and start-up list. Nothing in
+//! this module communicates with a device.
 
+mod custom_pdo;
 mod dc;
 mod device;
 mod error;
 mod module;
-mod own;
+mod oversampling;
 mod pdo;
-mod samples;
 
 pub use dc::DcSettings;
 pub use device::{DeviceQuery, find_device};
@@ -26,67 +27,69 @@ use crate::model::{
 };
 use crate::startup::{self, StartupSdo};
 
-/// An object to be mapped.
+/// An object for a PDO mapping.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct EntryRef {
     pub index: u16,
     pub sub: u8,
 }
 
-/// A start-up SDO of the user's.
+/// A user-defined start-up SDO.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UserSdo {
     pub index: u16,
     pub sub: u8,
-    /// Little-endian, as long as the object.
+    /// The value in little-endian order, with the length of the object.
     pub data: Vec<u8>,
 }
 
-/// What the user asks of one device.
+/// The user's choices for one device.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Choice<'a> {
+pub struct SelectOptions<'a> {
     pub mode: Option<Mode>,
-    /// The user's own contents of the output PDO.
+    /// User-defined contents of the output PDO.
     pub rx: Option<&'a [EntryRef]>,
-    /// The user's own contents of the input PDO.
+    /// User-defined contents of the input PDO.
     pub tx: Option<&'a [EntryRef]>,
-    /// Modules slot by slot (type, name or identity; `-` for none); slots that are not named follow mode and
-    /// default.
+    /// Modules slot by slot (type, name or identity; `-` for none). Slots without an element in
+    /// this list follow mode and default.
     pub modules: &'a [&'a str],
-    /// Name of an `AlternativeSmMapping`.
+    /// The name of an `AlternativeSmMapping`.
     pub assignment: Option<&'a str>,
-    /// Name or description of a `Dc/OpMode`, or `off`.
+    /// The name or description of a `Dc/OpMode`, or `off`.
     pub dc_mode: Option<&'a str>,
     pub cycle_ns: u64,
     pub sdo: &'a [UserSdo],
 }
 
-/// One device, fully decided.
+/// The complete configuration of one device.
 #[derive(Debug, Clone)]
 pub struct Selection {
     pub identity: Identity,
     pub device_name: String,
-    /// In the order of their slots.
+    /// The modules in slot order.
     pub modules: Vec<SelectedModule>,
     pub mode: Option<Mode>,
-    /// The assignment by name that applies, the user's or the DC mode's.
+    /// The named assignment that applies, from the user or from the DC mode.
     pub assignment: Option<String>,
-    /// As they will be on the wire, in the order of assignment; `sm` is always set.
+    /// The PDOs on the wire in assignment order. `sm` is always set.
     pub rx: Vec<Pdo>,
     pub tx: Vec<Pdo>,
-    /// The device's objects and the module's; where both have one, the module's.
+    /// The objects of device and modules. A module's object replaces the device's object of the
+    /// same index.
     pub dictionary: Dictionary,
-    /// `None`: free run or SyncManager-synchronous, no distributed clock.
+    /// `None`: free run or SyncManager-synchronous, without distributed clock.
     pub dc: Option<DcSettings>,
     pub layout: Layout,
     pub startup: Vec<StartupSdo>,
-    /// What was decided that the user might not expect.
+    /// Decisions that the user may not expect.
     pub notes: Vec<String>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SelectedModule {
-    /// Counted from 0 over all slots and their instances; 0xF030 has it at subindex `place + 1`.
+    /// The place, counted from 0 over all slots and their instances. In 0xF030 it has subindex
+    /// `place + 1`.
     pub place: usize,
     pub ident: u32,
     pub type_name: String,
@@ -94,11 +97,11 @@ pub struct SelectedModule {
     pub slot_name: String,
     pub position: Position,
     pub init_cmds: Vec<InitCmd>,
-    /// Its PDOs' indices, as they are in this slot.
+    /// The indices of its PDOs in this slot.
     pub pdos: Vec<u16>,
 }
 
-/// What of an element of the file could not be read.
+/// Returns the read errors of the elements below `path`.
 fn left_out(file: &EsiFile, path: &str) -> Vec<String> {
     let within = |warning: &&Warning| {
         let rest = warning.path.strip_prefix(path);
@@ -109,13 +112,13 @@ fn left_out(file: &EsiFile, path: &str) -> Vec<String> {
         .collect()
 }
 
-/// Decides everything about one device.
+/// Selects the complete configuration of one device.
 pub fn select(
     file: &EsiFile,
     device: &Device,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
 ) -> Result<Selection, SelectError> {
-    if device.speaks_soe_alone() {
+    if device.is_soe_only() {
         return Err(SelectError::SoeOnly {
             device: device.name.clone(),
         });
@@ -144,7 +147,7 @@ pub fn select(
             whole_direction: true,
         });
     let assignment = by_name.or(by_dc_mode);
-    let chooser = |direction| pdo::Chooser {
+    let chooser = |direction| pdo::PdoSelector {
         device,
         placed: &placed,
         dictionary: &dictionary,
@@ -199,8 +202,8 @@ pub fn select(
     Ok(selection)
 }
 
-/// A drive stops by itself when its outputs do not come, whatever its ESI says: bit 6 of the
-/// ControlByte (ETG.1000.4, table 58) lets writing them trigger the watchdog.
+/// Enables the output watchdog: a drive must stop if its outputs fail, whatever its ESI contains.
+/// Bit 6 of the ControlByte (ETG.1000.4, table 58) lets writes of the outputs trigger the watchdog.
 fn watch_outputs(device: &Device, layout: &mut Layout, notes: &mut Vec<String>) {
     const WATCHDOG_TRIGGER: u8 = 0x40;
     for sm in &mut layout.outputs {
@@ -217,10 +220,10 @@ fn watch_outputs(device: &Device, layout: &mut Layout, notes: &mut Vec<String>) 
     }
 }
 
-fn merged(device: &Device, placed: &[module::Placed<'_>]) -> Dictionary {
+fn merged(device: &Device, placed: &[module::PluggedModule<'_>]) -> Dictionary {
     let mut dictionary = device.dictionary.clone();
-    // Where an object stands, and which object of a module it is a copy of: the same module in many places brings
-    // what does not depend on the slot only once.
+    // The position of each object, and the module object that it copies. Slot-independent objects
+    // of a module in several places are listed once.
     let mut known: HashMap<u16, (usize, Option<&Object>)> = HashMap::new();
     for (at, object) in dictionary.objects.iter().enumerate() {
         known.entry(object.index).or_insert((at, None));
@@ -244,7 +247,8 @@ fn merged(device: &Device, placed: &[module::Placed<'_>]) -> Dictionary {
     dictionary
 }
 
-/// The modes that a device offers through its modules or PDO sets, for lists and error texts.
+/// Returns the modes that a device offers through its modules or PDO sets, for lists and error
+/// texts.
 #[must_use]
 pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
     let has_slots = device
@@ -266,10 +270,11 @@ pub fn offered_modes(file: &EsiFile, device: &Device) -> Vec<Mode> {
         .collect()
 }
 
-/// Every PDO of one direction, those of the default module in place; for images that know no choice.
+/// Returns all PDOs of one direction, including those of the default module, for images without a
+/// choice.
 pub(crate) fn default_pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
     let placed = module::choose(modules, device, None, &[]).unwrap_or_default();
-    pdo::Chooser {
+    pdo::PdoSelector {
         device,
         placed: &placed,
         dictionary: &device.dictionary,

@@ -1,50 +1,53 @@
-//! Which modules go into which slots, and what a module's indices become there.
+//! Assigns modules to slots and computes the indices of a module in its slot.
 
 use std::collections::HashMap;
 use std::rc::Rc;
 
 use super::SelectError;
 use crate::mode::Mode;
-use crate::model::{Device, Module, Place, Slot, Slots};
+use crate::model::{Device, Module, Slot, SlotPosition, Slots};
 
 const MODES_OF_OPERATION: u16 = 0x6060;
-/// 0xF030 has so many subindices.
+/// The number of subindices of 0xF030.
 const MAX_PLACES: usize = 254;
-/// Bytes of the modules in all places together, with their objects. A choice copies them.
+/// The maximum size in bytes of the modules in all places together, with their objects. A selection
+/// copies them.
 const MAX_SIZE: usize = 24 << 20;
 
-/// A module in its slot; its indices are those that it has there.
+/// A module in its slot, with the indices that apply in this slot.
 #[derive(Debug, Clone)]
-pub(super) struct Placed<'m> {
-    /// Counted from 0 over all slots and their instances, empty ones included.
+pub(super) struct PluggedModule<'m> {
+    /// The place, counted from 0 over all slots and their instances, including empty ones.
     pub place: usize,
     pub slot_name: String,
-    /// Without its dictionary.
+    /// The module without its dictionary.
     pub module: Module,
-    pub at: Place,
-    /// The module as the file has it.
+    pub at: SlotPosition,
+    /// The module as in the file.
     pub source: &'m Module,
 }
 
 /// One instance of a slot.
 struct Instance<'a> {
     slot: &'a Slot,
-    /// Every module that the slot takes.
+    /// All modules that the slot accepts.
     offered: Rc<[&'a Module]>,
     name: String,
     required: bool,
 }
 
-/// Empty where the device has no slots, or its optional slots stay empty.
+/// Returns the selected modules. The list is empty if the device has no slots or its optional slots
+/// stay empty.
 ///
-/// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills every required
-/// place that offers drive modes and is not named, or the first place where none is required.
+/// `wanted` names modules place by place (type, name or identity; `-` for none). A mode fills each
+/// required place that `wanted` does not name. Without required places, the mode fills the first
+/// place.
 pub(super) fn choose<'m>(
     modules: &'m [Module],
     device: &'m Device,
     mode: Option<Mode>,
     wanted: &[&str],
-) -> Result<Vec<Placed<'m>>, SelectError> {
+) -> Result<Vec<PluggedModule<'m>>, SelectError> {
     let Some(slots) = device.slots.as_ref() else {
         return match wanted.len() {
             0 => Ok(Vec::new()),
@@ -92,8 +95,8 @@ pub(super) fn choose<'m>(
                 limit: MAX_SIZE,
             });
         }
-        let at = Place::new(slots, place.slot, number);
-        chosen.push(Placed {
+        let at = SlotPosition::new(slots, place.slot, number);
+        chosen.push(PluggedModule {
             place: number,
             slot_name: place.name.clone(),
             module: module.without_objects_at(&at),
@@ -110,7 +113,7 @@ fn places<'a>(modules: &'a [Module], slots: &'a Slots) -> Result<Vec<Instance<'a
         .and_then(|count| usize::try_from(count).ok())
         .filter(|count| *count > 0)
         .map_or(MAX_PLACES, |count| count.min(MAX_PLACES));
-    // Of several descriptions of one module the first is taken.
+    // If a file describes a module several times, the first description applies.
     let mut by_ident: HashMap<u32, &Module> = HashMap::new();
     for module in modules {
         by_ident.entry(module.ident).or_insert(module);
@@ -174,7 +177,7 @@ fn named<'a>(
     }
 }
 
-/// The module of this mode; a slot without drive modules gets its default.
+/// Returns the module of this mode. A slot without drive modules gets its default.
 fn for_mode<'a>(
     device: &Device,
     place: &Instance<'a>,
@@ -203,7 +206,7 @@ fn for_mode<'a>(
     }
 }
 
-/// The modules that one slot takes.
+/// Returns the modules that one slot accepts.
 fn offered<'a>(
     modules: &'a [Module],
     by_ident: &HashMap<u32, &'a Module>,
@@ -240,7 +243,7 @@ fn default_module<'a>(place: &Instance<'a>) -> Option<&'a Module> {
     }
 }
 
-/// The mode that a module's own InitCmd writes.
+/// Returns the mode that the module's own InitCmd writes.
 fn commanded_mode(module: &Module) -> Option<i8> {
     let command = module
         .init_cmds

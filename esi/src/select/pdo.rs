@@ -1,23 +1,23 @@
-//! Which PDOs are assigned, and with what contents.
+//! Selects the assigned PDOs and their contents.
 
-use super::module::Placed;
-use super::{EntryRef, SelectError, samples};
+use super::module::PluggedModule;
+use super::{EntryRef, SelectError, oversampling};
 use crate::mode::Mode;
 use crate::model::{Device, Dictionary, Direction, Pdo, SmUse};
 
-/// PDOs by SyncManager under a name: an `AlternativeSmMapping`, or what a DC mode assigns.
+/// A named list of PDOs by SyncManager: an `AlternativeSmMapping`, or the assignment of a DC mode.
 #[derive(Clone, Copy)]
 pub(super) struct Assignment<'a> {
     pub name: &'a str,
     pub sync_managers: &'a [(u8, Vec<u16>)],
-    /// (PDO, samples in a cycle).
+    /// (PDO, samples per cycle).
     pub oversampling: &'a [(u16, u16)],
-    /// Of a direction of which it names a SyncManager, the others carry nothing: channels that an OpMode leaves out
-    /// are off.
+    /// If the list names a SyncManager of a direction, the other SyncManagers of that direction
+    /// stay empty. An OpMode thus disables the channels that it does not list.
     pub whole_direction: bool,
 }
 
-/// The assignment that is asked for by name.
+/// Returns the assignment of the requested name.
 pub(super) fn assignment<'a>(
     device: &'a Device,
     wanted: &str,
@@ -51,17 +51,17 @@ pub(super) fn assignment<'a>(
     })
 }
 
-/// One direction of one device.
-pub(super) struct Chooser<'a> {
+/// Selects the PDOs of one direction of one device.
+pub(super) struct PdoSelector<'a> {
     pub device: &'a Device,
-    pub placed: &'a [Placed<'a>],
+    pub placed: &'a [PluggedModule<'a>],
     pub dictionary: &'a Dictionary,
     pub direction: Direction,
     pub assignment: Option<Assignment<'a>>,
 }
 
-impl Chooser<'_> {
-    /// Every PDO that could be assigned: the device's, with those of the modules in their place.
+impl PdoSelector<'_> {
+    /// Returns all assignable PDOs of the device, with modules' PDOs at their places.
     pub fn available(&self) -> Vec<Pdo> {
         let device = self.of_device();
         let modules = self.placed.iter().flat_map(|p| match self.direction {
@@ -96,7 +96,7 @@ impl Chooser<'_> {
         }
     }
 
-    /// The PDOs as they will be assigned, in order, each with its SyncManager.
+    /// Returns the PDOs to assign, in order, each with its SyncManager.
     pub fn choose(
         &self,
         mode: Option<Mode>,
@@ -126,12 +126,13 @@ impl Chooser<'_> {
         }
         let mut sampled = Vec::with_capacity(chosen.len());
         for pdo in chosen {
-            samples::append(&mut sampled, &pdo, self.samples(&pdo))?;
+            oversampling::append(&mut sampled, &pdo, self.samples(&pdo))?;
         }
         Ok(sampled)
     }
 
-    /// How many samples of a PDO one cycle brings: what its assignment says, else what it says itself.
+    /// Returns the number of samples of a PDO per cycle: from its assignment, otherwise from the
+    /// PDO itself.
     fn samples(&self, pdo: &Pdo) -> u16 {
         let assigned = self.assignment.filter(|assignment| {
             let mut all = assignment.sync_managers.iter().flat_map(|(_, pdos)| pdos);
@@ -147,8 +148,8 @@ impl Chooser<'_> {
         }
     }
 
-    /// Applies the assignment by name, if there is one: the SyncManagers that it names carry its PDOs in its
-    /// order, before those of the others.
+    /// Applies the named assignment, if there is one. Its SyncManagers carry its PDOs in its order,
+    /// before the PDOs of other SyncManagers.
     fn assigned(&self, mut available: Vec<Pdo>) -> Result<Vec<Pdo>, SelectError> {
         let Some(assignment) = self.assignment else {
             return Ok(available);
@@ -172,7 +173,7 @@ impl Chooser<'_> {
         for (sm, pdos) in assignment.sync_managers.iter().filter(of_direction) {
             for index in pdos {
                 let Some(at) = available.iter().position(|pdo| pdo.index == *index) else {
-                    // Virtual PDOs are listed, and reached without an assignment.
+                    // Virtual PDOs are listed but accessible without an assignment.
                     if self.of_device().iter().any(|pdo| pdo.index == *index) {
                         continue;
                     }
@@ -191,7 +192,7 @@ impl Chooser<'_> {
         Ok(first)
     }
 
-    /// What the device assigns when nobody says anything; mutual exclusions are resolved in file order.
+    /// Returns the device's default assignment. Mutual exclusions are resolved in file order.
     fn default_set(&self, available: &[Pdo], notes: &mut Vec<String>) -> Vec<Pdo> {
         let mut set: Vec<Pdo> = Vec::new();
         for pdo in available.iter().filter(|pdo| pdo.sm.is_some()) {
@@ -257,11 +258,11 @@ impl Chooser<'_> {
         }
     }
 
-    /// `pdo` first; beside it the default PDOs that it does not exclude, as far as there is room.
+    /// Returns `pdo`, followed by the default PDOs that `pdo` does not exclude, up to the capacity.
     pub(super) fn alongside(&self, pdo: Pdo, default: &[Pdo]) -> Vec<Pdo> {
         let room = self.capacity(&pdo);
         let mut set = vec![pdo];
-        // Mandatory ones first in line for the room, but assigned in file order.
+        // Mandatory PDOs take capacity first, but the assignment keeps file order.
         let mut keep: Vec<u16> = Vec::new();
         for other in default
             .iter()
@@ -279,7 +280,7 @@ impl Chooser<'_> {
         set
     }
 
-    /// How many PDOs the assignment object takes.
+    /// Returns the number of PDOs that the assignment object can hold.
     fn capacity(&self, pdo: &Pdo) -> usize {
         let Ok(sm) = self.sm_of(pdo) else {
             return usize::MAX;
@@ -303,7 +304,7 @@ impl Chooser<'_> {
         }
     }
 
-    /// The SyncManager that carries this direction unless a PDO says otherwise.
+    /// Returns the SyncManager that carries this direction unless a PDO names another one.
     fn primary_sm(&self) -> Option<u8> {
         let place = self
             .device
@@ -344,8 +345,8 @@ pub(super) fn conflict(a: &Pdo, b: &Pdo) -> bool {
     a.index != b.index && (excludes(a, b) || excludes(b, a))
 }
 
-/// Several PDOs that together bring what a mode needs, for devices whose PDOs hold one object each: the default
-/// ones first, then for every object that is missing the shortest PDO that has it.
+/// Returns several PDOs that together contain the objects of a mode, for devices with one object
+/// per PDO. Default PDOs come first, then the shortest PDO for each missing object.
 fn cover(available: &[Pdo], default: &[Pdo], needed: &[u16]) -> Option<Vec<Pdo>> {
     let mut set: Vec<Pdo> = Vec::new();
     for &index in needed {

@@ -1,4 +1,4 @@
-//! Where two images differ, field by field: usually a device's EEPROM against its ESI.
+//! Differences between two images, field by field, usually between a device's EEPROM and its ESI.
 
 use std::fmt::Display;
 
@@ -7,36 +7,36 @@ use crate::model::FmmuUse;
 
 use super::{General, MailboxAreas, Protocols, Sii, SiiDc, SiiPdo};
 
-/// What a difference touches.
+/// The aspect of the device that a difference affects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Aspect {
+pub enum DifferenceKind {
     /// Another device, or another revision of it.
     Identity,
-    /// Mailbox, SyncManagers, FMMUs, PDOs, clocks: what a MainDevice builds on.
+    /// Settings that a MainDevice uses: mailbox, SyncManagers, FMMUs, PDOs, clocks.
     Behaviour,
-    /// Names and what else is only shown.
+    /// Names and other display texts.
     Description,
-    /// Differs from one piece of hardware to the next as it should: serial number, alias.
+    /// Values that are individual to each unit: serial number, alias.
     Instance,
 }
 
-/// One field.
+/// One differing field.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    pub aspect: Aspect,
-    /// `RxPdo 0x1600 / entry 2 / bits`.
+    pub aspect: DifferenceKind,
+    /// The field, such as `RxPdo 0x1600 / entry 2 / bits`.
     pub field: String,
     pub expected: String,
     pub found: String,
 }
 
-/// Every field in which `found` is not `expected`, in the order of the image.
+/// Returns every field in which `found` differs from `expected`, in image order.
 #[must_use]
 pub fn compare(expected: &Sii, found: &Sii) -> Vec<Difference> {
     let mut list = List(Vec::new());
     header(&mut list, expected, found);
     general(&mut list, expected.general.as_ref(), found.general.as_ref());
-    // An odd number of FMMUs is filled up, by some with an unused one.
+    // Images pad an odd number of FMMUs, some with an unused FMMU.
     let usages = |sii: &Sii| {
         let used = sii.fmmus.iter().rposition(|usage| *usage != FmmuUse::Other);
         sii.fmmus
@@ -46,28 +46,28 @@ pub fn compare(expected: &Sii, found: &Sii) -> Vec<Difference> {
             .collect::<Vec<_>>()
     };
     list.items(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "FMMU",
         &usages(expected),
         &usages(found),
         |fmmu| format!("{fmmu:?}"),
     );
     list.items(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "FMMU detail",
         &expected.fmmu_details,
         &found.fmmu_details,
         |detail| format!("{detail:?}"),
     );
     list.items(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "sync unit",
         &expected.sync_units,
         &found.sync_units,
         |flags| format!("{flags:#04x}"),
     );
     list.items(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "SyncManager",
         &expected.sync_managers,
         &found.sync_managers,
@@ -82,7 +82,7 @@ pub fn compare(expected: &Sii, found: &Sii) -> Vec<Difference> {
     pdos(&mut list, "TxPdo", &expected.tx_pdos, &found.tx_pdos);
     dc(&mut list, &expected.dc, &found.dc);
     list.items(
-        Aspect::Description,
+        DifferenceKind::Description,
         "further category",
         &expected.others,
         &found.others,
@@ -94,7 +94,13 @@ pub fn compare(expected: &Sii, found: &Sii) -> Vec<Difference> {
 struct List(Vec<Difference>);
 
 impl List {
-    fn add(&mut self, aspect: Aspect, field: impl Display, expected: String, found: String) {
+    fn add(
+        &mut self,
+        aspect: DifferenceKind,
+        field: impl Display,
+        expected: String,
+        found: String,
+    ) {
         self.0.push(Difference {
             aspect,
             field: field.to_string(),
@@ -105,7 +111,7 @@ impl List {
 
     fn field<T: PartialEq>(
         &mut self,
-        aspect: Aspect,
+        aspect: DifferenceKind,
         field: impl Display,
         [expected, found]: [&T; 2],
         show: impl Fn(&T) -> String,
@@ -116,15 +122,18 @@ impl List {
     }
 
     fn text(&mut self, field: impl Display, [expected, found]: [&String; 2]) {
-        self.field(Aspect::Description, field, [expected, found], |text| {
-            format!("{text:?}")
-        });
+        self.field(
+            DifferenceKind::Description,
+            field,
+            [expected, found],
+            |text| format!("{text:?}"),
+        );
     }
 
-    /// Things in order, numbered from 0.
+    /// Compares two ordered lists. Items are numbered from 0.
     fn items<T: PartialEq>(
         &mut self,
-        aspect: Aspect,
+        aspect: DifferenceKind,
         what: &str,
         expected: &[T],
         found: &[T],
@@ -143,38 +152,43 @@ impl List {
 fn header(list: &mut List, a: &Sii, b: &Sii) {
     let hex = |value: &u32| format!("0x{value:08x}");
     let (id, other) = (a.identity, b.identity);
-    list.field(Aspect::Identity, "vendor", [&id.vendor, &other.vendor], hex);
     list.field(
-        Aspect::Identity,
+        DifferenceKind::Identity,
+        "vendor",
+        [&id.vendor, &other.vendor],
+        hex,
+    );
+    list.field(
+        DifferenceKind::Identity,
         "product code",
         [&id.product, &other.product],
         hex,
     );
     list.field(
-        Aspect::Identity,
+        DifferenceKind::Identity,
         "revision",
         [&id.revision, &other.revision],
         hex,
     );
     list.field(
-        Aspect::Instance,
+        DifferenceKind::Instance,
         "serial number",
         [&a.serial, &b.serial],
         hex,
     );
     list.field(
-        Aspect::Instance,
+        DifferenceKind::Instance,
         "alias",
         [&a.alias, &b.alias],
         u16::to_string,
     );
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "checksum",
         [&a.checksum_ok, &b.checksum_ok],
         |ok| if *ok { "right" } else { "wrong" }.to_owned(),
     );
-    // Without the alias, which words 4 of the configuration holds.
+    // Excludes the alias, which is word 4 of the configuration.
     let config = |sii: &Sii| {
         let words = sii
             .config
@@ -186,7 +200,7 @@ fn header(list: &mut List, a: &Sii, b: &Sii) {
             .collect::<Vec<u16>>()
     };
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "PDI configuration",
         [&config(a), &config(b)],
         |words| {
@@ -201,19 +215,19 @@ fn header(list: &mut List, a: &Sii, b: &Sii) {
         )
     };
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "mailbox",
         [&a.mailbox, &b.mailbox],
         areas,
     );
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "bootstrap mailbox",
         [&a.bootstrap, &b.bootstrap],
         areas,
     );
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "mailbox protocols",
         [&a.protocols, &b.protocols],
         |protocols| {
@@ -235,7 +249,7 @@ fn header(list: &mut List, a: &Sii, b: &Sii) {
         },
     );
     list.field(
-        Aspect::Description,
+        DifferenceKind::Description,
         "EEPROM size",
         [&a.byte_size, &b.byte_size],
         |bytes| format!("{bytes} bytes"),
@@ -248,7 +262,12 @@ fn general(list: &mut List, a: Option<&General>, b: Option<&General>) {
             if general.is_some() { "present" } else { "none" }.to_owned()
         };
         if a.is_some() != b.is_some() {
-            list.add(Aspect::Behaviour, "general category", show(a), show(b));
+            list.add(
+                DifferenceKind::Behaviour,
+                "general category",
+                show(a),
+                show(b),
+            );
         }
         return;
     };
@@ -258,30 +277,43 @@ fn general(list: &mut List, a: Option<&General>, b: Option<&General>) {
     list.text("name", [&a.name, &b.name]);
     let bits = |byte: &u8| format!("{byte:#010b}");
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         "CoE details",
         [&a.coe_details, &b.coe_details],
         bits,
     );
-    list.field(Aspect::Behaviour, "FoE", [&a.foe, &b.foe], bool::to_string);
-    list.field(Aspect::Behaviour, "EoE", [&a.eoe, &b.eoe], bool::to_string);
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
+        "FoE",
+        [&a.foe, &b.foe],
+        bool::to_string,
+    );
+    list.field(
+        DifferenceKind::Behaviour,
+        "EoE",
+        [&a.eoe, &b.eoe],
+        bool::to_string,
+    );
+    list.field(
+        DifferenceKind::Behaviour,
         "general flags",
         [&a.flags, &b.flags],
         bits,
     );
     list.field(
-        Aspect::Description,
+        DifferenceKind::Description,
         "E-bus current",
         [&a.ebus_ma, &b.ebus_ma],
         |current| format!("{current} mA"),
     );
-    list.field(Aspect::Behaviour, "ports", [&a.ports, &b.ports], |ports| {
-        format!("0x{ports:04x}")
-    });
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
+        "ports",
+        [&a.ports, &b.ports],
+        |ports| format!("0x{ports:04x}"),
+    );
+    list.field(
+        DifferenceKind::Behaviour,
         "identification address",
         [&a.identification_address, &b.identification_address],
         |address| format!("0x{address:04x}"),
@@ -295,7 +327,7 @@ fn pdos(list: &mut List, kind: &str, expected: &[SiiPdo], found: &[SiiPdo]) {
         match of(found, a.index).and_then(|at| found.get(at)) {
             Some(b) => pdo(list, &name, a, b),
             None => list.add(
-                Aspect::Behaviour,
+                DifferenceKind::Behaviour,
                 name,
                 format!("{} bits", a.bit_len()),
                 "none".into(),
@@ -305,7 +337,7 @@ fn pdos(list: &mut List, kind: &str, expected: &[SiiPdo], found: &[SiiPdo]) {
     for b in found.iter().filter(|b| of(expected, b.index).is_none()) {
         let name = format!("{kind} 0x{:04x}", b.index);
         list.add(
-            Aspect::Behaviour,
+            DifferenceKind::Behaviour,
             name,
             "none".into(),
             format!("{} bits", b.bit_len()),
@@ -321,7 +353,7 @@ fn pdos(list: &mut List, kind: &str, expected: &[SiiPdo], found: &[SiiPdo]) {
             list.join(" ")
         };
         list.add(
-            Aspect::Behaviour,
+            DifferenceKind::Behaviour,
             format_args!("order of {kind}s"),
             show(a),
             show(b),
@@ -333,19 +365,19 @@ fn pdo(list: &mut List, name: &str, a: &SiiPdo, b: &SiiPdo) {
     let sm = |sm: &Option<u8>| sm.map_or_else(|| "not assigned".to_owned(), |sm| sm.to_string());
     list.text(format_args!("{name} / name"), [&a.name, &b.name]);
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         format_args!("{name} / SyncManager"),
         [&a.sm, &b.sm],
         sm,
     );
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         format_args!("{name} / flags"),
         [&a.flags, &b.flags],
         |flags| format!("0x{flags:04x}"),
     );
     list.field(
-        Aspect::Behaviour,
+        DifferenceKind::Behaviour,
         format_args!("{name} / synchronisation"),
         [&a.synchronization, &b.synchronization],
         u8::to_string,
@@ -357,7 +389,7 @@ fn pdo(list: &mut List, name: &str, a: &SiiPdo, b: &SiiPdo) {
                 entry.map_or_else(|| "none".to_owned(), |e| mapping(e.index, e.sub, e.bit_len))
             };
             list.add(
-                Aspect::Behaviour,
+                DifferenceKind::Behaviour,
                 what,
                 show(a.entries.get(n)),
                 show(b.entries.get(n)),
@@ -366,17 +398,17 @@ fn pdo(list: &mut List, name: &str, a: &SiiPdo, b: &SiiPdo) {
         };
         let mapped = |e: &super::SiiEntry| mapping(e.index, e.sub, e.bit_len);
         if mapped(x) != mapped(y) {
-            list.add(Aspect::Behaviour, &what, mapped(x), mapped(y));
+            list.add(DifferenceKind::Behaviour, &what, mapped(x), mapped(y));
         }
         list.text(format_args!("{what} / name"), [&x.name, &y.name]);
         list.field(
-            Aspect::Description,
+            DifferenceKind::Description,
             format_args!("{what} / data type"),
             [&x.data_type, &y.data_type],
             |code| format!("0x{code:02x}"),
         );
         list.field(
-            Aspect::Description,
+            DifferenceKind::Description,
             format_args!("{what} / flags"),
             [&x.flags, &y.flags],
             |flags| format!("0x{flags:04x}"),
@@ -400,7 +432,7 @@ fn dc(list: &mut List, expected: &[SiiDc], found: &[SiiDc]) {
                 mode.map_or_else(|| "none".to_owned(), |mode| format!("{:?}", mode.name))
             };
             list.add(
-                Aspect::Behaviour,
+                DifferenceKind::Behaviour,
                 what,
                 show(expected.get(n)),
                 show(found.get(n)),
@@ -414,7 +446,7 @@ fn dc(list: &mut List, expected: &[SiiDc], found: &[SiiDc]) {
         );
         let mut number = |field: &str, a: i64, b: i64| {
             list.field(
-                Aspect::Behaviour,
+                DifferenceKind::Behaviour,
                 format_args!("{what} / {field}"),
                 [&a, &b],
                 i64::to_string,
@@ -426,7 +458,7 @@ fn dc(list: &mut List, expected: &[SiiDc], found: &[SiiDc]) {
         number("SYNC0 factor", a.sync0_factor.into(), b.sync0_factor.into());
         number("SYNC1 factor", a.sync1_factor.into(), b.sync1_factor.into());
         list.field(
-            Aspect::Behaviour,
+            DifferenceKind::Behaviour,
             format_args!("{what} / AssignActivate"),
             [&a.assign_activate, &b.assign_activate],
             |word| format!("0x{word:04x}"),

@@ -1,6 +1,6 @@
 //! CRC-8, polynomial x⁸+x²+x+1, start value 0xff, no reflection (ETG.2010).
 
-/// Over the first 14 bytes of an image; stands in byte 14.
+/// Returns the checksum of the first 14 bytes of an image, which byte 14 contains.
 #[must_use]
 pub fn checksum(config: &[u8; 14]) -> u8 {
     config.iter().fold(0xff, |crc, &byte| {
@@ -18,9 +18,9 @@ pub fn checksum(config: &[u8; 14]) -> u8 {
 mod tests {
     use super::checksum;
 
-    /// Controller settings and checksums as found in devices.
+    /// Controller settings and checksums from real devices.
     #[test]
-    fn checksums_of_real_devices() {
+    fn checksum_matches_real_devices() {
         for (config, expected) in [
             ([0x04, 0x01, 0, 0, 0, 0, 0x0f, 0, 0, 0, 0, 0, 0, 0], 0xd8),
             ([0, 0x0d, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], 0x46),

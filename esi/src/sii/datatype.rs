@@ -1,6 +1,6 @@
 //! Base type names → their index in the object dictionary (ETG.1020).
 
-/// Index of a base type in the object dictionary (ETG.1020); 0 where it has none.
+/// Returns the index of a base type in the object dictionary (ETG.1020), or 0 for other types.
 pub(super) fn type_code(name: &str) -> u8 {
     match name {
         "BOOL" | "BIT" => 0x01,

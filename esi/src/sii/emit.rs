@@ -3,12 +3,13 @@
 use super::strings::Table;
 use super::{HEADER_BYTES, Sii, SiiPdo, category, checksum, fmmu_code, sm_code};
 
-/// Makers' images have ones in the bits that nothing uses.
+/// Vendors set unused bits to 1.
 const UNUSED_FMMU_FLAGS: u8 = 0xf8;
 const UNUSED_UNIT_FLAGS: u8 = 0xf0;
 
 impl Sii {
-    /// Padded with 0xff to `byte_size`; longer, in steps of 128 bytes, where the contents need it.
+    /// Returns the image, padded with 0xff to `byte_size`. Longer contents extend the image in
+    /// steps of 128 bytes.
     #[must_use]
     pub fn to_bytes(&self) -> Vec<u8> {
         let categories = self.categories();
@@ -60,7 +61,8 @@ impl Sii {
 
     fn categories(&self) -> Vec<u8> {
         let mut strings = Table::default();
-        // Strings come first in the image and are known last.
+        // The string category comes first in the image, but its contents are complete only at the
+        // end.
         let mut rest = Vec::new();
         if let Some(data) = self.general_category(&mut strings) {
             push(&mut rest, category::GENERAL, &data, 0);

@@ -10,7 +10,7 @@ use crate::model::{
 };
 use crate::select::default_pdos;
 
-/// What differs from one piece of hardware to the next.
+/// Values that are individual to each unit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SiiOptions {
     pub alias: u16,
@@ -55,7 +55,8 @@ impl Sii {
                     shift0_ns: i32::try_from(mode.sync0.shift_ns).unwrap_or(0),
                     shift1_ns: i32::try_from(mode.sync1.shift_ns).unwrap_or(0),
                     sync0_factor: match mode.sync0 {
-                        // Without a cycle and a factor it follows the bus, which makers write as 1.
+                        // A signal without cycle and factor follows the bus cycle. Vendors write
+                        // this as factor 1.
                         SyncTime {
                             cycle_ns: 0,
                             factor: 0,
@@ -80,7 +81,8 @@ impl Sii {
     }
 }
 
-/// Those that can be chosen, and in their places those that stand for registers: images list both.
+/// Returns the selectable PDOs and, at their places, the PDOs that represent registers. Images list
+/// both.
 fn pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
     let own = match direction {
         Direction::Rx => &device.rx_pdos,
@@ -101,12 +103,12 @@ fn pdos(device: &Device, modules: &[Module], direction: Direction) -> Vec<Pdo> {
         all.push(pdo);
     }
     let place = |pdo: &Pdo| own.iter().position(|other| other.index == pdo.index);
-    // Those of modules come last.
+    // PDOs of modules come last.
     all.sort_by_key(|pdo| place(pdo).unwrap_or(usize::MAX));
     all
 }
 
-/// Categories that follow from the rest of the ESI; a file that lists them as well means the same.
+/// Categories that are generated from the rest of the ESI. Copies of them in the file are ignored.
 const GENERATED: [u16; 9] = [
     category::STRINGS,
     category::GENERAL,
@@ -119,23 +121,23 @@ const GENERATED: [u16; 9] = [
     category::DC,
 ];
 
-/// Categories are made of words.
+/// Pads to whole words, because categories consist of words.
 fn even(data: &[u8]) -> Vec<u8> {
     let mut data = data.to_vec();
     data.resize(data.len().next_multiple_of(2), 0);
     data
 }
 
-/// Only where the file tells more than the order of the FMMUs.
+/// Returns FMMU details only if the file contains more than the order of the FMMUs.
 fn fmmu_details(device: &Device) -> Vec<SiiFmmuDetail> {
     let details = device.fmmus.iter().map(|fmmu| SiiFmmuDetail {
         op_only: fmmu.op_only,
         sm: fmmu.sm,
         su: fmmu.su,
     });
-    let told = |detail: &SiiFmmuDetail| *detail != SiiFmmuDetail::default();
+    let reported = |detail: &SiiFmmuDetail| *detail != SiiFmmuDetail::default();
     let details: Vec<_> = details.collect();
-    if details.iter().any(told) {
+    if details.iter().any(reported) {
         details
     } else {
         Vec::new()
@@ -262,7 +264,7 @@ fn general(device: &Device) -> General {
     }
 }
 
-/// `Physics`, first letter = port 0.
+/// Encodes `Physics`; first letter = port 0.
 fn ports(physics: &str) -> u16 {
     physics
         .chars()
@@ -279,7 +281,8 @@ fn ports(physics: &str) -> u16 {
         })
 }
 
-/// A size that the ESI leaves open is what the default PDOs need; registers need none.
+/// Returns the SyncManagers. A size that is missing in the ESI comes from the default PDOs;
+/// registers have size 0.
 fn sync_managers(device: &Device, rx: &[Pdo], tx: &[Pdo]) -> Vec<SiiSyncManager> {
     (0..=u8::MAX)
         .zip(&device.sync_managers)

@@ -1,8 +1,11 @@
-//! The EEPROM image (SII, ETG.2010): what a SubDevice tells about itself before anybody has its ESI.
+//! The EEPROM image (SII, ETG.2010): the self-description of a SubDevice, readable without its ESI.
 //!
-//! `image` derives it from an ESI device, `emit` writes the bytes, `parse` reads them, `strings` and `crc` are the
-//! two details both need; `warnings` tells what is odd in one image, `compare` where two images differ. [`Sii`] is the meeting point: `parse(emit(sii))` gives the same value again as long
-//! as its texts are ASCII of at most 63 characters.
+//! `image` derives the contents from an ESI device, `emit` writes the bytes and `parse` reads them.
+//! `strings` and `crc` are helpers for both. `warning` lists problems in one image, `compare` lists
+//! differences between two images.
+//!
+//! [`Sii`] is the common type. `parse(emit(sii))` returns the same value if its texts are ASCII
+//! with at most 63 characters.
 
 mod compare;
 mod crc;
@@ -11,33 +14,35 @@ mod emit;
 mod image;
 mod parse;
 mod strings;
-mod warnings;
+mod warning;
 
-pub use compare::{Aspect, Difference, compare};
+pub use compare::{Difference, DifferenceKind, compare};
 pub use crc::checksum;
 pub use image::SiiOptions;
 pub use parse::SiiError;
-pub use warnings::{Remark, SiiWarning};
+pub use warning::{SiiWarning, WarningKind};
 
 use crate::model::{Device, FmmuUse, Identity, Module, SmUse};
 
-/// Categories start here.
+/// The offset of the first category.
 const HEADER_BYTES: usize = 0x80;
 
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Sii {
-    /// Words 0–3, 5 and 6: PDI control, PDI configuration, pulse length, extended PDI configuration, reserved.
+    /// Words 0–3, 5 and 6: PDI control, PDI configuration, pulse length, extended PDI
+    /// configuration, reserved.
     pub config: [u8; 14],
-    /// Configured station alias (word 4, part of `config`).
+    /// The configured station alias (word 4, part of `config`).
     pub alias: u16,
-    /// The checksum over `config` is right; a controller ignores an image where it is not.
+    /// True if the checksum of `config` is correct. A controller ignores an image with a wrong
+    /// checksum.
     pub checksum_ok: bool,
     pub identity: Identity,
     pub serial: u32,
     pub bootstrap: MailboxAreas,
     pub mailbox: MailboxAreas,
     pub protocols: Protocols,
-    /// Bytes of EEPROM that the image claims.
+    /// The EEPROM size in bytes that the image states.
     pub byte_size: u32,
     pub general: Option<General>,
     pub fmmus: Vec<FmmuUse>,
@@ -45,18 +50,19 @@ pub struct Sii {
     pub tx_pdos: Vec<SiiPdo>,
     pub rx_pdos: Vec<SiiPdo>,
     pub dc: Vec<SiiDc>,
-    /// Extended FMMU settings (category 42), one for each FMMU; empty where the image has none.
+    /// Extended FMMU settings (category 42), one per FMMU. Empty if the image has none.
     pub fmmu_details: Vec<SiiFmmuDetail>,
-    /// Four flags of each sync unit (category 43): bit 0 separate, 1 separate frame, 2 depends on the input state,
-    /// 3 frames may be repeated.
+    /// Four flags per sync unit (category 43): bit 0 separate, 1 separate frame, 2 depends on the
+    /// input state, 3 frames may be repeated.
     pub sync_units: Vec<u8>,
-    /// Categories that are not interpreted, as they are: data types, dictionaries, makers' own.
+    /// Uninterpreted categories in raw form: data types, dictionaries, vendor-specific categories.
     pub others: Vec<(u16, Vec<u8>)>,
-    /// The end mark was found.
+    /// True if the image has an end mark.
     pub ended: bool,
 }
 
-/// MainDevice → SubDevice (`receive`) and back (`send`), as the SubDevice sees it.
+/// Mailbox areas from the SubDevice's view: MainDevice → SubDevice (`receive`) and SubDevice →
+/// MainDevice (`send`).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MailboxAreas {
     pub receive_offset: u16,
@@ -93,11 +99,12 @@ pub struct General {
     pub coe_details: u8,
     pub foe: bool,
     pub eoe: bool,
-    /// Bit 0: SafeOp is allowed, bit 1: no LRW, bit 2: mailbox data link layer, bit 3: identification in the AL status
-    /// code register, bit 4: identification at `identification_address`.
+    /// Bit 0: SafeOp is allowed, bit 1: no LRW, bit 2: mailbox data link layer, bit 3:
+    /// identification in the AL status code register, bit 4: identification at
+    /// `identification_address`.
     pub flags: u8,
     pub ebus_ma: i16,
-    /// Four bits a port: 0 none, 1 MII, 3 E-bus, 4 fast hot connect.
+    /// Four bits per port: 0 none, 1 MII, 3 E-bus, 4 fast hot connect.
     pub ports: u16,
     pub identification_address: u16,
 }
@@ -109,7 +116,7 @@ impl General {
     pub const IDENTIFICATION_ADDRESS: u8 = 0x10;
 }
 
-/// Category 42: four bytes each.
+/// Category 42: four bytes per FMMU.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SiiFmmuDetail {
     pub op_only: bool,
@@ -144,7 +151,7 @@ pub struct SiiEntry {
     pub index: u16,
     pub sub: u8,
     pub name: String,
-    /// Index of the base type in the object dictionary's type area (ETG.1020).
+    /// The index of the base type in the object dictionary's type area (ETG.1020).
     pub data_type: u8,
     pub bit_len: u8,
     pub flags: u16,
@@ -172,7 +179,7 @@ impl SiiPdo {
     }
 }
 
-/// The EEPROM image of a device as its ESI describes it. A modular device appears with its default module.
+/// Returns the EEPROM image of a device from its ESI. A modular device contains its default module.
 #[must_use]
 pub fn emit(device: &Device, modules: &[Module], options: &SiiOptions) -> Vec<u8> {
     Sii::from_device(device, modules, options).to_bytes()
@@ -183,7 +190,7 @@ pub fn parse(bytes: &[u8]) -> Result<Sii, SiiError> {
     parse::image(bytes).map(|(sii, _)| sii)
 }
 
-/// Reads an EEPROM image, and tells what is wrong with it that does not keep it from being read.
+/// Reads an EEPROM image and returns its problems as well, if the image is readable.
 pub fn inspect(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
     parse::image(bytes)
 }

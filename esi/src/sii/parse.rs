@@ -1,6 +1,8 @@
-//! Bytes → image contents. Every offset comes from outside and may point anywhere.
+//! Bytes → image contents. All offsets come from outside and may point anywhere.
 
-use super::warnings::{Notes, Remark, SiiWarning, Texts, left_over, repeated, strings_of};
+use super::warning::{
+    SiiWarning, StringRefs, WarningKind, Warnings, repeated, strings_of, trailing_bytes,
+};
 use super::{
     General, HEADER_BYTES, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiPdo,
     SiiSyncManager, category, checksum, fmmu_use, sm_use,
@@ -29,7 +31,7 @@ pub enum SiiError {
     },
 }
 
-/// Byte 14.
+/// The offset of the checksum.
 const CHECKSUM: usize = 14;
 
 pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
@@ -37,19 +39,19 @@ pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
         return Err(SiiError::TooShort { len: bytes.len() });
     };
     let mut sii = read_header(header);
-    let mut notes = Notes::default();
+    let mut notes = Warnings::default();
     let right = checksum(&sii.config);
     let found = byte(header, CHECKSUM);
     if right != found {
-        notes.add(CHECKSUM, None, Remark::Checksum { found, right });
+        notes.add(CHECKSUM, None, WarningKind::Checksum { found, right });
     }
     let (found, ended) = categories(body)?;
     sii.ended = ended;
     if !ended {
-        notes.add(bytes.len(), None, Remark::NoEnd);
+        notes.add(bytes.len(), None, WarningKind::NoEnd);
     }
     if ended && found.is_empty() {
-        notes.add(HEADER_BYTES, None, Remark::NoCategories);
+        notes.add(HEADER_BYTES, None, WarningKind::NoCategories);
     }
     repeated(&found, &mut notes);
     let strings = found.iter().find(|c| c.kind == category::STRINGS);
@@ -58,8 +60,8 @@ pub(super) fn image(bytes: &[u8]) -> Result<(Sii, Vec<SiiWarning>), SiiError> {
         .unwrap_or_default();
     for here in &found {
         let (kind, data) = (here.kind, here.data);
-        left_over(here, &mut notes);
-        let mut strings = Texts {
+        trailing_bytes(here, &mut notes);
+        let mut strings = StringRefs {
             table: &strings,
             here: *here,
             notes: &mut notes,
@@ -127,12 +129,12 @@ fn read_header(header: &[u8]) -> Sii {
 #[derive(Clone, Copy)]
 pub(super) struct Category<'a> {
     pub kind: u16,
-    /// Of the data, from the beginning of the image.
+    /// The offset of the data from the start of the image.
     pub offset: usize,
     pub data: &'a [u8],
 }
 
-/// All categories up to the end mark; an image that just stops is accepted and said to be so.
+/// Returns all categories up to the end mark, and whether the end mark exists.
 fn categories(body: &[u8]) -> Result<(Vec<Category<'_>>, bool), SiiError> {
     let mut found = Vec::new();
     let mut rest = body;
@@ -163,7 +165,7 @@ fn categories(body: &[u8]) -> Result<(Vec<Category<'_>>, bool), SiiError> {
     }
 }
 
-fn general(data: &[u8], strings: &mut Texts<'_>) -> General {
+fn general(data: &[u8], strings: &mut StringRefs<'_>) -> General {
     General {
         group: strings.text(0),
         image: strings.text(1),
@@ -189,7 +191,7 @@ fn fmmu_detail(data: &[u8]) -> SiiFmmuDetail {
 }
 
 fn fmmus(data: &[u8]) -> Vec<FmmuUse> {
-    // The last byte may only fill the word.
+    // The last byte may be padding to a whole word.
     let used = match data.split_last() {
         Some((0xff, before)) => before,
         _ => data,
@@ -207,7 +209,7 @@ fn sync_manager(data: &[u8]) -> SiiSyncManager {
     }
 }
 
-fn pdos(data: &[u8], strings: &mut Texts<'_>) -> Result<Vec<SiiPdo>, SiiError> {
+fn pdos(data: &[u8], strings: &mut StringRefs<'_>) -> Result<Vec<SiiPdo>, SiiError> {
     let mut found = Vec::new();
     let mut at = 0;
     while let Some(head) = data.get(at..at + 8) {
@@ -246,8 +248,8 @@ fn pdos(data: &[u8], strings: &mut Texts<'_>) -> Result<Vec<SiiPdo>, SiiError> {
     Ok(found)
 }
 
-/// `at`: where the mode begins in its category.
-fn dc(data: &[u8], at: usize, strings: &mut Texts<'_>) -> SiiDc {
+/// Reads a DC mode. `at` is the offset of the mode in its category.
+fn dc(data: &[u8], at: usize, strings: &mut StringRefs<'_>) -> SiiDc {
     let signed = |at| i32::from_le_bytes(double_word(data, at).to_le_bytes());
     let factor = |at| i16::from_le_bytes(word(data, at).to_le_bytes());
     SiiDc {
@@ -262,7 +264,7 @@ fn dc(data: &[u8], at: usize, strings: &mut Texts<'_>) -> SiiDc {
     }
 }
 
-/// Little-endian reads; what lies outside reads as 0, as in a shorter, older category.
+/// Little-endian reads. Bytes beyond the end read as 0, because older categories are shorter.
 pub(super) fn byte(data: &[u8], at: usize) -> u8 {
     data.get(at).copied().unwrap_or(0)
 }

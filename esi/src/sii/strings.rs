@@ -1,6 +1,6 @@
-//! The string category: texts are referred to by number, 1 being the first, 0 none.
+//! The string category: texts are referenced by number, from 1; 0 means no text.
 
-/// Other masters keep names in fixed buffers of 64 bytes.
+/// Other MainDevices store names in fixed buffers of 64 bytes.
 const MAX_BYTES: usize = 63;
 const MAX_STRINGS: usize = 255;
 
@@ -10,7 +10,8 @@ pub(super) struct Table {
 }
 
 impl Table {
-    /// The number of `text`; equal texts share one. 0 when it is empty or the table is full.
+    /// Returns the number of `text`; equal texts share a number. Returns 0 if `text` is empty or
+    /// the table is full.
     pub fn number(&mut self, text: &str) -> u8 {
         let bytes: Vec<u8> = text.chars().map(visible).take(MAX_BYTES).collect();
         if bytes.is_empty() {
@@ -71,7 +72,8 @@ impl Table {
     }
 }
 
-/// VISIBLE_STRING holds ASCII; some masters refuse an image with anything else.
+/// Replaces non-ASCII characters. VISIBLE_STRING contains ASCII only, and some MainDevices reject
+/// other characters.
 fn visible(character: char) -> u8 {
     match character {
         ' '..='~' => u8::try_from(character).unwrap_or(b'?'),

@@ -1,21 +1,22 @@
-//! 0x60C2: the cycle as value × 10^index seconds.
+//! 0x60C2: the cycle time as value × 10^index seconds.
 
 use crate::model::{Bytes, Dictionary, ObjectItem};
 use crate::select::SelectError;
 
-/// What the drive takes; without a dictionary entry, all that the types can hold.
+/// The range that the drive accepts. Without a dictionary entry, the range of the types.
 struct Range {
     value: (u8, u8),
     exponent: (i8, i8),
 }
 
-/// Value (subindex 1) and exponent (subindex 2) for a bus cycle. Whole milliseconds are written in milliseconds.
+/// Returns value (subindex 1) and exponent (subindex 2) for a bus cycle. Whole milliseconds use
+/// exponent -3.
 pub(super) fn interpolation_time(
     dictionary: &Dictionary,
     cycle_ns: u64,
 ) -> Result<(u8, i8), SelectError> {
     let range = range(dictionary);
-    // Milliseconds first, then the coarsest unit that is exact.
+    // Milliseconds come first, then the coarsest exact unit.
     let exponents = [-3, -4, -5, -6, -7, -8, -9, -2, -1, 0];
     let allowed = || {
         exponents
@@ -74,7 +75,7 @@ fn range(dictionary: &Dictionary) -> Range {
         .unwrap_or(u8::MAX);
     let low = byte(exponent, |i| i.min.as_ref()).map_or(i8::MIN, |b| i8::from_le_bytes([b]));
     let high = byte(exponent, |i| i.max.as_ref()).map_or(i8::MAX, |b| i8::from_le_bytes([b]));
-    // A file that gives 0 to 0 states no range.
+    // A range of 0 to 0 in the file means that no range is defined.
     let exponent = if low >= high {
         (i8::MIN, i8::MAX)
     } else {
@@ -125,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn cycles_as_a_drive_takes_them() {
+    fn interpolation_time_uses_a_unit_that_the_drive_accepts() {
         for (us, expected) in [
             (1_000, (1, -3)),
             (2_000, (2, -3)),
@@ -150,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cycle_between_the_steps_names_its_neighbours() {
+    fn interpolation_time_error_names_the_neighbouring_cycles() {
         let error = interpolation_time(&drive(100), 125_000).unwrap_err();
         let SelectError::CycleNotExpressible { nearest, .. } = error else {
             panic!("{error}")

@@ -1,8 +1,9 @@
-//! The ordered list of SDOs that a device gets between PreOp and SafeOp.
+//! The ordered list of SDOs that a device receives between PreOp and SafeOp.
 //!
-//! Module identities, PDO assignment cleared, PDO contents, PDO assignment, interpolation time, InitCmds of
-//! device and module, mode of operation, and the user's own last. What the device's CoE flags do not allow to be
-//! written is not written; then the ESI's defaults must already be what was chosen.
+//! The order: module identities, clearing of the PDO assignment, PDO contents, PDO assignment,
+//! interpolation time, InitCmds of device and module, mode of operation, user-defined SDOs. Objects
+//! that the CoE flags declare read-only are not written. The ESI's defaults must then match the
+//! selection.
 
 mod interpolation;
 mod pdo;
@@ -11,25 +12,26 @@ use std::collections::HashMap;
 
 use crate::layout::Layout;
 use crate::model::{Device, InitCmd, Object, ObjectItem, Writable};
-use crate::select::{Choice, SelectError, SelectedModule, Selection};
+use crate::select::{SelectError, SelectOptions, SelectedModule, Selection};
 use crate::{Dictionary, Mode, address};
 
 /// One SDO download.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StartupSdo {
-    /// `PS` unless an InitCmd asks for `IP` (once PreOp is reached) or `SO` (before Op); sorted in that order.
+    /// The transition: `PS`, or `IP` (once PreOp is reached) or `SO` (before Op) from an InitCmd.
+    /// The list is sorted in the order `IP`, `PS`, `SO`.
     pub transition: &'static str,
     pub index: u16,
     pub sub: u8,
     pub complete_access: bool,
     pub data: Vec<u8>,
-    /// Name of the object, empty where the ESI has none.
+    /// The name of the object; empty if the ESI has none.
     pub name: String,
-    /// Which element or key it comes from.
+    /// The element or key from which the SDO originates.
     pub origin: String,
 }
 
-/// The transitions on the way to Op, in their order.
+/// The transitions up to Op, in order.
 const UPWARDS: [&str; 3] = ["IP", "PS", "SO"];
 
 const MODES_OF_OPERATION: u16 = 0x6060;
@@ -37,12 +39,12 @@ const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
 const INTERPOLATION_TIME: u16 = 0x60c2;
 const MODULE_LIST: u16 = 0xf030;
 
-/// `selection` comes without its dictionary, which is `dictionary`.
+/// Builds the list. `selection` has an empty dictionary; `dictionary` contains its objects.
 pub(crate) fn list(
     device: &Device,
     selection: &mut Selection,
     dictionary: &Dictionary,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
 ) -> Result<Vec<StartupSdo>, SelectError> {
     let Some(coe) = device
         .mailbox
@@ -56,7 +58,8 @@ pub(crate) fn list(
     module_list(device, selection, &mut list);
     pdo::configure(device, coe, selection, choice, &mut list)?;
     interpolation_time(selection, choice, &mut list)?;
-    // A module's own command for the same object takes the place of one that says so.
+    // A module's command replaces a device's command for the same object, if that one is
+    // replaceable.
     let replaced = |cmd: &InitCmd| {
         let mut own = selection.modules.iter().flat_map(|m| &m.init_cmds);
         cmd.overwritten_by_module && own.any(|own| (own.index, own.sub) == (cmd.index, cmd.sub))
@@ -74,7 +77,7 @@ pub(crate) fn list(
     }
     mode(selection, &mut list);
     user(choice, selection, &mut list)?;
-    // By transition; within one, the order above stays.
+    // The stable sort by transition keeps the order above within a transition.
     list.sdos.sort_by_key(|sdo| {
         UPWARDS
             .iter()
@@ -83,11 +86,11 @@ pub(crate) fn list(
     Ok(list.sdos)
 }
 
-/// Devices without CoE get nothing; what only CoE could do is refused.
+/// Handles devices without CoE: they receive no SDOs. Fails if the selection requires CoE.
 fn without_coe(
     device: &Device,
     selection: &mut Selection,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
 ) -> Result<Vec<StartupSdo>, SelectError> {
     if !choice.sdo.is_empty() {
         return Err(SelectError::NoCoe {
@@ -104,7 +107,7 @@ fn without_coe(
     Ok(Vec::new())
 }
 
-/// The dictionary, for many questions about it.
+/// An index over the dictionary for repeated lookups.
 struct Objects<'d> {
     dictionary: &'d Dictionary,
     by_index: HashMap<u16, &'d Object>,
@@ -142,7 +145,7 @@ impl<'d> Objects<'d> {
 struct List<'d> {
     objects: &'d Objects<'d>,
     sdos: Vec<StartupSdo>,
-    /// 0x60C2 is written from cycle and mode.
+    /// True once the list contains 0x60C2, derived from cycle and mode.
     knows_period: bool,
 }
 
@@ -167,7 +170,8 @@ impl<'d> List<'d> {
         });
     }
 
-    /// The whole object by complete access, from subindex 0, which takes two bytes.
+    /// Adds a complete access download of the whole object from subindex 0, which occupies two
+    /// bytes.
     fn push_whole(&mut self, index: u16, data: Vec<u8>, origin: &str) {
         self.push(index, 0, data, origin);
         if let Some(sdo) = self.sdos.last_mut() {
@@ -216,7 +220,7 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
             .modules
             .iter()
             .find(|m| m.place == usize::from(place));
-        // An empty place in between is told as identity 0.
+        // An empty place between modules has identity 0.
         let ident = module.map_or(0, |m| m.ident);
         let origin = module.map_or_else(|| "empty slot".to_owned(), origin);
         list.push(
@@ -229,12 +233,12 @@ fn module_list(device: &Device, selection: &Selection, list: &mut List<'_>) {
     list.push(MODULE_LIST, 0, vec![count], &whole);
 }
 
-/// Cyclic set-points are interpolated over the bus cycle in CSP and CSV, whether the axis starts in them or can be
-/// switched to them. In CST alone the EPOS4 application notes set the time to zero; that is written where the
-/// dictionary says that zero is allowed, because a time stored by an earlier configuration would otherwise stay.
+/// Adds 0x60C2. CSP and CSV interpolate set-points over the bus cycle, and an axis may switch to
+/// them during operation. In CST alone, the EPOS4 application notes set the time to zero, so a
+/// stored time does not remain. Zero is written only if the dictionary permits zero.
 fn interpolation_time(
     selection: &mut Selection,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     list: &mut List<'_>,
 ) -> Result<(), SelectError> {
     let Some(mode) = selection.mode.filter(|mode| mode.is_cyclic()) else {
@@ -250,7 +254,7 @@ fn interpolation_time(
     if !writable {
         if interpolates {
             selection.notes.push(format!(
-                "the dictionary has no writable 0x60C2; the drive is not told the cycle of {} µs",
+                "the dictionary has no writable 0x60C2; the drive does not receive the cycle of {} µs",
                 choice.cycle_ns / 1000
             ));
         }
@@ -282,7 +286,7 @@ fn interpolation_time(
     Ok(())
 }
 
-/// The mode and its display are in the process data, and a target that is interpolated is.
+/// True if the process data contain the mode, its display and an interpolated target.
 fn can_leave_cst(layout: &Layout) -> bool {
     let mapped = |index| layout.rx_field(index, 0).is_some();
     mapped(MODES_OF_OPERATION)
@@ -296,8 +300,9 @@ fn is_zero(bytes: &[u8]) -> bool {
     bytes.iter().all(|&byte| byte == 0)
 }
 
-/// InitCmds for the way up to Op. One that sets another mode than the chosen one is left out, and so is one that
-/// writes the interpolation time of the maker's usual cycle over that of this bus.
+/// Adds the InitCmds for the way up to Op. Skips a command that sets a mode other than the selected
+/// one. Skips a command that would overwrite the interpolation time of this bus with that of the
+/// vendor's default cycle.
 fn init_cmds(commands: &[InitCmd], origin: &str, selection: &mut Selection, list: &mut List<'_>) {
     for cmd in commands {
         let upwards = UPWARDS
@@ -378,7 +383,7 @@ fn mode(selection: &mut Selection, list: &mut List<'_>) {
 }
 
 fn user(
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     selection: &mut Selection,
     list: &mut List<'_>,
 ) -> Result<(), SelectError> {

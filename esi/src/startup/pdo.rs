@@ -2,14 +2,15 @@
 
 use super::{List, Objects};
 use crate::model::{Coe, Device, Direction, Pdo, Writable};
-use crate::select::{Choice, SelectError, Selection};
+use crate::select::{SelectError, SelectOptions, Selection};
 
-/// The order of the maker's own example: assignments off, inputs' contents, outputs' contents, assignments on.
+/// Adds the PDO SDOs in the order of the vendor's example: clear assignments, input contents,
+/// output contents, set assignments.
 pub(super) fn configure(
     device: &Device,
     coe: &Coe,
     selection: &Selection,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     list: &mut List<'_>,
 ) -> Result<(), SelectError> {
     let assignments = assignments(device, selection, list.objects);
@@ -24,8 +25,8 @@ pub(super) fn configure(
         contents(device, Direction::Tx, selection, choice, &mut changes);
         contents(device, Direction::Rx, selection, choice, &mut changes);
     }
-    // Contents can only change while nothing is assigned. Where they stay, complete access replaces the whole
-    // assignment at once.
+    // Contents are writable only while the assignment is empty. If the contents stay the same,
+    // complete access replaces the whole assignment at once.
     let at_once = coe.complete_access && changes.sdos.is_empty();
     if coe.pdo_assign && !at_once {
         for (sm, _) in &assignments {
@@ -58,8 +59,8 @@ pub(super) fn configure(
     Ok(())
 }
 
-/// For devices that nobody can write to. One without a mailbox knows no assignment: its SyncManagers alone decide,
-/// so what the ESI itself lists under a name can be had.
+/// Checks a device without writable PDO objects. A device without a mailbox has no assignment
+/// objects. Its SyncManagers define the process data, so a named assignment of the ESI is possible.
 pub(super) fn check_unchanged(device: &Device, selection: &Selection) -> Result<(), SelectError> {
     if selection.assignment.is_none() {
         check_assignment(device, selection)?;
@@ -71,7 +72,8 @@ fn assign_object(sm: u8) -> u16 {
     0x1c10u16.saturating_add(u16::from(sm))
 }
 
-/// Every process data SyncManager with its PDOs, outputs first; one that carries nothing is cleared as well.
+/// Returns each process data SyncManager with its PDOs, outputs first. SyncManagers without PDOs
+/// are included, to clear their assignment.
 fn assignments<'s>(
     device: &Device,
     selection: &'s Selection,
@@ -110,7 +112,7 @@ fn contents(
     device: &Device,
     direction: Direction,
     selection: &Selection,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     list: &mut List<'_>,
 ) {
     let (chosen, offered) = match direction {
@@ -132,13 +134,13 @@ fn contents(
                 &origin,
             );
         }
-        // Without entries, the zero that opened it is the count.
+        // Without entries, the initial zero already is the final count.
         if !pdo.entries.is_empty() {
             let count = u8::try_from(pdo.entries.len()).unwrap_or(u8::MAX);
             list.push(pdo.index, 0, vec![count], &origin);
         }
     }
-    // Some drives refuse an object that two mapping objects contain, assigned or not.
+    // Some drives reject an object that two mapping objects contain, even if unassigned.
     let unused = offered.iter().filter(|pdo| {
         let assigned = chosen.iter().any(|other| other.index == pdo.index);
         let writable = list
@@ -162,11 +164,11 @@ fn check_assignment(device: &Device, selection: &Selection) -> Result<(), Select
         (&selection.rx, &device.rx_pdos, Direction::Rx),
         (&selection.tx, &device.tx_pdos, Direction::Tx),
     ] {
-        // A module's PDOs are assigned by the device itself once it knows the module.
+        // The device assigns a module's PDOs itself once it knows the module.
         let of_module = |index: u16| {
             !selection.modules.is_empty() && !offered.iter().any(|pdo| pdo.index == index)
         };
-        // A further sample stands where its first one does, and comes with it.
+        // A further sample has the position of its first sample and is assigned with it.
         let is_sample = |chosen: &Pdo| {
             let mut all = offered.iter().filter(|pdo| pdo.oversampling.is_some());
             all.any(|pdo| pdo.position == chosen.position && pdo.index != chosen.index)
@@ -182,7 +184,8 @@ fn check_assignment(device: &Device, selection: &Selection) -> Result<(), Select
             .map(|pdo| pdo.index)
             .filter(|index| !of_module(*index))
             .collect();
-        // The default may list PDOs that exclude each other; a subset that keeps its order is what remains of it.
+        // The default may list PDOs that exclude each other. A subset in the same order is then
+        // valid.
         let conflict_free =
             wanted.len() == default.len() || has_excludes(offered, &default, direction);
         if wanted.iter().any(|index| !default.contains(index)) || !conflict_free {

@@ -1,4 +1,4 @@
-//! `Dictionary/DataTypes`, as written.
+//! `Dictionary/DataTypes` as in the file.
 
 use std::collections::HashMap;
 
@@ -10,7 +10,7 @@ use crate::model::Text;
 
 #[derive(Default)]
 pub(super) struct DataTypes {
-    /// With what `Cursor::at` makes a position of.
+    /// The types by name, with the byte offset for `Cursor::at`.
     by_name: HashMap<Text, (usize, Named)>,
 }
 
@@ -19,7 +19,7 @@ pub(super) type Named = (Text, DataType);
 
 #[derive(Default)]
 pub(super) struct DataType {
-    /// Empty where it has none.
+    /// The base type; empty if the type has none.
     pub base: Text,
     pub bit_size: u32,
     pub arrays: Vec<ArrayInfo>,
@@ -42,7 +42,7 @@ pub(super) struct SubItem {
     pub flags: Flags,
 }
 
-/// Alias chains longer than this are cycles.
+/// Longer alias chains are treated as cycles.
 const MAX_ALIASES: usize = 8;
 
 impl DataType {
@@ -56,14 +56,14 @@ impl DataTypes {
         self.by_name.get(name).map(|(_, named)| &named.1)
     }
 
-    /// Types whose aliases lead nowhere, in file order.
+    /// Returns types with circular aliases, in file order.
     fn circular(&self) -> Vec<(usize, String)> {
         let mut found: Vec<_> = self
             .by_name
             .iter()
             .filter(|(name, (_, named))| {
                 let of = &named.1;
-                // A base type may name itself: BOOL is a BOOL.
+                // A base type may name itself, for example BOOL.
                 let base = self.base(name);
                 of.is_alias()
                     && of.base != **name
@@ -77,12 +77,12 @@ impl DataTypes {
         found
     }
 
-    /// Follows enumerations and aliases to the type they are made of; arrays and records stand for themselves.
+    /// Follows enumerations and aliases to the base type. Returns arrays and records unchanged.
     pub fn base<'s>(&'s self, name: &'s Text) -> &'s Text {
         self.with_base(name).1
     }
 
-    /// The type of that name, and what [`Self::base`] makes of it.
+    /// Returns the type of that name, and the result of [`Self::base`].
     pub fn with_base<'s>(&'s self, name: &'s Text) -> (Option<&'s DataType>, &'s Text) {
         let found = self.get(name);
         let (mut name, mut next) = (name, found);

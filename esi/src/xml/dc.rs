@@ -67,7 +67,7 @@ fn shift<'a>(
     Ok(())
 }
 
-/// Nanoseconds; an empty element means 0.
+/// Returns a time in ns; an empty element means 0.
 fn time<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<i64, EsiError> {
     c.optional_number(element, "time in nanoseconds")
         .map(Option::unwrap_or_default)

@@ -1,11 +1,12 @@
 //! Bytes → text, by byte order mark and XML declaration.
 //!
-//! Windows tools write windows-1252 and call it ISO-8859-1, so both are read as windows-1252. A file that
-//! claims UTF-8 and is not falls back to the same table: what breaks is a letter in a name, not the layout.
+//! Windows tools write windows-1252 and declare it as ISO-8859-1, so both are read as windows-1252.
+//! Invalid UTF-8 is read as windows-1252 too: this damages letters in names, but not the layout.
 
 use std::borrow::Cow;
 
-/// windows-1252, 0x80 to 0x9f; the rest equals ISO-8859-1. The five holes stay C1 controls.
+/// windows-1252, 0x80 to 0x9f; the rest equals ISO-8859-1. The five unassigned codes stay C1
+/// controls.
 const HIGH_CONTROLS: [char; 32] = [
     '\u{20ac}', '\u{81}', '\u{201a}', '\u{192}', '\u{201e}', '\u{2026}', '\u{2020}', '\u{2021}',
     '\u{2c6}', '\u{2030}', '\u{160}', '\u{2039}', '\u{152}', '\u{8d}', '\u{17d}', '\u{8f}',
@@ -15,13 +16,13 @@ const HIGH_CONTROLS: [char; 32] = [
 
 pub(super) struct Decoded<'a> {
     pub text: Cow<'a, str>,
-    /// What to tell the user about the encoding, if anything, and where in `text` (bytes).
+    /// A warning about the encoding, with its byte offset in `text`.
     pub remark: Option<(usize, String)>,
 }
 
 pub(super) fn decode(bytes: &[u8]) -> Decoded<'_> {
     let mut decoded = by_encoding(bytes);
-    // XML has no NUL; what is around it is still worth reading.
+    // XML does not permit NUL, but the rest of the text is readable.
     if let (None, Some(at)) = (&decoded.remark, memchr::memchr(0, decoded.text.as_bytes())) {
         let message = "a NUL character; the file may be damaged".to_owned();
         decoded.remark = Some((at, message));
@@ -87,7 +88,7 @@ fn windows_1252(bytes: &[u8]) -> Cow<'_, str> {
         return Cow::Borrowed(text);
     }
     let mut text = String::with_capacity(bytes.len() + bytes.len() / 16);
-    // In large pieces as far as they are ASCII, in small ones around what is not.
+    // ASCII is copied in large pieces; other bytes are decoded in small pieces.
     for piece in bytes.chunks(1024) {
         if !push_ascii(&mut text, piece) {
             for piece in piece.chunks(64) {
@@ -100,7 +101,7 @@ fn windows_1252(bytes: &[u8]) -> Cow<'_, str> {
     Cow::Owned(text)
 }
 
-/// Whether it was ASCII.
+/// Appends `bytes` if they are ASCII. Returns false otherwise.
 fn push_ascii(text: &mut String, bytes: &[u8]) -> bool {
     let ascii = bytes.is_ascii();
     if let (true, Ok(plain)) = (ascii, std::str::from_utf8(bytes)) {
@@ -130,7 +131,7 @@ fn utf16(bytes: &[u8], unit: fn([u8; 2]) -> u16) -> Decoded<'static> {
     }
 }
 
-/// The encoding that the XML declaration names, in lower case.
+/// Returns the encoding that the XML declaration names, in lower case.
 fn declared(bytes: &[u8]) -> Option<String> {
     let head = bytes.get(..bytes.len().min(256))?;
     let head: String = head.iter().map(|&b| char::from(b)).collect();
@@ -155,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_encoding_yields_the_same_text() {
+    fn decode_yields_the_same_text_for_each_encoding() {
         let plain = "<?xml version=\"1.0\"?><a>\u{fc}\u{b5}</a>";
         let mut bom = vec![0xef, 0xbb, 0xbf];
         bom.extend_from_slice(plain.as_bytes());
@@ -168,14 +169,14 @@ mod tests {
     }
 
     #[test]
-    fn declared_latin_1_is_read_as_windows_1252() {
+    fn decode_reads_declared_latin_1_as_windows_1252() {
         let decoded = decode(b"<?xml version='1.0' encoding='ISO-8859-1'?><a>\xfc \x80</a>");
         assert!(decoded.text.ends_with("<a>\u{fc} \u{20ac}</a>"));
         assert_eq!(decoded.remark, None);
     }
 
     #[test]
-    fn broken_utf_8_is_remarked_and_read() {
+    fn decode_reads_broken_utf_8_with_a_remark() {
         let decoded = decode(b"<a>\xfc</a>");
         assert_eq!(decoded.text, "<a>\u{fc}</a>");
         assert!(decoded.remark.is_some_and(|(at, _)| at == 3));

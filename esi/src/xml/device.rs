@@ -1,4 +1,4 @@
-//! `Device`: identity, and the families below it.
+//! `Device`: identity and child elements.
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
@@ -64,7 +64,7 @@ pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Devi
     Ok(device)
 }
 
-/// Identity and what belongs to it.
+/// Reads `Type`: the identity and its attributes.
 fn type_element<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,

@@ -1,4 +1,4 @@
-//! `Device/Info`: what a device says of itself, and the alternative PDO assignments that stand below it.
+//! `Device/Info`: properties of a device, and the alternative PDO assignments below it.
 
 use super::cursor::{Cursor, Element};
 use super::sync;
@@ -106,7 +106,8 @@ fn port<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Port, EsiError>
     Ok(port)
 }
 
-/// One vendor's section holds what others read as well; the rest of these sections belongs to configurators.
+/// Reads the one vendor-specific section that contains generally used data. Other vendor sections
+/// are for configurators only.
 pub(super) fn vendor_specific<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,

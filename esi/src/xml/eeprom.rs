@@ -4,7 +4,7 @@ use super::cursor::{Cursor, Element};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Eeprom, EepromCategory};
 
-/// Word 0x3E of an image holds the size, in units of 128 bytes less one.
+/// The maximum image size. Word 0x3E contains the size in units of 128 bytes, minus one.
 const MAX_BYTES: u32 = 0x1_0000 * 128;
 
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Eeprom, EsiError> {

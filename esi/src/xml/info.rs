@@ -120,7 +120,7 @@ fn one_module<'a>(
     c.leave_out_damaged(element, read)
 }
 
-/// The modules stand directly below the root or inside `Modules`; some files have a `Vendor`, some have none.
+/// Reads modules directly below the root or inside `Modules`. `Vendor` is optional.
 fn modules_alone<'a>(
     c: &mut Cursor<'a>,
     root: &Element<'a>,

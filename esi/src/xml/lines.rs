@@ -1,15 +1,16 @@
-//! Line and column of byte offsets, without a table of all lines: a file may be nothing but line ends, or one line.
+//! Line and column of byte offsets, without a table of all lines: a file may consist of line ends
+//! only, or of one line.
 
 use std::cell::{Cell, RefCell};
 
 pub(super) struct Lines<'a> {
     text: &'a [u8],
-    /// What ends a line: CR where a file has no LF.
+    /// The line end byte: CR if the file contains no LF.
     end: u8,
-    /// Line ends before each block, and characters since the last of them; grows with the offsets asked for, while
-    /// what is counted was just read.
+    /// For each block: line ends before it, and characters since the last line end. Extended on
+    /// demand, while the counted bytes are still in the cache.
     before: RefCell<Vec<(u32, u32)>>,
-    /// The same before the offset asked for last; the next is mostly not far behind it.
+    /// The same values for the last requested offset. The next request is usually shortly after it.
     last: Cell<(usize, (u32, u32))>,
 }
 
@@ -29,7 +30,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Both from 1; columns count characters.
+    /// Returns line and column, both from 1. Columns count characters.
     pub fn position(&self, offset: usize) -> (u32, u32) {
         let offset = offset.min(self.text.len());
         let (lines, characters) = self.before(offset);
@@ -55,7 +56,7 @@ impl<'a> Lines<'a> {
         self.passed(known, &self.text[from..offset])
     }
 
-    /// Lines and characters behind `bytes`.
+    /// Returns lines and characters after `bytes`.
     fn passed(&self, (lines, characters): (u32, u32), bytes: &[u8]) -> (u32, u32) {
         let small = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
         // A character is counted by its first byte.

@@ -4,7 +4,7 @@ use super::number::{boolean, hex_bytes, hex_start, number};
 use super::object::Literal;
 use crate::model::Bytes;
 
-/// `Ok(None)`: the element is empty. The error text completes "default …".
+/// Converts a literal; `Ok(None)`: the element is empty. The error text completes "default …".
 pub(super) fn bytes(
     literal: &Literal<'_>,
     type_name: &str,
@@ -28,7 +28,7 @@ pub(super) fn bytes(
     }
 }
 
-/// `bit_len` bits of a block from `bit_offset` on.
+/// Returns `bit_len` bits of a block from `bit_offset`.
 pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Bytes> {
     let (offset, length) = (
         usize::try_from(bit_offset).ok()?,
@@ -46,7 +46,7 @@ pub(super) fn slice(block: &[u8], bit_offset: u32, bit_len: u32) -> Option<Bytes
     Some(out.into())
 }
 
-/// Length of ETG.1020's base types; 0 where the name says nothing.
+/// Returns the bit length of an ETG.1020 base type, or 0 for other names.
 pub(super) fn base_bits(type_name: &str) -> u32 {
     match type_name {
         "BOOL" | "BIT" | "BIT1" => 1,
@@ -120,7 +120,7 @@ fn not_a_number(text: &str) -> String {
     format!("{:?} is not a number", short(text))
 }
 
-/// Hexadecimal bytes of any number, fitted to `length`.
+/// Parses any number of hexadecimal bytes, fitted to `length`.
 fn data(text: &str, length: usize) -> Option<Bytes> {
     let mut short = [0; 16];
     if text.len() <= 2 * short.len() {
@@ -132,7 +132,7 @@ fn data(text: &str, length: usize) -> Option<Bytes> {
     Some(Bytes::fitted(&hex_bytes(text)?, length))
 }
 
-/// A negative number in an odd length must not carry its sign past the last bit.
+/// Clears the sign bits of a negative number beyond `bit_len`.
 fn odd_length(bytes: &mut [u8], bit_len: u32) {
     if !bit_len.is_multiple_of(8)
         && let Some(last) = bytes.last_mut()
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn values_by_type_and_length() {
+    fn literal_bytes_follow_type_and_length() {
         for (text, type_name, bits, expected) in [
             ("-1", "INT", 16, vec![0xff, 0xff]),
             ("#xffff", "INT", 16, vec![0xff, 0xff]),
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn data_is_little_endian_already() {
+    fn literal_data_stays_little_endian() {
         assert_eq!(
             bytes(&Literal::Data("0001".into()), "UINT", 16),
             Ok(Some([0, 1].into()))
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_is_cut_at_bit_offsets() {
+    fn literal_slice_cuts_a_block_at_bit_offsets() {
         assert_eq!(
             slice(&[2, 0, 0x34, 0x12, 0x78], 16, 16),
             Some([0x34, 0x12].into())

@@ -1,5 +1,5 @@
-//! `Mailbox`: which protocols, what CoE may do, and the InitCmds. InitCmds of other protocols, and those in
-//! vendor-specific parts of the file, are not start-up commands and are left out.
+//! `Mailbox`: the protocols, CoE capabilities and InitCmds. InitCmds of other protocols and of
+//! vendor-specific sections are not start-up commands and are skipped.
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;

@@ -1,11 +1,12 @@
-//! Devices that describe their PDOs in the dictionary alone: mapping objects (0x1600 …, 0x1A00 …) and assignment
-//! objects (0x1C1x) by their defaults.
+//! PDOs of devices that describe them only in the dictionary: defaults of mapping objects (0x1600
+//! …, 0x1A00 …) and assignment objects (0x1C1x).
 
 use crate::model::{
     Device, Dictionary, Direction, Entry, Object, Pdo, SlotDependence, SmUse, Writable,
 };
 
-/// Fills a direction that has no PDO elements. Where slots are, modules bring the PDOs.
+/// Fills a direction that has no PDO elements. Devices with slots are excluded, because their
+/// modules define the PDOs.
 pub(super) fn complete(device: &mut Device) {
     if device.slots.is_some() {
         return;
@@ -104,7 +105,7 @@ fn pdo(dictionary: &Dictionary, direction: Direction, object: &Object) -> Option
     })
 }
 
-/// The values that subindex 0 counts.
+/// Returns the values of the subindices 1 to the count in subindex 0.
 fn defaults(object: &Object) -> impl Iterator<Item = u32> {
     let (count, rest) = match object.items.split_first() {
         Some((count, rest)) => (value(&count.default), rest),

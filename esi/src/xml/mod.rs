@@ -1,14 +1,17 @@
-//! The ESI file as a stream of XML tags, one file per ETG.2000 element family.
+//! Reads the ESI file as a stream of XML tags; one source file per ETG.2000 element family.
 //!
-//! `decode` turns bytes into text, `scan` finds tags in it, `lines` their line and column, `cursor`
-//! walks elements with position and path, `number` reads literals.
-//! `info` is the root; below it `device`, `device_info`, `sync` (Fmmu, Sm, Su), `pdo`, `mailbox`, `dc`, `slots`,
-//! `module`, `eeprom` and `profile` with the dictionary: `datatype` and `object` read it as written, `resolve` joins
-//! the two, and `mapping` takes PDOs from there where a file has no other.
+//! `decode` turns bytes into text, `scan` finds tags in the text, and `lines` computes line and
+//! column. `cursor` walks elements with position and path, and `number` reads literals.
 //!
-//! Rules here: unknown elements are skipped. A PDO, object, data type or OpMode with a value that cannot be read is left
-//! out; any other element with such a value, or damaged text, costs its device or module; nothing in a file may make the reader panic, recurse without bound or
-//! allocate more than a fixed multiple of what real files need.
+//! `info` is the root. Below it are `device`, `device_info`, `sync` (Fmmu, Sm, Su), `pdo`,
+//! `mailbox`, `dc`, `slots`, `module`, `eeprom` and `profile` with the dictionary. `datatype` and
+//! `object` read the dictionary as written, and `resolve` joins both. `mapping` derives PDOs from
+//! the dictionary if a file has no PDO elements.
+//!
+//! Rules: Unknown elements are skipped. A PDO, object, data type or OpMode with an unreadable value
+//! is skipped. Any other element with an unreadable value, or damaged text, removes its device or
+//! module. No file may cause a panic, unbounded recursion, or allocation beyond a fixed multiple of
+//! the need of real files.
 
 mod cursor;
 mod datatype;
@@ -38,8 +41,8 @@ mod text;
 use crate::error::EsiError;
 use crate::model::{EsiFile, Warning};
 
-/// Reads an ESI file (`EtherCATInfo`), a file of modules alone (`EtherCATModule`), or what `ethercat xml` prints
-/// (`EtherCATInfoList`).
+/// Reads an ESI file (`EtherCATInfo`), a module file (`EtherCATModule`), or the output of `ethercat
+/// xml` (`EtherCATInfoList`).
 pub fn parse(bytes: &[u8]) -> Result<EsiFile, EsiError> {
     let decoded = decode::decode(bytes);
     let mut cursor = cursor::Cursor::new(&decoded.text);

@@ -1,4 +1,4 @@
-//! `Modules/Module`: what may be put into a slot.
+//! `Modules/Module`: the modules for slots.
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;

@@ -1,8 +1,8 @@
 //! Number and byte literals of ETG.2000: `#x1a00`, `0x1A00`, `#x0x1a00`, `6656`, `-5`; `0A1b`.
 
-/// Wide enough for every value that an ESI can hold, unsigned or signed.
+/// Parses a number. `i128` holds every signed and unsigned value of an ESI.
 pub(super) fn number(text: &str) -> Option<i128> {
-    // Mostly nothing is around it.
+    // Most literals have no surrounding white space.
     let text = match text.as_bytes() {
         [first, .., last] if first.is_ascii_graphic() && last.is_ascii_graphic() => text,
         _ => text.trim(),
@@ -12,7 +12,7 @@ pub(super) fn number(text: &str) -> Option<i128> {
         None => (false, text.strip_prefix('+').unwrap_or(text)),
     };
     let (digits, radix) = match digits.as_bytes() {
-        // Written by a tool that adds its own prefix.
+        // Some tools add a second prefix.
         [b'#', b'x' | b'X', b'0', b'x' | b'X', digits @ ..] => (digits, 16),
         [b'#' | b'0', b'x' | b'X', digits @ ..] => (digits, 16),
         digits => (digits, 10),
@@ -20,7 +20,7 @@ pub(super) fn number(text: &str) -> Option<i128> {
     if digits.is_empty() || digits.len() > 30 {
         return None;
     }
-    // In steps that a machine word holds; mostly it is one.
+    // Digits are parsed in pieces that fit a machine word; most literals need one piece.
     let (first, more) = digits.split_at(digits.len().min(15));
     let mut magnitude = i128::from(word(first, radix)?);
     for step in more.chunks(15) {
@@ -30,7 +30,7 @@ pub(super) fn number(text: &str) -> Option<i128> {
     Some(if negative { -magnitude } else { magnitude })
 }
 
-/// At most 15 digits.
+/// Parses at most 15 digits.
 fn word(digits: &[u8], radix: u8) -> Option<u64> {
     let mut value = 0;
     for digit in digits {
@@ -51,14 +51,14 @@ pub(super) fn boolean(text: &str) -> Option<bool> {
     }
 }
 
-/// Hexadecimal bytes in file order, white space between them allowed.
+/// Parses hexadecimal bytes in file order; white space between them is allowed.
 pub(super) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
     let mut bytes = vec![0; text.len() / 2];
-    // As nearly all are written: in pairs.
+    // Most byte strings consist of digit pairs without white space.
     let (pairs, rest) = hex_start(text.as_bytes(), &mut bytes);
     bytes.truncate(pairs);
     let mut high = None;
-    // What is behind a pair of ASCII begins with a character.
+    // The text after ASCII pairs starts at a character boundary.
     let rest = &text[text.len() - rest.len()..];
     for character in rest.chars().filter(|c| !c.is_whitespace()) {
         let digit = hex_digit(u8::try_from(character).ok()?)?;
@@ -70,7 +70,8 @@ pub(super) fn hex_bytes(text: &str) -> Option<Vec<u8>> {
     high.is_none().then_some(bytes)
 }
 
-/// Pairs of digits from the beginning, as far as `bytes` holds them: how many, and what is behind them.
+/// Parses digit pairs from the start until `bytes` is full. Returns their count and the remaining
+/// text.
 pub(super) fn hex_start<'a>(mut rest: &'a [u8], bytes: &mut [u8]) -> (usize, &'a [u8]) {
     let mut pairs = 0;
     for byte in bytes {
@@ -92,7 +93,7 @@ fn hex_digit(letter: u8) -> Option<u8> {
     (value < 16).then_some(value)
 }
 
-/// 16 and more: not a digit.
+/// Values of 16 and more: not a digit.
 const HEX: [u8; 256] = {
     let mut table = [0xff; 256];
     let mut value = 0;
@@ -110,7 +111,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn literals() {
+    fn number_parses_every_form_of_literal() {
         for (text, value) in [
             ("#x1A00", Some(0x1a00)),
             ("#X1a00", Some(0x1a00)),
@@ -134,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes() {
+    fn hex_bytes_parses_pairs_and_white_space() {
         assert_eq!(hex_bytes(" 0A1b \n ff"), Some(vec![0x0a, 0x1b, 0xff]));
         assert_eq!(hex_bytes(""), Some(vec![]));
         assert_eq!(hex_bytes("0"), None);
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn booleans() {
+    fn boolean_parses_numbers_and_words() {
         for (text, value) in [
             ("1", Some(true)),
             ("0", Some(false)),

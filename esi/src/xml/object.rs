@@ -1,4 +1,4 @@
-//! `Dictionary/Objects`, as written.
+//! `Dictionary/Objects` as in the file.
 
 use std::borrow::Cow;
 
@@ -18,10 +18,11 @@ pub(super) struct RawObject<'a> {
     pub flags: Flags,
 }
 
-/// Name and values of a subindex.
+/// The name and values of a subindex.
 pub(super) type SubItem<'a> = (Cow<'a, str>, Info<'a>);
 
-/// Default and range of an object or of one of its subindices; literals are read when the type is known.
+/// Default and range of an object or of one of its subindices. Literals are parsed once the type is
+/// known.
 #[derive(Default)]
 pub(super) struct Info<'a> {
     pub default: Option<Literal<'a>>,
@@ -116,7 +117,7 @@ fn info<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Info<'a>, EsiEr
                 out.unit = unit.unwrap_or(0);
             }
             "SubItem" => {
-                // Most have that many.
+                // Most objects have at most 16 subindices.
                 out.sub_items.reserve(16);
                 out.sub_items.push(sub_item(c, el)?);
             }
@@ -175,7 +176,7 @@ pub(super) fn flags<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Fla
     Ok(flags)
 }
 
-/// `PreOP_SafeOP` → the states in which writing is allowed.
+/// Converts `PreOP_SafeOP` → the states that allow writing.
 fn restriction(text: &str) -> Option<Writable> {
     let names: Vec<String> = text
         .split(['_', ' '])

@@ -6,12 +6,12 @@ use crate::address;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Direction, Entry, Excluded, Oversampling, Pdo, SlotDependence, Text};
 
-/// A frame carries 11888 bits.
+/// The maximum number of entries; a frame carries 11888 bits.
 const MAX_ENTRIES: usize = 12_000;
-/// There are 512 mapping objects for each direction.
+/// The maximum number of PDOs. There are 512 mapping objects per direction.
 const MAX_PDOS: usize = 2048;
 
-/// Reads one more PDO of a device or module; one that cannot be read is left out.
+/// Reads one more PDO of a device or module and skips an unreadable one.
 pub(super) fn append<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
@@ -81,7 +81,7 @@ fn read<'a>(
     Ok(pdo)
 }
 
-/// For one more entry.
+/// Checks that one more entry is allowed.
 fn room<'a>(c: &Cursor<'a>, element: &Element<'a>, entries: &[Entry]) -> Result<(), EsiError> {
     let (what, limit) = ("a PDO's entries", MAX_ENTRIES);
     match entries.len() < limit {

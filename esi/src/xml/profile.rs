@@ -1,4 +1,4 @@
-//! `Profile`, of a device or of a module: number, dictionary, diagnosis texts.
+//! `Profile` of a device or of a module: number, dictionary, diagnosis texts.
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;
@@ -13,7 +13,8 @@ pub(super) struct Profile {
     pub diag_messages: Vec<DiagMessage>,
 }
 
-/// The number stands in `Profile` itself or, newer, in one `ChannelInfo` per axis; then the first axis counts.
+/// Reads `Profile`. The number is in `Profile` itself or, in newer files, in one `ChannelInfo` per
+/// axis. The first axis then applies.
 pub(super) fn read<'a>(c: &mut Cursor<'a>, element: &Element<'a>) -> Result<Profile, EsiError> {
     let mut profile = Profile::default();
     let mut of_channel = None;
@@ -57,8 +58,8 @@ fn dictionary<'a>(
         "Objects" => object::read(c, el, &mut raw_objects),
         _ => Ok(()),
     })?;
-    // Objects may stand before the types they use, so they are joined at the end.
-    let mut memory = resolve::Memory::default();
+    // Objects may precede the types that they use, so both are joined at the end.
+    let mut memory = resolve::ResolveCache::default();
     objects.reserve(raw_objects.len());
     for (position, raw) in &raw_objects {
         let place = (*position, element);
@@ -67,7 +68,7 @@ fn dictionary<'a>(
     Ok(())
 }
 
-/// A text without a usable number is of no use to anybody and left out.
+/// Reads a diagnosis text. A text without a valid number is skipped.
 fn diag_message<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,

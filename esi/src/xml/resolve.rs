@@ -1,5 +1,5 @@
-//! Objects and data types joined: every subindex becomes an item with its own length, offset, default, range
-//! and access.
+//! Joins objects and data types: each subindex becomes an item with its own length, offset,
+//! default, range and access.
 
 use std::borrow::Cow;
 
@@ -12,7 +12,7 @@ use crate::address;
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Access, Bytes, Object, ObjectCode, ObjectItem, Position, Text, Writable};
 
-/// One MiB; longer objects (files, domains) carry no default and are transferred by length.
+/// 1 MiB. Longer objects (files, domains) have no default and are transferred by length.
 const MAX_ITEM_BITS: u32 = 8 << 20;
 const MAX_ITEMS: usize = 256;
 
@@ -21,7 +21,7 @@ pub(super) fn object<'t, 'a>(
     place @ (position, dictionary): (Position, &Element<'a>),
     types: &'t DataTypes,
     raw: &'t RawObject<'a>,
-    memory: &mut Memory<'t, 'a>,
+    memory: &mut ResolveCache<'t, 'a>,
 ) -> Result<Object, EsiError> {
     let data_type = types.get(&raw.type_name);
     memory.slots.clear();
@@ -102,7 +102,7 @@ pub(super) fn object<'t, 'a>(
         let default = own.default.as_ref();
         let default = default.and_then(|default| read(default, "default"));
         let default = default.or_else(|| match (&block, code) {
-            // Older files give a record's default as one block, as complete access would carry it.
+            // Older files contain a record's default as one block in complete access format.
             (Some(block), ObjectCode::Array | ObjectCode::Record) => {
                 literal::slice(block, slot.bit_offset, slot.bit_len)
             }
@@ -147,15 +147,15 @@ pub(super) fn object<'t, 'a>(
     })
 }
 
-/// Kept from object to object.
+/// Buffers that are reused for all objects.
 #[derive(Default)]
-pub(super) struct Memory<'t, 'a> {
-    slots: Vec<Slot<'t, 'a>>,
-    /// Names of array elements, by subindex.
+pub(super) struct ResolveCache<'t, 'a> {
+    slots: Vec<UnresolvedItem<'t, 'a>>,
+    /// The names of array elements, by subindex.
     names: Vec<Option<Text>>,
 }
 
-impl Memory<'_, '_> {
+impl ResolveCache<'_, '_> {
     fn name(&mut self, sub: u8) -> Text {
         self.names.resize(256, None);
         let name = || format!("SubIndex {sub:03}").into();
@@ -166,8 +166,8 @@ impl Memory<'_, '_> {
     }
 }
 
-/// An item before its default is known.
-struct Slot<'t, 'a> {
+/// An item without its default.
+struct UnresolvedItem<'t, 'a> {
     sub: u8,
     name: Cow<'t, Text>,
     type_name: &'t Text,
@@ -181,11 +181,11 @@ fn variable<'t, 'a>(
     types: &'t DataTypes,
     data_type: Option<&DataType>,
     raw: &'t RawObject<'a>,
-) -> Slot<'t, 'a> {
+) -> UnresolvedItem<'t, 'a> {
     let type_name = types.base(&raw.type_name);
     let typed = data_type.map_or(0, |t| t.bit_size);
     let bit_len = first_non_zero([raw.bit_size, typed, literal::base_bits(type_name)]);
-    Slot {
+    UnresolvedItem {
         sub: 0,
         name: Cow::Borrowed(&raw.name),
         type_name,
@@ -201,11 +201,11 @@ fn record_items<'t, 'a>(
     types: &'t DataTypes,
     record: &'t DataType,
     (position, dictionary): (Position, &Element<'a>),
-    memory: &mut Memory<'t, 'a>,
+    memory: &mut ResolveCache<'t, 'a>,
 ) -> Result<ObjectCode, EsiError> {
     let mut code = ObjectCode::Record;
     let mut running = 0u32;
-    // Neighbours are mostly of one type.
+    // Neighbouring elements usually have the same type.
     let mut last: Option<(&Text, _)> = None;
     for item in &record.sub_items {
         let (sub_type, base) = match &last {
@@ -239,9 +239,12 @@ fn record_items<'t, 'a>(
                     let Ok(sub) = u8::try_from(array.lower_bound.saturating_add(number)) else {
                         break;
                     };
-                    c.spend(size_of::<Slot>() + element.len(), (position, dictionary))?;
+                    c.spend(
+                        size_of::<UnresolvedItem>() + element.len(),
+                        (position, dictionary),
+                    )?;
                     let name = memory.name(sub);
-                    memory.slots.push(Slot {
+                    memory.slots.push(UnresolvedItem {
                         sub,
                         name: Cow::Owned(name),
                         type_name: element,
@@ -252,7 +255,7 @@ fn record_items<'t, 'a>(
                     });
                 }
             }
-            (sub, _) => memory.slots.push(Slot {
+            (sub, _) => memory.slots.push(UnresolvedItem {
                 sub: sub.unwrap_or(next_sub),
                 name: Cow::Borrowed(&item.name),
                 type_name: base,
@@ -275,8 +278,8 @@ fn record_items<'t, 'a>(
     Ok(code)
 }
 
-/// `Info/SubItem`s name the subindices of a record; where they do not, they stand in subindex order.
-fn assign_infos<'t, 'a>(slots: &mut [Slot<'t, 'a>], infos: &'t [SubItem<'a>]) {
+/// Assigns `Info/SubItem`s to the subindices of a record: by name, otherwise in subindex order.
+fn assign_infos<'t, 'a>(slots: &mut [UnresolvedItem<'t, 'a>], infos: &'t [SubItem<'a>]) {
     let mut next = 0;
     for info in infos {
         let (name, _) = info;
@@ -300,7 +303,7 @@ fn better_name(from_info: &str, from_type: &Text) -> Text {
     }
 }
 
-/// A subindex's own access; the states in which the whole object may be written narrow it.
+/// Returns the access of a subindex. The states that allow writing the whole object restrict it.
 fn access(item: Option<Access>, object: Option<Access>) -> Access {
     match (item, object) {
         (Some(item), Some(object))

@@ -1,7 +1,7 @@
-//! Text → tags and text, by quick-xml, with the place of each.
+//! Text → tags and text with their offsets, through quick-xml.
 //!
-//! That elements are closed in order is checked by the cursor. A document type is passed over, so nothing that it
-//! declares is ever expanded.
+//! The cursor checks that elements are closed in order. A document type is skipped, so its
+//! declarations are never expanded.
 
 use std::borrow::Cow;
 
@@ -10,9 +10,9 @@ use quick_xml::errors::SyntaxError;
 use quick_xml::events::attributes::{AttrError, Attributes};
 use quick_xml::events::{BytesStart, Event};
 
-/// A piece of the document; everything else (comments, declarations, processing instructions) is passed over.
+/// One piece of the document. Comments, declarations and processing instructions are skipped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Piece<'a> {
+pub(super) enum XmlEvent<'a> {
     /// `<name attributes>` or, with `empty`, `<name attributes/>`.
     Start {
         name: &'a str,
@@ -24,28 +24,28 @@ pub(super) enum Piece<'a> {
         name: &'a str,
         offset: usize,
     },
-    /// As written, references included.
+    /// Text as written, with references.
     Text(&'a str),
     CData(&'a str),
     Eof,
 }
 
-/// Not well-formed at a byte of the text.
+/// The offset of a byte at which the text is not well-formed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Malformed {
     pub offset: usize,
-    /// `None`: the text ends inside a tag, a comment or the like.
+    /// `None`: the text ends inside a tag, a comment or similar.
     pub what: Option<String>,
 }
 
-pub(super) struct Scanner<'a> {
+pub(super) struct XmlReader<'a> {
     text: &'a str,
     reader: Reader<&'a [u8]>,
-    /// Bytes of the text that the reader has not seen.
+    /// The number of bytes before the part that the reader sees.
     skipped: usize,
 }
 
-impl<'a> Scanner<'a> {
+impl<'a> XmlReader<'a> {
     pub fn new(text: &'a str) -> Self {
         Self {
             text,
@@ -54,7 +54,7 @@ impl<'a> Scanner<'a> {
         }
     }
 
-    /// Reads on from a byte, whatever was read before.
+    /// Continues reading at an offset.
     pub fn begin_at(&mut self, offset: usize) {
         self.reader = reader(self.text.get(offset..).unwrap_or_default());
         self.skipped = offset;
@@ -64,22 +64,22 @@ impl<'a> Scanner<'a> {
         self.skipped + to_usize(self.reader.buffer_position())
     }
 
-    /// All that stands from a byte on.
+    /// Returns the text from an offset to the end.
     pub fn rest(&self, from: usize) -> &'a [u8] {
         self.text.as_bytes().get(from..).unwrap_or_default()
     }
 
-    /// The next tag, whatever text stands before it.
-    pub fn next_tag(&mut self) -> Result<Piece<'a>, Malformed> {
+    /// Returns the next tag and skips text before it.
+    pub fn next_tag(&mut self) -> Result<XmlEvent<'a>, Malformed> {
         loop {
             match self.next()? {
-                Piece::Text(_) | Piece::CData(_) => {}
+                XmlEvent::Text(_) | XmlEvent::CData(_) => {}
                 piece => return Ok(piece),
             }
         }
     }
 
-    pub fn next(&mut self) -> Result<Piece<'a>, Malformed> {
+    pub fn next(&mut self) -> Result<XmlEvent<'a>, Malformed> {
         loop {
             let offset = self.offset();
             let event = self.reader.read_event();
@@ -91,15 +91,15 @@ impl<'a> Scanner<'a> {
                 Event::End(_) => {
                     let name = written.get(2..written.len() - 1).unwrap_or_default();
                     let name = name.trim_ascii_end();
-                    Ok(Piece::End { name, offset })
+                    Ok(XmlEvent::End { name, offset })
                 }
-                Event::Text(_) | Event::GeneralRef(_) => Ok(Piece::Text(written)),
+                Event::Text(_) | Event::GeneralRef(_) => Ok(XmlEvent::Text(written)),
                 Event::CData(_) => {
                     let inner = written.strip_prefix("<![CDATA[");
                     let inner = inner.and_then(|inner| inner.strip_suffix("]]>"));
-                    Ok(Piece::CData(inner.unwrap_or_default()))
+                    Ok(XmlEvent::CData(inner.unwrap_or_default()))
                 }
-                Event::Eof => Ok(Piece::Eof),
+                Event::Eof => Ok(XmlEvent::Eof),
                 Event::Comment(_) | Event::Decl(_) | Event::PI(_) | Event::DocType(_) => continue,
             };
         }
@@ -111,7 +111,7 @@ impl<'a> Scanner<'a> {
         written: &'a str,
         offset: usize,
         empty: bool,
-    ) -> Result<Piece<'a>, Malformed> {
+    ) -> Result<XmlEvent<'a>, Malformed> {
         let inner = written.get(1..written.len() - 1 - usize::from(empty));
         let inner = inner.and_then(|inner| inner.split_at_checked(tag.name().0.len()));
         let (name, attributes) = inner.unwrap_or_default();
@@ -119,7 +119,7 @@ impl<'a> Scanner<'a> {
             let what = Some("a tag without a name".to_owned());
             return Err(Malformed { offset, what });
         }
-        Ok(Piece::Start {
+        Ok(XmlEvent::Start {
             name,
             attributes,
             offset,
@@ -153,13 +153,14 @@ fn to_usize(offset: u64) -> usize {
     usize::try_from(offset).unwrap_or(usize::MAX)
 }
 
-/// Without the namespace's prefix.
+/// Returns the name without its namespace prefix.
 pub(super) fn local_name(qualified: &str) -> &str {
     let local = qualified.rsplit_once(':');
     local.map_or(qualified, |(_, local)| local)
 }
 
-/// The value of one attribute as written; `Err` where the tag is not made of `name="value"` before it.
+/// Returns the raw value of one attribute. Fails if the tag before the attribute is not a list of
+/// `name="value"`.
 pub(super) fn attribute<'a>(
     attributes: &'a str,
     name: &str,

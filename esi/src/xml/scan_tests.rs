@@ -1,32 +1,35 @@
-//! Pieces, their places, and damage.
+//! Tests of events, their offsets, and damaged text.
 
 use super::lines::Lines;
-use super::scan::{Malformed, Piece, Scanner, attribute};
+use super::scan::{Malformed, XmlEvent, XmlReader, attribute};
 use proptest::prelude::*;
 
-fn pieces(document: &str) -> Result<Vec<Piece<'_>>, Malformed> {
-    let mut scanner = Scanner::new(document);
+fn pieces(document: &str) -> Result<Vec<XmlEvent<'_>>, Malformed> {
+    let mut scanner = XmlReader::new(document);
     let mut all = Vec::new();
     let mut at = 0;
     loop {
         let piece = scanner.next()?;
-        assert!(scanner.offset() > at || piece == Piece::Eof, "{document}");
+        assert!(
+            scanner.offset() > at || piece == XmlEvent::Eof,
+            "{document}"
+        );
         at = scanner.offset();
-        if let Piece::Start { name, offset, .. } = piece {
+        if let XmlEvent::Start { name, offset, .. } = piece {
             assert!(document[offset..].starts_with(&format!("<{name}")));
         }
         match piece {
-            Piece::Eof => return Ok(all),
+            XmlEvent::Eof => return Ok(all),
             piece => all.push(piece),
         }
     }
 }
 
-/// As `start`, `/end`, `"text"`.
+/// Formats the events as `start`, `/end`, `"text"`.
 fn seen(document: &str) -> String {
     let pieces = pieces(document).unwrap().into_iter();
     let pieces = pieces.map(|piece| match piece {
-        Piece::Start {
+        XmlEvent::Start {
             name,
             attributes,
             empty,
@@ -35,15 +38,15 @@ fn seen(document: &str) -> String {
             let end = if empty { "/" } else { "" };
             format!("{name}[{}]{end}", attributes.trim())
         }
-        Piece::End { name, .. } => format!("/{name}"),
-        Piece::Text(text) | Piece::CData(text) => format!("{text:?}"),
-        Piece::Eof => String::new(),
+        XmlEvent::End { name, .. } => format!("/{name}"),
+        XmlEvent::Text(text) | XmlEvent::CData(text) => format!("{text:?}"),
+        XmlEvent::Eof => String::new(),
     });
     pieces.collect::<Vec<_>>().join(" ")
 }
 
 #[test]
-fn every_kind_of_markup() {
+fn scanner_reads_every_kind_of_markup() {
     for (document, expected) in [
         ("", ""),
         ("plain", "\"plain\""),
@@ -74,7 +77,7 @@ fn every_kind_of_markup() {
 }
 
 #[test]
-fn what_is_not_closed_ends_at_the_end() {
+fn scanner_ends_at_the_end_of_text_with_open_markup() {
     for document in [
         "<",
         "<a",
@@ -106,7 +109,7 @@ fn what_is_not_closed_ends_at_the_end() {
 }
 
 #[test]
-fn attributes_by_their_local_name() {
+fn attribute_finds_values_by_local_name() {
     let tag = " a='1'\n p:b = \"x 'y' = z\" c=''";
     for (name, value) in [
         ("a", Some("1")),
@@ -136,9 +139,9 @@ fn any_markup() -> impl Strategy<Value = String> {
 }
 
 proptest! {
-    /// Nothing panics, and everything ends: every piece moves on.
+    /// Checks that no text causes a panic, and that each event advances the offset.
     #[test]
-    fn any_damage_is_survived(document in any_markup(), at in any::<prop::sample::Index>(), by in "[<>/!?'\"\\[\\]ä=-]{0,3}") {
+    fn scanner_survives_any_damage(document in any_markup(), at in any::<prop::sample::Index>(), by in "[<>/!?'\"\\[\\]ä=-]{0,3}") {
         let mut at = at.index(document.len() + 1);
         while !document.is_char_boundary(at) {
             at -= 1;
@@ -151,11 +154,11 @@ proptest! {
     }
 
     #[test]
-    fn lines_and_columns_as_counted_one_by_one(
+    fn lines_position_matches_a_character_count(
         text in "[aä€\n]{0,1500}",
         at in proptest::collection::vec(any::<prop::sample::Index>(), 1..8),
     ) {
-        // What was asked for before must not matter.
+        // Earlier requests must not change the result.
         let lines = Lines::new(&text);
         for at in at {
             let mut offset = at.index(text.len() + 1);

@@ -1,4 +1,5 @@
-//! `Slots`: where modules go. Slots inside a `SlotGroup` element are read as if they stood in the list.
+//! `Slots`: the places for modules. Slots inside a `SlotGroup` element are treated as direct
+//! elements of the list.
 
 use super::cursor::{Cursor, Element};
 use super::text::Names;

@@ -31,10 +31,11 @@ pub(super) fn sync_unit<'a>(
     })
 }
 
-/// A SyncManager's number and its PDOs; the oversampling factors that stand there, by PDO.
+/// A SyncManager's number with its PDOs, and the oversampling factors by PDO.
 pub(super) type Assignment = (Option<(u8, Vec<u16>)>, Vec<(u16, u16)>);
 
-/// `Sm No="2"` with its `Pdo`s, in an OpMode or in an AlternativeSmMapping. One without a number says nothing.
+/// Reads `Sm No="2"` with its `Pdo`s in an OpMode or an AlternativeSmMapping. Returns no
+/// SyncManager without a number.
 pub(super) fn assignment<'a>(
     c: &mut Cursor<'a>,
     element: &Element<'a>,
@@ -67,7 +68,8 @@ pub(super) fn sync_manager<'a>(
             },
         ));
     };
-    // ETG.2000 lets bit 0 of Enable say enabled; the higher bits only say that it may be changed.
+    // ETG.2000: bit 0 of Enable means enabled; the higher bits only declare that the value is
+    // changeable.
     let enable: Option<u8> = match c.attribute(element, "Enable")?.as_deref().map(str::trim) {
         Some("true") => Some(1),
         Some("false") => Some(0),

@@ -8,11 +8,11 @@ use crate::model::LocalName;
 
 const ENGLISH: u32 = 1033;
 
-/// Collects sibling `Name` elements, borrowed where they stand in the file in one piece.
+/// Collects sibling `Name` elements, borrowed if the file contains the text in one piece.
 #[derive(Default)]
 pub(super) struct Names<'a> {
     first: Option<Name<'a>>,
-    /// Few have more than one.
+    /// Further names; few elements have more than one.
     more: Vec<Name<'a>>,
 }
 
@@ -34,7 +34,7 @@ impl<'a> Names<'a> {
         Ok(())
     }
 
-    /// English where it is marked, else the first.
+    /// Returns the English name if one is marked, otherwise the first.
     pub fn take(self) -> Cow<'a, str> {
         let is_english = |name: &Name<'_>| name.lcid == Some(ENGLISH);
         let Some(first) = self.first else {
@@ -47,7 +47,7 @@ impl<'a> Names<'a> {
         english.unwrap_or(first).text
     }
 
-    /// The same, and all of them.
+    /// Same as [`Self::take`], with all names.
     pub fn take_all(self) -> (String, Vec<LocalName>) {
         let all = self.first.iter().chain(&self.more).map(|name| LocalName {
             lcid: name.lcid,

@@ -1,10 +1,11 @@
-//! Where recorded third-party files are found. They are not part of the repository.
+//! Locates recorded third-party files. They are not part of the repository.
 
 #![allow(dead_code)]
 
 use std::path::{Path, PathBuf};
 
-/// `ECAXIS_FIXTURES`, or `../shared/fixtures` beside the workspace. Absent: says so; on CI that is a failure.
+/// Returns `ECAXIS_FIXTURES`, or `../shared/fixtures` next to the workspace. Prints a note if the
+/// folder is missing; on CI this is a failure.
 pub fn fixtures() -> Option<PathBuf> {
     let root = std::env::var_os("ECAXIS_FIXTURES").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/fixtures"),

@@ -1,6 +1,6 @@
-//! Seeded changes to XML: bytes, numbers, whole elements, pieces of other files.
+//! Seeded changes to XML: bytes, numbers, whole elements, and pieces of other files.
 
-/// splitmix64.
+/// splitmix64 random numbers.
 pub struct Dice(pub u64);
 
 impl Dice {
@@ -12,7 +12,7 @@ impl Dice {
         z ^ (z >> 31)
     }
 
-    /// 0 to `end` − 1; 0 where there is nothing.
+    /// Returns a number from 0 to `end` − 1, or 0 if `end` is 0.
     pub fn below(&mut self, end: usize) -> usize {
         (self.roll() % end.max(1) as u64) as usize
     }
@@ -78,7 +78,7 @@ const PARTS: &[&str] = &[
     "\0",
 ];
 
-/// One to four changes.
+/// Applies one to four changes.
 pub fn mutate(original: &[u8], others: &[Vec<u8>], dice: &mut Dice) -> Vec<u8> {
     let mut bytes = original.to_vec();
     for _ in 0..=dice.below(4) {
@@ -124,7 +124,7 @@ fn change(bytes: &mut Vec<u8>, others: &[Vec<u8>], dice: &mut Dice) {
     }
 }
 
-/// Another number where one stands.
+/// Replaces a number.
 fn number(bytes: &mut Vec<u8>, dice: &mut Dice) {
     let digit = |byte: &u8| byte.is_ascii_digit();
     let from = dice.below(bytes.len());
@@ -140,7 +140,7 @@ fn number(bytes: &mut Vec<u8>, dice: &mut Dice) {
     bytes.splice(start..end, dice.pick(NUMBERS).bytes());
 }
 
-/// Where a start tag begins or, for an attribute, where its name ends.
+/// Returns the start of a start tag or, for an attribute, the end of the tag's name.
 fn boundary(bytes: &[u8], attribute: bool, dice: &mut Dice) -> usize {
     let from = dice.below(bytes.len());
     let starts = |pair: &[u8]| pair[0] == b'<' && pair[1].is_ascii_alphabetic();
@@ -154,7 +154,7 @@ fn boundary(bytes: &[u8], attribute: bool, dice: &mut Dice) -> usize {
     (at + 1 + name).min(bytes.len())
 }
 
-/// From a `<` to the end of the element of that name, or of the tag.
+/// Returns the range from a `<` to the end of the element of that name, or of the tag.
 fn element(bytes: &[u8], dice: &mut Dice) -> std::ops::Range<usize> {
     let start = boundary(bytes, false, dice);
     let rest = &bytes[start..];

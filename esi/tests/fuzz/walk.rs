@@ -1,12 +1,12 @@
-//! An ESI file all the way: parse → every choice → layout and start-up list → EEPROM image → parse again. Shared by
-//! `cargo test` and the coverage-guided target.
+//! Passes an ESI file through all steps: parse → every choice → layout and start-up list → EEPROM
+//! image → parse again. Used by `cargo test` and the coverage-guided fuzz target.
 
 use ecaxis_esi::{
-    Choice, Device, EntryRef, EsiFile, Field, Mode, Selection, SmLayout, lint, offered_modes,
-    parse, select, sii,
+    Device, EntryRef, EsiFile, Field, Mode, SelectOptions, Selection, SmLayout, lint,
+    offered_modes, parse, select, sii,
 };
 
-/// How far inputs came.
+/// Counters of the inputs that reached each step.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub struct Reached {
     pub files: u64,
@@ -16,7 +16,7 @@ pub struct Reached {
     pub images: u64,
 }
 
-/// What does not hold makes it panic; what is wrong with the file does not.
+/// Panics if a property fails. Errors in the file itself are accepted.
 pub fn walk(bytes: &[u8], reached: &mut Reached) {
     reached.files += 1;
     let file = match parse(bytes) {
@@ -38,24 +38,30 @@ pub fn walk(bytes: &[u8], reached: &mut Reached) {
 }
 
 fn choices(file: &EsiFile, device: &Device, reached: &mut Reached) {
-    let plain = Choice {
+    let plain = SelectOptions {
         cycle_ns: 1_000_000,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let mut own: Vec<EntryRef> = Vec::new();
     let mut all = vec![plain];
     let modes = offered_modes(file, device).into_iter();
     let modes: Vec<Mode> = modes.collect();
-    all.extend(modes.iter().map(|&mode| Choice {
+    all.extend(modes.iter().map(|&mode| SelectOptions {
         mode: Some(mode),
         cycle_ns: 125_000,
         ..plain
     }));
-    all.extend(device.sm_mappings.iter().take(3).map(|mapping| Choice {
-        assignment: Some(&mapping.name),
-        ..plain
-    }));
-    all.extend(device.dc_modes.iter().take(4).map(|mode| Choice {
+    all.extend(
+        device
+            .sm_mappings
+            .iter()
+            .take(3)
+            .map(|mapping| SelectOptions {
+                assignment: Some(&mapping.name),
+                ..plain
+            }),
+    );
+    all.extend(device.dc_modes.iter().take(4).map(|mode| SelectOptions {
         dc_mode: Some(&mode.name),
         cycle_ns: 3_333_333,
         ..plain
@@ -76,7 +82,11 @@ fn choices(file: &EsiFile, device: &Device, reached: &mut Reached) {
             ]
         })
         .collect();
-    all.extend(modules.iter().map(|modules| Choice { modules, ..plain }));
+    all.extend(
+        modules
+            .iter()
+            .map(|modules| SelectOptions { modules, ..plain }),
+    );
     for pdo in device.rx_pdos.iter().chain(&device.tx_pdos).take(4) {
         own.extend(pdo.entries.iter().take(4).map(|entry| EntryRef {
             index: entry.index,
@@ -84,7 +94,7 @@ fn choices(file: &EsiFile, device: &Device, reached: &mut Reached) {
         }));
     }
     let (rx, tx) = (Some(own.as_slice()), Some(own.as_slice()));
-    all.extend([Choice { rx, ..plain }, Choice { tx, ..plain }]);
+    all.extend([SelectOptions { rx, ..plain }, SelectOptions { tx, ..plain }]);
     for choice in &all {
         reached.choices += 1;
         if let Ok(selection) = select(file, device, choice) {
@@ -107,7 +117,7 @@ fn holds(selection: &Selection) {
     assert!(steps.is_sorted() && steps.iter().all(Option::is_some));
 }
 
-/// Fields follow each other and end inside the SyncManagers.
+/// Checks that fields are consecutive and end inside the SyncManagers.
 fn direction(sms: &[SmLayout], fields: &[Field]) {
     let mut end = 0;
     for field in fields {
@@ -123,7 +133,7 @@ fn image(file: &EsiFile, device: &Device, reached: &mut Reached) {
     let Ok(parsed) = sii::parse(&image) else {
         panic!("an emitted image cannot be read");
     };
-    // A file that brings its whole image says in there who it is.
+    // A complete image in the file contains its own identity.
     if device.eeprom.image.is_empty() {
         assert_eq!(parsed.identity, device.identity);
     }

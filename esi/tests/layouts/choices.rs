@@ -1,12 +1,12 @@
-//! Every choice that a device offers, one by one.
+//! Visits each choice that a device offers.
 
 use std::fmt::Write;
 
-use ecaxis_esi::{Choice, Device, EsiFile, Finding, lint, offered_modes, select};
+use ecaxis_esi::{Device, EsiFile, Finding, SelectOptions, lint, offered_modes, select};
 
 use super::text::{self, digest};
 
-/// A usual bus cycle.
+/// A typical bus cycle.
 const CYCLE_NS: u64 = 1_000_000;
 const MANY_FINDINGS: usize = 24;
 
@@ -47,7 +47,7 @@ fn findings(out: &mut String, all: &[Finding]) {
     }
 }
 
-/// What came of each choice so far; equal ones are named and not repeated.
+/// The results so far. Equal results are referenced, not repeated.
 struct Choices<'a> {
     file: &'a EsiFile,
     device: &'a Device,
@@ -64,18 +64,18 @@ fn of_device(file: &EsiFile, device: &Device, full: bool) -> String {
         out: text::device(device),
         seen: Vec::new(),
     };
-    let plain = Choice {
+    let plain = SelectOptions {
         cycle_ns: CYCLE_NS,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     choices.add("default", &plain, full);
-    if device.speaks_soe_alone() {
+    if device.is_soe_only() {
         return choices.out;
     }
     for mode in offered_modes(file, device) {
         choices.add(
             &format!("mode {mode}"),
-            &Choice {
+            &SelectOptions {
                 mode: Some(mode),
                 ..plain
             },
@@ -84,20 +84,20 @@ fn of_device(file: &EsiFile, device: &Device, full: bool) -> String {
     }
     choices.modules(&plain);
     for (n, mapping) in device.sm_mappings.iter().enumerate() {
-        let choice = Choice {
+        let choice = SelectOptions {
             assignment: Some(&mapping.name),
             ..plain
         };
         choices.add(&format!("assignment {}", n + 1), &choice, full);
     }
     for (n, mode) in device.dc_modes.iter().enumerate() {
-        // Some files give several OpModes one name and tell them apart by description.
+        // Some files give several OpModes the same name; their descriptions differ.
         let mut before = device.dc_modes.iter().take(n);
         let name = match before.any(|other| other.name == mode.name) {
             true => &mode.description,
             false => &mode.name,
         };
-        let choice = Choice {
+        let choice = SelectOptions {
             dc_mode: Some(name),
             ..plain
         };
@@ -107,9 +107,9 @@ fn of_device(file: &EsiFile, device: &Device, full: bool) -> String {
 }
 
 impl Choices<'_> {
-    /// Each module in each place that takes it, the other places as empty as they may be; then one choice that fills
-    /// every place with the first module that it takes.
-    fn modules(&mut self, plain: &Choice<'_>) {
+    /// Visits each module in each place that accepts it, with the other places as empty as
+    /// possible. Then visits one choice with all places filled with their first module.
+    fn modules(&mut self, plain: &SelectOptions<'_>) {
         let Some(slots) = &self.device.slots else {
             return;
         };
@@ -150,16 +150,22 @@ impl Choices<'_> {
         }
     }
 
-    fn add_modules(&mut self, name: &str, modules: &[String], plain: &Choice<'_>, full: bool) {
+    fn add_modules(
+        &mut self,
+        name: &str,
+        modules: &[String],
+        plain: &SelectOptions<'_>,
+        full: bool,
+    ) {
         let modules: Vec<&str> = modules.iter().map(String::as_str).collect();
-        let choice = Choice {
+        let choice = SelectOptions {
             modules: &modules,
             ..*plain
         };
         self.add(name, &choice, full && self.full);
     }
 
-    fn add(&mut self, name: &str, choice: &Choice<'_>, full: bool) {
+    fn add(&mut self, name: &str, choice: &SelectOptions<'_>, full: bool) {
         let selection = match select(self.file, self.device, choice) {
             Ok(selection) => selection,
             Err(error) => {

@@ -1,10 +1,10 @@
-//! Numbers as lines, and how two texts differ.
+//! Formats numbers as lines and shows the difference between two texts.
 
 use std::fmt::Write;
 
 use ecaxis_esi::{Device, Field, Pdo, SelectError, Selection, SmLayout, StartupSdo};
 
-/// Longer data is told by its length and digest.
+/// Longer data is shown as length and digest.
 const SHOWN_BYTES: usize = 20;
 
 pub fn device(device: &Device) -> String {
@@ -80,7 +80,7 @@ pub fn dc(selection: &Selection) -> String {
     })
 }
 
-/// Everything but the clocks.
+/// Formats a selection without its clocks.
 pub fn selection(selection: &Selection) -> Vec<String> {
     let mut lines = Vec::new();
     for module in &selection.modules {
@@ -105,7 +105,7 @@ pub fn selection(selection: &Selection) -> Vec<String> {
         lines.push(format!("  {}", command(sdo)));
     }
     for note in &selection.notes {
-        // A note's text may name things as the file does.
+        // A note may quote names from the file, so only its word count is kept.
         lines.push(format!("note of {} words", note.split_whitespace().count()));
     }
     lines
@@ -153,7 +153,7 @@ fn command(sdo: &StartupSdo) -> String {
     format!("{:04x}:{:02x}{whole} = {data}", sdo.index, sdo.sub)
 }
 
-/// SyncManager lengths and PDOs in a line.
+/// Returns SyncManager lengths and PDOs in one line.
 pub fn short(selection: &Selection) -> String {
     let layout = &selection.layout;
     let mut parts = Vec::new();
@@ -178,7 +178,7 @@ pub fn short(selection: &Selection) -> String {
     parts.join(", ")
 }
 
-/// FNV-1a of the lines, 64 bits.
+/// Returns the 64-bit FNV-1a hash of the lines.
 pub fn digest(lines: &[String]) -> String {
     let bytes = lines.iter().flat_map(|line| line.bytes().chain([b'\n']));
     let hash = bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
@@ -187,7 +187,7 @@ pub fn digest(lines: &[String]) -> String {
     format!("#{hash:016x}")
 }
 
-/// The lines that differ, each behind the device it belongs to.
+/// Returns the differing lines, each after its device.
 pub fn difference(before: &str, now: &str) -> String {
     const SHOWN: usize = 40;
     let (before, now): (Vec<&str>, Vec<&str>) = (before.lines().collect(), now.lines().collect());
@@ -223,7 +223,7 @@ pub fn difference(before: &str, now: &str) -> String {
 }
 
 #[test]
-fn a_difference_shows_what_changed_and_where() {
+fn difference_shows_the_change_and_its_device() {
     let text = difference("device 1\n  a\n  b\n  c\n", "device 1\n  a\n  x\n  c\n");
     assert_eq!(text, "  line 3, device 1\n  -  b\n  +  x\n");
 }

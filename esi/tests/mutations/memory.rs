@@ -1,6 +1,6 @@
-//! The peak of this process's whole resident memory, as Linux tells it; elsewhere 0.
+//! The peak resident memory of this process on Linux; elsewhere 0.
 
-/// Forgets the peak so far.
+/// Resets the peak.
 pub fn reset() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

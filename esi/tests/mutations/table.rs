@@ -1,4 +1,4 @@
-//! Where the file is damaged, and what is said of it.
+//! The damages with their expected messages.
 
 pub struct Mutation {
     pub name: &'static str,
@@ -7,21 +7,21 @@ pub struct Mutation {
 }
 
 pub struct Says {
-    /// `refused`: nothing can be read; else the severity of a finding.
+    /// `refused`: the whole file is unreadable; otherwise the severity of a finding.
     pub kind: &'static str,
     pub at: At,
     pub path: &'static str,
-    /// Part of it.
+    /// A part of the message.
     pub text: &'static str,
 }
 
-/// A place of the damaged text.
+/// A position in the damaged text.
 pub enum At {
     First(&'static str),
-    /// Counted from 1.
+    /// The n-th occurrence, from 1.
     Nth(usize, &'static str),
     Last(&'static str),
-    /// The last of the second before the first of the first.
+    /// The last occurrence of the second text before the first occurrence of the first text.
     Before(&'static str, &'static str),
 }
 
@@ -41,7 +41,7 @@ pub fn replace(text: &str, from: &str, to: &str) -> String {
     text.replacen(from, to, 1)
 }
 
-/// The first `from` behind `behind`.
+/// Replaces the first `from` after `behind`.
 pub fn replace_in(text: &str, behind: &str, from: &str, to: &str) -> String {
     let (before, after) = text.split_once(behind).unwrap();
     format!("{before}{behind}{}", replace(after, from, to))
@@ -61,7 +61,7 @@ pub fn cut_first(mut text: String, at: &str) -> String {
     text
 }
 
-/// So many objects of 10 kB in the default module, others in each slot.
+/// Adds `count` objects of 10 kB to the default module, and other objects to each slot.
 pub fn large_module(text: &str, count: usize) -> String {
     let objects: String = (0..count)
         .map(|n| {
@@ -91,7 +91,7 @@ pub fn slots(text: &str, count: usize) -> String {
     insert(&text, "</Slots>", &slot.repeat(count))
 }
 
-/// Small copies of the device, each with places enough.
+/// Adds `count` small copies of the device, each with enough places.
 pub fn doubled(text: &str, count: usize) -> String {
     let device = "<Device Physics=\"YY\"><Type ProductCode=\"#x69500000\" RevisionNo=\"#x01700000\">E</Type>\
                   <Slots><Slot MinInstances=\"254\" MaxInstances=\"254\"><ModuleIdent>1</ModuleIdent></Slot></Slots></Device>";
@@ -112,7 +112,7 @@ pub fn long_type(text: &str) -> String {
     insert(&text, "<Object>", object)
 }
 
-/// Ten times ten times ten …
+/// Nests entities with ten references per level.
 pub fn bomb(text: &str) -> String {
     let entities: String = (1..10)
         .map(|n| {

@@ -1,20 +1,21 @@
-//! Start-up lists against those that another tool made of the same file.
+//! Start-up lists compared with those of another tool for the same file.
 
 use super::*;
 
-/// The configuration that another tool made of the same file with its default module: the same commands in the same
-/// order, whole assignments by complete access, no contents because PdoConfig is not set, 9 before Op.
+/// Another tool's configuration of the same file with its default module must contain the same
+/// commands in the same order. Whole assignments use complete access. PdoConfig is not set, so no
+/// contents are written. 9 comes before Op.
 #[test]
-fn the_same_start_up_commands_as_a_recorded_eni() {
+fn startup_commands_match_a_recorded_eni() {
     let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
         return;
     };
     let Some(eni) = common::read("eni/CherryECAT_CIA402_ENI.xml") else {
         return;
     };
-    let choice = Choice {
+    let choice = SelectOptions {
         cycle_ns: MS,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let selection = choose(&file, &choice).unwrap();
     let ours: Vec<_> = selection
@@ -46,7 +47,7 @@ struct InitCmd {
     data: Vec<u8>,
 }
 
-/// The CoE commands of an ENI, read without our own reader.
+/// Returns the CoE commands of an ENI, read without the ecaxis reader.
 fn coe_init_cmds(eni: &str) -> Vec<InitCmd> {
     let coe = eni.split("<CoE>").nth(1).unwrap();
     let coe = coe.split("</CoE>").next().unwrap();

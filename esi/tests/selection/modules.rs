@@ -2,16 +2,16 @@
 
 use super::*;
 
-/// Two axes in one device: the second module's indices count on by the slot's increments.
+/// Two axes in one device: the slot's increments shift the indices of the second module.
 #[test]
-fn a_module_in_the_second_slot_counts_on() {
+fn a_module_in_the_second_slot_has_shifted_indices() {
     let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
         return;
     };
-    let choice = Choice {
+    let choice = SelectOptions {
         modules: &["0x319800", "0x219800"],
         cycle_ns: MS,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let selection = choose(&file, &choice).unwrap();
     let places: Vec<_> = selection
@@ -39,15 +39,15 @@ fn a_module_in_the_second_slot_counts_on() {
 }
 
 #[test]
-fn a_module_that_does_not_fit_is_refused_by_name() {
+fn a_module_that_does_not_fit_is_rejected_by_name() {
     let Some(file) = file("esi/hpmicro/ECAT_CIA402.xml") else {
         return;
     };
     let refused = |modules: &[&str]| {
-        let choice = Choice {
+        let choice = SelectOptions {
             modules,
             cycle_ns: MS,
-            ..Choice::default()
+            ..SelectOptions::default()
         };
         choose(&file, &choice).unwrap_err().to_string()
     };

@@ -1,23 +1,23 @@
-//! CiA 402 axes in process data: where their objects are on the wire, and what became of them.
+//! CiA 402 axes in process data: the location of their objects, and their motion.
 
 use ecaxis_axis::{Mode, State, Statusword};
 use ecaxis_esi::Layout;
 
-use super::events::What;
+use super::events::EventKind;
+use super::match_frames::DatagramExchange;
 use super::objects::{Mapped, Objects};
-use super::pair::Passed;
 use super::registers::Registers;
 
-/// Points of one curve; twice as many are folded in two.
+/// The maximum number of points per curve; twice as many are merged in pairs.
 const POINTS: usize = 1500;
-/// Changes of state, mode or error that are kept of one axis.
+/// The maximum number of stored state, mode and error changes per axis.
 const CHANGES: usize = 2000;
-/// Objects of one device that are followed.
+/// The maximum number of objects per device.
 const PLACES: usize = 256;
-/// Axes of one device: each has 0x800 objects.
+/// The maximum number of axes per device; each has 0x800 objects.
 const AXES: u16 = 8;
 
-/// What of an axis is followed; indices of the first axis.
+/// An object of an axis. The values are indices of the first axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Signal {
     Controlword,
@@ -52,12 +52,12 @@ impl Signal {
     }
 }
 
-/// A curve with a bounded number of points: least and greatest of so many cycles each.
+/// A curve with a bounded number of points, each with minimum and maximum of several cycles.
 #[derive(Debug, Default, Clone)]
 pub struct Curve {
-    /// Time of the first cycle in nanoseconds since 1970, least, greatest.
+    /// The time of the first cycle in ns since 1970, minimum, maximum.
     pub points: Vec<(u64, f64, f64)>,
-    /// Cycles to a point.
+    /// The number of cycles per point.
     every: u64,
     left: u64,
 }
@@ -85,7 +85,7 @@ impl Curve {
         }
     }
 
-    /// Least and greatest of all.
+    /// Returns minimum and maximum of all points.
     #[must_use]
     pub fn range(&self) -> Option<(f64, f64)> {
         let (_, least, greatest) = *self.points.first()?;
@@ -100,19 +100,20 @@ impl Curve {
 /// One axis of a device.
 #[derive(Debug, Default)]
 pub struct Axis {
-    /// 0 is the one at 0x6000.
+    /// 0 is the axis at 0x6000.
     pub number: u8,
     pub cycles: u64,
     pub state: Option<State>,
-    /// When which state began.
+    /// The states and their start times.
     pub states: Vec<(u64, State)>,
-    /// When which mode began, as 0x6061 shows it, or 0x6060 where that is not mapped.
+    /// The modes and their start times, from 0x6061, or from 0x6060 if 0x6061 is not mapped.
     pub modes: Vec<(u64, Mode)>,
     pub error: Option<u16>,
     pub position: (Curve, Curve),
     pub velocity: (Curve, Curve),
     pub torque: (Curve, Curve),
-    /// Of target and actual position while Operation enabled in CSP, in counts.
+    /// The largest difference between target and actual position in counts, in CSP while Operation
+    /// enabled.
     pub largest_error: Option<i64>,
     shows_mode: bool,
 }
@@ -121,7 +122,7 @@ pub struct Axis {
 struct Place {
     axis: usize,
     signal: Signal,
-    /// Logical address in bits.
+    /// The logical address in bits.
     bit: u64,
     bits: u8,
     output: bool,
@@ -135,7 +136,7 @@ pub struct Axes {
 }
 
 impl Axes {
-    /// Finds the objects anew: by what the recording shows of the PDOs, else by a layout.
+    /// Locates the objects: from the PDOs in the recording, else from a layout.
     pub fn locate(&mut self, registers: &Registers, objects: &Objects, layout: Option<&Layout>) {
         self.places.clear();
         let fmmus: Vec<_> = registers.fmmus().collect();
@@ -162,7 +163,7 @@ impl Axes {
                 }
             }
         }
-        // A device without a Statusword or Controlword is no axis.
+        // An axis has a Statusword or a Controlword.
         let is_word = |p: &Place| matches!(p.signal, Signal::Controlword | Signal::Statusword);
         let words: Vec<usize> = self
             .places
@@ -215,8 +216,12 @@ impl Axes {
         });
     }
 
-    /// One datagram of process data.
-    pub fn process_data(&mut self, passed: &Passed<'_>, mut tell: impl FnMut(What)) {
+    /// Processes one process data datagram.
+    pub fn process_data(
+        &mut self,
+        passed: &DatagramExchange<'_>,
+        mut report: impl FnMut(EventKind),
+    ) {
         let start = u64::from(passed.address) * 8;
         let mut targets = [None; AXES as usize];
         for place in &self.places {
@@ -234,7 +239,7 @@ impl Axes {
             {
                 *target = Some(value.1);
             }
-            axis.takes(place.signal, passed.at, value, &mut tell);
+            axis.takes(place.signal, passed.at, value, &mut report);
             if place.signal == Signal::ActualPosition
                 && let Some(Some(target)) = targets.get(place.axis)
             {
@@ -243,14 +248,20 @@ impl Axes {
         }
     }
 
-    /// Axes that showed something.
+    /// Iterates over the axes with data.
     pub fn seen(&self) -> impl Iterator<Item = &Axis> {
         self.axes.iter().filter(|axis| axis.cycles > 0)
     }
 }
 
 impl Axis {
-    fn takes(&mut self, signal: Signal, at: u64, value: (u64, i64), tell: &mut impl FnMut(What)) {
+    fn takes(
+        &mut self,
+        signal: Signal,
+        at: u64,
+        value: (u64, i64),
+        report: &mut impl FnMut(EventKind),
+    ) {
         let (raw, signed) = value;
         let number = signed as f64;
         match signal {
@@ -262,7 +273,7 @@ impl Axis {
                     self.state = Some(state);
                     if self.states.len() < CHANGES {
                         self.states.push((at, state));
-                        tell(What::Axis {
+                        report(EventKind::Axis {
                             axis: self.number,
                             state,
                         });
@@ -280,7 +291,7 @@ impl Axis {
             Signal::ErrorCode => {
                 let code = raw as u16;
                 if self.error.unwrap_or(0) != code {
-                    tell(What::AxisError {
+                    report(EventKind::AxisError {
                         axis: self.number,
                         code,
                     });
@@ -305,7 +316,7 @@ impl Axis {
     }
 }
 
-/// The objects of a SyncManager by a layout, each from the start of its SyncManager.
+/// Returns the objects of a SyncManager from a layout, with offsets in the SyncManager.
 fn of_layout(layout: &Layout, number: u8) -> Vec<Mapped> {
     let both = [(&layout.outputs, &layout.rx), (&layout.inputs, &layout.tx)];
     for (managers, fields) in both {
@@ -328,7 +339,7 @@ fn of_layout(layout: &Layout, number: u8) -> Vec<Mapped> {
     Vec::new()
 }
 
-/// Up to 64 bits of process data: without and with sign.
+/// Returns up to 64 bits of process data, unsigned and signed.
 fn bits(data: &[u8], at: u64, len: u8) -> Option<(u64, i64)> {
     let len = u32::from(len);
     if !(1..=64).contains(&len) {

@@ -1,13 +1,13 @@
-//! Distributed clocks as a recording shows them: the reference clock against the recording's own, and every other
-//! device's distance from it.
+//! Distributed clocks of a recording: the reference clock against the recording's clock, and the
+//! other devices' differences from it.
 
 use std::collections::BTreeMap;
 
 use hdrhistogram::Histogram;
 
-/// Devices whose clocks are followed.
+/// The maximum number of devices with clocks.
 const CLOCKS: usize = 1024;
-/// Readings farther apart say nothing about jitter.
+/// Readings farther apart in ns are not used for jitter.
 const APART_NS: u64 = 100_000_000;
 
 /// Readings of the reference clock.
@@ -15,31 +15,31 @@ const APART_NS: u64 = 100_000_000;
 pub struct Reference {
     pub station: u16,
     pub readings: u64,
-    /// Recording's time and reference time of the first and last reading.
+    /// The time of the recording and of the reference clock at the first and last reading.
     pub first: (u64, u64),
     pub last: (u64, u64),
-    /// By how much an interval of the reference clock differs from that of the recording.
+    /// The differences between intervals of the reference clock and of the recording in ns.
     pub jitter: Histogram<u64>,
 }
 
-/// Readings of a device's system time difference, 0x092C.
+/// Readings of a device's system time difference (0x092C).
 #[derive(Debug)]
 pub struct Difference {
     pub last: i64,
     pub readings: u64,
-    /// Without sign.
+    /// The absolute values in ns.
     pub amounts: Histogram<u64>,
 }
 
 #[derive(Debug, Default)]
 pub struct Clocks {
     pub reference: Option<Reference>,
-    /// By station.
+    /// The differences by station address.
     pub differences: BTreeMap<u16, Difference>,
 }
 
 impl Clocks {
-    /// The reference clock's system time, 0x0910, read at `at`.
+    /// Adds the reference clock's system time (0x0910), read at `at`.
     pub fn reference(&mut self, station: u16, at: u64, data: &[u8]) {
         let wide = data
             .first_chunk::<8>()
@@ -56,7 +56,7 @@ impl Clocks {
             Some(reference) if reference.station == station => {
                 let (host, before) = reference.last;
                 if wide.is_none() {
-                    // 32 bits go round every 4.3 s.
+                    // 32 bits wrap every 4.3 s.
                     let ahead = (time as u32).wrapping_sub(before as u32);
                     time = before.wrapping_add(u64::from(ahead));
                 }
@@ -81,7 +81,7 @@ impl Clocks {
         }
     }
 
-    /// 0x092C: 31 bits, and a sign that says whether the local copy is greater.
+    /// Adds a value of 0x092C: 31 bits, and a sign that is set if the local copy is greater.
     pub fn difference(&mut self, station: u16, raw: u32) {
         if self.differences.len() >= CLOCKS && !self.differences.contains_key(&station) {
             return;
@@ -103,7 +103,8 @@ impl Clocks {
 }
 
 impl Reference {
-    /// How much faster the reference clock goes than the recording's, in millionths; from 100 ms on.
+    /// Returns the deviation of the reference clock's rate from the recording's in ppm; `None`
+    /// below 100 ms.
     pub fn rate_ppm(&self) -> Option<f64> {
         let host = self.last.0.checked_sub(self.first.0)?;
         let own = self.last.1.checked_sub(self.first.1)?;

@@ -1,28 +1,28 @@
-//! The cyclic exchange: datagrams to logical addresses, how regularly they come, and their working counters.
+//! The cyclic exchange: logical datagrams, their intervals and working counters.
 
 use std::collections::BTreeMap;
 
 use hdrhistogram::Histogram;
 
-use super::pair::Passed;
+use super::match_frames::DatagramExchange;
 use crate::recording::frame::Command;
 
-/// Datagrams with an address of their own that are followed: one a group, and one for every eight mailboxes.
+/// The maximum number of logical datagrams: one per group, and one per eight mailboxes.
 const GROUPS: usize = 64;
-/// Changes of a working counter that are kept; they are counted beyond.
+/// The maximum number of stored working counter changes; further ones are counted.
 const RUNS: usize = 256;
-/// Gaps that are kept.
+/// The maximum number of stored gaps.
 const GAPS: usize = 64;
-/// An interval that is no cycle any more.
+/// The maximum interval of a cycle in ns.
 const PAUSE_NS: u64 = 10_000_000_000;
 
-/// Which process data: command, logical address, bytes.
+/// The identity of process data: command, logical address, length in bytes.
 pub type Key = (Command, u32, usize);
 
-/// Cycles in a row with the same working counter; `None`: no answer.
+/// Consecutive cycles with the same working counter; `None`: no answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Run {
-    /// Nanoseconds since 1970.
+    /// The time in ns since 1970.
     pub at: u64,
     pub wkc: Option<u16>,
     pub cycles: u64,
@@ -38,26 +38,26 @@ pub struct Group {
     pub counters: BTreeMap<u16, u64>,
     pub runs: Vec<Run>,
     pub more_runs: u64,
-    /// Nanoseconds from one to the next.
+    /// The intervals between datagrams in ns.
     pub intervals: Histogram<u64>,
     pub round_trips: Histogram<u64>,
-    /// The longest intervals: length and when they ended.
+    /// The longest intervals: length and end.
     pub gaps: Vec<(u64, u64)>,
-    /// Of the last cycle, and the highest of all.
+    /// The working counter of the last cycle, and the highest one.
     wkc: Option<u16>,
     highest: Option<u16>,
-    /// The next interval is none.
+    /// True if the next interval is not counted.
     paused: bool,
 }
 
 #[derive(Debug, Default)]
 pub struct Cycle {
     pub groups: BTreeMap<Key, Group>,
-    /// Datagrams of groups beyond those followed.
+    /// The number of datagrams of groups beyond the maximum.
     pub unfollowed: u64,
 }
 
-/// Numbers with four digits that count; grows as it needs.
+/// Returns an auto-resizing histogram with this number of significant digits.
 fn histogram(digits: u8) -> Option<Histogram<u64>> {
     Histogram::new(digits).ok()
 }
@@ -81,7 +81,7 @@ impl Group {
         })
     }
 
-    /// The working counter that most answers had.
+    /// Returns the most frequent working counter.
     pub fn usual(&self) -> Option<u16> {
         let most = self
             .counters
@@ -92,16 +92,17 @@ impl Group {
 }
 
 impl Cycle {
-    /// Something may be missing from here on.
+    /// Marks a possible gap in the recording.
     pub fn pause(&mut self) {
         for group in self.groups.values_mut() {
             group.paused = true;
         }
     }
 
-    /// A datagram to a logical address. `open`: its answer may have come after the recording's end. Returns whether everybody
-    /// answered who ever did: otherwise what was sent stands in the place of somebody's inputs.
-    pub fn passed(&mut self, passed: &Passed<'_>, open: bool) -> bool {
+    /// Processes a logical datagram. `open`: its answer may have arrived after the end of the
+    /// recording. Returns true if the working counter is the highest so far. Otherwise some inputs
+    /// still have their transmitted values.
+    pub fn passed(&mut self, passed: &DatagramExchange<'_>, open: bool) -> bool {
         let len = passed.sent.or(passed.back).map_or(0, <[u8]>::len);
         let key = (passed.command, passed.address, len);
         if !self.groups.contains_key(&key) {
@@ -121,7 +122,7 @@ impl Cycle {
 }
 
 impl Group {
-    fn passed(&mut self, passed: &Passed<'_>, open: bool) {
+    fn passed(&mut self, passed: &DatagramExchange<'_>, open: bool) {
         let interval = passed.at.saturating_sub(self.last);
         if !self.paused && passed.at >= self.last && interval < PAUSE_NS {
             let _ = self.intervals.record(interval);
@@ -148,7 +149,7 @@ impl Group {
                 .record(back.saturating_sub(passed.at).min(PAUSE_NS));
         }
         if passed.wkc == self.wkc && !self.runs.is_empty() {
-            // Of a change that was not kept, nor are its cycles.
+            // Cycles of a change that was not stored are not counted.
             if self.more_runs == 0
                 && let Some(run) = self.runs.last_mut()
             {
@@ -167,7 +168,7 @@ impl Group {
         self.highest = self.highest.max(passed.wkc);
     }
 
-    /// Keeps the longest.
+    /// Stores the gap if it is among the longest.
     fn gap(&mut self, interval: u64, at: u64) {
         if self.gaps.len() < GAPS {
             self.gaps.push((interval, at));

@@ -1,13 +1,12 @@
-//! What a recording shows of a SubDevice's EEPROM (ETG.1000.6, ETG.2010): words that were read through 0x0502 and 0x0508.
+//! The EEPROM content of a SubDevice in a recording (ETG.1000.6, ETG.2010): words read with 0x0502
+//! and 0x0508.
 
 use std::collections::BTreeMap;
 
 use super::registers::{part, part_u16};
+use ecaxis_ecat::registers;
 
-const CONTROL: u16 = 0x0502;
-const ADDRESS: u16 = 0x0504;
-const DATA: u16 = 0x0508;
-/// In the control register: a command is being carried out, the last one failed, eight bytes are read at a time.
+/// Bits of the control register: busy, eight-byte reads, command mask, read command.
 const BUSY: u16 = 0x8000;
 const WIDE: u16 = 0x0040;
 const COMMAND: u16 = 0x0700;
@@ -17,40 +16,40 @@ const FIRST_CATEGORY: u16 = 0x0040;
 const STRINGS: u16 = 10;
 const GENERAL: u16 = 30;
 const END: u16 = 0xffff;
-/// More than any image has.
+/// The maximum number of categories.
 const CATEGORIES: usize = 64;
 
-/// The words of an EEPROM that were seen.
+/// The known words of an EEPROM.
 #[derive(Debug, Default, Clone)]
 pub struct Eeprom {
     words: BTreeMap<u16, u16>,
-    /// Word address of a read whose data is awaited.
+    /// The word address of a pending read.
     reading: Option<u16>,
     wide: bool,
 }
 
 impl Eeprom {
-    /// The control registers were written.
+    /// Processes a write to the control registers.
     pub fn written(&mut self, register: u16, data: &[u8]) {
-        let Some(control) = part_u16(register, data, CONTROL) else {
+        let Some(control) = part_u16(register, data, registers::EEPROM_CONTROL) else {
             return;
         };
         self.reading = (control & COMMAND == READ)
-            .then(|| part_u16(register, data, ADDRESS))
+            .then(|| part_u16(register, data, registers::EEPROM_ADDRESS))
             .flatten();
     }
 
-    /// They were read, the data behind them perhaps as well.
+    /// Processes a read of the control registers, and of the data registers if included.
     pub fn read(&mut self, register: u16, data: &[u8]) {
-        let status = part_u16(register, data, CONTROL);
+        let status = part_u16(register, data, registers::EEPROM_CONTROL);
         if let Some(status) = status {
             self.wide = status & WIDE != 0;
         }
         let (Some(at), false) = (self.reading, status.is_some_and(|s| s & BUSY != 0)) else {
             return;
         };
-        let wide = part(register, data, DATA, 8).filter(|_| self.wide);
-        let Some(found) = wide.or_else(|| part(register, data, DATA, 4)) else {
+        let wide = part(register, data, registers::EEPROM_DATA, 8).filter(|_| self.wide);
+        let Some(found) = wide.or_else(|| part(register, data, registers::EEPROM_DATA, 4)) else {
             return;
         };
         for (n, word) in (0..).zip(found.chunks_exact(2)) {
@@ -93,7 +92,7 @@ impl Eeprom {
         self.two(0x0e)
     }
 
-    /// Where the content of a category is, in words: start and length. Its contents need not be known.
+    /// Returns start and length of a category in words. Its content may be unknown.
     fn category(&self, wanted: u16) -> Option<(u16, u16)> {
         let mut at = FIRST_CATEGORY;
         for _ in 0..CATEGORIES {
@@ -111,7 +110,7 @@ impl Eeprom {
         None
     }
 
-    /// Bytes of a category up to the first word that was not read.
+    /// Returns the known bytes of a category up to the first unknown word.
     fn bytes(&self, category: u16) -> Option<Vec<u8>> {
         let (start, len) = self.category(category)?;
         let known = (start..start.saturating_add(len)).map_while(|at| self.word(at));
@@ -130,7 +129,7 @@ impl Eeprom {
         (number > 0 && !text.is_empty()).then(|| text.to_owned())
     }
 
-    /// The type ("order") text, else the name.
+    /// Returns the type ("order") text, else the name.
     pub fn name(&self) -> Option<String> {
         let general = self.bytes(GENERAL)?;
         let text = |at: usize| self.text(*general.get(at)?);

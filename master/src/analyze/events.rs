@@ -1,40 +1,40 @@
-//! What happened, in order.
+//! The events of a recording in order.
 
 use std::fmt;
 
 use ecaxis_axis::State;
 use ecaxis_axis::cia402::describe;
 
-use super::mailbox::{Ended, FileTransfer, Transfer, Way};
+use super::mailbox::{FileTransfer, Transfer, TransferDirection, TransferOutcome};
 use super::values::value;
-use crate::al_status::al_status_text;
 use crate::bringup::AlState;
 use crate::mailbox::{Emergency, abort_text, mailbox_error_text, object_name};
+use ecaxis_ecat::al_status_code::al_status_text;
 
-/// Events that are kept; beyond, they are counted.
+/// The maximum number of stored events; further ones are counted.
 pub const EVENTS: usize = 50_000;
 
-/// Which devices an event is of.
+/// The source of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Of {
+pub enum EventScope {
     Bus,
-    /// Place in the list of devices.
+    /// An index into the list of devices.
     Device(usize),
 }
 
 #[derive(Debug, Clone)]
 pub struct Event {
-    /// Nanoseconds since 1970.
+    /// The time in ns since 1970.
     pub at: u64,
-    pub of: Of,
-    pub what: What,
+    pub of: EventScope,
+    pub what: EventKind,
 }
 
 #[derive(Debug, Clone)]
-pub enum What {
-    /// So many devices answer a broadcast read.
+pub enum EventKind {
+    /// The number of devices that answer a broadcast read.
     Answering(u16),
-    /// A station address was given.
+    /// A station address was assigned.
     Station(u16),
     Requested {
         state: AlState,
@@ -45,7 +45,7 @@ pub enum What {
         error: bool,
         code: Option<u16>,
     },
-    /// The code of an error that was told before.
+    /// The AL status code of an earlier error event.
     Code(u16),
     Transfer(Box<Transfer>),
     Emergency(Emergency),
@@ -63,8 +63,8 @@ pub enum What {
     },
 }
 
-impl What {
-    /// Belongs on the page, not only into the log.
+impl EventKind {
+    /// True if the event appears in the summary, not only in the full list.
     pub fn matters(&self) -> bool {
         match self {
             Self::Transfer(transfer) => transfer.is_trouble(),
@@ -73,7 +73,7 @@ impl What {
         }
     }
 
-    /// Something went wrong.
+    /// True if the event is a problem.
     pub fn is_trouble(&self) -> bool {
         match self {
             Self::State { error, .. } => *error,
@@ -90,12 +90,12 @@ impl What {
     }
 }
 
-/// Object, transfer and outcome.
+/// Formats object, transfer and outcome.
 impl fmt::Display for Transfer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let way = match self.way {
-            Way::Read => "read",
-            Way::Write => "write",
+            TransferDirection::Read => "read",
+            TransferDirection::Write => "write",
         };
         write!(f, "{way} 0x{:04x}", self.index)?;
         if self.complete {
@@ -107,19 +107,19 @@ impl fmt::Display for Transfer {
             write!(f, " ({name})")?;
         }
         match self.ended {
-            Ended::Done => write!(f, " = {}", value(self)),
-            Ended::Aborted { code, by_device } => {
+            TransferOutcome::Done => write!(f, " = {}", value(self)),
+            TransferOutcome::Aborted { code, by_device } => {
                 let who = if by_device { "" } else { " by the MainDevice" };
                 write!(f, ": aborted{who} with 0x{code:08x}, {}", abort_text(code))
             }
-            Ended::Refused(code) => {
+            TransferOutcome::Refused(code) => {
                 write!(
                     f,
                     ": refused with {code:#06x}, {}",
                     mailbox_error_text(code)
                 )
             }
-            Ended::Unanswered => write!(f, ": no answer"),
+            TransferOutcome::Unanswered => write!(f, ": no answer"),
         }
     }
 }
@@ -127,8 +127,8 @@ impl fmt::Display for Transfer {
 impl fmt::Display for FileTransfer {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let way = match self.way {
-            Way::Read => "read",
-            Way::Write => "write",
+            TransferDirection::Read => "read",
+            TransferDirection::Write => "write",
         };
         write!(f, "{way} file `{}`, {} bytes", self.name, self.len)?;
         match &self.error {
@@ -138,7 +138,7 @@ impl fmt::Display for FileTransfer {
     }
 }
 
-impl fmt::Display for What {
+impl fmt::Display for EventKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Answering(1) => write!(f, "1 device answers"),

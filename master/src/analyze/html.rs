@@ -1,4 +1,4 @@
-//! The report as a page to keep or to send: tables, and pictures of every axis.
+//! The report as an HTML page with tables and a plot of every axis.
 
 use std::fmt::Write;
 
@@ -6,30 +6,30 @@ use ecaxis_esi::address;
 
 use super::plot::{Span, bands, curves};
 use super::report::{AxisReport, Report, called};
-use crate::page::{self, escaped, key, time};
+use crate::html::{self, escape_xml, legend_entry, time};
 
-/// Rows of a table that may be long; the rest is counted.
+/// The maximum number of table rows; further ones are counted.
 const ROWS: usize = 500;
 
-/// The whole document. `name` is the recording's.
+/// Returns the complete document. `name` is the name of the recording.
 #[must_use]
 pub fn html(name: &str, report: &Report) -> String {
-    let mut out = page::head(&format!("What {name} tells"));
-    // Writing to a string does not fail.
+    let mut out = html::head(&format!("Analysis of {name}"));
+    // Writing to a String cannot fail.
     let _ = sections(&mut out, report);
-    out + page::END
+    out + html::END
 }
 
 fn table(out: &mut String, head: &[&str], rows: &[Vec<String>]) -> std::fmt::Result {
     write!(out, "<table><thead><tr>")?;
     for cell in head {
-        write!(out, "<th>{}</th>", escaped(cell))?;
+        write!(out, "<th>{}</th>", escape_xml(cell))?;
     }
     writeln!(out, "</tr></thead><tbody>")?;
     for row in rows.iter().take(ROWS) {
         write!(out, "<tr>")?;
         for cell in row {
-            write!(out, "<td>{}</td>", escaped(cell))?;
+            write!(out, "<td>{}</td>", escape_xml(cell))?;
         }
         writeln!(out, "</tr>")?;
     }
@@ -43,7 +43,7 @@ fn table(out: &mut String, head: &[&str], rows: &[Vec<String>]) -> std::fmt::Res
 fn list(out: &mut String, items: &[String]) -> std::fmt::Result {
     writeln!(out, "<ul>")?;
     for item in items.iter().take(ROWS) {
-        writeln!(out, "<li>{}</li>", escaped(item))?;
+        writeln!(out, "<li>{}</li>", escape_xml(item))?;
     }
     writeln!(out, "</ul>")
 }
@@ -141,7 +141,7 @@ fn sections(out: &mut String, report: &Report) -> std::fmt::Result {
 }
 
 fn axes(out: &mut String, report: &Report) -> std::fmt::Result {
-    // All pictures have the same time below them.
+    // All plots share the same time axis.
     let begins = report
         .axes
         .iter()
@@ -152,7 +152,7 @@ fn axes(out: &mut String, report: &Report) -> std::fmt::Result {
         to: report.file.seconds,
     };
     for axis in &report.axes {
-        writeln!(out, "<h2>Axis {}</h2>", escaped(&axis.name))?;
+        writeln!(out, "<h2>Axis {}</h2>", escape_xml(&axis.name))?;
         let mut facts = vec![format!("{} cycles", axis.cycles)];
         if let Some((low, high)) = axis.travelled {
             facts.push(format!("position from {low:.4} to {high:.4} {}", axis.unit));
@@ -160,7 +160,7 @@ fn axes(out: &mut String, report: &Report) -> std::fmt::Result {
         if let Some(error) = axis.largest_following_error {
             facts.push(format!("largest following error {error:.4} {}", axis.unit));
         }
-        writeln!(out, "<p>{}.</p>", escaped(&facts.join(", ")))?;
+        writeln!(out, "<p>{}.</p>", escape_xml(&facts.join(", ")))?;
         picture(out, axis, span)?;
     }
     Ok(())
@@ -179,24 +179,24 @@ fn picture(out: &mut String, axis: &AxisReport, span: Span) -> std::fmt::Result 
             bands(&format!("{}: mode", axis.name), &axis.modes, span)
         )?;
     } else if let Some((_, mode)) = axis.modes.first() {
-        writeln!(out, "<p>Mode {}.</p>", escaped(mode))?;
+        writeln!(out, "<p>Mode {}.</p>", escape_xml(mode))?;
     }
     for plot in &axis.plots {
         writeln!(
             out,
             "<h3>{} ({})</h3>{}<p>{} {}</p>",
             plot.title,
-            escaped(&plot.unit),
+            escape_xml(&plot.unit),
             curves(&format!("{}: {}", axis.name, plot.title), plot, span),
             if plot.target.is_empty() {
                 String::new()
             } else {
-                key(0, "set-point")
+                legend_entry(0, "set-point")
             },
             if plot.actual.is_empty() {
                 String::new()
             } else {
-                key(1, "actual value")
+                legend_entry(1, "actual value")
             },
         )?;
     }
@@ -270,7 +270,7 @@ fn clocks(out: &mut String, report: &Report) -> std::fmt::Result {
     if let Some(ppm) = clocks.rate_ppm {
         facts.push(format!("{ppm:+.1} ppm against the recording's clock"));
     }
-    writeln!(out, "<p>{}.</p>", escaped(&facts.join(", ")))?;
+    writeln!(out, "<p>{}.</p>", escape_xml(&facts.join(", ")))?;
     if clocks.differences.is_empty() {
         return Ok(());
     }

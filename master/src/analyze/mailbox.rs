@@ -1,4 +1,4 @@
-//! Mailbox messages as they pass (ETG.1000.4 clause 5.6, ETG.1000.6 clause 5.6), put together to transfers.
+//! Mailbox messages (ETG.1000.4 clause 5.6, ETG.1000.6 clause 5.6), assembled to transfers.
 
 use std::collections::BTreeMap;
 
@@ -9,23 +9,23 @@ const TYPE_ERROR: u8 = 0;
 const TYPE_COE: u8 = 3;
 const TYPE_FOE: u8 = 4;
 
-/// What of an object is kept; its length is counted.
+/// The maximum number of stored bytes of an object; the full length is counted.
 const KEPT: usize = 1024;
-/// Names and entries of dictionaries that are kept of one device.
+/// The maximum number of stored dictionary names of one device.
 const NAMES: usize = 20_000;
 
-/// Which way a transfer goes, seen from the MainDevice.
+/// The direction of a transfer, seen from the MainDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Way {
+pub enum TransferDirection {
     /// SDO upload.
     Read,
     /// SDO download.
     Write,
 }
 
-/// How a transfer ended.
+/// The outcome of a transfer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ended {
+pub enum TransferOutcome {
     Done,
     Aborted {
         code: u32,
@@ -33,70 +33,70 @@ pub enum Ended {
     },
     /// The device's mailbox refused the request.
     Refused(u16),
-    /// Another one began, or the recording ended.
+    /// Another transfer began, or the recording ended.
     Unanswered,
 }
 
 /// An SDO transfer with all its segments.
 #[derive(Debug, Clone)]
 pub struct Transfer {
-    /// Nanoseconds since 1970.
+    /// The time in ns since 1970.
     pub began: u64,
     pub ended_at: u64,
-    pub way: Way,
+    pub way: TransferDirection,
     pub index: u16,
     pub sub: u8,
     pub complete: bool,
-    /// As long as is kept.
+    /// The stored part of the data.
     pub data: Vec<u8>,
-    /// Bytes that passed.
+    /// The number of transferred bytes.
     pub len: usize,
     pub segments: u32,
-    pub ended: Ended,
+    pub ended: TransferOutcome,
 }
 
 impl Transfer {
-    /// Asked for an object that is not there: how one finds out what a device has.
+    /// True if the object does not exist. MainDevices detect optional objects in this way.
     pub fn is_absent(&self) -> bool {
         let absent = matches!(
             self.ended,
-            Ended::Aborted {
+            TransferOutcome::Aborted {
                 code: 0x0602_0000 | 0x0609_0011,
                 ..
             }
         );
-        absent && self.way == Way::Read
+        absent && self.way == TransferDirection::Read
     }
 
-    /// Did not end as it should.
+    /// True if the transfer failed.
     pub fn is_trouble(&self) -> bool {
-        self.ended != Ended::Done && !self.is_absent()
+        self.ended != TransferOutcome::Done && !self.is_absent()
     }
 }
 
-/// A file over FoE.
+/// A file transfer over FoE.
 #[derive(Debug, Clone)]
 pub struct FileTransfer {
     pub began: u64,
     pub ended_at: u64,
-    pub way: Way,
+    pub way: TransferDirection,
     pub name: String,
     pub len: usize,
-    /// Code and text of an error.
+    /// The code and text of an error.
     pub error: Option<(u32, String)>,
 }
 
-/// What came out of a message.
+/// The result of a message.
 #[derive(Debug, Clone)]
-pub enum Told {
+pub enum MailboxEvent {
     Transfer(Transfer),
     Emergency(Emergency),
     File(FileTransfer),
-    /// A list of objects, how many.
+    /// An object list with this number of objects.
     ObjectList(usize),
-    /// The mailbox refused something that was no SDO request.
+    /// The mailbox refused a message other than an SDO request.
     Refused(u16),
-    /// SDO Information refused a question.
+    /// SDO Information refused a request.
     NoInformation(u32),
 }
 
@@ -106,18 +106,18 @@ pub struct Mailbox {
     transfer: Option<Pending>,
     file: Option<FileTransfer>,
     last_request: Vec<u8>,
-    /// Objects of a list that is still coming.
+    /// The number of objects in an incomplete list.
     listed: usize,
-    /// Names that SDO Information told, by index; subindex 0xffff is the object's own.
+    /// Names from SDO Information by index; subindex 0xffff is the object itself.
     pub names: BTreeMap<(u16, u16), String>,
-    /// Messages by type: both ways.
+    /// The number of messages by type, in both directions.
     pub messages: [u64; 16],
 }
 
 #[derive(Debug, Clone)]
 struct Pending {
     transfer: Transfer,
-    /// As announced.
+    /// The announced size.
     size: usize,
     last_sent: bool,
 }
@@ -136,7 +136,8 @@ fn text(bytes: &[u8]) -> String {
     text.chars().filter(|c| !c.is_control()).take(200).collect()
 }
 
-/// Whether bytes begin like a mailbox message, for recordings that do not show how SyncManagers were set.
+/// True if bytes look like a mailbox message. Used if the recording does not show the SyncManager
+/// configuration.
 pub fn plausible(bytes: &[u8]) -> bool {
     let (Some(len), Some(kind)) = (u16_at(bytes, 0), bytes.get(5)) else {
         return false;
@@ -152,20 +153,20 @@ pub fn plausible(bytes: &[u8]) -> bool {
 }
 
 impl Mailbox {
-    /// A message, whole as in the mailbox. Returns what it completes.
-    pub fn message(&mut self, at: u64, to_device: bool, bytes: &[u8]) -> Vec<Told> {
-        let mut told = Vec::new();
+    /// Processes a complete mailbox. Returns the completed events.
+    pub fn message(&mut self, at: u64, to_device: bool, bytes: &[u8]) -> Vec<MailboxEvent> {
+        let mut reported = Vec::new();
         let (Some(len), Some(kind)) = (u16_at(bytes, 0), bytes.get(5).copied()) else {
-            return told;
+            return reported;
         };
         let Some(body) = bytes.get(HEADER..HEADER + usize::from(len)) else {
-            return told;
+            return reported;
         };
         if to_device {
             let whole = bytes.get(..HEADER + body.len()).unwrap_or_default();
-            // Sent again, because its answer was lost: the counter tells.
+            // A repeated request after a lost answer has the same counter.
             if kind >> 4 & 7 != 0 && self.last_request == whole {
-                return told;
+                return reported;
             }
             self.last_request.clear();
             self.last_request.extend_from_slice(whole);
@@ -174,59 +175,59 @@ impl Mailbox {
             *count += 1;
         }
         match kind & 0x0f {
-            TYPE_COE => self.coe(at, to_device, body, &mut told),
-            TYPE_FOE => self.foe(at, to_device, body, &mut told),
+            TYPE_COE => self.coe(at, to_device, body, &mut reported),
+            TYPE_FOE => self.foe(at, to_device, body, &mut reported),
             TYPE_ERROR => {
                 let code = u16_at(body, 2).unwrap_or(0);
                 if self.transfer.is_some() {
-                    self.close(at, Ended::Refused(code), &mut told);
+                    self.close(at, TransferOutcome::Refused(code), &mut reported);
                 } else {
-                    told.push(Told::Refused(code));
+                    reported.push(MailboxEvent::Refused(code));
                 }
             }
             _ => {}
         }
-        told
+        reported
     }
 
-    /// The recording ends.
-    pub fn end(&mut self, at: u64) -> Vec<Told> {
-        let mut told = Vec::new();
-        self.close(at, Ended::Unanswered, &mut told);
+    /// Ends the recording.
+    pub fn end(&mut self, at: u64) -> Vec<MailboxEvent> {
+        let mut reported = Vec::new();
+        self.close(at, TransferOutcome::Unanswered, &mut reported);
         if let Some(mut file) = self.file.take() {
             file.ended_at = at;
-            told.push(Told::File(file));
+            reported.push(MailboxEvent::File(file));
         }
-        told
+        reported
     }
 
-    fn close(&mut self, at: u64, ended: Ended, told: &mut Vec<Told>) {
+    fn close(&mut self, at: u64, ended: TransferOutcome, reported: &mut Vec<MailboxEvent>) {
         if let Some(mut pending) = self.transfer.take() {
             pending.transfer.ended_at = at;
             pending.transfer.ended = ended;
-            told.push(Told::Transfer(pending.transfer));
+            reported.push(MailboxEvent::Transfer(pending.transfer));
         }
     }
 
-    fn coe(&mut self, at: u64, to_device: bool, body: &[u8], told: &mut Vec<Told>) {
+    fn coe(&mut self, at: u64, to_device: bool, body: &[u8], reported: &mut Vec<MailboxEvent>) {
         let (Some(head), Some(content)) = (u16_at(body, 0), body.get(2..)) else {
             return;
         };
         match head >> 12 {
-            1 => told.extend(Emergency::parse(content).map(Told::Emergency)),
+            1 => reported.extend(Emergency::parse(content).map(MailboxEvent::Emergency)),
             2 | 3 if content.first() == Some(&0x80) => {
                 let code = u32_at(content, 4).unwrap_or(0);
                 let by_device = !to_device;
-                self.close(at, Ended::Aborted { code, by_device }, told);
+                self.close(at, TransferOutcome::Aborted { code, by_device }, reported);
             }
-            2 if to_device => self.request(at, content, told),
-            3 => self.response(at, content, told),
-            8 => self.information(to_device, content, told),
+            2 if to_device => self.request(at, content, reported),
+            3 => self.response(at, content, reported),
+            8 => self.information(to_device, content, reported),
             _ => {}
         }
     }
 
-    fn request(&mut self, at: u64, content: &[u8], told: &mut Vec<Told>) {
+    fn request(&mut self, at: u64, content: &[u8], reported: &mut Vec<MailboxEvent>) {
         let Some((&command, rest)) = content.split_first() else {
             return;
         };
@@ -239,11 +240,11 @@ impl Mailbox {
                 }
                 return;
             }
-            1 => Way::Write,
-            2 => Way::Read,
+            1 => TransferDirection::Write,
+            2 => TransferDirection::Read,
             _ => return,
         };
-        self.close(at, Ended::Unanswered, told);
+        self.close(at, TransferOutcome::Unanswered, reported);
         let (Some(index), Some(sub)) = (u16_at(rest, 0), rest.get(2).copied()) else {
             return;
         };
@@ -258,12 +259,12 @@ impl Mailbox {
                 data: Vec::new(),
                 len: 0,
                 segments: 0,
-                ended: Ended::Unanswered,
+                ended: TransferOutcome::Unanswered,
             },
             size: 0,
             last_sent: false,
         };
-        if way == Way::Write {
+        if way == TransferDirection::Write {
             let (size, data) = initiated(command, rest.get(3..).unwrap_or_default());
             pending.size = size;
             pending.add(data);
@@ -271,7 +272,7 @@ impl Mailbox {
         self.transfer = Some(pending);
     }
 
-    fn response(&mut self, at: u64, content: &[u8], told: &mut Vec<Told>) {
+    fn response(&mut self, at: u64, content: &[u8], reported: &mut Vec<MailboxEvent>) {
         let (Some((&command, rest)), Some(pending)) = (content.split_first(), &mut self.transfer)
         else {
             return;
@@ -279,28 +280,28 @@ impl Mailbox {
         let transfer = &pending.transfer;
         let same = u16_at(rest, 0) == Some(transfer.index);
         let done = match (command >> 5, transfer.way) {
-            (2, Way::Read) if same => {
+            (2, TransferDirection::Read) if same => {
                 let (size, data) = initiated(command, rest.get(3..).unwrap_or_default());
                 pending.size = size;
                 pending.add(data);
                 pending.transfer.len >= size
             }
-            (0, Way::Read) => {
+            (0, TransferDirection::Read) => {
                 pending.add(segment(command, rest));
                 pending.transfer.segments += 1;
                 command & 1 != 0
             }
-            (3, Way::Write) if same => transfer.len >= pending.size,
-            (1, Way::Write) => pending.last_sent,
+            (3, TransferDirection::Write) if same => transfer.len >= pending.size,
+            (1, TransferDirection::Write) => pending.last_sent,
             _ => false,
         };
         if done {
-            self.close(at, Ended::Done, told);
+            self.close(at, TransferOutcome::Done, reported);
         }
     }
 
-    /// SDO Information: opcode, fragments left, content.
-    fn information(&mut self, to_device: bool, content: &[u8], told: &mut Vec<Told>) {
+    /// Processes SDO Information: opcode, fragments left, content.
+    fn information(&mut self, to_device: bool, content: &[u8], reported: &mut Vec<MailboxEvent>) {
         let (Some(&opcode), Some(left), Some(body)) =
             (content.first(), u16_at(content, 2), content.get(4..))
         else {
@@ -314,8 +315,8 @@ impl Mailbox {
             2 => {
                 self.listed += body.len() / 2;
                 if left == 0 {
-                    // The first word says which list it is.
-                    told.push(Told::ObjectList(self.listed.saturating_sub(1)));
+                    // The first word is the list type.
+                    reported.push(MailboxEvent::ObjectList(self.listed.saturating_sub(1)));
                 }
             }
             4 => {
@@ -326,13 +327,13 @@ impl Mailbox {
             6 => {
                 if let (Some(index), Some(sub), Some(name)) =
                     (u16_at(body, 0), body.get(2), body.get(10..))
-                    // Nothing else in front of the name.
+                    // Only if no other fields precede the name.
                     && body.get(3).is_some_and(|info| info & 0x78 == 0)
                 {
                     self.name(index, u16::from(*sub), name);
                 }
             }
-            7 => told.push(Told::NoInformation(u32_at(body, 0).unwrap_or(0))),
+            7 => reported.push(MailboxEvent::NoInformation(u32_at(body, 0).unwrap_or(0))),
             _ => {}
         }
     }
@@ -344,7 +345,7 @@ impl Mailbox {
         }
     }
 
-    fn foe(&mut self, at: u64, to_device: bool, body: &[u8], told: &mut Vec<Told>) {
+    fn foe(&mut self, at: u64, to_device: bool, body: &[u8], reported: &mut Vec<MailboxEvent>) {
         let (Some(&opcode), Some(rest)) = (body.first(), body.get(2..)) else {
             return;
         };
@@ -352,12 +353,16 @@ impl Mailbox {
             1 | 2 if to_device => {
                 if let Some(mut file) = self.file.take() {
                     file.ended_at = at;
-                    told.push(Told::File(file));
+                    reported.push(MailboxEvent::File(file));
                 }
                 self.file = Some(FileTransfer {
                     began: at,
                     ended_at: at,
-                    way: if opcode == 1 { Way::Read } else { Way::Write },
+                    way: if opcode == 1 {
+                        TransferDirection::Read
+                    } else {
+                        TransferDirection::Write
+                    },
                     name: text(rest.get(4..).unwrap_or_default()),
                     len: 0,
                     error: None,
@@ -374,7 +379,7 @@ impl Mailbox {
                     file.ended_at = at;
                     let code = u32_at(rest, 0).unwrap_or(0);
                     file.error = Some((code, text(rest.get(4..).unwrap_or_default())));
-                    told.push(Told::File(file));
+                    reported.push(MailboxEvent::File(file));
                 }
             }
             _ => {}
@@ -391,7 +396,7 @@ impl Pending {
     }
 }
 
-/// Announced size and first data of what follows command, index and subindex.
+/// Returns the announced size and the first data after command, index and subindex.
 fn initiated(command: u8, rest: &[u8]) -> (usize, &[u8]) {
     if command & 0x02 != 0 {
         let unused = if command & 1 != 0 {
@@ -407,7 +412,7 @@ fn initiated(command: u8, rest: &[u8]) -> (usize, &[u8]) {
     (size, data.get(..size).unwrap_or(data))
 }
 
-/// The data of a segment; what is shorter than a CAN frame is padded.
+/// Returns the data of a segment. Short segments are padded to the size of a CAN frame.
 fn segment(command: u8, data: &[u8]) -> &[u8] {
     if data.len() > 7 {
         return data;

@@ -1,81 +1,83 @@
-//! What a recording tells: who is on the bus, how it came up, what was said in mailboxes, how regular the cycle is, and what the
-//! axes did. Reads recordings of any MainDevice; sends nothing. Everything that is kept is bounded, however long a recording is.
+//! Analysis of a recording: devices, bring-up, mailbox transfers, cycle regularity and axes. It
+//! reads recordings of any MainDevice and sends nothing. Memory is bounded for recordings of any
+//! length.
 //!
-//! - `pair`: which answer belongs to which request;
-//! - `segment`: the devices, and what each datagram says of them; `registers`, `eeprom`, `mailbox`, `objects`: parts of a device;
+//! - `match_frames`: matches answers with requests;
+//! - `segment`: the devices and the evaluation of each datagram; `registers`, `eeprom`, `mailbox`,
+//!   `objects`: parts of a device;
 //! - `cycle`, `clocks`, `axes`: process data, distributed clocks, CiA 402;
-//! - `known`: machine file and ESI files, for what a recording does not carry;
-//! - `events`, `values`: what happened, in words;
-//! - `report`: [`Report`], from all of it; `html`, `plot`: as a page with pictures.
+//! - `context`: machine file and ESI files;
+//! - `events`, `values`: events as text;
+//! - `report`: the [`Report`]; `html`, `plot`: an HTML page with plots.
 
 use std::io::Read;
 
-use crate::recording::frame::{Carrier, Content, content};
+use crate::recording::frame::{Content, Encapsulation, content};
 use crate::recording::{Packet, Reader};
 
 mod axes;
 mod clocks;
+mod context;
 mod cycle;
 mod eeprom;
 mod events;
 mod html;
-mod known;
 mod mailbox;
+mod match_frames;
 mod objects;
-mod pair;
 mod plot;
 mod registers;
 mod report;
 mod segment;
 mod values;
 
+pub use context::{Context, library};
 pub use html::html;
-pub use known::{Known, library};
 pub use report::{
     AxisReport, ClockReport, ClocksReport, CycleReport, DeviceReport, FileReport, Line, Report,
     SyncManagerReport, TransferReport, WkcRun, called, highest,
 };
 
-pub use crate::page::time;
+pub use crate::html::time;
 
-use pair::Pairing;
+use match_frames::Pairing;
 use segment::Segment;
 
-/// VLANs of a recording that are told apart.
+/// The maximum number of distinguished VLANs.
 const CARRIERS: usize = 16;
 
-/// Packets of a recording by what they are.
+/// The packets of a recording by content.
 #[derive(Debug, Default)]
-struct Counted {
+struct PacketCounts {
     packets: u64,
     frames: u64,
-    /// EtherCAT that carries no datagrams.
+    /// EtherCAT frames without datagrams.
     other_ethercat: u64,
-    /// Not EtherCAT.
+    /// Packets other than EtherCAT.
     other: u64,
-    /// EtherCAT frames of which datagrams are missing.
+    /// EtherCAT frames with missing datagrams.
     cut: u64,
-    /// Of EtherCAT frames, nanoseconds since 1970.
+    /// The time of the first EtherCAT frame in ns since 1970.
     first: Option<u64>,
     last: u64,
-    /// A frame's time lies before that of the one in front of it.
+    /// Frames with an earlier time than the frame before.
     back: u64,
     interfaces: Vec<u32>,
-    carriers: Vec<Carrier>,
+    carriers: Vec<Encapsulation>,
 }
 
-/// Reads a recording to its end: one file, or its parts in their order. Never fails: what is wrong with them is among the
-/// report's remarks. With `interface` only the packets of that one count.
-pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Known) -> Report {
-    let mut counted = Counted::default();
+/// Analyzes one file, or its parts in order. Never fails: problems of the files are part of the
+/// report. With `interface`, only its packets are used.
+pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Context) -> Report {
+    let mut counted = PacketCounts::default();
     let mut pairing = Pairing::default();
     let mut segment = Segment::new(known);
     let mut remarks = Vec::new();
     let several = parts.len() > 1;
     for (number, mut reader) in (1..).zip(parts) {
-        // Something may lie between this part and the one before.
+        // Frames may be missing between two parts.
         let next = reader.peek().and_then(|packet| packet.at);
-        if next.is_some_and(|at| at > counted.last.saturating_add(pair::PATIENCE_NS)) {
+        if next.is_some_and(|at| at > counted.last.saturating_add(match_frames::PATIENCE_NS)) {
             pairing.end();
             drain(&mut pairing, &mut segment);
             segment.cycle.pause();
@@ -120,7 +122,7 @@ fn drain(pairing: &mut Pairing, segment: &mut Segment) {
     }
 }
 
-impl Counted {
+impl PacketCounts {
     fn frame(&mut self, packet: Packet) -> Option<crate::recording::frame::Frame> {
         match content(packet) {
             Content::Frame(frame) => {

@@ -1,13 +1,13 @@
-//! What SDO transfers tell of a device: identity, name, and which objects its PDOs carry.
+//! Objects of a device from SDO transfers: identity, name, and the PDO mapping.
 
 use std::collections::BTreeMap;
 
-use super::mailbox::{Ended, Transfer, Way};
+use super::mailbox::{Transfer, TransferDirection, TransferOutcome};
 
-/// Objects of which the value is kept.
+/// The maximum number of stored objects.
 const OBJECTS: usize = 8192;
 
-/// Values of the objects that describe a device.
+/// The values of the objects that describe a device.
 #[derive(Debug, Default, Clone)]
 pub struct Objects {
     values: BTreeMap<(u16, u8), Vec<u8>>,
@@ -18,7 +18,7 @@ pub struct Objects {
 pub struct Mapped {
     pub index: u16,
     pub sub: u8,
-    /// From the start of its SyncManager.
+    /// The bit offset in its SyncManager.
     pub bit: u32,
     pub bits: u8,
 }
@@ -32,10 +32,10 @@ fn maps(index: u16) -> bool {
 }
 
 impl Objects {
-    /// Takes what a transfer tells. Returns whether PDOs changed.
+    /// Stores the value of a transfer. Returns true if the PDOs changed.
     pub fn learn(&mut self, transfer: &Transfer) -> bool {
         let whole = transfer.data.len() == transfer.len;
-        if transfer.ended != Ended::Done || !describes(transfer.index) || !whole {
+        if transfer.ended != TransferOutcome::Done || !describes(transfer.index) || !whole {
             return false;
         }
         let index = transfer.index;
@@ -44,8 +44,8 @@ impl Objects {
         } else {
             self.set((index, transfer.sub), transfer.data.clone());
         }
-        // What was read without having been written is how the device is; reading does not change it.
-        maps(index) && (transfer.way == Way::Write || !self.values.is_empty())
+        // A download changes the mapping. An upload shows the existing one.
+        maps(index) && (transfer.way == TransferDirection::Write || !self.values.is_empty())
     }
 
     fn set(&mut self, at: (u16, u8), data: Vec<u8>) {
@@ -54,7 +54,7 @@ impl Objects {
         }
     }
 
-    /// Complete access: subindex 0 in two bytes, then every other.
+    /// Stores a complete access: subindex 0 in two bytes, then all other subindices.
     fn whole(&mut self, transfer: &Transfer) {
         let size = match transfer.index {
             0x1c10..=0x1c2f => 2,
@@ -89,20 +89,20 @@ impl Objects {
         )
     }
 
-    /// Vendor, product, revision, serial number.
+    /// Returns vendor, product, revision and serial number.
     pub fn identity(&self) -> (Option<u32>, Option<u32>, Option<u32>, Option<u32>) {
         let of = |sub| self.number(0x1018, sub);
         (of(1), of(2), of(3), of(4))
     }
 
-    /// 0x1008.
+    /// Returns the device name (0x1008).
     pub fn name(&self) -> Option<String> {
         let text = String::from_utf8_lossy(self.values.get(&(0x1008, 0))?);
         let text = text.trim_matches(|c: char| c.is_whitespace() || c.is_control());
         (!text.is_empty()).then(|| text.chars().filter(|c| !c.is_control()).take(60).collect())
     }
 
-    /// What a SyncManager carries, in order; `None` where the recording does not show all of it.
+    /// Returns the objects of a SyncManager in order; `None` if the recording is incomplete.
     pub fn mapping(&self, sync_manager: u8) -> Option<Vec<Mapped>> {
         let assignment = 0x1c10 + u16::from(sync_manager);
         let pdos = self.number(assignment, 0)?;

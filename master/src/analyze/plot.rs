@@ -1,9 +1,9 @@
-//! Curves over time, and states as bands, as SVG.
+//! Curves over time and state bands as SVG.
 
 use std::fmt::Write;
 
 use super::report::Plot;
-use crate::page::{COLOURS, escaped};
+use crate::html::{COLOURS, escape_xml};
 
 const WIDTH: f64 = 860.0;
 const HEIGHT: f64 = 220.0;
@@ -12,10 +12,10 @@ const RIGHT: f64 = 12.0;
 const TOP: f64 = 10.0;
 const BOTTOM: f64 = 26.0;
 const BAND: f64 = 30.0;
-/// Bands that are drawn; more could not be told apart.
+/// The maximum number of bands; more could not be distinguished.
 const BANDS: usize = 400;
 
-/// Where times lie in a picture.
+/// The mapping of times to the picture.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Span {
     pub from: f64,
@@ -29,7 +29,7 @@ impl Span {
     }
 }
 
-/// Round numbers from `low` to `high`, about `count` of them.
+/// Returns about `count` round numbers from `low` to `high`.
 fn ticks(low: f64, high: f64, count: f64) -> Vec<f64> {
     let rough = (high - low) / count;
     if !rough.is_finite() || rough <= 0.0 {
@@ -48,7 +48,7 @@ fn ticks(low: f64, high: f64, count: f64) -> Vec<f64> {
         .collect()
 }
 
-/// With as many digits as tell ticks apart.
+/// Formats a value with enough digits to distinguish the ticks.
 fn label(value: f64, step: f64) -> String {
     let digits = (-step.abs().max(1e-12).log10().floor()).clamp(0.0, 9.0);
     let text = format!("{value:.*}", digits as usize);
@@ -82,11 +82,11 @@ fn time_axis(svg: &mut String, span: Span, height: f64) -> std::fmt::Result {
 fn open(title: &str, height: f64) -> String {
     format!(
         "<svg viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" xmlns=\"http://www.w3.org/2000/svg\"><title>{}</title>\n",
-        escaped(title)
+        escape_xml(title)
     )
 }
 
-/// Target and actual value, one over the other.
+/// Draws target and actual value in one plot.
 pub(super) fn curves(title: &str, plot: &Plot, span: Span) -> String {
     let all = || plot.target.iter().chain(&plot.actual);
     let low = all().map(|point| point.1).fold(f64::INFINITY, f64::min);
@@ -114,7 +114,7 @@ pub(super) fn curves(title: &str, plot: &Plot, span: Span) -> String {
             label(value, step)
         );
     }
-    // The actual value lies on top, thinner.
+    // The actual value is drawn on top with a thinner line.
     for (colour, width, points) in [(0, 2.5, &plot.target), (1, 1.2, &plot.actual)] {
         let mut path = String::new();
         for (seconds, least, greatest) in points {
@@ -135,7 +135,7 @@ pub(super) fn curves(title: &str, plot: &Plot, span: Span) -> String {
     svg + "</svg>\n"
 }
 
-/// States one after the other, each with its name where there is room.
+/// Draws the states as bands, with their names if there is room.
 pub(super) fn bands(title: &str, states: &[(f64, String)], span: Span) -> String {
     let height = BAND + TOP + BOTTOM;
     let mut svg = open(title, height);
@@ -159,7 +159,7 @@ pub(super) fn bands(title: &str, states: &[(f64, String)], span: Span) -> String
             svg,
             "<rect x=\"{x:.1}\" y=\"{TOP}\" width=\"{width:.1}\" height=\"{BAND}\" fill=\"{colour}\" fill-opacity=\"0.25\">\
              <title>{} from {from:.6} s</title></rect>",
-            escaped(name)
+            escape_xml(name)
         );
         if width > 7.0 * name.chars().count() as f64 {
             let _ = writeln!(
@@ -167,7 +167,7 @@ pub(super) fn bands(title: &str, states: &[(f64, String)], span: Span) -> String
                 "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>",
                 x + width / 2.0,
                 TOP + BAND / 2.0 + 4.0,
-                escaped(name)
+                escape_xml(name)
             );
         }
     }

@@ -1,10 +1,10 @@
-//! What is known of a SubDevice's registers (ETG.1000.4), as they were written and read.
+//! The register values of a SubDevice (ETG.1000.4) from writes and reads.
 
-/// Registers end where process memory begins.
+/// The end of the registers and start of process memory.
 const REGISTERS: usize = 0x1000;
 const FMMUS: usize = 16;
 const SYNC_MANAGERS: usize = 16;
-/// Of SyncManagers that are mailboxes.
+/// The mode of SyncManagers that are mailboxes.
 const MODE_MAILBOX: u8 = 2;
 
 /// The registers of one device.
@@ -30,19 +30,19 @@ impl Default for Registers {
     }
 }
 
-/// One SyncManager, as configured.
+/// The configuration of one SyncManager.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SyncManager {
     pub number: u8,
     pub start: u16,
     pub len: u16,
     pub mailbox: bool,
-    /// MainDevice to SubDevice.
+    /// True for MainDevice to SubDevice.
     pub output: bool,
     pub enabled: bool,
 }
 
-/// One FMMU, as configured.
+/// The configuration of one FMMU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fmmu {
     pub number: u8,
@@ -51,7 +51,7 @@ pub struct Fmmu {
     pub logical_start_bit: u8,
     pub physical: u16,
     pub physical_start_bit: u8,
-    /// MainDevice to SubDevice.
+    /// True for MainDevice to SubDevice.
     pub output: bool,
     pub input: bool,
 }
@@ -66,7 +66,7 @@ impl Registers {
         }
     }
 
-    /// Bytes that are all known.
+    /// Returns the bytes if all of them are known.
     pub fn bytes(&self, register: u16, len: usize) -> Option<&[u8]> {
         let range = usize::from(register)..usize::from(register) + len;
         let known = self.known.get(range.clone())?;
@@ -89,10 +89,11 @@ impl Registers {
         Some(u32::from_le_bytes(*bytes))
     }
 
-    /// SyncManagers whose start, length and control are known and that have a length.
+    /// Iterates over the SyncManagers with a known configuration and a length above 0.
     pub fn sync_managers(&self) -> impl Iterator<Item = SyncManager> + '_ {
         (0..SYNC_MANAGERS as u8).filter_map(|number| {
-            let at = 0x0800 + 8 * u16::from(number);
+            let at = ecaxis_ecat::registers::SYNC_MANAGER
+                + ecaxis_ecat::registers::SYNC_MANAGER_LEN * u16::from(number);
             let control = self.u8(at + 4)?;
             let len = self.u16(at + 2)?;
             (len > 0).then_some(SyncManager {
@@ -106,7 +107,7 @@ impl Registers {
         })
     }
 
-    /// FMMUs that are active.
+    /// Iterates over the active FMMUs.
     pub fn fmmus(&self) -> impl Iterator<Item = Fmmu> + '_ {
         (0..FMMUS as u8).filter_map(|number| {
             let at = 0x0600 + 16 * u16::from(number);
@@ -125,13 +126,13 @@ impl Registers {
     }
 }
 
-/// The part of a datagram's data that is the register at `wanted`, where all of its `len` bytes are there.
+/// Returns the part of the data at the register `wanted` if all `len` bytes are present.
 pub fn part(register: u16, data: &[u8], wanted: u16, len: usize) -> Option<&[u8]> {
     let at = usize::from(wanted.checked_sub(register)?);
     data.get(at..at.checked_add(len)?)
 }
 
-/// Likewise, as a little-endian number of two bytes.
+/// Returns the part as a little-endian number of two bytes.
 pub fn part_u16(register: u16, data: &[u8], wanted: u16) -> Option<u16> {
     let bytes = part(register, data, wanted, 2)?.first_chunk()?;
     Some(u16::from_le_bytes(*bytes))

@@ -1,32 +1,27 @@
-//! The SubDevices of a recording, as its datagrams show them.
+//! The SubDevices of a recording, reconstructed from its datagrams.
 
 use crate::bringup::AlState;
 use crate::recording::frame::Command;
+use ecaxis_ecat::registers;
 
 use super::axes::Axes;
 use super::clocks::Clocks;
+use super::context::Context;
 use super::cycle::Cycle;
 use super::eeprom::Eeprom;
-use super::events::{EVENTS, Event, Of, What};
-use super::known::Known;
-use super::mailbox::{self, Mailbox, Told};
+use super::events::{EVENTS, Event, EventKind, EventScope};
+use super::mailbox::{self, Mailbox, MailboxEvent};
+use super::match_frames::{DatagramExchange, FrameExchange};
 use super::objects::Objects;
-use super::pair::{Exchange, Passed};
 use super::registers::{Registers, part, part_u16};
 
-/// Devices that are followed. More do not fit into the addresses of a frame's circulation in any cycle.
+/// The maximum number of devices.
 const DEVICES: usize = 1024;
 
-const STATION: u16 = 0x0010;
-const AL_CONTROL: u16 = 0x0120;
-const AL_STATUS: u16 = 0x0130;
-const AL_CODE: u16 = 0x0134;
-const EEPROM: std::ops::Range<u16> = 0x0500..0x0510;
-const SYSTEM_TIME: u16 = 0x0910;
-const DIFFERENCE: u16 = 0x092c;
+const EEPROM: std::ops::Range<u16> = registers::EEPROM_CONFIGURATION..0x0510;
 const PROCESS_MEMORY: u16 = 0x1000;
-/// FMMUs and SyncManagers.
-const MAPPING: std::ops::Range<u16> = 0x0600..0x0880;
+/// The registers of FMMUs and SyncManagers.
+const MAPPING: std::ops::Range<u16> = registers::FMMU..0x0880;
 
 /// A SubDevice.
 #[derive(Debug, Default)]
@@ -34,7 +29,7 @@ pub struct Device {
     pub position: Option<u16>,
     pub station: Option<u16>,
     pub registers: Registers,
-    /// The registers in the highest state that was reached, before a MainDevice cleared them.
+    /// The registers in the highest state, before a MainDevice cleared them.
     pub configured: Option<(AlState, Registers)>,
     pub eeprom: Eeprom,
     pub mailbox: Mailbox,
@@ -42,23 +37,23 @@ pub struct Device {
     pub state: Option<AlState>,
     pub error: bool,
     pub code: Option<u16>,
-    /// The state last asked for, and whether errors were acknowledged with it.
+    /// The last requested state, and whether the request acknowledged errors.
     asked: Option<(AlState, bool)>,
-    /// AL status has the error bit, be it an error or not.
+    /// True if AL status has the error bit, including copied acknowledgements.
     flagged: bool,
-    /// Every state that was reached, in order and without repetitions in a row.
+    /// The states in order, without consecutive repetitions.
     pub reached: Vec<AlState>,
     pub axes: Axes,
 }
 
 impl Device {
-    /// What was configured: while it was used, else as it is.
+    /// Returns the configuration in the highest state, else the present registers.
     pub fn configuration(&self) -> &Registers {
         self.configured.as_ref().map_or(&self.registers, |(_, r)| r)
     }
 }
 
-/// A bus with everything that happened on it.
+/// A bus and its events.
 #[derive(Debug, Default)]
 pub struct Segment {
     pub devices: Vec<Device>,
@@ -74,26 +69,26 @@ pub struct Segment {
     pub unanswered: u64,
     pub unasked: u64,
     pub open: u64,
-    /// Devices beyond those that are followed.
+    /// The number of devices beyond the maximum.
     pub unfollowed: u64,
-    /// The state that was last asked of all devices, and whether errors were acknowledged with it.
+    /// The last state requested of all devices, and whether the request acknowledged errors.
     asked: Option<(AlState, bool)>,
-    /// Changes with whatever moves process data.
+    /// Incremented when the mapping of process data changes.
     version: u64,
     located: Option<u64>,
-    pub known: Known,
+    pub known: Context,
     last: u64,
 }
 
 impl Segment {
-    pub fn new(known: Known) -> Self {
+    pub fn new(known: Context) -> Self {
         Self {
             known,
             ..Self::default()
         }
     }
 
-    fn event(&mut self, at: u64, of: Of, what: What) {
+    fn event(&mut self, at: u64, of: EventScope, what: EventKind) {
         if self.events.len() < EVENTS {
             self.events.push(Event { at, of, what });
         } else {
@@ -101,7 +96,7 @@ impl Segment {
         }
     }
 
-    pub fn exchange(&mut self, exchange: &Exchange) {
+    pub fn exchange(&mut self, exchange: &FrameExchange) {
         self.sent += u64::from(exchange.sent.is_some());
         self.answered += u64::from(exchange.back.is_some());
         match (&exchange.sent, &exchange.back) {
@@ -122,22 +117,22 @@ impl Segment {
         }
     }
 
-    /// The recording ends.
+    /// Ends the recording.
     pub fn end(&mut self) {
         for device in 0..self.devices.len() {
             let at = self.last;
-            let told = self.devices.get_mut(device).map(|d| d.mailbox.end(at));
-            self.told(at, device, told.unwrap_or_default());
+            let reported = self.devices.get_mut(device).map(|d| d.mailbox.end(at));
+            self.record_mailbox_events(at, device, reported.unwrap_or_default());
         }
         self.events.sort_by_key(|event| event.at);
     }
 
-    fn datagram(&mut self, passed: &Passed<'_>) {
+    fn datagram(&mut self, passed: &DatagramExchange<'_>) {
         let command = passed.command;
         match command {
             Command::BRD | Command::BRW | Command::BWR => self.broadcast(passed),
             Command::APRD | Command::APWR | Command::APRW | Command::ARMW => {
-                // The answer alone does not say which position it was.
+                // The answer alone does not contain the original position.
                 let position = passed.sent.map(|_| 0_u16.wrapping_sub(passed.adp()));
                 let device = position.and_then(|p| self.at_position(p, passed.wkc));
                 if let Some(device) = device {
@@ -153,7 +148,7 @@ impl Segment {
         }
     }
 
-    /// The device at a position; a new one where somebody answered there.
+    /// Returns the device at a position; adds one if it answered.
     fn at_position(&mut self, position: u16, wkc: Option<u16>) -> Option<usize> {
         let known = self
             .devices
@@ -184,7 +179,8 @@ impl Segment {
         Some(self.devices.len() - 1)
     }
 
-    /// A station address was written to, or read from, the device at a position.
+    /// Assigns a station address, from a write or read of its register, to the device at a
+    /// position.
     fn named(&mut self, at: u64, device: usize, station: u16) {
         let before = self.devices.get(device).and_then(|d| d.station);
         if before == Some(station) {
@@ -200,32 +196,32 @@ impl Segment {
         if let Some(device) = self.devices.get_mut(device) {
             device.station = Some(station);
         }
-        self.event(at, Of::Device(device), What::Station(station));
+        self.event(at, EventScope::Device(device), EventKind::Station(station));
     }
 
-    fn broadcast(&mut self, passed: &Passed<'_>) {
+    fn broadcast(&mut self, passed: &DatagramExchange<'_>) {
         let (register, at) = (passed.ado(), passed.at);
         if passed.command == Command::BRD
-            && matches!(register, 0x0000..0x0010 | AL_CONTROL..0x0138)
+            && matches!(register, 0x0000..0x0010 | registers::AL_CONTROL..0x0138)
             && let Some(wkc) = passed.wkc
             && self.now_answering != Some(wkc)
         {
             self.now_answering = Some(wkc);
             self.answering = self.answering.max(Some(wkc));
-            self.event(at, Of::Bus, What::Answering(wkc));
+            self.event(at, EventScope::Bus, EventKind::Answering(wkc));
         }
         if passed.command.writes()
             && let Some(data) = passed.written()
         {
             if let Some(control) =
-                part_u16(register, data, AL_CONTROL).or_else(|| low(register, data))
+                part_u16(register, data, registers::AL_CONTROL).or_else(|| low(register, data))
             {
                 let asked = asked(control);
                 self.asked = Some(asked);
                 for device in &mut self.devices {
                     device.asked = Some(asked);
                 }
-                self.event(at, Of::Bus, requested(control));
+                self.event(at, EventScope::Bus, requested(control));
             }
             if passed.wkc.is_some_and(|wkc| wkc > 0) {
                 self.version += u64::from(touches(register, data));
@@ -237,13 +233,14 @@ impl Segment {
         }
         if passed.command == Command::BRD
             && let (Some(data), Some(wkc)) = (passed.back, passed.wkc)
-            && let Some([status]) = part(register, data, AL_STATUS, 1)
+            && let Some([status]) = part(register, data, registers::AL_STATUS, 1)
         {
             self.everybody(at, *status, wkc);
         }
     }
 
-    /// AL status of all devices, one over the other: tells the state where they are all in the same.
+    /// Evaluates the AL status of all devices, combined by OR. It is unambiguous if all have the
+    /// same state.
     fn everybody(&mut self, at: u64, status: u8, wkc: u16) {
         let state = AlState::from_status(status);
         let same = matches!(status & 0x1f, 1 | 2 | 4 | 8) && Some(wkc) == self.answering;
@@ -258,34 +255,34 @@ impl Segment {
             device.enters(state, false, None);
         }
         if fresh {
-            let what = What::State {
+            let what = EventKind::State {
                 state,
                 error: false,
                 code: None,
             };
-            self.event(at, Of::Bus, what);
+            self.event(at, EventScope::Bus, what);
         }
     }
 
-    /// A datagram to one device.
-    fn addressed(&mut self, index: usize, passed: &Passed<'_>) {
+    /// Processes a datagram to one device.
+    fn addressed(&mut self, index: usize, passed: &DatagramExchange<'_>) {
         let (register, at) = (passed.ado(), passed.at);
         let executed = passed.wkc.is_some_and(|wkc| wkc > 0);
         let written = passed.written().filter(|_| passed.command.writes());
         if let Some(data) = written
             && let Some(control) =
-                part_u16(register, data, AL_CONTROL).or_else(|| low(register, data))
+                part_u16(register, data, registers::AL_CONTROL).or_else(|| low(register, data))
         {
             if let Some(device) = self.devices.get_mut(index) {
                 device.asked = Some(asked(control));
             }
-            self.event(at, Of::Device(index), requested(control));
+            self.event(at, EventScope::Device(index), requested(control));
         }
         if !executed {
             return;
         }
         if let Some(data) = written {
-            if let Some(station) = part_u16(register, data, STATION) {
+            if let Some(station) = part_u16(register, data, registers::STATION_ADDRESS) {
                 self.named(at, index, station);
             }
             if touches(register, data) {
@@ -307,7 +304,7 @@ impl Segment {
         }
     }
 
-    fn read(&mut self, index: usize, at: u64, passed: &Passed<'_>, data: &[u8]) {
+    fn read(&mut self, index: usize, at: u64, passed: &DatagramExchange<'_>, data: &[u8]) {
         let register = passed.ado();
         let Some(device) = self.devices.get_mut(index) else {
             return;
@@ -319,22 +316,31 @@ impl Segment {
             device.eeprom.read(register, data);
         }
         let station = device.station.unwrap_or(0);
-        if let Some(read) = part_u16(register, data, STATION).filter(|read| *read != 0) {
+        if let Some(read) =
+            part_u16(register, data, registers::STATION_ADDRESS).filter(|read| *read != 0)
+        {
             self.named(at, index, read);
         }
-        if let Some([status]) = part(register, data, AL_STATUS, 1) {
-            self.status(at, index, *status, part_u16(register, data, AL_CODE));
-        } else if let Some(code) = part_u16(register, data, AL_CODE) {
+        if let Some([status]) = part(register, data, registers::AL_STATUS, 1) {
+            self.status(
+                at,
+                index,
+                *status,
+                part_u16(register, data, registers::AL_STATUS_CODE),
+            );
+        } else if let Some(code) = part_u16(register, data, registers::AL_STATUS_CODE) {
             self.code(at, index, code);
         }
-        if let Some(time) = part(register, data, SYSTEM_TIME, 8)
-            .or_else(|| part(register, data, SYSTEM_TIME, 4))
+        if let Some(time) = part(register, data, registers::DC_SYSTEM_TIME, 8)
+            .or_else(|| part(register, data, registers::DC_SYSTEM_TIME, 4))
             .filter(|_| matches!(passed.command, Command::FRMW | Command::ARMW))
         {
-            // When the frame was there is nearer to when it was sent.
+            // The transmission time is closest to the time of the read.
             self.clocks.reference(station, passed.at, time);
         }
-        if let Some(raw) = part(register, data, DIFFERENCE, 4).and_then(<[u8]>::first_chunk) {
+        if let Some(raw) = part(register, data, registers::DC_SYSTEM_TIME_DIFFERENCE, 4)
+            .and_then(<[u8]>::first_chunk)
+        {
             self.clocks.difference(station, u32::from_le_bytes(*raw));
         }
         if !matches!(passed.command, Command::FRMW | Command::ARMW) {
@@ -348,12 +354,16 @@ impl Segment {
         };
         let state = AlState::from_status(status);
         device.flagged = status & 0x10 != 0;
-        // Devices without a processor copy AL control, the acknowledgement included.
+        // Devices without a processor copy AL control, including the acknowledge bit.
         let copied = device.asked == Some((state, true)) && code.is_none_or(|code| code == 0);
         let error = device.flagged && !copied;
         let code = code.filter(|_| error);
         if device.enters(state, error, code) {
-            self.event(at, Of::Device(index), What::State { state, error, code });
+            self.event(
+                at,
+                EventScope::Device(index),
+                EventKind::State { state, error, code },
+            );
         }
     }
 
@@ -367,29 +377,30 @@ impl Segment {
         let copied = !device.error;
         (device.error, device.code) = (true, Some(code));
         if let (true, Some(state)) = (copied, device.state) {
-            let what = What::State {
+            let what = EventKind::State {
                 state,
                 error: true,
                 code: Some(code),
             };
-            self.event(at, Of::Device(index), what);
+            self.event(at, EventScope::Device(index), what);
         } else {
-            // The state was told without it: it belongs there.
+            // Add the code to the earlier state event.
             let state = self.events.iter_mut().rev().find(|event| {
-                event.of == Of::Device(index) && matches!(event.what, What::State { .. })
+                event.of == EventScope::Device(index)
+                    && matches!(event.what, EventKind::State { .. })
             });
             match state.map(|event| &mut event.what) {
-                Some(What::State {
+                Some(EventKind::State {
                     error: true,
-                    code: told @ None,
+                    code: reported @ None,
                     ..
-                }) => *told = Some(code),
-                _ => self.event(at, Of::Device(index), What::Code(code)),
+                }) => *reported = Some(code),
+                _ => self.event(at, EventScope::Device(index), EventKind::Code(code)),
             }
         }
     }
 
-    /// A message, if this is a mailbox.
+    /// Processes a message if the address is a mailbox.
     fn mail(&mut self, index: usize, at: u64, to_device: bool, address: u16, data: &[u8]) {
         let Some(device) = self.devices.get_mut(index) else {
             return;
@@ -403,34 +414,34 @@ impl Segment {
             fits |= sm.start == address && sm.output == to_device;
         }
         if fits || !known && mailbox::plausible(data) {
-            let told = device.mailbox.message(at, to_device, data);
-            self.told(at, index, told);
+            let reported = device.mailbox.message(at, to_device, data);
+            self.record_mailbox_events(at, index, reported);
         }
     }
 
-    fn told(&mut self, at: u64, index: usize, told: Vec<Told>) {
-        for told in told {
-            let (at, what) = match told {
-                Told::Transfer(transfer) => {
+    fn record_mailbox_events(&mut self, at: u64, index: usize, reported: Vec<MailboxEvent>) {
+        for reported in reported {
+            let (at, what) = match reported {
+                MailboxEvent::Transfer(transfer) => {
                     if let Some(device) = self.devices.get_mut(index)
                         && device.objects.learn(&transfer)
                     {
                         self.version += 1;
                     }
-                    (transfer.began, What::Transfer(Box::new(transfer)))
+                    (transfer.began, EventKind::Transfer(Box::new(transfer)))
                 }
-                Told::Emergency(emergency) => (at, What::Emergency(emergency)),
-                Told::File(file) => (file.began, What::File(Box::new(file))),
-                Told::ObjectList(count) => (at, What::ObjectList(count)),
-                Told::NoInformation(code) => (at, What::NoInformation(code)),
-                Told::Refused(code) => (at, What::Refused(code)),
+                MailboxEvent::Emergency(emergency) => (at, EventKind::Emergency(emergency)),
+                MailboxEvent::File(file) => (file.began, EventKind::File(Box::new(file))),
+                MailboxEvent::ObjectList(count) => (at, EventKind::ObjectList(count)),
+                MailboxEvent::NoInformation(code) => (at, EventKind::NoInformation(code)),
+                MailboxEvent::Refused(code) => (at, EventKind::Refused(code)),
             };
-            self.event(at, Of::Device(index), what);
+            self.event(at, EventScope::Device(index), what);
         }
     }
 
-    /// What axes say in process data.
-    fn process_data(&mut self, passed: &Passed<'_>) {
+    /// Evaluates the axes in process data.
+    fn process_data(&mut self, passed: &DatagramExchange<'_>) {
         if self.located != Some(self.version) {
             self.located = Some(self.version);
             for device in &mut self.devices {
@@ -444,13 +455,13 @@ impl Segment {
                 .process_data(passed, |what| happened.push((index, what)));
         }
         for (index, what) in happened {
-            self.event(passed.at, Of::Device(index), what);
+            self.event(passed.at, EventScope::Device(index), what);
         }
     }
 }
 
 impl Device {
-    /// Returns whether this is new.
+    /// Updates the state. Returns true if it changed.
     fn enters(&mut self, state: AlState, error: bool, code: Option<u16>) -> bool {
         let fresh =
             (self.state, self.error) != (Some(state), error) || code.is_some() && self.code != code;
@@ -471,7 +482,7 @@ impl Device {
         fresh
     }
 
-    fn locate(&mut self, known: &mut Known) {
+    fn locate(&mut self, known: &mut Context) {
         let eeprom = &self.eeprom;
         let identity = self.objects.identity();
         let vendor = eeprom.vendor().or(identity.0);
@@ -483,25 +494,25 @@ impl Device {
     }
 }
 
-/// Whether a write moves process data.
+/// True if a write changes the mapping of process data.
 fn touches(register: u16, data: &[u8]) -> bool {
     let end = usize::from(register) + data.len();
     usize::from(register) < usize::from(MAPPING.end) && end > usize::from(MAPPING.start)
 }
 
-/// AL control written by its low byte alone.
+/// Returns AL control even if only its low byte was written.
 fn low(register: u16, data: &[u8]) -> Option<u16> {
-    part(register, data, AL_CONTROL, 1)?
+    part(register, data, registers::AL_CONTROL, 1)?
         .first()
         .map(|byte| u16::from(*byte))
 }
 
-/// What AL control asks for, and whether it acknowledges errors.
+/// Returns the state requested by AL control, and whether it acknowledges errors.
 fn asked(control: u16) -> (AlState, bool) {
     (AlState::from_status(control as u8), control & 0x10 != 0)
 }
 
-fn requested(control: u16) -> What {
+fn requested(control: u16) -> EventKind {
     let (state, acknowledge) = asked(control);
-    What::Requested { state, acknowledge }
+    EventKind::Requested { state, acknowledge }
 }

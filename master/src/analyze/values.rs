@@ -1,11 +1,11 @@
-//! Values of objects as people read them.
+//! Formats object values.
 
 use super::mailbox::Transfer;
 
-/// Bytes that are shown of what is neither a number nor a text.
+/// The maximum number of bytes shown of a value that is neither a number nor a text.
 const SHOWN: usize = 16;
 
-/// The value of a transfer: a number of up to eight bytes, a text, or bytes.
+/// Formats the value of a transfer: a number of up to eight bytes, a text, or bytes.
 pub fn value(transfer: &Transfer) -> String {
     let data = &transfer.data;
     if let Some(text) = printable(data, matches!(transfer.index, 0x1008..=0x100a)) {
@@ -34,7 +34,7 @@ pub fn value(transfer: &Transfer) -> String {
     }
 }
 
-/// Readable, and longer than a number or known to be a text.
+/// Returns the text if it is printable, and longer than a number or known to be a text.
 fn printable(data: &[u8], known: bool) -> Option<String> {
     let end = data.iter().rposition(|byte| *byte != 0)? + 1;
     let text = data.get(..end)?;

@@ -1,5 +1,5 @@
-//! Answers cyclic frames as a bus would, from the other end of a pair of interfaces and from another CPU, holding each reply
-//! for as long as the wire would. It has a thread of its own, which spins only while a frame is due.
+//! Answers cyclic frames like a bus, from the peer interface and on another CPU. Each reply is
+//! delayed by the time on the wire. The thread spins only while a frame is due.
 
 use std::io;
 use std::num::NonZeroU64;
@@ -10,75 +10,76 @@ use std::thread::{self, JoinHandle};
 
 use serde::Serialize;
 
-use super::held::Held;
+use super::reply_queue::ReplyQueue;
 use super::segment::{Seen, Segment, wire_ns};
 use super::veth::{self, VethPair};
 use crate::clock::{self, Clock, Nanos};
-use crate::link::{self, BackEnd, Link, MAX_FRAME};
-use crate::os::process;
-use crate::rt;
+use crate::link::{self, Link, MAX_FRAME, SocketKind};
+use crate::sys::process;
+use crate::sys::rt_thread;
 
-/// Before something is due, sleeping ends this early, or a quarter of a cycle if that is less.
+/// The maximum time in ns that sleeping ends early; at most a quarter of a cycle.
 const LONGEST_MARGIN: Nanos = 150_000;
-/// Frames of one cycle follow each other this closely.
+/// The maximum gap between frames of one cycle in ns.
 const BACK_TO_BACK: Nanos = 10_000;
-/// Where nothing is expected, it looks this often.
+/// The polling period in ns if no frame is expected.
 const IDLE: Nanos = 50_000;
-/// A frame that was looked at or sent this much too late was held up by this computer, not by the bus.
+/// A frame read or sent later than this in ns was delayed by this computer, not by the bus.
 const HELD_UP: Nanos = 10_000;
 
-/// How long a reply is held.
+/// The delay of a reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Hold {
-    /// Nanoseconds, whatever the frame.
+pub enum ReplyDelay {
+    /// A fixed delay in ns.
     Fixed(Nanos),
-    /// As long as the frame takes on a wire of 100 Mbit/s through its SubDevices.
+    /// The time of the frame on a 100 Mbit/s wire through its SubDevices.
     Wire,
 }
 
-/// What is done to some of the replies.
+/// Faults injected into replies.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Mischief {
-    /// Every so manieth reply is not sent.
+pub struct FaultInjection {
+    /// Every n-th reply is dropped.
     pub drop_every: Option<NonZeroU64>,
-    /// Every so manieth reply is held longer by so many nanoseconds.
+    /// Every n-th reply is delayed by additional ns.
     pub late_every: Option<(NonZeroU64, Nanos)>,
 }
 
 #[derive(Debug, Clone, Copy)]
 pub struct Options {
-    pub hold: Hold,
-    /// How often frames come, so that it need not spin in between.
+    pub hold: ReplyDelay,
+    /// The cycle time in ns, which avoids spinning between frames.
     pub cycle_ns: Nanos,
-    pub mischief: Mischief,
+    pub mischief: FaultInjection,
     pub priority: u8,
     pub cpu: Option<usize>,
-    /// A reply that this computer holds up by more than this can cost a cycle.
+    /// The delay in ns beyond which a cycle can be lost.
     pub slack_ns: Nanos,
 }
 
-/// What it has seen and done so far.
+/// Counters of the bus.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
     pub frames: u64,
     pub replies: u64,
     pub malformed: u64,
-    /// Not EtherCAT.
+    /// Frames that are not EtherCAT.
     pub foreign: u64,
-    /// On purpose.
+    /// Replies dropped by fault injection.
     pub dropped: u64,
-    /// On purpose.
+    /// Replies delayed by fault injection.
     pub delayed: u64,
-    /// The interface refused them, or too many were held.
+    /// Replies that the interface refused, or for which the queue was full.
     pub not_sent: u64,
-    /// Replies that this computer held up noticeably, because another program or the hypervisor had the CPU.
+    /// Replies delayed noticeably by this computer, because another program or the hypervisor had
+    /// the CPU.
     pub held_up: u64,
-    /// Of these, those that cannot have been in time any more.
+    /// Those of `held_up` that were certainly too late.
     pub too_late: u64,
 }
 
 impl Counts {
-    /// What has come since.
+    /// Returns the increments since `before`.
     #[must_use]
     pub fn since(&self, before: &Self) -> Self {
         Self {
@@ -117,7 +118,7 @@ struct Shared {
 }
 
 impl Shared {
-    fn tell(&self, c: &Counts) {
+    fn publish(&self, c: &Counts) {
         let values = [
             c.frames,
             c.replies,
@@ -134,7 +135,7 @@ impl Shared {
         }
     }
 
-    fn told(&self) -> Counts {
+    fn counts(&self) -> Counts {
         let [a, b, c, d, e, f, g, h, i] = &self.counts;
         let get = |n: &AtomicU64| n.load(Ordering::Relaxed);
         Counts {
@@ -151,22 +152,22 @@ impl Shared {
     }
 }
 
-/// A bus at work; it ends when this is dropped.
+/// A running bus; dropping it stops the thread.
 #[derive(Debug)]
 pub struct Bus {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// What the bus's thread does before it opens its link, and tells of that.
-pub(super) type Settle = Box<dyn FnOnce() -> io::Result<Box<dyn Link>> + Send>;
+/// Opens the link on the thread of the bus.
+pub(super) type ThreadSetup = Box<dyn FnOnce() -> io::Result<Box<dyn Link>> + Send>;
 
 impl Bus {
     /// Starts the thread; `open` runs on it. Returns when frames are answered.
     ///
     /// # Errors
-    /// Those of `open`, and where no thread can be started.
-    pub fn start(open: Settle, segment: Segment, options: Options) -> io::Result<Self> {
+    /// Fails if `open` fails or no thread can be started.
+    pub fn start(open: ThreadSetup, segment: Segment, options: Options) -> io::Result<Self> {
         let shared = Arc::new(Shared::default());
         let (ready, started): (Sender<io::Result<()>>, Receiver<_>) = channel();
         let theirs = Arc::clone(&shared);
@@ -175,8 +176,8 @@ impl Bus {
                 .name("ecaxis-bus".to_owned())
                 .spawn(move || match open() {
                     Ok(link) => {
-                        // What is denied shows in how many replies were held up.
-                        let _ = rt::thread::prepare(options.priority, options.cpu);
+                        // A missing permission shows in the number of delayed replies.
+                        let _ = rt_thread::become_realtime(options.priority, options.cpu);
                         let _ = ready.send(Ok(()));
                         Worker::new(link, segment, options, &theirs).serve();
                     }
@@ -194,29 +195,29 @@ impl Bus {
         Ok(bus)
     }
 
-    /// Puts a bus on the far end of a pair, and that end out of the host's sight where that is permitted; then nothing that
-    /// ends this process can leave the pair behind.
+    /// Starts a bus on the far end of a pair. If permitted, that end moves to a separate network
+    /// namespace; then the kernel removes the pair with this process.
     ///
     /// # Errors
-    /// Where the interface cannot be moved, brought up or opened.
+    /// Fails if the interface cannot be moved, brought up or opened.
     pub fn on(pair: &VethPair, segment: Segment, options: Options) -> io::Result<Self> {
-        let (tell, told): (Sender<Option<i32>>, Receiver<_>) = channel();
+        let (report, reported): (Sender<Option<i32>>, Receiver<_>) = channel();
         let (go, gone): (Sender<()>, Receiver<()>) = channel();
         let nic = pair.b.clone();
         let open = Box::new(move || -> io::Result<Box<dyn Link>> {
             let away = process::own_network().ok();
-            let _ = tell.send(away);
+            let _ = report.send(away);
             gone.recv()
                 .map_err(|_| io::Error::other("the interface cannot be moved"))?;
             if away.is_some() {
                 veth::up_here(&nic)?;
             }
-            let (link, _) = link::open(&nic, BackEnd::default()).map_err(io::Error::other)?;
+            let (link, _) = link::open(&nic, SocketKind::default()).map_err(io::Error::other)?;
             Ok(link)
         });
         let bus = thread::scope(|scope| {
             let starting = scope.spawn(|| Self::start(open, segment, options));
-            let moved = match told.recv() {
+            let moved = match reported.recv() {
                 Ok(Some(thread)) => pair.move_b(thread),
                 _ => Ok(()),
             };
@@ -237,7 +238,7 @@ impl Bus {
 
     #[must_use]
     pub fn counts(&self) -> Counts {
-        self.shared.told()
+        self.shared.counts()
     }
 }
 
@@ -256,10 +257,10 @@ struct Worker<'a> {
     options: Options,
     shared: &'a Shared,
     counts: Counts,
-    held: Held,
-    /// Where a frame goes that finds no place.
+    held: ReplyQueue,
+    /// The buffer for a frame if the queue is full.
     spare: [u8; MAX_FRAME],
-    /// When the wire is free for the next frame.
+    /// The time when the wire is free for the next frame.
     free: Nanos,
     looked: Nanos,
 }
@@ -272,7 +273,7 @@ impl<'a> Worker<'a> {
             options,
             shared,
             counts: Counts::default(),
-            held: Held::new(),
+            held: ReplyQueue::new(),
             spare: [0; MAX_FRAME],
             free: 0,
             looked: clock::now(),
@@ -282,14 +283,15 @@ impl<'a> Worker<'a> {
     fn serve(&mut self) {
         let cycle = self.options.cycle_ns;
         let margin = LONGEST_MARGIN.min(cycle / 4);
-        // First frame of the last cycle, and the last frame of all.
+        // The first frame of the last cycle, and the last frame.
         let (mut began, mut last) = (0, 0);
         while !self.shared.stop.load(Ordering::Relaxed) {
             let now = clock::now();
             let unseen = now.saturating_sub(self.looked);
             if self.take(now) {
                 if now.saturating_sub(began) > cycle / 2 {
-                    // What has come while nobody looked may have come at once: look earlier next time.
+                    // Frames that arrived during sleep may have arrived together: wake up earlier
+                    // next time.
                     began = if unseen > BACK_TO_BACK {
                         self.looked
                     } else {
@@ -320,7 +322,7 @@ impl<'a> Worker<'a> {
         }
     }
 
-    /// A frame, if one has come. `now` is before it was looked for.
+    /// Takes a frame if one has arrived. `now` is the time before the poll.
     fn take(&mut self, now: Nanos) -> bool {
         let mut place = self.held.place();
         let buf = place
@@ -344,12 +346,12 @@ impl<'a> Worker<'a> {
         let nth = |every: NonZeroU64| self.counts.frames.is_multiple_of(every.get());
         if self.options.mischief.drop_every.is_some_and(nth) {
             self.counts.dropped += 1;
-            self.tell();
+            self.publish();
             return true;
         }
         let mut due = match self.options.hold {
-            Hold::Fixed(hold) => now + hold,
-            Hold::Wire => {
+            ReplyDelay::Fixed(hold) => now + hold,
+            ReplyDelay::Wire => {
                 let start = now.max(self.free);
                 self.free = start + wire_ns(len);
                 start + self.segment.wire_ns(len)
@@ -368,7 +370,7 @@ impl<'a> Worker<'a> {
         } else {
             self.counts.not_sent += 1;
         }
-        self.tell();
+        self.publish();
         true
     }
 
@@ -381,11 +383,11 @@ impl<'a> Worker<'a> {
             }
             self.counts.held_up += u64::from(late > HELD_UP);
             self.counts.too_late += u64::from(late > self.options.slack_ns);
-            self.shared.tell(&self.counts);
+            self.shared.publish(&self.counts);
         }
     }
 
-    fn tell(&self) {
-        self.shared.tell(&self.counts);
+    fn publish(&self) {
+        self.shared.publish(&self.counts);
     }
 }

@@ -1,27 +1,27 @@
-//! What one frame to and fro costs on a link, in the rhythm of a cycle.
+//! The round-trip cost of one frame on a link at the rate of a cycle.
 
 use std::io;
 
 use crate::clock::{self, Clock, Nanos};
-use crate::link::port::ETHERCAT;
+use crate::link::pdu_loop::ETHERCAT;
 use crate::link::{Link, LinkError, MAX_FRAME};
-use crate::os::process::ThreadUse;
-use crate::rt::margin::Margin;
-use crate::rt::stats::Times;
+use crate::rt::spin::SpinWindow;
+use crate::rt::stats::LatencyHistogram;
+use crate::sys::process::ThreadUsage;
 
-/// What a link came to, over any number of rounds.
+/// The result of a link over all rounds.
 #[derive(Debug, Clone, Default)]
 pub struct Exchanges {
-    /// Sent to back.
-    pub round_trip: Times,
+    /// Transmission to reception.
+    pub round_trip: LatencyHistogram,
     pub lost: u64,
-    /// Back after its time.
+    /// Frames that returned after the deadline.
     pub late: u64,
-    pub used: ThreadUse,
+    pub used: ThreadUsage,
     pub cycles: u64,
 }
 
-/// Why a round could not be done.
+/// Why a round failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ExchangeError {
     #[error(transparent)]
@@ -31,28 +31,28 @@ pub enum ExchangeError {
 }
 
 impl Exchanges {
-    /// Adds so many cycles of the calling thread: each sends one frame with `data` bytes of datagrams and waits for it,
-    /// spinning, for three quarters of the cycle.
+    /// Runs `cycles` on the calling thread. Each cycle sends one frame with `data` bytes of
+    /// datagrams and spins until it returns, for at most three quarters of the cycle.
     ///
     /// # Errors
-    /// Where the link fails.
+    /// Fails if the link fails.
     pub fn round(
         &mut self,
         link: &mut dyn Link,
         data: u16,
         cycle: Nanos,
-        margin: &mut Margin,
+        margin: &mut SpinWindow,
         cycles: u32,
     ) -> Result<(), ExchangeError> {
         let mut frame = frame(data);
         let mut buf = [0; MAX_FRAME];
-        // What is left of an earlier round.
+        // Discard frames of an earlier round.
         while link.recv(&mut buf)?.is_some() {}
-        let before = ThreadUse::now()?;
+        let before = ThreadUsage::now()?;
         let mut next = clock::now() + cycle;
         for number in 0..cycles {
             let slept = Clock::Real.sleep_until(next, margin.get());
-            margin.slept(slept);
+            margin.record_wakeup(slept);
             let mark = number.to_le_bytes();
             frame[HEADERS..HEADERS + mark.len()].copy_from_slice(&mark);
             let sent = clock::now();
@@ -82,22 +82,23 @@ impl Exchanges {
                 next = now + cycle;
             }
         }
-        self.used = self.used.plus(ThreadUse::now()?.since(before));
+        self.used = self.used.plus(ThreadUsage::now()?.since(before));
         self.cycles += u64::from(cycles);
         Ok(())
     }
 
-    /// Of the thread, for one cycle; what is spun is in it.
+    /// Returns the CPU time per cycle of the thread in ns, including spinning.
     #[must_use]
     pub fn cpu_ns_a_cycle(&self) -> f64 {
         self.used.cpu_ns as f64 / self.cycles.max(1) as f64
     }
 }
 
-/// Ethernet header and EtherCAT header.
+/// Ethernet header and EtherCAT header in bytes.
 const HEADERS: usize = 16;
 
-/// A frame of ours with so many bytes in place of datagrams, at least 44 so that nothing pads it.
+/// Returns a test frame with `data` bytes instead of datagrams; at least 44, so that it needs no
+/// padding.
 fn frame(data: u16) -> Vec<u8> {
     let data = data.clamp(44, 1498);
     let mut frame = vec![0xff; 6];

@@ -1,4 +1,4 @@
-//! The computer that a bench runs on.
+//! The computer that runs a bench.
 
 use std::fs;
 use std::sync::Arc;
@@ -9,8 +9,8 @@ use rustix::thread::{CpuSet, sched_getaffinity};
 
 use super::plan::Plan;
 use super::report::Fact;
-use crate::doctor::{self, Host, Intent, Severity, Tried};
-use crate::rt::thread::pin;
+use crate::doctor::{self, Host, Measurements, RunProfile, Severity};
+use crate::sys::rt_thread::pin;
 
 fn read(path: &str) -> Option<String> {
     let text = fs::read_to_string(path).ok()?;
@@ -18,8 +18,8 @@ fn read(path: &str) -> Option<String> {
     (!text.is_empty()).then(|| text.to_owned())
 }
 
-/// Of the CPUs that this process may use: the one for the cycle, isolated from others if there is such a one, and the one for
-/// everything beside it.
+/// Returns the CPU for the cycle, isolated if possible, and the CPU for all other work. Both are
+/// CPUs that this process may use.
 #[must_use]
 pub fn cpus() -> (usize, Option<usize>) {
     let allowed: Vec<usize> = sched_getaffinity(None).map_or_else(
@@ -42,14 +42,14 @@ pub fn cpus() -> (usize, Option<usize>) {
     (cycle, other)
 }
 
-/// The CPUs that are switched on, as the kernel writes them, where the one that is named is not among them.
+/// Returns the online CPUs in the kernel's notation if `cpu` is not one of them.
 #[must_use]
 pub fn without(cpu: usize) -> Option<String> {
     let online = read("/sys/devices/system/cpu/online")?;
     (!list(&online).contains(&cpu)).then_some(online)
 }
 
-/// `0,2-4` as the kernel writes it.
+/// Parses the kernel's notation `0,2-4`.
 fn list(text: &str) -> Vec<usize> {
     let mut cpus = Vec::new();
     for part in text.split(',') {
@@ -61,7 +61,7 @@ fn list(text: &str) -> Vec<usize> {
     cpus
 }
 
-/// Whether a hypervisor decides when its CPUs run.
+/// True on a virtual machine.
 #[must_use]
 pub fn is_virtual() -> bool {
     let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -69,7 +69,7 @@ pub fn is_virtual() -> bool {
     flags.is_some_and(|flags| flags.split_whitespace().any(|flag| flag == "hypervisor"))
 }
 
-/// What a reader has to know of it to make sense of the figures: facts, and what `ecaxis doctor` would have mended.
+/// Returns facts about the computer and the findings of `ecaxis doctor`, which explain the figures.
 #[must_use]
 pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
     let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -84,7 +84,7 @@ pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
         }
     };
     add("processor", model);
-    let intent = Intent {
+    let intent = RunProfile {
         nic: None,
         cpu: Some(plan.cpu),
         priority: plan.priority,
@@ -92,7 +92,7 @@ pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
         spin: plan.spin,
         program: std::env::current_exe().unwrap_or_default(),
     };
-    let report = doctor::examine(&Host::here(), &intent, Tried::default());
+    let report = doctor::examine(&Host::here(), &intent, Measurements::default());
     for fact in report.facts {
         add(fact.name, Some(fact.value));
     }
@@ -106,21 +106,21 @@ pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
     (facts, findings.map(|finding| finding.found).collect())
 }
 
-/// A thread of the ordinary class that takes all of a CPU, and its memory's bandwidth, until this is dropped.
+/// A SCHED_OTHER thread that loads a CPU and the memory bus until dropped.
 #[derive(Debug)]
 pub struct Hog {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// More than most caches nearby hold.
+/// Larger than most caches, in words.
 const HOG_WORDS: usize = 1 << 20;
 
 impl Hog {
-    /// Starts it.
+    /// Starts the thread on `cpu`.
     ///
     /// # Errors
-    /// Where no thread can be started.
+    /// Fails if no thread can be started.
     pub fn start(cpu: usize) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let ended = Arc::clone(&stop);
@@ -158,14 +158,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_of_cpus() {
+    fn list_parses_kernel_lists() {
         assert_eq!(list("0,2-4"), [0, 2, 3, 4]);
         assert!(list("").is_empty());
         assert!(list("x,3-1,5-").is_empty());
     }
 
     #[test]
-    fn this_computer_says_something_of_itself() {
+    fn examined_returns_facts_about_this_computer() {
         let (cpu, other) = cpus();
         assert_ne!(Some(cpu), other);
     }

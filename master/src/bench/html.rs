@@ -1,18 +1,18 @@
-//! A report to send to somebody: one file of XHTML with its drawings in it, and nothing that is loaded from elsewhere.
+//! The report as one XHTML file with embedded drawings and without external resources.
 
 use std::fmt::Write;
 
-use super::report::{Dist, Fact, Ratio, Report, Variant, losses};
+use super::report::{Fact, LatencySummary, Ratio, Report, Variant, losses};
 use super::svg::chart;
-use crate::page::{self, escaped, key, time};
+use crate::html::{self, escape_xml, legend_entry, time};
 
-/// The whole document.
+/// Returns the complete document.
 #[must_use]
 pub fn html(report: &Report) -> String {
-    let mut out = page::head("Timing of an EtherCAT cycle");
-    // Writing to a string does not fail.
+    let mut out = html::head("Timing of an EtherCAT cycle");
+    // Writing to a String cannot fail.
     let _ = sections(&mut out, report);
-    out + page::END
+    out + html::END
 }
 
 fn sections(out: &mut String, report: &Report) -> std::fmt::Result {
@@ -23,17 +23,17 @@ fn sections(out: &mut String, report: &Report) -> std::fmt::Result {
     if !report.findings.is_empty() {
         writeln!(
             out,
-            "<p>What of it disturbs a cycle (<code>ecaxis doctor</code> says what that costs and what mends it):</p><ul>"
+            "<p>Settings that disturb a cycle (<code>ecaxis doctor</code> shows their effect and the fix):</p><ul>"
         )?;
         for finding in &report.findings {
-            writeln!(out, "<li>{}</li>", escaped(finding))?;
+            writeln!(out, "<li>{}</li>", escape_xml(finding))?;
         }
         writeln!(out, "</ul>")?;
     }
     if !report.remarks.is_empty() {
         writeln!(out, "<h2>To be kept in mind</h2><ul>")?;
         for remark in &report.remarks {
-            writeln!(out, "<li>{}</li>", escaped(remark))?;
+            writeln!(out, "<li>{}</li>", escape_xml(remark))?;
         }
         writeln!(out, "</ul>")?;
     }
@@ -45,13 +45,13 @@ fn sections(out: &mut String, report: &Report) -> std::fmt::Result {
         out,
         "<footer>ecaxis {}. Percentiles: p99 is what 99 of 100 cycles did not exceed. Both axes of the drawings are \
          logarithmic; the marks below them are p50, p99 and p99.9.</footer>",
-        escaped(report.version)
+        escape_xml(report.version)
     )
 }
 
-type Get = fn(&Variant) -> Option<&Dist>;
+type Get = fn(&Variant) -> Option<&LatencySummary>;
 
-/// What there is a table and a drawing of.
+/// The measures with a table and a drawing.
 pub(super) const MEASURES: [(&str, &str, Get); 4] = [
     (
         "Wake-up lateness",
@@ -81,14 +81,14 @@ fn facts(out: &mut String, facts: &[Fact]) -> std::fmt::Result {
         writeln!(
             out,
             "<tr><td>{}</td><td>{}</td></tr>",
-            escaped(fact.name),
-            escaped(&fact.value)
+            escape_xml(fact.name),
+            escape_xml(&fact.value)
         )?;
     }
     writeln!(out, "</tbody></table>")
 }
 
-/// A quotient with two digits that count.
+/// Formats a quotient with two significant digits.
 #[must_use]
 pub(super) fn times(value: Option<f64>) -> String {
     match value {
@@ -107,7 +107,7 @@ fn measure(
     what: &str,
     get: Get,
 ) -> std::fmt::Result {
-    let all: Vec<(usize, &Variant, &Dist)> = report
+    let all: Vec<(usize, &Variant, &LatencySummary)> = report
         .variants
         .iter()
         .enumerate()
@@ -117,7 +117,8 @@ fn measure(
         return Ok(());
     }
     writeln!(out, "<h2>{title}</h2><p>{what}</p>")?;
-    let drawn: Vec<(usize, &Dist)> = all.iter().map(|(place, _, dist)| (*place, *dist)).collect();
+    let drawn: Vec<(usize, &LatencySummary)> =
+        all.iter().map(|(place, _, dist)| (*place, *dist)).collect();
     out.push_str(&chart(title, &drawn));
     writeln!(
         out,
@@ -127,7 +128,7 @@ fn measure(
         writeln!(
             out,
             "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
-            key(*place, &variant.name),
+            legend_entry(*place, &variant.name),
             time(dist.p50_ns),
             dist.p99_ns.map_or_else(|| "–".to_owned(), time),
             dist.p99_9_ns.map_or_else(|| "–".to_owned(), time),
@@ -140,8 +141,8 @@ fn measure(
         writeln!(
             out,
             "<tr class=\"ratio\"><td>{} ∕ {}{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td></td></tr>",
-            escaped(&ratio.of),
-            escaped(&ratio.to),
+            escape_xml(&ratio.of),
+            escape_xml(&ratio.to),
             ratio.measure.note(),
             times(ratio.p50),
             times(ratio.p99),
@@ -164,7 +165,7 @@ fn counters(out: &mut String, report: &Report) -> std::fmt::Result {
         writeln!(
             out,
             "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
-            key(place, &variant.name),
+            legend_entry(place, &variant.name),
             variant.cycles,
             number(counters.map(|c| c.lost_frames)),
             number(losses(variant).map(|(_, ours)| ours)),
@@ -185,8 +186,8 @@ fn counters(out: &mut String, report: &Report) -> std::fmt::Result {
             out,
             "<p>{}, {} ∕ {}: {}</p>",
             ratio.measure.name(),
-            escaped(&ratio.of),
-            escaped(&ratio.to),
+            escape_xml(&ratio.of),
+            escape_xml(&ratio.to),
             times(ratio.value)
         )?;
     }

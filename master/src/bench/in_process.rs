@@ -1,7 +1,8 @@
-//! The segment in the thread of the cycle itself, for want of an interface: shows the work of a cycle, but no exchange.
+//! The segment on the thread of the cycle, without an interface: measures the work of a cycle, but
+//! no exchange.
 
-use super::bus::Hold;
-use super::held::Held;
+use super::bus::ReplyDelay;
+use super::reply_queue::ReplyQueue;
 use super::segment::{Seen, Segment};
 use crate::clock::{self, Nanos};
 use crate::link::{Link, LinkError, MAX_FRAME};
@@ -10,17 +11,17 @@ use crate::link::{Link, LinkError, MAX_FRAME};
 #[derive(Debug)]
 pub struct InProcess {
     segment: Segment,
-    hold: Hold,
-    held: Held,
+    hold: ReplyDelay,
+    held: ReplyQueue,
 }
 
 impl InProcess {
     #[must_use]
-    pub fn new(segment: Segment, hold: Hold) -> Self {
+    pub fn new(segment: Segment, hold: ReplyDelay) -> Self {
         Self {
             segment,
             hold,
-            held: Held::new(),
+            held: ReplyQueue::new(),
         }
     }
 }
@@ -30,8 +31,8 @@ impl Link for InProcess {
         let now = clock::now();
         let due = now
             + match self.hold {
-                Hold::Fixed(hold) => hold,
-                Hold::Wire => self.segment.wire_ns(frame.len()),
+                ReplyDelay::Fixed(hold) => hold,
+                ReplyDelay::Wire => self.segment.wire_ns(frame.len()),
             };
         let slot = self
             .held

@@ -1,33 +1,33 @@
-//! What the kernel counts for a CPU: time that others had of it, and what interrupted it.
+//! The kernel's counters of a CPU: time used by others, and interrupts.
 
 use std::collections::BTreeMap;
 use std::fs;
 
 use serde::Serialize;
 
-/// `USER_HZ`, the unit of /proc/stat, is this on every Linux there is.
+/// `USER_HZ`, the unit of /proc/stat; 100 on every Linux.
 const TICKS_PER_SECOND: u64 = 100;
 const NANOS_PER_TICK: u64 = 1_000_000_000 / TICKS_PER_SECOND;
-/// The most frequent interrupts, of which to tell.
-const TOLD: usize = 4;
+/// The maximum number of interrupt sources reported.
+const MAX_REPORTED: usize = 4;
 
-/// Counters of one CPU since the computer was started.
+/// Counters of one CPU since boot.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct CpuView {
+pub struct CpuCounters {
     steal: u64,
     interrupt_time: u64,
     interrupts: BTreeMap<String, u64>,
 }
 
-/// What happened on a CPU meanwhile.
+/// The increments of a CPU's counters.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
-pub struct CpuTaken {
-    /// By the hypervisor for others, to 10 ms.
+pub struct CpuTimeDelta {
+    /// Time taken by the hypervisor; resolution 10 ms.
     pub steal_ns: u64,
-    /// By interrupts, to 10 ms.
+    /// Time taken by interrupts; resolution 10 ms.
     pub interrupt_ns: u64,
     pub interrupts: u64,
-    /// The most frequent ones.
+    /// The most frequent interrupts.
     pub most: Vec<Interrupt>,
 }
 
@@ -37,8 +37,8 @@ pub struct Interrupt {
     pub count: u64,
 }
 
-impl CpuView {
-    /// As it is now; empty where the kernel does not tell.
+impl CpuCounters {
+    /// Returns the present counters; empty if the kernel does not provide them.
     #[must_use]
     pub fn now(cpu: usize) -> Self {
         let read = |path| fs::read_to_string(path).unwrap_or_default();
@@ -61,9 +61,9 @@ impl CpuView {
         }
     }
 
-    /// What has come since `before`.
+    /// Returns the increments since `before`.
     #[must_use]
-    pub fn since(&self, before: &Self) -> CpuTaken {
+    pub fn since(&self, before: &Self) -> CpuTimeDelta {
         let mut most: Vec<Interrupt> = self
             .interrupts
             .iter()
@@ -75,8 +75,8 @@ impl CpuView {
             .collect();
         most.sort_by_key(|i| std::cmp::Reverse(i.count));
         let interrupts = most.iter().map(|interrupt| interrupt.count).sum();
-        most.truncate(TOLD);
-        CpuTaken {
+        most.truncate(MAX_REPORTED);
+        CpuTimeDelta {
             steal_ns: self.steal.saturating_sub(before.steal),
             interrupt_ns: self.interrupt_time.saturating_sub(before.interrupt_time),
             interrupts,
@@ -85,8 +85,8 @@ impl CpuView {
     }
 }
 
-impl CpuTaken {
-    /// Both together.
+impl CpuTimeDelta {
+    /// Adds the increments of another measurement.
     pub fn add(&mut self, other: &Self) {
         self.steal_ns += other.steal_ns;
         self.interrupt_ns += other.interrupt_ns;
@@ -98,11 +98,11 @@ impl CpuTaken {
             }
         }
         self.most.sort_by_key(|i| std::cmp::Reverse(i.count));
-        self.most.truncate(TOLD);
+        self.most.truncate(MAX_REPORTED);
     }
 }
 
-/// By the text after the columns of the CPUs, or the short name where there is none.
+/// Returns counts by device name, or by short name if there is no device.
 fn counts(cpu: usize, text: &str) -> BTreeMap<String, u64> {
     let mut lines = text.lines();
     let head: Vec<&str> = lines
@@ -123,11 +123,11 @@ fn counts(cpu: usize, text: &str) -> BTreeMap<String, u64> {
         let Some(count) = words.get(column).and_then(|n| n.parse::<u64>().ok()) else {
             continue;
         };
-        let told = words.get(head.len()..).unwrap_or_default();
-        // Numbered ones end with the device, the others are a phrase.
-        let name = match (short.trim().parse::<u32>(), told.last()) {
+        let reported = words.get(head.len()..).unwrap_or_default();
+        // Numbered interrupts end with the device; others have a description.
+        let name = match (short.trim().parse::<u32>(), reported.last()) {
             (Ok(_), Some(device)) => (*device).to_owned(),
-            (Err(_), Some(_)) => told.join(" "),
+            (Err(_), Some(_)) => reported.join(" "),
             (_, None) => short.trim().to_owned(),
         };
         *counts.entry(name).or_insert(0) += count;
@@ -144,8 +144,8 @@ mod tests {
         LOC:    7129672    7491558   Local timer interrupts\nERR:          3\n";
 
     #[test]
-    fn one_cpu_is_read_out_of_both_files() {
-        let view = CpuView::parse(1, STAT, INTERRUPTS);
+    fn counters_read_one_cpu_from_both_files() {
+        let view = CpuCounters::parse(1, STAT, INTERRUPTS);
         assert_eq!(view.steal, 800_000_000);
         assert_eq!(view.interrupt_time, 1_300_000_000);
         let mut later = view.clone();
@@ -163,9 +163,12 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_told_of_a_cpu_that_is_not_there() {
-        let view = CpuView::parse(7, STAT, INTERRUPTS);
-        assert_eq!(view, CpuView::default());
-        assert_eq!(CpuView::parse(0, "", "garbage\n: :\n"), CpuView::default());
+    fn counters_of_a_missing_cpu_are_empty() {
+        let view = CpuCounters::parse(7, STAT, INTERRUPTS);
+        assert_eq!(view, CpuCounters::default());
+        assert_eq!(
+            CpuCounters::parse(0, "", "garbage\n: :\n"),
+            CpuCounters::default()
+        );
     }
 }

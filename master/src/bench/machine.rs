@@ -1,19 +1,19 @@
-//! The machine of a file: its own bus, brought up and down again by the session that also runs it.
+//! The machine of a machine file on its own bus. A normal session brings the bus up and down.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use super::measure::Measured;
 use super::plan::Plan;
-use super::turn::Measured;
 use crate::config::Machine;
-use crate::rt::margin::Spin;
+use crate::rt::spin::Spin;
 use crate::session::{self, Observer, Options, Outcome, RunError};
 
-/// Runs it for the plan's time; without `enable`, in Op and without power. `None` where it was interrupted before its first
-/// cycle.
+/// Runs the machine for the plan's time. Without `enable` it stays in Op without power. Returns
+/// `None` if it was interrupted before the first cycle.
 ///
 /// # Errors
-/// What a run of this machine fails with.
+/// Fails like a run of this machine.
 pub fn run(
     machine: &Machine,
     enable: bool,

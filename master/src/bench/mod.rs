@@ -1,36 +1,36 @@
-//! What measuring needs: a wire that is made and removed again, something at its other end that answers, and the same cycle
-//! that a machine turns. `benches/` and `ecaxis bench` are built on it. May block and allocate.
+//! Measurement tools for `benches/` and `ecaxis bench`: a temporary wire, a simulated peer, and the
+//! real cycle of a machine. May block and allocate.
 //!
-//! - [`veth`]: two virtual interfaces, connected;
+//! - [`veth`]: a pair of connected virtual interfaces;
 //! - [`reflector`]: answers every frame unchanged after a fixed time;
-//! - [`segment`]: drives as the cyclic frames see them; [`bus`]: answers with them from another CPU, [`in_process`]: in
-//!   the same thread;
-//! - [`rig`]: a machine of such axes, made of the parts of the real cycle;
-//! - [`turn`]: turns it and measures; [`kernel`]: what the kernel tells of a CPU meanwhile;
-//! - [`wakeup`]: how late a thread wakes up, by the cycle's clock and by cyclictest;
-//! - [`exchange`]: what a frame to and fro costs;
-//! - [`plan`], [`compare`]: what takes turns, and the rounds of it; [`program`]: another MainDevice; [`machine`]: the bus of a
-//!   machine file; [`host`]: the computer;
-//! - [`report`], [`remarks`], [`text`], [`html`]: what it came to, and what is to be kept in mind.
+//! - [`segment`]: drives as seen by cyclic frames; [`bus`] answers with them from another CPU,
+//!   [`in_process`] on the same thread;
+//! - [`fixture`]: a machine of such axes, built from the parts of the real cycle;
+//! - [`measure`]: runs and measures it; [`kernel`]: the kernel's counters of a CPU;
+//! - [`wakeup`]: wake-up latency by the cycle's clock and by cyclictest;
+//! - [`exchange`]: the round-trip cost of a frame;
+//! - [`plan`], [`run`]: the variants and their rounds; [`peer`]: another MainDevice; [`machine`]:
+//!   the bus of a machine file; [`host`]: the computer;
+//! - [`report`], [`caveats`], [`text`], [`html`]: the result and its limits.
 
 pub mod bus;
-pub mod compare;
+pub mod caveats;
 pub mod exchange;
-mod held;
+pub mod fixture;
 pub mod host;
 pub mod html;
 pub mod in_process;
 pub mod kernel;
 pub mod machine;
+pub mod measure;
+pub mod peer;
 pub mod plan;
-pub mod program;
 pub mod reflector;
-pub mod remarks;
+mod reply_queue;
 pub mod report;
-pub mod rig;
+pub mod run;
 pub mod segment;
 mod svg;
 pub mod text;
-pub mod turn;
 pub mod veth;
 pub mod wakeup;

@@ -1,85 +1,86 @@
-//! What is measured, and against what.
+//! The plan of a bench: what is measured, and compared with what.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::bus::{Hold, Mischief};
+use super::bus::{FaultInjection, ReplyDelay};
 use crate::clock::Nanos;
 use crate::config::duration::show as duration;
 use crate::config::{Exchange, Machine, Nic};
-use crate::link::BackEnd;
-use crate::rt::margin::Spin;
+use crate::link::SocketKind;
+use crate::rt::spin::Spin;
 
-/// Bytes of a cycle's frame beside the process data: headers, clock, AL status, a diagnostic read.
+/// Bytes of a cycle's frame in addition to the process data: headers, clock, AL status, a
+/// diagnostic read.
 const FRAME: usize = 16 + 20 + 12 + 14 + 20;
-/// What sending and receiving take at both ends together, roughly.
+/// The approximate time for sending and receiving at both ends in ns.
 const SOFTWARE: Nanos = 10_000;
 
-/// A bench.
+/// The plan of a bench.
 #[derive(Debug, Clone)]
 pub struct Plan {
     pub target: Target,
     pub axes: usize,
     pub cycle_ns: Nanos,
     pub exchange: Exchange,
-    pub link: BackEnd,
+    pub link: SocketKind,
     pub spin: Spin,
-    pub hold: Hold,
-    pub mischief: Mischief,
+    pub hold: ReplyDelay,
+    pub mischief: FaultInjection,
     pub priority: u8,
-    /// Of the cycle.
+    /// The CPU of the cycle.
     pub cpu: usize,
-    /// Of the bus and the hog; `None` where there is only one.
+    /// The CPU of the bus and the load; `None` on a computer with one CPU.
     pub other_cpu: Option<usize>,
-    /// Of one round of each variant.
+    /// The time of one round of each variant.
     pub time: Duration,
     pub rounds: u32,
-    /// A program that takes all of the other CPU.
+    /// True if a program loads the other CPU.
     pub hog: bool,
-    /// Keep the cycle's CPU from idling, whoever is measured.
+    /// True if the cycle's CPU is kept from idling for all variants.
     pub awake: bool,
-    pub against: Vec<Against>,
+    pub against: Vec<Baseline>,
 }
 
-/// What the cycle runs on.
+/// The target of the measurement.
 #[derive(Debug, Clone)]
 pub enum Target {
-    /// Drives that answer at the other end of a pair of virtual interfaces.
+    /// Drives at the far end of a pair of virtual interfaces.
     Veth,
-    /// The same in the thread of the cycle.
+    /// The same drives on the thread of the cycle.
     InProcess,
-    /// The bus of a machine file, as it is or simulated; axes are enabled where that is asked for.
+    /// The bus of a machine file, real or simulated. Axes are enabled only on request.
     Machine { machine: Box<Machine>, enable: bool },
 }
 
-/// What takes turns with the cycle.
+/// A variant to compare with.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Against {
-    /// Of rt-tests, with the same priority, CPU and interval.
+pub enum Baseline {
+    /// cyclictest of rt-tests with the same priority, CPU and interval.
     Cyclictest,
     /// The same cycle without spinning before the release.
     Sleep,
     /// The same cycle with another exchange.
     Exchange(Exchange),
     /// The same cycle with another link.
-    Link(BackEnd),
+    Link(SocketKind),
     /// A program that exchanges as many bytes on the same interface; see `benches/ethercrab`.
     Program(PathBuf),
 }
 
 impl Plan {
-    /// Process data of all axes, bytes.
+    /// Returns the process data of all axes in bytes.
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.axes * super::segment::DRIVE_BYTES
     }
 
-    /// How much later than due an answer may come, with this exchange: no more, and its cycle is lost.
+    /// Returns the maximum delay of an answer in ns before its cycle is lost, for this exchange.
     #[must_use]
     pub fn slack_ns(&self, exchange: Exchange) -> Nanos {
         let hold = match self.hold {
-            Hold::Fixed(hold) => hold,
-            Hold::Wire => {
+            ReplyDelay::Fixed(hold) => hold,
+            ReplyDelay::Wire => {
                 let devices = self.axes as u64 * super::segment::NANOS_PER_DEVICE;
                 super::segment::wire_ns(FRAME + self.bytes()) + devices
             }
@@ -91,23 +92,23 @@ impl Plan {
         time.saturating_sub(hold + SOFTWARE)
     }
 
-    /// What is held anyway is no share of the software's.
+    /// Returns the constant delay of replies in ns, which the software does not cause.
     #[must_use]
     pub fn fixed_hold(&self) -> Option<Nanos> {
         match (&self.target, self.hold) {
-            (Target::Veth, Hold::Fixed(hold)) => Some(hold),
+            (Target::Veth, ReplyDelay::Fixed(hold)) => Some(hold),
             _ => None,
         }
     }
 
-    /// In words.
+    /// Returns a description of the target.
     #[must_use]
     pub fn target_name(&self) -> String {
         match &self.target {
             Target::Veth => {
                 let hold = match self.hold {
-                    Hold::Fixed(hold) => format!("each reply held {}", duration(hold)),
-                    Hold::Wire => {
+                    ReplyDelay::Fixed(hold) => format!("each reply held {}", duration(hold)),
+                    ReplyDelay::Wire => {
                         "each reply held as long as a wire of 100 Mbit/s would".to_owned()
                     }
                 };
@@ -126,7 +127,7 @@ impl Plan {
     }
 }
 
-/// The name of an exchange in the machine file and on the command line.
+/// Returns the name of an exchange as in the machine file and on the command line.
 #[must_use]
 pub fn exchange_name(exchange: Exchange) -> &'static str {
     match exchange {

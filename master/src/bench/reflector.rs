@@ -1,4 +1,4 @@
-//! Answers every EtherCAT frame unchanged after a fixed time, as a bus of that length would.
+//! Answers every EtherCAT frame unchanged after a fixed time, like a bus of that delay.
 
 use std::io;
 use std::sync::Arc;
@@ -6,26 +6,26 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 
 use crate::clock::{self, Clock, Nanos};
-use crate::link::{self, BackEnd, Link, MAX_FRAME, OpenError};
-use crate::rt::thread as rt_thread;
+use crate::link::{self, Link, MAX_FRAME, OpenError, SocketKind};
+use crate::sys::rt_thread;
 
-/// The first SubDevice sets it in the first byte of the source address.
+/// The first SubDevice sets this bit in the first byte of the source address.
 const PROCESSED: u8 = 0x02;
 
-/// SCHED_FIFO; below that of who measures.
+/// The SCHED_FIFO priority, below that of the measuring thread.
 const PRIORITY: u8 = 60;
 
-/// How a reflector answers. Nanoseconds.
+/// The timing of a reflector in ns.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Pace {
-    /// From a frame to its answer.
+pub struct ReplyTiming {
+    /// The time from a frame to its answer.
     pub hold: Nanos,
-    /// Sleep after an answer, while no frame is to be expected. A thread that never sleeps meets the kernel's limit for
-    /// real-time threads, and stands still for some time a second.
+    /// The sleep after an answer, when no frame is expected. A thread that never sleeps is
+    /// throttled by the kernel for part of every second.
     pub rest: Nanos,
 }
 
-/// A thread that answers; ends when this is dropped. It spins while it waits.
+/// A thread that answers until it is dropped. It spins while it waits.
 #[derive(Debug)]
 pub struct Reflector {
     stop: Arc<AtomicBool>,
@@ -33,20 +33,20 @@ pub struct Reflector {
 }
 
 impl Reflector {
-    /// Answers on `nic`. With a CPU, the thread spins there at real-time priority, if permitted; without, it gives way to others
-    /// and answers when it can.
+    /// Answers on `nic`. With a CPU, the thread spins there with real-time priority if permitted.
+    /// Without one, it yields to other threads.
     ///
     /// # Errors
-    /// Where the interface cannot be used or the thread not be started.
-    pub fn start(nic: &str, pace: Pace, cpu: Option<usize>) -> Result<Self, OpenError> {
-        let (mut link, _) = link::open(nic, BackEnd::Ring)?;
+    /// Fails if the interface cannot be used or the thread cannot be started.
+    pub fn start(nic: &str, pace: ReplyTiming, cpu: Option<usize>) -> Result<Self, OpenError> {
+        let (mut link, _) = link::open(nic, SocketKind::Ring)?;
         let stop = Arc::new(AtomicBool::new(false));
         let ended = Arc::clone(&stop);
         let thread = thread::Builder::new()
             .name("reflector".to_owned())
             .spawn(move || {
                 if let Some(cpu) = cpu {
-                    let _ = rt_thread::prepare(PRIORITY, Some(cpu));
+                    let _ = rt_thread::become_realtime(PRIORITY, Some(cpu));
                 }
                 reflect(link.as_mut(), pace, cpu.is_some(), &ended)
             })
@@ -61,7 +61,7 @@ impl Reflector {
         })
     }
 
-    /// Ends it; frames answered.
+    /// Stops the thread and returns the number of answered frames.
     #[must_use]
     pub fn finish(mut self) -> u64 {
         self.end()
@@ -79,7 +79,7 @@ impl Drop for Reflector {
     }
 }
 
-fn reflect(link: &mut dyn Link, pace: Pace, alone: bool, stop: &AtomicBool) -> u64 {
+fn reflect(link: &mut dyn Link, pace: ReplyTiming, alone: bool, stop: &AtomicBool) -> u64 {
     let mut buf = [0; MAX_FRAME];
     let mut answered = 0;
     while !stop.load(Ordering::Relaxed) {

@@ -1,31 +1,31 @@
-//! What a bench came to, in numbers.
+//! The figures of a bench.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 
 use super::bus::Counts;
-use super::kernel::CpuTaken;
-use crate::os::process::ThreadUse;
-use crate::rt::stats::{Counters, Times};
+use super::kernel::CpuTimeDelta;
+use crate::rt::stats::{Counters, LatencyHistogram};
+use crate::sys::process::ThreadUsage;
 
-/// Of a histogram, in a decade of times.
+/// The number of histogram steps per decade.
 const STEPS_PER_DECADE: f64 = 20.0;
 
-/// Everything that is told of a bench. Times are nanoseconds.
+/// The complete result of a bench. Times are in ns.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     pub version: &'static str,
-    /// The computer.
+    /// Facts about the computer.
     pub facts: Vec<Fact>,
-    /// What in it disturbs a cycle; `ecaxis doctor` tells what mends it.
+    /// Settings that disturb a cycle; `ecaxis doctor` shows the fixes.
     pub findings: Vec<String>,
     pub settings: Vec<Fact>,
-    /// The first is the cycle as asked for, what follows took turns with it.
+    /// The requested cycle first, then the variants to compare with.
     pub variants: Vec<Variant>,
-    /// Of each variant to each that follows it.
+    /// The ratios of each variant to each following one.
     pub ratios: Vec<Ratio>,
-    /// What makes a number say less than it seems to.
+    /// Remarks on figures that need caution.
     pub remarks: Vec<String>,
 }
 
@@ -35,57 +35,57 @@ pub struct Fact {
     pub value: String,
 }
 
-/// One way of doing it.
+/// The result of one variant.
 #[derive(Debug, Clone, Serialize)]
 pub struct Variant {
     pub name: String,
     pub rounds: u32,
     pub cycles: u64,
     /// Planned release to wake-up.
-    pub wake_up_lateness: Option<Dist>,
+    pub wake_up_lateness: Option<LatencySummary>,
     /// Planned release to the last answer.
-    pub release_to_input: Option<Dist>,
-    /// Wake-up to the end of the cycle's work, waiting for answers included.
-    pub work: Option<Dist>,
-    /// Amount, against SYNC0.
-    pub phase_error: Option<Dist>,
+    pub release_to_input: Option<LatencySummary>,
+    /// Wake-up to the end of the cycle's work, including the wait for answers.
+    pub work: Option<LatencySummary>,
+    /// The absolute phase error against SYNC0.
+    pub phase_error: Option<LatencySummary>,
     pub counters: Option<Counters>,
-    /// Cycles that began so late that their answers can hardly have been in time.
+    /// Cycles that began so late that their answers were hardly in time.
     pub late_releases: Option<u64>,
-    /// Of the whole process where it is not ours.
-    pub used: Option<ThreadUse>,
+    /// The usage of the thread, or of the whole process for other programs.
+    pub used: Option<ThreadUsage>,
     pub cpu_ns_per_cycle: Option<f64>,
-    /// Of one CPU.
+    /// The load in percent of one CPU.
     pub cpu_percent: Option<f64>,
     pub context_switches_per_cycle: Option<f64>,
-    /// Before a release, at the end.
+    /// The final spin time before a release.
     pub spin_ns: Option<u64>,
-    /// Of the cycle's CPU, by others.
-    pub taken: Option<CpuTaken>,
+    /// Time of the cycle's CPU taken by others.
+    pub taken: Option<CpuTimeDelta>,
     pub bus: Option<Counts>,
 }
 
-/// Fewer times than this hardly have a 99th percentile.
+/// With fewer values, the 99th percentile is not meaningful.
 pub(super) const FEW: u64 = 1_000;
 
 /// A distribution of times.
 #[derive(Debug, Clone, Serialize)]
-pub struct Dist {
+pub struct LatencySummary {
     pub count: u64,
     pub p50_ns: u64,
-    /// `null`: fewer than ten times are longer.
+    /// `null` if fewer than ten values are longer.
     pub p99_ns: Option<u64>,
-    /// `null`: fewer than ten times are longer.
+    /// `null` if fewer than ten values are longer.
     pub p99_9_ns: Option<u64>,
     pub max_ns: u64,
-    /// Upper end of each step, and how many times fell into it; twenty steps a decade.
+    /// The upper limit of each step and its count; twenty steps per decade.
     pub histogram: Vec<(u64, u64)>,
 }
 
-impl Dist {
-    /// `None` where nothing was recorded.
+impl LatencySummary {
+    /// Returns the summary, or `None` without values.
     #[must_use]
-    pub fn of(times: &Times) -> Option<Self> {
+    pub fn of(times: &LatencyHistogram) -> Option<Self> {
         let summary = times.summary();
         if summary.count == 0 {
             return None;
@@ -107,7 +107,7 @@ impl Dist {
     }
 }
 
-/// One measure of one variant, divided by that of another.
+/// One measure of one variant divided by that of another.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Ratio {
     pub measure: Measure,
@@ -117,7 +117,7 @@ pub struct Ratio {
     pub p99: Option<f64>,
     pub p99_9: Option<f64>,
     pub max: Option<f64>,
-    /// Where it is one number.
+    /// The ratio, if it is a single number.
     pub value: Option<f64>,
 }
 
@@ -126,7 +126,7 @@ pub struct Ratio {
 pub enum Measure {
     WakeUpLateness,
     ReleaseToInput,
-    /// Release to input, less what the bus held the reply.
+    /// Release to input without the delay of the bus.
     SoftwareShare,
     CpuPerCycle,
 }
@@ -142,7 +142,7 @@ impl Measure {
         }
     }
 
-    /// The heading that it belongs under.
+    /// Returns the heading of the measure.
     pub(super) fn title(self) -> &'static str {
         match self {
             Self::WakeUpLateness => "Wake-up lateness",
@@ -151,7 +151,7 @@ impl Measure {
         }
     }
 
-    /// What a reader has to know beside its heading.
+    /// Returns the explanation below the heading.
     pub(super) fn note(self) -> &'static str {
         match self {
             Self::SoftwareShare => ", less hold",
@@ -164,7 +164,8 @@ fn quotient(a: u64, b: u64) -> Option<f64> {
     (b > 0).then(|| a as f64 / b as f64)
 }
 
-/// Every variant by each that follows it; `hold` is what the bus held every reply.
+/// Returns the ratios of every variant to each following one. `hold` is the delay of every reply by
+/// the bus.
 #[must_use]
 pub fn ratios(variants: &[Variant], hold: Option<u64>) -> Vec<Ratio> {
     let mut ratios = Vec::new();
@@ -177,7 +178,7 @@ pub fn ratios(variants: &[Variant], hold: Option<u64>) -> Vec<Ratio> {
 }
 
 fn of_two(first: &Variant, other: &Variant, hold: Option<u64>, ratios: &mut Vec<Ratio>) {
-    let mut add = |measure, a: &Option<Dist>, b: &Option<Dist>, less: u64| {
+    let mut add = |measure, a: &Option<LatencySummary>, b: &Option<LatencySummary>, less: u64| {
         let (Some(a), Some(b)) = (a, b) else { return };
         let by = |a: u64, b: u64| quotient(a.saturating_sub(less), b.saturating_sub(less));
         ratios.push(Ratio {
@@ -218,7 +219,8 @@ fn of_two(first: &Variant, other: &Variant, hold: Option<u64>, ratios: &mut Vec<
     }
 }
 
-/// Lost cycles of a variant, and how many of them neither the bus nor this computer's other CPU can have lost.
+/// Returns the lost cycles of a variant, and how many of them neither the bus nor the other CPU can
+/// have caused.
 #[must_use]
 pub fn losses(variant: &Variant) -> Option<(u64, u64)> {
     let counters = variant.counters?;
@@ -233,8 +235,8 @@ pub fn losses(variant: &Variant) -> Option<(u64, u64)> {
 mod tests {
     use super::*;
 
-    fn times(values: impl IntoIterator<Item = u64>) -> Times {
-        let mut times = Times::new();
+    fn times(values: impl IntoIterator<Item = u64>) -> LatencyHistogram {
+        let mut times = LatencyHistogram::new();
         values.into_iter().for_each(|n| times.record(n));
         times
     }
@@ -244,8 +246,8 @@ mod tests {
             name: name.to_owned(),
             rounds: 1,
             cycles: 100,
-            wake_up_lateness: Dist::of(&times([lateness; 100])),
-            release_to_input: Dist::of(&times([round_trip; 100])),
+            wake_up_lateness: LatencySummary::of(&times([lateness; 100])),
+            release_to_input: LatencySummary::of(&times([round_trip; 100])),
             work: None,
             phase_error: None,
             counters: None,
@@ -261,19 +263,32 @@ mod tests {
     }
 
     #[test]
-    fn a_histogram_keeps_every_time() {
-        let dist = Dist::of(&times((1..=20_000).map(|n| n * 7))).expect("recorded");
+    fn histogram_keeps_every_value() {
+        let dist = LatencySummary::of(&times((1..=20_000).map(|n| n * 7))).expect("recorded");
         assert_eq!(dist.histogram.iter().map(|(_, n)| n).sum::<u64>(), 20_000);
         assert!(dist.histogram.is_sorted());
         assert!(dist.p99_9_ns.is_some());
-        assert!(Dist::of(&times([])).is_none());
-        assert_eq!(Dist::of(&times([5; 9_999])).expect("some").p99_9_ns, None);
-        assert!(Dist::of(&times([5; 1_000])).expect("some").p99_ns.is_some());
-        assert_eq!(Dist::of(&times([5; 999])).expect("some").p99_ns, None);
+        assert!(LatencySummary::of(&times([])).is_none());
+        assert_eq!(
+            LatencySummary::of(&times([5; 9_999]))
+                .expect("some")
+                .p99_9_ns,
+            None
+        );
+        assert!(
+            LatencySummary::of(&times([5; 1_000]))
+                .expect("some")
+                .p99_ns
+                .is_some()
+        );
+        assert_eq!(
+            LatencySummary::of(&times([5; 999])).expect("some").p99_ns,
+            None
+        );
     }
 
     #[test]
-    fn ratios_are_of_the_first_to_the_others_and_leave_the_hold_out() {
+    fn ratios_compare_the_first_variant_without_the_hold() {
         let all = [
             variant("a", 100, 36_000, 10.0),
             variant("b", 1_000, 60_000, 40.0),
@@ -289,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_bus_did_is_not_lost_by_us() {
+    fn losses_exclude_those_of_the_bus() {
         let mut variant = variant("a", 1, 1, 1.0);
         variant.counters = Some(Counters {
             lost_frames: 5,

@@ -1,12 +1,13 @@
-//! A segment of CiA 402 drives in Op, as far as the cyclic frames see it. It knows no bring-up: no states, no mailbox, no
-//! EEPROM. What drives of silicon do in all that is the simulator's business; here, answering must cost next to nothing.
+//! A segment of CiA 402 drives in Op, limited to cyclic frames. It has no bring-up, states, mailbox
+//! or EEPROM; the simulator covers those. Answering must take very little time.
 
 use crate::clock::Nanos;
-use crate::link::port::ETHERCAT;
+use crate::link::pdu_loop::ETHERCAT;
+use ecaxis_ecat::registers;
 
-/// Process data of a drive, each way.
+/// The process data of a drive in bytes per direction.
 pub const DRIVE_BYTES: usize = 12;
-/// Station address of the first drive, which is also the reference clock.
+/// The station address of the first drive, which is the reference clock.
 pub const FIRST_STATION: u16 = 0x1001;
 
 const HEADERS: usize = 16;
@@ -16,15 +17,15 @@ const WKC: usize = 2;
 const LOCALLY_ADMINISTERED: u8 = 0x02;
 const OP: u8 = 0x08;
 
-/// Bytes of a frame on the wire beyond what a socket sees: preamble, check sequence, gap.
+/// Bytes of a frame on the wire that a socket does not see: preamble, FCS, gap.
 const WIRE_OVERHEAD: u64 = 24;
 const SHORTEST_FRAME: u64 = 60;
-/// At 100 Mbit/s.
+/// Time per byte in ns at 100 Mbit/s.
 const NANOS_PER_BYTE: u64 = 80;
-/// Forwarding by one SubDevice and its cable, there and back.
+/// The forwarding delay of one SubDevice and its cable in ns, both directions.
 pub const NANOS_PER_DEVICE: u64 = 1_000;
 
-/// The power state machine of CiA 402, as far as an undisturbed drive has it.
+/// The CiA 402 power states of a drive without faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum Power {
     #[default]
@@ -36,7 +37,7 @@ enum Power {
 }
 
 impl Power {
-    /// CiA 402, table of commands in the Controlword.
+    /// Returns the next state according to the CiA 402 Controlword command table.
     fn after(self, controlword: u16) -> Self {
         let quick_stop = controlword & 0x04 == 0;
         if controlword & 0x02 == 0 {
@@ -69,7 +70,8 @@ impl Power {
     }
 }
 
-/// A drive that is where it is told to be. Outputs: Controlword, target position, mode; inputs: Statusword, position, mode.
+/// A drive that reaches its target immediately. Outputs: Controlword, target position, mode;
+/// inputs: Statusword, position, mode.
 #[derive(Debug, Clone, Copy, Default)]
 struct Drive {
     logical: u32,
@@ -98,18 +100,18 @@ impl Drive {
     }
 }
 
-/// What a frame was.
+/// The result for a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Seen {
     /// Answered in place.
     Answered,
-    /// Its datagrams do not fit together; left as it was.
+    /// Inconsistent datagrams; unchanged.
     Malformed,
     /// Not EtherCAT.
     Foreign,
 }
 
-/// Drives one after the other.
+/// A line of drives.
 #[derive(Debug, Clone)]
 pub struct Segment {
     drives: Vec<Drive>,
@@ -117,7 +119,8 @@ pub struct Segment {
 }
 
 impl Segment {
-    /// Drives whose outputs and inputs share these logical addresses. Their clocks run `drift_ppm` faster than this computer's.
+    /// Creates drives whose outputs and inputs share these logical addresses. Their clocks run
+    /// `drift_ppm` faster than the computer's.
     #[must_use]
     pub fn new(logical: impl IntoIterator<Item = u32>, drift_ppm: i64) -> Self {
         let drives = logical.into_iter().map(|logical| Drive {
@@ -135,20 +138,21 @@ impl Segment {
         u16::try_from(self.drives.len()).unwrap_or(u16::MAX)
     }
 
-    /// From the first bit of a frame on the wire to the last one back, at 100 Mbit/s.
+    /// Returns the time in ns from the first bit of a frame on the wire to its last bit back, at
+    /// 100 Mbit/s.
     #[must_use]
     pub fn wire_ns(&self, frame: usize) -> Nanos {
         wire_ns(frame) + self.drives.len() as u64 * NANOS_PER_DEVICE
     }
 
-    /// System time of the reference clock.
+    /// Returns the system time of the reference clock.
     #[must_use]
     pub fn system_time(&self, now: Nanos) -> u64 {
         let drift = i128::from(now) * i128::from(self.drift_ppm) / 1_000_000;
         now.wrapping_add_signed(i64::try_from(drift).unwrap_or(0))
     }
 
-    /// Answers a frame in place, as it passes at `now`.
+    /// Answers a frame in place as it passes at `now`.
     pub fn answer(&mut self, frame: &mut [u8], now: Nanos) -> Seen {
         if frame.get(12..14) != Some(&ETHERCAT[..]) {
             return Seen::Foreign;
@@ -170,7 +174,7 @@ impl Segment {
         }
     }
 
-    /// One datagram.
+    /// Processes one datagram.
     fn pass(&mut self, datagram: &mut [u8], now: Nanos) {
         let (header, rest) = datagram.split_at_mut(DATAGRAM_HEADER);
         let (data, wkc) = rest.split_at_mut(rest.len() - WKC);
@@ -186,7 +190,7 @@ impl Segment {
                 read_register(ado, data);
                 1
             }
-            // BRD: the address counts the devices, the data of all are or-ed.
+            // BRD: the address counts the devices; the data of all are OR-ed.
             7 => {
                 header[2..4].copy_from_slice(&adp.wrapping_add(devices).to_le_bytes());
                 read_register(ado, data);
@@ -194,7 +198,7 @@ impl Segment {
             }
             // FRMW: read from the reference clock, written to all others.
             14 if station == Some(0) => {
-                if ado == 0x0910 {
+                if ado == registers::DC_SYSTEM_TIME {
                     let time = self.system_time(now).to_le_bytes();
                     let len = data.len().min(time.len());
                     data[..len].copy_from_slice(&time[..len]);
@@ -208,7 +212,7 @@ impl Segment {
         wkc.copy_from_slice(&sum.to_le_bytes());
     }
 
-    /// LRD, LWR, LRW (10 to 12): what they add to the working counter.
+    /// Processes LRD, LWR, LRW (10 to 12). Returns their working counter increment.
     fn logical(&mut self, command: u8, start: u32, data: &mut [u8]) -> u16 {
         let (reads, writes) = (command != 11, command != 10);
         let mut sum = 0;
@@ -218,7 +222,7 @@ impl Segment {
             else {
                 continue;
             };
-            // What goes out is what came in before this frame, as with a SyncManager's buffers.
+            // Inputs are the values before this frame, as with a SyncManager's buffers.
             let inputs = drive.inputs();
             if writes {
                 drive.take(mapped);
@@ -233,26 +237,26 @@ impl Segment {
     }
 }
 
-/// How long a frame occupies the wire, preamble and gap included.
+/// Returns the time of a frame on the wire in ns, including preamble and gap.
 #[must_use]
 pub fn wire_ns(frame: usize) -> Nanos {
     ((frame as u64).max(SHORTEST_FRAME) + WIRE_OVERHEAD) * NANOS_PER_BYTE
 }
 
-/// AL status of a device in Op; everything else reads as zero.
+/// Returns the AL status of a device in Op; all other registers read as zero.
 fn read_register(ado: u16, data: &mut [u8]) {
     data.fill(0);
-    if let (0x0130, Some(status)) = (ado, data.first_mut()) {
+    if let (registers::AL_STATUS, Some(status)) = (ado, data.first_mut()) {
         *status = OP;
     }
 }
 
-/// Of the datagram at this place.
+/// Returns the data length of the datagram at this offset.
 fn length(frame: &[u8], at: usize) -> usize {
     usize::from(u16::from_le_bytes([frame[at + 6], frame[at + 7] & 0x07]))
 }
 
-/// Whether all datagrams lie within the frame, the last one saying that it is the last.
+/// True if all datagrams lie within the frame and the last one is marked as last.
 fn well_formed(frame: &[u8]) -> bool {
     let Some(&[low, high]) = frame.get(14..HEADERS) else {
         return false;

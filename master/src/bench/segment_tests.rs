@@ -1,4 +1,4 @@
-//! Judged by the simulator's codec, which shares nothing with this one.
+//! Tests against the simulator's independent codec.
 
 use ecaxis_sim::frame::{self, Datagram, FrameBuilder, Kind};
 use proptest::prelude::*;
@@ -22,7 +22,7 @@ fn datagrams(frame: &[u8]) -> Vec<Datagram> {
     all
 }
 
-/// One LRW over all drives with these outputs; inputs and working counter.
+/// Exchanges one LRW over all drives. Returns inputs and working counter.
 fn exchange(segment: &mut Segment, outputs: &[u8]) -> (Vec<u8>, u16) {
     let mut frame = FrameBuilder::default().logical(12, BASE, outputs).build();
     assert_eq!(segment.answer(&mut frame, 0), Seen::Answered);
@@ -40,7 +40,7 @@ fn outputs(controlword: u16, target: i32) -> [u8; DRIVE_BYTES] {
 }
 
 #[test]
-fn a_cycles_frame_comes_back_as_from_a_bus() {
+fn segment_answers_a_cyclic_frame_like_a_bus() {
     let mut segment = segment(3);
     segment.drift_ppm = 100;
     let mut frame = FrameBuilder::default()
@@ -55,19 +55,19 @@ fn a_cycles_frame_comes_back_as_from_a_bus() {
     assert_eq!(frame[6], sent[6] | 0x02, "the first SubDevice's mark");
     let all = datagrams(&frame);
     let wkcs: Vec<u16> = all.iter().map(|d| d.wkc(&frame)).collect();
-    // FRMW: one reads, two are written. LRW: two for outputs, one for inputs, of each.
+    // FRMW: one reads, two are written. LRW: two for outputs and one for inputs, per drive.
     assert_eq!(wkcs, [3, 9, 3, 1, 0]);
     let data = |n: usize| &frame[all[n].data.clone()];
     assert_eq!(data(0), 2_000_200_u64.to_le_bytes());
     assert_eq!(data(2), [8, 0]);
     assert_eq!(all[2].adp(&frame), 3, "counted by the devices");
     assert_eq!(data(3), [8, 0, 0, 0, 0, 0]);
-    assert_eq!(data(4), [0xaa; 6], "of nobody");
+    assert_eq!(data(4), [0xaa; 6], "of no device");
 }
 
-/// ETG.1000.4: what LRD, LWR and LRW add.
+/// ETG.1000.4: working counter increments of LRD, LWR and LRW.
 #[test]
-fn working_counters_of_logical_commands() {
+fn logical_commands_add_standard_working_counters() {
     for (command, each) in [(10, 1), (11, 1), (12, 3)] {
         for (devices, covered, len) in [(2, 2, 24), (2, 1, 23), (2, 0, 11), (4, 3, 40)] {
             let mut segment = segment(devices);
@@ -87,9 +87,9 @@ fn working_counters_of_logical_commands() {
 }
 
 #[test]
-fn a_drive_goes_where_the_controlword_leads() {
+fn drive_follows_the_controlword() {
     let mut segment = segment(1);
-    // Controlword, Statusword that it leads to, seen one cycle later.
+    // Controlword and the Statusword that follows it one cycle later.
     for (controlword, statusword) in [
         (0x0000, 0x0250),
         (0x000f, 0x0250),
@@ -115,7 +115,7 @@ fn a_drive_goes_where_the_controlword_leads() {
 }
 
 #[test]
-fn an_enabled_drive_is_at_its_target_one_cycle_later_and_another_stays() {
+fn only_an_enabled_drive_reaches_its_target() {
     let mut segment = segment(2);
     for controlword in [6, 7, 15] {
         let both = [outputs(controlword, -5), outputs(0, 99)].concat();
@@ -130,7 +130,7 @@ fn an_enabled_drive_is_at_its_target_one_cycle_later_and_another_stays() {
 }
 
 #[test]
-fn what_is_no_frame_of_ours_stays_as_it_is() {
+fn foreign_frames_stay_unchanged() {
     let mut segment = segment(1);
     let good = FrameBuilder::default()
         .datagram(7, 0, 0x130, &[0; 2])
@@ -158,16 +158,16 @@ fn what_is_no_frame_of_ours_stays_as_it_is() {
     }
 }
 
-/// The design's table: bytes on the wire with preamble and gap, and a microsecond a device.
+/// Bytes on the wire with preamble and gap, plus 1 µs per device.
 #[test]
-fn wire_time_is_that_of_a_hundred_megabit() {
+fn wire_time_matches_100_mbit() {
     assert_eq!(segment(8).wire_ns(144), 168 * 80 + 8_000);
     assert_eq!(segment(1).wire_ns(20), 84 * 80 + 1_000, "padded");
 }
 
 proptest! {
     #[test]
-    fn takes_whatever_comes(mut frame: Vec<u8>, ethercat: bool, devices in 0_u32..5) {
+    fn answer_accepts_any_frame(mut frame: Vec<u8>, ethercat: bool, devices in 0_u32..5) {
         if ethercat && frame.len() > 14 {
             frame[12..14].copy_from_slice(&[0x88, 0xa4]);
         }
@@ -178,7 +178,7 @@ proptest! {
     }
 
     #[test]
-    fn agrees_with_the_simulators_codec_on_what_is_a_frame(
+    fn answer_agrees_with_the_simulator_codec(
         datagrams in proptest::collection::vec((0_u8..16, any::<u16>(), any::<u16>(), 0_usize..60), 1..5),
         cut in 0_usize..100,
     ) {

@@ -1,10 +1,11 @@
-//! Histograms as SVG, both axes logarithmic: what happens once in a million cycles is what one wants to see.
+//! Histograms as SVG with two logarithmic axes, so that events once in a million cycles are
+//! visible.
 
 use std::fmt::Write;
 
-use super::report::Dist;
+use super::report::LatencySummary;
 use crate::config::duration::show as duration;
-use crate::page::{COLOURS, escaped};
+use crate::html::{COLOURS, escape_xml};
 
 const WIDTH: f64 = 860.0;
 const HEIGHT: f64 = 260.0;
@@ -13,9 +14,9 @@ const RIGHT: f64 = 12.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 40.0;
 
-/// A chart of distributions, each with its place among [`COLOURS`].
+/// Draws a chart of distributions, each with its index into [`COLOURS`].
 #[must_use]
-pub(super) fn chart(label: &str, all: &[(usize, &Dist)]) -> String {
+pub(super) fn chart(label: &str, all: &[(usize, &LatencySummary)]) -> String {
     let ends = || all.iter().flat_map(|(_, dist)| &dist.histogram);
     let (Some(low), Some(high)) = (
         ends().map(|(end, _)| *end).min(),
@@ -23,10 +24,10 @@ pub(super) fn chart(label: &str, all: &[(usize, &Dist)]) -> String {
     ) else {
         return String::new();
     };
-    // Whole decades around everything.
+    // Round outwards to whole decades.
     let first = (low.max(1) as f64).log10().floor();
     let last = (high.max(2) as f64).log10().ceil().max(first + 1.0);
-    let share = |dist: &Dist, count: u64| count as f64 / dist.count.max(1) as f64;
+    let share = |dist: &LatencySummary, count: u64| count as f64 / dist.count.max(1) as f64;
     let rarest = all
         .iter()
         .flat_map(|(_, dist)| dist.histogram.iter().map(|(_, n)| share(dist, *n)))
@@ -42,7 +43,7 @@ pub(super) fn chart(label: &str, all: &[(usize, &Dist)]) -> String {
     };
     let mut svg = format!(
         "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" xmlns=\"http://www.w3.org/2000/svg\"><title>{}</title>\n",
-        escaped(label)
+        escape_xml(label)
     );
     let _ = grid(&mut svg, (first, last), bottom, &x, &y);
     for (colour, dist) in all {
@@ -94,15 +95,15 @@ fn grid(
     Ok(())
 }
 
-/// One outline, its steps as wide as the histogram's, and a mark at its p50, p99 and p99.9.
+/// Draws one outline with the histogram's steps, and marks at p50, p99 and p99.9.
 fn steps(
     svg: &mut String,
-    dist: &Dist,
+    dist: &LatencySummary,
     colour: &str,
     x: &dyn Fn(f64) -> f64,
     y: &dyn Fn(f64) -> f64,
 ) -> std::fmt::Result {
-    // Twenty to a decade, see `Dist`.
+    // Twenty steps per decade, see `LatencySummary`.
     let step = 10_f64.powf(1.0 / 20.0);
     let floor = HEIGHT - BOTTOM;
     let mut path = String::new();

@@ -1,19 +1,19 @@
-//! A report for a terminal of 80 columns.
+//! The report as text of 80 columns.
 
 use std::fmt::Write;
 
 use super::html::{MEASURES, times};
-use super::report::{Dist, Report, Variant, losses};
-use crate::page::time;
+use super::report::{LatencySummary, Report, Variant, losses};
+use crate::html::time;
 
 const WIDTH: usize = 80;
 const NAME: usize = 34;
 
-/// The whole report.
+/// Formats the whole report.
 #[must_use]
 pub fn text(report: &Report) -> String {
     let mut out = String::new();
-    // Writing to a string does not fail.
+    // Writing to a String cannot fail.
     let _ = write_all(&mut out, report);
     out
 }
@@ -37,13 +37,13 @@ fn write_all(out: &mut String, report: &Report) -> std::fmt::Result {
     }
     if !report.findings.is_empty() {
         let found = report.findings.len();
-        let what = "what disturbs a cycle on this computer, and what mends it: ecaxis doctor";
+        let what = "what disturbs a cycle on this computer, and how to fix it: ecaxis doctor";
         folded(out, "note: ", &format!("{found} findings of {what}"))?;
     }
     Ok(())
 }
 
-/// Text that goes on under itself where a line is full.
+/// Wraps text and aligns continuation lines with its start.
 fn folded(out: &mut String, head: &str, text: &str) -> std::fmt::Result {
     let indent = head.chars().count();
     let mut line = head.to_owned();
@@ -62,7 +62,7 @@ fn folded(out: &mut String, head: &str, text: &str) -> std::fmt::Result {
     writeln!(out, "{}", line.trim_end())
 }
 
-/// A name in its column, cut where it is longer.
+/// Pads or cuts a name to its column.
 fn named(name: &str) -> String {
     let len = name.chars().count();
     if len > NAME {
@@ -97,7 +97,7 @@ fn measure(
     out: &mut String,
     report: &Report,
     title: &str,
-    get: fn(&Variant) -> Option<&Dist>,
+    get: fn(&Variant) -> Option<&LatencySummary>,
 ) -> std::fmt::Result {
     if report.variants.iter().all(|v| get(v).is_none()) {
         return Ok(());
@@ -164,14 +164,14 @@ fn counted(out: &mut String, report: &Report) -> std::fmt::Result {
     Ok(())
 }
 
-/// What else there was, where there was something.
+/// Formats the non-zero counters of a variant.
 fn details(out: &mut String, v: &Variant) -> std::fmt::Result {
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     if let Some((lost, ours)) = losses(v)
         && lost > 0
         && v.bus.is_some()
     {
-        told.push(format!("{ours} lost without the bus's doing"));
+        reported.push(format!("{ours} lost without the bus's doing"));
     }
     if let Some(c) = v.counters {
         for (n, what) in [
@@ -179,12 +179,12 @@ fn details(out: &mut String, v: &Variant) -> std::fmt::Result {
             (c.link_errors, "link errors"),
         ] {
             if n > 0 {
-                told.push(format!("{n} {what}"));
+                reported.push(format!("{n} {what}"));
             }
         }
     }
     if let Some(used) = v.used {
-        told.push(format!(
+        reported.push(format!(
             "{} page faults, {} times made to wait",
             used.minor_faults + used.major_faults,
             used.involuntary_switches
@@ -197,7 +197,7 @@ fn details(out: &mut String, v: &Variant) -> std::fmt::Result {
             .take(2)
             .map(|i| format!("{} {}", i.count, i.name))
             .collect();
-        told.push(format!(
+        reported.push(format!(
             "CPU taken by the hypervisor {}, by interrupts {} ({})",
             time(taken.steal_ns),
             time(taken.interrupt_ns),
@@ -207,10 +207,10 @@ fn details(out: &mut String, v: &Variant) -> std::fmt::Result {
     if let Some(bus) = v.bus
         && bus.held_up > 0
     {
-        told.push(format!(
+        reported.push(format!(
             "{} of {} replies held up at the other end",
             bus.held_up, bus.frames
         ));
     }
-    folded(out, &format!("  {}: ", v.name), &told.join("; "))
+    folded(out, &format!("  {}: ", v.name), &reported.join("; "))
 }

@@ -1,8 +1,9 @@
-//! Two virtual Ethernet interfaces, connected to each other. Needs root (CAP_NET_ADMIN) and `ip` of iproute2.
+//! A pair of connected virtual Ethernet interfaces. Needs root (CAP_NET_ADMIN) and `ip` from
+//! iproute2.
 //!
-//! A process that is killed leaves its pair behind. One end can be moved into a network namespace that lives as long as a
-//! thread; then whatever ends the process, the kernel removes both. Where that is not permitted, what a process has left is
-//! recognised by its number in the name.
+//! A killed process leaves its pair behind. One end can move to the network namespace of a thread;
+//! the kernel then removes both with the process. If that is not permitted, leftovers are
+//! recognized by the process ID in the name.
 
 use std::io;
 use std::path::Path;
@@ -11,12 +12,12 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Before the process's number.
+/// The name prefix before the process ID.
 const PREFIX: &str = "ecx";
-/// How long an interface may take to have a link.
+/// The time-out for a link.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// A pair of interfaces, removed when this is dropped.
+/// A pair of interfaces, removed on drop.
 #[derive(Debug)]
 pub struct VethPair {
     pub a: String,
@@ -24,10 +25,10 @@ pub struct VethPair {
 }
 
 impl VethPair {
-    /// Makes both, without IP, and waits until they have a link.
+    /// Creates both interfaces without IP and waits for a link.
     ///
     /// # Errors
-    /// Where interfaces may not be made, or `ip` is missing.
+    /// Fails if interfaces cannot be created or `ip` is missing.
     pub fn new() -> io::Result<Self> {
         static PAIRS: AtomicU32 = AtomicU32::new(0);
         let number = PAIRS.fetch_add(1, Ordering::Relaxed) % 100;
@@ -36,7 +37,7 @@ impl VethPair {
         ip(&["link", "add", &a, "type", "veth", "peer", "name", &b])?;
         let pair = Self { a, b };
         for nic in [&pair.a, &pair.b] {
-            quiet(nic);
+            disable_ipv6(nic);
             ip(&["link", "set", nic, "up"])?;
         }
         for nic in [&pair.a, &pair.b] {
@@ -45,41 +46,41 @@ impl VethPair {
         Ok(pair)
     }
 
-    /// Takes one end down or up.
+    /// Brings one end up or down.
     ///
     /// # Errors
-    /// What `ip` says.
+    /// Returns the error of `ip`.
     pub fn set(&self, nic: &str, up: bool) -> io::Result<()> {
         ip(&["link", "set", nic, if up { "up" } else { "down" }])
     }
 
-    /// Moves `b` into the network namespace of a thread of this process, where it is down.
+    /// Moves `b` to the network namespace of a thread of this process, where it is down.
     ///
     /// # Errors
-    /// What `ip` says.
+    /// Returns the error of `ip`.
     pub fn move_b(&self, thread: i32) -> io::Result<()> {
         ip(&["link", "set", &self.b, "netns", &thread.to_string()])
     }
 
-    /// Waits until `a` has a link, as it does when both ends are up.
+    /// Waits until `a` has a link, which requires both ends to be up.
     ///
     /// # Errors
-    /// When that takes too long.
+    /// Fails after a time-out.
     pub fn wait_for_link(&self) -> io::Result<()> {
         wait_for_link(&self.a)
     }
 }
 
-/// Brings an end up that has been moved into the calling thread's network namespace.
+/// Brings an end up that was moved to the calling thread's network namespace.
 ///
 /// # Errors
-/// What `ip` says.
+/// Returns the error of `ip`.
 pub(super) fn up_here(nic: &str) -> io::Result<()> {
-    quiet(nic);
+    disable_ipv6(nic);
     ip(&["link", "set", nic, "up"])
 }
 
-/// Interfaces whose makers are no longer there.
+/// Returns the interfaces whose process no longer exists.
 #[must_use]
 pub fn leftovers() -> Vec<String> {
     let Ok(entries) = std::fs::read_dir("/sys/class/net") else {
@@ -100,8 +101,8 @@ fn is_leftover(name: &str) -> bool {
     process.is_some_and(|process| !Path::new(&format!("/proc/{process}")).exists())
 }
 
-/// No address resolution or router solicitation of the host's on this wire.
-fn quiet(nic: &str) {
+/// Disables address resolution and router solicitation of the host on this wire.
+fn disable_ipv6(nic: &str) {
     let _ = std::fs::write(format!("/proc/sys/net/ipv6/conf/{nic}/disable_ipv6"), "1");
 }
 
@@ -131,8 +132,8 @@ fn ip(arguments: &[&str]) -> io::Result<()> {
     if output.status.success() {
         Ok(())
     } else {
-        let told = String::from_utf8_lossy(&output.stderr);
-        Err(io::Error::other(format!("ip: {}", told.trim())))
+        let reported = String::from_utf8_lossy(&output.stderr);
+        Err(io::Error::other(format!("ip: {}", reported.trim())))
     }
 }
 
@@ -141,10 +142,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_a_dead_process_leaves_interfaces_behind() {
+    fn leftovers_belong_to_ended_processes() {
         let here = std::process::id();
         assert!(!is_leftover(&format!("{PREFIX}{here}-0a")));
-        // Process numbers end at 2²².
+        // Process IDs end at 2²².
         assert!(is_leftover(&format!("{PREFIX}9999999-0a")));
         assert!(is_leftover(&format!("{PREFIX}9999999-12b")));
         for other in [
@@ -161,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn names_fit_into_an_interface_name() {
+    fn veth_names_fit_the_interface_name_limit() {
         assert!(format!("{PREFIX}4194304-99b").len() < 16);
     }
 }

@@ -1,32 +1,32 @@
-//! How late a thread wakes up for its cycles: with the cycle's own clock, and as cyclictest sees the same computer.
+//! Wake-up latency of a thread by the cycle's own clock, and by cyclictest.
 
 use std::io;
 use std::process::{Command, Stdio};
 
 use crate::clock::{self, Clock, Nanos};
-use crate::os::process::ThreadUse;
-use crate::rt::margin::Margin;
-use crate::rt::stats::Times;
+use crate::rt::spin::SpinWindow;
+use crate::rt::stats::LatencyHistogram;
+use crate::sys::process::ThreadUsage;
 
-/// What a way of waking up came to, over any number of rounds.
+/// The result of a wake-up method over all rounds.
 #[derive(Debug, Clone, Default)]
 pub struct Wakeups {
-    /// Release planned to release.
-    pub lateness: Times,
-    /// How late sleeping ended, before anything was spun.
-    pub slept: Times,
-    pub used: ThreadUse,
+    /// Planned release to actual release.
+    pub lateness: LatencyHistogram,
+    /// The latency of sleeping, before the spin.
+    pub slept: LatencyHistogram,
+    pub used: ThreadUsage,
     pub wall_ns: Nanos,
 }
 
 impl Wakeups {
-    /// Adds so many cycles of the calling thread, which does nothing but wake up. A cycle that is over when the thread wakes is
-    /// left out.
+    /// Runs `cycles` on the calling thread, which only wakes up. Cycles that are over at the
+    /// wake-up are skipped.
     ///
     /// # Errors
-    /// What getrusage(2) says.
-    pub fn round(&mut self, cycle: Nanos, margin: &mut Margin, cycles: u32) -> io::Result<()> {
-        let (before, began) = (ThreadUse::now()?, clock::now());
+    /// Returns the error of getrusage(2).
+    pub fn round(&mut self, cycle: Nanos, margin: &mut SpinWindow, cycles: u32) -> io::Result<()> {
+        let (before, began) = (ThreadUsage::now()?, clock::now());
         let mut next = began + cycle;
         for _ in 0..cycles {
             let slept = Clock::Real.sleep_until(next, margin.get());
@@ -35,20 +35,20 @@ impl Wakeups {
             if let Some(late) = slept {
                 self.slept.record(late);
             }
-            margin.slept(slept);
+            margin.record_wakeup(slept);
             next += cycle;
             if next < now {
                 next = now + cycle;
             }
         }
-        let used = ThreadUse::now()?.since(before);
+        let used = ThreadUsage::now()?.since(before);
         self.used = self.used.plus(used);
         self.wall_ns += clock::now() - began;
         Ok(())
     }
 }
 
-/// A thread of cyclictest (rt-tests) like ours.
+/// A cyclictest thread (rt-tests) with the parameters of ours.
 #[derive(Debug, Clone, Copy)]
 pub struct Cyclictest {
     pub cycle: Nanos,
@@ -56,15 +56,15 @@ pub struct Cyclictest {
     pub cpu: Option<usize>,
 }
 
-/// Longest lateness that its histogram tells apart, ns; it takes no more.
+/// The maximum latency of cyclictest's histogram in ns.
 const LONGEST_NS: u64 = 1_000_000;
 
 impl Cyclictest {
-    /// Runs it for so many cycles and adds what it saw, in nanoseconds.
+    /// Runs cyclictest for this many cycles and adds its histogram in ns.
     ///
     /// # Errors
-    /// Where cyclictest is not installed, fails, or prints something else.
-    pub fn round(&self, cycles: u32, lateness: &mut Times) -> io::Result<()> {
+    /// Fails if cyclictest is not installed, fails, or prints an invalid result.
+    pub fn round(&self, cycles: u32, lateness: &mut LatencyHistogram) -> io::Result<()> {
         let mut command = Command::new("cyclictest");
         command
             .args(["--quiet", "--mlockall", "--threads=1", "--nsecs"])
@@ -78,8 +78,8 @@ impl Cyclictest {
         let output = command.stdin(Stdio::null()).output()?;
         let text = String::from_utf8_lossy(&output.stdout);
         if !output.status.success() {
-            let told = String::from_utf8_lossy(&output.stderr);
-            return Err(io::Error::other(format!("cyclictest: {}", told.trim())));
+            let reported = String::from_utf8_lossy(&output.stderr);
+            return Err(io::Error::other(format!("cyclictest: {}", reported.trim())));
         }
         let seen = histogram(&text, lateness);
         if seen == 0 {
@@ -89,9 +89,9 @@ impl Cyclictest {
     }
 }
 
-/// Adds the lines `013562 000042` (nanoseconds, how often). Of those that were longer than the histogram only the longest is
-/// known; the others are added as if they had just not fitted. Returns how many there were.
-fn histogram(text: &str, lateness: &mut Times) -> u64 {
+/// Adds the lines `013562 000042` (ns, count). Values beyond the histogram are counted at its
+/// limit, except the longest. Returns their number.
+fn histogram(text: &str, lateness: &mut LatencyHistogram) -> u64 {
     let mut seen = 0;
     let mut add = |nanos: u64, count: u64| {
         lateness.record_n(nanos, count);
@@ -131,14 +131,14 @@ fn histogram(text: &str, lateness: &mut Times) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rt::exchange::Mode;
-    use crate::rt::margin::Spin;
+    use crate::rt::exchange::ExchangeMode;
+    use crate::rt::spin::Spin;
 
     #[test]
-    fn every_cycle_is_counted_once() {
+    fn round_counts_every_cycle_once() {
         let mut wakeups = Wakeups::default();
         for spin in [Spin::Auto, Spin::For(0)] {
-            let mut margin = Margin::new(spin, 1_000_000, Mode::SameCycle);
+            let mut margin = SpinWindow::new(spin, 1_000_000, ExchangeMode::SameCycle);
             wakeups.round(1_000_000, &mut margin, 20).unwrap();
         }
         assert_eq!(wakeups.lateness.summary().count, 40);
@@ -147,11 +147,11 @@ mod tests {
     }
 
     #[test]
-    fn a_histogram_of_cyclictest() {
+    fn histogram_parses_cyclictest_output() {
         let text = "# /dev/cpu_dma_latency set to 0us\n# Histogram\n000000 000000\n012345 000007\n013000 000002\n\
                     # Total: 000000009\n# Min Latencies: 12345\n# Max Latencies: 20000042\n\
                     # Histogram Overflows: 00002\n# Thread 0: 00042\n";
-        let mut times = Times::new();
+        let mut times = LatencyHistogram::new();
         assert_eq!(histogram(text, &mut times), 11);
         let summary = times.summary();
         assert_eq!(summary.count, 11);
@@ -159,7 +159,7 @@ mod tests {
         assert!(summary.max_ns >= 20_000_000);
 
         let short = "012000 000007\n013000 000002\n000500 000000\n# Max Latencies: 13000\n# Histogram Overflows: 00000\n";
-        let mut times = Times::new();
+        let mut times = LatencyHistogram::new();
         assert_eq!(histogram(short, &mut times), 9);
         assert_eq!(times.summary().max_ns / 1_000, 13);
     }

@@ -1,4 +1,4 @@
-//! AL states, requested and awaited over raw datagrams so that a refusal names its device.
+//! AL states, requested and awaited over raw datagrams, so that a refusal names its device.
 //!
 //! Registers: AL control 0x0120, AL status 0x0130, AL status code 0x0134 (ETG.1000.4, 6.1).
 
@@ -6,23 +6,20 @@ use std::fmt;
 use std::time::Duration;
 
 use super::DeviceRef;
-use crate::al_status::al_status_text;
-use crate::mailbox::{Wire, WireError};
+use crate::mailbox::{DatagramError, MailboxTransport};
+use ecaxis_ecat::al_status_code::al_status_text;
+use ecaxis_ecat::registers;
 
-const AL_CONTROL: u16 = 0x0120;
-pub(crate) const AL_STATUS: u16 = 0x0130;
 pub(super) const ERROR: u8 = 0x10;
 const ID_REQUEST: u8 = 0x20;
-/// ESC configuration: device emulation.
-const ESC_CONFIGURATION: u16 = 0x0141;
 const DEVICE_EMULATION: u8 = 0x01;
 const POLL: Duration = Duration::from_micros(500);
-/// 200 ms for a device to take an acknowledgement.
+/// 200 ms for a device to process an acknowledgement.
 const ACKNOWLEDGE_POLLS: u32 = 400;
 
-/// ETG.1020 default for PreOp → SafeOp.
+/// The ETG.1020 default for PreOp → SafeOp.
 pub const SAFE_OP_TIMEOUT: Duration = Duration::from_secs(10);
-/// ETG.1020 default for a way back.
+/// The ETG.1020 default for a transition to a lower state.
 pub const BACK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A state of the EtherCAT state machine.
@@ -38,7 +35,7 @@ pub enum AlState {
 }
 
 impl AlState {
-    /// From the low nibble of AL status.
+    /// Decodes the low nibble of AL status.
     #[must_use]
     pub fn from_status(status: u8) -> Self {
         match status & 0x0f {
@@ -77,7 +74,7 @@ impl fmt::Display for AlState {
     }
 }
 
-/// A SubDevice that did not go where it was sent.
+/// A SubDevice that did not reach the requested state.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
     #[error(
@@ -103,14 +100,21 @@ pub enum StateError {
     Wire {
         device: DeviceRef,
         wanted: AlState,
-        source: WireError,
+        source: DatagramError,
     },
 }
 
-/// AL status and AL status code; `None` where the device does not answer.
-pub async fn read_status(wire: &impl Wire, station: u16) -> Result<Option<(u8, u16)>, WireError> {
+/// Returns AL status and AL status code; `None` if the device does not answer.
+pub async fn read_status(
+    wire: &impl MailboxTransport,
+    station: u16,
+) -> Result<Option<(u8, u16)>, DatagramError> {
     let mut status = [0; 6];
-    if wire.read(station, AL_STATUS, &mut status).await? != 1 {
+    if wire
+        .read(station, registers::AL_STATUS, &mut status)
+        .await?
+        != 1
+    {
         return Ok(None);
     }
     Ok(Some((
@@ -119,20 +123,21 @@ pub async fn read_status(wire: &impl Wire, station: u16) -> Result<Option<(u8, u
     )))
 }
 
-/// Whether AL status is AL control, bit by bit, without anything behind the controller (device emulation, ETG.1000.4): the
-/// error bit is then the MainDevice's own acknowledgement, and no refusal.
-pub(super) async fn emulated(wire: &impl Wire, station: u16) -> bool {
+/// True if AL status mirrors AL control, without a processor behind the controller (device
+/// emulation, ETG.1000.4). The error bit is then the MainDevice's own acknowledgement and not a
+/// refusal.
+pub(super) async fn emulated(wire: &impl MailboxTransport, station: u16) -> bool {
     let mut configuration = [0];
     let read = wire
-        .read(station, ESC_CONFIGURATION, &mut configuration)
+        .read(station, registers::ESC_CONFIGURATION, &mut configuration)
         .await;
     read.is_ok_and(|count| count == 1) && configuration[0] & DEVICE_EMULATION != 0
 }
 
-/// Sends all devices to `wanted` and waits until the last is there. Errors that devices still hold
-/// are acknowledged first.
+/// Requests `wanted` from all devices and waits until the last one reaches it. Pending errors of
+/// devices are acknowledged first.
 pub async fn change_state(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
@@ -143,10 +148,9 @@ pub async fn change_state(
     wait_state(wire, devices, wanted, timeout).await
 }
 
-/// Sends every device that answers to a lower state, however many do not; the first trouble is told
-/// at the end.
+/// Requests a lower state from every device, even if some fail. Returns the first error at the end.
 pub async fn lower_state(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
@@ -156,7 +160,7 @@ pub async fn lower_state(
         if let Err(error) = request(wire, device, wanted).await {
             let silent = matches!(error, StateError::Wire { .. });
             trouble.get_or_insert(error);
-            // Not a device but the wire: the others would only cost their time-outs.
+            // The wire failed, not a device: the other devices would only time out.
             if silent {
                 break;
             }
@@ -174,8 +178,12 @@ pub async fn lower_state(
     trouble.map_or(Ok(()), Err)
 }
 
-/// Acknowledges an error that the device still holds, then asks for a state.
-async fn request(wire: &impl Wire, device: &DeviceRef, wanted: AlState) -> Result<(), StateError> {
+/// Acknowledges an error that the device still has, then requests a state.
+async fn request(
+    wire: &impl MailboxTransport,
+    device: &DeviceRef,
+    wanted: AlState,
+) -> Result<(), StateError> {
     let failed = |source| StateError::Wire {
         device: device.clone(),
         wanted,
@@ -192,7 +200,7 @@ async fn request(wire: &impl Wire, device: &DeviceRef, wanted: AlState) -> Resul
         write_control(wire, device.station, status & 0x0f | ERROR)
             .await
             .map_err(failed)?;
-        // A request that comes before the device has read the acknowledgement is lost.
+        // A request that arrives before the device has read the acknowledgement is lost.
         for _ in 0..ACKNOWLEDGE_POLLS {
             match read_status(wire, device.station).await.map_err(failed)? {
                 Some((status, _)) if status & ERROR != 0 => wire.delay(POLL).await,
@@ -211,7 +219,7 @@ async fn request(wire: &impl Wire, device: &DeviceRef, wanted: AlState) -> Resul
 
 /// Waits until every device is in `wanted`.
 pub async fn wait_state(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     devices: &[DeviceRef],
     wanted: AlState,
     timeout: Duration,
@@ -259,13 +267,22 @@ pub async fn wait_state(
     Ok(())
 }
 
-async fn write_control(wire: &impl Wire, station: u16, value: u8) -> Result<u16, WireError> {
-    wire.write(station, AL_CONTROL, &[value, 0]).await
+async fn write_control(
+    wire: &impl MailboxTransport,
+    station: u16,
+    value: u8,
+) -> Result<u16, DatagramError> {
+    wire.write(station, registers::AL_CONTROL, &[value, 0])
+        .await
 }
 
-/// The explicit device identification (ETG.1020, "Explicit Device Identification"): requested in
-/// AL control, answered in AL status code. `None` where the device does not offer it.
-pub async fn read_explicit_id(wire: &impl Wire, station: u16) -> Result<Option<u16>, WireError> {
+/// Reads the explicit device identification (ETG.1020, "Explicit Device Identification"). It is
+/// requested in AL control and answered in AL status code. Returns `None` if the device does not
+/// support it.
+pub async fn read_explicit_id(
+    wire: &impl MailboxTransport,
+    station: u16,
+) -> Result<Option<u16>, DatagramError> {
     let Some((state, _)) = read_status(wire, station).await? else {
         return Ok(None);
     };
@@ -284,6 +301,6 @@ pub async fn read_explicit_id(wire: &impl Wire, station: u16) -> Result<Option<u
         write_control(wire, station, state & 0x0f).await?;
         Ok(id)
     };
-    // The request is taken back.
-    wire.stop().hold(whole).await
+    // Shielded, because the request must be withdrawn.
+    wire.stop().shield(whole).await
 }

@@ -1,36 +1,32 @@
-//! SYNC0 on every device whose ESI OpMode asks for it.
+//! SYNC0 on every device whose ESI OpMode uses it.
 //!
 //! ethercrab has measured the propagation delays, set offsets and run the static drift
-//! compensation. It would start SYNC0 at a whole multiple of the cycle whatever the ESI says, so
-//! start, shift, cycle and AssignActivate are written here (ETG.1000.4, 6.4.2; ETG.2000, Dc).
+//! compensation. It would start SYNC0 at a whole multiple of the cycle regardless of the ESI.
+//! Therefore start, shift, cycle and AssignActivate are written here (ETG.1000.4, 6.4.2; ETG.2000,
+//! Dc).
 
 use super::device::{read, write};
 use super::{BringUpError, BusDevice, DeviceRef, Step};
 use crate::clock::Nanos;
 use crate::config::Machine;
-use crate::mailbox::Wire;
+use crate::datagram::DatagramClient;
+use crate::mailbox::MailboxTransport;
 use crate::rt::phase::ClockPlan;
-use crate::wire::Datagrams;
+use ecaxis_ecat::registers;
 
 const STEP: &str = "starting SYNC0";
-const SYSTEM_TIME: u16 = 0x0910;
-/// 0x0980 cyclic unit control, 0x0981 activation.
-pub(crate) const ACTIVATION: u16 = 0x0980;
-const START_TIME: u16 = 0x0990;
-const SYNC0_CYCLE: u16 = 0x09a0;
-const SYNC1_CYCLE: u16 = 0x09a4;
 
-/// The first pulse must still lie ahead when the last device has been told of it.
+/// The first pulse must still be in the future when the last device receives its start time.
 const START_DELAY: Nanos = 100_000_000;
 const START_DELAY_PER_DEVICE: Nanos = 5_000_000;
-/// So much of it must be left when the last one knows.
+/// The minimum of that delay left after the last device was configured.
 const START_MARGIN: Nanos = 10_000_000;
-/// Lost datagrams can use the delay up; then again, with more.
+/// Lost datagrams can use up the delay; then the start is repeated with a longer one.
 const TRIES: u32 = 3;
 
-/// `None` where no device asks for distributed clocks.
+/// Returns `None` if no device uses distributed clocks.
 pub(super) async fn configure(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     machine: &Machine,
     devices: &[BusDevice],
     progress: &mut dyn FnMut(Step),
@@ -61,14 +57,21 @@ pub(super) async fn configure(
         let now = system_time(wire, reference).await?;
         let start = (now.wrapping_add(ahead) / cycle + 1).wrapping_mul(cycle);
         for (dc, device) in &wanting {
-            write(wire, device, STEP, ACTIVATION, &[0, 0]).await?;
+            write(wire, device, STEP, registers::DC_CYCLIC_CONTROL, &[0, 0]).await?;
             let first = start.wrapping_add_signed(i64::from(dc.sync0_shift_ns));
-            write(wire, device, STEP, START_TIME, &first.to_le_bytes()).await?;
             write(
                 wire,
                 device,
                 STEP,
-                SYNC0_CYCLE,
+                registers::DC_START_TIME,
+                &first.to_le_bytes(),
+            )
+            .await?;
+            write(
+                wire,
+                device,
+                STEP,
+                registers::DC_SYNC0_CYCLE,
                 &dc.sync0_cycle_ns.to_le_bytes(),
             )
             .await?;
@@ -76,7 +79,7 @@ pub(super) async fn configure(
                 wire,
                 device,
                 STEP,
-                SYNC1_CYCLE,
+                registers::DC_SYNC1_CYCLE,
                 &dc.sync1_cycle_ns.to_le_bytes(),
             )
             .await?;
@@ -84,17 +87,17 @@ pub(super) async fn configure(
                 wire,
                 device,
                 STEP,
-                ACTIVATION,
+                registers::DC_CYCLIC_CONTROL,
                 &dc.assign_activate.to_le_bytes(),
             )
             .await?;
         }
-        // A device that is told of a start in the past never gives a pulse.
+        // A device with a start time in the past never generates a pulse.
         let shifts = || wanting.iter().map(|(dc, _)| i64::from(dc.sync0_shift_ns));
         let first = start.wrapping_add_signed(shifts().min().unwrap_or(0));
-        let told = system_time(wire, reference).await?;
-        tracing::debug!(start, told, "SYNC0 started");
-        if told.wrapping_add(START_MARGIN) < first {
+        let reported = system_time(wire, reference).await?;
+        tracing::debug!(start, reported, "SYNC0 started");
+        if reported.wrapping_add(START_MARGIN) < first {
             progress(Step::Clocks {
                 reference: reference.at.name.clone(),
                 devices: wanting.len(),
@@ -112,29 +115,33 @@ pub(super) async fn configure(
     })
 }
 
-/// Ends SYNC0 and SYNC1 of devices that are in PreOp or Init again: it is a sign of somebody who drives the segment.
-pub(crate) async fn stop(wire: &impl Wire, stations: impl Iterator<Item = u16>) {
+/// Stops SYNC0 and SYNC1 of devices that are back in PreOp or Init. Active pulses would indicate a
+/// running MainDevice.
+pub(crate) async fn stop(wire: &impl MailboxTransport, stations: impl Iterator<Item = u16>) {
     for station in stations {
-        // The segment goes to Init all the same.
-        if let Err(error) = wire.write(station, ACTIVATION, &[0, 0]).await {
+        // On an error, the segment still goes to Init.
+        if let Err(error) = wire
+            .write(station, registers::DC_CYCLIC_CONTROL, &[0, 0])
+            .await
+        {
             tracing::debug!("SYNC0 goes on: {error}");
             break;
         }
     }
 }
 
-/// Sets the clocks anew, by the first device that has one. ethercrab takes the first that has receive times for the reference; where that one
-/// has no system time, everybody else has been told of a time of zero.
-pub(super) async fn set_anew(wire: &Datagrams, devices: &[BusDevice]) -> Result<(), BringUpError> {
+/// Sets the clocks again, with the first device that has a system time as reference. ethercrab uses
+/// the first device with receive times. If that device has no system time, ethercrab has given all
+/// other devices a time of zero.
+pub(super) async fn set_again(
+    wire: &DatagramClient,
+    devices: &[BusDevice],
+) -> Result<(), BringUpError> {
     const STEP: &str = "setting the clocks";
-    const RECEIVE_TIMES: u16 = 0x0900;
-    const RECEIVE_TIME: u16 = 0x0918;
-    const OFFSET: u16 = 0x0920;
-    const DELAY: u16 = 0x0928;
-    const SPEED_START: u16 = 0x0930;
-    /// As after reset; writing it starts the loop anew, from the bare crystal.
+    /// The value after reset; writing it restarts the control loop at the frequency of the
+    /// oscillator.
     const DEFAULT_SPEED_START: u16 = 0x1000;
-    /// As many as ethercrab sends.
+    /// The number that ethercrab sends.
     const STATIC_SYNC_CYCLES: u32 = 1_000;
 
     let clocks = || devices.iter().filter(|device| device.dc);
@@ -147,28 +154,70 @@ pub(super) async fn set_anew(wire: &Datagrams, devices: &[BusDevice]) -> Result<
     };
     for device in clocks() {
         let start = DEFAULT_SPEED_START.to_le_bytes();
-        write(wire, device, STEP, SPEED_START, &start).await?;
-        write(wire, device, STEP, DELAY, &delay(device).to_le_bytes()).await?;
+        write(
+            wire,
+            device,
+            STEP,
+            registers::DC_SPEED_COUNTER_START,
+            &start,
+        )
+        .await?;
+        write(
+            wire,
+            device,
+            STEP,
+            registers::DC_SYSTEM_TIME_DELAY,
+            &delay(device).to_le_bytes(),
+        )
+        .await?;
     }
     let failed = |source| BringUpError::Wire {
         device: reference.at.clone(),
         step: STEP,
         source,
     };
-    wire.write_all(RECEIVE_TIMES, &[0; 4])
+    wire.write_all(registers::DC_RECEIVE_TIME, &[0; 4])
         .await
         .map_err(failed)?;
     let mut offset = [0; 8];
-    read(wire, reference, STEP, OFFSET, &mut offset).await?;
+    read(
+        wire,
+        reference,
+        STEP,
+        registers::DC_SYSTEM_TIME_OFFSET,
+        &mut offset,
+    )
+    .await?;
     let mut local = [0; 8];
-    read(wire, reference, STEP, RECEIVE_TIME, &mut local).await?;
+    read(
+        wire,
+        reference,
+        STEP,
+        registers::DC_RECEIVE_TIME_UNIT,
+        &mut local,
+    )
+    .await?;
     // The system time at which the frame was at the reference clock.
     let then = u64::from_le_bytes(local).wrapping_add(u64::from_le_bytes(offset));
     for device in clocks().filter(|device| device.at != reference.at) {
-        read(wire, device, STEP, RECEIVE_TIME, &mut local).await?;
+        read(
+            wire,
+            device,
+            STEP,
+            registers::DC_RECEIVE_TIME_UNIT,
+            &mut local,
+        )
+        .await?;
         let there = then.wrapping_add(u64::from(delay(device)));
         let offset = there.wrapping_sub(u64::from_le_bytes(local));
-        write(wire, device, STEP, OFFSET, &offset.to_le_bytes()).await?;
+        write(
+            wire,
+            device,
+            STEP,
+            registers::DC_SYSTEM_TIME_OFFSET,
+            &offset.to_le_bytes(),
+        )
+        .await?;
     }
     for _ in 0..STATIC_SYNC_CYCLES {
         wire.distribute_time(reference.at.station)
@@ -178,13 +227,16 @@ pub(super) async fn set_anew(wire: &Datagrams, devices: &[BusDevice]) -> Result<
     Ok(())
 }
 
-/// Some devices take receive times for others' sake and have no clock beyond that: what they say in 0x0008 is the
-/// same, but 0x0910 does not answer (Beckhoff ESC data sheet, section I, 9.1).
+/// True if the device has a system time. Some devices only latch receive times for the delay
+/// measurement. Their 0x0008 reads the same, but 0x0910 does not answer (Beckhoff ESC data sheet,
+/// section I, 9.1).
 pub(super) async fn has_system_time(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     at: &DeviceRef,
 ) -> Result<bool, BringUpError> {
-    let counter = wire.read(at.station, SYSTEM_TIME, &mut [0; 8]).await;
+    let counter = wire
+        .read(at.station, registers::DC_SYSTEM_TIME, &mut [0; 8])
+        .await;
     counter
         .map(|counter| counter > 0)
         .map_err(|source| BringUpError::Wire {
@@ -194,14 +246,17 @@ pub(super) async fn has_system_time(
         })
 }
 
-async fn system_time(wire: &impl Wire, reference: &BusDevice) -> Result<u64, BringUpError> {
+async fn system_time(
+    wire: &impl MailboxTransport,
+    reference: &BusDevice,
+) -> Result<u64, BringUpError> {
     let mut time = [0; 8];
-    read(wire, reference, STEP, SYSTEM_TIME, &mut time).await?;
+    read(wire, reference, STEP, registers::DC_SYSTEM_TIME, &mut time).await?;
     Ok(u64::from_le_bytes(time))
 }
 
-/// The middle of the longest pause between the SYNC0 pulses of a cycle, nanoseconds after the pulse
-/// without shift: there a frame is as far from every pulse as can be.
+/// Returns the middle of the longest pause between the SYNC0 pulses of a cycle, in ns after the
+/// pulse without shift. A frame there has the largest distance from every pulse.
 fn between_pulses(cycle: u64, shifts: impl Iterator<Item = i64>) -> u64 {
     let period = i64::try_from(cycle).unwrap_or(i64::MAX).max(1);
     let mut pulses: Vec<i64> = shifts.map(|shift| shift.rem_euclid(period)).collect();
@@ -222,7 +277,7 @@ mod tests {
     use super::between_pulses;
 
     #[test]
-    fn frames_pass_in_the_longest_pause() {
+    fn between_pulses_returns_the_longest_pause() {
         for (shifts, expected) in [
             (&[0][..], 500_000),
             (&[500_000], 0),

@@ -1,49 +1,45 @@
-//! The steps of one SubDevice on its way from PreOp to SafeOp.
+//! The steps of one SubDevice from PreOp to SafeOp.
 
+use ecaxis_ecat::registers;
 use ecaxis_esi::layout::SmLayout;
 use ecaxis_esi::{StartupSdo, address};
 
 use super::{BringUpError, BusDevice, DeviceRef, Step};
-use crate::config::{DeviceConfig, StartupWay};
-use crate::mailbox::{CoeClient, ObjectAddress, SdoError, Wire, object_name};
-use crate::rt::image::Region;
+use crate::config::{DeviceConfig, StartupOptions};
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, object_name};
+use crate::rt::image::DeviceRegion;
 
-/// FMMU registers (ETG.1000.4, Table 56): 16 bytes each.
-const FMMU: u16 = 0x0600;
 const FMMU_SIZE: u16 = 16;
-/// One that maps nothing, as all are after a reset.
+/// An FMMU that maps nothing, as after a reset.
 const OFF: [u8; FMMU_SIZE as usize] = [0; FMMU_SIZE as usize];
-/// SyncManager registers (ETG.1000.4, Table 58): 8 bytes each.
-pub(super) const SYNC_MANAGER: u16 = 0x0800;
-pub(super) const SYNC_MANAGER_SIZE: u16 = 8;
 const STATUS: u16 = 5;
 
-/// When start-up SDOs are sent.
+/// The state in which start-up SDOs are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Moment {
-    /// Before SafeOp is asked for: those of Init → PreOp too, which a mailbox can only take now.
+pub(super) enum StartupPhase {
+    /// Before SafeOp is requested. This includes those of Init → PreOp, which need the mailbox.
     InPreOp,
-    /// Before Op is asked for.
+    /// Before Op is requested.
     InSafeOp,
 }
 
-/// Downloads the start-up SDOs of one moment in order. The mailbox is emptied before, because a device may have
-/// sent emergencies while nobody listened.
+/// Downloads the start-up SDOs of one phase in order. The mailbox is emptied first, because the
+/// device may have sent emergencies before.
 pub(super) async fn start_up(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
-    moment: Moment,
+    moment: StartupPhase,
     progress: &mut dyn FnMut(Step),
 ) -> Result<(), BringUpError> {
-    let due = |transition: &str| (transition == "SO") == (moment == Moment::InSafeOp);
+    let due = |transition: &str| (transition == "SO") == (moment == StartupPhase::InSafeOp);
     let list: Vec<_> = config
         .selection
         .startup
         .iter()
         .filter(|sdo| due(sdo.transition))
         .collect();
-    if list.is_empty() && moment == Moment::InSafeOp {
+    if list.is_empty() && moment == StartupPhase::InSafeOp {
         return Ok(());
     }
     let Some(coe) = device.coe.as_mut() else {
@@ -59,13 +55,13 @@ pub(super) async fn start_up(
     for (done, sdo) in list.iter().enumerate() {
         let way = config.startup.way(sdo.index, sdo.sub);
         match start_up_one(wire, &device.at, coe, sdo, way).await? {
-            Done::Held => held += 1,
-            Done::Unreadable => progress(Step::Warning(format!(
+            SdoOutcome::Held => held += 1,
+            SdoOutcome::Unreadable => progress(Step::Warning(format!(
                 "{}: {} cannot be read, so it is not verified",
                 device.at,
                 object(sdo)
             ))),
-            Done::Written => {}
+            SdoOutcome::Written => {}
         }
         progress(Step::StartUp {
             device: config.name.clone(),
@@ -83,39 +79,40 @@ pub(super) async fn start_up(
     Ok(())
 }
 
-/// What became of a start-up SDO.
+/// The result of one start-up SDO.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Done {
-    /// And verified, where that was wanted.
+enum SdoOutcome {
+    /// Written, and verified if requested.
     Written,
-    /// The device held it already.
+    /// The device already had the value.
     Held,
-    /// Written, and not verified: it cannot be read.
+    /// Written, but not verified: the object cannot be read.
     Unreadable,
 }
 
-/// Writes one start-up SDO, unless the device holds it and that is enough; reads it back where that is wanted.
+/// Writes one start-up SDO, unless the device already has the value and that suffices. Reads it
+/// back if requested.
 async fn start_up_one(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     at: &DeviceRef,
     coe: &mut CoeClient,
     sdo: &StartupSdo,
-    way: StartupWay,
-) -> Result<Done, BringUpError> {
+    way: StartupOptions,
+) -> Result<SdoOutcome, BringUpError> {
     if way.skip_equal
         && let Some(now) = read_back(wire, at, coe, sdo).await?
         && holds(sdo, &now)
     {
         tracing::debug!(device = %at, "{} is held already", object(sdo));
-        return Ok(Done::Held);
+        return Ok(SdoOutcome::Held);
     }
     download(wire, at, coe, sdo).await?;
     if !way.verify {
-        return Ok(Done::Written);
+        return Ok(SdoOutcome::Written);
     }
     match read_back(wire, at, coe, sdo).await? {
-        None => Ok(Done::Unreadable),
-        Some(now) if holds(sdo, &now) => Ok(Done::Written),
+        None => Ok(SdoOutcome::Unreadable),
+        Some(now) if holds(sdo, &now) => Ok(SdoOutcome::Written),
         Some(now) => Err(BringUpError::NotHeld {
             device: at.clone(),
             object: object(sdo),
@@ -126,9 +123,9 @@ async fn start_up_one(
     }
 }
 
-/// What the device holds; `None` where it does not let it be read.
+/// Returns the device's value; `None` if the object cannot be read.
 async fn read_back(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     at: &DeviceRef,
     coe: &mut CoeClient,
     sdo: &StartupSdo,
@@ -143,7 +140,7 @@ async fn read_back(
     }
 }
 
-/// By complete access a device may tell more than was written.
+/// True if the device has the value. By complete access, a device may return more than was written.
 fn holds(sdo: &StartupSdo, now: &[u8]) -> bool {
     if sdo.complete_access {
         now.starts_with(&sdo.data)
@@ -152,11 +149,11 @@ fn holds(sdo: &StartupSdo, now: &[u8]) -> bool {
     }
 }
 
-/// `0x6065:00 (Following error window)`, with the ESI's name where it has one.
+/// Formats `0x6065:00 (Following error window)`, with the ESI's name if there is one.
 fn object(sdo: &StartupSdo) -> String {
     let (index, sub) = (sdo.index, sdo.sub);
     if sdo.name.is_empty() {
-        return ObjectAddress { index, sub }.to_string();
+        return NamedObject { index, sub }.to_string();
     }
     format!("{} ({})", address(index, sub), sdo.name)
 }
@@ -184,7 +181,7 @@ fn failed(at: &DeviceRef, sdo: &StartupSdo, source: SdoError) -> BringUpError {
 
 /// Downloads one start-up SDO.
 pub(super) async fn download(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     at: &DeviceRef,
     coe: &mut CoeClient,
     sdo: &StartupSdo,
@@ -200,7 +197,7 @@ pub(super) async fn download(
     Ok(())
 }
 
-/// Little-endian bytes as a user writes the number.
+/// Formats little-endian bytes as a number.
 fn format_value(data: &[u8]) -> String {
     if data.len() > 8 {
         return format!("{} bytes", data.len());
@@ -212,13 +209,13 @@ fn format_value(data: &[u8]) -> String {
     format!("0x{value:0width$x}", width = data.len() * 2)
 }
 
-/// Configures the SyncManagers of the process data, and one FMMU for each; and the one of the mailbox's status, to be read at
-/// `status`. Outputs and inputs start at the same logical address.
+/// Configures the SyncManagers of the process data with one FMMU each, and the FMMU of the mailbox
+/// status at `status`. Outputs and inputs start at the same logical address.
 pub(super) async fn map_process_data(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &BusDevice,
-    region: Option<Region>,
+    region: Option<DeviceRegion>,
     status: Option<u32>,
 ) -> Result<(), BringUpError> {
     const READ: u8 = 1;
@@ -229,7 +226,7 @@ pub(super) async fn map_process_data(
     for (sms, kind) in [(&layout.outputs, WRITE), (&layout.inputs, READ)] {
         let mut logical = region.map_or(0, |region| region.logical);
         for sm in sms {
-            let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm.sm);
+            let register = registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm);
             write(
                 wire,
                 device,
@@ -245,21 +242,23 @@ pub(super) async fn map_process_data(
         }
     }
     if let (Some(logical), Some((number, sm))) = (status, config.device.mailbox_status_fmmu()) {
-        // The ESI's number, unless the process data has taken that.
+        // The ESI's number, unless the process data already uses it.
         let number = usize::from(number).max(fmmus.len());
         fmmus.resize(number, OFF);
-        let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm) + STATUS;
+        let register =
+            registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm) + STATUS;
         fmmus.push(fmmu(logical, register, 1, READ));
     }
     for (i, fmmu) in fmmus.iter().enumerate().filter(|(_, fmmu)| **fmmu != OFF) {
-        let register = FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
+        let register =
+            registers::FMMU + FMMU_SIZE * u16::try_from(i).unwrap_or(u16::MAX / FMMU_SIZE);
         write(wire, device, "configuring FMMUs", register, fmmu).await?;
     }
     Ok(())
 }
 
-/// A SyncManager without data stays off: a device refuses an active one of length 0.
-fn sync_manager(sm: &SmLayout) -> [u8; SYNC_MANAGER_SIZE as usize] {
+/// A SyncManager without data stays disabled: devices reject an active one of length 0.
+fn sync_manager(sm: &SmLayout) -> [u8; registers::SYNC_MANAGER_LEN as usize] {
     let [p0, p1] = sm.start_address.to_le_bytes();
     let [n0, n1] = sm.len.to_le_bytes();
     [p0, p1, n0, n1, sm.control_byte, 0, u8::from(sm.len > 0), 0]
@@ -273,9 +272,9 @@ fn fmmu(logical: u32, physical: u16, len: u16, kind: u8) -> [u8; FMMU_SIZE as us
     [l0, l1, l2, l3, n0, n1, 0, 7, p0, p1, 0, kind, 1, 0, 0, 0]
 }
 
-/// A register write that the device must take.
+/// Writes a register; fails if the device does not answer.
 pub(super) async fn write(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &BusDevice,
     step: &'static str,
     register: u16,
@@ -289,9 +288,9 @@ pub(super) async fn write(
     )
 }
 
-/// A register read that the device must answer.
+/// Reads a register; fails if the device does not answer.
 pub(super) async fn read(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &BusDevice,
     step: &'static str,
     register: u16,
@@ -306,7 +305,7 @@ pub(super) async fn read(
 }
 
 fn taken(
-    result: Result<u16, crate::mailbox::WireError>,
+    result: Result<u16, crate::mailbox::DatagramError>,
     device: &BusDevice,
     step: &'static str,
     register: u16,
@@ -329,7 +328,7 @@ fn taken(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mailbox::tests::mischief::Mischief;
+    use crate::mailbox::tests::fault_injection::Mischief;
     use crate::mailbox::tests::server::Server;
     use crate::mailbox::tests::{STATION, block_on, client};
 
@@ -348,13 +347,13 @@ mod tests {
         }
     }
 
-    /// What becomes of one SDO, and how many the device was asked for.
+    /// Returns the result of one SDO, and how many requests the device received.
     fn done(
         sdo: &StartupSdo,
         verify: bool,
         skip_equal: bool,
         mischief: &[Mischief],
-    ) -> (Result<Done, String>, usize) {
+    ) -> (Result<SdoOutcome, String>, usize) {
         let server = Server::new(
             48,
             &[
@@ -368,55 +367,61 @@ mod tests {
             position: 0,
             station: STATION,
         };
-        let way = StartupWay { verify, skip_equal };
+        let way = StartupOptions { verify, skip_equal };
         let done = block_on(start_up_one(&server, &at, &mut client(), sdo, way));
         (done.map_err(|error| error.to_string()), server.log().len())
     }
 
     #[test]
-    fn what_is_held_is_not_written_where_that_is_enough() {
+    fn start_up_sdo_is_skipped_if_the_device_has_the_value() {
         let (same, other) = (sdo(HELD, &[7, 0, 0, 0], ""), sdo(HELD, &[8, 0, 0, 0], ""));
-        assert_eq!(done(&same, false, true, &[]), (Ok(Done::Held), 1));
-        assert_eq!(done(&same, true, true, &[]), (Ok(Done::Held), 1));
-        assert_eq!(done(&same, false, false, &[]), (Ok(Done::Written), 1));
-        assert_eq!(done(&other, false, true, &[]), (Ok(Done::Written), 2));
-        assert_eq!(done(&other, true, true, &[]), (Ok(Done::Written), 3));
+        assert_eq!(done(&same, false, true, &[]), (Ok(SdoOutcome::Held), 1));
+        assert_eq!(done(&same, true, true, &[]), (Ok(SdoOutcome::Held), 1));
+        assert_eq!(done(&same, false, false, &[]), (Ok(SdoOutcome::Written), 1));
+        assert_eq!(done(&other, false, true, &[]), (Ok(SdoOutcome::Written), 2));
+        assert_eq!(done(&other, true, true, &[]), (Ok(SdoOutcome::Written), 3));
     }
 
     #[test]
-    fn what_is_written_and_not_held_is_told_with_its_name() {
+    fn verification_failure_names_the_object() {
         let forgets = [Mischief::Forgetful];
         let known = sdo(HELD, &[8, 0, 0, 0], "");
-        let (told, _) = done(&known, true, false, &forgets);
-        let told = told.expect_err("it holds another value");
+        let (reported, _) = done(&known, true, false, &forgets);
+        let reported = reported.expect_err("it holds another value");
         assert!(
-            told.contains("0x6065:00 (Following error window)")
-                && told.contains("0x00000008")
-                && told.contains("0x00000007"),
-            "{told}"
+            reported.contains("0x6065:00 (Following error window)")
+                && reported.contains("0x00000008")
+                && reported.contains("0x00000007"),
+            "{reported}"
         );
         let named = sdo(HELD, &[8, 0, 0, 0], "Window");
-        let told = done(&named, true, false, &forgets).0.expect_err("likewise");
-        assert!(told.contains("0x6065:00 (Window)"), "{told}");
-        assert_eq!(done(&known, false, false, &forgets), (Ok(Done::Written), 1));
+        let reported = done(&named, true, false, &forgets).0.expect_err("likewise");
+        assert!(reported.contains("0x6065:00 (Window)"), "{reported}");
+        assert_eq!(
+            done(&known, false, false, &forgets),
+            (Ok(SdoOutcome::Written), 1)
+        );
     }
 
     #[test]
-    fn what_cannot_be_read_is_written_and_that_is_said() {
+    fn unreadable_start_up_sdo_is_written_and_reported() {
         let secret = sdo(WRITE_ONLY, &[1], "");
         let hidden = [Mischief::WriteOnly(WRITE_ONLY.0)];
         assert_eq!(
             done(&secret, true, true, &hidden),
-            (Ok(Done::Unreadable), 3)
+            (Ok(SdoOutcome::Unreadable), 3)
         );
     }
 
     #[test]
     fn errors_name_the_object() {
         let missing = sdo((0x607d, 2), &[0; 4], "");
-        let told = done(&missing, false, false, &[])
+        let reported = done(&missing, false, false, &[])
             .0
             .expect_err("it is not there");
-        assert!(told.contains("0x607d:02 Max position limit"), "{told}");
+        assert!(
+            reported.contains("0x607d:02 Max position limit"),
+            "{reported}"
+        );
     }
 }

@@ -1,42 +1,46 @@
-//! Who answers, and is it what the machine file says?
+//! Identifies the SubDevices on the bus and compares them with the machine file.
 
+use ecaxis_ecat::registers;
 use ecaxis_esi::model::Identity;
 use ethercrab::error::{Error, TimeoutError};
 use ethercrab::{MainDevice, SubDeviceIdentity};
 
 use super::{BringUpError, DeviceRef, Group, Step, al, scan_error};
 use crate::config::{DeviceConfig, Locator, Machine};
-use crate::mailbox::WireError;
-use crate::wire::Datagrams;
+use crate::datagram::DatagramClient;
+use crate::mailbox::DatagramError;
 
-/// Broadcasts tried before the segment is called silent.
+/// The number of broadcasts before the segment counts as silent.
 const TRIES: u32 = 5;
-/// Station addresses as ethercrab gives them out.
+/// The first station address that ethercrab assigns.
 pub(crate) const FIRST_STATION: u16 = 0x1000;
 
-/// A SubDevice that was scanned.
-struct Present {
+/// A scanned SubDevice.
+struct ScannedDevice {
     identity: Identity,
     serial: u32,
     alias: u16,
     station: u16,
 }
 
-/// DL status, for whoever asks later what has changed; 0 where it is not to be had.
-pub(super) async fn dl_status(wire: &Datagrams, position: u16) -> u16 {
+/// Returns DL status, for a later comparison; 0 if it cannot be read.
+pub(super) async fn dl_status(wire: &DatagramClient, position: u16) -> u16 {
     let mut status = [0; 2];
-    match wire.read_at(position, 0x0110, &mut status).await {
+    match wire
+        .read_at(position, registers::DL_STATUS, &mut status)
+        .await
+    {
         Ok(1) => u16::from_le_bytes(status),
         _ => 0,
     }
 }
 
-/// At least one SubDevice answers a broadcast.
-pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
+/// Returns how many SubDevices answer a broadcast; at least one must.
+pub(super) async fn answering(wire: &DatagramClient) -> Result<u16, BringUpError> {
     for _ in 0..TRIES {
         match wire.count().await {
             Ok(count) if count > 0 => return Ok(count),
-            Ok(_) | Err(WireError::Timeout { .. }) => {}
+            Ok(_) | Err(DatagramError::Timeout { .. }) => {}
             Err(error) => {
                 return Err(BringUpError::Scan {
                     step: "scanning",
@@ -48,9 +52,9 @@ pub(super) async fn answering(wire: &Datagrams) -> Result<u16, BringUpError> {
     Err(BringUpError::NoAnswer)
 }
 
-/// ethercrab reports that a device did not reach PreOp, but neither which nor why: all devices are asked.
+/// Finds the device that did not reach PreOp, and the reason. ethercrab reports neither.
 pub(super) async fn explain_scan(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     machine: &Machine,
     error: Error,
 ) -> BringUpError {
@@ -67,7 +71,7 @@ pub(super) async fn explain_scan(
         };
         let (status, code) = match al::read_status(wire, station).await {
             Ok(Some(read)) => read,
-            // It is counted, and has no station address: it has lost it since.
+            // The device is counted but no longer has its station address.
             Ok(None) => {
                 unaddressed.get_or_insert(device);
                 continue;
@@ -106,7 +110,7 @@ pub(super) async fn explain_scan(
                 device,
                 wanted: al::AlState::PreOp,
                 actual,
-                timeout: crate::link::port::STATE_TIMEOUT,
+                timeout: crate::link::pdu_loop::STATE_TIMEOUT,
             })
         }
         (error, _) => scan_error("scanning the segment and going to PreOp", &error),
@@ -121,10 +125,10 @@ fn name_at(machine: &Machine, position: u16) -> String {
     device.map_or_else(|| format!("device {position}"), |d| d.name.clone())
 }
 
-/// For each device of the machine file its position on the bus. Every SubDevice must be named and
-/// be what its ESI says.
+/// Returns the bus position of each device in the machine file. Every SubDevice must be named there
+/// and match its ESI.
 pub(super) async fn assign(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     main_device: &MainDevice<'static>,
     group: &Group,
     machine: &Machine,
@@ -132,7 +136,7 @@ pub(super) async fn assign(
 ) -> Result<Vec<u16>, BringUpError> {
     let mut found = Vec::with_capacity(group.len());
     for sub_device in group.iter(main_device) {
-        found.push(Present {
+        found.push(ScannedDevice {
             identity: identity(sub_device.identity()),
             serial: sub_device.identity().serial,
             alias: sub_device.alias_address(),
@@ -175,7 +179,7 @@ pub(super) async fn assign(
     }
 
     for (config, &position) in machine.devices.iter().zip(&order) {
-        let &Present {
+        let &ScannedDevice {
             identity,
             serial,
             station,
@@ -213,7 +217,7 @@ pub(super) async fn assign(
             });
         }
     }
-    for (position, Present { identity, .. }) in found.iter().enumerate() {
+    for (position, ScannedDevice { identity, .. }) in found.iter().enumerate() {
         let position = u16::try_from(position).unwrap_or(u16::MAX);
         if !order.contains(&position) {
             return Err(BringUpError::Unexpected {
@@ -225,9 +229,10 @@ pub(super) async fn assign(
     Ok(order)
 }
 
-/// Devices at positions that are not on the bus. One that is missing in the middle of a tree moves those behind it: where the others
-/// are of the models that the file names, in its order, those are missing that lack between them, and the last ones otherwise.
-fn missing_devices(machine: &Machine, found: &[Present]) -> Vec<String> {
+/// Returns the devices whose positions are missing on the bus. A device missing in the middle of a
+/// tree shifts those behind it. If the found models match the file in order, the gaps are the
+/// missing devices. Otherwise the last ones are missing.
+fn missing_devices(machine: &Machine, found: &[ScannedDevice]) -> Vec<String> {
     let expected: Vec<_> = positions(machine).collect();
     let models = |identity: &Identity| (identity.vendor, identity.product);
     let wanted = expected
@@ -242,7 +247,7 @@ fn missing_devices(machine: &Machine, found: &[Present]) -> Vec<String> {
     missing.copied().map(named).collect()
 }
 
-/// Devices that the file tells by their position, in the order of the segment.
+/// Returns the devices that the file identifies by position, in the order of the segment.
 fn positions(machine: &Machine) -> impl Iterator<Item = (u16, &DeviceConfig)> {
     let mut devices: Vec<_> = machine
         .devices
@@ -260,7 +265,7 @@ fn named((position, config): (u16, &DeviceConfig)) -> String {
     format!("`{}` (position {position})", config.name)
 }
 
-/// Of `wanted`, those that `there` lacks.
+/// Returns the indices of `wanted` that are missing in `there`.
 fn lacking<T: PartialEq>(wanted: &[T], there: &[T]) -> Vec<usize> {
     let mut rest = there.iter().peekable();
     let mut lacking = Vec::new();
@@ -282,8 +287,8 @@ fn not_located(name: &str, locator: String) -> BringUpError {
     }
 }
 
-async fn find_id(wire: &Datagrams, found: &[Present], id: u16) -> Option<usize> {
-    for (position, &Present { station, .. }) in found.iter().enumerate() {
+async fn find_id(wire: &DatagramClient, found: &[ScannedDevice], id: u16) -> Option<usize> {
+    for (position, &ScannedDevice { station, .. }) in found.iter().enumerate() {
         if matches!(al::read_explicit_id(wire, station).await, Ok(Some(actual)) if actual == id) {
             return Some(position);
         }
@@ -299,7 +304,7 @@ fn identity(from: SubDeviceIdentity) -> Identity {
     }
 }
 
-/// An identity with the name that one of the machine's ESI files gives it.
+/// Returns an identity with the name from one of the machine's ESI files.
 fn known(machine: &Machine, identity: Identity) -> String {
     machine
         .devices
@@ -317,7 +322,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_is_missing() {
+    fn lacking_returns_the_missing_devices() {
         for (there, expected) in [
             ("caab", &[][..]),
             ("cab", &[2]),
@@ -325,7 +330,7 @@ mod tests {
             ("cb", &[1, 2]),
             ("aab", &[0]),
             ("", &[0, 1, 2, 3]),
-            // Another one among them: the last ones.
+            // The bus has an unexpected device: the last ones count as missing.
             ("cx", &[2, 3]),
         ] {
             let there = there.as_bytes();

@@ -1,15 +1,15 @@
-//! What a drive itself allows, asked after its start-up SDOs and its units: a limit of the machine
-//! file beyond it is warned of. What would add to every target is set to zero.
+//! The drive's own limits, read after its start-up SDOs and its units. A limit of the machine file
+//! beyond them causes a warning. Objects that would add to every target are set to zero.
 
 use ecaxis_esi::StartupSdo;
 
 use super::{BringUpError, BusDevice, Step, device};
 use crate::config::DeviceConfig;
 use crate::config::drive_limits::{OFFSETS, speed_unit};
-use crate::mailbox::{CoeClient, ObjectAddress, SdoError, Wire};
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError};
 
 pub(super) async fn compare(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
     progress: &mut dyn FnMut(Step),
@@ -23,7 +23,7 @@ pub(super) async fn compare(
     };
     let selection = &config.selection;
     let dictionary = &selection.dictionary;
-    // A drive is asked only for what its ESI has, if that has a dictionary.
+    // Only objects in the ESI's dictionary are read, if the ESI has a dictionary.
     let exists =
         |index, sub| dictionary.objects.is_empty() || dictionary.item(index, sub).is_some();
     let axis = device
@@ -48,7 +48,7 @@ pub(super) async fn compare(
         device.limits.push(conflict);
     }
     for index in OFFSETS {
-        // Those in the process data are written every cycle.
+        // Objects in the process data are written every cycle.
         if !exists(index, 0) || selection.layout.rx_field(index, 0).is_some() {
             continue;
         }
@@ -69,15 +69,15 @@ pub(super) async fn compare(
         progress(Step::Warning(format!(
             "{}: {} was not zero and adds to every target: it is zero now",
             device.at,
-            ObjectAddress { index, sub: 0 }
+            NamedObject { index, sub: 0 }
         )));
     }
     Ok(())
 }
 
-/// `None` where the drive does not have it, or does not let it be read.
+/// Returns `None` if the drive does not have the object or does not allow reading it.
 async fn read(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     coe: &mut CoeClient,
     index: u16,
     sub: u8,

@@ -1,16 +1,15 @@
-//! Where a device's mailboxes are: as ethercrab has set them up from the EEPROM, compared with the
-//! ESI. A mailbox of another length than its SyncManager's is never complete.
+//! The positions of a device's mailboxes, as ethercrab has configured them from the EEPROM,
+//! compared with the ESI. A mailbox whose length differs from its SyncManager's never becomes full.
 
 use ecaxis_esi::model::SmUse;
 
-use super::device::SYNC_MANAGER_SIZE;
 use super::{BringUpError, DeviceRef};
 use crate::config::DeviceConfig;
-use crate::mailbox::{MailboxLayout, Wire};
+use crate::mailbox::{MailboxLayout, MailboxTransport};
 
-/// `None` where the ESI declares no CoE mailbox.
+/// Returns `None` if the ESI declares no CoE mailbox.
 pub(super) async fn open(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &DeviceRef,
 ) -> Result<Option<MailboxLayout>, BringUpError> {
@@ -44,7 +43,7 @@ pub(super) async fn open(
     }))
 }
 
-/// Number, and address and length, of the first SyncManager of this use.
+/// Returns number, address and length of the first SyncManager with this use.
 fn find(config: &DeviceConfig, usage: SmUse) -> Option<(u8, (u16, u16))> {
     let sms = &config.device.sync_managers;
     let (number, sm) = sms.iter().enumerate().find(|(_, sm)| sm.usage == usage)?;
@@ -54,9 +53,14 @@ fn find(config: &DeviceConfig, usage: SmUse) -> Option<(u8, (u16, u16))> {
     ))
 }
 
-async fn read(wire: &impl Wire, device: &DeviceRef, sm: u8) -> Result<(u16, u16), BringUpError> {
+async fn read(
+    wire: &impl MailboxTransport,
+    device: &DeviceRef,
+    sm: u8,
+) -> Result<(u16, u16), BringUpError> {
     const STEP: &str = "reading the mailbox SyncManagers";
-    let register = super::device::SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm);
+    let register = ecaxis_ecat::registers::SYNC_MANAGER
+        + ecaxis_ecat::registers::SYNC_MANAGER_LEN * u16::from(sm);
     let mut bytes = [0; 4];
     match wire.read(device.station, register, &mut bytes).await {
         Ok(1) => {

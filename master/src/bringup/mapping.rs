@@ -1,17 +1,17 @@
-//! What the device has made of its PDO assignment and mapping, read back and compared with the
-//! layout that the cycle will use. One bit off and a set-point lands in another object.
+//! The device's actual PDO assignment and mapping, read back and compared with the layout that the
+//! cycle will use. With one bit of offset, a set-point would reach another object.
 
 use ecaxis_esi::model::Pdo;
 
 use super::{BringUpError, BusDevice};
 use crate::config::DeviceConfig;
-use crate::mailbox::{SdoError, Wire};
+use crate::mailbox::{MailboxTransport, SdoError};
 
-/// PDO assignment of SyncManager n is 0x1C10 + n (ETG.1000.6, Table 67).
+/// The PDO assignment of SyncManager n is 0x1C10 + n (ETG.1000.6, Table 67).
 const ASSIGNMENT: u16 = 0x1c10;
 
 pub(super) async fn compare(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     config: &DeviceConfig,
     device: &mut BusDevice,
 ) -> Result<(), BringUpError> {
@@ -24,8 +24,8 @@ pub(super) async fn compare(
         for sm in sms {
             let index = ASSIGNMENT + u16::from(sm.sm);
             let Some(list) = read_list(wire, device, index).await? else {
-                // A device with a fixed assignment need not show it; it checks the lengths itself
-                // on its way to SafeOp.
+                // A device with a fixed assignment may hide it; it checks the lengths itself on the
+                // way to SafeOp.
                 return Ok(());
             };
             assigned.extend(list.into_iter().map(|pdo| (index, pdo)));
@@ -49,7 +49,7 @@ pub(super) async fn compare(
 }
 
 async fn compare_contents(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &mut BusDevice,
     pdo: &Pdo,
 ) -> Result<(), BringUpError> {
@@ -67,10 +67,10 @@ async fn compare_contents(
     Ok(())
 }
 
-/// Subindices 1 to n of an array that counts itself in subindex 0. `None` where the device has no
+/// Reads subindices 1 to n of an array with n in subindex 0. Returns `None` if the device has no
 /// such object or no CoE mailbox.
 async fn read_list(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &mut BusDevice,
     index: u16,
 ) -> Result<Option<Vec<u32>>, BringUpError> {
@@ -89,7 +89,7 @@ async fn read_list(
 }
 
 async fn read(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &mut BusDevice,
     index: u16,
     sub: u8,

@@ -1,9 +1,10 @@
-//! From a silent wire to SafeOp. MAY BLOCK AND ALLOCATE.
+//! Bring-up, from power-up to SafeOp. MAY BLOCK AND ALLOCATE.
 //!
 //! ethercrab scans, addresses, reads the EEPROMs, sets up mailboxes, measures propagation delays
-//! and goes to PreOp. Ours are the comparison with the machine file, the start-up SDOs, SyncManagers
-//! and FMMUs of the process data, SYNC0, watchdogs and the further state changes, because those
-//! need the ESI or must name the device when they fail.
+//! and requests PreOp. This module does the rest: it compares the bus with the machine file and
+//! writes start-up SDOs. It also sets up the process data's SyncManagers and FMMUs, SYNC0,
+//! watchdogs and the further states. These steps need the ESI or must name the device when they
+//! fail.
 
 #![allow(
     clippy::result_large_err,
@@ -12,42 +13,43 @@
 
 use std::fmt;
 
+use ecaxis_ecat::registers;
 use ethercrab::{DcSupport, MainDevice, SubDeviceGroup};
 
 use ecaxis_esi::address;
 
 use crate::clock;
-use crate::config::{Adopted, LimitConflict, Machine, UnitProblem};
-use crate::mailbox::desk::Listen;
-use crate::mailbox::{CoeClient, SdoError, WireError};
+use crate::config::{AdoptedUnits, LimitConflict, Machine, UnitProblem};
+use crate::datagram::DatagramClient;
+use crate::mailbox::worker::EmergencySink;
+use crate::mailbox::{CoeClient, DatagramError, SdoError};
 use crate::rt::image::{self, ImagePlan};
 use crate::rt::phase::ClockPlan;
-use crate::wire::Datagrams;
-use crate::words::counted;
+use crate::text::pluralize;
 
 pub mod al;
 pub(crate) mod clocks;
 mod device;
-mod held;
 mod identify;
+mod output_defaults;
 pub(crate) use identify::FIRST_STATION;
+pub(crate) mod drive_units;
 mod limits;
 mod mailbox;
 mod mapping;
-pub(crate) mod units;
 mod watchdog;
 
 pub use al::{AlState, StateError};
-use device::Moment;
+use device::StartupPhase;
 
-/// SubDevices that ethercrab keeps in one group; a power of two.
+/// The maximum number of SubDevices in ethercrab's group; a power of two.
 pub(crate) const MAX_SUBDEVICES: usize = 512;
-/// ethercrab's own process image, which stays unused.
+/// The size of ethercrab's own process image, which is not used.
 const MAX_PDI: usize = 1;
 
 type Group = SubDeviceGroup<MAX_SUBDEVICES, MAX_PDI>;
 
-/// Which SubDevice an error is about.
+/// The SubDevice that an error refers to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeviceRef {
     pub name: String,
@@ -69,17 +71,18 @@ impl fmt::Display for DeviceRef {
 #[derive(Debug)]
 pub struct BusDevice {
     pub at: DeviceRef,
-    /// `None` where the device has no CoE mailbox, and once its mailbox is looked after beside the cycle.
+    /// `None` without a CoE mailbox, and once a mailbox worker owns the mailbox.
     pub coe: Option<CoeClient>,
-    /// It has a system time: not every one that says so in 0x0008 has it switched on.
+    /// True if the device has a system time: not every device that reports one in 0x0008 has it
+    /// enabled.
     pub dc: bool,
     /// Outputs that no axis drives and that must not be zero: index, subindex, value.
     pub held: Vec<(u16, u8, i64)>,
-    /// Of a drive: its axis, as the drive's own units make it.
-    pub adopted: Option<Box<Adopted>>,
-    /// Of a drive: its own limits that the machine file exceeds.
+    /// For a drive: its axis in the drive's own units.
+    pub adopted: Option<Box<AdoptedUnits>>,
+    /// For a drive: its own limits that the machine file exceeds.
     pub limits: Vec<LimitConflict>,
-    /// From the reference clock, nanoseconds.
+    /// Propagation delay from the reference clock in ns.
     pub propagation_delay: u32,
     /// DL status (0x0110) after the scan: which ports are in use.
     pub dl_status: u16,
@@ -94,7 +97,7 @@ pub struct Bus {
     pub dc: Option<ClockPlan>,
 }
 
-/// What is being done, for the user to see.
+/// A step of the bring-up, for display.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
     Scan,
@@ -106,7 +109,7 @@ pub enum Step {
         done: usize,
         of: usize,
     },
-    /// Start-up SDOs that the device held already.
+    /// Start-up SDOs whose values the device already had.
     Held {
         device: String,
         held: usize,
@@ -121,12 +124,12 @@ pub enum Step {
         devices: usize,
     },
     State(AlState),
-    /// A unit that is the drive's own word.
+    /// A unit taken over from the drive.
     Adopted {
         device: String,
         what: String,
     },
-    /// The bus comes up all the same.
+    /// A warning; the bring-up continues.
     Warning(String),
 }
 
@@ -154,15 +157,15 @@ impl fmt::Display for Step {
                 write!(
                     f,
                     "process image: {} in {}",
-                    counted(*bytes, "byte"),
-                    counted(*frames, "frame")
+                    pluralize(*bytes, "byte"),
+                    pluralize(*frames, "frame")
                 )
             }
             Self::Clocks { reference, devices } => {
                 write!(
                     f,
                     "distributed clocks: `{reference}` is the reference, SYNC0 on {}",
-                    counted(*devices, "device")
+                    pluralize(*devices, "device")
                 )
             }
             Self::State(state) => write!(f, "all SubDevices in {state}"),
@@ -172,7 +175,7 @@ impl fmt::Display for Step {
     }
 }
 
-/// The first of many.
+/// Returns the first names of a list, and how many follow.
 fn few(names: &[String]) -> String {
     const FEW: usize = 3;
     let first = names.iter().take(FEW).map(String::as_str);
@@ -183,7 +186,7 @@ fn few(names: &[String]) -> String {
     }
 }
 
-/// Why the bus did not come up.
+/// Why the bring-up failed.
 #[derive(Debug, thiserror::Error)]
 pub enum BringUpError {
     #[error("no SubDevice answers")]
@@ -208,7 +211,7 @@ pub enum BringUpError {
         esi: String,
         expected: String,
         found: String,
-        /// Expected and found, where nothing else differs.
+        /// The expected and the found revision, if nothing else differs.
         revisions: Option<(u32, u32)>,
     },
     #[error(
@@ -274,7 +277,7 @@ pub enum BringUpError {
     Wire {
         device: DeviceRef,
         step: &'static str,
-        source: WireError,
+        source: DatagramError,
     },
     #[error("{device}: {step}: register 0x{register:04x} did not take the write")]
     NotTaken {
@@ -292,7 +295,9 @@ pub enum BringUpError {
     },
     #[error("{device}: the ESI asks for SYNC0, the device has no distributed clock")]
     NoClock { device: DeviceRef },
-    #[error("{device}: starting SYNC0: telling all devices takes longer than the start lies ahead")]
+    #[error(
+        "{device}: starting SYNC0: writing the start time to all devices takes longer than the time until the start"
+    )]
     NoStart { device: DeviceRef },
     #[error("{device}: the mailbox is at {actual}, the ESI says {expected}")]
     MailboxMoved {
@@ -309,15 +314,16 @@ fn list(problems: &[UnitProblem]) -> String {
     each.join("; ")
 }
 
-/// Brings the segment from whatever it is in to SafeOp. The listener is told what devices say unasked, whether that succeeds or not.
+/// Brings the segment from any state to SafeOp. Passes emergencies of the devices to the listener,
+/// on success and on failure.
 pub async fn bring_up(
     main_device: &'static MainDevice<'static>,
     machine: &Machine,
     image: ImagePlan,
     progress: &mut dyn FnMut(Step),
-    listener: &dyn Listen,
+    listener: &dyn EmergencySink,
 ) -> Result<Bus, BringUpError> {
-    let wire = Datagrams::new(main_device);
+    let wire = DatagramClient::new(main_device);
     progress(Step::Scan);
     identify::answering(&wire).await?;
 
@@ -334,7 +340,7 @@ pub async fn bring_up(
     });
 
     let mut devices = Vec::with_capacity(order.len());
-    // Everybody with receive times, and whether there is a clock behind them.
+    // All devices with receive times, and whether they have a system time.
     let mut timed = Vec::new();
     for (config, &position) in machine.devices.iter().zip(&order) {
         let sub_device = group
@@ -370,35 +376,35 @@ pub async fn bring_up(
     }
 
     if timed.iter().min().is_some_and(|(_, clock)| !clock) {
-        clocks::set_anew(&wire, &devices).await?;
+        clocks::set_again(&wire, &devices).await?;
     }
 
-    // From here on ethercrab only carries datagrams; see docs/decisions/0001.
+    // From here on, ethercrab only carries datagrams; see docs/decisions/0001.
     drop(group);
     let set_up = set_up(&wire, machine, image, &mut devices, progress, listener).await;
     for device in &devices {
-        device.tell(listener);
+        device.report(listener);
     }
     let (image, dc) = set_up?;
     Ok(Bus { devices, image, dc })
 }
 
-/// From PreOp to SafeOp.
+/// Takes the segment from PreOp to SafeOp.
 async fn set_up(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     machine: &Machine,
     mut image: ImagePlan,
     devices: &mut [BusDevice],
     progress: &mut dyn FnMut(Step),
-    listener: &dyn Listen,
+    listener: &dyn EmergencySink,
 ) -> Result<(ImagePlan, Option<ClockPlan>), BringUpError> {
     for (config, device) in machine.devices.iter().zip(&mut *devices) {
-        device::start_up(wire, config, device, Moment::InPreOp, progress).await?;
+        device::start_up(wire, config, device, StartupPhase::InPreOp, progress).await?;
         mapping::compare(wire, config, device).await?;
-        units::compare(wire, config, device, progress).await?;
+        drive_units::compare(wire, config, device, progress).await?;
         limits::compare(wire, config, device, progress).await?;
-        held::read(wire, config, device).await?;
-        device.tell(listener);
+        output_defaults::read(wire, config, device).await?;
+        device.report(listener);
     }
 
     if let Some(without) = without_lrw(wire, machine, devices).await? {
@@ -422,41 +428,41 @@ async fn set_up(
     al::change_state(wire, &at, AlState::SafeOp, al::SAFE_OP_TIMEOUT).await?;
     progress(Step::State(AlState::SafeOp));
     for (config, device) in machine.devices.iter().zip(devices) {
-        device::start_up(wire, config, device, Moment::InSafeOp, progress).await?;
+        device::start_up(wire, config, device, StartupPhase::InSafeOp, progress).await?;
     }
     Ok((image, dc))
 }
 
 impl BusDevice {
-    /// What it has said unasked.
-    fn tell(&self, listener: &dyn Listen) {
+    /// Passes the device's emergencies to the listener.
+    fn report(&self, listener: &dyn EmergencySink) {
         if let Some(coe) = &self.coe {
             listener.listen(&self.at.name, &coe.emergencies());
         }
     }
 }
 
-/// The image with the devices whose controllers say that they know no LRW (0x0008 bit 9) beyond those of which the ESI says so;
-/// `None` if there are none. Everything lies where it lay.
+/// Returns the image without LRW for devices whose controllers report no LRW (0x0008 bit 9), in
+/// addition to those declared by the ESI. Returns `None` if there are none. The positions in the
+/// image do not change.
 async fn without_lrw(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     machine: &Machine,
     devices: &[BusDevice],
 ) -> Result<Option<ImagePlan>, BringUpError> {
-    const FEATURES: u16 = 0x0008;
     const NO_LRW: u16 = 1 << 9;
     let mut process_data = image::process_data(machine);
     let mut more = false;
     for (device, data) in devices.iter().zip(&mut process_data) {
         let mut features = [0; 2];
         let step = "reading what its controller can do";
-        device::read(wire, device, step, FEATURES, &mut features).await?;
+        device::read(wire, device, step, registers::FEATURES, &mut features).await?;
         if data.lrw && u16::from_le_bytes(features) & NO_LRW != 0 {
             data.lrw = false;
             more = true;
         }
     }
-    // Each that is taken out of an LRW fits into a frame by itself.
+    // Each device removed from an LRW fits into a frame of its own.
     Ok(more.then(|| image::plan(&process_data).ok()).flatten())
 }
 
@@ -468,7 +474,7 @@ fn scan_error(step: &'static str, error: &ethercrab::error::Error) -> BringUpErr
 }
 
 impl Bus {
-    /// Every device's address, in the order of the machine file.
+    /// Returns every device's address, in the order of the machine file.
     #[must_use]
     pub fn addresses(&self) -> Vec<DeviceRef> {
         self.devices.iter().map(|d| d.at.clone()).collect()

@@ -1,27 +1,24 @@
-//! The watchdogs of a SubDevice (ETG.1000.4, tables 52 to 56): a drive whose outputs do not come
-//! leaves Op by itself. What a drive's watchdog consists of is read back: without it, nothing stops
-//! the drive when this computer dies.
+//! The watchdogs of a SubDevice (ETG.1000.4, tables 52 to 56): a drive that receives no outputs
+//! leaves Op by itself. The settings of a drive's watchdog are read back: without the watchdog,
+//! nothing stops the drive if this host fails.
 
-use super::device::{SYNC_MANAGER, SYNC_MANAGER_SIZE};
 use super::{BringUpError, BusDevice, Step};
 use crate::config::{Bus, DeviceConfig};
-use crate::mailbox::{Wire, WireError};
+use crate::mailbox::{DatagramError, MailboxTransport};
+use ecaxis_ecat::registers;
 
-const DIVIDER: u16 = 0x0400;
-const PDI: u16 = 0x0410;
-const PROCESS_DATA: u16 = 0x0420;
 /// ControlByte of a SyncManager, and its bit 6: writing its area triggers the watchdog.
 const CONTROL: u16 = 4;
 const TRIGGER: u8 = 0x40;
 
 const STEP: &str = "setting the watchdogs";
 
-/// Writes the watchdogs' times and reads them back.
+/// Writes the watchdog times and reads them back.
 ///
 /// # Errors
-/// An axis' device does not hold its divider, its process data time or its trigger.
+/// Fails if an axis' device does not keep its divider, its process data time or its trigger.
 pub(super) async fn set(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     bus: &Bus,
     config: &DeviceConfig,
     device: &BusDevice,
@@ -31,10 +28,18 @@ pub(super) async fn set(
     let outputs = &config.selection.layout.outputs;
     let is_watched = outputs.iter().any(|sm| sm.control_byte & TRIGGER != 0);
     for (register, what, value) in [
-        (DIVIDER, "the watchdogs' divider", Bus::WATCHDOG_DIVIDER),
-        (PDI, "the PDI watchdog's time", Bus::PDI_WATCHDOG),
         (
-            PROCESS_DATA,
+            registers::WATCHDOG_DIVIDER,
+            "the watchdogs' divider",
+            Bus::WATCHDOG_DIVIDER,
+        ),
+        (
+            registers::WATCHDOG_TIME_PDI,
+            "the registers::WATCHDOG_TIME_PDI watchdog's time",
+            Bus::PDI_WATCHDOG,
+        ),
+        (
+            registers::WATCHDOG_TIME_PROCESS_DATA,
             "the process data watchdog's time",
             bus.process_data_watchdog(),
         ),
@@ -56,11 +61,12 @@ pub(super) async fn set(
         if found == Some(wanted) {
             continue;
         }
-        // The PDI watchdog reports a hung processor and stops nothing.
-        if has_axis && register != PDI {
+        // The PDI watchdog reports a hung processor but stops nothing.
+        if has_axis && register != registers::WATCHDOG_TIME_PDI {
             return Err(differs);
         }
-        // A controller without these registers watches nothing; one that nothing triggers neither.
+        // A controller without these registers has no watchdog, and one without a trigger never
+        // starts.
         if found.is_some() && is_watched {
             progress(Step::Warning(differs.to_string()));
         }
@@ -69,7 +75,8 @@ pub(super) async fn set(
         return Ok(());
     }
     for sm in outputs {
-        let register = SYNC_MANAGER + SYNC_MANAGER_SIZE * u16::from(sm.sm) + CONTROL;
+        let register =
+            registers::SYNC_MANAGER + registers::SYNC_MANAGER_LEN * u16::from(sm.sm) + CONTROL;
         let found: Option<[u8; 1]> = read(wire, device, register).await?;
         if found.is_none_or(|[control]| control & TRIGGER == 0) {
             return Err(BringUpError::Watchdog {
@@ -84,9 +91,9 @@ pub(super) async fn set(
     Ok(())
 }
 
-/// `None` where the device has no such register.
+/// Returns `None` if the device has no such register.
 async fn read<const N: usize>(
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &BusDevice,
     register: u16,
 ) -> Result<Option<[u8; N]>, BringUpError> {
@@ -96,7 +103,7 @@ async fn read<const N: usize>(
     Ok((answered == 1).then_some(data))
 }
 
-fn lost(device: &BusDevice, source: WireError) -> BringUpError {
+fn lost(device: &BusDevice, source: DatagramError) -> BringUpError {
     BringUpError::Wire {
         device: device.at.clone(),
         step: STEP,

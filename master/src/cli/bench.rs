@@ -1,4 +1,4 @@
-//! `ecaxis bench`: measures the cycle on this computer, and compares.
+//! `ecaxis bench`: measures and compares the cycle on this computer.
 
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
@@ -6,20 +6,20 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use ecaxis::bench::bus::{Hold, Mischief};
-use ecaxis::bench::compare::{self, BenchError, Watcher};
-use ecaxis::bench::plan::{Against, Plan, Target, exchange_name};
-use ecaxis::bench::{host, html, rig, text, veth};
+use ecaxis::bench::bus::{FaultInjection, ReplyDelay};
+use ecaxis::bench::plan::{Baseline, Plan, Target, exchange_name};
+use ecaxis::bench::run::{self, BenchError, BenchObserver};
+use ecaxis::bench::{fixture, host, html, text, veth};
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, Bus, Exchange, Nic, duration};
-use ecaxis::link::BackEnd;
-use ecaxis::rt::margin::Spin;
+use ecaxis::link::SocketKind;
+use ecaxis::rt::spin::Spin;
 use ecaxis::session::Observer;
 
-use super::progress::Teller;
+use super::progress::ProgressPrinter;
 use super::{Failure, files, hints, note, result, signals, unwritable};
 
-/// The shortest cycle that is measured; SYNC0 of most drives is no faster.
+/// The shortest cycle that is measured in ns; most drives support no faster SYNC0.
 const SHORTEST: u64 = 20_000;
 const LONGEST: u64 = 100_000_000;
 
@@ -32,32 +32,33 @@ Examples:
   ecaxis bench --sim --axes 100     the work of a cycle; no root, no exchange
   ecaxis bench --machine m.toml     the file's real bus, axes without power";
 
-/// Measure the cycle on this computer, and compare it
+/// Measure the cycle on this computer and compare it with alternatives
 ///
-/// The real cycle, with axes that move, runs on a pair of virtual interfaces; drives answer at the other end from another CPU. It
-/// tells how late cycles begin, how long an exchange takes, what it costs, and what was lost, beside what takes turns with it.
+/// The real cycle with moving axes runs on a pair of virtual interfaces. Simulated drives answer
+/// from another CPU. The report shows wake-up latency, exchange time, CPU load and losses, for each
+/// alternative as well.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// Cycle time, such as 1ms or 62.5us [default: 1ms, or the machine file's]
     #[arg(long, value_name = "DURATION", value_parser = cycle)]
     cycle: Option<u64>,
-    /// Axes, 12 bytes each way
-    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..=rig::MOST_AXES as i64))]
+    /// Number of axes, each with 12 bytes per direction
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..=fixture::MOST_AXES as i64))]
     axes: u16,
-    /// When a cycle takes its answers: same-cycle or pipelined (one cycle later)
+    /// Exchange mode: same-cycle, or pipelined (answers one cycle later)
     #[arg(long, value_name = "HOW", value_parser = exchange)]
     exchange: Option<Exchange>,
-    /// How frames are taken from the interface: ring or packet
+    /// Link type: ring or packet
     #[arg(long, value_name = "HOW", value_parser = link)]
-    link: Option<BackEnd>,
-    /// Spin so long before each release; auto: as long as needed; 0us: sleep only
+    link: Option<SocketKind>,
+    /// Spin this long before each release; auto: as long as needed; 0us: sleep only
     #[arg(long, value_name = "DURATION", value_parser = spin)]
     spin: Option<Spin>,
-    /// How long the other end holds a reply: a duration, or wire for what 100 Mbit/s takes
+    /// Delay of each reply: a duration, or `wire` for the time on 100 Mbit/s
     #[arg(long, value_name = "DURATION", default_value = "30us", value_parser = hold)]
-    hold: Hold,
-    /// Measure in process, without an interface; with --machine: on its simulated bus
+    hold: ReplyDelay,
+    /// Measure in process without an interface; with --machine: on its simulated bus
     #[arg(long)]
     sim: bool,
     /// Measure on the bus of this machine file; axes are not enabled
@@ -69,19 +70,20 @@ pub(crate) struct Args {
     /// Enable the axes and run the file's program: THE MACHINE MOVES
     #[arg(long, requires = "machine")]
     enable: bool,
-    /// Take turns with: cyclictest, sleep (no spinning), an exchange, a link, or the path of a program; may be repeated
+    /// Compare with: cyclictest, sleep (no spinning), an exchange, a link, or the path of a
+    /// program; may be repeated
     #[arg(long, value_name = "WHAT", value_parser = against)]
-    against: Vec<Against>,
-    /// Length of a round of each
+    against: Vec<Baseline>,
+    /// Length of each measurement in seconds
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=86_400))]
     seconds: u32,
-    /// Rounds, in each of which everything has its turn [default: 1, or 3 with --against]
+    /// Rounds; each round measures every alternative once [default: 1, or 3 with --against]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000))]
     rounds: Option<u32>,
-    /// Keep the other CPU busy with an ordinary program
+    /// Load the other CPU with an ordinary program
     #[arg(long)]
     hog: bool,
-    /// Keep the CPU of the cycle from idling, whoever has its turn
+    /// Keep the CPU of the cycle from idling in all measurements
     #[arg(long)]
     awake: bool,
     /// CPU of the cycle [default: an isolated one, or the last]
@@ -90,19 +92,19 @@ pub(crate) struct Args {
     /// SCHED_FIFO priority of the cycle
     #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(u8).range(1..=98))]
     priority: u8,
-    /// Hold every N-th reply for two cycles longer
+    /// Delay every N-th reply by two more cycles
     #[arg(long, value_name = "N")]
     late_every: Option<NonZeroU64>,
-    /// Do not send every N-th reply
+    /// Drop every N-th reply
     #[arg(long, value_name = "N")]
     drop_every: Option<NonZeroU64>,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
-    /// Write the report, with histograms, to this file
+    /// Write the report with histograms to this file
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
-    /// Write all figures, as JSON, to this file
+    /// Write all figures as JSON to this file
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
     #[command(flatten)]
@@ -131,12 +133,12 @@ fn exchange_named(text: &str) -> Option<Exchange> {
         .find(|exchange| exchange_name(*exchange) == text)
 }
 
-fn link_named(text: &str) -> Option<BackEnd> {
-    BackEnd::ALL.iter().copied().find(|b| b.name() == text)
+fn link_named(text: &str) -> Option<SocketKind> {
+    SocketKind::ALL.iter().copied().find(|b| b.name() == text)
 }
 
-fn link(text: &str) -> Result<BackEnd, String> {
-    let names: Vec<&str> = BackEnd::ALL.iter().map(|b| b.name()).collect();
+fn link(text: &str) -> Result<SocketKind, String> {
+    let names: Vec<&str> = SocketKind::ALL.iter().map(|b| b.name()).collect();
     link_named(text).ok_or_else(|| format!("there are {}", names.join(" and ")))
 }
 
@@ -149,12 +151,12 @@ fn spin(text: &str) -> Result<Spin, String> {
         .map_err(|e| e.to_string())
 }
 
-fn hold(text: &str) -> Result<Hold, String> {
+fn hold(text: &str) -> Result<ReplyDelay, String> {
     if text == "wire" {
-        return Ok(Hold::Wire);
+        return Ok(ReplyDelay::Wire);
     }
     match duration::parse(text) {
-        Ok(nanos) if nanos <= LONGEST => Ok(Hold::Fixed(nanos)),
+        Ok(nanos) if nanos <= LONGEST => Ok(ReplyDelay::Fixed(nanos)),
         Ok(_) => Err(format!(
             "a reply is held for {} at most",
             duration::show(LONGEST)
@@ -163,17 +165,17 @@ fn hold(text: &str) -> Result<Hold, String> {
     }
 }
 
-fn against(text: &str) -> Result<Against, String> {
+fn against(text: &str) -> Result<Baseline, String> {
     let known = match text {
-        "cyclictest" => Some(Against::Cyclictest),
-        "sleep" => Some(Against::Sleep),
+        "cyclictest" => Some(Baseline::Cyclictest),
+        "sleep" => Some(Baseline::Sleep),
         _ => exchange_named(text)
-            .map(Against::Exchange)
-            .or_else(|| link_named(text).map(Against::Link)),
+            .map(Baseline::Exchange)
+            .or_else(|| link_named(text).map(Baseline::Link)),
     };
     match known {
         Some(against) => Ok(against),
-        None if Path::new(text).is_file() => Ok(Against::Program(PathBuf::from(text))),
+        None if Path::new(text).is_file() => Ok(Baseline::Program(PathBuf::from(text))),
         None => Err("not cyclictest, sleep, an exchange, a link, nor a program".to_owned()),
     }
 }
@@ -209,18 +211,22 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         cycle_ns: plan.cycle_ns,
         ..Bus::default()
     };
-    let mut told = Told(Teller::new(Clock::Real, &bus, args.verbosity.plain()));
-    let report = compare::run(&plan, &stop, &mut told).map_err(|e| failure(&e, &plan))?;
-    drop(told);
+    let mut reported = BenchProgress(ProgressPrinter::new(
+        Clock::Real,
+        &bus,
+        args.verbosity.plain(),
+    ));
+    let report = run::run(&plan, &stop, &mut reported).map_err(|e| failure(&e, &plan))?;
+    drop(reported);
     let Some(report) = report else {
         return Err(Failure::new(
             hints::INTERRUPTED,
             "interrupted before anything was measured",
         ));
     };
-    // Text as keys and numbers that are finite always are JSON.
+    // Serialization cannot fail: keys are text and numbers are finite.
     let json = serde_json::to_string_pretty(&report).unwrap_or_default() + "\n";
-    // What was measured is shown even where it cannot be kept.
+    // Print the result even if it cannot be written to a file.
     let text = text::text(&report);
     let shown = result(if args.json { &json } else { &text });
     if let Some(path) = &args.html {
@@ -288,7 +294,7 @@ fn plan(args: &Args) -> Result<Plan, Failure> {
         && args
             .against
             .iter()
-            .any(|a| matches!(a, Against::Program(_)))
+            .any(|a| matches!(a, Baseline::Program(_)))
     {
         return Err(wrong(
             "a program to compare with needs the pair of virtual interfaces".to_owned(),
@@ -310,7 +316,7 @@ fn plan(args: &Args) -> Result<Plan, Failure> {
         link: args.link.unwrap_or(bus.link),
         spin,
         hold: args.hold,
-        mischief: Mischief {
+        mischief: FaultInjection {
             drop_every: args.drop_every,
             late_every: args.late_every.map(|every| (every, two_cycles)),
         },
@@ -327,9 +333,9 @@ fn plan(args: &Args) -> Result<Plan, Failure> {
     })
 }
 
-struct Told(Teller);
+struct BenchProgress(ProgressPrinter);
 
-impl Watcher for Told {
+impl BenchObserver for BenchProgress {
     fn round(&mut self, round: u32, of: u32, variant: &str) {
         note(&format!("round {round} of {of}: {variant}"));
     }

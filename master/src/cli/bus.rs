@@ -1,39 +1,40 @@
-//! A bus for verbs that turn no cycle: a network interface, or the simulated bus of a machine file.
+//! A bus for subcommands without a cycle: a network interface, or the simulated bus of a machine
+//! file.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
+use ecaxis::acyclic::{self, DatagramClient};
 use ecaxis::clock::Clock;
 use ecaxis::config::{Machine, Nic};
-use ecaxis::link::{self, BackEnd, Link};
-use ecaxis::service::{self, Datagrams};
+use ecaxis::link::{self, Link, SocketKind};
 use ecaxis::session::{self, Options, RunError};
 
-use super::{Failure, hints, note, screen, signals};
+use super::{Failure, hints, note, output, signals};
 
 #[derive(Debug)]
 pub(crate) struct Bus {
-    on: On,
-    /// Of them the clock, what happens on a simulated bus, and the recording.
+    on: BusKind,
+    /// Only the clock, the faults of a simulated bus and the recording are used.
     options: Options,
-    /// No other program drives the interface meanwhile.
+    /// True if no other program may drive the interface during the work.
     alone: bool,
 }
 
 #[derive(Debug)]
-enum On {
-    Interface { nic: String, back_end: BackEnd },
+enum BusKind {
+    Interface { nic: String, back_end: SocketKind },
     Sim(Box<Machine>),
 }
 
 impl Bus {
-    /// What the machine's `nic` names.
+    /// Returns the bus that the machine's `nic` names.
     pub fn of(machine: &Machine) -> Self {
         let (on, clock) = match &machine.bus.nic {
-            Nic::Sim => (On::Sim(Box::new(machine.clone())), Clock::Virtual),
+            Nic::Sim => (BusKind::Sim(Box::new(machine.clone())), Clock::Virtual),
             Nic::Interface(nic) => {
                 let (nic, back_end) = (nic.clone(), machine.bus.link);
-                (On::Interface { nic, back_end }, Clock::Real)
+                (BusKind::Interface { nic, back_end }, Clock::Real)
             }
         };
         let options = Options {
@@ -48,20 +49,20 @@ impl Bus {
     }
 
     pub fn interface(nic: &str) -> Self {
-        let (nic, back_end) = (nic.to_owned(), BackEnd::default());
+        let (nic, back_end) = (nic.to_owned(), SocketKind::default());
         Self {
-            on: On::Interface { nic, back_end },
+            on: BusKind::Interface { nic, back_end },
             options: Options::default(),
             alone: false,
         }
     }
 
-    /// With a clock, faults and a recording of one's own.
+    /// Sets clock, faults and recording.
     pub fn with(self, options: Options) -> Self {
         Self { options, ..self }
     }
 
-    /// For work that no machine may be driven beside.
+    /// Requires that no other program drives the interface.
     pub fn alone(self) -> Self {
         Self {
             alone: true,
@@ -69,20 +70,20 @@ impl Bus {
         }
     }
 
-    /// Hints depend on it.
+    /// The interface; hints depend on it.
     pub fn nic(&self) -> Nic {
         match &self.on {
-            On::Interface { nic, .. } => Nic::Interface(nic.clone()),
-            On::Sim(_) => Nic::Sim,
+            BusKind::Interface { nic, .. } => Nic::Interface(nic.clone()),
+            BusKind::Sim(_) => Nic::Sim,
         }
     }
 
-    /// Does a piece of work on it; `work` is told how many frames of others came in before anything was sent. Ctrl-C ends it, and
-    /// what is in hand comes to its end first.
+    /// Runs `work` on the bus. `work` receives the number of foreign frames seen before the first
+    /// transmission. Ctrl-C cancels it; shielded sections run to completion.
     pub fn visit<T, W>(self, work: W) -> Result<T, Failure>
     where
         T: Send + 'static,
-        W: AsyncFnOnce(Datagrams, u64) -> T + Send + 'static,
+        W: AsyncFnOnce(DatagramClient, u64) -> T + Send + 'static,
     {
         let nic = self.nic();
         let clock = self.options.clock;
@@ -90,11 +91,11 @@ impl Bus {
         signals::stop_on_interrupt(&stop);
         let heard = Arc::new(AtomicU64::new(0));
         let others = Arc::clone(&heard);
-        let done = service::visit(
+        let done = acyclic::with_bus(
             move || self.open(&others),
             clock,
             stop,
-            async move |wire: Datagrams| work(wire, heard.load(Ordering::Relaxed)).await,
+            async move |wire: DatagramClient| work(wire, heard.load(Ordering::Relaxed)).await,
         );
         done.map_err(|error| hints::run(&error, &nic))
     }
@@ -102,50 +103,53 @@ impl Bus {
     fn open(self, heard: &AtomicU64) -> Result<Box<dyn Link>, RunError> {
         let Self { on, options, alone } = self;
         let link: Box<dyn Link> = match on {
-            On::Sim(machine) => {
+            BusKind::Sim(machine) => {
                 let faults = options.faults.as_ref();
                 let segment = session::simulated_bus(&machine, options.seed, faults, None)?;
                 Box::new(link::sim::SimLink::new(segment))
             }
-            On::Interface { nic, back_end } => {
-                // What only disturbs a cycle is no concern of a bus without one.
+            BusKind::Interface { nic, back_end } => {
+                // Interface settings that only disturb a cycle are irrelevant here.
                 let (mut link, _) = match alone {
-                    true => link::open_alone(&nic, back_end)?,
+                    true => link::open_exclusive(&nic, back_end)?,
                     false => link::open(&nic, back_end)?,
                 };
-                let frames = link::heard(link.as_mut()).map_err(RunError::Link)?;
+                let frames = link::sniff_foreign_frames(link.as_mut()).map_err(RunError::Link)?;
                 heard.store(frames, Ordering::Relaxed);
-                // It may be a machine of this program's that runs there.
-                Box::new(link::apart::Apart::new(link, std::process::id()))
+                // Another ecaxis may drive a machine on this interface.
+                Box::new(link::source_address::PrivateMacLink::new(
+                    link,
+                    std::process::id(),
+                ))
             }
         };
         session::recorded(link, &options)
     }
 }
 
-/// Somebody else sent frames before anything was sent.
-pub(crate) fn warn_of(others: u64) {
+/// Warns about foreign frames that arrived before the first transmission.
+pub(crate) fn warn_foreign_frames(others: u64) {
     if others > 0 {
-        warn("another MainDevice is at work on this bus; what both do may collide");
+        warn("another MainDevice is active on this bus; what both do may collide");
     }
 }
 
-/// What a piece of work on a bus ended with, as the user sees it.
-pub(crate) fn done<T>(result: Result<T, service::ServiceError>, nic: &Nic) -> Result<T, Failure> {
+/// Maps the error of work on a bus to a failure with hints.
+pub(crate) fn done<T>(result: Result<T, acyclic::ServiceError>, nic: &Nic) -> Result<T, Failure> {
     result.map_err(|error| hints::service(&error, nic))
 }
 
-/// A line on stderr where somebody watches.
+/// Shows a transient status line on stderr, on a terminal only.
 pub(crate) fn passing(text: &str) {
-    screen::pass(text);
+    output::set_status_line(text);
 }
 
-/// The last of those lines goes.
+/// Clears the status line.
 pub(crate) fn passed() {
     passing("");
 }
 
-/// Warnings, one a line.
+/// Prints one line per warning.
 pub(crate) fn warn(text: impl std::fmt::Display) {
     note(&format!("warning: {text}"));
 }

@@ -1,9 +1,9 @@
-//! `ecaxis check`: a machine file against the ESI files it names, without a bus.
+//! `ecaxis check`: checks a machine file and its ESI files, without a bus.
 
 use std::path::{Path, PathBuf};
 
 use ecaxis::config::{self, ConfigError, Machine, duration};
-use ecaxis::words::counted;
+use ecaxis::text::pluralize;
 use serde_json::json;
 
 use super::{Failure, hints, page, result};
@@ -20,7 +20,7 @@ pub(crate) struct Args {
     /// Machine file
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Print what was found as JSON
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
@@ -50,7 +50,7 @@ fn as_json(path: &Path, loaded: &Result<Machine, ConfigError>) -> serde_json::Va
     }
 }
 
-/// One line, without what [`problems`] tells.
+/// Returns the error in one line, without the list from [`problems`].
 pub(super) fn in_short(path: &Path, error: &ConfigError) -> String {
     match error {
         ConfigError::Problems(problems) if problems.len() == 1 => {
@@ -63,7 +63,7 @@ pub(super) fn in_short(path: &Path, error: &ConfigError) -> String {
     }
 }
 
-/// The mistakes in a machine file, for programs.
+/// Returns the problems of a machine file as JSON.
 pub(super) fn problems(error: &ConfigError) -> serde_json::Value {
     let problems = match error {
         ConfigError::Problems(problems) => problems.as_slice(),
@@ -86,9 +86,9 @@ fn summary(machine: &Machine) -> String {
     let mut text = format!(
         "{}: {}, cycle {}, {}\n",
         machine.path.display(),
-        counted(machine.devices.len(), "device"),
+        pluralize(machine.devices.len(), "device"),
         duration::show(machine.bus.cycle_ns),
-        counted(machine.steps.len(), "step"),
+        pluralize(machine.steps.len(), "step"),
     );
     for device in &machine.devices {
         let selection = &device.selection;
@@ -98,7 +98,7 @@ fn summary(machine: &Machine) -> String {
             device.name,
             device.at,
             selection.device_name,
-            counted(selection.layout.rx_bytes(), "byte"),
+            pluralize(selection.layout.rx_bytes(), "byte"),
             selection.layout.tx_bytes(),
         );
         for note in &selection.notes {

@@ -1,30 +1,30 @@
-//! `ecaxis compare`: a machine file against a bus, and the file made to be as the bus.
+//! `ecaxis compare`: compares a machine file with a bus, and updates the file with `--apply`.
 
 use std::path::{Path, PathBuf};
 
-use ecaxis::compare::apply::{self, Actual, ApplyError};
+use ecaxis::compare::apply::{self, ApplyError, BusSnapshot};
 use ecaxis::compare::{self, Comparison, Difference};
 use ecaxis::config::{self, Machine, Nic};
-use ecaxis::library::{self, Library};
+use ecaxis::esi_library::{self, Library};
 use ecaxis::scan::{self, Scan};
 use serde_json::{Value, json};
 
 use super::bus::{self, Bus};
-use super::files::{Old, replace};
-use super::scan::{Seen, open};
+use super::files::{BackupPolicy, replace};
+use super::scan::{ScanResult, open};
 use super::{Failure, hints, page, result};
 
 const EXAMPLES: &str = "\
 Examples:
-  ecaxis compare m.toml                    the bus at the file's interface
-  ecaxis compare m.toml --nic enp3s0       at another one
+  ecaxis compare m.toml                    the bus on the file's interface
+  ecaxis compare m.toml --nic enp3s0       another interface
   ecaxis compare m.toml --sim other.toml   another file's simulated bus
-  ecaxis compare m.toml --apply            make the file as the bus is";
+  ecaxis compare m.toml --apply            update the file to match the bus";
 
-/// Compare a machine file with the bus: missing, added, swapped devices, revisions, aliases, serial numbers, modules
+/// Compare a machine file with the bus: devices, revisions, aliases, serial numbers, modules
 ///
-/// Nothing is changed on the bus; devices in Init are in PreOp while they are asked for modules and parameters. Where everything is as in the
-/// file, the exit code is 0, else 1.
+/// Changes nothing on the bus. Devices in Init are in PreOp while their modules and parameters are
+/// read. The exit code is 0 if everything matches, else 1.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -37,16 +37,17 @@ pub(crate) struct Args {
     /// Compare with the simulated bus of this machine file
     #[arg(long, value_name = "FILE")]
     sim: Option<PathBuf>,
-    /// Compare what the devices hold of the start-up SDOs, too
+    /// Compare the start-up SDO values as well
     #[arg(long)]
     parameters: bool,
-    /// Ask the devices even where another master shows
+    /// Use the mailboxes even if another MainDevice is active
     #[arg(long)]
     intrude: bool,
-    /// Rewrite the file so that it is as the bus; comments stay
+    /// Update the file to match the bus; comments are kept
     #[arg(long, conflicts_with = "json")]
     apply: bool,
-    /// ESI file or folder for devices that are not in the file; otherwise the folders of the file's own
+    /// ESI file or folder for devices that are not in the file [default: the folders of the file's
+    /// ESI files]
     #[arg(long, value_name = "PATH", requires = "apply")]
     esi: Option<PathBuf>,
     /// Print as JSON
@@ -74,7 +75,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let text = "the parameters: the devices were not asked";
         comparison.unknown.push(text.to_owned());
     }
-    let seen = Seen::new(&nic, scan, library.as_ref());
+    let seen = ScanResult::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
     if seen.scan.devices.iter().any(|device| device.sii.is_err()) {
         let message = "an EEPROM could not be read, so it is not known who is there";
@@ -84,12 +85,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     for unknown in &comparison.unknown {
         bus::warn(format_args!("not compared: {unknown}"));
     }
-    // Without parameters, what a bus that somebody drives tells is all that was wanted.
+    // Without parameters, missing mailbox data of a driven bus does not matter.
     let complete = !args.parameters || comparison.unknown.is_empty();
     let differences: Vec<String> = comparison
         .differences
         .iter()
-        .map(|difference| difference.told(&machine, &seen.scan).to_string())
+        .map(|difference| difference.display(&machine, &seen.scan).to_string())
         .collect();
     if args.json {
         result(&format!(
@@ -153,11 +154,11 @@ fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), 
             intrude,
             heard,
         };
-        let mut tell = |step: scan::Step| {
+        let mut report = |step: scan::Step| {
             let (what, position, of) = (step.what, step.position, step.of);
             bus::passing(&format!("{what} position {position}, {of} in all"));
         };
-        let scan = scan::scan(&wire, options, &mut tell).await?;
+        let scan = scan::scan(&wire, options, &mut report).await?;
         let mut comparison = compare::compare(&machine, &scan);
         if parameters && scan.asked {
             compare::parameters(&wire, &machine, &scan, &mut comparison).await;
@@ -168,7 +169,7 @@ fn look(bus: Bus, machine: &Machine, args: &Args) -> Result<(Scan, Comparison), 
     bus::done(done?, &nic)
 }
 
-/// The folders of the file's own ESI files, where nothing else is said.
+/// Returns the ESI library: `--esi`, else the folders of the file's own ESI files.
 fn library(args: &Args, machine: &Machine) -> Result<Library, Failure> {
     if let Some(path) = &args.esi {
         return open(path);
@@ -186,9 +187,9 @@ fn library(args: &Args, machine: &Machine) -> Result<Library, Failure> {
         } else {
             folder
         };
-        let next = Library::open(here, library::cache_file(here).as_deref())
+        let next = Library::open(here, esi_library::cache_file(here).as_deref())
             .map_err(|error| Failure::new(hints::WRONG, error.to_string()))?;
-        // The one that describes most is asked; several folders are rare.
+        // Use the folder that describes most devices; several folders are rare.
         if library
             .as_ref()
             .is_none_or(|known| known.entries().len() < next.entries().len())
@@ -202,11 +203,11 @@ fn library(args: &Args, machine: &Machine) -> Result<Library, Failure> {
 fn rewrite(
     args: &Args,
     machine: &Machine,
-    seen: &Seen,
+    seen: &ScanResult,
     comparison: &Comparison,
 ) -> Result<(), Failure> {
     let file = &args.file;
-    /// No machine file is longer.
+    /// The maximum size of a machine file in bytes.
     const MAX_BYTES: u64 = 16 << 20;
     let only_parameters = |d: &Difference| matches!(d, Difference::Parameter { .. });
     if comparison.differences.iter().all(only_parameters) {
@@ -218,22 +219,22 @@ fn rewrite(
     }
     let text = ecaxis::file::read_text(file, MAX_BYTES)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", file.display())))?;
-    let actual = Actual {
+    let actual = BusSnapshot {
         scan: &seen.scan,
         described: &seen.described,
         comparison,
     };
     let applied = apply::apply(file, &text, machine, actual).map_err(|e| refused(file, &e))?;
-    let kept = replace(file, &applied.text, Old::Kept)?;
-    for told in &applied.told {
-        super::note(&format!("  {told}"));
+    let kept = replace(file, &applied.text, BackupPolicy::Kept)?;
+    for reported in &applied.reported {
+        super::note(&format!("  {reported}"));
     }
     if let Some(kept) = kept {
         super::note(&format!("the old text is in {}", kept.display()));
     }
     let shown = file.display();
     super::note(&format!(
-        "{shown} is as the bus now; `ecaxis check {shown}` is due"
+        "{shown} matches the bus now; run `ecaxis check {shown}`"
     ));
     let marked = applied.text.lines();
     let marked = marked.filter(|line| line.contains(scan::write::MARK));
@@ -244,7 +245,7 @@ fn rewrite(
             scan::write::MARK
         )),
         n => super::note(&format!(
-            "{n} lines are marked \"{}\" and want a look",
+            "{n} lines are marked \"{}\" and need a check",
             scan::write::MARK
         )),
     }
@@ -275,7 +276,7 @@ fn refused(file: &Path, error: &ApplyError) -> Failure {
     }
 }
 
-/// `complete`: everything that was wanted was compared.
+/// Formats the comparison as JSON. `complete`: all requested items were compared.
 fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan, complete: bool) -> Value {
     let name = |index: usize| machine.devices.get(index).map(|d| d.name.clone());
     let each: Vec<Value> = comparison
@@ -309,7 +310,7 @@ fn as_json(machine: &Machine, comparison: &Comparison, scan: &Scan, complete: bo
                 "kind": kind,
                 "devices": devices.into_iter().map(name).collect::<Vec<_>>(),
                 "positions": positions,
-                "text": difference.told(machine, scan).to_string(),
+                "text": difference.display(machine, scan).to_string(),
             })
         })
         .collect();

@@ -1,4 +1,4 @@
-//! `ecaxis completions`: what a shell needs to complete verbs, options and files.
+//! `ecaxis completions`: shell completion for subcommands, options and files.
 
 use clap_complete::Shell;
 
@@ -10,7 +10,7 @@ Examples:
   ecaxis completions zsh > ~/.zfunc/_ecaxis        with ~/.zfunc in `fpath`
   ecaxis completions fish > ~/.config/fish/completions/ecaxis.fish";
 
-/// Print the completions of a shell
+/// Print the completion script for a shell
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {

@@ -1,54 +1,54 @@
-//! Which device, for verbs that work on one: named by a machine file, or by its place on an interface.
+//! Device selection: by name in a machine file, or by position or alias on an interface.
 
 use std::path::PathBuf;
 
+use ecaxis::acyclic::{DatagramClient, ServiceError, device};
 use ecaxis::bringup::{AlState, DeviceRef};
 use ecaxis::config::{self, DeviceConfig, Locator, Machine, Nic, nearest};
-use ecaxis::library::{self, Library, Match, cache_file};
-use ecaxis::mailbox::{CoeClient, ObjectAddress};
+use ecaxis::esi_library::{self, Library, RevisionMatch, cache_file};
+use ecaxis::mailbox::{CoeClient, NamedObject};
+use ecaxis::parameters::dictionary;
 use ecaxis::parameters::dump::Origin;
-use ecaxis::parameters::learn;
-use ecaxis::service::{Datagrams, ServiceError, device};
 use ecaxis_esi::sii::Sii;
-use ecaxis_esi::{Choice, Dictionary, Identity, select};
+use ecaxis_esi::{Dictionary, Identity, SelectOptions, select};
 
 use super::bus::{self, Bus};
 use super::{Failure, hints};
 
-/// Where the device is
+/// Options that select a device
 #[derive(Debug, Clone, clap::Args)]
 #[command(next_help_heading = "Which device")]
-pub(crate) struct Place {
+pub(crate) struct DeviceArgs {
     /// Use this network interface; without a machine file, with --position or --alias
     #[arg(long, value_name = "IF", conflicts_with = "sim")]
     nic: Option<String>,
     /// Use the machine file's simulated bus
     #[arg(long)]
     sim: bool,
-    /// The device's place on the interface; the first is 0
+    /// Position of the device on the interface, counted from 0
     #[arg(long, value_name = "N", requires = "nic", conflicts_with = "alias")]
     position: Option<u16>,
-    /// The device's station alias
+    /// Station alias of the device
     #[arg(long, value_name = "A", requires = "nic", value_parser = super::esi::number_16)]
     alias: Option<u16>,
-    /// ESI file of the device, or a folder of ESI files, where there is no machine file
+    /// ESI file or folder of the device, without a machine file
     #[arg(long, value_name = "PATH", requires = "nic")]
     esi: Option<PathBuf>,
 }
 
-/// A device that was asked for.
+/// The device selected on the command line.
 #[derive(Debug)]
 pub(crate) struct Target {
     pub bus: Bus,
     at: Locator,
-    /// Its part of the machine file.
+    /// The device's section of the machine file.
     config: Option<Box<DeviceConfig>>,
     esi: Option<PathBuf>,
 }
 
-impl Place {
-    /// The device, and the words that are left. Without `--position` or `--alias` the first two are the machine file and the
-    /// device's name in it; `rest` says what comes then.
+impl DeviceArgs {
+    /// Returns the device and the remaining words. Without `--position` or `--alias`, the first two
+    /// words are machine file and device name. `rest` describes the words after them.
     pub fn take<'w>(
         &self,
         words: &'w [String],
@@ -108,28 +108,28 @@ fn named<'m>(machine: &'m Machine, name: &str) -> Result<&'m DeviceConfig, Failu
     })
 }
 
-/// A device that was found.
+/// A device found on the bus.
 #[derive(Debug)]
-pub(crate) struct Located {
-    pub wire: Datagrams,
+pub(crate) struct OpenDevice {
+    pub wire: DatagramClient,
     pub device: DeviceRef,
-    /// As it was found.
+    /// The AL state in which it was found.
     pub state: AlState,
-    /// Of the ESI that the machine file names.
+    /// Name and identity from the ESI that the machine file names.
     pub expected: Option<(String, Identity)>,
     config: Option<Box<DeviceConfig>>,
     esi: Option<PathBuf>,
     nic: Nic,
-    /// Another MainDevice is at work on the bus.
+    /// True if another MainDevice is active on the bus.
     others: bool,
-    found: ecaxis::service::station::Found,
+    found: ecaxis::acyclic::enumerate::EnumeratedDevice,
 }
 
 impl Target {
-    /// Does a piece of work on the device, as it is found.
+    /// Runs `work` on the device in its current state.
     pub fn visit<T: Send + 'static>(
         self,
-        work: impl AsyncFnOnce(&Located) -> Result<T, Failure> + Send + 'static,
+        work: impl AsyncFnOnce(&OpenDevice) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {
         let Self {
             bus,
@@ -138,11 +138,11 @@ impl Target {
             esi,
         } = self;
         let nic = bus.nic();
-        let done = bus.visit(async move |wire: Datagrams, others| {
-            bus::warn_of(others);
-            let located = Located::find(wire, at, config, nic).await?;
+        let done = bus.visit(async move |wire: DatagramClient, others| {
+            bus::warn_foreign_frames(others);
+            let located = OpenDevice::find(wire, at, config, nic).await?;
             let others = others > 0;
-            work(&Located {
+            work(&OpenDevice {
                 esi,
                 others,
                 ..located
@@ -152,16 +152,17 @@ impl Target {
         done?
     }
 
-    /// Does a piece of work on the device's mailbox; `step` says which. A device in Init is in PreOp meanwhile.
+    /// Runs `work` on the device's mailbox. `step` names the work in errors. A device in Init is in
+    /// PreOp during the work.
     pub fn open<T: Send + 'static>(
         self,
         step: &'static str,
         work: impl AsyncFnOnce(&mut Open<'_>) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {
-        self.visit(async move |located: &Located| {
+        self.visit(async move |located: &OpenDevice| {
             let at = located;
             let sii = device::information(&at.wire, &at.found, &at.device).await;
-            let sii = at.told(sii)?;
+            let sii = at.map_error(sii)?;
             at.check(sii.identity)?;
             let done = device::with_mailbox(&at.wire, &at.device, &sii, step, async |lent| {
                 let mut open = Open {
@@ -176,29 +177,29 @@ impl Target {
     }
 }
 
-/// What ends a piece of work.
+/// The errors that end the work.
 #[derive(Debug)]
-pub(crate) enum Trouble {
-    Told(Failure),
+pub(crate) enum DeviceError {
+    Reported(Failure),
     Service(ServiceError),
 }
 
-impl From<ServiceError> for Trouble {
+impl From<ServiceError> for DeviceError {
     fn from(error: ServiceError) -> Self {
         Self::Service(error)
     }
 }
 
-impl From<Failure> for Trouble {
+impl From<Failure> for DeviceError {
     fn from(failure: Failure) -> Self {
-        Self::Told(failure)
+        Self::Reported(failure)
     }
 }
 
-impl Located {
-    /// Without an ESI file of the command line's.
+impl OpenDevice {
+    /// Finds the device, without an ESI file from the command line.
     pub async fn find(
-        wire: Datagrams,
+        wire: DatagramClient,
         at: Locator,
         config: Option<Box<DeviceConfig>>,
         nic: Nic,
@@ -222,7 +223,7 @@ impl Located {
         })
     }
 
-    /// Nobody drives it: its parameters as a whole can change. `what` is done with them.
+    /// Fails if the device is driven. `what` describes the change of its parameters.
     pub fn at_rest(&self, what: &str) -> Result<(), Failure> {
         if matches!(self.state, AlState::Init | AlState::PreOp) {
             return Ok(());
@@ -232,32 +233,32 @@ impl Located {
             .hint("end what drives the device first; then it is in Init or PreOp"))
     }
 
-    /// An error of another kind, as the user sees it.
+    /// Maps an error of another type to a failure with hints.
     pub fn advised<E>(&self, error: &E, advice: impl FnOnce(&E, &Nic) -> Failure) -> Failure {
         advice(error, &self.nic)
     }
 
-    pub fn ended<T>(&self, result: Result<T, Trouble>) -> Result<T, Failure> {
+    pub fn ended<T>(&self, result: Result<T, DeviceError>) -> Result<T, Failure> {
         result.map_err(|trouble| match trouble {
-            Trouble::Told(failure) => failure,
-            Trouble::Service(error) => self.failure(&error),
+            DeviceError::Reported(failure) => failure,
+            DeviceError::Service(error) => self.failure(&error),
         })
     }
 
-    /// As the user sees it.
-    pub fn told<T>(&self, result: Result<T, ServiceError>) -> Result<T, Failure> {
+    /// Maps a service error to a failure with hints.
+    pub fn map_error<T>(&self, result: Result<T, ServiceError>) -> Result<T, Failure> {
         result.map_err(|error| self.failure(&error))
     }
 
     fn failure(&self, error: &ServiceError) -> Failure {
         let failure = hints::service(error, &self.nic);
         if self.others {
-            return hints::beside_another(failure, error);
+            return hints::with_other_main_device(failure, error);
         }
         failure
     }
 
-    /// The device is the machine file's. One that does not tell is taken for it.
+    /// Fails if the identity differs from the machine file. A device without an identity passes.
     pub fn check(&self, actual: Identity) -> Result<(), Failure> {
         match &self.expected {
             Some((name, expected))
@@ -276,16 +277,17 @@ impl Located {
     }
 }
 
-/// A device with its mailbox open.
+/// A device with open mailbox.
 #[derive(Debug)]
 pub(crate) struct Open<'a> {
-    pub at: &'a Located,
+    pub at: &'a OpenDevice,
     pub sii: &'a Sii,
     pub coe: &'a mut CoeClient,
 }
 
 impl Open<'_> {
-    /// The dictionary of the ESI file, where there is one. `ask`: the device's own all the same.
+    /// Returns the dictionary from the ESI file, else from the device. `ask`: always from the
+    /// device.
     pub async fn dictionary(&mut self, ask: bool) -> Result<Dictionary, Failure> {
         match self.described(ask)? {
             Some(dictionary) => Ok(dictionary),
@@ -293,7 +295,7 @@ impl Open<'_> {
         }
     }
 
-    /// What an ESI file says.
+    /// Returns the dictionary of the ESI file, if there is one.
     pub fn described(&self, ask: bool) -> Result<Option<Dictionary>, Failure> {
         if ask {
             return Ok(None);
@@ -308,21 +310,23 @@ impl Open<'_> {
     }
 
     fn in_library(&self, path: &std::path::Path) -> Result<Dictionary, Failure> {
-        let wrong = |error: library::LoadError| Failure::new(hints::WRONG, error.to_string());
+        let wrong = |error: esi_library::LoadError| Failure::new(hints::WRONG, error.to_string());
         let library = match path.is_dir() {
             true => Library::open(path, cache_file(path).as_deref()),
             false => Library::of_file(path),
         };
         let library = library.map_err(wrong)?;
         let identity = self.sii.identity;
-        let entry = library.find(identity, Match::Newer).ok_or_else(|| {
-            let message = format!("{}: describes no {identity}", path.display());
-            Failure::new(hints::WRONG, message).hint(format!(
-                "`ecaxis esi list {}` shows what it describes",
-                path.display()
-            ))
-        })?;
-        let file = library::load(&library.folder().join(&entry.file)).map_err(wrong)?;
+        let entry = library
+            .find(identity, RevisionMatch::Newer)
+            .ok_or_else(|| {
+                let message = format!("{}: describes no {identity}", path.display());
+                Failure::new(hints::WRONG, message).hint(format!(
+                    "`ecaxis esi list {}` shows what it describes",
+                    path.display()
+                ))
+            })?;
+        let file = esi_library::load(&library.folder().join(&entry.file)).map_err(wrong)?;
         let wanted = Identity {
             revision: entry.revision,
             ..identity
@@ -331,11 +335,11 @@ impl Open<'_> {
         let Some(device) = device else {
             return Ok(Dictionary::default());
         };
-        let choice = Choice {
+        let choice = SelectOptions {
             cycle_ns: 1_000_000,
-            ..Choice::default()
+            ..SelectOptions::default()
         };
-        // Where the default configuration is impossible the device's own objects are still there.
+        // If the default configuration is invalid, use the device's own objects.
         let selected = select(&file, device, &choice).map(|selection| selection.dictionary);
         Ok(selected.unwrap_or_else(|_| device.dictionary.clone()))
     }
@@ -343,12 +347,12 @@ impl Open<'_> {
     async fn own_dictionary(&mut self) -> Result<Dictionary, Failure> {
         let Self { at, coe, .. } = self;
         let mut progress = counter("asking for objects");
-        let learned = learn::dictionary(coe, &at.wire, &at.device, &mut progress).await;
+        let learned = dictionary::dictionary(coe, &at.wire, &at.device, &mut progress).await;
         bus::passed();
-        at.told(learned)
+        at.map_error(learned)
     }
 
-    /// Who it is, by its own objects; what they do not tell is the EEPROM's.
+    /// Returns the identity from the device's objects, completed from the EEPROM.
     pub async fn origin(&mut self) -> Result<Origin, Failure> {
         let sii = self.sii;
         let general = sii.general.as_ref();
@@ -359,13 +363,13 @@ impl Open<'_> {
             sii.identity.revision,
             sii.serial,
         ];
-        let mut told = [0; 4];
-        for (n, (value, known)) in (1..).zip(told.iter_mut().zip(known)) {
+        let mut reported = [0; 4];
+        for (n, (value, known)) in (1..).zip(reported.iter_mut().zip(known)) {
             let read = self.read(0x1018, n).await?;
             let read = read.ok().and_then(|bytes| bytes.try_into().ok());
             *value = read.map_or(known, u32::from_le_bytes);
         }
-        let [vendor, product, revision, serial] = told;
+        let [vendor, product, revision, serial] = reported;
         Ok(Origin {
             name: name.unwrap_or_else(|| self.at.device.name.clone()),
             vendor,
@@ -375,13 +379,13 @@ impl Open<'_> {
         })
     }
 
-    /// One subindex, or the abort code of the device's refusal.
+    /// Reads one subindex. Returns the abort code if the device refuses it.
     pub async fn read(&mut self, index: u16, sub: u8) -> Result<Result<Vec<u8>, u32>, Failure> {
         let read = self.coe.upload(&self.at.wire, index, sub, false).await;
         match read.map_err(|error| (error.abort_code(), error)) {
             Ok(value) => Ok(Ok(value)),
             Err((Some(code), _)) => Ok(Err(code)),
-            Err((None, source)) => self.at.told(Err(ServiceError::Sdo {
+            Err((None, source)) => self.at.map_error(Err(ServiceError::Sdo {
                 device: self.at.device.clone(),
                 source,
             })),
@@ -389,11 +393,11 @@ impl Open<'_> {
     }
 }
 
-/// Tells how far a long piece of work is.
+/// Returns a callback that shows the progress of `what` in percent.
 pub(crate) fn counter(what: &'static str) -> impl FnMut(usize, usize) {
     let mut last = usize::MAX;
     move |done, all| {
-        // A terminal need not be written to a thousand times a second.
+        // Update the terminal once per percent, not for every object.
         let part = done * 100 / all.max(1);
         if part != last {
             last = part;
@@ -402,7 +406,7 @@ pub(crate) fn counter(what: &'static str) -> impl FnMut(usize, usize) {
     }
 }
 
-/// `0x6041:00`
-pub(crate) fn address(at: ObjectAddress) -> String {
+/// Formats an object as `0x6041:00`.
+pub(crate) fn address(at: NamedObject) -> String {
     at.number().to_string()
 }

@@ -1,19 +1,19 @@
-//! `ecaxis doctor`: what in this computer keeps the cycle from being on time, and what mends it.
+//! `ecaxis doctor`: host settings that disturb the cycle, each with the command that fixes it.
 
 use std::path::PathBuf;
 
 use ecaxis::config::{self, Nic, duration};
-use ecaxis::doctor::{self, Host, Intent, Severity, Tried, ethtool, wakeup};
+use ecaxis::doctor::{self, Host, Measurements, RunProfile, Severity, ethtool, wakeup};
 use ecaxis::link::OpenError;
-use ecaxis::rt::margin::Spin;
+use ecaxis::rt::spin::Spin;
 
 use super::{Failure, hints, note, result, stderr_is_terminal};
 
 const EXAMPLES: &str = "\
 Examples:
   sudo ecaxis doctor enp3s0              the computer and the network card
-  ecaxis doctor --machine m.toml         as the machine file wants to run
-  ecaxis doctor enp3s0 --cpu 3           as if the file said `cpu = 3`
+  ecaxis doctor --machine m.toml         with the settings of the machine file
+  ecaxis doctor enp3s0 --cpu 3           for CPU 3
   ecaxis doctor --seconds 600            wake-ups for ten minutes
   ecaxis doctor --seconds 0 --json       no measurement, for a script
 
@@ -21,7 +21,7 @@ Nothing is changed. Without sudo it examines what this user may do; sudo sees
 more, such as the preemption model. Exit code: 0 nothing is bad (there may be
 warnings), 1 something is, 2 the command line or the file is wrong.";
 
-/// Examine this computer and its network card for what disturbs the cycle, and say what mends it
+/// Find host and network card settings that disturb the cycle, each with its fix
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -31,19 +31,19 @@ pub(crate) struct Args {
     /// Take interface, CPU, priority, cycle and spin from this machine file
     #[arg(long, value_name = "FILE")]
     machine: Option<PathBuf>,
-    /// CPU of the realtime thread; otherwise the file's, or the first isolated one
+    /// CPU of the real-time thread [default: the file's, or the first isolated one]
     #[arg(long, value_name = "N")]
     cpu: Option<usize>,
-    /// SCHED_FIFO priority of the realtime thread [default: the file's, or 80]
+    /// SCHED_FIFO priority of the real-time thread [default: the file's, or 80]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=99))]
     priority: Option<u8>,
     /// Cycle time, such as 250us [default: the file's, or 1ms]
     #[arg(long, value_name = "DURATION", value_parser = cycle)]
     cycle: Option<u64>,
-    /// How long to measure wake-ups; 0 does not
+    /// Measure wake-ups for this many seconds; 0 skips it
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = seconds)]
     seconds: u32,
-    /// Print what was found as JSON
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
@@ -70,7 +70,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let failure = Failure::new(hints::WRONG, error.to_string());
         return Err(hints::interface(failure, &error));
     }
-    let tried = Tried {
+    let tried = Measurements {
         nic: intent.nic.as_deref().map(ethtool::ask),
         wake_up: measure(args.seconds, &host, &intent)?,
     };
@@ -90,9 +90,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-fn intent(args: &Args) -> Result<Intent, Failure> {
+fn intent(args: &Args) -> Result<RunProfile, Failure> {
     let program = std::env::current_exe().unwrap_or_else(|_| "ecaxis".into());
-    let mut intent = Intent::new(program);
+    let mut intent = RunProfile::new(program);
     if let Some(file) = &args.machine {
         let machine = config::load(file).map_err(|e| hints::config(file, &e))?;
         let bus = machine.bus;
@@ -117,7 +117,11 @@ fn intent(args: &Args) -> Result<Intent, Failure> {
     Ok(intent)
 }
 
-fn measure(seconds: u32, host: &Host, intent: &Intent) -> Result<Option<wakeup::WakeUp>, Failure> {
+fn measure(
+    seconds: u32,
+    host: &Host,
+    intent: &RunProfile,
+) -> Result<Option<wakeup::WakeUp>, Failure> {
     if seconds == 0 {
         return Ok(None);
     }

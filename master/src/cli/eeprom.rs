@@ -1,17 +1,17 @@
-//! `ecaxis eeprom`: the EEPROM of a device: read, written, checked, and its station alias set.
+//! `ecaxis eeprom`: reads, writes and checks the EEPROM of a device, and sets its station alias.
 
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use ecaxis::service::eeprom::{Claim, Eeprom, size_of, with_eeprom};
-use ecaxis::service::image::{category, with_alias, with_category, write};
-use ecaxis::service::{Datagrams, ServiceError};
+use ecaxis::acyclic::eeprom::{Eeprom, EepromAccess, size_of, with_eeprom};
+use ecaxis::acyclic::image::{category, with_alias, with_category, write};
+use ecaxis::acyclic::{DatagramClient, ServiceError};
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{self, Sii};
 use serde_json::json;
 
-use super::device::{Located, Place, Trouble, counter};
-use super::{Failure, Verbosity, bus, hints, keep, note, result};
+use super::device::{DeviceArgs, DeviceError, OpenDevice, counter};
+use super::{Failure, Verbosity, bus, hints, note, result, write_new};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -21,8 +21,8 @@ Examples:
   ecaxis eeprom alias --nic enp3s0 --position 0 1001 --yes
   ecaxis eeprom write machine.toml x x.bin --yes --backup old.bin
 
-What is written is read back; the old image is kept in a file first. A station
-alias counts when the device is switched on again.";
+The new image is read back; the old image is backed up first. A station
+alias takes effect after the next power-up.";
 
 const READ_EXAMPLES: &str = "\
 Examples:
@@ -44,9 +44,9 @@ Examples:
   ecaxis eeprom verify machine.toml x
   ecaxis eeprom verify machine.toml x x.bin --json";
 
-/// Read, write and check the EEPROM of a device, set its station alias
+/// Read, write and check the EEPROM of a device, or set its station alias
 ///
-/// The device is named by a machine file and its name in it, or by --nic with --position or --alias.
+/// Select the device by machine file and name, or by --nic with --position or --alias.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -64,7 +64,7 @@ enum Command {
     Verify(VerifyArgs),
 }
 
-/// Keep the image, or one category of it, in a file
+/// Save the image, or one category of it, to a file
 #[derive(Debug, clap::Args)]
 #[command(after_help = READ_EXAMPLES, override_usage = "ecaxis eeprom read FILE DEVICE IMAGE\n       \
     ecaxis eeprom read --nic IF --position N IMAGE")]
@@ -72,28 +72,28 @@ struct ReadArgs {
     /// Machine file, device, and the file to write, which must not exist yet
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
-    /// Only the data of this category, such as 30 (general) or 41 (SyncManagers)
+    /// Read only this category, such as 30 (general) or 41 (SyncManagers)
     #[arg(long, value_name = "TYPE", value_parser = super::esi::number_16)]
     category: Option<u16>,
-    /// All that the chip holds, not only up to the image's end
+    /// Read the whole chip, not only up to the end of the image
     #[arg(long, conflicts_with = "category")]
     all: bool,
     #[command(flatten)]
-    place: Place,
+    place: DeviceArgs,
 }
 
-/// What keeps somebody from losing an image.
+/// The options that protect the old image.
 #[derive(Debug, Clone, clap::Args)]
-struct Care {
-    /// Really write: a wrong image makes a device unusable
+struct BackupOptions {
+    /// Confirm writing: a wrong image makes a device unusable
     #[arg(long)]
     yes: bool,
-    /// Keep the image as it was in this file, which must not exist yet; without it a name is chosen
+    /// Back up the old image to this file, which must not exist yet [default: a generated name]
     #[arg(long, value_name = "FILE")]
     backup: Option<PathBuf>,
 }
 
-/// Write an image, or one category of it; the old image is kept in a file, the new one read back
+/// Write an image or one category, back up the old image, and read the new one back
 #[derive(Debug, clap::Args)]
 #[command(after_help = WRITE_EXAMPLES, override_usage = "ecaxis eeprom write FILE DEVICE IMAGE --yes\n       \
     ecaxis eeprom write --nic IF --position N IMAGE --yes"
@@ -102,34 +102,35 @@ struct WriteArgs {
     /// Machine file, device, and the image
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
-    /// The file holds the data of this category alone
+    /// The file contains only this category
     #[arg(long, value_name = "TYPE", value_parser = super::esi::number_16)]
     category: Option<u16>,
-    /// Even where the image is of another device
+    /// Write even if the image is for another device
     #[arg(long)]
     other_device: bool,
     #[command(flatten)]
-    care: Care,
+    care: BackupOptions,
     #[command(flatten)]
-    place: Place,
+    place: DeviceArgs,
 }
 
-/// Set the station alias, with its checksum; it counts when the device is switched on again
+/// Set the station alias and its checksum; effective after the next power-up
 #[derive(Debug, clap::Args)]
 #[command(after_help = ALIAS_EXAMPLES, override_usage = "ecaxis eeprom alias FILE DEVICE ALIAS --yes\n       \
     ecaxis eeprom alias --nic IF --position N ALIAS --yes"
 )]
 struct AliasArgs {
-    /// Machine file, device, and the alias; 0 is none
+    /// Machine file, device, and the alias; 0 removes it
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
     #[command(flatten)]
-    care: Care,
+    care: BackupOptions,
     #[command(flatten)]
-    place: Place,
+    place: DeviceArgs,
 }
 
-/// Check the image in the device: by itself, against the machine file, against an image in a file
+/// Check the device's image: its checksum and structure, against the machine file, or against a
+/// file
 #[derive(Debug, clap::Args)]
 #[command(after_help = VERIFY_EXAMPLES, override_usage = "ecaxis eeprom verify FILE DEVICE [IMAGE]\n       \
     ecaxis eeprom verify --nic IF --position N [IMAGE]")]
@@ -141,7 +142,7 @@ struct VerifyArgs {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    place: Place,
+    place: DeviceArgs,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -157,10 +158,10 @@ fn read(args: &ReadArgs) -> Result<(), Failure> {
     let (target, rest) = args.place.take(&args.words, "a file to write")?;
     let path = only(rest, "one file to write")?;
     if path.exists() {
-        return Err(super::in_the_way(&path));
+        return Err(super::already_exists(&path));
     }
     let all = args.all;
-    let image = target.visit(async move |at: &Located| image(at, all).await)?;
+    let image = target.visit(async move |at: &OpenDevice| image(at, all).await)?;
     let bytes = match args.category {
         None => image.as_slice(),
         Some(kind) => {
@@ -168,7 +169,7 @@ fn read(args: &ReadArgs) -> Result<(), Failure> {
             image.get(place).unwrap_or_default()
         }
     };
-    keep(&path, bytes)?;
+    write_new(&path, bytes)?;
     note(&format!("{}: {} bytes", path.display(), bytes.len()));
     Ok(())
 }
@@ -182,14 +183,14 @@ fn replace(args: &WriteArgs) -> Result<(), Failure> {
     }
     args.care.allow()?;
     let (kind, care, other_device) = (args.category, args.care.clone(), args.other_device);
-    let done = target.visit(async move |at: &Located| {
+    let done = target.visit(async move |at: &OpenDevice| {
         let old = image(at, false).await?;
         let new = match kind {
             None => given,
             Some(kind) => {
                 let new = with_category(&old, kind, &given);
                 let new = new.ok_or_else(|| no_category(kind, &old))?;
-                // A broken image may be mended part by part.
+                // Allow writing single categories to repair a broken image.
                 if sii::parse(&old).is_ok() {
                     sound(&path, &new)?;
                 }
@@ -224,7 +225,7 @@ fn alias(args: &AliasArgs) -> Result<(), Failure> {
     let alias = alias.map_err(|error| Failure::new(hints::WRONG, error))?;
     args.care.allow()?;
     let care = args.care.clone();
-    let done = target.visit(async move |at: &Located| {
+    let done = target.visit(async move |at: &OpenDevice| {
         let old = image(at, false).await?;
         let mut new = old.clone();
         let Some(area) = new.first_chunk_mut() else {
@@ -237,7 +238,7 @@ fn alias(args: &AliasArgs) -> Result<(), Failure> {
         burn(at, &care, &old, &new).await
     })?;
     note(&done);
-    note("the alias counts when the device is switched on again");
+    note("the alias takes effect when the device is switched on again");
     Ok(())
 }
 
@@ -251,11 +252,11 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
         }
     };
     let compared = other.as_ref().map_or(0, |(image, _)| image.len());
-    let ((there, longer), expected, device) = target.visit(async move |at: &Located| {
+    let ((there, longer), expected, device) = target.visit(async move |at: &OpenDevice| {
         let read = in_eeprom(at, "reading its EEPROM", async |eeprom| {
             let mut progress = counter("reading bytes");
             let there = eeprom.image(&mut progress).await?;
-            // A file may go on behind the image's end, and so does the chip.
+            // File and chip may both continue after the end of the image.
             let room = eeprom.size().await?.max(there.len());
             let longer = compared.min(room);
             let longer = eeprom.longer(there.clone(), longer, &mut progress).await?;
@@ -307,7 +308,8 @@ fn verify(args: &VerifyArgs) -> Result<(), Failure> {
     .hint("`ecaxis eeprom write` writes another"))
 }
 
-/// Where an image in a file differs from that in the device; the device may hold more.
+/// Describes the differences between the image in a file and the device, or returns `None`. The
+/// device may hold more bytes.
 fn differing(there: &[u8], image: &[u8], path: &Path) -> Option<String> {
     let at = (0..image.len()).filter(|at| there.get(*at) != image.get(*at));
     let all: Vec<usize> = at.collect();
@@ -319,21 +321,21 @@ fn differing(there: &[u8], image: &[u8], path: &Path) -> Option<String> {
     ))
 }
 
-impl Care {
+impl BackupOptions {
     fn allow(&self) -> Result<(), Failure> {
         if self.yes {
             return Ok(());
         }
         Err(
-            Failure::new(hints::WRONG, "nothing was written: say `--yes`")
-                .hint("a wrong image makes a device unusable; the old one is kept in a file first"),
+            Failure::new(hints::WRONG, "nothing was written: add `--yes`")
+                .hint("a wrong image makes a device unusable; the old image is backed up first"),
         )
     }
 
-    /// Keeps the old image, and says where.
-    fn keep(&self, at: &Located, old: &[u8]) -> Result<PathBuf, Failure> {
+    /// Backs up the old image and prints the path.
+    fn keep(&self, at: &OpenDevice, old: &[u8]) -> Result<PathBuf, Failure> {
         if let Some(path) = &self.backup {
-            return keep(path, old).map(|()| path.clone());
+            return write_new(path, old).map(|()| path.clone());
         }
         let serial = sii::parse(old).map_or(0, |sii| sii.serial);
         let plain = |c: char| if c.is_alphanumeric() { c } else { '-' };
@@ -341,7 +343,7 @@ impl Care {
         for n in 1..1000 {
             let path = PathBuf::from(format!("eeprom-{name}-{serial}-{n}.bin"));
             if !path.exists() {
-                return keep(&path, old).map(|()| path);
+                return write_new(&path, old).map(|()| path);
             }
         }
         Err(
@@ -351,16 +353,22 @@ impl Care {
     }
 }
 
-/// Keeps the old image, writes the new one, reads it back.
-async fn burn(at: &Located, care: &Care, old: &[u8], new: &[u8]) -> Result<String, Failure> {
+/// Backs up the old image, writes the new one and reads it back.
+async fn burn(
+    at: &OpenDevice,
+    care: &BackupOptions,
+    old: &[u8],
+    new: &[u8],
+) -> Result<String, Failure> {
     let done = in_eeprom(at, "writing its EEPROM", async |eeprom| {
-        // What the device says of its chip may be what is to be mended; a smaller one shows by what is read behind its end.
+        // The size word of the old image may be wrong. A smaller chip is detected by reading beyond
+        // its end.
         let room = eeprom.size().await?.max(size_of(new));
         if new.len() > room {
             let message = format!("the image has {} bytes, the EEPROM {room}", new.len());
             return Err(Failure::new(hints::FAILED, message).into());
         }
-        // What lies behind the old image's end is written over, too.
+        // Bytes after the end of the old image are overwritten as well.
         let bytes = new.len().next_multiple_of(2);
         let there = eeprom.longer(old.to_vec(), bytes, &mut |_, _| {}).await?;
         let backup = care.keep(at, &there)?;
@@ -379,15 +387,18 @@ async fn burn(at: &Located, care: &Care, old: &[u8], new: &[u8]) -> Result<Strin
     ))
 }
 
-/// Does a piece of work on the EEPROM, which goes back to whom it was lent.
+/// Runs `work` on the EEPROM, then returns the EEPROM to its previous owner.
 async fn in_eeprom<T>(
-    at: &Located,
+    at: &OpenDevice,
     step: &'static str,
-    work: impl AsyncFnOnce(&Eeprom<'_, Datagrams>) -> Result<T, Trouble>,
+    work: impl AsyncFnOnce(&Eeprom<'_, DatagramClient>) -> Result<T, DeviceError>,
 ) -> Result<T, Failure> {
-    let done = with_eeprom(&at.wire, &at.device, step, Claim::of(at.state), work).await;
-    // Writing that has begun is never left.
-    let untouched = matches!(done, Err(Trouble::Service(ServiceError::Stopped { .. })));
+    let done = with_eeprom(&at.wire, &at.device, step, EepromAccess::of(at.state), work).await;
+    // Writing that has begun is never cancelled.
+    let untouched = matches!(
+        done,
+        Err(DeviceError::Service(ServiceError::Stopped { .. }))
+    );
     at.ended(done).map_err(|failure| match untouched {
         true => Failure {
             message: format!("{}; nothing was written", failure.message),
@@ -397,8 +408,8 @@ async fn in_eeprom<T>(
     })
 }
 
-/// What the device holds.
-async fn image(at: &Located, all: bool) -> Result<Vec<u8>, Failure> {
+/// Reads the image of the device.
+async fn image(at: &OpenDevice, all: bool) -> Result<Vec<u8>, Failure> {
     let read = in_eeprom(at, "reading its EEPROM", async |eeprom| {
         let mut progress = counter("reading bytes");
         Ok(match all {
@@ -411,7 +422,7 @@ async fn image(at: &Located, all: bool) -> Result<Vec<u8>, Failure> {
     read
 }
 
-/// What is odd about an image, and not about the one before.
+/// Returns the remarks on the new image that the old one does not have.
 fn new_remarks(old: &[u8], new: &[u8]) -> Vec<String> {
     let remarks = |image: &[u8]| -> Vec<String> {
         let warnings = sii::inspect(image).map(|(_, warnings)| warnings);
@@ -436,7 +447,7 @@ fn identity(image: &[u8]) -> Identity {
     }
 }
 
-/// What is the device's own, and changes.
+/// Returns the device-specific values that would change: name, old value, new value.
 fn kept(old: &[u8], new: &[u8]) -> Vec<(&'static str, u32, u32)> {
     let (Ok(old), Ok(new)) = (sii::parse(old), sii::parse(new)) else {
         return Vec::new();
@@ -455,7 +466,7 @@ fn kept(old: &[u8], new: &[u8]) -> Vec<(&'static str, u32, u32)> {
 }
 
 fn load(path: &Path) -> Result<Vec<u8>, Failure> {
-    /// No EEPROM holds more.
+    /// The maximum size of an EEPROM in bytes.
     const MAX_BYTES: u64 = 512 * 1024;
     let shown = path.display();
     let wrong = |what: String| Failure::new(hints::WRONG, what);
@@ -463,11 +474,11 @@ fn load(path: &Path) -> Result<Vec<u8>, Failure> {
         .map_err(|error| wrong(format!("cannot read {shown}: {error}")))
 }
 
-/// A device with a broken image has no mailbox, and some have no controller.
+/// Fails for a broken image: the device would lose its mailbox, and some devices their controller.
 fn sound(path: &Path, image: &[u8]) -> Result<(), Failure> {
     let wrong = |what: String| {
         Failure::new(hints::WRONG, format!("{}: {what}", path.display()))
-            .hint("`ecaxis esi sii` makes an image from an ESI file")
+            .hint("`ecaxis esi sii` generates an image from an ESI file")
     };
     match sii::parse(image) {
         Ok(sii) if !sii.checksum_ok => Err(wrong(

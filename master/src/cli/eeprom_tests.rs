@@ -1,25 +1,26 @@
-//! What a device holds before and after, and what is kept of it.
+//! The EEPROM before and after a command, and its backup.
 
 use std::sync::atomic::AtomicBool;
 use std::thread;
 
+use ecaxis::acyclic::run_on_link;
 use ecaxis::bringup::AlState;
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, Locator, Nic};
 use ecaxis::link::sim::SimLink;
-use ecaxis::mailbox::Wire;
-use ecaxis::service::carry;
+use ecaxis::mailbox::MailboxTransport;
 use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice};
 
 use super::*;
 
-/// Bytes of the chip in these tests.
+/// The EEPROM size in bytes in these tests.
 const CHIP: usize = 2048;
 
-/// A drive with this in its EEPROM, and what is in it afterwards. Virtual time belongs to a thread.
+/// Runs a command on a drive with this EEPROM image. Returns the EEPROM afterwards. It needs a
+/// separate thread, because virtual time is thread-local.
 fn with_eeprom_of<T: Send + 'static>(
     image: Vec<u8>,
-    work: impl AsyncFnOnce(&mut Located) -> T + Send + 'static,
+    work: impl AsyncFnOnce(&mut OpenDevice) -> T + Send + 'static,
 ) -> (T, Vec<u8>) {
     let there = thread::Builder::new().stack_size(16 << 20).spawn(move || {
         Clock::Virtual.enter();
@@ -34,8 +35,8 @@ fn with_eeprom_of<T: Send + 'static>(
         let devices = vec![device.expect("a device")];
         let mut link = SimLink::new(Segment::new(devices, SegmentOptions::default()));
         let stop = AtomicBool::new(false);
-        let done = carry(&mut link, Clock::Virtual, &stop, async |wire| {
-            let at = Located::find(wire, Locator::Position(0), None, Nic::Sim).await;
+        let done = run_on_link(&mut link, Clock::Virtual, &stop, async |wire| {
+            let at = OpenDevice::find(wire, Locator::Position(0), None, Nic::Sim).await;
             work(&mut at.expect("located")).await
         });
         let device = link.segment().device(0).expect("a device");
@@ -44,7 +45,7 @@ fn with_eeprom_of<T: Send + 'static>(
     there.expect("a thread").join().expect("no panic")
 }
 
-/// The demonstration drive's image, as long as the chip.
+/// The image of the demonstration drive, padded to the size of the chip.
 fn good() -> Vec<u8> {
     let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
     let machine = config::load(&demo).expect("a machine");
@@ -60,15 +61,15 @@ fn good() -> Vec<u8> {
     image
 }
 
-fn keeps(path: PathBuf) -> Care {
-    Care {
+fn keeps(path: PathBuf) -> BackupOptions {
+    BackupOptions {
         yes: true,
         backup: Some(path),
     }
 }
 
 #[test]
-fn what_is_written_over_behind_the_end_is_in_the_backup() {
+fn backup_contains_bytes_after_the_end_of_the_image() {
     let folder = tempfile::tempdir().expect("a folder");
     let kept = folder.path().join("kept.bin");
     let mut there = good();
@@ -81,7 +82,7 @@ fn what_is_written_over_behind_the_end_is_in_the_backup() {
         assert!(old.len() < 1500, "{}", old.len());
         burn(at, &care, &old, &wanted).await
     });
-    // The serial number, and two words behind the end.
+    // The serial number, and two words after the end of the old image.
     let done = done.expect("written");
     assert!(done.contains("3 words written"), "{done}");
     assert_eq!(after, new);
@@ -89,7 +90,7 @@ fn what_is_written_over_behind_the_end_is_in_the_backup() {
 }
 
 #[test]
-fn an_image_that_belittles_its_chip_is_read_and_mended() {
+fn image_with_small_size_word_is_read_and_repaired() {
     for said in [0_u16, 1] {
         let folder = tempfile::tempdir().expect("a folder");
         let kept = folder.path().join("kept.bin");
@@ -113,7 +114,7 @@ fn an_image_that_belittles_its_chip_is_read_and_mended() {
 }
 
 #[test]
-fn an_image_that_says_more_than_the_chip_holds_is_not_written() {
+fn image_larger_than_the_chip_is_not_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let kept = folder.path().join("kept.bin");
     let mut new = good();
@@ -127,13 +128,13 @@ fn an_image_that_says_more_than_the_chip_holds_is_not_written() {
     assert_eq!(after, good());
     assert_eq!(failure.code, hints::FAILED);
     let message = &failure.message;
-    let told = format!("holds 2048 bytes; nothing was written; the old image is in {shown}");
-    assert!(message.ends_with(&told), "{message}");
+    let reported = format!("holds 2048 bytes; nothing was written; the old image is in {shown}");
+    assert!(message.ends_with(&reported), "{message}");
     assert!(kept.exists());
 }
 
 #[test]
-fn what_is_ended_before_the_first_word_says_so() {
+fn cancelled_write_reports_that_nothing_was_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let kept = folder.path().join("kept.bin");
     let mut new = good();
@@ -141,23 +142,23 @@ fn what_is_ended_before_the_first_word_says_so() {
     let care = keeps(kept.clone());
     let (failure, after) = with_eeprom_of(good(), async move |at| {
         let old = image(at, false).await.expect("an image");
-        at.wire.stop().ask();
+        at.wire.stop().cancel();
         burn(at, &care, &old, &new).await.expect_err("ended")
     });
-    let told = "writing its EEPROM: interrupted; nothing was written";
-    assert!(failure.message.ends_with(told), "{failure:?}");
+    let reported = "writing its EEPROM: interrupted; nothing was written";
+    assert!(failure.message.ends_with(reported), "{failure:?}");
     assert!(!failure.hints.is_empty() && !kept.exists());
     assert_eq!(after, good());
 }
 
 #[test]
-fn zeros_are_no_image_of_any_length() {
+fn sound_rejects_zeros_of_any_length() {
     let (read, _) = with_eeprom_of(vec![0; CHIP], async |at| image(at, false).await);
     assert!(read.expect("read").len() < 0x100);
 }
 
 #[test]
-fn parameters_as_a_whole_change_at_rest_alone() {
+fn at_rest_accepts_only_init_and_preop() {
     let (allowed, _) = with_eeprom_of(good(), async |at| {
         let states = [
             (AlState::Init, true),
@@ -174,9 +175,9 @@ fn parameters_as_a_whole_change_at_rest_alone() {
     for (allowed, state, good) in allowed {
         assert_eq!(allowed.is_ok(), good, "{state}");
         if let Err(failure) = allowed {
-            let told = format!("is in {state}: parameters are reset in PreOp");
+            let reported = format!("is in {state}: parameters are reset in PreOp");
             assert_eq!(failure.code, hints::FAILED);
-            assert!(failure.message.ends_with(&told), "{failure:?}");
+            assert!(failure.message.ends_with(&reported), "{failure:?}");
             assert!(!failure.hints.is_empty());
         }
     }

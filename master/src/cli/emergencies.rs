@@ -1,10 +1,10 @@
-//! What devices reported unasked, as a table.
+//! The emergency messages of devices as a table.
 
 use ecaxis::session::EmergencyLine;
 
 use super::report::Table;
 
-/// As many as are kept, and how many more there were; ends with a line's end.
+/// Formats the stored emergencies and the number of further ones. Ends with a line feed.
 pub(super) fn table(emergencies: &[EmergencyLine], more: u64) -> String {
     let mut table = Table::new(&["time", "device", "emergency", "register", "data", "what"]);
     for line in emergencies {

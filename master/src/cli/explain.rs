@@ -1,20 +1,20 @@
-//! `ecaxis explain`: everything that was derived from the ESI files, and from which element.
+//! `ecaxis explain`: everything derived from the ESI files, each with its source element.
 
 use std::fmt::Write;
 use std::path::PathBuf;
 
 use ecaxis::config::{self, Action, Bus, DeviceConfig, Exchange, Machine, Nic, Step, duration};
-use ecaxis::link::BackEnd;
+use ecaxis::link::SocketKind;
 use ecaxis::rt::exchange::LONGEST_LOOK;
 use ecaxis::rt::image::{self, Access, ImagePlan};
-use ecaxis::rt::margin::Spin;
-use ecaxis::words::counted;
+use ecaxis::rt::spin::Spin;
+use ecaxis::text::pluralize;
 use ecaxis_esi::SmLayout;
 
 mod axis;
 mod stop;
 
-use super::tables::{fields, startup};
+use super::pdo_table::{fields, startup};
 use super::{Failure, hints, page, report::Table};
 
 const EXAMPLES: &str = "\
@@ -22,7 +22,8 @@ Examples:
   ecaxis explain machine.toml
   ecaxis explain machine.toml | less";
 
-/// Show what a machine file and its ESI files come to: PDOs, start-up SDOs, clocks, frames
+/// Show the configuration derived from a machine file and its ESI files: PDOs, start-up SDOs,
+/// clocks, frames
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -87,13 +88,13 @@ fn bus(machine: &Machine, out: &mut String) -> std::fmt::Result {
         Exchange::Pipelined => [
             "exchange",
             "pipelined",
-            "answers are taken in the next cycle, nobody waits",
+            "answers are read in the next cycle, without waiting",
         ],
     });
     if matches!(bus.nic, Nic::Interface(_)) {
         let meaning = match bus.link {
-            BackEnd::Ring => "frames are taken from memory that the kernel shares",
-            BackEnd::Packet => "frames are taken by system calls",
+            SocketKind::Ring => "frames are taken from memory that the kernel shares",
+            SocketKind::Packet => "frames are taken by system calls",
         };
         row(["link", bus.link.name(), meaning]);
     }
@@ -290,7 +291,7 @@ const SHORTEST_PAYLOAD: usize = 46;
 const NS_PER_BYTE: usize = 80;
 const FORWARDING_NS: usize = 1_000;
 
-/// Bytes on the wire of each frame of a cycle, at most, gap included.
+/// Returns the maximum size of each frame of a cycle on the wire in bytes, with the interframe gap.
 fn frame_bytes(plan: &ImagePlan, clock: bool) -> Vec<usize> {
     let mut frames = vec![0; plan.frames()];
     frames[0] = AL_STATUS + LONGEST_LOOK + if clock { CLOCK } else { 0 };
@@ -311,7 +312,7 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     writeln!(
         out,
         "\nprocess image: {}; outputs and inputs share addresses",
-        counted(plan.len, "byte")
+        pluralize(plan.len, "byte")
     )?;
     let mut table = Table::new(&["device", "logical", "outputs", "inputs", "frame"]);
     for (device, region) in machine.devices.iter().zip(&plan.regions) {
@@ -361,12 +362,13 @@ fn wire(machine: &Machine, out: &mut String) -> std::fmt::Result {
     )
 }
 
-/// CPU time a cycle, by what was measured on small computers (docs/realtime.md), and what it consists of.
+/// Returns the estimated CPU time per cycle in ns and its composition. The figures are measurements
+/// on small computers (docs/realtime.md).
 fn load(machine: &Machine, wire_ns: u64) -> (u64, &'static str) {
-    /// Waking up, building frames, stepping the axes, publishing.
+    /// Wake-up, building frames, stepping the axes, publishing, in ns.
     const WORK_NS: u64 = 20_000;
     const AXIS_NS: u64 = 200;
-    /// What `"auto"` settles at; it never exceeds these parts of a cycle.
+    /// A typical spin time of `"auto"` in ns. It never exceeds this fraction of the cycle:
     const SPIN_NS: u64 = 50_000;
     let axes = machine.devices.iter().filter(|d| d.axis.is_some()).count();
     let work = WORK_NS + AXIS_NS * u64::try_from(axes).unwrap_or(u64::MAX / AXIS_NS);
@@ -383,7 +385,7 @@ fn load(machine: &Machine, wire_ns: u64) -> (u64, &'static str) {
     }
 }
 
-/// `LRW, ` or `2 LRW, LWR, LRD, `.
+/// Formats the datagrams as `LRW, ` or `2 LRW, LWR, LRD, `.
 fn commands(plan: &ImagePlan) -> String {
     let mut text = String::new();
     for (access, name) in [

@@ -1,8 +1,8 @@
-use super::super::tables::{short_name, value};
+use super::super::pdo_table::{short_name, value};
 use super::*;
 
 #[test]
-fn bytes_on_the_wire_as_counted_by_hand() {
+fn frame_bytes_match_a_manual_count() {
     for (axes, bytes) in [(8, 168), (32, 456), (100, 1272)] {
         let axis = image::ProcessData {
             out_len: 12,
@@ -25,7 +25,7 @@ fn bytes_on_the_wire_as_counted_by_hand() {
 }
 
 #[test]
-fn an_entrys_name_stands_for_itself() {
+fn short_name_omits_the_object_name() {
     for (name, short) in [
         ("RxPDO assignment / Assigned PDOs", "Assigned PDOs"),
         ("RxPDO / SubIndex 001", "RxPDO / SubIndex 001"),
@@ -36,7 +36,7 @@ fn an_entrys_name_stands_for_itself() {
 }
 
 #[test]
-fn fits_a_terminal_and_tells_what_is_assumed() {
+fn explain_fits_a_terminal_and_shows_assumptions() {
     let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
     let demo = std::fs::read_to_string(configs.join("demo.toml")).unwrap();
     let explained = |text: &str| {
@@ -86,7 +86,7 @@ fn fits_a_terminal_and_tells_what_is_assumed() {
 }
 
 #[test]
-fn stops_and_groups() {
+fn explain_shows_stops_and_groups() {
     let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
     let explained = |file: &str| {
         let machine = config::load(&configs.join(file)).unwrap();
@@ -124,7 +124,7 @@ fn stops_and_groups() {
 }
 
 #[test]
-fn values_read_as_numbers() {
+fn value_formats_bytes_as_number() {
     assert_eq!(value(&[0x10, 0x27]), "0x2710");
     assert_eq!(value(&[1; 9]), "01 01 01 01 01 01 01 01 01");
     assert_eq!(value(&[]), "");

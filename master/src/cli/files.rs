@@ -1,8 +1,8 @@
-//! Files that verbs write: what was there before is not lost.
+//! Output files. No function overwrites a file whose content could be lost.
 //!
-//! - [`keep`]: a file that must not exist yet;
-//! - [`may_replace`]: whether a file holds nothing but what is written anew every time;
-//! - [`replace`]: somebody's file, with another text.
+//! - [`write_new`]: creates a file that must not exist yet;
+//! - [`may_replace`]: checks that a file is missing or is an earlier output of the same kind;
+//! - [`replace`]: replaces a user's file and keeps a backup if required.
 
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
@@ -10,20 +10,20 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::os::unix::fs::{FileTypeExt, MetadataExt, chown};
 use std::path::{Path, PathBuf};
 
-use super::{Failure, hints, story};
+use super::{Failure, fault_report, hints};
 
-/// Names that are tried for a file beside another.
+/// The maximum number of names tried for a file next to another.
 const NAMES: u32 = 1000;
 
-/// A file that must not exist yet. It is on the disk when this returns.
-pub(crate) fn keep(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+/// Creates a file that must not exist yet. The file is synced to disk on return.
+pub(crate) fn write_new(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     create(path, bytes).map_err(|error| match error.kind() {
-        ErrorKind::AlreadyExists => in_the_way(path),
+        ErrorKind::AlreadyExists => already_exists(path),
         _ => unwritable(path, &error),
     })
 }
 
-/// A file that was named and cannot be written.
+/// Returns the failure for a file that cannot be written.
 pub(crate) fn unwritable(path: &Path, error: &io::Error) -> Failure {
     let message = format!("cannot write {}: {error}", path.display());
     Failure::new(hints::WRONG, message).hint(WRITABLE)
@@ -31,12 +31,12 @@ pub(crate) fn unwritable(path: &Path, error: &io::Error) -> Failure {
 
 const WRITABLE: &str = "name a file in a folder that exists and can be written";
 
-pub(crate) fn in_the_way(path: &Path) -> Failure {
+pub(crate) fn already_exists(path: &Path) -> Failure {
     Failure::new(hints::WRONG, format!("{} exists already", path.display()))
-        .hint("nothing is written over; name another file or remove that one")
+        .hint("existing files are not overwritten; name another file or remove that one")
 }
 
-/// All of it or nothing.
+/// Creates the file completely or not at all.
 fn create(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = File::create_new(path)?;
     let written = file.write_all(bytes).and_then(|()| file.sync_all());
@@ -48,7 +48,7 @@ fn create(path: &Path, bytes: &[u8]) -> io::Result<()> {
     Ok(())
 }
 
-/// The name, too, is on the disk then, where the file system can tell.
+/// Syncs the directory entry to disk if the file system supports it.
 fn sync_folder(path: &Path) {
     let _ = File::open(folder(path)).and_then(|folder| folder.sync_all());
 }
@@ -60,26 +60,26 @@ fn folder(path: &Path) -> &Path {
     }
 }
 
-/// What may be written over: a file of the kind that is written.
+/// The kind of an output file. Only files of the same kind may be overwritten.
 #[derive(Debug)]
-pub(crate) struct Kind {
-    /// What shows it.
-    sign: Sign,
+pub(crate) struct FileKind {
+    /// How a file of this kind is recognized.
+    sign: FileSignature,
     what: &'static str,
     pub instead: &'static str,
 }
 
 #[derive(Debug)]
-enum Sign {
-    /// Every such file begins with it.
+enum FileSignature {
+    /// Every file of this kind begins with these bytes.
     Begins(&'static [u8]),
-    /// By the first [`EARLY`] of its bytes.
+    /// A predicate on the first [`EARLY`] bytes.
     Early(fn(&str) -> bool),
 }
 
 const EARLY: usize = 4096;
 
-impl Sign {
+impl FileSignature {
     fn within(&self) -> usize {
         match self {
             Self::Begins(bytes) => bytes.len(),
@@ -95,47 +95,48 @@ impl Sign {
     }
 }
 
-/// pcapng, in either byte order.
-pub(crate) const RECORDING: Kind = Kind {
-    sign: Sign::Begins(&[0x0a, 0x0d, 0x0d, 0x0a]),
+/// A pcapng recording in either byte order.
+pub(crate) const RECORDING: FileKind = FileKind {
+    sign: FileSignature::Begins(&[0x0a, 0x0d, 0x0d, 0x0a]),
     what: "a recording (pcapng)",
-    instead: "name a new file, or a recording to write over",
+    instead: "name a new file, or a recording to overwrite",
 };
-pub(crate) const PAGE: Kind = Kind {
-    sign: Sign::Begins(b"<!DOCTYPE html>"),
+pub(crate) const PAGE: FileKind = FileKind {
+    sign: FileSignature::Begins(b"<!DOCTYPE html>"),
     what: "a report (HTML)",
-    instead: "name a new file, or a report to write over",
+    instead: "name a new file, or a report to overwrite",
 };
-pub(crate) const FIGURES: Kind = Kind {
-    sign: Sign::Begins(b"{"),
+pub(crate) const FIGURES: FileKind = FileKind {
+    sign: FileSignature::Begins(b"{"),
     what: "a file of figures (JSON)",
-    instead: "name a new file, or a file of figures to write over",
+    instead: "name a new file, or a file of figures to overwrite",
 };
 
-pub(crate) const STORY: Kind = Kind {
-    sign: Sign::Early(story::is_page),
-    what: "a fault story",
-    instead: "name a new file, or a story to write over",
+pub(crate) const STORY: FileKind = FileKind {
+    sign: FileSignature::Early(fault_report::is_page),
+    what: "a fault report",
+    instead: "name a new file, or a fault report to overwrite",
 };
-/// What is beside [`STORY`].
-pub(crate) const STORY_DATA: Kind = Kind {
-    sign: Sign::Begins(br#"{"headline":"#),
-    what: "the data of a fault story (JSON)",
-    instead: "the data go beside the page: name another page",
+/// The JSON data next to [`STORY`].
+pub(crate) const STORY_DATA: FileKind = FileKind {
+    sign: FileSignature::Begins(br#"{"headline":"#),
+    what: "the data of a fault report (JSON)",
+    instead: "the data are written next to the page: name another page",
 };
 
-/// As [`super::trace`] writes it.
-pub(crate) const TRACE: Kind = Kind {
-    sign: Sign::Begins(b"time_ns,position,device,"),
+/// A trace as `super::trace` writes it.
+pub(crate) const TRACE: FileKind = FileKind {
+    sign: FileSignature::Begins(b"time_ns,position,device,"),
     what: "a trace of `ecaxis sim` (CSV)",
-    instead: "name a new file, or a trace to write over",
+    instead: "name a new file, or a trace to overwrite",
 };
 
-/// Whether `target`, which `option` names, may be written over; `inputs` are read, and what they are.
+/// Fails if `target`, given with `option`, must not be overwritten. `inputs` are the files that are
+/// read, each with its description.
 pub(crate) fn may_replace<'p>(
     option: &str,
     target: &Path,
-    kind: &Kind,
+    kind: &FileKind,
     inputs: impl IntoIterator<Item = (&'p Path, &'p str)>,
 ) -> Result<(), Failure> {
     let shown = target.display();
@@ -146,8 +147,8 @@ pub(crate) fn may_replace<'p>(
         }
     }
     match existing(target, kind) {
-        Ok(Existing::Free) => Ok(()),
-        Ok(Existing::Taken(what)) => Err(refuse(format!("{shown} {what}")).hint(kind.instead)),
+        Ok(TargetFile::Free) => Ok(()),
+        Ok(TargetFile::Taken(what)) => Err(refuse(format!("{shown} {what}")).hint(kind.instead)),
         Err(e) => {
             let failure = refuse(format!("cannot write {shown}: {e}"));
             Err(failure.hint(WRITABLE))
@@ -163,22 +164,22 @@ fn same_file(a: &Path, b: &Path) -> bool {
 }
 
 #[derive(Debug)]
-pub(crate) enum Existing {
-    /// Nothing that would be lost.
+pub(crate) enum TargetFile {
+    /// The target holds nothing that would be lost.
     Free,
     Taken(String),
 }
 
-/// Tries what writing will do, and leaves everything as it was.
-pub(crate) fn existing(target: &Path, kind: &Kind) -> io::Result<Existing> {
-    let taken = |what: &str| Ok(Existing::Taken(what.to_owned()));
+/// Checks whether the target can be written and leaves it unchanged.
+pub(crate) fn existing(target: &Path, kind: &FileKind) -> io::Result<TargetFile> {
+    let taken = |what: &str| Ok(TargetFile::Taken(what.to_owned()));
     let file_type = match fs::metadata(target) {
         Ok(metadata) => metadata.file_type(),
         Err(e) if e.kind() == ErrorKind::NotFound => {
             drop(File::create(target)?);
-            // The file, not a link that leads to it.
+            // Remove the created file, not a symlink that leads to it.
             fs::remove_file(fs::canonicalize(target)?)?;
-            return Ok(Existing::Free);
+            return Ok(TargetFile::Free);
         }
         Err(e) => return Err(e),
     };
@@ -188,47 +189,51 @@ pub(crate) fn existing(target: &Path, kind: &Kind) -> io::Result<Existing> {
     if file_type.is_block_device() {
         return taken("is a disk");
     }
-    // A pipe into a program, a null device: opening it could block, and nothing is kept there.
+    // Opening a pipe or a device could block, and it holds no data.
     if !file_type.is_file() {
-        return Ok(Existing::Free);
+        return Ok(TargetFile::Free);
     }
     let file = OpenOptions::new().read(true).write(true).open(target)?;
     let most = u64::try_from(kind.sign.within()).unwrap_or(u64::MAX);
     let mut head = Vec::new();
     file.take(most).read_to_end(&mut head)?;
     if head.is_empty() || kind.sign.shows(&head) {
-        return Ok(Existing::Free);
+        return Ok(TargetFile::Free);
     }
     taken(&format!("exists and is not {}", kind.what))
 }
 
-/// What becomes of the text that is replaced.
+/// What happens to the replaced text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Old {
+pub(crate) enum BackupPolicy {
     Kept,
     Lost,
 }
 
-/// Gives a file, or one that does not exist yet, another text: it has the old one or the new one at any time. A link still leads to
-/// it, and it is as readable as before. Returns where the old text is kept.
-pub(crate) fn replace(path: &Path, text: &str, old: Old) -> Result<Option<PathBuf>, Failure> {
+/// Replaces the text of a file atomically, or creates the file. Symlinks and permissions are kept.
+/// Returns the path of the backup.
+pub(crate) fn replace(
+    path: &Path,
+    text: &str,
+    old: BackupPolicy,
+) -> Result<Option<PathBuf>, Failure> {
     let failed = |e: io::Error| unwritable(path, &e);
-    let target = led_to(path).map_err(failed)?;
+    let target = resolve_symlink(path).map_err(failed)?;
     let there = match fs::metadata(&target) {
         Ok(there) => Some(there),
         Err(e) if e.kind() == ErrorKind::NotFound => None,
         Err(e) => return Err(failed(e)),
     };
-    let as_before = |beside: &Path| -> io::Result<()> {
+    let as_before = |sibling: &Path| -> io::Result<()> {
         let Some(there) = &there else { return Ok(()) };
-        // Root alone can; everybody else has made the file their own.
-        let _ = chown(beside, Some(there.uid()), Some(there.gid()));
-        fs::set_permissions(beside, there.permissions())
+        // Only root can change the owner; other users already own the file.
+        let _ = chown(sibling, Some(there.uid()), Some(there.gid()));
+        fs::set_permissions(sibling, there.permissions())
     };
     let kept = match (old, &there) {
-        (Old::Kept, Some(_)) => {
+        (BackupPolicy::Kept, Some(_)) => {
             let old = fs::read(&target).map_err(failed)?;
-            let kept = beside(path, &old, |n| match n {
+            let kept = write_sibling(path, &old, |n| match n {
                 0 => ".old".to_owned(),
                 n => format!(".old.{n}"),
             })
@@ -239,7 +244,8 @@ pub(crate) fn replace(path: &Path, text: &str, old: Old) -> Result<Option<PathBu
         _ => None,
     };
     let pid = std::process::id();
-    let new = beside(&target, text.as_bytes(), |n| format!(".{pid}.{n}.new")).map_err(failed)?;
+    let new =
+        write_sibling(&target, text.as_bytes(), |n| format!(".{pid}.{n}.new")).map_err(failed)?;
     let moved = as_before(&new).and_then(|()| fs::rename(&new, &target));
     if moved.is_err() {
         let _ = fs::remove_file(&new);
@@ -249,8 +255,8 @@ pub(crate) fn replace(path: &Path, text: &str, old: Old) -> Result<Option<PathBu
     Ok(kept)
 }
 
-/// A new file beside another, under the first free name.
-fn beside(path: &Path, bytes: &[u8], ending: impl Fn(u32) -> String) -> io::Result<PathBuf> {
+/// Writes a new file next to another, under the first free name.
+fn write_sibling(path: &Path, bytes: &[u8], ending: impl Fn(u32) -> String) -> io::Result<PathBuf> {
     for n in 0..NAMES {
         let mut name = OsString::from(path);
         name.push(ending(n));
@@ -259,11 +265,11 @@ fn beside(path: &Path, bytes: &[u8], ending: impl Fn(u32) -> String) -> io::Resu
             created => return created.map(|()| name.into()),
         }
     }
-    Err(io::Error::other("too many old files beside it"))
+    Err(io::Error::other("too many old files next to it"))
 }
 
-/// The file itself, where a link leads to it; it need not exist.
-fn led_to(path: &Path) -> io::Result<PathBuf> {
+/// Returns the target of a symlink; the target need not exist.
+fn resolve_symlink(path: &Path) -> io::Result<PathBuf> {
     match fs::canonicalize(path) {
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(match fs::read_link(path) {
             Ok(target) => folder(path).join(target),
@@ -289,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn somebodys_file_keeps_its_place_its_mode_and_its_neighbours() {
+    fn replace_keeps_symlink_mode_and_other_files() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         fs::create_dir(at("shared")).unwrap();
@@ -299,7 +305,7 @@ mod tests {
         fs::write(at("m.toml.new"), "a neighbour").unwrap();
         fs::write(at("m.toml.old"), "another").unwrap();
 
-        let kept = replace(&at("m.toml"), "new", Old::Kept).unwrap();
+        let kept = replace(&at("m.toml"), "new", BackupPolicy::Kept).unwrap();
         assert_eq!(kept, Some(at("m.toml.old.1")));
         assert!(at("m.toml").is_symlink());
         let read = |name: &str| fs::read_to_string(at(name)).unwrap();
@@ -316,24 +322,27 @@ mod tests {
         assert_eq!(read("m.toml.old"), "another");
         assert_eq!(names(&at("shared")), ["real.toml"]);
 
-        assert_eq!(replace(&at("m.toml"), "newer", Old::Lost), Ok(None));
+        assert_eq!(
+            replace(&at("m.toml"), "newer", BackupPolicy::Lost),
+            Ok(None)
+        );
         assert_eq!(read("shared/real.toml"), "newer");
-        // A link that leads nowhere yet, and a file that is not there.
+        // A dangling symlink to a file that does not exist.
         symlink("shared/more.toml", at("n.toml")).unwrap();
         for (name, real) in [("n.toml", "shared/more.toml"), ("o.toml", "o.toml")] {
-            assert_eq!(replace(&at(name), "first", Old::Kept), Ok(None));
+            assert_eq!(replace(&at(name), "first", BackupPolicy::Kept), Ok(None));
             assert_eq!(read(real), "first");
         }
         assert!(at("n.toml").is_symlink());
         let here = ["m.toml", "m.toml.new", "m.toml.old", "m.toml.old.1"];
         assert_eq!(names(folder.path())[..4], here);
         assert_eq!(names(folder.path())[4..], ["n.toml", "o.toml", "shared"]);
-        let failure = replace(&at("no/such/folder"), "x", Old::Kept).unwrap_err();
+        let failure = replace(&at("no/such/folder"), "x", BackupPolicy::Kept).unwrap_err();
         assert!(failure.message.contains("cannot write"), "{failure:?}");
     }
 
     #[test]
-    fn only_what_is_written_anew_every_time_is_written_over() {
+    fn may_replace_accepts_only_files_of_the_same_kind() {
         let folder = tempfile::tempdir().unwrap();
         let file = |name: &str, bytes: &[u8]| {
             let path = folder.path().join(name);
@@ -363,7 +372,7 @@ mod tests {
                     assert!(failure.message.contains(kind.what), "{failure:?}");
                 }
             }
-            // Not even one of its kind that is read.
+            // An input must not be overwritten even if it has the right kind.
             let inputs = [(own.as_path(), "what is read")];
             let failure = may_replace("--x", own, kind, inputs).unwrap_err();
             assert!(failure.message.ends_with("is what is read"), "{failure:?}");

@@ -1,46 +1,46 @@
-//! Failures as the user sees them: exit code, message, and what to do about it.
+//! Failures for the user: exit code, message and advice.
 
 use std::io::ErrorKind;
 use std::path::Path;
 
-use ecaxis::al_status::al_status_hint;
 use ecaxis::bringup::{BringUpError, StateError};
 use ecaxis::config::{ConfigError, LimitConflict, Nic, UnitProblem};
-use ecaxis::mailbox::{ObjectAddress, SdoError};
+use ecaxis::mailbox::{NamedObject, SdoError};
 use ecaxis::session::RunError;
 use ecaxis_axis::cia402::describe;
-use ecaxis_axis::scale::Contradiction;
-use ecaxis_axis::{HomingError, Refused, State, Trip, VelocityUnit};
+use ecaxis_axis::scale::UnitMismatch;
+use ecaxis_axis::{CommandError, HomingError, State, Trip, VelocityUnit};
+use ecaxis_ecat::al_status_code::al_status_hint;
 use ecaxis_esi::address;
 use ecaxis_sim::ServeError;
 
 use super::note;
 
+mod fault_report;
 mod firmware;
 mod host;
 mod service;
-mod story;
 
+pub(crate) use fault_report::cause;
 pub(crate) use firmware::{firmware, shared_bus};
 use host::interfaces;
 pub(crate) use host::{capabilities, concern, denied, interface, overload};
-pub(crate) use service::{beside_another, image, restore, service};
-pub(crate) use story::cause;
+pub(crate) use service::{image, restore, service, with_other_main_device};
 
-/// The machine or the bus failed.
+/// Exit code: the machine or the bus failed.
 pub(crate) const FAILED: u8 = 1;
-/// The file or the command line is wrong.
+/// Exit code: the file or the command line is wrong.
 pub(crate) const WRONG: u8 = 2;
-/// A signal ended the work, and nothing else failed: 128 + SIGINT, as a shell reports it.
+/// Exit code: a signal ended the work without another failure (128 + SIGINT).
 pub(crate) const INTERRUPTED: u8 = 130;
 
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Failure {
     pub code: u8,
-    /// Complete in itself; a list of problems is already laid out.
+    /// The complete message. A list of problems is already formatted.
     pub message: String,
     pub hints: Vec<String>,
-    /// A line that comes behind them.
+    /// A line printed after the hints.
     pub after: Option<String>,
 }
 
@@ -54,7 +54,7 @@ impl Failure {
         }
     }
 
-    /// Of work that a signal has ended.
+    /// The failure of work that a signal ended.
     pub fn interrupted() -> Self {
         Self::new(INTERRUPTED, RunError::Interrupted.to_string())
     }
@@ -80,21 +80,21 @@ impl Failure {
     }
 }
 
-/// What to look at for an emergency's code, as for 0x603F.
+/// Returns the advice for the error code of an emergency message, as for 0x603F.
 pub(crate) fn emergency(code: u16) -> &'static str {
     describe(code).hint
 }
 
-/// A recording that shows nothing of a bus.
+/// Adds advice for a recording without EtherCAT frames.
 pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
     failure.hint(if one_interface {
-        "leave `--interface` out to take them all"
+        "omit `--interface` to use all"
     } else {
         "record on the interface of the bus: frames of EtherType 0x88a4, or UDP port 34980"
     })
 }
 
-/// A run that failed. Hints depend on whether the bus is a real one.
+/// Maps the error of a run to a failure. Hints depend on whether the bus is real.
 pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
     let failure = Failure::new(FAILED, message(error));
     let hint = match error {
@@ -103,12 +103,12 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::State(state) => self::state(state),
         RunError::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
         RunError::Replay(_) => {
-            // The file is the user's.
+            // The recording is a user input.
             return Failure { code: WRONG, ..failure }
-                .hint("a replay needs a whole recording of this machine file's run, as `ecaxis run --record` makes it");
+                .hint("a replay needs a complete recording of a run of this machine file, made with `ecaxis run --record`");
         }
         RunError::NotMapped { source, .. } => format!(
-            "add \"{}\" to the device's `pdo` lists, or leave them out to take the ESI's",
+            "add \"{}\" to the device's `pdo` lists, or omit them to use the ESI's",
             address(source.index, source.sub),
         ),
         RunError::NoProcessData { .. } => {
@@ -131,9 +131,9 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::DriveFault { code: None, .. } => "read 0x603F and the error history 0x1003 of the drive".to_owned(),
         RunError::Trip { trip, .. } => self::trip(trip).to_owned(),
         RunError::BusLost { answered: false, .. } => {
-            "check cables and power; `lost_frames` sets how many bad cycles are ridden through".to_owned()
+            "check cables and power; `lost_frames` sets how many bad cycles are tolerated".to_owned()
         }
-        RunError::BusLost { answered: true, wkc, .. } => story::working_counter(*wkc).to_owned(),
+        RunError::BusLost { answered: true, wkc, .. } => fault_report::working_counter(*wkc).to_owned(),
         RunError::LeftOp { code, .. } => al_status(*code).to_owned(),
         RunError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
         RunError::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
@@ -141,19 +141,19 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
             "check load and tuning, or give the axis a wider `target_window`".to_owned()
         }
         RunError::ProbeNotArmed { input, .. } => format!(
-            "look whether the drive has a digital input configured as touch probe {input} (0x60B8 and 0x60B9 in its manual)"
+            "check that the drive has a digital input configured as touch probe {input} (0x60B8 and 0x60B9 in its manual)"
         ),
         RunError::NotProbed { input, edge, .. } => format!(
             "check the sensor, its wiring, and that the drive's digital input is configured as touch probe {input}; an input that is {} when the search begins shows no such edge; search farther with `to` or `by`, or for the other `edge`",
             if *edge == "rising" { "already on" } else { "off" }
         ),
-        RunError::StepTimeout { .. } => "look at the drive's state and fault; the step waits as long as `bus.enable_timeout`, or as the slowest axis may take to stop".to_owned(),
-        RunError::NotSwitched { .. } => "look at 0x6502 (supported drive modes), and at the drive's manual for what the mode needs".to_owned(),
+        RunError::StepTimeout { .. } => "check the drive's state and fault; the step waits for `bus.enable_timeout`, or for the longest stop time of an axis".to_owned(),
+        RunError::NotSwitched { .. } => "check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual".to_owned(),
         RunError::NotHomed { error, .. } => not_homed(*error).to_owned(),
         RunError::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
         RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
         RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
-        RunError::NotDisabled { .. } => "the drive does not obey its Controlword: take its power away by hand, then look at its fault".to_owned(),
+        RunError::NotDisabled { .. } => "the drive ignores its Controlword: switch its power off by hand, then check its fault".to_owned(),
         RunError::Refused { by_axis, device, .. } => refused(by_axis.as_deref(), &device.name),
         RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
         RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
@@ -164,11 +164,11 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
         RunError::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
         RunError::GroupStopped { cause, .. } => {
             let cause = run(cause, nic).hints.into_iter();
-            let back = "once the cause is known, let steps bring the group back: `reset`, then `enable`";
+            let back = "once the cause is known, restart the group with the steps `reset` and `enable`";
             return cause.fold(failure, Failure::hint).hint(back);
         }
-        RunError::Unsupervised => "the computer had no time for it: give the cycle a CPU of its own (`cpu` in [bus]), and look with `ecaxis doctor`".to_owned(),
-        RunError::Controller => "its message is on stderr; the axes have been brought to rest".to_owned(),
+        RunError::Unsupervised => "the computer is overloaded: reserve a CPU for the cycle (`cpu` in [bus]) and run `ecaxis doctor`".to_owned(),
+        RunError::Controller => "its message is on stderr; the axes were stopped".to_owned(),
         RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
         RunError::Interrupted => return Failure { code: INTERRUPTED, ..failure },
         RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) => return failure,
@@ -176,7 +176,7 @@ pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
     failure.hint(hint)
 }
 
-/// A run whose bus was a recording. Nothing can be done about that bus: whose it was may help.
+/// Returns the hint for a replayed run whose recording is of another bus.
 pub(crate) fn replayed(error: &RunError, devices: usize) -> Option<String> {
     let RunError::BringUp(error) = error else {
         return None;
@@ -191,11 +191,11 @@ pub(crate) fn replayed(error: &RunError, devices: usize) -> Option<String> {
         _ => return None,
     };
     Some(format!(
-        "the recording is of another machine, or of a bus that was not whole: it shows {shown}, the file has {devices}"
+        "the recording is of another machine or of an incomplete bus: it shows {shown}, the file has {devices}"
     ))
 }
 
-/// The error's text, with the address of an SDO once: its own errors carry it, too.
+/// Returns the error text with the device and object address once. The source error repeats both.
 fn message(error: &RunError) -> String {
     let text = error.to_string();
     let RunError::BringUp(error) = error else {
@@ -209,7 +209,7 @@ fn message(error: &RunError) -> String {
             source,
             ..
         } => {
-            let object = ObjectAddress {
+            let object = NamedObject {
                 index: *index,
                 sub: *sub,
             };
@@ -235,29 +235,31 @@ fn message(error: &RunError) -> String {
     }
 }
 
-/// `name`: of the device that refused.
-fn refused(reason: Option<&Refused>, name: &str) -> String {
+/// Returns the hint for a refused command. `name`: the axis that refused it.
+fn refused(reason: Option<&CommandError>, name: &str) -> String {
     match reason {
-        Some(Refused::NotEnabled { .. }) => {
-            format!("let a step enable the axis before: `enable = [\"{name}\"]`")
+        Some(CommandError::NotEnabled { .. }) => {
+            format!("enable the axis in an earlier step: `enable = [\"{name}\"]`")
         }
-        Some(Refused::StillMoving { .. }) => format!(
-            "bring the axis to rest before: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
+        Some(CommandError::StillMoving { .. }) => format!(
+            "stop the axis in an earlier step: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
         ),
-        Some(Refused::Following) => {
-            format!("let a step end what it follows before: `stop = [\"{name}\"]`")
+        Some(CommandError::Following) => {
+            format!("end following in an earlier step: `stop = [\"{name}\"]`")
         }
-        Some(Refused::WrongMode { needs, .. }) => format!(
-            "let a step switch the axis before: `mode = {{ {name} = \"{}\" }}`",
+        Some(CommandError::WrongMode { needs, .. }) => format!(
+            "switch the mode in an earlier step: `mode = {{ {name} = \"{}\" }}`",
             needs.to_string().to_lowercase()
         ),
-        Some(Refused::Faulted(_) | Refused::Tripped(_) | Refused::GroupStopped) => format!(
-            "let a step reset the axis before, once the cause is known: `reset = [\"{name}\"]`"
-        ),
-        Some(Refused::ModeNotOffered { .. } | Refused::NoModeDisplay) => {
+        Some(CommandError::Faulted(_) | CommandError::Tripped(_) | CommandError::GroupStopped) => {
+            format!(
+                "once the cause is known, reset the axis in an earlier step: `reset = [\"{name}\"]`"
+            )
+        }
+        Some(CommandError::ModeNotOffered { .. } | CommandError::NoModeDisplay) => {
             "map 0x6060, 0x6061 and the mode's targets with `pdo.rx` and `pdo.tx`".to_owned()
         }
-        Some(Refused::NoProbe) => {
+        Some(CommandError::NoProbe) => {
             "map 0x60B8, 0x60B9 and 0x60BA to 0x60BD with `pdo.rx` and `pdo.tx`".to_owned()
         }
         _ => "check the step and the axis' limits in the machine file".to_owned(),
@@ -267,16 +269,16 @@ fn refused(reason: Option<&Refused>, name: &str) -> String {
 fn not_homed(error: HomingError) -> &'static str {
     match error {
         HomingError::Timeout { .. } => {
-            "check that what the method looks for is there, wired and on that side (0x60FD shows the drive's inputs); a long way needs a higher `homing.search` or a longer `homing.timeout`"
+            "check the switch or sensor of the method, its wiring and its side (0x60FD shows the drive's inputs); a long travel needs a higher `homing.search` or a longer `homing.timeout`"
         }
         HomingError::Drive => {
-            "the search met the other limit switch or no index pulse: check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`"
+            "the search reached the other limit switch or found no index pulse: check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`"
         }
         HomingError::ModeRefused => {
-            "look at 0x6502 (supported drive modes): this drive may not know homing"
+            "check 0x6502 (supported drive modes): this drive may not support homing"
         }
-        HomingError::PowerLost => "look at the drive's fault (0x603F) and its supply",
-        HomingError::Aborted => "home the axis again before it moves to positions",
+        HomingError::PowerLost => "check the drive's fault (0x603F) and its supply",
+        HomingError::Aborted => "home the axis again before any absolute move",
     }
 }
 
@@ -287,28 +289,28 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
                 Nic::Interface(name) => failure
                     .hint(format!("is `{name}` the right interface? {}", interfaces()))
                     .hint("check that the first SubDevice has power and its IN port is connected"),
-                Nic::Sim => failure.hint("a fault script that silences the bus does this"),
+                Nic::Sim => failure.hint("check the fault script: it may silence the bus"),
             };
             return failure;
         }
         BringUpError::Missing { .. } => {
-            "check the power of the first one missing and the cable to it, or take its [[device]] out of the file; `ecaxis compare` shows all that differs".to_owned()
+            "check the power of the first one missing and the cable to it, or remove its [[device]] from the file; `ecaxis compare` shows all differences".to_owned()
         }
         BringUpError::Unexpected { position, .. } => {
             format!("add a [[device]] with `position = {position}`, or disconnect it")
         }
         BringUpError::Identity { .. } => {
-            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` takes newer revisions as well; `ecaxis compare` shows all that differs".to_owned()
+            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` accepts newer revisions as well; `ecaxis compare` shows all differences".to_owned()
         }
         BringUpError::Serial { found, .. } => {
-            format!("where the device was replaced on purpose, write `serial = {found}`, or leave `serial` out")
+            format!("if the device was replaced on purpose, write `serial = {found}` or omit `serial`")
         }
         BringUpError::NotLocated { .. } => {
             "set the device's alias or ID switch, or find it by `position`".to_owned()
         }
         BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
         BringUpError::NotHeld { .. } => {
-            "the device rounds or limits the value, or another object has changed it: write what it holds, or leave `verify` out for this object".to_owned()
+            "the device rounds or limits the value, or another object has changed it: write the value that it holds, or omit `verify` for this object".to_owned()
         }
         BringUpError::Mailbox { source, .. }
         | BringUpError::ReadBack { source, .. }
@@ -317,7 +319,7 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             sdo(source, "bring-up")
         }
         BringUpError::Watchdog { .. } => {
-            "without its watchdog the drive goes on when its outputs no longer come: ask its vendor how it is switched on".to_owned()
+            "without its watchdog the drive keeps moving when the outputs fail: ask its vendor how to enable it".to_owned()
         }
         BringUpError::Units { problems, .. } => {
             return problems.iter().map(units).fold(failure, Failure::hint);
@@ -335,14 +337,14 @@ fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
             "run the device without distributed clock: `dc = \"off\"`".to_owned()
         }
         BringUpError::Scan { .. } | BringUpError::Wire { .. } | BringUpError::NotTaken { .. } => {
-            "frames are lost or a device restarts: check cables and supply, and look with `--record`".to_owned()
+            "frames are lost or a device restarts: check cables and supply, and record with `--record`".to_owned()
         }
         BringUpError::State(state) => self::state(state),
     };
     failure.hint(hint)
 }
 
-/// What to change in the machine file or in the drive.
+/// Returns what to change in the machine file or in the drive.
 fn units(problem: &UnitProblem) -> String {
     let found = match problem {
         UnitProblem::Contradiction(found) => found,
@@ -357,7 +359,7 @@ fn units(problem: &UnitProblem) -> String {
         }
     };
     match *found {
-        Contradiction::VelocityUnit {
+        UnitMismatch::VelocityUnit {
             expected,
             found: code,
         } => {
@@ -366,27 +368,28 @@ fn units(problem: &UnitProblem) -> String {
                 expected.si_code()
             );
             match VelocityUnit::from_si_code(code) {
-                Some(unit) => format!(
-                    "{write}, or `velocity_unit = \"{unit}\"`, or leave `velocity_unit` out"
-                ),
+                Some(unit) => {
+                    format!("{write}, or `velocity_unit = \"{unit}\"`, or omit `velocity_unit`")
+                }
                 None => write,
             }
         }
-        Contradiction::CountsPerTurn {
+        UnitMismatch::CountsPerTurn {
             index: 0x608F,
             found: counts,
             ..
         } => format!(
             "write `encoder = {counts}`, or correct the drive's encoder resolution (0x608F)"
         ),
-        Contradiction::RatedTorque { found: 1.., .. } => {
-            "correct `sdo`, or the drive's motor data; `rated_torque` has the last word".to_owned()
+        UnitMismatch::RatedTorque { found: 1.., .. } => {
+            "correct `sdo`, or the drive's motor data; `rated_torque` takes precedence".to_owned()
         }
         ref other => other.advice().to_owned(),
     }
 }
 
-/// `origin` is what asked for it; `OWN_SDO` for the user's own list.
+/// Returns the hint for an SDO error. `origin` is the source of the request; `OWN_SDO` for the
+/// user's own list.
 fn sdo(error: &SdoError, origin: &str) -> String {
     let own = origin == OWN_SDO;
     match error {
@@ -407,49 +410,49 @@ fn sdo(error: &SdoError, origin: &str) -> String {
                 "the value is outside what the drive allows: its firmware does not match the ESI file"
             }
             0x0601_0000..=0x0601_0003 if own => {
-                "the object cannot be written: take it out of `sdo`"
+                "the object cannot be written: remove it from `sdo`"
             }
             0x0601_0000..=0x0601_0003 => {
-                "the drive does not let it be written: its firmware does not match the ESI file"
+                "the object is read-only in the drive: its firmware does not match the ESI file"
             }
             0x0607_0010..=0x0607_0013 if own => {
-                "the drive has another length for it: give its `type` in `sdo`"
+                "the object has another length in the drive: set its `type` in `sdo`"
             }
-            0x0607_0010..=0x0607_0013 => "the drive has another length for it: its firmware does not match the ESI file",
+            0x0607_0010..=0x0607_0013 => "the object has another length in the drive: its firmware does not match the ESI file",
             0x0604_0041..=0x0604_0042 if origin.starts_with("pdo.") => {
-                "the drive cannot map this: take it out of `pdo.rx` or `pdo.tx`"
+                "the drive cannot map this: remove it from `pdo.rx` or `pdo.tx`"
             }
             0x0604_0041..=0x0604_0042 => {
                 "the drive cannot map what the ESI file lists: choose other objects with `pdo.rx` and `pdo.tx`"
             }
             0x0800_0021 => "the drive is under local control: end its panel or commissioning tool; an object that is mapped now may not be writable either",
-            0x0504_0005 | 0x0800_0020 | 0x0606_0000 => "the drive cannot store it now: switch it off and on, then look at its own error history",
+            0x0504_0005 | 0x0800_0020 | 0x0606_0000 => "the drive cannot store it now: switch it off and on, then check its own error history",
             0x0604_0043 | 0x0604_0047 if own => "the value contradicts another setting of the drive: the order of `sdo` matters, and the mode must allow it",
             0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
             _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
         },
         SdoError::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
         SdoError::Gone { .. } | SdoError::Wire { .. } => "check the device's power and the cable to it",
-        _ => "look at the exchange with `--record`",
+        _ => "record the exchange with `--record`",
     }
     .to_owned()
 }
 
-/// What a start-up SDO of the machine file has as its origin.
+/// The origin of start-up SDOs from the machine file.
 const OWN_SDO: &str = "sdo of the machine file";
 
 fn state(error: &StateError) -> String {
     match error {
         StateError::Refused { code, .. } => al_status(*code).to_owned(),
         StateError::Timeout { .. } => {
-            "switch the device off and on, then look at its own display or error history".to_owned()
+            "switch the device off and on, then check its own display or error history".to_owned()
         }
         StateError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
         StateError::Wire { .. } => "check the cables".to_owned(),
     }
 }
 
-/// What to look at for an AL status code (ETG.1020).
+/// Returns the advice for an AL status code (ETG.1020).
 pub(crate) fn al_status(code: u16) -> &'static str {
     al_status_hint(code).unwrap_or("look the code up in the device's manual")
 }
@@ -459,16 +462,16 @@ fn not_enabled(state: State, code: Option<u16>, mode_confirmed: bool) -> String 
         (State::Fault | State::FaultReactionActive, Some(code)) if code != 0 => describe(code).hint.to_owned(),
         (State::Fault | State::FaultReactionActive, _) => "read the drive's error history (0x1003)".to_owned(),
         (State::OperationEnabled, _) if !mode_confirmed => {
-            "the drive does not take the mode over: check that 0x6060 is mapped or written, and supported".to_owned()
+            "the drive does not accept the mode: check that 0x6060 is mapped or written, and supported".to_owned()
         }
         _ => "check the supply of the power stage, STO and enable inputs, and that no other tool controls the drive".to_owned(),
     }
 }
 
-/// Error code of CiA 402.
+/// The CiA 402 error code of a following error.
 const FOLLOWING_ERROR: u16 = 0x8611;
 
-/// An axis could not follow where its drive bounds it more than the file does.
+/// Returns the hint for a following error of an axis whose drive has lower limits than the file.
 fn allows_less(limits: &[LimitConflict]) -> String {
     let each: Vec<_> = limits.iter().map(ToString::to_string).collect();
     format!(
@@ -501,7 +504,7 @@ fn trip(trip: &Trip) -> &'static str {
     }
 }
 
-/// The simulated bus on an interface.
+/// Maps an error of the simulated bus on an interface to a failure.
 pub(crate) fn serve(error: &ServeError) -> Failure {
     let failure = Failure::new(FAILED, error.to_string());
     match error {
@@ -515,7 +518,7 @@ pub(crate) fn serve(error: &ServeError) -> Failure {
     }
 }
 
-/// A machine file that is wrong.
+/// Maps an error of a machine file to a failure.
 pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
     let failure = Failure::new(WRONG, error.to_string());
     match error {
@@ -525,7 +528,7 @@ pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
         ConfigError::Io { source, .. } if source.kind() == ErrorKind::IsADirectory => {
             failure.hint("name the machine file in it")
         }
-        ConfigError::Io { .. } => failure.hint("look at the file's permissions"),
+        ConfigError::Io { .. } => failure.hint("check the file's permissions"),
         ConfigError::NotText { .. } => failure.hint("a machine file is TOML, in UTF-8"),
         ConfigError::Problems(problems) if problems.len() > 1 => {
             let message = format!(
@@ -539,7 +542,7 @@ pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
     }
 }
 
-/// Machine files that could have been meant.
+/// Suggests machine files in the neighbourhood of a missing one.
 fn machine_files(path: &Path) -> String {
     let nearby = [
         path.parent().unwrap_or(Path::new("")),

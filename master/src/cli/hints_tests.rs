@@ -17,7 +17,7 @@ fn hints_of(error: &RunError) -> (u8, String) {
 }
 
 #[test]
-fn every_failure_says_what_next() {
+fn every_failure_has_a_hint() {
     let sdo = |code| SdoError::Abort {
         station: 0x1001,
         index: 0x60c2,
@@ -66,7 +66,7 @@ fn every_failure_says_what_next() {
     let contradicts = |found| units(UnitProblem::Contradiction(found));
     for (error, code, hint) in [
         (
-            contradicts(Contradiction::VelocityUnit {
+            contradicts(UnitMismatch::VelocityUnit {
                 expected: VelocityUnit::MILLI_RPM,
                 found: VelocityUnit::RPM.si_code(),
             }),
@@ -74,7 +74,7 @@ fn every_failure_says_what_next() {
             "value = 0xFDB44700 }]`, or `velocity_unit = \"rpm\"`",
         ),
         (
-            contradicts(Contradiction::CountsPerTurn {
+            contradicts(UnitMismatch::CountsPerTurn {
                 index: 0x608f,
                 expected: 2000.0,
                 found: 4096.0,
@@ -83,7 +83,7 @@ fn every_failure_says_what_next() {
             "write `encoder = 4096`",
         ),
         (
-            contradicts(Contradiction::CountsPerTurn {
+            contradicts(UnitMismatch::CountsPerTurn {
                 index: 0x6091,
                 expected: 2000.0,
                 found: 1000.0,
@@ -132,12 +132,12 @@ fn every_failure_says_what_next() {
         ),
         (start_up(0x0602_0000, "ESI"), FAILED, "firmware"),
         (start_up(0x0601_0002, "mode csp"), FAILED, "firmware"),
-        (start_up(0x0601_0002, OWN_SDO), FAILED, "out of `sdo`"),
+        (start_up(0x0601_0002, OWN_SDO), FAILED, "from `sdo`"),
         (start_up(0x0602_0000, OWN_SDO), FAILED, "`index`"),
         (
             start_up(0x0604_0041, "pdo.rx in RxPdo 0x1600"),
             FAILED,
-            "out of `pdo.rx`",
+            "from `pdo.rx`",
         ),
         (refused(0x001e), FAILED, "assigned TxPDOs"),
         (refused(0x0035), FAILED, "cycle time"),
@@ -187,7 +187,7 @@ fn every_failure_says_what_next() {
 }
 
 #[test]
-fn only_the_users_own_sdo_is_blamed_on_it() {
+fn sdo_hint_names_the_sdo_key_only_for_user_sdos() {
     for code in (0x0503_0000..0x0504_0010).chain(0x0601_0000..0x060a_0030) {
         let error = SdoError::Abort {
             station: 0x1001,
@@ -202,7 +202,7 @@ fn only_the_users_own_sdo_is_blamed_on_it() {
 }
 
 #[test]
-fn an_address_is_told_once() {
+fn message_names_an_address_once() {
     let abort = SdoError::Abort {
         station: 0x1001,
         index: 0x6060,
@@ -247,7 +247,7 @@ fn an_address_is_told_once() {
     assert!(text.contains("back: 0x6060"), "{text}");
 }
 
-/// Whether the machine file has such a key in its bus, devices or axes.
+/// True if the key exists in [bus], [[device]] or [device.axis] of the machine file.
 fn is_a_key(key: &str) -> bool {
     let takes = |text: &str| {
         let Err(ConfigError::Problems(problems)) = ecaxis::config::parse(Path::new("m.toml"), text)
@@ -274,7 +274,7 @@ fn hints_name_keys_that_exist() {
 }
 
 #[test]
-fn only_a_file_that_is_not_there_has_neighbours() {
+fn config_suggests_files_only_for_a_missing_file() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("m.toml"), "[bus]").unwrap();
     std::fs::write(folder.path().join("noise.toml"), [0xff, 0xfe, 0]).unwrap();
@@ -292,9 +292,9 @@ fn only_a_file_that_is_not_there_has_neighbours() {
     }
 }
 
-/// Whoever waits in vain beside a machine that runs is not sent to its power switch.
+/// A time-out caused by another MainDevice must not suggest switching the drive off.
 #[test]
-fn beside_another_main_device_nobody_switches_a_drive_off() {
+fn hints_keep_drives_on_with_another_main_device() {
     let nic = Nic::Interface("eth9".into());
     let timeout = SdoError::Timeout {
         station: 0x1001,
@@ -311,27 +311,27 @@ fn beside_another_main_device_nobody_switches_a_drive_off() {
         code: 0x0609_0030,
     };
     for (source, takes_away) in [(timeout, true), (refused, false)] {
-        let error = ecaxis::service::ServiceError::Sdo {
+        let error = ecaxis::acyclic::ServiceError::Sdo {
             device: device(),
             source,
         };
         let alone = service(&error, &nic);
-        let beside = beside_another(service(&error, &nic), &error);
-        let told = beside.hints.join("\n");
+        let during = with_other_main_device(service(&error, &nic), &error);
+        let reported = during.hints.join("\n");
         assert_eq!(
-            told.contains("takes the answers away"),
+            reported.contains("takes the answers away"),
             takes_away,
-            "{told}"
+            "{reported}"
         );
-        assert!(!told.contains("off and on"), "{told}");
-        assert_eq!(beside.hints != alone.hints, takes_away, "{told}");
-        assert_eq!((beside.code, beside.message), (alone.code, alone.message));
+        assert!(!reported.contains("off and on"), "{reported}");
+        assert_eq!(during.hints != alone.hints, takes_away, "{reported}");
+        assert_eq!((during.code, during.message), (alone.code, alone.message));
     }
 }
 
 #[test]
-fn a_firmware_error_names_its_device_once() {
-    use ecaxis::firmware::{Cause, FirmwareError, Left, Step};
+fn firmware_error_names_its_device_once() {
+    use ecaxis::firmware::{Cause, FinalDeviceState, FirmwareError, Step};
     let abort = SdoError::Abort {
         station: 0x1001,
         index: 0x1f51,
@@ -350,7 +350,7 @@ fn a_firmware_error_names_its_device_once() {
             device: device(),
             step,
             cause,
-            left: Left::Silent,
+            left: FinalDeviceState::Silent,
         };
         let text = firmware(&error, &Nic::Sim).message;
         assert!(

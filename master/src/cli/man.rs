@@ -1,4 +1,4 @@
-//! `ecaxis man`: the manual, out of what the command line says of itself.
+//! `ecaxis man`: manual pages from the command-line definition.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -12,17 +12,17 @@ Examples:
   ecaxis man | man -l -                            read it
   ecaxis man --out ~/.local/share/man/man1         then `man ecaxis-run`";
 
-/// Print the manual page, or write a page for every verb
+/// Print the manual page, or write one page per subcommand
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Write ecaxis.1 and a page for every verb into this folder, which is made if need be
+    /// Write ecaxis.1 and one page per subcommand to this folder; create it if missing
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    // Help is no page of its own.
+    // The generated `help` subcommand gets no page.
     let mut command = command().disable_help_subcommand(true);
     command.build();
     let Some(folder) = &args.out else {
@@ -34,7 +34,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The page of a verb and of those below it; how many.
+/// Writes the pages of a subcommand and of those below it. Returns the number of pages.
 fn write_all(folder: &Path, verb: &clap::Command) -> io::Result<usize> {
     let man = Man::new(verb.clone());
     std::fs::write(folder.join(man.get_filename()), page(&man))?;
@@ -45,10 +45,10 @@ fn write_all(folder: &Path, verb: &clap::Command) -> io::Result<usize> {
     Ok(pages)
 }
 
-/// Examples keep their lines.
+/// Renders a page and keeps the line breaks of the examples.
 fn page(man: &Man) -> String {
     let mut page = Vec::new();
-    // Writing into memory cannot fail.
+    // Writing to memory cannot fail.
     let _ = man.render(&mut page);
     String::from_utf8_lossy(&page)
         .replacen("\n.SH EXTRA\n", "\n.SH EXAMPLES\n.nf\n", 1)

@@ -1,10 +1,13 @@
-//! The command line: one file a verb, each with its arguments and `run`.
+//! The command line: one file per subcommand, each with its arguments and `run`.
 //!
-//! Results go to stdout, progress and complaints to stderr. [`hints`] is the one place that turns
-//! failures into advice; [`report`] turns a run into a table, [`progress`] tells of it meanwhile;
-//! [`files`] and [`record`] keep what is written from destroying another file; [`style`] decides about
-//! colours, [`screen`] about lines; [`story`] lays out what stopped a run; [`bus`] is the one way to a
-//! bus without a cycle.
+//! Results go to stdout, progress and errors to stderr.
+//!
+//! - `hints`: exit code, message and advice for each failure;
+//! - `report`: the summary of a run; `progress`: its status during operation;
+//! - `fault_report`: the fault report of a failed run;
+//! - `files`, `record`: protect other files from being overwritten;
+//! - `style`: colours; `output`: status line and line width;
+//! - `bus`: access to a bus without a cycle.
 
 use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
@@ -24,38 +27,38 @@ mod eeprom;
 mod emergencies;
 mod esi;
 mod explain;
+mod fault_report;
 mod files;
 mod firmware;
 mod hints;
 mod jog;
 mod man;
+mod output;
+mod pdo_table;
 mod progress;
 mod record;
 mod report;
 mod run;
 mod scan;
-mod screen;
 mod sdo;
 mod signals;
 mod sim;
-mod story;
 mod style;
 mod table;
-mod tables;
 mod trace;
 
-pub(crate) use files::{in_the_way, keep, unwritable};
+pub(crate) use files::{already_exists, unwritable, write_new};
 pub(crate) use hints::Failure;
 
 const EXAMPLES: &str = "\
 Examples:
-  ecaxis scan enp3s0                 who is on the bus
-  ecaxis check machine.toml          every mistake in the machine file at once
-  ecaxis explain machine.toml        what follows from it
+  ecaxis scan enp3s0                 the devices on the bus
+  ecaxis check machine.toml          all problems in the machine file
+  ecaxis explain machine.toml        the derived configuration
   ecaxis run machine.toml --sim      its program on the simulated bus
   ecaxis run machine.toml            on the file's network interface
   ecaxis analyze run.pcapng          what a recording shows
-  ecaxis help run                    the options of a verb, with examples
+  ecaxis help run                    the options of a subcommand, with examples
 
 Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
 line is wrong, 130 interrupted.
@@ -91,13 +94,13 @@ enum Verb {
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Verbosity {
-    /// Log what happens; twice for more. RUST_LOG overrides it
+    /// Log events to stderr; repeat for more detail; RUST_LOG overrides it
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     verbose: u8,
 }
 
 impl Verbosity {
-    /// Log lines come in between.
+    /// True if log lines are mixed with the output, so that no line is rewritten.
     pub fn plain(&self) -> bool {
         self.verbose > 0
     }
@@ -112,14 +115,15 @@ impl Verbosity {
         let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
         tracing_subscriber::fmt()
             .with_env_filter(filter)
-            .with_writer(|| screen::Log)
+            .with_writer(|| output::Log)
             .with_ansi(style::on_stderr())
             .with_timer(tracing_subscriber::fmt::time::uptime())
             .init();
     }
 }
 
-/// Exit codes: 0 done, 1 the machine or the bus failed, 2 the file or the command line is wrong, 130 interrupted.
+/// Runs the command line. Exit codes: 0 done, 1 the machine or the bus failed, 2 the file or the
+/// command line is wrong, 130 interrupted.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     match &cli.verb {
@@ -169,18 +173,18 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// A result on stdout.
+/// Prints a result on stdout.
 pub(crate) fn result(text: &str) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
 }
 
-/// Prose on stdout: on a terminal, lines that are too long for it are broken.
+/// Prints prose on stdout. On a terminal, long lines are wrapped.
 pub(crate) fn page(text: &str) -> Result<(), Failure> {
-    result(&screen::wrapped(text, screen::stdout_width()))
+    result(&output::wrapped(text, output::stdout_width()))
 }
 
-/// A reader that has gone (`| head`) is no failure.
+/// Maps a write result. A closed pipe (`| head`) is not a failure.
 fn written(done: io::Result<()>) -> Result<(), Failure> {
     match done {
         Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Failure::new(
@@ -191,13 +195,13 @@ fn written(done: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// A line on stderr.
+/// Prints a line on stderr.
 pub(crate) fn note(text: &str) {
-    let text = screen::wrapped(text, screen::stderr_width());
-    let _ = screen::stay(|mut err| style::complaint(&mut err, &text));
+    let text = output::wrapped(text, output::stderr_width());
+    let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
 }
 
-/// What the command line takes, without what is read from it.
+/// Returns the definition of the command line.
 fn command() -> clap::Command {
     <Cli as clap::CommandFactory>::command()
 }
@@ -211,7 +215,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_a_reader_that_has_gone_is_no_failure() {
+    fn output_ignores_only_a_closed_pipe() {
         assert_eq!(written(Ok(())), Ok(()));
         let gone = io::Error::from(io::ErrorKind::BrokenPipe);
         assert_eq!(written(Err(gone)), Ok(()));
@@ -221,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn every_verb_has_examples_that_fit_a_terminal_and_are_right() {
+    fn every_subcommand_has_valid_examples() {
         fn look(verb: &clap::Command, path: &str) {
             let path = format!("{path} {}", verb.get_name());
             if verb.get_name() == "help" {
@@ -235,7 +239,7 @@ mod tests {
                 let Some(example) = line.trim().strip_prefix("ecaxis ") else {
                     continue;
                 };
-                // What the example is about stands behind a wide gap.
+                // Two or more spaces separate the example from its description.
                 let words = example.split("  ").next().unwrap_or_default();
                 let words = words.split(['<', '>', '|']).next().unwrap_or_default();
                 let line = std::iter::once("ecaxis").chain(words.split_whitespace());

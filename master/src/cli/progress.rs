@@ -1,5 +1,4 @@
-//! What a run tells while it goes on, on stderr: a line that is rewritten on a terminal, lines
-//! elsewhere.
+//! Progress of a run on stderr: a rewritten line on a terminal, otherwise separate lines.
 
 use std::time::{Duration, Instant};
 
@@ -10,30 +9,30 @@ use ecaxis::session::{AxisLine, Observer, Progress, Status};
 use ecaxis_axis::Mode;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{hints, note, screen, style};
+use super::{hints, note, output, style};
 
-/// Virtual time makes an hour of status lines in seconds; people read one a second.
+/// The minimum interval between status lines. In virtual time, an hour of status passes in seconds.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
 
-pub(crate) struct Teller {
-    /// `None`: plain lines.
+pub(crate) struct ProgressPrinter {
+    /// `None` prints separate lines.
     bar: Option<ProgressBar>,
     clock: Clock,
     cycle_ns: u64,
-    /// Hints depend on it.
+    /// The interface; hints depend on it.
     nic: Nic,
     last_passing: Option<Instant>,
     advised: Vec<String>,
 }
 
-impl Teller {
-    /// `plain`: do not rewrite lines, log lines come in between.
+impl ProgressPrinter {
+    /// `plain`: print separate lines, because log lines are mixed in.
     pub fn new(clock: Clock, bus: &Bus, plain: bool) -> Self {
         let bar = (style::rewrites() && !plain).then(|| {
             let bar = ProgressBar::new_spinner();
             let style = ProgressStyle::with_template("{spinner} {wide_msg}");
             let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
-            screen::put_up(&bar);
+            output::attach_bar(&bar);
             bar
         });
         Self {
@@ -46,7 +45,7 @@ impl Teller {
         }
     }
 
-    /// Something that the next of its kind replaces.
+    /// Shows a transient message.
     fn passing(&self, text: &str) {
         match &self.bar {
             Some(bar) => {
@@ -57,8 +56,8 @@ impl Teller {
         }
     }
 
-    /// At most one of these a second where lines stay or time is virtual.
-    fn occasional(&mut self, text: impl FnOnce() -> String) {
+    /// Prints at most one message per second with separate lines or in virtual time.
+    fn rate_limited(&mut self, text: impl FnOnce() -> String) {
         if self
             .last_passing
             .is_none_or(|last| last.elapsed() >= STATUS_PERIOD)
@@ -69,10 +68,10 @@ impl Teller {
     }
 }
 
-impl Observer for Teller {
+impl Observer for ProgressPrinter {
     fn progress(&mut self, progress: &Progress) {
         match progress {
-            // One line a device is enough where lines stay.
+            // With separate lines, one line per device is enough.
             Progress::Step(Step::StartUp { done, of, .. }) if self.bar.is_none() && done < of => {}
             Progress::Step(step @ (Step::StartUp { .. } | Step::Scan)) => {
                 self.passing(&step.to_string());
@@ -120,7 +119,7 @@ impl Observer for Teller {
                 if *run == 1 && self.bar.is_none() {
                     note(&text);
                 } else {
-                    self.occasional(|| text);
+                    self.rate_limited(|| text);
                 }
             }
             Progress::Captured { run, capture } => {
@@ -128,7 +127,7 @@ impl Observer for Teller {
             }
             Progress::Status(status) if self.clock == Clock::Virtual => {
                 let cycle_ns = self.cycle_ns;
-                self.occasional(|| status_line(status, cycle_ns));
+                self.rate_limited(|| status_line(status, cycle_ns));
             }
             Progress::Status(status) => self.passing(&status_line(status, self.cycle_ns)),
             Progress::Stopping => note("stopping: axes to rest, power off, bus to Init"),
@@ -136,9 +135,9 @@ impl Observer for Teller {
     }
 }
 
-impl Drop for Teller {
+impl Drop for ProgressPrinter {
     fn drop(&mut self) {
-        screen::take_down();
+        output::detach_bar();
     }
 }
 

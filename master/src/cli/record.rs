@@ -1,24 +1,25 @@
-//! Where a recording goes: never over a file that is something else.
+//! Targets of recordings. A recording never overwrites a file of another kind.
 
 use std::path::Path;
 
 use ecaxis::config::Machine;
 use ecaxis::link::capture;
 
-use super::files::{Existing, RECORDING, existing, may_replace};
+use super::files::{RECORDING, TargetFile, existing, may_replace};
 use super::{Failure, hints};
 
-/// Whether a run may write its frames to `target`.
+/// Fails if a run must not write its frames to `target`.
 pub(crate) fn check(
     target: &Path,
     machine: &Machine,
     faults: Option<&Path>,
 ) -> Result<(), Failure> {
-    check_beside(target, Some(machine), faults, None)
+    check_distinct(target, Some(machine), faults, None)
 }
 
-/// Whether frames may be written to `target`; `input` is another file that is read, and what it is.
-pub(crate) fn check_beside(
+/// Fails if frames must not be written to `target`. `input` is a file that is read, with its
+/// description.
+pub(crate) fn check_distinct(
     target: &Path,
     machine: Option<&Machine>,
     faults: Option<&Path>,
@@ -35,11 +36,11 @@ pub(crate) fn check_beside(
     may_replace("--record", target, &RECORDING, inputs)
 }
 
-/// Whether the parts of a recording with a limit would be written over something else.
+/// Fails if the parts of a limited recording would overwrite another file.
 pub(crate) fn check_parts(target: &Path) -> Result<(), Failure> {
     let parts = capture::parts_of(target).unwrap_or_default();
     for part in parts {
-        if let Ok(Existing::Taken(what)) = existing(&part, &RECORDING) {
+        if let Ok(TargetFile::Taken(what)) = existing(&part, &RECORDING) {
             let message = format!("--record-limit: {} {what}", part.display());
             return Err(Failure::new(hints::WRONG, message).hint(RECORDING.instead));
         }
@@ -47,10 +48,10 @@ pub(crate) fn check_parts(target: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The first of four parts should hold the bring-up, also of a long bus.
+/// The minimum size: the first of four parts should hold the bring-up of a long bus.
 const SMALLEST: u64 = 10_000_000;
 
-/// A size as people write it (`100MB`, `2 GiB`), in bytes.
+/// Parses a size such as `100MB` or `2 GiB` into bytes.
 pub(crate) fn size(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, u64); 7] = [
         ("GiB", 1 << 30),
@@ -84,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_nothing_and_recordings_are_written_over() {
+    fn recording_replaces_only_recordings() {
         let folder = tempfile::tempdir().unwrap();
         let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
         let copy = |name: &str| {
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_that_are_something_else() {
+    fn check_parts_rejects_other_files() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.pcapng");
         assert_eq!(check_parts(&path), Ok(()));

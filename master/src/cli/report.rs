@@ -1,4 +1,5 @@
-//! A run as a table, for people. In virtual time every figure is the machine's, none the computer's.
+//! The summary of a run as text. In virtual time all figures describe the machine, not the
+//! computer.
 
 use std::time::Duration;
 
@@ -8,7 +9,7 @@ use ecaxis::session::{AxisSummary, DeviceErrors, EventLine, Summary, ThreadSumma
 
 pub(crate) use super::table::Table;
 
-/// The whole result of a run.
+/// Formats the whole summary of a run.
 pub(crate) fn summary(summary: &Summary) -> String {
     let mut text = head(summary);
     text += "\n";
@@ -115,7 +116,7 @@ fn counters(summary: &Summary) -> Table {
         (
             "overruns",
             counters.overruns,
-            "cycles left out because the thread woke too late",
+            "cycles skipped because the thread woke too late",
         ),
         (
             "link errors",
@@ -145,10 +146,10 @@ fn counters(summary: &Summary) -> Table {
         (
             "dropped frames",
             summary.link.dropped,
-            "the kernel had no room: nobody looked for long",
+            "kernel receive buffer overflow",
         ),
     ] {
-        // The first three are always asked for; the others only matter when they happen.
+        // The first three are always shown, the others only if not zero.
         if count > 0
             || matches!(
                 name,
@@ -188,7 +189,7 @@ fn times(summary: &Summary) -> Table {
     table
 }
 
-/// What the real-time thread took.
+/// Formats CPU time and page faults of the real-time thread.
 fn thread(thread: &ThreadSummary, cycles: u64) -> String {
     let used = &thread.used;
     let a_cycle = |n: u64| n as f64 / cycles.max(1) as f64;
@@ -217,7 +218,7 @@ fn thread(thread: &ThreadSummary, cycles: u64) -> String {
     text
 }
 
-/// A line for each port that has seen errors.
+/// One row per port with errors.
 fn errors(devices: &[DeviceErrors]) -> Table {
     let mut table = Table::new(&[
         "SubDevice",
@@ -257,7 +258,7 @@ fn errors(devices: &[DeviceErrors]) -> Table {
     table
 }
 
-/// The last that led to the end, and when.
+/// Formats the last events before the end, with their times.
 fn events(events: &[EventLine]) -> String {
     const SHOWN: usize = 12;
     let mut table = Table::new(&["time", "cycle", "what the cycle noticed last"]);
@@ -315,7 +316,7 @@ fn axes(axes: &[AxisSummary]) -> Table {
     table
 }
 
-/// `-0.0000` reads like a mistake.
+/// Replaces negative zero, which would print as `-0.0000`.
 fn positive_zero(x: f64) -> f64 {
     if x.abs() < 0.000_05 { 0.0 } else { x }
 }
@@ -369,7 +370,7 @@ mod tests {
                 fault: None,
                 trip: None,
             }],
-            probes: vec![ecaxis::session::Capture {
+            probes: vec![ecaxis::session::ProbeCapture {
                 step: "3".into(),
                 axis: "x".into(),
                 input: 2,
@@ -425,7 +426,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_on_paper() {
+    fn summary_prints_all_figures() {
         let expected = "\
 m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
 
@@ -463,7 +464,7 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
     }
 
     #[test]
-    fn what_was_not_heard_is_not_final() {
+    fn summary_shows_when_an_axis_was_last_heard() {
         let mut summary = sample();
         summary.axes[0].last_heard_s = Some(0.908);
         let text = self::summary(&summary);
@@ -486,9 +487,9 @@ m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
     }
 
     #[test]
-    fn what_the_thread_took() {
+    fn summary_prints_thread_figures() {
         let thread = ThreadSummary {
-            used: ecaxis::os::process::ThreadUse {
+            used: ecaxis::sys::process::ThreadUsage {
                 cpu_ns: 625_000_000,
                 minor_faults: 3,
                 major_faults: 1,

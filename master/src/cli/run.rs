@@ -1,4 +1,4 @@
-//! `ecaxis run`: brings a machine up, runs its program, sums up.
+//! `ecaxis run`: brings a machine up, runs its program and prints a summary.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -6,24 +6,24 @@ use std::sync::atomic::AtomicBool;
 
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, ConfigError, Machine, Nic, duration};
+use ecaxis::post_mortem::FaultReport;
 use ecaxis::session::{self, Options, Outcome, Summary};
-use ecaxis::story::Story;
 use ecaxis_sim::FaultScript;
 use serde_json::{Value, json};
 
-use super::progress::Teller;
-use super::story::{self, Keep};
+use super::fault_report::{self, ReportDestination};
+use super::progress::ProgressPrinter;
 use super::{Failure, check, files, hints, note, page, record, report, result, signals};
 
 const EXAMPLES: &str = "\
 Examples:
   ecaxis run                                the demonstration, simulated
-  ecaxis run m.toml --sim --virtual         as fast as the computer can
+  ecaxis run m.toml --sim --virtual         in virtual time
   ecaxis run m.toml --nic enp3s0 --for 1h   for an hour on a real bus
-  ecaxis run m.toml --record bus.pcapng     every frame kept for Wireshark
-  ecaxis run m.toml --sim --faults f.toml   with things that go wrong
+  ecaxis run m.toml --record bus.pcapng     record all frames for Wireshark
+  ecaxis run m.toml --sim --faults f.toml   with a fault script
   ecaxis run m.toml --no-enable             to Op, axes without power
-  ecaxis run m.toml --json                  the result for a script
+  ecaxis run m.toml --json                  the result as JSON
 
 Ctrl-C, SIGTERM, or a terminal that closes: the axes decelerate within their
 limits, lose power, and the bus goes back to Init; the exit code is 130. Ctrl-Z
@@ -45,10 +45,10 @@ pub(crate) struct Args {
     /// Run in virtual time: as fast as possible, the same every time (simulated bus only)
     #[arg(long = "virtual")]
     virtual_time: bool,
-    /// Repeat the program until this time is over, such as 10s or 1h
+    /// Repeat the program for this time, such as 10s or 1h
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse, allow_hyphen_values = true)]
     time: Option<u64>,
-    /// Run the program this often instead of the file's `repeat`
+    /// Run the program this many times instead of the file's `repeat`
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), allow_hyphen_values = true)]
     repeat: Option<u32>,
     /// Seed of the simulated bus
@@ -57,31 +57,33 @@ pub(crate) struct Args {
     /// Fault script for the simulated bus
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
-    /// Take the bus to Op and leave the axes without power, until Ctrl-C or `--for` is over
+    /// Bring the bus to Op without enabling the axes, until Ctrl-C or the end of `--for`
     #[arg(long, conflicts_with = "enable")]
     no_enable: bool,
-    /// Enable the axes although the file says `enable = false`
+    /// Enable the axes even if the file has `enable = false`
     #[arg(long)]
     enable: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
-    /// Keep every frame in this pcapng file
+    /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Of a recording: keep its beginning and the newest frames, in parts, within this size, such as 100MB
+    /// Limit the recording to this size, such as 100MB; keep the beginning and the newest frames,
+    /// in parts
     #[arg(long, value_name = "SIZE", requires = "record", value_parser = record::size)]
     record_limit: Option<u64>,
-    /// Answer from this recording of a `--virtual` run in the place of a bus, and tell where this run deviates from it
+    /// Replay this recording of a `--virtual` run instead of a bus, and report where this run
+    /// deviates
     #[arg(long, value_name = "FILE", conflicts_with_all = ["nic", "seed", "faults"])]
     replay: Option<PathBuf>,
-    /// When the run fails, write its story here, and as JSON beside it; without this it goes to
-    /// ecaxis-stop-TIME.txt in the current folder, on a real bus
-    #[arg(long, value_name = "FILE")]
-    story: Option<PathBuf>,
-    /// Keep no story
-    #[arg(long, conflicts_with = "story")]
-    no_story: bool,
+    /// Write the fault report of a failed run to this file, and as JSON next to it [default:
+    /// ecaxis-stop-TIME.txt in the current folder, on a real bus only]
+    #[arg(long, alias = "story", value_name = "FILE")]
+    fault_report: Option<PathBuf>,
+    /// Write no fault report
+    #[arg(long, alias = "no-story", conflicts_with = "fault_report")]
+    no_fault_report: bool,
     #[command(flatten)]
     pub verbosity: super::Verbosity,
 }
@@ -96,12 +98,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Err(error) => {
             let short = check::in_short(&args.file, &error);
             let failure = hints::config(&args.file, &error);
-            tell(args, &short, &failure.hints, check::problems(&error));
+            print_failure(args, &short, &failure.hints, check::problems(&error));
             return Err(failure);
         }
     };
-    let options =
-        options(args, &machine).inspect_err(|f| tell(args, &f.message, &f.hints, json!([])))?;
+    let options = options(args, &machine)
+        .inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?;
     if !machine.enable && !args.no_enable {
         note(
             "note: the file says `enable = false`: the axes get no power; `--enable` gives it to them",
@@ -110,7 +112,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
     let stop = Arc::new(AtomicBool::new(false));
     signals::stop_on_interrupt(&stop);
-    let mut teller = Teller::new(options.clock, &machine.bus, args.verbosity.plain());
+    let mut teller = ProgressPrinter::new(options.clock, &machine.bus, args.verbosity.plain());
     let Outcome {
         summary,
         result: ended,
@@ -130,7 +132,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     });
     failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
     if let (Some(story), Some(failure)) = (&story, &mut failure) {
-        tell_story(args, story, failure, &nic);
+        print_fault_report(args, story, failure, &nic);
     }
     let text = if args.json {
         let report = json!({
@@ -153,13 +155,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     failure.map_or(written, Err)
 }
 
-/// What a run that ended without an error has not done. What failed goes before an interruption.
+/// Returns what a run that ended without an error did not complete. A stopped group takes
+/// precedence over an interruption.
 pub(super) fn unfinished(summary: &Summary) -> Option<Failure> {
     let interrupted = summary.interrupted.then(Failure::interrupted);
     stopped_since(summary).or(interrupted)
 }
 
-/// A machine that went on without a group of its axes has not done all that it should.
+/// Returns a failure if an axis group stopped and was not reset.
 fn stopped_since(summary: &Summary) -> Option<Failure> {
     let mut stopped = summary.group_stops.iter().filter(|stop| !stop.released);
     let stop = stopped.next()?;
@@ -171,32 +174,34 @@ fn stopped_since(summary: &Summary) -> Option<Failure> {
         "the group `{}` has stopped and was not reset{others}: {}",
         stop.group, stop.cause
     );
-    let hint = "mend the cause and run again; in a program, the steps `reset` and `enable` bring a group back";
+    let hint =
+        "fix the cause and run again; in a program, the steps `reset` and `enable` restart a group";
     Some(Failure::new(hints::FAILED, message).hint(hint))
 }
 
-/// In short on stderr, whole in a file. Where it knows the cause, its advice takes the place of that for the error.
-fn tell_story(args: &Args, story: &Story, failure: &mut Failure, nic: &Nic) {
+/// Prints the fault report in short on stderr and writes it to a file. If the cause is known, its
+/// advice replaces the advice for the error.
+fn print_fault_report(args: &Args, story: &FaultReport, failure: &mut Failure, nic: &Nic) {
     let advice = hints::cause(&story.cause);
-    // A bus that was recorded is not to be mended.
+    // The recorded bus cannot be fixed during a replay.
     if !advice.is_empty() && args.replay.is_none() {
         failure.hints = advice;
     }
-    let short = story::short(story);
+    let short = fault_report::short(story);
     if !short.is_empty() {
         note(short.trim_end());
     }
-    let keep = match (&args.story, nic) {
-        _ if args.no_story => Keep::No,
-        (Some(path), _) => Keep::File(path.clone()),
-        (None, Nic::Interface(_)) => Keep::Folder(PathBuf::new()),
-        // It can be run again.
-        (None, Nic::Sim) => Keep::No,
+    let keep = match (&args.fault_report, nic) {
+        _ if args.no_fault_report => ReportDestination::No,
+        (Some(path), _) => ReportDestination::File(path.clone()),
+        (None, Nic::Interface(_)) => ReportDestination::Folder(PathBuf::new()),
+        // A simulated run is repeatable, so its fault report is not kept.
+        (None, Nic::Sim) => ReportDestination::No,
     };
-    match story::keep(story, &failure.hints, &keep) {
+    match fault_report::keep(story, &failure.hints, &keep) {
         Ok(Some(path)) => {
             failure.after = Some(format!(
-                "  the whole story: {}, and as JSON beside it",
+                "  full fault report: {}, and as JSON next to it",
                 path.display()
             ))
         }
@@ -205,18 +210,18 @@ fn tell_story(args: &Args, story: &Story, failure: &mut Failure, nic: &Nic) {
     }
 }
 
-/// A script that asked for JSON gets it for a file that is wrong, too.
-fn tell(args: &Args, error: &str, hints: &[String], problems: Value) {
+/// Prints the failure as JSON if `--json` was given.
+fn print_failure(args: &Args, error: &str, hints: &[String], problems: Value) {
     if args.json {
         let report = json!({
             "ok": false, "error": error, "hints": hints, "problems": problems, "summary": null,
         });
-        // What is wrong with the file goes to stderr as well, and decides the exit code.
+        // Ignored: the caller prints the failure on stderr and sets the exit code.
         let _ = result(&format!("{report:#}\n"));
     }
 }
 
-/// A machine on the bus that the command line says, or its file.
+/// Loads a machine file. `nic` and `sim` override the bus of the file.
 pub(super) fn load(file: &Path, nic: Option<&str>, sim: bool) -> Result<Machine, ConfigError> {
     let mut machine = config::load(file)?;
     if sim || nic == Some("sim") {
@@ -253,15 +258,19 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
             record::check_parts(path)?;
         }
     }
-    if let Some(path) = &args.story {
+    if let Some(path) = &args.fault_report {
         let data = path.with_extension("json");
         if data == *path {
-            let message = format!("--story: {} is where the data go", path.display());
-            return Err(Failure::new(hints::WRONG, message)
-                .hint("name the page, such as `story.txt`; the data go beside it"));
+            let message = format!(
+                "--fault-report: {} is the file of the JSON data",
+                path.display()
+            );
+            return Err(Failure::new(hints::WRONG, message).hint(
+                "name the page, such as `report.txt`; the JSON data are written next to it",
+            ));
         }
-        files::may_replace("--story", path, &files::STORY, [])?;
-        files::may_replace("--story", &data, &files::STORY_DATA, [])?;
+        files::may_replace("--fault-report", path, &files::STORY, [])?;
+        files::may_replace("--fault-report", &data, &files::STORY_DATA, [])?;
     }
     let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
     let defaults = Options::default();
@@ -282,10 +291,10 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     })
 }
 
-/// No fault script is longer.
+/// The maximum size of a fault script in bytes.
 const MAX_BYTES: u64 = 16 << 20;
 
-/// A fault script from its file, for the machine's simulated bus.
+/// Loads a fault script and checks it against the machine's simulated bus.
 pub(super) fn faults(path: &Path, machine: &Machine) -> Result<FaultScript, Failure> {
     let text = ecaxis::file::read_text(path, MAX_BYTES)
         .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
@@ -303,9 +312,9 @@ mod tests {
 
     use super::*;
 
-    struct Silent;
+    struct QuietObserver;
 
-    impl Observer for Silent {
+    impl Observer for QuietObserver {
         fn progress(&mut self, _: &Progress) {}
     }
 
@@ -318,7 +327,7 @@ mod tests {
             seed,
             ..Options::default()
         };
-        let outcome = session::run(machine, options, Arc::default(), &mut Silent);
+        let outcome = session::run(machine, options, Arc::default(), &mut QuietObserver);
         outcome.result.unwrap();
         let summary = outcome.summary.unwrap();
         (
@@ -344,14 +353,14 @@ mod tests {
     }
 
     #[test]
-    fn virtual_time_needs_an_end() {
+    fn virtual_time_needs_a_program_or_a_limit() {
         let failure = refused(&["--virtual", "--repeat", "3"], "no steps");
         assert_eq!(failure.code, hints::WRONG);
         assert!(failure.hints[0].contains("--for 10s"));
     }
 
     #[test]
-    fn a_fault_of_a_device_that_is_not_there() {
+    fn faults_rejects_an_unknown_device() {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("f.toml");
         std::fs::write(&script, "\n[[fault]]\nkind = \"absent\"\ndevice = 2\n").unwrap();

@@ -1,4 +1,5 @@
-//! The signals of the verbs that send frames: [`session::stop_on_signals`] with words for the terminal.
+//! Signals of the subcommands that send frames: [`session::stop_on_signals`] with terminal
+//! messages.
 
 use std::io;
 use std::sync::Arc;
@@ -12,13 +13,13 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::hints::FAILED;
 use super::{jog, note};
 
-/// Sets `stop` at the first signal that ends the program; the next leaves at once. Without signals the
-/// program still ends by itself, so a failure here is only reported.
+/// Sets `stop` at the first signal that ends the program; the next signal exits at once. An
+/// installation failure is only reported, because the program ends without signals, too.
 pub(crate) fn stop_on_interrupt(stop: &Arc<AtomicBool>) {
     listen(stop, true);
 }
 
-/// Likewise, and writes nothing on the terminal until the program leaves.
+/// Like [`stop_on_interrupt`], but prints nothing until the program exits.
 pub(crate) fn stop_quietly(stop: &Arc<AtomicBool>) {
     listen(stop, false);
 }

@@ -1,4 +1,5 @@
-//! `ecaxis sim`: the machine file's bus, simulated, on a network interface for any MainDevice.
+//! `ecaxis sim`: serves the simulated bus of a machine file on a network interface, for any
+//! MainDevice.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -7,15 +8,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use ecaxis::config;
 use ecaxis::link::OpenError;
 use ecaxis::link::packet::PacketLink;
-use ecaxis::rt::thread;
 use ecaxis::session;
+use ecaxis::sys::rt_thread;
 use ecaxis_sim::{SecondPort, Segment, ServeStats, Server};
 use serde_json::{Value, json};
 
 use super::trace::Trace;
-use super::{Failure, files, hints, keep, note, result, run, signals, unwritable};
+use super::{Failure, files, hints, note, result, run, signals, unwritable, write_new};
 
-/// SCHED_FIFO priority of the simulated bus; below that of a master on the same computer.
+/// SCHED_FIFO priority of the simulated bus, below that of a master on the same computer.
 const PRIORITY: u8 = 70;
 
 const EXAMPLES: &str = "\
@@ -28,7 +29,7 @@ Examples:
 `ip link add veth0 type veth peer name veth1` makes two interfaces that are
 connected; needs root, or cap_net_raw.";
 
-/// Serve the machine's bus, simulated, on a network interface until Ctrl-C
+/// Serve the machine's simulated bus on a network interface until Ctrl-C
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -38,20 +39,23 @@ pub(crate) struct Args {
     /// Network interface to answer on
     #[arg(long, value_name = "IF")]
     nic: String,
-    /// The other interface of a MainDevice with cable redundancy: closes the bus into a ring
+    /// Second interface of a MainDevice with cable redundancy: closes the bus to a ring
     #[arg(long, value_name = "IF")]
     nic2: Option<String>,
     /// Fault script
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
-    /// The fault script begins at SIGUSR1, and anew at each further one, not with the first frame
+    /// Start the fault script at SIGUSR1 instead of the first frame, and again at each further
+    /// SIGUSR1
     #[arg(long, requires = "faults")]
     faults_on_signal: bool,
-    /// Write what every device does to this CSV file, once a millisecond: AL state and code, age of the outputs, Controlword, Statusword, velocity of the
-    /// motor shaft in turns per second; times are CLOCK_MONOTONIC
+    /// Write the state of every device to this CSV file, once per millisecond: AL state and code,
+    /// age of the outputs, Controlword, Statusword, velocity of the motor shaft in turns per
+    /// second; times are CLOCK_MONOTONIC
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …; other files are not written over
+    /// Write every device's EEPROM image to this folder first: 0.bin, 1.bin …; never overwrites
+    /// other files
     #[arg(long, value_name = "FOLDER")]
     sii: Option<PathBuf>,
     /// Print the statistics as JSON
@@ -95,7 +99,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         signals::raise_on_usr1(&signalled)
             .map_err(|e| Failure::new(hints::FAILED, format!("cannot wait for SIGUSR1: {e}")))?;
     }
-    // What cannot be opened is told before anything is said to answer.
+    // Report an interface that cannot be opened before announcing the bus.
     for nic in &nics {
         match PacketLink::open(nic) {
             Ok(_) => {}
@@ -125,8 +129,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         if devices == 1 { "s" } else { "" },
         nics.join("` and `"),
     ));
-    // Devices of silicon answer whatever else the computer does.
-    for denied in thread::prepare(PRIORITY, None) {
+    // Real devices answer independently of the computer's load.
+    for denied in rt_thread::become_realtime(PRIORITY, None) {
         note(&format!("warning: {denied}"));
     }
     let stats = server
@@ -152,7 +156,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     })
 }
 
-/// Only replaces a trace.
+/// Creates the trace file; overwrites only an earlier trace.
 fn trace(path: &Path) -> Result<Trace, Failure> {
     files::may_replace("--trace", path, &files::TRACE, [])?;
     let file = std::fs::File::create(path).and_then(Trace::new);
@@ -163,11 +167,11 @@ fn write_images(segment: &Segment, folder: &Path) -> Result<(), Failure> {
     std::fs::create_dir_all(folder).map_err(|error| unwritable(folder, &error))?;
     for (position, device) in devices(segment) {
         let path = folder.join(format!("{position}.bin"));
-        // The same image as last time is there already.
+        // Keep an identical image from an earlier start.
         if std::fs::read(&path).is_ok_and(|there| there == device.sii()) {
             continue;
         }
-        keep(&path, device.sii())?;
+        write_new(&path, device.sii())?;
     }
     Ok(())
 }

@@ -1,7 +1,7 @@
-//! Colours, decided in one place: none where the output is no terminal, where TERM is dumb, or where NO_COLOR is set.
+//! Colours. They are off if the output is not a terminal, if TERM is `dumb`, or if NO_COLOR is set.
 //!
-//! Text is written with escape sequences, and `anstream` takes them out where they are not wanted. Nothing is said by
-//! a colour alone.
+//! Text is written with escape sequences; `anstream` strips them if colours are off. No information
+//! is given by colour alone.
 
 use std::io::{self, IsTerminal, Write};
 
@@ -12,7 +12,7 @@ const ERROR: Style = AnsiColor::Red.on_default().bold();
 const WARNING: Style = AnsiColor::Yellow.on_default().bold();
 const HELP: Style = AnsiColor::Cyan.on_default().bold();
 
-/// How the lines of a complaint begin.
+/// The prefixes of message lines and their styles.
 const STARTS: [(&str, Style); 4] = [
     ("error:", ERROR),
     ("warning:", WARNING),
@@ -24,22 +24,22 @@ pub(super) fn stderr() -> impl Write {
     anstream::stderr().lock()
 }
 
-/// Whether what goes to stderr is coloured.
+/// True if stderr is coloured.
 pub(super) fn on_stderr() -> bool {
     AutoStream::choice(&io::stderr()) != ColorChoice::Never
 }
 
-/// Likewise on stdout.
+/// True if stdout is coloured.
 pub(super) fn on_stdout() -> bool {
     AutoStream::choice(&io::stdout()) != ColorChoice::Never
 }
 
-/// Whether lines on stderr can be written over.
+/// True if lines on stderr can be overwritten.
 pub(super) fn rewrites() -> bool {
     io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
 }
 
-/// Lines whose beginning says what they are.
+/// Writes a message and colours the prefixes of its lines.
 pub(super) fn complaint(out: &mut impl Write, text: &str) -> io::Result<()> {
     for line in text.split('\n') {
         let start = STARTS.iter().find(|(start, _)| line.starts_with(start));
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn beginnings_are_coloured_and_nothing_else() {
+    fn complaint_colours_only_prefixes() {
         let text = "error: no `x`\n  --> m.toml:3\n  = help: write `y`\nthe error: not here";
         let coloured = written(text, ColorChoice::AlwaysAnsi);
         assert_eq!(coloured.matches("\u{1b}[0m").count(), 2, "{coloured:?}");

@@ -1,8 +1,8 @@
-//! Columns of text, on paper or on a terminal.
+//! Text tables for files and terminals.
 
-use super::screen::stdout_width;
+use super::output::stdout_width;
 
-/// Columns as wide as their widest cell.
+/// A table whose columns are as wide as their widest cell.
 #[derive(Debug)]
 pub(crate) struct Table {
     rows: Vec<Vec<String>>,
@@ -19,32 +19,32 @@ impl Table {
         self.line(cells.map(ToOwned::to_owned).to_vec());
     }
 
-    /// A row of as many cells as the head has.
+    /// Adds a row with as many cells as the header.
     pub fn line(&mut self, cells: Vec<String>) {
         self.rows.push(cells);
     }
 
-    /// Without a line end after the last row.
+    /// Formats the table, indented by `by`, without a final line feed.
     pub fn indented(&self, by: usize) -> String {
         self.fitted(by, None)
     }
 
-    /// For a result that may be read on a terminal: there, long cells are broken so that lines need not be.
+    /// Like [`Self::indented`], but wraps long cells to the width of a terminal.
     pub fn shown(&self, by: usize) -> String {
         self.fitted(by, stdout_width())
     }
 
-    /// For a page of a fixed width, wider only where the terminal is.
+    /// Formats the table for `width` columns, or more if the terminal is wider.
     pub fn within(&self, by: usize, width: usize) -> String {
         self.fitted(by, Some(stdout_width().unwrap_or(width).max(width)))
     }
 
-    /// For a page of this many columns.
+    /// Formats the table for exactly this many columns.
     pub fn on_page(&self, by: usize, columns: usize) -> String {
         self.fitted(by, Some(columns))
     }
 
-    /// The widest columns give way until a line has no more than `limit` characters.
+    /// Shrinks the widest columns until no line exceeds `limit` characters.
     fn fitted(&self, by: usize, limit: Option<usize>) -> String {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let width = |column: usize| {
@@ -54,7 +54,7 @@ impl Table {
         let mut widths: Vec<usize> = (0..columns).map(width).collect();
         let between = by + GAP * columns.saturating_sub(1);
         let limit = limit.unwrap_or(usize::MAX);
-        // Where columns of whole words are too wide still, words are broken, too.
+        // If wrapping between words does not suffice, words are broken as well.
         let words = |column: usize| {
             let cells = self.rows.iter().filter_map(|row| row.get(column));
             let words = cells.flat_map(|cell| cell.split(' '));
@@ -98,14 +98,14 @@ impl Table {
     }
 }
 
-/// Between columns.
+/// The gap between columns.
 const GAP: usize = 2;
-/// Columns are made as narrow as this before others give way, too.
+/// The minimum width before narrower columns are shrunk as well.
 const NARROWEST: usize = 14;
-/// No column is made narrower to fit a terminal.
+/// The absolute minimum width of a column.
 const NARROWEST_WORD: usize = 6;
 
-/// In lines of at most `width` characters, between words where there is a place.
+/// Breaks a cell into lines of at most `width` characters, between words if possible.
 pub(crate) fn broken(cell: &str, width: usize) -> Vec<String> {
     if cell.chars().count() <= width {
         return vec![cell.to_owned()];
@@ -123,7 +123,7 @@ pub(crate) fn broken(cell: &str, width: usize) -> Vec<String> {
                 lines.push(String::new());
                 continue;
             }
-            // A word longer than a line.
+            // The word is longer than a line.
             lines.pop();
             lines.push(word.drain(..width.max(1)).collect());
             lines.push(String::new());
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn a_terminal_too_narrow_breaks_cells_and_loses_nothing() {
+    fn table_wraps_cells_on_a_narrow_terminal() {
         let mut table = Table::new(&["no", "what it takes", "name"]);
         table.row([
             "1",

@@ -1,4 +1,4 @@
-//! `ecaxis sim --trace`: what the simulated drives really do, as CSV.
+//! `ecaxis sim --trace`: the true state of the simulated drives as CSV.
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -9,7 +9,8 @@ use ecaxis_sim::{Nanos, Segment, SimDevice};
 const HEAD: &str = "time_ns,position,device,al_state,al_status_code,outputs_age_ns,controlword,statusword,velocity\n";
 const PERIOD: Nanos = 1_000_000;
 
-/// A line a device and millisecond. Each sample is written at once, so that it can be read while the bus is served.
+/// Writes one line per device and millisecond. Each sample is flushed, so that it can be read while
+/// the bus is served.
 pub(super) struct Trace {
     file: File,
     next: Nanos,
@@ -26,7 +27,7 @@ impl Trace {
         })
     }
 
-    /// Writes a sample, if one is due.
+    /// Writes a sample if one is due.
     pub fn sample(&mut self, segment: &Segment, now: Nanos) -> io::Result<()> {
         if now < self.next {
             return Ok(());
@@ -44,7 +45,8 @@ impl Trace {
     }
 }
 
-/// Without power there is no AL state. What is no drive has no words and no velocity (of the motor shaft, turns per second).
+/// Formats one line. Without power there is no AL state. Devices that are not drives have no
+/// Controlword, Statusword or velocity.
 fn line(lines: &mut String, now: Nanos, position: usize, device: &SimDevice, age: Option<Nanos>) {
     let state = match device.has_power() {
         true => device.al_state().to_string(),
@@ -52,7 +54,7 @@ fn line(lines: &mut String, now: Nanos, position: usize, device: &SimDevice, age
     };
     let (name, code) = (device.name(), device.al_status_code());
     let age = age.map(|age| age.to_string()).unwrap_or_default();
-    // Writing to a string cannot fail.
+    // Writing to a String cannot fail.
     let _ = write!(lines, "{now},{position},{name},{state},0x{code:04x},{age},");
     let _ = match device.drive() {
         Some(drive) => {

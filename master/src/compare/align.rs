@@ -1,9 +1,10 @@
-//! Two rows with as many partners as possible, in order.
+//! Longest common subsequence of two lists.
 
-/// Rows of devices are short; longer ones are not aligned (a quarter of a million comparisons).
+/// The maximum length of a list; longer lists are not aligned (a quarter of a million comparisons).
 const MOST: usize = 512;
 
-/// Pairs (left, right) of the longest common row, rising on both sides. Where several are as long, partners come as early as possible.
+/// Returns the pairs (left, right) of the longest common subsequence. Among equal lengths, it
+/// prefers early pairs.
 pub(super) fn longest(
     left: usize,
     right: usize,
@@ -11,7 +12,7 @@ pub(super) fn longest(
 ) -> Vec<(usize, usize)> {
     let (left, right) = (left.min(MOST), right.min(MOST));
     let width = right + 1;
-    // How many pairs the rows from (l, r) on have.
+    // The number of pairs from (l, r) on.
     let mut pairs = vec![0_u16; (left + 1) * width];
     let at = |l: usize, r: usize| l * width + r;
     let of = |pairs: &[u16], l: usize, r: usize| pairs.get(at(l, r)).copied().unwrap_or(0);
@@ -55,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn rows() {
+    fn longest_returns_common_subsequences() {
         for (left, right, expected) in [
             ("", "", vec![]),
             ("abc", "abc", vec![(0, 0), (1, 1), (2, 2)]),
@@ -69,7 +70,7 @@ mod tests {
         }
     }
 
-    /// Length of the longest common row, by another way.
+    /// Length of the longest common subsequence by exhaustive search.
     fn slowly(left: &[u8], right: &[u8]) -> usize {
         match (left.split_first(), right.split_first()) {
             (Some((a, left_rest)), Some((b, right_rest))) => {
@@ -88,7 +89,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn as_many_as_there_are(left in "[ab]{0,7}", right in "[abc]{0,7}") {
+        fn longest_has_maximum_length(left in "[ab]{0,7}", right in "[abc]{0,7}") {
             let pairs = aligned(&left, &right);
             prop_assert_eq!(pairs.len(), slowly(left.as_bytes(), right.as_bytes()));
             prop_assert!(pairs.is_sorted_by(|a, b| a.0 < b.0 && a.1 < b.1));

@@ -1,4 +1,4 @@
-//! The machine file rewritten so that it is as the bus. What does not differ stays as it is written, comments included.
+//! Rewrites the machine file to match the bus. Unchanged parts and comments are kept.
 
 use std::path::Path;
 
@@ -6,11 +6,11 @@ use toml_edit::{Array, ArrayOfTables, DocumentMut, Item, Table, TableLike, Value
 
 use super::{Comparison, Difference};
 use crate::config::{self, ConfigError, Locator, Machine};
-use crate::library::Match;
-use crate::scan::write::{self, Place};
-use crate::scan::{Described, Scan};
+use crate::esi_library::RevisionMatch;
+use crate::scan::write::{self, OutputPath};
+use crate::scan::{EsiMatch, Scan};
 
-/// Repetitions inside one another, as deep as a file may have them and then some.
+/// The maximum nesting of `repeat`, above the limit of machine files.
 const DEPTH: usize = 16;
 
 #[derive(Debug, thiserror::Error)]
@@ -27,51 +27,51 @@ pub enum ApplyError {
     Wrong(ConfigError),
 }
 
-/// What a bus is like, for the file.
+/// The inputs for the rewrite.
 #[derive(Debug, Clone, Copy)]
-pub struct Actual<'a> {
+pub struct BusSnapshot<'a> {
     pub scan: &'a Scan,
-    /// One for each device of the scan.
-    pub described: &'a [Option<Described>],
+    /// One per device of the scan.
+    pub described: &'a [Option<EsiMatch>],
     pub comparison: &'a Comparison,
 }
 
-impl Actual<'_> {
-    fn described(&self, position: u16) -> Option<&Described> {
+impl BusSnapshot<'_> {
+    fn described(&self, position: u16) -> Option<&EsiMatch> {
         self.described.get(usize::from(position))?.as_ref()
     }
 }
 
-/// A file that is as the bus.
+/// The rewritten file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Applied {
     pub text: String,
-    /// What else than the differences themselves has changed, in words: places that followed, steps and groups that went.
-    pub told: Vec<String>,
+    /// Consequences of the differences as text: moved positions, removed steps and groups.
+    pub reported: Vec<String>,
 }
 
-/// Rewrites `text`, the file at `path`, which was checked to be `machine`. Parameters stay as they are. The result is a file without
-/// mistakes; what of it lost a device that it named is marked with [`write::MARK`].
+/// Rewrites `text`, the file at `path`, which parses to `machine`. Parameters are kept. The result
+/// is a valid file. Items that lost a named device are marked with [`write::MARK`].
 ///
 /// # Errors
-/// Where the file cannot become as the bus.
+/// Fails if the file cannot match the bus.
 pub fn apply(
     path: &Path,
     text: &str,
     machine: &Machine,
-    actual: Actual<'_>,
+    actual: BusSnapshot<'_>,
 ) -> Result<Applied, ApplyError> {
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let mut document: DocumentMut = text
         .parse()
         .map_err(|error: toml_edit::TomlError| ApplyError::NotToml(error.to_string()))?;
-    let place = Place {
+    let place = OutputPath {
         nic: "",
         folder: path.parent().unwrap_or(Path::new("")),
     };
     let differences = &actual.comparison.differences;
 
-    // New ones first: a file without devices says nothing of how they are written.
+    // Add new devices first: a file without devices has no form to follow.
     let mut new = Vec::new();
     for difference in differences {
         if let Difference::Added { position } = difference {
@@ -88,7 +88,7 @@ pub fn apply(
             && from != position
         {
             set(table, "position", &position.to_string());
-            told.push(format!(
+            reported.push(format!(
                 "`{}` has `position = {position}` now, it was {from}",
                 config.name
             ));
@@ -105,7 +105,7 @@ pub fn apply(
         });
     let names: Vec<&str> = missing.map(|config| config.name.as_str()).collect();
     if !names.is_empty() {
-        remove(&mut document, &names, &mut told)?;
+        remove(&mut document, &names, &mut reported)?;
     }
     let list = devices(&mut document)?;
     for section in sections {
@@ -116,7 +116,7 @@ pub fn apply(
     }
     let text = document.to_string();
     config::parse(path, &text).map_err(ApplyError::Wrong)?;
-    Ok(Applied { text, told })
+    Ok(Applied { text, reported })
 }
 
 fn devices(document: &mut DocumentMut) -> Result<&mut ArrayOfTables, ApplyError> {
@@ -131,7 +131,7 @@ fn device<'d>(document: &'d mut DocumentMut, name: &str) -> Result<&'d mut Table
     all.find(named).ok_or(ApplyError::OtherForm)
 }
 
-/// Writes a value in the place of the one there is, with its comment; or at the end.
+/// Replaces a value and keeps its comment, or appends it.
 fn set(table: &mut Table, key: &str, value: &str) {
     let Ok(mut value) = value.parse::<Value>() else {
         return;
@@ -142,7 +142,7 @@ fn set(table: &mut Table, key: &str, value: &str) {
             *old = value;
         }
         None => {
-            // Beside the others of its table, in columns as they are.
+            // Format it like the other keys of the table.
             value.decor_mut().set_prefix(" ");
             table.insert(key, Item::Value(value));
         }
@@ -153,11 +153,11 @@ fn quoted(text: &str) -> String {
     Value::from(text).to_string()
 }
 
-/// Sections of devices that the file does not have.
+/// Returns sections for the devices that the file does not have.
 fn added(
     machine: &Machine,
-    actual: Actual<'_>,
-    place: Place<'_>,
+    actual: BusSnapshot<'_>,
+    place: OutputPath<'_>,
     positions: &[u16],
 ) -> Result<Vec<Table>, ApplyError> {
     let aliases = write::aliases(actual.scan);
@@ -193,7 +193,7 @@ fn added(
     Ok(tables)
 }
 
-/// Tables of another file stand where they are put.
+/// Clears the positions of tables from another document.
 fn unplaced(table: &mut Table, depth: usize) {
     table.set_position(None);
     if depth == 0 {
@@ -206,12 +206,12 @@ fn unplaced(table: &mut Table, depth: usize) {
     }
 }
 
-/// What can be changed in the device's own table.
+/// Applies the differences that only change the device's own table.
 fn change(
     document: &mut DocumentMut,
     machine: &Machine,
-    actual: Actual<'_>,
-    place: Place<'_>,
+    actual: BusSnapshot<'_>,
+    place: OutputPath<'_>,
     difference: &Difference,
 ) -> Result<(), ApplyError> {
     let name = |index: usize| machine.devices.get(index).map(|d| d.name.as_str());
@@ -282,20 +282,20 @@ fn change(
     Ok(())
 }
 
-/// The description that fits best, and a rule where it is of another revision.
+/// Selects the best description, and a rule if its revision differs.
 fn revision(
     table: &mut Table,
     config: &config::DeviceConfig,
-    described: &Described,
+    described: &EsiMatch,
     found: u32,
-    place: Place<'_>,
+    place: OutputPath<'_>,
 ) {
     let identity = |d: &ecaxis_esi::Device| {
         let id = d.identity;
         (id.vendor, id.product, id.revision)
     };
     let wanted = identity(&described.device);
-    // The file that is named may describe it as well.
+    // The named file may describe the revision as well.
     if !config.esi.devices.iter().any(|d| identity(d) == wanted) {
         let path = write::relative(&described.path, place.folder);
         set(table, "esi", &quoted(&path.display().to_string()));
@@ -303,25 +303,25 @@ fn revision(
     let (.., revision) = wanted;
     set(table, "revision", &format!("0x{revision:08x}"));
     let rule = if revision == found {
-        Match::Equal
-    } else if Match::Newer.accepts(revision, found) {
-        Match::Newer
+        RevisionMatch::Equal
+    } else if RevisionMatch::Newer.accepts(revision, found) {
+        RevisionMatch::Newer
     } else {
-        Match::Ignore
+        RevisionMatch::Ignore
     };
     match rule {
-        Match::Equal if config.identity.accepts(revision, found) => {}
-        Match::Equal => set(table, "identity", &quoted("equal")),
-        Match::Newer => set(table, "identity", &quoted(">=")),
+        RevisionMatch::Equal if config.identity.accepts(revision, found) => {}
+        RevisionMatch::Equal => set(table, "identity", &quoted("equal")),
+        RevisionMatch::Newer => set(table, "identity", &quoted(">=")),
         _ => set(table, "identity", &quoted("ignore")),
     }
 }
 
-/// Takes devices out, and everything that names them.
+/// Removes devices and all references to them.
 fn remove(
     document: &mut DocumentMut,
     names: &[&str],
-    told: &mut Vec<String>,
+    reported: &mut Vec<String>,
 ) -> Result<(), ApplyError> {
     let named = |item: Option<&Item>| {
         let name = item.and_then(Item::as_str);
@@ -339,10 +339,10 @@ fn remove(
         }
     }
     if let Some(steps) = document.get_mut("step") {
-        forget_in_steps(steps, names, DEPTH, "", told);
+        forget_in_steps(steps, names, DEPTH, "", reported);
     }
     if let Some(stop) = document.get_mut("stop") {
-        forget_in_stop(stop, names, told);
+        forget_in_stop(stop, names, reported);
     }
     for key in ["step", "stop"] {
         if document.get(key).is_some_and(is_empty) {
@@ -352,14 +352,14 @@ fn remove(
     Ok(())
 }
 
-/// `` `x` is gone ``
+/// Formats `` `x` is gone ``.
 fn are_gone(names: &[&str]) -> String {
     let quoted: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
     let be = if names.len() == 1 { "is" } else { "are" };
     format!("{} {be} gone", quoted.join(", "))
 }
 
-/// A comment behind what has lost a name, beside the one that is there.
+/// Adds a comment to an item that lost a name, next to an existing comment.
 fn mark(item: &mut Item, gone: &[&str]) {
     let decor = match item {
         Item::Value(value) => value.decor_mut(),
@@ -386,13 +386,14 @@ fn is_empty(item: &Item) -> bool {
     }
 }
 
-/// A step that only these devices took part in goes. `outer`: the number of the step that these are in, with a point.
+/// Removes steps in which only these devices took part. `outer`: the number of the parent step with
+/// a point.
 fn forget_in_steps(
     steps: &mut Item,
     names: &[&str],
     depth: usize,
     outer: &str,
-    told: &mut Vec<String>,
+    reported: &mut Vec<String>,
 ) {
     let Some(steps) = steps.as_array_of_tables_mut().filter(|_| depth > 0) else {
         return;
@@ -400,9 +401,9 @@ fn forget_in_steps(
     let mut kept = Vec::with_capacity(steps.len());
     for (n, step) in (1..).zip(steps.iter_mut()) {
         let number: String = format!("{outer}{n}");
-        let left = forget_in_step(step, names, depth, &number, told);
+        let left = forget_in_step(step, names, depth, &number, reported);
         if !left {
-            told.push(format!("step {number} is taken out: nobody is left in it"));
+            reported.push(format!("step {number} is removed: no axis is left in it"));
         }
         kept.push(left);
     }
@@ -410,13 +411,13 @@ fn forget_in_steps(
     steps.retain(|_| kept.next().unwrap_or(true));
 }
 
-/// Whether anything is left to be done.
+/// Removes the names from a step. Returns whether anything remains.
 fn forget_in_step(
     step: &mut Table,
     names: &[&str],
     depth: usize,
     number: &str,
-    told: &mut Vec<String>,
+    reported: &mut Vec<String>,
 ) -> bool {
     let mut kept = true;
     for (_, item) in step.iter_mut() {
@@ -424,21 +425,21 @@ fn forget_in_step(
         let mut gone = Vec::new();
         match item {
             Item::ArrayOfTables(_) => {
-                forget_in_steps(item, names, depth - 1, &format!("{number}."), told);
+                forget_in_steps(item, names, depth - 1, &format!("{number}."), reported);
             }
             Item::Value(Value::Array(list)) => gone = forget_in_list(list, names),
             _ => {
                 if let Some(axes) = item.as_table_like_mut() {
                     gone = forget_axes(axes, names);
                 }
-                // The last one before the brace has the blank.
+                // The blank before the closing brace is attached to the last item.
                 let inline = item.as_inline_table_mut();
                 if let Some((_, last)) = inline.and_then(|axes| axes.iter_mut().last()) {
                     last.decor_mut().set_suffix(" ");
                 }
             }
         }
-        // Nobody is left to take part.
+        // No device is left.
         kept &= before || !is_empty(item);
         if !gone.is_empty() && !is_empty(item) {
             mark(item, &gone);
@@ -447,7 +448,7 @@ fn forget_in_step(
     kept
 }
 
-/// Which of the names were in it.
+/// Removes the names from a list and returns those it contained.
 fn forget_in_list<'n>(list: &mut Array, names: &[&'n str]) -> Vec<&'n str> {
     let there = |name: &&&str| list.iter().any(|item| item.as_str() == Some(**name));
     let gone: Vec<&str> = names.iter().filter(there).copied().collect();
@@ -455,7 +456,7 @@ fn forget_in_list<'n>(list: &mut Array, names: &[&'n str]) -> Vec<&'n str> {
     gone
 }
 
-/// The axes' own entries, and those of axes that follow them. Which of the names that concerned.
+/// Removes the axes' entries and those of their followers. Returns the names concerned.
 fn forget_axes<'n>(axes: &mut dyn TableLike, names: &[&'n str]) -> Vec<&'n str> {
     let mut gone = Vec::new();
     for name in names {
@@ -480,8 +481,8 @@ fn forget_axes<'n>(axes: &mut dyn TableLike, names: &[&'n str]) -> Vec<&'n str> 
     gone
 }
 
-fn forget_in_stop(stop: &mut Item, names: &[&str], told: &mut Vec<String>) {
-    // Within braces a comment would hide what closes them.
+fn forget_in_stop(stop: &mut Item, names: &[&str], reported: &mut Vec<String>) {
+    // In an inline table, a comment would hide the closing brace.
     let roomy = stop.is_table();
     let Some(stop) = stop.as_table_like_mut() else {
         return;
@@ -498,7 +499,7 @@ fn forget_in_stop(stop: &mut Item, names: &[&str], told: &mut Vec<String>) {
         if !gone.is_empty() && !is_empty(item) && roomy {
             mark(item, &gone);
         } else if !gone.is_empty() {
-            told.push(format!(
+            reported.push(format!(
                 "`[stop] emergency` has lost inputs: {}",
                 are_gone(&gone)
             ));
@@ -525,8 +526,8 @@ fn forget_in_stop(stop: &mut Item, names: &[&str], told: &mut Vec<String>) {
             if !kept {
                 let name = group.get("name").and_then(Item::as_str);
                 let name = name.unwrap_or_default();
-                told.push(format!(
-                    "the group `{name}` is taken out: no axis of it is left"
+                reported.push(format!(
+                    "the group `{name}` is removed: no axis of it is left"
                 ));
             }
             kept

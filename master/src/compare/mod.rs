@@ -1,8 +1,9 @@
-//! A machine file against a bus: who is missing, who is there besides, who stands where another should. Pure, but for [`parameters`].
+//! Compares a machine file with a bus: missing, added, and displaced devices. Pure, except
+//! [`parameters`].
 //!
-//! - here: which device of the bus is which of the file, and what is wrong with it;
-//! - `parameters`: what the devices hold of the start-up SDOs;
-//! - [`apply`]: the file rewritten so that it is as the bus.
+//! - this module: assigns bus devices to file devices, and compares each pair;
+//! - `parameters`: compares the start-up SDO values;
+//! - [`apply`]: rewrites the file to match the bus.
 
 use std::fmt;
 
@@ -17,28 +18,29 @@ mod parameters;
 
 pub use parameters::parameters;
 
-/// One thing about which bus and file disagree. Devices of the file are indices into [`Machine::devices`], those of the bus positions.
+/// A difference between bus and file. File devices are indices into [`Machine::devices`], bus
+/// devices are positions.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Difference {
-    /// Nobody on the bus is this device.
+    /// No device on the bus matches this one.
     Missing { device: usize },
-    /// The file does not name this one.
+    /// The file does not contain this device.
     Added { position: u16 },
-    /// Each stands where the other should.
+    /// Two devices are in each other's position.
     Swapped {
         devices: [usize; 2],
         positions: [u16; 2],
     },
-    /// It stands elsewhere; those between may have moved on with it.
+    /// The device is in another position; those in between may have moved as well.
     Moved { device: usize, from: u16, to: u16 },
-    /// A revision that the device's `identity` does not take.
+    /// A revision that the device's `identity` does not accept.
     Revision {
         device: usize,
         position: u16,
         expected: u32,
         found: u32,
     },
-    /// The device is there, under another alias or device identification.
+    /// The device has another alias or device identification.
     Alias {
         device: usize,
         position: u16,
@@ -51,14 +53,14 @@ pub enum Difference {
         expected: u32,
         found: u32,
     },
-    /// Modules by their names, slot by slot.
+    /// Module names by slot.
     Modules {
         device: usize,
         position: u16,
         expected: Vec<String>,
         found: Vec<String>,
     },
-    /// What a start-up SDO would write, and what the device holds.
+    /// A start-up SDO value and the value in the device.
     Parameter {
         device: usize,
         position: u16,
@@ -70,17 +72,17 @@ pub enum Difference {
     },
 }
 
-/// What a comparison found.
+/// The result of a comparison.
 #[derive(Debug, Clone, Default)]
 pub struct Comparison {
     pub differences: Vec<Difference>,
-    /// For each device of the file its position on the bus.
+    /// The bus position of each file device.
     pub places: Vec<Option<u16>>,
-    /// What could not be compared.
+    /// Items that could not be compared.
     pub unknown: Vec<String>,
 }
 
-/// Compares a machine with a bus that was scanned.
+/// Compares a machine with a scanned bus.
 #[must_use]
 pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
     let mut comparison = Comparison {
@@ -91,7 +93,7 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
     by_serial(machine, scan, &mut comparison.places, &mut free);
     by_alias(machine, scan, &mut comparison.places, &mut free);
     by_order(machine, scan, &mut comparison.places, &mut free);
-    elsewhere(machine, scan, &mut comparison, &mut free);
+    match_moved(machine, scan, &mut comparison, &mut free);
 
     let missing = comparison.places.iter().enumerate();
     let missing = missing.filter(|(_, place)| place.is_none());
@@ -106,7 +108,7 @@ pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
     for (index, config) in machine.devices.iter().enumerate() {
         let place = comparison.places.get(index).copied().flatten();
         if let Some(device) = place.and_then(|at| scan.devices.get(usize::from(at))) {
-            one(index, config, device, scan.asked, &mut comparison);
+            compare_device(index, config, device, scan.asked, &mut comparison);
         }
     }
     comparison
@@ -119,17 +121,17 @@ fn is_product(config: &DeviceConfig, device: &Device) -> bool {
         .is_some_and(|i| (i.vendor, i.product) == (ours.vendor, ours.product))
 }
 
-type Places = [Option<u16>];
+type Positions = [Option<u16>];
 
-/// Serial numbers tell devices apart whatever else has changed.
-fn by_serial(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [bool]) {
-    claim(machine, scan, places, free, |config, device| {
+/// Assigns devices by serial number, which is always unique.
+fn by_serial(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
+    assign(machine, scan, places, free, |config, device| {
         config.serial.is_some() && config.serial == device.serial()
     });
 }
 
-fn by_alias(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [bool]) {
-    claim(machine, scan, places, free, |config, device| {
+fn by_alias(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
+    assign(machine, scan, places, free, |config, device| {
         match config.at {
             Locator::Position(_) => false,
             Locator::Alias(alias) => device.found.alias == alias,
@@ -138,11 +140,12 @@ fn by_alias(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [boo
     });
 }
 
-/// Gives each device of the file that has no place yet the first free one of its product that fits.
-fn claim(
+/// Assigns each remaining file device the first free bus device that has its product and satisfies
+/// `fits`.
+fn assign(
     machine: &Machine,
     scan: &Scan,
-    places: &mut Places,
+    places: &mut Positions,
     free: &mut [bool],
     fits: impl Fn(&DeviceConfig, &Device) -> bool,
 ) {
@@ -160,8 +163,9 @@ fn claim(
     }
 }
 
-/// The longest row of devices that stand in the order of the file: one that is missing or added moves the others, and nothing else.
-fn by_order(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [bool]) {
+/// Assigns devices by the longest common subsequence, so that a missing or added device only shifts
+/// the others.
+fn by_order(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
     let mut expected: Vec<(u16, usize)> = machine
         .devices
         .iter()
@@ -194,10 +198,10 @@ fn by_order(machine: &Machine, scan: &Scan, places: &mut Places, free: &mut [boo
     }
 }
 
-/// What is left of a product is that device in another place, or under another alias.
-fn elsewhere(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: &mut [bool]) {
+/// Assigns the remaining devices of a product to other positions or aliases.
+fn match_moved(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: &mut [bool]) {
     let before = comparison.places.clone();
-    claim(machine, scan, &mut comparison.places, free, |_, _| true);
+    assign(machine, scan, &mut comparison.places, free, |_, _| true);
     for (index, config) in machine.devices.iter().enumerate() {
         let now = comparison.places.get(index).copied().flatten();
         let (Some(None), Some(position)) = (before.get(index), now) else {
@@ -218,7 +222,7 @@ fn elsewhere(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: 
     }
 }
 
-/// Devices that are found by position, and stand in another order.
+/// Reports devices that are located by position and have another order.
 fn order(machine: &Machine, comparison: &mut Comparison) {
     let mut all: Vec<(u16, u16, usize)> = machine
         .devices
@@ -231,7 +235,7 @@ fn order(machine: &Machine, comparison: &mut Comparison) {
         })
         .collect();
     all.sort_unstable();
-    // Ranks: what is missing or added moves nobody.
+    // Use ranks, so that missing or added devices do not count as moves.
     let mut places: Vec<u16> = all.iter().map(|(_, place, _)| *place).collect();
     places.sort_unstable();
     let rank = |place: u16| places.iter().position(|other| *other == place);
@@ -244,7 +248,7 @@ fn order(machine: &Machine, comparison: &mut Comparison) {
         let back = ranks.get(found).copied().flatten() == Some(n);
         match all.get(found) {
             Some((_, other_to, other)) if back => {
-                // Told once, by the first.
+                // Reported once, by the first of the two.
                 if found > n {
                     comparison.differences.push(Difference::Swapped {
                         devices: [*device, *other],
@@ -261,8 +265,8 @@ fn order(machine: &Machine, comparison: &mut Comparison) {
     }
 }
 
-/// A device that is there.
-fn one(
+/// Compares a device that was found.
+fn compare_device(
     index: usize,
     config: &DeviceConfig,
     device: &Device,
@@ -294,7 +298,7 @@ fn one(
     modules(index, config, device, asked, comparison);
 }
 
-/// Where a mode picks the module, the device takes what it is told.
+/// Compares the modules, unless the mode selects the module.
 fn modules(
     index: usize,
     config: &DeviceConfig,
@@ -354,10 +358,10 @@ fn modules(
 }
 
 impl Difference {
-    /// In words.
+    /// Returns the difference as text.
     #[must_use]
-    pub fn told<'a>(&'a self, machine: &'a Machine, scan: &'a Scan) -> impl fmt::Display + 'a {
-        Told {
+    pub fn display<'a>(&'a self, machine: &'a Machine, scan: &'a Scan) -> impl fmt::Display + 'a {
+        DifferenceDisplay {
             difference: self,
             machine,
             scan,
@@ -365,13 +369,13 @@ impl Difference {
     }
 }
 
-struct Told<'a> {
+struct DifferenceDisplay<'a> {
     difference: &'a Difference,
     machine: &'a Machine,
     scan: &'a Scan,
 }
 
-impl Told<'_> {
+impl DifferenceDisplay<'_> {
     fn name(&self, device: usize) -> &str {
         let device = self.machine.devices.get(device);
         device.map_or("?", |device| device.name.as_str())
@@ -382,11 +386,11 @@ impl Told<'_> {
         device.map_or_else(String::new, |d| d.device.type_name.clone())
     }
 
-    /// Who stands at a position.
+    /// Describes the device at a position.
     fn there(&self, position: u16) -> String {
         let device = self.scan.devices.get(usize::from(position));
         let Some(identity) = device.and_then(Device::identity) else {
-            return "somebody unknown".to_owned();
+            return "an unknown device".to_owned();
         };
         let esi = self.machine.devices.iter().flat_map(|d| &d.esi.devices);
         let mut of_product = esi.filter(|d| {
@@ -400,7 +404,7 @@ impl Told<'_> {
     }
 }
 
-impl fmt::Display for Told<'_> {
+impl fmt::Display for DifferenceDisplay<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.difference {
             Difference::Missing { device } => {
@@ -459,7 +463,7 @@ impl fmt::Display for Told<'_> {
                 };
                 write!(
                     f,
-                    "`{}`: nobody has {expected}; the {} at position {position} has {what} {found}",
+                    "`{}`: no device has {expected}; the {} at position {position} has {what} {found}",
                     self.name(*device),
                     self.kind(*device)
                 )
@@ -506,7 +510,7 @@ impl fmt::Display for Told<'_> {
     }
 }
 
-/// Little-endian bytes as a number.
+/// Formats little-endian bytes as a number.
 fn number(bytes: &[u8]) -> String {
     if bytes.len() > 8 {
         return format!("{} bytes", bytes.len());

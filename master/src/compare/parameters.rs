@@ -1,15 +1,16 @@
-//! What devices hold of the parameters that start-up SDOs would write.
+//! Compares the device values of start-up SDOs.
 
 use ecaxis_esi::StartupSdo;
 
 use super::{Comparison, Difference};
+use crate::acyclic::device::with_mailbox;
+use crate::acyclic::{DatagramClient, ServiceError};
 use crate::config::Machine;
 use crate::mailbox::SdoError;
 use crate::scan::Scan;
-use crate::service::device::with_mailbox;
-use crate::service::{Datagrams, ServiceError};
 
-/// What is no parameter: PDO mapping and assignment, the module list, the mode. Every start-up writes them anew.
+/// False for PDO mapping and assignment, the module list and the mode, which every start-up
+/// rewrites.
 fn is_parameter(sdo: &StartupSdo) -> bool {
     !matches!(
         sdo.index,
@@ -17,10 +18,10 @@ fn is_parameter(sdo: &StartupSdo) -> bool {
     )
 }
 
-/// Reads every object that a start-up SDO writes, and adds what differs. Devices in Init are in PreOp meanwhile. One that does not let
-/// itself be read, or does not go back to its state, is told of in [`Comparison::unknown`].
+/// Reads every object that a start-up SDO writes, and adds the differences. Devices in Init are in
+/// PreOp meanwhile. Failures of a device are added to [`Comparison::unknown`].
 pub async fn parameters(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     machine: &Machine,
     scan: &Scan,
     comparison: &mut Comparison,
@@ -40,7 +41,7 @@ pub async fn parameters(
         let Ok(sii) = &device.sii else { continue };
         let at = device.found.named(&config.name);
         let read = with_mailbox(wire, &at, sii, "reading its parameters", async |lent| {
-            // The last one written is what stays.
+            // The last write of an object takes effect.
             for (n, sdo) in sdos.iter().enumerate() {
                 let again = |later: &&StartupSdo| (later.index, later.sub) == (sdo.index, sdo.sub);
                 if sdos.iter().skip(n + 1).any(again) {
@@ -61,7 +62,7 @@ pub async fn parameters(
                         expected: sdo.data.clone(),
                         found,
                     }),
-                    // Some can only be written.
+                    // Some objects are write-only.
                     Err(SdoError::Abort { .. }) => {}
                     Err(source) => {
                         let device = at.clone();

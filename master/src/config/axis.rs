@@ -1,4 +1,4 @@
-//! One axis: units, limits, and the unit of the drive's velocities.
+//! One axis: units, limits, and the drive's velocity unit.
 
 use ecaxis_axis::cia402::QuickStopOption;
 use ecaxis_axis::{Axis, AxisConfig, ConfigError, LimitError, Limits, Mode, Modes};
@@ -15,7 +15,7 @@ use super::raw::{RawAxis, RawLimits, RawSdo, SdoValue};
 use super::units::unit;
 use super::{AxisSetup, TorqueSetup, TorqueUnit};
 
-/// maxon's vendor id.
+/// maxon's vendor ID.
 const MAXON: u32 = 0xfb;
 
 pub(crate) fn setup(
@@ -27,7 +27,7 @@ pub(crate) fn setup(
 ) -> Option<AxisSetup> {
     let velocity = scale::velocity_unit(raw, sdos, selection, p);
     let name = unit(raw.unit.as_ref(), p);
-    // A wrong name is no reason to leave the figures unread.
+    // The numbers are checked even if the unit's name is wrong.
     let shown = name.as_deref().unwrap_or("units");
     let scale = scale::scale(raw, shown, p);
     let way = scale::way(raw, p);
@@ -78,7 +78,7 @@ pub(crate) fn setup(
     })
 }
 
-/// 0x605A, as it will be.
+/// Returns 0x605A as it is after start-up.
 fn quick_stop(sdos: &[RawSdo], selection: Option<&esi::Selection>) -> Option<QuickStopOption> {
     const QUICK_STOP_OPTION: u16 = 0x605a;
     let written = sdos.iter().find(|s| s.index == QUICK_STOP_OPTION);
@@ -94,7 +94,8 @@ fn quick_stop(sdos: &[RawSdo], selection: Option<&esi::Selection>) -> Option<Qui
         .then(|| QuickStopOption(i16::from_le_bytes(bytes)))
 }
 
-/// Those that can be switched to: 0x6060 and its display are in the process data, and the mode's target is.
+/// Returns the modes to which the axis can switch. 0x6060, 0x6061 and the mode's targets must be in
+/// the process data.
 fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
     let mut modes = Modes::only(own);
     let Some(layout) = selection.map(|s| &s.layout) else {
@@ -107,11 +108,11 @@ fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
         (Mode::Csp, &[0x607a]),
         (Mode::Csv, &[0x60ff]),
         (Mode::Cst, &[0x6071]),
-        // The speed of a move is a fraction of the axis' limit, so the drive has to be told.
+        // A move's speed is a fraction of the axis limit, so the drive needs the profile objects.
         (Mode::Pp, &[0x607a, 0x6081, 0x6083, 0x6084]),
         (Mode::Pv, &[0x60ff, 0x6083, 0x6084]),
     ];
-    // Without the reported torque a switch to CST would begin with none.
+    // A switch to CST starts from the actual torque.
     let torque = layout.tx_field(0x6077, 0).is_some();
     for (mode, targets) in targets {
         let mapped = |index: &u16| layout.rx_field(*index, 0).is_some();
@@ -122,7 +123,7 @@ fn modes(own: Mode, selection: Option<&esi::Selection>) -> Modes {
     modes.with(Mode::Hm)
 }
 
-/// `unit` may be empty.
+/// Returns the value if it is positive. `unit` may be empty.
 pub(super) fn positive<'v>(
     value: &'v Spanned<f64>,
     what: &str,
@@ -141,7 +142,7 @@ pub(super) fn positive<'v>(
     None
 }
 
-/// What the axis refuses, at the key that is to blame and in the user's unit.
+/// Returns the key and message, in the user's unit, for a configuration that the axis rejects.
 fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) -> (Span, String) {
     let limits = &raw.limits;
     let of = |value: Option<Span>| value.unwrap_or(limits.span.clone());
@@ -153,7 +154,7 @@ fn refused(error: &ConfigError, raw: &RawAxis, known: &TorqueSetup, unit: &str) 
             position,
             format!(
                 "`limits.position` of {low} to {high} {unit} is {counts:.3e} counts wide, more than \
-                 the 2^31 that a drive can tell apart"
+                 the 2^31 that a drive can distinguish"
             ),
         ),
         ConfigError::Limit(LimitError::VelocityNotRepresentable {
@@ -256,11 +257,11 @@ fn limits(
     ok.then_some(limits)
 }
 
-/// How long it takes to reach a velocity, where that is more than an hour.
+/// Returns the time to reach a velocity if it exceeds one hour.
 pub(crate) fn too_long(velocity: f64, acceleration: f64) -> Option<String> {
     const HOUR: f64 = 3600.0;
     let seconds = velocity / acceleration;
-    // Not a comparison with `>`: infinity over infinity is too long as well.
+    // Written so that NaN (infinity / infinity) counts as too long.
     if seconds <= HOUR {
         return None;
     }

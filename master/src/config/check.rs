@@ -1,4 +1,5 @@
-//! Raw machine → checked machine: the bus, names and places; devices and steps have their own files.
+//! Raw machine → checked machine: the bus, names and positions. Devices and steps have their own
+//! files.
 
 use std::path::Path;
 
@@ -8,14 +9,14 @@ use super::device::{self, EsiFiles};
 use super::problem::{Problems, Span};
 use super::raw::{RawBus, RawDevice, RawMachine};
 use super::sim;
-use super::steps::{self, Known};
+use super::steps::{self, ResolvedDevice};
 use crate::bringup::MAX_SUBDEVICES;
-use crate::link::BackEnd;
-use crate::rt::margin::Spin;
+use crate::link::SocketKind;
+use crate::rt::spin::Spin;
 
 use super::{Bus, DeviceConfig, Exchange, Locator, Machine, Nic, Signal, duration, signal};
 
-/// `None` only where something has been reported.
+/// Returns `None` only if a problem has been reported.
 pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Option<Machine> {
     let cycle_span = raw.bus.cycle.as_ref().map_or(0..0, Spanned::span);
     let bus = bus(raw.bus, p);
@@ -49,7 +50,7 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
         ));
         devices.push(device::check(raw, at, &mut files, &all, p));
     }
-    // Indices in steps are those of the machine, so the order is settled first.
+    // Steps use the machine's device indices, so the order is determined first.
     if devices.iter().all(|d| {
         matches!(
             d,
@@ -67,12 +68,12 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
             _ => 0,
         });
     }
-    let known: Vec<Known<'_>> = devices
+    let known: Vec<ResolvedDevice<'_>> = devices
         .iter()
         .zip(&names)
         .filter_map(|(device, (name, has_axis))| match device {
-            Some(device) => Some(Known::from(device)),
-            None => name.as_deref().map(|name| Known {
+            Some(device) => Some(ResolvedDevice::from(device)),
+            None => name.as_deref().map(|name| ResolvedDevice {
                 name,
                 axis: Err(*has_axis),
                 device: None,
@@ -105,10 +106,11 @@ pub(crate) fn machine(path: &Path, raw: RawMachine, p: &mut Problems<'_>) -> Opt
     })
 }
 
-/// The outputs that open brakes, by the name of the axis' device. `set` are those that steps set.
+/// Returns the outputs that release brakes, with the name of the axis's device. `set`: the outputs
+/// that steps set.
 fn brake_outputs(
     brakes: &[(String, Spanned<String>)],
-    known: &[Known<'_>],
+    known: &[ResolvedDevice<'_>],
     set: &[Signal],
     p: &mut Problems<'_>,
 ) -> Vec<(String, Signal)> {
@@ -153,7 +155,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         .cycle
         .as_ref()
         .and_then(|c| in_range(c, 50_000, 100_000_000, "a cycle", p));
-    // The watchdogs count 100 µs in 16 bits.
+    // The watchdog registers count 100 µs in 16 bits.
     let watchdog = raw
         .watchdog
         .as_ref()
@@ -174,7 +176,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
         );
         p.add_hint(at, message, "make `watchdog` several cycles long");
     } else if let (Some(cycle), Some(watchdog)) = (cycle_ns, watchdog_ns) {
-        ridden_through(&raw, cycle, watchdog, p);
+        check_lost_frames(&raw, cycle, watchdog, p);
     }
     let clock_window = raw
         .clock_window
@@ -243,7 +245,7 @@ fn bus(raw: RawBus, p: &mut Problems<'_>) -> Option<Bus> {
     })
 }
 
-/// Whether `cpu` is kept awake.
+/// Returns `true` if `cpu` is kept awake.
 fn awake(idle: &Spanned<String>, has_cpu: bool, p: &mut Problems<'_>) -> Option<bool> {
     match idle.get_ref().as_str() {
         "sleep" => Some(false),
@@ -267,10 +269,10 @@ fn awake(idle: &Spanned<String>, has_cpu: bool, p: &mut Problems<'_>) -> Option<
     }
 }
 
-fn back_end(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<BackEnd> {
-    let found = BackEnd::ALL.iter().find(|b| b.name() == name.get_ref());
+fn back_end(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<SocketKind> {
+    let found = SocketKind::ALL.iter().find(|b| b.name() == name.get_ref());
     if found.is_none() {
-        let names: Vec<_> = BackEnd::ALL.iter().map(|b| format!("\"{b}\"")).collect();
+        let names: Vec<_> = SocketKind::ALL.iter().map(|b| format!("\"{b}\"")).collect();
         p.add_hint(
             name.span(),
             format!("unknown link `{}`", name.get_ref()),
@@ -280,8 +282,8 @@ fn back_end(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<BackEnd> {
     found.copied()
 }
 
-/// The axes must be told to stop before the drives' watchdogs end it their way.
-fn ridden_through(raw: &RawBus, cycle: u64, watchdog: u64, p: &mut Problems<'_>) {
+/// Checks that lost frames stop the axes before the drives' watchdogs expire.
+fn check_lost_frames(raw: &RawBus, cycle: u64, watchdog: u64, p: &mut Problems<'_>) {
     let lost = raw
         .lost_frames
         .as_ref()
@@ -299,7 +301,7 @@ fn ridden_through(raw: &RawBus, cycle: u64, watchdog: u64, p: &mut Problems<'_>)
         duration::show(gap),
         duration::show(watchdog),
     );
-    // At least 1, because the watchdog is two cycles or more.
+    // At least 1, because the watchdog is two cycles or longer.
     let most = (watchdog - 1) / cycle;
     let hint = format!("write `lost_frames = {most}` or less, or a longer `watchdog`");
     p.add_hint(at.unwrap_or(0..0), message, hint);
@@ -329,7 +331,7 @@ fn in_range(
 fn nic(name: &Spanned<String>, p: &mut Problems<'_>) -> Option<Nic> {
     match name.get_ref().as_str() {
         "sim" => Some(Nic::Sim),
-        // What Linux takes as the name of an interface.
+        // The length limit of Linux interface names.
         other
             if (1..16).contains(&other.len())
                 && !other.contains(|c: char| c == '/' || c.is_whitespace()) =>
@@ -369,7 +371,7 @@ fn unique_names(devices: &[RawDevice], p: &mut Problems<'_>) {
     }
 }
 
-/// Where each device is, `None` where that has been refused.
+/// Returns the locator of each device; `None` if it is invalid.
 fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
     let mut places: Vec<Option<(Locator, Span)>> = Vec::new();
     for device in devices {
@@ -420,7 +422,7 @@ fn places(devices: &[RawDevice], p: &mut Problems<'_>) -> Vec<Option<Locator>> {
         .collect()
 }
 
-/// Every SubDevice is described, so positions have no holes.
+/// Checks that positions have no gaps, because every SubDevice must be described.
 fn gaps(places: &[Option<(Locator, Span)>], p: &mut Problems<'_>) {
     let mut positions: Vec<(u16, &Span)> = Vec::new();
     for place in places {

@@ -1,4 +1,4 @@
-//! One device: its ESI file, which device of it, mode, PDOs, start-up SDOs.
+//! One device: its ESI file, its entry there, mode, PDOs, start-up SDOs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,14 +10,14 @@ use toml::Spanned;
 use super::problem::{Problems, Span, suggestion, unreadable};
 use super::raw::{RawDevice, RawEntry};
 use super::{DeviceConfig, Locator, Startup, axis, drive_limits, sdo, sim};
-use crate::library::{self, Library, LoadError, Match};
+use crate::esi_library::{self, Library, LoadError, RevisionMatch};
 
-/// What all devices share: where ESI files are, those read so far, and the cycle.
+/// Data shared by all devices: the ESI folder, the files read so far, and the cycle.
 pub(crate) struct EsiFiles<'f> {
     folder: &'f Path,
-    /// Nanoseconds and where they are written; `None` where the cycle itself is wrong.
+    /// The cycle in ns and its place in the file; `None` if the cycle is invalid.
     cycle: Option<(u64, Span)>,
-    /// `None`: could not be read, which has been reported.
+    /// The files; `None`: could not be read, which has been reported.
     files: BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>,
     folders: BTreeMap<PathBuf, Option<Library>>,
 }
@@ -32,7 +32,7 @@ impl<'f> EsiFiles<'f> {
         }
     }
 
-    /// The file that `esi` names, or the one of the folder that it names which describes the device.
+    /// Returns the file that `esi` names, or the matching file in the folder that it names.
     fn file(
         &mut self,
         raw: &RawDevice,
@@ -46,7 +46,7 @@ impl<'f> EsiFiles<'f> {
         if let Some(known) = self.files.get(&path) {
             return known.clone().map(|file| (path, file));
         }
-        let read = library::load(&path).map_err(|e| match e {
+        let read = esi_library::load(&path).map_err(|e| match e {
             LoadError::Read { path, source } => {
                 let hint = match source.kind() {
                     std::io::ErrorKind::NotFound => neighbours(&path),
@@ -70,7 +70,7 @@ impl<'f> EsiFiles<'f> {
         file.map(|file| (path, file))
     }
 
-    /// The one file of a folder that describes what `type`, `vendor`, `product` and `revision` say.
+    /// Returns the file of a folder that describes `type`, `vendor`, `product` and `revision`.
     fn in_folder(
         &mut self,
         folder: &Path,
@@ -79,7 +79,7 @@ impl<'f> EsiFiles<'f> {
         p: &mut Problems<'_>,
     ) -> Option<PathBuf> {
         if !self.folders.contains_key(folder) {
-            let cache = library::cache_file(folder);
+            let cache = esi_library::cache_file(folder);
             let opened = Library::open(folder, cache.as_deref());
             let opened = opened.map_err(|e| p.add(name.span(), e.to_string())).ok();
             self.folders.insert(folder.to_owned(), opened);
@@ -87,7 +87,7 @@ impl<'f> EsiFiles<'f> {
         let known = self.folders.get(folder)?.as_ref()?;
         let of = |number: &Option<Spanned<u32>>| number.as_ref().map(|n| *n.get_ref());
         let type_name = raw.type_name.as_ref().map(|t| t.get_ref().trim());
-        let fits = |e: &&library::Entry| {
+        let fits = |e: &&esi_library::Entry| {
             of(&raw.vendor).is_none_or(|vendor| vendor == e.vendor)
                 && of(&raw.product).is_none_or(|product| product == e.product)
                 && of(&raw.revision).is_none_or(|revision| revision == e.revision)
@@ -95,7 +95,7 @@ impl<'f> EsiFiles<'f> {
                     e.type_name.eq_ignore_ascii_case(name) || e.name.eq_ignore_ascii_case(name)
                 })
         };
-        // Of several revisions in several files, the newest.
+        // The newest of several revisions in several files.
         let newest = known
             .entries()
             .iter()
@@ -141,7 +141,7 @@ impl<'f> EsiFiles<'f> {
     }
 }
 
-/// ESI files that could have been meant.
+/// Returns ESI files that could have been meant.
 fn neighbours(path: &Path) -> String {
     let folder = path
         .parent()
@@ -180,7 +180,7 @@ pub(crate) fn check(
     let device = file.as_ref().and_then(|(_, file)| find(&raw, file, p));
     let mut chosen = match (&file, device, mode, &files.cycle) {
         (Some((_, file)), Some(device), Ok(mode), Some((cycle_ns, cycle))) => {
-            let wanted = Wanted {
+            let wanted = DeviceQuery {
                 raw: &raw,
                 mode,
                 cycle_ns: *cycle_ns,
@@ -190,7 +190,7 @@ pub(crate) fn check(
         }
         _ => None,
     };
-    // An axis can be judged without its ESI, only less.
+    // An axis can be checked without its ESI, but less thoroughly.
     let axis = match (&raw.axis, mode) {
         (Some(axis), Ok(Some(mode))) => Some(axis::setup(axis, &raw.sdo, mode, chosen.as_ref(), p)),
         _ => None,
@@ -238,7 +238,7 @@ pub(crate) fn check(
     })
 }
 
-/// Says which axes of a drive stay without power.
+/// Reports which axes of a drive stay without power.
 fn further_axes(selection: &mut esi::Selection) {
     let axes = selection.layout.rx.iter().filter_map(further_axis);
     let controlwords = axes.filter(|(_, object)| *object == 0x6040);
@@ -254,17 +254,17 @@ fn further_axes(selection: &mut esi::Selection) {
     selection.notes.extend(notes);
 }
 
-/// Of an object of a further axis of a drive: which axis, counted from 0, and the same object of the first
-/// (CiA 402: 0x800 apart, eight axes).
+/// Returns the axis number of an object of a further axis, counted from 0, and the same object of
+/// the first axis (CiA 402: 0x800 apart, eight axes).
 pub(crate) fn further_axis(field: &esi::layout::Field) -> Option<(u16, u16)> {
     let n = field.index.checked_sub(0x6000)? / 0x800;
     (1..8).contains(&n).then_some((n, field.index - n * 0x800))
 }
 
-/// Which revisions may stand for the ESI's: its own alone, where nothing is said.
-fn identity(rule: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<Match> {
+/// Returns the rule for revisions; the default is the ESI's own revision.
+fn identity(rule: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<RevisionMatch> {
     let Some(rule) = rule else {
-        return Some(Match::Equal);
+        return Some(RevisionMatch::Equal);
     };
     let known = rule.get_ref().parse();
     if known.is_err() {
@@ -276,7 +276,7 @@ fn identity(rule: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<Matc
     known.ok()
 }
 
-/// `Err`: wrong, and reported.
+/// Returns `Err` if the mode is invalid and has been reported.
 fn mode(raw: &RawDevice, p: &mut Problems<'_>) -> Result<Option<esi::Mode>, ()> {
     let cyclic = || {
         esi::Mode::ALL
@@ -359,15 +359,15 @@ fn find<'e>(
     }
 }
 
-/// What the file asks of one device of an ESI file.
-struct Wanted<'r> {
+/// The machine file's choices for one device of an ESI file.
+struct DeviceQuery<'r> {
     raw: &'r RawDevice,
     mode: Option<esi::Mode>,
     cycle_ns: u64,
     cycle: Span,
 }
 
-impl Wanted<'_> {
+impl DeviceQuery<'_> {
     fn select(
         &self,
         file: &esi::EsiFile,
@@ -391,7 +391,7 @@ impl Wanted<'_> {
             .iter()
             .map(String::as_str)
             .collect();
-        let mut choice = esi::Choice {
+        let mut choice = esi::SelectOptions {
             mode: self.mode,
             rx: rx.as_deref(),
             tx: tx.as_deref(),
@@ -407,7 +407,7 @@ impl Wanted<'_> {
         if self.raw.sdo.is_empty() {
             return Some(first);
         }
-        // The dictionary depends on the module, so values become bytes only now.
+        // The dictionary depends on the module, so values are encoded here.
         let mut sdos = Vec::new();
         for raw in &self.raw.sdo {
             let item = first.dictionary.item(raw.index, raw.sub);

@@ -1,9 +1,9 @@
-//! Every key that is read is in docs/machine-file.md, and every key there is read.
+//! Checks that docs/machine-file.md and the parser have the same keys.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// What precedes a key where the file's tables are read.
+/// Text that precedes a key where a table is read.
 const READERS: [&str; 5] = [".get(", ".need(", "number(", "&mut f,", "optional!(p, f,"];
 
 fn is_key(word: &str) -> bool {
@@ -16,7 +16,7 @@ fn quoted(text: &str) -> Option<&str> {
     is_key(word).then_some(word)
 }
 
-/// The keys that a source file asks tables for.
+/// Returns the keys that a source file reads from tables.
 fn keys(source: &str) -> BTreeSet<String> {
     let code = source.split("#[cfg(test)]").next().unwrap_or_default();
     let mut keys = BTreeSet::new();
@@ -25,7 +25,7 @@ fn keys(source: &str) -> BTreeSet<String> {
         let asked = asked.filter_map(|(at, _)| quoted(&code[at + reader.len()..]));
         keys.extend(asked.map(str::to_owned));
     }
-    // Lists of keys.
+    // Keys in lists.
     for list in ["const VERBS", "const COMPANIONS"] {
         let Some((_, after)) = code.split_once(list) else {
             continue;
@@ -61,9 +61,9 @@ fn document() -> String {
 }
 
 #[test]
-fn every_key_is_in_the_document() {
+fn document_lists_every_key() {
     let (known, document) = (known(), document());
-    // The scan itself has to see something of each file.
+    // The search itself must find keys of every file.
     for key in [
         "cycle",
         "encoder",
@@ -99,7 +99,7 @@ fn every_key_is_in_the_document() {
 }
 
 #[test]
-fn every_key_of_the_document_is_read() {
+fn parser_reads_every_documented_key() {
     let (known, document) = (known(), document());
     let mut rows = 0;
     for line in document.lines() {

@@ -1,5 +1,5 @@
-//! What the drive itself allows (CiA 402), against the machine file's limits. A limit of the file
-//! beyond the drive's own makes the drive clip its set-points or fault in motion.
+//! Compares the drive's own limits (CiA 402) with the machine file's limits. If a limit in the file
+//! exceeds the drive's, the drive clips set-points or faults in motion.
 
 use std::fmt;
 
@@ -9,8 +9,8 @@ use ecaxis_esi as esi;
 
 use super::problem::Problems;
 use super::raw::RawSdo;
-use super::{AxisSetup, UnitFrom};
-use crate::mailbox::ObjectAddress;
+use super::{AxisSetup, UnitSource};
+use crate::mailbox::NamedObject;
 
 const POSITION_RANGE: u16 = 0x607b;
 const SOFTWARE_LIMIT: u16 = 0x607d;
@@ -19,7 +19,7 @@ const FOLLOWING_WINDOW: u16 = 0x6065;
 const MAX_ACCELERATION: u16 = 0x60c5;
 const MAX_TORQUES: [u16; 3] = [0x6072, 0x60e0, 0x60e1];
 
-/// Objects that add to a target, which nothing limits then: position, velocity, torque offset.
+/// Offset objects, which add to a target after its limits: position, velocity, torque.
 pub(crate) const OFFSETS: [u16; 3] = [0x60b0, 0x60b1, 0x60b2];
 
 /// A limit of the drive that the machine file exceeds.
@@ -27,21 +27,21 @@ pub(crate) const OFFSETS: [u16; 3] = [0x60b0, 0x60b1, 0x60b2];
 pub struct LimitConflict {
     pub index: u16,
     pub sub: u8,
-    /// The drive's value in its own unit and in that of the axis, and the file's.
+    /// The drive's value in its own unit and in the axis's unit, and the file's value.
     text: String,
-    /// Whether the unit of the drive's value is known.
+    /// `true` if the unit of the drive's value is known.
     pub certain: bool,
 }
 
 impl fmt::Display for LimitConflict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (index, sub) = (self.index, self.sub);
-        write!(f, "{} {}", ObjectAddress { index, sub }, self.text)
+        write!(f, "{} {}", NamedObject { index, sub }, self.text)
     }
 }
 
 impl AxisSetup {
-    /// Index and subindex of what bounds this axis in the drive.
+    /// Returns index and subindex of the drive's limits for this axis.
     pub(crate) fn limit_objects(&self) -> Vec<(u16, u8)> {
         let mut objects = vec![
             (POSITION_RANGE, 1),
@@ -62,8 +62,8 @@ impl AxisSetup {
         objects
     }
 
-    /// What of `drive`, the bytes of its limit objects, this axis exceeds. `speed_unit`: what
-    /// 0x6080 counts, where the ESI says so. Zero is a limit that is not set.
+    /// Returns the limits that this axis exceeds. `drive` returns the bytes of a limit object.
+    /// `speed_unit`: the unit of 0x6080 if the ESI gives it. Zero means no limit.
     pub(crate) fn exceeded(
         &self,
         drive: impl Fn(u16, u8) -> Option<Vec<u8>>,
@@ -97,7 +97,7 @@ impl AxisSetup {
         found
     }
 
-    /// A range of positions, which counts where its ends are in order.
+    /// Checks a position range; an inverted range does not count.
     fn positions(&self, index: u16, low: i64, high: i64, found: &mut Vec<LimitConflict>) {
         if low >= high {
             return;
@@ -131,7 +131,7 @@ impl AxisSetup {
         }
     }
 
-    /// CiA 402 counts 0x6080 in rpm of the motor; some drives count it in the unit of 0x60A9.
+    /// Checks 0x6080. CiA 402 counts it in rpm of the motor; some drives use the unit of 0x60A9.
     fn speed(&self, raw: i64, unit: Option<VelocityUnit>) -> Option<LimitConflict> {
         let scale = &self.config.scale;
         let of_drive = scale.velocity_unit();
@@ -167,7 +167,7 @@ impl AxisSetup {
         let scale = &self.config.scale;
         let most = scale.acceleration_to_user(RawAcceleration(raw)).0.abs();
         let limit = self.config.limits.acceleration;
-        let certain = self.acceleration_unit_from != UnitFrom::Nothing;
+        let certain = self.acceleration_unit_from != UnitSource::Nothing;
         let (unit, name) = (scale.acceleration_unit(), &self.unit);
         let doubt = match certain {
             true => String::new(),
@@ -202,7 +202,7 @@ impl AxisSetup {
         })
     }
 
-    /// In thousandths of the rated torque.
+    /// Checks a torque limit in thousandths of the rated torque.
     fn max_torque(&self, index: u16, raw: i64) -> Option<LimitConflict> {
         let torque = &self.torque;
         let is_known = torque.unit == super::TorqueUnit::Percent || torque.rated.is_some();
@@ -222,7 +222,7 @@ impl AxisSetup {
     }
 }
 
-/// Beyond what rounding explains.
+/// Returns `true` if the excess is larger than a rounding error.
 fn exceeds(limit: f64, most: f64) -> bool {
     limit > most * (1.0 + 1e-6)
 }
@@ -244,13 +244,13 @@ fn number(bytes: &[u8], signed: bool) -> i64 {
     }
 }
 
-/// What 0x6080 counts, where the ESI says so.
+/// Returns the unit of 0x6080 if the ESI gives it.
 pub(crate) fn speed_unit(selection: &esi::Selection) -> Option<VelocityUnit> {
     let item = selection.dictionary.item(MAX_MOTOR_SPEED, 0)?;
     VelocityUnit::from_si_code(item.unit)
 }
 
-/// The limits that the drive will hold by the file's `sdo` entries and by its ESI.
+/// Checks the limits that the file's `sdo` entries and the ESI set in the drive.
 pub(super) fn check(
     axis: &AxisSetup,
     sdos: &[RawSdo],
@@ -287,7 +287,7 @@ pub(super) fn check(
             written(own.index, own.sub).is_none_or(|sdo| sdo.data.iter().all(|b| *b == 0));
         if !is_zero {
             let (index, sub) = (own.index, own.sub);
-            let object = ObjectAddress { index, sub };
+            let object = NamedObject { index, sub };
             let message = format!("{object} adds to every target of the axis, past its limits");
             p.add_hint(own.value.span(), message, "write 0, or leave it out");
         }

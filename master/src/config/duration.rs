@@ -1,4 +1,4 @@
-//! Durations as people write them (`250us`, `1.5 s`), in whole nanoseconds.
+//! Durations in text form (`250us`, `1.5 s`), as whole nanoseconds.
 
 use super::problem::suggestion;
 
@@ -17,14 +17,14 @@ const UNITS: [(&str, u64); 7] = [
 pub struct DurationError {
     pub message: String,
     pub hint: String,
-    /// Bytes of the text that are at fault.
+    /// The byte range of the error in the text.
     pub at: std::ops::Range<usize>,
 }
 
 /// Reads a duration: a decimal number and a unit.
 ///
 /// # Errors
-/// Says which part of the text is not understood.
+/// Returns the invalid part of the text.
 pub fn parse(text: &str) -> Result<u64, DurationError> {
     let error = |at: std::ops::Range<usize>, message: String, hint: &str| DurationError {
         message,
@@ -89,7 +89,7 @@ fn nanoseconds(number: &str, scale: u64) -> Option<u64> {
     Some(ns)
 }
 
-/// The shortest exact way to write a duration.
+/// Returns the shortest exact text of a duration.
 #[must_use]
 pub fn show(ns: u64) -> String {
     for (unit, scale) in [("s", 1_000_000_000_u64), ("ms", 1_000_000), ("µs", 1_000)] {
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn good() {
+    fn parse_accepts_numbers_with_units() {
         for (text, ns) in [
             ("1ms", 1_000_000),
             ("250us", 250_000),
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn bad() {
+    fn parse_rejects_invalid_durations() {
         for (text, message, at) in [
             ("1mms", "unknown unit of time `mms`", 1..4),
             ("10 sec", "unknown unit of time `sec`", 3..6),
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn shown() {
+    fn show_uses_the_shortest_exact_unit() {
         for (ns, text) in [
             (0, "0 ns"),
             (999, "999 ns"),

@@ -1,5 +1,5 @@
-//! Reads typed values out of TOML tables. What does not fit becomes a problem and a `None`; reading
-//! goes on, so that one look at the file finds everything.
+//! Reads typed values from TOML tables. An invalid value becomes a problem and a `None`. Reading
+//! continues, so that one check finds all problems.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -9,11 +9,11 @@ use super::problem::{Problems, Span, list, nearest};
 
 type Value<'d> = &'d Spanned<DeValue<'d>>;
 
-/// One table while it is read. Keys that nobody asked for are unknown.
+/// One table while it is read. Keys that are never read are unknown.
 pub(crate) struct Fields<'d> {
     table: &'d DeTable<'d>,
     span: Span,
-    /// How the table is called in messages: `[bus]`.
+    /// The table's name in messages: `[bus]`.
     name: &'static str,
     asked: Vec<&'static str>,
     missing: Vec<(&'static str, &'static str)>,
@@ -38,12 +38,12 @@ impl<'d> Fields<'d> {
             .map(|(_, v)| v)
     }
 
-    /// Whether it is there, understood or not.
+    /// Returns `true` if the key is present, valid or not.
     pub fn has(&self, key: &str) -> bool {
         self.table.contains_key(key)
     }
 
-    /// Like [`Fields::get`]; without it the table is incomplete. `example` is what could stand there.
+    /// Like [`Fields::get`], but reports a missing key. `example` shows a possible line.
     pub fn need(&mut self, key: &'static str, example: &'static str) -> Option<Value<'d>> {
         let value = self.get(key);
         if value.is_none() {
@@ -52,7 +52,7 @@ impl<'d> Fields<'d> {
         value
     }
 
-    /// Keys that stand in the table and were asked for, each with its line.
+    /// Returns the known keys of the table, each with its line.
     pub fn written(&self, problems: &Problems<'_>) -> Vec<(&'static str, u32)> {
         let keys = self.table.keys().filter_map(|key| {
             let known = self
@@ -68,14 +68,15 @@ impl<'d> Fields<'d> {
         self.asked.contains(&key)
     }
 
-    /// Whether the table has keys nobody has asked for so far.
+    /// Returns `true` if the table has keys that have not been read.
     pub fn unknown(&self) -> bool {
         self.table
             .keys()
             .any(|k| !self.asked.contains(&k.get_ref().as_ref()))
     }
 
-    /// Reports unknown keys, then missing ones unless one of the unknown was meant to be it.
+    /// Reports unknown keys, then missing ones. A missing key that an unknown one resembles is not
+    /// reported.
     pub fn done(self, problems: &mut Problems<'_>) {
         let mut meant = Vec::new();
         for key in self.table.keys() {
@@ -139,10 +140,11 @@ pub(crate) fn boolean(problems: &mut Problems<'_>, value: Value<'_>) -> Option<S
     }
 }
 
-/// The largest number that means something: beyond it, axes and tables refuse positions, and f64 knows no cents.
+/// The maximum absolute number. Beyond it, axes and tables reject positions, and `f64` loses
+/// decimals.
 const LARGEST: f64 = 1e15;
 
-/// A number, whole or not, of at most [`LARGEST`] either way.
+/// Reads an integer or decimal number of at most ±[`LARGEST`].
 pub(crate) fn number(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<f64>> {
     let parsed = match value.get_ref() {
         DeValue::Float(f) => f.as_str().parse::<f64>().ok(),
@@ -160,7 +162,7 @@ fn whole(i: &toml::de::DeInteger<'_>) -> Option<i64> {
 }
 
 fn wrong_range<T>(problems: &mut Problems<'_>, value: Value<'_>, wanted: &str) -> Option<T> {
-    /// Digits that are enough to find the number again.
+    /// The maximum number of digits shown of a number.
     const SHOWN: usize = 24;
     let text = problems.text(&value.span());
     let cut = text.char_indices().nth(SHOWN).map(|(at, _)| at);
@@ -172,7 +174,8 @@ fn wrong_range<T>(problems: &mut Problems<'_>, value: Value<'_>, wanted: &str) -
     None
 }
 
-/// A whole number between `min` and `max`; also as a string, because other tools print identities so.
+/// Reads an integer between `min` and `max`. Also accepts a string, because other tools print
+/// identities so.
 pub(crate) fn integer<T>(
     problems: &mut Problems<'_>,
     value: Value<'_>,
@@ -197,7 +200,7 @@ where
     }
 }
 
-/// `"0x6064"`, `"#x6064"` or `"24676"`.
+/// Parses `"0x6064"`, `"#x6064"` or `"24676"`.
 pub(crate) fn unquoted(text: &str) -> Option<i64> {
     let text = text.trim();
     for prefix in ["0x", "0X", "#x"] {
@@ -211,7 +214,7 @@ pub(crate) fn unquoted(text: &str) -> Option<i64> {
     text.parse().ok()
 }
 
-/// A duration in nanoseconds.
+/// Reads a duration in ns.
 pub(crate) fn duration(problems: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<u64>> {
     let text = match value.get_ref() {
         DeValue::String(s) => s,
@@ -227,7 +230,7 @@ pub(crate) fn duration(problems: &mut Problems<'_>, value: Value<'_>) -> Option<
         Ok(ns) => Some(Spanned::new(value.span(), ns)),
         Err(e) => {
             let all = value.span();
-            // Inside plain quotes the text's bytes are the file's.
+            // Only within plain quotes the text's bytes equal the file's.
             let at = if all.len() == text.len() + 2 && !e.at.is_empty() {
                 all.start + 1 + e.at.start..all.start + 1 + e.at.end
             } else {
@@ -250,7 +253,7 @@ pub(crate) fn table<'d>(
     }
 }
 
-/// The elements of a list.
+/// Returns the elements of a list.
 pub(crate) fn array<'d>(
     problems: &mut Problems<'_>,
     value: Value<'d>,

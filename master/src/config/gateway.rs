@@ -1,4 +1,4 @@
-//! What a simulated gateway needs of `[device.sim]`: its network and the nodes there.
+//! Settings of a simulated gateway in `[device.sim]`: its network and its nodes.
 
 use ecaxis_esi as esi;
 use ecaxis_sim::gateway::{BIT_RATES, Epos, GatewayOptions, NodeOptions, PdoLink, Supervision};
@@ -13,17 +13,17 @@ type Value<'d> = &'d Spanned<DeValue<'d>>;
 
 const MS: u64 = 1_000_000;
 
-/// As written. Nodes stand with their place in the file.
+/// The gateway as written. Each node has its place in the file.
 #[derive(Debug)]
 pub(crate) struct RawGateway {
     span: Span,
     options: GatewayOptions,
     nodes: Vec<(NodeOptions, Span)>,
-    /// Something has been reported.
+    /// `true` if a mistake has been reported.
     wrong: bool,
 }
 
-/// `None` where nothing is said of a gateway.
+/// Returns `None` if the table has no gateway keys.
 pub(crate) fn read(f: &mut Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawGateway> {
     let mentioned = ["bit_rate", "sync", "node"]
         .into_iter()
@@ -140,7 +140,7 @@ fn link(mut f: Fields<'_>, p: &mut Problems<'_>) -> Option<PdoLink> {
     })
 }
 
-/// What the device, if it is known, makes of it.
+/// Checks the gateway against its device, if known, and returns its options.
 pub(crate) fn setup(
     raw: RawGateway,
     device: Option<&esi::Device>,
@@ -151,7 +151,7 @@ pub(crate) fn setup(
     let device = device?;
     for (node, span) in raw.nodes {
         options.nodes.push(node);
-        // One after the other, so that the blame falls on the right one.
+        // Validated after each node, so that the error marks the right one.
         if !wrong && let Err(error) = options.validate(device) {
             p.add(span, error.to_string());
             wrong = true;
@@ -172,7 +172,7 @@ mod tests {
 
     use super::super::{ConfigError, parse};
 
-    /// Problems of the project's own gateway machine with one text replaced by another.
+    /// Returns the problems of the example gateway machine with one text replaced.
     fn broken(from: &str, to: &str) -> Vec<(String, String)> {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/gateway.toml");
         let text = std::fs::read_to_string(&path).unwrap();
@@ -187,8 +187,8 @@ mod tests {
     }
 
     #[test]
-    #[rustfmt::skip] // one row a mistake
-    fn every_way_to_be_wrong() {
+    #[rustfmt::skip] // one row per mistake
+    fn gateway_rejects_invalid_settings() {
         for (from, to, message, hint) in [
             ("\"EPOS 24/1\"", "\"EPOS 24/2\"", "unknown drive `EPOS 24/2`", "did you mean `EPOS 24/1`?"),
             ("id      = 1", "id = 16", "takes node numbers up to 15", ""),

@@ -1,36 +1,37 @@
-//! The machine file: TOML as written ([`raw`](self)), then checked against the ESI files it names.
+//! The machine file: parsed from TOML (`raw`), then checked against the ESI files it names.
 //!
-//! | file | what lives there |
+//! | file | contents |
 //! |---|---|
 //! | `problem.rs` | a mistake with its place in the file; "did you mean" |
 //! | `duration.rs` | `"250us"` |
-//! | `fields.rs` | typed values out of TOML tables |
-//! | `raw.rs` | the file as written |
-//! | `check.rs` | raw → [`Machine`]: bus, names, places |
+//! | `fields.rs` | typed values from TOML tables |
+//! | `raw/` | the file as written |
+//! | `check.rs` | raw → [`Machine`]: bus, names, positions |
 //! | `device.rs` | one device: its ESI file, mode, PDOs |
 //! | `sdo.rs` | values of start-up SDOs as bytes |
-//! | `startup.rs` | whether they are verified, or skipped where the device holds them |
-//! | `axis.rs` | limits; units in `axis/scale.rs`, loops, guards and homing in `axis/control.rs` |
-//! | `adopt.rs` | what the drive itself says of its units |
-//! | `drive_limits.rs` | what the drive itself allows |
-//! | `sim.rs` | what only the simulated bus needs: connections, clocks |
-//! | `units.rs` | the names of units of positions |
+//! | `startup.rs` | which start-up SDOs are verified or skipped |
+//! | `axis.rs` | limits; units in `axis/scale.rs`, loops and homing in `axis/control.rs` |
+//! | `drive_units.rs` | the units that the drive itself reports |
+//! | `drive_limits.rs` | the limits that the drive itself allows |
+//! | `sim.rs` | settings of the simulated bus: connections, clocks |
+//! | `travel.rs` | switches and ends along a simulated axis |
+//! | `units.rs` | names of position units |
 //! | `gateway.rs` | the network behind a simulated gateway |
-//! | `steps.rs` | the demonstration program; `[stop]` in `steps/stop.rs` |
+//! | `steps.rs` | the program; `[stop]` in `steps/stop.rs` |
 //!
-//! Every mistake is collected; a file with five of them is refused once, with five answers.
+//! All mistakes are collected, so that one check reports every mistake of a file.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-mod adopt;
 mod axis;
 mod check;
-mod describe;
 mod device;
+mod display;
 #[cfg(test)]
 mod documented;
 pub(crate) mod drive_limits;
+mod drive_units;
 pub mod duration;
 mod fields;
 mod gateway;
@@ -44,84 +45,85 @@ pub(crate) mod steps;
 mod syntax;
 #[cfg(test)]
 mod tests;
-mod track;
+mod travel;
 mod units;
 
-pub use adopt::{Adopted, UnitProblem};
 pub(crate) use axis::is_maxon;
 pub(crate) use device::further_axis;
 pub use drive_limits::LimitConflict;
+pub use drive_units::{AdoptedUnits, UnitProblem};
 pub use problem::{ConfigError, Problem, nearest};
 pub use signal::{AxisRef, InputRef, NameError, OutputRef};
-pub use startup::{Startup, StartupWay};
+pub use startup::{Startup, StartupOptions};
 
-pub use crate::rt::exchange::Mode as Exchange;
+pub use crate::rt::exchange::ExchangeMode as Exchange;
 
 use ecaxis_axis::StopMethod;
 use ecaxis_esi as esi;
 
+use crate::esi_library::RevisionMatch;
 use crate::file;
-use crate::library::Match;
-use crate::link::BackEnd;
-use crate::rt::margin::Spin;
+use crate::link::SocketKind;
+use crate::rt::spin::Spin;
 
-/// A machine: what the file says, with everything derived from the ESI files beside it.
+/// A machine: the content of the machine file and everything derived from its ESI files.
 #[derive(Debug, Clone)]
 pub struct Machine {
     pub path: PathBuf,
     pub bus: Bus,
-    /// In the order of the bus where every device is found by position, else as in the file.
+    /// The devices, in bus order if every device is located by position, otherwise in file order.
     pub devices: Vec<DeviceConfig>,
     pub steps: Vec<Step>,
-    /// What the steps read, and set.
+    /// The signals that the steps read; `outputs` are those they set.
     pub inputs: Vec<Signal>,
     pub outputs: Vec<Signal>,
     pub stop: StopSetup,
-    /// Set-points by time that the steps play.
+    /// The set-point tables that the steps play.
     pub tables: Vec<TableFile>,
-    /// How often the steps are run, at least 1.
+    /// The number of program runs, at least 1.
     pub repeat: u32,
-    /// Axes get power; otherwise the bus goes to Op and no further.
+    /// `true` if the axes get power. Otherwise the bus goes to Op and the axes stay disabled.
     pub enable: bool,
 }
 
-/// Times in nanoseconds.
+/// Settings of the bus. Times are in ns.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Bus {
     pub nic: Nic,
     pub cycle_ns: u64,
-    /// Consecutive cycles without a valid answer before the axes are stopped.
+    /// The number of consecutive cycles without a valid answer that stops the axes.
     pub lost_frames: u32,
     /// The CPU to pin the real-time thread to.
     pub cpu: Option<usize>,
     /// SCHED_FIFO priority of the real-time thread.
     pub priority: u8,
-    /// How long before a cycle is due sleeping ends and spinning starts.
+    /// The time before a cycle at which sleeping ends and spinning starts.
     pub spin: Spin,
-    /// Whether `cpu` is kept from sleeping.
+    /// `true` if `cpu` is kept from sleep states.
     pub awake: bool,
-    /// How long the bus may take from SafeOp to Op.
+    /// The timeout from SafeOp to Op.
     pub op_timeout_ns: u64,
-    /// How long a drive may take to Operation enabled.
+    /// The timeout of a drive to Operation enabled.
     pub enable_timeout_ns: u64,
-    /// Of the process data of every SubDevice.
+    /// The process data watchdog of every SubDevice.
     pub watchdog_ns: u64,
-    /// A SubDevice whose clock differs more from the reference (0x092C) is reported.
+    /// The clock difference (0x092C) above which a SubDevice is reported.
     pub clock_window_ns: u64,
     pub exchange: Exchange,
-    /// How frames are taken from the network interface.
-    pub link: BackEnd,
-    /// Keys that the file has, each with its line; the others are defaults.
+    /// The way frames are exchanged with the network interface.
+    pub link: SocketKind,
+    /// Keys present in the file, each with its line; all others have defaults.
     pub written: Vec<(&'static str, u32)>,
 }
 
 impl Bus {
-    /// Of register 0x0400: (2498 + 2) × 40 ns, so that watchdogs count in 100 µs.
+    /// The value of register 0x0400: (2498 + 2) × 40 ns, so that watchdogs count in 100 µs.
     pub const WATCHDOG_DIVIDER: u16 = 2498;
-    /// Of register 0x0410, in 100 µs: the reset value. Another MainDevice may have left another one.
+    /// The value of register 0x0410 in 100 µs. This is the reset value; another MainDevice may have
+    /// changed it.
     pub const PDI_WATCHDOG: u16 = 1000;
 
-    /// Of register 0x0420, in 100 µs.
+    /// Returns the value of register 0x0420 in 100 µs.
     #[must_use]
     pub fn process_data_watchdog(&self) -> u16 {
         let ticks = u16::try_from(self.watchdog_ns / 100_000);
@@ -144,7 +146,7 @@ impl Default for Bus {
             watchdog_ns: 100_000_000,
             clock_window_ns: 10_000,
             exchange: Exchange::SameCycle,
-            link: BackEnd::default(),
+            link: SocketKind::default(),
             written: Vec::new(),
         }
     }
@@ -152,15 +154,15 @@ impl Default for Bus {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Nic {
-    /// The simulated bus, from the same ESI files.
+    /// The simulated bus, with the same ESI files.
     Sim,
-    /// A network interface by name.
+    /// The network interface with this name.
     Interface(String),
 }
 
 #[derive(Debug, Clone)]
 pub struct DeviceConfig {
-    /// The file names the modules in its slots; otherwise they are what the ESI makes of the choice.
+    /// `true` if the file names the modules in its slots. Otherwise the ESI defines them.
     pub modules_named: bool,
     pub name: String,
     pub at: Locator,
@@ -169,24 +171,24 @@ pub struct DeviceConfig {
     pub device: Arc<esi::Device>,
     pub selection: esi::Selection,
     pub startup: Startup,
-    /// Which revisions may stand for the ESI's.
-    pub identity: Match,
-    /// The one device that it must be.
+    /// The rule for revisions that differ from the ESI's.
+    pub identity: RevisionMatch,
+    /// The required serial number.
     pub serial: Option<u32>,
     pub axis: Option<AxisSetup>,
     pub sim: sim::SimSetup,
-    /// Of its `[[device]]` in the machine file.
+    /// The line of its `[[device]]` in the machine file.
     pub line: u32,
 }
 
-/// How a device is found on the bus.
+/// How a device is located on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Locator {
-    /// 0 is the first behind the MainDevice.
+    /// The position; the first device after the MainDevice has 0.
     Position(u16),
-    /// Configured station alias (register 0x0012).
+    /// The configured station alias (register 0x0012).
     Alias(u16),
-    /// Explicit device identification (requested through AL control, or ID switch).
+    /// The explicit device identification (requested through AL control, or ID switch).
     Id(u16),
 }
 
@@ -203,31 +205,31 @@ impl std::fmt::Display for Locator {
 #[derive(Debug, Clone, PartialEq)]
 pub struct AxisSetup {
     pub config: ecaxis_axis::AxisConfig,
-    /// The user's name for the unit of positions, `mm`.
+    /// The user's name for the position unit, for example `mm`.
     pub unit: String,
     pub mode: esi::Mode,
-    pub velocity_unit_from: UnitFrom,
-    pub acceleration_unit_from: UnitFrom,
+    pub velocity_unit_from: UnitSource,
+    pub acceleration_unit_from: UnitSource,
     pub torque: TorqueSetup,
-    /// Which way a modulo axis moves.
-    pub way: ecaxis_axis::scale::Way,
+    /// The direction in which a modulo axis moves.
+    pub way: ecaxis_axis::scale::ModuloDirection,
     pub homing: Option<HomingSetup>,
-    /// The output that opens its brake, of one bit.
+    /// The one-bit output that releases the axis's brake.
     pub brake_output: Option<Signal>,
 }
 
-/// How an axis finds home.
+/// The homing of an axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HomingSetup {
     pub homing: ecaxis_axis::homing::Homing,
-    /// The same as SDOs.
+    /// The homing settings as SDOs.
     pub startup: Vec<esi::StartupSdo>,
-    /// For the whole search.
+    /// The timeout of the whole search in ns.
     pub timeout_ns: u64,
 }
 
 impl HomingSetup {
-    /// With the others before SafeOp, after what the ESI asks for.
+    /// Adds the SDOs before SafeOp, after those of the ESI.
     fn add_to(&self, startup: &mut Vec<esi::StartupSdo>) {
         let at = startup
             .iter()
@@ -237,31 +239,32 @@ impl HomingSetup {
     }
 }
 
-/// The unit of an axis' torques, and what is known of its motor.
+/// The unit of an axis's torques, and the motor data.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TorqueSetup {
     pub unit: TorqueUnit,
-    /// Rated torque, Nm. `None`: only the drive knows it.
+    /// The rated torque in Nm; `None` if only the drive knows it.
     pub rated: Option<f64>,
-    pub rated_from: UnitFrom,
-    /// Torque constant, Nm/A.
+    pub rated_from: UnitSource,
+    /// The torque constant in Nm/A.
     pub constant: Option<f64>,
-    pub constant_from: UnitFrom,
-    /// Of 0x6076.
+    pub constant_from: UnitSource,
+    /// The number of counts of 0x6076 per Nm.
     pub counts_per_newton_metre: f64,
-    /// Percent of rated torque that one of the unit is. Where the rated torque is not known: percent of the limit.
+    /// The percentage of rated torque per file unit. With an unknown rated torque: the percentage
+    /// of the limit.
     percent_per_unit: f64,
-    /// Otherwise the limit is the rated torque, whatever that is.
+    /// `true` if the file sets a torque limit. Otherwise the limit is the rated torque.
     limit_said: bool,
 }
 
-/// `torque_unit`.
+/// The key `torque_unit`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum TorqueUnit {
-    /// Of the motor's rated torque.
+    /// Percent of the motor's rated torque.
     #[default]
     Percent,
-    /// Of the motor, before any gear.
+    /// Nm at the motor, before any gear.
     NewtonMetres,
     Amperes,
 }
@@ -283,10 +286,10 @@ impl std::fmt::Display for TorqueUnit {
     }
 }
 
-/// What says how the drive counts something.
+/// The source of a drive unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum UnitFrom {
-    /// A key of [device.axis].
+pub enum UnitSource {
+    /// A key of `[device.axis]`.
     File,
     /// A start-up SDO of the machine file.
     Sdo,
@@ -294,28 +297,28 @@ pub enum UnitFrom {
     Esi,
     /// The drive itself.
     Drive,
-    /// It is assumed.
+    /// No source: the unit is assumed.
     Nothing,
 }
 
 /// One step of the program.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
-    /// As people count: `2`, or `2.1` for the first step inside the second.
+    /// The step number: `2`, or `2.1` for the first step inside the second.
     pub number: String,
-    /// Of the machine file.
+    /// The line in the machine file.
     pub line: u32,
     pub action: Action,
 }
 
-/// What a step does. Axes are indices into [`Machine::devices`], targets pairs of such an index and a value in
-/// user units.
+/// The action of a step. Axes are indices into [`Machine::devices`]. Targets are pairs of such an
+/// index and a value in user units.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
     Enable {
         axes: Vec<usize>,
     },
-    /// Decelerate, then take the power away.
+    /// Decelerate, then remove power.
     Disable {
         axes: Vec<usize>,
     },
@@ -327,94 +330,94 @@ pub enum Action {
     Home {
         axes: Vec<usize>,
     },
-    /// Decelerate and hold.
+    /// Decelerate and hold position.
     Stop {
         axes: Vec<usize>,
     },
-    /// Move and wait until every axis is in its target.
+    /// Move and wait until every axis is in target.
     Move {
-        /// From where the axes are when the step begins.
+        /// `true` if targets are relative to the position at the start of the step.
         relative: bool,
         targets: Vec<(usize, f64)>,
-        /// Fraction of each axis' velocity limit.
+        /// The fraction of each axis's velocity limit.
         speed: f64,
-        /// Fraction of each axis' acceleration limit.
+        /// The fraction of each axis's acceleration limit.
         ramp: f64,
-        /// Jerk-limited, from rest, and all arrive in the same cycle.
+        /// `true` for jerk-limited motion from rest in which all axes arrive in the same cycle.
         together: bool,
     },
-    /// Move until an edge comes at the input of a touch probe; without one the step fails.
+    /// Move until the touch probe's input has an edge. The step fails without an edge.
     Probe {
         axis: usize,
         probe: ecaxis_axis::Probe,
         edge: ecaxis_axis::Edge,
-        /// How far: a position, or a way from where the axis is.
+        /// `true` if the end of the move is relative to the present position.
         relative: bool,
         target: f64,
-        /// Fractions, as in a move.
+        /// The fractions, as in [`Action::Move`].
         speed: f64,
         ramp: f64,
     },
-    /// A straight line through the positions of all its axes, jerk-limited; they arrive in the same cycle.
+    /// Move all axes along a straight line, jerk-limited; they arrive in the same cycle.
     Line {
         relative: bool,
         targets: Vec<(usize, f64)>,
-        /// Fraction of each axis' velocity limit.
+        /// The fraction of each axis's velocity limit.
         speed: f64,
-        /// Fraction of each axis' acceleration and jerk limits.
+        /// The fraction of each axis's acceleration and jerk limits.
         ramp: f64,
     },
-    /// About where the axis stands.
+    /// Move in a wave around the present position.
     Wave {
         axis: usize,
         wave: ecaxis_axis::setpoint::Wave,
     },
-    /// To the table's first position, then along it.
+    /// Move to the table's first position, then play the table.
     Table {
         axis: usize,
-        /// Index into [`Machine::tables`].
+        /// The index into [`Machine::tables`].
         table: usize,
-        /// On the way to the first position, as in a move.
+        /// The fractions for the move to the first position, as in [`Action::Move`].
         speed: f64,
         ramp: f64,
     },
-    /// One axis follows another from now on; until it is told something else.
+    /// Make one axis follow another until its next motion.
     Gear {
         axis: usize,
         master: usize,
-        /// What the master reports instead of its set-point.
+        /// `true` to follow the master's actual position instead of its set-point.
         actual: bool,
-        /// The follower's units per master's unit.
+        /// The number of follower units per master unit.
         ratio: f64,
-        /// The follower's position when the master's is 0; `None`: as it is when the step begins.
+        /// The follower's position at master position 0. `None`: the present relation stays.
         offset: Option<f64>,
         smoothing_ns: u64,
     },
-    /// Reach the velocities and go on turning.
+    /// Reach the velocities and keep moving.
     Velocity {
         targets: Vec<(usize, f64)>,
-        /// Fraction of each axis' acceleration limit.
+        /// The fraction of each axis's acceleration limit.
         ramp: f64,
     },
-    /// Apply torques, percent of rated torque.
+    /// Apply torques in percent of rated torque.
     Torque {
         targets: Vec<(usize, f64)>,
-        /// From the present torque to the new one.
+        /// The time of the ramp to the new torque.
         ramp_ns: u64,
     },
-    /// Switch modes of operation, also in motion.
+    /// Switch modes of operation, even in motion.
     Mode {
         targets: Vec<(usize, ecaxis_axis::Mode)>,
     },
     Dwell {
         ns: u64,
     },
-    /// Until all conditions hold in the same cycle.
+    /// Wait until all conditions hold in the same cycle.
     Wait {
         conditions: Vec<Condition>,
         timeout_ns: u64,
     },
-    /// Indices into [`Machine::outputs`], and values.
+    /// Set outputs: indices into [`Machine::outputs`], and values.
     Set {
         values: Vec<(usize, f64)>,
     },
@@ -427,13 +430,13 @@ pub enum Action {
 /// How the machine stops.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StopSetup {
-    /// Of the other axes when one faults or trips, where its group does not say otherwise.
+    /// The stop method of the other axes after a fault or trip, unless their group has its own.
     pub others: StopMethod,
-    /// Of axes whose inputs no longer arrive; those that still answer stop by set-points.
+    /// The stop method of axes without valid inputs. Axes that still answer stop by set-points.
     pub bus_lost: StopMethod,
-    /// One of them is enough for an emergency stop.
+    /// The conditions for an emergency stop; one is enough.
     pub emergency: Vec<Condition>,
-    /// SubDevices that stop together; those in none are one more group.
+    /// The groups of SubDevices that stop together. Devices without a group form one more group.
     pub groups: Vec<StopGroup>,
 }
 
@@ -452,24 +455,25 @@ impl Default for StopSetup {
 #[derive(Debug, Clone, PartialEq)]
 pub struct StopGroup {
     pub name: String,
-    /// Indices into [`Machine::devices`], with and without an axis; in no other group.
+    /// The indices into [`Machine::devices`], with and without an axis. A device is in one group
+    /// only.
     pub devices: Vec<usize>,
-    /// Of its other axes when one faults or trips.
+    /// The stop method of its other axes after a fault or trip.
     pub others: StopMethod,
-    pub outside: Outside,
+    pub outside: GroupStopScope,
 }
 
 /// What the machine does when a group stops.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Outside {
-    /// It stops, too: within the limits of its axes.
+pub enum GroupStopScope {
+    /// The machine stops as well, within the limits of its axes.
     #[default]
     Stop,
     Continue,
 }
 
 impl Machine {
-    /// As the machine file names it; empty for the first, which it does not.
+    /// Returns the group's name in the machine file; empty for group 0, which has no name.
     #[must_use]
     pub fn group_name(&self, group: usize) -> &str {
         let named = group
@@ -478,7 +482,8 @@ impl Machine {
         named.map_or("", |group| &group.name)
     }
 
-    /// The group of a device: 0 where none names it, else one more than the index into [`StopSetup::groups`].
+    /// Returns the group of a device: 0 without a named group, otherwise the index into
+    /// [`StopSetup::groups`] plus 1.
     #[must_use]
     pub fn group_of(&self, device: usize) -> usize {
         let mut groups = self.stop.groups.iter();
@@ -487,17 +492,17 @@ impl Machine {
     }
 }
 
-/// A table of set-points and the file it comes from.
+/// A table of set-points and its file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TableFile {
     pub path: PathBuf,
     pub table: ecaxis_axis::setpoint::Table,
 }
 
-/// An input and what it must be; every bound that is given holds.
+/// A condition on an input. All given bounds must hold.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Condition {
-    /// Index into [`Machine::inputs`].
+    /// The index into [`Machine::inputs`].
     pub input: usize,
     pub equal: Option<f64>,
     pub above: Option<f64>,
@@ -513,19 +518,19 @@ impl Condition {
     }
 }
 
-/// A piece of process data that the program reads or sets.
+/// Process data that the program reads or sets.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Signal {
-    /// Index into [`Machine::devices`].
+    /// The index into [`Machine::devices`].
     pub device: usize,
-    /// With its device's: `io.Input 3`.
+    /// The name with its device's name: `io.Input 3`.
     pub name: String,
     pub field: esi::layout::Field,
 }
 
-/// How a signal's bits are a number.
+/// The number format of a signal's bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum NumericFormat {
     Unsigned,
     Signed,
     /// IEEE 754, 32 bits.
@@ -534,34 +539,34 @@ pub enum Kind {
 
 impl Signal {
     #[must_use]
-    pub fn kind(&self) -> Kind {
+    pub fn kind(&self) -> NumericFormat {
         match self.field.data_type.as_str() {
-            "REAL" if self.field.bit_len == 32 => Kind::Real,
+            "REAL" if self.field.bit_len == 32 => NumericFormat::Real,
             "SINT" | "INT" | "INT24" | "DINT" | "INT40" | "INT48" | "INT56" | "LINT"
-            | "INTEGER8" | "INTEGER16" | "INTEGER32" | "INTEGER64" => Kind::Signed,
-            _ => Kind::Unsigned,
+            | "INTEGER8" | "INTEGER16" | "INTEGER32" | "INTEGER64" => NumericFormat::Signed,
+            _ => NumericFormat::Unsigned,
         }
     }
 
-    /// Lowest and highest value, and whether only whole ones.
+    /// Returns the lowest and highest value, and whether only integers are possible.
     fn range(&self) -> (f64, f64, bool) {
         let steps = f64::from(self.field.bit_len).exp2();
         match self.kind() {
-            Kind::Real => (f64::from(f32::MIN), f64::from(f32::MAX), false),
-            Kind::Signed => (-steps / 2.0, steps / 2.0 - 1.0, true),
-            Kind::Unsigned => (0.0, steps - 1.0, true),
+            NumericFormat::Real => (f64::from(f32::MIN), f64::from(f32::MAX), false),
+            NumericFormat::Signed => (-steps / 2.0, steps / 2.0 - 1.0, true),
+            NumericFormat::Unsigned => (0.0, steps - 1.0, true),
         }
     }
 }
 
-/// No machine file is longer.
+/// The maximum length of a machine file in bytes.
 const MAX_BYTES: u64 = 16 << 20;
 
 /// Reads and checks a machine file and the ESI files it names.
 ///
 /// # Errors
-/// [`ConfigError::Io`] where the file cannot be read, [`ConfigError::NotText`] where it is no text, else
-/// everything that is wrong with it.
+/// [`ConfigError::Io`] if the file cannot be read, [`ConfigError::NotText`] if it is not text,
+/// otherwise all mistakes in it.
 pub fn load(path: &Path) -> Result<Machine, ConfigError> {
     let bytes = file::read(path, MAX_BYTES).map_err(|source| ConfigError::Io {
         path: path.to_owned(),
@@ -574,13 +579,13 @@ pub fn load(path: &Path) -> Result<Machine, ConfigError> {
     parse(path, &text)
 }
 
-/// Of a text that is no TOML, as many are told.
+/// The maximum number of TOML syntax errors reported.
 const MOST_SYNTAX_ERRORS: usize = 10;
 
-/// Checks a machine file's text; `path` is what its ESI files are relative to.
+/// Checks a machine file's text. `path` is the base of relative ESI file names.
 ///
 /// # Errors
-/// Everything that is wrong with it.
+/// All mistakes in the file.
 pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
     let mut problems = problem::Problems::new(path, text);
     let start = text.trim_start_matches('\u{feff}').trim_start();
@@ -591,9 +596,9 @@ pub fn parse(path: &Path, text: &str) -> Result<Machine, ConfigError> {
         return Err(problems.into_error());
     }
     let (document, mut errors) = toml::de::DeTable::parse_recoverable(text);
-    // What follows would be guesses about text that has not been understood.
+    // Checks after a syntax error would only report consequences of it.
     if !errors.is_empty() {
-        // A table that is written wrong leaves those below it without one, which is then said of each of them.
+        // A malformed table would make its subtables look incomplete.
         raw::names(&document, &mut problems);
         if !problems.is_empty() {
             errors.retain(|error| !error.message().starts_with("duplicate key"));

@@ -1,12 +1,12 @@
-//! What is wrong with a machine file, and where: one [`Problem`] a mistake, with line, caret and a
-//! suggestion, all of them collected before anything is reported.
+//! Mistakes in a machine file with their place: one [`Problem`] per mistake, with line, caret and a
+//! suggestion. All are collected before the report.
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// Why there is no machine.
+/// The reason why a machine file is rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     #[error("{}", unreadable(path, source))]
@@ -19,12 +19,12 @@ pub enum ConfigError {
         path: PathBuf,
         source: std::str::Utf8Error,
     },
-    /// Everything that is wrong with the file, in the order of its lines.
+    /// All mistakes in the file, in line order.
     #[error("{}", all(.0))]
     Problems(Vec<Problem>),
 }
 
-/// Why a file cannot be read.
+/// Returns the reason why a file cannot be read.
 pub(crate) fn unreadable(path: &Path, error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::IsADirectory => format!("{} is a folder, not a file", path.display()),
@@ -41,11 +41,11 @@ fn all(problems: &[Problem]) -> String {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
     pub path: PathBuf,
-    /// From 1.
+    /// The line, from 1.
     pub line: u32,
-    /// From 1, in characters.
+    /// The column in characters, from 1.
     pub column: u32,
-    /// How many characters of the line it concerns, at least 1.
+    /// The number of marked characters, at least 1.
     pub width: u32,
     pub message: String,
     pub hint: Option<String>,
@@ -59,7 +59,7 @@ impl fmt::Display for Problem {
         } = self;
         let number = line.to_string();
         let margin = " ".repeat(number.len());
-        // Tabs stay tabs before the caret, whatever their width on the reader's terminal.
+        // Tabs before the caret stay tabs, independent of their width on the terminal.
         let before: String = self
             .source_line
             .chars()
@@ -83,17 +83,17 @@ impl fmt::Display for Problem {
     }
 }
 
-/// Bytes of the machine file.
+/// A byte range of the machine file.
 pub(crate) type Span = Range<usize>;
 
-/// The file's text and what has been found wrong with it so far.
+/// The file's text and the problems found so far.
 #[derive(Debug)]
 pub(crate) struct Problems<'s> {
     path: &'s Path,
     text: &'s str,
-    /// Where lines begin.
+    /// The byte offsets of the lines.
     lines: Vec<usize>,
-    /// By the byte at which they begin.
+    /// The problems by their first byte.
     found: BTreeMap<usize, Vec<Problem>>,
 }
 
@@ -125,7 +125,7 @@ impl<'s> Problems<'s> {
         let rest = &self.text[line_start..];
         let source_line = rest.lines().next().unwrap_or_default();
         let column = self.text[line_start..start].chars().count() + 1;
-        // A span over several lines (a table, a long list) is underlined on its first.
+        // A span over several lines (a table, a long list) is underlined on its first line.
         let line_end = (line_start + source_line.len()).max(start);
         let width = self.text[start..end.min(line_end)].chars().count().max(1);
         let problem = Problem {
@@ -147,12 +147,12 @@ impl<'s> Problems<'s> {
         small(self.line_at(floor(self.text, span.start)))
     }
 
-    /// The line of a byte, from 1.
+    /// Returns the line of a byte, from 1.
     fn line_at(&self, byte: usize) -> usize {
         self.lines.partition_point(|start| *start <= byte)
     }
 
-    /// The text a span covers.
+    /// Returns the text of a span.
     pub fn text(&self, span: &Span) -> &'s str {
         let start = floor(self.text, span.start);
         &self.text[start..floor(self.text, span.end).max(start)]
@@ -166,7 +166,7 @@ impl<'s> Problems<'s> {
         self.found.is_empty()
     }
 
-    /// All problems in the order of the file.
+    /// Returns all problems in file order.
     pub fn into_error(self) -> ConfigError {
         ConfigError::Problems(self.found.into_values().flatten().collect())
     }
@@ -176,7 +176,7 @@ fn small(n: usize) -> u32 {
     u32::try_from(n).unwrap_or(u32::MAX)
 }
 
-/// The last character boundary at or before `at`.
+/// Returns the last character boundary at or before `at`.
 fn floor(text: &str, at: usize) -> usize {
     let mut at = at.min(text.len());
     while !text.is_char_boundary(at) {
@@ -185,12 +185,12 @@ fn floor(text: &str, at: usize) -> usize {
     at
 }
 
-/// The one of `known` that `word` was probably meant to be.
+/// Returns the entry of `known` that `word` probably stands for.
 #[must_use]
 pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     let word = word.to_lowercase();
     let known: Vec<&str> = known.into_iter().collect();
-    // `move_to` is farther from `move` than from `move_by`, which means something else.
+    // By edit distance alone, `move_to` is nearer to `move_by`, which means something else.
     let stem = |k: &&&str| {
         word.strip_prefix(**k)
             .is_some_and(|rest| rest.starts_with('_'))
@@ -200,7 +200,7 @@ pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Opti
         .into_iter()
         .map(|k| (distance(&word, &k.to_lowercase()), k))
         .filter(|(d, k)| match k.chars().count().max(word.chars().count()) {
-            // Every one-letter name is one edit away from every other.
+            // All one-letter names are one edit apart.
             0..=2 => *d == 0,
             longer => *d <= (longer / 3).max(1),
         })
@@ -211,7 +211,7 @@ pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Opti
     }
 }
 
-/// ``did you mean `x`?``, or what there is to choose from.
+/// Returns ``did you mean `x`?`` or the list of choices.
 pub(crate) fn suggestion<'k>(
     word: &str,
     known: impl IntoIterator<Item = &'k str> + Clone,
@@ -223,13 +223,14 @@ pub(crate) fn suggestion<'k>(
     }
 }
 
-/// `` `a`, `b` or `c` `` without its last word's ceremony: `` `a`, `b`, `c` ``.
+/// Returns a list such as `` `a`, `b`, `c` ``.
 pub(crate) fn list<'k>(words: impl IntoIterator<Item = &'k str>) -> String {
     let quoted: Vec<String> = words.into_iter().map(|k| format!("`{k}`")).collect();
     quoted.join(", ")
 }
 
-/// Edits (insertion, deletion, substitution, neighbours swapped) that turn `a` into `b`.
+/// Returns the number of edits (insertion, deletion, substitution, transposition) that turn `a`
+/// into `b`.
 fn distance(a: &str, b: &str) -> usize {
     let a: Vec<char> = a.chars().take(64).collect();
     let b: Vec<char> = b.chars().take(64).collect();
@@ -256,7 +257,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn distances() {
+    fn distance_counts_edits() {
         for (a, b, d) in [
             ("", "", 0),
             ("cycle", "cycle", 0),
@@ -275,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn caret_stands_under_what_is_meant() {
+    fn problem_puts_the_caret_under_the_marked_text() {
         let text = "a = 1\n\tβeta = \"zwölf\" # c\nc = 2";
         let mut problems = Problems::new(Path::new("m.toml"), text);
         let at = text.find("\"zw").unwrap();
@@ -293,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn a_span_past_the_end_is_no_accident() {
+    fn problem_accepts_a_span_past_the_end() {
         for text in ["", "x", "ä", "x\n"] {
             let mut problems = Problems::new(Path::new("m.toml"), text);
             for start in 0..4 {

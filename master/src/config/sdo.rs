@@ -1,14 +1,15 @@
-//! A start-up SDO's value as bytes: width and sign from the ESI's dictionary, or from `type`.
+//! The value of a start-up SDO as bytes. Width and sign come from the ESI's dictionary or from
+//! `type`.
 
 use ecaxis_esi::{ObjectItem, Writable};
 
 use super::raw::SdoValue;
 use crate::parameters::{DataType, Kind};
 
-/// What is wrong with the value, and a hint.
-pub(crate) type Refusal = (String, Option<String>);
+/// The problem with a value, and a hint.
+pub(crate) type ValueProblem = (String, Option<String>);
 
-/// Names that are told; those of ETG.2000 are taken as well.
+/// Type names shown in messages; those of ETG.2000 are accepted as well.
 const TYPES: [&str; 12] = [
     "bool", "i8", "u8", "i16", "u16", "i32", "u32", "i64", "u64", "f32", "f64", "text",
 ];
@@ -17,7 +18,7 @@ pub(crate) fn encode(
     value: &SdoValue,
     type_name: Option<&str>,
     item: Option<&ObjectItem>,
-) -> Result<Vec<u8>, Refusal> {
+) -> Result<Vec<u8>, ValueProblem> {
     let names = || TYPES.map(|name| format!("`{name}`")).join(", ");
     if let Some(item) = item {
         let closed = match item.access.write {
@@ -74,17 +75,17 @@ fn little_endian(bytes: &[u8], signed: bool) -> i128 {
     i128::from_le_bytes(all)
 }
 
-fn bytes(value: &SdoValue, data_type: DataType) -> Result<Vec<u8>, Refusal> {
+fn bytes(value: &SdoValue, data_type: DataType) -> Result<Vec<u8>, ValueProblem> {
     let number = matches!(data_type.kind, Kind::Unsigned | Kind::Signed);
     let written = match value {
         SdoValue::Bytes(bytes) => return Ok(bytes.clone()),
-        // TOML has taken the quotes and escapes out already.
+        // TOML has already removed quotes and escapes.
         SdoValue::Text(text) if data_type.kind == Kind::Text => {
             return Ok(text.clone().into_bytes());
         }
         SdoValue::Text(text) => text.clone(),
         SdoValue::Integer(n) => n.to_string(),
-        // In TOML it is `nan`.
+        // TOML writes `nan` in lower case.
         SdoValue::Float(x) => x.to_string().to_lowercase(),
         SdoValue::Boolean(b) if number => u8::from(*b).to_string(),
         SdoValue::Boolean(b) => b.to_string(),
@@ -102,12 +103,12 @@ fn bytes(value: &SdoValue, data_type: DataType) -> Result<Vec<u8>, Refusal> {
 mod tests {
     use super::*;
 
-    fn typed(value: SdoValue, name: &str) -> Result<Vec<u8>, Refusal> {
+    fn typed(value: SdoValue, name: &str) -> Result<Vec<u8>, ValueProblem> {
         encode(&value, Some(name), None)
     }
 
     #[test]
-    fn widths_and_signs() {
+    fn encode_uses_width_and_sign_of_the_type() {
         use SdoValue::{Boolean, Bytes, Float, Integer, Text};
         for (value, name, bytes) in [
             (Integer(2000), "u32", vec![0xd0, 7, 0, 0]),
@@ -145,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dictionary_decides() {
+    fn encode_follows_the_dictionary() {
         let mut item = ObjectItem {
             name: "Following error window".into(),
             type_name: "UDINT".into(),

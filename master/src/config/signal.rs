@@ -1,4 +1,4 @@
-//! Process data by name: which bits of which device a step reads or sets.
+//! Process data by name: the bits of a device that a step reads or sets.
 
 use ecaxis_esi as esi;
 use ecaxis_esi::layout::Field;
@@ -7,24 +7,24 @@ use toml::Spanned;
 
 use super::problem::{Problems, suggestion};
 use super::raw::RawSignal;
-use super::steps::Known;
+use super::steps::ResolvedDevice;
 use super::{DeviceConfig, Machine, Signal, further_axis};
 
-/// Axes write these themselves (CiA 402, ETG.6010).
+/// Objects that only the axes write (CiA 402, ETG.6010).
 const AXIS_OUTPUTS: [u16; 11] = [
     0x6040, 0x6060, 0x6071, 0x607a, 0x6081, 0x6083, 0x6084, 0x60b1, 0x60b2, 0x60b8, 0x60ff,
 ];
-/// It adds to the target position, and the axis leaves it at zero.
+/// The position offset adds to the target position; the axis keeps it at zero.
 const POSITION_OFFSET: u16 = 0x60b0;
 
-/// Whether a signal comes in or goes out.
+/// The direction of a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Way {
+enum SignalDirection {
     In,
     Out,
 }
 
-impl Way {
+impl SignalDirection {
     fn noun(self) -> &'static str {
         match self {
             Self::In => "input",
@@ -33,24 +33,25 @@ impl Way {
     }
 }
 
-/// A name that means no axis and no process data of the machine.
+/// A name without a matching axis or process data.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}; {hint}")]
 pub struct NameError {
     pub message: String,
     pub hint: String,
-    /// The device's name is wrong, not the signal's.
+    /// `true` if the device's name is wrong, not the signal's.
     device: bool,
 }
 
-/// What can be read, or set, of one device.
+/// The readable or writable fields of one device.
 struct Candidates<'d> {
     fields: &'d [Field],
     pdos: &'d [esi::Pdo],
 }
 
 impl<'d> Candidates<'d> {
-    /// The names that a field answers to besides its address: its own, its PDO's where that has no other, and both.
+    /// Returns the names of a field besides its address: its own, `PDO/entry`, and the PDO's name
+    /// if it has one entry.
     fn names(&self, field: &Field) -> Vec<String> {
         let mut names = vec![field.name.clone()];
         if let Some(pdo) = self.pdos.iter().find(|pdo| pdo.index == field.pdo) {
@@ -74,7 +75,7 @@ impl<'d> Candidates<'d> {
         .collect()
     }
 
-    /// The shortest name that means this field alone.
+    /// Returns the shortest unique name of a field.
     fn name(&self, field: &Field) -> String {
         let mut names = self.names(field);
         names.rotate_left(1);
@@ -88,7 +89,7 @@ fn show(field: &Field) -> String {
     esi::address(field.index, field.sub).to_string()
 }
 
-/// `0x6000:01`; `None` where it is a name.
+/// Parses an address such as `0x6000:01`; returns `None` for a name.
 fn address(text: &str) -> Option<(u16, u8)> {
     let (index, sub) = text.trim().split_once(':').unwrap_or((text.trim(), "0"));
     let index = index
@@ -100,33 +101,33 @@ fn address(text: &str) -> Option<(u16, u8)> {
     ))
 }
 
-/// An input of the machine, to be waited for.
+/// Returns an input of the machine.
 pub(crate) fn input(
     raw: &RawSignal,
-    devices: &[Known<'_>],
+    devices: &[ResolvedDevice<'_>],
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
-    said(raw, devices, Way::In, p)
+    resolve(raw, devices, SignalDirection::In, p)
 }
 
-/// An output of the machine that no axis writes.
+/// Returns an output of the machine that no axis writes.
 pub(crate) fn output(
     raw: &RawSignal,
-    devices: &[Known<'_>],
+    devices: &[ResolvedDevice<'_>],
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
-    said(raw, devices, Way::Out, p)
+    resolve(raw, devices, SignalDirection::Out, p)
 }
 
-/// An output that no axis writes, as `io.Output 3`.
+/// Returns an output that no axis writes, from a text such as `io.Output 3`.
 pub(crate) fn output_of_text(
     text: &Spanned<String>,
-    devices: &[Known<'_>],
+    devices: &[ResolvedDevice<'_>],
     p: &mut Problems<'_>,
 ) -> Option<Signal> {
     let word = text.get_ref();
-    // Names of devices may have dots.
-    let named = |d: &Known<'_>| {
+    // Device names may contain dots.
+    let named = |d: &ResolvedDevice<'_>| {
         word.strip_prefix(d.name)?
             .strip_prefix('.')
             .map(|_| d.name.len())
@@ -152,10 +153,15 @@ pub(crate) fn output_of_text(
     output(&raw, devices, p)
 }
 
-fn said(raw: &RawSignal, devices: &[Known<'_>], way: Way, p: &mut Problems<'_>) -> Option<Signal> {
+fn resolve(
+    raw: &RawSignal,
+    devices: &[ResolvedDevice<'_>],
+    way: SignalDirection,
+    p: &mut Problems<'_>,
+) -> Option<Signal> {
     let names = devices.iter().map(|d| d.name);
     let found = place(raw.device.get_ref(), names).and_then(|index| {
-        // Nothing can be said of a device that is wrong itself, and that has been said.
+        // An invalid device has already been reported.
         let device = devices[index].device;
         device
             .map(|device| one(raw.name.get_ref(), way, index, device))
@@ -180,7 +186,12 @@ fn place<'n>(
     })
 }
 
-fn one(wanted: &str, way: Way, index: usize, device: &DeviceConfig) -> Result<Signal, NameError> {
+fn one(
+    wanted: &str,
+    way: SignalDirection,
+    index: usize,
+    device: &DeviceConfig,
+) -> Result<Signal, NameError> {
     let what = way.noun();
     let wrong = |message: String, hint: String| NameError {
         message,
@@ -188,11 +199,11 @@ fn one(wanted: &str, way: Way, index: usize, device: &DeviceConfig) -> Result<Si
         device: false,
     };
     let candidates = match way {
-        Way::In => Candidates {
+        SignalDirection::In => Candidates {
             fields: &device.selection.layout.tx,
             pdos: &device.selection.tx,
         },
-        Way::Out => Candidates {
+        SignalDirection::Out => Candidates {
             fields: &device.selection.layout.rx,
             pdos: &device.selection.rx,
         },
@@ -237,7 +248,7 @@ fn one(wanted: &str, way: Way, index: usize, device: &DeviceConfig) -> Result<Si
         let message = format!("`{}` has {} bits", signal.name, field.bit_len);
         return Err(wrong(message, "numbers have 64 bits at most".to_owned()));
     }
-    if way == Way::Out && device.axis.is_some() {
+    if way == SignalDirection::Out && device.axis.is_some() {
         let refused = match further_axis(field) {
             Some((_, same)) if AXIS_OUTPUTS.contains(&same) || same == POSITION_OFFSET => {
                 Some("belongs to an axis of the drive that is not used")
@@ -257,24 +268,24 @@ fn one(wanted: &str, way: Way, index: usize, device: &DeviceConfig) -> Result<Si
     Ok(signal)
 }
 
-/// An axis of a machine, by which a controller names it.
+/// A reference to an axis of a machine, for controllers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct AxisRef(pub(crate) usize);
 
-/// An input of a machine.
+/// A reference to an input of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct InputRef(pub(crate) usize);
 
-/// An output of a machine.
+/// A reference to an output of a machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct OutputRef(pub(crate) usize);
 
-/// What a controller needs to know before the machine runs.
+/// Names that a controller resolves before the machine runs.
 impl Machine {
-    /// The axis of the device of this name.
+    /// Returns the axis of the device with this name.
     ///
     /// # Errors
-    /// No device is named so, or it has no axis.
+    /// Fails if no device has the name, or if the device has no axis.
     pub fn axis(&self, name: &str) -> Result<AxisRef, NameError> {
         let axes = self.devices.iter().filter(|d| d.axis.is_some());
         let names = axes.map(|d| d.name.as_str());
@@ -286,22 +297,23 @@ impl Machine {
         Ok(AxisRef(at))
     }
 
-    /// An input by its device's name and its own: that of its entry in the ESI, that of its PDO, both as `PDO/entry`,
-    /// or its address as `0x6000:01`.
+    /// Returns an input by its device's name and its own name. Valid names are the entry's name in
+    /// the ESI, its PDO's name, `PDO/entry`, and an address such as `0x6000:01`.
     ///
     /// # Errors
-    /// Nothing has this name, or several have.
+    /// Fails if no input or several inputs have this name.
     pub fn input(&mut self, device: &str, name: &str) -> Result<InputRef, NameError> {
-        let signal = self.signal(device, name, Way::In)?;
+        let signal = self.signal(device, name, SignalDirection::In)?;
         Ok(InputRef(known(&mut self.inputs, signal)))
     }
 
-    /// An output that no axis writes; named as inputs are.
+    /// Returns an output that no axis writes. Names are as for inputs.
     ///
     /// # Errors
-    /// Nothing has this name, several have, an axis writes it, or it opens a brake.
+    /// Fails if no output or several outputs have this name, if an axis writes it, or if it
+    /// releases a brake.
     pub fn output(&mut self, device: &str, name: &str) -> Result<OutputRef, NameError> {
-        let signal = self.signal(device, name, Way::Out)?;
+        let signal = self.signal(device, name, SignalDirection::Out)?;
         let brakes = |axis: &&DeviceConfig| {
             let setup = axis.axis.as_ref();
             setup.is_some_and(|setup| setup.brake_output.as_ref() == Some(&signal))
@@ -316,13 +328,13 @@ impl Machine {
         Ok(OutputRef(known(&mut self.outputs, signal)))
     }
 
-    fn signal(&self, device: &str, name: &str, way: Way) -> Result<Signal, NameError> {
+    fn signal(&self, device: &str, name: &str, way: SignalDirection) -> Result<Signal, NameError> {
         let index = place(device, self.devices.iter().map(|d| d.name.as_str()))?;
         one(name, way, index, &self.devices[index])
     }
 }
 
-/// The place of a signal among those in use.
+/// Returns the index of a signal among those in use.
 pub(crate) fn known(signals: &mut Vec<Signal>, signal: Signal) -> usize {
     if let Some(known) = signals.iter().position(|s| *s == signal) {
         return known;

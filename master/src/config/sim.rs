@@ -1,40 +1,40 @@
-//! `[device.sim]`: what only the simulated bus needs to know of a device.
+//! `[device.sim]`: settings of a device on the simulated bus.
 
 use ecaxis_esi as esi;
 use ecaxis_sim::gateway::GatewayOptions;
 use ecaxis_sim::network::topology::Media;
-use ecaxis_sim::{Medium, Topology, TopologyError, Wish};
+use ecaxis_sim::{Medium, PortRequest, Topology, TopologyError};
 use toml::Spanned;
 
 use super::fields::{self, Fields};
 use super::gateway::{self, RawGateway};
 use super::problem::{Problems, Span, suggestion};
 use super::raw::RawDevice;
-use super::track::{self, RawTrack, TrackSetup};
+use super::travel::{self, RawTrack, TrackSetup};
 use super::{AxisSetup, DeviceConfig, Locator};
 
-/// A device of the simulated bus, as far as its ESI file does not describe it.
+/// Settings of a simulated device that its ESI file does not describe.
 #[derive(Debug, Clone, Default)]
 pub struct SimSetup {
-    /// The device that it is connected to, by name; `None`: as the order of devices suggests.
+    /// The name of the upstream device; `None`: according to the device order.
     pub after: Option<String>,
-    /// At which port of that device.
+    /// The port of that device.
     pub port: Option<u8>,
-    /// Propagation on the cable to it, one way.
+    /// The propagation delay on the cable to it, one way.
     pub cable_ns: Option<u64>,
-    /// How much faster its clock is than true time.
+    /// The drift of its clock against true time.
     pub drift_ppm: Option<f64>,
-    /// What its clock shows at power-on.
+    /// The time of its clock at power-on.
     pub offset_ns: u64,
-    /// What frames read of its clock is off by up to so much either way.
+    /// The maximum deviation of its clock reads in either direction.
     pub jitter_ns: u32,
     /// The network behind a gateway.
     pub gateway: Option<GatewayOptions>,
-    /// Of a drive.
+    /// The switches and ends along a drive's axis.
     pub track: TrackSetup,
 }
 
-/// As written.
+/// `[device.sim]` as written.
 #[derive(Debug)]
 pub(crate) struct RawSim {
     after: Option<Spanned<String>>,
@@ -47,9 +47,9 @@ pub(crate) struct RawSim {
     track: Option<RawTrack>,
 }
 
-/// Crystals are better than this by far.
+/// The maximum drift. Crystals are far better.
 const MOST_DRIFT_PPM: f64 = 1000.0;
-/// 200 km of cable; no clock is read worse.
+/// The maximum cable delay (200 km of cable) and clock jitter.
 const LONGEST_NS: u64 = 1_000_000;
 
 pub(crate) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawSim {
@@ -61,13 +61,13 @@ pub(crate) fn read(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawSi
         offset: f.get("offset").and_then(|v| fields::duration(p, v)),
         jitter: f.get("jitter").and_then(|v| fields::duration(p, v)),
         gateway: gateway::read(&mut f, span, p),
-        track: f.get("track").and_then(|v| track::read(v, p)),
+        track: f.get("track").and_then(|v| travel::read(v, p)),
     };
     f.done(p);
     raw
 }
 
-/// `names` are those of all devices; for `axis` see [`track::check`].
+/// Checks the settings. `names` are those of all devices; for `axis` see [`travel::check`].
 pub(crate) fn check(
     raw: RawSim,
     names: &[String],
@@ -119,13 +119,13 @@ pub(crate) fn check(
         gateway: raw.gateway.and_then(|raw| gateway::setup(raw, device, p)),
         track: raw
             .track
-            .and_then(|raw| track::check(&raw, axis, p))
+            .and_then(|raw| travel::check(&raw, axis, p))
             .unwrap_or_default(),
     }
 }
 
-/// Devices in the order in which frames pass them. Those found by alias or identification may stand
-/// anywhere: they fill the gaps in order.
+/// Returns the devices in the order in which frames pass them. Devices located by alias or
+/// identification fill the gaps in file order.
 #[must_use]
 pub fn bus_order(devices: &[DeviceConfig]) -> Vec<&DeviceConfig> {
     let mut placed: Vec<Option<&DeviceConfig>> = devices.iter().map(|_| None).collect();
@@ -144,23 +144,23 @@ pub fn bus_order(devices: &[DeviceConfig]) -> Vec<&DeviceConfig> {
     filled.flatten().collect()
 }
 
-/// How the simulated bus is cabled: the devices of [`bus_order`], with its indices.
+/// Returns the cabling of the simulated bus, with the indices of [`bus_order`].
 ///
 /// # Errors
-/// Every device that cannot be where it is to be; [`told`] says it in words.
+/// Every device that cannot be at its position; [`topology_message`] explains it.
 pub fn topology(devices: &[DeviceConfig]) -> Result<Topology, Vec<TopologyError>> {
     let order = bus_order(devices);
-    let wishes: Vec<Option<Wish>> = order
+    let requests: Vec<Option<PortRequest>> = order
         .iter()
         .map(|device| {
             let name = device.sim.after.as_ref()?;
-            Some(Wish {
+            Some(PortRequest {
                 after: order.iter().position(|d| d.name == *name)?,
                 port: device.sim.port,
             })
         })
         .collect();
-    let mut topology = Topology::connect(&media(&order), &wishes)?;
+    let mut topology = Topology::connect(&media(&order), &requests)?;
     for (n, device) in order.iter().enumerate() {
         if let Some(ns) = device.sim.cable_ns {
             topology = topology.with_cable(n, ns);
@@ -174,9 +174,9 @@ fn media(order: &[&DeviceConfig]) -> Vec<Media> {
     physics.map(Medium::from_physics).collect()
 }
 
-/// What is wrong with a device's place, and what would help.
+/// Returns the problem with a device's connection, and a hint.
 #[must_use]
-pub fn told(error: &TopologyError, devices: &[DeviceConfig]) -> (String, String) {
+pub fn topology_message(error: &TopologyError, devices: &[DeviceConfig]) -> (String, String) {
     use TopologyError as E;
     let order = bus_order(devices);
     let media = media(&order);
@@ -274,7 +274,7 @@ fn medium_name(medium: Medium) -> &'static str {
     }
 }
 
-/// Where the places that were asked for are written, with the devices' names.
+/// The connections given in the file, with the devices' names.
 pub(crate) struct Places(Vec<(String, Span)>);
 
 impl Places {
@@ -288,8 +288,8 @@ impl Places {
         Self(devices.iter().filter_map(place).collect())
     }
 
-    /// Reports the places that cannot be had. One that nobody asked for is no mistake of the file: the
-    /// real bus is what it is.
+    /// Reports connections that are impossible. A device without a connection in the file is not a
+    /// mistake, because the real bus may differ.
     pub(crate) fn check(&self, devices: &[DeviceConfig], p: &mut Problems<'_>) {
         let order = bus_order(devices);
         for error in topology(devices).err().unwrap_or_default() {
@@ -299,7 +299,7 @@ impl Places {
                 .iter()
                 .find(|(name, _)| device.is_some_and(|d| d.name == *name));
             if let Some((_, span)) = asked {
-                let (message, hint) = told(&error, devices);
+                let (message, hint) = topology_message(&error, devices);
                 p.add_hint(span.clone(), message, hint);
             }
         }
@@ -321,7 +321,7 @@ mod tests {
 </Devices></Descriptions></EtherCATInfo>
 "##;
 
-    /// A bus of devices: name, type, position and the lines of their `[device.sim]`.
+    /// Loads a bus of devices: name, type, position and the lines of their `[device.sim]`.
     fn load(devices: &[(&str, &str, usize, &str)]) -> Result<Machine, ConfigError> {
         let folder = tempfile::tempdir().expect("folder");
         std::fs::write(folder.path().join("bus.xml"), ESI).expect("file");
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_for_is_what_the_simulated_bus_gets() {
+    fn simulated_bus_gets_the_configured_settings() {
         let machine = load(&[
             (
                 "c",
@@ -367,8 +367,8 @@ mod tests {
     }
 
     #[test]
-    #[rustfmt::skip] // one row a mistake
-    fn every_way_to_be_connected_wrongly() {
+    #[rustfmt::skip] // one row per mistake
+    fn simulated_bus_rejects_wrong_connections() {
         let c = ("c", "C", 0, "");
         for (rest, message, hint) in [
             (&[("t", "T", 1, "after = \"d\"")][..], "no device \"d\"", "devices"),
@@ -379,7 +379,7 @@ mod tests {
             (&[("t", "T", 1, "after = \"t\"")], "frames do not reach \"t\" before \"t\"", "positions count"),
             (&[("t", "T", 1, ""), ("u", "T", 2, "after = \"c\"\nport = 1")], "port 1 of \"c\" leads to \"t\"", ""),
             (&[("x", "B", 1, ""), ("y", "B", 2, "after = \"c\"")], "\"c\" has no port left for \"y\", which needs Ethernet", ""),
-            // The terminals of a coupler come before what is connected to its second socket.
+            // Frames pass a coupler's terminals before the devices at its second socket.
             (&[("x", "B", 1, ""), ("t", "T", 2, "after = \"c\"")], "frames pass port 1 of \"c\" before they reach \"x\", so \"t\" comes before it", "port 3 first"),
             (&[("x", "B", 1, "drift_ppm = 2000")], "more than 1000 ppm", ""),
             (&[("x", "B", 1, "jitter = \"2ms\"")], "a jitter of more than 1 ms", ""),
@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn every_wrong_connection_is_reported_with_its_line() {
+    fn simulated_bus_reports_each_wrong_connection_with_its_line() {
         let found = problems(&[
             ("c", "C", 0, ""),
             ("t", "T", 1, "after = \"c\"\nport = 3"),

@@ -1,28 +1,28 @@
-//! What is done with start-up SDOs besides writing them.
+//! Options for start-up SDOs besides writing them.
 
 use super::raw::{RawDevice, RawStartup};
 
-/// How a device's start-up SDOs are sent.
+/// The options of a device's start-up SDOs.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Startup {
-    all: StartupWay,
-    /// What the file says otherwise of an object, by index and subindex.
-    own: Vec<(u16, u8, StartupWay)>,
+    all: StartupOptions,
+    /// Options in the file for single objects, by index and subindex.
+    own: Vec<(u16, u8, StartupOptions)>,
 }
 
-/// What is done beside writing an object.
+/// What is done in addition to writing an object.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct StartupWay {
-    /// Read back and compared.
+pub struct StartupOptions {
+    /// Reads the object back and compares.
     pub verify: bool,
-    /// Read before, and not written where the device holds the value.
+    /// Reads the object first and skips the write if the value is equal.
     pub skip_equal: bool,
 }
 
 impl Startup {
-    /// An SDO's own word counts before that of the whole list.
+    /// Returns the options of a device. An SDO's own options override the device's.
     pub(crate) fn of(raw: &RawDevice) -> Self {
-        let way = |own: RawStartup| StartupWay {
+        let way = |own: RawStartup| StartupOptions {
             verify: own.verify.or(raw.startup.verify).unwrap_or(false),
             skip_equal: own.skip_equal.or(raw.startup.skip_equal).unwrap_or(false),
         };
@@ -36,11 +36,12 @@ impl Startup {
         }
     }
 
-    /// Of an object. Orders to store and to restore parameters are no values: what is read of them is something else.
+    /// Returns the options of an object. Store and restore parameters (0x1010, 0x1011) read back
+    /// other values than written, so they have none.
     #[must_use]
-    pub fn way(&self, index: u16, sub: u8) -> StartupWay {
+    pub fn way(&self, index: u16, sub: u8) -> StartupOptions {
         if matches!(index, 0x1010 | 0x1011) {
-            return StartupWay::default();
+            return StartupOptions::default();
         }
         let own = self
             .own

@@ -6,9 +6,9 @@ use std::path::Path;
 
 use toml::Spanned;
 
-mod flow;
 mod follow;
 mod modes;
+mod preconditions;
 mod probe;
 mod stop;
 mod target;
@@ -21,31 +21,31 @@ use super::{
     signal,
 };
 use ecaxis_axis::Mode;
-pub(crate) use flow::enables;
-use target::{What, fraction};
+pub(crate) use preconditions::enables;
+use target::{TargetKind, fraction};
 
-/// Of the limits: how an axis goes to the beginning of a table where the step does not say.
+/// The default fraction of the limits for the move to the beginning of a table.
 const GENTLE: f64 = 0.1;
-/// How a gear smooths what its master reports, where the step does not say.
+/// The default smoothing of a gear that follows actual positions, in ns.
 const SMOOTHING_NS: u64 = 10_000_000;
 const WHOLE_TORQUE_RAMP_NS: u64 = 100_000_000;
-/// How long an input is waited for where the step does not say.
+/// The default timeout for an input in ns.
 const WAIT_NS: u64 = 10_000_000_000;
-/// Half an hour more than a week.
+/// The maximum timeout in ns: half an hour more than a week.
 const LONGEST_WAIT_NS: u64 = 606_600_000_000_000;
-/// Steps of a program, those inside repeated ones included.
+/// The maximum number of steps in a program, including those inside repetitions.
 const MOST_STEPS: usize = 10_000;
 
-/// What steps know about a device, which may itself be wrong.
+/// What steps know about a device, which may be invalid itself.
 #[derive(Clone, Copy)]
-pub(crate) struct Known<'c> {
+pub(crate) struct ResolvedDevice<'c> {
     pub name: &'c str,
-    /// `Err(false)`: it has no axis; `Err(true)`: its axis is wrong, and that has been said.
+    /// `Err(false)`: it has no axis; `Err(true)`: its axis is invalid and has been reported.
     pub axis: Result<&'c AxisSetup, bool>,
     pub device: Option<&'c DeviceConfig>,
 }
 
-impl<'c> From<&'c DeviceConfig> for Known<'c> {
+impl<'c> From<&'c DeviceConfig> for ResolvedDevice<'c> {
     fn from(device: &'c DeviceConfig) -> Self {
         Self {
             name: &device.name,
@@ -55,7 +55,7 @@ impl<'c> From<&'c DeviceConfig> for Known<'c> {
     }
 }
 
-/// Steps with the signals that they use.
+/// The steps with their signals.
 #[derive(Debug, Default)]
 pub(crate) struct Program {
     pub stop: StopSetup,
@@ -65,18 +65,18 @@ pub(crate) struct Program {
     pub tables: Vec<TableFile>,
 }
 
-/// `folder` is what files are relative to.
+/// Checks the steps. `folder` is the base of relative file names.
 pub(crate) fn check(
     steps: Vec<RawStep>,
     stop: RawStop,
-    devices: &[Known<'_>],
+    devices: &[ResolvedDevice<'_>],
     folder: &Path,
     cycle_s: f64,
     repeat: u32,
     p: &mut Problems<'_>,
 ) -> Program {
     let before = p.count();
-    let mut checker = Checker {
+    let mut checker = ProgramChecker {
         devices,
         folder,
         cycle_s,
@@ -89,7 +89,7 @@ pub(crate) fn check(
         places: RefCell::default(),
     };
     let steps = checker.all(steps, "", p);
-    // With a step that is wrong in itself nothing is certain about those after it.
+    // After an invalid step, the state of the axes is unknown.
     if p.count() == before {
         checker.flow(&steps, repeat, p);
     }
@@ -103,23 +103,23 @@ pub(crate) fn check(
     }
 }
 
-struct Checker<'c> {
-    devices: &'c [Known<'c>],
+struct ProgramChecker<'c> {
+    devices: &'c [ResolvedDevice<'c>],
     folder: &'c Path,
     cycle_s: f64,
     tables: Vec<TableFile>,
     inputs: Vec<Signal>,
     outputs: Vec<Signal>,
     count: usize,
-    /// Modes that steps so far have switched to.
+    /// The modes to which previous steps have switched.
     switched: Vec<(usize, Mode)>,
-    /// Of the step that is being checked.
+    /// The number of the step being checked.
     number: String,
-    /// Where steps are, and where they name an axis.
+    /// The places of steps, and of axes named in them.
     places: RefCell<BTreeMap<(String, Option<usize>), Span>>,
 }
 
-impl Checker<'_> {
+impl ProgramChecker<'_> {
     fn all(&mut self, steps: Vec<RawStep>, prefix: &str, p: &mut Problems<'_>) -> Vec<Step> {
         let mut checked = Vec::with_capacity(steps.len());
         for (index, RawStep { span, action }) in steps.into_iter().enumerate() {
@@ -176,10 +176,14 @@ impl Checker<'_> {
                 let together = one_of(arrive.as_ref(), &ways, "arrive", p);
                 let at = ramp.as_ref().map(Spanned::span);
                 let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
-                let what = if relative { What::Way } else { What::Position };
+                let what = if relative {
+                    TargetKind::Way
+                } else {
+                    TargetKind::Position
+                };
                 let targets = self.targets(targets, what, p)?;
                 let (speed, ramp) = (speed?, ramp?);
-                self.not_too_slow(&targets, ramp, at, p, |_, limit| limit * speed);
+                self.check_ramp_time(&targets, ramp, at, p, |_, limit| limit * speed);
                 Action::Move {
                     relative,
                     targets,
@@ -196,7 +200,11 @@ impl Checker<'_> {
                 ramp,
             } => {
                 let (speed, ramp) = (fraction(speed, "speed", p), fraction(ramp, "ramp", p));
-                let what = if relative { What::Way } else { What::Position };
+                let what = if relative {
+                    TargetKind::Way
+                } else {
+                    TargetKind::Position
+                };
                 Action::Line {
                     relative,
                     targets: self.targets(targets, what, p)?,
@@ -263,7 +271,7 @@ impl Checker<'_> {
                     offset: offset.map(Spanned::into_inner),
                     smoothing_ns: match smoothing {
                         Some(smoothing) => smoothing.into_inner(),
-                        // Reported positions come in whole counts.
+                        // Actual positions are whole counts, so they need smoothing.
                         None if actual => SMOOTHING_NS,
                         None => 0,
                     },
@@ -272,15 +280,15 @@ impl Checker<'_> {
             RawAction::Velocity { targets, ramp } => {
                 let at = ramp.as_ref().map(Spanned::span);
                 let ramp = fraction(ramp, "ramp", p);
-                let targets = self.targets(targets, What::Velocity, p)?;
-                self.not_too_slow(&targets, ramp?, at, p, |target, _| target.abs());
+                let targets = self.targets(targets, TargetKind::Velocity, p)?;
+                self.check_ramp_time(&targets, ramp?, at, p, |target, _| target.abs());
                 Action::Velocity {
                     targets,
                     ramp: ramp?,
                 }
             }
             RawAction::Torque { targets, ramp } => Action::Torque {
-                targets: self.targets(targets, What::Torque, p)?,
+                targets: self.targets(targets, TargetKind::Torque, p)?,
                 ramp_ns: ramp.map_or(WHOLE_TORQUE_RAMP_NS, Spanned::into_inner),
             },
             RawAction::Mode(named) => {
@@ -325,14 +333,14 @@ impl Checker<'_> {
         })
     }
 
-    /// Whether something is so in a mode that the axis is in at some time.
-    fn ever(&self, index: usize, so: impl Fn(Mode) -> bool) -> bool {
+    /// Returns `true` if `so` holds in any mode that the axis has in the program.
+    fn any_mode(&self, index: usize, so: impl Fn(Mode) -> bool) -> bool {
         let own = self.devices[index].axis.ok().map(|axis| axis.config.mode);
         let switched = self.switched.iter().filter(|(axis, _)| *axis == index);
         switched.map(|(_, mode)| *mode).chain(own).any(so)
     }
 
-    /// Of the machine's axes, those that are named; `None`: all.
+    /// Returns the named axes of the machine; `None`: all.
     fn axes(
         &self,
         names: Option<Vec<Spanned<String>>>,
@@ -414,7 +422,7 @@ impl Checker<'_> {
     }
 }
 
-/// A value that the signal's bits can hold.
+/// Checks that the signal's bits can hold the value.
 fn possible(signal: &Signal, value: &Spanned<f64>, p: &mut Problems<'_>) -> Option<()> {
     let (low, high, whole) = signal.range();
     let n = *value.get_ref();

@@ -1,8 +1,8 @@
-//! What is no TOML, in words that say what to write instead.
+//! TOML syntax errors in words that name the correction.
 
 use super::problem::{Problems, Span};
 
-/// Words of other formats.
+/// Boolean words of other formats.
 const BOOLEANS: [(&str, &str); 8] = [
     ("no", "false"),
     ("off", "false"),
@@ -14,7 +14,7 @@ const BOOLEANS: [(&str, &str); 8] = [
     ("TRUE", "true"),
 ];
 
-/// Reports what the parser found.
+/// Reports an error of the TOML parser.
 pub(crate) fn report(text: &str, error: &toml::de::Error, p: &mut Problems<'_>) {
     let span = error.span().unwrap_or(0..0);
     if error.message().starts_with("missing escaped value") {
@@ -39,11 +39,11 @@ pub(crate) fn report(text: &str, error: &toml::de::Error, p: &mut Problems<'_>) 
     }
 }
 
-/// The word without quotes that stands as a value where the parser gave up.
+/// Returns the unquoted word that stands as a value where the parser failed.
 fn bare_word<'t>(text: &'t str, span: &Span) -> Option<(&'t str, Span)> {
     let line_start = text.get(..span.start)?.rfind('\n').map_or(0, |at| at + 1);
     let line = text.get(line_start..)?.lines().next()?;
-    // From the last thing that a value follows.
+    // Starts after the last character that a value can follow.
     let within = line.get(..span.start - line_start)?;
     let begin = within.rfind(['=', '[', ',']).map(|at| at + 1);
     let begin = begin.or_else(|| line.strip_prefix('=').map(|_| 1))?;

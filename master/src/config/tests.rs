@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use super::*;
 
-/// A drive that takes CSP and CSV but not CST, with 0x60C2 and one object to set.
+/// A drive with CSP and CSV but without CST, with 0x60C2 and one writable object.
 const ESI: &str = r##"<?xml version="1.0" encoding="utf-8"?>
 <EtherCATInfo><Vendor><Id>#x1234</Id><Name>Test</Name></Vendor><Descriptions><Devices>
 <Device Physics="YY"><Type ProductCode="#x10" RevisionNo="#x1">D1</Type><Name>Drive one</Name>
@@ -85,7 +85,7 @@ pub(super) fn with_esi(text: &str) -> Result<Machine, ConfigError> {
     parse(&folder.path().join("m.toml"), text)
 }
 
-/// The problems of the good file with one text replaced by another.
+/// Returns the problems of the good file with one text replaced.
 fn broken(from: &str, to: &str) -> Vec<Problem> {
     assert!(GOOD.contains(from), "{from}");
     problems(&GOOD.replacen(from, to, 1))
@@ -98,7 +98,7 @@ fn problems(text: &str) -> Vec<Problem> {
     }
 }
 
-/// Exactly one problem with this message, hint (or part of it) and marked text.
+/// Expects one problem with this message, hint (or part of it) and marked text.
 fn one(from: &str, to: &str, message: &str, hint: &str, marked: &str) {
     let found = broken(from, to);
     let [problem] = found.as_slice() else {
@@ -120,7 +120,7 @@ fn one(from: &str, to: &str, message: &str, hint: &str, marked: &str) {
 }
 
 #[test]
-fn a_good_file_becomes_a_machine() {
+fn config_parses_a_good_file() {
     let machine = with_esi(GOOD).unwrap();
     assert_eq!(machine.repeat, 2);
     let expected = Bus {
@@ -180,7 +180,7 @@ fn a_good_file_becomes_a_machine() {
 }
 
 #[test]
-fn units_of_ones_own_and_what_says_the_velocity_unit() {
+fn axis_accepts_custom_units_and_records_the_velocity_unit_source() {
     for (text, shown) in [("custom:slots", "slots"), ("μm", "µm"), ("°", "°")] {
         let machine = with_esi(&GOOD.replace("\"mm\"", &format!("\"{text}\""))).unwrap();
         assert_eq!(machine.devices[0].axis.as_ref().unwrap().unit, shown);
@@ -189,18 +189,18 @@ fn units_of_ones_own_and_what_says_the_velocity_unit() {
         let axis = with_esi(text).unwrap().devices[0].axis.clone();
         axis.unwrap().velocity_unit_from
     };
-    assert_eq!(from(GOOD), UnitFrom::Esi);
+    assert_eq!(from(GOOD), UnitSource::Esi);
     let said = GOOD.replace("unit = \"mm\"", "unit = \"mm\"\nvelocity_unit = \"rpm\"");
-    assert_eq!(from(&said), UnitFrom::File);
+    assert_eq!(from(&said), UnitSource::File);
     let written = GOOD.replace(
         "{ index = 0x6065, value = 2500 }",
         "{ index = 0x60A9, value = 0x00B44700 }",
     );
-    assert_eq!(from(&written), UnitFrom::Sdo);
+    assert_eq!(from(&written), UnitSource::Sdo);
 }
 
 #[test]
-fn gear_feed_and_modulo() {
+fn axis_scale_uses_gear_feed_and_modulo() {
     let axis = |keys: &str| {
         let text = GOOD.replace(
             "[device.axis]\nencoder",
@@ -219,12 +219,12 @@ fn gear_feed_and_modulo() {
     }
     let turntable = axis("unit = \"deg\"\nfeed = 360.0\nmodulo = 360.0\nway = \"positive\"");
     assert_eq!(turntable.config.scale.modulo(), Some(360.0));
-    assert_eq!(turntable.way, ecaxis_axis::scale::Way::Positive);
+    assert_eq!(turntable.way, ecaxis_axis::scale::ModuloDirection::Positive);
     assert_eq!(axis("").config.scale.modulo(), None);
 }
 
 #[test]
-fn torques_in_nm_and_a() {
+fn axis_converts_torques_in_nm_and_a() {
     let axis = |keys: &str| {
         let text = GOOD.replace(
             "unit = \"mm\"",
@@ -234,22 +234,22 @@ fn torques_in_nm_and_a() {
         with_esi(&text).unwrap().devices[0].axis.clone().unwrap()
     };
     for (keys, limit, supervised, from) in [
-        // A vendor whose 0x6076 counts mNm.
+        // This vendor's 0x6076 counts mNm.
         (
             "torque_unit = \"Nm\"\nrated_torque = 0.2",
             50.0,
             25.0,
-            UnitFrom::File,
+            UnitSource::File,
         ),
         (
             "torque_unit = \"A\"\ntorque_constant = 0.5\nrated_torque = 0.2",
             25.0,
             12.5,
-            UnitFrom::File,
+            UnitSource::File,
         ),
-        // Not known before the drive tells: parts of the limit.
-        ("torque_unit = \"Nm\"", 100.0, 50.0, UnitFrom::Nothing),
-        ("torque_unit = \"percent\"", 0.1, 0.05, UnitFrom::Nothing),
+        // Unknown until the drive reports it: fractions of the limit.
+        ("torque_unit = \"Nm\"", 100.0, 50.0, UnitSource::Nothing),
+        ("torque_unit = \"percent\"", 0.1, 0.05, UnitSource::Nothing),
     ] {
         let axis = axis(keys);
         let watched = axis.config.supervision.torque.unwrap().percent;
@@ -261,8 +261,8 @@ fn torques_in_nm_and_a() {
 }
 
 #[test]
-fn spinning_is_automatic_or_so_long() {
-    use crate::rt::margin::Spin;
+fn bus_spin_is_automatic_or_fixed() {
+    use crate::rt::spin::Spin;
     for (said, spin) in [
         ("repeat = 2", Spin::Auto),
         ("spin = \"auto\"", Spin::Auto),
@@ -278,7 +278,7 @@ fn spinning_is_automatic_or_so_long() {
 }
 
 #[test]
-fn devices_are_sorted_and_steps_follow() {
+fn devices_are_sorted_and_steps_keep_their_axes() {
     let swapped = GOOD
         .replace("position = 1", "position = 9")
         .replace("position = 0", "position = 1");
@@ -297,8 +297,8 @@ fn devices_are_sorted_and_steps_follow() {
 }
 
 #[test]
-#[rustfmt::skip] // one row a mistake
-fn every_way_to_be_wrong() {
+#[rustfmt::skip] // one row per mistake
+fn config_reports_each_mistake_with_its_place() {
     for (from, to, message, hint, marked) in [
         ("cycle =", "cycel =", "unknown key `cycel` in [bus]", "did you mean `cycle`?", "cycel"),
         ("\"1ms\"", "\"1mms\"", "unknown unit of time `mms`", "did you mean `ms`?", "mms"),
@@ -416,9 +416,9 @@ fn every_way_to_be_wrong() {
     }
 }
 
-/// What an axis without a range would refuse once it has power.
+/// Distances that an axis without a range rejects during operation.
 #[test]
-fn a_way_farther_than_an_axis_counts_is_refused() {
+fn move_by_rejects_distances_beyond_the_axis_range() {
     let endless = GOOD.replace("position = [-50.0, 50.0], ", "");
     for (step, message) in [
         (
@@ -437,7 +437,7 @@ fn a_way_farther_than_an_axis_counts_is_refused() {
 }
 
 #[test]
-fn what_is_no_toml_says_what_to_write() {
+fn toml_syntax_errors_name_the_correction() {
     for (from, to, message, hint) in [
         (
             "\"D1.xml\"",
@@ -472,13 +472,13 @@ fn what_is_no_toml_says_what_to_write() {
     }
 }
 
-/// Of this thread, whatever else the computer does.
+/// Returns the CPU time of this thread in s.
 fn cpu_seconds() -> f64 {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// Ten times the steps take ten times as long, not a hundred times; with and without mistakes in them.
+/// Ten times the steps take about ten times as long, with and without mistakes.
 #[test]
 fn checking_is_linear_in_the_steps() {
     let text = |steps: usize, wrong: &str| {
@@ -502,7 +502,7 @@ fn checking_is_linear_in_the_steps() {
 }
 
 #[test]
-fn a_brake_has_an_output_of_its_own() {
+fn brake_output_is_exclusive() {
     let io = "[[device]]\nname = \"io.a\"\nesi = \"esi/IO8.xml\"\nposition = 2\n";
     let axis = |name: &str, position: usize, brake: &str| {
         format!(
@@ -559,7 +559,7 @@ fn a_brake_has_an_output_of_its_own() {
 }
 
 #[test]
-fn modes_and_axes_belong_together() {
+fn mode_and_axis_require_each_other() {
     let found = broken("mode = \"csv\"\n", "");
     assert_eq!(found.len(), 1, "{found:#?}");
     assert!(found[0].message.contains("needs a `mode`"));
@@ -570,7 +570,7 @@ fn modes_and_axes_belong_together() {
 }
 
 #[test]
-fn a_mode_the_esi_does_not_offer() {
+fn mode_must_be_offered_by_the_esi() {
     let found = problems(&GOOD.replace("mode = \"csv\"", "mode = \"cst\""));
     assert!(
         found[0].message.contains("6071") || found[0].message.contains("cst"),
@@ -579,7 +579,7 @@ fn a_mode_the_esi_does_not_offer() {
 }
 
 #[test]
-fn everything_at_once() {
+fn config_reports_all_mistakes_at_once() {
     let text = GOOD
         .replace("cycle = ", "cycel = ")
         .replace("name = \"v\"", "name = \"x\"")
@@ -595,7 +595,7 @@ fn everything_at_once() {
 }
 
 #[test]
-fn broken_toml_is_pointed_at() {
+fn broken_toml_is_reported_with_its_line() {
     let found = problems("[bus\nnic = \"sim\"\n");
     assert_eq!(found[0].line, 1);
     let found = problems("");
@@ -608,7 +608,7 @@ fn broken_toml_is_pointed_at() {
 }
 
 #[test]
-fn a_file_that_is_not_there() {
+fn load_reports_a_missing_file() {
     let e = load(&PathBuf::from("/nowhere/m.toml")).unwrap_err();
     assert!(
         e.to_string().starts_with("cannot read /nowhere/m.toml"),
@@ -618,7 +618,7 @@ fn a_file_that_is_not_there() {
 
 proptest::proptest! {
     #[test]
-    fn no_text_makes_it_stumble(cut in 0..GOOD.len(), with in ".{0,8}", len in 0..12_usize) {
+    fn parse_never_panics(cut in 0..GOOD.len(), with in ".{0,8}", len in 0..12_usize) {
         let mut text = GOOD.to_owned();
         let end = (cut + len).min(text.len());
         text.replace_range(cut..end, &with);

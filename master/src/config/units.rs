@@ -1,4 +1,5 @@
-//! Units of positions. They are only shown, never converted; a list of them finds the misspelt one.
+//! Position units. They are only displayed, never converted. The list of known units detects
+//! misspellings.
 
 use toml::Spanned;
 
@@ -6,7 +7,7 @@ use super::problem::{Problems, suggestion};
 
 const DEFAULT: &str = "turn";
 
-/// Those of a turn, which need no scale.
+/// Units of a turn, which need no scale.
 const TURNS: [&str; 4] = ["turn", "turns", "rev", "revs"];
 
 const KNOWN: [&str; 23] = [
@@ -14,10 +15,10 @@ const KNOWN: [&str; 23] = [
     "arcsec", "turn", "turns", "rev", "revs", "count", "counts", "inc", "%",
 ];
 
-/// What precedes a unit that is not in the list.
+/// The prefix of a unit that is not in the list.
 const CUSTOM: &str = "custom:";
 
-/// The unit's name as it is shown.
+/// Returns the unit's name for display.
 pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Option<String> {
     let Some(given) = given else {
         return Some(DEFAULT.to_owned());
@@ -32,7 +33,7 @@ pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Opt
         p.add_hint(given.span(), message, "write `unit = \"custom:slots\"`");
         return None;
     }
-    // Both are the same sign to a reader: Greek mu and the micro sign.
+    // Greek mu and the micro sign look the same.
     let word = word.replace('μ', "µ");
     if KNOWN.contains(&word.as_str()) {
         return Some(word);
@@ -47,7 +48,7 @@ pub(crate) fn unit(given: Option<&Spanned<String>>, p: &mut Problems<'_>) -> Opt
     None
 }
 
-/// Whether a unit is a turn of the motor, or of the shaft behind its gear.
+/// Returns `true` if the unit is a turn of the motor or of the gear's output shaft.
 pub(crate) fn is_turn(unit: &str) -> bool {
     TURNS.contains(&unit)
 }

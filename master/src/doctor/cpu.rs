@@ -1,15 +1,15 @@
-//! The CPUs: which one is the cycle's alone, and what makes it slow to wake.
+//! CPU checks: isolation of the cycle's CPU, and what slows its wake-up.
 
+use super::fix::{Fix, boot, file, write};
 use super::host::{Cpus, Host};
-use super::mend::{Mend, boot, file, write};
-use super::{Context, Notes, Severity};
-use crate::rt::exchange::Mode;
+use super::{Context, ReportBuilder, Severity};
+use crate::rt::exchange::ExchangeMode;
 
 const FOLDER: &str = "sys/devices/system/cpu";
-/// What /dev/cpu_dma_latency says when nobody asks for less.
+/// The value of /dev/cpu_dma_latency without any request.
 const NO_LIMIT: i32 = 2_000_000_000;
 
-/// Where /sys does not say which CPUs there are.
+/// Returns the CPUs from other files if /sys does not list them.
 pub(super) fn counted(host: &Host) -> Cpus {
     let stat = host.text("proc/stat").unwrap_or_default();
     let numbers = stat
@@ -19,7 +19,7 @@ pub(super) fn counted(host: &Host) -> Cpus {
     Cpus::parse(&list.join(",")).unwrap_or_default()
 }
 
-pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
+pub(super) fn examine(context: &Context<'_>, notes: &mut ReportBuilder) {
     if context.online.is_empty() {
         return notes.fact("CPUs", "not visible here");
     }
@@ -35,7 +35,7 @@ pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
             "cpu",
             format!("CPU {cpu} is not there or switched off"),
             "The realtime thread cannot be pinned and moves between CPUs.",
-            vec![Mend::advice(format!(
+            vec![Fix::advice(format!(
                 "choose another `cpu`; there are {}",
                 context.online
             ))],
@@ -47,15 +47,15 @@ pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
     siblings(context, notes);
 }
 
-fn isolation(context: &Context<'_>, notes: &mut Notes) {
+fn isolation(context: &Context<'_>, notes: &mut ReportBuilder) {
     let isolated = &context.isolated;
     if context.online.len() == 1 {
         return notes.find(
             Severity::Warning,
             "isolation",
             "there is one CPU: the cycle shares it with everything else",
-            "Interrupts and kernel work of all other programs delay the cycle, and whatever it spins away is missing elsewhere.",
-            vec![Mend::advice("take a computer with at least two CPUs")],
+            "Interrupts and kernel work of all other programs delay the cycle, and its spinning takes CPU time from other programs.",
+            vec![Fix::advice("take a computer with at least two CPUs")],
         );
     }
     match context.cpu {
@@ -72,7 +72,7 @@ fn isolation(context: &Context<'_>, notes: &mut Notes) {
             "isolation",
             format!("the cycle runs on CPU {cpu}, isolated is {isolated}"),
             "Other programs, their system calls and interrupts delay the cycle, while an isolated CPU has nothing to do.",
-            vec![Mend::advice(match isolated.first() {
+            vec![Fix::advice(match isolated.first() {
                 Some(free) => format!("write `cpu = {free}` into the machine file's [bus]"),
                 None => "choose an isolated CPU".to_owned(),
             })],
@@ -81,16 +81,16 @@ fn isolation(context: &Context<'_>, notes: &mut Notes) {
     }
 }
 
-fn not_isolated(context: &Context<'_>, cpu: Option<usize>, notes: &mut Notes) {
+fn not_isolated(context: &Context<'_>, cpu: Option<usize>, notes: &mut ReportBuilder) {
     let Some(take) = cpu.or(context.online.last()) else {
         return;
     };
     let rest = context.online.without(&Cpus::only(take));
-    let mut mend = vec![boot(context.host, &isolating(context, take, &rest))];
+    let mut fix = vec![boot(context.host, &isolating(context, take, &rest))];
     let found = match cpu {
         Some(cpu) => format!("no CPU is isolated; the cycle shares CPU {cpu} with other programs"),
         None => {
-            mend.push(Mend::advice(format!(
+            fix.push(Fix::advice(format!(
                 "In any case write `cpu = {take}` into the machine file's [bus]: it pins the realtime thread."
             )));
             "no CPU is isolated, and none is chosen for the cycle".to_owned()
@@ -101,11 +101,11 @@ fn not_isolated(context: &Context<'_>, cpu: Option<usize>, notes: &mut Notes) {
         "isolation",
         found,
         "Other programs' kernel work, timers and interrupts come in between: wake-ups some 10 to 100 µs later now and then. A program that the scheduler has put on the same CPU (`ecaxis sim` for one) starves while the cycle spins.",
-        mend,
+        fix,
     );
 }
 
-/// Parameters that the kernel at hand understands.
+/// Returns the isolation parameters that this kernel supports.
 fn isolating(context: &Context<'_>, cpu: usize, rest: &Cpus) -> String {
     let mut text = format!("isolcpus=managed_irq,domain,{cpu}");
     for (parameter, option) in [("nohz_full", "NO_HZ_FULL"), ("rcu_nocbs", "RCU_NOCB_CPU")] {
@@ -119,8 +119,8 @@ fn isolating(context: &Context<'_>, cpu: usize, rest: &Cpus) -> String {
     text
 }
 
-/// An isolated CPU without the kernel's own work.
-fn quiet(context: &Context<'_>, cpu: usize, notes: &mut Notes) {
+/// Checks an isolated CPU for remaining kernel work.
+fn quiet(context: &Context<'_>, cpu: usize, notes: &mut ReportBuilder) {
     let kernel = &context.kernel;
     let full = context.host.cpus(&format!("{FOLDER}/nohz_full"));
     let ticks = !full.unwrap_or_default().contains(cpu);
@@ -154,7 +154,7 @@ fn quiet(context: &Context<'_>, cpu: usize, notes: &mut Notes) {
     );
 }
 
-/// The CPUs that the cycle may run on.
+/// Returns the CPUs that the cycle may run on.
 fn candidates(context: &Context<'_>) -> Vec<usize> {
     match context.cpu {
         Some(cpu) => vec![cpu],
@@ -162,7 +162,7 @@ fn candidates(context: &Context<'_>) -> Vec<usize> {
     }
 }
 
-fn frequency(context: &Context<'_>, notes: &mut Notes) {
+fn frequency(context: &Context<'_>, notes: &mut ReportBuilder) {
     let governor = |cpu: &usize| {
         let path = format!("{FOLDER}/cpu{cpu}/cpufreq/scaling_governor");
         Some((
@@ -218,7 +218,7 @@ fn idle_states(host: &Host, cpu: usize) -> Vec<IdleState> {
     host.names(&folder).into_iter().filter_map(state).collect()
 }
 
-fn idle(context: &Context<'_>, notes: &mut Notes) {
+fn idle(context: &Context<'_>, notes: &mut ReportBuilder) {
     let host = context.host;
     let deepest = |states: &[IdleState]| states.iter().map(|s| s.latency_us).max();
     let Some((cpu, states)) = candidates(context)
@@ -236,55 +236,55 @@ fn idle(context: &Context<'_>, notes: &mut Notes) {
         .and_then(|bytes| Some(i32::from_ne_bytes(bytes.get(..4)?.try_into().ok()?)))
         .filter(|limit| *limit != NO_LIMIT)
         .and_then(|limit| u64::try_from(limit).ok());
-    let told = format!("{}, {} µs to wake", state.name, state.latency_us);
+    let reported = format!("{}, {} µs to wake", state.name, state.latency_us);
     if let Some(limit) = limit.filter(|limit| *limit < state.latency_us) {
-        let limited = format!("{told}; now limited to {limit} µs by a program");
+        let limited = format!("{reported}; now limited to {limit} µs by a program");
         return notes.fact("deepest idle state", limited);
     }
     let covered_us = context
         .intent
         .spin
-        .longest(context.intent.cycle_ns, Mode::SameCycle)
+        .longest(context.intent.cycle_ns, ExchangeMode::SameCycle)
         / 1_000;
-    // What spinning covers has to be spun in every cycle.
+    // Spinning must cover this latency in every cycle.
     let hidden = (covered_us / 4).max(10);
     if state.latency_us <= hidden {
-        return notes.fact("deepest idle state", told);
+        return notes.fact("deepest idle state", reported);
     }
     let request = "dev/cpu_dma_latency";
     if host.writable(request) {
-        let never = format!("{told}; ruled out while a machine runs");
+        let never = format!("{reported}; ruled out while a machine runs");
         return notes.fact("deepest idle state", never);
     }
     let cost = format!(
         "The cycle wakes that much later, and with cold caches. Spinning covers {covered_us} µs at most, at the price of CPU time."
     );
-    let found = format!("CPU {cpu} may sleep as deep as {told}");
+    let found = format!("CPU {cpu} may sleep as deep as {reported}");
     if host.exists(request) {
         let rule = ["KERNEL==\"cpu_dma_latency\", MODE=\"0666\""];
-        let mend = vec![
-            Mend::advice(format!(
+        let fix = vec![
+            Fix::advice(format!(
                 "The program rules such states out while it runs, if it may write to /{request}:"
             )),
-            Mend::now(format!("sudo chmod 666 /{request}")),
-            Mend::lasting(file(&rule, "/etc/udev/rules.d/90-ecaxis.rules")),
+            Fix::now(format!("sudo chmod 666 /{request}")),
+            Fix::lasting(file(&rule, "/etc/udev/rules.d/90-ecaxis.rules")),
         ];
-        return notes.find(Severity::Warning, "idle-states", found, cost, mend);
+        return notes.find(Severity::Warning, "idle-states", found, cost, fix);
     }
     let slow = states.iter().filter(|state| state.latency_us > hidden);
     let slow: Vec<String> = slow.map(|state| state.number.to_string()).collect();
     let slow = match slow.as_slice() {
         [one] => one.clone(),
-        // There are ten at most.
+        // A CPU has at most ten idle states.
         several => format!("[{}]", several.concat()),
     };
     let cpus = context.cpu.map_or("*".to_owned(), |cpu| cpu.to_string());
     let path = format!("/{FOLDER}/cpu{cpus}/cpuidle/state{slow}/disable");
-    let mend = write(host, "1", &path);
-    notes.find(Severity::Warning, "idle-states", found, cost, mend);
+    let fix = write(host, "1", &path);
+    notes.find(Severity::Warning, "idle-states", found, cost, fix);
 }
 
-fn siblings(context: &Context<'_>, notes: &mut Notes) {
+fn siblings(context: &Context<'_>, notes: &mut ReportBuilder) {
     let host = context.host;
     let Some(cpu) = context.cpu else {
         if host.text(&format!("{FOLDER}/smt/active")).as_deref() == Some("1") {

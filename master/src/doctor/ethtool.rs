@@ -1,49 +1,49 @@
-//! What only the network driver and the kernel's network stack know.
+//! Settings known only to the network driver and the kernel's network stack.
 
 use std::ffi::CStr;
 
-use crate::os::ethtool::{Driver, Question, WORDS};
-use crate::os::packet;
+use crate::sys::ethtool::{EthtoolCommand, EthtoolSocket, WORDS};
+use crate::sys::packet;
 
-/// `ETH_FLAG_…` of the flags.
+/// The `ETH_FLAG_…` bits of the flags.
 const FLAG_RX_VLAN: u32 = 1 << 8;
 const FLAG_LRO: u32 = 1 << 15;
 
-/// `None`: the driver does not say.
+/// The driver's answers. `None`: the driver does not report it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Answers {
     pub driver: Option<String>,
     pub coalescing: Option<Coalescing>,
     pub energy_efficient: Option<EnergyEfficient>,
-    /// Generic and large receive offload, VLAN tags taken off.
+    /// Generic and large receive offload, VLAN tag stripping.
     pub gro: Option<bool>,
     pub lro: Option<bool>,
     pub rx_vlan: Option<bool>,
-    /// Receive descriptors: in use, at most.
+    /// Receive descriptors: current and maximum.
     pub ring: Option<(u32, u32)>,
-    /// Receive queues.
+    /// The number of receive queues.
     pub queues: Option<u32>,
-    /// IP addresses on it.
+    /// The IP addresses of the interface.
     pub addresses: Vec<String>,
 }
 
-/// How long the card saves up frames before it interrupts.
+/// Interrupt coalescing: how long the card collects frames before an interrupt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Coalescing {
     pub rx_us: u32,
-    /// Adapted to the traffic by the driver.
+    /// True if the driver adapts it to the traffic.
     pub adaptive_rx: bool,
 }
 
-/// IEEE 802.3az.
+/// Energy-Efficient Ethernet (IEEE 802.3az).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EnergyEfficient {
     pub enabled: bool,
-    /// The device at the other end takes part.
+    /// True if the link partner uses it as well.
     pub active: bool,
 }
 
-/// Asks about an interface of this computer.
+/// Queries an interface of this computer.
 #[must_use]
 pub fn ask(nic: &str) -> Answers {
     let addresses = packet::ip_addresses(nic).unwrap_or_default();
@@ -51,30 +51,30 @@ pub fn ask(nic: &str) -> Answers {
         addresses: addresses.iter().map(ToString::to_string).collect(),
         ..Answers::default()
     };
-    let Ok(driver) = Driver::of(nic) else {
+    let Ok(driver) = EthtoolSocket::of(nic) else {
         return answers;
     };
     let ask = |question| driver.ask(question).ok();
-    answers.driver = ask(Question::DriverInfo).and_then(|a| name(&a));
-    answers.coalescing = ask(Question::Coalescing).map(|a| Coalescing {
+    answers.driver = ask(EthtoolCommand::DriverInfo).and_then(|a| name(&a));
+    answers.coalescing = ask(EthtoolCommand::Coalescing).map(|a| Coalescing {
         rx_us: a[1],
         adaptive_rx: a[10] != 0,
     });
-    answers.energy_efficient = ask(Question::EnergyEfficient).map(|a| EnergyEfficient {
+    answers.energy_efficient = ask(EthtoolCommand::EnergyEfficient).map(|a| EnergyEfficient {
         active: a[4] != 0,
         enabled: a[5] != 0,
     });
-    answers.gro = ask(Question::GenericReceiveOffload).map(|a| a[1] != 0);
-    let flags = ask(Question::Flags).map(|a| a[1]);
+    answers.gro = ask(EthtoolCommand::GenericReceiveOffload).map(|a| a[1] != 0);
+    let flags = ask(EthtoolCommand::Flags).map(|a| a[1]);
     answers.lro = flags.map(|f| f & FLAG_LRO != 0);
     answers.rx_vlan = flags.map(|f| f & FLAG_RX_VLAN != 0);
-    answers.ring = ask(Question::Ring).map(|a| (a[5], a[1]));
-    // Those that receive alone, and those that send as well.
-    answers.queues = ask(Question::Channels).map(|a| a[5].saturating_add(a[8]));
+    answers.ring = ask(EthtoolCommand::Ring).map(|a| (a[5], a[1]));
+    // Receive-only queues and combined queues.
+    answers.queues = ask(EthtoolCommand::Channels).map(|a| a[5].saturating_add(a[8]));
     answers
 }
 
-/// The second field, NUL-terminated in 32 bytes.
+/// Returns the second field: NUL-terminated in 32 bytes.
 fn name(answer: &[u32; WORDS]) -> Option<String> {
     let bytes: Vec<u8> = answer[1..9]
         .iter()
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_loopback_has_its_addresses() {
+    fn ask_returns_the_loopback_addresses() {
         let answers = ask("lo");
         assert!(
             answers.addresses.iter().any(|a| a == "127.0.0.1"),
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn no_such_interface() {
+    fn ask_returns_nothing_for_an_unknown_interface() {
         for nic in [
             "nonet7",
             "",
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_drivers_name() {
+    fn name_parses_the_driver_name() {
         let mut answer = [0_u32; WORDS];
         answer[1] = u32::from_ne_bytes(*b"igc\0");
         assert_eq!(name(&answer).as_deref(), Some("igc"));

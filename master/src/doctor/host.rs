@@ -1,5 +1,5 @@
-//! Reads what a computer says of itself in files. All paths are relative to a root folder, so that
-//! other computers than this one can be examined, too.
+//! Reads the state of a computer from its files. Paths are relative to a root folder, so that
+//! copies of other computers can be examined.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -7,25 +7,25 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// More than any file here has; the rest of a longer one is not looked at.
+/// The maximum number of bytes read from a file.
 const LONGEST: u64 = 1 << 20;
-/// No computer has more.
+/// The maximum number of CPUs.
 const MOST_CPUS: usize = 8192;
 
-/// A computer, as far as its files tell.
+/// A computer, described by its files.
 #[derive(Debug, Clone)]
 pub struct Host {
     root: PathBuf,
 }
 
 impl Host {
-    /// This computer.
+    /// Returns this computer.
     #[must_use]
     pub fn here() -> Self {
         Self::at("/")
     }
 
-    /// The computer whose `proc`, `sys`, `etc` … lie in `root`.
+    /// Returns the computer whose `proc`, `sys`, `etc` … are in `root`.
     #[must_use]
     pub fn at(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
@@ -39,7 +39,7 @@ impl Host {
         self.path(path).exists()
     }
 
-    /// `None`: not there, or not to be read.
+    /// Returns the content, or `None` if the file is missing or unreadable.
     pub(super) fn bytes(&self, path: &str) -> Option<Vec<u8>> {
         let mut bytes = Vec::new();
         let file = File::open(self.path(path)).ok()?;
@@ -47,7 +47,7 @@ impl Host {
         Some(bytes)
     }
 
-    /// Without white space around it; what is not UTF-8 is replaced.
+    /// Returns the trimmed text. Invalid UTF-8 is replaced.
     pub(super) fn text(&self, path: &str) -> Option<String> {
         let bytes = self.bytes(path)?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
@@ -61,7 +61,7 @@ impl Host {
         Cpus::parse(&self.text(path)?)
     }
 
-    /// What lies in a folder, in order; empty if there is none.
+    /// Returns the sorted entries of a folder, or nothing if it is missing.
     pub(super) fn names(&self, folder: &str) -> Vec<String> {
         let Ok(entries) = fs::read_dir(self.path(folder)) else {
             return Vec::new();
@@ -73,7 +73,7 @@ impl Host {
         names
     }
 
-    /// Those of [`Self::names`] that are numbers, by size.
+    /// Returns the numeric entries of [`Self::names`], sorted by value.
     pub(super) fn numbers(&self, folder: &str) -> Vec<u32> {
         let names = self.names(folder);
         let mut numbers: Vec<u32> = names.iter().filter_map(|n| n.parse().ok()).collect();
@@ -81,19 +81,19 @@ impl Host {
         numbers
     }
 
-    /// The last part of what a symbolic link leads to.
+    /// Returns the last path component of a symlink's target.
     pub(super) fn link(&self, path: &str) -> Option<String> {
         let target = fs::read_link(self.path(path)).ok()?;
         Some(target.file_name()?.to_str()?.to_owned())
     }
 
-    /// Whether a file could be written. Opens it and writes nothing.
+    /// True if the file can be opened for writing. Writes nothing.
     pub(super) fn writable(&self, path: &str) -> bool {
         let path: &Path = &self.path(path);
         fs::OpenOptions::new().write(true).open(path).is_ok()
     }
 
-    /// The network interfaces that could carry EtherCAT.
+    /// Returns the network interfaces that could carry EtherCAT.
     #[must_use]
     pub fn interfaces(&self) -> Vec<String> {
         let mut names = self.names("sys/class/net");
@@ -107,12 +107,12 @@ impl Host {
     }
 }
 
-/// A set of CPUs as the kernel writes it: `0-3,7`.
+/// A set of CPUs in the kernel's notation: `0-3,7`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Cpus(BTreeSet<usize>);
 
 impl Cpus {
-    /// `None` for anything that the kernel would not write.
+    /// Parses the kernel's notation; otherwise `None`.
     pub fn parse(text: &str) -> Option<Self> {
         let mut set = BTreeSet::new();
         let parts = text.trim().split(',').filter(|part| !part.is_empty());
@@ -187,7 +187,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_of_cpus() {
+    fn cpus_parse_kernel_lists() {
         for (text, expected) in [
             ("0-3,7", Some("0-3,7")),
             ("", Some("")),
@@ -206,7 +206,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_shown_reads_back(cpus in proptest::collection::btree_set(0..200_usize, 0..40)) {
+        fn cpus_parse_their_own_output(cpus in proptest::collection::btree_set(0..200_usize, 0..40)) {
             let cpus = Cpus(cpus);
             prop_assert_eq!(Cpus::parse(&cpus.to_string()), Some(cpus));
         }

@@ -1,15 +1,15 @@
-//! Which CPU serves which interrupt.
+//! Interrupt checks: which CPU serves which interrupt.
 
+use super::fix::{Fix, boot};
 use super::host::{Cpus, Host};
-use super::mend::{Mend, boot};
-use super::{Context, Notes, Severity};
+use super::{Context, ReportBuilder, Severity};
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Interrupt {
     pub number: u32,
-    /// Whose it is, as /proc/interrupts says.
+    /// The device name from /proc/interrupts.
     pub name: String,
-    /// Where it is served at present.
+    /// The CPUs that serve it now.
     pub cpus: Option<Cpus>,
 }
 
@@ -18,11 +18,11 @@ pub(super) struct Interrupt {
 struct Line<'a> {
     number: u32,
     name: &'a str,
-    /// By column; columns are the CPUs that are online.
+    /// Counts by column; columns are the online CPUs.
     counts: Vec<u64>,
 }
 
-/// Device interrupts only: those with a number.
+/// Returns the device interrupts: those with a number.
 fn lines(text: &str) -> (Vec<usize>, Vec<Line<'_>>) {
     let mut all = text.lines();
     let head = all.next().unwrap_or_default();
@@ -47,12 +47,12 @@ fn lines(text: &str) -> (Vec<usize>, Vec<Line<'_>>) {
     (cpus, lines)
 }
 
-/// All interrupts that a CPU has taken so far, device or not.
+/// Returns the number of all interrupts that a CPU has served, including non-device interrupts.
 pub(super) fn taken(host: &Host, cpu: Option<usize>) -> Option<u64> {
     let text = host.text("proc/interrupts")?;
     let (cpus, _) = lines(&text);
     let column = cpu.map(|cpu| cpus.iter().position(|c| *c == cpu));
-    // A CPU that has no column.
+    // The CPU has no column.
     if column == Some(None) {
         return None;
     }
@@ -82,10 +82,10 @@ fn served(host: &Host, number: u32) -> Option<Cpus> {
         .or_else(|| host.cpus(&format!("{folder}/smp_affinity_list")))
 }
 
-/// The interrupts of a network card.
+/// Returns the interrupts of a network card.
 pub(super) fn of(host: &Host, nic: &str) -> Vec<Interrupt> {
     let device = format!("sys/class/net/{nic}/device");
-    // A virtio card's lie with the PCI device that it is part of.
+    // A virtio card's interrupts belong to its parent PCI device.
     let mut numbers = host.numbers(&format!("{device}/msi_irqs"));
     if numbers.is_empty() && host.link(&format!("{device}/subsystem")).as_deref() == Some("virtio")
     {
@@ -115,7 +115,7 @@ pub(super) fn of(host: &Host, nic: &str) -> Vec<Interrupt> {
         .collect()
 }
 
-pub(super) fn examine(context: &Context<'_>, nic: Option<&[Interrupt]>, notes: &mut Notes) {
+pub(super) fn examine(context: &Context<'_>, nic: Option<&[Interrupt]>, notes: &mut ReportBuilder) {
     let own = nic.unwrap_or_default();
     if !own.is_empty() {
         let list: Vec<String> = own
@@ -139,13 +139,13 @@ pub(super) fn examine(context: &Context<'_>, nic: Option<&[Interrupt]>, notes: &
     others(context, own, cpu, elsewhere, notes);
 }
 
-/// Handlers that are threads of lower priority do not run where the cycle spins.
+/// Finds interrupt threads with lower priority, which starve on the CPU where the cycle spins.
 fn starved(
     context: &Context<'_>,
     own: &[Interrupt],
     cpu: usize,
     elsewhere: usize,
-    notes: &mut Notes,
+    notes: &mut ReportBuilder,
 ) {
     if !context.kernel.threads_interrupts() {
         return;
@@ -154,7 +154,7 @@ fn starved(
         let prefix = format!("irq/{}-", interrupt.number);
         let mut threads = context.threads.iter();
         let found = threads.find(|t| t.kernel && t.name.starts_with(&prefix));
-        // What the kernel gives them.
+        // The kernel's default priority.
         found.map_or(50, |t| t.priority)
     };
     let waits = |i: &&Interrupt| {
@@ -180,7 +180,7 @@ fn others(
     own: &[Interrupt],
     cpu: usize,
     elsewhere: usize,
-    notes: &mut Notes,
+    notes: &mut ReportBuilder,
 ) {
     let text = context.host.text("proc/interrupts").unwrap_or_default();
     let (cpus, lines) = lines(&text);
@@ -207,9 +207,9 @@ fn others(
         .map(|i| format!("{} ({})", i.number, i.name))
         .collect();
     let more = if here.len() > list.len() { ", …" } else { "" };
-    let mut mend = Vec::new();
+    let mut fix = Vec::new();
     if !context.container {
-        mend.push(moving(&here.iter().collect::<Vec<_>>(), elsewhere));
+        fix.push(moving(&here.iter().collect::<Vec<_>>(), elsewhere));
     }
     if context.kernel.parameter("irqaffinity").is_none() {
         let rest = context
@@ -221,26 +221,26 @@ fn others(
         } else {
             rest
         };
-        mend.push(boot(context.host, &format!("irqaffinity={rest}")));
+        fix.push(boot(context.host, &format!("irqaffinity={rest}")));
     }
     notes.find(
         Severity::Note,
         "interrupts",
         format!("CPU {cpu} serves interrupts of other devices: {}{more}", list.join(", ")),
         "Each takes a few microseconds out of the cycle, a disk's or another network's under load many of them.",
-        mend,
+        fix,
     );
 }
 
-fn moving(interrupts: &[&Interrupt], to: usize) -> Mend {
+fn moving(interrupts: &[&Interrupt], to: usize) -> Fix {
     match interrupts {
-        [one] => Mend::now(format!(
+        [one] => Fix::now(format!(
             "echo {to} | sudo tee /proc/irq/{}/smp_affinity_list",
             one.number
         )),
         many => {
             let numbers: Vec<String> = many.iter().map(|i| i.number.to_string()).collect();
-            Mend::now(format!(
+            Fix::now(format!(
                 "for i in {}; do echo {to} | sudo tee /proc/irq/$i/smp_affinity_list; done",
                 numbers.join(" ")
             ))
@@ -262,7 +262,7 @@ ERR:          0
 ";
 
     #[test]
-    fn the_kernels_table() {
+    fn lines_parse_the_kernel_table() {
         let (cpus, lines) = lines(TABLE);
         assert_eq!(cpus, [0, 2]);
         let numbers: Vec<_> = lines
@@ -273,7 +273,7 @@ ERR:          0
     }
 
     #[test]
-    fn what_a_cpu_has_taken() {
+    fn taken_counts_the_interrupts_of_a_cpu() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir(folder.path().join("proc")).unwrap();
         std::fs::write(folder.path().join("proc/interrupts"), TABLE).unwrap();

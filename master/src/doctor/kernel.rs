@@ -1,15 +1,15 @@
-//! The kernel: version, preemption, throttling, clock; and whether it has a computer of its own.
+//! Kernel checks: version, preemption, throttling, clock, and virtualization.
 
+use super::fix::{Fix, boot, sysctl};
 use super::host::Host;
-use super::mend::{Mend, boot, sysctl};
-use super::{Context, Notes, Severity};
+use super::{Context, ReportBuilder, Severity};
 
-/// Longest configuration of a kernel that is unpacked; they have 300 kB.
+/// The maximum size of an unpacked kernel configuration in bytes; typical is 300 kB.
 const LONGEST_CONFIG: usize = 4 << 20;
-/// From this version on realtime threads are throttled by groups alone.
+/// From this version on, real-time threads are throttled by groups only.
 const FAIR_SERVER_SINCE: (u32, u32) = (6, 12);
 
-/// When a thread in the kernel gives way to one of higher priority.
+/// The preemption model of the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Preemption {
     RealTime,
@@ -27,7 +27,7 @@ pub(super) struct Kernel {
     pub release: Option<String>,
     pub version: Option<(u32, u32)>,
     pub preemption: Preemption,
-    /// The model can be chosen while booting.
+    /// True if the model can be chosen at boot.
     pub dynamic: bool,
     pub command_line: Vec<String>,
     config: Option<String>,
@@ -68,7 +68,7 @@ impl Kernel {
             "lazy" => Some(Preemption::Lazy),
             _ => None,
         };
-        // Such as `none voluntary (full) lazy`; for root alone.
+        // For example `none voluntary (full) lazy`; readable by root only.
         let chosen = host.text("sys/kernel/debug/sched/preempt");
         let chosen = chosen.as_deref().and_then(|text| {
             let (_, rest) = text.split_once('(')?;
@@ -89,7 +89,7 @@ impl Kernel {
             .find(|(option, _)| self.has(option) == Some(true))
             .map(|(_, model)| model)
         };
-        let told = || match built {
+        let reported = || match built {
             "" => Preemption::Unknown,
             _ if self.dynamic => Preemption::Unknown,
             _ if built.split_whitespace().any(|word| word == "PREEMPT") => Preemption::Full,
@@ -98,10 +98,10 @@ impl Kernel {
         chosen
             .or_else(booted)
             .or_else(configured)
-            .unwrap_or_else(told)
+            .unwrap_or_else(reported)
     }
 
-    /// Whether the kernel was built with `CONFIG_…`; `None` where its configuration is not to be found.
+    /// True if the kernel was built with `CONFIG_…`; `None` if its configuration is not found.
     pub fn has(&self, option: &str) -> Option<bool> {
         let config = self.config.as_deref()?;
         let set = |line: &str| {
@@ -111,7 +111,7 @@ impl Kernel {
         Some(config.lines().find_map(set).unwrap_or(false))
     }
 
-    /// The value of the last such parameter of the command line.
+    /// Returns the value of the last such command-line parameter.
     pub fn parameter(&self, name: &str) -> Option<&str> {
         let value = |word: &'_ String| {
             let rest = word.strip_prefix(name)?;
@@ -127,12 +127,12 @@ impl Kernel {
         self.command_line.iter().any(|word| word == name)
     }
 
-    /// Interrupts are handled in threads that have a priority.
+    /// True if interrupts run in threads with a priority.
     pub fn threads_interrupts(&self) -> bool {
         self.preemption == Preemption::RealTime || self.flag("threadirqs")
     }
 
-    /// Whether realtime threads get budgets by control group.
+    /// True if control groups have real-time budgets.
     pub fn groups_realtime(&self) -> Option<bool> {
         let has = self.has("RT_GROUP_SCHED")?;
         let off_unless_asked = self.has("RT_GROUP_SCHED_DEFAULT_DISABLED") == Some(true);
@@ -158,7 +158,7 @@ fn config(host: &Host, release: Option<&str>) -> Option<String> {
         .or_else(packed)
 }
 
-/// A gzip file (RFC 1952) of one member.
+/// Unpacks a gzip file (RFC 1952) with one member.
 fn unpack(bytes: &[u8]) -> Option<String> {
     let [0x1f, 0x8b, 8, flags, _, _, _, _, _, _, rest @ ..] = bytes else {
         return None;
@@ -181,7 +181,7 @@ fn unpack(bytes: &[u8]) -> Option<String> {
     Some(String::from_utf8_lossy(&text).into_owned())
 }
 
-pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
+pub(super) fn examine(context: &Context<'_>, notes: &mut ReportBuilder) {
     let host = context.host;
     if let Some(release) = &context.kernel.release {
         notes.fact("kernel", release);
@@ -198,16 +198,16 @@ pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
     battery(host, notes);
 }
 
-fn preemption(context: &Context<'_>, notes: &mut Notes) {
+fn preemption(context: &Context<'_>, notes: &mut ReportBuilder) {
     let kernel = &context.kernel;
     let name = match kernel.preemption {
         Preemption::RealTime => return notes.fact("preemption", "PREEMPT_RT"),
         Preemption::Unknown => {
-            let told = match kernel.dynamic {
+            let reported = match kernel.dynamic {
                 true => "chosen while booting, not visible here; not PREEMPT_RT",
                 false => "not visible here",
             };
-            notes.fact("preemption", told);
+            notes.fact("preemption", reported);
             if !kernel.dynamic {
                 return;
             }
@@ -228,18 +228,18 @@ fn preemption(context: &Context<'_>, notes: &mut Notes) {
             "A system call or a driver of any other program can keep the CPU until it is done: most wake-ups are on time, some come milliseconds late."
         }
     };
-    let mut mend = vec![real_time_kernel(context)];
+    let mut fix = vec![real_time_kernel(context)];
     if kernel.dynamic && !gives_way {
-        mend.push(Mend::advice(
+        fix.push(Fix::advice(
             "Until then, the same kernel gives way earlier with `preempt=full`:",
         ));
-        mend.push(boot(context.host, "preempt=full"));
+        fix.push(boot(context.host, "preempt=full"));
     }
     let found = format!("the kernel is not PREEMPT_RT: {name}");
-    notes.find(Severity::Warning, "preemption", found, cost, mend);
+    notes.find(Severity::Warning, "preemption", found, cost, fix);
 }
 
-fn real_time_kernel(context: &Context<'_>) -> Mend {
+fn real_time_kernel(context: &Context<'_>) -> Fix {
     let host = context.host;
     let generic = || {
         let whose = if context.container {
@@ -247,11 +247,11 @@ fn real_time_kernel(context: &Context<'_>) -> Mend {
         } else {
             "boot"
         };
-        Mend::advice(format!(
+        Fix::advice(format!(
             "{whose} a kernel with CONFIG_PREEMPT_RT=y (part of Linux since 6.12)"
         ))
     };
-    // Where no kernel is installed, packages install none that boots.
+    // Without an installed kernel, a kernel package would not boot.
     let installed = host
         .names("boot")
         .iter()
@@ -270,19 +270,19 @@ fn real_time_kernel(context: &Context<'_>) -> Mend {
                 None if cfg!(target_arch = "x86_64") => "amd64",
                 _ => return generic(),
             };
-            Mend::lasting(format!(
+            Fix::lasting(format!(
                 "sudo apt install linux-image-rt-{arch} && sudo reboot"
             ))
         }
-        Some("ubuntu") => Mend::lasting("sudo pro enable realtime-kernel && sudo reboot"),
+        Some("ubuntu") => Fix::lasting("sudo pro enable realtime-kernel && sudo reboot"),
         Some("rhel" | "almalinux" | "rocky" | "centos") => {
-            Mend::lasting("sudo dnf install kernel-rt && sudo reboot")
+            Fix::lasting("sudo dnf install kernel-rt && sudo reboot")
         }
         _ => generic(),
     }
 }
 
-fn throttling(context: &Context<'_>, notes: &mut Notes) {
+fn throttling(context: &Context<'_>, notes: &mut ReportBuilder) {
     let host = context.host;
     let kernel = &context.kernel;
     let read = |name: &str| host.number::<i64>(&format!("proc/sys/kernel/sched_rt_{name}_us"));
@@ -292,11 +292,11 @@ fn throttling(context: &Context<'_>, notes: &mut Notes) {
     let by_groups_alone = kernel.version.is_some_and(|v| v >= FAIR_SERVER_SINCE);
     let off = by_groups_alone && kernel.groups_realtime() == Some(false);
     if runtime < 0 || runtime >= period || period <= 0 || off {
-        let told = match off {
+        let reported = match off {
             true => "none by this kernel",
             false => "off",
         };
-        return notes.fact("RT throttling", told);
+        return notes.fact("RT throttling", reported);
     }
     let ms = |us: i64| {
         let ms = us as f64 / 1e3;
@@ -312,16 +312,16 @@ fn throttling(context: &Context<'_>, notes: &mut Notes) {
         100 * runtime / period,
         ms(period - runtime),
     );
-    let mut mend = sysctl("kernel.sched_rt_runtime_us", "-1");
+    let mut fix = sysctl("kernel.sched_rt_runtime_us", "-1");
     if context.container {
-        mend = vec![Mend::advice(
+        fix = vec![Fix::advice(
             "on the computer that the container runs on: `sysctl kernel.sched_rt_runtime_us=-1`",
         )];
     }
-    notes.find(Severity::Warning, "throttling", found, cost, mend);
+    notes.find(Severity::Warning, "throttling", found, cost, fix);
 }
 
-fn clock(context: &Context<'_>, notes: &mut Notes) {
+fn clock(context: &Context<'_>, notes: &mut ReportBuilder) {
     let folder = "sys/devices/system/clocksource/clocksource0";
     let Some(source) = context.host.text(&format!("{folder}/current_clocksource")) else {
         return;
@@ -337,11 +337,11 @@ fn clock(context: &Context<'_>, notes: &mut Notes) {
         .text(&format!("{folder}/available_clocksource"));
     let better = available.unwrap_or_default();
     let better = better.split_whitespace().find(|name| *name == "tsc");
-    let mend = match better {
-        Some(name) => vec![Mend::now(format!(
+    let fix = match better {
+        Some(name) => vec![Fix::now(format!(
             "echo {name} | sudo tee /{folder}/current_clocksource"
         ))],
-        None => vec![Mend::advice(
+        None => vec![Fix::advice(
             "the kernel has rejected the CPU's own clock (`journalctl -k | grep -i tsc` says why): update the BIOS; if the clock is known to be good, boot with `tsc=reliable`",
         )],
     };
@@ -350,11 +350,11 @@ fn clock(context: &Context<'_>, notes: &mut Notes) {
         "clock-source",
         format!("time is read from `{source}`, a device, not from the CPU"),
         "Every look at the clock is a system call and takes a microsecond or more: spinning is coarse, each cycle costs more.",
-        mend,
+        fix,
     );
 }
 
-/// What the computer is, where it is not one of metal.
+/// Returns the name of the hypervisor, or `None` on a physical computer.
 fn hypervisor(host: &Host) -> Option<String> {
     let cpu = host.text("proc/cpuinfo").unwrap_or_default();
     let flags = cpu.lines().find(|line| line.starts_with("flags"));
@@ -376,7 +376,7 @@ fn hypervisor(host: &Host) -> Option<String> {
     ))
 }
 
-/// Share of the time since boot in which the host ran something else although there was work.
+/// Returns the share of time since boot in which the host delayed runnable work.
 fn stolen(host: &Host) -> Option<f64> {
     let stat = host.text("proc/stat")?;
     let line = stat.lines().find(|line| line.starts_with("cpu "))?;
@@ -385,7 +385,7 @@ fn stolen(host: &Host) -> Option<f64> {
         .skip(1)
         .map_while(|word| word.parse().ok())
         .collect();
-    // user nice system idle iowait irq softirq steal; guest time is in user.
+    // user nice system idle iowait irq softirq steal; user includes guest time.
     let steal = *ticks.get(7)?;
     let all = ticks
         .iter()
@@ -394,7 +394,7 @@ fn stolen(host: &Host) -> Option<f64> {
     (all > 0).then(|| steal as f64 / all as f64)
 }
 
-fn battery(host: &Host, notes: &mut Notes) {
+fn battery(host: &Host, notes: &mut ReportBuilder) {
     let folder = "sys/class/power_supply";
     let supplies = host.names(folder);
     let mut mains = supplies
@@ -408,7 +408,7 @@ fn battery(host: &Host, notes: &mut Notes) {
             "battery",
             "the computer runs on its battery",
             "Firmware slows the CPU down and lets it sleep deeper than the kernel knows.",
-            vec![Mend::advice("connect the mains supply")],
+            vec![Fix::advice("connect the mains supply")],
         );
     }
 }
@@ -431,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn a_packed_configuration() {
+    fn unpack_reads_a_gzip_configuration() {
         let text = "CONFIG_PREEMPT_RT=y\n".repeat(100);
         let packed = miniz_oxide::deflate::compress_to_vec(text.as_bytes(), 6);
         let head = |flags: u8| vec![0x1f, 0x8b, 8, flags, 0, 0, 0, 0, 0, 3];

@@ -1,21 +1,21 @@
-//! Examines a computer for what keeps a cycle from being released on time: what was found, what it
-//! costs, and the command that mends it.
+//! Finds host settings that delay the cycle: each finding with its effect and the command that
+//! fixes it.
 //!
-//! - [`host`]: the files that tell, in this computer or in a folder;
-//! - [`kernel`], [`cpu`], [`interrupts`], [`threads`], [`permission`], [`nic`]: the examinations;
-//! - [`ethtool`]: what only the network driver knows;
-//! - [`mend`]: how things are changed on the system at hand;
-//! - [`wakeup`]: measures how late this computer wakes a thread;
-//! - [`text`]: the result for people.
+//! - `host`: the files of this computer, or a copy in a folder;
+//! - `kernel`, `cpu`, `interrupts`, `threads`, `permission`, `nic`: the checks;
+//! - [`ethtool`]: settings known only to the network driver;
+//! - `fix`: commands for the present system;
+//! - [`wakeup`]: measures wake-up latency;
+//! - `text`: the report as text.
 //!
-//! Nothing is changed. What cannot be seen is no finding.
+//! The checks change nothing. Unreadable settings produce no finding.
 
 mod cpu;
 pub mod ethtool;
+mod fix;
 mod host;
 mod interrupts;
 mod kernel;
-mod mend;
 mod nic;
 mod permission;
 mod text;
@@ -27,63 +27,63 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use crate::config::Bus;
-use crate::rt::margin::Spin;
-use crate::rt::thread::Denied;
+use crate::rt::spin::Spin;
+use crate::sys::rt_thread::RtSetupError;
 
+pub use fix::Fix;
 use host::Cpus;
 pub use host::Host;
 use kernel::Kernel;
-pub use mend::Mend;
 use wakeup::WakeUp;
 
-/// How much a finding matters.
+/// The severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// Worth knowing; costs little.
+    /// Information with little effect on timing.
     Note,
-    /// Costs timing.
+    /// Degrades timing.
     Warning,
-    /// A bus does not run like this, or loses cycles all the time.
+    /// The bus does not run, or loses cycles permanently.
     Bad,
 }
 
-/// Something to mend.
+/// A setting that should be fixed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
     pub severity: Severity,
-    /// What it is about, the same in every release: `preemption`, `throttling` …
+    /// The identifier, stable across releases: `preemption`, `throttling` …
     pub id: &'static str,
     pub found: String,
-    /// What it costs not to mend it.
+    /// The effect on the cycle if it is not fixed.
     pub cost: String,
-    pub mend: Vec<Mend>,
+    pub fix: Vec<Fix>,
 }
 
-/// Something that is as it should be, or cannot be otherwise.
+/// A setting that is correct or cannot be changed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Fact {
     pub name: &'static str,
     pub value: String,
 }
 
-/// What is going to run here.
+/// The intended configuration of the run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Intent {
+pub struct RunProfile {
     pub nic: Option<String>,
     /// `None`: not pinned.
     pub cpu: Option<usize>,
-    /// SCHED_FIFO priority of the cycle.
+    /// The SCHED_FIFO priority of the cycle.
     pub priority: u8,
     pub cycle_ns: u64,
     #[serde(skip)]
     pub spin: Spin,
-    /// The program that needs the rights.
+    /// The program that needs the permissions.
     pub program: PathBuf,
 }
 
-impl Intent {
-    /// What a machine file without any of the keys means.
+impl RunProfile {
+    /// Returns the defaults of a machine file.
     #[must_use]
     pub fn new(program: PathBuf) -> Self {
         let bus = Bus::default();
@@ -98,18 +98,18 @@ impl Intent {
     }
 }
 
-/// What was tried or asked beyond files.
+/// Results of system calls and measurements.
 #[derive(Debug, Clone, Default)]
-pub struct Tried {
-    /// What the network driver says; `None` where there is no interface to ask.
+pub struct Measurements {
+    /// The network driver's answers; `None` without an interface.
     pub nic: Option<ethtool::Answers>,
     pub wake_up: Option<WakeUp>,
 }
 
-/// The whole result. Findings: worst first.
+/// The complete result. Findings are sorted, worst first.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
-    pub intent: Intent,
+    pub intent: RunProfile,
     pub facts: Vec<Fact>,
     pub findings: Vec<Finding>,
     pub wake_up: Option<WakeUp>,
@@ -123,14 +123,14 @@ impl Report {
     }
 }
 
-/// Collects what the examinations say.
+/// Collects findings and facts.
 #[derive(Debug, Default)]
-struct Notes {
+struct ReportBuilder {
     facts: Vec<Fact>,
     findings: Vec<Finding>,
 }
 
-impl Notes {
+impl ReportBuilder {
     fn fact(&mut self, name: &'static str, value: impl Into<String>) {
         let value = text::clean(&value.into());
         self.facts.push(Fact { name, value });
@@ -142,35 +142,35 @@ impl Notes {
         id: &'static str,
         found: impl Into<String>,
         cost: impl Into<String>,
-        mend: Vec<Mend>,
+        fix: Vec<Fix>,
     ) {
         self.findings.push(Finding {
             severity,
             id,
             found: text::clean(&found.into()),
             cost: cost.into(),
-            mend,
+            fix,
         });
     }
 }
 
-/// What several examinations need to know.
+/// The inputs of the checks.
 #[derive(Debug)]
 struct Context<'a> {
     host: &'a Host,
-    intent: &'a Intent,
+    intent: &'a RunProfile,
     kernel: Kernel,
     online: Cpus,
     isolated: Cpus,
-    /// The CPU of the cycle: as intended, or else the first isolated one.
+    /// The CPU of the cycle: the configured one, else the first isolated one.
     cpu: Option<usize>,
-    /// In a container, what belongs to the computer cannot be changed.
+    /// True in a container, where host settings cannot be changed.
     container: bool,
     threads: Vec<threads::Thread>,
 }
 
 impl<'a> Context<'a> {
-    fn new(host: &'a Host, intent: &'a Intent) -> Self {
+    fn new(host: &'a Host, intent: &'a RunProfile) -> Self {
         let online = host.cpus("sys/devices/system/cpu/online");
         let online = online.unwrap_or_else(|| cpu::counted(host));
         let isolated = host.cpus("sys/devices/system/cpu/isolated");
@@ -182,12 +182,12 @@ impl<'a> Context<'a> {
             cpu: intent.cpu.or_else(|| isolated.first()),
             online,
             isolated,
-            container: mend::in_container(host),
+            container: fix::in_container(host),
             threads: threads::all(host),
         }
     }
 
-    /// A CPU for everything that must not share the cycle's.
+    /// Returns a CPU for work that must not run on the cycle's CPU.
     fn elsewhere(&self) -> Option<usize> {
         let cpu = self.cpu?;
         let others = self.online.without(&Cpus::only(cpu));
@@ -195,19 +195,19 @@ impl<'a> Context<'a> {
     }
 }
 
-/// The CPU that a cycle with this intent runs on: the intended one, or else the first isolated one.
+/// Returns the CPU of the cycle: the configured one, else the first isolated one.
 #[must_use]
-pub fn cycle_cpu(host: &Host, intent: &Intent) -> Option<usize> {
+pub fn cycle_cpu(host: &Host, intent: &RunProfile) -> Option<usize> {
     let isolated = || host.cpus("sys/devices/system/cpu/isolated")?.first();
     intent.cpu.or_else(isolated)
 }
 
-/// Looks at everything.
+/// Runs all checks.
 #[must_use]
-pub fn examine(host: &Host, intent: &Intent, tried: Tried) -> Report {
+pub fn examine(host: &Host, intent: &RunProfile, tried: Measurements) -> Report {
     let context = Context::new(host, intent);
-    let denied: &[Denied] = tried.wake_up.as_ref().map_or(&[], |w| &w.denied);
-    let mut notes = Notes::default();
+    let denied: &[RtSetupError] = tried.wake_up.as_ref().map_or(&[], |w| &w.denied);
+    let mut notes = ReportBuilder::default();
     kernel::examine(&context, &mut notes);
     cpu::examine(&context, &mut notes);
     permission::examine(&context, denied, &mut notes);

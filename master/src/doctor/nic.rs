@@ -1,18 +1,23 @@
-//! The network card: whether it can carry EtherCAT, and what holds up its frames.
+//! Network card checks: suitability for EtherCAT, and what delays frames.
 
 use super::ethtool::Answers;
-use super::mend::{Mend, file, write};
-use super::{Context, Notes, Severity};
+use super::fix::{Fix, file, write};
+use super::{Context, ReportBuilder, Severity};
 
-/// `IFF_UP` of /sys/class/net/…/flags.
+/// `IFF_UP` in /sys/class/net/…/flags.
 const UP: u32 = 1;
-/// `ARPHRD_ETHER` of /sys/class/net/…/type.
+/// `ARPHRD_ETHER` in /sys/class/net/…/type.
 const ETHERNET: u32 = 1;
 const MTU: u32 = 1500;
 const NETWORKD: &str = "/etc/systemd/network/10-ecaxis";
 
-pub(super) fn examine(context: &Context<'_>, nic: &str, answers: &Answers, notes: &mut Notes) {
-    let card = Card {
+pub(super) fn examine(
+    context: &Context<'_>,
+    nic: &str,
+    answers: &Answers,
+    notes: &mut ReportBuilder,
+) {
+    let card = NicCheck {
         context,
         nic,
         answers,
@@ -45,8 +50,8 @@ pub(super) fn examine(context: &Context<'_>, nic: &str, answers: &Answers, notes
     }
 }
 
-/// The other end of a virtual cable is a program on the same computer.
-fn pair(context: &Context<'_>, notes: &mut Notes) {
+/// Checks a veth interface, whose peer is on the same computer.
+fn pair(context: &Context<'_>, notes: &mut ReportBuilder) {
     if context.intent.cpu.is_some() || context.online.len() < 2 {
         return;
     }
@@ -56,19 +61,19 @@ fn pair(context: &Context<'_>, notes: &mut Notes) {
         "same-cpu",
         "the other end of this interface is served by a program on this computer",
         "Where the scheduler puts it on the CPU that the cycle spins on, it does not run, and every reply is late.",
-        vec![Mend::advice(format!(
+        vec![Fix::advice(format!(
             "write `cpu = {take}` into the machine file's [bus], and start the other program with `taskset` on another CPU"
         ))],
     );
 }
 
-struct Card<'a> {
+struct NicCheck<'a> {
     context: &'a Context<'a>,
     nic: &'a str,
     answers: &'a Answers,
 }
 
-impl Card<'_> {
+impl NicCheck<'_> {
     fn path(&self, attribute: &str) -> String {
         format!("sys/class/net/{}/{attribute}", self.nic)
     }
@@ -94,19 +99,19 @@ impl Card<'_> {
         self.has("") && !self.has("device")
     }
 
-    /// Whether it is an interface for EtherCAT at all.
-    fn kind(&self, notes: &mut Notes) -> bool {
+    /// Checks the type. Returns false if the interface cannot carry EtherCAT.
+    fn kind(&self, notes: &mut ReportBuilder) -> bool {
         let nic = self.nic;
-        let bad = |notes: &mut Notes, what: &str, cost: &str, mend: Vec<Mend>| {
+        let bad = |notes: &mut ReportBuilder, what: &str, cost: &str, fix: Vec<Fix>| {
             notes.find(
                 Severity::Bad,
                 "nic-kind",
                 format!("`{nic}` {what}"),
                 cost,
-                mend,
+                fix,
             );
         };
-        let other = || Mend::advice("take an Ethernet card of its own for EtherCAT");
+        let other = || Fix::advice("take an Ethernet card of its own for EtherCAT");
         if self.has("wireless") || self.has("phy80211") {
             bad(
                 notes,
@@ -133,7 +138,7 @@ impl Card<'_> {
                 notes,
                 "is a bridge or a bond, not a card",
                 "Frames take detours through the kernel and may be sent to other networks.",
-                vec![Mend::advice(
+                vec![Fix::advice(
                     "name the card itself, and take it out of the bridge or bond",
                 )],
             );
@@ -144,7 +149,7 @@ impl Card<'_> {
                 notes,
                 &format!("is a part of `{master}`"),
                 "Replies go to the bridge or bond, and other networks' frames onto the bus: frames are lost.",
-                vec![Mend::now(format!("sudo ip link set {nic} nomaster"))],
+                vec![Fix::now(format!("sudo ip link set {nic} nomaster"))],
             );
         }
         if self
@@ -159,25 +164,25 @@ impl Card<'_> {
                 "nic-usb",
                 format!("`{nic}` is a USB adapter"),
                 "USB asks for received frames in intervals of its own: replies come 0.1 to 1 ms later, irregularly. Good for cycles of some milliseconds at best.",
-                vec![Mend::advice("take a card on PCI Express, or one of the mainboard's")],
+                vec![Fix::advice("take a card on PCI Express, or one of the mainboard's")],
             );
         }
         true
     }
 
-    fn link(&self, virtual_one: bool, notes: &mut Notes) {
+    fn link(&self, virtual_one: bool, notes: &mut ReportBuilder) {
         let nic = self.nic;
         let flags = self.text("flags");
         let flags = flags.and_then(|f| u32::from_str_radix(f.strip_prefix("0x")?, 16).ok());
         if flags.is_some_and(|flags| flags & UP == 0) {
-            let mut mend = vec![Mend::now(format!("sudo ip link set {nic} up"))];
-            mend.extend(self.left_alone());
+            let mut fix = vec![Fix::now(format!("sudo ip link set {nic} up"))];
+            fix.extend(self.left_alone());
             return notes.find(
                 Severity::Bad,
                 "nic-down",
                 format!("`{nic}` is down"),
                 "No frame can be sent.",
-                mend,
+                fix,
             );
         }
         if self.text("carrier").as_deref() == Some("0") {
@@ -186,7 +191,7 @@ impl Card<'_> {
                 "nic-carrier",
                 format!("`{nic}` has no link"),
                 "No cable, or nothing powered at its end: nothing will answer.",
-                vec![Mend::advice(
+                vec![Fix::advice(
                     "connect the first SubDevice's IN port and give it power",
                 )],
             );
@@ -203,19 +208,19 @@ impl Card<'_> {
         }
     }
 
-    fn wrong_link(&self, speed: i64, duplex: &str, notes: &mut Notes) {
+    fn wrong_link(&self, speed: i64, duplex: &str, notes: &mut ReportBuilder) {
         let nic = self.nic;
         let found = format!("`{nic}` runs at {speed} Mbit/s {duplex} duplex");
         // 0x008 is 100BASE-TX full duplex.
-        let again = Mend::now(format!("sudo ethtool -s {nic} autoneg on advertise 0x008"));
+        let again = Fix::now(format!("sudo ethtool -s {nic} autoneg on advertise 0x008"));
         if speed > 100 && duplex == "full" {
-            // EtherCAT on copper is 100BASE-TX (IEC 61158-2): a SubDevice never agrees on more.
+            // EtherCAT on copper is 100BASE-TX (IEC 61158-2): SubDevices negotiate nothing else.
             return notes.find(
                 Severity::Warning,
                 "nic-speed",
                 found,
-                "EtherCAT devices run at 100 Mbit/s: what is connected is none, but a switch or another computer. A switch delays every frame.",
-                vec![Mend::advice("connect the first SubDevice's IN port directly")],
+                "EtherCAT devices run at 100 Mbit/s: a switch or another computer is connected. A switch delays every frame.",
+                vec![Fix::advice("connect the first SubDevice's IN port directly")],
             );
         }
         notes.find(
@@ -225,12 +230,12 @@ impl Card<'_> {
             "EtherCAT needs 100 Mbit/s full duplex: frames meet their own replies and are lost.",
             vec![
                 again,
-                Mend::advice("and look at the cable: both pairs are needed"),
+                Fix::advice("and look at the cable: both pairs are needed"),
             ],
         );
     }
 
-    fn settings(&self, notes: &mut Notes) {
+    fn settings(&self, notes: &mut ReportBuilder) {
         let nic = self.nic;
         if let Some(mtu) = self.number::<u32>("mtu").filter(|mtu| *mtu < MTU) {
             notes.find(
@@ -238,7 +243,7 @@ impl Card<'_> {
                 "nic-mtu",
                 format!("`{nic}` carries frames of at most {mtu} bytes (MTU), {MTU} are needed"),
                 "The program refuses the interface, because long frames would not get through.",
-                vec![Mend::now(format!("sudo ip link set {nic} mtu {MTU}"))],
+                vec![Fix::now(format!("sudo ip link set {nic} mtu {MTU}"))],
             );
         }
         if self.text("threaded").as_deref() == Some("1") {
@@ -271,7 +276,7 @@ impl Card<'_> {
         }
     }
 
-    fn coalescing(&self, notes: &mut Notes) {
+    fn coalescing(&self, notes: &mut ReportBuilder) {
         let nic = self.nic;
         let Some(coalescing) = self.answers.coalescing else {
             return notes.fact("NIC coalescing", "the driver does not say");
@@ -301,35 +306,35 @@ impl Card<'_> {
             true => &["UseAdaptiveRxCoalesce=no", "RxCoalesceSec=0"][..],
             false => &["RxCoalesceSec=0"],
         };
-        let mut mend = vec![Mend::now(format!(
+        let mut fix = vec![Fix::now(format!(
             "sudo ethtool -C {nic} {adaptive}rx-usecs 0"
         ))];
-        mend.extend(self.link_file(lasting));
+        fix.extend(self.link_file(lasting));
         notes.find(
             Severity::Warning,
             "nic-coalescing",
             format!("`{nic}` collects received frames {held} before it interrupts"),
             format!("{cost}."),
-            mend,
+            fix,
         );
     }
 
-    /// Settings that systemd-udevd applies when the card appears.
-    fn link_file(&self, settings: &[&str]) -> Option<Mend> {
+    /// Returns the .link file that systemd-udevd applies when the card appears.
+    fn link_file(&self, settings: &[&str]) -> Option<Fix> {
         let mac = self.text("address").filter(|mac| is_mac(mac))?;
         let mac = format!("MACAddress={mac}");
-        // The file takes the place of the one that gives interfaces their names.
+        // The file replaces the one that sets interface names.
         let names = "NamePolicy=keep kernel database onboard slot path";
         let lines = [&["[Match]", &mac, "[Link]", names], settings].concat();
         self.systemd()
-            .then(|| Mend::lasting(file(&lines, &format!("{NETWORKD}.link"))))
+            .then(|| Fix::lasting(file(&lines, &format!("{NETWORKD}.link"))))
     }
 
     fn systemd(&self) -> bool {
         !self.context.container && self.context.host.exists("run/systemd/system")
     }
 
-    fn energy(&self, notes: &mut Notes) {
+    fn energy(&self, notes: &mut ReportBuilder) {
         let nic = self.nic;
         let Some(eee) = self.answers.energy_efficient else {
             return;
@@ -349,34 +354,34 @@ impl Card<'_> {
                 "Nothing with this device at the other end; with another, 30 µs a frame and lost links.",
             ),
         };
-        let mend = vec![Mend::now(format!("sudo ethtool --set-eee {nic} eee off"))];
-        notes.find(severity, "nic-eee", format!("`{nic}` {found}"), cost, mend);
+        let fix = vec![Fix::now(format!("sudo ethtool --set-eee {nic} eee off"))];
+        notes.find(severity, "nic-eee", format!("`{nic}` {found}"), cost, fix);
     }
 
-    /// Frames of others on the bus.
-    fn traffic(&self, notes: &mut Notes) {
+    /// Checks for traffic of other programs on the bus.
+    fn traffic(&self, notes: &mut ReportBuilder) {
         let nic = self.nic;
         if let Some(manager) = self.manager() {
-            let mut mend = Vec::new();
+            let mut fix = Vec::new();
             if manager == "NetworkManager" {
-                mend.push(Mend::now(format!("sudo nmcli device set {nic} managed no")));
+                fix.push(Fix::now(format!("sudo nmcli device set {nic} managed no")));
                 let own = format!("unmanaged-devices=interface-name:{nic}");
                 let file = file(
                     &["[keyfile]", &own],
                     "/etc/NetworkManager/conf.d/90-ecaxis.conf",
                 );
-                mend.push(Mend::lasting(format!(
+                fix.push(Fix::lasting(format!(
                     "{file} && sudo systemctl reload NetworkManager"
                 )));
             } else {
-                mend.extend(self.left_alone());
+                fix.extend(self.left_alone());
             }
             notes.find(
                 Severity::Warning,
                 "nic-managed",
                 format!("{manager} manages `{nic}`"),
                 "It sends frames of its own (DHCP, IPv6) between the cycle's, and takes the interface down when it gets no answer: the bus is lost.",
-                mend,
+                fix,
             );
         }
         let addresses = &self.answers.addresses;
@@ -384,18 +389,18 @@ impl Card<'_> {
             return notes.fact("NIC addresses", "none");
         }
         let local = addresses.iter().all(|a| a.starts_with("fe80:"));
-        let mut mend = vec![Mend::now(format!(
+        let mut fix = vec![Fix::now(format!(
             "sudo ip address flush dev {nic}; sudo sysctl net.ipv6.conf.{nic}.disable_ipv6=1"
         ))];
         if !local {
-            mend.insert(
+            fix.insert(
                 0,
-                Mend::advice(
+                Fix::advice(
                     "This may be the interface that you work over: EtherCAT needs one of its own.",
                 ),
             );
         }
-        mend.push(Mend::lasting(format!(
+        fix.push(Fix::lasting(format!(
             "echo net.ipv6.conf.{nic}.disable_ipv6=1 | sudo tee -a /etc/sysctl.d/90-ecaxis.conf"
         )));
         notes.find(
@@ -403,11 +408,11 @@ impl Card<'_> {
             "nic-address",
             format!("`{nic}` has IP addresses: {}", addresses.join(", ")),
             "The computer sends its own frames onto the bus; one of 1500 bytes holds up the cycle's by 120 µs.",
-            mend,
+            fix,
         );
     }
 
-    /// Who configures the interface.
+    /// Returns the program that configures the interface.
     fn manager(&self) -> Option<&'static str> {
         let host = self.context.host;
         let index: u32 = self.number("ifindex")?;
@@ -428,13 +433,13 @@ impl Card<'_> {
         let managed = ["configured", "configuring", "pending", "degraded", "failed"]
             .iter()
             .any(|state| says(networkd.clone(), &format!("ADMIN_STATE={state}")));
-        // systemd-network: names of threads have 15 characters.
+        // systemd-network: thread names have at most 15 characters.
         (self.runs("systemd-network") && managed).then_some("systemd-networkd")
     }
 
-    /// A file by which systemd-networkd brings the interface up without an address. Not where
-    /// NetworkManager does it.
-    fn left_alone(&self) -> Option<Mend> {
+    /// Returns the systemd-networkd file that brings the interface up without an address. `None` if
+    /// NetworkManager is used.
+    fn left_alone(&self) -> Option<Fix> {
         let name = format!("Name={}", self.nic);
         let lines = [
             "[Match]",
@@ -448,14 +453,14 @@ impl Card<'_> {
         ];
         let file = file(&lines, &format!("{NETWORKD}.network"));
         self.runs("systemd-network")
-            .then(|| Mend::lasting(format!("{file} && sudo networkctl reload")))
+            .then(|| Fix::lasting(format!("{file} && sudo networkctl reload")))
     }
 
     fn runs(&self, name: &str) -> bool {
         self.context.threads.iter().any(|t| t.name == name)
     }
 
-    fn offloads(&self, notes: &mut Notes) {
+    fn offloads(&self, notes: &mut ReportBuilder) {
         let nic = self.nic;
         let a = self.answers;
         if a.lro == Some(true) {
@@ -464,21 +469,21 @@ impl Card<'_> {
                 "nic-lro",
                 format!("`{nic}` may join received frames to larger ones (LRO)"),
                 "Some cards hold frames back for that, EtherCAT's too.",
-                vec![Mend::now(format!("sudo ethtool -K {nic} lro off"))],
+                vec![Fix::now(format!("sudo ethtool -K {nic} lro off"))],
             );
         }
-        // EtherCAT frames are neither joined by GRO nor tagged: told, no more.
-        let told = [
+        // GRO does not merge EtherCAT frames, and they have no VLAN tags: information only.
+        let reported = [
             ("GRO", a.gro),
             ("LRO", a.lro),
             ("VLAN stripping", a.rx_vlan),
         ];
-        let told: Vec<String> = told
+        let reported: Vec<String> = reported
             .into_iter()
             .filter_map(|(name, on)| Some(format!("{name} {}", if on? { "on" } else { "off" })))
             .collect();
-        if !told.is_empty() {
-            notes.fact("NIC offloads", told.join(", "));
+        if !reported.is_empty() {
+            notes.fact("NIC offloads", reported.join(", "));
         }
         let ring = a
             .ring
@@ -492,7 +497,7 @@ impl Card<'_> {
     }
 }
 
-/// As sysfs writes it: `00:1b:21:0a:0b:0c`.
+/// True for the sysfs notation `00:1b:21:0a:0b:0c`.
 fn is_mac(text: &str) -> bool {
     let mut bytes = 0;
     text.split(':').all(|byte| {

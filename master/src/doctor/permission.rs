@@ -1,30 +1,30 @@
-//! What this user and this program may do.
+//! Permission checks for this user and this program.
 
-use crate::rt::thread::Denied;
+use crate::sys::rt_thread::RtSetupError;
 
+use super::fix::Fix;
 use super::host::Host;
-use super::mend::Mend;
-use super::{Context, Notes, Severity};
+use super::{Context, ReportBuilder, Severity};
 
-/// Bit and name in capabilities(7).
+/// Bit and name from capabilities(7).
 const NET_RAW: (u32, &str) = (13, "cap_net_raw");
 const IPC_LOCK: (u32, &str) = (14, "cap_ipc_lock");
 const SYS_NICE: (u32, &str) = (23, "cap_sys_nice");
-/// Enough for the program with all its threads' stacks.
+/// Sufficient for the program and the stacks of all threads, in bytes.
 const ENOUGH_LOCKED: u64 = 1 << 30;
 
 #[derive(Debug)]
-struct Rights {
+struct Capabilities {
     effective: u64,
-    /// File capabilities give nothing.
+    /// If true, file capabilities have no effect.
     no_new_privileges: bool,
     root: bool,
     realtime_limit: Option<u64>,
-    /// Bytes.
+    /// The lock limit in bytes.
     lock_limit: Option<u64>,
 }
 
-impl Rights {
+impl Capabilities {
     fn of(host: &Host) -> Option<Self> {
         let status = host.text("proc/self/status")?;
         let field = |name: &str| {
@@ -35,7 +35,7 @@ impl Rights {
         };
         let effective = u64::from_str_radix(field("CapEff")?, 16).ok()?;
         let limits = host.text("proc/self/limits").unwrap_or_default();
-        // The soft limit, which decides; names have blanks in them.
+        // The soft limit decides. Limit names contain spaces.
         let limit = |name: &str| {
             let mut lines = limits.lines();
             let rest = lines.find_map(|line| line.strip_prefix(name))?;
@@ -58,9 +58,9 @@ impl Rights {
     }
 }
 
-pub(super) fn examine(context: &Context<'_>, denied: &[Denied], notes: &mut Notes) {
+pub(super) fn examine(context: &Context<'_>, denied: &[RtSetupError], notes: &mut ReportBuilder) {
     let budget = group(context, notes);
-    let Some(rights) = Rights::of(context.host) else {
+    let Some(rights) = Capabilities::of(context.host) else {
         return notes.fact("rights", "not visible here");
     };
     let priority = context.intent.priority;
@@ -107,36 +107,36 @@ pub(super) fn examine(context: &Context<'_>, denied: &[Denied], notes: &mut Note
             notes.fact("swap", "in use; the program's own memory is locked");
         }
     } else {
-        let mend = granting(context, &rights, &missing);
+        let fix = granting(context, &rights, &missing);
         let found = format!("the program is not permitted {}", lacking.join(", "));
-        notes.find(severity, "rights", found, costs.join(" "), mend);
+        notes.find(severity, "rights", found, costs.join(" "), fix);
     }
     if realtime && budget {
         refused(context, denied, notes);
     }
 }
 
-fn granting(context: &Context<'_>, rights: &Rights, missing: &[&str]) -> Vec<Mend> {
+fn granting(context: &Context<'_>, rights: &Capabilities, missing: &[&str]) -> Vec<Fix> {
     let upper: Vec<String> = missing.iter().map(|m| m.to_uppercase()).collect();
     if context.container {
         let options: Vec<String> = upper
             .iter()
             .map(|name| format!("--cap-add={}", name.trim_start_matches("CAP_")))
             .collect();
-        return vec![Mend::advice(format!(
+        return vec![Fix::advice(format!(
             "start the container with `{}` (docker, podman)",
             options.join(" ")
         ))];
     }
     if rights.root || rights.no_new_privileges {
-        return vec![Mend::advice(format!(
-            "whoever started this program has taken the rights away; a systemd unit grants them with `AmbientCapabilities={}` and without `NoNewPrivileges`",
+        return vec![Fix::advice(format!(
+            "the program was started without these permissions; a systemd unit grants them with `AmbientCapabilities={}` and without `NoNewPrivileges`",
             upper.join(" ")
         ))];
     }
-    // All three, because a later call replaces what an earlier one has set.
+    // A later setcap call replaces the earlier one, so one call sets all three.
     let program = context.intent.program.display();
-    vec![Mend::lasting(format!(
+    vec![Fix::lasting(format!(
         "sudo setcap {},{},{}+ep {program}",
         NET_RAW.1, SYS_NICE.1, IPC_LOCK.1
     ))]
@@ -147,21 +147,22 @@ fn swaps(host: &Host) -> bool {
     text.lines().skip(1).any(|line| !line.trim().is_empty())
 }
 
-/// Where the files promise it and the kernel still says no.
-fn refused(context: &Context<'_>, denied: &[Denied], notes: &mut Notes) {
-    let Some(Denied::Priority { priority, reason }) =
-        denied.iter().find(|d| matches!(d, Denied::Priority { .. }))
+/// Reports operations that the kernel refused although the files permit them.
+fn refused(context: &Context<'_>, denied: &[RtSetupError], notes: &mut ReportBuilder) {
+    let Some(RtSetupError::Priority { priority, reason }) = denied
+        .iter()
+        .find(|d| matches!(d, RtSetupError::Priority { .. }))
     else {
         return;
     };
-    let mend = match context.kernel.groups_realtime() {
+    let fix = match context.kernel.groups_realtime() {
         Some(true) => vec![
-            Mend::advice(
+            Fix::advice(
                 "This kernel gives realtime time to control groups (CONFIG_RT_GROUP_SCHED), and this one has none: start the program outside of it, or turn that off:",
             ),
-            super::mend::boot(context.host, "rt_group_sched=0"),
+            super::fix::boot(context.host, "rt_group_sched=0"),
         ],
-        _ => vec![Mend::advice(
+        _ => vec![Fix::advice(
             "a security module or a sandbox forbids it: look into the journal",
         )],
     };
@@ -172,12 +173,12 @@ fn refused(context: &Context<'_>, denied: &[Denied], notes: &mut Notes) {
             "SCHED_FIFO priority {priority} is refused although the rights are there: {reason}"
         ),
         "Every other program can delay the cycle, by milliseconds under load.",
-        mend,
+        fix,
     );
 }
 
-/// The budget of a version 1 control group. Says whether there is one at all.
-fn group(context: &Context<'_>, notes: &mut Notes) -> bool {
+/// Checks the real-time budget of a version 1 control group. Returns true if there is one.
+fn group(context: &Context<'_>, notes: &mut ReportBuilder) -> bool {
     let host = context.host;
     let groups = host.text("proc/self/cgroup").unwrap_or_default();
     let own = groups.lines().find_map(|line| {
@@ -203,7 +204,7 @@ fn group(context: &Context<'_>, notes: &mut Notes) -> bool {
     let (Some(path), Some(mount)) = (own, mount) else {
         return true;
     };
-    // Seen from inside a container the path may lead out of it.
+    // Seen from a container, the path may lead outside.
     let inside = if path.split('/').any(|part| part == "..") {
         ""
     } else {
@@ -224,8 +225,8 @@ fn group(context: &Context<'_>, notes: &mut Notes) -> bool {
     }
     let name = format!("/{inside}");
     let out = vec![
-        Mend::advice("Leave the group, in the shell that starts the program:"),
-        Mend::now(format!(
+        Fix::advice("Leave the group, in the shell that starts the program:"),
+        Fix::now(format!(
             "echo $$ | sudo tee /{}/tasks",
             mount.trim_matches('/')
         )),

@@ -1,25 +1,25 @@
-//! A report for people: 80 columns, no colours. Commands can be copied as they stand.
+//! The report as text: 80 columns, no colours. Commands can be copied unchanged.
 
 use std::fmt::{self, Display, Formatter};
 
-use super::wakeup::{WakeUp, Way};
-use super::{Finding, Mend, Report, Severity};
+use super::wakeup::{WaitMethod, WakeUp};
+use super::{Finding, Fix, Report, Severity};
 use crate::config::duration;
 
 const COLUMNS: usize = 80;
-/// Where the text of a finding begins, behind the labels.
+/// The column of a finding's text, after the labels.
 const INDENT: usize = 11;
-/// Longest name that is repeated as a file gives it.
+/// The maximum length of a name from a file.
 const LONGEST_NAME: usize = 40;
-/// Longest text of a finding or a fact.
+/// The maximum length of a finding or a fact.
 const LONGEST_TEXT: usize = 600;
 
-/// A name out of a file, made harmless.
+/// Trims, shortens and sanitizes a name from a file.
 pub(super) fn short(text: &str) -> String {
     limited(text.trim(), LONGEST_NAME)
 }
 
-/// Without control characters.
+/// Replaces control characters and limits the length.
 pub(super) fn clean(text: &str) -> String {
     limited(text, LONGEST_TEXT)
 }
@@ -34,7 +34,7 @@ fn limited(text: &str, most: usize) -> String {
     text
 }
 
-/// In lines of at most `width` characters; a longer word has a line of its own.
+/// Breaks words into lines of at most `width` characters. A longer word gets its own line.
 fn lines(words: impl Iterator<Item = String>, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in words {
@@ -49,7 +49,7 @@ fn lines(words: impl Iterator<Item = String>, width: usize) -> Vec<String> {
     lines
 }
 
-/// The words of a command: not parted inside quotation marks.
+/// Splits a command into words, but not inside quotation marks.
 fn shell_words(command: &str) -> Vec<String> {
     let mut words = vec![String::new()];
     let mut quote = None;
@@ -70,7 +70,7 @@ fn shell_words(command: &str) -> Vec<String> {
     words
 }
 
-/// A label, and text beside it.
+/// Prints a label and the text next to it.
 fn labelled(f: &mut Formatter<'_>, label: &str, lines: &[String]) -> fmt::Result {
     for (n, line) in lines.iter().enumerate() {
         let label = if n == 0 { label } else { "" };
@@ -86,7 +86,7 @@ fn prose(f: &mut Formatter<'_>, label: &str, text: &str) -> fmt::Result {
 }
 
 fn command(f: &mut Formatter<'_>, label: &str, command: &str) -> fmt::Result {
-    // Room for what continues a line.
+    // Room for the line continuation.
     let mut all = lines(shell_words(command).into_iter(), COLUMNS - INDENT - 4);
     let last = all.len().saturating_sub(1);
     for (n, line) in all.iter_mut().enumerate() {
@@ -115,11 +115,11 @@ impl Display for Finding {
             writeln!(f, "{}{line}", if n == 0 { "" } else { "  " })?;
         }
         prose(f, "cost", &self.cost)?;
-        for mend in &self.mend {
-            match mend {
-                Mend::Now(line) => command(f, "now", line)?,
-                Mend::Lasting(line) => command(f, "for good", line)?,
-                Mend::Advice(text) => prose(f, "mend", text)?,
+        for fix in &self.fix {
+            match fix {
+                Fix::Now(line) => command(f, "now", line)?,
+                Fix::Lasting(line) => command(f, "for good", line)?,
+                Fix::Advice(text) => prose(f, "fix", text)?,
             }
         }
         Ok(())
@@ -237,7 +237,7 @@ fn prose_at(f: &mut Formatter<'_>, text: &str) -> fmt::Result {
     Ok(())
 }
 
-fn way(f: &mut Formatter<'_>, name: &str, way: &Way) -> fmt::Result {
+fn way(f: &mut Formatter<'_>, name: &str, way: &WaitMethod) -> fmt::Result {
     let or = |n: Option<u64>, unit: &str| n.map_or("-".to_owned(), |n| format!("{n}{unit}"));
     let l = &way.lateness;
     writeln!(
@@ -252,7 +252,7 @@ fn way(f: &mut Formatter<'_>, name: &str, way: &Way) -> fmt::Result {
     )
 }
 
-/// Three digits or so.
+/// Formats a time with about three digits.
 fn time(ns: u64) -> String {
     let micros = ns as f64 / 1e3;
     match ns {
@@ -270,44 +270,44 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_finding_on_paper() {
+    fn finding_prints_labels_and_wrapped_text() {
         let finding = Finding {
             severity: Severity::Warning,
             id: "x",
             found:
-                "one thing is found here that takes more than a line to tell, because it is long"
+                "one thing is found here that takes more than one line to say, because it is long"
                     .into(),
             cost: "Much.".into(),
-            mend: vec![
-                Mend::Now("echo 1 | sudo tee /proc/x".into()),
-                Mend::Lasting(format!(
+            fix: vec![
+                Fix::Now("echo 1 | sudo tee /proc/x".into()),
+                Fix::Lasting(format!(
                     "printf '%s %s\\n' 'a b' {} | sudo tee /etc/x",
                     "word ".repeat(9).trim()
                 )),
-                Mend::Advice("Or not.".into()),
+                Fix::Advice("Or not.".into()),
             ],
         };
         let expected = "\
-warning: one thing is found here that takes more than a line to tell, because
+warning: one thing is found here that takes more than one line to say, because
   it is long
   cost     Much.
   now      echo 1 | sudo tee /proc/x
   for good printf '%s %s\\n' 'a b' word word word word word word word word \\
              word | sudo tee /etc/x
-  mend     Or not.
+  fix      Or not.
 ";
         assert_eq!(finding.to_string(), expected);
     }
 
     #[test]
-    fn names_are_made_harmless() {
+    fn short_removes_control_characters() {
         assert_eq!(short(" a\u{1b}[31m\n"), "a?[31m");
         assert_eq!(short(&"x".repeat(100)).chars().count(), LONGEST_NAME + 1);
     }
 
     proptest! {
         #[test]
-        fn a_command_keeps_its_words(command in "[a-z'\" |]{0,200}") {
+        fn command_keeps_its_words(command in "[a-z'\" |]{0,200}") {
             prop_assert_eq!(shell_words(&command).join(" "), command);
         }
     }

@@ -1,15 +1,15 @@
-//! Threads that run before the cycle does, and programs that rearrange the computer.
+//! Thread checks: threads with higher priority, and programs that change settings during operation.
 
+use super::fix::Fix;
 use super::host::{Cpus, Host};
-use super::mend::Mend;
-use super::{Context, Notes, Severity};
+use super::{Context, ReportBuilder, Severity};
 
 /// `PF_KTHREAD` of the flags in /proc/…/stat.
 const KERNEL_THREAD: u64 = 0x0020_0000;
 const FIFO: u32 = 1;
 const ROUND_ROBIN: u32 = 2;
 const DEADLINE: u32 = 6;
-/// More threads than these are not looked at.
+/// The maximum number of threads that are examined.
 const MOST: usize = 20_000;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,7 +29,7 @@ impl Thread {
     }
 }
 
-/// The main thread of every process, and all threads that are realtime ones.
+/// Returns the main thread of every process and all real-time threads.
 pub(super) fn all(host: &Host) -> Vec<Thread> {
     let own: Option<u32> = host.link("proc/self").and_then(|id| id.parse().ok());
     let mut threads = Vec::new();
@@ -64,7 +64,7 @@ pub(super) fn all(host: &Host) -> Vec<Thread> {
     threads
 }
 
-/// proc_pid_stat(5). The name may contain anything, brackets too.
+/// Parses proc_pid_stat(5). The name may contain any character, including brackets.
 fn parse(process: u32, id: u32, stat: &str) -> Option<Thread> {
     let (head, rest) = stat.rsplit_once(')')?;
     let (_, name) = head.split_once('(')?;
@@ -83,7 +83,7 @@ fn parse(process: u32, id: u32, stat: &str) -> Option<Thread> {
     })
 }
 
-pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
+pub(super) fn examine(context: &Context<'_>, notes: &mut ReportBuilder) {
     let own = u32::from(context.intent.priority);
     let meets = |thread: &&Thread| match (context.cpu, &thread.cpus) {
         (Some(cpu), Some(allowed)) => allowed.contains(cpu),
@@ -93,7 +93,7 @@ pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
         .threads
         .iter()
         .filter(|t| t.policy == DEADLINE || (t.is_realtime() && t.priority >= own))
-        // The kernel moves threads between CPUs with these; nothing outranks them.
+        // The kernel migrates threads with these; they have the highest priority.
         .filter(|t| !(t.kernel && t.name.starts_with("migration/")))
         .filter(meets)
         .collect();
@@ -113,15 +113,15 @@ pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
             String::new()
         };
         let theirs = before.iter().any(|t| !t.kernel);
-        let mut mend = Vec::new();
+        let mut fix = Vec::new();
         if theirs {
             let lower = own.saturating_sub(1).max(1);
             let user = before.iter().find(|t| !t.kernel).unwrap_or(first);
             if user.policy != DEADLINE {
-                mend.push(Mend::now(format!("sudo chrt -f -p {lower} {}", user.id)));
+                fix.push(Fix::now(format!("sudo chrt -f -p {lower} {}", user.id)));
             }
         }
-        mend.push(Mend::advice(
+        fix.push(Fix::advice(
             "give the cycle a higher `priority` in the machine file's [bus] (up to 98), or those threads another CPU",
         ));
         notes.find(
@@ -136,14 +136,14 @@ pub(super) fn examine(context: &Context<'_>, notes: &mut Notes) {
                 list.join(", ")
             ),
             "The cycle is late by as long as one of them runs.",
-            mend,
+            fix,
         );
     }
     balancing(context, notes);
 }
 
-/// irqbalance keeps off isolated CPUs by itself.
-fn balancing(context: &Context<'_>, notes: &mut Notes) {
+/// Checks for irqbalance, which spares isolated CPUs by itself.
+fn balancing(context: &Context<'_>, notes: &mut ReportBuilder) {
     let protected = context
         .cpu
         .is_some_and(|cpu| context.isolated.contains(cpu));
@@ -154,7 +154,7 @@ fn balancing(context: &Context<'_>, notes: &mut Notes) {
             "irqbalance",
             "irqbalance moves interrupts between all CPUs",
             "The cycle's CPU gets the interrupts of other devices, a few microseconds each, and the network card's wander.",
-            vec![Mend::lasting("sudo systemctl disable --now irqbalance")],
+            vec![Fix::lasting("sudo systemctl disable --now irqbalance")],
         );
     }
 }
@@ -166,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_name_with_everything_in_it() {
+    fn parse_accepts_any_thread_name() {
         let mut fields = vec!["0"; 49];
         fields[0] = "S";
         fields[6] = "2129984";

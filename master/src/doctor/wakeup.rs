@@ -1,65 +1,65 @@
-//! Measures how late a thread of the cycle's kind wakes up: sleeping alone, and sleeping until shortly
-//! before with the rest spun, in turns in the same run.
+//! Measures the wake-up latency of a real-time thread with two methods in turn: sleep only, and
+//! sleep with a final spin.
 
 use std::io;
 use std::thread;
 
 use serde::Serialize;
 
+use super::fix::Fix;
 use super::host::Host;
-use super::mend::Mend;
-use super::{Notes, Severity, interrupts};
+use super::{ReportBuilder, Severity, interrupts};
 use crate::clock::{self, Clock};
 use crate::config::duration;
-use crate::os::process::ThreadUse;
-use crate::rt::exchange::Mode;
-use crate::rt::margin::{Margin, Spin};
-use crate::rt::stats::{Percentiles, Times};
-use crate::rt::thread::{Denied, Held, prepare};
+use crate::rt::exchange::ExchangeMode;
+use crate::rt::spin::{Spin, SpinWindow};
+use crate::rt::stats::{LatencyHistogram, Percentiles};
+use crate::sys::process::ThreadUsage;
+use crate::sys::rt_thread::{CpuWakeGuard, RtSetupError, become_realtime};
 
-/// Time of one turn.
+/// The time of one turn in ns.
 const TURN_NS: u64 = 250_000_000;
-/// The part of a cycle that may be lost to a late wake-up: replies may take three quarters of it.
+/// The fraction of a cycle that a late wake-up may use; replies may take three quarters.
 const SHARE: u64 = 4;
-/// Cycle times that a bus is run at.
+/// Typical cycle times in ns.
 const CYCLES_NS: [u64; 10] = [
     62_500, 125_000, 250_000, 500_000, 1_000_000, 2_000_000, 4_000_000, 5_000_000, 10_000_000,
     20_000_000,
 ];
 
-/// One way of waiting.
+/// The result of one wait method.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct Way {
+pub struct WaitMethod {
     pub lateness: Percentiles,
-    /// Wake-ups later than a quarter of the cycle.
+    /// The number of wake-ups later than a quarter of the cycle.
     pub too_late: u64,
-    /// The thread was taken off its CPU.
+    /// The number of times the thread was preempted.
     pub involuntary_switches: u64,
-    /// Taken by the CPU meanwhile, or by all of them where the thread is not pinned.
+    /// Interrupts on the CPU during the measurement, or on all CPUs if the thread is not pinned.
     pub interrupts: Option<u64>,
-    /// In units of 10 ms, of the CPU or of all.
+    /// Stolen time in ms with a resolution of 10 ms, of the CPU or of all.
     pub stolen_ms: Option<u64>,
 }
 
-/// The whole measurement.
+/// The complete measurement.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct WakeUp {
     pub cycle_ns: u64,
-    /// How long before the release sleeping ended, at last.
+    /// The final spin time before the release in ns.
     pub spin_ns: u64,
     pub seconds: u32,
-    /// Where the thread was pinned to.
+    /// The CPU of the thread, if pinned.
     pub cpu: Option<usize>,
     pub priority: u8,
-    pub sleep: Way,
-    pub sleep_and_spin: Way,
+    pub sleep: WaitMethod,
+    pub sleep_and_spin: WaitMethod,
     #[serde(skip)]
-    pub denied: Vec<Denied>,
-    /// [`Self::denied`] in words.
+    pub denied: Vec<RtSetupError>,
+    /// [`Self::denied`] as text.
     pub denials: Vec<String>,
 }
 
-/// What is measured.
+/// The parameters of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setup {
     pub seconds: u32,
@@ -69,7 +69,7 @@ pub struct Setup {
     pub spin: Spin,
 }
 
-/// Takes as long as `setup.seconds`. Fails when no thread can be started.
+/// Measures for `setup.seconds`. Fails if no thread can be started.
 pub fn measure(setup: Setup) -> io::Result<WakeUp> {
     let thread = thread::Builder::new().name("wake-up".to_owned());
     let running = thread.spawn(move || run(setup))?;
@@ -79,13 +79,15 @@ pub fn measure(setup: Setup) -> io::Result<WakeUp> {
 }
 
 fn run(setup: Setup) -> WakeUp {
-    let (held, mut denied) = Held::take(None);
-    denied.extend(prepare(setup.priority, setup.cpu));
-    let affine = !denied.iter().any(|d| matches!(d, Denied::Affinity { .. }));
+    let (held, mut denied) = CpuWakeGuard::take(None);
+    denied.extend(become_realtime(setup.priority, setup.cpu));
+    let affine = !denied
+        .iter()
+        .any(|d| matches!(d, RtSetupError::Affinity { .. }));
     let cpu = setup.cpu.filter(|_| affine);
     let host = Host::here();
-    let mut sleeping = Taking::new(Spin::For(0), setup.cycle_ns);
-    let mut spinning = Taking::new(setup.spin, setup.cycle_ns);
+    let mut sleeping = Sampling::new(Spin::For(0), setup.cycle_ns);
+    let mut spinning = Sampling::new(setup.spin, setup.cycle_ns);
     let end = clock::now() + u64::from(setup.seconds) * 1_000_000_000;
     while clock::now() < end {
         sleeping.turn(&host, cpu, setup.cycle_ns);
@@ -106,43 +108,43 @@ fn run(setup: Setup) -> WakeUp {
 }
 
 #[derive(Debug)]
-struct Taking {
-    margin: Margin,
-    lateness: Times,
-    way: Way,
+struct Sampling {
+    margin: SpinWindow,
+    lateness: LatencyHistogram,
+    way: WaitMethod,
 }
 
-impl Taking {
+impl Sampling {
     fn new(spin: Spin, cycle: u64) -> Self {
         Self {
-            margin: Margin::new(spin, cycle, Mode::SameCycle),
-            lateness: Times::new(),
-            way: Way::default(),
+            margin: SpinWindow::new(spin, cycle, ExchangeMode::SameCycle),
+            lateness: LatencyHistogram::new(),
+            way: WaitMethod::default(),
         }
     }
 
     fn turn(&mut self, host: &Host, cpu: Option<usize>, cycle: u64) {
-        let before = Outside::now(host, cpu);
+        let before = Interference::now(host, cpu);
         let mut next = clock::now() + cycle;
         for _ in 0..(TURN_NS / cycle).max(4) {
             let slept = Clock::Real.sleep_until(next, self.margin.get());
-            self.margin.slept(slept);
+            self.margin.record_wakeup(slept);
             let now = clock::now();
             let late = now.saturating_sub(next);
             self.lateness.record(late);
             self.way.too_late += u64::from(late > cycle / SHARE);
-            // A cycle that is over already is left out.
+            // Skip cycles that are already over.
             next += cycle * (1 + late / cycle);
         }
-        let after = Outside::now(host, cpu);
+        let after = Interference::now(host, cpu);
         let way = &mut self.way;
         way.involuntary_switches += after.switches.saturating_sub(before.switches);
         way.interrupts = more(way.interrupts, before.interrupts, after.interrupts);
         way.stolen_ms = more(way.stolen_ms, before.stolen_ms, after.stolen_ms);
     }
 
-    fn way(self) -> Way {
-        Way {
+    fn way(self) -> WaitMethod {
+        WaitMethod {
             lateness: self.lateness.summary(),
             ..self.way
         }
@@ -153,38 +155,38 @@ fn more(sum: Option<u64>, before: Option<u64>, after: Option<u64>) -> Option<u64
     Some(sum.unwrap_or(0) + after?.saturating_sub(before?))
 }
 
-/// What else happened.
+/// Counters of interference by the computer.
 #[derive(Debug)]
-struct Outside {
+struct Interference {
     switches: u64,
     interrupts: Option<u64>,
     stolen_ms: Option<u64>,
 }
 
-impl Outside {
+impl Interference {
     fn now(host: &Host, cpu: Option<usize>) -> Self {
         let stat = host.text("proc/stat").unwrap_or_default();
         let name = cpu.map_or("cpu".to_owned(), |cpu| format!("cpu{cpu}"));
         let line = stat
             .lines()
             .find(|line| line.split_whitespace().next() == Some(&name));
-        // The eighth after the name, in ticks of USER_HZ, which is 100.
+        // The eighth value after the name, in ticks of USER_HZ (100).
         let ticks = line.and_then(|line| line.split_whitespace().nth(8)?.parse::<u64>().ok());
         Self {
-            switches: ThreadUse::now().map_or(0, |used| used.involuntary_switches),
+            switches: ThreadUsage::now().map_or(0, |used| used.involuntary_switches),
             interrupts: interrupts::taken(host, cpu),
             stolen_ms: ticks.map(|ticks| ticks.saturating_mul(10)),
         }
     }
 }
 
-/// The shortest usual cycle of which a wake-up so late loses no more than a quarter.
+/// Returns the shortest typical cycle of which this latency is at most a quarter.
 fn good_for(late_ns: u64) -> Option<u64> {
     CYCLES_NS.into_iter().find(|cycle| late_ns <= cycle / SHARE)
 }
 
 impl WakeUp {
-    /// The shortest usual cycles that 99.9 % of the wake-ups, and all of them, would have been in time for.
+    /// Returns the shortest typical cycles for 99.9 % of the wake-ups, and for all of them.
     #[must_use]
     pub fn good_for(&self) -> (Option<u64>, Option<u64>) {
         let lateness = &self.sleep_and_spin.lateness;
@@ -192,7 +194,7 @@ impl WakeUp {
     }
 }
 
-pub(super) fn examine(wake_up: &WakeUp, notes: &mut Notes) {
+pub(super) fn examine(wake_up: &WakeUp, notes: &mut ReportBuilder) {
     let way = &wake_up.sleep_and_spin;
     let count = way.lateness.count;
     if way.too_late == 0 || count == 0 {
@@ -205,15 +207,16 @@ pub(super) fn examine(wake_up: &WakeUp, notes: &mut Notes) {
         _ => Severity::Note,
     };
     let stolen = way.stolen_ms.filter(|ms| *ms > 0);
-    let mut mend = vec![Mend::advice(match stolen {
+    let mut fix = vec![Fix::advice(match stolen {
         Some(ms) => format!(
             "The host of this virtual machine took {ms} ms meanwhile: give it CPUs of its own there, or take a computer of metal."
         ),
-        None => "Mend what else is found here, then measure again with the machine's usual load."
-            .to_owned(),
+        None => {
+            "Fix the other findings, then measure again with the machine's usual load.".to_owned()
+        }
     })];
     if let Some(cycle) = wake_up.good_for().0.filter(|c| *c > wake_up.cycle_ns) {
-        mend.push(Mend::advice(format!(
+        fix.push(Fix::advice(format!(
             "`cycle = \"{}\"` would have lost fewer than one in a thousand.",
             duration::show(cycle).replace(' ', ""),
         )));
@@ -227,7 +230,7 @@ pub(super) fn examine(wake_up: &WakeUp, notes: &mut Notes) {
             duration::show(wake_up.cycle_ns),
         ),
         "The reply then has too little time left: a lost frame. `lost_frames` of them in a row stop the machine.",
-        mend,
+        fix,
     );
 }
 
@@ -236,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cycles_that_a_lateness_allows() {
+    fn good_for_returns_the_shortest_cycle() {
         for (late, expected) in [
             (0, Some(62_500)),
             (15_625, Some(62_500)),
@@ -250,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn both_ways_are_measured_as_often() {
+    fn measure_runs_both_methods_equally() {
         let setup = Setup {
             seconds: 1,
             cpu: None,

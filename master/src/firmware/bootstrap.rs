@@ -1,28 +1,28 @@
-//! A file over FoE in Bootstrap: Init, the mailboxes that the EEPROM names for Bootstrap, the file, and back to Init, where the device starts
-//! what it was given.
+//! Firmware update over FoE in Bootstrap: Init, Bootstrap with its own mailboxes from the EEPROM,
+//! the file, and back to Init, where the device starts the new program.
 
 use std::time::Duration;
 
-use super::error::{Broken, Cause, Step};
-use super::{Examined, INIT_TIMEOUT, Order, ReadBack, Told, since};
+use super::error::{Cause, Step, StepFailure};
+use super::{DeviceIdentity, INIT_TIMEOUT, ReadBack, UpdateProgress, UpdateRequest, since};
+use crate::acyclic::{DatagramClient, Registers, mailbox};
 use crate::bringup::al::{self, AlState};
 use crate::mailbox::foe::FoeProgress;
-use crate::mailbox::{FoeClient, FoeError, Wire};
-use crate::service::{Datagrams, Registers, mailbox};
+use crate::mailbox::{FoeClient, FoeError, MailboxTransport};
 
 pub(super) async fn send(
-    wire: &Datagrams,
-    before: &Examined,
-    order: &Order,
-    tell: &mut dyn FnMut(Told),
-) -> Result<(ReadBack, Duration), Broken> {
+    wire: &DatagramClient,
+    before: &DeviceIdentity,
+    order: &UpdateRequest,
+    report: &mut dyn FnMut(UpdateProgress),
+) -> Result<(ReadBack, Duration), StepFailure> {
     let devices = std::slice::from_ref(&before.device);
-    tell(Told::Step(Step::Prepare));
+    report(UpdateProgress::Step(Step::Prepare));
     al::change_state(wire, devices, AlState::Init, INIT_TIMEOUT)
         .await
         .map_err(|error| Step::Prepare.failed(error))?;
 
-    tell(Told::Step(Step::Bootstrap));
+    report(UpdateProgress::Step(Step::Bootstrap));
     let registers = Registers {
         wire,
         device: &before.device,
@@ -35,13 +35,13 @@ pub(super) async fn send(
         .await
         .map_err(|error| Step::Bootstrap.failed(error))?;
 
-    tell(Told::Step(Step::Send));
+    report(UpdateProgress::Step(Step::Send));
     let mut foe = FoeClient::new(layout);
     let of = order.file.len();
     let mut progress = |progress| {
-        tell(match progress {
-            FoeProgress::Bytes(done) => Told::Moved { done, of },
-            FoeProgress::Busy { done, entire } => Told::Busy { done, entire },
+        report(match progress {
+            FoeProgress::Bytes(done) => UpdateProgress::Moved { done, of },
+            FoeProgress::Busy { done, entire } => UpdateProgress::Busy { done, entire },
         });
     };
     let begin = wire.now();
@@ -65,8 +65,8 @@ pub(super) async fn send(
         ReadBack::NotAsked
     };
 
-    tell(Told::Step(Step::Leave));
-    // A device that resets itself is not there to say that it has arrived; whether it comes back is seen afterwards.
+    report(UpdateProgress::Step(Step::Leave));
+    // A device that resets itself cannot confirm Init; a later check detects whether it returns.
     match al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await {
         Err(error @ crate::bringup::StateError::Refused { .. }) => Err(Step::Leave.failed(error)),
         Ok(()) | Err(_) => Ok((read_back, took)),
@@ -74,12 +74,12 @@ pub(super) async fn send(
 }
 
 async fn compare(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     foe: &mut FoeClient,
-    order: &Order,
+    order: &UpdateRequest,
     progress: &mut dyn FnMut(FoeProgress),
 ) -> Result<ReadBack, Cause> {
-    // One byte more, so that a longer file shows.
+    // One more byte detects a longer file.
     let most = order.file.len().saturating_add(1);
     let read = foe
         .read(wire, &order.name, order.password, most, progress)

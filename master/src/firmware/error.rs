@@ -1,20 +1,20 @@
-//! What failed at which step, and how the device was left.
+//! The failed step and the final state of the device.
 
 use std::fmt;
 use std::time::Duration;
 
 use ecaxis_esi::sii::SiiError;
 
-use super::{Runs, Via};
-use crate::bringup::al::{self, AlState};
+use super::{RunningProgram, UpdateMethod};
+use crate::acyclic::{DatagramClient, ServiceError, enumerate};
+use crate::bringup::al::AlState;
 use crate::bringup::{DeviceRef, StateError};
 use crate::mailbox::{FoeError, SdoError};
-use crate::service::{Datagrams, ServiceError, station};
 
-/// Part of an update.
+/// A step of an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Step {
-    /// To Init, from wherever it is.
+    /// To Init from any state.
     Prepare,
     Bootstrap,
     Send,
@@ -57,24 +57,24 @@ pub enum Cause {
     State(#[from] StateError),
     #[error(transparent)]
     Service(#[from] ServiceError),
-    /// 0x1F51 does not become what it should.
+    /// 0x1F51 did not reach the expected value.
     #[error("0x1F51:01 is not {wanted} within {after:?}: {last}{}", Refusal(refused.as_deref()))]
     Control {
         wanted: u8,
         after: Duration,
-        /// What was read last, or why nothing.
+        /// The last value, or why it was not readable.
         last: String,
-        /// What the device answered when it was told, if it did.
+        /// The device's answer to the command, if any.
         refused: Option<Box<SdoError>>,
     },
     #[error("interrupted")]
     Interrupted,
-    #[error("what the device hands out differs from the file from byte {at} on")]
+    #[error("the file read back differs from byte {at} on")]
     Differs { at: usize },
     #[error("after {after:?} it is in {state} and {runs}")]
     NotRunning {
         state: AlState,
-        runs: Runs,
+        runs: RunningProgram,
         after: Duration,
     },
     #[error("after {after:?} it is not back: {error}")]
@@ -95,19 +95,19 @@ impl fmt::Display for Refusal<'_> {
     }
 }
 
-/// How a device was left.
+/// The final state of a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Left {
+pub enum FinalDeviceState {
     In { state: AlState, code: u16 },
     Silent,
 }
 
-impl fmt::Display for Left {
+impl fmt::Display for FinalDeviceState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::In { state, code: 0 } => write!(f, "the device is in {state}"),
             Self::In { state, code } => {
-                let text = crate::al_status::al_status_text(*code);
+                let text = ecaxis_ecat::al_status_code::al_status_text(*code);
                 write!(
                     f,
                     "the device is in {state}, AL status code {code:#06x} ({text})"
@@ -137,21 +137,21 @@ pub enum FirmwareError {
         before: String,
         now: String,
     },
-    #[error("{device}: is in Op: somebody drives it")]
+    #[error("{device}: is in Op: another MainDevice drives it")]
     Driven { device: DeviceRef },
     #[error("{device}: does not offer {via}: {reason}")]
     NotOffered {
         device: DeviceRef,
-        via: Via,
+        via: UpdateMethod,
         reason: &'static str,
     },
-    #[error("{device}: offers no way: {foe}, and {program}")]
+    #[error("{device}: no firmware update method available: {foe}, and {program}")]
     NoWay {
         device: DeviceRef,
         foe: &'static str,
         program: &'static str,
     },
-    #[error("{device}: `{name}` is no name for a file in it: 1 to {room} bytes")]
+    #[error("{device}: `{name}` is not a valid file name: 1 to {room} bytes")]
     Name {
         device: DeviceRef,
         name: String,
@@ -159,42 +159,48 @@ pub enum FirmwareError {
     },
     #[error("the file is empty")]
     Empty,
-    /// From the moment on at which the device was touched.
+    /// Any failure after the first change.
     #[error("{device}: {step}: {cause}; {left}")]
     Failed {
         device: DeviceRef,
         step: Step,
         cause: Cause,
-        left: Left,
+        left: FinalDeviceState,
     },
 }
 
-/// A step that failed.
+/// A failed step.
 #[derive(Debug)]
-pub(super) struct Broken {
+pub(super) struct StepFailure {
     step: Step,
     cause: Cause,
 }
 
 impl Step {
-    pub(super) fn failed(self, cause: impl Into<Cause>) -> Broken {
-        Broken {
+    pub(super) fn failed(self, cause: impl Into<Cause>) -> StepFailure {
+        StepFailure {
             step: self,
             cause: cause.into(),
         }
     }
 }
 
-impl Broken {
-    /// With a look at how the device is left. It may have another address than it had.
-    pub(super) async fn at(self, wire: &Datagrams, device: &DeviceRef) -> FirmwareError {
-        let seen = station::at(wire, device.position, "looking after it", al::AL_STATUS).await;
+impl StepFailure {
+    /// Adds the final state of the device, whose address may have changed.
+    pub(super) async fn at(self, wire: &DatagramClient, device: &DeviceRef) -> FirmwareError {
+        let seen = enumerate::at(
+            wire,
+            device.position,
+            "looking after it",
+            ecaxis_ecat::registers::AL_STATUS,
+        )
+        .await;
         let left = match seen {
-            Ok([status, _, _, _, c0, c1]) => Left::In {
+            Ok([status, _, _, _, c0, c1]) => FinalDeviceState::In {
                 state: AlState::from_status(status),
                 code: u16::from_le_bytes([c0, c1]),
             },
-            Err(_) => Left::Silent,
+            Err(_) => FinalDeviceState::Silent,
         };
         FirmwareError::Failed {
             device: device.clone(),

@@ -1,13 +1,14 @@
-//! A device's firmware, by the two ways that drives offer. MAY BLOCK AND ALLOCATE; works on a bus without a cycle ([`crate::service`]).
+//! Firmware update with the two methods that drives support. MAY BLOCK AND ALLOCATE; works on a bus
+//! without a cycle ([`crate::acyclic`]).
 //!
-//! - `examine`: who a device is, what it offers, and what runs in it;
+//! - `identify`: identity, update methods and running program of a device;
 //! - `bootstrap`: a file over FoE in Bootstrap, started on the way back to Init;
-//! - `program`: program download by the objects 0x1F50, 0x1F51 and 0x1F56 (CiA 302-3);
-//! - `error`: what failed at which step, and in which state the device was left.
+//! - `program_download`: program download with 0x1F50, 0x1F51 and 0x1F56 (CiA 302-3);
+//! - `error`: the failed step and the final state of the device.
 //!
-//! A file is the maker's; nothing is known of what is in it. What is checked is the device: before, whether it is the one that is meant, and
-//! afterwards, whether it is still the same and runs a program. A device whose update broke off keeps its boot loader, which waits in Bootstrap or
-//! with its program stopped; an update starts from there as from anywhere else.
+//! The content of a file is opaque. Only the device is checked: its identity before the update, and
+//! identity and running program afterwards. After a failed update, a device keeps its boot loader,
+//! in Bootstrap or with stopped program. A new update can start from there.
 
 use std::cell::Cell;
 use std::fmt;
@@ -15,38 +16,38 @@ use std::time::Duration;
 
 use ecaxis_esi::sii::Protocols;
 
+use crate::acyclic::DatagramClient;
+use crate::acyclic::enumerate::{DeviceSelector, address, enumerate};
 use crate::bringup::AlState;
 use crate::bringup::al;
-use crate::mailbox::{Wire, foe};
-use crate::service::Datagrams;
-use crate::service::station::{Which, address, census};
-use error::Broken;
-use examine::look_at;
+use crate::mailbox::{MailboxTransport, foe};
+use error::StepFailure;
+use identify::look_at;
 
 mod bootstrap;
 mod error;
-mod examine;
-mod program;
+mod identify;
+mod program_download;
 
-pub use error::{Cause, FirmwareError, Left, Step};
-pub use examine::{BOOT_LOADER, Examined, Expected, Runs, Spoken, examine};
+pub use error::{Cause, FinalDeviceState, FirmwareError, Step};
+pub use identify::{BOOT_LOADER, CoeIdentity, DeviceIdentity, Expected, RunningProgram, examine};
 
-/// From a reset or a start until the program runs, at most.
+/// The maximum time from a reset or start until the program runs.
 pub const START_TIMEOUT: Duration = Duration::from_secs(30);
-/// Until a device is in Init: one that a broken update left at erasing its memory does not look after its state meanwhile.
+/// The time-out for Init. After a failed update, a device may be busy erasing its memory.
 const INIT_TIMEOUT: Duration = Duration::from_secs(30);
-/// A device that resets itself may be seen as it was before.
+/// A device that resets itself may show its old state for this time.
 const SETTLE: Duration = Duration::from_millis(500);
 const LOOK_AGAIN: Duration = Duration::from_millis(200);
 
-/// How a program gets into a device.
+/// The update method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Via {
+pub enum UpdateMethod {
     Foe,
     Program,
 }
 
-impl fmt::Display for Via {
+impl fmt::Display for UpdateMethod {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Foe => "FoE in Bootstrap",
@@ -55,89 +56,95 @@ impl fmt::Display for Via {
     }
 }
 
-/// What is to be done.
+/// The parameters of an update.
 #[derive(Debug, Clone)]
-pub struct Order {
-    pub via: Via,
+pub struct UpdateRequest {
+    pub via: UpdateMethod,
     pub file: Vec<u8>,
-    /// What the file is called over FoE.
+    /// The file name for FoE.
     pub name: String,
-    /// Over FoE; 0: none.
+    /// The password for FoE; 0: none.
     pub password: u32,
-    /// Read the file back and compare it, over FoE, where the device hands it out.
+    /// Read the file back over FoE and compare it, if the device supports it.
     pub read_back: bool,
 }
 
-/// An update goes on.
+/// The progress of an update.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Told {
+pub enum UpdateProgress {
     Step(Step),
-    /// So many bytes of so many have gone through.
+    /// Transferred bytes and total.
     Moved {
         done: usize,
         of: usize,
     },
-    /// The device puts us off; so much of so much is done.
+    /// The device is busy; its progress and total.
     Busy {
         done: u16,
         entire: u16,
     },
 }
 
-/// What came of reading the file back.
+/// The result of reading the file back.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ReadBack {
     NotAsked,
     Same,
-    /// The device does not hand it out, with the reason.
+    /// The device refuses to send it, with the reason.
     Refused(String),
 }
 
-/// An update that succeeded.
+/// The result of a successful update.
 #[derive(Debug)]
-pub struct Done {
-    /// As the device was found afterwards; it is in Init.
-    pub after: Examined,
+pub struct UpdateReport {
+    /// The device after the update, in Init.
+    pub after: DeviceIdentity,
     pub read_back: ReadBack,
-    /// From the first byte of the file to the last.
+    /// The time from the first byte of the file to the last.
     pub took: Duration,
 }
 
-impl Examined {
-    /// Whether the device offers a way, and why not. What the device keeps from being read it may have.
+impl DeviceIdentity {
+    /// Checks whether the device supports a method. A property that cannot be read counts as
+    /// supported.
     ///
     /// # Errors
-    /// What it lacks.
-    pub fn offers(&self, via: Via) -> Result<(), &'static str> {
+    /// Returns the missing property.
+    pub fn offers(&self, via: UpdateMethod) -> Result<(), &'static str> {
         let boot = self.sii.bootstrap;
         match via {
-            Via::Foe if self.in_use => Ok(()),
-            Via::Foe if !self.sii.protocols.has(Protocols::FOE) => Err("its EEPROM names no FoE"),
-            Via::Foe if boot.receive_size == 0 || boot.send_size == 0 => {
+            UpdateMethod::Foe if self.in_use => Ok(()),
+            UpdateMethod::Foe if !self.sii.protocols.has(Protocols::FOE) => {
+                Err("its EEPROM names no FoE")
+            }
+            UpdateMethod::Foe if boot.receive_size == 0 || boot.send_size == 0 => {
                 Err("its EEPROM has no mailboxes for Bootstrap")
             }
-            Via::Foe => Ok(()),
-            Via::Program if !self.in_use && !self.sii.protocols.has(Protocols::COE) => {
+            UpdateMethod::Foe => Ok(()),
+            UpdateMethod::Program if !self.in_use && !self.sii.protocols.has(Protocols::COE) => {
                 Err("its EEPROM names no CoE")
             }
-            Via::Program => match &self.spoken {
+            UpdateMethod::Program => match &self.spoken {
                 Some(spoken) if spoken.control.is_none() => Err("it has no object 0x1F51"),
-                // One that does not speak now may have it.
+                // The property is unreadable now, but may exist.
                 Some(_) | None => Ok(()),
             },
         }
     }
 
-    /// The way that is chosen, or where nobody chose, FoE or else program download.
+    /// Returns the chosen method, else FoE, else program download.
     ///
     /// # Errors
     /// [`FirmwareError::NoWay`].
-    pub fn way(&self, chosen: Option<Via>) -> Result<Via, FirmwareError> {
-        let (foe, program) = (self.offers(Via::Foe), self.offers(Via::Program));
+    pub fn way(&self, chosen: Option<UpdateMethod>) -> Result<UpdateMethod, FirmwareError> {
+        let (foe, program) = (
+            self.offers(UpdateMethod::Foe),
+            self.offers(UpdateMethod::Program),
+        );
         match (chosen, foe, program) {
             (Some(via), ..) => Ok(via),
-            (None, Ok(()), _) => Ok(Via::Foe),
-            (None, Err(_), Ok(())) => Ok(Via::Program),
+            (None, Ok(()), _) => Ok(UpdateMethod::Foe),
+            (None, Err(_), Ok(())) => Ok(UpdateMethod::Program),
             (None, Err(foe), Err(program)) => Err(FirmwareError::NoWay {
                 device: self.device.clone(),
                 foe,
@@ -146,11 +153,12 @@ impl Examined {
         }
     }
 
-    /// Whether an update may begin: the device is the one that is meant, nobody drives it, and it offers the way.
+    /// Checks whether an update may begin: correct device, not driven, method supported.
     ///
     /// # Errors
-    /// [`FirmwareError::Identity`], [`FirmwareError::Driven`], [`FirmwareError::NotOffered`], [`FirmwareError::Name`], [`FirmwareError::Empty`].
-    pub fn ready(&self, order: &Order, expected: Expected) -> Result<(), FirmwareError> {
+    /// [`FirmwareError::Identity`], [`FirmwareError::Driven`], [`FirmwareError::NotOffered`],
+    /// [`FirmwareError::Name`], [`FirmwareError::Empty`].
+    pub fn ready(&self, order: &UpdateRequest, expected: Expected) -> Result<(), FirmwareError> {
         self.check(expected)?;
         let device = || self.device.clone();
         if self.state == AlState::Op && !self.error {
@@ -164,7 +172,7 @@ impl Examined {
                 reason,
             })?;
         let room = foe::room(self.sii.bootstrap.receive_size);
-        if via == Via::Foe && !self.in_use && !foe::is_name(&order.name, room) {
+        if via == UpdateMethod::Foe && !self.in_use && !foe::is_name(&order.name, room) {
             return Err(FirmwareError::Name {
                 device: device(),
                 name: order.name.clone(),
@@ -178,21 +186,22 @@ impl Examined {
     }
 }
 
-/// Puts a program into a device and starts it. The device ends in Init.
+/// Writes a program to a device and starts it. The device ends in Init.
 ///
 /// # Errors
-/// As [`Examined::ready`], with nothing touched; [`FirmwareError::Failed`] from then on, also where the user ends it.
+/// Those of [`DeviceIdentity::ready`], without any change. [`FirmwareError::Failed`] after that,
+/// also for a cancellation.
 pub async fn update(
-    wire: &Datagrams,
-    before: &Examined,
+    wire: &DatagramClient,
+    before: &DeviceIdentity,
     expected: Expected,
-    order: &Order,
-    tell: &mut dyn FnMut(Told),
-) -> Result<Done, FirmwareError> {
+    order: &UpdateRequest,
+    report: &mut dyn FnMut(UpdateProgress),
+) -> Result<UpdateReport, FirmwareError> {
     before.ready(order, expected)?;
     let seized;
     let before = if before.in_use {
-        let which = Which::Position(before.device.position);
+        let which = DeviceSelector::Position(before.device.position);
         seized = look_at(wire, which, &before.device.name, true).await?;
         seized.ready(order, expected)?;
         &seized
@@ -200,24 +209,26 @@ pub async fn update(
         before
     };
     let step = Cell::new(Step::Prepare);
-    let mut telling = |told| {
-        if let Told::Step(now) = told {
+    let mut reporting = |reported| {
+        if let UpdateProgress::Step(now) = reported {
             step.set(now);
         }
-        tell(told);
+        report(reported);
     };
     let whole = async {
         let work = async {
             let (read_back, took) = match order.via {
-                Via::Foe => bootstrap::send(wire, before, order, &mut telling).await?,
-                Via::Program => program::send(wire, before, order, &mut telling).await?,
+                UpdateMethod::Foe => bootstrap::send(wire, before, order, &mut reporting).await?,
+                UpdateMethod::Program => {
+                    program_download::send(wire, before, order, &mut reporting).await?
+                }
             };
-            telling(Told::Step(Step::Check));
+            reporting(UpdateProgress::Step(Step::Check));
             let after = running(wire, before).await;
             let after = after.map_err(|cause| Step::Check.failed(cause))?;
             Ok((after, read_back, took))
         };
-        let done = match wire.stop().unless(work).await {
+        let done = match wire.stop().run_until_cancelled(work).await {
             Some(done) => done,
             None => Err(given_up(wire, before, step.get()).await),
         };
@@ -226,23 +237,23 @@ pub async fn update(
             Err(failed) => Err(failed.at(wire, &before.device).await),
         }
     };
-    let (after, read_back, took) = wire.stop().hold(whole).await?;
-    // It may show another product once its program runs than it did without.
+    let (after, read_back, took) = wire.stop().shield(whole).await?;
+    // With a running program, it may show another product than without.
     after.check(expected)?;
     after.same_as(before)?;
-    Ok(Done {
+    Ok(UpdateReport {
         after,
         read_back,
         took,
     })
 }
 
-/// The device is not left in the middle of a transfer: in Init it starts what it has.
-async fn given_up(wire: &Datagrams, before: &Examined, step: Step) -> Broken {
-    // It may have another address than it had; how it is left is looked at afterwards in any case.
-    if let Ok(mut found) = census(wire).await
+/// Ends a transfer by returning to Init, where the device starts its present program.
+async fn given_up(wire: &DatagramClient, before: &DeviceIdentity, step: Step) -> StepFailure {
+    // Its address may have changed; the final state is checked afterwards.
+    if let Ok(mut found) = enumerate(wire).await
         && address(wire, &mut found).await.is_ok()
-        && let Ok(found) = Which::Position(before.device.position).among(&found)
+        && let Ok(found) = DeviceSelector::Position(before.device.position).select_from(&found)
     {
         let device = [found.named(before.device.name.clone())];
         let _ = al::change_state(wire, &device, AlState::Init, INIT_TIMEOUT).await;
@@ -250,16 +261,16 @@ async fn given_up(wire: &Datagrams, before: &Examined, step: Step) -> Broken {
     step.failed(Cause::Interrupted)
 }
 
-/// Waits until the device answers again and runs a program, whatever its address and state are meanwhile.
-async fn running(wire: &Datagrams, before: &Examined) -> Result<Examined, Cause> {
-    let which = Which::Position(before.device.position);
+/// Waits until the device answers again and runs a program, independent of address and state.
+async fn running(wire: &DatagramClient, before: &DeviceIdentity) -> Result<DeviceIdentity, Cause> {
+    let which = DeviceSelector::Position(before.device.position);
     let end = after(wire, START_TIMEOUT);
     wire.delay(SETTLE).await;
     loop {
         let cause = match examine(wire, which, &before.device.name).await {
             Ok(found) => match found.runs() {
-                Runs::Program => return Ok(found),
-                Runs::Unknown if found.state != AlState::Bootstrap => return Ok(found),
+                RunningProgram::Program => return Ok(found),
+                RunningProgram::Unknown if found.state != AlState::Bootstrap => return Ok(found),
                 runs => Cause::NotRunning {
                     state: found.state,
                     runs,
@@ -278,11 +289,11 @@ async fn running(wire: &Datagrams, before: &Examined) -> Result<Examined, Cause>
     }
 }
 
-fn after(wire: &impl Wire, time: Duration) -> u64 {
+fn after(wire: &impl MailboxTransport, time: Duration) -> u64 {
     let time = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
     wire.now().saturating_add(time)
 }
 
-fn since(wire: &impl Wire, begin: u64) -> Duration {
+fn since(wire: &impl MailboxTransport, begin: u64) -> Duration {
     Duration::from_nanos(wire.now().saturating_sub(begin))
 }

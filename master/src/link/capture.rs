@@ -1,12 +1,14 @@
-//! Keeps every frame in a pcapng file.
+//! Records all frames in a pcapng file.
 //!
-//! One side is called from the cycle, the other writes. With [`Mode::Background`] the two are apart:
-//! a ring of bytes between them, a thread behind it, and a counter for what did not fit.
-//! [`Mode::Inline`] writes where it is called and loses nothing; virtual time can afford that.
+//! One side is called from the cycle, the other writes the file. With [`WriterMode::Background`] a
+//! ring of bytes connects the cycle to a writer thread, and a counter counts the frames that do not
+//! fit. [`WriterMode::Inline`] writes in the calling thread and loses nothing, which is acceptable
+//! in virtual time.
 //!
-//! With a limit a recording is written in parts, each a file that stands for itself and a quarter of the limit long. The first, under
-//! the name that was asked for, stays: it shows who is on the bus and how it was configured. Of the others, numbered
-//! (`run.0001.pcapng`), the newest three stay.
+//! With a limit, a recording is written in parts. Each part is a complete file of a quarter of the
+//! limit. The first part, under the requested name, is kept: it shows the devices on the bus and
+//! their configuration. Of the other, numbered parts (`run.0001.pcapng`), the newest three are
+//! kept.
 
 use std::fmt;
 use std::io;
@@ -20,16 +22,16 @@ use super::{MAX_FRAME, Nanos};
 
 mod file;
 
-use file::Parts;
+use file::RotatingWriter;
 pub use file::parts_of;
 
-/// Bytes between the cycle and the writer: about a second of 8 kHz with 200-byte frames.
+/// Bytes between the cycle and the writer: about one second at 8 kHz with 200-byte frames.
 const RING: usize = 4 << 20;
 const HEADER: usize = 11;
 const WRITER_PAUSE: Duration = Duration::from_millis(2);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Mode {
+pub enum WriterMode {
     /// The caller writes the file.
     Inline,
     /// A thread writes the file; the caller never blocks and frames may be dropped, counted.
@@ -43,7 +45,7 @@ pub enum Dir {
 }
 
 impl Dir {
-    /// Bits 0–1 of pcapng's `epb_flags`.
+    /// Returns bits 0–1 of pcapng's `epb_flags`.
     fn flag(self) -> u32 {
         match self {
             Self::In => 1,
@@ -55,11 +57,11 @@ impl Dir {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RecordStats {
     pub written: u64,
-    /// Frames that found the ring full, or were longer than a frame may be.
+    /// Frames dropped because the ring was full or they exceeded the maximum length.
     pub dropped: u64,
 }
 
-/// Where frames are recorded to.
+/// Writes frames to a recording.
 pub struct Recorder {
     sink: Sink,
     dropped: u64,
@@ -67,7 +69,7 @@ pub struct Recorder {
 
 enum Sink {
     Inline {
-        file: Parts,
+        file: RotatingWriter,
         error: Option<io::Error>,
     },
     Background {
@@ -77,16 +79,17 @@ enum Sink {
 }
 
 impl Recorder {
-    /// Creates the file, writes its head and, for [`Mode::Background`], starts the writer. With a `limit` the recording takes no
-    /// more bytes than that; parts of an older recording of this name are removed.
+    /// Creates the file, writes its header and, for [`WriterMode::Background`], starts the writer.
+    /// With a `limit` the recording uses at most that many bytes. Parts of an older recording of
+    /// this name are removed.
     ///
     /// # Errors
-    /// Where the file cannot be created or written, or the thread cannot be started.
-    pub fn create(path: &Path, mode: Mode, limit: Option<u64>) -> io::Result<Self> {
-        let file = Parts::create(path, limit)?;
+    /// Fails if the file cannot be created or written, or the thread cannot be started.
+    pub fn create(path: &Path, mode: WriterMode, limit: Option<u64>) -> io::Result<Self> {
+        let file = RotatingWriter::create(path, limit)?;
         let sink = match mode {
-            Mode::Inline => Sink::Inline { file, error: None },
-            Mode::Background => {
+            WriterMode::Inline => Sink::Inline { file, error: None },
+            WriterMode::Background => {
                 let (mut ring, mut reader) = RingBuffer::new(RING);
                 touch(&mut ring, &mut reader);
                 let writer = thread::Builder::new()
@@ -98,8 +101,8 @@ impl Recorder {
         Ok(Self { sink, dropped: 0 })
     }
 
-    /// Takes one frame. `at` is nanoseconds since 1970. RT with [`Mode::Background`]: never blocks
-    /// nor allocates; O(bytes). A write error shows in [`Recorder::finish`].
+    /// Records one frame. `at` is nanoseconds since 1970. RT with [`WriterMode::Background`]: never
+    /// blocks or allocates; O(bytes). Write errors are returned by [`Recorder::finish`].
     pub fn frame(&mut self, dir: Dir, at: Nanos, frame: &[u8]) {
         let len = match u16::try_from(frame.len()) {
             Ok(len) if frame.len() <= MAX_FRAME => len,
@@ -126,23 +129,23 @@ impl Recorder {
                 head[0] = u8::from(dir == Dir::In);
                 head[1..3].copy_from_slice(&len.to_le_bytes());
                 head[3..].copy_from_slice(&at.to_le_bytes());
-                // There is room for both: only this side takes slots away.
+                // Both fit: only this side fills the ring.
                 let _ = ring.push_entire_slice(&head);
                 let _ = ring.push_entire_slice(frame);
             }
         }
     }
 
-    /// Frames that were not recorded so far. RT.
+    /// Returns the number of frames not recorded so far. RT.
     #[must_use]
     pub fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// Writes what is still under way and closes the file.
+    /// Writes all buffered frames and closes the file.
     ///
     /// # Errors
-    /// The first error that any write met.
+    /// The first write error.
     pub fn finish(self) -> io::Result<RecordStats> {
         let written = match self.sink {
             Sink::Inline { error: Some(e), .. } => return Err(e),
@@ -164,8 +167,8 @@ impl Recorder {
 impl fmt::Debug for Recorder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mode = match self.sink {
-            Sink::Inline { .. } => Mode::Inline,
-            Sink::Background { .. } => Mode::Background,
+            Sink::Inline { .. } => WriterMode::Inline,
+            Sink::Background { .. } => WriterMode::Background,
         };
         f.debug_struct("Recorder")
             .field("mode", &mode)
@@ -174,7 +177,7 @@ impl fmt::Debug for Recorder {
     }
 }
 
-/// Runs once over the ring so that its pages exist before the cycle starts.
+/// Touches all pages of the ring, so that they exist before the cycle starts.
 fn touch(ring: &mut Producer<u8>, reader: &mut Consumer<u8>) {
     let zeros = [0; 4096];
     let mut sink = [0; 4096];
@@ -184,12 +187,13 @@ fn touch(ring: &mut Producer<u8>, reader: &mut Consumer<u8>) {
     }
 }
 
-fn write_all(mut ring: Consumer<u8>, mut file: Parts) -> io::Result<u64> {
+fn write_all(mut ring: Consumer<u8>, mut file: RotatingWriter) -> io::Result<u64> {
     let mut head = [0; HEADER];
     let mut frame = [0; MAX_FRAME];
     let mut failed = None;
     loop {
-        // Asked before the ring is: what was pushed before the other side left is seen below.
+        // Read before the ring: anything pushed before the producer was dropped is still found
+        // below.
         let last = ring.is_abandoned();
         while ring.slots() >= HEADER {
             if ring.pop_entire_slice(&mut head).is_err() {
@@ -206,7 +210,7 @@ fn write_all(mut ring: Consumer<u8>, mut file: Parts) -> io::Result<u64> {
                 }
                 thread::yield_now();
             }
-            // After a failure the ring is still emptied, so that the cycle sees no difference.
+            // After a write error the ring is still emptied, so that the cycle is not affected.
             if failed.is_none() {
                 failed = file.packet(dir, u64::from_le_bytes(at), frame).err();
             }
@@ -238,7 +242,7 @@ mod tests {
             .collect()
     }
 
-    fn record(mode: Mode) -> (Vec<u8>, RecordStats) {
+    fn record(mode: WriterMode) -> (Vec<u8>, RecordStats) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pcapng");
         let mut recorder = Recorder::create(&path, mode, None).unwrap();
@@ -250,8 +254,8 @@ mod tests {
     }
 
     #[test]
-    fn every_frame_returns_with_time_and_direction() {
-        let (bytes, stats) = record(Mode::Inline);
+    fn recording_contains_each_frame_with_time_and_direction() {
+        let (bytes, stats) = record(WriterMode::Inline);
         assert_eq!(
             stats,
             RecordStats {
@@ -269,7 +273,7 @@ mod tests {
             let (dir, at, frame) = expected.next().unwrap();
             assert_eq!(packet.data.as_ref(), frame);
             assert_eq!(packet.original_len as usize, frame.len());
-            // The crate takes the raw value for nanoseconds, which it is here.
+            // The crate returns the raw value as nanoseconds, which is correct here.
             assert_eq!(packet.timestamp, Duration::from_nanos(at));
             let flags = packet.options.iter().find_map(|o| match o {
                 EnhancedPacketOption::Flags(flags) => Some(*flags),
@@ -283,8 +287,8 @@ mod tests {
 
     #[test]
     fn both_modes_write_the_same_bytes() {
-        let (inline, _) = record(Mode::Inline);
-        let (background, stats) = record(Mode::Background);
+        let (inline, _) = record(WriterMode::Inline);
+        let (background, stats) = record(WriterMode::Background);
         assert_eq!(
             stats,
             RecordStats {
@@ -296,10 +300,10 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_counted() {
+    fn recorder_counts_dropped_frames() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pcapng");
-        let mut recorder = Recorder::create(&path, Mode::Background, None).unwrap();
+        let mut recorder = Recorder::create(&path, WriterMode::Background, None).unwrap();
         let frame = [0x5a; MAX_FRAME];
         let sent = 20_000;
         for at in 0..sent {
@@ -312,9 +316,9 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_shows_at_the_end() {
+    fn finish_returns_the_error_of_a_full_disk() {
         let full = Path::new("/dev/full");
-        let mut recorder = Recorder::create(full, Mode::Background, None).unwrap();
+        let mut recorder = Recorder::create(full, WriterMode::Background, None).unwrap();
         for at in 0..2000 {
             recorder.frame(Dir::In, at, &[0; 1000]);
         }

@@ -1,12 +1,12 @@
-//! What an interface must be for EtherCAT, and what makes it a bad one.
+//! The requirements on a network interface for EtherCAT, and settings that disturb the cycle.
 
 use std::fmt;
 use std::io;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
-use super::sift::LinkStats;
-use crate::os::packet::{self, PacketSocket};
+use super::filter::LinkStats;
+use crate::sys::packet::{self, PacketSocket};
 
 pub(super) const ETHERTYPE: u16 = 0x88a4;
 
@@ -34,10 +34,10 @@ pub enum OpenError {
     #[error("another ecaxis{} drives `{nic}`", holder(*pid))]
     Taken {
         nic: String,
-        /// Its process.
+        /// Its process id.
         pid: Option<i32>,
     },
-    #[error("another MainDevice drives the segment on `{nic}`: {frames} EtherCAT frames in {} ms that nobody here has sent", super::LISTEN.as_millis())]
+    #[error("another MainDevice drives the segment on `{nic}`: {frames} foreign EtherCAT frames in {} ms", super::LISTEN.as_millis())]
     Driven { nic: String, frames: u64 },
     #[error("the kernel gives no receive ring on `{nic}`: {source}")]
     NoRing { nic: String, source: io::Error },
@@ -53,18 +53,18 @@ fn holder(pid: Option<i32>) -> String {
     pid.map_or_else(String::new, |pid| format!(" (pid {pid})"))
 }
 
-/// Something about an interface that will disturb the cycle; it can be used all the same.
+/// A setting of a usable interface that will disturb the cycle.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Concern {
-    /// The computer's own traffic goes out there, too.
+pub enum NicWarning {
+    /// The interface has IP addresses, so the host's own traffic uses it too.
     Addresses { nic: String, addresses: Vec<IpAddr> },
-    /// Part of a bridge, bond or team.
+    /// The interface is part of a bridge, bond or team.
     Member { nic: String, of: String },
-    /// A plain socket takes the place of the ring.
+    /// A plain socket replaces the ring.
     NoRing { nic: String, reason: String },
 }
 
-impl fmt::Display for Concern {
+impl fmt::Display for NicWarning {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Addresses { nic, addresses } => {
@@ -88,34 +88,35 @@ impl fmt::Display for Concern {
     }
 }
 
-/// Up, with a carrier, Ethernet by cable, and of full frame size; returns the interface's number. Asks sysfs, which needs
-/// no privileges; where that is not mounted, only the name is checked.
+/// Checks that the interface is up, has a carrier, is wired Ethernet and has the full frame size.
+/// Returns its index. Reads sysfs, which needs no privileges. Without sysfs, only the name is
+/// checked.
 ///
 /// # Errors
-/// What is missing.
+/// The first unmet requirement.
 pub fn check(nic: &str) -> Result<i32, OpenError> {
     let Some(index) = packet::interface_index(nic) else {
         return Err(OpenError::NoSuchInterface {
             nic: nic.to_owned(),
         });
     };
-    Attributes::of(Path::new(SYS), nic).check()?;
+    SysfsNic::of(Path::new(SYS), nic).check()?;
     Ok(index)
 }
 
-/// What is wrong with an interface that can be used.
+/// Returns warnings about a usable interface.
 #[must_use]
-pub fn concerns(nic: &str) -> Vec<Concern> {
+pub fn concerns(nic: &str) -> Vec<NicWarning> {
     let addresses = packet::ip_addresses(nic).unwrap_or_default();
-    let addresses = (!addresses.is_empty()).then(|| Concern::Addresses {
+    let addresses = (!addresses.is_empty()).then(|| NicWarning::Addresses {
         nic: nic.to_owned(),
         addresses,
     });
-    let member = Attributes::of(Path::new(SYS), nic).member();
+    let member = SysfsNic::of(Path::new(SYS), nic).member();
     addresses.into_iter().chain(member).collect()
 }
 
-/// The interfaces of this computer that could carry EtherCAT.
+/// Returns the interfaces of this host that could carry EtherCAT.
 #[must_use]
 pub fn interfaces() -> Vec<String> {
     let Ok(entries) = std::fs::read_dir(SYS) else {
@@ -124,7 +125,7 @@ pub fn interfaces() -> Vec<String> {
     let mut names: Vec<String> = entries
         .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
         .filter(|name| {
-            let attributes = Attributes::of(Path::new(SYS), name);
+            let attributes = SysfsNic::of(Path::new(SYS), name);
             attributes.kind().is_none()
         })
         .collect();
@@ -133,12 +134,12 @@ pub fn interfaces() -> Vec<String> {
 }
 
 /// An interface's folder in sysfs.
-struct Attributes<'n> {
+struct SysfsNic<'n> {
     nic: &'n str,
     folder: PathBuf,
 }
 
-impl<'n> Attributes<'n> {
+impl<'n> SysfsNic<'n> {
     fn of(sys: &Path, nic: &'n str) -> Self {
         Self {
             nic,
@@ -154,7 +155,7 @@ impl<'n> Attributes<'n> {
         self.folder.join(attribute).exists()
     }
 
-    /// Why it can never carry EtherCAT, whatever its state.
+    /// Returns why the interface can never carry EtherCAT, regardless of its state.
     fn kind(&self) -> Option<&'static str> {
         let number = self.read("type").ok().and_then(|text| text.parse().ok());
         match number {
@@ -184,7 +185,7 @@ impl<'n> Attributes<'n> {
             Err(error) if error.raw_os_error() == Some(libc::EINVAL) => {
                 return Err(OpenError::Down { nic });
             }
-            // No sysfs: nothing to check against.
+            // Without sysfs, nothing can be checked.
             Err(_) => return Ok(()),
         }
         match self.read("mtu").ok().and_then(|text| text.parse().ok()) {
@@ -193,10 +194,10 @@ impl<'n> Attributes<'n> {
         }
     }
 
-    /// Of a bridge, bond or team.
-    fn member(&self) -> Option<Concern> {
+    /// Returns a warning if the interface is part of a bridge, bond or team.
+    fn member(&self) -> Option<NicWarning> {
         let master = std::fs::read_link(self.folder.join("master")).ok()?;
-        Some(Concern::Member {
+        Some(NicWarning::Member {
             nic: self.nic.to_owned(),
             of: master.file_name()?.to_string_lossy().into_owned(),
         })
@@ -216,9 +217,9 @@ pub(super) fn socket(nic: &str) -> Result<PacketSocket, OpenError> {
 }
 
 pub(super) fn bind(nic: &str, socket: &PacketSocket, index: i32) -> Result<(), OpenError> {
-    // A kernel that does not know it shows our own frames to us, and says that they are.
+    // Without this option, the kernel also delivers sent frames, marked as outgoing.
     let _ = socket.set(libc::PACKET_IGNORE_OUTGOING, 1);
-    // Cyclic frames must not wait behind a traffic shaper; a kernel that does not know it does without.
+    // Cyclic frames must not wait behind a traffic shaper. Kernels without this option ignore it.
     let _ = socket.set(libc::PACKET_QDISC_BYPASS, 1);
     socket
         .bind(index, ETHERTYPE)
@@ -229,7 +230,7 @@ pub(super) fn bind(nic: &str, socket: &PacketSocket, index: i32) -> Result<(), O
         })
 }
 
-/// What the kernel has dropped since this was last asked.
+/// Adds the frames that the kernel has dropped since the last call.
 pub(super) fn add_drops(socket: &PacketSocket, stats: &mut LinkStats) {
     if let Ok((_, dropped)) = socket.statistics() {
         stats.dropped += u64::from(dropped);
@@ -240,7 +241,7 @@ pub(super) fn add_drops(socket: &PacketSocket, stats: &mut LinkStats) {
 mod tests {
     use super::*;
 
-    /// A folder as sysfs has it for an interface that carries frames.
+    /// Checks an interface with these sysfs files; the others are those of a working interface.
     fn with(files: &[(&str, &str)]) -> (tempfile::TempDir, Result<(), String>) {
         let sys = tempfile::tempdir().unwrap();
         let folder = sys.path().join("eth9");
@@ -254,13 +255,13 @@ mod tests {
         for (name, text) in fine.iter().chain(files) {
             std::fs::write(folder.join(name), format!("{text}\n")).unwrap();
         }
-        let checked = Attributes::of(sys.path(), "eth9").check();
+        let checked = SysfsNic::of(sys.path(), "eth9").check();
         let result = checked.map_err(|error| error.to_string());
         (sys, result)
     }
 
     #[test]
-    fn each_kind_of_interface() {
+    fn check_rejects_unsuitable_interfaces() {
         assert_eq!(with(&[]).1, Ok(()));
         assert_eq!(with(&[("mtu", "9000")]).1, Ok(()));
         for (file, text, said) in [
@@ -278,19 +279,19 @@ mod tests {
     }
 
     #[test]
-    fn no_sysfs_means_no_check() {
-        let nowhere = Attributes::of(Path::new("/nonexistent"), "eth9");
+    fn check_passes_without_sysfs() {
+        let nowhere = SysfsNic::of(Path::new("/nonexistent"), "eth9");
         assert!(nowhere.check().is_ok());
         assert_eq!(nowhere.member(), None);
     }
 
     #[test]
-    fn a_member_names_what_it_is_part_of() {
+    fn member_warning_names_the_bridge() {
         let (sys, _) = with(&[]);
         let folder = sys.path().join("eth9");
         std::os::unix::fs::symlink("../../devices/virtual/net/br0", folder.join("master")).unwrap();
-        let member = Attributes::of(sys.path(), "eth9").member();
-        let expected = Concern::Member {
+        let member = SysfsNic::of(sys.path(), "eth9").member();
+        let expected = NicWarning::Member {
             nic: "eth9".into(),
             of: "br0".into(),
         };
@@ -298,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loopback_of_this_computer_is_refused_and_has_addresses() {
+    fn loopback_is_rejected_and_has_addresses() {
         if packet::interface_index("lo").is_none() {
             return;
         }

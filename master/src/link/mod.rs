@@ -1,84 +1,86 @@
-//! What carries Ethernet frames. Nothing here knows EtherCAT beyond its frame header.
+//! Transports for Ethernet frames. Nothing here knows EtherCAT beyond its frame header.
 //!
-//! - [`interface`]: what a network interface must be;
+//! - [`interface`]: the requirements on a network interface;
 //! - [`ring`], [`packet`]: a network interface, through mapped memory or a plain socket;
-//! - [`claim`]: one program an interface;
-//! - [`sift`]: which of an interface's frames are ours;
+//! - [`lock`]: one program per interface;
+//! - [`filter`]: selects the frames of an interface that belong to this program;
 //! - [`sim`]: the simulated bus in this process;
-//! - [`apart`]: an address of one's own, beside a machine that runs on the same interface;
-//! - [`recorded`], [`capture`]: a recording around any of them;
-//! - [`replay`]: a recording in the place of a bus;
-//! - [`port`]: ethercrab's two ends.
+//! - [`source_address`]: a separate source address, for use while a machine runs on the same
+//!   interface;
+//! - [`tee`], [`capture`]: record the frames of any link;
+//! - [`replay`]: a recording in place of a bus;
+//! - [`pdu_loop`]: connects ethercrab to a link.
 
 use std::fmt;
 use std::time::{Duration, Instant};
 
-pub mod apart;
 pub mod capture;
-pub mod claim;
+pub mod filter;
 pub mod interface;
+pub mod lock;
 pub mod packet;
-pub mod port;
-pub mod recorded;
+pub mod pdu_loop;
 pub mod replay;
 pub mod ring;
-pub mod sift;
 pub mod sim;
+pub mod source_address;
+pub mod tee;
 
 pub use crate::clock::Nanos;
-pub use claim::open_alone;
-pub use interface::{Concern, OpenError};
-pub use sift::LinkStats;
+pub use filter::LinkStats;
+pub use interface::{NicWarning, OpenError};
+pub use lock::open_exclusive;
 
 /// Largest frame without FCS.
 pub const MAX_FRAME: usize = 1514;
-/// Data of the only datagram in such a frame: behind the Ethernet header (14 bytes), the frame's own (2) and the datagram's (10), before
-/// its working counter (2).
+/// The data bytes of the only datagram in such a frame: the frame without Ethernet header (14
+/// bytes), EtherCAT header (2), datagram header (10) and working counter (2).
 pub const MAX_DATA: u16 = 1486;
 
-/// A place to send frames to and receive them from. RT: no method blocks or allocates.
+/// Sends and receives frames. RT: no method blocks or allocates, unless stated otherwise.
 pub trait Link: fmt::Debug + Send {
-    /// Hands one whole Ethernet frame (without FCS) to the wire.
+    /// Sends one whole Ethernet frame (without FCS).
     fn send(&mut self, frame: &[u8]) -> Result<(), LinkError>;
 
-    /// The next frame that has arrived, copied to the front of `buf`; `None` where there is none.
+    /// Copies the next received frame to the front of `buf` and returns its length; `None` if none
+    /// has arrived.
     fn recv(&mut self, buf: &mut [u8; MAX_FRAME]) -> Result<Option<usize>, LinkError>;
 
-    /// When the next frame will arrive, where the link can know it (it simulates). Lets virtual
-    /// time jump instead of spin.
+    /// Returns the arrival time of the next frame, if a simulated link knows it. Virtual time can
+    /// then jump instead of spinning.
     fn next_arrival(&self) -> Option<Nanos> {
         None
     }
 
-    /// EtherCAT frames of other MainDevices that came so far. RT.
+    /// Returns the number of EtherCAT frames of other MainDevices received so far. RT.
     fn main_devices(&self) -> u64 {
         0
     }
 
-    /// What has been seen beside the frames that were handed on. Not for the cycle: may ask the kernel.
+    /// Returns the counters of rejected and dropped frames. Not for the cycle: may call the kernel.
     fn stats(&mut self) -> LinkStats {
         LinkStats::default()
     }
 
-    /// What else there is to say at the end, in words. Not for the cycle.
-    fn remarks(&mut self) -> Vec<String> {
+    /// Returns further notices for the end of a run. Not for the cycle.
+    fn notices(&mut self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Why nothing more can come, where the link knows it. Not for the cycle.
-    fn lacks(&self) -> Option<&'static str> {
+    /// Returns why no more frames can arrive, if the link knows it. Not for the cycle.
+    fn exhausted_reason(&self) -> Option<&'static str> {
         None
     }
 
-    /// Ends a recording that goes on in this link, if there is one. Blocks.
+    /// Ends the recording in this link, if there is one. Blocks.
     fn finish(self: Box<Self>) -> std::io::Result<Option<capture::RecordStats>> {
         Ok(None)
     }
 }
 
-/// How frames are taken from a network interface.
+/// How frames are received from a network interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum BackEnd {
+pub enum SocketKind {
     /// From mapped memory: [`ring::RingLink`].
     #[default]
     Ring,
@@ -86,10 +88,10 @@ pub enum BackEnd {
     Packet,
 }
 
-impl BackEnd {
+impl SocketKind {
     pub const ALL: &[Self] = &[Self::Ring, Self::Packet];
 
-    /// As the machine file has it.
+    /// Returns the name in the machine file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -99,50 +101,55 @@ impl BackEnd {
     }
 }
 
-impl fmt::Display for BackEnd {
+impl fmt::Display for SocketKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
 }
 
-/// Opens a network interface, and tells what about it will disturb the cycle. Without a ring a plain socket takes its place,
-/// which is told. Blocks and allocates.
+/// Opens a network interface and returns warnings about settings that disturb the cycle. If no ring
+/// is available, a plain socket is used, with a warning. Blocks and allocates.
 ///
 /// # Errors
+/// The reason why the interface cannot be used.
 /// Why the interface cannot be used.
-pub fn open(nic: &str, back_end: BackEnd) -> Result<(Box<dyn Link>, Vec<Concern>), OpenError> {
+pub fn open(
+    nic: &str,
+    back_end: SocketKind,
+) -> Result<(Box<dyn Link>, Vec<NicWarning>), OpenError> {
     let mut concerns = interface::concerns(nic);
     let link: Box<dyn Link> = match back_end {
-        BackEnd::Ring => match ring::RingLink::open(nic) {
+        SocketKind::Ring => match ring::RingLink::open(nic) {
             Ok(link) => Box::new(link),
             Err(OpenError::NoRing { nic, source }) => {
                 let link = packet::PacketLink::open(&nic)?;
                 let reason = source.to_string();
-                concerns.push(Concern::NoRing { nic, reason });
+                concerns.push(NicWarning::NoRing { nic, reason });
                 Box::new(link)
             }
             Err(error) => return Err(error),
         },
-        BackEnd::Packet => Box::new(packet::PacketLink::open(nic)?),
+        SocketKind::Packet => Box::new(packet::PacketLink::open(nic)?),
     };
     Ok((link, concerns))
 }
 
-/// How long is listened before anything is sent; the slowest cycles are of a few tens of milliseconds.
+/// The listening time before anything is sent. The slowest cycles take some tens of milliseconds.
 pub const LISTEN: Duration = Duration::from_millis(100);
 
-/// EtherCAT frames that come in within [`LISTEN`], in which nothing is sent: another MainDevice's. Blocks, on the monotonic clock.
+/// Returns the EtherCAT frames received within [`LISTEN`] without sending: frames of another
+/// MainDevice. Blocks, on the monotonic clock.
 ///
 /// # Errors
-/// Of the link.
-pub fn heard(link: &mut dyn Link) -> Result<u64, LinkError> {
+/// Errors of the link.
+pub fn sniff_foreign_frames(link: &mut dyn Link) -> Result<u64, LinkError> {
     let mut buf = [0; MAX_FRAME];
     let mut frames = 0;
     let end = Instant::now() + LISTEN;
     while Instant::now() < end {
         while link.recv(&mut buf)?.is_some() {
-            // Who only looks beside a machine leads nothing.
-            frames += u64::from(!apart::is_beside(&buf));
+            // A program that only accesses a running segment is not a MainDevice.
+            frames += u64::from(!source_address::is_acyclic_client_frame(&buf));
         }
         std::thread::sleep(Duration::from_millis(1));
     }

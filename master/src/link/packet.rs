@@ -1,14 +1,14 @@
-//! An interface through a plain AF_PACKET socket: a system call for every frame and every look.
+//! An interface through a plain AF_PACKET socket: one system call per frame and per poll.
 
+use super::filter::{LinkStats, ReceivedFrame, classify_frame};
 use super::interface::{self, OpenError};
-use super::sift::{LinkStats, Seen, sift};
 use super::{Link, LinkError, MAX_FRAME};
-use crate::os::packet::PacketSocket;
+use crate::sys::packet::PacketSocket;
 
-/// Foreign frames passed over at once; the rest waits for the next look.
+/// The maximum of foreign frames skipped per call; the rest waits for the next call.
 const PASSED_OVER: usize = 32;
 
-/// One interface, taken for EtherCAT frames only.
+/// One interface, receiving EtherCAT frames only.
 #[derive(Debug)]
 pub struct PacketLink {
     socket: PacketSocket,
@@ -19,11 +19,11 @@ impl PacketLink {
     /// Opens the interface. Blocks and allocates.
     ///
     /// # Errors
-    /// Why it cannot be used.
+    /// The reason why the interface cannot be used.
     pub fn open(nic: &str) -> Result<Self, OpenError> {
         let index = interface::check(nic)?;
         let socket = interface::socket(nic)?;
-        // Without it a VLAN tag does not show; no kernel of today is without it.
+        // VLAN tags are visible only with this option, which all current kernels support.
         let _ = socket.set(libc::PACKET_AUXDATA, 1);
         interface::bind(nic, &socket, index)?;
         Ok(Self {
@@ -47,13 +47,13 @@ impl Link for PacketLink {
             let Some(received) = received.map_err(LinkError::Receive)? else {
                 return Ok(None);
             };
-            let seen = Seen {
+            let seen = ReceivedFrame {
                 frame: &buf[..received.len],
                 wire_len: received.wire_len,
                 status: received.status,
                 packet_type: received.packet_type,
             };
-            match sift(&seen) {
+            match classify_frame(&seen) {
                 Ok(()) => return Ok(Some(received.len)),
                 Err(refused) => self.stats.count(refused),
             }

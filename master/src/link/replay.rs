@@ -1,7 +1,8 @@
-//! A recording in the place of a bus: answers what was asked before as it was answered then, and tells where a run deviates from it.
+//! A recording in place of a bus. It answers each request as it was answered in the recording, and
+//! reports where a run diverges from it.
 //!
-//! For tests and for looking at a run again, in virtual time; it allocates. A run that does as the recorded one did meets
-//! the same bytes after the same times, so its outcome is the same.
+//! For tests and for repeating a run in virtual time; it allocates. A run that repeats the recorded
+//! one gets the same bytes after the same times, so its outcome is the same.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -12,21 +13,22 @@ use crate::clock;
 use crate::recording::frame::{Content, Frame, content};
 use crate::recording::{Direction, Reader};
 
-/// Recorded frames that are searched for one that was sent: so many may have been left out.
+/// The number of recorded frames that are searched for a sent one; the frames before it were
+/// skipped.
 const AHEAD: usize = 256;
-/// Deviations that are kept; beyond, they are counted.
+/// Divergences kept in full; further ones are only counted.
 const DEVIATIONS: usize = 16;
-/// Bytes of a recording that is held in memory.
+/// The maximum bytes of a recording held in memory.
 const LIMIT: usize = 1 << 30;
 
 /// Bytes from a datagram's index to its data.
 const INDEX: usize = 9;
 
-/// How a run differs from the recorded one.
+/// A difference between the run and the recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Deviation {
-    /// Other data in a frame that was sent then as well; it is answered as that one was.
+pub enum Divergence {
+    /// A recorded frame was sent with other data; it is answered as recorded.
     Data {
         frame: u64,
         datagram: usize,
@@ -34,19 +36,20 @@ pub enum Deviation {
         sent: u8,
         recorded: u8,
     },
-    /// Frames that were sent then, and not now: how many, and the first.
+    /// Recorded frames that were not sent now: the first, and how many.
     LeftOut { frame: u64, count: usize },
-    /// A frame that was not sent then: it gets no answer. `expected` is the number of the frame that was sent then instead.
+    /// A frame that is not in the recording: it gets no answer. `expected` is the number of the
+    /// recorded frame in its place.
     Other {
         sent: String,
         recorded: String,
         expected: u64,
     },
-    /// Everything recorded has been sent; what follows gets no answer.
+    /// All recorded frames have been sent; further frames get no answer.
     Beyond { sent: String },
 }
 
-impl fmt::Display for Deviation {
+impl fmt::Display for Divergence {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Data {
@@ -84,35 +87,35 @@ impl fmt::Display for Deviation {
     }
 }
 
-/// What was sent, and what came back for it.
+/// A sent frame and its answers.
 #[derive(Debug)]
-struct Sent {
+struct RecordedExchange {
     frame: Frame,
-    /// Nanoseconds after it was sent.
+    /// Each answer with its delay after sending, in ns.
     answers: Vec<(Nanos, Vec<u8>)>,
 }
 
 /// Answers from a recording.
 #[derive(Debug)]
 pub struct Replay {
-    /// What has not been sent, in order.
-    left: VecDeque<Sent>,
-    /// When which frame arrives, the next one first.
+    /// Recorded frames not sent yet, in order.
+    left: VecDeque<RecordedExchange>,
+    /// Arrival times and answers, the next one first.
     under_way: VecDeque<(Nanos, Vec<u8>)>,
-    deviations: Vec<Deviation>,
+    deviations: Vec<Divergence>,
     more: u64,
     too_long: bool,
-    /// Something was sent after the last frame.
+    /// A frame was sent after the last recorded one.
     beyond: bool,
 }
 
 impl Replay {
-    /// Reads a recording that shows both directions.
+    /// Reads a recording that contains both directions.
     ///
     /// # Errors
-    /// Where it shows no answers, or is longer than memory should hold.
+    /// Fails if the recording contains no answers or is too long for memory.
     pub fn new<R: Read>(mut reader: Reader<R>) -> io::Result<Self> {
-        let mut sent: Vec<Sent> = Vec::new();
+        let mut sent: Vec<RecordedExchange> = Vec::new();
         let (mut bytes, mut answered) = (0, false);
         while let Some(packet) = reader.next() {
             let Content::Frame(frame) = content(packet) else {
@@ -127,18 +130,19 @@ impl Replay {
                 None => frame.source[0] & 0x02 != 0,
             };
             if !is_answer {
-                sent.push(Sent {
+                sent.push(RecordedExchange {
                     frame,
                     answers: Vec::new(),
                 });
                 continue;
             }
-            // The request it belongs to, or else whatever was sent before it.
+            // The request of this answer, or else the last frame sent before it.
             let index =
                 |frame: &Frame| -> Vec<u8> { frame.datagrams.iter().map(|d| d.index).collect() };
             let indices = index(&frame);
-            let fits =
-                |sent: &&mut Sent| index(&sent.frame) == indices && same_shape(&sent.frame, &frame);
+            let fits = |sent: &&mut RecordedExchange| {
+                index(&sent.frame) == indices && same_shape(&sent.frame, &frame)
+            };
             let mut recent = sent.iter_mut().rev().take(AHEAD);
             let own = recent.find(fits);
             let own = match own {
@@ -165,7 +169,7 @@ impl Replay {
         })
     }
 
-    fn tell(&mut self, deviation: Deviation) {
+    fn report_divergence(&mut self, deviation: Divergence) {
         if self.deviations.len() < DEVIATIONS {
             self.deviations.push(deviation);
         } else {
@@ -173,14 +177,14 @@ impl Replay {
         }
     }
 
-    /// How this run deviated so far; the first ones.
+    /// Returns the first divergences of this run.
     #[must_use]
-    pub fn deviations(&self) -> &[Deviation] {
+    pub fn deviations(&self) -> &[Divergence] {
         &self.deviations
     }
 
-    /// Answers to `sent`, with the indices of the frame that was sent now.
-    fn answer(&mut self, sent: Sent, now_sent: &Frame) {
+    /// Queues the answers to `sent`, with the indices of the frame that was sent now.
+    fn answer(&mut self, sent: RecordedExchange, now_sent: &Frame) {
         let now = clock::now();
         for (after, mut bytes) in sent.answers {
             for (old, new) in sent.frame.datagrams.iter().zip(&now_sent.datagrams) {
@@ -197,17 +201,17 @@ impl Replay {
         }
     }
 
-    fn take(&mut self, n: usize) -> Option<Sent> {
+    fn take(&mut self, n: usize) -> Option<RecordedExchange> {
         if n > 0 {
             let frame = self.left.front().map_or(0, |sent| sent.frame.number);
-            self.tell(Deviation::LeftOut { frame, count: n });
+            self.report_divergence(Divergence::LeftOut { frame, count: n });
             self.left.drain(..n);
         }
         self.left.pop_front()
     }
 }
 
-/// The same commands to the same addresses, of the same lengths.
+/// True if both frames have the same commands, addresses and lengths.
 fn same_shape(a: &Frame, b: &Frame) -> bool {
     let key = |frame: &Frame| {
         let of = |d: &crate::recording::frame::Datagram| {
@@ -223,7 +227,7 @@ fn same_shape(a: &Frame, b: &Frame) -> bool {
     a.source.get(1..) == b.source.get(1..) && key(a) == key(b)
 }
 
-/// Its datagrams in short.
+/// Returns the datagrams of a frame in short form.
 fn short(frame: &Frame) -> String {
     let one = |d: &crate::recording::frame::Datagram| {
         if d.command.is_logical() {
@@ -265,30 +269,30 @@ impl Link for Replay {
         let Some(frame) = parsed(bytes) else {
             return Ok(());
         };
-        // Recordings may pad.
-        let equal = |sent: &Sent| sent.frame.bytes.starts_with(bytes);
-        let alike = |sent: &Sent| same_shape(&sent.frame, &frame);
+        // Recordings may contain padding.
+        let equal = |sent: &RecordedExchange| sent.frame.bytes.starts_with(bytes);
+        let alike = |sent: &RecordedExchange| same_shape(&sent.frame, &frame);
         let equal = self.left.iter().take(AHEAD).position(equal);
         let near = equal.or_else(|| self.left.iter().take(AHEAD).position(alike));
         if let Some(sent) = near.and_then(|n| self.take(n)) {
             if let Some(deviation) = difference(&sent.frame, &frame) {
-                self.tell(deviation);
+                self.report_divergence(deviation);
             }
             self.answer(sent, &frame);
         } else {
             let sent = short(&frame);
             let deviation = match self.left.front() {
-                Some(next) => Deviation::Other {
+                Some(next) => Divergence::Other {
                     sent,
                     recorded: short(&next.frame),
                     expected: next.frame.number,
                 },
                 None => {
                     self.beyond = true;
-                    Deviation::Beyond { sent }
+                    Divergence::Beyond { sent }
                 }
             };
-            self.tell(deviation);
+            self.report_divergence(deviation);
         }
         Ok(())
     }
@@ -312,12 +316,12 @@ impl Link for Replay {
         self.under_way.front().map(|(at, _)| *at)
     }
 
-    fn lacks(&self) -> Option<&'static str> {
+    fn exhausted_reason(&self) -> Option<&'static str> {
         self.beyond.then_some("the recording ends")
     }
 
-    /// The first deviation says most: what follows mostly follows from it.
-    fn remarks(&mut self) -> Vec<String> {
+    /// Reports the first divergence in full, because most of the others follow from it.
+    fn notices(&mut self) -> Vec<String> {
         let mut remarks: Vec<String> = Vec::new();
         if let Some(first) = self.deviations.first() {
             remarks.push(format!("the run deviates from the recording: {first}"));
@@ -344,12 +348,13 @@ impl Link for Replay {
     }
 }
 
-/// Where the data of two frames of one shape first differ. Indices may: they are the MainDevice's own affair.
-fn difference(recorded: &Frame, sent: &Frame) -> Option<Deviation> {
+/// Returns the first difference in the data of two frames of the same shape. Indices may differ:
+/// they are chosen by the MainDevice.
+fn difference(recorded: &Frame, sent: &Frame) -> Option<Divergence> {
     for (n, (old, new)) in recorded.datagrams.iter().zip(&sent.datagrams).enumerate() {
         let both = recorded.data(old).iter().zip(sent.data(new));
         if let Some((offset, (old, new))) = both.enumerate().find(|(_, (old, new))| old != new) {
-            return Some(Deviation::Data {
+            return Some(Divergence::Data {
                 frame: recorded.number,
                 datagram: n + 1,
                 offset,

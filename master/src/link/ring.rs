@@ -1,29 +1,29 @@
-//! An interface through an AF_PACKET socket whose received frames are put into mapped memory: looking whether one is there
-//! costs a read of that memory instead of a system call.
+//! An interface through an AF_PACKET socket whose received frames are stored in mapped memory.
+//! Polling for a frame costs a memory read instead of a system call.
 //!
-//! The ring is of version 2 (TPACKET_V2). Version 3 hands over whole blocks of frames, when they are full or a
-//! timer of a millisecond at least has run out; version 2 hands over each frame as soon as it is there. Frames are sent
-//! one by one: a ring for sending would take a system call each, too.
+//! The ring has version 2 (TPACKET_V2), which releases each frame at once. Version 3 releases whole
+//! blocks of frames, when they are full or after a timer of at least one millisecond. Frames are
+//! sent one by one: a transmit ring would need a system call each as well.
 
+use super::filter::{LinkStats, classify_frame};
 use super::interface::{self, OpenError};
-use super::sift::{LinkStats, sift};
 use super::{Link, LinkError, MAX_FRAME};
-use crate::os::packet::PacketSocket;
-use crate::os::ring::Ring;
+use crate::sys::packet::PacketSocket;
+use crate::sys::ring::Ring;
 
-/// A slot holds header, address and a whole frame: 66 bytes before it, 1514 of it.
+/// A slot holds header, address and a whole frame: 66 bytes in front, then 1514 bytes.
 const SLOT: usize = 2048;
 
-/// Frames between two looks; 8 kHz may be left alone for 16 ms with two frames a cycle.
+/// Capacity between two polls: 16 ms at 8 kHz with two frames per cycle.
 const SLOTS: usize = 256;
 
-/// Foreign frames passed over at once; the rest waits for the next look.
+/// The maximum of foreign frames skipped per call; the rest waits for the next call.
 const PASSED_OVER: usize = 32;
 
-/// One interface, taken for EtherCAT frames only.
+/// One interface, receiving EtherCAT frames only.
 #[derive(Debug)]
 pub struct RingLink {
-    // Before the socket that it belongs to.
+    // Declared before the socket, so that it is dropped first.
     ring: Ring,
     socket: PacketSocket,
     stats: LinkStats,
@@ -33,7 +33,7 @@ impl RingLink {
     /// Opens the interface. Blocks and allocates.
     ///
     /// # Errors
-    /// [`OpenError::NoRing`] where the kernel gives no ring; plain sockets may still do.
+    /// [`OpenError::NoRing`] if the kernel provides no ring; plain sockets may still work.
     pub fn open(nic: &str) -> Result<Self, OpenError> {
         let index = interface::check(nic)?;
         let socket = interface::socket(nic)?;
@@ -66,9 +66,9 @@ impl Link for RingLink {
                 return Ok(None);
             };
             let seen = header::parse(slot);
-            let judged = seen.and_then(|seen| sift(&seen).map(|()| seen.frame));
+            let judged = seen.and_then(|seen| classify_frame(&seen).map(|()| seen.frame));
             let taken = judged.map(|frame| {
-                // `sift` lets nothing longer pass.
+                // `classify_frame` rejects longer frames.
                 let len = frame.len().min(buf.len());
                 buf[..len].copy_from_slice(&frame[..len]);
                 len
@@ -92,13 +92,14 @@ impl Link for RingLink {
     }
 }
 
-/// A slot's head: `tpacket2_hdr` and behind it, aligned to 16 bytes, `sockaddr_ll` (linux/if_packet.h).
+/// The header of a slot: `tpacket2_hdr`, then `sockaddr_ll`, aligned to 16 bytes
+/// (linux/if_packet.h).
 mod header {
     use std::mem::offset_of;
 
     use libc::{sockaddr_ll, tpacket2_hdr};
 
-    use super::super::sift::{Refused, Seen};
+    use super::super::filter::{ReceivedFrame, RejectReason};
 
     const ADDRESS: usize = size_of::<tpacket2_hdr>().next_multiple_of(16);
     pub(super) const STATUS: usize = offset_of!(tpacket2_hdr, tp_status);
@@ -109,11 +110,11 @@ mod header {
     #[cfg(test)]
     pub(super) const HEAD: usize = ADDRESS + size_of::<sockaddr_ll>();
 
-    /// The frame in a slot. RT.
+    /// Returns the frame in a slot. RT.
     ///
     /// # Errors
-    /// [`Refused::Damaged`] where the frame would not lie in the slot.
-    pub(super) fn parse(slot: &[u8]) -> Result<Seen<'_>, Refused> {
+    /// [`RejectReason::Damaged`] if the frame would extend beyond the slot.
+    pub(super) fn parse(slot: &[u8]) -> Result<ReceivedFrame<'_>, RejectReason> {
         let word = |at: usize| {
             let bytes = slot.get(at..)?.first_chunk()?;
             Some(u32::from_ne_bytes(*bytes))
@@ -122,14 +123,14 @@ mod header {
             let mac = u16::from_ne_bytes(*slot.get(MAC..)?.first_chunk()?);
             let start = usize::from(mac);
             let end = start.checked_add(usize::try_from(word(SNAPLEN)?).ok()?)?;
-            Some(Seen {
+            Some(ReceivedFrame {
                 frame: slot.get(start..end)?,
                 wire_len: usize::try_from(word(LEN)?).ok()?,
                 status: word(STATUS)?,
                 packet_type: *slot.get(PACKET_TYPE)?,
             })
         };
-        fields().ok_or(Refused::Damaged)
+        fields().ok_or(RejectReason::Damaged)
     }
 }
 
@@ -137,11 +138,11 @@ mod header {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::sift::Refused;
-    use super::super::sift::tests::answer;
+    use super::super::filter::RejectReason;
+    use super::super::filter::tests::answer;
     use super::*;
 
-    /// As the kernel fills a slot.
+    /// Returns a slot as the kernel fills it.
     fn slot(frame: &[u8], status: u32, packet_type: u8) -> Vec<u8> {
         let mac = header::HEAD.next_multiple_of(16) + 2;
         let mut slot = vec![0xa5; SLOT];
@@ -156,29 +157,29 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_is_found_where_the_header_says() {
+    fn parse_finds_the_frame_by_its_slot_header() {
         let frame = answer(100);
         let slot = slot(&frame, libc::TP_STATUS_USER, libc::PACKET_BROADCAST);
         let seen = header::parse(&slot).unwrap();
         assert_eq!(seen.frame, frame);
         assert_eq!(seen.wire_len, frame.len());
         assert_eq!(seen.packet_type, libc::PACKET_BROADCAST);
-        assert_eq!(sift(&seen), Ok(()));
+        assert_eq!(classify_frame(&seen), Ok(()));
     }
 
     #[test]
     fn a_frame_that_would_reach_beyond_its_slot_is_damaged() {
         let mut slot = slot(&answer(100), libc::TP_STATUS_USER, 1);
         slot[header::SNAPLEN..][..4].copy_from_slice(&u32::MAX.to_ne_bytes());
-        assert_eq!(header::parse(&slot).err(), Some(Refused::Damaged));
+        assert_eq!(header::parse(&slot).err(), Some(RejectReason::Damaged));
         slot[header::SNAPLEN..][..4].copy_from_slice(&100_u32.to_ne_bytes());
         slot[header::MAC..][..2].copy_from_slice(&u16::MAX.to_ne_bytes());
-        assert_eq!(header::parse(&slot).err(), Some(Refused::Damaged));
+        assert_eq!(header::parse(&slot).err(), Some(RejectReason::Damaged));
     }
 
     proptest! {
         #[test]
-        fn what_is_put_in_comes_out(len in 0_u16..1499, status: u32, packet_type: u8) {
+        fn parse_returns_the_frame_in_the_slot(len in 0_u16..1499, status: u32, packet_type: u8) {
             let frame = answer(len);
             let slot = slot(&frame, status, packet_type);
             let seen = header::parse(&slot).unwrap();
@@ -187,15 +188,15 @@ mod tests {
         }
 
         #[test]
-        fn no_slot_is_too_strange(slot in prop::collection::vec(any::<u8>(), 0..300), head: [u8; 16]) {
+        fn parse_never_panics(slot in prop::collection::vec(any::<u8>(), 0..300), head: [u8; 16]) {
             let mut slot = slot;
-            // Small numbers in the header, so that frames do lie in the slot at times.
+            // Small numbers in the header, so that some frames do lie within the slot.
             for (byte, from) in slot.iter_mut().zip(head) {
                 *byte = from & if from % 3 == 0 { 0xff } else { 0x01 };
             }
             if let Ok(seen) = header::parse(&slot) {
                 prop_assert!(seen.frame.len() <= slot.len());
-                let _ = sift(&seen);
+                let _ = classify_frame(&seen);
             }
         }
     }

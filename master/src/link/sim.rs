@@ -1,39 +1,39 @@
 //! The simulated segment as a link, in the same thread and on the same clock.
 
-use ecaxis_sim::{Segment, Transit};
+use ecaxis_sim::{FrameOutcome, Segment};
 
-use super::sift::{LinkStats, Seen, sift};
+use super::filter::{LinkStats, ReceivedFrame, classify_frame};
 use super::{Link, LinkError, MAX_FRAME, Nanos};
 use crate::clock;
 
-/// Frames that may be under way at once.
+/// The maximum of frames in flight.
 const IN_FLIGHT: usize = 64;
 
 #[derive(Debug, Clone)]
-struct Slot {
+struct PendingFrame {
     len: usize,
     frame: [u8; MAX_FRAME],
 }
 
-/// Carries frames through a [`Segment`] and hands them back when they would have arrived: late, in
-/// another order or twice where the fault script says so.
+/// Carries frames through a [`Segment`] and returns them at their arrival time. The fault script
+/// may make them late, reordered or duplicated.
 #[derive(Debug)]
 pub struct SimLink {
     segment: Segment,
     /// The clock's time at the segment's time zero.
     start: Nanos,
-    slots: Vec<Slot>,
+    slots: Vec<PendingFrame>,
     free: Vec<usize>,
-    /// Arrival and slot of frames on their way back, the next one last.
+    /// Arrival time and slot of returning frames, the next one last.
     under_way: Vec<(Nanos, usize)>,
     stats: LinkStats,
 }
 
 impl SimLink {
-    /// The segment's time starts now.
+    /// Creates the link. The segment's time starts now.
     #[must_use]
     pub fn new(segment: Segment) -> Self {
-        let empty = Slot {
+        let empty = PendingFrame {
             len: 0,
             frame: [0; MAX_FRAME],
         };
@@ -52,12 +52,13 @@ impl SimLink {
         &self.segment
     }
 
-    /// To take a device's power, or pull a cable, between frames.
+    /// Returns the segment, for example to switch a device off or unplug a cable between frames.
     pub fn segment_mut(&mut self) -> &mut Segment {
         &mut self.segment
     }
 
-    /// Every slot is free or under way, so that neither list ever grows beyond its capacity.
+    /// Adds a returning frame. Every slot is either free or in flight, so neither list exceeds its
+    /// capacity.
     fn arrives(&mut self, at: Nanos, slot: usize) {
         let at = at.saturating_add(self.start);
         let place = self.under_way.partition_point(|(other, _)| *other > at);
@@ -78,10 +79,10 @@ impl Link for SimLink {
         slot.len = frame.len();
         slot.frame[..frame.len()].copy_from_slice(frame);
         match self.segment.transit(&mut slot.frame[..frame.len()], now) {
-            Transit::Lost => self.free.push(n),
-            Transit::Back { at, again, .. } => {
+            FrameOutcome::Lost => self.free.push(n),
+            FrameOutcome::Back { at, again, .. } => {
                 self.arrives(at, n);
-                // A copy that finds no place is lost.
+                // A copy without a free slot is lost.
                 if let Some(at) = again
                     && let Some(copy) = self.free.pop()
                 {
@@ -91,14 +92,14 @@ impl Link for SimLink {
             }
         }
         if let Some((_, frame)) = self.segment.take_overheard() {
-            // It is sifted out when it arrives, and nobody else looks at it.
-            let seen = Seen {
+            // Rejected frames are counted here and never delivered.
+            let seen = ReceivedFrame {
                 frame: &frame,
                 wire_len: frame.len(),
                 status: 0,
                 packet_type: libc::PACKET_BROADCAST,
             };
-            if let Err(refused) = sift(&seen) {
+            if let Err(refused) = classify_frame(&seen) {
                 self.stats.count(refused);
             }
         }
@@ -139,7 +140,7 @@ mod tests {
     use super::*;
     use crate::clock::Clock;
 
-    /// Sends so many frames, 10 µs apart, and tells in which order they come back.
+    /// Sends `frames` frames, 10 µs apart, and returns the order in which they come back.
     fn order(script: &str, frames: u8) -> Vec<u8> {
         let script = FaultScript::parse(script).expect("script");
         std::thread::spawn(move || {
@@ -182,17 +183,17 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_comes_back_twice() {
+    fn duplicated_frame_comes_back_twice() {
         let twice = "[[fault]]\nkind = \"frame-duplicate\"\ncount = 1\n";
         assert_eq!(order(twice, 3), [0, 0, 1, 2]);
     }
 
     #[test]
-    fn every_place_can_be_taken_by_frames_and_copies() {
+    fn all_slots_hold_frames_and_copies() {
         let script = "[[fault]]\nkind = \"frame-delay\"\nprobability = 1.0\ndelay = \"1s\"\n\
                       [[fault]]\nkind = \"frame-duplicate\"\nprobability = 1.0\n";
         let seen = order(script, 32);
-        // 32 frames and their copies fill 64 places.
+        // 32 frames and their copies fill 64 slots.
         assert_eq!(seen.len(), IN_FLIGHT);
         assert_eq!(seen[..4], [0, 0, 1, 1]);
     }

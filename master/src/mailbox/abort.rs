@@ -1,6 +1,7 @@
-//! What the codes of refusals mean: SDO abort codes (CiA 301, ETG.1000.6, ETG.1020, maxon) and mailbox error codes (ETG.1000.4).
+//! Texts of error codes: SDO abort codes (CiA 301, ETG.1000.6, ETG.1020, maxon) and mailbox error
+//! codes (ETG.1000.4).
 
-/// The text of an SDO abort code; codes from 0x0F00_0000 on are maxon's.
+/// Returns the text of an SDO abort code; codes from 0x0F00_0000 on are maxon's.
 pub fn abort_text(code: u32) -> &'static str {
     match code {
         0x0000_0000 => "no abort",
@@ -52,7 +53,7 @@ pub fn abort_text(code: u32) -> &'static str {
     }
 }
 
-/// The text of a mailbox error reply's code.
+/// Returns the text of the code in a mailbox error reply.
 pub fn mailbox_error_text(code: u16) -> &'static str {
     match code {
         0x0001 => "the mailbox header is wrong",

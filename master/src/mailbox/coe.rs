@@ -1,18 +1,19 @@
-//! The bytes of mailbox, CoE and SDO messages. Parsing borrows and never fails on what it does not know: unknown
-//! services survive as [`Message::Other`]. Only a message that contradicts itself is a [`Flaw`].
+//! The bytes of mailbox, CoE and SDO messages. Parsing borrows, and accepts unknown services as
+//! [`Message::Other`]. Only an inconsistent message is a [`DecodeError`].
 
 use super::emergency::Emergency;
-use super::port::Emit;
+use super::transport::Encode;
 
 /// Mailbox header (ETG.1000.4 Table 29): length, address, channel and priority, type and counter.
 pub(super) const MAILBOX_HEADER: usize = 6;
 /// CoE header plus SDO header: service, command, index, subindex.
 const COE_SDO_HEADER: usize = 6;
-/// What a segment carries before its data: CoE header and command.
+/// The header of a segment: CoE header and command.
 const SEGMENT_HEADER: usize = 3;
-/// A segment is padded to this many data bytes, as on CAN; then, and only then, the command tells how many are unused.
+/// A segment is padded to this many data bytes, as on CAN. Only then the command contains the
+/// number of unused bytes.
 const SEGMENT_MIN: usize = 7;
-/// Shortest mailbox that holds an expedited transfer and a segment.
+/// The shortest mailbox that holds an expedited transfer and a segment.
 pub(super) const MAILBOX_MIN: u16 = 16;
 
 pub(super) const TYPE_ERROR: u8 = 0;
@@ -26,17 +27,17 @@ const SERVICE_SDO_INFORMATION: u16 = 8;
 const COMPLETE_ACCESS: u8 = 0x10;
 const TOGGLE: u8 = 0x10;
 
-/// Data bytes that fit into a download request that tells the size.
+/// Returns the data bytes that fit into a download request with a size field.
 pub(super) fn download_room(mailbox: u16) -> usize {
     usize::from(mailbox).saturating_sub(MAILBOX_HEADER + COE_SDO_HEADER + 4)
 }
 
-/// Data bytes that fit into a download segment.
+/// Returns the data bytes that fit into a download segment.
 pub(super) fn segment_room(mailbox: u16) -> usize {
     usize::from(mailbox).saturating_sub(MAILBOX_HEADER + SEGMENT_HEADER)
 }
 
-/// What this client sends.
+/// A message from this client.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Request<'a> {
     Upload {
@@ -53,7 +54,7 @@ pub(super) enum Request<'a> {
         sub: u8,
         data: &'a [u8],
     },
-    /// `size` is the whole object's, `data` its beginning.
+    /// `size` is the size of the whole object, `data` its beginning.
     Download {
         index: u16,
         sub: u8,
@@ -78,7 +79,7 @@ pub(super) enum Request<'a> {
     },
 }
 
-impl Emit for Request<'_> {
+impl Encode for Request<'_> {
     fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>) {
         out.clear();
         out.extend_from_slice(&[0, 0, 0, 0, 0, TYPE_COE | counter << 4]);
@@ -152,20 +153,20 @@ impl Emit for Request<'_> {
     }
 }
 
-/// How many of `room` bytes `used` leaves; 0 where it fills or exceeds them.
+/// Returns how many of `room` bytes are unused; 0 if `used` reaches or exceeds `room`.
 fn unused(room: usize, used: usize) -> u8 {
     u8::try_from(room.saturating_sub(used)).unwrap_or(0)
 }
 
-/// What a SubDevice says.
+/// A message from a SubDevice.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Message<'a> {
     Emergency(Emergency),
     Sdo(Answer<'a>),
     Information(Fragment<'a>),
-    /// The SubDevice's mailbox refused a message, with this code.
+    /// The SubDevice's mailbox rejected a message, with this code.
     Refused(u16),
-    /// Anything else: another protocol, another CoE service.
+    /// Any other message: another protocol or another CoE service.
     Other,
 }
 
@@ -176,7 +177,7 @@ pub(super) enum Answer<'a> {
         sub: u8,
         code: u32,
     },
-    /// `size` is the whole object's; segments follow where it exceeds `data`.
+    /// `size` is the size of the whole object; segments follow if it exceeds `data`.
     Upload {
         index: u16,
         sub: u8,
@@ -201,14 +202,14 @@ pub(super) enum Answer<'a> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Fragment<'a> {
     pub(super) opcode: u8,
-    /// How many follow.
+    /// The number of fragments that follow.
     pub(super) left: u16,
     pub(super) data: &'a [u8],
 }
 
-/// How a message contradicts itself.
+/// How a message is inconsistent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Flaw {
+pub(super) enum DecodeError {
     #[error("its length field says {length}, the mailbox holds {room}")]
     Oversized { length: usize, room: usize },
     #[error("{what} of {length} bytes is too short")]
@@ -219,17 +220,17 @@ pub(super) enum Flaw {
     Command(u8),
 }
 
-/// Type and contents of one whole mailbox.
-pub(super) fn open(mailbox: &[u8]) -> Result<(u8, &[u8]), Flaw> {
+/// Returns type and contents of one whole mailbox.
+pub(super) fn open(mailbox: &[u8]) -> Result<(u8, &[u8]), DecodeError> {
     let [len_low, len_high, _, _, _, kind, body @ ..] = mailbox else {
-        return Err(Flaw::Short {
+        return Err(DecodeError::Short {
             what: "a mailbox",
             length: mailbox.len(),
         });
     };
     let length = usize::from(u16::from_le_bytes([*len_low, *len_high]));
     let Some(body) = body.get(..length) else {
-        return Err(Flaw::Oversized {
+        return Err(DecodeError::Oversized {
             length,
             room: body.len(),
         });
@@ -237,8 +238,8 @@ pub(super) fn open(mailbox: &[u8]) -> Result<(u8, &[u8]), Flaw> {
     Ok((kind & 0x0f, body))
 }
 
-/// Reads one whole mailbox.
-pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
+/// Parses one whole mailbox.
+pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, DecodeError> {
     match open(mailbox)? {
         (TYPE_COE, body) => parse_coe(body),
         (TYPE_ERROR, body) => refused(body).map(Message::Refused),
@@ -246,33 +247,35 @@ pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
     }
 }
 
-/// The code of a mailbox error (ETG.1000.4 Table 30).
-pub(super) fn refused(body: &[u8]) -> Result<u16, Flaw> {
+/// Returns the code of a mailbox error (ETG.1000.4 Table 30).
+pub(super) fn refused(body: &[u8]) -> Result<u16, DecodeError> {
     match body {
         [_, _, low, high, ..] => Ok(u16::from_le_bytes([*low, *high])),
-        _ => Err(Flaw::Short {
+        _ => Err(DecodeError::Short {
             what: "a mailbox error",
             length: body.len(),
         }),
     }
 }
 
-fn parse_coe(body: &[u8]) -> Result<Message<'_>, Flaw> {
+fn parse_coe(body: &[u8]) -> Result<Message<'_>, DecodeError> {
     let [low, high, content @ ..] = body else {
-        return Err(Flaw::Short {
+        return Err(DecodeError::Short {
             what: "a CoE message",
             length: body.len(),
         });
     };
     match u16::from_le_bytes([*low, *high]) >> 12 {
-        SERVICE_EMERGENCY => Emergency::parse(content)
-            .map(Message::Emergency)
-            .ok_or(Flaw::Short {
-                what: "an emergency",
-                length: body.len(),
-            }),
+        SERVICE_EMERGENCY => {
+            Emergency::parse(content)
+                .map(Message::Emergency)
+                .ok_or(DecodeError::Short {
+                    what: "an emergency",
+                    length: body.len(),
+                })
+        }
         SERVICE_SDO_RESPONSE => parse_sdo(content).map(Message::Sdo),
-        // Devices send an abort under either service.
+        // Devices send an abort with either service.
         SERVICE_SDO_REQUEST if content.first() == Some(&0x80) => {
             parse_sdo(content).map(Message::Sdo)
         }
@@ -283,7 +286,7 @@ fn parse_coe(body: &[u8]) -> Result<Message<'_>, Flaw> {
                 left: u16::from_le_bytes([*low, *high]),
                 data,
             })),
-            _ => Err(Flaw::Short {
+            _ => Err(DecodeError::Short {
                 what: "an SDO Information answer",
                 length: content.len(),
             }),
@@ -292,8 +295,8 @@ fn parse_coe(body: &[u8]) -> Result<Message<'_>, Flaw> {
     }
 }
 
-fn parse_sdo(content: &[u8]) -> Result<Answer<'_>, Flaw> {
-    let short = Flaw::Short {
+fn parse_sdo(content: &[u8]) -> Result<Answer<'_>, DecodeError> {
+    let short = DecodeError::Short {
         what: "an SDO answer",
         length: content.len(),
     };
@@ -339,7 +342,7 @@ fn parse_sdo(content: &[u8]) -> Result<Answer<'_>, Flaw> {
                 });
             }
             let size = usize::try_from(number).unwrap_or(usize::MAX);
-            // Some devices pad what is shorter than a CAN frame.
+            // Some devices pad data shorter than a CAN frame.
             let data = data.get(..size).unwrap_or(data);
             Ok(Answer::Upload {
                 index,
@@ -348,7 +351,7 @@ fn parse_sdo(content: &[u8]) -> Result<Answer<'_>, Flaw> {
                 data,
             })
         }
-        _ => Err(Flaw::Command(command)),
+        _ => Err(DecodeError::Command(command)),
     }
 }
 

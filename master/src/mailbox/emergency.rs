@@ -1,4 +1,4 @@
-//! Emergencies: what a device says unasked, kept until somebody takes them.
+//! CoE emergencies: messages that a device sends without a request, queued until they are taken.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -6,17 +6,18 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecaxis_axis::cia402::describe;
 
-/// How many emergencies wait to be taken. Beyond it the newest are dropped and counted: the first tell the cause.
+/// The capacity of the queue. Beyond it the newest are dropped and counted, because the first ones
+/// show the cause.
 pub const EMERGENCY_QUEUE: usize = 32;
 
 /// One CoE emergency (ETG.1000.6 Table 50).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Emergency {
-    /// As in 0x603F; 0x0000 says that an earlier error is gone.
+    /// The code as in 0x603F; 0x0000 means that an earlier error is gone.
     pub code: u16,
     /// Error register 0x1001.
     pub register: u8,
-    /// The manufacturer's own.
+    /// Vendor-specific data.
     pub data: [u8; 5],
 }
 
@@ -30,7 +31,7 @@ impl Emergency {
         })
     }
 
-    /// What the code means, as far as CiA 301, CiA 402 and maxon list it.
+    /// Returns the meaning of the code according to CiA 301, CiA 402 and maxon.
     pub fn text(&self) -> &'static str {
         match self.code {
             0xa000 | 0xa001 => self.class(),
@@ -39,12 +40,13 @@ impl Emergency {
         }
     }
 
-    /// An earlier error is gone.
+    /// True if the emergency reports that an earlier error is gone.
     pub fn is_reset(&self) -> bool {
         self.code == 0
     }
 
-    /// What CiA 301 says of the code's class. What it says exactly is in the drive's fault table.
+    /// Returns the meaning of the code's class according to CiA 301. The drive's fault table has
+    /// the exact text.
     pub fn class(&self) -> &'static str {
         match self.code {
             0xa000 => "PreOp to SafeOp failed",
@@ -83,16 +85,16 @@ impl fmt::Display for Emergency {
     }
 }
 
-/// An emergency, and when it was read.
+/// An emergency with the time at which it was read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Received {
-    /// On the wire's clock, nanoseconds.
+    /// On the wire's clock, in ns.
     pub at: u64,
     pub emergency: Emergency,
 }
 
-/// What a device has said unasked and nobody has taken yet: bounded, the first are kept. Clones are the same queue, so that it can be
-/// emptied while a transfer goes on.
+/// The emergencies of a device that were not taken yet. The queue is bounded and keeps the first
+/// ones. Clones share one queue, so it can be emptied during a transfer.
 #[derive(Debug, Clone, Default)]
 pub struct Emergencies(Arc<Mutex<Queue>>);
 
@@ -116,12 +118,12 @@ impl Emergencies {
         }
     }
 
-    /// Those that wait, oldest first.
+    /// Takes the queued emergencies, oldest first.
     pub fn take(&self) -> Vec<Received> {
         self.queue().waiting.drain(..).collect()
     }
 
-    /// How many found the queue full.
+    /// Returns how many emergencies were dropped because the queue was full.
     pub fn lost(&self) -> u64 {
         self.queue().lost
     }

@@ -1,16 +1,17 @@
-//! Why a transfer failed, with the whole address.
+//! SDO errors, with the full address of the object.
 
 use std::fmt;
 use std::time::Duration;
 
 use super::abort::{abort_text, mailbox_error_text};
-use super::objects::ObjectAddress;
-use super::{MAX_OBJECT, WireError};
+use super::object_names::NamedObject;
+use super::{DatagramError, MAX_OBJECT};
 
-/// `station` is the SubDevice's configured address. The transfer is over in every case; the next one starts clean.
+/// An SDO error. `station` is the SubDevice's configured address. The transfer has ended in every
+/// case, and the next one starts clean.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SdoError {
-    /// The SubDevice refused, with a CiA 301 or manufacturer's code.
+    /// The SubDevice aborted, with a CiA 301 or vendor-specific code.
     #[error("station {station:#06x}: {} was refused with {code:#010x}: {}", object(index, sub), abort_text(*code))]
     Abort {
         station: u16,
@@ -18,8 +19,8 @@ pub enum SdoError {
         sub: u8,
         code: u32,
     },
-    /// `set_aside` messages that answer something else arrived meanwhile.
-    #[error("station {station:#06x}: {}: {phase} within {after:?}{}", object(index, sub), Aside(*set_aside))]
+    /// No answer in time. Meanwhile `set_aside` messages arrived that belong to something else.
+    #[error("station {station:#06x}: {}: {phase} within {after:?}{}", object(index, sub), StrayReplies(*set_aside))]
     Timeout {
         station: u16,
         index: u16,
@@ -28,7 +29,7 @@ pub enum SdoError {
         after: Duration,
         set_aside: u64,
     },
-    /// The SubDevice's mailbox refused the request itself.
+    /// The SubDevice's mailbox rejected the request itself.
     #[error("station {station:#06x}: {}: the mailbox refused the request with {code:#06x}: {}", object(index, sub), mailbox_error_text(*code))]
     Refused {
         station: u16,
@@ -56,38 +57,38 @@ pub enum SdoError {
         sub: u8,
         size: usize,
     },
-    /// Frames come back, but this SubDevice touched none of them.
+    /// Frames come back, but this SubDevice processed none of them.
     #[error(
         "station {station:#06x}: {asked}: the device does not answer: it is off, or has lost its address"
     )]
-    Gone { station: u16, asked: About },
+    Gone { station: u16, asked: Subject },
     #[error(
         "station {station:#06x}: {asked}: mailboxes of {out_len} bytes out and {in_len} bytes in cannot carry CoE"
     )]
     Mailbox {
         station: u16,
-        asked: About,
+        asked: Subject,
         out_len: u16,
         in_len: u16,
     },
-    /// Frames do not come back.
-    #[error("station {station:#06x}: {asked}: {}", Lost(source))]
+    /// No frames come back.
+    #[error("station {station:#06x}: {asked}: {}", LostDatagram(source))]
     Wire {
         station: u16,
-        asked: About,
-        source: WireError,
+        asked: Subject,
+        source: DatagramError,
     },
 }
 
-/// What a mailbox was used for when nothing could be had of it.
+/// The purpose of a mailbox access that failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum About {
-    Object(ObjectAddress),
-    /// What lay in it was fetched, whatever it was.
+pub enum Subject {
+    Object(NamedObject),
+    /// Reading and discarding the messages in the mailbox.
     Emptying,
 }
 
-impl fmt::Display for About {
+impl fmt::Display for Subject {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Object(at) => at.fmt(f),
@@ -96,20 +97,20 @@ impl fmt::Display for About {
     }
 }
 
-/// Without the address of a datagram, which could be taken for an object's.
-pub(super) struct Lost<'a>(pub(super) &'a WireError);
+/// A lost datagram, displayed without its address, which could be mistaken for an object's.
+pub(super) struct LostDatagram<'a>(pub(super) &'a DatagramError);
 
-impl fmt::Display for Lost<'_> {
+impl fmt::Display for LostDatagram<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
-            WireError::Timeout { .. } => f.write_str("no frame came back"),
-            WireError::Other(why) => f.write_str(why),
+            DatagramError::Timeout { .. } => f.write_str("no frame came back"),
+            DatagramError::Other(why) => f.write_str(why),
         }
     }
 }
 
 impl SdoError {
-    /// The device's abort code, where it gave one.
+    /// Returns the device's abort code, if there is one.
     pub fn abort_code(&self) -> Option<u32> {
         match self {
             Self::Abort { code, .. } => Some(*code),
@@ -118,16 +119,16 @@ impl SdoError {
     }
 }
 
-/// What did not happen in time.
+/// The phase in which a timeout occurred.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Phase {
-    /// The mailbox stayed full: the SubDevice did not take the previous message.
+    /// The mailbox stayed full: the SubDevice did not fetch the previous message.
     Request,
-    /// The request was taken, and not answered.
+    /// The SubDevice fetched the request but did not answer it.
     Answer,
     /// An answer was lost, and the SubDevice did not repeat it.
     Repeat,
-    /// Everything went on, but too slowly.
+    /// The transfer continued, but too slowly.
     Transfer,
 }
 
@@ -142,16 +143,16 @@ impl fmt::Display for Phase {
     }
 }
 
-fn object(index: &u16, sub: &u8) -> ObjectAddress {
-    ObjectAddress {
+fn object(index: &u16, sub: &u8) -> NamedObject {
+    NamedObject {
         index: *index,
         sub: *sub,
     }
 }
 
-struct Aside(u64);
+struct StrayReplies(u64);
 
-impl fmt::Display for Aside {
+impl fmt::Display for StrayReplies {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             0 => Ok(()),

@@ -1,90 +1,94 @@
-//! CoE and FoE over raw datagrams, beside the cyclic loop. May wait and allocate; never panics on what a device sends.
+//! CoE and FoE over raw datagrams, also during operation. May wait and allocate. Never panics on
+//! data from a device.
 //!
-//! - [`Wire`]: the two datagrams, the delay and the clock that everything here is made of.
-//! - `port`: the mailbox SyncManagers: taking turns, lost answers, emergencies in between.
+//! - [`MailboxTransport`]: the datagrams, the delay and the clock that this module uses.
+//! - `transport`: the mailbox SyncManagers: request and answer, lost answers, emergencies in
+//!   between.
 //! - `coe`: the bytes of mailbox, CoE and SDO headers (ETG.1000.4, ETG.1000.6).
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
-//! - `info`: what objects a device has, as it says itself (SDO Information).
-//! - [`foe`]: [`FoeClient`], files.
-//! - `desk`: [`Mailboxes`], transfers for everybody while somebody else looks after the mailboxes.
-//! - `error`, `abort`, `emergency`, `objects`: what is said when something goes wrong.
+//! - `sdo_info`: the object dictionary as reported by the device (SDO Information).
+//! - [`foe`]: [`FoeClient`], file transfer.
+//! - `worker`: [`Mailboxes`], transfers from any thread while workers serve the mailboxes.
+//! - `error`, `abort`, `emergency`, `object_names`: error types and texts.
 
 use std::time::Duration;
 
-use crate::stop::Stop;
+use crate::cancel::CancelToken;
 
 mod abort;
 mod coe;
-pub mod desk;
 mod emergency;
 mod error;
 pub mod foe;
-mod info;
-mod objects;
-mod port;
+mod object_names;
 mod sdo;
+mod sdo_info;
 #[cfg(test)]
 pub(crate) mod tests;
 mod transfer;
+mod transport;
+pub mod worker;
 
 pub use abort::{abort_text, mailbox_error_text};
-pub use desk::{DeviceMailbox, MailboxError, Mailboxes};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
-pub use error::{About, Phase, SdoError};
+pub use error::{Phase, SdoError, Subject};
 pub use foe::{FoeClient, FoeError};
-pub use info::{Asked, EntryDescription, InfoError, ObjectDescription, ObjectList};
-pub use objects::{ObjectAddress, object_name};
+pub use object_names::{NamedObject, object_name};
 pub use sdo::{CoeClient, MAX_OBJECT};
+pub use sdo_info::{EntryDescription, InfoError, InfoRequest, ObjectDescription, ObjectList};
+pub use worker::{DeviceMailbox, MailboxError, Mailboxes};
 
-/// Datagrams to one SubDevice, and time. Nothing else of the outside world is used here.
+/// Datagrams to a SubDevice, and time. This module has no other access to the outside.
 #[allow(async_fn_in_trait)]
-pub trait Wire {
-    /// One configured-address read (FPRD). Returns the working counter.
-    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError>;
+pub trait MailboxTransport {
+    /// Reads by configured address (FPRD). Returns the working counter.
+    async fn read(&self, station: u16, register: u16, buf: &mut [u8])
+    -> Result<u16, DatagramError>;
 
-    /// One configured-address write (FPWR). Returns the working counter.
-    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError>;
+    /// Writes by configured address (FPWR). Returns the working counter.
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError>;
 
     async fn delay(&self, duration: Duration);
 
-    /// Nanoseconds of a clock that never goes back and that [`Wire::delay`] advances.
+    /// Returns the time in ns of a monotonic clock that [`MailboxTransport::delay`] advances.
     fn now(&self) -> u64;
 
-    /// What somebody else has last seen of the SubDevice's mailbox, the one that is read; `None` where nobody looks.
-    fn seen(&self) -> Option<Seen> {
+    /// Returns the last status of the SubDevice's input mailbox that the cycle has read; `None`
+    /// without a cycle.
+    fn seen(&self) -> Option<MailboxStatus> {
         None
     }
 
-    /// The same, where it is so new that nobody else needs to look.
-    fn seen_lately(&self) -> Option<Seen> {
+    /// Returns this status only if it is so recent that it need not be read again.
+    fn seen_lately(&self) -> Option<MailboxStatus> {
         self.seen()
     }
 
-    /// Who may end what is done with it.
-    fn stop(&self) -> &Stop {
-        Stop::never()
+    /// Returns the token that cancels operations on this transport.
+    fn stop(&self) -> &CancelToken {
+        CancelToken::never()
     }
 }
 
-/// A mailbox as the cycle saw it.
+/// The status of a mailbox as read by the cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Seen {
-    /// On [`Wire::now`]'s clock; the mailbox was looked at then or later.
+pub struct MailboxStatus {
+    /// The time on [`MailboxTransport::now`]'s clock at or after which the status was read.
     pub at: u64,
-    /// A message waits in it.
+    /// True if a message waits in the mailbox.
     pub full: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum WireError {
-    /// The frame, or its answer, was lost.
+pub enum DatagramError {
+    /// The frame or its answer was lost.
     #[error("station {station:#06x}, register {register:#06x}: no frame came back")]
     Timeout { station: u16, register: u16 },
     #[error("{0}")]
     Other(String),
 }
 
-/// Where a SubDevice's mailboxes are, as its SyncManagers were configured.
+/// The positions of a SubDevice's mailboxes, as configured in its SyncManagers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MailboxLayout {
     pub station: u16,
@@ -99,12 +103,13 @@ pub struct MailboxLayout {
     pub in_sm: u8,
 }
 
-/// How long to wait. The defaults of `request` and `answer` are those of ETG.2000 for devices whose ESI says nothing.
+/// Timeouts of mailbox transfers. The defaults of `request` and `answer` are those of ETG.2000 for
+/// devices whose ESI specifies none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timeouts {
-    /// Until the SubDevice has taken the previous message out of its mailbox.
+    /// Until the SubDevice has fetched the previous message from its mailbox.
     pub request: Duration,
-    /// Until it answers one message.
+    /// Until the SubDevice answers one message.
     pub answer: Duration,
     /// For one whole transfer with all its segments.
     pub transfer: Duration,

@@ -1,15 +1,16 @@
-//! The CoE client of one SubDevice: SDO upload and download, expedited, normal and segmented, with complete access.
+//! The CoE client of one SubDevice: SDO upload and download, expedited, normal and segmented, with
+//! complete access.
 
 use super::coe::{Answer, Message, Request, download_room, parse, segment_room};
 use super::emergency::{Emergencies, Emergency};
 use super::error::{Phase, SdoError};
-use super::port::{Deadline, Port, Trouble};
-use super::transfer::{Ended, Transfer, emptying};
-use super::{MailboxLayout, Timeouts, Wire};
+use super::transfer::{Transfer, TransferFailure, drain_error};
+use super::transport::{Deadline, Port, TransportError};
+use super::{MailboxLayout, MailboxTransport, Timeouts};
 
-/// Bytes of the largest object that is read or written; a program may be longer.
+/// The maximum size of an object in bytes; a firmware program may be longer.
 pub const MAX_OBJECT: usize = 1 << 20;
-/// Messages that [`CoeClient::drain`] reads at most in one go.
+/// The maximum number of messages that [`CoeClient::drain`] reads per call.
 const DRAIN: usize = 64;
 
 const ABORT_TOGGLE: u32 = 0x0503_0000;
@@ -17,14 +18,14 @@ const ABORT_TIMEOUT: u32 = 0x0504_0000;
 const ABORT_MEMORY: u32 = 0x0504_0005;
 const ABORT_GENERAL: u32 = 0x0800_0000;
 
-/// One SubDevice's CoE mailbox. One transfer at a time. A transfer that failed, or whose future was dropped, leaves
-/// nothing behind that the next one would take for its answer.
+/// The CoE mailbox of one SubDevice, for one transfer at a time. After a transfer that failed or
+/// was dropped, the next one never takes an old answer for its own.
 #[derive(Debug)]
 pub struct CoeClient {
     pub(super) port: Port,
-    /// A transfer ended without its last answer; it may still come.
+    /// A transfer ended without its last answer, which may still arrive.
     pub(super) unsettled: bool,
-    /// The object whose segments are under way, as far as is known.
+    /// The object of the segmented transfer in progress, as far as known.
     in_segments: Option<(u16, u8)>,
 }
 
@@ -37,10 +38,12 @@ impl CoeClient {
         }
     }
 
-    /// The client of a mailbox that another program may have used since the device was in Init: which counter
-    /// (ETG.1000.4) the device saw last is not known, and a request with that counter would be dropped as a repetition.
-    /// An abort goes before the first request. No device answers an abort, whether it drops it or ends a transfer by
-    /// it, and the counter of the request is another one in either case.
+    /// Creates a client for a mailbox that another program may have used since the device was in
+    /// Init. The counter (ETG.1000.4) that the device saw last is then unknown. The device would
+    /// drop a request with that counter as a repetition.
+    ///
+    /// Therefore an abort precedes the first request. Devices do not answer an abort, whether they
+    /// drop it or end a transfer. The next request has another counter in either case.
     pub fn joining(layout: MailboxLayout) -> Self {
         const DEVICE_TYPE: u16 = 0x1000;
         Self {
@@ -49,14 +52,14 @@ impl CoeClient {
         }
     }
 
-    /// The same with other timeouts.
+    /// Returns the client with other timeouts.
     #[must_use]
     pub fn with_timeouts(mut self, timeouts: Timeouts) -> Self {
         self.port.timeouts = timeouts;
         self
     }
 
-    /// For what takes longer or shorter; returns those until now.
+    /// Sets other timeouts and returns the previous ones.
     pub fn set_timeouts(&mut self, timeouts: Timeouts) -> Timeouts {
         std::mem::replace(&mut self.port.timeouts, timeouts)
     }
@@ -65,8 +68,9 @@ impl CoeClient {
         &self.port.layout
     }
 
-    /// Reads an object. With `complete` all of it from `sub` (0 or 1) on, as ETG.1000.6 lays it out.
-    pub async fn upload<W: Wire>(
+    /// Reads an object. If `complete`, reads all of it from `sub` (0 or 1) on, in the layout of
+    /// ETG.1000.6.
+    pub async fn upload<W: MailboxTransport>(
         &mut self,
         w: &W,
         index: u16,
@@ -78,8 +82,8 @@ impl CoeClient {
         self.end(w, &transfer, result).await
     }
 
-    /// Writes an object. With `complete` all of it from `sub` (0 or 1) on.
-    pub async fn download<W: Wire>(
+    /// Writes an object. If `complete`, writes all of it from `sub` (0 or 1) on.
+    pub async fn download<W: MailboxTransport>(
         &mut self,
         w: &W,
         index: u16,
@@ -94,8 +98,9 @@ impl CoeClient {
         self.end(w, &transfer, result).await
     }
 
-    /// Writes one subindex, which may be as long as a program, and tells how many bytes have been taken.
-    pub async fn download_with<W: Wire>(
+    /// Writes one subindex of any length, such as a firmware program, and reports the bytes
+    /// accepted so far.
+    pub async fn download_with<W: MailboxTransport>(
         &mut self,
         w: &W,
         (index, sub): (u16, u8),
@@ -109,48 +114,50 @@ impl CoeClient {
         self.end(w, &transfer, result).await
     }
 
-    /// Empties the SubDevice's mailbox: keeps emergencies, forgets everything else. Returns how many messages it read.
-    pub async fn drain<W: Wire>(&mut self, w: &W) -> Result<usize, SdoError> {
+    /// Empties the SubDevice's mailbox: keeps emergencies and drops all other messages. Returns how
+    /// many messages it read.
+    pub async fn drain<W: MailboxTransport>(&mut self, w: &W) -> Result<usize, SdoError> {
         let drained = match self.port.check() {
             Ok(()) => self.port.drain(w, DRAIN).await,
             Err(trouble) => Err(trouble),
         };
-        drained.map_err(|trouble| emptying(&self.port, trouble))
+        drained.map_err(|trouble| drain_error(&self.port, trouble))
     }
 
-    /// What the SubDevice reported unasked since the last call, oldest first.
+    /// Takes the emergencies since the last call, oldest first.
     pub fn take_emergencies(&mut self) -> impl Iterator<Item = Emergency> + '_ {
         let taken = self.port.emergencies.take().into_iter();
         taken.map(|received| received.emergency)
     }
 
-    /// The queue of what the SubDevice reports unasked; it can be emptied while a transfer goes on.
+    /// Returns the queue of emergencies; it can be emptied during a transfer.
     pub fn emergencies(&self) -> Emergencies {
         self.port.emergencies.clone()
     }
 
-    /// Whether somebody else has seen a message in the mailbox that nobody has read.
-    pub fn waits<W: Wire>(&self, w: &W) -> bool {
+    /// True if the cycle has seen a message in the mailbox that was not read yet.
+    pub fn has_message<W: MailboxTransport>(&self, w: &W) -> bool {
         self.port.waits(w)
     }
 
-    /// Ends a transfer whose future was dropped: the SubDevice is told, and its mailbox emptied. The next transfer would do so.
-    pub async fn give_up<W: Wire>(&mut self, w: &W) -> Result<(), SdoError> {
-        let settled = self.settle(w).await;
-        settled.map_err(|trouble| emptying(&self.port, trouble))
+    /// Ends a transfer whose future was dropped: sends an abort and empties the mailbox. The next
+    /// transfer would do this as well.
+    pub async fn abort_transfer<W: MailboxTransport>(&mut self, w: &W) -> Result<(), SdoError> {
+        let settled = self.drain_after_failure(w).await;
+        settled.map_err(|trouble| drain_error(&self.port, trouble))
     }
 
-    /// How many emergencies found the queue full.
+    /// Returns how many emergencies were dropped because the queue was full.
     pub fn lost_emergencies(&self) -> u64 {
         self.port.emergencies.lost()
     }
 
-    /// How many messages came that nothing waited for, emergencies not counted.
+    /// Returns how many unexpected messages arrived, not counting emergencies.
     pub fn set_aside(&self) -> u64 {
         self.port.forgotten
     }
 
-    async fn begin<W: Wire>(
+    async fn begin<W: MailboxTransport>(
         &mut self,
         w: &W,
         index: u16,
@@ -165,18 +172,21 @@ impl CoeClient {
             deadline: Deadline::after(w, self.port.timeouts.transfer),
             forgotten: self.port.forgotten,
         };
-        let ready = self.settle(w).await;
+        let ready = self.drain_after_failure(w).await;
         ready.map_err(|trouble| transfer.trouble(&self.port, trouble).error)?;
         Ok(transfer)
     }
 
-    /// Makes sure that what arrives from now on belongs to what is sent from now on.
-    pub(super) async fn settle<W: Wire>(&mut self, w: &W) -> Result<(), Trouble> {
+    /// Ensures that messages from now on belong to requests from now on.
+    pub(super) async fn drain_after_failure<W: MailboxTransport>(
+        &mut self,
+        w: &W,
+    ) -> Result<(), TransportError> {
         self.port.check()?;
         if let Some((index, sub)) = self.in_segments.take() {
             let code = ABORT_GENERAL;
             let farewell = Request::Abort { index, sub, code };
-            // The device may not hear it; whether it is there at all shows now.
+            // The device may not receive it; whether it is present shows in the next step.
             let _ = self.port.send(w, &farewell).await;
         }
         if self.unsettled {
@@ -186,11 +196,11 @@ impl CoeClient {
         Ok(())
     }
 
-    async fn end<W: Wire, T>(
+    async fn end<W: MailboxTransport, T>(
         &mut self,
         w: &W,
         transfer: &Transfer,
-        result: Result<T, Ended>,
+        result: Result<T, TransferFailure>,
     ) -> Result<T, SdoError> {
         self.in_segments = None;
         match result {
@@ -198,12 +208,12 @@ impl CoeClient {
                 self.unsettled = false;
                 Ok(value)
             }
-            Err(Ended { error, abort }) => {
+            Err(TransferFailure { error, abort }) => {
                 if matches!(error, SdoError::Abort { .. }) {
                     self.unsettled = false;
                 }
                 if let Some(code) = abort {
-                    // The device may not hear it; what matters to the caller is the first error.
+                    // The device may not receive it; the caller needs the first error.
                     let farewell = Request::Abort {
                         index: transfer.index,
                         sub: transfer.sub,
@@ -216,11 +226,11 @@ impl CoeClient {
         }
     }
 
-    async fn upload_in<W: Wire>(
+    async fn upload_in<W: MailboxTransport>(
         &mut self,
         w: &W,
         transfer: &mut Transfer,
-    ) -> Result<Vec<u8>, Ended> {
+    ) -> Result<Vec<u8>, TransferFailure> {
         let Transfer {
             index,
             sub,
@@ -243,7 +253,7 @@ impl CoeClient {
             )
             .await?;
         if size > MAX_OBJECT {
-            return Err(transfer.too_large(size).telling(ABORT_MEMORY));
+            return Err(transfer.too_large(size).with_abort_code(ABORT_MEMORY));
         }
         if data.len() >= size {
             return Ok(data);
@@ -267,12 +277,12 @@ impl CoeClient {
             if seen != toggle {
                 return Err(transfer
                     .malformed("the toggle bit of a segment did not alternate")
-                    .telling(ABORT_TOGGLE));
+                    .with_abort_code(ABORT_TOGGLE));
             }
             if part.is_empty() && !last {
                 return Err(transfer
                     .malformed("a segment without data")
-                    .telling(ABORT_GENERAL));
+                    .with_abort_code(ABORT_GENERAL));
             }
             data.extend_from_slice(&part);
             if data.len() > size || last && data.len() < size {
@@ -281,7 +291,7 @@ impl CoeClient {
                 return Err(if last {
                     ended
                 } else {
-                    ended.telling(ABORT_GENERAL)
+                    ended.with_abort_code(ABORT_GENERAL)
                 });
             }
             if last {
@@ -291,14 +301,14 @@ impl CoeClient {
         }
     }
 
-    async fn download_in<W: Wire>(
+    async fn download_in<W: MailboxTransport>(
         &mut self,
         w: &W,
         transfer: &mut Transfer,
         data: &[u8],
         most: usize,
         progress: &mut dyn FnMut(usize),
-    ) -> Result<(), Ended> {
+    ) -> Result<(), TransferFailure> {
         let Transfer {
             index,
             sub,
@@ -357,7 +367,7 @@ impl CoeClient {
             if seen != toggle {
                 return Err(transfer
                     .malformed("the toggle bit of a segment did not alternate")
-                    .telling(ABORT_TOGGLE));
+                    .with_abort_code(ABORT_TOGGLE));
             }
             toggle = !toggle;
             progress(data.len() - rest.len());
@@ -365,22 +375,22 @@ impl CoeClient {
         Ok(())
     }
 
-    /// Sends a request and waits for its answer. `expected` picks what it needs out of the answer; what answers
-    /// something else is set aside.
-    async fn ask<W: Wire, T>(
+    /// Sends a request and waits for its answer. `expected` extracts the result from the answer.
+    /// Answers to other requests are discarded.
+    async fn ask<W: MailboxTransport, T>(
         &mut self,
         w: &W,
         transfer: &mut Transfer,
         request: &Request<'_>,
         expected: impl Fn(&Answer<'_>) -> Option<T>,
-    ) -> Result<T, Ended> {
+    ) -> Result<T, TransferFailure> {
         let in_segments = matches!(
             request,
             Request::UploadSegment { .. } | Request::DownloadSegment { .. }
         );
-        let told = |ended: Ended, code| {
+        let reported = |ended: TransferFailure, code| {
             if in_segments {
-                ended.telling(code)
+                ended.with_abort_code(code)
             } else {
                 ended
             }
@@ -391,18 +401,22 @@ impl CoeClient {
         let mut deadline = Deadline::after(w, self.port.timeouts.answer);
         loop {
             if transfer.deadline.passed(w) {
-                let ended = transfer.trouble(&self.port, Trouble::Timeout(Phase::Transfer));
-                return Err(told(ended, ABORT_TIMEOUT));
+                let ended = transfer.trouble(&self.port, TransportError::Timeout(Phase::Transfer));
+                return Err(reported(ended, ABORT_TIMEOUT));
             }
             match self.port.receive(w, &mut deadline).await {
                 Ok(()) => {}
-                Err(trouble @ Trouble::Timeout(_)) => {
-                    return Err(told(transfer.trouble(&self.port, trouble), ABORT_TIMEOUT));
+                Err(trouble @ TransportError::Timeout(_)) => {
+                    return Err(reported(
+                        transfer.trouble(&self.port, trouble),
+                        ABORT_TIMEOUT,
+                    ));
                 }
                 Err(trouble) => return Err(transfer.trouble(&self.port, trouble)),
             }
             match parse(self.port.message()) {
-                // Among segments, which carry no address, devices do not fill in that of an abort either.
+                // Segments carry no address, and in an abort among them some devices leave it empty
+                // as well.
                 Ok(Message::Sdo(Answer::Abort { index, code, .. }))
                     if in_segments || index == transfer.index =>
                 {
@@ -417,12 +431,12 @@ impl CoeClient {
                 }
                 Ok(Message::Refused(code)) => return Err(transfer.refused(code)),
                 Ok(_) => {}
-                Err(flaw) => return Err(told(transfer.malformed(flaw), ABORT_GENERAL)),
+                Err(flaw) => return Err(reported(transfer.malformed(flaw), ABORT_GENERAL)),
             }
             self.port.set_aside(w);
             if deadline.passed(w) {
-                let ended = transfer.trouble(&self.port, Trouble::Timeout(Phase::Answer));
-                return Err(told(ended, ABORT_TIMEOUT));
+                let ended = transfer.trouble(&self.port, TransportError::Timeout(Phase::Answer));
+                return Err(reported(ended, ABORT_TIMEOUT));
             }
             deadline.pause(w).await;
         }

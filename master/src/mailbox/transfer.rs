@@ -1,10 +1,10 @@
-//! One transfer: what it is about, which answers are to it, and how it ends.
+//! One SDO transfer: its object, the answers that belong to it, and its end.
 
 use super::MailboxLayout;
 use super::coe::Answer;
-use super::error::{About, Phase, SdoError};
-use super::objects::ObjectAddress;
-use super::port::{Deadline, Port, Trouble};
+use super::error::{Phase, SdoError, Subject};
+use super::object_names::NamedObject;
+use super::transport::{Deadline, Port, TransportError};
 
 #[derive(Debug)]
 pub(super) struct Transfer {
@@ -13,25 +13,25 @@ pub(super) struct Transfer {
     pub(super) sub: u8,
     pub(super) complete: bool,
     pub(super) deadline: Deadline,
-    /// [`Port::forgotten`] at its beginning.
+    /// [`Port::forgotten`] at the start of the transfer.
     pub(super) forgotten: u64,
 }
 
-/// Why a transfer ended, and what the device is told where it still waits for more.
+/// Why a transfer ended, and the abort code for the device if it still waits.
 #[derive(Debug)]
-pub(super) struct Ended {
+pub(super) struct TransferFailure {
     pub(super) error: SdoError,
     pub(super) abort: Option<u32>,
 }
 
-impl From<SdoError> for Ended {
+impl From<SdoError> for TransferFailure {
     fn from(error: SdoError) -> Self {
         Self { error, abort: None }
     }
 }
 
-impl Ended {
-    pub(super) fn telling(self, code: u32) -> Self {
+impl TransferFailure {
+    pub(super) fn with_abort_code(self, code: u32) -> Self {
         Self {
             abort: Some(code),
             ..self
@@ -40,7 +40,8 @@ impl Ended {
 }
 
 impl Transfer {
-    /// Whether an answer is to this transfer, as far as it says. With complete access devices differ in the subindex.
+    /// True if an answer belongs to this transfer. With complete access, devices differ in the
+    /// subindex.
     pub(super) fn fits(&self, answer: &Answer<'_>) -> bool {
         match *answer {
             Answer::Upload { index, sub, .. } | Answer::Download { index, sub } => {
@@ -51,15 +52,15 @@ impl Transfer {
         }
     }
 
-    pub(super) fn trouble(&self, port: &Port, trouble: Trouble) -> Ended {
+    pub(super) fn trouble(&self, port: &Port, trouble: TransportError) -> TransferFailure {
         let Self {
             station,
             index,
             sub,
             ..
         } = *self;
-        let asked = About::Object(ObjectAddress { index, sub });
-        Ended::from(explain(port, trouble, asked, |phase| SdoError::Timeout {
+        let asked = Subject::Object(NamedObject { index, sub });
+        TransferFailure::from(explain(port, trouble, asked, |phase| SdoError::Timeout {
             station,
             index,
             sub,
@@ -69,14 +70,14 @@ impl Transfer {
         }))
     }
 
-    pub(super) fn aborted(&self, code: u32) -> Ended {
+    pub(super) fn aborted(&self, code: u32) -> TransferFailure {
         let Self {
             station,
             index,
             sub,
             ..
         } = *self;
-        Ended::from(SdoError::Abort {
+        TransferFailure::from(SdoError::Abort {
             station,
             index,
             sub,
@@ -84,14 +85,14 @@ impl Transfer {
         })
     }
 
-    pub(super) fn refused(&self, code: u16) -> Ended {
+    pub(super) fn refused(&self, code: u16) -> TransferFailure {
         let Self {
             station,
             index,
             sub,
             ..
         } = *self;
-        Ended::from(SdoError::Refused {
+        TransferFailure::from(SdoError::Refused {
             station,
             index,
             sub,
@@ -99,14 +100,14 @@ impl Transfer {
         })
     }
 
-    pub(super) fn malformed(&self, what: impl ToString) -> Ended {
+    pub(super) fn malformed(&self, what: impl ToString) -> TransferFailure {
         let Self {
             station,
             index,
             sub,
             ..
         } = *self;
-        Ended::from(SdoError::Malformed {
+        TransferFailure::from(SdoError::Malformed {
             station,
             index,
             sub,
@@ -114,14 +115,14 @@ impl Transfer {
         })
     }
 
-    pub(super) fn too_large(&self, size: usize) -> Ended {
+    pub(super) fn too_large(&self, size: usize) -> TransferFailure {
         let Self {
             station,
             index,
             sub,
             ..
         } = *self;
-        Ended::from(SdoError::TooLarge {
+        TransferFailure::from(SdoError::TooLarge {
             station,
             index,
             sub,
@@ -130,11 +131,12 @@ impl Transfer {
     }
 }
 
-/// The mailbox's trouble with the SubDevice's address and what was asked; `timeout` says what a timeout means.
+/// Converts a transport error to an SDO error with the SubDevice's address and the request.
+/// `timeout` creates the error for a timeout.
 pub(super) fn explain(
     port: &Port,
-    trouble: Trouble,
-    asked: About,
+    trouble: TransportError,
+    asked: Subject,
     timeout: impl FnOnce(Phase) -> SdoError,
 ) -> SdoError {
     let MailboxLayout {
@@ -144,14 +146,14 @@ pub(super) fn explain(
         ..
     } = port.layout;
     match trouble {
-        Trouble::Timeout(phase) => timeout(phase),
-        Trouble::Gone => SdoError::Gone { station, asked },
-        Trouble::Wire(source) => SdoError::Wire {
+        TransportError::Timeout(phase) => timeout(phase),
+        TransportError::Gone => SdoError::Gone { station, asked },
+        TransportError::Wire(source) => SdoError::Wire {
             station,
             asked,
             source,
         },
-        Trouble::Layout => SdoError::Mailbox {
+        TransportError::Layout => SdoError::Mailbox {
             station,
             asked,
             out_len,
@@ -160,8 +162,9 @@ pub(super) fn explain(
     }
 }
 
-/// Trouble with a mailbox that is emptied. That waits for no answer, so only the device itself can be missing.
-pub(super) fn emptying(port: &Port, trouble: Trouble) -> SdoError {
-    let (station, asked) = (port.layout.station, About::Emptying);
+/// Converts an error while emptying a mailbox. Emptying waits for no answer, so a timeout means
+/// that the device is gone.
+pub(super) fn drain_error(port: &Port, trouble: TransportError) -> SdoError {
+    let (station, asked) = (port.layout.station, Subject::Emptying);
     explain(port, trouble, asked, |_| SdoError::Gone { station, asked })
 }

@@ -1,19 +1,21 @@
-//! "save" and "load" (CiA 301, objects 0x1010 and 0x1011): a device keeps its parameters over power cycles, or forgets them.
+//! "save" and "load" (CiA 301, objects 0x1010 and 0x1011): stores the parameters or restores the
+//! defaults.
 
 use std::time::Duration;
 
+use crate::acyclic::ServiceError;
 use crate::bringup::DeviceRef;
-use crate::mailbox::{CoeClient, Timeouts, Wire};
-use crate::service::ServiceError;
+use crate::mailbox::{CoeClient, MailboxTransport, Timeouts};
 
-/// A device answers when it is done. EEPROMs of drives take seconds, flash memories tens of them.
+/// The time-out of the command. A device answers when it is done; flash memories take tens of
+/// seconds.
 pub const WAIT: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
     /// 0x1010:01 = "save".
     Store,
-    /// 0x1011:01 = "load"; counts from the next start on.
+    /// 0x1011:01 = "load"; effective after the next start.
     Defaults,
 }
 
@@ -25,14 +27,14 @@ impl Command {
         }
     }
 
-    /// Waits until the device says that it is done.
+    /// Sends the command and waits until the device has completed it.
     ///
     /// # Errors
-    /// [`ServiceError::Sdo`], with the device's own reason.
+    /// [`ServiceError::Sdo`] with the device's reason.
     pub async fn give(
         self,
         coe: &mut CoeClient,
-        wire: &impl Wire,
+        wire: &impl MailboxTransport,
         device: &DeviceRef,
     ) -> Result<(), ServiceError> {
         let (index, signature) = self.object();

@@ -1,26 +1,27 @@
-//! Two sets of values against each other.
+//! Compares two sets of values.
 
 use std::collections::BTreeMap;
 
 use super::Parameter;
-use super::rules::{is_setting, that_count};
-use crate::mailbox::ObjectAddress;
+use super::restore_order::{is_setting, settings_only};
+use crate::mailbox::NamedObject;
 
-/// A value that is not the same on both sides; `None` where a side has no such object.
+/// A value that differs; `None` if a side does not have the object.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    pub at: ObjectAddress,
+    pub at: NamedObject,
     pub name: String,
     pub left: Option<String>,
     pub right: Option<String>,
 }
 
-/// Settings that differ, by index and subindex; with `all` whatever differs, actual values too.
+/// Returns the differing settings by index and subindex; with `all` also actual values and
+/// commands.
 #[must_use]
 pub fn compare(left: &[Parameter], right: &[Parameter], all: bool) -> Vec<Difference> {
     let mut both: BTreeMap<(u16, u8), [Option<&Parameter>; 2]> = BTreeMap::new();
     for (side, parameters) in [left, right].into_iter().enumerate() {
-        for parameter in that_count(parameters) {
+        for parameter in settings_only(parameters) {
             let key = (parameter.at.index, parameter.at.sub);
             if let Some(place) = both.entry(key).or_default().get_mut(side) {
                 *place = Some(parameter);

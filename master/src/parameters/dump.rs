@@ -1,4 +1,4 @@
-//! Parameters in a file: TOML, one line an object.
+//! Parameter files: TOML with one line per object.
 //!
 //! ```toml
 //! format = 2
@@ -17,9 +17,9 @@ use ecaxis_esi::{Address, Identity};
 use serde::Deserialize;
 
 use super::{DataType, Parameter};
-use crate::mailbox::ObjectAddress;
+use crate::mailbox::NamedObject;
 
-/// Whose parameters they are.
+/// The device of the parameters.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Origin {
@@ -45,7 +45,7 @@ impl Origin {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Dump {
     pub device: Origin,
-    /// By index and subindex, rising.
+    /// Sorted by index and subindex.
     pub parameters: Vec<Parameter>,
 }
 
@@ -58,7 +58,8 @@ struct Raw {
     parameters: BTreeMap<String, Line>,
 }
 
-/// Subindices are hexadecimal; in the first, which did not say what it was, they were decimal.
+/// The format number. Subindices are hexadecimal; they were decimal in files without a format
+/// number.
 const FORMAT: u32 = 2;
 
 fn first_format() -> u32 {
@@ -77,11 +78,11 @@ struct Line {
     value: toml::Value,
 }
 
-/// Access of what a restore may write.
+/// The access of objects that a restore may write.
 const READ_WRITE: &str = "rw";
 const READ_ONLY: &str = "ro";
 
-/// What is wrong with a file; complete in itself but for the file's name.
+/// An error in a file. The message is complete except for the file name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DumpError {
     #[error("{0}")]
@@ -104,7 +105,7 @@ pub enum DumpError {
 }
 
 impl Dump {
-    /// As a file.
+    /// Formats the file.
     #[must_use]
     pub fn to_toml(&self) -> String {
         let Origin {
@@ -135,7 +136,7 @@ impl Dump {
         text
     }
 
-    /// From a file.
+    /// Parses a file.
     ///
     /// # Errors
     /// [`DumpError`].
@@ -194,20 +195,20 @@ impl Line {
     }
 }
 
-fn place(key: &str, format: u32) -> Option<ObjectAddress> {
+fn place(key: &str, format: u32) -> Option<NamedObject> {
     let (index, sub) = key.split_once(':')?;
     let hexadecimal = sub.starts_with("0x") || sub.starts_with("0X");
     let sub = match format {
         1 if !hexadecimal => sub.parse().ok()?,
         _ => Address::sub_of(sub)?,
     };
-    // A name in the place of a number would be one of the standards'.
+    // A name instead of a number would match a standard object.
     let number = index.starts_with(|c: char| c.is_ascii_digit());
-    let index = super::find::find(None, index).ok()?.index;
-    number.then_some(ObjectAddress { index, sub })
+    let index = super::lookup::find(None, index).ok()?.index;
+    number.then_some(NamedObject { index, sub })
 }
 
-/// Numbers and truth values as TOML has them, everything else as text.
+/// Formats numbers and booleans as TOML values, everything else as text.
 fn value(parameter: &Parameter) -> String {
     let shown = parameter.shown();
     let bare = match parameter.data_type.kind {

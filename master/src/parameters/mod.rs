@@ -1,42 +1,43 @@
-//! What a device's objects are called, made of and hold: parameters by name or number, kept in files, compared and written
-//! back. MAY BLOCK AND ALLOCATE.
+//! Parameters of a device: found by name or number, saved to files, compared and restored. MAY
+//! BLOCK AND ALLOCATE.
 //!
-//! - [`kind`], [`value`]: data types, and values as text;
-//! - [`find`]: an object by its number or name;
-//! - [`learn`]: a dictionary from the device itself (SDO Information), in the form that ESI files' have;
-//! - [`collect`]: every readable object with its value;
-//! - [`dump`]: those in a file;
-//! - [`rules`]: which of them a restore writes, and in which order;
-//! - [`compare`], [`restore`]: two dictionaries against each other, one into a device;
+//! - [`data_type`], [`value`]: data types, and values as text;
+//! - [`lookup`]: finds an object by number or name;
+//! - [`dictionary`]: the dictionary from the device (SDO Information), in the form of ESI
+//!   dictionaries;
+//! - [`upload`]: reads every readable object;
+//! - [`dump`]: parameter files;
+//! - [`restore_order`]: selects and orders the writes of a restore;
+//! - [`compare`], [`restore`]: compares two sets of values, writes one to a device;
 //! - [`command`]: "save" and "load" (0x1010, 0x1011).
 
 use ecaxis_esi::{Dictionary, Object, ObjectItem, Writable};
 
-use crate::mailbox::ObjectAddress;
+use crate::mailbox::NamedObject;
 
-pub mod collect;
 pub mod command;
 pub mod compare;
+pub mod data_type;
+pub mod dictionary;
 pub mod dump;
-pub mod find;
-pub mod kind;
-pub mod learn;
+pub mod lookup;
 pub mod restore;
-pub mod rules;
+pub mod restore_order;
 #[cfg(test)]
 mod tests;
+pub mod upload;
 pub mod value;
 
-pub use kind::{DataType, Kind};
+pub use data_type::{DataType, Kind};
 pub use value::ValueError;
 
 /// One subindex with its value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
-    pub at: ObjectAddress,
+    pub at: NamedObject,
     pub name: String,
     pub data_type: DataType,
-    /// It can be written in PreOp.
+    /// True if it is writable in PreOp.
     pub writable: bool,
     pub value: Vec<u8>,
 }
@@ -48,7 +49,7 @@ impl Parameter {
     }
 }
 
-/// Every subindex with its object.
+/// Iterates over all subindices with their objects.
 pub fn items(dictionary: &Dictionary) -> impl Iterator<Item = (&Object, &ObjectItem)> {
     let objects = dictionary.objects.iter();
     objects.flat_map(|object| object.items.iter().map(move |item| (object, item)))
@@ -59,7 +60,7 @@ pub fn type_of(item: &ObjectItem) -> DataType {
     DataType::named(&item.type_name, item.bit_len).unwrap_or(DataType::BYTES)
 }
 
-/// Of a variable its own, of a subindex with the object's before it.
+/// Returns the name of a variable, or the name of a subindex with the object's name as prefix.
 #[must_use]
 pub fn name_of(object: &Object, item: &ObjectItem) -> String {
     if object.items.len() == 1 || item.name.is_empty() || item.name == object.name {

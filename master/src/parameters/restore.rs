@@ -1,29 +1,30 @@
-//! Values written back into a device.
+//! Writes values to a device.
 
 use ecaxis_esi::Dictionary;
 
 use super::compare::Difference;
-use super::rules::{Write, is_list, is_setting, order, that_count};
+use super::restore_order::{Write, is_list, is_setting, order, settings_only};
 use super::{Parameter, writable_in_pre_op};
+use crate::acyclic::ServiceError;
 use crate::bringup::DeviceRef;
-use crate::mailbox::{CoeClient, ObjectAddress, SdoError, Wire, abort_text};
-use crate::service::ServiceError;
+use crate::mailbox::{CoeClient, MailboxTransport, NamedObject, SdoError, abort_text};
 
-/// Settings limit each other; what is refused is tried again after the others, as long as that helps.
+/// The maximum number of passes. Settings limit each other, so refused writes are retried after the
+/// others.
 const PASSES: usize = 8;
 
-/// How it went.
+/// The result of a restore.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Restored {
-    /// Subindices that had another value, and were written.
+    /// The number of subindices that differed and were written.
     pub written: usize,
-    /// Subindices that had the value already.
+    /// The number of subindices that had the value already.
     pub same: usize,
-    /// Settings of the file that the device does not have, or does not let be written.
-    pub missing: Vec<ObjectAddress>,
-    /// Refused to the end, with the abort code.
-    pub refused: Vec<(ObjectAddress, u32)>,
-    /// Read back, and not what was written.
+    /// Settings that the device does not have or does not allow to write.
+    pub missing: Vec<NamedObject>,
+    /// Settings that were refused in every pass, with the abort code.
+    pub refused: Vec<(NamedObject, u32)>,
+    /// Settings whose read-back value differs.
     pub differing: Vec<Difference>,
 }
 
@@ -34,21 +35,21 @@ impl Restored {
     }
 }
 
-/// A restore that broke off.
+/// An incomplete restore.
 #[derive(Debug, thiserror::Error)]
 #[error("{source}{}", self.left())]
 pub struct RestoreError {
     pub source: ServiceError,
-    /// Writes that the device has confirmed.
+    /// The number of confirmed writes.
     pub written: usize,
-    /// Writes that there were to be; 0 where it broke off before the first.
+    /// The number of planned writes; 0 if it ended before the first.
     pub of: usize,
-    /// Lists that may have been emptied and were not filled again.
+    /// Lists that may be empty because they were not refilled.
     pub emptied: Vec<u16>,
 }
 
 impl RestoreError {
-    /// In which condition the device is left, behind what failed.
+    /// Describes the state in which the device is left.
     #[must_use]
     pub fn left(&self) -> String {
         let mut text = match (self.written, self.of) {
@@ -56,7 +57,7 @@ impl RestoreError {
             (written, of) => format!("; {written} of {of} writes were done"),
         };
         if !self.emptied.is_empty() {
-            let at = |index: &u16| ObjectAddress {
+            let at = |index: &u16| NamedObject {
                 index: *index,
                 sub: 0,
             };
@@ -67,19 +68,19 @@ impl RestoreError {
     }
 }
 
-/// How far the writing is.
+/// The progress of the writes.
 #[derive(Debug, Default)]
-struct Course {
+struct RestoreProgress {
     written: usize,
     of: usize,
-    /// Lists that are still to be filled.
+    /// Lists that must still be filled.
     open: Vec<u16>,
-    /// Emptied lists that the device does not let be filled.
+    /// Emptied lists that the device refuses to fill.
     lost: Vec<u16>,
 }
 
-impl Course {
-    fn broke_off(self, source: ServiceError) -> RestoreError {
+impl RestoreProgress {
+    fn aborted(self, source: ServiceError) -> RestoreError {
         RestoreError {
             source,
             written: self.written,
@@ -89,15 +90,15 @@ impl Course {
     }
 }
 
-/// What `device` says to one object.
+/// Access to the objects of `device`.
 struct Device<'a, W> {
     coe: &'a mut CoeClient,
     wire: &'a W,
     device: &'a DeviceRef,
 }
 
-impl<W: Wire> Device<'_, W> {
-    /// The abort code where the device refuses.
+impl<W: MailboxTransport> Device<'_, W> {
+    /// Returns the abort code if the device refuses the object.
     fn refusal<T>(&self, result: Result<T, SdoError>) -> Result<Result<T, u32>, ServiceError> {
         match result {
             Ok(value) => Ok(Ok(value)),
@@ -109,7 +110,7 @@ impl<W: Wire> Device<'_, W> {
         }
     }
 
-    async fn read(&mut self, at: ObjectAddress) -> Result<Result<Vec<u8>, u32>, ServiceError> {
+    async fn read(&mut self, at: NamedObject) -> Result<Result<Vec<u8>, u32>, ServiceError> {
         let read = self.coe.upload(self.wire, at.index, at.sub, false).await;
         self.refusal(read)
     }
@@ -124,14 +125,14 @@ impl<W: Wire> Device<'_, W> {
     }
 }
 
-impl<W: Wire> Device<'_, W> {
-    /// Notes what becomes of lists.
+impl<W: MailboxTransport> Device<'_, W> {
+    /// Tracks which lists are empty.
     async fn follow(
         &mut self,
         write: Write<'_>,
-        course: &mut Course,
+        course: &mut RestoreProgress,
     ) -> Result<Result<(), u32>, ServiceError> {
-        // Whether a request got there is not known before it is answered.
+        // A request may have taken effect even without an answer.
         let list = match write {
             Write::Empty(index) => {
                 course.open.push(index);
@@ -156,30 +157,32 @@ impl<W: Wire> Device<'_, W> {
     }
 }
 
-/// Writes those settings of `parameters` that the device has and that differ, in a safe order, and reads them back. The
-/// device is in PreOp. `progress` is told writes done and writes there are. Who ends it ends it where no list is empty.
+/// Writes the settings of `parameters` that exist and differ, in a safe order, and reads them back.
+/// The device must be in PreOp. `progress` receives the completed and planned writes. A
+/// cancellation takes effect when no list is empty.
 ///
 /// # Errors
-/// [`ServiceError::Sdo`] where the device stops answering, with how it is left. What it refuses is part of the result.
+/// [`ServiceError::Sdo`] with the remaining state if the device stops answering. Refused objects
+/// are part of the result.
 pub async fn restore(
     coe: &mut CoeClient,
-    wire: &impl Wire,
+    wire: &impl MailboxTransport,
     device: &DeviceRef,
     dictionary: &Dictionary,
     parameters: &[Parameter],
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Restored, RestoreError> {
-    let mut course = Course::default();
+    let mut course = RestoreProgress::default();
     let mut device = Device { coe, wire, device };
     let whole = device.restore(dictionary, parameters, progress, &mut course);
-    let done = wire.stop().hold(whole).await;
-    done.map_err(|source| course.broke_off(source))
+    let done = wire.stop().shield(whole).await;
+    done.map_err(|source| course.aborted(source))
 }
 
-impl<W: Wire> Device<'_, W> {
-    /// Ends here where somebody wants it to.
-    fn go_on(&self, course: &Course) -> Result<(), ServiceError> {
-        if !self.wire.stop().is_asked() || !course.open.is_empty() {
+impl<W: MailboxTransport> Device<'_, W> {
+    /// Fails if a cancellation was requested.
+    fn go_on(&self, course: &RestoreProgress) -> Result<(), ServiceError> {
+        if !self.wire.stop().is_cancelled() || !course.open.is_empty() {
             return Ok(());
         }
         Err(ServiceError::Stopped {
@@ -193,12 +196,15 @@ impl<W: Wire> Device<'_, W> {
         dictionary: &Dictionary,
         parameters: &[Parameter],
         progress: &mut dyn FnMut(usize, usize),
-        course: &mut Course,
+        course: &mut RestoreProgress,
     ) -> Result<Restored, ServiceError> {
         let mut restored = Restored::default();
         let mut wanted = Vec::new();
-        let mut differing: Vec<ObjectAddress> = Vec::new();
-        for parameter in that_count(parameters).into_iter().filter(|p| is_setting(p)) {
+        let mut differing: Vec<NamedObject> = Vec::new();
+        for parameter in settings_only(parameters)
+            .into_iter()
+            .filter(|p| is_setting(p))
+        {
             self.go_on(course)?;
             let item = dictionary.item(parameter.at.index, parameter.at.sub);
             if !item.is_some_and(writable_in_pre_op) {
@@ -207,7 +213,7 @@ impl<W: Wire> Device<'_, W> {
             }
             match self.read(parameter.at).await? {
                 Ok(value) if value == parameter.value => restored.same += 1,
-                // What cannot be read can still be written.
+                // Unreadable objects may be writable.
                 Ok(_) | Err(_) => differing.push(parameter.at),
             }
             wanted.push(parameter);
@@ -223,7 +229,7 @@ impl<W: Wire> Device<'_, W> {
                     restored.refused.push((parameter.at, code));
                 }
                 (Err(code), Write::Value(parameter)) => left.push((*parameter, code)),
-                // That a list cannot be emptied shows in its elements.
+                // If a list cannot be emptied, its elements fail as well.
                 (Err(_), Write::Empty(_)) | (Ok(()), _) => {}
             }
         }

@@ -1,4 +1,4 @@
-//! Names, files, differences, the order in which a restore writes, and how one ends early.
+//! Names, files, differences, the order of a restore, and its early end.
 
 use std::cell::Cell;
 use std::time::Duration;
@@ -9,20 +9,20 @@ use proptest::prelude::*;
 
 use super::compare::compare;
 use super::dump::{Dump, DumpError, Origin};
-use super::find::{FindError, Wanted, find};
+use super::lookup::{FindError, ObjectQuery, find};
 use super::restore::{RestoreError, Restored, restore};
-use super::rules::{Write, order};
+use super::restore_order::{Write, order};
 use super::{DataType, Kind, Parameter};
+use crate::acyclic::ServiceError;
 use crate::bringup::DeviceRef;
+use crate::cancel::CancelToken;
 use crate::mailbox::tests::server::Server;
 use crate::mailbox::tests::{STATION, block_on, client};
-use crate::mailbox::{ObjectAddress, Wire, WireError};
-use crate::service::ServiceError;
-use crate::stop::Stop;
+use crate::mailbox::{DatagramError, MailboxTransport, NamedObject};
 
 fn parameter(index: u16, sub: u8, data_type: &str, value: &[u8]) -> Parameter {
     Parameter {
-        at: ObjectAddress { index, sub },
+        at: NamedObject { index, sub },
         name: format!("n{index:x}"),
         data_type: DataType::named(data_type, 0).expect("a type"),
         writable: true,
@@ -51,7 +51,7 @@ fn object(index: u16, name: &str, items: &[&str]) -> Object {
 }
 
 #[test]
-fn objects_by_number_and_name() {
+fn find_accepts_numbers_and_names() {
     let dictionary = Dictionary {
         objects: vec![
             object(0x2000, "Node-ID", &[""]),
@@ -59,7 +59,7 @@ fn objects_by_number_and_name() {
             object(0x3001, "Motor", &["Count", "Gear"]),
         ],
     };
-    let at = |index, sub| Ok(Wanted { index, sub });
+    let at = |index, sub| Ok(ObjectQuery { index, sub });
     for (text, wanted) in [
         ("0x6064", at(0x6064, None)),
         ("0x6041:00", at(0x6041, Some(0))),
@@ -69,7 +69,7 @@ fn objects_by_number_and_name() {
         ("Motor", at(0x3001, None)),
         ("sensors", at(0x3000, Some(1))),
         ("Motor: gear", at(0x3001, Some(1))),
-        // Of the standards.
+        // Names from the standards.
         ("Statusword", at(0x6041, None)),
         ("position actual value", at(0x6064, None)),
         ("Vendor ID", at(0x1018, Some(1))),
@@ -106,7 +106,7 @@ fn objects_by_number_and_name() {
     assert_eq!(near("-"), None);
 }
 
-/// The first ones, which did not say so, had them decimal.
+/// Files without a format number have decimal subindices.
 #[test]
 fn subindices_of_old_files_are_decimal() {
     let file = |format: &str, key: &str| {
@@ -135,7 +135,7 @@ fn subindices_of_old_files_are_decimal() {
 }
 
 #[test]
-fn mistakes_in_a_file_are_told() {
+fn parse_reports_errors_in_a_file() {
     let file = |line: &str| {
         format!(
             "[device]\nname = \"x\"\nvendor = 1\nproduct = 2\nrevision = 3\n[parameters]\n{line}\n"
@@ -174,7 +174,7 @@ fn mistakes_in_a_file_are_told() {
 }
 
 #[test]
-fn what_differs_and_is_a_setting_is_told() {
+fn compare_returns_differing_settings() {
     let mut left = vec![
         parameter(0x1600, 0, "USINT", &[1]),
         parameter(0x1600, 1, "UDINT", &[1, 2, 3, 4]),
@@ -186,7 +186,7 @@ fn what_differs_and_is_a_setting_is_told() {
     left[4].writable = false;
     assert_eq!(compare(&left, &left, true), []);
     let mut right = left.clone();
-    // Beyond the count, a command, an actual value.
+    // A count, a command, an actual value.
     for n in [2, 3, 4] {
         right[n].value[0] = 99;
     }
@@ -194,12 +194,12 @@ fn what_differs_and_is_a_setting_is_told() {
     assert_eq!(compare(&left, &right, true).len(), 2);
     right[5].value[0] = 8;
     right.push(parameter(0x6067, 0, "UDINT", &[1, 0, 0, 0]));
-    let told: Vec<_> = compare(&left, &right, false)
+    let reported: Vec<_> = compare(&left, &right, false)
         .into_iter()
         .map(|d| (d.at.index, d.left, d.right))
         .collect();
     assert_eq!(
-        told,
+        reported,
         [
             (0x6065, Some("7".to_owned()), Some("8".to_owned())),
             (0x6067, None, Some("1".to_owned()))
@@ -208,7 +208,7 @@ fn what_differs_and_is_a_setting_is_told() {
 }
 
 #[test]
-fn lists_are_emptied_filled_and_counted_before_everything_else() {
+fn order_writes_lists_first() {
     let all = [
         parameter(0x1600, 0, "USINT", &[1]),
         parameter(0x1600, 1, "UDINT", &[1; 4]),
@@ -221,7 +221,7 @@ fn lists_are_emptied_filled_and_counted_before_everything_else() {
         parameter(0xf030, 1, "UDINT", &[9; 4]),
     ];
     let wanted: Vec<&Parameter> = all.iter().collect();
-    let told = |differing: &[(u16, u8)]| -> Vec<String> {
+    let reported = |differing: &[(u16, u8)]| -> Vec<String> {
         let writes = order(&wanted, |p| differing.contains(&(p.at.index, p.at.sub)));
         let each = writes.iter().map(|write| match write {
             Write::Empty(index) => format!("{index:x} = 0"),
@@ -229,12 +229,13 @@ fn lists_are_emptied_filled_and_counted_before_everything_else() {
         });
         each.collect()
     };
-    assert_eq!(told(&[]), [""; 0]);
-    assert_eq!(told(&[(0x6066, 0)]), ["6066:0"]);
-    // Another assignment leaves the mapping alone; another mapping is written while nothing is assigned.
-    assert_eq!(told(&[(0x1c12, 1)]), ["1c12 = 0", "1c12:1", "1c12:0"]);
+    assert_eq!(reported(&[]), [""; 0]);
+    assert_eq!(reported(&[(0x6066, 0)]), ["6066:0"]);
+    // A changed assignment leaves the mapping alone. A changed mapping is written while no PDO is
+    // assigned.
+    assert_eq!(reported(&[(0x1c12, 1)]), ["1c12 = 0", "1c12:1", "1c12:0"]);
     assert_eq!(
-        told(&[(0x1600, 1), (0xf030, 0), (0x6065, 0)]),
+        reported(&[(0x1600, 1), (0xf030, 0), (0x6065, 0)]),
         [
             "f030 = 0", "f030:1", "f030:0", "1c12 = 0", "1600 = 0", "1600:1", "1600:0", "1c12:1",
             "1c12:0", "6065:0"
@@ -242,18 +243,18 @@ fn lists_are_emptied_filled_and_counted_before_everything_else() {
     );
 }
 
-/// A device whose frames are lost from a download on, before it or with its answer.
+/// A device that loses its frames from a given download on, before the download or with its answer.
 struct Failing {
     server: Server,
     downloads: Cell<usize>,
     fails_at: usize,
     arrives: bool,
     dead: Cell<bool>,
-    stop: Stop,
+    stop: CancelToken,
 }
 
 impl Failing {
-    /// With a mapping and an assignment of one entry each, and two settings.
+    /// Has a mapping and an assignment with one entry each, and two settings.
     fn new(fails_at: usize, arrives: bool) -> Self {
         let objects: [(u16, u8, &[u8]); 6] = [
             (0x1600, 0, &[1]),
@@ -269,11 +270,11 @@ impl Failing {
             fails_at,
             arrives,
             dead: Cell::new(false),
-            stop: Stop::default(),
+            stop: CancelToken::default(),
         }
     }
 
-    /// Gives it other values of all of that.
+    /// Restores other values for all of them.
     fn restore(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Restored, RestoreError> {
         let wanted = [
             parameter(0x1600, 0, "USINT", &[1]),
@@ -312,16 +313,21 @@ impl Failing {
     }
 }
 
-impl Wire for Failing {
-    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+impl MailboxTransport for Failing {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
         match self.dead.get() {
-            true => Err(WireError::Timeout { station, register }),
+            true => Err(DatagramError::Timeout { station, register }),
             false => self.server.read(station, register, buf).await,
         }
     }
 
-    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
-        // The mailbox, and in it an SDO download.
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        // A mailbox write that contains an SDO download.
         let download = register == 0x1000 && data.get(8).is_some_and(|c| c >> 5 == 1);
         self.downloads
             .set(self.downloads.get() + usize::from(download));
@@ -332,7 +338,7 @@ impl Wire for Failing {
         }
         self.dead.set(self.dead.get() || dies);
         match self.dead.get() {
-            true => Err(WireError::Timeout { station, register }),
+            true => Err(DatagramError::Timeout { station, register }),
             false => self.server.write(station, register, data).await,
         }
     }
@@ -345,7 +351,7 @@ impl Wire for Failing {
         self.server.now()
     }
 
-    fn stop(&self) -> &Stop {
+    fn stop(&self) -> &CancelToken {
         &self.stop
     }
 }
@@ -354,7 +360,7 @@ impl Wire for Failing {
 const WRITES: usize = 8;
 
 #[test]
-fn a_restore_that_breaks_off_tells_what_it_leaves() {
+fn failed_restore_reports_the_remaining_state() {
     let whole = Failing::new(0, false);
     let done = whole.restore(&mut |_, _| {}).expect("restored");
     assert!(done.complete(), "{done:?}");
@@ -368,11 +374,11 @@ fn a_restore_that_breaks_off_tells_what_it_leaves() {
             assert!(matches!(error.source, ServiceError::Sdo { .. }), "{error}");
             assert_eq!((error.written, error.of), (k - 1, WRITES), "{error}");
             let text = error.to_string();
-            let told = match k {
+            let reported = match k {
                 1 => true,
                 k => text.contains(&format!("; {} of 8 writes were done", k - 1)),
             };
-            assert!(told, "{text}");
+            assert!(reported, "{text}");
             for (index, name) in [(0x1c12, "0x1c12:00"), (0x1600, "0x1600:00")] {
                 if device.is_empty(index) {
                     empty += 1;
@@ -381,7 +387,7 @@ fn a_restore_that_breaks_off_tells_what_it_leaves() {
                     assert!(left.contains(name), "{k}: {text}");
                 }
             }
-            // Nothing is said to be empty that is full again.
+            // A refilled list is not reported as empty.
             let still: &[u16] = match k {
                 1 | 5..=6 => &[0x1c12],
                 2..=4 => &[0x1c12, 0x1600],
@@ -394,12 +400,12 @@ fn a_restore_that_breaks_off_tells_what_it_leaves() {
 }
 
 #[test]
-fn who_ends_a_restore_ends_it_where_no_list_is_empty() {
+fn cancelled_restore_leaves_no_list_empty() {
     for k in 0..WRITES {
         let device = Failing::new(0, false);
         let mut progress = |n, _| {
             if n == k {
-                device.stop.ask();
+                device.stop.cancel();
             }
         };
         let ended = device.restore(&mut progress);
@@ -407,7 +413,7 @@ fn who_ends_a_restore_ends_it_where_no_list_is_empty() {
         let error = ended.expect_err("ended");
         let stopped = matches!(error.source, ServiceError::Stopped { .. });
         assert!(stopped && error.emptied.is_empty(), "{k}: {error}");
-        // The lists are six writes; what is asked for among them is done at their end.
+        // The lists are six writes; a cancellation during these takes effect after the sixth.
         assert_eq!(error.written, (k + 1).max(6), "{k}: {error}");
         assert_eq!(device.downloads.get(), error.written);
     }
@@ -439,7 +445,7 @@ fn any_parameter() -> impl Strategy<Value = Parameter> {
                     value.resize(width, 0);
                 }
                 Parameter {
-                    at: ObjectAddress { index, sub },
+                    at: NamedObject { index, sub },
                     name,
                     data_type,
                     writable,
@@ -453,7 +459,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_file_is_read_as_it_was_written(
+    fn dump_parses_its_own_output(
         name in "\\PC{0,20}",
         numbers: [u32; 4],
         mut parameters in prop::collection::vec(any_parameter(), 0..20),

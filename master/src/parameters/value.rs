@@ -1,11 +1,12 @@
-//! Values as people write them: numbers, texts and bytes, by their type. What is printed can be read again, bit by bit.
+//! Values as text: numbers, strings and bytes, by type. Printed values can be parsed again without
+//! loss.
 //!
-//! Whatever has another length than its type, or bits that its type does not have, is printed as raw bytes in brackets,
-//! `[01 02]`; those are read for every type.
+//! A value whose length or bits do not fit its type is printed as raw bytes in brackets, `[01 02]`.
+//! This form is accepted for every type.
 
-use super::kind::{DataType, Kind};
+use super::data_type::{DataType, Kind};
 
-/// What is wrong with a value as it was written.
+/// An error in a value's text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ValueError {
     #[error("{value} does not fit; the object takes {least} to {most}")]
@@ -23,7 +24,7 @@ pub enum ValueError {
 }
 
 impl DataType {
-    /// The value as text.
+    /// Formats the value.
     #[must_use]
     pub fn show(self, bytes: &[u8]) -> String {
         let shown = match self.kind {
@@ -42,7 +43,7 @@ impl DataType {
         shown.unwrap_or_else(|| format!("[{}]", hex(bytes)))
     }
 
-    /// The number, sign-extended; `None` where the bytes are no number of this type.
+    /// Returns the sign-extended number; `None` if the bytes are not a number of this type.
     #[must_use]
     pub fn integer(self, bytes: &[u8]) -> Option<i128> {
         if !matches!(self.kind, Kind::Unsigned | Kind::Signed)
@@ -67,10 +68,10 @@ impl DataType {
         })
     }
 
-    /// What was written, as bytes.
+    /// Parses a value.
     ///
     /// # Errors
-    /// [`ValueError`], worded for whoever wrote it.
+    /// [`ValueError`] with a message for the user.
     pub fn read(self, written: &str) -> Result<Vec<u8>, ValueError> {
         let trimmed = written.trim();
         if let Some(raw) = bracketed(trimmed) {
@@ -84,7 +85,7 @@ impl DataType {
             Kind::Unicode if trimmed.starts_with('"') => unquote_unicode(trimmed),
             Kind::Unicode => Ok(little_endian(written.encode_utf16())),
             Kind::Bytes if trimmed.starts_with('"') => unquote(trimmed),
-            Kind::Bytes => pairs(trimmed).ok_or_else(|| self.misfit(trimmed)),
+            Kind::Bytes => pairs(trimmed).ok_or_else(|| self.type_mismatch(trimmed)),
         }
     }
 
@@ -94,7 +95,7 @@ impl DataType {
             let bytes = unquote(text)?;
             return match bytes.len() == width {
                 true => Ok(bytes),
-                false => Err(self.misfit(text)),
+                false => Err(self.type_mismatch(text)),
             };
         }
         let (least, most) = match self.kind {
@@ -105,7 +106,7 @@ impl DataType {
             _ => (0, (1_i128 << self.bits) - 1),
         };
         let number = match (digits(text), text) {
-            // Hexadecimal and binary numbers are patterns of bits, signed or not.
+            // Hexadecimal and binary numbers are bit patterns, signed or not.
             (Some(pattern), _) if pattern >> self.bits == 0 => pattern,
             (Some(pattern), _) => {
                 return Err(ValueError::Range {
@@ -117,7 +118,7 @@ impl DataType {
             (None, "true") if self.bits == 1 => 1,
             (None, "false") if self.bits == 1 => 0,
             (None, _) => {
-                let number: i128 = text.parse().map_err(|_| self.misfit(text))?;
+                let number: i128 = text.parse().map_err(|_| self.type_mismatch(text))?;
                 if !(least..=most).contains(&number) {
                     return Err(ValueError::Range {
                         value: number.to_string(),
@@ -132,7 +133,7 @@ impl DataType {
     }
 
     fn read_real(self, text: &str) -> Result<Vec<u8>, ValueError> {
-        let misfit = || self.misfit(text);
+        let misfit = || self.type_mismatch(text);
         let pattern = digits(text).map(u64::try_from);
         Ok(match (self.bits, pattern) {
             (32, Some(Ok(pattern))) => {
@@ -152,7 +153,7 @@ impl DataType {
         })
     }
 
-    fn misfit(self, found: &str) -> ValueError {
+    fn type_mismatch(self, found: &str) -> ValueError {
         let wanted = match self.kind {
             Kind::Unsigned if self.bits == 1 => "true or false".to_owned(),
             Kind::Unsigned | Kind::Signed => format!("an integer of {} bits", self.bits),
@@ -171,7 +172,7 @@ impl DataType {
     }
 }
 
-/// Numbers that are not decimal.
+/// Parses numbers that are not decimal.
 fn digits(text: &str) -> Option<i128> {
     let (radix, digits) = [(16, "0x"), (16, "0X"), (16, "#x"), (2, "0b"), (8, "0o")]
         .iter()
@@ -180,7 +181,7 @@ fn digits(text: &str) -> Option<i128> {
     plain.then(|| i128::from_str_radix(digits, radix).ok())?
 }
 
-/// Only what says itself that it is not a number is none.
+/// Parses a float. NaN is accepted only if it is written as such.
 fn real_of<T: std::str::FromStr>(text: &str) -> Option<T> {
     let known = matches!(text, "nan" | "inf" | "-inf" | "+inf");
     let plain = text
@@ -189,7 +190,7 @@ fn real_of<T: std::str::FromStr>(text: &str) -> Option<T> {
     (known || plain).then(|| text.parse().ok())?
 }
 
-/// Not-a-numbers other than the usual one are patterns of bits.
+/// Formats a float. Non-standard NaNs are formatted as bit patterns.
 fn real(bytes: &[u8]) -> Option<String> {
     let shown = |text: String| text.replace("NaN", "nan");
     if let Ok(raw) = <[u8; 4]>::try_from(bytes) {
@@ -216,8 +217,8 @@ fn hex(bytes: &[u8]) -> String {
     pairs.join(" ")
 }
 
-/// A text stands for itself, unless something of it would be lost or taken for something else.
-fn stands_for_itself(text: &str) -> bool {
+/// True if the text needs no quotes: nothing is lost or ambiguous without them.
+fn is_unambiguous_text(text: &str) -> bool {
     !text.is_empty()
         && text.trim() == text
         && !text.starts_with(['"', '['])
@@ -226,7 +227,7 @@ fn stands_for_itself(text: &str) -> bool {
 
 fn text(bytes: &[u8]) -> String {
     if let Ok(text) = std::str::from_utf8(bytes)
-        && stands_for_itself(text)
+        && is_unambiguous_text(text)
     {
         return text.to_owned();
     }
@@ -257,7 +258,7 @@ fn unicode(bytes: &[u8]) -> Option<String> {
     let decoded: Vec<_> = char::decode_utf16(units).collect();
     let plain: Result<String, _> = decoded.iter().cloned().collect();
     if let Ok(text) = plain
-        && stands_for_itself(&text)
+        && is_unambiguous_text(&text)
     {
         return Some(text);
     }
@@ -277,7 +278,7 @@ fn little_endian(units: impl Iterator<Item = u16>) -> Vec<u8> {
     units.flat_map(u16::to_le_bytes).collect()
 }
 
-/// `[01 02]`, also with 0x and commas.
+/// Parses `[01 02]`, also with 0x and commas.
 fn bracketed(text: &str) -> Option<Vec<u8>> {
     let inside = text.strip_prefix('[')?.strip_suffix(']')?;
     let parts = inside.split([' ', ',']).filter(|part| !part.is_empty());
@@ -290,7 +291,7 @@ fn byte(part: &str) -> Option<u8> {
     plain.then(|| u8::from_str_radix(digits, 16).ok())?
 }
 
-/// `01 02`, `01,02` or `0102`.
+/// Parses `01 02`, `01,02` or `0102`.
 fn pairs(text: &str) -> Option<Vec<u8>> {
     if text.contains([' ', ',']) || text.starts_with("0x") && text.len() <= 4 {
         return bracketed(&format!("[{text}]"));
@@ -306,14 +307,14 @@ fn pairs(text: &str) -> Option<Vec<u8>> {
     (!bytes.is_empty()).then_some(bytes)
 }
 
-/// A text in quotes: pieces of it, or characters by their numbers.
-enum Piece {
+/// Parts of a quoted string: literal text, or characters by number.
+enum StringPart {
     Char(char),
     Byte(u8),
     Unit(u16),
 }
 
-fn pieces(text: &str) -> Result<Vec<Piece>, ValueError> {
+fn pieces(text: &str) -> Result<Vec<StringPart>, ValueError> {
     let broken = || ValueError::Escape(text.to_owned());
     let inside = text.strip_prefix('"').ok_or_else(broken)?;
     let mut chars = inside.chars();
@@ -329,19 +330,19 @@ fn pieces(text: &str) -> Result<Vec<Piece>, ValueError> {
             '"' if chars.as_str().is_empty() => return Ok(out),
             '"' => return Err(broken()),
             '\\' => match chars.next().ok_or_else(broken)? {
-                c @ ('"' | '\\') => Piece::Char(c),
-                'n' => Piece::Char('\n'),
-                'r' => Piece::Char('\r'),
-                't' => Piece::Char('\t'),
-                '0' => Piece::Char('\0'),
+                c @ ('"' | '\\') => StringPart::Char(c),
+                'n' => StringPart::Char('\n'),
+                'r' => StringPart::Char('\r'),
+                't' => StringPart::Char('\t'),
+                '0' => StringPart::Char('\0'),
                 'x' => {
                     let byte = number(&mut chars, 2).and_then(|n| u8::try_from(n).ok());
-                    Piece::Byte(byte.ok_or_else(broken)?)
+                    StringPart::Byte(byte.ok_or_else(broken)?)
                 }
-                'u' => Piece::Unit(number(&mut chars, 4).ok_or_else(broken)?),
+                'u' => StringPart::Unit(number(&mut chars, 4).ok_or_else(broken)?),
                 _ => return Err(broken()),
             },
-            c => Piece::Char(c),
+            c => StringPart::Char(c),
         });
     }
 }
@@ -350,9 +351,9 @@ fn unquote(text: &str) -> Result<Vec<u8>, ValueError> {
     let mut out = Vec::new();
     for piece in pieces(text)? {
         match piece {
-            Piece::Char(c) => out.extend(c.encode_utf8(&mut [0; 4]).bytes()),
-            Piece::Byte(byte) => out.push(byte),
-            Piece::Unit(unit) => {
+            StringPart::Char(c) => out.extend(c.encode_utf8(&mut [0; 4]).bytes()),
+            StringPart::Byte(byte) => out.push(byte),
+            StringPart::Unit(unit) => {
                 let c = char::from_u32(u32::from(unit));
                 let c = c.ok_or_else(|| ValueError::Escape(text.to_owned()))?;
                 out.extend(c.encode_utf8(&mut [0; 4]).bytes());
@@ -366,9 +367,9 @@ fn unquote_unicode(text: &str) -> Result<Vec<u8>, ValueError> {
     let mut units = Vec::new();
     for piece in pieces(text)? {
         match piece {
-            Piece::Char(c) => units.extend(c.encode_utf16(&mut [0; 2]).iter().copied()),
-            Piece::Byte(byte) => units.push(u16::from(byte)),
-            Piece::Unit(unit) => units.push(unit),
+            StringPart::Char(c) => units.extend(c.encode_utf16(&mut [0; 2]).iter().copied()),
+            StringPart::Byte(byte) => units.push(u16::from(byte)),
+            StringPart::Unit(unit) => units.push(unit),
         }
     }
     Ok(little_endian(units.into_iter()))
@@ -385,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn values_as_they_are_shown() {
+    fn show_formats_values_by_type() {
         for (name, bytes, shown) in [
             ("BOOL", &[1][..], "true"),
             ("BOOL", &[2], "[02]"),
@@ -418,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn values_as_people_write_them() {
+    fn read_accepts_common_notations() {
         for (name, written, bytes) in [
             ("UINT", "0x0250", &[0x50, 2][..]),
             ("UINT", " 592 ", &[0x50, 2]),
@@ -445,8 +446,8 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_told() {
-        for (name, written, told) in [
+    fn read_rejects_values_that_do_not_fit() {
+        for (name, written, reported) in [
             (
                 "USINT",
                 "256",
@@ -487,7 +488,7 @@ mod tests {
             ),
         ] {
             let error = ty(name).read(written).unwrap_err();
-            assert_eq!(error.to_string(), told, "{name} {written}");
+            assert_eq!(error.to_string(), reported, "{name} {written}");
         }
         for broken in [
             "\"a",
@@ -524,9 +525,9 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig { cases: 4000, failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// Of the type's own length or of any.
+        /// Bytes of the type's length, or of any length.
         #[test]
-        fn what_is_shown_is_read_again(
+        fn read_accepts_shown_values(
             ty in any_type(),
             mut bytes in prop::collection::vec(any::<u8>(), 0..12),
             own: bool,
@@ -538,7 +539,7 @@ mod tests {
         }
 
         #[test]
-        fn texts_are_read_again(text in "\\PC{0,12}|[\"\\\\\\[ x0-9\n]{0,8}", unicode: bool) {
+        fn read_accepts_shown_texts(text in "\\PC{0,12}|[\"\\\\\\[ x0-9\n]{0,8}", unicode: bool) {
             let (ty, bytes) = match unicode {
                 true => (ty("UNICODE_STRING"), little_endian(text.encode_utf16())),
                 false => (ty("STRING"), text.into_bytes()),
@@ -547,7 +548,7 @@ mod tests {
         }
 
         #[test]
-        fn nothing_that_is_written_panics(ty in any_type(), written in "\\PC{0,16}") {
+        fn read_never_panics(ty in any_type(), written in "\\PC{0,16}") {
             let _ = ty.read(&written);
         }
     }

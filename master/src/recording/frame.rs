@@ -1,4 +1,5 @@
-//! What of a packet is EtherCAT (ETG.1000.4, clause 5): the datagrams of a frame in Ethernet, behind VLAN tags, or in UDP.
+//! The EtherCAT datagrams of a packet (ETG.1000.4, clause 5): in Ethernet, after VLAN tags, or in
+//! UDP.
 
 use std::ops::Range;
 
@@ -8,24 +9,24 @@ const ETHERTYPE: u16 = 0x88a4;
 const VLAN: [u16; 3] = [0x8100, 0x88a8, 0x9100];
 const IPV4: u16 = 0x0800;
 const UDP: u8 = 17;
-/// UDP port of EtherCAT.
+/// The UDP port of EtherCAT.
 const UDP_PORT: u16 = 0x88a4;
 
 const LINK_ETHERNET: u16 = 1;
-/// Linux "cooked", as a recording of interface `any` has it, and its second version.
+/// Linux cooked capture, as recorded on interface `any`, and its second version.
 const LINK_SLL: u16 = 113;
 const LINK_SLL2: u16 = 276;
 
 const DATAGRAM_HEADER: usize = 10;
 const WKC: usize = 2;
-/// Type of an EtherCAT frame that carries datagrams.
+/// The type of an EtherCAT frame with datagrams.
 const DLPDUS: u8 = 1;
 
-/// How an EtherCAT frame was carried.
+/// The encapsulation of an EtherCAT frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Carrier {
+pub enum Encapsulation {
     Ethernet,
-    /// Behind at least one tag; the innermost's VLAN.
+    /// At least one tag; the VLAN ID of the innermost.
     Vlan(u16),
     Udp,
 }
@@ -50,7 +51,7 @@ impl Command {
     pub const ARMW: Self = Self(13);
     pub const FRMW: Self = Self(14);
 
-    /// Its abbreviation; unknown ones have none.
+    /// Returns its abbreviation; empty for unknown commands.
     #[must_use]
     pub const fn name(self) -> &'static str {
         const NAMES: [&str; 15] = [
@@ -64,13 +65,13 @@ impl Command {
         }
     }
 
-    /// One 32-bit address in place of two of 16 bits.
+    /// True if it has one 32-bit address instead of two 16-bit addresses.
     #[must_use]
     pub const fn is_logical(self) -> bool {
         matches!(self, Self::LRD | Self::LWR | Self::LRW)
     }
 
-    /// SubDevices count the address up.
+    /// True if SubDevices increment the address.
     #[must_use]
     pub const fn is_positional(self) -> bool {
         matches!(
@@ -103,26 +104,26 @@ impl Command {
     }
 }
 
-/// One datagram; its data lies in the frame.
+/// One datagram; its data are in the frame.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Datagram {
     pub command: Command,
     pub index: u8,
     /// Low half: position or station address; high half: register. One number for logical commands.
     pub address: u32,
-    /// Of the data, in [`Frame::bytes`].
+    /// The range of the data in [`Frame::bytes`].
     pub data: Range<usize>,
     pub wkc: u16,
 }
 
 impl Datagram {
-    /// Position (counted down from 0) or station address.
+    /// Returns the position (counted down from 0) or station address.
     #[must_use]
     pub const fn adp(&self) -> u16 {
         (self.address & 0xffff) as u16
     }
 
-    /// Register, or address in the memory of the SubDevice.
+    /// Returns the register or memory address in the SubDevice.
     #[must_use]
     pub const fn ado(&self) -> u16 {
         (self.address >> 16) as u16
@@ -133,16 +134,16 @@ impl Datagram {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Frame {
     pub number: u64,
-    /// Nanoseconds since 1970.
+    /// The time in ns since 1970.
     pub at: u64,
     pub source: [u8; 6],
     pub direction: Option<Direction>,
     pub interface: u32,
-    pub carrier: Carrier,
+    pub carrier: Encapsulation,
     pub datagrams: Vec<Datagram>,
     /// The packet as recorded.
     pub bytes: Vec<u8>,
-    /// Datagrams do not fill what they should, or exceed it.
+    /// True if the datagrams do not match the length of the frame.
     pub cut: bool,
 }
 
@@ -153,23 +154,23 @@ impl Frame {
     }
 }
 
-/// What a packet is.
+/// The content of a packet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Content {
     Frame(Frame),
-    /// EtherCAT that carries no datagrams: network variables, mailbox gateway; the type.
+    /// EtherCAT without datagrams: network variables, mailbox gateway; the type.
     OtherEthercat(u8),
     /// Not EtherCAT.
     Other,
 }
 
-/// Big-endian, as everything before EtherCAT is.
+/// Reads big-endian, as in all headers before EtherCAT.
 fn be16(bytes: &[u8], at: usize) -> Option<u16> {
     let two = bytes.get(at..)?.first_chunk()?;
     Some(u16::from_be_bytes(*two))
 }
 
-/// Looks for EtherCAT in a packet.
+/// Parses a packet.
 #[must_use]
 pub fn content(packet: Packet) -> Content {
     match find(&packet.data, packet.link_type) {
@@ -178,15 +179,15 @@ pub fn content(packet: Packet) -> Content {
     }
 }
 
-/// Where EtherCAT begins.
-struct Found {
+/// The start of the EtherCAT payload.
+struct EthercatPayload {
     at: usize,
     source: [u8; 6],
-    carrier: Carrier,
+    carrier: Encapsulation,
     sent: Option<Direction>,
 }
 
-fn find(bytes: &[u8], link_type: u16) -> Option<Found> {
+fn find(bytes: &[u8], link_type: u16) -> Option<EthercatPayload> {
     let (mut at, source, sent) = match link_type {
         LINK_ETHERNET => (12, 6, None),
         LINK_SLL => (14, 6, Some(be16(bytes, 0)?)),
@@ -203,21 +204,21 @@ fn find(bytes: &[u8], link_type: u16) -> Option<Found> {
         }
     });
     let mut kind = be16(bytes, at)?;
-    // The protocol stands first in the second version, everything else behind its head.
+    // In the second version the protocol comes first; its header precedes the rest.
     at = if link_type == LINK_SLL2 { 20 } else { at + 2 };
-    let mut carrier = Carrier::Ethernet;
+    let mut carrier = Encapsulation::Ethernet;
     while VLAN.contains(&kind) {
-        carrier = Carrier::Vlan(be16(bytes, at)? & 0x0fff);
+        carrier = Encapsulation::Vlan(be16(bytes, at)? & 0x0fff);
         kind = be16(bytes, at + 2)?;
         at += 4;
     }
     if kind == IPV4 {
         at = udp(bytes, at)?;
-        carrier = Carrier::Udp;
+        carrier = Encapsulation::Udp;
     } else if kind != ETHERTYPE {
         return None;
     }
-    Some(Found {
+    Some(EthercatPayload {
         at,
         source,
         carrier,
@@ -225,11 +226,11 @@ fn find(bytes: &[u8], link_type: u16) -> Option<Found> {
     })
 }
 
-/// Where the payload of a UDP packet to or from EtherCAT's port begins.
+/// Returns the payload offset of a UDP packet to or from EtherCAT's port.
 fn udp(bytes: &[u8], at: usize) -> Option<usize> {
     let first = *bytes.get(at)?;
     let head = usize::from(first & 0x0f) * 4;
-    // A later fragment has no UDP header.
+    // Later fragments have no UDP header.
     let fragment = be16(bytes, at + 6)? & 0x1fff;
     if first >> 4 != 4 || head < 20 || fragment != 0 || *bytes.get(at + 9)? != UDP {
         return None;
@@ -239,7 +240,7 @@ fn udp(bytes: &[u8], at: usize) -> Option<usize> {
     ours.then_some(udp + 8)
 }
 
-impl Found {
+impl EthercatPayload {
     fn read(self, packet: Packet) -> Content {
         let bytes = packet.data;
         let Some(head) = bytes.get(self.at..).and_then(<[u8]>::first_chunk::<2>) else {
@@ -267,7 +268,7 @@ impl Found {
     }
 }
 
-/// Whole datagrams, and whether something is missing.
+/// Returns the complete datagrams, and true if data are missing.
 fn datagrams(bytes: &[u8], start: usize, end: usize) -> (Vec<Datagram>, bool) {
     let mut found = Vec::new();
     let mut at = start;

@@ -1,10 +1,10 @@
-//! Recordings as files: pcap and pcapng, ours and other people's. Reads what may be cut, damaged or something else: what is
-//! wrong becomes a [`Remark`], what follows is read all the same. Memory is bounded however long the file is.
+//! Reads pcap and pcapng files of any origin. Damage and truncation become a [`ReadIssue`], and
+//! reading continues behind them. Memory is bounded for files of any length.
 //!
-//! - [`Reader`]: packets of a file, one after the other;
+//! - [`Reader`]: the packets of a file in order;
 //! - `pcap`, `pcapng`: the two formats;
-//! - `window`: a part of a file in memory;
-//! - [`frame`]: what of a packet is EtherCAT, and its datagrams.
+//! - `window`: the buffer;
+//! - [`frame`]: the EtherCAT datagrams of a packet.
 
 use std::fmt;
 use std::io::{self, Read};
@@ -14,15 +14,15 @@ mod pcap;
 mod pcapng;
 mod window;
 
-use window::Window;
+use window::PeekReader;
 
-/// No packet is longer. What claims to be is damaged: Ethernet has 1518 bytes, jumbo frames 9000.
+/// The maximum packet size. Larger ones are damaged: Ethernet has 1518 bytes, jumbo frames 9000.
 const MAX_PACKET: usize = 256 * 1024;
 
-/// Which way a packet went, where the recording says so.
+/// The direction of a packet, if recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
-    /// Sent by the computer that recorded.
+    /// Sent by the recording computer.
     Out,
     In,
 }
@@ -30,47 +30,48 @@ pub enum Direction {
 /// One packet of a recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Packet {
-    /// From 1, as Wireshark counts.
+    /// The packet number from 1, as in Wireshark.
     pub number: u64,
-    /// Nanoseconds since 1970; `None` where the format has no time.
+    /// The time in ns since 1970; `None` if the format has no time.
     pub at: Option<u64>,
     pub interface: u32,
-    /// LINKTYPE_… of <https://www.tcpdump.org/linktypes.html>.
+    /// LINKTYPE_… from <https://www.tcpdump.org/linktypes.html>.
     pub link_type: u16,
     pub direction: Option<Direction>,
     pub data: Vec<u8>,
-    /// How long it was on the wire; more than `data` where the recording cut it.
+    /// The length on the wire; more than `data` if the recording truncated it.
     pub original_len: usize,
 }
 
-/// Something about a file that its reader should know.
+/// A problem of a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Remark {
-    /// The file is no recording; what it seems to be.
+pub enum ReadIssue {
+    /// The file is not a recording; its probable type.
     Foreign(&'static str),
     /// The file ends within a packet, at this byte.
     Truncated { at: u64 },
-    /// What stands at this byte is no packet; `skipped` bytes later there was one again, or the file's end.
+    /// The data at this byte are not a packet. The next packet or the end of the file follows after
+    /// `skipped` bytes.
     Damaged { at: u64, skipped: u64 },
-    /// An operating system error while reading.
+    /// An operating system error during reading.
     Unreadable { at: u64, error: String },
 }
 
-impl fmt::Display for Remark {
+impl fmt::Display for ReadIssue {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Foreign(what) => write!(f, "this is no recording but {what}"),
+            Self::Foreign(what) => write!(f, "this is not a recording but {what}"),
             Self::Truncated { at } => write!(f, "the file ends within a packet, at byte {at}"),
             Self::Damaged { at, skipped } => {
-                write!(f, "damaged at byte {at}: {skipped} bytes were left out")
+                write!(f, "damaged at byte {at}: {skipped} bytes were skipped")
             }
             Self::Unreadable { at, error } => write!(f, "cannot be read beyond byte {at}: {error}"),
         }
     }
 }
 
-/// Remarks that are kept; a file of noise would have thousands.
+/// The maximum number of stored issues.
 const REMARKS: usize = 16;
 
 #[derive(Debug)]
@@ -80,32 +81,32 @@ enum Format {
     Foreign,
 }
 
-/// Packets of a file, in the file's order.
+/// The packets of a file in file order.
 #[derive(Debug)]
 pub struct Reader<R> {
-    window: Window<R>,
+    window: PeekReader<R>,
     format: Format,
     peeked: Option<Packet>,
     packets: u64,
-    remarks: Vec<Remark>,
+    remarks: Vec<ReadIssue>,
     more_remarks: u64,
 }
 
-/// What a format made of the bytes in front of it.
+/// The result of parsing at the present position.
 enum Step {
     Packet(Packet),
-    /// Something that is no packet.
+    /// A block without a packet.
     Skip,
     End,
-    /// Not what the format says; nothing has been taken.
+    /// Invalid data; nothing was consumed.
     Damaged,
     Truncated,
 }
 
 impl<R: Read> Reader<R> {
-    /// Looks at the head of a file. A file that is no recording has a remark and no packets.
+    /// Detects the format. A file that is not a recording has one issue and no packets.
     pub fn new(source: R) -> Self {
-        let mut window = Window::new(source);
+        let mut window = PeekReader::new(source);
         let mut remarks = Vec::new();
         let head = window.fill(24);
         let format = if let Some(pcap) = pcap::Pcap::new(head) {
@@ -114,7 +115,7 @@ impl<R: Read> Reader<R> {
         } else if head.starts_with(&pcapng::SECTION.to_le_bytes()) {
             Format::Pcapng(pcapng::Pcapng::default())
         } else {
-            remarks.push(Remark::Foreign(looks_like(head)));
+            remarks.push(ReadIssue::Foreign(looks_like(head)));
             Format::Foreign
         };
         Self {
@@ -127,7 +128,7 @@ impl<R: Read> Reader<R> {
         }
     }
 
-    /// The next packet.
+    /// Returns the next packet.
     #[expect(
         clippy::should_implement_trait,
         reason = "it never ends with an error either"
@@ -136,7 +137,7 @@ impl<R: Read> Reader<R> {
         self.peeked.take().or_else(|| self.read())
     }
 
-    /// The next packet, which stays the next.
+    /// Returns the next packet without consuming it.
     pub fn peek(&mut self) -> Option<&Packet> {
         if self.peeked.is_none() {
             self.peeked = self.read();
@@ -161,7 +162,7 @@ impl<R: Read> Reader<R> {
                 Step::Skip => {}
                 Step::End => return self.ended(),
                 Step::Truncated => {
-                    self.remark(Remark::Truncated {
+                    self.remark(ReadIssue::Truncated {
                         at: self.window.end(),
                     });
                     self.format = Format::Foreign;
@@ -180,7 +181,7 @@ impl<R: Read> Reader<R> {
                         }
                     }
                     let skipped = self.window.offset() - at;
-                    self.remark(Remark::Damaged { at, skipped });
+                    self.remark(ReadIssue::Damaged { at, skipped });
                 }
             }
         }
@@ -189,12 +190,12 @@ impl<R: Read> Reader<R> {
     fn ended(&mut self) -> Option<Packet> {
         if let Some(error) = self.window.error() {
             let at = self.window.end();
-            self.remark(Remark::Unreadable { at, error });
+            self.remark(ReadIssue::Unreadable { at, error });
         }
         None
     }
 
-    fn remark(&mut self, remark: Remark) {
+    fn remark(&mut self, remark: ReadIssue) {
         if self.remarks.len() < REMARKS {
             self.remarks.push(remark);
         } else {
@@ -202,26 +203,26 @@ impl<R: Read> Reader<R> {
         }
     }
 
-    /// What was noticed so far; the first ones.
+    /// Returns the first issues.
     #[must_use]
-    pub fn remarks(&self) -> &[Remark] {
+    pub fn remarks(&self) -> &[ReadIssue] {
         &self.remarks
     }
 
-    /// Remarks that were not kept.
+    /// Returns the number of issues that were not stored.
     #[must_use]
     pub fn more_remarks(&self) -> u64 {
         self.more_remarks
     }
 
-    /// Bytes of the file that have been read.
+    /// Returns the number of bytes read.
     #[must_use]
     pub fn offset(&self) -> u64 {
         self.window.offset()
     }
 }
 
-/// What a file that is no recording may be.
+/// Returns the probable type of a file that is not a recording.
 fn looks_like(head: &[u8]) -> &'static str {
     match head {
         [] => "an empty file",
@@ -239,10 +240,10 @@ fn looks_like(head: &[u8]) -> &'static str {
     }
 }
 
-/// Opens a file for reading.
+/// Opens a file.
 ///
 /// # Errors
-/// Where it cannot be opened; everything later is a [`Remark`].
+/// Fails if it cannot be opened. Later errors are [`ReadIssue`]s.
 pub fn open(path: &std::path::Path) -> io::Result<Reader<std::fs::File>> {
     let file = std::fs::File::open(path)?;
     if file.metadata()?.is_dir() {

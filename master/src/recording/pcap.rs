@@ -3,19 +3,19 @@
 
 use std::io::Read;
 
-use super::window::{Order, Window};
+use super::window::{ByteOrder, PeekReader};
 use super::{MAX_PACKET, Packet, Step};
 
 const MICROS: u32 = 0xa1b2_c3d4;
 const NANOS: u32 = 0xa1b2_3c4d;
 const RECORD: usize = 16;
-/// A record whose time is farther from the one before does not follow it; used to find one again after damage.
+/// The maximum distance of consecutive records in s; used to resynchronize after damage.
 const APART_S: u32 = 86_400;
 
 #[derive(Debug)]
 pub(super) struct Pcap {
-    order: Order,
-    /// Fractions of a second are nanoseconds.
+    order: ByteOrder,
+    /// True if fractions of a second are in ns.
     nanos: bool,
     link_type: u16,
     seconds: Option<u32>,
@@ -24,22 +24,22 @@ pub(super) struct Pcap {
 impl Pcap {
     pub fn new(head: &[u8]) -> Option<Self> {
         let head = head.get(..24)?;
-        let of = |order: Order| match order.u32(head, 0) {
+        let of = |order: ByteOrder| match order.u32(head, 0) {
             MICROS => Some((order, false)),
             NANOS => Some((order, true)),
             _ => None,
         };
-        let (order, nanos) = of(Order::Little).or_else(|| of(Order::Big))?;
+        let (order, nanos) = of(ByteOrder::Little).or_else(|| of(ByteOrder::Big))?;
         Some(Self {
             order,
             nanos,
-            // The upper half has the length of the FCS.
+            // The upper half contains the length of the FCS.
             link_type: (order.u32(head, 20) & 0xffff) as u16,
             seconds: None,
         })
     }
 
-    /// (seconds, fraction, bytes kept, bytes of the packet) of a record's head that can be one.
+    /// Returns (seconds, fraction, stored bytes, packet bytes) of a plausible record header.
     fn head(&self, head: &[u8]) -> Option<(u32, u32, usize, usize)> {
         let field = |n: usize| self.order.u32(head, 4 * n);
         let kept = usize::try_from(field(2)).ok()?;
@@ -49,7 +49,7 @@ impl Pcap {
         good.then_some((field(0), field(1), kept, original))
     }
 
-    pub fn step<R: Read>(&mut self, window: &mut Window<R>) -> Step {
+    pub fn step<R: Read>(&mut self, window: &mut PeekReader<R>) -> Step {
         let head = window.fill(RECORD);
         match head.len() {
             0 => return Step::End,
@@ -77,8 +77,8 @@ impl Pcap {
         })
     }
 
-    /// Whether a record begins here that has another one, or the end of the file, behind it.
-    pub fn sound<R: Read>(&mut self, window: &mut Window<R>) -> bool {
+    /// True if a record begins here and is followed by another one or the end of the file.
+    pub fn sound<R: Read>(&mut self, window: &mut PeekReader<R>) -> bool {
         let near = |seconds: u32| self.seconds.is_none_or(|s| s.abs_diff(seconds) <= APART_S);
         let follows = |head: &[u8]| {
             let fields = self.head(head)?;

@@ -1,23 +1,24 @@
-//! pcapng: sections of blocks, each with its type, its length, and its length once more
+//! pcapng: sections of blocks; each block has a type, and its length at both ends
 //! (<https://www.ietf.org/archive/id/draft-ietf-opsawg-pcapng-02.html>).
 
 use std::io::Read;
 
-use super::window::{Order, Window};
+use super::window::{ByteOrder, PeekReader};
 use super::{Direction, MAX_PACKET, Packet, Step};
 
 pub(super) const SECTION: u32 = 0x0a0d_0d0a;
 const MAGIC: u32 = 0x1a2b_3c4d;
 const INTERFACE: u32 = 1;
-/// Obsolete, before enhanced packets.
+/// The obsolete predecessor of enhanced packets.
 const PACKET: u32 = 2;
 const SIMPLE: u32 = 3;
 const ENHANCED: u32 = 6;
 /// Type, length, length.
 const EMPTY: usize = 12;
-/// What is no packet (names, statistics, secrets) may be longer than one.
+/// The maximum block size. Blocks without packets (names, statistics, secrets) may be longer than a
+/// packet.
 const MAX_BLOCK: usize = 64 << 20;
-/// More than anybody has; the others' packets are of an unknown kind.
+/// The maximum number of interfaces; packets of others have an unknown link type.
 const MAX_INTERFACES: usize = 1024;
 
 const OPTION_END: u16 = 0;
@@ -28,36 +29,37 @@ const IF_TSOFFSET: u16 = 14;
 #[derive(Debug, Clone, Copy)]
 struct Interface {
     link_type: u16,
-    /// As `if_tsresol` has it: a power of ten, or with the highest bit of two, in negative.
+    /// As in `if_tsresol`: a negative power of ten, or of two with the highest bit set.
     resolution: u8,
     offset_s: i64,
 }
 
 #[derive(Debug)]
 pub(super) struct Pcapng {
-    order: Order,
+    order: ByteOrder,
     interfaces: Vec<Interface>,
 }
 
 impl Default for Pcapng {
     fn default() -> Self {
         Self {
-            order: Order::Little,
+            order: ByteOrder::Little,
             interfaces: Vec::new(),
         }
     }
 }
 
 impl Pcapng {
-    /// Type and length of a block whose head can be one. A section's head also tells the byte order.
-    fn head(&self, head: &[u8]) -> Option<(u32, usize, Order)> {
+    /// Returns type, length and byte order of a plausible block header. Only a section header
+    /// contains the byte order.
+    fn head(&self, head: &[u8]) -> Option<(u32, usize, ByteOrder)> {
         if head.len() < EMPTY {
             return None;
         }
-        // The same in both orders.
-        let order = if Order::Little.u32(head, 0) == SECTION {
-            let of = |order: Order| (order.u32(head, 8) == MAGIC).then_some(order);
-            of(Order::Little).or_else(|| of(Order::Big))?
+        // The type is the same in both byte orders.
+        let order = if ByteOrder::Little.u32(head, 0) == SECTION {
+            let of = |order: ByteOrder| (order.u32(head, 8) == MAGIC).then_some(order);
+            of(ByteOrder::Little).or_else(|| of(ByteOrder::Big))?
         } else {
             self.order
         };
@@ -71,7 +73,7 @@ impl Pcapng {
         (len >= EMPTY && len.is_multiple_of(4) && len <= most).then_some((kind, len, order))
     }
 
-    pub fn step<R: Read>(&mut self, window: &mut Window<R>) -> Step {
+    pub fn step<R: Read>(&mut self, window: &mut PeekReader<R>) -> Step {
         let head = window.fill(EMPTY);
         match head.len() {
             0 => return Step::End,
@@ -121,7 +123,7 @@ impl Pcapng {
         let (interface, fixed, kept, original): (u32, usize, u32, u32) = match kind {
             ENHANCED => (word(0), 20, word(12), word(16)),
             PACKET => (u32::from(self.order.u16(body, 0)), 20, word(12), word(16)),
-            // Cut by the interface's length alone.
+            // Limited by the interface's snapshot length only.
             _ => {
                 let there = u32::try_from(body.len().saturating_sub(4)).ok()?;
                 (0, 4, word(0).min(there), word(0))
@@ -156,12 +158,12 @@ impl Pcapng {
         })
     }
 
-    /// Whether a block begins here: known, and with its length at both ends.
-    pub fn sound<R: Read>(&mut self, window: &mut Window<R>) -> bool {
+    /// True if a block of known type begins here with the same length at both ends.
+    pub fn sound<R: Read>(&mut self, window: &mut PeekReader<R>) -> bool {
         let Some((kind, len, order)) = self.head(window.fill(EMPTY)) else {
             return false;
         };
-        // Unknown kinds and long blocks are nothing to rely on.
+        // Unknown types and long blocks do not prove a block boundary.
         matches!(kind, SECTION | INTERFACE | PACKET | SIMPLE | ENHANCED)
             && len <= MAX_PACKET
             && usize::try_from(order.u32(window.fill(len), len - 4)) == Ok(len)
@@ -169,7 +171,7 @@ impl Pcapng {
 }
 
 impl Interface {
-    /// Nanoseconds since 1970 of a time stamp; what does not fit is 0 or as late as can be.
+    /// Converts a timestamp to ns since 1970, limited to the representable range.
     fn nanos(&self, raw: u64) -> u64 {
         let raw = u128::from(raw);
         let exponent = u32::from(self.resolution & 0x7f);
@@ -188,7 +190,7 @@ impl Interface {
     }
 }
 
-fn interface(order: Order, body: &[u8]) -> Interface {
+fn interface(order: ByteOrder, body: &[u8]) -> Interface {
     let options = body.get(8..).unwrap_or_default();
     let offset = option(order, options, IF_TSOFFSET).and_then(<[u8]>::first_chunk::<8>);
     Interface {
@@ -197,14 +199,14 @@ fn interface(order: Order, body: &[u8]) -> Interface {
             .and_then(|value| value.first().copied())
             .unwrap_or(6),
         offset_s: offset.map_or(0, |bytes| match order {
-            Order::Little => i64::from_le_bytes(*bytes),
-            Order::Big => i64::from_be_bytes(*bytes),
+            ByteOrder::Little => i64::from_le_bytes(*bytes),
+            ByteOrder::Big => i64::from_be_bytes(*bytes),
         }),
     }
 }
 
-/// The value of the first option with this code.
-fn option(order: Order, mut options: &[u8], wanted: u16) -> Option<&[u8]> {
+/// Returns the value of the first option with this code.
+fn option(order: ByteOrder, mut options: &[u8], wanted: u16) -> Option<&[u8]> {
     while options.len() >= 4 {
         let code = order.u16(options, 0);
         let len = usize::from(order.u16(options, 2));

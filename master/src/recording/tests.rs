@@ -1,7 +1,7 @@
-use super::frame::{Carrier, Content, content};
+use super::frame::{Content, Encapsulation, content};
 use super::*;
 
-fn all(bytes: &[u8]) -> (Vec<Packet>, Vec<Remark>) {
+fn all(bytes: &[u8]) -> (Vec<Packet>, Vec<ReadIssue>) {
     let mut reader = Reader::new(bytes);
     let packets = std::iter::from_fn(|| reader.next()).collect();
     (packets, reader.remarks().to_vec())
@@ -49,7 +49,8 @@ fn block(big: bool, kind: u32, body: &[u8], out: &mut Vec<u8>) {
     number(big, len, out);
 }
 
-/// A section with one interface for each `if_tsresol`, and packets: interface, stamp, data, flags.
+/// Returns a section with one interface per `if_tsresol`, and packets: interface, timestamp, data,
+/// flags.
 fn pcapng(big: bool, resolutions: &[Option<u8>], packets: &[(u32, u64, &[u8], u32)]) -> Vec<u8> {
     let mut out = Vec::new();
     let mut body = Vec::new();
@@ -91,7 +92,7 @@ fn pcapng(big: bool, resolutions: &[Option<u8>], packets: &[(u32, u64, &[u8], u3
 }
 
 #[test]
-fn pcap_of_either_order_and_resolution() {
+fn pcap_supports_both_byte_orders_and_resolutions() {
     for (big, nanos) in [(false, false), (false, true), (true, false), (true, true)] {
         let file = pcap(
             big,
@@ -111,7 +112,7 @@ fn pcap_of_either_order_and_resolution() {
 }
 
 #[test]
-fn pcapng_stamps_interfaces_and_directions() {
+fn pcapng_returns_timestamps_interfaces_and_directions() {
     let two_to_minus_10 = 0x80 | 10;
     for big in [false, true] {
         let resolutions = [None, Some(9), Some(two_to_minus_10), Some(12), Some(127)];
@@ -121,7 +122,7 @@ fn pcapng_stamps_interfaces_and_directions() {
             (2, 3 * 1024 + 512, &[3; 61], 2),
             (3, 7_123_456_789_000, &[4; 62], 3),
             (4, 9, &[5; 63], 0),
-            // Nobody described it.
+            // An interface without a description.
             (9, 9, &[6; 64], 0),
             (1, 42, &[], 0),
         ];
@@ -153,9 +154,9 @@ fn pcapng_stamps_interfaces_and_directions() {
 }
 
 #[test]
-fn sections_of_both_orders_in_one_file() {
+fn pcapng_supports_both_byte_orders_in_one_file() {
     let mut file = pcapng(false, &[Some(9)], &[(0, 1, &[1; 20], 0)]);
-    // Name resolution, which nobody needs.
+    // A name resolution block, which is skipped.
     block(false, 4, &[0; 40], &mut file);
     file.extend(pcapng(true, &[Some(9)], &[(0, 2, &[2; 20], 0)]));
     let (packets, remarks) = all(&file);
@@ -165,7 +166,7 @@ fn sections_of_both_orders_in_one_file() {
 }
 
 #[test]
-fn what_is_no_recording() {
+fn reader_rejects_other_files() {
     for (file, what) in [
         (&b""[..], "an empty file"),
         (b"[bus]\nnic = \"sim\"\n", "a text file"),
@@ -176,38 +177,39 @@ fn what_is_no_recording() {
         let (packets, remarks) = all(file);
         assert!(packets.is_empty());
         assert!(
-            matches!(&remarks[..], [Remark::Foreign(is)] if is.contains(what)),
+            matches!(&remarks[..], [ReadIssue::Foreign(is)] if is.contains(what)),
             "{remarks:?}"
         );
     }
 }
 
 #[test]
-fn what_is_damaged_is_left_out_and_the_rest_read() {
+fn reader_skips_damaged_data() {
     let packets: Vec<_> = (0..20).map(|n| (n, 0, vec![n as u8; 60])).collect();
     let mut old = pcap(false, true, &packets);
-    // The length of the tenth.
+    // The length of the tenth packet.
     let at = 24 + 9 * 76 + 8;
     old[at..at + 4].fill(0xee);
     let new: Vec<_> = (0..20_u64).map(|n| (0, n, &[7; 60][..], 0)).collect();
     let mut new = pcapng(false, &[Some(9)], &new);
     // Blocks of 100 bytes.
     let at = new.len() - 5 * 100 - 4;
-    // The second length of one, the first of another.
+    // The second length of one block, the first of the next.
     new[at..at + 4].fill(0xee);
     let at = at - 5 * 100 - 92;
     new[at..at + 4].fill(0xee);
     for (file, kept, places) in [(old, 19, 1), (new, 18, 2)] {
         let (packets, remarks) = all(&file);
         assert_eq!(packets.len(), kept);
-        let damaged = |r: &Remark| matches!(r, Remark::Damaged { skipped, .. } if *skipped < 200);
+        let damaged =
+            |r: &ReadIssue| matches!(r, ReadIssue::Damaged { skipped, .. } if *skipped < 200);
         assert_eq!(remarks.len(), places, "{remarks:?}");
         assert!(remarks.iter().all(damaged), "{remarks:?}");
     }
 }
 
 #[test]
-fn a_file_cut_at_any_byte() {
+fn reader_accepts_files_cut_at_any_byte() {
     let packets: Vec<_> = (0..6).map(|n| (n, 0, vec![n as u8; 40])).collect();
     let ng: Vec<_> = (0..6_u64).map(|n| (0, n, &[7; 40][..], 0)).collect();
     for file in [pcap(true, false, &packets), pcapng(false, &[None], &ng)] {
@@ -221,7 +223,7 @@ fn a_file_cut_at_any_byte() {
 }
 
 #[test]
-fn an_error_of_the_disk_is_a_remark() {
+fn read_error_becomes_an_issue() {
     struct Broken(Vec<u8>);
     impl Read for Broken {
         fn read(&mut self, to: &mut [u8]) -> io::Result<usize> {
@@ -238,7 +240,7 @@ fn an_error_of_the_disk_is_a_remark() {
     assert!(reader.peek().is_some() && reader.next().is_some() && reader.next().is_none());
     let remarks = reader.remarks();
     assert!(
-        matches!(remarks, [Remark::Unreadable { error, .. }] if error.contains("sector")),
+        matches!(remarks, [ReadIssue::Unreadable { error, .. }] if error.contains("sector")),
         "{remarks:?}"
     );
 }
@@ -282,7 +284,7 @@ fn ipv4(protocol: u8, port: u16, fragment: u16) -> Vec<u8> {
 }
 
 #[test]
-fn ethercat_is_found_wherever_it_is_carried() {
+fn content_finds_ethercat_in_any_encapsulation() {
     let sll = |protocol: &[u8]| {
         [
             &[0, 4, 0, 1, 0, 6, 0x12, 1, 1, 1, 1, 1, 0, 0][..],
@@ -300,20 +302,24 @@ fn ethercat_is_found_wherever_it_is_carried() {
     .concat();
     let padded = [&ETHERCAT[..], &[0; 28]].concat();
     for (link, bytes, carrier) in [
-        (1, ethernet(&[0x88, 0xa4], &padded), Carrier::Ethernet),
+        (1, ethernet(&[0x88, 0xa4], &padded), Encapsulation::Ethernet),
         (
             1,
             ethernet(&[0x81, 0, 0x20, 5, 0x88, 0xa4], &ETHERCAT),
-            Carrier::Vlan(5),
+            Encapsulation::Vlan(5),
         ),
         (
             1,
             ethernet(&[0x88, 0xa8, 0, 9, 0x81, 0, 0, 7, 0x88, 0xa4], &ETHERCAT),
-            Carrier::Vlan(7),
+            Encapsulation::Vlan(7),
         ),
-        (1, ethernet(&ipv4(17, 0x88a4, 0), &ETHERCAT), Carrier::Udp),
-        (113, sll(&[0x88, 0xa4]), Carrier::Ethernet),
-        (276, sll2, Carrier::Ethernet),
+        (
+            1,
+            ethernet(&ipv4(17, 0x88a4, 0), &ETHERCAT),
+            Encapsulation::Udp,
+        ),
+        (113, sll(&[0x88, 0xa4]), Encapsulation::Ethernet),
+        (276, sll2, Encapsulation::Ethernet),
     ] {
         let whole = bytes.len();
         let Content::Frame(frame) = content(packet(link, bytes.clone())) else {
@@ -338,7 +344,7 @@ fn ethercat_is_found_wherever_it_is_carried() {
             Direction::In
         });
         assert_eq!(frame.direction, sent);
-        // Cut anywhere it is less, and never a panic.
+        // A cut packet has fewer datagrams and never panics.
         for end in 0..whole {
             match content(packet(link, bytes[..end].to_vec())) {
                 Content::Frame(frame) => assert!(frame.cut || end >= whole - 28),
@@ -350,7 +356,7 @@ fn ethercat_is_found_wherever_it_is_carried() {
 }
 
 #[test]
-fn what_is_not_ethercat() {
+fn content_ignores_other_protocols() {
     let gateway = [&[4, 0x50][..], &[0; 40]].concat();
     for (link, bytes) in [
         (1, ethernet(&[0x08, 0x06], &ETHERCAT)),

@@ -1,23 +1,23 @@
-//! The part of a file that is looked at, in memory.
+//! A buffered window of a file.
 
 use std::io::{ErrorKind, Read};
 
 const CHUNK: usize = 64 * 1024;
 
-/// Bytes from [`Window::offset`] on, as many as were asked for.
+/// The bytes from [`PeekReader::offset`] on.
 #[derive(Debug)]
-pub(super) struct Window<R> {
+pub(super) struct PeekReader<R> {
     source: R,
     buffer: Vec<u8>,
-    /// Of what has not been taken, in the buffer.
+    /// The start of the unconsumed bytes in the buffer.
     start: usize,
-    /// In the file, of `start`.
+    /// The file offset of `start`.
     offset: u64,
     ended: bool,
     error: Option<String>,
 }
 
-impl<R: Read> Window<R> {
+impl<R: Read> PeekReader<R> {
     pub fn new(source: R) -> Self {
         Self {
             source,
@@ -29,7 +29,7 @@ impl<R: Read> Window<R> {
         }
     }
 
-    /// The next `len` bytes, fewer only where the file ends.
+    /// Returns the next `len` bytes, fewer only at the end of the file.
     pub fn fill(&mut self, len: usize) -> &[u8] {
         while !self.ended && self.buffer.len() - self.start < len {
             if self.start > 0 {
@@ -59,7 +59,7 @@ impl<R: Read> Window<R> {
         self.buffer.get(self.start..end).unwrap_or_default()
     }
 
-    /// Moves on; returns by how much, which is less than `len` only at the file's end.
+    /// Skips bytes. Returns their number, which is less than `len` only at the end of the file.
     pub fn take(&mut self, len: usize) -> usize {
         let mut left = len;
         while left > 0 {
@@ -74,12 +74,12 @@ impl<R: Read> Window<R> {
         len - left
     }
 
-    /// Where in the file this is.
+    /// Returns the file offset.
     pub fn offset(&self) -> u64 {
         self.offset
     }
 
-    /// Where the bytes that are known end.
+    /// Returns the file offset of the end of the buffer.
     pub fn end(&self) -> u64 {
         self.offset + (self.buffer.len() - self.start) as u64
     }
@@ -89,14 +89,14 @@ impl<R: Read> Window<R> {
     }
 }
 
-/// An integer of a file of either byte order.
+/// The byte order of a file's integers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Order {
+pub(super) enum ByteOrder {
     Little,
     Big,
 }
 
-impl Order {
+impl ByteOrder {
     pub fn u16(self, bytes: &[u8], at: usize) -> u16 {
         let two = bytes.get(at..).and_then(<[u8]>::first_chunk).copied();
         let two = two.unwrap_or_default();

@@ -1,21 +1,22 @@
-//! A user's own control loop inside the cycle.
+//! User-supplied control loops inside the cycle.
 
-use ecaxis_axis::{AxisStatus, Command, Refused};
+use ecaxis_axis::{AxisStatus, Command, CommandError};
 
+use super::axis::RtAxis;
+use super::bus_monitor::StopCause;
 use super::cycle::Signals;
-use super::groups::{Group, admit};
-use super::guard::StopCause;
-use super::slot::AxisSlot;
+use super::reaction_group::{ReactionGroup, check_permitted};
 use crate::config::{AxisRef, InputRef, OutputRef};
 
-/// Called once a cycle in the real-time thread, after the inputs have arrived and before the outputs are made.
+/// User code that runs in the real-time thread once per cycle, after the inputs have arrived and
+/// before the outputs are computed.
 ///
-/// What it orders passes the same guards as everything else: limits, supervision, and the stop of the machine stay in
-/// force. It must neither block nor allocate; the time it takes is part of the cycle's. If it panics, the machine stops
-/// as after a fault, and it is not called again.
+/// Its commands pass the same checks as all others: limits, supervision and the stop of the machine
+/// stay in force. It must neither block nor allocate; its run time is part of the cycle. If it
+/// panics, the machine stops as after a fault, and the controller is not called again.
 pub trait Controller: Send {
-    /// One cycle.
-    fn cycle(&mut self, machine: &mut Cycle<'_>);
+    /// Runs once per cycle.
+    fn cycle(&mut self, machine: &mut CycleContext<'_>);
 }
 
 impl std::fmt::Debug for dyn Controller {
@@ -27,49 +28,50 @@ impl std::fmt::Debug for dyn Controller {
 /// The machine in one cycle, as a [`Controller`] sees it.
 ///
 /// # Panics
-/// With references of another machine: where this one has no such axis or signal. That stops the machine like any other panic
-/// of the controller.
+/// Panics if a reference belongs to another machine, and this one has no such axis or signal. Such
+/// a panic stops the machine like any other panic of the controller.
 #[derive(Debug)]
-pub struct Cycle<'a> {
+pub struct CycleContext<'a> {
     pub(super) number: u64,
     pub(super) dt_s: f64,
     pub(super) fresh: bool,
     pub(super) guarded: bool,
-    pub(super) axes: &'a mut [AxisSlot],
-    pub(super) groups: &'a mut [Group],
+    pub(super) axes: &'a mut [RtAxis],
+    pub(super) groups: &'a mut [ReactionGroup],
     pub(super) inputs: &'a [f64],
     pub(super) signals: &'a Signals,
     pub(super) outputs: &'a mut [u8],
     pub(super) finished: &'a mut bool,
 }
 
-impl Cycle<'_> {
-    /// Counts the cycles since the loop began.
+impl CycleContext<'_> {
+    /// Returns the number of cycles since the loop began.
     #[must_use]
     pub fn number(&self) -> u64 {
         self.number
     }
 
-    /// Nominal length of a cycle, seconds.
+    /// Returns the nominal cycle time in seconds.
     #[must_use]
     pub fn dt_s(&self) -> f64 {
         self.dt_s
     }
 
-    /// `false`: frames of this cycle were lost, or a SubDevice is missing, and its inputs and actual values are those of a cycle before;
-    /// of an axis, `stale_cycles` of its status tells how long ago that was.
+    /// False if frames of this cycle were lost or a SubDevice is missing. Inputs and actual values
+    /// are then from an earlier cycle. `stale_cycles` in an axis' status is the age in cycles.
     #[must_use]
     pub fn fresh(&self) -> bool {
         self.fresh
     }
 
-    /// All SubDevices are in Op and the guards are armed. Before, axes cannot be enabled.
+    /// True once all SubDevices are in Op and the bus monitor is active. Before that, axes cannot
+    /// be enabled.
     #[must_use]
     pub fn in_op(&self) -> bool {
         self.guarded
     }
 
-    /// The machine is being stopped and takes no more motion.
+    /// True while the machine is being stopped; it then rejects motion commands.
     #[must_use]
     pub fn stopping(&self) -> bool {
         self.groups
@@ -77,59 +79,61 @@ impl Cycle<'_> {
             .is_some_and(|rest| rest.stop().is_some())
     }
 
-    /// Why the group of an axis is stopped. It takes no motion until one of its axes is reset ([`Command::ResetFault`]) and none of them
-    /// has a fault, a trip or power any more; then it can be enabled again, unless the machine stops, too.
+    /// Returns why the group of an axis is stopped. The group rejects motion until one of its axes
+    /// is reset ([`Command::ResetFault`]) and none of them has a fault, a trip or power. The group
+    /// can then be enabled again, unless the machine stops as well.
     #[must_use]
     pub fn stopped(&self, axis: AxisRef) -> Option<StopCause> {
         let group = self.groups.get(self.axes[axis.0].group)?;
         group.stop().map(|stop| stop.cause)
     }
 
-    /// An axis with this cycle's actual values.
+    /// Returns the status of an axis with this cycle's actual values.
     #[must_use]
     pub fn axis(&self, axis: AxisRef) -> AxisStatus {
         self.axes[axis.0].axis.status()
     }
 
-    /// Orders an axis to do something from this cycle on.
+    /// Sends a command to an axis; it takes effect in this cycle.
     ///
     /// # Errors
-    /// Why it does not; nothing has changed then.
-    pub fn command(&mut self, axis: AxisRef, command: Command) -> Result<(), Refused> {
+    /// The reason for the rejection. A rejected command changes nothing.
+    pub fn command(&mut self, axis: AxisRef, command: Command) -> Result<(), CommandError> {
         let slot = &mut self.axes[axis.0];
-        admit(self.groups, slot.group, command)?;
+        check_permitted(self.groups, slot.group, command)?;
         if !self.guarded && command == Command::Enable {
-            return Err(Refused::NotInOp);
+            return Err(CommandError::NotInOp);
         }
         slot.command(command)
     }
 
-    /// Gives the set-point's position for this cycle; to be called in every cycle, or the axis decelerates and holds.
+    /// Sets the axis' set-point position for this cycle. Call it in every cycle; otherwise the axis
+    /// decelerates and holds.
     ///
     /// # Errors
-    /// It would step further or harder than the limits allow, or leave the range: the axis decelerates instead.
-    pub fn set_point(&mut self, axis: AxisRef, position: f64) -> Result<(), Refused> {
+    /// Fails if the step would exceed the limits or leave the range. The axis then decelerates.
+    pub fn set_point(&mut self, axis: AxisRef, position: f64) -> Result<(), CommandError> {
         if self.stopping() {
-            return Err(Refused::Stopping);
+            return Err(CommandError::Stopping);
         }
         if self.stopped(axis).is_some() {
-            return Err(Refused::GroupStopped);
+            return Err(CommandError::GroupStopped);
         }
         self.axes[axis.0].axis.set_point(position)
     }
 
-    /// An input as a number; a bit that is set is 1.
+    /// Returns an input as a number; a set bit is 1.
     #[must_use]
     pub fn input(&self, input: InputRef) -> f64 {
         self.inputs[input.0]
     }
 
-    /// Puts an output to a value; what does not fit is cut down to the nearest that does.
+    /// Sets an output. Values out of range are clamped.
     pub fn set(&mut self, output: OutputRef, value: f64) {
         self.signals.outputs[output.0].set(self.outputs, value);
     }
 
-    /// The work is done: the machine is brought to rest, the run ends well.
+    /// Ends the run normally: the machine is brought to rest.
     pub fn finish(&mut self) {
         *self.finished = true;
     }

@@ -1,34 +1,34 @@
-//! One turn of the loop: wake, send, receive, check, step, publish.
+//! One cycle: wake, send, receive, check, step, publish.
 
 use std::panic::AssertUnwindSafe;
 
 use ecaxis_axis::setpoint::Table;
 
+use super::axis::RtAxis;
+use super::bus_monitor::{BusMonitor, StopCause};
+use super::channel::{Event, PhaseStatus, RtEndpoint, Snapshot};
 use super::controller::{self, Controller};
-use super::exchange::{Answer, Diagnosis, Evidence, Exchange, Window};
-use super::feed::FeedState;
-use super::groups::{Group, GroupStatus};
-use super::guard::{Guard, StopCause};
-use super::handover::{Event, PhaseStatus, RtEnd, Snapshot};
+use super::event_log::LogEntryKind;
+use super::exchange::{CycleResult, Evidence, Exchange, SubDeviceDiagnostics, Window};
+use super::flight_recorder::{self, FlightRecorder};
 use super::heartbeat;
-use super::history::{self, History};
 use super::image::SignalBits;
-use super::journal::Note;
-use super::margin::{Margin, Spin};
 use super::phase::Phase;
-use super::slot::AxisSlot;
+use super::reaction_group::{GroupStatus, ReactionGroup};
+use super::setpoint_generator::GeneratorState;
+use super::spin::{Spin, SpinWindow};
 use super::stats::Stats;
 
-mod act;
-mod orders;
+mod axes;
+mod commands;
+mod io;
 mod panic;
-mod wire;
 
 use panic::Plain;
 
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Condition, StopSetup};
-use crate::link::port::Port;
+use crate::link::pdu_loop::PduLoop;
 use crate::link::{Link, MAX_FRAME};
 
 /// The process data that the program reads and sets.
@@ -38,121 +38,121 @@ pub struct Signals {
     pub outputs: Vec<SignalBits>,
 }
 
-/// How the loop is timed.
+/// The timing of the loop.
 #[derive(Debug, Clone, Copy)]
 pub struct Timing {
     pub cycle_ns: u64,
-    /// A clock farther from the reference is told of.
+    /// DC offsets beyond this are reported.
     pub clock_window_ns: u64,
-    /// Before the release; the rest is slept.
+    /// The time spun before the release; the rest of the cycle is slept.
     pub spin: Spin,
 }
 
-/// Everything that a cycle touches.
+/// The state of the cycle.
 #[derive(Debug)]
 pub struct Engine {
     clock: Clock,
     timing: Timing,
     link: Box<dyn Link>,
-    port: Port,
+    port: PduLoop,
     exchange: Exchange,
-    axes: Vec<AxisSlot>,
-    /// The first is the machine's: what no other holds.
-    groups: Vec<Group>,
+    axes: Vec<RtAxis>,
+    /// The first group is the machine's: all axes without a group.
+    groups: Vec<ReactionGroup>,
     signals: Signals,
-    /// Each of the last cycle in which its group's were fresh.
+    /// Each value is from the last cycle in which its group was fresh.
     inputs: Vec<f64>,
     controller: Option<Box<dyn Controller>>,
-    /// The controller has; it is not called again.
+    /// The controller panicked and is no longer called.
     panicked: bool,
     tables: Box<[Table]>,
     stop_setup: StopSetup,
     finished: bool,
     phase: Option<Phase>,
     phase_error: i64,
-    /// As last noted.
+    /// The AL status as last logged.
     al_status: Option<(u8, u16)>,
-    /// Of each SubDevice, whether its clock has been told of.
+    /// For each SubDevice, true while its clock is reported as off.
     clocks_off: Vec<bool>,
-    guard: Guard,
+    guard: BusMonitor,
     guarding: bool,
     supervisor: heartbeat::Watch,
     stats: Stats,
-    history: History,
-    end: RtEnd,
+    history: FlightRecorder,
+    end: RtEndpoint,
     next: Nanos,
-    /// When the last frames went; `None`: none yet.
+    /// The time at which the last frames were sent; `None` before the first.
     woke: Option<Nanos>,
     started: Nanos,
-    margin: Margin,
+    margin: SpinWindow,
     plain: Plain,
-    answer: Answer,
+    answer: CycleResult,
     events_lost: u64,
     orders_taken: u64,
     /// Frames of other MainDevices so far.
     main_devices: u64,
-    /// The next window of the error counters begins then.
+    /// The start of the next window of the error counters.
     window: Nanos,
     halted: bool,
     buf: [u8; MAX_FRAME],
 }
 
-/// What an engine is made of.
+/// The parts of an engine.
 #[derive(Debug)]
-pub struct Parts {
+pub struct EngineConfig {
     pub clock: Clock,
     pub timing: Timing,
     pub link: Box<dyn Link>,
-    pub port: Port,
+    pub port: PduLoop,
     pub exchange: Exchange,
-    pub axes: Vec<AxisSlot>,
+    pub axes: Vec<RtAxis>,
     /// At least one.
-    pub groups: Vec<Group>,
+    pub groups: Vec<ReactionGroup>,
     pub signals: Signals,
     pub controller: Option<Box<dyn Controller>>,
     pub tables: Box<[Table]>,
     pub stop: StopSetup,
     pub phase: Option<Phase>,
-    pub guard: Guard,
-    pub end: RtEnd,
+    pub guard: BusMonitor,
+    pub end: RtEndpoint,
 }
 
-/// What remains when the loop has ended.
+/// The results after the end of the loop.
 #[derive(Debug)]
-pub struct Remains {
+pub struct EngineReport {
     pub link: Box<dyn Link>,
-    pub port: Port,
-    pub axes: Vec<AxisSlot>,
+    pub port: PduLoop,
+    pub axes: Vec<RtAxis>,
     pub stats: Stats,
-    /// Spinning before a release, at the end.
+    /// The spin time before a release, at the end of the run.
     pub spin_ns: Nanos,
-    /// What the diagnostic slot has found, in the order of the exchange's members.
-    pub diagnoses: Vec<Diagnosis>,
-    /// Of their error counters, around the stop.
+    /// The results of the diagnostic slot, in the order of the exchange's members.
+    pub diagnoses: Vec<SubDeviceDiagnostics>,
+    /// The error counters of the members around the stop.
     pub windows: Vec<Window>,
-    /// The first cycle was due then.
+    /// Due time of the first cycle.
     pub started: Nanos,
     /// The cycles around the stop.
-    pub history: History,
-    /// Since when each group has been stopping.
+    pub history: FlightRecorder,
+    /// For each group, the time since which it has been stopping.
     pub stops: Vec<Option<Nanos>>,
 }
 
 impl Engine {
-    /// The first cycle is due one cycle from now.
+    /// Creates an engine. The first cycle is due one cycle from now.
     #[must_use]
-    #[allow(clippy::disallowed_macros, reason = "prepares")]
-    pub fn new(parts: Parts) -> Self {
+    #[allow(clippy::disallowed_macros, reason = "runs before the loop")]
+    pub fn new(parts: EngineConfig) -> Self {
         let started = clock::now() + parts.timing.cycle_ns;
         let clocks_off = vec![false; parts.exchange.diagnoses().len()];
         let mode = parts.exchange.mode();
-        let history = History::new(parts.axes.len());
+        let history = FlightRecorder::new(parts.axes.len());
         Self {
             plain: Plain::new(&parts.axes),
             clock: parts.clock,
             timing: parts.timing,
             main_devices: parts.link.main_devices(),
-            window: started + history::COUNTER_WINDOW,
+            window: started + flight_recorder::COUNTER_WINDOW,
             link: parts.link,
             port: parts.port,
             exchange: parts.exchange,
@@ -178,8 +178,8 @@ impl Engine {
             next: started,
             woke: None,
             started,
-            margin: Margin::new(parts.timing.spin, parts.timing.cycle_ns, mode),
-            answer: Answer::default(),
+            margin: SpinWindow::new(parts.timing.spin, parts.timing.cycle_ns, mode),
+            answer: CycleResult::default(),
             events_lost: 0,
             orders_taken: 0,
             halted: false,
@@ -187,14 +187,14 @@ impl Engine {
         }
     }
 
-    /// Whether [`Order::Halt`] has been taken.
+    /// True once [`RtCommand::Halt`](super::channel::RtCommand::Halt) was processed.
     #[must_use]
     pub fn halted(&self) -> bool {
         self.halted
     }
 
-    /// Measures from here on. The time that this takes is not counted as an overrun.
-    pub fn measure_anew(&mut self) {
+    /// Restarts the statistics. The time that this takes is not counted as an overrun.
+    pub fn reset_statistics(&mut self) {
         self.stats.clear();
         let now = clock::now();
         while self.next <= now {
@@ -204,8 +204,8 @@ impl Engine {
 
     #[must_use]
     #[allow(clippy::disallowed_methods, reason = "the loop has ended")]
-    pub fn into_remains(self) -> Remains {
-        Remains {
+    pub fn finish(self) -> EngineReport {
+        EngineReport {
             link: self.link,
             port: self.port,
             axes: self.axes,
@@ -230,18 +230,18 @@ impl Engine {
         self.stats.lateness.record(lateness);
         self.stats.counters.cycles += 1;
         if self.guarding && lateness > self.timing.cycle_ns / 4 {
-            self.jot(Note::WokeLate(lateness));
+            self.log(LogEntryKind::WokeLate(lateness));
         }
 
-        self.catch_up(woke);
+        self.handle_skipped_cycles(woke);
         self.send(lateness);
-        self.margin.slept(slept);
+        self.margin.record_wakeup(slept);
         if let Some(late) = slept {
             self.stats.slept.record(late);
         }
         self.receive(woke);
-        self.answer = self.exchange.answer();
-        self.count();
+        self.answer = self.exchange.evaluate();
+        self.update_counters();
         let adjust = self.follow_clock();
         if self.guarding {
             self.watch_bus();
@@ -258,13 +258,13 @@ impl Engine {
         self.act();
         self.exchange.stage();
         self.publish(woke, lateness);
-        self.plan_next(adjust);
+        self.schedule_next_cycle(adjust);
         self.stats.work.record(clock::now().saturating_sub(woke));
     }
 
     fn watch_bus(&mut self) {
         let (shares, evidence) = (self.exchange.shares(), self.exchange.evidence());
-        self.guard.look(&self.answer, shares, evidence);
+        self.guard.update(&self.answer, shares, evidence);
         for group in 0..self.groups.len() {
             if let Some(cause) = self.guard.lost(group) {
                 self.stop(Some(group), cause);
@@ -292,7 +292,7 @@ impl Engine {
             *to = signal.get(image);
         }
         let inputs = &self.inputs;
-        // What is no number says nothing about what it stands for.
+        // A missing or NaN input counts as an active emergency stop.
         let pressed = |c: &Condition| {
             inputs
                 .get(c.input)
@@ -303,12 +303,13 @@ impl Engine {
         }
     }
 
-    /// The user's own code. What it has done when it panics is kept: the axes guard themselves.
+    /// Calls the user's controller. Its commands before a panic stay in force: the axes supervise
+    /// themselves.
     fn call_controller(&mut self) {
         let Some(controller) = self.controller.as_mut().filter(|_| !self.panicked) else {
             return;
         };
-        let mut view = controller::Cycle {
+        let mut view = controller::CycleContext {
             number: self.stats.counters.cycles,
             dt_s: self.timing.cycle_ns as f64 * 1e-9,
             fresh: self.answer.inputs_fresh,
@@ -322,21 +323,21 @@ impl Engine {
         };
         let call = AssertUnwindSafe(|| controller.cycle(&mut view));
         if std::panic::catch_unwind(call).is_err() {
-            // Dropped when the loop has ended: that may free, and panic again.
+            // Dropped after the loop: the drop may free memory and panic again.
             self.panicked = true;
             self.stop(None, StopCause::Controller);
         }
     }
 
-    /// To those beside the cycle, and to the history.
+    /// Publishes the snapshot to the other threads and records the cycle.
     fn publish(&mut self, woke: Nanos, lateness: Nanos) {
         if self.next >= self.window {
-            self.window = self.next + history::COUNTER_WINDOW;
+            self.window = self.next + flight_recorder::COUNTER_WINDOW;
             self.exchange.begin_windows();
         }
         let stopping = self.stopping();
         let stop_ended = stopping.is_some() && self.stop_ended();
-        let mut stops = self.groups.iter().filter_map(Group::stop);
+        let mut stops = self.groups.iter().filter_map(ReactionGroup::stop);
         let failure = stops.find_map(|stop| stop.failure);
         let snapshot = self.end.snapshots.input_buffer_mut();
         snapshot.time = woke;
@@ -379,46 +380,51 @@ impl Engine {
         snapshot.events_lost = self.events_lost;
         snapshot.orders_taken = self.orders_taken;
         let number = self.stats.counters.cycles;
-        let cycle =
-            history::Cycle::new(number, self.next, lateness, &self.answer, self.phase_error);
+        let cycle = flight_recorder::Cycle::new(
+            number,
+            self.next,
+            lateness,
+            &self.answer,
+            self.phase_error,
+        );
         self.history.keep(cycle, snapshot.axes.iter());
         self.end.snapshots.publish();
     }
 
-    /// A cycle that is already over is left out instead of sent in a burst.
-    fn plan_next(&mut self, adjust: i64) {
+    /// Schedules the next cycle. Cycles already over are skipped, not sent in a burst.
+    fn schedule_next_cycle(&mut self, adjust: i64) {
         self.next = (self.next + self.timing.cycle_ns).saturating_add_signed(adjust);
         let now = clock::now();
         if now > self.next {
             let missed = (now - self.next) / self.timing.cycle_ns + 1;
             self.stats.counters.overruns += missed;
-            self.jot(Note::Overrun(missed));
+            self.log(LogEntryKind::Overrun(missed));
             self.next += missed * self.timing.cycle_ns;
         }
     }
 
-    fn jot(&mut self, note: Note) {
+    fn log(&mut self, note: LogEntryKind) {
         let cycle = self.stats.counters.cycles;
         self.stats.journal.note(cycle, self.next, note);
     }
 
     fn report(&mut self, event: Event) {
-        self.jot(Note::Told(event));
+        self.log(LogEntryKind::Event(event));
         if self.end.events.push(event).is_err() {
             self.events_lost += 1;
         }
     }
 }
 
-/// The snapshot before the first cycle, with room for all there is.
+/// Returns the snapshot before the first cycle, with capacity for all values.
 #[must_use]
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
-    reason = "prepares"
+    reason = "runs before the loop"
 )]
 pub fn first_snapshot(
-    axes: &[AxisSlot],
+    axes: &[RtAxis],
     groups: usize,
     signals: &Signals,
     devices: usize,
@@ -430,10 +436,10 @@ pub fn first_snapshot(
         inputs_fresh: false,
         al_status: None,
         axes: axes.iter().map(|slot| slot.axis.status()).collect(),
-        feeds: vec![FeedState::None; axes.len()],
+        feeds: vec![GeneratorState::None; axes.len()],
         inputs: vec![0.0; signals.inputs.len()],
         finished: false,
-        diagnoses: vec![Diagnosis::default(); devices],
+        diagnoses: vec![SubDeviceDiagnostics::default(); devices],
         stopping: None,
         failure: None,
         stop_ended: false,

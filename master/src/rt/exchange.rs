@@ -1,12 +1,18 @@
-//! The frames of a cycle: FRMW of the system time, an LRW of each group's process data (LWR and LRD where a SubDevice
-//! knows no LRW), one BRD of AL status and one read of the diagnostic slot; built once, refilled every cycle, sent back to back.
+//! The frames of a cycle. They are built once, refilled every cycle and sent back to back. They
+//! carry:
 //!
-//! Ours and ethercrab's frames are told apart by the last byte of the source MAC, because
-//! ethercrab uses all 256 datagram indices. The byte before it numbers the frames of a cycle; what it has left and the
-//! datagram index number the cycle, so that late and repeated frames are recognised.
+//! - an FRMW of the system time;
+//! - an LRW of each group's process data, or LWR and LRD where a SubDevice has no LRW;
+//! - one BRD of AL status;
+//! - one read of the diagnostic slot.
 //!
-//! Devices share datagrams and so working counters. After a wrong counter each device gets a datagram of its own, so that
-//! a device that is missing leaves the evidence of the others alone.
+//! The last byte of the source MAC distinguishes these frames from ethercrab's, because ethercrab
+//! uses all 256 datagram indices. The byte before it holds the number of the frame in the cycle.
+//! Its remaining bits and the datagram index hold the number of the cycle. Late and repeated frames
+//! are therefore recognised.
+//!
+//! Devices share datagrams and therefore working counters. After a wrong counter each device gets
+//! its own datagram, so that a missing device does not hide the state of the others.
 
 use std::sync::Arc;
 
@@ -14,24 +20,25 @@ use super::image::plan::frames as frames_of;
 use super::image::{Access, DatagramPlan, ImagePlan};
 use super::phase::ClockPlan;
 use crate::clock::Nanos;
-use crate::link::port::ETHERCAT;
+use crate::link::pdu_loop::ETHERCAT;
 use crate::link::{Link, LinkError, MAX_FRAME};
 
-mod flight;
+mod bus_status;
+mod diagnostics;
 mod frame;
-mod probe;
-mod rota;
-mod sights;
+mod frame_set;
+mod poll_schedule;
 
-use flight::Flight;
+pub use bus_status::BusStatus;
+pub use diagnostics::{DiagnosticRegister, ErrorCounters, SubDeviceDiagnostics, Window};
+use ecaxis_ecat::registers;
 use frame::{
-    DATAGRAM_HEADER, FIRST_DATAGRAM, Frame, MAC_TAIL, Place, WKC, clear_wkc, frame_number,
+    DATAGRAM_HEADER, DatagramSlot, FIRST_DATAGRAM, Frame, MAC_TAIL, WKC, clear_wkc, frame_number,
     frame_tag, new_frames, push, same_datagram, write_header,
 };
-pub use probe::{Diagnosis, ErrorCounters, Probe, Window};
-pub use rota::LONGEST_LOOK;
-use rota::{Look, Rota};
-pub use sights::Sights;
+use frame_set::FrameSet;
+pub use poll_schedule::LONGEST_LOOK;
+use poll_schedule::{PollSchedule, PollTarget};
 
 const FPRD: u8 = 4;
 const BRD: u8 = 7;
@@ -40,49 +47,48 @@ const LWR: u8 = 11;
 const LRW: u8 = 12;
 const FRMW: u8 = 14;
 
-/// After a wrong working counter each device has a datagram of its own until so many cycles in a row were right.
+/// After a wrong working counter each device has its own datagram, until this many cycles in a row
+/// were right.
 const SEPARATE_CYCLES: u16 = 100;
-
-const SYSTEM_TIME: u16 = 0x0910;
-const AL_STATUS: u16 = 0x0130;
 
 #[derive(Debug, Clone, Copy)]
 struct ProcessDatagram {
-    place: Place,
+    place: DatagramSlot,
     access: Access,
     group: usize,
     /// Offset in the image.
     image: usize,
     expected_wkc: u16,
-    /// Its devices: the first and one behind the last in [`Exchange::order`].
+    /// The range of its devices in [`Exchange::order`]: the first, and one past the last.
     devices: (usize, usize),
 }
 
-/// A SubDevice as the exchange sees it.
+/// A SubDevice in the exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Member {
+pub struct ExchangeDevice {
     pub station: u16,
-    /// It takes the system time.
+    /// True if it processes the system time.
     pub clock: bool,
-    /// The SyncManager through which its mailbox is read; `None` where it has none.
+    /// The SyncManager through which its mailbox is read; `None` without a mailbox.
     pub mailbox: Option<u8>,
 }
 
-/// What came back of one group's process data in a cycle.
+/// The result of one group's process data in a cycle.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Share {
-    /// Every frame with a part of it came back; for a group without process data, the first.
+pub struct GroupResult {
+    /// True if every frame with a part of the group came back. For a group without process data,
+    /// this refers to the first frame.
     pub answered: bool,
-    /// And every working counter was as expected: its part of the input image is this cycle's.
+    /// True if every working counter was also as expected: the group's inputs are from this cycle.
     pub fresh: bool,
-    /// Sum of the working counters seen, of those expected.
+    /// Sums of the working counters seen and of those expected.
     pub wkc: (u16, u16),
-    /// SubDevices that take the system time.
+    /// The number of SubDevices that process the system time.
     clocks: u16,
 }
 
 #[cfg(test)]
-impl Share {
+impl GroupResult {
     pub(super) const fn new(answered: bool, fresh: bool, wkc: (u16, u16)) -> Self {
         Self {
             answered,
@@ -93,58 +99,59 @@ impl Share {
     }
 }
 
-/// What a cycle's answers say of one device.
+/// What the answers of a cycle show about one device.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Evidence {
-    /// Its own working counter, or one that it shares, was right: it took its outputs, and its inputs are this cycle's.
+    /// Its working counter, own or shared, was right: it processed its outputs, and its inputs are
+    /// from this cycle.
     Fresh,
-    /// A working counter that it shares with others was wrong.
+    /// A working counter that it shares with other devices was wrong.
     #[default]
     Unknown,
-    /// Its own working counter was wrong, or no answer came.
+    /// Its own working counter was wrong, or its frame did not come back.
     Missing,
 }
 
-/// What a received frame turned out to be.
+/// The classification of a received frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Received {
-    /// One of this cycle's frames.
+    /// A frame of this cycle.
     Current,
-    /// One of ours, but of another cycle or a second time.
+    /// A frame of this exchange, but of another cycle or received twice.
     Late,
-    /// Not ours.
+    /// Not a frame of this exchange.
     Foreign,
 }
 
 /// The result of a cycle's exchange.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Answer {
-    /// Every frame came back.
+pub struct CycleResult {
+    /// True if every frame came back.
     pub complete: bool,
-    /// Every working counter was as expected; the whole input image is this cycle's.
+    /// True if every working counter was as expected: the whole input image is from this cycle.
     pub inputs_fresh: bool,
-    /// Sum of the working counters seen, of those expected.
+    /// Sums of the working counters seen and of those expected.
     pub wkc: (u16, u16),
     /// System time of the reference clock as the frame passed it.
     pub system_time: Option<u64>,
-    /// AL status of all SubDevices or-ed together, and how many answered.
+    /// AL status of all SubDevices, or-ed, and the number of answers.
     pub al_status: Option<(u8, u16)>,
-    /// How long after their planned release these frames were sent.
+    /// The delay from the planned release of these frames until they were sent.
     pub sent_late: Nanos,
 }
 
-/// When answers are taken.
+/// The cycle in which answers are evaluated.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Mode {
-    /// In the cycle that asks; the thread waits for them.
+pub enum ExchangeMode {
+    /// The cycle that sent the frames; the thread waits for the answers.
     #[default]
     SameCycle,
-    /// In the next; they have long arrived, and nobody waits.
+    /// The cycle after it: the answers have arrived by then, and the thread does not wait.
     Pipelined,
 }
 
-impl Mode {
-    /// Cycles whose frames are under way at once.
+impl ExchangeMode {
+    /// Returns how many cycles have frames in flight at once.
     #[must_use]
     pub const fn flights(self) -> u8 {
         match self {
@@ -157,52 +164,54 @@ impl Mode {
 /// The exchange of process data.
 #[derive(Debug)]
 pub struct Exchange {
-    /// The one that is staged or was sent in this cycle, and those sent before.
-    flights: Vec<Flight>,
+    /// The frame set that is staged or was sent in this cycle, and those sent before.
+    flights: Vec<FrameSet>,
     staged: usize,
-    /// Where the datagrams lie: with shared ones, and with one for each device.
-    forms: Vec<Places>,
-    /// The form of each of the last cycles, by the low byte of its number.
+    /// The positions of the datagrams: with shared datagrams, and with one for each device.
+    forms: Vec<DatagramSlots>,
+    /// The layout of each of the last cycles, by the low byte of the cycle's number.
     form_of: [u8; 256],
-    /// Cycles for which each device still has a datagram of its own.
+    /// The number of cycles for which each device still has its own datagram.
     separate_cycles: u16,
-    /// Devices are in Op: a wrong counter says that one is missing.
+    /// True while devices are in Op: a wrong counter then means that a device is missing.
     op_expected: bool,
-    /// Devices as the image lies.
+    /// The devices in the order of their data in the image.
     order: Vec<usize>,
     evidence: Vec<Evidence>,
-    /// Devices for which a late answer has come since the last cycle.
+    /// For each device, true if a late answer has arrived since the last cycle.
     late: Vec<bool>,
     /// Index of the reference clock among the members.
     reference: usize,
-    /// What a clock is set to if the reference before it does not answer: its own time, nearly.
+    /// The value to which a clock is set if the reference before it does not answer: almost its own
+    /// time.
     expected_time: u64,
     cycle_ns: u64,
-    sights: Arc<Sights>,
-    shares: Vec<Share>,
-    diagnoses: Vec<Diagnosis>,
+    bus_status: Arc<BusStatus>,
+    shares: Vec<GroupResult>,
+    diagnoses: Vec<SubDeviceDiagnostics>,
     windows: Vec<Window>,
-    /// Of each member.
+    /// The group of each member.
     groups: Vec<usize>,
-    rota: Rota,
+    schedule: PollSchedule,
     cycle: u32,
     outputs: Vec<u8>,
     inputs: Vec<u8>,
 }
 
 impl Exchange {
-    /// Builds the frames. `members` are the plan's devices, in the same order; they are reported in it.
+    /// Builds the frames. `members` are the devices of the plan, in the same order. Results have
+    /// this order too.
     #[must_use]
     #[allow(
         clippy::disallowed_methods,
         clippy::disallowed_macros,
-        reason = "prepares"
+        reason = "runs before the loop"
     )]
     pub fn new(
         plan: &ImagePlan,
         clock: Option<&ClockPlan>,
-        members: &[Member],
-        mode: Mode,
+        members: &[ExchangeDevice],
+        mode: ExchangeMode,
     ) -> Self {
         let mut order: Vec<usize> = (0..plan.regions.len()).collect();
         order.retain(|&device| plan.regions[device].is_some());
@@ -217,17 +226,17 @@ impl Exchange {
             let mut frames = Vec::new();
             for datagrams in &datagrams {
                 let mut form = new_frames(frames_of(datagrams));
-                let places = Places::fill(&mut form, plan, datagrams, &order, clock);
+                let places = DatagramSlots::fill(&mut form, plan, datagrams, &order, clock);
                 frames.push(form);
                 if flight == 0 {
                     forms.push(places);
                 }
             }
-            flights.push(Flight::new(frames));
+            flights.push(FrameSet::new(frames));
         }
-        // The first group is there without members, too.
+        // The first group exists even without members.
         let groups = plan.groups.iter().max().map_or(1, |last| last + 1);
-        let mut shares = vec![Share::default(); groups];
+        let mut shares = vec![GroupResult::default(); groups];
         for (member, &group) in members.iter().zip(&plan.groups) {
             shares[group].clocks += u16::from(member.clock);
         }
@@ -252,12 +261,12 @@ impl Exchange {
             reference: reference.unwrap_or(0),
             expected_time: 0,
             cycle_ns: clock.map_or(0, |clock| clock.cycle_ns),
-            sights: Arc::new(Sights::new(members.len())),
+            bus_status: Arc::new(BusStatus::new(members.len())),
             shares,
-            diagnoses: vec![Diagnosis::default(); members.len()],
+            diagnoses: vec![SubDeviceDiagnostics::default(); members.len()],
             windows: vec![Window::default(); members.len()],
             groups: plan.groups.clone(),
-            rota: Rota::new(members, plan.mailboxes.as_ref()),
+            schedule: PollSchedule::new(members, plan.mailboxes.as_ref()),
             cycle: 0,
             outputs: vec![0; plan.len],
             inputs: vec![0; plan.len],
@@ -266,71 +275,75 @@ impl Exchange {
         exchange
     }
 
-    /// When answers are taken.
+    /// Returns when answers are evaluated.
     #[must_use]
-    pub fn mode(&self) -> Mode {
+    pub fn mode(&self) -> ExchangeMode {
         if self.flights.len() == 1 {
-            Mode::SameCycle
+            ExchangeMode::SameCycle
         } else {
-            Mode::Pipelined
+            ExchangeMode::Pipelined
         }
     }
 
-    /// Outputs of the next cycle.
+    /// Returns the outputs of the next cycle.
     pub fn outputs_mut(&mut self) -> &mut [u8] {
         &mut self.outputs
     }
 
-    /// Inputs of the last cycle whose working counters were right.
+    /// Returns the inputs; each part is from the last cycle in which its working counter was right.
     #[must_use]
     pub fn inputs(&self) -> &[u8] {
         &self.inputs
     }
 
-    /// What came back of each group's process data, as of the last [`Exchange::answer`].
+    /// Returns the result of each group's process data as of the last [`Exchange::evaluate`].
     #[must_use]
-    pub fn shares(&self) -> &[Share] {
+    pub fn shares(&self) -> &[GroupResult] {
         &self.shares
     }
 
-    /// What this cycle's answers say of each device, as of the last [`Exchange::answer`]; in the order of the members.
+    /// Returns the evidence about each device as of the last [`Exchange::evaluate`], in the order
+    /// of the members.
     #[must_use]
     pub fn evidence(&self) -> &[Evidence] {
         &self.evidence
     }
 
-    /// Whether an answer to an earlier cycle's frame has come late since the last cycle, in which this device took part.
+    /// True if a late answer to an earlier cycle's frame has arrived since the last cycle, and this
+    /// device processed that frame.
     #[must_use]
     pub fn came_late(&self, device: usize) -> bool {
         self.late.get(device).copied().unwrap_or(false)
     }
 
-    /// On their way to Op and back, devices answer one after the other, and share their datagrams. Those
-    /// that have datagrams of their own keep them until all answer.
+    /// Sets whether devices are expected in Op. On the way to Op and back, devices begin to answer
+    /// one by one and share their datagrams. Devices that already have their own datagrams keep
+    /// them until all answer.
     pub fn expect_op(&mut self, expected: bool) {
         self.op_expected = expected;
     }
 
-    /// What the diagnostic slot has found, in the order of the members.
+    /// Returns the results of the diagnostic slot, in the order of the members.
     #[must_use]
-    pub fn diagnoses(&self) -> &[Diagnosis] {
+    pub fn diagnoses(&self) -> &[SubDeviceDiagnostics] {
         &self.diagnoses
     }
 
-    /// What the error counters were around the stop, in the order of the members.
+    /// Returns the error counters around the stop, in the order of the members.
     #[must_use]
     pub fn windows(&self) -> &[Window] {
         &self.windows
     }
 
-    /// A window of what the error counters grow by begins. RT: O(members).
+    /// Begins a window for the increments of the error counters. RT: O(members).
     pub fn begin_windows(&mut self) {
         for (window, found) in self.windows.iter_mut().zip(&self.diagnoses) {
             window.begin(&found.errors);
         }
     }
 
-    /// The windows of a group stand still at its stop and end with the next read; `None`: all groups. RT: O(members).
+    /// Freezes the windows of a group at its stop; they end with the next read. `None`: all groups.
+    /// RT: O(members).
     pub fn stop_windows(&mut self, group: Option<usize>) {
         for (window, own) in self.windows.iter_mut().zip(&self.groups) {
             if group.is_none_or(|group| group == *own) {
@@ -339,7 +352,7 @@ impl Exchange {
         }
     }
 
-    /// A group has been reset. RT: O(members).
+    /// Restarts the windows of a group that was reset. RT: O(members).
     pub fn release_windows(&mut self, group: usize) {
         let members = self.windows.iter_mut().zip(&self.diagnoses);
         for ((window, found), own) in members.zip(&self.groups) {
@@ -349,26 +362,26 @@ impl Exchange {
         }
     }
 
-    /// What the cycle sees of mailboxes and of time, for everybody beside it.
+    /// Returns the status of mailboxes and the bus time, for the other threads.
     #[must_use]
-    pub fn sights(&self) -> Arc<Sights> {
-        Arc::clone(&self.sights)
+    pub fn bus_status(&self) -> Arc<BusStatus> {
+        Arc::clone(&self.bus_status)
     }
 
-    /// Whose clock difference the answers of this cycle have brought.
+    /// Returns the device and the clock difference that the answers of this cycle contain.
     #[must_use]
     pub fn clock_read(&self) -> Option<(usize, i32)> {
         let flight = self.flights.get(self.due())?;
-        let Look::At { device, probe } = flight.turn?.look else {
+        let PollTarget::At { device, probe } = flight.turn?.look else {
             return None;
         };
         flight.answer(0)?;
         let found = self.diagnoses.get(device)?;
-        let read = probe == Probe::ClockDifference && found.answers;
+        let read = probe == DiagnosticRegister::ClockDifference && found.answers;
         read.then_some((device, found.clock_difference))
     }
 
-    /// The flight whose answers this cycle takes: the oldest.
+    /// Returns the index of the oldest frame set, which is evaluated in this cycle.
     fn due(&self) -> usize {
         (self.staged + 1) % self.flights.len()
     }
@@ -385,7 +398,7 @@ impl Exchange {
         if let Some(flight) = self.flights.get_mut(self.staged) {
             flight.form = form;
         }
-        self.restage();
+        self.refresh_outputs();
         let time = self.expected_time;
         let (Some(flight), Some(places)) =
             (self.flights.get_mut(self.staged), self.forms.get(form))
@@ -393,12 +406,13 @@ impl Exchange {
             return;
         };
         let first = &mut flight.frames_mut()[0].bytes;
-        let turn = self.rota.next();
+        let turn = self.schedule.next();
         if let Some(turn) = turn {
-            // The last datagram of its frame, so its length may change; within the capacity of the frame.
+            // The diagnostic datagram is the last of its frame, so its length may change within the
+            // capacity of the frame.
             let data = places.probe_at + DATAGRAM_HEADER;
             first.truncate(data);
-            first.resize(data + turn.len, Sights::UNSEEN);
+            first.resize(data + turn.len, BusStatus::UNSEEN);
             first.resize(data + turn.len + WKC, 0);
             write_header(first, places.probe_at, turn.command, turn.address, turn.len);
         }
@@ -413,8 +427,9 @@ impl Exchange {
         self.expected_time = time.wrapping_add(self.cycle_ns);
     }
 
-    /// Outputs have changed since the frames were filled, and before they are sent. RT: O(image).
-    pub fn restage(&mut self) {
+    /// Copies outputs that have changed since [`Exchange::stage`] into the frames. Call before
+    /// [`Exchange::send`]. RT: O(image).
+    pub fn refresh_outputs(&mut self) {
         let Some(flight) = self.flights.get_mut(self.staged) else {
             return;
         };
@@ -432,7 +447,8 @@ impl Exchange {
         }
     }
 
-    /// Sends all frames of the cycle back to back, `late` after their planned release. RT: blocks on the wire only.
+    /// Sends all frames of the cycle back to back, `late` after their planned release. RT: blocks
+    /// on the wire only.
     pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
         match self.flights.get_mut(self.staged) {
             Some(flight) => flight.send(link, late),
@@ -440,7 +456,7 @@ impl Exchange {
         }
     }
 
-    /// Keeps an answer until its flight is due. RT: O(frame).
+    /// Stores an answer until its frame set is evaluated. RT: O(frame).
     pub fn receive(&mut self, frame: &[u8]) -> Received {
         if frame.get(12..14) != Some(&ETHERCAT[..]) || frame.get(11) != Some(&MAC_TAIL) {
             return Received::Foreign;
@@ -454,7 +470,8 @@ impl Exchange {
         }
     }
 
-    /// A frame of an earlier cycle that reached its devices all the same. RT: O(devices).
+    /// Processes a late frame of an earlier cycle: it proves that its devices received their
+    /// outputs. RT: O(devices).
     fn receive_late(&mut self, frame: &[u8]) {
         let (Some(&low), Some(&tag)) = (frame.get(FIRST_DATAGRAM + 1), frame.get(10)) else {
             return;
@@ -471,7 +488,7 @@ impl Exchange {
         let Some(sent) = sent.get(number).filter(|_| recent && same_tag) else {
             return;
         };
-        // The diagnostic datagram may have another length; those before it have not.
+        // The diagnostic datagram may have another length; the datagrams before it have not.
         let known = if number == 0 {
             places.probe_at
         } else {
@@ -496,20 +513,21 @@ impl Exchange {
         }
     }
 
-    /// Whether every frame that this cycle judges has come back.
+    /// True if every frame that is evaluated in this cycle has come back.
     #[must_use]
     pub fn complete(&self) -> bool {
-        self.flights.get(self.due()).is_some_and(Flight::complete)
+        self.flights.get(self.due()).is_some_and(FrameSet::complete)
     }
 
-    /// Judges the answers that are due, for all groups and for each, and takes their inputs. RT: O(image).
-    pub fn answer(&mut self) -> Answer {
+    /// Evaluates the due answers per device, per group and in total, and copies their inputs. RT:
+    /// O(image).
+    pub fn evaluate(&mut self) -> CycleResult {
         let due = self.due();
         let Some(flight) = self.flights.get(due) else {
-            return Answer::default();
+            return CycleResult::default();
         };
         let Some(places) = self.forms.get(flight.form) else {
-            return Answer::default();
+            return CycleResult::default();
         };
         let first = flight.answer(0);
         let alone = if first.is_some() {
@@ -561,7 +579,7 @@ impl Exchange {
         if (ambiguous && self.op_expected) || (self.separate_cycles > 0 && !all_right) {
             self.separate_cycles = SEPARATE_CYCLES;
         }
-        let mut answer = Answer {
+        let mut answer = CycleResult {
             complete: flight.complete(),
             inputs_fresh: self.shares.iter().all(|share| share.fresh),
             wkc: self.shares.iter().fold((0, 0), |sum, share| {
@@ -579,14 +597,14 @@ impl Exchange {
             .get(places.al_status.data())
             .and_then(|data| Some((*data.first()?, places.al_status.wkc(first))));
         if let Some(turn) = flight.turn {
-            let place = Place {
+            let place = DatagramSlot {
                 frame: 0,
                 offset: places.probe_at,
                 len: turn.len,
             };
             let data = first.get(place.data()).unwrap_or_default();
             match turn.look {
-                Look::At { device, probe } => {
+                PollTarget::At { device, probe } => {
                     if let Some(to) = self.diagnoses.get_mut(device) {
                         to.answers = place.wkc(first) == 1;
                         if to.answers {
@@ -598,30 +616,33 @@ impl Exchange {
                         }
                     }
                 }
-                Look::Mailboxes { first } => {
-                    let devices = self.rota.mailbox_devices.iter().skip(first);
+                PollTarget::Mailboxes { first } => {
+                    let devices = self.schedule.mailbox_devices.iter().skip(first);
                     for (&device, &status) in devices.zip(data) {
-                        self.sights.see(device, flight.sent_at, status);
+                        self.bus_status
+                            .store_mailbox_status(device, flight.sent_at, status);
                     }
                 }
             }
         }
         answer.system_time = self.system_time(first, places.clock);
         if let Some(time) = answer.system_time {
-            self.sights.set_clock(flight.sent_at, time);
-            // Of the flight that is staged next; those under way lie between.
+            self.bus_status.set_clock(flight.sent_at, time);
+            // The time of the frame set that is staged next; those in flight lie between.
             let ahead = self.cycle_ns.saturating_mul(self.flights.len() as u64);
             self.expected_time = time.wrapping_add(ahead);
         }
         answer
     }
 
-    /// If the reference clock has given it: where clocks are missing, only those of groups that are, and it was seen lately.
-    fn system_time(&self, first: &[u8], place: Option<Place>) -> Option<u64> {
+    /// Returns the time if the reference clock has set it. If clocks are missing, they must all be
+    /// in groups with missing devices, and the reference must have answered its last diagnostic
+    /// read.
+    fn system_time(&self, first: &[u8], place: Option<DatagramSlot>) -> Option<u64> {
         let place = place?;
         let time = u64::from_le_bytes(first.get(place.data())?.try_into().ok()?);
         let wkc = place.wkc(first);
-        let clocks = |shares: &mut dyn Iterator<Item = &Share>| -> u16 {
+        let clocks = |shares: &mut dyn Iterator<Item = &GroupResult>| -> u16 {
             shares
                 .map(|share| share.clocks)
                 .fold(0, u16::saturating_add)
@@ -633,7 +654,7 @@ impl Exchange {
         (all || others).then_some(time)
     }
 
-    /// Bytes of each frame as staged, without FCS.
+    /// Returns the bytes of each staged frame without FCS.
     pub fn frame_lengths(&self) -> impl Iterator<Item = usize> + '_ {
         let staged = self.flights.get(self.staged);
         staged
@@ -642,18 +663,18 @@ impl Exchange {
     }
 }
 
-/// Where the datagrams of a cycle lie in its frames.
+/// The positions of a cycle's datagrams in its frames.
 #[derive(Debug)]
-struct Places {
-    clock: Option<Place>,
+struct DatagramSlots {
+    clock: Option<DatagramSlot>,
     process_data: Vec<ProcessDatagram>,
-    al_status: Place,
+    al_status: DatagramSlot,
     probe_at: usize,
 }
 
-impl Places {
-    /// Puts all datagrams but the diagnostic one into empty frames.
-    #[allow(clippy::disallowed_methods, reason = "prepares")]
+impl DatagramSlots {
+    /// Puts all datagrams except the diagnostic one into empty frames.
+    #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
     fn fill(
         frames: &mut [Frame],
         plan: &ImagePlan,
@@ -662,7 +683,7 @@ impl Places {
         clock: Option<&ClockPlan>,
     ) -> Self {
         let clock = clock.map(|clock| {
-            let address = u32::from(SYSTEM_TIME) << 16 | u32::from(clock.reference);
+            let address = u32::from(registers::DC_SYSTEM_TIME) << 16 | u32::from(clock.reference);
             push(&mut frames[0], 0, FRMW, address, 8)
         });
         let offset = |device: &usize| plan.regions[*device].map_or(0, |region| region.offset);
@@ -687,7 +708,13 @@ impl Places {
             }
         });
         let process_data = process_data.collect();
-        let al_status = push(&mut frames[0], 0, BRD, u32::from(AL_STATUS) << 16, 2);
+        let al_status = push(
+            &mut frames[0],
+            0,
+            BRD,
+            u32::from(registers::AL_STATUS) << 16,
+            2,
+        );
         let probe_at = frames[0].bytes.len();
         debug_assert!(probe_at + LONGEST_LOOK <= MAX_FRAME);
         Self {

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 
 use super::frame::FIRST_DATAGRAM;
 
-/// Swallows what it is given.
+/// A link that discards all frames.
 #[derive(Debug)]
 struct Nowhere;
 
@@ -18,7 +18,8 @@ impl Link for Nowhere {
     }
 }
 
-/// Sends the cycle's frames; what comes back of the one of this number, as from SubDevices that are all there.
+/// Sends the cycle's frames and returns the answer to frame `number`, as if all SubDevices were
+/// present.
 fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
     exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
     let mut frame = exchange.flights[exchange.staged].frames()[number]
@@ -55,20 +56,20 @@ fn axis(group: usize) -> ProcessData {
 }
 
 fn axes(count: usize) -> Exchange {
-    exchange(&vec![axis(0); count], Mode::SameCycle)
+    exchange(&vec![axis(0); count], ExchangeMode::SameCycle)
 }
 
-/// An axis in each of the groups.
+/// Creates an exchange with one axis in each of the groups.
 fn grouped(groups: &[usize]) -> Exchange {
     let devices: Vec<_> = groups.iter().map(|&group| axis(group)).collect();
-    exchange(&devices, Mode::SameCycle)
+    exchange(&devices, ExchangeMode::SameCycle)
 }
 
-/// The first with a clock.
-fn exchange(devices: &[ProcessData], mode: Mode) -> Exchange {
+/// Creates an exchange; the first device has a clock.
+fn exchange(devices: &[ProcessData], mode: ExchangeMode) -> Exchange {
     let plan = plan(devices).expect("fits");
     let members: Vec<_> = (0..devices.len())
-        .map(|i| Member {
+        .map(|i| ExchangeDevice {
             station: 0x1000 + i as u16,
             clock: i == 0,
             mailbox: None,
@@ -97,13 +98,13 @@ fn frame_bytes_for_8_32_and_100_axes() {
 }
 
 #[test]
-fn an_answer_is_taken_once_and_only_in_its_cycle() {
+fn exchange_accepts_an_answer_once_and_only_in_its_cycle() {
     let mut exchange = axes(2);
     let first = reflect(&mut exchange, 0, 0x5a);
     assert_eq!(exchange.receive(&first), Received::Current);
     assert!(exchange.complete());
     assert_eq!(exchange.receive(&first), Received::Late, "a duplicate");
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert!(answer.complete && answer.inputs_fresh);
     assert_eq!(answer.wkc, (6, 6));
     assert_eq!(answer.system_time, Some(0x5a5a_5a5a_5a5a_5a5a));
@@ -116,77 +117,77 @@ fn an_answer_is_taken_once_and_only_in_its_cycle() {
         Received::Late,
         "an answer of the cycle before"
     );
-    assert!(!exchange.answer().complete);
+    assert!(!exchange.evaluate().complete);
 }
 
 #[test]
-fn pipelined_answers_count_in_the_next_cycle_whenever_they_come() {
-    let mut exchange = exchange(&[axis(0); 2], Mode::Pipelined);
+fn pipelined_answers_are_evaluated_in_the_next_cycle() {
+    let mut exchange = exchange(&[axis(0); 2], ExchangeMode::Pipelined);
     let first = reflect(&mut exchange, 0, 1);
     assert!(!exchange.complete(), "nothing was asked before");
-    // It comes back at once, but its turn is the next cycle.
+    // It comes back at once but is evaluated in the next cycle.
     assert_eq!(exchange.receive(&first), Received::Current);
-    assert!(!exchange.answer().complete);
+    assert!(!exchange.evaluate().complete);
     assert_eq!(exchange.inputs(), [0; 24]);
     exchange.stage();
 
     let second = reflect(&mut exchange, 0, 2);
     assert!(exchange.complete());
     assert_eq!(exchange.receive(&first), Received::Late, "a duplicate");
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert!(answer.complete && answer.inputs_fresh);
     assert_eq!(answer.system_time, Some(0x0101_0101_0101_0101));
     assert_eq!(exchange.inputs(), [1; 24]);
     exchange.stage();
-    // Two cycles after the one that was answered.
+    // Two cycles after the answered one.
     assert_eq!(exchange.expected_time, 0x0101_0101_0101_0101 + 3_000_000);
 
-    // The second comes after the third was sent.
+    // The second answer arrives after the third cycle was sent.
     let third = reflect(&mut exchange, 0, 3);
     assert_eq!(exchange.receive(&second), Received::Current);
-    assert!(exchange.answer().complete);
+    assert!(exchange.evaluate().complete);
     assert_eq!(exchange.inputs(), [2; 24]);
     exchange.stage();
 
-    // The third not within the fourth's cycle.
+    // The third answer does not arrive within the fourth cycle.
     let fourth = reflect(&mut exchange, 0, 4);
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert!(!answer.complete && !answer.inputs_fresh);
     assert_eq!(exchange.inputs(), [2; 24]);
     exchange.stage();
     reflect(&mut exchange, 0, 5);
     assert_eq!(exchange.receive(&third), Received::Late);
     assert_eq!(exchange.receive(&fourth), Received::Current);
-    assert!(exchange.answer().complete);
+    assert!(exchange.evaluate().complete);
     assert_eq!(exchange.inputs(), [4; 24]);
 }
 
 #[test]
-fn an_answer_tells_how_late_its_frames_were_sent() {
+fn cycle_result_contains_the_send_delay() {
     for (mode, expected) in [
-        (Mode::SameCycle, [10, 20, 30]),
-        (Mode::Pipelined, [0, 10, 20]),
+        (ExchangeMode::SameCycle, [10, 20, 30]),
+        (ExchangeMode::Pipelined, [0, 10, 20]),
     ] {
         let mut exchange = exchange(&[axis(0)], mode);
         for (late, expected) in [10, 20, 30].into_iter().zip(expected) {
             exchange
                 .send(&mut Nowhere, late)
                 .expect("nowhere takes all");
-            assert_eq!(exchange.answer().sent_late, expected, "{mode:?}");
+            assert_eq!(exchange.evaluate().sent_late, expected, "{mode:?}");
             exchange.stage();
         }
     }
 }
 
 #[test]
-fn a_device_without_lrw_gets_and_gives_its_data_by_two_datagrams() {
+fn device_without_lrw_exchanges_data_in_two_datagrams() {
     let without = ProcessData {
         out_len: 4,
         in_len: 6,
         lrw: false,
         ..axis(0)
     };
-    let mut exchange = exchange(&[axis(0), without], Mode::SameCycle);
+    let mut exchange = exchange(&[axis(0), without], ExchangeMode::SameCycle);
     exchange.outputs_mut().fill(0x77);
     exchange.stage();
     let sent = exchange.flights[0].frames()[0].bytes.clone();
@@ -203,40 +204,40 @@ fn a_device_without_lrw_gets_and_gives_its_data_by_two_datagrams() {
     assert_eq!(commands, [(LRW, true), (LWR, true), (LRD, false)]);
     let answer = reflect(&mut exchange, 0, 0x11);
     assert_eq!(exchange.receive(&answer), Received::Current);
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert_eq!((answer.wkc, answer.inputs_fresh), ((5, 5), true));
     assert_eq!(exchange.inputs(), [0x11; 18]);
 }
 
 #[test]
-fn a_wrong_working_counter_leaves_the_inputs_alone() {
+fn wrong_working_counter_keeps_the_last_inputs() {
     let mut exchange = axes(1);
     let mut frame = reflect(&mut exchange, 0, 0x11);
     let wkc = exchange.forms[0].process_data[0].place.data().end;
     frame[wkc] = 2;
     assert_eq!(exchange.receive(&frame), Received::Current);
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert!(answer.complete && !answer.inputs_fresh);
     assert_eq!(answer.wkc, (2, 3));
     assert_eq!(exchange.inputs(), [0; 12]);
 }
 
 #[test]
-fn the_diagnostic_slot_walks_through_devices_and_probes() {
+fn diagnostic_slot_reads_all_registers_of_all_devices() {
     let mut exchange = axes(2);
     let mut seen = Vec::new();
-    for _ in 0..2 * Probe::ALL.len() {
+    for _ in 0..2 * DiagnosticRegister::ALL.len() {
         let turn = exchange.flights[0].turn.expect("there are members");
-        let Look::At { device, probe } = turn.look else {
-            panic!("nobody has a mailbox");
+        let PollTarget::At { device, probe } = turn.look else {
+            panic!("no device has a mailbox");
         };
         seen.push((device, probe as usize));
         let frame = reflect(&mut exchange, 0, 1);
         exchange.receive(&frame);
-        exchange.answer();
+        exchange.evaluate();
         exchange.stage();
     }
-    let expected: Vec<_> = (0..Probe::ALL.len())
+    let expected: Vec<_> = (0..DiagnosticRegister::ALL.len())
         .flat_map(|p| [(0, p), (1, p)])
         .collect();
     assert_eq!(seen, expected);
@@ -256,22 +257,22 @@ fn the_diagnostic_slot_walks_through_devices_and_probes() {
 }
 
 #[test]
-fn the_status_of_mailboxes_comes_in_every_other_cycle_and_costs_no_more_than_a_probe() {
+fn mailbox_status_is_read_every_other_cycle_at_the_cost_of_a_diagnostic_read() {
     let mut devices = vec![axis(0); 11];
     for device in &mut devices {
         device.mailbox = true;
     }
-    let mut exchange = exchange(&devices, Mode::SameCycle);
-    let sights = exchange.sights();
+    let mut exchange = exchange(&devices, ExchangeMode::SameCycle);
+    let bus_status = exchange.bus_status();
     let without = axes(11).frame_lengths().next().expect("a frame") - 18;
     for cycle in 0..8 {
         let frame = reflect(&mut exchange, 0, 0x08);
         assert!(frame.len() - without <= 20, "{}", frame.len());
         exchange.receive(&frame);
-        exchange.answer();
+        exchange.evaluate();
         exchange.stage();
-        // Eight of them in the second cycle, three in the fourth.
-        let seen = |n: usize| sights.mailbox(n).is_some_and(|seen| seen.full);
+        // Eight mailboxes in the second cycle, three in the fourth.
+        let seen = |n: usize| bus_status.mailbox(n).is_some_and(|seen| seen.full);
         assert_eq!((seen(0), seen(7)), (cycle >= 1, cycle >= 1), "{cycle}");
         assert_eq!((seen(8), seen(10)), (cycle >= 3, cycle >= 3), "{cycle}");
     }
@@ -286,12 +287,12 @@ fn large_images_take_several_frames() {
         let frame = reflect(&mut exchange, number, 7);
         assert_eq!(exchange.receive(&frame), Received::Current);
     }
-    assert!(exchange.answer().inputs_fresh);
+    assert!(exchange.evaluate().inputs_fresh);
 }
 
 proptest! {
     #[test]
-    fn no_received_bytes_panic(mut frame in proptest::collection::vec(any::<u8>(), 0..1600), ours: bool) {
+    fn receive_never_panics(mut frame in proptest::collection::vec(any::<u8>(), 0..1600), ours: bool) {
         let mut exchange = axes(3);
         if ours && frame.len() > 20 {
             let template = reflect(&mut exchange, 0, 0);
@@ -299,13 +300,13 @@ proptest! {
             frame[..n].copy_from_slice(&template[..n]);
         }
         exchange.receive(&frame);
-        let _ = exchange.answer();
+        let _ = exchange.evaluate();
     }
 }
 
-/// 12 bytes a group; the rest of the machine is in none.
+/// 12 bytes per group; the rest of the machine is in no group.
 #[test]
-fn each_group_has_a_working_counter_of_its_own() {
+fn each_group_has_its_own_working_counter() {
     let mut exchange = grouped(&[1, 0, 2, 1]);
     assert_eq!(
         exchange.forms[0].probe_at,
@@ -315,7 +316,7 @@ fn each_group_has_a_working_counter_of_its_own() {
     let of_first_group = exchange.forms[0].process_data[1].place.data().end;
     frame[of_first_group] = 4;
     assert_eq!(exchange.receive(&frame), Received::Current);
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert!(answer.complete && !answer.inputs_fresh);
     assert_eq!(answer.wkc, (10, 12));
     let shares: Vec<_> = exchange
@@ -336,9 +337,9 @@ fn each_group_has_a_working_counter_of_its_own() {
     assert_eq!(exchange.inputs(), inputs);
 }
 
-/// A clock that is missing with its group does not keep the others from their reference.
+/// A clock that is missing with its group does not keep the other clocks from the reference.
 #[test]
-fn the_system_time_is_the_reference_s_alone() {
+fn system_time_comes_only_from_the_reference_clock() {
     let mut exchange = grouped(&[0, 1]);
     exchange.shares[1].clocks = 1;
     let mut answer = |wkc: u8, fresh: bool| {
@@ -349,23 +350,23 @@ fn the_system_time_is_the_reference_s_alone() {
         let second = exchange.forms[0].process_data[1].place.data().end;
         frame[second] = if fresh { 3 } else { 0 };
         exchange.receive(&frame);
-        exchange.answer().system_time.is_some()
+        exchange.evaluate().system_time.is_some()
     };
     assert!(answer(2, true), "both are there");
-    assert!(!answer(1, true), "one is missing, and nobody knows which");
+    assert!(!answer(1, true), "one of them is missing");
     assert!(answer(1, false), "it is the one whose group is missing");
     assert!(!answer(0, false));
 }
 
-/// Groups in frames of their own are lost with these alone.
+/// A lost frame affects only the groups in it.
 #[test]
-fn a_frame_that_is_lost_concerns_its_groups() {
+fn lost_frame_affects_only_its_groups() {
     let groups: Vec<usize> = (0..200).map(|i| usize::from(i >= 100)).collect();
     let mut exchange = grouped(&groups);
     assert_eq!(exchange.frame_lengths().count(), 2);
     let frame = reflect(&mut exchange, 0, 7);
     exchange.receive(&frame);
-    let answer = exchange.answer();
+    let answer = exchange.evaluate();
     assert!(!answer.complete && !answer.inputs_fresh);
     let [rest, second] = exchange.shares() else {
         panic!("two groups")
@@ -373,10 +374,11 @@ fn a_frame_that_is_lost_concerns_its_groups() {
     assert!(rest.fresh && !second.answered && !second.fresh);
 }
 
-/// After a wrong counter that devices share, each has a datagram and so evidence of its own, until all have been right for long.
+/// After a wrong shared counter, each device has its own datagram, until all were right for long
+/// enough.
 #[test]
-fn a_missing_device_leaves_the_evidence_of_the_others_alone() {
-    for mode in [Mode::SameCycle, Mode::Pipelined] {
+fn missing_device_does_not_change_the_evidence_of_others() {
+    for mode in [ExchangeMode::SameCycle, ExchangeMode::Pipelined] {
         let mut exchange = exchange(&[axis(0); 3], mode);
         exchange.expect_op(true);
         let missing_second = |exchange: &mut Exchange, input: u8| {
@@ -385,14 +387,14 @@ fn a_missing_device_leaves_the_evidence_of_the_others_alone() {
             let at = exchange.forms[form].process_data[form].place.data().end;
             frame[at] = if form == 0 { 6 } else { 0 };
             assert_eq!(exchange.receive(&frame), Received::Current);
-            exchange.answer();
+            exchange.evaluate();
             let evidence = exchange.evidence().to_vec();
             exchange.stage();
             evidence
         };
         let unknown = [Evidence::Unknown; 3];
         let first = missing_second(&mut exchange, 1);
-        if mode == Mode::SameCycle {
+        if mode == ExchangeMode::SameCycle {
             assert_eq!(first, unknown);
         } else {
             assert_eq!(first, [Evidence::Missing; 3], "nothing was asked before");
@@ -404,11 +406,11 @@ fn a_missing_device_leaves_the_evidence_of_the_others_alone() {
             assert_eq!(missing_second(&mut exchange, 2), own);
         }
         assert_eq!(exchange.inputs()[..12], [2; 12]);
-        // Back, and after a while with shared datagrams again.
+        // The device is back; after a while the datagrams are shared again.
         for cycle in 0..=SEPARATE_CYCLES + 2 {
             let frame = reflect(&mut exchange, 0, 3);
             assert_eq!(exchange.receive(&frame), Received::Current);
-            exchange.answer();
+            exchange.evaluate();
             if cycle > 1 {
                 assert_eq!(exchange.evidence(), [Evidence::Fresh; 3]);
             }
@@ -419,10 +421,10 @@ fn a_missing_device_leaves_the_evidence_of_the_others_alone() {
 }
 
 #[test]
-fn a_late_answer_proves_delivery_and_an_old_one_nothing() {
+fn late_answer_proves_delivery_but_an_old_one_does_not() {
     let mut exchange = axes(2);
     let first = reflect(&mut exchange, 0, 1);
-    exchange.answer();
+    exchange.evaluate();
     assert_eq!(exchange.evidence(), [Evidence::Missing; 2]);
     exchange.stage();
     assert!(!exchange.came_late(0));
@@ -430,7 +432,7 @@ fn a_late_answer_proves_delivery_and_an_old_one_nothing() {
     assert!(exchange.came_late(0) && exchange.came_late(1));
     exchange.stage();
     assert!(!exchange.came_late(0), "it is of one cycle");
-    // Of a device that did not take part, or of another frame.
+    // An answer of a device that did not process it, or of another frame.
     let mut without = reflect(&mut exchange, 0, 1);
     let wkc = exchange.forms[0].process_data[0].place.data().end;
     without[wkc] = 3;
@@ -457,5 +459,5 @@ fn an_answer_256_cycles_old_is_late() {
         exchange.send(&mut Nowhere, 0).expect("nowhere takes all");
     }
     assert_eq!(exchange.receive(&first), Received::Late);
-    assert!(!exchange.answer().inputs_fresh);
+    assert!(!exchange.evaluate().inputs_fresh);
 }

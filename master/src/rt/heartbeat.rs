@@ -1,14 +1,15 @@
-//! Whether the thread beside the cycle still runs: without it no step ends, no device is asked, and nobody can stop the machine.
+//! Detects a supervisor thread that no longer runs. Without the supervisor, no step of the program
+//! ends, no device is polled and no operator can stop the machine.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::clock::Nanos;
 
-/// Longer than a busy computer keeps a thread without real-time priority waiting.
+/// Longer than a busy computer delays a thread without real-time priority.
 const TIMEOUT: Nanos = 2_000_000_000;
 
-/// Beats as often as the supervisor is polled.
+/// The counter that the supervisor increments at every poll.
 #[derive(Debug, Clone, Default)]
 pub struct Heartbeat(Arc<AtomicU64>);
 
@@ -18,16 +19,17 @@ impl Heartbeat {
     }
 }
 
-/// The cycle's view of it.
+/// The cycle's view of the heartbeat.
 #[derive(Debug, Default)]
 pub(super) struct Watch {
     last: u64,
-    /// Time of the cycles since the last beat. A suspended process turns no cycles.
+    /// The cycle time accumulated since the last beat. A suspended process runs no cycles.
     silent_ns: Nanos,
 }
 
 impl Watch {
-    /// Looks once a cycle; true once it has been silent for too long. Before the first beat there is no supervisor.
+    /// Call once per cycle. Returns true once the heartbeat was missing for too long. Before the
+    /// first beat, there is no supervisor to miss.
     pub fn is_silent(&mut self, heartbeat: &Heartbeat, cycle_ns: Nanos) -> bool {
         let beats = heartbeat.0.load(Ordering::Relaxed);
         if beats == self.last {
@@ -47,14 +49,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_a_supervisor_that_has_run_falls_silent() {
+    fn heartbeat_is_silent_only_after_a_first_beat() {
         const CYCLE: Nanos = 1_000_000;
         let (heartbeat, mut watch) = (Heartbeat::default(), Watch::default());
         let silent = |watch: &mut Watch, cycles: u64| {
             let each = (0..cycles).map(|_| watch.is_silent(&heartbeat, CYCLE));
             each.filter(|silent| *silent).count()
         };
-        assert_eq!(silent(&mut watch, 5000), 0, "nobody is there yet");
+        assert_eq!(silent(&mut watch, 5000), 0, "no heartbeat yet");
         heartbeat.beat();
         assert_eq!(silent(&mut watch, 2001), 0);
         assert_eq!(silent(&mut watch, 10), 10);

@@ -1,25 +1,23 @@
-//! The real-time side. MUST NOT BLOCK OR ALLOCATE: nothing here waits for anything but the clock
-//! and the wire, allocates, locks or logs once a value has been prepared.
+//! The real-time side. MUST NOT BLOCK OR ALLOCATE: after its preparation, nothing here allocates,
+//! locks, logs, or waits for anything but the clock and the wire.
 //!
-//! - [`image`]: where each SubDevice's process data lies;
+//! - [`image`]: the layout of the process image;
 //! - [`exchange`]: the frames of a cycle, built once and refilled;
 //! - [`phase`]: keeps the release of frames in phase with SYNC0;
-//! - [`guard`]: how many bad cycles the machine rides through;
-//! - [`groups`]: what stops together, and when it may come back;
-//! - [`feed`]: set-points from lines, tables, other axes;
-//! - [`slot`]: one axis in the cycle;
+//! - [`bus_monitor`]: counts bad cycles and decides when the bus is lost;
+//! - [`reaction_group`]: axes that stop together, and their release;
+//! - [`setpoint_generator`]: set-points from lines, tables and other axes;
+//! - [`axis`]: one axis in the cycle;
 //! - [`stats`]: bounded histograms and counters;
-//! - [`journal`]: what the cycle has noticed, in order;
-//! - [`history`]: the last cycles as they were;
-//! - [`heartbeat`]: whether the thread beside the cycle still runs;
-//! - [`handover`]: the queues to and from everybody else;
-//! - [`controller`]: a user's own code in the cycle;
-//! - [`cycle`]: one turn of the loop, from wake-up to publishing;
-//! - [`margin`]: when sleeping ends and spinning begins;
-//! - [`awake`]: keeps a CPU from sleeping;
-//! - [`thread`]: scheduling class, affinity and memory of the thread that turns it.
+//! - [`event_log`]: the events of the cycle, in order;
+//! - [`flight_recorder`]: the state of the last cycles;
+//! - [`heartbeat`]: detects a dead supervisor thread;
+//! - [`channel`]: the queues to and from the other threads;
+//! - [`controller`]: user code in the cycle;
+//! - [`cycle`]: one cycle, from wake-up to publishing;
+//! - [`spin`]: the time between the end of the sleep and the release.
 //!
-//! Constructors run before the loop and may allocate; they are the only functions that may.
+//! Constructors run before the loop. They are the only functions that may allocate.
 
 #![cfg_attr(
     not(test),
@@ -30,20 +28,18 @@
     )
 )]
 
-pub mod awake;
+pub mod axis;
+pub mod bus_monitor;
+pub mod channel;
 pub mod controller;
 pub mod cycle;
+pub mod event_log;
 pub mod exchange;
-pub mod feed;
-pub mod groups;
-pub mod guard;
-pub mod handover;
+pub mod flight_recorder;
 pub mod heartbeat;
-pub mod history;
 pub mod image;
-pub mod journal;
-pub mod margin;
 pub mod phase;
-pub mod slot;
+pub mod reaction_group;
+pub mod setpoint_generator;
+pub mod spin;
 pub mod stats;
-pub mod thread;

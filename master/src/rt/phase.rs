@@ -1,16 +1,16 @@
 //! Keeps the release of frames in phase with SYNC0.
 //!
-//! The error is where in the SYNC0 cycle the frame passed the reference clock, against where it
-//! should. A PI controller turns it into the length of the next cycle; the integral is the drift
-//! between this machine's clock and the reference. The measured lateness of the wake-up is taken
-//! out first, so that a late thread does not make the clock wander.
+//! The phase error is the time within the SYNC0 cycle at which the frame passed the reference
+//! clock, minus the planned time. A PI controller turns the error into the length of the next
+//! cycle. Its integral is the drift between the host clock and the reference clock. The measured
+//! wake-up lateness is subtracted first, so that a late thread does not shift the phase.
 //!
-//! Before the first lock, no device is in Op and nobody minds one cycle of odd length: the phase is
-//! set at once, not approached.
+//! Before the first lock no device is in Op, and one cycle of odd length does no harm. The phase is
+//! therefore set at once, not approached.
 
 use crate::clock::Nanos;
 
-/// Parts of the error that go into the next cycle and into the drift.
+/// The shares of the error that go into the next cycle and into the drift.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gains {
     pub proportional: f64,
@@ -18,33 +18,34 @@ pub struct Gains {
 }
 
 impl Gains {
-    /// A tenth of the error a cycle, critically damped: Ki = Kp² ∕ 4.
+    /// A tenth of the error per cycle, critically damped: Ki = Kp² ∕ 4.
     pub const DEFAULT: Self = Self {
         proportional: 0.1,
         integral: 0.0025,
     };
-    /// The whole error into the next cycle, as a loop has it that sleeps what it measures; to compare with.
+    /// The whole error goes into the next cycle, as in a loop that sleeps for what it measures. For
+    /// comparison only.
     pub const RAW: Self = Self {
         proportional: 1.0,
         integral: 0.0,
     };
 }
 
-/// Score at which the phase counts as locked; a measurement inside the window adds one, one outside
-/// takes one away, so that a single late answer on a busy host does not start the count anew.
+/// The score at which the phase counts as locked. A measurement inside the window adds one, one
+/// outside subtracts one. A single late answer on a busy host therefore does not restart the count.
 const LOCKED_SCORE: u32 = 50;
-/// Highest score: so many measurements outside, and the phase counts as lost.
+/// The highest score. From here, 21 more measurements outside than inside unlock the phase.
 const BEST_SCORE: u32 = 70;
-/// Measurements after the phase was set that may still be of frames released before.
+/// Measurements after the phase was set that may belong to frames released before.
 const UNDER_WAY: u8 = 2;
 
-/// What the cyclic exchange needs to know to keep the clocks together and itself in phase.
+/// The parameters with which the cyclic exchange distributes time and keeps its phase.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClockPlan {
     /// Station address of the reference clock.
     pub reference: u16,
     pub cycle_ns: u64,
-    /// A system time at which a frame should pass the reference clock, and every cycle from then.
+    /// A system time at which a frame should pass the reference clock, repeating every cycle.
     pub release: u64,
 }
 
@@ -55,24 +56,24 @@ pub struct Phase {
     cycle: i64,
     /// System time of the last measurement, extended to 64 bits.
     time: Option<u64>,
-    /// System time at which a frame should have passed, modulo the cycle.
+    /// The planned passing time modulo the cycle, in system time.
     target: i64,
-    /// Nanoseconds a cycle.
+    /// The drift in ns per cycle.
     drift: f64,
     locked: bool,
-    /// It has been locked.
+    /// True once the phase was locked for the first time.
     acquired: bool,
     score: u32,
-    /// Measurements to leave out.
+    /// The number of measurements still to ignore.
     under_way: u8,
 }
 
-/// What one measurement told.
+/// The result of one measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhaseStep {
-    /// Where the frame passed minus where it should have, wake-up lateness included.
+    /// The actual passing time minus the planned one, including the wake-up lateness.
     pub error: i64,
-    /// To be added to the next cycle's length.
+    /// The correction to add to the length of the next cycle.
     pub adjust: i64,
 }
 
@@ -104,16 +105,16 @@ impl Phase {
         self.locked
     }
 
-    /// Drift of the reference clock against ours in parts per million.
+    /// Returns the drift of the reference clock against the host clock, in parts per million.
     #[must_use]
     pub fn drift_ppm(&self) -> f64 {
         self.drift / self.cycle as f64 * 1e6
     }
 
-    /// Takes a measurement in. RT.
+    /// Processes one measurement. RT.
     ///
-    /// `system_time` is the reference clock's as the frame passed; `lateness` how long after its
-    /// planned release the frame was sent.
+    /// `system_time` is the reference clock's time as the frame passed. `lateness` is how long
+    /// after its planned release the frame was sent.
     pub fn update(&mut self, system_time: u64, lateness: Nanos) -> PhaseStep {
         let system_time = self.extend(system_time);
         let passed = i64::try_from(system_time % self.cycle.unsigned_abs()).unwrap_or(0);
@@ -132,11 +133,11 @@ impl Phase {
             let adjust = self.holdover() - planned;
             return PhaseStep { error, adjust };
         }
-        // A single wild measurement may move a locked phase by a 1000th of a cycle, one that was lost
-        // by a 50th: faster would look like jitter to the drives.
+        // A single outlier may shift a locked phase by a 1000th of a cycle, an unlocked one by a
+        // 50th. The drives would see faster changes as jitter.
         let bound = self.cycle as f64 / if self.locked { 100.0 } else { 5.0 };
         let bounded = (planned as f64).clamp(-bound, bound);
-        // The way to the target says nothing about drift.
+        // An error far from the target contains no information about drift.
         if near {
             self.drift += self.gains.integral * bounded;
             let most = self.cycle as f64 * 1e-3;
@@ -149,7 +150,7 @@ impl Phase {
         }
     }
 
-    /// Without a measurement the drift estimate carries on. RT.
+    /// Returns the correction without a measurement: the estimated drift. RT.
     #[must_use]
     pub fn holdover(&self) -> i64 {
         -self.drift.round() as i64
@@ -170,8 +171,8 @@ impl Phase {
         self.acquired |= self.locked;
     }
 
-    /// A clock of 32 bits wraps every 4.3 s, in the middle of a cycle; measurements are closer
-    /// together than half of that.
+    /// Extends a 32-bit clock to 64 bits. Such a clock wraps every 4.3 s, in the middle of a cycle.
+    /// Measurements are less than half of that apart.
     fn extend(&mut self, raw: u64) -> u64 {
         let time = match self.time {
             None => raw,
@@ -184,7 +185,7 @@ impl Phase {
         time
     }
 
-    /// Into ±half a cycle.
+    /// Wraps a value into ± half a cycle.
     fn wrap(&self, value: i64) -> i64 {
         (value + self.cycle / 2).rem_euclid(self.cycle) - self.cycle / 2
     }
@@ -211,7 +212,7 @@ mod tests {
         }
     }
 
-    /// Cycles until locked, and the largest error in the 1000 cycles after.
+    /// Returns the cycles until lock, and the largest error in the 1000 cycles after it.
     fn run(cycle: u64, offset: u64, ppm: f64, late: impl Fn(u64) -> u64) -> (u64, i64) {
         let mut phase = Phase::new(&plan(cycle, 7_000_000));
         let mut release = 50_000_000_u64;
@@ -250,7 +251,7 @@ mod tests {
         }
     }
 
-    /// Answers may be of frames that were released before the phase was set.
+    /// Answers may belong to frames that were released before the phase was set.
     #[test]
     fn before_the_first_lock_the_phase_is_set_at_once() {
         for lag in [0_usize, 1] {

@@ -1,54 +1,54 @@
-//! Numbers that prove the timing: bounded, preallocated, recorded in a few nanoseconds.
+//! Timing statistics: bounded, preallocated, recorded in a few nanoseconds.
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-use super::journal::Journal;
+use super::event_log::EventLog;
 
-/// Longest time a histogram tells apart; longer ones count as this.
+/// The longest time that a histogram resolves; longer ones count as this.
 const LONGEST_NS: u64 = 10_000_000_000;
 
-/// A distribution of nanoseconds.
+/// A distribution of times in ns.
 #[derive(Debug, Clone)]
-pub struct Times(Histogram<u64>);
+pub struct LatencyHistogram(Histogram<u64>);
 
-impl Times {
+impl LatencyHistogram {
     #[must_use]
     pub fn new() -> Self {
         let Ok(mut histogram) = Histogram::new_with_bounds(1, LONGEST_NS, 3) else {
             unreachable!("constant bounds are valid");
         };
-        // Writes to every page of it, so that none is met for the first time in a cycle.
+        // Writes to every page, so that no page faults in a cycle.
         histogram.reset();
         Self(histogram)
     }
 
-    /// RT.
+    /// Records one value. RT.
     pub fn record(&mut self, nanos: u64) {
         self.0.saturating_record(nanos);
     }
 
-    /// So many at once. RT.
+    /// Records a value `count` times. RT.
     pub fn record_n(&mut self, nanos: u64, count: u64) {
-        // None at all would still be the longest.
+        // A count of zero would still raise the maximum.
         if count > 0 {
             self.0.saturating_record_n(nanos, count);
         }
     }
 
-    /// Forgets everything, without giving memory back.
+    /// Clears the values and keeps the memory.
     pub fn clear(&mut self) {
         self.0.reset();
     }
 
-    /// Adds what another has recorded.
+    /// Adds the values of another histogram.
     pub fn add(&mut self, other: &Self) {
         for (nanos, count) in other.recorded() {
             self.record_n(nanos, count);
         }
     }
 
-    /// The shortest times first, as far as they are told apart, and how often each was recorded.
+    /// Returns each recorded value with its count, shortest first, at the histogram's resolution.
     pub fn recorded(&self) -> impl Iterator<Item = (u64, u64)> + '_ {
         let each = self.0.iter_recorded();
         each.map(|step| (step.value_iterated_to(), step.count_at_value()))
@@ -66,13 +66,13 @@ impl Times {
     }
 }
 
-impl Default for Times {
+impl Default for LatencyHistogram {
     fn default() -> Self {
         Self::new()
     }
 }
 
-/// What is told of a distribution.
+/// A summary of a distribution.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Percentiles {
     pub count: u64,
@@ -82,26 +82,26 @@ pub struct Percentiles {
     pub max_ns: u64,
 }
 
-/// How often things happened.
+/// Event counters.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counters {
     pub cycles: u64,
     /// Cycles whose frames did not all come back before the deadline.
     pub lost_frames: u64,
-    /// Frames of ours that came back in a later cycle, or twice.
+    /// Cyclic frames that came back in a later cycle, or twice.
     pub late_frames: u64,
-    /// Cycles with a working counter other than expected.
+    /// Cycles with an unexpected working counter.
     pub wkc_errors: u64,
-    /// Cycles left out because the thread woke up too late for them.
+    /// Cycles skipped because the thread woke up too late for them.
     pub overruns: u64,
-    /// Sends and receives that the link refused.
+    /// Sends and receives that failed in the link.
     pub link_errors: u64,
-    /// Answers that came too late for the mailbox side, or damaged.
+    /// Mailbox answers that came too late or damaged.
     pub refused_answers: u64,
 }
 
 impl Counters {
-    /// Both together.
+    /// Returns the sum of both.
     #[must_use]
     pub fn plus(&self, other: &Self) -> Self {
         Self {
@@ -117,7 +117,7 @@ impl Counters {
 }
 
 impl Stats {
-    /// Forgets everything, without giving memory back.
+    /// Clears the values and keeps the memory.
     pub fn clear(&mut self) {
         self.counters = Counters::default();
         for times in [
@@ -131,7 +131,7 @@ impl Stats {
         }
     }
 
-    /// Adds what another has recorded.
+    /// Adds the values of another.
     pub fn add(&mut self, other: &Self) {
         self.counters = self.counters.plus(&other.counters);
         self.lateness.add(&other.lateness);
@@ -142,20 +142,20 @@ impl Stats {
     }
 }
 
-/// Everything the cycle records.
+/// All statistics of the cycle.
 #[derive(Debug, Clone, Default)]
 pub struct Stats {
     pub counters: Counters,
     /// Wake-up after the planned release.
-    pub lateness: Times,
-    /// How late sleeping ended, whatever was spun after it.
-    pub slept: Times,
+    pub lateness: LatencyHistogram,
+    /// How late the sleep ended, before any spinning.
+    pub slept: LatencyHistogram,
     /// Release to the last answer.
-    pub round_trip: Times,
-    /// Amount of the phase error against SYNC0.
-    pub phase: Times,
-    /// Wake-up to going to sleep again.
-    pub work: Times,
-    /// What led to it.
-    pub journal: Journal,
+    pub round_trip: LatencyHistogram,
+    /// Magnitude of the phase error against SYNC0.
+    pub phase: LatencyHistogram,
+    /// Wake-up until going to sleep again.
+    pub work: LatencyHistogram,
+    /// The events of the cycle, in order.
+    pub journal: EventLog,
 }

@@ -1,67 +1,62 @@
-//! Who is on a segment, and what they are: position, identity, state, ports, clocks, mailbox, and on request what drives say of
-//! themselves. MAY BLOCK AND ALLOCATE.
+//! Enumerates the SubDevices of a segment: identity, state, ports, clocks, mailbox, and on request
+//! the parameters of drives. MAY BLOCK AND ALLOCATE.
 //!
-//! A segment that another MainDevice drives stays as it is: registers are read, EEPROMs where nobody holds them; states and mailboxes
-//! are left alone unless [`Options::intrude`] says otherwise.
+//! A segment that another MainDevice drives is not disturbed. Registers are read, and EEPROMs if
+//! they are free. States and mailboxes are not used unless [`Options::intrude`] is set.
 //!
-//! - [`registers`]: what the controller's registers mean;
-//! - [`tree`]: who hangs at whose port, and how far away in time;
-//! - [`others`]: signs of another MainDevice;
-//! - [`answers`]: what a device says over its mailbox;
-//! - [`described`]: the ESI files that fit;
-//! - [`write`]: the machine file that follows from all that.
+//! - [`registers`]: the controller's registers;
+//! - [`topology`]: connections and propagation delays;
+//! - [`other_main_device`]: evidence of another MainDevice;
+//! - [`coe_info`]: answers over the CoE mailbox;
+//! - [`esi_match`]: matching ESI files;
+//! - [`mod@write`]: generates a machine file.
 
 use std::time::Duration;
 
+use ecaxis_ecat::registers as esc;
 use ecaxis_esi::Identity;
 use ecaxis_esi::sii::{self, General, Protocols, Sii};
 
+use crate::acyclic::device::with_mailbox;
+use crate::acyclic::eeprom::{EepromAccess, with_eeprom};
+use crate::acyclic::enumerate::{self, EnumeratedDevice};
+use crate::acyclic::{DatagramClient, ServiceError};
 use crate::bringup::DeviceRef;
 use crate::bringup::al::{self, AlState};
-use crate::mailbox::Wire;
-use crate::service::device::with_mailbox;
-use crate::service::eeprom::{Claim, with_eeprom};
-use crate::service::station::{self, Found};
-use crate::service::{Datagrams, ServiceError};
+use crate::mailbox::MailboxTransport;
 
-pub mod answers;
-pub mod described;
-pub mod others;
+pub mod coe_info;
+pub mod esi_match;
+pub mod other_main_device;
 pub mod registers;
 #[cfg(test)]
 mod tests;
-pub mod tree;
+pub mod topology;
 pub mod write;
 
-pub use answers::{Answers, DriveAnswers};
-pub use described::Described;
-pub use others::Sign;
+pub use coe_info::{CoeInfo, DriveInfo};
+pub use esi_match::EsiMatch;
+pub use other_main_device::MainDeviceEvidence;
 use registers::{CONTROLLER_BYTES, Controller};
-pub use tree::Uplink;
+pub use topology::ParentPort;
 
-/// Another MainDevice shows within this time.
+/// The time to detect another MainDevice.
 const WATCH: Duration = Duration::from_millis(50);
-/// Receive times are latched so often; the delays are averaged.
+/// The number of latched receive times; the delays are averages.
 const LATCHES: u32 = 8;
 
-const CONTROLLER: u16 = 0x0000;
-const DL_STATUS: u16 = 0x0110;
-const RECEIVE_TIMES: u16 = 0x0900;
-const SYSTEM_TIME: u16 = 0x0910;
-const SYSTEM_TIME_DELAY: u16 = 0x0928;
-
-/// How far a scan goes.
+/// The extent of a scan.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Options {
-    /// Devices are asked over their mailboxes; those in Init are in PreOp meanwhile.
+    /// Use the mailboxes of the devices; those in Init are in PreOp meanwhile.
     pub ask: bool,
-    /// Even where another MainDevice drives the segment.
+    /// Use the mailboxes even if another MainDevice drives the segment.
     pub intrude: bool,
-    /// Frames of others that the interface heard before anything was sent.
+    /// Foreign frames that the interface received before the first transmission.
     pub heard: u64,
 }
 
-/// What is being done, for the user to see: a device of so many.
+/// The progress of the scan for display.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Step {
     pub what: &'static str,
@@ -69,38 +64,40 @@ pub struct Step {
     pub of: usize,
 }
 
-/// A segment as it was found.
+/// The result of a scan.
 #[derive(Debug, Clone, Default)]
 pub struct Scan {
-    /// In the order of the segment.
+    /// The devices in segment order.
     pub devices: Vec<Device>,
-    /// What tells of another MainDevice; empty where there is none.
-    pub others: Vec<Sign>,
-    /// The devices were asked over their mailboxes.
+    /// Evidence of another MainDevice; empty if there is none.
+    pub others: Vec<MainDeviceEvidence>,
+    /// True if the mailboxes were used.
     pub asked: bool,
-    /// Propagation delays were measured; otherwise they are what another MainDevice wrote.
+    /// True if the propagation delays were measured; otherwise they are those that another
+    /// MainDevice wrote.
     pub measured: bool,
 }
 
-/// A SubDevice as it was found.
+/// A SubDevice of the scan.
 #[derive(Debug, Clone)]
 pub struct Device {
-    pub found: Found,
+    pub found: EnumeratedDevice,
     pub controller: Controller,
     /// DL status (0x0110).
     pub dl_status: u16,
-    /// The port that it hangs at; `None`: the MainDevice's.
-    pub uplink: Option<Uplink>,
-    /// From the first device, nanoseconds, one way.
+    /// The port that it is connected to; `None`: the MainDevice.
+    pub uplink: Option<ParentPort>,
+    /// The one-way delay from the first device in ns.
     pub delay_ns: Option<u32>,
-    /// It has a system time: not every one that says so in 0x0008 has it switched on.
+    /// True if it has a running system time. Not every device with DC support in 0x0008 has it
+    /// enabled.
     pub dc: bool,
-    /// What its EEPROM says, or why that is not known.
+    /// The content of its EEPROM, or why it is unknown.
     pub sii: Result<Sii, String>,
-    /// Explicit device identification, where it has one and could be asked.
+    /// The explicit device identification, if supported and readable.
     pub id: Option<u16>,
-    /// What it says over CoE; `Err`: why it did not.
-    pub answers: Option<Result<Answers, String>>,
+    /// The answers over CoE, or why there are none.
+    pub answers: Option<Result<CoeInfo, String>>,
 }
 
 impl Device {
@@ -119,7 +116,7 @@ impl Device {
         self.sii.as_ref().ok().map(|sii| sii.serial)
     }
 
-    /// As its EEPROM calls it: by its type, or by a longer name.
+    /// Returns the type from its EEPROM, or its longer name.
     #[must_use]
     pub fn own_name(&self) -> Option<String> {
         let general = self.sii.as_ref().ok()?.general.as_ref()?;
@@ -129,7 +126,7 @@ impl Device {
         Some(name.chars().filter(|c| !c.is_control()).collect())
     }
 
-    /// Names of its mailbox protocols.
+    /// Returns the names of its mailbox protocols.
     #[must_use]
     pub fn protocols(&self) -> Vec<&'static str> {
         const NAMES: [(u16, &str); 6] = [
@@ -146,7 +143,7 @@ impl Device {
         named.map(|(_, name)| *name).collect()
     }
 
-    /// By what it says itself: device type (0x1000) or the Controlword in its EEPROM's PDOs.
+    /// True if its device type (0x1000) or a Controlword in its EEPROM's PDOs marks it as a drive.
     #[must_use]
     pub fn says_drive(&self) -> bool {
         const CIA_402: u32 = 402;
@@ -162,27 +159,28 @@ impl Device {
         }
         let pdos = self.sii.as_ref().map(|sii| sii.rx_pdos.as_slice());
         let mut entries = pdos.unwrap_or_default().iter().flat_map(|pdo| &pdo.entries);
-        // A bit of a terminal may have the number, too.
+        // A single bit of a terminal may have the same index.
         entries.any(|entry| entry.index == CONTROLWORD && entry.bit_len == 16)
     }
 }
 
-/// Looks at everybody on the segment.
+/// Scans all devices on the segment.
 ///
 /// # Errors
-/// [`ServiceError::NoAnswer`], and devices that leave meanwhile. What one device alone keeps to itself is told of that device.
+/// [`ServiceError::NoAnswer`], or a device that leaves during the scan. Failures of one device are
+/// stored in its result.
 pub async fn scan(
-    wire: &Datagrams,
+    wire: &DatagramClient,
     options: Options,
-    tell: &mut dyn FnMut(Step),
+    report: &mut dyn FnMut(Step),
 ) -> Result<Scan, ServiceError> {
-    let mut found = station::census(wire).await?;
-    let others = others::look(wire, &found, options.heard, WATCH).await?;
+    let mut found = enumerate::enumerate(wire).await?;
+    let others = other_main_device::look(wire, &found, options.heard, WATCH).await?;
     let quiet = others.is_empty();
-    // One that is bringing the segment up gives out addresses and reads EEPROMs itself.
-    let shared = others.iter().any(Sign::is_live) && !options.intrude;
+    // A MainDevice in bring-up assigns addresses and reads EEPROMs.
+    let shared = others.iter().any(MainDeviceEvidence::is_live) && !options.intrude;
     if !shared {
-        station::address(wire, &mut found).await?;
+        enumerate::address(wire, &mut found).await?;
     }
 
     let of = found.len();
@@ -193,7 +191,7 @@ pub async fn scan(
         let addressed = found.station != 0 && same.count() == 1;
         let readable = addressed && !(shared && found.state == AlState::Init);
         let position = found.position;
-        tell(Step {
+        report(Step {
             what: "reading",
             position,
             of,
@@ -218,7 +216,7 @@ pub async fn scan(
         scan.asked = true;
         for device in &mut scan.devices {
             let position = device.position();
-            tell(Step {
+            report(Step {
                 what: "asking",
                 position,
                 of,
@@ -229,17 +227,21 @@ pub async fn scan(
     Ok(scan)
 }
 
-/// Registers and EEPROM; nothing that a state machine would notice.
-async fn look_at(wire: &Datagrams, found: Found, readable: bool) -> Result<Device, ServiceError> {
+/// Reads registers and EEPROM without any effect on the state machine.
+async fn look_at(
+    wire: &DatagramClient,
+    found: EnumeratedDevice,
+    readable: bool,
+) -> Result<Device, ServiceError> {
     const STEP: &str = "reading what its controller is";
     let position = found.position;
-    let controller: [u8; CONTROLLER_BYTES] = station::at(wire, position, STEP, CONTROLLER).await?;
-    let dl_status: [u8; 2] = station::at(wire, position, STEP, DL_STATUS).await?;
+    let controller: [u8; CONTROLLER_BYTES] = enumerate::at(wire, position, STEP, esc::TYPE).await?;
+    let dl_status: [u8; 2] = enumerate::at(wire, position, STEP, esc::DL_STATUS).await?;
     let controller = Controller::from_registers(controller);
     let mut time = [0; 4];
     let dc = controller.has_receive_times()
         && matches!(
-            wire.read_at(position, SYSTEM_TIME, &mut time).await,
+            wire.read_at(position, esc::DC_SYSTEM_TIME, &mut time).await,
             Ok(1..)
         );
     let at = found.named(format!("position {position}"));
@@ -263,10 +265,10 @@ async fn look_at(wire: &Datagrams, found: Found, readable: bool) -> Result<Devic
     })
 }
 
-/// Only where nobody holds it.
-async fn read_eeprom(wire: &Datagrams, at: &DeviceRef) -> Result<Sii, String> {
+/// Reads the EEPROM if it is free.
+async fn read_eeprom(wire: &DatagramClient, at: &DeviceRef) -> Result<Sii, String> {
     const STEP: &str = "reading the EEPROM";
-    let read = with_eeprom(wire, at, STEP, Claim::IfFree, async |eeprom| {
+    let read = with_eeprom(wire, at, STEP, EepromAccess::IfFree, async |eeprom| {
         eeprom.image(&mut |_, _| {}).await
     });
     let image: Result<Vec<u8>, ServiceError> = read.await;
@@ -274,31 +276,36 @@ async fn read_eeprom(wire: &Datagrams, at: &DeviceRef) -> Result<Sii, String> {
     sii::parse(&image).map_err(|error| format!("EEPROM: {error}"))
 }
 
-/// Finds every device's parent.
+/// Finds the parent of every device.
 fn place(devices: &mut [Device]) {
     let open: Vec<[bool; 4]> = devices
         .iter()
         .map(|device| registers::open_ports(device.dl_status))
         .collect();
-    for (device, uplink) in devices.iter_mut().zip(tree::uplinks(&open)) {
+    for (device, uplink) in devices.iter_mut().zip(topology::uplinks(&open)) {
         device.uplink = uplink;
     }
 }
 
-/// Measures how long frames take to each device. Latching the receive times disturbs nobody but one who measures, too; where there is
-/// another MainDevice, what it has written is taken.
-async fn delays(wire: &Datagrams, devices: &mut [Device], quiet: bool) -> Result<(), ServiceError> {
+/// Measures propagation delays. Latching receive times only disturbs another measurement. With
+/// another MainDevice, its written delays are used.
+async fn delays(
+    wire: &DatagramClient,
+    devices: &mut [Device],
+    quiet: bool,
+) -> Result<(), ServiceError> {
     const STEP: &str = "measuring propagation delays";
     if !quiet {
         for device in devices.iter_mut().filter(|device| device.dc) {
-            let bytes = station::at(wire, device.position(), STEP, SYSTEM_TIME_DELAY).await?;
+            let bytes =
+                enumerate::at(wire, device.position(), STEP, esc::DC_SYSTEM_TIME_DELAY).await?;
             device.delay_ns = Some(u32::from_le_bytes(bytes));
         }
         return Ok(());
     }
     let places: Vec<_> = devices
         .iter()
-        .map(|device| tree::Place {
+        .map(|device| topology::TreeNode {
             open: registers::open_ports(device.dl_status),
             uplink: device.uplink,
         })
@@ -306,20 +313,20 @@ async fn delays(wire: &Datagrams, devices: &mut [Device], quiet: bool) -> Result
     let mut sums = vec![0_i64; devices.len()];
     let mut measured = vec![false; devices.len()];
     for _ in 0..LATCHES {
-        wire.write_all(RECEIVE_TIMES, &[0; 4])
+        wire.write_all(esc::DC_RECEIVE_TIME, &[0; 4])
             .await
             .map_err(|source| ServiceError::Segment { step: STEP, source })?;
         let mut times = Vec::with_capacity(devices.len());
         for device in devices.iter() {
             times.push(if device.controller.has_receive_times() {
                 let bytes: [u8; 16] =
-                    station::at(wire, device.position(), STEP, RECEIVE_TIMES).await?;
+                    enumerate::at(wire, device.position(), STEP, esc::DC_RECEIVE_TIME).await?;
                 Some(registers::receive_times(bytes))
             } else {
                 None
             });
         }
-        let delays = tree::delays(&places, &times);
+        let delays = topology::delays(&places, &times);
         for ((sum, measured), delay) in sums.iter_mut().zip(&mut measured).zip(delays) {
             if let Some(delay) = delay {
                 *sum += delay;
@@ -334,8 +341,9 @@ async fn delays(wire: &Datagrams, devices: &mut [Device], quiet: bool) -> Result
     Ok(())
 }
 
-/// Where the EEPROM says that there is one. Asked in AL control, with the state as it is.
-async fn explicit_id(wire: &Datagrams, device: &Device) -> Result<Option<u16>, ServiceError> {
+/// Reads the explicit device identification if the EEPROM declares it. It is requested by AL
+/// control in the present state.
+async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u16>, ServiceError> {
     const STEP: &str = "reading its device identification";
     let Ok(Sii {
         general: Some(general),
@@ -357,8 +365,8 @@ async fn explicit_id(wire: &Datagrams, device: &Device) -> Result<Option<u16>, S
     Ok(None)
 }
 
-/// Everything that is asked over CoE; `None` where there is no such mailbox.
-async fn ask(wire: &Datagrams, device: &Device) -> Option<Result<Answers, String>> {
+/// Reads all CoE objects of the scan; `None` without a CoE mailbox.
+async fn ask(wire: &DatagramClient, device: &Device) -> Option<Result<CoeInfo, String>> {
     let sii = device.sii.as_ref().ok()?;
     if !sii.protocols.has(Protocols::COE) {
         return None;
@@ -367,7 +375,7 @@ async fn ask(wire: &Datagrams, device: &Device) -> Option<Result<Answers, String
         .found
         .named(format!("position {}", device.position()));
     let answers = with_mailbox(wire, &at, sii, "asking it who it is", async |lent| {
-        let answers = answers::ask(wire, &mut lent.coe, device).await;
+        let answers = coe_info::ask(wire, &mut lent.coe, device).await;
         answers.map_err(|source| ServiceError::Sdo {
             device: at.clone(),
             source,

@@ -1,8 +1,8 @@
-//! What a controller's registers mean (ETG.1000.4; Beckhoff ESC data sheet, section II).
+//! Meaning of the controller's registers (ETG.1000.4; Beckhoff ESC data sheet, section II).
 
 use std::fmt;
 
-/// 0x0000 to 0x0009.
+/// The size of registers 0x0000 to 0x0009.
 pub const CONTROLLER_BYTES: usize = 10;
 
 /// Bits of 0x0008.
@@ -10,7 +10,7 @@ const DC: u16 = 0x0004;
 const DC_64_BIT: u16 = 0x0008;
 const NO_LRW: u16 = 0x0200;
 
-/// What a controller says of itself.
+/// The controller information.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Controller {
     /// 0x0000: 0x04 IP core, 0x11 ET1100, 0x12 ET1200, 0xc0 LAN9252 …
@@ -19,14 +19,14 @@ pub struct Controller {
     pub build: u16,
     pub fmmus: u8,
     pub sync_managers: u8,
-    /// Process RAM.
+    /// Process RAM in KiB.
     pub ram_kib: u8,
     pub ports: [PortKind; 4],
     /// 0x0008.
     pub features: u16,
 }
 
-/// What a port is made for (0x0007).
+/// The physical type of a port (0x0007).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum PortKind {
     #[default]
@@ -80,13 +80,13 @@ impl Controller {
         }
     }
 
-    /// Distributed clocks: receive times at least.
+    /// True if it supports distributed clocks, or at least receive times.
     #[must_use]
     pub fn has_receive_times(&self) -> bool {
         self.features & DC != 0
     }
 
-    /// Of the distributed clock.
+    /// Returns the size of the distributed clock in bits.
     #[must_use]
     pub fn clock_bits(&self) -> u8 {
         if self.features & DC_64_BIT != 0 {
@@ -102,12 +102,12 @@ impl Controller {
     }
 }
 
-/// What a port does (DL status, 0x0110).
+/// The state of a port (DL status, 0x0110).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Port {
-    /// The cable, or the neighbour on the E-bus, is there.
+    /// The cable, or the E-bus neighbour, is connected.
     pub link: bool,
-    /// Frames go out and come back.
+    /// Frames are forwarded and return.
     pub open: bool,
 }
 
@@ -128,7 +128,7 @@ pub fn open_ports(dl_status: u16) -> [bool; 4] {
     ports(dl_status).map(|port| port.open)
 }
 
-/// 0x0900 to 0x090F: nanoseconds of the device's own time at which a frame came in at each port.
+/// Parses 0x0900 to 0x090F: local times in ns at which a frame arrived at each port.
 #[must_use]
 pub fn receive_times(bytes: [u8; 16]) -> [u32; 4] {
     let mut times = [0; 4];
@@ -146,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_controller() {
+    fn controller_parses_an_et1100() {
         // ET1100 with two MII ports.
         let bytes = [0x11, 0, 2, 0, 8, 8, 8, 0x0f, 0xfc, 0x00];
         let controller = Controller::from_registers(bytes);
@@ -166,7 +166,7 @@ mod tests {
 
     /// Rows of the table "DL status": link, loop, communication.
     #[test]
-    fn ports_are_open_where_they_communicate_and_have_no_loop() {
+    fn ports_are_open_if_communicating_without_loop() {
         for (status, link, open) in [
             (0x5530, [true, true, false, false], [false; 4]),
             (
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn times_are_little_endian() {
+    fn receive_times_are_little_endian() {
         let mut bytes = [0; 16];
         bytes[4..8].copy_from_slice(&0x1234_5678_u32.to_le_bytes());
         assert_eq!(receive_times(bytes), [0, 0x1234_5678, 0, 0]);

@@ -11,24 +11,24 @@ use std::time::Duration;
 
 use ecaxis_sim::FaultScript;
 
-use super::{Options, Scan, Sign, scan};
+use super::{MainDeviceEvidence, Options, Scan, scan};
+use crate::acyclic::enumerate::{address, enumerate};
+use crate::acyclic::{DatagramClient, run_on_link};
 use crate::bringup::AlState;
 use crate::clock::{Clock, Nanos};
 use crate::config::{self, Machine};
 use crate::link::sim::SimLink;
 use crate::link::{Link, LinkError, MAX_FRAME};
-use crate::mailbox::Wire;
+use crate::mailbox::MailboxTransport;
 use crate::rt::cycle::Engine;
-use crate::service::station::{address, census};
-use crate::service::{Datagrams, carry};
-use crate::session::{self, Job, Prepared, simulated_bus};
+use crate::session::{self, Prepared, RunBuilder, simulated_bus};
 
 const STACK: usize = 16 * 1024 * 1024;
 
-/// Does a piece of work on the bus of one of our machine files.
+/// Runs `work` on the bus of a machine file.
 fn on<T: Send + 'static>(
     file: &'static str,
-    work: impl AsyncFnOnce(Datagrams) -> T + Send + 'static,
+    work: impl AsyncFnOnce(DatagramClient) -> T + Send + 'static,
 ) -> (T, SimLink) {
     let there = std::thread::Builder::new().stack_size(STACK);
     let done = there.spawn(move || {
@@ -38,18 +38,18 @@ fn on<T: Send + 'static>(
             .join(file);
         let machine = config::load(&path).expect("a machine");
         let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
-        let done = carry(&mut link, Clock::Virtual, &AtomicBool::new(false), work);
+        let done = run_on_link(&mut link, Clock::Virtual, &AtomicBool::new(false), work);
         (done.expect("carried"), link)
     });
     done.expect("a thread").join().expect("no panic")
 }
 
-async fn scanned(wire: &Datagrams, options: Options) -> Scan {
+async fn scanned(wire: &DatagramClient, options: Options) -> Scan {
     scan(wire, options, &mut |_| {}).await.expect("a scan")
 }
 
-/// The other does its work for as long as the first lasts.
-async fn beside<T>(first: impl Future<Output = T>, other: impl Future<Output = ()>) -> T {
+/// Runs `other` for as long as `first` runs.
+async fn run_during<T>(first: impl Future<Output = T>, other: impl Future<Output = ()>) -> T {
     let (mut first, mut other) = (pin!(first), pin!(other));
     let mut gone = false;
     poll_fn(move |context| {
@@ -72,7 +72,7 @@ fn states(link: &SimLink, count: usize) -> Vec<String> {
 }
 
 #[test]
-fn a_quiet_bus_is_asked_and_left_as_it_was() {
+fn scan_restores_an_idle_bus() {
     let ask = Options {
         ask: true,
         ..Options::default()
@@ -91,7 +91,7 @@ fn a_quiet_bus_is_asked_and_left_as_it_was() {
 }
 
 #[test]
-fn only_what_was_asked_for() {
+fn scan_uses_mailboxes_only_on_request() {
     let (scan, link) = on("demo.toml", async |wire| {
         scanned(&wire, Options::default()).await
     });
@@ -104,9 +104,10 @@ fn only_what_was_asked_for() {
     assert_eq!(states(&link, 2), ["Init", "Init"]);
 }
 
-/// Another MainDevice gives out the time; everything is left alone, and `intrude` asks all the same.
+/// Another MainDevice distributes the time: the devices are left alone, but `intrude` uses the
+/// mailboxes.
 #[test]
-fn another_master_shows_by_the_time_that_it_gives() {
+fn scan_detects_a_main_device_by_its_clock_writes() {
     for intrude in [false, true] {
         let options = Options {
             ask: true,
@@ -114,7 +115,7 @@ fn another_master_shows_by_the_time_that_it_gives() {
             heard: 0,
         };
         let (scan, link) = on("demo.toml", async move |wire| {
-            let mut found = census(&wire).await.expect("two");
+            let mut found = enumerate(&wire).await.expect("two");
             address(&wire, &mut found).await.expect("addresses");
             let station = found[0].station;
             let master = async {
@@ -123,25 +124,26 @@ fn another_master_shows_by_the_time_that_it_gives() {
                     wire.delay(Duration::from_millis(1)).await;
                 }
             };
-            beside(scanned(&wire, options), master).await
+            run_during(scanned(&wire, options), master).await
         });
         assert!(
-            scan.others.contains(&Sign::Time { position: 1 }),
+            scan.others
+                .contains(&MainDeviceEvidence::Time { position: 1 }),
             "{:?}",
             scan.others
         );
-        assert!(scan.others.iter().all(Sign::is_live));
+        assert!(scan.others.iter().all(MainDeviceEvidence::is_live));
         assert_eq!(scan.asked, intrude);
         assert!(!scan.measured, "what it measured is not disturbed");
         assert_eq!(states(&link, 2), ["Init", "Init"]);
     }
 }
 
-/// A terminal goes where AL control says.
+/// A terminal follows AL control.
 #[test]
-fn a_bus_that_was_left_running() {
+fn scan_reports_a_bus_left_running() {
     let (scan, link) = on("terminals.toml", async |wire| {
-        let mut found = census(&wire).await.expect("devices");
+        let mut found = enumerate(&wire).await.expect("devices");
         address(&wire, &mut found).await.expect("addresses");
         let station = found[1].station;
         for state in [2, 4] {
@@ -156,19 +158,22 @@ fn a_bus_that_was_left_running() {
         scanned(&wire, ask).await
     });
     let state = AlState::SafeOp;
-    assert_eq!(scan.others, [Sign::State { position: 1, state }]);
+    assert_eq!(
+        scan.others,
+        [MainDeviceEvidence::State { position: 1, state }]
+    );
     assert!(!scan.asked);
     assert_eq!(states(&link, 3), ["Init", "SafeOp", "Init"]);
 }
 
-/// SYNC0 of a device in Init was forgotten by somebody; nobody is disturbed.
+/// SYNC0 of a device in Init is a leftover and does not count as a MainDevice.
 #[test]
-fn a_forgotten_sync0_is_no_master() {
+fn leftover_sync0_is_not_a_main_device() {
     let (scan, link) = on("demo.toml", async |wire| {
-        let mut found = census(&wire).await.expect("two");
+        let mut found = enumerate(&wire).await.expect("two");
         address(&wire, &mut found).await.expect("addresses");
         let station = found[1].station;
-        // SYNC0 in an hour.
+        // SYNC0 starts in an hour.
         wire.write(station, 0x0990, &3_600_000_000_000_u64.to_le_bytes())
             .await
             .expect("written");
@@ -187,7 +192,7 @@ fn a_forgotten_sync0_is_no_master() {
     assert_eq!(states(&link, 2), ["Init", "Init"]);
 }
 
-/// A bus that can be looked at when the run that had it is over.
+/// A bus that can be accessed after the run that used it.
 #[derive(Debug, Clone)]
 struct Shared(Arc<Mutex<SimLink>>);
 
@@ -220,7 +225,7 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
     let stop = Arc::new(AtomicBool::new(false));
     let (progress, _told) = channel();
     let own = Box::new(link.clone());
-    let job = Job {
+    let job = RunBuilder {
         machine,
         options: &options,
         stop,
@@ -231,13 +236,13 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
         return false;
     };
     let mut engine = Engine::new(parts);
-    let mut beside = pin!(supervisor.run());
+    let mut during = pin!(supervisor.run());
     let mut context = Context::from_waker(Waker::noop());
     let mut done = None;
     while !engine.halted() {
         engine.cycle();
         if done.is_none()
-            && let Poll::Ready((_, result)) = beside.as_mut().poll(&mut context)
+            && let Poll::Ready((_, result)) = during.as_mut().poll(&mut context)
         {
             done = Some(result);
         }
@@ -245,10 +250,10 @@ fn ran_well(link: &Shared, machine: &Arc<Machine>) -> bool {
     matches!(done, Some(Ok(())))
 }
 
-/// However a run ends, a scan after it finds a bus that nobody drives, and SYNC0 off in every device.
+/// After every kind of run, a scan finds no MainDevice, and SYNC0 is off in every device.
 #[test]
-fn after_a_run_nobody_seems_to_drive_the_bus() {
-    // Faults, and whether the machine comes up and does its program.
+fn scan_finds_no_main_device_after_a_run() {
+    // Faults, and whether the machine comes up and completes its program.
     for (faults, comes_up, works) in [
         ("", true, true),
         (
@@ -283,16 +288,21 @@ fn after_a_run_nobody_seems_to_drive_the_bus() {
                 ..Options::default()
             };
             let stop = AtomicBool::new(false);
-            let look = carry(&mut bus, Clock::Virtual, &stop, async |wire: Datagrams| {
-                let mut activations = Vec::new();
-                for position in 0..2 {
-                    let mut activation = [0xa5; 1];
-                    let answer = wire.read_at(position, 0x0981, &mut activation).await;
-                    assert_eq!(answer.expect("read"), 1);
-                    activations.push(activation[0]);
-                }
-                (activations, scanned(&wire, ask).await)
-            });
+            let look = run_on_link(
+                &mut bus,
+                Clock::Virtual,
+                &stop,
+                async |wire: DatagramClient| {
+                    let mut activations = Vec::new();
+                    for position in 0..2 {
+                        let mut activation = [0xa5; 1];
+                        let answer = wire.read_at(position, 0x0981, &mut activation).await;
+                        assert_eq!(answer.expect("read"), 1);
+                        activations.push(activation[0]);
+                    }
+                    (activations, scanned(&wire, ask).await)
+                },
+            );
             let (activations, scan) = look.expect("carried");
             assert_eq!(activations, [0, 0], "{faults}");
             assert_eq!(scan.others, [], "{faults}");
@@ -303,22 +313,22 @@ fn after_a_run_nobody_seems_to_drive_the_bus() {
 }
 
 #[test]
-fn frames_that_were_heard() {
+fn scan_reports_foreign_frames() {
     let options = Options {
         heard: 12,
         ask: true,
         ..Options::default()
     };
     let (scan, _) = on("demo.toml", async move |wire| scanned(&wire, options).await);
-    assert_eq!(scan.others, [Sign::Frames { count: 12 }]);
+    assert_eq!(scan.others, [MainDeviceEvidence::Frames { count: 12 }]);
     assert!(!scan.asked);
 }
 
-/// An EEPROM that the device's processor holds is not taken from it.
+/// An EEPROM owned by the device's processor is not taken away.
 #[test]
-fn an_eeprom_that_is_lent() {
+fn scan_skips_an_eeprom_in_use() {
     let ((scan, access), _) = on("demo.toml", async |wire| {
-        let mut found = census(&wire).await.expect("two");
+        let mut found = enumerate(&wire).await.expect("two");
         address(&wire, &mut found).await.expect("addresses");
         let station = found[0].station;
         wire.write(station, 0x0500, &[1]).await.expect("written");

@@ -1,4 +1,4 @@
-//! What becomes of emergencies: each is told once, and the first are kept.
+//! Log of emergency messages: reports each message once and keeps the first ones for the summary.
 
 use std::fmt;
 use std::sync::mpsc::Sender;
@@ -8,22 +8,23 @@ use serde::Serialize;
 
 use super::Progress;
 use crate::clock::Nanos;
-use crate::mailbox::desk::Listen;
+use crate::mailbox::worker::EmergencySink;
 use crate::mailbox::{Emergencies, Emergency};
-use crate::rt::exchange::Sights;
+use crate::rt::exchange::BusStatus;
 
-/// Emergencies of one run that are kept for its summary; more are told and counted.
+/// The number of emergencies kept for the summary of a run. Further ones are reported and counted.
 const KEPT: usize = 64;
 
-/// An emergency as it is told.
+/// One emergency message as the observer receives it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EmergencyReport {
-    /// Its name.
+    /// The device's name.
     pub device: String,
     pub emergency: Emergency,
-    /// When it was read, on the session's clock.
+    /// The time at which the message was read, on the session's clock.
     pub at: Nanos,
-    /// DC system time of that moment, nanoseconds; `None` without distributed clocks, and until the cycle has heard them.
+    /// The DC system time in ns when the message was read. `None` without distributed clocks and
+    /// until the cycle has received them.
     pub dc_time: Option<u64>,
 }
 
@@ -33,21 +34,21 @@ impl fmt::Display for EmergencyReport {
     }
 }
 
-/// An emergency in the summary.
+/// One emergency message in the summary.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EmergencyLine {
     pub device: String,
-    /// Seconds from the first cycle on; negative in bring-up.
+    /// The time since the first cycle in s; negative during bring-up.
     pub at_s: f64,
-    /// DC system time, nanoseconds.
+    /// The DC system time in ns.
     pub dc_time_ns: Option<u64>,
-    /// As in 0x603F.
+    /// The error code, as in 0x603F.
     pub code: u16,
-    /// What the code means.
+    /// The meaning of the code.
     pub text: String,
-    /// Error register, 0x1001.
+    /// The error register (0x1001).
     pub register: u8,
-    /// The manufacturer's own.
+    /// The manufacturer-specific part.
     pub data: [u8; 5],
 }
 
@@ -70,56 +71,56 @@ impl EmergencyReport {
     }
 }
 
-/// Where all devices' emergencies go. Clones are the same log.
+/// The log for the emergencies of all devices. Clones share the same log.
 #[derive(Debug, Clone)]
-pub struct Log {
-    told: Sender<Progress>,
-    kept: Arc<Mutex<Kept>>,
-    /// The cycle's, once there is one.
-    sights: Arc<OnceLock<Arc<Sights>>>,
+pub struct EmergencyLog {
+    reported: Sender<Progress>,
+    kept: Arc<Mutex<EmergencyStore>>,
+    /// The status of the cycle; empty until the cycle exists.
+    bus_status: Arc<OnceLock<Arc<BusStatus>>>,
 }
 
 #[derive(Debug, Default)]
-struct Kept {
+struct EmergencyStore {
     first: Vec<EmergencyReport>,
-    /// The last of each device that has sent one, newest last.
+    /// The last messages of each device, newest last.
     last: Vec<EmergencyReport>,
     more: u64,
-    /// That found a device's queue full, by its name.
+    /// The number of messages lost because a device's queue was full, by device name.
     lost: Vec<(String, u64)>,
 }
 
-/// Of one device, for the report of its fault.
+/// The number of messages of one device that its fault report shows.
 const LAST: usize = 4;
 
-impl Log {
+impl EmergencyLog {
     #[must_use]
-    pub fn new(told: Sender<Progress>) -> Self {
+    pub fn new(reported: Sender<Progress>) -> Self {
         Self {
-            told,
+            reported,
             kept: Arc::default(),
-            sights: Arc::default(),
+            bus_status: Arc::default(),
         }
     }
 
-    /// From here on emergencies are stamped with DC time.
-    pub fn set_sights(&self, sights: Arc<Sights>) {
-        let _ = self.sights.set(sights);
+    /// Sets the bus status; later emergencies carry the DC time.
+    pub fn set_bus_status(&self, bus_status: Arc<BusStatus>) {
+        let _ = self.bus_status.set(bus_status);
     }
 
-    fn kept(&self) -> MutexGuard<'_, Kept> {
+    fn kept(&self) -> MutexGuard<'_, EmergencyStore> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What found a device's queue full.
+    /// Counts messages lost because the device's queue was full.
     fn lose(&self, device: &str, lost: u64) {
         if lost > 0 && self.kept().lose(device, lost) {
             let text = format!("`{device}`: {lost} emergencies found the queue full and are lost");
-            let _ = self.told.send(Progress::Warning(text));
+            let _ = self.reported.send(Progress::Warning(text));
         }
     }
 
-    /// The first of all devices, and how many more there were.
+    /// Returns the first emergencies of all devices and the number of further ones.
     pub(super) fn lines(&self, started: Nanos) -> (Vec<EmergencyLine>, u64) {
         let kept = self.kept();
         let lines = kept.first.iter().map(|report| report.line(started));
@@ -128,7 +129,7 @@ impl Log {
         (lines.collect(), more.unwrap_or(u64::MAX))
     }
 
-    /// The last few of a device since a moment, oldest first.
+    /// Returns the last emergencies of a device since `since`, oldest first.
     #[must_use]
     pub fn last_of(&self, device: &str, since: Nanos) -> Vec<EmergencyReport> {
         let kept = self.kept();
@@ -140,27 +141,27 @@ impl Log {
     }
 }
 
-impl Listen for Log {
-    /// Tells what waits in a device's queue, and empties it.
+impl EmergencySink for EmergencyLog {
+    /// Reports the messages in a device's queue and empties the queue.
     fn listen(&self, device: &str, emergencies: &Emergencies) {
         for received in emergencies.take() {
-            let sights = self.sights.get();
+            let bus_status = self.bus_status.get();
             let report = EmergencyReport {
                 device: device.to_owned(),
                 emergency: received.emergency,
                 at: received.at,
-                dc_time: sights.and_then(|sights| sights.system_time(received.at)),
+                dc_time: bus_status.and_then(|bus_status| bus_status.system_time(received.at)),
             };
             tracing::debug!(dc_time = report.dc_time, "{report}");
             self.kept().keep(&report);
-            // Nobody listening is no reason to stop.
-            let _ = self.told.send(Progress::Emergency(report));
+            // A closed channel does not stop the run.
+            let _ = self.reported.send(Progress::Emergency(report));
         }
         self.lose(device, emergencies.lost());
     }
 }
 
-impl Kept {
+impl EmergencyStore {
     fn keep(&mut self, report: &EmergencyReport) {
         if self.first.len() < KEPT {
             self.first.push(report.clone());
@@ -176,7 +177,7 @@ impl Kept {
         }
     }
 
-    /// `true` where there are more than before.
+    /// Returns `true` if the number has grown.
     fn lose(&mut self, device: &str, lost: u64) -> bool {
         let Some((_, before)) = self.lost.iter_mut().find(|(name, _)| name == device) else {
             self.lost.push((device.to_owned(), lost));

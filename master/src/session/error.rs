@@ -1,21 +1,22 @@
-//! Why a run failed: what, where, which code. What to do about it is the command line's to say.
+//! Errors of a run: what failed, where, with which code. Hints for the user come from the command
+//! line.
 
 use std::fmt;
 use std::sync::Arc;
 
 use ecaxis_axis::cia402::describe;
-use ecaxis_axis::{Mode, Refused, State, Trip};
+use ecaxis_axis::{CommandError, Mode, State, Trip};
 
-use crate::al_status::al_status_text;
 use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::config::LimitConflict;
 use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
 use crate::session::{EmergencyReport, StepRef};
-use crate::supervise::history::DiagnosisMessage;
-use crate::words::counted;
+use crate::supervise::diagnosis_history::DiagnosisMessage;
+use crate::text::pluralize;
+use ecaxis_ecat::al_status_code::al_status_text;
 
-/// A machine or a bus that failed.
+/// A failure of the machine or the bus.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     #[error(transparent)]
@@ -88,7 +89,7 @@ pub enum RunError {
         lost(group.as_deref()), lost_note(*answered, *wkc)
     )]
     BusLost {
-        /// The one whose process data it is, where it is not the whole machine's.
+        /// The reaction group whose process data was lost; `None` for the whole machine.
         group: Option<String>,
         cycles: u32,
         wkc: (u16, u16),
@@ -112,8 +113,8 @@ pub enum RunError {
         device: DeviceRef,
         step: StepRef,
         reason: String,
-        /// Where it was the axis that refused.
-        by_axis: Option<Box<Refused>>,
+        /// The axis's error if the axis refused the command.
+        by_axis: Option<Box<CommandError>>,
     },
     #[error(
         "{step}: {device}: the target of {} {unit} is not reached, the axis is at {actual:.4} {unit}",
@@ -122,7 +123,7 @@ pub enum RunError {
     NotReached {
         device: DeviceRef,
         step: StepRef,
-        /// Both in `unit`.
+        /// The target; like `actual` in `unit`.
         target: f64,
         actual: f64,
         unit: String,
@@ -168,7 +169,7 @@ pub enum RunError {
     NotHomed {
         device: DeviceRef,
         step: StepRef,
-        /// 0x6098.
+        /// The homing method (0x6098).
         method: i8,
         error: ecaxis_axis::homing::HomingError,
     },
@@ -195,7 +196,7 @@ pub enum RunError {
     FollowLost {
         device: DeviceRef,
         reason: String,
-        /// What stopped the group of the axis that it followed.
+        /// The error that stopped the group of the axis it followed.
         cause: Option<Arc<RunError>>,
     },
     #[error("{device}: is not enabled: {reason}")]
@@ -205,13 +206,13 @@ pub enum RunError {
         device: DeviceRef,
         step: Option<StepRef>,
         group: String,
-        /// What stopped the group.
+        /// The error that stopped the group.
         cause: Arc<RunError>,
     },
     #[error("the controller panicked")]
     Controller,
     #[error(
-        "the thread beside the cycle (`ecaxis-mailbox`) did not run for 2 s: the machine was stopped"
+        "the supervisor thread (`ecaxis-mailbox`) did not run for 2 s: the machine was stopped"
     )]
     Unsupervised,
     #[error("interrupted")]
@@ -221,7 +222,7 @@ pub enum RunError {
 }
 
 impl RunError {
-    /// Of which this is only a consequence.
+    /// Returns the error that caused this one.
     #[must_use]
     pub fn cause(&self) -> Option<&Self> {
         self.shared_cause().map(Arc::as_ref)
@@ -235,7 +236,7 @@ impl RunError {
         }
     }
 
-    /// The machine was not in Op yet.
+    /// `true` if the machine had not reached Op yet.
     pub(crate) fn is_on_the_way_to_op(&self) -> bool {
         matches!(
             self,
@@ -246,7 +247,7 @@ impl RunError {
         )
     }
 
-    /// The cycle has stopped the machine for it.
+    /// `true` if the cycle stopped the machine because of this error.
     pub(crate) fn is_of_cycle(&self) -> bool {
         matches!(
             self,
@@ -264,14 +265,14 @@ impl RunError {
     }
 }
 
-/// What a device that has failed says of it, beside its error code.
+/// What a failed device reports in addition to its error code.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DriveReport {
-    /// The last few, oldest first.
+    /// The device's last emergencies, oldest first.
     pub emergencies: Vec<EmergencyReport>,
-    /// Of its diagnosis history (0x10F3), newest first.
+    /// The device's diagnosis messages (0x10F3), newest first.
     pub history: Vec<DiagnosisMessage>,
-    /// Its own limits that the machine file exceeds.
+    /// The drive's own limits that the machine file exceeds.
     pub limits: Vec<LimitConflict>,
 }
 
@@ -293,14 +294,14 @@ fn al_note(al_status: Option<(u8, u16)>) -> String {
             let answer = if count == 1 { "answers" } else { "answer" };
             format!(
                 "the working counter is wrong; {} {answer}, AL status 0x{status:02x}",
-                counted(usize::from(count), "SubDevice")
+                pluralize(usize::from(count), "SubDevice")
             )
         }
         None => "cyclic frames do not return in time".to_owned(),
     }
 }
 
-/// Without the digits that are only rounding.
+/// Returns the number without digits that come from rounding.
 fn rounded(x: f64) -> f64 {
     let short = (x * 1e6).round() / 1e6;
     if short.is_finite() { short } else { x }
@@ -343,7 +344,7 @@ fn lost_note(answered: bool, (seen, expected): (u16, u16)) -> String {
     }
 }
 
-/// A homing method in words.
+/// Returns the homing method in words.
 fn by(method: i8) -> String {
     match ecaxis_axis::homing::method(method) {
         Some(known) => format!("method {method} ({})", known.text),

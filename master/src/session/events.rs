@@ -1,68 +1,68 @@
-//! What the cycle has noticed, in words.
+//! Events of the cycle as text.
 
 use serde::Serialize;
 
 use crate::clock::Nanos;
 use crate::config::{Machine, duration};
-use crate::rt::guard::StopCause;
-use crate::rt::handover::Event;
-use crate::rt::journal::{Entry, Journal, Note};
-use crate::words::counted;
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::Event;
+use crate::rt::event_log::{Entry, EventLog, LogEntryKind};
+use crate::text::pluralize;
 
-/// One thing that the cycle has noticed, or a run of the same in cycles that follow each other.
+/// One event of the cycle, or the same event in consecutive cycles.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EventLine {
-    /// From the first cycle on.
+    /// The time since the first cycle in s.
     pub at_s: f64,
     pub first_cycle: u64,
     pub last_cycle: u64,
     pub what: String,
-    /// The machine, or a part of it, stops for it.
+    /// `true` if the machine or one of its groups stops because of this event.
     pub failure: bool,
 }
 
-/// All that the journal has kept.
-pub(super) fn lines(journal: &Journal, started: Nanos, machine: &Machine) -> Vec<EventLine> {
+/// Returns all events that the log has kept.
+pub(super) fn lines(journal: &EventLog, started: Nanos, machine: &Machine) -> Vec<EventLine> {
     let line = |entry: &Entry| EventLine {
         at_s: entry.time.saturating_sub(started) as f64 * 1e-9,
         first_cycle: entry.first_cycle,
         last_cycle: entry.last_cycle,
-        what: told(&entry.note, machine),
+        what: describe_note(&entry.note, machine),
         failure: matches!(
             entry.note,
-            Note::Told(Event::Stopping { cause, .. } | Event::GroupStopping { cause, .. })
+            LogEntryKind::Event(Event::Stopping { cause, .. } | Event::GroupStopping { cause, .. })
                 if cause != StopCause::Requested
         ),
     };
     journal.entries().map(line).collect()
 }
 
-fn told(note: &Note, machine: &Machine) -> String {
+fn describe_note(note: &LogEntryKind, machine: &Machine) -> String {
     match *note {
-        Note::Lost => "frames were not back before the deadline".to_owned(),
-        Note::WorkingCounter(seen, expected) => {
+        LogEntryKind::Lost => "frames were not back before the deadline".to_owned(),
+        LogEntryKind::WorkingCounter(seen, expected) => {
             format!("the working counter was {seen} instead of {expected}")
         }
-        Note::AlStatus(status, answered) => {
+        LogEntryKind::AlStatus(status, answered) => {
             format!("AL status 0x{status:02x} of {answered} SubDevices together")
         }
-        Note::Late => "frames of an earlier cycle came back".to_owned(),
-        Note::WokeLate(late) => format!("the thread woke up {} late", duration::show(late)),
-        Note::Overrun(1) => "1 cycle was left out".to_owned(),
-        Note::Overrun(missed) => format!("{missed} cycles were left out"),
-        Note::OtherMainDevice(frames) => {
+        LogEntryKind::Late => "frames of an earlier cycle came back".to_owned(),
+        LogEntryKind::WokeLate(late) => format!("the thread woke up {} late", duration::show(late)),
+        LogEntryKind::Overrun(1) => "1 cycle was left out".to_owned(),
+        LogEntryKind::Overrun(missed) => format!("{missed} cycles were left out"),
+        LogEntryKind::OtherMainDevice(frames) => {
             let frames = usize::try_from(frames).unwrap_or(usize::MAX);
             format!(
                 "{} of another MainDevice came",
-                counted(frames, "EtherCAT frame")
+                pluralize(frames, "EtherCAT frame")
             )
         }
-        Note::LinkError => "the interface refused to send or to receive".to_owned(),
-        Note::Told(event) => event_told(event, machine),
+        LogEntryKind::LinkError => "the interface refused to send or to receive".to_owned(),
+        LogEntryKind::Event(event) => describe_event(event, machine),
     }
 }
 
-fn event_told(event: Event, machine: &Machine) -> String {
+fn describe_event(event: Event, machine: &Machine) -> String {
     let axis = |axis: usize| {
         let mut axes = machine
             .devices
@@ -86,12 +86,12 @@ fn event_told(event: Event, machine: &Machine) -> String {
             let name = machine.devices.get(device).map_or("?", |d| d.name.as_str());
             clock_off(name, difference_ns)
         }
-        Event::Stopping { cause, .. } => cause_told(cause, &axis),
+        Event::Stopping { cause, .. } => describe_cause(cause, &axis),
         Event::GroupStopping { group, cause, .. } => {
             format!(
                 "group `{}`: {}",
                 machine.group_name(group),
-                cause_told(cause, &axis)
+                describe_cause(cause, &axis)
             )
         }
         Event::GroupReleased { group, .. } => {
@@ -100,7 +100,7 @@ fn event_told(event: Event, machine: &Machine) -> String {
     }
 }
 
-fn cause_told<'m>(cause: StopCause, axis: &impl Fn(usize) -> &'m str) -> String {
+fn describe_cause<'m>(cause: StopCause, axis: &impl Fn(usize) -> &'m str) -> String {
     match cause {
         StopCause::Requested => "stop: asked for".to_owned(),
         StopCause::DriveFault { axis: at } => {
@@ -116,7 +116,7 @@ fn cause_told<'m>(cause: StopCause, axis: &impl Fn(usize) -> &'m str) -> String 
         }
         StopCause::Controller => "stop: the controller panicked".to_owned(),
         StopCause::Panicked => "stop: the cycle panicked".to_owned(),
-        StopCause::Unsupervised => "stop: the thread beside the cycle does not run".to_owned(),
+        StopCause::Unsupervised => "stop: the supervisor thread does not run".to_owned(),
         StopCause::LeftOp { al_status } => {
             format!("stop: a SubDevice has left Op, AL status 0x{al_status:02x}")
         }
@@ -126,7 +126,7 @@ fn cause_told<'m>(cause: StopCause, axis: &impl Fn(usize) -> &'m str) -> String 
     }
 }
 
-/// How far a clock is from the reference's.
+/// Returns a text with the deviation of a clock from the reference clock.
 pub(crate) fn clock_off(name: &str, difference_ns: i32) -> String {
     format!(
         "the clock of `{name}` is {} {} the reference clock",

@@ -1,7 +1,8 @@
-//! One run of a machine: opens the link and brings the bus up (`prepare`), turns the cycle (`turn`), and sums up (`summary`).
+//! One run of a machine: opens the link, brings the bus up (`prepare`), runs the cycle
+//! (`cycle_thread`) and sums up (`summary`).
 //!
-//! One thread owns the link. In real time it becomes the real-time thread and a second one runs
-//! the supervisor beside it; in virtual time it does both in turn, so that a run can be repeated.
+//! One thread owns the link. In real time it becomes the real-time thread, and a second thread runs
+//! the supervisor. In virtual time it alternates between both, so a run is reproducible.
 
 use std::io::Write as _;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -16,64 +17,65 @@ use ecaxis_sim::FaultScript;
 use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
 use crate::link::Link;
+use crate::post_mortem::FaultReport;
 use crate::rt::controller::Controller;
-use crate::rt::cycle::Remains;
+use crate::rt::cycle::EngineReport;
 use crate::rt::stats::Stats;
-use crate::story::Story;
-use crate::supervise::manual::{self, Operator};
+use crate::supervise::jog::{self, Operator};
 
+mod cycle_thread;
 mod emergencies;
 mod error;
 mod events;
+mod fault_evidence;
 mod open;
 mod prepare;
 mod progress;
 mod signals;
-mod story;
 mod summary;
-mod turn;
 
-pub use crate::supervise::history::{DiagnosisKind, DiagnosisMessage};
-pub use emergencies::{EmergencyLine, EmergencyReport, Log};
+pub use crate::supervise::diagnosis_history::{DiagnosisKind, DiagnosisMessage};
+use cycle_thread::CycleRun;
+pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
 pub use error::{DriveReport, RunError};
 pub use events::EventLine;
 pub(crate) use events::clock_off;
+use fault_evidence::{BringUpEvidence, RunEvidence};
 pub use open::{recorded, simulated_bus, topology};
-pub use prepare::{Job, Prepared};
-use prepare::{go_silent, lacking};
-pub use progress::{AxisLine, Capture, Observer, Progress, Status, StepRef};
+pub use prepare::{Prepared, RunBuilder};
+use prepare::{broadcast_init, prefer_replay_end};
+pub use progress::{AxisLine, Observer, ProbeCapture, Progress, Status, StepRef};
 pub use signals::{SignalReport, stop_on_signals};
-use story::{Left, Seen};
-use summary::Aside;
+use summary::SummaryInputs;
 pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
-use turn::Turned;
 
-/// Stack of the thread that owns the link; ethercrab's futures hold its tables by value.
+/// The stack size in bytes of the thread that owns the link. ethercrab's futures hold its tables by
+/// value.
 const STACK: usize = 16 * 1024 * 1024;
 
-/// The thread that owns the link.
+/// The name of the thread that owns the link.
 const RT_THREAD: &str = "ecaxis-rt";
-/// Panics of that thread that are reported.
+/// The maximum number of panics of that thread that are reported.
 const REPORTED_PANICS: u32 = 10;
 
-/// How a machine is run.
+/// Options of a run.
 #[derive(Debug, Clone)]
 pub struct Options {
     pub clock: Clock,
-    /// Time limit of the program; it is repeated until then.
+    /// The time limit of the program. The program repeats until then.
     pub limit: Option<Nanos>,
-    /// Runs of the program instead of the file's.
+    /// The number of program runs; overrides the machine file.
     pub repeat: Option<u32>,
-    /// Of the simulated bus.
+    /// The seed of the simulated bus.
     pub seed: u64,
     pub faults: Option<FaultScript>,
-    /// Keep every frame here.
+    /// The file to which every frame is recorded.
     pub record: Option<PathBuf>,
-    /// Of a recording; the newest frames are kept, see [`crate::link::capture`].
+    /// The size limit of a recording. The newest frames are kept, see [`crate::link::capture`].
     pub record_limit: Option<u64>,
-    /// Answer from this recording in the place of a bus.
+    /// The recording that answers instead of a bus.
     pub replay: Option<PathBuf>,
-    /// Enable the axes and run the program; otherwise stay in Op without power.
+    /// Enables the axes and runs the program. Otherwise the bus stays in Op without drive power.
     pub enable: bool,
 }
 
@@ -93,15 +95,15 @@ impl Default for Options {
     }
 }
 
-/// How a run ended. There is a summary as soon as the cycle has run.
+/// The result of a run. A summary exists once the cycle has run.
 #[derive(Debug)]
 pub struct Outcome {
     pub summary: Option<Summary>,
     pub result: Result<(), RunError>,
-    /// What the summary is of.
+    /// The statistics behind the summary.
     pub stats: Option<Box<Stats>>,
-    /// Of a failure on the bus, or of a group that stopped and was not reset.
-    pub story: Option<Box<Story>>,
+    /// The fault report of a bus failure, or of a group that stopped and was not reset.
+    pub story: Option<Box<FaultReport>>,
 }
 
 impl From<RunError> for Outcome {
@@ -115,18 +117,19 @@ impl From<RunError> for Outcome {
     }
 }
 
-/// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends it. Blocks; tells the
-/// observer meanwhile. Where the observer panics, the panic goes on once the machine has been stopped.
+/// Runs a machine until its program, its time limit, `stop` ([`stop_on_signals`]) or an error ends
+/// the run. Blocks, and reports progress to the observer. If the observer panics, the machine stops
+/// before the panic resumes.
 pub fn run(
     machine: Machine,
     options: Options,
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
 ) -> Outcome {
-    start(machine, options, stop, observer, Instead::Nobody, None)
+    start(machine, options, stop, observer, ProgramSource::None, None)
 }
 
-/// Like [`run`], on a link of one's own in the place of the file's `nic`.
+/// Like [`run`], on the given link instead of the file's `nic`.
 pub fn run_on(
     link: Box<dyn Link>,
     machine: Machine,
@@ -139,13 +142,14 @@ pub fn run_on(
         options,
         stop,
         observer,
-        Instead::Nobody,
+        ProgramSource::None,
         Some(link),
     )
 }
 
-/// Like [`run`], with a controller of one's own in the place of the file's program: all axes are enabled, then they are
-/// its until it calls [`rt::controller::Cycle::finish`], or something else ends the run.
+/// Like [`run`], with the given controller instead of the file's program. All axes are enabled,
+/// then the controller moves them. The run ends when it calls
+/// [`crate::rt::controller::CycleContext::finish`] or anything else ends the run.
 pub fn run_with(
     machine: Machine,
     options: Options,
@@ -153,31 +157,32 @@ pub fn run_with(
     observer: &mut dyn Observer,
     controller: Box<dyn Controller>,
 ) -> Outcome {
-    let controller = Instead::Controller(controller);
+    let controller = ProgramSource::Controller(controller);
     start(machine, options, stop, observer, controller, None)
 }
 
-/// Like [`run`], with somebody in the file's program's place: axes are enabled and moved when they ask for it, until they
-/// leave or something else ends the run. See [`manual::by_hand`] for what of the file is different.
-pub fn run_by_hand(
+/// Like [`run`], with an operator instead of the file's program. Axes are enabled and moved on
+/// request until the operator leaves or anything else ends the run. [`jog::for_manual_mode`] lists
+/// what differs from the machine file.
+pub fn run_with_operator(
     machine: Machine,
     options: Options,
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
     operator: Box<dyn Operator>,
 ) -> Outcome {
-    let machine = manual::by_hand(machine);
+    let machine = jog::for_manual_mode(machine);
     let options = Options {
         enable: true,
         ..options
     };
-    let operator = Instead::Operator(operator);
+    let operator = ProgramSource::Operator(operator);
     start(machine, options, stop, observer, operator, None)
 }
 
-/// Who takes the place of the file's program.
-enum Instead {
-    Nobody,
+/// What controls the axes.
+enum ProgramSource {
+    None,
     Controller(Box<dyn Controller>),
     Operator(Box<dyn Operator>),
 }
@@ -187,26 +192,28 @@ fn start(
     options: Options,
     stop: Arc<AtomicBool>,
     observer: &mut dyn Observer,
-    instead: Instead,
+    instead: ProgramSource,
     link: Option<Box<dyn Link>>,
 ) -> Outcome {
     report_panics_briefly();
-    let (progress, told) = channel();
+    let (progress, reported) = channel();
     let stopped = Arc::clone(&stop);
     let owner = thread::Builder::new()
         .name(RT_THREAD.to_owned())
         .stack_size(STACK)
-        .spawn(move || own_the_link(&Arc::new(machine), &options, stop, progress, instead, link));
+        .spawn(move || {
+            run_on_link_thread(&Arc::new(machine), &options, stop, progress, instead, link)
+        });
     let owner = match owner {
         Ok(owner) => owner,
         Err(error) => return RunError::Thread(error.to_string()).into(),
     };
     let observed = catch_unwind(AssertUnwindSafe(|| {
-        for progress in told {
+        for progress in reported {
             observer.progress(&progress);
         }
     }));
-    // The process may end with an observer that panics: the axes come to rest before.
+    // A panic of the observer may end the process, so the axes stop first.
     if observed.is_err() {
         stopped.store(true, Ordering::Relaxed);
     }
@@ -216,7 +223,8 @@ fn start(
     observed.map_or_else(|panic| resume_unwind(panic), |()| outcome)
 }
 
-/// A panic of the real-time thread is one line, and no backtrace: looking up its symbols takes longer than the drives' watchdogs.
+/// Prints a panic of the real-time thread as one line without a backtrace. Symbol lookup takes
+/// longer than the drives' watchdogs.
 fn report_panics_briefly() {
     static ONCE: std::sync::Once = std::sync::Once::new();
     static REPORTED: AtomicU32 = AtomicU32::new(0);
@@ -240,23 +248,23 @@ pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
         .unwrap_or_else(|| "unknown cause".to_owned())
 }
 
-fn own_the_link(
+fn run_on_link_thread(
     machine: &Arc<Machine>,
     options: &Options,
     stop: Arc<AtomicBool>,
     progress: Sender<Progress>,
-    instead: Instead,
+    instead: ProgramSource,
     link: Option<Box<dyn Link>>,
 ) -> Outcome {
     options.clock.enter();
-    let told = progress.clone();
-    let mut seen = Seen::default();
+    let reported = progress.clone();
+    let mut seen = BringUpEvidence::default();
     let (controller, operator) = match instead {
-        Instead::Nobody => (None, None),
-        Instead::Controller(controller) => (Some(controller), None),
-        Instead::Operator(operator) => (None, Some(operator)),
+        ProgramSource::None => (None, None),
+        ProgramSource::Controller(controller) => (Some(controller), None),
+        ProgramSource::Operator(operator) => (None, Some(operator)),
     };
-    let job = Job {
+    let job = RunBuilder {
         machine,
         options,
         stop,
@@ -265,7 +273,7 @@ fn own_the_link(
     };
     let prepared = match link {
         Some(link) => job.prepare_with(link, &mut seen),
-        None => job.prepare_seeing(&mut seen),
+        None => job.prepare_with_evidence(&mut seen),
     };
     let Prepared {
         parts,
@@ -274,28 +282,29 @@ fn own_the_link(
         Ok(prepared) => prepared,
         Err(error) => {
             return Outcome {
-                story: story::of_bring_up(machine, options, &error, seen),
+                story: fault_evidence::of_bring_up(machine, options, &error, seen),
                 ..error.into()
             };
         }
     };
     supervisor.operator = operator;
     let wire = supervisor.wire;
-    let places = story::places(&supervisor.bus);
+    let places = fault_evidence::places(&supervisor.bus);
     let log = supervisor.log.clone();
     let machine = &Arc::clone(&supervisor.machine);
-    let Turned {
+    let CycleRun {
         remains,
         result: (mut ended, result),
         used,
     } = match options.clock {
-        Clock::Virtual => turn::in_virtual_time(parts, supervisor),
-        Clock::Real => match turn::in_real_time(parts, supervisor, &machine.bus, &told) {
+        Clock::Virtual => cycle_thread::in_virtual_time(parts, supervisor),
+        Clock::Real => match cycle_thread::in_real_time(parts, supervisor, &machine.bus, &reported)
+        {
             Ok(done) => done,
             Err(error) => return error.into(),
         },
     };
-    let Remains {
+    let EngineReport {
         mut link,
         mut port,
         axes,
@@ -307,13 +316,13 @@ fn own_the_link(
         history,
         stops,
     } = remains;
-    let result = result.map_err(|error| lacking(error, link.as_ref(), "the run does"));
+    let result = result.map_err(|error| prefer_replay_end(error, link.as_ref(), "the run does"));
     if result.is_err() {
-        go_silent(options.clock, wire.main_device(), link.as_mut(), &mut port);
+        broadcast_init(options.clock, wire.main_device(), link.as_mut(), &mut port);
     }
     let seen = link.stats();
-    for remark in link.remarks() {
-        let _ = told.send(Progress::Warning(remark));
+    for remark in link.notices() {
+        let _ = reported.send(Progress::Warning(remark));
     }
     let (record, result) = match link.finish() {
         Ok(record) => (record, result),
@@ -325,7 +334,7 @@ fn own_the_link(
     let failed = result.as_ref().err().or(unreleased.as_deref());
     let witnessed = ended.witnessed.take().or(then).unwrap_or_default();
     let story = failed.and_then(|error| {
-        let left = Left {
+        let left = RunEvidence {
             places,
             witnessed,
             diagnoses: &diagnoses,
@@ -337,9 +346,9 @@ fn own_the_link(
             link: seen,
             events: &events,
         };
-        story::of_run(machine, options, error, left)
+        fault_evidence::of_run(machine, options, error, left)
     });
-    let aside = Aside {
+    let aside = SummaryInputs {
         link: seen,
         thread,
         record,

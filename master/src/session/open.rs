@@ -1,4 +1,4 @@
-//! Opens what the machine file's `nic` names, with a recording around it where one is asked for.
+//! Opens the link that the machine file's `nic` names, and records it on request.
 
 use std::borrow::Cow;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -16,21 +16,22 @@ use super::{Options, RunError};
 use crate::clock::{self, Clock};
 use crate::config::sim::{self, bus_order};
 use crate::config::{DeviceConfig, Locator, Machine, Nic};
-use crate::link::capture::{Mode, Recorder};
-use crate::link::recorded::Recorded;
+use crate::link::capture::{Recorder, WriterMode};
 use crate::link::replay::Replay;
 use crate::link::sim::SimLink;
-use crate::link::{self, Concern, Link, OpenError};
+use crate::link::tee::CapturingLink;
+use crate::link::{self, Link, NicWarning, OpenError};
 use crate::recording;
 
-/// Blocks.
+/// Opens the link of the machine. Blocks.
 ///
 /// # Errors
-/// [`RunError::Open`], also where another MainDevice is heard; [`RunError::Sim`], [`RunError::Record`], [`RunError::Link`].
+/// [`RunError::Open`], also if another MainDevice is active; [`RunError::Sim`],
+/// [`RunError::Record`], [`RunError::Link`].
 pub fn link(
     machine: &Machine,
     options: &Options,
-    mut tell: impl FnMut(Concern),
+    mut report: impl FnMut(NicWarning),
 ) -> Result<Box<dyn Link>, RunError> {
     let link: Box<dyn Link> = match (&options.replay, &machine.bus.nic) {
         (Some(path), _) => {
@@ -45,21 +46,21 @@ pub fn link(
             None,
         )?)),
         (None, Nic::Interface(nic)) => {
-            let (mut link, concerns) = link::open_alone(nic, machine.bus.link)?;
-            // The first thing sent would take its drives to Init.
-            let frames = link::heard(link.as_mut()).map_err(RunError::Link)?;
+            let (mut link, concerns) = link::open_exclusive(nic, machine.bus.link)?;
+            // The first frame would set another MainDevice's drives to Init.
+            let frames = link::sniff_foreign_frames(link.as_mut()).map_err(RunError::Link)?;
             if frames > 0 {
                 let nic = nic.clone();
                 return Err(OpenError::Driven { nic, frames }.into());
             }
-            concerns.into_iter().for_each(&mut tell);
+            concerns.into_iter().for_each(&mut report);
             link
         }
     };
     recorded(link, options)
 }
 
-/// A link with the recording around it that is asked for, if one is.
+/// Adds the recording that `options` request to a link.
 ///
 /// # Errors
 /// [`RunError::Record`].
@@ -68,13 +69,16 @@ pub fn recorded(link: Box<dyn Link>, options: &Options) -> Result<Box<dyn Link>,
         return Ok(link);
     };
     let (mode, epoch) = match options.clock {
-        // A run in virtual time is to be recorded the same every time, and may wait for the disk.
-        Clock::Virtual => (Mode::Inline, 0),
-        Clock::Real => (Mode::Background, since_1970().saturating_sub(clock::now())),
+        // In virtual time a recording must be reproducible, and the run may wait for the disk.
+        Clock::Virtual => (WriterMode::Inline, 0),
+        Clock::Real => (
+            WriterMode::Background,
+            since_1970().saturating_sub(clock::now()),
+        ),
     };
     let recorder = Recorder::create(path, mode, options.record_limit)
         .map_err(|error| RunError::Record(format!("{}: {error}", path.display())))?;
-    Ok(Box::new(Recorded::new(link, recorder, epoch)))
+    Ok(Box::new(CapturingLink::new(link, recorder, epoch)))
 }
 
 fn since_1970() -> u64 {
@@ -85,8 +89,8 @@ fn since_1970() -> u64 {
         .unwrap_or(0)
 }
 
-/// The simulated bus that the machine file describes: every device from its own ESI. With `ring`, the last open port
-/// leads back to a second port of the MainDevice.
+/// Builds the simulated bus of the machine file. Every device uses its own ESI. With `ring`, the
+/// last open port leads back to a second port of the MainDevice.
 pub fn simulated_bus(
     machine: &Machine,
     seed: u64,
@@ -113,29 +117,30 @@ pub fn simulated_bus(
     Ok(segment)
 }
 
-/// How the simulated bus is cabled.
+/// Returns the cabling of the simulated bus.
 ///
 /// # Errors
-/// [`RunError::Sim`] where a device finds no port.
+/// [`RunError::Sim`] if a device finds no free port.
 pub fn topology(machine: &Machine) -> Result<Topology, RunError> {
     sim::topology(&machine.devices).map_err(|errors| {
-        let told = errors
+        let reported = errors
             .iter()
-            .map(|error| sim::told(error, &machine.devices).0);
-        RunError::Sim(told.collect::<Vec<_>>().join("; "))
+            .map(|error| sim::topology_message(error, &machine.devices).0);
+        RunError::Sim(reported.collect::<Vec<_>>().join("; "))
     })
 }
 
-/// Clocks of real devices differ by some tens of ppm; a simulated bus without drift would hide a
-/// clock control that does nothing.
+/// The clock drifts of the simulated devices in ppm, as in real devices. Without drift a defective
+/// clock control would go unnoticed.
 const DRIFTS_PPM: [f64; 4] = [18.0, -23.0, 7.0, -11.0];
 
-/// Vendor of the demonstration devices. They have boot loaders, which take nothing but their own firmware files; other devices keep a file that is
-/// written in Bootstrap as any other.
+/// The vendor ID of the demonstration devices. Their boot loaders accept only their own firmware
+/// files. Other simulated devices store a file written in Bootstrap like any other file.
 const DEMONSTRATION: u32 = 0x0e0a;
 
-/// The device with the modules that the file names in its slots. Where a mode picks the module it is no hardware: the device takes what it is told.
-fn plugged(device: &DeviceConfig) -> Cow<'_, Device> {
+/// Returns the device with the modules that the file assigns to its slots. If a mode selects the
+/// module, the device is returned unchanged: it takes the configured module list.
+fn with_configured_modules(device: &DeviceConfig) -> Cow<'_, Device> {
     let selection = &device.selection;
     let Some(slots) = &device.device.slots else {
         return Cow::Borrowed(&device.device);
@@ -154,7 +159,7 @@ fn plugged(device: &DeviceConfig) -> Cow<'_, Device> {
             let module = selection.modules.iter().find(|m| m.place == places.len());
             place.module_idents.iter_mut().for_each(|(_, d)| *d = false);
             if let Some(module) = module {
-                // It may fit by its class alone.
+                // The module may fit only by its class, so its ident is added.
                 place
                     .module_idents
                     .retain(|(ident, _)| *ident != module.ident);
@@ -190,14 +195,14 @@ fn sim_device(device: &DeviceConfig, position: usize, seed: u64) -> Result<SimDe
         Locator::Alias(alias) | Locator::Id(alias) => options.alias = alias,
     }
     if let Some(axis) = &device.axis {
-        // Validated as a positive number that fits.
+        // The configuration check ensures a positive value that fits.
         options.plant.counts_per_turn = axis.config.scale.counts_per_turn().round() as u32;
         options.plant.initial_position = device.sim.track.start;
         options.plant.track = device.sim.track.track;
     }
-    let hardware = plugged(device);
+    let hardware = with_configured_modules(device);
     if let Cow::Owned(_) = hardware {
-        // Whatever is plugged, the EEPROM is as it left the factory.
+        // The EEPROM has its factory content, whatever modules are plugged in.
         let own = SiiOptions {
             serial: options.serial,
             alias: options.alias,

@@ -1,4 +1,4 @@
-//! From a machine file to a segment in SafeOp, with everything in place that turns its cycle.
+//! Brings the segment from a machine file to SafeOp and prepares everything that the cycle needs.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -7,61 +7,65 @@ use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use ecaxis_axis::Axis;
+use ecaxis_ecat::registers;
 use ethercrab::{Command as Datagram, MainDevice};
 
-use super::story::Seen;
-use super::{Log, Options, Progress, RunError, open, panic_text};
-use crate::bringup::{Bus, Step, bring_up, clocks};
+use super::fault_evidence::BringUpEvidence;
+use super::{EmergencyLog, Options, Progress, RunError, open, panic_text};
+use crate::bringup::{Bus, Step, bring_up};
 use crate::clock::{self, Clock, Nanos};
 use crate::config::{Machine, Signal};
+use crate::datagram::{CyclicMailboxTransport, DatagramClient};
 use crate::link::Link;
-use crate::link::port::{Port, main_device, pump};
+use crate::link::pdu_loop::{PduLoop, drive_pdu_loop, main_device};
 use crate::mailbox::Mailboxes;
-use crate::mailbox::desk::{self, Desk, Listen, Opening};
+use crate::mailbox::worker::{self, EmergencySink, MailboxWorker, WorkerConfig};
+use crate::post_mortem::DeviceSnapshot;
+use crate::post_mortem::snapshot::{self, Depth};
+use crate::rt::axis::RtAxis;
+use crate::rt::bus_monitor::BusMonitor;
+use crate::rt::channel::channel;
 use crate::rt::controller::Controller;
-use crate::rt::cycle::{Parts, Signals, Timing, first_snapshot};
-use crate::rt::exchange::{Exchange, Member};
-use crate::rt::groups::Group;
-use crate::rt::guard::Guard;
-use crate::rt::handover::ends;
-use crate::rt::image::{self, AxisBits, Bits, ImagePlan, NotMapped, SignalBits};
+use crate::rt::cycle::{EngineConfig, Signals, Timing, first_snapshot};
+use crate::rt::exchange::{Exchange, ExchangeDevice};
+use crate::rt::image::{self, AxisBits, BitField, ImagePlan, NotMapped, SignalBits};
 use crate::rt::phase::Phase;
-use crate::rt::slot::AxisSlot;
-use crate::story::Look;
-use crate::story::look::{self, Depth};
+use crate::rt::reaction_group::ReactionGroup;
 use crate::supervise::{Supervisor, interruptible};
-use crate::wire::{BesideCycle, Datagrams};
 
-/// A segment in SafeOp, with everything in place that turns its cycle.
+/// A segment in SafeOp with everything that the cycle needs.
 #[derive(Debug)]
 pub struct Prepared {
-    pub parts: Parts,
+    pub parts: EngineConfig,
     pub supervisor: Supervisor,
 }
 
-/// A run that is to be prepared.
+/// The inputs of a run.
 #[derive(Debug)]
-pub struct Job<'a> {
+pub struct RunBuilder<'a> {
     pub machine: &'a Arc<Machine>,
     pub options: &'a Options,
-    /// Who may end it.
+    /// The flag that stops the run.
     pub stop: Arc<AtomicBool>,
-    /// Who hears of it.
+    /// The receiver of progress reports.
     pub progress: Sender<Progress>,
-    /// In the place of the file's program.
+    /// The controller that replaces the file's program.
     pub controller: Option<Box<dyn Controller>>,
 }
 
-impl Job<'_> {
+impl RunBuilder<'_> {
     /// Opens the link and brings the bus to SafeOp, on the calling thread and its clock
     /// ([`Clock::enter`]).
     pub fn prepare(self) -> Result<Prepared, RunError> {
-        self.prepare_seeing(&mut Seen::default())
+        self.prepare_with_evidence(&mut BringUpEvidence::default())
     }
 
-    /// Likewise; `seen` is what a bus looked like that did not come up.
-    pub(super) fn prepare_seeing(self, seen: &mut Seen) -> Result<Prepared, RunError> {
-        // Whatever can be known to fail without a bus fails before there is one.
+    /// Like `prepare`; fills `seen` if the bus does not come up.
+    pub(super) fn prepare_with_evidence(
+        self,
+        seen: &mut BringUpEvidence,
+    ) -> Result<Prepared, RunError> {
+        // Errors that need no bus are found before the link opens.
         plan(self.machine)?;
         let link = open::link(self.machine, self.options, |concern| {
             let _ = self.progress.send(Progress::Concern(concern));
@@ -69,15 +73,15 @@ impl Job<'_> {
         self.prepare_with(link, seen)
     }
 
-    /// Likewise, on a link of one's own in the place of the file's `nic`.
+    /// Like [`RunBuilder::prepare`], on the given link instead of the file's `nic`.
     pub fn prepare_on(self, link: Box<dyn Link>) -> Result<Prepared, RunError> {
-        self.prepare_with(link, &mut Seen::default())
+        self.prepare_with(link, &mut BringUpEvidence::default())
     }
 
     pub(super) fn prepare_with(
         self,
         mut link: Box<dyn Link>,
-        seen: &mut Seen,
+        seen: &mut BringUpEvidence,
     ) -> Result<Prepared, RunError> {
         let Self {
             machine,
@@ -88,32 +92,32 @@ impl Job<'_> {
         } = self;
         let (image, ..) = plan(machine)?;
         let (main_device, mut port) = main_device(machine.bus.cycle_ns);
-        let carried = Carried {
+        let carried = BringUpIo {
             clock: options.clock,
             stop: &stop,
             link: link.as_mut(),
             port: &mut port,
         };
-        let log = Log::new(progress.clone());
-        match come_up(machine, main_device, image, carried, &progress, &log) {
+        let log = EmergencyLog::new(progress.clone());
+        match bring_up_catching_panics(machine, main_device, image, carried, &progress, &log) {
             Ok(mut bus) => {
-                let machine = &as_the_drives_say(machine, &bus);
+                let machine = &apply_drive_units(machine, &bus);
                 let (_, slots, axes, signals) = plan(machine)?;
-                let wire = Datagrams::new(main_device);
+                let wire = DatagramClient::new(main_device);
                 let timing = Timing {
                     cycle_ns: machine.bus.cycle_ns,
                     clock_window_ns: machine.bus.clock_window_ns,
                     spin: machine.bus.spin,
                 };
-                let groups = Group::all(machine);
+                let groups = ReactionGroup::all(machine);
                 let clock = options.clock;
-                let members = bus.devices.iter().map(|device| Member {
+                let members = bus.devices.iter().map(|device| ExchangeDevice {
                     station: device.at.station,
                     clock: device.dc,
                     mailbox: device.coe.as_ref().map(|coe| coe.layout().in_sm),
                 });
                 let members: Vec<_> = members.collect();
-                let (rt_end, outer) = ends(&first_snapshot(
+                let (rt_end, outer) = channel(&first_snapshot(
                     &slots,
                     groups.len(),
                     &signals,
@@ -121,14 +125,14 @@ impl Job<'_> {
                 ));
                 let mut exchange =
                     Exchange::new(&bus.image, bus.dc.as_ref(), &members, machine.bus.exchange);
-                hold_outputs(machine, &bus, &mut exchange);
+                preset_outputs(machine, &bus, &mut exchange);
                 exchange.stage();
-                log.set_sights(exchange.sights());
-                let (mailboxes, desks) =
-                    desks(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
+                log.set_bus_status(exchange.bus_status());
+                let (mailboxes, workers) =
+                    mailbox_workers(&mut bus, wire, &exchange, machine.bus.cycle_ns, &log);
                 let _ = progress.send(Progress::Mailboxes(mailboxes.clone()));
                 let controlled = controller.is_some();
-                let parts = Parts {
+                let parts = EngineConfig {
                     clock,
                     timing,
                     link,
@@ -141,7 +145,7 @@ impl Job<'_> {
                     tables: machine.tables.iter().map(|t| t.table.clone()).collect(),
                     stop: machine.stop.clone(),
                     phase: bus.dc.as_ref().map(Phase::new),
-                    guard: Guard::new(machine.bus.lost_frames, &bus.image.groups),
+                    guard: BusMonitor::new(machine.bus.lost_frames, &bus.image.groups),
                     end: rt_end,
                 };
                 let supervisor = Supervisor {
@@ -149,7 +153,7 @@ impl Job<'_> {
                     bus,
                     wire,
                     mailboxes,
-                    desks,
+                    workers,
                     log,
                     outer,
                     stop,
@@ -172,27 +176,28 @@ impl Job<'_> {
                 Ok(Prepared { parts, supervisor })
             }
             Err(error) => {
-                let error = lacking(error, link.as_ref(), "bring-up is over");
+                let error = prefer_replay_end(error, link.as_ref(), "bring-up is over");
                 seen.on_the_bus = true;
-                // What has panicked may have left anything behind.
+                // A panic may have left the link in any state.
                 if !matches!(
                     error,
                     RunError::Interrupted | RunError::Panicked(_) | RunError::Link(_)
                 ) {
-                    seen.looks = vec![Look::default(); machine.devices.len()];
-                    let wire = Datagrams::new(main_device);
+                    seen.looks = vec![DeviceSnapshot::default(); machine.devices.len()];
+                    let wire = DatagramClient::new(main_device);
                     let stations: Vec<_> = (crate::bringup::FIRST_STATION..)
                         .take(machine.devices.len())
                         .collect();
-                    let look = look::at_registers(&wire, &stations, &mut seen.looks, Depth::Whole);
-                    let _ = pump(&mut port, link.as_mut(), options.clock, look);
+                    let look =
+                        snapshot::read_registers(&wire, &stations, &mut seen.looks, Depth::Whole);
+                    let _ = drive_pdu_loop(&mut port, link.as_mut(), options.clock, look);
                 }
-                go_silent(options.clock, main_device, link.as_mut(), &mut port);
+                broadcast_init(options.clock, main_device, link.as_mut(), &mut port);
                 seen.link = link.stats();
-                for remark in link.remarks() {
+                for remark in link.notices() {
                     let _ = progress.send(Progress::Warning(remark));
                 }
-                // The bring-up's error is the one to report.
+                // The error of the bring-up takes precedence.
                 let _ = link.finish();
                 Err(error)
             }
@@ -200,26 +205,27 @@ impl Job<'_> {
     }
 }
 
-/// A desk for every mailbox of the bus.
-fn desks(
+/// Creates a mailbox worker for every device of the bus.
+fn mailbox_workers(
     bus: &mut Bus,
-    wire: Datagrams,
+    wire: DatagramClient,
     exchange: &Exchange,
     cycle_ns: Nanos,
-    log: &Log,
-) -> (Mailboxes, Vec<Desk<BesideCycle>>) {
-    let wires = BesideCycle::all(wire, &exchange.sights(), bus.devices.len(), cycle_ns);
+    log: &EmergencyLog,
+) -> (Mailboxes, Vec<MailboxWorker<CyclicMailboxTransport>>) {
+    let wires =
+        CyclicMailboxTransport::all(wire, &exchange.bus_status(), bus.devices.len(), cycle_ns);
     let openings = bus.devices.iter_mut().zip(wires).map(|(device, wire)| {
         let mailbox = device.coe.take().map(|coe| (wire, coe));
         let name = device.at.name.clone();
-        Opening { name, mailbox }
+        WorkerConfig { name, mailbox }
     });
-    let listener: Arc<dyn Listen> = Arc::new(log.clone());
-    desk::open(openings, &listener)
+    let listener: Arc<dyn EmergencySink> = Arc::new(log.clone());
+    worker::open(openings, &listener)
 }
 
-/// The machine with its axes in the drives' own units.
-fn as_the_drives_say(machine: &Machine, bus: &Bus) -> Arc<Machine> {
+/// Returns the machine with its axes in the drives' own units.
+fn apply_drive_units(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     let mut machine = machine.clone();
     for (device, found) in bus.devices.iter().enumerate() {
         if let Some(adopted) = &found.adopted {
@@ -229,10 +235,10 @@ fn as_the_drives_say(machine: &Machine, bus: &Bus) -> Arc<Machine> {
     Arc::new(machine)
 }
 
-type Plan = (ImagePlan, Vec<AxisSlot>, Vec<usize>, Signals);
+type CyclePlan = (ImagePlan, Vec<RtAxis>, Vec<usize>, Signals);
 
-/// The process image, and every axis with its place in it.
-fn plan(machine: &Machine) -> Result<Plan, RunError> {
+/// Returns the process image and the axes with their offsets in it.
+fn plan(machine: &Machine) -> Result<CyclePlan, RunError> {
     let name = |index: usize| machine.devices[index].name.clone();
     let image = image::of(machine).map_err(|source| RunError::TooLarge {
         name: name(source.device),
@@ -251,14 +257,14 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
             }
         })?;
         let mut config = setup.config;
-        // A report is of the set-point of a cycle earlier.
+        // A feedback value belongs to the set-point of an earlier cycle.
         config.answers_late = machine.bus.exchange.flights() - 1;
         config.dead_time_s += f64::from(config.answers_late) * machine.bus.cycle_ns as f64 * 1e-9;
         let axis = Axis::new(config).map_err(|source| RunError::Axis {
             name: name(index),
             source,
         })?;
-        slots.push(AxisSlot::new(axis, bits, index, image.groups[index]));
+        slots.push(RtAxis::new(axis, bits, index, image.groups[index]));
         axes.push(index);
     }
     let bits = |signal: &Signal, output: bool| {
@@ -268,7 +274,7 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
         } else {
             region.in_len
         };
-        let bits = Bits::new(&signal.field, region.offset, len)?;
+        let bits = BitField::new(&signal.field, region.offset, len)?;
         let kind = signal.kind();
         Some(SignalBits { bits, kind })
     };
@@ -296,60 +302,61 @@ fn plan(machine: &Machine) -> Result<Plan, RunError> {
     Ok((image, slots, axes, signals))
 }
 
-/// Puts the outputs that no axis drives to the values that their drives hold.
-fn hold_outputs(machine: &Machine, bus: &Bus, exchange: &mut Exchange) {
+/// Sets the outputs that no axis drives to the values that their drives hold.
+fn preset_outputs(machine: &Machine, bus: &Bus, exchange: &mut Exchange) {
     let devices = machine.devices.iter().zip(&bus.devices);
     for ((config, device), region) in devices.zip(&bus.image.regions) {
         let Some(region) = region else { continue };
         for &(index, sub, value) in &device.held {
             let field = config.selection.layout.rx_field(index, sub);
-            if let Some(bits) = field.and_then(|f| Bits::new(f, region.offset, region.out_len)) {
+            if let Some(bits) = field.and_then(|f| BitField::new(f, region.offset, region.out_len))
+            {
                 bits.set(exchange.outputs_mut(), value);
             }
         }
     }
 }
 
-/// Where nothing more could come, that is the error.
-pub(super) fn lacking(error: RunError, link: &dyn Link, before: &str) -> RunError {
-    match link.lacks() {
+/// Returns the end of the recording as the error if a replay has run out of frames.
+pub(super) fn prefer_replay_end(error: RunError, link: &dyn Link, before: &str) -> RunError {
+    match link.exhausted_reason() {
         Some(why) => RunError::Replay(format!("{why} before {before}")),
         None => error,
     }
 }
 
-/// What carries the bring-up's frames, and what may end it.
-struct Carried<'a> {
+/// The I/O of a bring-up and its stop conditions.
+struct BringUpIo<'a> {
     clock: Clock,
     stop: &'a AtomicBool,
     link: &'a mut dyn Link,
-    port: &'a mut Port,
+    port: &'a mut PduLoop,
 }
 
-fn come_up(
+fn bring_up_catching_panics(
     machine: &Machine,
     main_device: &'static MainDevice<'static>,
     image: ImagePlan,
-    carried: Carried<'_>,
+    carried: BringUpIo<'_>,
     progress: &Sender<Progress>,
-    log: &Log,
+    log: &EmergencyLog,
 ) -> Result<Bus, RunError> {
-    let mut tell = |step| {
+    let mut report = |step| {
         let _ = progress.send(match step {
             Step::Warning(text) => Progress::Warning(text),
             step => Progress::Step(step),
         });
     };
-    let Carried {
+    let BringUpIo {
         clock,
         stop,
         link,
         port,
     } = carried;
-    // ethercrab panics on some things a wire can carry (a SubDevice without an open port, say).
+    // ethercrab panics on some wire content, for example on a SubDevice without an open port.
     let run = std::panic::AssertUnwindSafe(|| {
-        let bring_up = Box::pin(bring_up(main_device, machine, image, &mut tell, log));
-        pump(port, link, clock, interruptible(stop, bring_up))
+        let bring_up = Box::pin(bring_up(main_device, machine, image, &mut report, log));
+        drive_pdu_loop(port, link, clock, interruptible(stop, bring_up))
     });
     match std::panic::catch_unwind(run) {
         Ok(Ok(Some(Ok(bus)))) => Ok(bus),
@@ -360,23 +367,24 @@ fn come_up(
     }
 }
 
-/// Every SubDevice that listens back to Init and without SYNC0, whatever it is doing.
-pub(super) fn go_silent(
+/// Requests Init from all SubDevices and switches SYNC0 off, in any state.
+pub(super) fn broadcast_init(
     clock: Clock,
     main_device: &'static MainDevice<'static>,
     link: &mut dyn Link,
-    port: &mut Port,
+    port: &mut PduLoop,
 ) {
-    /// A device in Op takes a missing SYNC0 for an error until it has read the request.
+    /// The delay until SYNC0 is switched off. A device in Op reports a missing SYNC0 until it has
+    /// read the request.
     const TO_INIT: Duration = Duration::from_millis(20);
     let all = async |register: u16, value: u16| {
         let datagram = Datagram::bwr(register).ignore_wkc();
         let _ = datagram.send(main_device, value).await;
     };
     let silence = async {
-        all(0x0120, 0x0011).await;
+        all(registers::AL_CONTROL, 0x0011).await;
         clock::delay(TO_INIT).await;
-        all(clocks::ACTIVATION, 0).await;
+        all(registers::DC_CYCLIC_CONTROL, 0).await;
     };
-    let _ = pump(port, link, clock, silence);
+    let _ = drive_pdu_loop(port, link, clock, silence);
 }

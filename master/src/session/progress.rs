@@ -1,4 +1,4 @@
-//! What a run tells while it goes on.
+//! Progress reports of a run.
 
 use std::sync::Arc;
 
@@ -9,22 +9,22 @@ use serde::Serialize;
 use crate::bringup::Step;
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
-use crate::link::Concern;
+use crate::link::NicWarning;
 use crate::mailbox::Mailboxes;
-use crate::rt::handover::{PhaseStatus, Snapshot};
+use crate::rt::channel::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
-use crate::rt::thread::{Denied, Overload};
 use crate::session::{EmergencyReport, RunError};
+use crate::sys::rt_thread::{RtSetupError, RtThrottlingRisk};
 
-/// Listens to a run.
+/// Receives the progress of a run.
 pub trait Observer {
     fn progress(&mut self, progress: &Progress);
 }
 
-/// A step of the machine file.
+/// Identifies a step of the machine file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StepRef {
-    /// `2`, or `2.1` for the first step inside the second.
+    /// The step number: `2`, or `2.1` for the first step inside the second.
     pub number: String,
     pub line: u32,
 }
@@ -35,17 +35,17 @@ impl std::fmt::Display for StepRef {
     }
 }
 
-/// One thing that happened.
+/// One progress report.
 #[derive(Debug, Clone)]
 pub enum Progress {
     Step(Step),
-    /// Something the operating system did not permit; the run goes on.
-    Denied(Denied),
-    /// The real-time thread took nearly all of its CPU.
-    Overload(Overload),
+    /// The operating system denied a real-time setting. The run continues.
+    Denied(RtSetupError),
+    /// The real-time thread used nearly all of its CPU.
+    Overload(RtThrottlingRisk),
     Warning(String),
-    /// Something about the network interface.
-    Concern(Concern),
+    /// A warning about the network interface.
+    Concern(NicWarning),
     /// Frames leave in phase with SYNC0.
     PhaseLocked,
     Enabled {
@@ -55,19 +55,19 @@ pub enum Progress {
     Program {
         run: u32,
         step: StepRef,
-        /// In words.
+        /// The step in words.
         what: String,
     },
     /// A probing step has found its edge.
     Captured {
         run: u32,
-        capture: Capture,
+        capture: ProbeCapture,
     },
-    /// A device has reported something unasked.
+    /// A device has sent an emergency message.
     Emergency(EmergencyReport),
-    /// From here to the end of the run anybody may make transfers beside the cycle.
+    /// Mailbox access during operation, valid from now to the end of the run.
     Mailboxes(Mailboxes),
-    /// A group of axes has begun to stop; the machine goes on without it.
+    /// A group of axes has begun to stop. The machine continues without it.
     GroupStopped {
         group: String,
         cause: Arc<RunError>,
@@ -76,31 +76,31 @@ pub enum Progress {
     GroupReleased {
         group: String,
     },
-    /// Once a second of the machine's time.
+    /// The status of the machine, once a second of machine time.
     Status(Status),
     Stopping,
 }
 
-/// What a probing step has found.
+/// The result of a probing step.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Capture {
-    /// Number of the step.
+pub struct ProbeCapture {
+    /// The step number.
     pub step: String,
     pub axis: String,
     /// Touch probe 1 or 2.
     pub input: u8,
     /// `"rising"` or `"falling"`.
     pub edge: &'static str,
-    /// How often the step has found one so far; the rest is of the last.
+    /// The number of edges found so far. The other fields belong to the last edge.
     pub times: u32,
-    /// Where the drive was at the edge, user units; on a modulo axis counted on over its turns.
+    /// The position at the edge in user units. On a modulo axis it counts on over several turns.
     pub position: f64,
-    /// On a modulo axis.
+    /// The position within one turn; modulo axes only.
     pub place: Option<f64>,
     pub unit: String,
 }
 
-impl std::fmt::Display for Capture {
+impl std::fmt::Display for ProbeCapture {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let at = self.place.unwrap_or(self.position);
         write!(
@@ -115,7 +115,7 @@ impl std::fmt::Display for Capture {
     }
 }
 
-/// `-0.0000` reads like a mistake.
+/// Returns `0.0` instead of `-0.0`, which would print as `-0.0000`.
 pub(crate) fn positive_zero(x: f64) -> f64 {
     if x.abs() < 0.000_05 { 0.0 } else { x }
 }
@@ -136,11 +136,11 @@ pub struct AxisLine {
     pub unit: String,
     pub mode: Mode,
     pub state: State,
-    /// User units; on a modulo axis the place.
+    /// The position in user units; on a modulo axis the position within one turn.
     pub position: f64,
-    /// User units a second.
+    /// The velocity in user units per second.
     pub velocity: f64,
-    /// In `torque_unit`.
+    /// The torque in `torque_unit`.
     pub torque: f64,
     pub torque_unit: TorqueUnit,
 }

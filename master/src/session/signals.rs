@@ -1,4 +1,4 @@
-//! Signals of a process whose axes move: what stops the machine, and what must not stop the process.
+//! Signal handling while axes move: which signals stop the machine, and which are ignored.
 
 use std::fmt;
 use std::io;
@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 use tokio::runtime::Builder;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use crate::os::signal as disposition;
+use crate::sys::signal as disposition;
 
-/// Signals whose default action ends or suspends the process, while the axes move.
+/// Signals that would end or suspend the process by default, ignored while the axes move.
 const IGNORED: [libc::c_int; 5] = [
     libc::SIGUSR1,
     libc::SIGUSR2,
@@ -21,15 +21,17 @@ const IGNORED: [libc::c_int; 5] = [
     libc::SIGTTOU,
 ];
 
-/// Some programs, such as timeout(1), send the signal to the process and to its group.
+/// A repeated signal within this time is ignored: timeout(1), for example, signals the process and
+/// its group.
 const REPEATED: Duration = Duration::from_millis(500);
 
-/// What [`stop_on_signals`] has done with a signal.
+/// The reaction of [`stop_on_signals`] to a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SignalReport {
     /// The flag is set: the run stops in order.
     Stopping,
-    /// Another SIGINT or SIGTERM arrived. A program that ends now leaves its axes to their watchdogs.
+    /// Another SIGINT or SIGTERM arrived. If the process ends now, only the drives' watchdogs stop
+    /// the axes.
     StopRepeated,
     /// SIGTSTP (Ctrl-Z) was ignored: a suspended process sends no frames.
     NotSuspended,
@@ -45,15 +47,15 @@ impl fmt::Display for SignalReport {
     }
 }
 
-/// Sets `stop` at SIGINT, SIGTERM or SIGHUP, so that a run with this flag stops in order. SIGHUP does
-/// nothing where it was ignored before, as by `nohup`.
+/// Sets `stop` on SIGINT, SIGTERM or SIGHUP, so that a run with this flag stops in order. SIGHUP
+/// has no effect if it was ignored before, as by `nohup`.
 ///
-/// From here on the process ignores SIGUSR1, SIGUSR2, SIGPIPE, SIGTTIN and SIGTTOU, and SIGTSTP does
-/// not suspend it. `report` is called on a thread of its own. SIGHUP is never reported as
-/// [`SignalReport::StopRepeated`]: a terminal that closes may send it several times.
+/// The process ignores SIGUSR1, SIGUSR2, SIGPIPE, SIGTTIN and SIGTTOU from now on. SIGTSTP no
+/// longer suspends it. A dedicated thread calls `report`. SIGHUP is never reported as
+/// [`SignalReport::StopRepeated`]: a closing terminal may send it several times.
 ///
 /// # Errors
-/// Where a signal cannot be caught, or the thread cannot be started.
+/// Fails if a signal cannot be caught or the thread cannot be started.
 pub fn stop_on_signals(
     stop: Arc<AtomicBool>,
     mut report: impl FnMut(SignalReport) + Send + 'static,
@@ -100,7 +102,7 @@ pub fn stop_on_signals(
     Ok(())
 }
 
-/// Never returns without a signal to wait for.
+/// Waits for the signal; never returns if there is none.
 async fn received(signal: &mut Option<Signal>) {
     match signal {
         Some(signal) => {

@@ -1,4 +1,4 @@
-//! What a run comes to, in numbers.
+//! The result of a run in numbers.
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Mode, Scale};
@@ -8,17 +8,17 @@ use crate::clock::{Clock, Nanos};
 use crate::config::Machine;
 use crate::link::LinkStats;
 use crate::link::capture::RecordStats;
-use crate::os::process::ThreadUse;
-use crate::rt::exchange::{Diagnosis, ErrorCounters};
-use crate::rt::slot::AxisSlot;
+use crate::rt::axis::RtAxis;
+use crate::rt::exchange::{ErrorCounters, SubDeviceDiagnostics};
 use crate::rt::stats::{Counters, Percentiles, Stats};
-use crate::supervise::Ended;
+use crate::supervise::ProgramOutcome;
+use crate::sys::process::ThreadUsage;
 
-use super::Capture;
+use super::ProbeCapture;
 use super::emergencies::EmergencyLine;
 use super::events::EventLine;
 
-/// The result of a run. In virtual time every figure depends on the file and the seed alone.
+/// The result of a run. In virtual time all values depend only on the machine file and the seed.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
     pub machine: String,
@@ -26,43 +26,45 @@ pub struct Summary {
     /// `"real"` or `"virtual"`.
     pub time: &'static str,
     pub cycle_ns: u64,
-    /// Cycles and overruns times the cycle.
+    /// The number of cycles and overruns, multiplied by the cycle time in s.
     pub machine_seconds: f64,
-    /// Complete runs of the program.
+    /// The number of completed program runs.
     pub program_runs: u32,
-    /// Ended by the user.
+    /// `true` if the user ended the run.
     pub interrupted: bool,
     pub counters: Counters,
-    /// What came over the network interface beside answers.
+    /// Received traffic other than answers.
     pub link: LinkStats,
-    /// Wake-up after the planned release of a frame.
+    /// The delay from the planned release of a frame to the wake-up.
     pub wake_up_lateness: Percentiles,
-    /// Planned release to the last answer.
+    /// The time from planned release to the last answer.
     pub round_trip: Percentiles,
-    /// Amount of the phase error against SYNC0, once locked; `None` without distributed clocks.
+    /// The absolute phase error against SYNC0 after lock; `None` without distributed clocks.
     pub dc_phase_error: Option<Percentiles>,
-    /// Wake-up to the end of the cycle's work.
+    /// The time from wake-up to the end of the cycle's work.
     pub work: Percentiles,
-    /// `None` in virtual time.
+    /// The real-time thread; `None` in virtual time.
     pub thread: Option<ThreadSummary>,
     pub axes: Vec<AxisSummary>,
-    /// What probing has found, one for each step.
-    pub probes: Vec<Capture>,
+    /// The probing results, one per step.
+    pub probes: Vec<ProbeCapture>,
     /// SubDevices whose error counters have grown.
     pub errors: Vec<DeviceErrors>,
-    /// The last that the cycle has noticed, oldest first.
+    /// The last events of the cycle, oldest first.
     pub events: Vec<EventLine>,
-    /// What devices reported unasked, oldest first, as many as are kept.
+    /// The emergencies of the devices, oldest first, up to a fixed number.
     pub emergencies: Vec<EmergencyLine>,
-    /// Further ones: told but not kept, or lost because a device's queue was full.
+    /// The number of emergencies not in the list: not kept, or lost because a device's queue was
+    /// full.
     pub more_emergencies: u64,
-    /// Stops of groups that the machine went on through.
+    /// The stops of groups during which the machine continued.
     pub group_stops: Vec<GroupStop>,
     pub recorded_frames: Option<u64>,
     pub recorded_frames_dropped: Option<u64>,
 }
 
-/// What a SubDevice's error counters (0x0300–0x0313) have grown by since the cycle began; 255 stands for more. Four ports each.
+/// The increase of a SubDevice's error counters (0x0300–0x0313) since the cycle began. 255 means
+/// 255 or more. Four ports each.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct DeviceErrors {
     pub name: String,
@@ -74,8 +76,11 @@ pub struct DeviceErrors {
     pub pdi: u8,
 }
 
-/// Those with something to tell.
-pub(super) fn device_errors(machine: &Machine, diagnoses: &[Diagnosis]) -> Vec<DeviceErrors> {
+/// Returns the devices whose counters have grown.
+pub(super) fn device_errors(
+    machine: &Machine,
+    diagnoses: &[SubDeviceDiagnostics],
+) -> Vec<DeviceErrors> {
     let devices = machine.devices.iter().zip(diagnoses);
     let grown = devices.map(|(device, found)| (device, found.grown()));
     grown
@@ -92,21 +97,22 @@ pub(super) fn device_errors(machine: &Machine, diagnoses: &[Diagnosis]) -> Vec<D
         .collect()
 }
 
-/// The real-time thread, from the first cycle to the last.
+/// The real-time thread from the first to the last cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThreadSummary {
     #[serde(flatten)]
-    pub used: ThreadUse,
-    /// Percent of its CPU.
+    pub used: ThreadUsage,
+    /// The CPU load in percent.
     pub load_percent: f64,
-    /// How late sleeping ended, whatever was spun after it; `count` is 0 where it never slept.
+    /// The delay of wake-ups from sleep, before any spinning. `count` is 0 if the thread never
+    /// slept.
     pub sleep_lateness: Percentiles,
-    /// Spinning before a release, at the end.
+    /// The spin time before a release at the end of the run, in ns.
     pub spin_ns: u64,
 }
 
 impl ThreadSummary {
-    pub(super) fn new(used: ThreadUse, wall_ns: u64, spin_ns: u64, stats: &Stats) -> Self {
+    pub(super) fn new(used: ThreadUsage, wall_ns: u64, spin_ns: u64, stats: &Stats) -> Self {
         Self {
             used,
             load_percent: used.load_percent(wall_ns),
@@ -116,27 +122,27 @@ impl ThreadSummary {
     }
 }
 
-/// What a run comes to beside its cycle.
-pub(super) struct Aside {
+/// The inputs of the summary that the cycle does not provide.
+pub(super) struct SummaryInputs {
     pub link: LinkStats,
     pub thread: Option<ThreadSummary>,
     pub record: Option<RecordStats>,
     pub errors: Vec<DeviceErrors>,
     pub events: Vec<EventLine>,
-    /// And how many more.
+    /// The kept emergencies and the number of further ones.
     pub emergencies: (Vec<EmergencyLine>, u64),
-    /// The first cycle was due then.
+    /// The time at which the first cycle was due.
     pub started: Nanos,
-    /// Since when each group of axes has been stopping.
+    /// The time at which each group of axes began to stop.
     pub stops: Vec<Option<Nanos>>,
 }
 
-/// A group of axes that stopped while the machine went on.
+/// A group of axes that stopped while the machine continued.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct GroupStop {
     pub group: String,
     pub cause: String,
-    /// It has been reset since.
+    /// `true` if the group has been reset since.
     pub released: bool,
 }
 
@@ -145,21 +151,22 @@ pub struct GroupStop {
 pub struct AxisSummary {
     pub name: String,
     pub unit: String,
-    /// The last one in which it had power, as the machine file writes it.
+    /// The last mode in which the axis had power, as the machine file writes it.
     pub mode: String,
-    /// Whether it ever was in Operation enabled.
+    /// `true` if the axis was ever in Operation enabled.
     pub was_enabled: bool,
     pub final_position: f64,
     pub target_position: f64,
-    /// On a modulo axis: where on the turn; positions count on.
+    /// The position within one turn; modulo axes only. `final_position` counts on over several
+    /// turns.
     pub final_place: Option<f64>,
     pub target_place: Option<f64>,
     /// Target minus final position in the drive's counts; CSP only.
     pub final_error_counts: Option<i64>,
     pub largest_following_error: f64,
     pub final_state: String,
-    /// Seconds from the first cycle to the last in which the drive was heard, where that was before the axis began to stop: position and
-    /// state are of that time.
+    /// The time in s from the first cycle to the drive's last answer, if that was before the axis
+    /// began to stop. Position and state are of that time.
     pub last_heard_s: Option<f64>,
     pub fault: Option<String>,
     pub trip: Option<String>,
@@ -169,14 +176,14 @@ fn error_counts(scale: &Scale, status: &AxisStatus) -> i64 {
     ((status.target_position - status.position) * scale.counts_per_unit()).round() as i64
 }
 
-/// `None`: it was heard when the stop began.
-fn silent_since(slot: &AxisSlot, aside: &Aside) -> Option<f64> {
+/// Returns `None` if the drive still answered when the stop began.
+fn last_fresh_age(slot: &RtAxis, aside: &SummaryInputs) -> Option<f64> {
     let stop = aside.stops.get(slot.group).copied().flatten()?;
     let heard = slot.heard.unwrap_or(aside.started);
     (heard < stop).then(|| heard.saturating_sub(aside.started) as f64 * 1e-9)
 }
 
-/// `csp`.
+/// Returns the mode as the machine file writes it, for example `csp`.
 fn name_of(mode: Mode) -> String {
     let known = ecaxis_esi::Mode::ALL.into_iter();
     let mut known = known.filter(|known| known.code() == mode.code());
@@ -189,10 +196,10 @@ impl Summary {
     pub(super) fn new(
         machine: &Machine,
         clock: Clock,
-        axes: &[AxisSlot],
+        axes: &[RtAxis],
         stats: &Stats,
-        ended: Ended,
-        aside: Aside,
+        ended: ProgramOutcome,
+        aside: SummaryInputs,
     ) -> Self {
         let setups = machine
             .devices
@@ -219,7 +226,7 @@ impl Summary {
                         .then(|| error_counts(&setup.config.scale, &last)),
                     largest_following_error: slot.largest_following_error,
                     final_state: now.state.to_string(),
-                    last_heard_s: silent_since(slot, &aside),
+                    last_heard_s: last_fresh_age(slot, &aside),
                     fault: now.fault.map(|fault| fault.to_string()),
                     trip: now.trip.map(|trip| trip.to_string()),
                 }

@@ -1,22 +1,23 @@
-//! Groups that stop while the machine goes on: told once, remembered for whoever needs one of their axes.
+//! Groups that stop while the machine continues. Each stop is reported once and kept for later
+//! steps that need its axes.
 
 use std::sync::Arc;
 
 use super::Supervisor;
 use crate::config::{Action, Step};
-use crate::rt::groups::GroupStatus;
-use crate::rt::guard::StopCause;
-use crate::rt::handover::Snapshot;
+use crate::post_mortem::Witnessed;
+use crate::post_mortem::snapshot::Depth;
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::Snapshot;
+use crate::rt::reaction_group::GroupStatus;
 use crate::session::{GroupStop, Progress, RunError};
-use crate::story::Witnessed;
-use crate::story::look::Depth;
 
-/// A stop of a group that the machine went on through.
+/// A stop of a group during which the machine continued.
 #[derive(Debug, Clone)]
 pub struct StoppedGroup {
-    /// As in [`crate::config::Machine::group_of`].
+    /// The group index, as in [`crate::config::Machine::group_of`].
     pub group: usize,
-    /// Which of its stops it is, from 1.
+    /// The number of the stop within its group, from 1.
     pub number: u32,
     pub cause: Arc<RunError>,
     pub witnessed: Witnessed,
@@ -33,7 +34,7 @@ impl Supervisor {
         self.machine.group_name(group).to_owned()
     }
 
-    /// Whether the machine goes on without this group.
+    /// Returns `true` if the machine continues without this group.
     pub(super) fn is_stopped(&self, group: usize) -> bool {
         self.stop_of(group).is_some()
     }
@@ -43,28 +44,28 @@ impl Supervisor {
         last.filter(|stop| !stop.released)
     }
 
-    /// What has become of groups since the last look.
-    pub(super) async fn tell_of_groups(&mut self, snapshot: &Snapshot) {
-        // A group that can no longer follow another one is explained by what stopped that.
+    /// Reports groups that stopped or were released since the last call.
+    pub(super) async fn report_stopped_groups(&mut self, snapshot: &Snapshot) {
+        // Followers come last: the stop of the group they followed explains theirs.
         let follows = |now: &GroupStatus| matches!(now.stopped, Some(StopCause::FollowLost { .. }));
         let groups = snapshot.groups.iter().enumerate();
         let mut groups: Vec<_> = groups.collect();
         groups.sort_by_key(|(_, now)| follows(now));
         for (group, now) in groups {
             let last = self.stopped.iter_mut().rev().find(|s| s.group == group);
-            let told = last.as_ref().map_or(0, |last| last.number);
-            let over = now.stopped.is_none() || now.stops != told;
+            let reported = last.as_ref().map_or(0, |last| last.number);
+            let over = now.stopped.is_none() || now.stops != reported;
             if let Some(last) = last
                 && over
                 && !last.released
             {
                 last.released = true;
                 let group = self.group_name(group);
-                self.tell(Progress::GroupReleased { group });
+                self.report(Progress::GroupReleased { group });
             }
-            // A stop that was over before anybody looked has no cause any more.
+            // A stop that has already ended has no cause any more.
             if let Some(cause) = now.stopped
-                && now.stops != told
+                && now.stops != reported
             {
                 let cause = self.explain_stop(cause, Some(group), snapshot).await;
                 let cause = Arc::new(cause);
@@ -80,12 +81,12 @@ impl Supervisor {
                     released: false,
                 });
                 let group = self.group_name(group);
-                self.tell(Progress::GroupStopped { group, cause });
+                self.report(Progress::GroupStopped { group, cause });
             }
         }
     }
 
-    /// For the summary.
+    /// Returns the stops for the summary.
     pub(super) fn group_stops(&self) -> Vec<GroupStop> {
         let stops = self.stopped.iter();
         stops
@@ -97,8 +98,12 @@ impl Supervisor {
             .collect()
     }
 
-    /// Fails with what stopped the first of these axes, if one is stopped with its group.
-    pub(super) fn none_stopped(&self, step: Option<&Step>, axes: &[usize]) -> Result<(), RunError> {
+    /// Fails with the cause of the first of these axes whose group is stopped.
+    pub(super) fn ensure_not_stopped(
+        &self,
+        step: Option<&Step>,
+        axes: &[usize],
+    ) -> Result<(), RunError> {
         let stopped = axes.iter().find_map(|&axis| {
             let stop = self.stop_of(self.group_of(axis))?;
             Some((axis, stop))
@@ -115,7 +120,8 @@ impl Supervisor {
     }
 }
 
-/// The axes that a step cannot do without, as devices; a stopped group may be reset and disabled.
+/// Returns the devices of the axes that a step needs to run. Resetting and disabling work in a
+/// stopped group.
 pub(super) fn needed(action: &Action) -> Vec<usize> {
     let targets = |targets: &[(usize, f64)]| targets.iter().map(|&(device, _)| device).collect();
     match action {

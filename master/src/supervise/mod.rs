@@ -1,6 +1,6 @@
-//! Everything beside the cycle while the machine runs: the way to Op and back, enabling, the steps
-//! of the program, and what to say when something stops it. MAY BLOCK AND ALLOCATE; talks to the
-//! cycle through `rt::handover` alone.
+//! Everything outside the cycle while the machine runs: the way to Op and back, enabling, the steps
+//! of the program, and the error after a stop. MAY BLOCK AND ALLOCATE; communicates with the cycle
+//! only through `rt::handover`.
 
 use std::collections::VecDeque;
 use std::future::{Future, poll_fn};
@@ -11,39 +11,40 @@ use std::sync::mpsc::Sender;
 use std::task::Poll;
 use std::time::Duration;
 
-use ecaxis_axis::{Command, Refused};
+use ecaxis_axis::{Command, CommandError};
 
 use crate::bringup::{AlState, Bus, DeviceRef, StateError, al, clocks};
 use crate::clock::{self, Nanos};
 use crate::config::steps::enables;
 use crate::config::{Machine, Step};
+use crate::datagram::{CyclicMailboxTransport, DatagramClient};
 use crate::mailbox::Mailboxes;
-use crate::mailbox::desk::{Desk, beside};
-use crate::rt::exchange::Probe;
-use crate::rt::guard::StopCause;
-use crate::rt::handover::{Event, ORDERS_A_CYCLE, Order, OuterEnd, Snapshot};
-use crate::session::{Capture, GroupStop, Log, Progress, RunError, Status, clock_off};
-use crate::story::{Witnessed, look};
-use crate::wire::{BesideCycle, Datagrams};
+use crate::mailbox::worker::{MailboxWorker, run_with_workers};
+use crate::post_mortem::{Witnessed, snapshot};
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::{Event, HostEndpoint, ORDERS_A_CYCLE, RtCommand, Snapshot};
+use crate::rt::exchange::DiagnosticRegister;
+use crate::session::{
+    EmergencyLog, GroupStop, ProbeCapture, Progress, RunError, Status, clock_off,
+};
 use groups::StoppedGroup;
 
-pub mod executor;
-mod faults;
-mod follow;
+mod coordinated;
+pub(crate) mod diagnosis_history;
+mod explain;
 mod groups;
-pub(crate) mod history;
-pub mod manual;
+pub mod jog;
 mod program;
 
-/// Cycles are looked at this often.
+/// The period at which the supervisor reads the cycle's snapshot.
 const TICK: Duration = Duration::from_millis(1);
-/// How long the phase may take to lock.
+/// The timeout in ns for the phase to lock.
 const LOCK_TIMEOUT: Nanos = 5_000_000_000;
-/// Cycles before Op is asked for.
+/// The number of cycles before Op is requested.
 const FIRST_CYCLES: u64 = 20;
-/// A clock closer to the reference than this has settled.
+/// The clock difference in ns below which a clock has settled.
 const SETTLED_NS: u32 = 1_000;
-/// Refusals that are kept until somebody looks.
+/// The maximum number of refused commands that wait for processing.
 const REFUSALS: usize = 256;
 const STATUS_PERIOD: Nanos = 1_000_000_000;
 
@@ -52,62 +53,63 @@ const STATUS_PERIOD: Nanos = 1_000_000_000;
 pub struct Supervisor {
     pub machine: Arc<Machine>,
     pub bus: Bus,
-    pub wire: Datagrams,
-    /// Transfers with devices; [`Supervisor::run`] looks after the desks that make them.
+    pub wire: DatagramClient,
+    /// Mailbox access to the devices. [`Supervisor::run`] runs the workers that perform the
+    /// transfers.
     pub mailboxes: Mailboxes,
-    pub desks: Vec<Desk<BesideCycle>>,
-    /// What devices have reported unasked.
-    pub log: Log,
-    pub outer: OuterEnd,
+    pub workers: Vec<MailboxWorker<CyclicMailboxTransport>>,
+    /// The emergencies of the devices.
+    pub log: EmergencyLog,
+    pub outer: HostEndpoint,
     pub stop: Arc<AtomicBool>,
     pub progress: Sender<Progress>,
-    /// Runs of the program, where the time limit does not end it first.
+    /// The number of program runs, unless the time limit ends the program first.
     pub repeat: u32,
-    /// Time limit of the program; it is repeated until then.
+    /// The time limit of the program. The program repeats until then.
     pub limit: Option<Nanos>,
     pub enable: bool,
-    /// A controller takes the program's place.
+    /// `true` if a controller replaces the program.
     pub controlled: bool,
-    /// Somebody who takes the program's place.
-    pub operator: Option<Box<dyn manual::Operator>>,
-    /// Axes whose faults and trips they have seen.
+    /// The operator that replaces the program.
+    pub operator: Option<Box<dyn jog::Operator>>,
+    /// Axes whose faults and trips the operator has seen.
     pub seen: Vec<usize>,
-    /// Indices into the machine's devices, one an axis of the cycle.
+    /// Indices into the machine's devices, one per axis of the cycle.
     pub axes: Vec<usize>,
-    /// Orders handed over so far.
+    /// The number of commands sent to the cycle so far.
     pub orders_given: u64,
-    /// Commands that axes did not take, in order; of too many the first, and the last.
-    pub refused: VecDeque<(usize, Refused)>,
-    /// What probing has found, one for each step.
-    pub captures: Vec<Capture>,
-    /// Stops of groups that the machine went on through, in the order in which they were told.
+    /// Commands that axes refused, in order. If too many, the first ones and the last one.
+    pub refused: VecDeque<(usize, CommandError)>,
+    /// The probing results, one per step.
+    pub captures: Vec<ProbeCapture>,
+    /// The stops of groups during which the machine continued, in the order of their reports.
     pub stopped: Vec<StoppedGroup>,
-    /// Axes whose drive has reported an internal limit.
+    /// `true` for axes whose drive has reported an internal limit.
     pub limited: Vec<bool>,
-    /// When the last status was told.
+    /// The time of the last status report.
     pub last_status: Nanos,
-    /// What was seen of the bus when it failed.
+    /// The state of the bus at the failure.
     pub witnessed: Option<Witnessed>,
 }
 
-/// How the machine's program ended.
+/// The result of the machine's program.
 #[derive(Debug, Clone, Default)]
-pub struct Ended {
-    /// Complete runs of the program.
+pub struct ProgramOutcome {
+    /// The number of completed program runs.
     pub runs: u32,
-    /// Stopped by the user before its end.
+    /// `true` if the user stopped the program before its end.
     pub interrupted: bool,
-    /// What probing has found, one for each step.
-    pub captures: Vec<Capture>,
-    /// Groups that stopped while the machine went on.
+    /// The probing results, one per step.
+    pub captures: Vec<ProbeCapture>,
+    /// Groups that stopped while the machine continued.
     pub group_stops: Vec<GroupStop>,
-    /// What was seen of the bus when it failed.
+    /// The state of the bus at the failure.
     pub witnessed: Option<Witnessed>,
-    /// What stopped a group that was not reset, and what was seen of the bus then.
+    /// The error of a group that was not reset, and the state of the bus at that stop.
     pub left: Option<(Arc<RunError>, Witnessed)>,
 }
 
-/// Runs a future until it ends or the user wants everything to; `None` then.
+/// Runs a future until it ends or the user stops the run; returns `None` then.
 pub async fn interruptible<F: Future>(stop: &AtomicBool, future: F) -> Option<F::Output> {
     let mut future = pin!(future);
     poll_fn(|context| {
@@ -120,11 +122,11 @@ pub async fn interruptible<F: Future>(stop: &AtomicBool, future: F) -> Option<F:
 }
 
 impl Supervisor {
-    /// The whole life beside the cycle. The cycle ends when this has ended.
-    pub async fn run(mut self) -> (Ended, Result<(), RunError>) {
-        let desks = std::mem::take(&mut self.desks);
+    /// Runs everything outside the cycle. The cycle ends when this future ends.
+    pub async fn run(mut self) -> (ProgramOutcome, Result<(), RunError>) {
+        let workers = std::mem::take(&mut self.workers);
         let heartbeat = self.outer.heartbeat.clone();
-        let mut work = pin!(beside(desks, self.live()));
+        let mut work = pin!(run_with_workers(workers, self.run_inner()));
         poll_fn(|context| {
             heartbeat.beat();
             work.as_mut().poll(context)
@@ -132,23 +134,23 @@ impl Supervisor {
         .await
     }
 
-    async fn live(mut self) -> (Ended, Result<(), RunError>) {
-        let mut ended = Ended::default();
+    async fn run_inner(mut self) -> (ProgramOutcome, Result<(), RunError>) {
+        let mut ended = ProgramOutcome::default();
         let stop = Arc::clone(&self.stop);
-        let worked = interruptible(&stop, self.work(&mut ended)).await;
+        let worked = interruptible(&stop, self.run_to_end(&mut ended)).await;
         ended.interrupted = worked.is_none();
         ended.group_stops = self.group_stops();
         let mut result = worked.unwrap_or(Ok(()));
         if let Err(error) = &result {
-            // The axes come to rest meanwhile.
-            self.order(Order::Stop).await;
+            // The axes stop while the bus is read.
+            self.order(RtCommand::Stop).await;
             self.witness(error).await;
         }
-        let back = self.wind_down(result.is_err()).await;
+        let back = self.shut_down(result.is_err()).await;
         if result.is_ok() {
             result = back;
         }
-        self.order(Order::Halt).await;
+        self.order(RtCommand::Halt).await;
         ended.captures = std::mem::take(&mut self.captures);
         ended.witnessed = self.witnessed.take();
         let left = self.stopped.into_iter().find(|stop| !stop.released);
@@ -156,15 +158,15 @@ impl Supervisor {
         (ended, result)
     }
 
-    async fn work(&mut self, ended: &mut Ended) -> Result<(), RunError> {
+    async fn run_to_end(&mut self, ended: &mut ProgramOutcome) -> Result<(), RunError> {
         self.await_phase().await?;
         let devices = self.bus.addresses();
         let timeout = Duration::from_nanos(self.machine.bus.op_timeout_ns);
         al::change_state(&self.wire, &devices, AlState::Op, timeout)
             .await
             .map_err(RunError::State)?;
-        self.tell(Progress::Step(crate::bringup::Step::State(AlState::Op)));
-        self.order(Order::Guard).await;
+        self.report(Progress::Step(crate::bringup::Step::State(AlState::Op)));
+        self.order(RtCommand::Guard).await;
         if !self.enable {
             return self.hold(clock::now()).await;
         }
@@ -172,7 +174,7 @@ impl Supervisor {
             return self.follow_controller(ended).await;
         }
         if let Some(mut operator) = self.operator.take() {
-            return self.attend(operator.as_mut()).await;
+            return self.run_operator(operator.as_mut()).await;
         }
         if !enables(&self.machine.steps) {
             let all: Vec<usize> = (0..self.axes.len()).collect();
@@ -181,23 +183,23 @@ impl Supervisor {
         self.run_program(ended).await
     }
 
-    /// Frames must be in phase with SYNC0, and the clocks together, before a device may leave
-    /// SafeOp.
+    /// Waits until frames are in phase with SYNC0 and all clocks are synchronized. A device may
+    /// leave SafeOp only then.
     async fn await_phase(&mut self) -> Result<(), RunError> {
         let start = clock::now();
-        // Every clock is to be looked at, which takes long on a big bus with a long cycle.
-        let looks = self.bus.devices.len() * Probe::ALL.len() * 2;
+        // Reading every clock takes long on a large bus with a long cycle.
+        let looks = self.bus.devices.len() * DiagnosticRegister::ALL.len() * 2;
         let looks = u64::try_from(looks).unwrap_or(u64::MAX);
         let patience = LOCK_TIMEOUT.saturating_add(looks.saturating_mul(self.machine.bus.cycle_ns));
         loop {
-            let snapshot = self.tick().await?;
+            let snapshot = self.poll_and_query().await?;
             let looked_at_all =
                 snapshot.counters.cycles > FIRST_CYCLES && self.clocks_read(&snapshot);
             let locked = snapshot.phase.is_none_or(|phase| phase.locked);
             let unsettled = self.unsettled_clock(&snapshot);
             if looked_at_all && snapshot.inputs_fresh && locked && unsettled.is_none() {
                 if snapshot.phase.is_some() {
-                    self.tell(Progress::PhaseLocked);
+                    self.report(Progress::PhaseLocked);
                 }
                 return Ok(());
             }
@@ -221,14 +223,16 @@ impl Supervisor {
         }
     }
 
-    /// The diagnostic slot has come to every clock.
+    /// Returns `true` if every clock difference has been read.
     fn clocks_read(&self, snapshot: &Snapshot) -> bool {
         let mut devices = self.bus.devices.iter().zip(&snapshot.diagnoses);
-        devices.all(|(device, found)| !device.dc || found.has_read(Probe::ClockDifference))
+        devices.all(|(device, found)| {
+            !device.dc || found.has_read(DiagnosticRegister::ClockDifference)
+        })
     }
 
     fn unsettled_clock(&self, snapshot: &Snapshot) -> Option<(DeviceRef, i32)> {
-        // The reference compares itself with nothing.
+        // The reference clock has no difference to itself.
         let reference = self.bus.dc?.reference;
         let devices = self.bus.devices.iter().zip(&snapshot.diagnoses);
         devices
@@ -238,24 +242,24 @@ impl Supervisor {
     }
 
     async fn enable_axes(&mut self, step: Option<&Step>, axes: &[usize]) -> Result<(), RunError> {
-        let snapshot = self.tick().await?;
+        let snapshot = self.poll_and_query().await?;
         let mut orders = Vec::with_capacity(2 * axes.len());
-        self.none_stopped(step, axes)?;
+        self.ensure_not_stopped(step, axes)?;
         for &axis in axes {
             if snapshot.axes.get(axis).is_some_and(|s| s.fault.is_some()) {
-                self.tell_of_old_fault(axis).await;
+                self.report_preexisting_fault(axis).await;
                 let command = Command::ResetFault;
-                orders.push(Order::Axis { axis, command });
+                orders.push(RtCommand::Axis { axis, command });
             }
             let command = Command::Enable;
-            orders.push(Order::Axis { axis, command });
+            orders.push(RtCommand::Axis { axis, command });
         }
         self.orders(&orders).await;
         let start = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns + self.longest_release(axes);
         loop {
-            let snapshot = self.tick().await?;
-            self.none_stopped(step, axes)?;
+            let snapshot = self.poll_and_query().await?;
+            self.ensure_not_stopped(step, axes)?;
             if let Some((axis, reason)) = self.refused.pop_front() {
                 return Err(RunError::EnableRefused {
                     device: self.device_of(axis),
@@ -275,11 +279,11 @@ impl Supervisor {
             }
         }
         self.confirm_modes(axes).await?;
-        self.tell(Progress::Enabled { axes: axes.len() });
+        self.report(Progress::Enabled { axes: axes.len() });
         Ok(())
     }
 
-    /// From the full speed of the slowest axis to rest.
+    /// Returns the longest time in ns that an axis needs to stop from full speed.
     fn longest_stop(&self) -> Nanos {
         let axes = self.machine.devices.iter().filter_map(|d| d.axis.as_ref());
         let times = axes.map(|axis| {
@@ -290,7 +294,7 @@ impl Supervisor {
         (times.fold(0.0, f64::max) * 1e9) as Nanos
     }
 
-    /// Of the brakes of axes: the drive is enabled meanwhile.
+    /// Returns the longest brake release time in ns; the drive is enabled during this time.
     fn longest_release(&self, axes: &[usize]) -> Nanos {
         let devices = axes.iter().filter_map(|&axis| self.axes.get(axis));
         let brakes = devices.filter_map(|&device| {
@@ -301,15 +305,17 @@ impl Supervisor {
         (brakes.fold(0.0, f64::max) * 1e9) as Nanos
     }
 
-    /// Waits for the next look at the cycle, and asks the devices what there is to be asked; fails if the cycle has stopped the machine.
-    async fn tick(&mut self) -> Result<Snapshot, RunError> {
-        let snapshot = self.glance().await?;
-        self.ask_devices(&snapshot).await;
+    /// Waits for the next snapshot and reports stopped groups, for which it reads their devices.
+    /// Fails if the cycle has stopped the machine.
+    async fn poll_and_query(&mut self) -> Result<Snapshot, RunError> {
+        let snapshot = self.poll_snapshot().await?;
+        self.report_stopped_groups(&snapshot).await;
         Ok(snapshot)
     }
 
-    /// Waits for the next look at the cycle, and for no device; fails if the cycle has stopped the machine.
-    async fn glance(&mut self) -> Result<Snapshot, RunError> {
+    /// Waits for the next snapshot without any device access. Fails if the cycle has stopped the
+    /// machine.
+    async fn poll_snapshot(&mut self) -> Result<Snapshot, RunError> {
         clock::delay(TICK).await;
         if self.outer.orders.is_abandoned() {
             return Err(RunError::Thread("the cycle has ended by itself".to_owned()));
@@ -319,7 +325,7 @@ impl Supervisor {
         self.report_limits(&snapshot);
         if clock::now().saturating_sub(self.last_status) >= STATUS_PERIOD {
             self.last_status = clock::now();
-            self.tell(Progress::Status(Status::new(
+            self.report(Progress::Status(Status::new(
                 &self.machine,
                 &self.axes,
                 &snapshot,
@@ -333,30 +339,25 @@ impl Supervisor {
         Ok(snapshot)
     }
 
-    /// Statusword bit 11, once for each axis.
+    /// Reports Statusword bit 11 (internal limit active) once for each axis.
     fn report_limits(&mut self, snapshot: &Snapshot) {
         self.limited.resize(snapshot.axes.len(), false);
         for (axis, status) in snapshot.axes.iter().enumerate() {
             if status.internal_limit && status.enabled && !self.limited[axis] {
                 self.limited[axis] = true;
                 let device = self.device_of(axis);
-                self.tell(Progress::Warning(format!(
+                self.report(Progress::Warning(format!(
                     "{device}: the drive limits what it is commanded (Statusword bit 11, internal limit active)"
                 )));
             }
         }
     }
 
-    /// What has stopped groups. Takes as long as the devices take to answer.
-    async fn ask_devices(&mut self, snapshot: &Snapshot) {
-        self.tell_of_groups(snapshot).await;
-    }
-
     fn pass_events_on(&mut self) {
         while let Ok(event) = self.outer.events.pop() {
             tracing::debug!(?event);
             match event {
-                Event::PhaseLost { cycle } => self.tell(Progress::Warning(format!(
+                Event::PhaseLost { cycle } => self.report(Progress::Warning(format!(
                     "cycle {cycle}: the release of frames has lost its phase to SYNC0"
                 ))),
                 Event::ClockOff {
@@ -366,13 +367,13 @@ impl Supervisor {
                 } => {
                     let devices = &self.machine.devices;
                     let name = devices.get(device).map_or("?", |d| d.name.as_str());
-                    self.tell(Progress::Warning(clock_off(name, difference_ns)));
+                    self.report(Progress::Warning(clock_off(name, difference_ns)));
                 }
                 Event::Refused { axis, reason, .. } => {
                     self.refused.truncate(REFUSALS - 1);
                     self.refused.push_back((axis, reason));
                 }
-                // The snapshot tells of stops, and cannot be lost.
+                // Stops are taken from the snapshot, where they cannot be lost.
                 Event::Stopping { .. }
                 | Event::GroupStopping { .. }
                 | Event::GroupReleased { .. }
@@ -381,14 +382,15 @@ impl Supervisor {
         }
     }
 
-    /// Axes to rest, power off, and the segment back to Init, as far as it still answers. `failed`: the run has an error already.
-    async fn wind_down(&mut self, failed: bool) -> Result<(), RunError> {
-        self.tell(Progress::Stopping);
-        self.order(Order::Stop).await;
-        let result = self.await_rest(failed).await;
+    /// Stops the axes, removes power and sets the segment back to Init, as far as it answers.
+    /// `failed`: the run already has an error.
+    async fn shut_down(&mut self, failed: bool) -> Result<(), RunError> {
+        self.report(Progress::Stopping);
+        self.order(RtCommand::Stop).await;
+        let result = self.wait_for_standstill(failed).await;
         let stations = self.stations();
         if let Some(witnessed) = &mut self.witnessed {
-            look::again(&self.wire, &stations, &mut witnessed.looks).await;
+            snapshot::retry_absent(&self.wire, &stations, &mut witnessed.looks).await;
         } else if let Err(error) = &result {
             self.witness(error).await;
         }
@@ -406,10 +408,10 @@ impl Supervisor {
                 self.end_sync().await;
             }
             match al::lower_state(&self.wire, &others, state, al::BACK_TIMEOUT).await {
-                Ok(()) => self.tell(Progress::Step(crate::bringup::Step::State(state))),
+                Ok(()) => self.report(Progress::Step(crate::bringup::Step::State(state))),
                 Err(error) => {
                     let silent = matches!(error, StateError::Wire { .. });
-                    self.tell(Progress::Warning(error.to_string()));
+                    self.report(Progress::Warning(error.to_string()));
                     if lowered.is_ok() {
                         lowered = Err(RunError::State(error));
                     }
@@ -418,7 +420,7 @@ impl Supervisor {
                     }
                 }
             }
-            // The machine has gone on without them; they go along as far as they still can.
+            // Stopped groups follow as far as they can; their errors do not count.
             if let Err(error) = al::lower_state(&self.wire, &stopped, state, al::BACK_TIMEOUT).await
             {
                 tracing::debug!("{error}");
@@ -427,15 +429,15 @@ impl Supervisor {
         result.and(lowered)
     }
 
-    /// In PreOp nobody wants SYNC0 any more, and in Init it would look as if a machine ran.
+    /// Stops SYNC0. PreOp does not need it, and in Init it would look like a running machine.
     async fn end_sync(&self) {
         let devices = self.machine.devices.iter().zip(&self.bus.devices);
         let pulsed = devices.filter(|(config, _)| config.selection.dc.is_some());
         clocks::stop(&self.wire, pulsed.map(|(_, device)| device.at.station)).await;
     }
 
-    /// Until nothing more can be done to stop any axis. Each axis sees to it in bounded time.
-    async fn await_rest(&mut self, failed: bool) -> Result<(), RunError> {
+    /// Waits until nothing more can stop any axis. Each axis ends its stop in bounded time.
+    async fn wait_for_standstill(&mut self, failed: bool) -> Result<(), RunError> {
         loop {
             clock::delay(TICK).await;
             let snapshot = self.outer.snapshots.read();
@@ -444,21 +446,21 @@ impl Supervisor {
                 break;
             }
         }
-        // What the cycle finds up to here is a failure of this run.
-        self.order(Order::Unguard).await;
+        // Until this point, anything the cycle finds is a failure of this run.
+        self.order(RtCommand::Unguard).await;
         while self.outer.snapshots.read().orders_taken < self.orders_given
             && !self.outer.orders.is_abandoned()
         {
             clock::delay(TICK).await;
         }
         let snapshot = self.outer.snapshots.read().clone();
-        // The machine may have stopped by itself when it was asked to.
+        // The machine may have failed at the same time as the requested stop.
         let unsaid = snapshot.stopping.filter(|_| !failed);
         let mut causes = snapshot.failure.into_iter().chain(unsaid);
         if let Some(failure) = causes.find(StopCause::is_failure) {
             return Err(self.explain_stop(failure, None, &snapshot).await);
         }
-        // What has not answered for long has been reported if its group was stopped.
+        // Axes of a stopped group may not answer; their group's stop has been reported.
         let mut axes = snapshot.axes.iter().enumerate();
         let powered = axes.find(|(axis, status)| {
             status.state.has_power() && !self.is_stopped(self.group_of(*axis))
@@ -472,12 +474,12 @@ impl Supervisor {
         }
     }
 
-    async fn order(&mut self, order: Order) {
+    async fn order(&mut self, order: RtCommand) {
         self.orders(&[order]).await;
     }
 
-    /// Hands orders over, all at once as far as a batch holds them: the cycle takes them in one turn.
-    async fn orders(&mut self, orders: &[Order]) {
+    /// Sends commands to the cycle. The cycle takes a batch in one cycle.
+    async fn orders(&mut self, orders: &[RtCommand]) {
         for batch in orders.chunks(ORDERS_A_CYCLE) {
             while !self.outer.orders.is_abandoned() {
                 if let Ok(room) = self.outer.orders.write_chunk_uninit(batch.len()) {
@@ -490,8 +492,8 @@ impl Supervisor {
         }
     }
 
-    fn tell(&self, progress: Progress) {
-        // Nobody listening is no reason to stop a machine.
+    fn report(&self, progress: Progress) {
+        // A closed channel does not stop the machine.
         let _ = self.progress.send(progress);
     }
 

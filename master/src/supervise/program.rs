@@ -2,52 +2,52 @@
 //!
 //! | file | |
 //! |---|---|
-//! | here | the order of steps, and what each of them is |
-//! | `moves` | axes to targets of their own, in all modes |
-//! | `probe` | a move that an edge ends |
-//! | `waits` | until something holds |
+//! | here | the order of steps and their execution |
+//! | `moves` | axes to their own targets, in all modes |
+//! | `probe` | a move that ends at an edge |
+//! | `waits` | waiting for a condition |
 
 use std::fmt::Display;
 use std::future::Future;
 use std::pin::Pin;
 
-use ecaxis_axis::setpoint::{Engage, GearConfig};
+use ecaxis_axis::setpoint::{GearConfig, GearInMode};
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command};
 
 use super::groups::needed;
-use super::{Ended, Supervisor};
+use super::{ProgramOutcome, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, AxisSetup, Step};
-use crate::rt::handover::{Order, Snapshot};
+use crate::rt::channel::{RtCommand, Snapshot};
 use crate::session::{Progress, RunError, StepRef};
 
 mod moves;
 mod probe;
 mod waits;
 
-use probe::Search;
+use probe::ProbeMove;
 
-/// How long an axis may take to follow once its set-point has arrived.
+/// The timeout in ns for an axis to follow after its set-point has arrived.
 const SETTLE_TIMEOUT: Nanos = 5_000_000_000;
-/// An axis that has moved no faster than standstill for so long stands.
+/// The time in ns at standstill velocity after which an axis is at rest.
 const STANDS: Nanos = 20_000_000;
 
-/// What a step's target is a target of.
+/// The quantity that a step's target sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Aim {
+pub(super) enum TargetKind {
     Position,
     Velocity,
     Torque,
 }
 
-/// How long axes whose set-points have arrived have been following.
+/// The time since the set-points arrived.
 #[derive(Debug, Default)]
 pub(super) struct Settling(Option<Nanos>);
 
 impl Settling {
-    /// Counts from the first call.
-    pub(super) fn over(&mut self) -> bool {
+    /// Returns `true` after the settle timeout; the first call starts the time.
+    pub(super) fn time_limit_reached(&mut self) -> bool {
         let since = *self.0.get_or_insert_with(clock::now);
         clock::now().saturating_sub(since) > SETTLE_TIMEOUT
     }
@@ -63,11 +63,11 @@ impl From<&Step> for StepRef {
 }
 
 impl Supervisor {
-    pub(super) async fn run_program(&mut self, ended: &mut Ended) -> Result<(), RunError> {
+    pub(super) async fn run_program(&mut self, ended: &mut ProgramOutcome) -> Result<(), RunError> {
         let start = clock::now();
         let steps = self.machine.steps.clone();
         if steps.is_empty() {
-            // Without a program the axes hold their position until somebody ends it.
+            // Without a program the axes hold their position until the run is stopped.
             return self.hold(start).await;
         }
         loop {
@@ -80,20 +80,23 @@ impl Supervisor {
             if self.limit.is_none() && ended.runs >= self.repeat {
                 return Ok(());
             }
-            // A program that takes no time must not keep the cycle from its turn.
+            // A program that takes no time must not block the cycle in virtual time.
             if clock::now() == begun {
-                self.tick().await?;
+                self.poll_and_query().await?;
             }
         }
     }
 
-    /// Enables every axis and leaves them to the controller until it has finished.
-    pub(super) async fn follow_controller(&mut self, ended: &mut Ended) -> Result<(), RunError> {
+    /// Enables every axis and hands control to the controller until it has finished.
+    pub(super) async fn follow_controller(
+        &mut self,
+        ended: &mut ProgramOutcome,
+    ) -> Result<(), RunError> {
         let start = clock::now();
         let all: Vec<usize> = (0..self.axes.len()).collect();
         self.enable_axes(None, &all).await?;
         while !self.over(start) {
-            if self.tick().await?.finished {
+            if self.poll_and_query().await?.finished {
                 ended.runs += 1;
                 break;
             }
@@ -106,15 +109,15 @@ impl Supervisor {
             .is_some_and(|limit| clock::now().saturating_sub(start) >= limit)
     }
 
-    /// Until the time limit ends it; the user can at any time.
+    /// Waits until the time limit. The user can stop the run earlier.
     pub(super) async fn hold(&mut self, start: Nanos) -> Result<(), RunError> {
         while !self.over(start) {
-            self.tick().await?;
+            self.poll_and_query().await?;
         }
         Ok(())
     }
 
-    /// Boxed, because steps may hold steps.
+    /// Runs steps; boxed because steps may contain steps.
     fn run_steps<'s>(
         &'s mut self,
         steps: &'s [Step],
@@ -134,12 +137,12 @@ impl Supervisor {
                             return Ok(());
                         }
                         if clock::now() == begun {
-                            self.tick().await?;
+                            self.poll_and_query().await?;
                         }
                     }
                     continue;
                 }
-                self.tell(Progress::Program {
+                self.report(Progress::Program {
                     run,
                     step: step.into(),
                     what: self.machine.describe(&step.action),
@@ -151,7 +154,7 @@ impl Supervisor {
     }
 
     async fn run_step(&mut self, step: &Step, run: u32, start: Nanos) -> Result<(), RunError> {
-        self.none_stopped(Some(step), &self.places(&needed(&step.action)))?;
+        self.ensure_not_stopped(Some(step), &self.places(&needed(&step.action)))?;
         match &step.action {
             Action::Enable { axes } => {
                 let axes = self.places(axes);
@@ -161,7 +164,7 @@ impl Supervisor {
                 let axes = self.places(axes);
                 self.command(axes.iter().map(|&axis| (axis, Command::Disable)))
                     .await;
-                // Of an axis whose process data is lost nothing is known.
+                // The state of an axis without process data is unknown.
                 let groups: Vec<_> = (0..self.axes.len()).map(|a| self.group_of(a)).collect();
                 let lost = |s: &Snapshot, axis: usize| {
                     let group = s.groups.get(groups[axis]);
@@ -175,7 +178,8 @@ impl Supervisor {
                 self.command(axes.iter().map(|&axis| (axis, Command::ResetFault)))
                     .await;
                 let of: Vec<_> = (0..self.axes.len()).map(|a| self.group_of(a)).collect();
-                // A stopped group comes to rest first, and then back, unless more keeps it than these axes.
+                // A stopped group first comes to rest, then returns, unless faults of its other
+                // axes prevent this.
                 let coming = |s: &Snapshot, group: usize| {
                     let sound = |axis: &AxisStatus| axis.fault.is_none() && axis.trip.is_none();
                     let mut own = s.axes.iter().zip(&of).filter(|(_, of)| **of == group);
@@ -220,7 +224,7 @@ impl Supervisor {
                 speed,
                 ramp,
             } => {
-                let search = Search {
+                let search = ProbeMove {
                     device: *axis,
                     probe: *probe,
                     edge: *edge,
@@ -260,7 +264,7 @@ impl Supervisor {
             } => {
                 let config = GearConfig {
                     ratio: *ratio,
-                    engage: offset.map_or(Engage::Here, |offset| Engage::At { offset }),
+                    engage: offset.map_or(GearInMode::Here, |offset| GearInMode::At { offset }),
                     smoothing_s: *smoothing_ns as f64 * 1e-9,
                     limits: self.limits(*axis).motion(),
                     range: self.limits(*axis).position,
@@ -270,7 +274,7 @@ impl Supervisor {
             }
             Action::Velocity { targets, ramp } => {
                 let targets = self.targets(targets);
-                self.reach(step, start, Aim::Velocity, &targets, |velocity| {
+                self.move_and_wait(step, start, TargetKind::Velocity, &targets, |velocity| {
                     Command::Velocity {
                         velocity,
                         ramp: *ramp,
@@ -280,7 +284,7 @@ impl Supervisor {
             }
             Action::Torque { targets, ramp_ns } => {
                 let targets = self.targets(targets);
-                self.reach(step, start, Aim::Torque, &targets, |percent| {
+                self.move_and_wait(step, start, TargetKind::Torque, &targets, |percent| {
                     Command::Torque {
                         percent,
                         ramp_s: *ramp_ns as f64 * 1e-9,
@@ -292,7 +296,7 @@ impl Supervisor {
             Action::Dwell { ns } => {
                 let until = clock::now().saturating_add(*ns);
                 while clock::now() < until && !self.over(start) {
-                    self.tick().await?;
+                    self.poll_and_query().await?;
                 }
                 Ok(())
             }
@@ -303,16 +307,16 @@ impl Supervisor {
             Action::Set { values } => {
                 let orders = values
                     .iter()
-                    .map(|&(output, value)| Order::Output { output, value });
+                    .map(|&(output, value)| RtCommand::Output { output, value });
                 self.orders(&orders.collect::<Vec<_>>()).await;
                 self.taken(start).await
             }
-            // `run_steps` unfolds them.
+            // `run_steps` expands repetitions.
             Action::Repeat { .. } => Ok(()),
         }
     }
 
-    /// Places in the cycle of axes given as devices.
+    /// Returns the axis indices of devices.
     pub(super) fn places(&self, devices: &[usize]) -> Vec<usize> {
         let places = devices
             .iter()
@@ -332,8 +336,8 @@ impl Supervisor {
         device.axis.as_ref()
     }
 
-    /// The position for a target; on a modulo axis the one that its way leads to.
-    pub(super) fn place_to_go(&self, axis: usize, from: f64, target: f64) -> f64 {
+    /// Returns the position for a target; on a modulo axis the one that its direction leads to.
+    pub(super) fn resolve_target(&self, axis: usize, from: f64, target: f64) -> f64 {
         let Some(setup) = self.setup(axis) else {
             return target;
         };
@@ -342,21 +346,21 @@ impl Supervisor {
         scale.destination(UserUnits(from), to, setup.way).0
     }
 
-    /// All of them in the same cycle.
+    /// Sends all commands in the same cycle.
     pub(super) async fn command(&mut self, commands: impl Iterator<Item = (usize, Command)>) {
-        let orders = commands.map(|(axis, command)| Order::Axis { axis, command });
+        let orders = commands.map(|(axis, command)| RtCommand::Axis { axis, command });
         self.orders(&orders.collect::<Vec<_>>()).await;
     }
 
-    /// Until the cycle has taken every order.
+    /// Waits until the cycle has taken every command.
     async fn taken(&mut self, start: Nanos) -> Result<(), RunError> {
-        while self.tick().await?.orders_taken < self.orders_given && !self.over(start) {}
+        while self.poll_and_query().await?.orders_taken < self.orders_given && !self.over(start) {}
         Ok(())
     }
 
-    /// Looks at every cycle from the one on that has taken all orders, until `look` says that the step is done or the program's
-    /// time limit is over.
-    pub(super) async fn watch(
+    /// Calls `look` with every snapshot after the cycle has taken all commands. Returns when `look`
+    /// is done or the program's time limit is over.
+    pub(super) async fn wait_until(
         &mut self,
         step: &Step,
         start: Nanos,
@@ -364,13 +368,13 @@ impl Supervisor {
     ) -> Result<(), RunError> {
         let needed = self.places(&needed(&step.action));
         loop {
-            let snapshot = self.tick().await?;
-            self.none_stopped(Some(step), &needed)?;
+            let snapshot = self.poll_and_query().await?;
+            self.ensure_not_stopped(Some(step), &needed)?;
             if self.over(start) {
-                // Winding down brings the axes to rest from wherever they are.
+                // The shutdown stops the axes from any state.
                 return Ok(());
             }
-            // Until then the status is that of the step before.
+            // Until then the status belongs to the previous step.
             if snapshot.orders_taken < self.orders_given {
                 continue;
             }

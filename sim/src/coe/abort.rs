@@ -13,18 +13,18 @@ impl Abort {
     pub const UNSUPPORTED_ACCESS: Self = Self(0x0601_0000);
     pub const WRITE_ONLY: Self = Self(0x0601_0001);
     pub const READ_ONLY: Self = Self(0x0601_0002);
-    /// Subindex 0 must be 0 while entries change.
+    /// Entries may change only while subindex 0 is 0.
     pub const COUNT_NOT_ZERO: Self = Self(0x0601_0003);
-    /// No complete access to objects of variable length.
+    /// Objects of variable length do not support complete access.
     pub const VARIABLE_LENGTH: Self = Self(0x0601_0004);
     pub const EXCEEDS_MAILBOX: Self = Self(0x0601_0005);
-    /// Process data write it.
+    /// Process data write the object.
     pub const MAPPED: Self = Self(0x0601_0006);
     pub const NO_OBJECT: Self = Self(0x0602_0000);
     pub const NOT_MAPPABLE: Self = Self(0x0604_0041);
     pub const MAPPING_TOO_LONG: Self = Self(0x0604_0042);
     pub const INCOMPATIBLE: Self = Self(0x0604_0043);
-    /// Not the length that the transfer announced.
+    /// The data length differs from the announced length.
     pub const LENGTH: Self = Self(0x0607_0010);
     pub const TOO_LONG: Self = Self(0x0607_0012);
     pub const TOO_SHORT: Self = Self(0x0607_0013);

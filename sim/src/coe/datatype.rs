@@ -1,23 +1,23 @@
-//! Data types: what SDO Information calls them, and what may be written to them.
+//! Data types: their codes in SDO Information and their permitted values.
 
 use super::Abort;
 
-/// Record of unknown layout.
+/// The code of a record of unknown layout.
 pub(crate) const RECORD: u16 = 0x002a;
 
-/// What a value's bits mean.
+/// The interpretation of the bits of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     Unsigned,
     Signed,
     Real,
     LongReal,
-    /// Variable length: ends at the first zero byte; a shorter download is padded.
+    /// Text of variable length. It ends at the first zero byte; a shorter download is padded.
     Text,
     Octets,
 }
 
-/// Index of a base type in the object dictionary (ETG.1020, table "Base Data Types"); 0 where the name says nothing.
+/// Returns the index of a base type (ETG.1020, table "Base Data Types"), or 0 for an unknown name.
 pub(crate) fn code(name: &str) -> u16 {
     let name = name.trim();
     match name {
@@ -60,7 +60,7 @@ pub(crate) fn code(name: &str) -> u16 {
     }
 }
 
-/// `ARRAY [0..n] OF …` without subindices is a string of its element.
+/// Returns the code of `ARRAY [0..n] OF …` without subindices: the string type of its element.
 fn array(name: &str) -> u16 {
     match name.rsplit(' ').next() {
         Some("BYTE" | "USINT") => 0x000a,
@@ -73,7 +73,7 @@ fn array(name: &str) -> u16 {
     }
 }
 
-/// For objects that no file describes.
+/// Returns the unsigned type of this length, for objects that no file describes.
 pub(crate) fn unsigned(bit_len: u32) -> u16 {
     match bit_len {
         1 => 0x0001,
@@ -102,8 +102,8 @@ pub(crate) fn kind(code: u16, bit_len: u32) -> Kind {
     }
 }
 
-/// Whether a value of the right length lies in its range (ETG.1000.6 table 41, 0x06090030 to 0x06090032). A range whose
-/// ends are the wrong way round, or the same, says nothing: files fill both with zeros.
+/// Checks that a value of the right length lies in its range (ETG.1000.6 table 41, 0x06090030 to
+/// 0x06090032). A range with `max` not above `min` is ignored: files fill both with zeros.
 pub(crate) fn check(
     kind: Kind,
     bit_len: u32,

@@ -1,9 +1,10 @@
-//! The diagnosis history, 0x10F3 (ETG.1020): what a device has to say stays in it until it is read.
+//! The diagnosis history, 0x10F3 (ETG.1020). It keeps the messages of a device until a client reads
+//! them.
 
 use ecaxis_esi::model::{Access, ObjectCode, Writable};
 
 use super::Abort;
-use super::store::ObjectStore;
+use super::object_dictionary::ObjectStore;
 
 const HISTORY: u16 = 0x10f3;
 const MOST: u8 = 1;
@@ -12,19 +13,19 @@ const ACKNOWLEDGED: u8 = 3;
 const AVAILABLE: u8 = 4;
 const FLAGS: u8 = 5;
 const FIRST: u8 = 6;
-/// Messages that are kept; then the oldest is overwritten.
+/// The capacity of the history. Further messages overwrite the oldest one.
 const MESSAGES: u8 = 8;
 const LAST: u8 = FIRST + MESSAGES - 1;
-/// Code, flags, text, time.
+/// Bits of a message: code, flags, text, time.
 const MESSAGE_BITS: u32 = 128;
-/// Flags (0x10F3:05): messages were overwritten that nobody had acknowledged.
+/// Flag (0x10F3:05): unacknowledged messages were overwritten.
 const OVERWRITTEN: i64 = 1 << 5;
-/// Low word of a diagnosis code whose high word is an emergency's error code.
+/// Low word of a diagnosis code whose high word is the error code of an emergency.
 const ERROR_CODE: u32 = 0xe800;
-/// Message flags: an error, without parameters.
+/// Message flags: error, no parameters.
 const ERROR: u16 = 2;
 
-/// Gives the device a history; what of it the ESI describes stays as described.
+/// Adds the history to the device. Items that the ESI describes are kept.
 pub(crate) fn create(store: &mut ObjectStore) {
     let ro = Access::default();
     let rw = Access {
@@ -53,7 +54,8 @@ pub(crate) fn create(store: &mut ObjectStore) {
     }
 }
 
-/// Adds an emergency's error code at the device's time in nanoseconds. Nothing without a history.
+/// Adds the error code of an emergency at the device time in ns. Without a history, nothing
+/// changes.
 pub(crate) fn add(store: &mut ObjectStore, error: u16, time: u64) {
     if !store.has_object(HISTORY) {
         return;
@@ -82,12 +84,12 @@ pub(crate) fn add(store: &mut ObjectStore, error: u16, time: u64) {
     set(store, AVAILABLE, 1);
 }
 
-/// Whether this is what a client acknowledges with.
+/// True for the object that acknowledges messages.
 pub(crate) fn is_acknowledgement(index: u16, sub: u8) -> bool {
     (index, sub) == (HISTORY, ACKNOWLEDGED)
 }
 
-/// A client has read up to this subindex; 0 clears the history.
+/// Acknowledges the messages up to this subindex; 0 clears the history.
 pub(crate) fn acknowledge(store: &mut ObjectStore, up_to: u8) -> Result<(), Abort> {
     match up_to {
         0 => {
@@ -129,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_come_one_after_the_other_and_the_oldest_goes() {
+    fn history_overwrites_the_oldest_message() {
         let mut store = ObjectStore::default();
         add(&mut store, 0x3220, 5);
         assert!(!store.has_object(HISTORY), "a device without a history");
@@ -140,8 +142,8 @@ mod tests {
             assert_eq!(get(&store, NEWEST), FIRST + n);
         }
         assert_eq!(get(&store, FLAGS), 0);
-        let told = [0x00, 0xe8, 0x20, 0x32, 2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0];
-        assert_eq!(message(&store, FIRST + 1), told);
+        let reported = [0x00, 0xe8, 0x20, 0x32, 2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0];
+        assert_eq!(message(&store, FIRST + 1), reported);
         add(&mut store, 0x8611, 99);
         assert_eq!(get(&store, NEWEST), FIRST);
         assert_eq!(message(&store, FIRST)[2..4], [0x11, 0x86]);
@@ -149,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_acknowledged_is_no_longer_new() {
+    fn history_reports_only_unacknowledged_messages_as_new() {
         let mut store = ObjectStore::default();
         create(&mut store);
         for refused in [1, FIRST, LAST + 1] {

@@ -1,16 +1,16 @@
-//! SDO Information (ETG.1000.6 §5.6.3): which objects there are, what they are called and made of. Whatever is longer than
-//! a mailbox goes out in fragments that count down to 0.
+//! SDO Information (ETG.1000.6 §5.6.3): the objects, their names and their types. Responses longer
+//! than a mailbox are sent in fragments that count down to 0.
 
 use ecaxis_esi::model::{Access, Direction, ObjectCode, Writable};
 
+use super::object_dictionary::Item;
 use super::objects::Dictionary;
-use super::store::Item;
 use super::{Abort, datatype, service};
-use crate::device::mailbox::{Answer, Detail, Room};
+use crate::device::mailbox::{Answer, Detail, MailboxCapacity};
 
 /// CoE header and SDO Information header.
 const HEADERS: usize = 6;
-/// In the first byte, beside the opcode: more fragments follow.
+/// Flag in the first byte, next to the opcode: more fragments follow.
 const INCOMPLETE: u8 = 0x80;
 
 mod opcode {
@@ -20,18 +20,22 @@ mod opcode {
     pub(super) const ERROR: u8 = 7;
 }
 
-/// Value info of an entry description: what was asked for and what is told.
+/// Value info of an entry description: the requested and the returned fields.
 mod value_info {
     pub(super) const UNIT: u8 = 0x08;
     pub(super) const DEFAULT: u8 = 0x10;
     pub(super) const MIN: u8 = 0x20;
     pub(super) const MAX: u8 = 0x40;
-    /// Access rights, category and mapping are always told.
+    /// Access rights, category and mapping are always returned.
     pub(super) const ALWAYS: u8 = 0x07;
 }
 
-/// Answers what follows the CoE header.
-pub(super) fn request(dictionary: &Dictionary<'_>, message: &[u8], room: Room) -> Answer {
+/// Answers a request. `request` starts behind the CoE header.
+pub(super) fn request(
+    dictionary: &Dictionary<'_>,
+    message: &[u8],
+    room: MailboxCapacity,
+) -> Answer {
     let Some((&[opcode, _, _, _], body)) = message.split_first_chunk() else {
         return Answer::Error(Detail::TooShort);
     };
@@ -55,14 +59,14 @@ pub(super) fn request(dictionary: &Dictionary<'_>, message: &[u8], room: Room) -
         Ok(data) => (opcode + 1, data),
         Err(abort) => (opcode::ERROR, abort.0.to_le_bytes().to_vec()),
     };
-    // Indices are not torn apart.
+    // A fragment ends between two indices.
     match fragments(opcode, &data, room.send.saturating_sub(HEADERS) & !1) {
         Some(fragments) => Answer::Parts(fragments),
         None => Answer::Error(Detail::NoMoreMemory),
     }
 }
 
-/// `None` where the mailbox cannot hold a fragment, or there would be too many to count.
+/// Returns `None` if the mailbox is too small for a fragment or there are too many fragments.
 fn fragments(opcode: u8, data: &[u8], room: usize) -> Option<Vec<Vec<u8>>> {
     if room == 0 {
         return None;
@@ -82,7 +86,7 @@ fn fragments(opcode: u8, data: &[u8], room: usize) -> Option<Vec<Vec<u8>>> {
     Some(out)
 }
 
-/// List type 0 asks for the lengths of the lists 1 to 5.
+/// Returns a list of indices. List type 0 returns the lengths of lists 1 to 5.
 fn list(dictionary: &Dictionary<'_>, kind: u16) -> Result<Vec<u8>, Abort> {
     let mut out = kind.to_le_bytes().to_vec();
     match kind {
@@ -99,7 +103,8 @@ fn list(dictionary: &Dictionary<'_>, kind: u16) -> Result<Vec<u8>, Abort> {
     Ok(out)
 }
 
-/// 1 all, 2 mappable into RxPDOs, 3 into TxPDOs, 4 kept by a store command, 5 settings for start-up.
+/// Returns the objects of a list: 1 all, 2 mappable into RxPDOs, 3 mappable into TxPDOs, 4 stored
+/// by a store command, 5 start-up settings.
 fn indices<'a>(dictionary: &'a Dictionary<'_>, kind: u16) -> impl Iterator<Item = u16> + 'a {
     let (store, pdo) = (&*dictionary.store, &*dictionary.pdo);
     let belongs = move |item: &Item| match kind {
@@ -138,7 +143,7 @@ fn object(dictionary: &Dictionary<'_>, index: u16) -> Result<Vec<u8>, Abort> {
     Ok(out)
 }
 
-/// Records that the standard knows have a type of their own.
+/// Returns the type code that the standard assigns to a known record.
 fn record_type(index: u16) -> u16 {
     match index {
         0x1018 => 0x0023,
@@ -166,8 +171,8 @@ fn entry(dictionary: &Dictionary<'_>, index: u16, sub: u8, asked: u8) -> Result<
         (value_info::MIN, item.min.as_deref()),
         (value_info::MAX, item.max.as_deref()),
     ];
-    let told = optional.map(|(bit, value)| (bit, value.filter(|_| asked & bit != 0)));
-    let info = told
+    let reported = optional.map(|(bit, value)| (bit, value.filter(|_| asked & bit != 0)));
+    let info = reported
         .iter()
         .filter(|(_, value)| value.is_some())
         .fold(asked & value_info::ALWAYS, |info, (bit, _)| info | bit);
@@ -177,14 +182,15 @@ fn entry(dictionary: &Dictionary<'_>, index: u16, sub: u8, asked: u8) -> Result<
     out.extend_from_slice(&item.data_type.to_le_bytes());
     out.extend_from_slice(&bits.to_le_bytes());
     out.extend_from_slice(&object_access(dictionary, item).to_le_bytes());
-    for value in told.iter().filter_map(|(_, value)| *value) {
+    for value in reported.iter().filter_map(|(_, value)| *value) {
         out.extend_from_slice(value);
     }
     out.extend_from_slice(item.name.as_bytes());
     Ok(out)
 }
 
-/// Bits 0 to 2: readable in PreOp, SafeOp, Op; 3 to 5 writable; 6 and 7 mappable into RxPDOs and TxPDOs; 8 backup; 9 setting.
+/// Returns the access bits of an object. Bits 0 to 2: readable in PreOp, SafeOp, Op. Bits 3 to 5:
+/// writable there. Bits 6 and 7: mappable into RxPDOs and TxPDOs. Bit 8: backup. Bit 9: setting.
 fn object_access(dictionary: &Dictionary<'_>, item: &Item) -> u16 {
     let Access { read, write } = item.access;
     let (pre_op, safe_op, op) = match write {

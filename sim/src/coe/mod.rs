@@ -1,30 +1,31 @@
-//! CANopen over EtherCAT: the object dictionary and the servers that answer for it.
+//! CANopen over EtherCAT: the object dictionary and its servers.
 //!
-//! * `store`: every object as a slot in one arena
-//! * `place`: where a value is in it
-//! * `datatype`: what values mean, their codes and ranges
+//! * `object_dictionary`: every object as an entry in one byte arena
+//! * `word`: the location of a value in the arena
+//! * `datatype`: data types, their codes and ranges
 //! * `objects`: reading and writing with access rights and complete access
 //! * `pdo`: PDO assignment and mapping, modules
 //! * `sdo`: the SDO server: expedited, normal and segmented transfers
-//! * `info`: SDO Information: what objects there are
+//! * `info`: SDO Information: the list of objects
 //! * `history`: the diagnosis history
 //!
-//! Messages in, answers out; mailboxes, their counters and queues are the device's.
+//! This module maps CoE messages to answers. [`crate::device`] handles mailboxes, counters and
+//! queues.
 
 mod abort;
 mod datatype;
 pub(crate) mod history;
 mod info;
+pub mod object_dictionary;
 mod objects;
 pub mod pdo;
-mod place;
 mod sdo;
-pub mod store;
+mod word;
 
 pub use abort::Abort;
 pub(crate) use objects::{Dictionary, ParameterCommand, read_item};
 
-use crate::device::mailbox::{Answer, Detail, Room};
+use crate::device::mailbox::{Answer, Detail, MailboxCapacity};
 use sdo::SdoServer;
 
 /// CoE services (the header's upper four bits).
@@ -36,12 +37,12 @@ mod service {
     pub(super) const SDO_INFORMATION: u8 = 8;
 }
 
-/// What a client may use.
+/// The CoE services that a client may use.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct CoeServices {
     pub(crate) sdo_info: bool,
     pub(crate) segmented: bool,
-    /// Bytes that a segmented transfer may take.
+    /// Maximum bytes of a segmented transfer.
     pub(crate) buffer: usize,
 }
 
@@ -57,7 +58,7 @@ impl CoeServer {
         dictionary: &mut Dictionary<'_>,
         services: CoeServices,
         message: &[u8],
-        room: Room,
+        room: MailboxCapacity,
     ) -> Answer {
         let Some((&[low, high], body)) = message.split_first_chunk() else {
             return Answer::Error(Detail::TooShort);
@@ -72,12 +73,12 @@ impl CoeServer {
         }
     }
 
-    /// A segmented transfer waits for the client.
+    /// True while a segmented transfer waits for the client.
     pub(crate) fn is_waiting(&self) -> bool {
         self.sdo.is_waiting()
     }
 
-    /// The client took too long; the message that tells it.
+    /// Ends a transfer whose client timed out, and returns the abort message.
     pub(crate) fn expire(&mut self) -> Option<Vec<u8>> {
         self.sdo.expire()
     }
@@ -91,7 +92,7 @@ pub(crate) fn emergency(code: u16, register: u8, data: [u8; 5]) -> Vec<u8> {
     message
 }
 
-/// CoE header: number 0 and the service.
+/// Returns the CoE header: number 0 and the service.
 fn header(service: u8) -> [u8; 2] {
     (u16::from(service) << 12).to_le_bytes()
 }

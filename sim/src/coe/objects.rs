@@ -1,50 +1,50 @@
-//! Objects as a CoE client may read and write them.
+//! Read and write access of CoE clients to objects.
 
 use ecaxis_esi::model::{ObjectCode, Writable};
 
+use super::object_dictionary::{EntryHandle, Item, ObjectStore};
 use super::pdo::PdoRules;
-use super::store::{Item, ObjectStore, Slot};
 use super::{Abort, datatype, history};
 use crate::coe::datatype::Kind;
 use crate::esc::al::AlState;
-use crate::firmware::Processor;
+use crate::firmware::BootLoader;
 
 const STORE_PARAMETERS: u16 = 0x1010;
 const RESTORE_PARAMETERS: u16 = 0x1011;
 
-/// Their objects are enumerations, of variable length.
+/// The index range of enumeration objects, which have a variable length.
 const ENUMERATIONS: std::ops::Range<u16> = 0x0800..0x1000;
 
-/// What a client asked for by writing the right word to 0x1010 or 0x1011 (CiA 301).
+/// The command of a client that wrote the right word to 0x1010 or 0x1011 (CiA 301).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ParameterCommand {
     Store,
     Restore,
 }
 
-/// What an SDO request works on.
+/// The data that an SDO request works on.
 #[derive(Debug)]
 pub(crate) struct Dictionary<'a> {
     pub(crate) store: &'a mut ObjectStore,
     pub(crate) pdo: &'a mut PdoRules,
     pub(crate) state: AlState,
     pub(crate) complete_access: bool,
-    /// Objects in a PDO that is received now cannot be written.
+    /// Rejects writes to objects in a PDO that is currently received.
     pub(crate) refuse_mapped: bool,
     /// Injected aborts: index, subindex, code.
     pub(crate) forced: &'a [(u16, u8, u32)],
     /// Writes that are confirmed and change nothing: index, subindex.
     pub(crate) ignored: &'a [(u16, u8)],
     pub(crate) command: Option<ParameterCommand>,
-    /// Which serves the objects of its program itself.
-    pub(crate) processor: Option<&'a mut Processor>,
+    /// The processor, which serves the objects of its program itself.
+    pub(crate) processor: Option<&'a mut BootLoader>,
 }
 
-/// What complete access carries at most; no device has longer objects, and an ESI may place an item anywhere.
+/// Maximum size of an object under complete access. An ESI may place an item at any offset.
 const MAX_OBJECT_BITS: usize = 64 << 20;
 
 impl Dictionary<'_> {
-    fn find(&self, index: u16, sub: u8) -> Result<(Slot, &Item), Abort> {
+    fn find(&self, index: u16, sub: u8) -> Result<(EntryHandle, &Item), Abort> {
         let mut forced = self.forced.iter();
         if let Some((.., code)) = forced.find(|(i, s, _)| (*i, *s) == (index, sub)) {
             return Err(Abort(*code));
@@ -58,7 +58,7 @@ impl Dictionary<'_> {
             })
     }
 
-    /// An item, or under complete access the object from subindex 0 or 1 on.
+    /// Reads an item, or under complete access the object from subindex 0 or 1 on.
     pub(crate) fn read(&self, index: u16, sub: u8, complete: bool) -> Result<Vec<u8>, Abort> {
         if self.is_whole(index, sub, complete)? {
             return Ok(self.read_all(index, sub));
@@ -70,7 +70,8 @@ impl Dictionary<'_> {
         Ok(read_item(self.store, slot))
     }
 
-    /// Whether complete access means more than one item here. Without subindices there is nothing to complete.
+    /// True if complete access applies to the whole object. Objects without subindices have only
+    /// one item.
     fn is_whole(&self, index: u16, sub: u8, complete: bool) -> Result<bool, Abort> {
         if !complete {
             return Ok(false);
@@ -88,14 +89,14 @@ impl Dictionary<'_> {
         Ok(self.store.object_code(index) != ObjectCode::Var)
     }
 
-    /// The items of complete access with their place in the data, in bits; subindex 0 takes 16. Of a list only the
-    /// elements that count.
+    /// Returns the items of complete access with their bit offsets in the data; subindex 0 takes 16
+    /// bits. Lists yield only the first `count` elements.
     fn places(
         &self,
         index: u16,
         first: u8,
         count: i64,
-    ) -> impl Iterator<Item = (Slot, &Item, usize)> {
+    ) -> impl Iterator<Item = (EntryHandle, &Item, usize)> {
         let start = if first == 0 { 0 } else { 16 };
         let list = self.pdo.is_list(index);
         self.store
@@ -110,7 +111,7 @@ impl Dictionary<'_> {
         count.map_or(0, |slot| self.store.get(slot))
     }
 
-    /// Gaps, and items that cannot be read, are zero.
+    /// Reads the whole object. Gaps and unreadable items are zero.
     fn read_all(&self, index: u16, first: u8) -> Vec<u8> {
         let mut out = Vec::new();
         for (slot, item, at) in self.places(index, first, self.count(index)) {
@@ -127,7 +128,7 @@ impl Dictionary<'_> {
         out
     }
 
-    /// Whether an item may be written now, whatever the value.
+    /// Checks that an item may be written now, regardless of the value.
     fn check_access(&self, item: &Item) -> Result<(), Abort> {
         match (item.access.write, self.state) {
             (Writable::Never, _) => return Err(Abort::READ_ONLY),
@@ -144,7 +145,8 @@ impl Dictionary<'_> {
         Ok(())
     }
 
-    /// Most bytes a download may carry, so that what cannot succeed is refused at once.
+    /// Returns the maximum bytes of a download, so that a transfer that cannot succeed is rejected
+    /// at once.
     pub(crate) fn capacity(&self, index: u16, sub: u8, complete: bool) -> Result<usize, Abort> {
         if self.is_whole(index, sub, complete)? {
             let ends = self.places(index, sub, i64::MAX).map(|(_, item, at)| {
@@ -219,9 +221,9 @@ impl Dictionary<'_> {
         Ok(())
     }
 
-    /// A complete-access download: items that cannot be written keep their values, data that end between two items leave
-    /// the rest alone. Lists (PDO assignment and mapping) are emptied first and get their count last, as if the
-    /// client had done it item by item.
+    /// Writes a complete-access download. Read-only items keep their values. Data that end between
+    /// two items leave the remaining items unchanged. Lists (PDO assignment and mapping) are
+    /// emptied first and get their count last, like item by item writes.
     fn write_all(&mut self, index: u16, first: u8, data: &[u8]) -> Result<(), Abort> {
         let list = self.pdo.is_list(index);
         let count = match data.first() {
@@ -256,7 +258,7 @@ impl Dictionary<'_> {
         }
         if list && first == 0 {
             self.write_item(index, 0, &[0])?;
-            // The count comes last.
+            // Moves the count to the end.
             values.rotate_left(1);
         }
         values
@@ -265,8 +267,8 @@ impl Dictionary<'_> {
     }
 }
 
-/// Bytes as an upload carries them; a text ends before its padding.
-pub(crate) fn read_item(store: &ObjectStore, slot: Slot) -> Vec<u8> {
+/// Returns the bytes of an upload. A text ends before its padding.
+pub(crate) fn read_item(store: &ObjectStore, slot: EntryHandle) -> Vec<u8> {
     let bytes = store.bytes(slot);
     if store.item(slot).is_some_and(|item| item.kind == Kind::Text) {
         let len = bytes.iter().position(|b| *b == 0).unwrap_or(bytes.len());
@@ -275,7 +277,7 @@ pub(crate) fn read_item(store: &ObjectStore, slot: Slot) -> Vec<u8> {
     bytes.to_vec()
 }
 
-/// Anything but the signature must not store or restore (CiA 301, objects 0x1010 and 0x1011).
+/// Returns the command of a write to 0x1010 or 0x1011. Fails without the right signature (CiA 301).
 fn command(index: u16, data: &[u8]) -> Result<ParameterCommand, Abort> {
     match (index, data) {
         (STORE_PARAMETERS, b"save") => Ok(ParameterCommand::Store),
@@ -284,7 +286,7 @@ fn command(index: u16, data: &[u8]) -> Result<ParameterCommand, Abort> {
     }
 }
 
-/// A value's two's complement; of long ones the low 64 bits.
+/// Returns the value as two's complement; long values yield their low 64 bits.
 fn extended(data: &[u8]) -> i64 {
     let negative = data.last().is_some_and(|last| last & 0x80 != 0);
     let mut raw = [if negative { 0xff } else { 0 }; 8];
@@ -294,7 +296,7 @@ fn extended(data: &[u8]) -> i64 {
     i64::from_le_bytes(raw)
 }
 
-/// What PDO rules look at: their objects are unsigned and of 32 bits at most.
+/// Returns the low bits for the PDO rules, whose objects are unsigned and at most 32 bits.
 fn low_bits(data: &[u8]) -> i64 {
     let mut raw = [0; 8];
     for (to, from) in raw.iter_mut().zip(data.iter().take(7)) {

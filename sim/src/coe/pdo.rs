@@ -1,21 +1,21 @@
-//! PDO assignment (0x1C10 + SyncManager) and mapping (0x16xx, 0x1Axx): what a client may write
-//! there, what modules change, and the bit layout that results.
+//! PDO assignment (0x1C10 + SyncManager) and mapping (0x16xx, 0x1Axx): permitted writes, the effect
+//! of modules, and the resulting bit layout.
 
 use ecaxis_esi::model::{Access, Device, Direction, Module, ObjectCode, Pdo, SmUse, Writable};
 
 use super::Abort;
-use super::store::{Item, ObjectStore, Slot};
+use super::object_dictionary::{EntryHandle, Item, ObjectStore};
 use crate::esc::al::AlState;
 use crate::esc::sm::Mode;
 
-/// 0x1C10 is SyncManager 0.
+/// The assignment object of SyncManager 0.
 const ASSIGNMENT: u16 = 0x1c10;
 const MODULE_LIST: u16 = 0xf030;
 const DETECTED_MODULES: u16 = 0xf050;
 const MAX_ASSIGNED: u8 = 8;
 const MAX_MAPPED: u8 = 16;
 
-/// A PDO the device knows.
+/// A PDO of the device.
 #[derive(Debug, Clone)]
 struct KnownPdo {
     index: u16,
@@ -24,29 +24,29 @@ struct KnownPdo {
     exclude: Vec<u16>,
 }
 
-/// Process data of one SyncManager.
+/// The process data of one SyncManager.
 #[derive(Debug, Clone)]
 pub struct ProcessSm {
     pub sm: u8,
     pub direction: Direction,
-    /// Three buffers, or one as some makers' terminals have it.
+    /// Three buffers, or one buffer as in terminals of some vendors.
     pub mode: Mode,
     max_len: Option<u16>,
 }
 
-/// PDO contents a module brings into its slot.
+/// The PDO contents that a module adds to its slot.
 #[derive(Debug, Clone)]
 struct ModulePdos {
     slot: usize,
     ident: u32,
-    /// PDO index and its mapping entries.
+    /// PDO indices and their mapping entries.
     contents: Vec<(u16, Vec<u32>)>,
 }
 
 /// One object inside the process data of a SyncManager.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mapped {
-    pub slot: Slot,
+    pub slot: EntryHandle,
     pub bit: usize,
     pub bits: usize,
 }
@@ -56,14 +56,15 @@ pub struct PdoRules {
     pdos: Vec<KnownPdo>,
     sms: Vec<ProcessSm>,
     modules: Vec<ModulePdos>,
-    /// Idents each slot accepts.
+    /// The module idents that each slot accepts.
     slots: Vec<Vec<u32>>,
-    /// (direction, index << 8 | sub) that the ESI's PDOs contain, mappable whatever the flags say.
+    /// The entries (direction, index << 8 | sub) of the ESI's PDOs. They are mappable regardless of
+    /// flags.
     known_entries: Vec<(Direction, u32)>,
 }
 
 impl PdoRules {
-    /// Reads the ESI and puts the power-on assignment and mapping into the store.
+    /// Reads the ESI and stores the power-on assignment and mapping.
     #[must_use]
     pub fn new(store: &mut ObjectStore, device: &Device, modules: &[Module]) -> Self {
         let mut rules = Self::default();
@@ -180,7 +181,7 @@ impl PdoRules {
         }
     }
 
-    /// The default modules' contents and the module lists.
+    /// Adds the default modules and the module lists.
     fn plug_defaults(&mut self, store: &mut ObjectStore, device: &Device) {
         let Some(slots) = &device.slots else { return };
         let defaults: Vec<u32> = expand(slots)
@@ -199,7 +200,7 @@ impl PdoRules {
         }
     }
 
-    /// Creates a list object where it is missing and sets count and elements.
+    /// Creates a list object if it is missing and sets count and elements.
     fn fill<T: Copy + Into<u32>>(
         &self,
         store: &mut ObjectStore,
@@ -232,7 +233,7 @@ impl PdoRules {
                 None if exists && sub > used => continue,
                 _ => store.ensure(index, sub, &format!("SubIndex {sub:03}"), bits, access, &[]),
             };
-            // Some files give the last entry the type of what it maps.
+            // Some files give the last entry the type of the mapped object.
             let slot = store.lengthen(slot, bits);
             if writable {
                 store.set_access(slot, write);
@@ -264,7 +265,7 @@ impl PdoRules {
         }
     }
 
-    /// Assignment, mapping and module lists: only the first "count" elements mean something.
+    /// True for assignment, mapping and module lists. Only their first "count" elements are valid.
     pub(crate) fn is_list(&self, index: u16) -> bool {
         self.assignment(index).is_some()
             || self.pdo(index).is_some()
@@ -281,7 +282,7 @@ impl PdoRules {
             .find(|sm| ASSIGNMENT + u16::from(sm.sm) == index)
     }
 
-    /// Whether a write keeps assignment and mapping sound.
+    /// Rejects a write that makes assignment or mapping invalid.
     pub(crate) fn before_write(
         &self,
         store: &ObjectStore,
@@ -325,7 +326,7 @@ impl PdoRules {
         }
     }
 
-    /// A module list entry changes its slot's PDOs.
+    /// Applies a write to a module list: the PDOs of the slot change.
     pub(crate) fn after_write(&self, store: &mut ObjectStore, index: u16, sub: u8, value: i64) {
         if index == MODULE_LIST && sub > 0 {
             let ident = u32::try_from(value).unwrap_or(0);
@@ -382,7 +383,7 @@ impl PdoRules {
         }
     }
 
-    /// By its flags, or because the ESI's own PDOs contain it.
+    /// True if the flags or the PDOs of the ESI allow mapping the item.
     pub(crate) fn mappable(&self, direction: Direction, item: &Item) -> bool {
         let flagged = match direction {
             Direction::Rx => item.mapping.rx,
@@ -392,7 +393,7 @@ impl PdoRules {
         flagged || self.known_entries.contains(&(direction, key))
     }
 
-    /// Whether the item stands in a PDO that is received, as assignment and mapping now are.
+    /// True if a received PDO contains the item under the current assignment and mapping.
     pub(crate) fn receives(&self, store: &ObjectStore, index: u16, sub: u8) -> bool {
         let key = u32::from(index) << 8 | u32::from(sub);
         let mut outputs = self.sms.iter().filter(|sm| sm.direction == Direction::Rx);
@@ -451,7 +452,7 @@ impl PdoRules {
         &self.sms
     }
 
-    /// The bit layout of a SyncManager as assignment and mapping now stand, and its bytes.
+    /// Computes the bit layout of a SyncManager from assignment and mapping. Returns its bytes.
     pub(crate) fn layout(&self, store: &ObjectStore, sm: u8, out: &mut Vec<Mapped>) -> usize {
         out.clear();
         let mut bit = 0;
@@ -462,7 +463,7 @@ impl PdoRules {
                 let [_, sub, low, high] = entry.to_le_bytes();
                 let index = u16::from_le_bytes([low, high]);
                 let slot = store.slot(index, sub).filter(|_| index != 0);
-                // Items beyond 255 bits only keep the low byte of their length in the mapping.
+                // For items above 255 bits, the mapping holds only the low byte of the length.
                 let bits = match slot.and_then(|slot| store.item(slot)) {
                     Some(item) => usize::try_from(item.bit_len).unwrap_or(0),
                     None => (entry & 0xff) as usize,
@@ -477,7 +478,7 @@ impl PdoRules {
     }
 }
 
-/// The slots of a modular device one by one; a slot with several instances counts several times.
+/// Returns the slots of a modular device one by one. A slot with several instances is repeated.
 pub(crate) fn expand(
     slots: &ecaxis_esi::model::Slots,
 ) -> impl Iterator<Item = &ecaxis_esi::model::Slot> + '_ {
@@ -491,7 +492,7 @@ fn count(store: &ObjectStore, index: u16) -> i64 {
     store.slot(index, 0).map_or(0, |slot| store.get(slot))
 }
 
-/// Elements 1 to `count` of a list object.
+/// Returns the elements 1 to `count` of a list object.
 fn elements(store: &ObjectStore, index: u16, count: i64) -> impl Iterator<Item = u32> + '_ {
     let count = u8::try_from(count).unwrap_or(0);
     (1..=count)

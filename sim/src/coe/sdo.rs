@@ -1,13 +1,13 @@
-//! The SDO server (ETG.1000.6 §5.6.2). Requests in, responses out; no mailbox in sight.
+//! The SDO server (ETG.1000.6 §5.6.2). It maps requests to responses, independent of the mailbox.
 
 use super::{Abort, CoeServices, Dictionary, service};
-use crate::device::mailbox::{Answer, Detail, Room};
+use crate::device::mailbox::{Answer, Detail, MailboxCapacity};
 
-/// Command, index, subindex, four data bytes.
+/// Bytes of an initiate request: command, index, subindex, four data bytes.
 const INITIATE: usize = 8;
-/// CoE header in front of every message.
+/// Bytes of the CoE header in front of every message.
 const COE: usize = 2;
-/// A segment is never shorter than the CAN frame it imitates.
+/// The minimum segment data: that of a CAN frame.
 const MIN_SEGMENT: usize = 7;
 
 const COMPLETE: u8 = 0x10;
@@ -29,14 +29,14 @@ struct Transfer {
 #[derive(Debug, Clone, Copy)]
 enum Kind {
     Upload {
-        /// Bytes sent.
+        /// Bytes already sent.
         at: usize,
     },
     Download {
         complete: bool,
-        /// As announced.
+        /// The announced size.
         size: Option<usize>,
-        /// Most that the object takes.
+        /// Maximum bytes that the object accepts.
         capacity: usize,
     },
 }
@@ -69,13 +69,13 @@ impl SdoServer {
         Some(abort(Abort::TIMEOUT, transfer.address))
     }
 
-    /// Answers one request (what follows the CoE header); an abort by the client has no answer.
+    /// Answers one request. `request` starts behind the CoE header. A client abort has no answer.
     pub(super) fn request(
         &mut self,
         dictionary: &mut Dictionary<'_>,
         services: CoeServices,
         request: &[u8],
-        room: Room,
+        room: MailboxCapacity,
     ) -> Answer {
         let Some((&command, segment)) = request.split_first() else {
             return Answer::Error(Detail::TooShort);
@@ -123,7 +123,7 @@ impl SdoServer {
         services: CoeServices,
         command: u8,
         address @ (index, sub): Address,
-        room: Room,
+        room: MailboxCapacity,
     ) -> Reply {
         let complete = command & COMPLETE;
         let data = dictionary.read(index, sub, complete != 0)?;
@@ -149,7 +149,12 @@ impl SdoServer {
         Ok(out)
     }
 
-    fn upload_segment(&mut self, transfer: Option<Transfer>, command: u8, room: Room) -> Reply {
+    fn upload_segment(
+        &mut self,
+        transfer: Option<Transfer>,
+        command: u8,
+        room: MailboxCapacity,
+    ) -> Reply {
         let Some(mut transfer) = transfer else {
             return Err(Abort::COMMAND.into());
         };
@@ -194,7 +199,7 @@ impl SdoServer {
             }
             let len = match sized {
                 true => 4 - usize::from(command >> 2 & 3),
-                // The object's own length, then.
+                // Without a size, the length of the object applies.
                 false => capacity.min(4),
             };
             let data = value.get(..len).unwrap_or_default();
@@ -203,7 +208,7 @@ impl SdoServer {
         } else {
             let size = <[u8; 4]>::try_from(value).map_or(0, u32::from_le_bytes);
             let size = usize::try_from(size).unwrap_or(usize::MAX);
-            // A complete size that is right counts even where it is not indicated.
+            // A correct complete size counts even if the size bit is not set.
             let size = Some(size).filter(|size| sized || (*size > 0 && *size == rest.len()));
             check_capacity(size.unwrap_or(rest.len()), capacity)?;
             if size.is_some_and(|size| rest.len() > size) {
@@ -288,7 +293,7 @@ fn check_capacity(len: usize, capacity: usize) -> Result<(), Abort> {
     }
 }
 
-/// Whether a transfer of this many bytes may continue in segments.
+/// Checks that a transfer of `len` bytes may continue in segments.
 fn check_segmented(services: CoeServices, len: usize) -> Result<(), Abort> {
     if !services.segmented {
         Err(Abort::EXCEEDS_MAILBOX)
@@ -299,7 +304,7 @@ fn check_segmented(services: CoeServices, len: usize) -> Result<(), Abort> {
     }
 }
 
-/// Up to four data bytes.
+/// Builds an initiate response with up to four data bytes.
 fn initiate(command: u8, (index, sub): Address, data: &[u8]) -> Vec<u8> {
     let mut out = super::header(service::SDO_RESPONSE).to_vec();
     out.push(command);
@@ -310,7 +315,7 @@ fn initiate(command: u8, (index, sub): Address, data: &[u8]) -> Vec<u8> {
     out
 }
 
-/// Aborts travel as requests, in both directions.
+/// Builds an abort. Aborts are sent as SDO requests in both directions.
 fn abort(abort: Abort, (index, sub): Address) -> Vec<u8> {
     let mut out = super::header(service::SDO_REQUEST).to_vec();
     out.push(0x80);

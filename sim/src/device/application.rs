@@ -1,5 +1,5 @@
-//! What stands behind the controller: a drive, a gateway, or inputs and outputs. An application works on the device's
-//! objects; which of them travel as process data is the device's business.
+//! The application behind the controller: a drive, a gateway, or inputs and outputs. An application
+//! works on the objects of the device. The device decides which objects travel as process data.
 
 use ecaxis_esi::model::{Device, Direction};
 
@@ -7,8 +7,8 @@ use super::build::Objects;
 use super::process::ProcessData;
 use super::{SimDevice, SimError};
 use crate::Nanos;
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::coe::pdo::Mapped;
-use crate::coe::store::{ObjectStore, Slot};
 use crate::drive::{CONTROL_PERIOD_NS, DeviceError, Drive, PlantParams};
 use crate::gateway::{self, Gateway, GatewayOptions};
 
@@ -23,19 +23,20 @@ pub(super) enum Application {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Io {
     mirrors: Vec<Mirror>,
-    /// Inputs that somebody has set.
-    held: Vec<Slot>,
+    /// Inputs with a value from [`SimDevice::set_input`].
+    held: Vec<EntryHandle>,
 }
 
-/// An input that copies an output, as I/O devices without a process behind them do here.
+/// An input that copies an output, because no process connects the outputs of an I/O device to its
+/// inputs.
 #[derive(Debug, Clone, Copy)]
 struct Mirror {
-    from: Slot,
-    to: Slot,
+    from: EntryHandle,
+    to: EntryHandle,
 }
 
 impl Application {
-    /// The gateway that a device is, if it is one.
+    /// Returns the gateway if the device is one.
     pub(super) fn gateway(
         device: &Device,
         serial: u32,
@@ -58,7 +59,7 @@ impl Application {
         Self::Drive(Box::new(Drive::new(store, plant)))
     }
 
-    /// How often it acts by itself.
+    /// Returns the period of the application in ns; `None` if it only reacts to frames.
     pub(super) fn period(&self) -> Option<Nanos> {
         match self {
             Self::Drive(_) => Some(CONTROL_PERIOD_NS),
@@ -67,7 +68,7 @@ impl Application {
         }
     }
 
-    /// Its inputs are what they are when a frame begins, or when it has acted, whatever outputs arrive.
+    /// True if the application samples inputs when a frame begins, regardless of arriving outputs.
     pub(super) fn samples_at_frames(&self) -> bool {
         matches!(self, Self::Io(_))
     }
@@ -76,11 +77,11 @@ impl Application {
         matches!(self, Self::Gateway(_))
     }
 
-    /// The layout of process data has been made anew.
+    /// Applies a new layout of the process data.
     pub(super) fn laid_out(&mut self, process: &[ProcessData]) {
         match self {
             Self::Drive(drive) => {
-                let mapped: Vec<Slot> = of(process, Direction::Rx).map(|m| m.slot).collect();
+                let mapped: Vec<EntryHandle> = of(process, Direction::Rx).map(|m| m.slot).collect();
                 drive.set_mapped(&mapped);
             }
             Self::Gateway(_) => {}
@@ -97,17 +98,18 @@ impl Application {
         }
     }
 
-    /// Outputs have been taken over into the objects.
+    /// Processes outputs after their transfer into the objects.
     pub(super) fn sync(&mut self, store: &mut ObjectStore) {
         match self {
             Self::Drive(drive) => drive.sync(store),
-            // It fetches them when it forwards.
+            // The gateway fetches its outputs when it forwards.
             Self::Gateway(_) => {}
             Self::Io(io) => io.mirror(store),
         }
     }
 
-    /// Its period is over; of a drive, the motor has turned. `now` is the true time, which not everybody wants to know.
+    /// Ends the period of the application; the motor of a drive has turned. `now` returns the true
+    /// time and is called only when needed.
     pub(super) fn act(
         &mut self,
         store: &mut ObjectStore,
@@ -121,8 +123,9 @@ impl Application {
         }
     }
 
-    /// Nobody commands outputs any more. Digital and analogue ones go to their safe state, zero; drives react
-    /// themselves, a gateway holds what it has. False if nothing changed.
+    /// Reacts to the end of commanded outputs. Digital and analogue outputs go to zero, their safe
+    /// state. Drives react by themselves; a gateway keeps its outputs. Returns false if nothing
+    /// changed.
     pub(super) fn rest(&mut self, store: &mut ObjectStore, process: &[ProcessData]) -> bool {
         let Self::Io(io) = self else { return false };
         for mapped in of(process, Direction::Rx) {
@@ -132,15 +135,15 @@ impl Application {
         true
     }
 
-    /// The communication side found an error.
+    /// Reports an error of the communication side to the application.
     pub(super) fn error(&mut self, error: DeviceError) {
         if let Self::Drive(drive) = self {
             drive.error(error);
         }
     }
 
-    /// An input is set from now on, whatever the outputs are.
-    pub(super) fn hold(&mut self, slot: Slot) {
+    /// Fixes an input, which no longer follows an output.
+    pub(super) fn hold(&mut self, slot: EntryHandle) {
         if let Self::Io(io) = self {
             io.mirrors.retain(|mirror| mirror.to != slot);
             io.held.push(slot);
@@ -196,21 +199,21 @@ impl SimDevice {
         }
     }
 
-    /// Shows in the objects what the drive has done.
+    /// Updates the objects with the state of the drive.
     pub(super) fn show(&mut self) {
         if let Application::Drive(drive) = &mut self.application {
             drive.show(&mut self.store);
         }
     }
 
-    /// As at power-on.
+    /// Resets the application as at power-on.
     pub(super) fn restart_application(&mut self, now: Nanos) {
         self.store = self.fresh.store.clone();
         let Application::Gateway(gateway) = &mut self.application else {
             self.application = self.fresh.application.clone();
             return;
         };
-        // What was configured on its other network outlives the power, and so do the nodes there.
+        // The configuration of the other network and its nodes survives a power cycle.
         if gateway.power_on(now) {
             let mut objects = Objects::new(&gateway.shaped(), &[], self.serial, |store| {
                 gateway.prepare(store);

@@ -1,4 +1,4 @@
-//! Devices from ESI files.
+//! Builds devices from ESI files.
 
 use ecaxis_esi::model::{Access, Device, Dictionary, Module, ObjectCode, SmUse, SyncManager};
 use ecaxis_esi::sii::{self, SiiError, SiiOptions};
@@ -8,55 +8,58 @@ use super::esm::Al;
 use super::mailbox::{Mailbox, MailboxOptions};
 use super::process::ProcessData;
 use super::supervision::Supervision;
-use super::{Delays, Fresh, MailboxLimits, SimDevice};
+use super::{Delays, MailboxLimits, PowerOnState, SimDevice};
 use crate::Nanos;
 use crate::coe::history;
+use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::{PdoRules, expand};
-use crate::coe::store::ObjectStore;
 use crate::drive::PlantParams;
-use crate::esc::info::Needs;
+use crate::esc::chip::ChipRequirements;
 use crate::esc::ports::Medium;
 use crate::esc::registers::{ADDRESS_SPACE, PROCESS_RAM};
 use crate::esc::{Esc, EscConfig, EscInfo};
-use crate::firmware::{FirmwareOptions, Processor};
+use crate::firmware::{BootLoader, FirmwareOptions};
 use crate::foe::FileStore;
 use crate::gateway::{Gateway, GatewayError, GatewayOptions};
 
-/// CiA 402.
+/// The CiA 402 profile number.
 const DRIVE_PROFILE: u32 = 402;
 const CONTROLWORD: u16 = 0x6040;
 const STATUSWORD: u16 = 0x6041;
 
-/// What the ESI does not say about one particular device.
+/// The properties of one particular device that the ESI does not contain.
 #[derive(Debug, Clone)]
 pub struct DeviceOptions {
     pub serial: u32,
     pub alias: u16,
     pub clock_drift_ppm: f64,
-    /// Local time at power-on.
+    /// The local time at power-on.
     pub clock_offset_ns: u64,
-    /// Noise on the time stamps of frames, ± nanoseconds, drawn from a seed.
+    /// The noise on the time stamps of frames, ± ns, drawn from a seed.
     pub clock_jitter_ns: u32,
     pub jitter_seed: u64,
     pub plant: PlantParams,
-    /// From one port to the next; `None`: 500 out of a port with a PHY, 150 to the E-bus.
+    /// The delay from one port to the next in ns. `None`: 500 for a port with a PHY, 150 for an
+    /// E-bus port.
     pub forwarding_ns: Option<u64>,
-    /// What the processing unit, between port 0 and the next, adds to that. Real ESCs take 20 to
-    /// 40; a MainDevice that does not know it misses the delays by half of it per device.
+    /// The additional delay of the processing unit, between port 0 and the next port. Real ESCs
+    /// take 20 to 40 ns. A MainDevice that ignores this delay misses half of it per device.
     pub processing_ns: u64,
-    /// EEPROM contents in place of those made from the ESI.
+    /// The EEPROM contents. `None`: generated from the ESI.
     pub sii: Option<Vec<u8>>,
-    /// What the application needs to see a request in AL control and to answer it in AL status.
+    /// The time in ns from a request in AL control to the answer in AL status.
     pub state_change_ns: Nanos,
-    /// How long until the application has read AL control, which may be written again then; at most the time above.
-    /// `None`: a quarter of it.
+    /// The time in ns until the application has read AL control; AL control is writable again after
+    /// it. At most `state_change_ns`. `None`: a quarter of `state_change_ns`.
     pub state_notice_ns: Option<Nanos>,
-    /// The chip; `None`: the smallest in which the device fits. Process RAM grows where SyncManagers need more.
+    /// The chip. `None`: the smallest chip that fits the device. Process RAM grows if SyncManagers
+    /// need more.
     pub esc: Option<EscInfo>,
     pub mailbox: MailboxOptions,
-    /// A boot loader that takes firmware in Bootstrap, and where the ESI has 0x1F51 by that, too ([`crate::firmware`]).
+    /// The boot loader for firmware in Bootstrap and, if the ESI contains 0x1F51, through that
+    /// object ([`crate::firmware`]).
     pub firmware: Option<FirmwareOptions>,
-    /// Of a CANopen gateway and the nodes behind it; a gateway without options has no nodes.
+    /// The options of a CANopen gateway and its nodes. A gateway without options has no nodes.
     pub gateway: Option<GatewayOptions>,
 }
 
@@ -110,7 +113,7 @@ pub(super) struct Objects {
 }
 
 impl Objects {
-    /// `first` may add objects before PDOs do.
+    /// Builds the objects. `first` may add objects before the PDOs are added.
     pub(super) fn new(
         device: &Device,
         modules: &[Module],
@@ -145,8 +148,8 @@ impl Objects {
 }
 
 impl SimDevice {
-    /// A device as the ESI describes it, powered on and in Init. Modular devices start with the
-    /// default module of every slot.
+    /// Creates the device that the ESI describes, powered on and in Init. A modular device starts
+    /// with the default module of every slot.
     pub fn from_esi(
         device: &Device,
         modules: &[Module],
@@ -191,7 +194,7 @@ impl SimDevice {
         } = objects;
         let ram_end = ram_end.max(mapped_end(device, &pdo, &store)).min(0x1_0000);
         let ram_kib = count((ram_end - PROCESS_RAM).div_ceil(1024));
-        let needs = Needs {
+        let needs = ChipRequirements {
             ports: Medium::descriptor(Medium::from_physics(&device.physics)),
             fmmus: count(device.fmmus.len()),
             sync_managers: count(device.sync_managers.len()),
@@ -227,7 +230,7 @@ impl SimDevice {
         let made_for = (device.identity.vendor, device.identity.product);
         let processor = options
             .firmware
-            .map(|o| Processor::new(o, &store, made_for));
+            .map(|o| BootLoader::new(o, &store, made_for));
         let mut sim = Self {
             name: device.type_name.clone(),
             delays: Delays {
@@ -240,7 +243,7 @@ impl SimDevice {
                 .state_notice_ns
                 .unwrap_or(options.state_change_ns / 4)
                 .min(options.state_change_ns),
-            fresh: Box::new(Fresh {
+            fresh: Box::new(PowerOnState {
                 store: store.clone(),
                 application: application.clone(),
             }),
@@ -281,22 +284,24 @@ impl SimDevice {
     }
 }
 
-/// By its profile, or because there is a Controlword and a Statusword in a dictionary or a PDO, be it a module's.
+/// True for a drive profile, or if a dictionary or PDO of device or modules has Controlword and
+/// Statusword.
 fn is_drive(device: &Device, store: &ObjectStore) -> bool {
     device.profile == Some(DRIVE_PROFILE)
         || [CONTROLWORD, STATUSWORD].map(|index| store.has_object(index)) == [true, true]
 }
 
-/// The high byte of the PDI control word switches SYNC and latch units on; some makers only offer OpModes.
+/// True if the PDI control word (high byte) switches SYNC and latch units on, or the ESI has
+/// OpModes. Some vendors provide only OpModes.
 fn uses_dc(device: &Device) -> bool {
     let units = device.eeprom.config_data.get(1).map_or(0, |b| b & 0x0c);
     units != 0 || !device.dc_modes.is_empty()
 }
 
-/// Modules of further places than these bring no objects of their own.
+/// Modules in slots beyond this number add no objects.
 const MAX_PLACES: usize = 32;
 
-/// Every module as it would be in every slot that takes it; whether it is the slot's default.
+/// Returns every module for every slot that accepts it, and whether it is the default of the slot.
 fn modules_at_places(device: &Device, modules: &[Module]) -> Vec<(Module, bool)> {
     let mut all = Vec::new();
     let Some(slots) = &device.slots else {
@@ -312,7 +317,8 @@ fn modules_at_places(device: &Device, modules: &[Module]) -> Vec<(Module, bool)>
     all
 }
 
-/// Modules that may be plugged, the device, its default modules: the later wins.
+/// Returns the dictionaries of pluggable modules, device and default modules. Later dictionaries
+/// win.
 fn dictionaries<'a>(device: &'a Device, plugged: &'a [(Module, bool)]) -> Vec<&'a Dictionary> {
     let of = |wanted: bool| {
         let fitting = plugged
@@ -326,7 +332,8 @@ fn dictionaries<'a>(device: &'a Device, plugged: &'a [(Module, bool)]) -> Vec<&'
         .collect()
 }
 
-/// Object 0x1018 says what the EEPROM says, 0x1C00 what the SyncManagers are for; every device with CoE has them.
+/// Adds 0x1018 with the identity of the EEPROM and 0x1C00 with the SyncManager types. Every device
+/// with CoE has both objects.
 fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
     if device
         .mailbox
@@ -373,7 +380,8 @@ fn identify(store: &mut ObjectStore, device: &Device, serial: u32) {
     }
 }
 
-/// Object 0x1C00 (ETG.1000.6, SyncManager communication type): 0 unused, 1 and 2 mailbox out and in, 3 and 4 process data out and in.
+/// Returns the value for 0x1C00 (ETG.1000.6, SyncManager communication type). 0: unused, 1 and 2:
+/// mailbox out and in, 3 and 4: process data out and in.
 fn sm_type(sm: &SyncManager) -> u8 {
     match sm.usage {
         SmUse::MBoxOut => 1,
@@ -384,7 +392,8 @@ fn sm_type(sm: &SyncManager) -> u8 {
     }
 }
 
-/// A SyncManager in name only: its "area" are registers, such as a latch's times, which an FMMU reads without it.
+/// True for a SyncManager whose area is registers, such as latch times. An FMMU reads the registers
+/// without the SyncManager.
 fn is_virtual(device: &Device, sm: u8) -> bool {
     let sm = device.sync_managers.get(usize::from(sm));
     sm.is_some_and(|sm| (1..ADDRESS_SPACE).contains(&usize::from(sm.start_address)))
@@ -394,7 +403,7 @@ fn count(n: usize) -> u8 {
     u8::try_from(n).unwrap_or(u8::MAX)
 }
 
-/// Where the process RAM that the device's SyncManagers need ends, as far as the ESI gives their sizes.
+/// Returns the end of the process RAM for the SyncManager sizes that the ESI contains.
 fn ram_end(device: &Device) -> Result<usize, SimError> {
     let mut end = PROCESS_RAM;
     for (n, sm) in device.sync_managers.iter().enumerate() {
@@ -415,8 +424,8 @@ fn ram_end(device: &Device) -> Result<usize, SimError> {
     Ok(end)
 }
 
-/// The same for the PDOs that are assigned at power-on. What modules will be plugged nobody knows: such a device
-/// gets 8 KiB.
+/// Returns the end of the process RAM for the PDOs assigned at power-on. A modular device gets 8
+/// KiB, because its modules are unknown.
 fn mapped_end(device: &Device, pdo: &PdoRules, store: &ObjectStore) -> usize {
     let mut map = Vec::new();
     let modular = if device.slots.is_some() { 0x3000 } else { 0 };
@@ -452,7 +461,7 @@ fn mailbox_limits(device: &Device) -> [MailboxLimits; 8] {
     limits
 }
 
-/// (address, length) of the receive and send mailbox in Bootstrap.
+/// Returns (address, length) of the receive and send mailbox in Bootstrap.
 fn boot_mailbox(device: &Device) -> ((u16, u16), (u16, u16)) {
     let word = |n: usize| match device.eeprom.bootstrap.get(n * 2..n * 2 + 2) {
         Some([low, high]) => u16::from_le_bytes([*low, *high]),

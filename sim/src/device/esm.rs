@@ -1,4 +1,4 @@
-//! State changes: what each transition demands and does.
+//! State changes: the requirements and the effects of each transition.
 
 use ecaxis_esi::model::Direction;
 
@@ -6,22 +6,22 @@ use super::SimDevice;
 use crate::drive::DeviceError;
 use crate::esc::al::{self, AlState, Request, code, judge};
 use crate::esc::registers as reg;
-use crate::esc::sm::{Filled, Mode, SyncManager};
+use crate::esc::sm::{BufferOwner, Mode, SyncManager};
 
-/// How long a device waits for the first SYNC0 on the way to Op.
+/// The time a device waits for the first SYNC0 before Op.
 const FIRST_SYNC_NS: u64 = 5_000_000_000;
 
 #[derive(Debug, Clone)]
 pub(super) struct Al {
     pub(super) state: AlState,
     pub(super) code: u16,
-    /// The request under way, or the last one.
+    /// The current request, or the last one.
     control: u16,
-    /// One that the application has not read yet, and one that it has read and follows.
+    /// The request that the application has not read yet, and the request in progress.
     unread: Option<u16>,
     followed: Option<u16>,
     pub(super) due: u64,
-    /// Op was requested; SYNC0 has been armed but not seen yet.
+    /// True while Op is requested and SYNC0 is armed but has not fired yet.
     pub(super) waits_for_sync: bool,
 }
 
@@ -52,8 +52,9 @@ impl SimDevice {
         }
     }
 
-    /// The controller has answered already, and no application could refuse. It copies the acknowledge bit, too, which
-    /// then looks like an error (EK1100 and EL1004 do so in recordings).
+    /// Applies a request that the controller has already answered; the application cannot refuse
+    /// it. The controller also copies the acknowledge bit, which then looks like an error.
+    /// Recordings of EK1100 and EL1004 show this.
     fn emulate(&mut self, control: u16) {
         let to = AlState::from_code((control & 0x0f) as u8);
         let refusal = self.refusals.iter().find(|(state, _)| Some(*state) == to);
@@ -67,7 +68,8 @@ impl SimDevice {
         self.esc.put(reg::AL_STATUS_CODE, &[0, 0]);
     }
 
-    /// The time has come to read a request, or to have followed it, or the wait for SYNC0 is over.
+    /// Handles a due event: a request to read, a request to complete, or the end of the wait for
+    /// SYNC0.
     pub(super) fn al_step(&mut self, local: u64) {
         self.al.due = u64::MAX;
         if std::mem::take(&mut self.al.waits_for_sync) {
@@ -109,7 +111,7 @@ impl SimDevice {
         }
     }
 
-    /// On the way to Op with a SYNC0 that runs: the wait is over.
+    /// Ends the wait for SYNC0 before Op if SYNC0 has fired.
     pub(super) fn first_sync_seen(&mut self) {
         if self.al.waits_for_sync && self.sync0_pulses() > 0 {
             self.al.waits_for_sync = false;
@@ -138,7 +140,7 @@ impl SimDevice {
         }
     }
 
-    /// What must hold before `to` is entered.
+    /// Checks the preconditions of state `to`.
     fn demand(&self, to: AlState) -> Result<(), u16> {
         if let Some((_, code)) = self.refusals.iter().find(|(state, _)| *state == to) {
             return Err(*code);
@@ -162,7 +164,7 @@ impl SimDevice {
         let Some(mailbox) = &self.mailbox else {
             return Ok(());
         };
-        let fits = |n: usize, filled: Filled, boot: &(u16, u16)| {
+        let fits = |n: usize, filled: BufferOwner, boot: &(u16, u16)| {
             let (Some(sm), Some(limits)) = (self.esc.sms.get(n), self.mailbox_limits.get(n)) else {
                 return false;
             };
@@ -173,12 +175,16 @@ impl SimDevice {
             };
             sm.enabled && sm.mode == Mode::Mailbox && sm.filled == filled && place
         };
-        let good = fits(mailbox.receive, Filled::ByMainDevice, &self.boot_mailbox.0)
-            && fits(mailbox.send, Filled::ByDevice, &self.boot_mailbox.1);
+        let good = fits(
+            mailbox.receive,
+            BufferOwner::ByMainDevice,
+            &self.boot_mailbox.0,
+        ) && fits(mailbox.send, BufferOwner::ByDevice, &self.boot_mailbox.1);
         if good { Ok(()) } else { Err(code) }
     }
 
-    /// SyncManagers against the device's own mapping. A buffered one takes three times its length.
+    /// Checks the SyncManagers against the mapping of the device. A buffered SyncManager takes
+    /// three times its length.
     fn check_process_data(&self) -> Result<(), u16> {
         for data in &self.process {
             let outputs = data.direction == Direction::Rx;
@@ -188,9 +194,9 @@ impl SimDevice {
                 code::INVALID_INPUTS
             };
             let filled = if outputs {
-                Filled::ByMainDevice
+                BufferOwner::ByMainDevice
             } else {
-                Filled::ByDevice
+                BufferOwner::ByDevice
             };
             let Some(sm) = self.esc.sms.get(data.sm) else {
                 return Err(code);
@@ -214,7 +220,7 @@ impl SimDevice {
         Ok(())
     }
 
-    /// Bytes of process data a SyncManager carries, as assignment and mapping now stand.
+    /// Returns the process data bytes of a SyncManager under the current assignment and mapping.
     #[must_use]
     pub fn pdo_len(&self, sm: usize) -> usize {
         let mut map = Vec::new();
@@ -222,7 +228,7 @@ impl SimDevice {
             .layout(&self.store, u8::try_from(sm).unwrap_or(0), &mut map)
     }
 
-    /// Whether no other SyncManager's memory is in the way.
+    /// True if the memory of the SyncManager overlaps no other SyncManager.
     fn is_free(&self, n: usize, sm: &SyncManager) -> bool {
         let area = |sm: &SyncManager| usize::from(sm.start)..usize::from(sm.start) + sm.footprint();
         let own = area(sm);
@@ -265,7 +271,7 @@ impl SimDevice {
         self.pump_mailbox();
     }
 
-    /// What leaving one state and entering another does to SyncManagers and outputs.
+    /// Applies the effects of a state change on SyncManagers and outputs.
     fn change(&mut self, to: AlState) {
         let from = std::mem::replace(&mut self.al.state, to);
         if from == AlState::Op && to != from {
@@ -290,7 +296,8 @@ impl SimDevice {
         }
     }
 
-    /// Only an application can hold SyncManagers closed.
+    /// Opens or closes the process data SyncManagers. Without an application, nothing holds them
+    /// closed.
     pub(super) fn close_process_data(&mut self, closed: bool) {
         let closed = closed && !self.esc.emulates_device();
         for data in &self.process {
@@ -298,13 +305,13 @@ impl SimDevice {
         }
     }
 
-    /// An error takes the device down by itself.
+    /// Changes to a lower state because of an error of the device.
     pub(super) fn fall_to(&mut self, state: AlState, code: u16, error: DeviceError) {
         self.drop_outputs();
         if state < AlState::SafeOp {
             self.close_process_data(true);
         }
-        // A request that stands is followed all the same.
+        // A pending request is still processed.
         if std::mem::take(&mut self.al.waits_for_sync) {
             self.al.due = u64::MAX;
         }
@@ -326,7 +333,7 @@ impl SimDevice {
         }
     }
 
-    /// The MainDevice changed SyncManagers or SYNC0 under a running application.
+    /// Reacts to SyncManager or SYNC0 changes by the MainDevice while the application runs.
     pub(super) fn configuration_changed(&mut self, sms: bool, sync: bool) {
         let minds = self.application_runs() && !self.esc.emulates_device();
         if self.al.state < AlState::SafeOp || !minds {

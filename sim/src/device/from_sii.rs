@@ -1,7 +1,7 @@
-//! Devices from an EEPROM image alone, as a MainDevice without the ESI sees them.
+//! Builds devices from an EEPROM image alone, like a MainDevice without the ESI sees them.
 //!
-//! The image is read into the same model that an ESI file yields, so that there is one way to build a device. What an
-//! image cannot say stays empty: objects beyond identification and PDOs, modules, start-up commands.
+//! The image is converted to the ESI model, so both sources share one way to build a device.
+//! Missing in an image: start-up commands, modules, and objects except identification and PDOs.
 
 use ecaxis_esi::model::{
     Access, Coe, DcMode, Device, Dictionary, Direction, Eeprom, Entry, Mailbox, Object, ObjectItem,
@@ -12,15 +12,18 @@ use ecaxis_esi::sii::{self, General, MailboxAreas, Protocols, Sii, SiiDc, SiiPdo
 use super::{DeviceOptions, SimDevice, SimError};
 
 impl SimDevice {
-    /// A device as its EEPROM image describes it, powered on and in Init. Serial number and alias come from the image; the
-    /// chip is `options.esc`, or the smallest in which the device fits.
+    /// Creates the device that the EEPROM image describes, powered on and in Init. Serial number
+    /// and alias come from the image. The chip is `options.esc`, or the smallest chip that fits the
+    /// device.
     ///
-    /// With a mailbox that carries CoE it has the objects 0x1000, 0x1008, 0x1018, 0x1C00, PDO assignment and mapping;
-    /// other mailboxes answer that the protocol is unknown. Without a mailbox it is a plain I/O terminal.
+    /// A device with a CoE mailbox has the objects 0x1000, 0x1008, 0x1018, 0x1C00, PDO assignment
+    /// and mapping. Other mailboxes report an unknown protocol. A device without a mailbox is a
+    /// plain I/O terminal.
     ///
     /// # Errors
     ///
-    /// The image does not hold what its headers claim, or SyncManagers that lie outside the address space.
+    /// Fails if the image is shorter than its headers state, or a SyncManager lies outside the
+    /// address space.
     pub fn from_sii(image: &[u8], options: DeviceOptions) -> Result<Self, SimError> {
         let sii = sii::parse(image)?;
         let options = DeviceOptions {
@@ -68,7 +71,7 @@ fn type_name(sii: &Sii, general: &General) -> String {
     }
 }
 
-/// Four bits a port → the ESI's letters; an image that names no port leaves them open.
+/// Converts four bits per port to the letters of the ESI. Empty if the image describes no port.
 fn physics(ports: u16) -> String {
     let letters = (0..4).map(|n| match ports >> (4 * n) & 0x0f {
         1 => 'Y',
@@ -83,7 +86,8 @@ fn has_mailbox(sii: &Sii) -> bool {
     sii.protocols != Protocols::default() && sii.mailbox.receive_size > 0
 }
 
-/// The category's; without one, the standard mailboxes of the header.
+/// Returns the SyncManagers of the category, or the standard mailboxes of the header without a
+/// category.
 fn sync_managers(sii: &Sii) -> Vec<SyncManager> {
     if !sii.sync_managers.is_empty() {
         return sii.sync_managers.iter().map(sync_manager).collect();
@@ -121,7 +125,7 @@ fn sync_manager(sm: &SiiSyncManager) -> SyncManager {
     }
 }
 
-/// Older images leave the usage open; mode and direction tell it.
+/// Returns the usage. Older images leave it open; it then follows from mode and direction.
 fn usage(sm: &SiiSyncManager) -> SmUse {
     if sm.usage != SmUse::Other || sm.enable & 1 == 0 {
         return sm.usage;
@@ -216,7 +220,8 @@ fn bootstrap(areas: MailboxAreas) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// The device name; identity, SyncManagers and PDOs are added with every device.
+/// Returns the dictionary with the device name. Identity, SyncManagers and PDOs are added for every
+/// device.
 fn dictionary(sii: &Sii, general: &General) -> Dictionary {
     if !has_mailbox(sii) || !sii.protocols.has(Protocols::COE) {
         return Dictionary::default();

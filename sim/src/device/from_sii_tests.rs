@@ -3,7 +3,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::{AlState, EscInfo};
 
-/// A small device with mailbox and process data both ways, as an image.
+/// Returns the image of a small device with mailbox and process data in both directions.
 fn image() -> Sii {
     let sm = |usage, start_address, len, control| SiiSyncManager {
         start_address,
@@ -65,7 +65,7 @@ fn build(sii: &Sii) -> SimDevice {
 }
 
 #[test]
-fn the_dictionary_has_what_the_image_yields() {
+fn dictionary_holds_the_objects_of_the_image() {
     let device = build(&image());
     assert_eq!(device.name(), "IO-32");
     assert_eq!(device.object(0x1008, 0).unwrap(), b"IO-32");
@@ -84,7 +84,7 @@ fn the_dictionary_has_what_the_image_yields() {
 }
 
 #[test]
-fn without_a_mailbox_it_is_a_plain_terminal() {
+fn image_without_mailbox_builds_a_plain_terminal() {
     let mut sii = image();
     sii.protocols = Protocols::default();
     sii.sync_managers.drain(..2);
@@ -99,7 +99,7 @@ fn without_a_mailbox_it_is_a_plain_terminal() {
 }
 
 #[test]
-fn a_mailbox_without_a_category_is_where_the_header_has_it() {
+fn mailbox_without_category_uses_the_header_addresses() {
     let mut sii = image();
     sii.sync_managers.clear();
     let sms = sync_managers(&sii);
@@ -138,7 +138,7 @@ fn an_open_usage_follows_from_mode_and_direction() {
 }
 
 #[test]
-fn the_chip_and_its_ports_show_in_the_information_registers() {
+fn information_registers_show_the_chip_and_its_ports() {
     let image = image().to_bytes();
     for (esc, ports) in [
         (EscInfo::ET1100, 0x0b),
@@ -165,7 +165,7 @@ fn the_chip_and_its_ports_show_in_the_information_registers() {
 }
 
 #[test]
-fn what_an_image_claims_and_does_not_hold_is_named() {
+fn from_sii_names_the_missing_part_of_a_short_image() {
     let error = |bytes: &[u8]| {
         SimDevice::from_sii(bytes, DeviceOptions::default())
             .unwrap_err()
@@ -190,7 +190,7 @@ fn what_an_image_claims_and_does_not_hold_is_named() {
     );
 }
 
-/// Builds it and lets every kind of access touch it.
+/// Builds the device and performs every kind of access.
 fn exercise(bytes: &[u8]) {
     let Ok(device) = SimDevice::from_sii(bytes, DeviceOptions::default()) else {
         return;

@@ -1,17 +1,17 @@
-//! A SubDevice: an ESC, the application behind it and the device's own time.
+//! A SubDevice: an ESC, its application and the time of the device.
 //!
-//! * `application`: what stands behind the controller
-//! * `build`: from an ESI device
-//! * `from_sii`: from an EEPROM image
-//! * `esm`: state changes and what they demand
-//! * `mailbox`: requests and replies
-//! * `parameters`: what outlives a power cycle
+//! * `application`: the application behind the controller
+//! * `build`: devices from an ESI
+//! * `from_sii`: devices from an EEPROM image
+//! * `esm`: state changes and their requirements
+//! * `mailbox`: requests and answers
+//! * `parameters`: data that survives a power cycle
 //! * `process`: process data and objects
-//! * `program`: with and without a program
-//! * `supervision`: whether they come in time
-//! * `time`: what a device does by itself, and until when it does nothing
+//! * `program`: program and boot loader
+//! * `supervision`: synchronisation of outputs and SYNC0
+//! * `time`: timed events of a device
 //!
-//! Everything a device does by itself happens in `time`, in the order of its clock.
+//! All actions of a device without a frame run in `time`, in the order of the device clock.
 
 mod application;
 mod build;
@@ -25,13 +25,13 @@ mod supervision;
 mod time;
 
 use crate::Nanos;
+use crate::coe::object_dictionary::ObjectStore;
 use crate::coe::pdo::PdoRules;
-use crate::coe::store::ObjectStore;
 use crate::drive::{Emergency, State};
 use crate::esc::Esc;
 use crate::esc::al::AlState;
 use crate::esc::dc::sync::Edges;
-use crate::firmware::Processor;
+use crate::firmware::BootLoader;
 use crate::foe::FileStore;
 use crate::frame::Datagram;
 use application::Application;
@@ -43,10 +43,10 @@ use process::ProcessData;
 use supervision::Supervision;
 pub(crate) use time::Rest;
 
-/// Events remembered by [`SimDevice::sync0_log`] and its like.
+/// Number of events in [`SimDevice::sync0_log`] and the similar logs.
 const LOG: usize = 64;
 
-/// True times of the last events of a kind.
+/// True times of the last events of one kind.
 #[derive(Debug, Clone)]
 struct EventLog {
     count: u64,
@@ -70,7 +70,7 @@ impl EventLog {
         self.count += 1;
     }
 
-    /// The last ones, oldest first.
+    /// Returns the last events, oldest first.
     fn last(&self) -> impl Iterator<Item = Nanos> + '_ {
         let kept = self.count.min(LOG as u64);
         (self.count - kept..self.count)
@@ -79,7 +79,7 @@ impl EventLog {
     }
 }
 
-/// Where a mailbox SyncManager must lie.
+/// The permitted location of a mailbox SyncManager.
 #[derive(Debug, Clone, Copy, Default)]
 struct MailboxLimits {
     start: u16,
@@ -87,37 +87,38 @@ struct MailboxLimits {
     max: u16,
 }
 
-/// State at power-on, to return to after a power cycle.
+/// The state at power-on, restored by a power cycle.
 #[derive(Debug, Clone)]
-struct Fresh {
+struct PowerOnState {
     store: ObjectStore,
     application: Application,
 }
 
-/// Through the device, from the first bit in to the first bit out.
+/// Delays through the device, from the first bit in to the first bit out.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Delays {
-    /// From one port to the next; `None`: as usual for the port it leaves at.
+    /// The delay from one port to the next in ns. `None`: the default of the port that the frame
+    /// leaves.
     pub(crate) forwarding_ns: Option<u64>,
-    /// What the processing unit adds.
+    /// The additional delay of the processing unit in ns.
     pub(crate) processing_ns: u64,
 }
 
-/// What a device is known by, as far as it is known or to be changed.
+/// The identity of a device, as far as it is known or to be changed.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Identification {
     /// Vendor, product, revision and serial number: SII words 8, 10, 12 and 14, 0x1018:01 to 04.
     pub(crate) numbers: [Option<u32>; 4],
-    /// SII word 4.
+    /// The alias, SII word 4.
     pub(crate) alias: Option<u16>,
 }
 
-/// What a frame has done to a device that concerns the network.
+/// The effects of a frame on a device that concern the network.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Seen {
-    /// Receive times are to be latched at every port it passes.
+pub(crate) struct FrameEffects {
+    /// True if every port that the frame passes latches its receive time.
     pub(crate) latches: bool,
-    /// DL control was written.
+    /// True if DL control was written.
     pub(crate) dl_control: bool,
 }
 
@@ -146,24 +147,24 @@ pub struct SimDevice {
     files: FileStore,
     al: Al,
     serial: u32,
-    /// Local time at which the application acts next.
+    /// The local time of the next action of the application.
     tick: u64,
-    /// SYNC0 and SYNC1.
+    /// The last SYNC0 and SYNC1 pulses.
     pulses: [EventLog; 2],
-    /// Outputs came.
+    /// The last arrivals of outputs.
     arrivals: EventLog,
-    /// Local time of what is going on.
+    /// The local time of the current event.
     local: u64,
-    /// The application hangs; its controller does not.
+    /// True while the application hangs; the controller continues.
     hangs: bool,
-    /// One that can have another program; what belongs to the program while only the boot loader runs; and the local time until
-    /// which it restarts.
-    processor: Option<Processor>,
+    /// The processor of a device with replaceable program, the program data while only the boot
+    /// loader runs, and the local time of the end of a restart.
+    processor: Option<BootLoader>,
     parked: Option<Box<(PdoRules, Vec<ProcessData>)>>,
     restarts_until: Option<u64>,
-    /// It has reset its controller since the last frame.
+    /// True if the device has reset its controller since the last frame.
     was_reset: bool,
-    fresh: Box<Fresh>,
+    fresh: Box<PowerOnState>,
     pub(crate) refusals: Vec<(AlState, u16)>,
     pub(crate) forced_aborts: Vec<(u16, u8, u32)>,
     pub(crate) ignored_writes: Vec<(u16, u8)>,
@@ -171,7 +172,7 @@ pub struct SimDevice {
 }
 
 impl SimDevice {
-    /// The ESI's type name.
+    /// Returns the type name of the ESI.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
@@ -182,7 +183,7 @@ impl SimDevice {
         self.al.state
     }
 
-    /// 0 while there is no error.
+    /// Returns the AL status code; 0 without an error.
     #[must_use]
     pub fn al_status_code(&self) -> u16 {
         self.al.code
@@ -198,12 +199,12 @@ impl SimDevice {
         &self.esc
     }
 
-    /// The controller as the device's own side has it.
+    /// Returns the controller with the access rights of the device side.
     pub fn esc_mut(&mut self) -> &mut Esc {
         &mut self.esc
     }
 
-    /// An object's value as an upload would carry it, access rights aside.
+    /// Returns the value of an object as an upload would, without access checks.
     #[must_use]
     pub fn object(&self, index: u16, sub: u8) -> Option<Vec<u8>> {
         let slot = self.store.slot(index, sub)?;
@@ -215,8 +216,8 @@ impl SimDevice {
         Some(crate::coe::read_item(&store, slot))
     }
 
-    /// The objects; those by which a drive shows its state may be up to a frame old ([`SimDevice::object`] has them as they
-    /// are).
+    /// Returns the objects. Objects that show the state of a drive may be up to one frame old;
+    /// [`SimDevice::object`] returns current values.
     #[must_use]
     pub fn store(&self) -> &ObjectStore {
         &self.store
@@ -227,13 +228,13 @@ impl SimDevice {
         &mut self.store
     }
 
-    /// The EEPROM's contents.
+    /// Returns the contents of the EEPROM.
     #[must_use]
     pub fn sii(&self) -> &[u8] {
         self.esc.eeprom.image()
     }
 
-    /// System time (0x0910) at a true time; `None` without distributed clocks.
+    /// Returns the system time (0x0910) at a true time; `None` without distributed clocks.
     #[must_use]
     pub fn system_time(&self, now: Nanos) -> Option<u64> {
         self.esc
@@ -242,35 +243,35 @@ impl SimDevice {
             .map(|dc| dc.system(self.esc.clock.local(now)))
     }
 
-    /// SYNC0 pulses since power-on.
+    /// Returns the number of SYNC0 pulses since power-on.
     #[must_use]
     pub fn sync0_count(&self) -> u64 {
         self.pulses[0].count
     }
 
-    /// True times of the last SYNC0 pulses, oldest first.
+    /// Returns the true times of the last SYNC0 pulses, oldest first.
     pub fn sync0_log(&self) -> impl Iterator<Item = Nanos> + '_ {
         self.pulses[0].last()
     }
 
-    /// True times of the last SYNC1 pulses, oldest first.
+    /// Returns the true times of the last SYNC1 pulses, oldest first.
     pub fn sync1_log(&self) -> impl Iterator<Item = Nanos> + '_ {
         self.pulses[1].last()
     }
 
-    /// True times at which the last frames that brought outputs began, oldest first.
+    /// Returns the true times at which the last frames with outputs began, oldest first.
     pub fn outputs_log(&self) -> impl Iterator<Item = Nanos> + '_ {
         self.arrivals.last()
     }
 
-    /// An input wired to LATCH0 (0) or LATCH1 (1) has this level at this true time.
+    /// Sets the level of an input wired to LATCH0 (0) or LATCH1 (1) at this true time.
     pub fn set_latch(&mut self, n: usize, level: bool, now: Nanos) {
         let local = self.esc.clock.local(now);
         self.esc.latch_input(n, level, local);
     }
 
-    /// The application stops, as a crashed processor does, while its controller goes on; or starts again where
-    /// it was. Nobody triggers the watchdog of the process data interface meanwhile.
+    /// Stops the application, like a crashed processor with a running controller, or resumes it. A
+    /// stopped application does not trigger the PDI watchdog.
     pub fn set_hanging(&mut self, hangs: bool, now: Nanos) {
         if hangs == self.hangs {
             return;
@@ -280,14 +281,14 @@ impl SimDevice {
         self.hangs = hangs;
         self.esc.pdi_stops(hangs, local);
         if !hangs {
-            // Interrupts that have waited.
+            // Clears the interrupts that arrived in the meantime.
             self.esc.acknowledge_sync(0);
             self.esc.acknowledge_sync(1);
             self.start_ticking(local);
         }
     }
 
-    /// An application without a sound configuration in its EEPROM never starts.
+    /// True if the application runs. It never starts without a valid configuration in the EEPROM.
     fn application_runs(&self) -> bool {
         !self.hangs && self.esc.is_loaded() && !self.is_restarting()
     }
@@ -297,7 +298,7 @@ impl SimDevice {
         self.tick = period.map_or(u64::MAX, |period| local + period);
     }
 
-    /// Without power nothing happens in it any more; it keeps what [`SimDevice::power_on`] clears.
+    /// Switches the power off. [`SimDevice::power_on`] clears the volatile state.
     pub(crate) fn power_off(&mut self) {
         self.powered = false;
     }
@@ -307,7 +308,7 @@ impl SimDevice {
         self.powered
     }
 
-    /// A motor without power turns on until friction has stopped it; `true` while it does.
+    /// Lets the unpowered motor turn until friction stops it. True while the motor turns.
     fn coast(&mut self, now: Nanos) -> bool {
         let local = self.esc.clock.local(now);
         while self.tick <= local {
@@ -321,7 +322,7 @@ impl SimDevice {
             .is_some_and(|drive| drive.velocity_rev_s() != 0.0)
     }
 
-    /// Everything volatile is lost; objects return to their defaults.
+    /// Switches the power on. Volatile data are lost and objects return to their defaults.
     pub(crate) fn power_on(&mut self, now: Nanos) {
         self.powered = true;
         self.esc.power_on(now);
@@ -341,7 +342,7 @@ impl SimDevice {
         self.arrivals = EventLog::default();
     }
 
-    /// SYNC outputs rose.
+    /// Handles rising edges of the SYNC outputs.
     fn synchronized(&mut self, edges: Edges) {
         let at = self.esc.clock.true_time(self.local);
         for (log, rose) in self.pulses.iter_mut().zip([edges.sync0, edges.sync1]) {
@@ -394,7 +395,7 @@ impl SimDevice {
         }
     }
 
-    /// Nothing but the device's own time can make it latch inputs.
+    /// True without outputs. Only the device time can then trigger latching of inputs.
     fn outputs_are_none(&self) -> bool {
         !self
             .process
@@ -403,11 +404,16 @@ impl SimDevice {
     }
 
     /// Processes a frame whose first byte arrives at `now`.
-    pub(crate) fn process(&mut self, bytes: &mut [u8], datagrams: &[Datagram], now: Nanos) -> Seen {
+    pub(crate) fn process(
+        &mut self,
+        bytes: &mut [u8],
+        datagrams: &[Datagram],
+        now: Nanos,
+    ) -> FrameEffects {
         let local = self.esc.begin_frame(now);
         self.local = local;
         if self.application.samples_at_frames() && !self.sync0_decides() {
-            // As digital inputs do: sampled when a frame begins.
+            // Digital inputs are sampled when a frame begins.
             self.latch_inputs();
         }
         for datagram in datagrams {
@@ -417,7 +423,7 @@ impl SimDevice {
         let raised = self.esc.take_raised();
         if raised.reset {
             self.reset_at(now);
-            return Seen {
+            return FrameEffects {
                 latches: false,
                 dl_control: true,
             };
@@ -446,13 +452,13 @@ impl SimDevice {
         if raised.sm_written != 0 && self.follows_sm(raised.sm_written) {
             self.exchange();
         }
-        Seen {
+        FrameEffects {
             latches: self.esc.take_latch(),
             dl_control: self.esc.dl_control_changed() | std::mem::take(&mut self.was_reset),
         }
     }
 
-    /// Outputs arrived and no SYNC0 decides when they count.
+    /// True if outputs arrived and take effect at once instead of at SYNC0.
     fn follows_sm(&self, written: u8) -> bool {
         self.al.state >= AlState::SafeOp
             && !self.sync0_decides()
@@ -463,12 +469,12 @@ impl SimDevice {
         self.esc.dc.as_ref().is_some_and(|dc| dc.sync.sync0_on())
     }
 
-    /// SYNC0 pulses since it was activated.
+    /// Returns the number of SYNC0 pulses since activation.
     fn sync0_pulses(&self) -> u64 {
         self.esc.dc.as_ref().map_or(0, |dc| dc.sync.pulses)
     }
 
-    /// Fault injection: what EEPROM and object 0x1018 say.
+    /// Returns the identity in EEPROM and object 0x1018, for fault injection.
     pub(crate) fn identification(&self) -> Identification {
         let rom = &self.esc.eeprom;
         let number = |word| u32::from(rom.word(word)) | u32::from(rom.word(word + 1)) << 16;
@@ -504,21 +510,21 @@ impl SimDevice {
         });
     }
 
-    /// The watchdog of the process data expires now.
+    /// Lets the process data watchdog expire now.
     pub(crate) fn expire_watchdog(&mut self) {
         if self.powered {
             self.watchdog_expired();
         }
     }
 
-    /// Whoever looks after the mailbox does not, or does again.
+    /// Stops the service of the mailbox, or resumes it.
     pub(crate) fn silence_mailbox(&mut self, silent: bool) {
         if std::mem::replace(&mut self.mailbox_silent, silent) && !silent {
             self.resume_mailbox();
         }
     }
 
-    /// SYNC0 begins so much later than its start time says, from the next start on.
+    /// Delays the first SYNC0 by `late` ns, from the next start on.
     pub(crate) fn delay_sync(&mut self, late: Nanos) {
         if let Some(dc) = &mut self.esc.dc {
             dc.sync.late = late;

@@ -1,17 +1,17 @@
-//! What outlives a power cycle: parameters stored by 0x1010, files.
+//! Data that survives a power cycle: parameters stored by 0x1010, and files.
 
 use super::SimDevice;
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::foe::FileStore;
 
 impl SimDevice {
-    /// The device's files, as FoE shows them.
+    /// Returns the files that FoE serves.
     #[must_use]
     pub fn foe_files(&self) -> &FileStore {
         &self.files
     }
 
-    /// Puts a file into the device, or replaces it. False, and nothing changes, if it does not fit.
+    /// Adds or replaces a file. Returns false and changes nothing if the file does not fit.
     pub fn put_file(&mut self, name: &str, data: &[u8]) -> bool {
         let capacity = self.mailbox_options.foe.capacity;
         let fits = self.files.has_room(name, data.len(), capacity);
@@ -21,19 +21,19 @@ impl SimDevice {
         fits
     }
 
-    /// Name of the file that a MainDevice completed last; each is told once.
+    /// Returns the name of the file that a MainDevice wrote last. Each write is reported once.
     pub fn take_written_file(&mut self) -> Option<String> {
         self.files.take_written()
     }
 
-    /// 0x1010: the next power-on starts with the present values.
+    /// Stores the present values for the next power-on (0x1010).
     pub(super) fn store_parameters(&mut self) {
         for slot in kept(&self.store) {
             self.fresh.store.copy_from(&self.store, slot);
         }
     }
 
-    /// 0x1011: the next power-on starts with the defaults.
+    /// Restores the defaults for the next power-on (0x1011).
     pub(super) fn restore_parameters(&mut self) {
         for slot in kept(&self.store) {
             self.fresh.store.restore(slot);
@@ -41,11 +41,11 @@ impl SimDevice {
     }
 }
 
-/// What the ESI marks as backup; where it marks nothing, all that can be written.
-fn kept(store: &ObjectStore) -> Vec<Slot> {
+/// Returns the entries that the ESI marks as backup, or all writable entries if it marks none.
+fn kept(store: &ObjectStore) -> Vec<EntryHandle> {
     use ecaxis_esi::model::Writable;
-    let those = |keeps: fn(&crate::coe::store::Item) -> bool| {
-        let of = |slot: &Slot| store.item(*slot).is_some_and(keeps);
+    let those = |keeps: fn(&crate::coe::object_dictionary::Item) -> bool| {
+        let of = |slot: &EntryHandle| store.item(*slot).is_some_and(keeps);
         store.slots().filter(of).collect::<Vec<_>>()
     };
     let marked = those(|item| item.backup);

@@ -1,5 +1,5 @@
-//! Process data: SyncManager buffers ↔ objects. Layouts are made when SafeOp is entered; afterwards
-//! nothing here allocates.
+//! Process data: SyncManager buffers ↔ objects. The layouts are computed on entry to SafeOp. Later
+//! code in this module does not allocate.
 
 use ecaxis_esi::model::Direction;
 
@@ -17,15 +17,15 @@ use crate::esc::sm::{Mode, SyncManager};
 pub(super) struct ProcessData {
     pub(super) sm: usize,
     pub(super) direction: Direction,
-    /// As the ESI has it.
+    /// The buffer mode in the ESI.
     pub(super) mode: Mode,
     pub(super) map: Vec<Mapped>,
-    /// Bytes.
+    /// The length in bytes.
     pub(super) len: usize,
 }
 
 impl SimDevice {
-    /// Makes the layouts anew from assignment and mapping.
+    /// Computes the layouts again from assignment and mapping.
     pub(super) fn lay_out(&mut self) {
         for data in &mut self.process {
             let sm = u8::try_from(data.sm).unwrap_or(0);
@@ -34,10 +34,10 @@ impl SimDevice {
         self.application.laid_out(&self.process);
     }
 
-    /// Takes outputs, if they count in this state, and latches inputs.
+    /// Takes outputs, if they take effect in this state, and latches inputs.
     pub(super) fn exchange(&mut self) {
         self.show();
-        // An emulated device stays in Op without outputs to obey.
+        // A device with device emulation stays in Op after the watchdog has expired.
         if self.al.state == AlState::Op && !self.esc.watchdog.expired() {
             self.take_outputs();
         }
@@ -45,14 +45,14 @@ impl SimDevice {
         self.latch_inputs();
     }
 
-    /// Nobody commands outputs any more.
+    /// Handles the end of commanded outputs.
     pub(super) fn drop_outputs(&mut self) {
         if self.application.rest(&mut self.store, &self.process) {
             self.latch_inputs();
         }
     }
 
-    /// An output area with one buffer only takes the next data once these have been fetched.
+    /// Frees output areas with one buffer, which accept new data only after that.
     fn empty_single_buffers(&mut self) {
         for data in &self.process {
             if data.mode == Mode::Mailbox && data.direction == Direction::Rx {
@@ -82,7 +82,7 @@ impl SimDevice {
         }
         self.show();
         for data in self.process.iter().filter(|d| d.direction == Direction::Tx) {
-            // Registers that a SyncManager looks at are not the device's to fill.
+            // A SyncManager over registers is not filled by the device.
             let ram = |sm: &&SyncManager| usize::from(sm.start) >= ADDRESS_SPACE;
             if self.esc.sms.get(data.sm).filter(ram).is_none() {
                 continue;
@@ -97,7 +97,7 @@ impl SimDevice {
         }
     }
 
-    /// What is in the buffers of a direction, SyncManager after SyncManager.
+    /// Returns the buffers of a direction, in the order of the SyncManagers.
     fn buffers(&self, direction: Direction) -> Vec<u8> {
         let of_direction = self.process.iter().filter(|d| d.direction == direction);
         of_direction
@@ -106,20 +106,20 @@ impl SimDevice {
             .collect()
     }
 
-    /// Output process data as last received.
+    /// Returns the last received output process data.
     #[must_use]
     pub fn outputs(&self) -> Vec<u8> {
         self.buffers(Direction::Rx)
     }
 
-    /// Input process data as last latched.
+    /// Returns the last latched input process data.
     #[must_use]
     pub fn inputs(&self) -> Vec<u8> {
         self.buffers(Direction::Tx)
     }
 
-    /// A wire to one of a drive's digital inputs ([`crate::drive::input`] names the bits of 0x60FD), from
-    /// this true time on. False if this is no drive.
+    /// Sets a digital input of a drive from this true time on. [`crate::drive::input`] names the
+    /// bits of 0x60FD. Returns false if the device is not a drive.
     pub fn set_digital_input(&mut self, now: Nanos, bit: u8, on: bool) -> bool {
         self.advance(now);
         let left = self.tick.saturating_sub(self.esc.clock.local(now));
@@ -130,14 +130,14 @@ impl SimDevice {
         true
     }
 
-    /// A drive's digital outputs, by the bits of 0x60FE.
+    /// Returns the digital outputs of a drive, with the bits of 0x60FE.
     #[must_use]
     pub fn digital_outputs(&self) -> Option<u32> {
         self.drive().map(|drive| drive.outputs(&self.store))
     }
 
-    /// Sets an input object of an I/O device; it no longer mirrors an output. False if there is no
-    /// such object.
+    /// Sets an input object of an I/O device, which then no longer mirrors an output. Returns false
+    /// if the object does not exist.
     pub fn set_input(&mut self, index: u16, sub: u8, value: i64) -> bool {
         let Some(slot) = self.store.slot(index, sub) else {
             return false;
@@ -148,7 +148,7 @@ impl SimDevice {
     }
 }
 
-/// Of one control period; more than a whole one is one.
+/// Returns the share of a control period, at most 1.
 fn share(part: Nanos, whole: Nanos) -> f64 {
     let short = |ns: Nanos| f64::from(u32::try_from(ns).unwrap_or(u32::MAX));
     (short(part) / short(whole)).min(1.0)

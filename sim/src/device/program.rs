@@ -1,20 +1,21 @@
-//! A device with its program, with its boot loader alone, and between the two.
+//! A device with a program, with only its boot loader, and during the change.
 
 use super::SimDevice;
 use super::application::{Application, Io};
 use crate::Nanos;
-use crate::coe::store::ObjectStore;
+use crate::coe::object_dictionary::ObjectStore;
 use crate::esc::al::AlState;
 use crate::firmware::{Next, PROGRAM_IDENTIFICATION, boot_objects};
 
 impl SimDevice {
-    /// Whether only the boot loader runs: the program is stopped, or there is none.
+    /// True while only the boot loader runs, because the program is stopped or missing.
     #[must_use]
     pub fn is_stopped(&self) -> bool {
         self.processor.as_ref().is_some_and(|p| p.stopped)
     }
 
-    /// The firmware file in the program memory; `None` where there is no program, or the one from the factory.
+    /// Returns the firmware file in the program memory; `None` for the factory program or no
+    /// program.
     #[must_use]
     pub fn firmware(&self) -> Option<&[u8]> {
         self.processor.as_ref()?.flash.file()
@@ -24,7 +25,7 @@ impl SimDevice {
         self.restarts_until.is_some()
     }
 
-    /// The processor starts, with everything else of the application as at power-on.
+    /// Starts the processor and resets the rest of the application as at power-on.
     pub(super) fn boot(&mut self, stop: bool) {
         if let Some(parked) = self.parked.take() {
             (self.pdo, self.process) = *parked;
@@ -49,7 +50,8 @@ impl SimDevice {
         }
     }
 
-    /// Does what was written to 0x1F51. True if it restarts for it: whoever wrote hears nothing.
+    /// Executes the command in 0x1F51. Returns true if it restarts the processor; the client then
+    /// gets no answer.
     pub(super) fn obey_program_control(&mut self) -> bool {
         let Some(processor) = &mut self.processor else {
             return false;
@@ -77,7 +79,7 @@ impl SimDevice {
         }
     }
 
-    /// The processor looks after its controller again.
+    /// Resumes the service of the controller after a restart.
     pub(super) fn restarted(&mut self, local: u64) {
         self.restarts_until = None;
         self.start_ticking(local);
@@ -91,13 +93,13 @@ impl SimDevice {
         self.plan_fetch(local);
     }
 
-    /// Back in Init with a program that has not run yet.
+    /// True in Init with a program that has not run yet.
     pub(super) fn starts_new_program(&self) -> bool {
         let is_new = self.processor.as_ref().is_some_and(|p| p.flash.is_new());
         is_new && self.al.state == AlState::Init
     }
 
-    /// Resets itself, its controller with it.
+    /// Resets the processor and its controller.
     pub(super) fn reset(&mut self, local: u64) {
         let now = self.esc.clock.true_time(local);
         self.reset_at(now);
@@ -106,7 +108,7 @@ impl SimDevice {
         self.was_reset = true;
     }
 
-    /// As switched off and on again, with the cables as they are.
+    /// Resets the device like a power cycle; the links are kept.
     pub(super) fn reset_at(&mut self, now: Nanos) {
         let links = self.esc.links();
         self.power_on(now);

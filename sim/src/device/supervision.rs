@@ -1,28 +1,29 @@
-//! Whether outputs and SYNC0 keep in step while SYNC0 decides when outputs count.
+//! Supervises outputs and SYNC0 while SYNC0 triggers the outputs.
 //!
-//! Outputs: a counter grows by 3 with every SYNC0 that finds no new ones and shrinks by 1 with every
-//! other; above 0x10F1:02 the device leaves Op (ETG.1020, "synchronization errors"). A device without
-//! that object, or with zero there, leaves it to its watchdog. SYNC0 itself is missed after three periods.
+//! A counter grows by 3 with every SYNC0 without new outputs and shrinks by 1 with every other
+//! SYNC0. Above 0x10F1:02 the device leaves Op (ETG.1020, "synchronization errors"). Without that
+//! object, or with zero in it, only the watchdog supervises the outputs. SYNC0 itself counts as
+//! lost after three periods.
 
 use super::SimDevice;
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::{CONTROL_PERIOD_NS, DeviceError};
 use crate::esc::al::{AlState, code};
 
 const MISSED: u32 = 3;
-/// SYNC0 periods without a pulse.
+/// The number of SYNC0 periods without a pulse after which SYNC0 is lost.
 const PATIENCE: u64 = 3;
 
 #[derive(Debug, Clone)]
 pub(super) struct Supervision {
-    /// 0x10F1:02.
-    limit: Option<Slot>,
-    /// 0x1C32:0B and 0x1C32:20.
-    missed: Option<Slot>,
-    sync_error: Option<Slot>,
-    /// Outputs came since the last SYNC0.
+    /// The limit, 0x10F1:02.
+    limit: Option<EntryHandle>,
+    /// The counters 0x1C32:0B and 0x1C32:20.
+    missed: Option<EntryHandle>,
+    sync_error: Option<EntryHandle>,
+    /// True if outputs arrived since the last SYNC0.
     fresh: bool,
-    /// They have begun to come since Op was entered.
+    /// True if outputs arrived since entry to Op.
     began: bool,
     errors: u32,
     /// Local time.
@@ -48,7 +49,7 @@ impl Supervision {
 }
 
 impl SimDevice {
-    /// SyncManagers were written to the last byte.
+    /// Handles SyncManagers that were written to the last byte.
     pub(super) fn outputs_came(&mut self, written: u8) {
         if self.process.iter().any(|d| written >> d.sm & 1 != 0) {
             self.supervision.fresh = true;
@@ -56,7 +57,7 @@ impl SimDevice {
         }
     }
 
-    /// A SYNC0 pulse, before it takes effect.
+    /// Counts a SYNC0 pulse before it takes effect.
     pub(super) fn count_sync0(&mut self) {
         let s = &mut self.supervision;
         s.last_sync0 = self.local;
@@ -84,7 +85,7 @@ impl SimDevice {
         }
     }
 
-    /// The control cycle looks whether SYNC0 still comes.
+    /// Checks in the control cycle that SYNC0 still arrives.
     pub(super) fn watch_sync0(&mut self) {
         if self.al.state != AlState::Op || !self.sync0_decides() {
             return;

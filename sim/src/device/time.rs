@@ -1,4 +1,5 @@
-//! What a device does by itself, in the order of its clock; and until when it does nothing, so that nobody has to ask.
+//! Timed events of a device in the order of its clock. Idle times are cached, so idle devices are
+//! skipped.
 
 use super::SimDevice;
 use super::application::Application;
@@ -7,35 +8,37 @@ use crate::Nanos;
 use crate::drive::Drive;
 use crate::frame::Datagram;
 
-/// Devices that live their lives together.
+/// Number of devices that advance together.
 const TOGETHER: usize = 4;
 
-/// What need not be asked of a device again while neither its time nor a frame has come.
+/// Cached facts about a device. They stay valid until a timed event or a frame for the device.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Rest {
-    /// Before this true time nothing happens in it by itself.
+    /// No timed event occurs before this true time.
     wake: Nanos,
-    /// Where it is addressed, if that is known and datagrams to other addresses leave it as it is.
+    /// Station address and alias, if known and if frames to other addresses do not affect the
+    /// device.
     addresses: Option<(u16, Option<u16>)>,
-    /// When the last frame passed that left it as it is.
+    /// The true time of the last frame that did not affect the device.
     passed: Option<Nanos>,
 }
 
-/// How far a device has come.
+/// The progress of a device.
 enum Run {
-    /// A drive's control cycle is over: its motor is to turn before [`SimDevice::tick`] goes on.
+    /// A control cycle of a drive is over. Its motor must turn before [`SimDevice::tick`]
+    /// continues.
     Control,
-    /// As far as it was to; before this true time nothing happens in it by itself.
+    /// The device has reached the requested time. No timed event occurs before this true time.
     Until(Nanos),
 }
 
 impl SimDevice {
-    /// Lets the device live up to `now`. Allocates only for mailbox traffic and state changes.
+    /// Advances the device to `now`. Allocates only for mailbox traffic and state changes.
     pub(crate) fn advance(&mut self, now: Nanos) {
         Self::advance_together(std::slice::from_mut(self), &mut [Rest::default()], |_| now);
     }
 
-    /// As [`SimDevice::advance`] of each, the n-th up to `until(n)`.
+    /// Advances several devices, the n-th to `until(n)`.
     pub(crate) fn advance_together(
         devices: &mut [Self],
         rests: &mut [Rest],
@@ -74,7 +77,7 @@ impl SimDevice {
         }
     }
 
-    /// Lives up to `now`, or until a drive's motor is to turn before [`SimDevice::tick`] goes on.
+    /// Runs to `now`, or until the motor of a drive must turn before [`SimDevice::tick`] continues.
     fn run(&mut self, now: Nanos) -> Run {
         if !self.powered {
             let turns = self.coast(now);
@@ -130,7 +133,7 @@ impl SimDevice {
                 self.al_step(due);
                 if self.starts_new_program() {
                     self.reset(due);
-                    // Its clock started anew.
+                    // The reset restarted the clock.
                     local = self.esc.clock.local(now);
                 }
             } else {
@@ -139,15 +142,15 @@ impl SimDevice {
         }
     }
 
-    /// Something is about to happen in the device that nobody foresaw.
+    /// Drops the cached facts before an event that they do not cover.
     pub(crate) fn disturb(&mut self, rest: &mut Rest) {
         if let Some(at) = std::mem::take(rest).passed {
             self.local = self.esc.clock.local(at);
         }
     }
 
-    /// Whether a frame that is here at `now` leaves the device as it is and is left as it is, as all its datagrams go to
-    /// other stations.
+    /// True if a frame at `now` does not affect the device and is not changed by it, because all
+    /// datagrams address other stations.
     pub(crate) fn is_passed(
         &self,
         rest: &mut Rest,

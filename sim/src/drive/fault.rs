@@ -6,19 +6,19 @@ use super::state::Ramp;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Emergency {
     pub code: u16,
-    /// 0x1001 at that time.
+    /// 0x1001 when the emergency was raised.
     pub register: u8,
     pub data: [u8; 5],
 }
 
-/// What the communication side tells the drive.
+/// Errors that the communication side reports to the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum DeviceError {
-    /// SYNC0 comes, but not in step with the process data.
+    /// SYNC0 is not in step with the process data.
     SyncLost,
-    /// A cyclic mode got no new set-point in time.
+    /// A cyclic mode received no new set-point in time.
     RxPdoTimeout,
-    /// Op was left, or the link is gone.
+    /// The device left Op, or the link is down.
     BusDown,
 }
 
@@ -37,7 +37,7 @@ pub(super) const NEGATIVE_LIMIT_SWITCH: u16 = 0x8a80;
 pub(super) const POSITIVE_LIMIT_SWITCH: u16 = 0x8a81;
 pub(super) const SOFTWARE_POSITION_LIMIT: u16 = 0x8a82;
 
-/// 0x1001 for a fault code: the generic bit and the bit of its family.
+/// Returns 0x1001 for a fault code: the generic bit and the bit of its family.
 pub(super) fn error_register(code: u16) -> u8 {
     1 | match code >> 8 {
         0x00 => return 0,
@@ -51,7 +51,7 @@ pub(super) fn error_register(code: u16) -> u8 {
     }
 }
 
-/// What a fault does to a moving axis: coast, or stop on a ramp.
+/// The reaction of a moving axis to a fault. `None`: coast.
 pub(super) type Reaction = Option<Ramp>;
 
 const QUEUE: usize = 8;
@@ -60,10 +60,10 @@ const QUEUE: usize = 8;
 pub(super) struct Faults {
     /// 0x603F.
     code: u16,
-    /// A cause that persists: reset is refused while it is there.
+    /// A persistent cause: reset is refused while it is set.
     cause: Option<u16>,
     queue: [Option<Emergency>; QUEUE],
-    /// The newest code not yet written to the history.
+    /// The newest code that is not yet in the error history.
     unrecorded: Option<u16>,
 }
 
@@ -90,7 +90,7 @@ impl Faults {
         self.announce(code);
     }
 
-    /// "Error reset or no error".
+    /// Clears the fault and queues the emergency "Error reset or no error".
     pub(super) fn clear(&mut self) {
         self.code = 0;
         self.announce(0);
@@ -109,7 +109,8 @@ impl Faults {
     }
 
     fn announce(&mut self, code: u16) {
-        // A full queue means that nobody reads the mailbox; the oldest are the ones worth keeping.
+        // The queue is full only if no client reads the mailbox. It then keeps the oldest
+        // emergencies.
         if let Some(free) = self.queue.iter_mut().find(|slot| slot.is_none()) {
             *free = Some(Emergency {
                 code,

@@ -1,20 +1,20 @@
-//! Digital inputs: from the track's switches and the wires outside to 0x60FD.
+//! Digital inputs: the track's switches and external signals, shown in 0x60FD.
 
 use super::plant::{Plant, PlantParams};
-use super::track::{Edge, Span, Track};
+use super::travel::{Edge, Span, Track};
 
-/// Bits of 0x60FD (CiA 402-2, "digital inputs"); from 16 on they are the maker's own.
+/// Bits of 0x60FD (CiA 402-2, "digital inputs"). Bits from 16 on are vendor-specific.
 pub mod input {
     pub const NEGATIVE_LIMIT: u8 = 0;
     pub const POSITIVE_LIMIT: u8 = 1;
     pub const HOME: u8 = 2;
-    /// The first of the general purpose inputs.
+    /// The first general-purpose input.
     pub const GENERAL: u8 = 16;
     pub const TOUCH_PROBE_1: u8 = 24;
     pub const TOUCH_PROBE_2: u8 = 25;
 }
 
-/// The bits of what [`Track::spans`] returns.
+/// The bits of the spans of [`Track::spans`], in the same order.
 pub(super) const SWITCHES: [u8; 5] = [
     input::NEGATIVE_LIMIT,
     input::POSITIVE_LIMIT,
@@ -23,14 +23,14 @@ pub(super) const SWITCHES: [u8; 5] = [
     input::TOUCH_PROBE_2,
 ];
 
-/// Changes from outside that are remembered with their time until the next control cycle.
+/// Capacity for external changes, with their time, until the next control cycle.
 const CHANGES: usize = 4;
 
 #[derive(Debug, Clone, Copy)]
 struct Change {
     bit: u8,
     on: bool,
-    /// Share of the control period that had passed; once resolved, the position is in `counts`.
+    /// The fraction of the control period at which the change occurred.
     after: f64,
     counts: i64,
 }
@@ -39,21 +39,21 @@ struct Change {
 pub(super) struct Inputs {
     track: Track,
     spans: [Span; 5],
-    /// Without a switch on the track nothing is looked for.
+    /// True if the track has a switch. Otherwise the spans are not searched.
     any: bool,
     turn: i64,
-    /// What the wires from outside carry.
+    /// The levels of the external signals.
     outside: u32,
     changes: [Option<Change>; CHANGES],
-    /// Changes of the control cycle that has just passed.
+    /// The changes of the last control cycle.
     passed: [Option<Change>; CHANGES],
-    /// Bits that read inverted: normally closed contacts, less what 0x3141:02 turns back.
+    /// Bits that read inverted: normally closed contacts, XOR the polarity of 0x3141:02.
     inverted: u32,
-    /// Bits that some input is configured for.
+    /// Bits that have a configured input.
     live: u32,
     from: i64,
     to: i64,
-    /// Where the plant stood exactly.
+    /// The plant's position at the end of the last cycle, with fraction.
     exact: f64,
     on: u32,
     rose: u32,
@@ -87,7 +87,7 @@ impl Inputs {
         }
     }
 
-    /// From outside, after this share of the control period under way.
+    /// Sets an external signal at this fraction of the current control period.
     pub(super) fn set(&mut self, bit: u8, on: bool, after: f64) {
         let Some(mask) = 1_u32.checked_shl(bit.into()) else {
             return;
@@ -106,18 +106,18 @@ impl Inputs {
         }
     }
 
-    /// 0x3141:02 and 0x3142: bits whose polarity is inverted, bits that have an input.
+    /// Sets the inverted bits (0x3141:02) and the bits that have an input (0x3142).
     pub(super) fn configure(&mut self, polarity: u32, live: u32) {
         self.inverted = self.track.normally_closed ^ polarity;
         self.live = live;
     }
 
-    /// Wires from outside are looked at.
+    /// Reads the external signals.
     pub(super) fn refresh(&mut self) {
         self.on = self.levels();
     }
 
-    /// The control cycle that has passed.
+    /// Evaluates the last control cycle.
     pub(super) fn advance(&mut self, motor: &Plant) {
         self.from = self.to;
         self.to = motor.counts();
@@ -144,13 +144,13 @@ impl Inputs {
         (closed ^ self.inverted) & self.live
     }
 
-    /// 0x60FD, if it is not what was taken last.
+    /// Returns 0x60FD if it changed since the last call.
     pub(super) fn take_change(&mut self) -> Option<u32> {
         let shown = self.shown.replace(self.on);
         (shown != Some(self.on)).then_some(self.on)
     }
 
-    /// 0x60FD.
+    /// Returns 0x60FD.
     pub(super) fn all(&self) -> u32 {
         self.on
     }
@@ -159,12 +159,12 @@ impl Inputs {
         self.on & 1 << bit != 0
     }
 
-    /// Went on in the control cycle that has passed.
+    /// True if the input switched on in the last control cycle.
     pub(super) fn rose(&self, bit: u8) -> bool {
         self.rose & 1 << bit != 0
     }
 
-    /// What an input did in the control cycle that has passed, in order, and where.
+    /// Returns the edges of an input in the last control cycle, in order, with their positions.
     pub(super) fn edges(&self, bit: u8) -> impl Iterator<Item = Edge> + '_ {
         let inverted = self.inverted & 1 << bit != 0;
         let span = SWITCHES.iter().position(|&b| b == bit);
@@ -185,12 +185,12 @@ impl Inputs {
             })
     }
 
-    /// The index pulse that the control cycle that has passed went over.
+    /// Returns the index pulse that the axis passed in the last control cycle.
     pub(super) fn index(&self) -> Option<i64> {
         self.index_since(self.from)
     }
 
-    /// The first index pulse between a count and the present one.
+    /// Returns the first index pulse between a count and the present one.
     pub(super) fn index_since(&self, counts: i64) -> Option<i64> {
         self.track.index_between(self.turn, counts, self.to)
     }
@@ -200,7 +200,10 @@ impl Inputs {
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "saturates, centuries away")]
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "saturates far beyond any axis"
+)]
 fn whole_counts(position: f64) -> i64 {
     position.floor() as i64
 }

@@ -1,17 +1,16 @@
-//! A CiA 402 drive: what happens between Controlword and Statusword, and between the target and the
-//! motor shaft.
+//! A CiA 402 drive, from Controlword to Statusword and from the target to the motor shaft.
 //!
-//! * `objects`: the objects it lives on, as slots of the device's store
+//! * `objects`: the drive's objects, as slots of the device's store
 //! * `state`, `fault`: the power state machine, error codes, emergencies
-//! * `supervise`, `publish`: what stops the axis by itself; what the drive shows of itself
+//! * `supervise`, `publish`: checks that stop the axis; Statusword and actual values
 //! * `modes`, `profile`: set-points of CSP, CSV, CST, PP, PV and HM
-//! * `io`, `touch_probe`, `track`: inputs, latched positions, and the switches along the axis
+//! * `io`, `touch_probe`, `travel`: inputs, latched positions, and the switches along the axis
 //! * `control`: position and velocity loops at 0.4 ms, current loop at 0.04 ms, gains
 //! * `plant`: motor, load, friction, encoder
 //!
-//! The device calls [`Drive::sync`] when process data takes effect and [`Drive::control`] every 0.4 ms
-//! of its own time. Neither allocates. State and mask values are this crate's own: a misreading must
-//! not pass on both sides of the wire.
+//! The device calls [`Drive::sync`] when process data takes effect and [`Drive::control`] every 0.4
+//! ms of its own time. Neither allocates. This crate defines its own state and mask values, so that
+//! a misread standard cannot cancel out between MainDevice and simulator.
 
 mod control;
 mod fault;
@@ -26,36 +25,38 @@ mod supervise;
 #[cfg(test)]
 mod tests;
 mod touch_probe;
-mod track;
+mod travel;
 
 pub use fault::{DeviceError, Emergency};
 pub use io::input;
 pub use plant::PlantParams;
 pub use state::State;
-pub use track::Track;
+pub use travel::Track;
 
 use control::{Bounds, Controller, Demand, Tuning};
 use fault::Faults;
 use io::Inputs as DigitalInputs;
-use modes::{Cycle, Frame, Mode, Motion, SetPoints};
+use modes::{Cycle, Mode, Motion, PositionFrame, SetPoints};
 use objects::{HomingParameters, Objects, Parameters};
 use plant::Plant;
 use state::{Inputs, Power, Request, Stop};
 use touch_probe::TouchProbes;
 
 use crate::Nanos;
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 
-/// Position and velocity loop.
+/// The period of the position and velocity loops, in ns.
 pub const CONTROL_PERIOD_NS: Nanos = 400_000;
-/// The same in seconds.
+/// [`CONTROL_PERIOD_NS`] in seconds.
 const CONTROL_STEP: f64 = 400e-6;
 
-/// Parameters are looked at anew after so many control cycles, as a drive's background task does.
+/// Control cycles between two reads of the parameters. A real drive's background task also reads
+/// them late.
 const PARAMETER_CYCLES: u32 = 5;
-/// The control parameters every so many of these.
+/// Parameter reads between two reads of the control parameters.
 const TUNING_ROUNDS: u32 = 5;
-/// A stop is over when the axis stands, or so many cycles after it should: a load may keep it moving.
+/// Control cycles after the end of a ramp until a stop ends although the axis still moves. A load
+/// may keep it moving.
 const SETTLE_CYCLES: u32 = 250;
 
 #[derive(Debug, Clone)]
@@ -63,7 +64,8 @@ pub struct Drive {
     objects: Objects,
     parameters: Parameters,
     parameters_age: u32,
-    /// The store's edits when parameters, and control parameters, were read last; `None`: to be read again.
+    /// The store's edit count when the parameters and the control parameters were last read. `None`
+    /// forces a new read.
     parameters_edits: Option<u64>,
     tuning_edits: Option<u64>,
     homing: HomingParameters,
@@ -78,21 +80,22 @@ pub struct Drive {
     inputs: DigitalInputs,
     probes: TouchProbes,
     mode: Option<Mode>,
-    frame: Frame,
+    frame: PositionFrame,
     set_points: SetPoints,
-    /// A SYNC since Op was entered: there is a Controlword to obey.
+    /// True after the first SYNC in Op: the Controlword is valid.
     commanded: bool,
     in_op: bool,
     /// Controlword edges since the last control cycle.
     start: bool,
     reset: bool,
-    /// The stop whose ramp is running, and for how long its end is overdue.
+    /// The stop whose ramp is running, and the control cycles since the ramp ended.
     stopping: Option<Stop>,
     overdue: u32,
     following_cycles: u32,
     following_error: bool,
     warning: bool,
-    /// What the last control cycle demanded, and whether that was limited, while the objects do not show it yet.
+    /// The demand of the last control cycle and whether it was limited. `None` after
+    /// [`Drive::show`].
     unseen: Option<(Demand, bool)>,
 }
 
@@ -105,7 +108,7 @@ impl Drive {
         let counts = motor.counts();
         let inputs = DigitalInputs::new(&plant, &motor);
         let mut drive = Self {
-            frame: Frame {
+            frame: PositionFrame {
                 min: parameters.range_min,
                 width: parameters.range_width,
                 shift: 0,
@@ -146,14 +149,14 @@ impl Drive {
         drive
     }
 
-    /// Tells which objects the output process data carries, each time that is decided anew. A limit of
-    /// zero that is received acts; one that is only an object without a value does not.
-    pub fn set_mapped(&mut self, mapped: &[Slot]) {
+    /// Sets the objects that the output process data carries. Call it after every change of the
+    /// mapping. A mapped limit of zero acts; an unmapped limit of zero means "no limit".
+    pub fn set_mapped(&mut self, mapped: &[EntryHandle]) {
         self.objects.set_mapped(mapped);
         (self.parameters_edits, self.tuning_edits) = (None, None);
     }
 
-    /// SYNC0, or a SyncManager event where there is no distributed clock: set-points take effect.
+    /// Applies the set-points on SYNC0, or on a SyncManager event without distributed clocks.
     pub fn sync(&mut self, store: &ObjectStore) {
         let o = &self.objects;
         let word = store.get(o.controlword).to_le_bytes();
@@ -186,7 +189,8 @@ impl Drive {
         }
     }
 
-    /// One control cycle, every 0.4 ms of device time. Set-points and Controlword count only in Op.
+    /// Runs one control cycle, every 0.4 ms of device time. Set-points and Controlword act only in
+    /// Op.
     pub fn control(&mut self, store: &mut ObjectStore, in_op: bool) {
         self.begin_control(store);
         self.controller.turn(&mut self.plant);
@@ -194,16 +198,16 @@ impl Drive {
         self.show(store);
     }
 
-    /// The first part of a control cycle.
+    /// Runs the first part of a control cycle: reads the parameters.
     pub(crate) fn begin_control(&mut self, store: &ObjectStore) {
         self.parameters_age += 1;
-        // What was written before a start counts for what it starts.
+        // Parameters written before a start apply to that start.
         if self.parameters_age >= PARAMETER_CYCLES || self.start {
             self.read_parameters(store);
         }
     }
 
-    /// The second part: the motors. Several at once take less time than one after the other.
+    /// Runs the second part: the motors. A batch is faster than one motor after the other.
     pub(crate) fn turn(drives: [Option<&mut Self>; 4]) {
         fn parts(drive: &mut Drive) -> (&mut Controller, &mut Plant) {
             (&mut drive.controller, &mut drive.plant)
@@ -226,7 +230,7 @@ impl Drive {
         }
     }
 
-    /// The third part: what the drive makes of it.
+    /// Runs the third part: inputs, state machine, mode and supervision.
     pub(crate) fn end_control(&mut self, store: &mut ObjectStore, in_op: bool) {
         self.controller.observe(&self.plant);
         self.watch_inputs(store);
@@ -235,7 +239,7 @@ impl Drive {
         self.step_power(store);
         let demand = self.demand();
         self.supervise(&demand);
-        // A fault found just now begins its ramp in the next cycle, but cuts the power at once.
+        // A new fault starts its ramp in the next cycle, but cuts the power at once.
         let demand = if self.power.powered() {
             demand
         } else {
@@ -252,36 +256,36 @@ impl Drive {
         self.unseen = Some((demand, limited));
     }
 
-    /// Shows in the objects what the last control cycle left. To be called before anybody reads them or does anything to
-    /// the drive but to let it go on.
+    /// Writes the results of the last control cycle to the objects. Call it before anything reads
+    /// the objects or changes the drive other than by the next control cycle.
     pub(crate) fn show(&mut self, store: &mut ObjectStore) {
         self.show_in(store);
         self.unseen = None;
     }
 
-    /// As [`Drive::show`], in a copy of the objects.
+    /// As [`Drive::show`], for a copy of the objects.
     pub(crate) fn show_in(&self, store: &mut ObjectStore) {
         if let Some((demand, limited)) = &self.unseen {
             self.publish(store, demand, *limited);
         }
     }
 
-    /// One control period without power.
+    /// Runs one control period without power.
     pub(crate) fn coast(&mut self) {
         self.controller.coast(&mut self.plant);
     }
 
-    /// The next emergency to send, oldest first.
+    /// Returns the next emergency to send, oldest first.
     pub fn take_emergency(&mut self) -> Option<Emergency> {
         self.faults.take_emergency()
     }
 
-    /// A fault whose cause is gone at once: the reaction runs, then a reset clears it.
+    /// Raises a fault without a lasting cause: the reaction runs, then a reset clears it.
     pub fn inject_fault(&mut self, code: u16) {
         self.raise(code, self.parameters.options.fault_ramp());
     }
 
-    /// A fault whose cause stays, so that resets fail, until `None` takes it away.
+    /// Sets a lasting fault cause. Resets fail until `None` removes the cause.
     pub fn set_fault_cause(&mut self, code: Option<u16>) {
         self.faults.set_cause(code);
         if let Some(code) = code {
@@ -289,35 +293,35 @@ impl Drive {
         }
     }
 
-    /// The drive never leaves this state once it is in it, not even by a fault.
+    /// Keeps the drive in this state once it is reached, even on a fault.
     pub fn hold_in(&mut self, state: Option<State>) {
         self.power.hold_in(state);
     }
 
-    /// A wire to one of the inputs of 0x60FD ([`input`]), in parallel to the track's switch. It is seen
-    /// in the next control cycle, but a touch probe latches where the axis was `after` (0 to 1) of the
-    /// control period had passed.
+    /// Sets an external signal on an input of 0x60FD ([`input`]), in parallel to the track's
+    /// switch. The input changes in the next control cycle. A touch probe latches the position at
+    /// the fraction `after` (0 to 1) of the control period.
     pub fn set_input(&mut self, bit: u8, on: bool, after: f64) {
         self.inputs.set(bit, on, after);
     }
 
-    /// 0x60FE as it reaches the terminals.
+    /// Returns 0x60FE as driven at the terminals.
     #[must_use]
     pub fn outputs(&self, store: &ObjectStore) -> u32 {
         self.objects.io.outputs(store)
     }
 
-    /// Statusword bit 7.
+    /// Sets Statusword bit 7.
     pub fn set_warning(&mut self, on: bool) {
         self.warning = on;
     }
 
-    /// Torque pulling towards negative positions, N·m.
+    /// Sets the torque that pulls towards negative positions, in N·m.
     pub fn set_load_torque(&mut self, torque: f64) {
         self.plant.set_load_torque(torque);
     }
 
-    /// A shaft that does not turn, whatever the motor does.
+    /// Blocks or releases the shaft.
     pub fn set_blocked(&mut self, blocked: bool) {
         self.plant.set_blocked(blocked);
     }
@@ -327,19 +331,19 @@ impl Drive {
         self.power.state()
     }
 
-    /// The output stage drives the motor.
+    /// True while the output stage drives the motor.
     #[must_use]
     pub fn power_on(&self) -> bool {
         self.power.powered()
     }
 
-    /// The shaft's position in 0x6064's frame, but never wrapped.
+    /// Returns the shaft's position in the frame of 0x6064, but never wrapped.
     #[must_use]
     pub fn position_counts(&self) -> i64 {
         self.plant.counts() + self.frame.shift
     }
 
-    /// The shaft's true speed, not what the drive observes.
+    /// Returns the shaft's true speed, not the drive's estimate.
     #[must_use]
     pub fn velocity_rev_s(&self) -> f64 {
         self.plant.velocity() / std::f64::consts::TAU
@@ -352,12 +356,12 @@ impl Drive {
         )
     }
 
-    /// Set-points move the axis.
+    /// True while set-points move the axis.
     fn follows(&self) -> bool {
         self.power.state() == State::OperationEnabled && self.power.stop().is_none()
     }
 
-    /// What the objects say now; where nobody has written to them since, that is known.
+    /// Reads the parameters. Skips the read if the store has no new edits.
     fn read_parameters(&mut self, store: &ObjectStore) {
         self.parameters_age = 0;
         let edits = Some(store.edits()).filter(|_| !self.objects.parameters_are_mapped());
@@ -393,7 +397,7 @@ impl Drive {
         }
     }
 
-    /// Switches, probes.
+    /// Evaluates switches and touch probes.
     fn watch_inputs(&mut self, store: &mut ObjectStore) {
         self.inputs.advance(&self.plant);
         self.show_inputs(store);
@@ -470,8 +474,8 @@ impl Drive {
         if self.power.stop() != self.stopping {
             self.stopping = self.power.stop();
             self.overdue = 0;
-            // A stop starts from what the axis does, not from what it was asked to do; an axis that is
-            // enabled again in the middle of a stop goes on from there, too.
+            // A stop starts from the actual motion, not from the demanded one. So does an axis that
+            // is enabled again during a stop.
             if self.power.powered() {
                 self.restart_motion();
             }
@@ -482,13 +486,12 @@ impl Drive {
         self.is_slow(self.controller.velocity())
     }
 
-    /// Below a tenth of a turn a second: as good as standing.
+    /// True below a tenth of a turn per second, which counts as standstill.
     fn is_slow(&self, velocity: f64) -> bool {
         velocity.abs() < 0.1 * f64::from(self.params.counts_per_turn)
     }
 
-    /// Profile modes and homing always know Controlword bit 8, the cyclic modes only where 0x605D says
-    /// what it does.
+    /// True if the mode obeys Controlword bit 8. Cyclic modes do so only if the drive has 0x605D.
     fn halts(&self, mode: Mode) -> bool {
         !mode.is_cyclic() || self.parameters.options.halt.is_some()
     }

@@ -1,52 +1,52 @@
-//! The motor and what hangs on it: winding, rotor with load, friction, encoder.
+//! The motor and its load: winding, rotor, friction, encoder.
 
 use std::f64::consts::TAU;
 
 use super::objects::float;
-use super::track::Track;
+use super::travel::Track;
 
 /// One step of the current loop, in seconds.
 pub(super) const CURRENT_STEP: f64 = 40e-6;
 
-/// Counts. Beyond this a double no longer knows every one.
+/// The largest position in counts. Beyond it, an f64 cannot represent every integer.
 const FARTHEST: f64 = 9_007_199_254_740_992.0;
 
-/// Motor, load and supply, in SI units. The default is a 70 W brushless motor of 45 mm with a load of
-/// about its own inertia.
+/// Motor, load and supply, in SI units. The default is a 70 W brushless motor of 45 mm with a load
+/// of about the rotor's inertia.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlantParams {
     /// Encoder counts per motor turn (four per line).
     pub counts_per_turn: u32,
-    /// What 0x6064 shows at power-on, in counts.
+    /// The value of 0x6064 at power-on, in counts.
     pub initial_position: i32,
-    /// Rotor and load, kg·m².
+    /// The inertia of rotor and load, in kg·m².
     pub inertia: f64,
-    /// N·m·s/rad.
+    /// Viscous friction, in N·m·s/rad.
     pub viscous_friction: f64,
-    /// N·m, holding and sliding.
+    /// Coulomb friction, static and sliding, in N·m.
     pub coulomb_friction: f64,
-    /// N·m, constantly pulling towards negative positions.
+    /// The constant load torque towards negative positions, in N·m.
     pub load_torque: f64,
-    /// N·m/A, and V·s/rad.
+    /// The torque constant in N·m/A, and the back-EMF constant in V·s/rad.
     pub torque_constant: f64,
-    /// Ω.
+    /// The winding resistance, in Ω.
     pub resistance: f64,
-    /// H.
+    /// The winding inductance, in H.
     pub inductance: f64,
-    /// V.
+    /// The supply voltage, in V.
     pub supply_voltage: f64,
-    /// A; rated torque is this times the torque constant.
+    /// The nominal current, in A. Nominal current times torque constant is the rated torque.
     pub nominal_current: f64,
-    /// A; what the output stage never exceeds.
+    /// The current limit of the output stage, in A.
     pub current_limit: f64,
-    /// Of the winding, s. How long the output stage may give more than the nominal current.
+    /// The thermal time constant of the winding, in s. It bounds the time above the nominal
+    /// current.
     pub thermal_time_constant: f64,
-    /// rpm; the power-on value of 0x6080.
+    /// The power-on value of 0x6080, in rpm.
     pub max_motor_speed: u32,
-    /// How long the output stage takes from Switched on to Operation enabled, in control cycles of
-    /// 0.4 ms.
+    /// The time from Switched on to Operation enabled, in control cycles of 0.4 ms.
     pub enable_cycles: u32,
-    /// What stands along the axis.
+    /// Switches, index pulses and mechanical ends along the axis.
     pub track: Track,
 }
 
@@ -78,7 +78,7 @@ impl PlantParams {
         f64::from(self.counts_per_turn.max(1)) / TAU
     }
 
-    /// N·m.
+    /// Returns the rated torque, in N·m.
     pub(super) fn rated_torque(&self) -> f64 {
         self.torque_constant * self.nominal_current
     }
@@ -86,20 +86,21 @@ impl PlantParams {
 
 #[derive(Debug, Clone)]
 pub(super) struct Plant {
-    /// Encoder counts, with fraction.
+    /// The encoder position in counts, with fraction.
     pub(super) position: f64,
-    /// rad/s.
+    /// The shaft speed, in rad/s.
     pub(super) velocity: f64,
-    /// A.
+    /// The winding current, in A.
     pub(super) current: f64,
     pub(super) load_torque: f64,
     pub(super) blocked: bool,
-    /// Mechanical ends, in counts.
+    /// The mechanical ends, in counts.
     pub(super) ends: (f64, f64),
     pub(super) coulomb: f64,
     pub(super) torque_constant: f64,
     counts_per_rad: f64,
-    // Per current-loop step: what is left of current and speed, what a volt and a newton metre do.
+    // Per current-loop step: decay factors of current and speed, and the gains per volt and per
+    // N·m.
     pub(super) current_decay: f64,
     pub(super) current_per_volt: f64,
     pub(super) velocity_decay: f64,
@@ -107,8 +108,8 @@ pub(super) struct Plant {
     pub(super) counts_per_velocity: f64,
 }
 
-/// `x' = (u − drag·x) / storage` over one current-loop step with `u` held: what is left of x, and what
-/// a unit of u adds.
+/// Solves `x' = (u − drag·x) / storage` over one current-loop step with constant `u`. Returns the
+/// decay factor of x and the gain per unit of u.
 fn first_order(storage: f64, drag: f64) -> (f64, f64) {
     let x = CURRENT_STEP * drag / storage;
     let gain = if x > 0.0 { -(-x).exp_m1() / x } else { 1.0 };
@@ -122,7 +123,7 @@ impl Plant {
         let (velocity_decay, velocity_per_torque) =
             first_order(p.inertia.max(1e-9), p.viscous_friction.max(0.0));
         Self {
-            // In the middle of a count, so that standing still is not standing on an edge.
+            // The middle of a count: a standing axis must not stand on an edge.
             position: f64::from(p.initial_position) + 0.5,
             velocity: 0.0,
             current: 0.0,
@@ -146,21 +147,24 @@ impl Plant {
         }
     }
 
-    /// What the encoder counted since power-on, from the initial position.
+    /// Returns the encoder count, starting at the initial position.
     pub(super) fn counts(&self) -> i64 {
-        // Rounding down by hand: `floor` is a call on processors without an instruction for it.
-        #[expect(clippy::cast_possible_truncation, reason = "saturates, centuries away")]
+        // Rounds down without `floor`, which is a library call on some processors.
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "saturates far beyond any axis"
+        )]
         let counts = self.position as i64;
         counts - i64::from(self.position < float(counts))
     }
 
-    /// Counts with fraction.
+    /// Returns the position in counts, with fraction.
     pub(super) fn position(&self) -> f64 {
         self.position
     }
 
-    /// The encoder edge passed last: its position in counts, and how long ago that was in seconds, going
-    /// by the present speed; at most `within`.
+    /// Returns the last encoder edge: its position in counts and its age in seconds. The age
+    /// follows from the present speed and is at most `within`.
     pub(super) fn edge(&self, within: f64) -> (f64, f64) {
         let speed = self.velocity * self.counts_per_rad;
         let below = float(self.counts());
@@ -194,12 +198,12 @@ impl Plant {
         self.blocked = blocked;
     }
 
-    /// Stands, and would go on standing without current.
+    /// True if the shaft stands and stays at rest without current.
     pub(super) fn at_rest(&self) -> bool {
         self.velocity == 0.0 && (self.blocked || self.load_torque.abs() <= self.coulomb)
     }
 
-    /// One current-loop step at this voltage.
+    /// Runs one current-loop step at this voltage.
     #[inline]
     pub(super) fn drive(&mut self, voltage: f64) {
         let before = self.current;
@@ -208,7 +212,7 @@ impl Plant {
         self.turn(0.5 * (before + self.current));
     }
 
-    /// One current-loop step with the winding open.
+    /// Runs one current-loop step with the winding open.
     #[inline]
     pub(super) fn coast(&mut self) {
         self.current = 0.0;
@@ -228,7 +232,7 @@ impl Plant {
         let torque = self.torque_constant * current - self.load_torque;
         let before = self.velocity;
         let free = before * self.velocity_decay + torque * self.velocity_per_torque;
-        // Friction takes away speed until there is none; it never drives.
+        // Friction reduces the speed to zero; it never drives the shaft.
         let friction = self.coulomb * self.velocity_per_torque;
         self.velocity = (free.abs() - friction).max(0.0).copysign(free);
         self.position += 0.5 * (before + self.velocity) * self.counts_per_velocity;

@@ -1,14 +1,14 @@
-//! Trapezoidal profiles, one control cycle at a time. Counts and seconds throughout.
+//! Trapezoidal profiles, one control cycle at a time, in counts and seconds.
 
 use super::CONTROL_STEP as DT;
 use super::control::Feed;
 
-/// A point moving under limits.
+/// A point that moves within speed and acceleration limits.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Profile {
     pub position: f64,
     pub velocity: f64,
-    /// Of the last step, for the feed-forward.
+    /// The acceleration of the last step, for the feed-forward.
     pub acceleration: f64,
 }
 
@@ -35,7 +35,7 @@ impl Profile {
         }
     }
 
-    /// Towards a velocity. True once it is reached.
+    /// Moves towards a velocity. True once it is reached.
     pub(super) fn ramp(&mut self, target: f64, acceleration: f64, deceleration: f64) -> bool {
         let slowing = target.abs() < self.velocity.abs() || target * self.velocity < 0.0;
         let step = DT * if slowing { deceleration } else { acceleration };
@@ -46,7 +46,7 @@ impl Profile {
         self.velocity == target
     }
 
-    /// Towards a position, coming to rest there. True once it is reached.
+    /// Moves towards a position and stops there. True once it is reached.
     pub(super) fn approach(&mut self, target: f64, limits: &Dynamics) -> bool {
         let distance = target - self.position;
         let step = limits.deceleration * DT;
@@ -54,8 +54,8 @@ impl Profile {
             *self = Self::at(target, 0.0);
             return true;
         }
-        // The speed after this cycle from which the way left then suffices to come to rest: the root of
-        // v²/2a + (v₀ + v)/2·Δt = distance.
+        // The speed after this cycle from which the remaining distance suffices to stop: the root
+        // of v²/2a + (v₀ + v)/2·Δt = distance.
         let half = 0.5 * step;
         let left = (distance.abs() - 0.5 * self.velocity * distance.signum() * DT).max(0.0);
         let allowed = (half * half + 2.0 * limits.deceleration * left).sqrt() - half;
@@ -65,12 +65,12 @@ impl Profile {
     }
 }
 
-/// Set-points that arrive once a cycle, drawn out to a line between the last two.
+/// Linear interpolation between the last two cyclic set-points.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Interpolator {
     from: f64,
     to: f64,
-    /// Since the segment began. Negative right after a set-point that came between two control cycles.
+    /// The time since the segment began. Negative if the set-point came between two control cycles.
     elapsed_ns: i64,
     period_ns: i64,
     output: f64,
@@ -88,17 +88,17 @@ impl Interpolator {
         }
     }
 
-    /// A set-point arrived. `period_ns` 0: no interpolation.
+    /// Takes a set-point. A `period_ns` of 0 disables interpolation.
     pub(super) fn take(&mut self, value: f64, period_ns: i64) {
-        // SYNC0 and the control cycle are not in step: what the last segment ran over or short of its
-        // period goes to this one, else every segment would begin with the same false phase.
+        // SYNC0 and the control cycle are not in step. The next segment inherits the last one's
+        // time error, otherwise every segment would begin with the same wrong phase.
         self.elapsed_ns = (self.elapsed_ns - self.period_ns).clamp(-STEP_NS, 0);
         self.from = self.to;
         self.to = value;
         self.period_ns = period_ns;
     }
 
-    /// One control cycle: value and slope per second.
+    /// Advances one control cycle. Returns the value and its slope per second.
     pub(super) fn advance(&mut self) -> (f64, f64) {
         let before = self.output;
         if self.period_ns <= 0 {
@@ -108,7 +108,7 @@ impl Interpolator {
         self.elapsed_ns = self.elapsed_ns.saturating_add(STEP_NS);
         if self.elapsed_ns > self.period_ns {
             self.output = self.to;
-            // Overdue: the last set-point stays, standing still.
+            // Overdue: hold the last set-point with zero slope.
             let overdue = self.elapsed_ns >= self.period_ns + STEP_NS;
             return (self.to, if overdue { 0.0 } else { self.slope() });
         }
@@ -121,7 +121,7 @@ impl Interpolator {
     }
 }
 
-/// Both far below 2^53.
+/// Both values are far below 2^53.
 #[expect(clippy::cast_precision_loss, reason = "nanoseconds of a few cycles")]
 fn ratio(a: i64, b: i64) -> f64 {
     a as f64 / b as f64
@@ -131,7 +131,7 @@ fn ratio(a: i64, b: i64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Largest overshoot, and control cycles to the target.
+    /// Returns the largest overshoot and the control cycles to the target.
     fn approach(from: Profile, target: f64, limits: &Dynamics) -> (f64, u32) {
         let (mut point, mut overshoot, mut cycles) = (from, 0.0_f64, 0);
         let way = (target - from.position).signum();
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_profile_ends_at_its_target_without_overshoot() {
+    fn profile_ends_at_its_target_without_overshoot() {
         let limits = Dynamics {
             velocity: 50_000.0,
             acceleration: 333_333.0,
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_profile_turns_round() {
+    fn profile_reverses_towards_its_target() {
         let limits = Dynamics {
             velocity: 10_000.0,
             acceleration: 100_000.0,
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn interpolation_keeps_its_phase_when_sync_and_control_cycle_beat() {
+    fn interpolation_keeps_its_phase_with_unsynchronised_cycles() {
         let mut line = Interpolator::at(0.0);
         let (mut control, mut worst) = (STEP_NS, 0.0_f64);
         for cycle in 0..100 {
@@ -190,7 +190,7 @@ mod tests {
             line.take(ratio(cycle, 1), 1_000_000);
             while control <= sync + 1_000_000 {
                 let (value, slope) = line.advance();
-                // One period behind, to the nanosecond.
+                // The output lags by exactly one period.
                 worst = worst.max((value - (ratio(control, 1_000_000) - 1.0).max(0.0)).abs());
                 assert!(cycle == 0 || (slope - 1000.0).abs() < 1e-9);
                 control += STEP_NS;

@@ -1,10 +1,10 @@
-//! What the drive shows of itself: Statusword and actual values.
+//! The drive's outputs: Statusword and actual values.
 
 use super::control::Demand;
 use super::modes::{Mode, bit};
 use super::objects::float;
 use super::{Drive, State};
-use crate::coe::store::ObjectStore;
+use crate::coe::object_dictionary::ObjectStore;
 
 impl Drive {
     fn statusword(&self, limited: bool) -> u16 {
@@ -82,7 +82,7 @@ impl Drive {
     }
 }
 
-/// `round` is a call on processors without an instruction for it.
+/// Rounds without `f64::round`, which is a library call on some processors.
 #[expect(clippy::cast_possible_truncation, reason = "saturates")]
 fn whole(value: f64) -> i64 {
     (value + 0.5_f64.copysign(value)) as i64

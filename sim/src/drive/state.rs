@@ -1,5 +1,5 @@
-//! The power state machine as the drive sees it: states, transitions 0–16, what stops the axis on the
-//! way. One call a control cycle, at most one transition a call.
+//! The power state machine of the drive: states, transitions 0–16, and stops during a transition.
+//! Each call is one control cycle and takes at most one transition.
 
 use super::fault::Reaction;
 
@@ -17,7 +17,7 @@ pub enum State {
 }
 
 impl State {
-    /// Statusword bits 0–3, 5 and 6.
+    /// Returns Statusword bits 0–3, 5 and 6.
     pub(super) fn bits(self) -> u16 {
         match self {
             Self::NotReadyToSwitchOn => 0x0000,
@@ -32,7 +32,7 @@ impl State {
     }
 }
 
-/// What a Controlword asks of the power state machine.
+/// The command that a Controlword carries for the power state machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Request {
     DisableVoltage,
@@ -40,13 +40,13 @@ pub(super) enum Request {
     Shutdown,
     SwitchOn,
     EnableOperation,
-    /// Bit 7 is up and nothing asks for less power.
+    /// Bit 7 is set and no bit requests less power.
     None,
 }
 
 impl Request {
     pub(super) fn decode(controlword: u16) -> Self {
-        // Asking for less power counts even while bit 7 is up; asking for more does not.
+        // A request for less power acts even while bit 7 is set. A request for more power does not.
         match controlword & 0x8f {
             w if w & 0x02 == 0 => Self::DisableVoltage,
             w if w & 0x04 == 0 => Self::QuickStop,
@@ -58,27 +58,27 @@ impl Request {
     }
 }
 
-/// How fast to stop.
+/// The deceleration of a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ramp {
     /// Profile deceleration, 0x6084.
     SlowDown,
     /// Quick stop deceleration, 0x6085.
     QuickStop,
-    /// No ramp: as fast as the current limit and the supply voltage allow.
+    /// No ramp: the current limit and the supply voltage determine the deceleration.
     Limit,
 }
 
-/// A stop under way, and the state it ends in.
+/// An active stop, and the state that follows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Stop {
     pub ramp: Ramp,
-    /// `None`: hold the axis where it stands.
+    /// `None`: hold the axis at standstill.
     pub then: Option<State>,
 }
 
-/// 0x605A to 0x605E and 0x6007 as written (CiA 402-2, "device control objects"). What a drive does not know it
-/// refuses to be written: see [`OptionCodes::QUICK_STOP`] and the others.
+/// 0x605A to 0x605E and 0x6007 as written (CiA 402-2, "device control objects"). A write of an
+/// unsupported value is refused: see [`OptionCodes::QUICK_STOP`] and the others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct OptionCodes {
     pub quick_stop: i64,
@@ -117,7 +117,7 @@ impl OptionCodes {
         }
     }
 
-    /// The axis stays enabled in any case.
+    /// Returns the ramp of a halt. The axis stays enabled in any case.
     pub(super) fn halt_ramp(&self) -> Ramp {
         match self.halt {
             Some(2) => Ramp::QuickStop,
@@ -126,7 +126,7 @@ impl OptionCodes {
         }
     }
 
-    /// What a communication error does to an enabled axis; `None`: nothing at all.
+    /// Returns the reaction of an enabled axis to a communication error. `None`: no reaction.
     pub(super) fn connection_reaction(&self) -> Option<Reaction> {
         match self.abort {
             1 => Some(self.fault_ramp()),
@@ -137,19 +137,19 @@ impl OptionCodes {
     }
 }
 
-/// What one control cycle tells the state machine.
+/// The inputs of the state machine for one control cycle.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Inputs {
     /// `None`: no Controlword is being received.
     pub request: Option<Request>,
     /// Controlword bit 7 rose and the fault's cause is gone.
     pub reset: bool,
-    /// The stop under way came to its end.
+    /// The active stop has ended.
     pub stopped: bool,
     pub options: OptionCodes,
 }
 
-/// Self-test after power-on, in control cycles.
+/// The self-test after power-on, in control cycles.
 const SELF_TEST: u32 = 5;
 
 #[derive(Debug, Clone)]
@@ -157,7 +157,7 @@ pub(super) struct Power {
     state: State,
     stop: Option<Stop>,
     hold: Option<State>,
-    /// Cycles until the next automatic step may happen.
+    /// Control cycles until the next automatic transition.
     wait: u32,
     enable_cycles: u32,
 }
@@ -185,7 +185,7 @@ impl Power {
         self.hold = state;
     }
 
-    /// The output stage drives the winding.
+    /// True while the output stage drives the winding.
     pub(super) fn powered(&self) -> bool {
         match self.state {
             State::OperationEnabled => true,
@@ -194,7 +194,8 @@ impl Power {
         }
     }
 
-    /// Transition 13. `ramp: None` lets the motor coast. False if the drive cannot or need not react.
+    /// Takes transition 13. With `ramp: None` the motor coasts. Returns false if the drive does not
+    /// react.
     pub(super) fn raise(&mut self, ramp: Option<Ramp>) -> bool {
         if matches!(self.state, State::FaultReactionActive | State::Fault) {
             return false;
@@ -206,7 +207,7 @@ impl Power {
         self.go(State::FaultReactionActive, stop)
     }
 
-    /// One control cycle. Returns the transition's number in CiA 402, for the tests.
+    /// Runs one control cycle. Returns the number of the CiA 402 transition, for the tests.
     pub(super) fn step(&mut self, inputs: &Inputs) -> Option<u8> {
         use State as S;
         let request = inputs.request.unwrap_or(Request::None);
@@ -258,7 +259,7 @@ impl Power {
                 return self.leave(8, S::ReadyToSwitchOn, inputs.options.shutdown);
             }
             (S::OperationEnabled, Request::EnableOperation) => {
-                // Enabled again while a shutdown or disable ramp runs.
+                // Enabled again during a shutdown or disable ramp.
                 self.stop = None;
                 return None;
             }
@@ -276,7 +277,7 @@ impl Power {
         self.go(to, stop).then_some(number)
     }
 
-    /// Transitions 5 and 8: at once, or after a ramp during which the state stays.
+    /// Takes transition 5 or 8: at once, or after a ramp during which the state stays.
     fn leave(&mut self, number: u8, to: State, option: i64) -> Option<u8> {
         if option == 1 {
             self.stop = Some(Stop {
@@ -288,7 +289,8 @@ impl Power {
         self.go(to, None).then_some(number)
     }
 
-    /// No Controlword comes any more: whatever is not moving goes back to Switch on disabled.
+    /// Handles the end of Controlword reception. Ready to switch on and Switched on go back to
+    /// Switch on disabled.
     pub(super) fn abandon(&mut self) {
         if matches!(self.state, State::ReadyToSwitchOn | State::SwitchedOn) {
             self.go(State::SwitchOnDisabled, None);
@@ -331,7 +333,7 @@ mod tests {
     ];
 
     #[test]
-    fn every_controlword_in_every_state_follows_an_arrow() {
+    fn controlwords_cause_only_standard_transitions() {
         let options = OptionCodes {
             quick_stop: 6,
             shutdown: 0,
@@ -367,7 +369,7 @@ mod tests {
             taken.sort_unstable();
             taken.dedup();
         }
-        // 1 waits for the self-test.
+        // Transition 1 waits for the self-test.
         let all = ARROWS.map(|(number, ..)| number);
         assert_eq!(taken, all[1..]);
     }

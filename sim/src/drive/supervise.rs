@@ -1,4 +1,4 @@
-//! What makes an enabled axis stop by itself: following error, limits, a lost connection.
+//! Checks that stop an enabled axis: following error, limits, a lost connection.
 
 use super::control::Demand;
 use super::io::input;
@@ -8,7 +8,7 @@ use super::{DeviceError, Drive, State, fault};
 const LIMIT_SWITCHES: u32 = 1 << input::NEGATIVE_LIMIT | 1 << input::POSITIVE_LIMIT;
 
 impl Drive {
-    /// What the communication side found. Only an enabled axis minds.
+    /// Handles a communication error. Only an enabled axis reacts.
     pub fn error(&mut self, error: DeviceError) {
         if !self.enabled() {
             return;
@@ -21,7 +21,7 @@ impl Drive {
         }
     }
 
-    /// 0x6007.
+    /// Reacts as 0x6007 demands.
     pub(super) fn lose_connection(&mut self, error: DeviceError) {
         if let Some(reaction) = self.parameters.options.connection_reaction() {
             self.raise(error.code(), reaction);
@@ -39,7 +39,7 @@ impl Drive {
         }
     }
 
-    /// Following error and position limits.
+    /// Checks following error and position limits.
     pub(super) fn supervise(&mut self, demand: &Demand) {
         if self.power.state() != State::OperationEnabled {
             return;
@@ -64,7 +64,8 @@ impl Drive {
         } else if let Some((min, max)) = self.parameters.software_limits
             && !matches!(demand, Demand::Position { .. })
         {
-            // Position set-points are kept inside; speed and torque can only be stopped.
+            // Position set-points are clamped to the limits. Speed and torque modes can only be
+            // stopped.
             let (at, speed) = (counts + self.frame.shift, self.controller.velocity());
             if (at > max && speed > 0.0) || (at < min && speed < 0.0) {
                 self.raise(fault::SOFTWARE_POSITION_LIMIT, ramp);
@@ -76,7 +77,8 @@ impl Drive {
         self.enabled() && self.inputs.all() & LIMIT_SWITCHES != 0
     }
 
-    /// The axis ran onto a limit switch, or is told to go further onto it. Homing looks for itself.
+    /// Returns the fault if the axis ran onto a limit switch or is commanded further onto it.
+    /// Homing handles the switches itself.
     fn struck_limit(&self, demand: &Demand) -> Option<u16> {
         if self.inputs.all() & LIMIT_SWITCHES == 0 || self.mode == Some(Mode::Homing) {
             return None;

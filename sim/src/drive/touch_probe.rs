@@ -1,30 +1,30 @@
-//! Touch probes 1 and 2: the position at an edge, by 0x60B8 into 0x60BA–0x60BD (CiA 402-2, "touch probe
-//! functionality").
+//! Touch probes 1 and 2: 0x60B8 selects the edges, 0x60BA–0x60BD hold the positions (CiA 402-2,
+//! "touch probe functionality").
 
 use super::io::{Inputs, input};
-use super::modes::Frame;
+use super::modes::PositionFrame;
 use super::objects::ProbeSlots;
-use super::track::Edge;
-use crate::coe::store::ObjectStore;
+use super::travel::Edge;
+use crate::coe::object_dictionary::ObjectStore;
 
-/// One byte of 0x60B8.
+/// Bits of one byte of 0x60B8.
 mod function {
     pub const ENABLE: u8 = 1;
     pub const CONTINUOUS: u8 = 1 << 1;
     pub const SOURCE_SHIFT: u8 = 2;
-    /// Positive edge; the next bit is the negative one's.
+    /// The positive edge, then the negative edge.
     pub const EDGES: [u8; 2] = [1 << 4, 1 << 5];
 }
 
-/// One byte of 0x60B9.
+/// Bits of one byte of 0x60B9.
 mod status {
     pub const ENABLED: u8 = 1;
     pub const STORED: [u8; 2] = [1 << 1, 1 << 2];
-    /// Change with every value stored by continuous sampling.
+    /// Toggle with every value that continuous sampling stores.
     pub const TOGGLE: [u8; 2] = [1 << 6, 1 << 7];
 }
 
-/// What latches.
+/// The trigger source of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Source {
     Input(u8),
@@ -44,13 +44,13 @@ pub(super) struct TouchProbes {
 }
 
 impl TouchProbes {
-    /// One control cycle.
+    /// Runs one control cycle.
     pub(super) fn step(
         &mut self,
         store: &mut ObjectStore,
         slots: &ProbeSlots,
         inputs: &Inputs,
-        frame: &Frame,
+        frame: &PositionFrame,
     ) {
         let word = store.get(slots.function);
         if word == 0 && self.function == 0 {
@@ -85,7 +85,7 @@ impl TouchProbes {
 }
 
 impl Probe {
-    /// Follows its byte of 0x60B8. True while the probe is enabled.
+    /// Applies the probe's byte of 0x60B8. True while the probe is enabled.
     fn arm(&mut self, function: u8, possible: bool) -> bool {
         let switched_on = function & !self.function;
         self.function = function;
@@ -96,7 +96,7 @@ impl Probe {
         if self.status == 0 || switched_on & function::ENABLE != 0 {
             self.status = status::ENABLED;
         }
-        // An edge that is switched on anew may store anew.
+        // An edge that is enabled again may store a new value.
         for (edge, stored) in function::EDGES.into_iter().zip(status::STORED) {
             if switched_on & edge != 0 {
                 self.status &= !stored;
@@ -105,7 +105,7 @@ impl Probe {
         true
     }
 
-    /// An edge came, 0 the positive, 1 the negative one. True if its position is to be stored.
+    /// Handles an edge: 0 positive, 1 negative. True if its position is to be stored.
     fn samples(&mut self, which: usize) -> bool {
         let (Some(edge), Some(stored), Some(toggle)) = (
             function::EDGES.get(which),
@@ -126,7 +126,7 @@ impl Probe {
     }
 }
 
-/// 0x60B8 bits 2 and 3, and 0x60D0 where these point there.
+/// Returns the source of 0x60B8 bits 2 and 3, or of 0x60D0 if they select it.
 fn source(function: u8, n: usize, store: &ObjectStore, slots: &ProbeSlots) -> Option<Source> {
     let own = if n == 0 {
         input::TOUCH_PROBE_1

@@ -1,22 +1,23 @@
-//! What datagrams read and write. RAM is written at once; writes to registers wait until the frame has been
-//! received well (shadow buffers, Beckhoff ESC data sheet, section I, 3.4) and are then carried out in `apply`.
+//! Reads and writes of datagrams. RAM is written at once. Register writes wait until the frame has
+//! been received without errors (shadow buffers, Beckhoff ESC data sheet, section I, 3.4);
+//! `datagram` then applies them.
 
 use super::Esc;
 use super::registers as reg;
-use super::sm::Filled;
+use super::sm::BufferOwner;
 
-/// What happens to the datagram's bytes on a read.
+/// The effect of a read on the bytes of the datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Combine {
+pub(super) enum ReadCombine {
     Replace,
     Or,
 }
 
-/// Register writes of the frame under way.
+/// The register writes of the current frame.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Shadow {
     bytes: Vec<u8>,
-    /// Address and length.
+    /// Address and length of each write.
     spans: Vec<(u16, u16)>,
 }
 
@@ -44,7 +45,7 @@ impl Shadow {
         self.spans.clear();
     }
 
-    /// Address and bytes of each write, in order.
+    /// Returns address and bytes of each write, in order.
     pub(super) fn writes(&self) -> impl Iterator<Item = (usize, &[u8])> {
         let mut rest = self.bytes.as_slice();
         self.spans.iter().map_while(move |(start, len)| {
@@ -56,8 +57,8 @@ impl Shadow {
 }
 
 impl Esc {
-    /// Reads into `out`; false where nothing of it is answered.
-    pub(super) fn read(&mut self, start: u16, out: &mut [u8], combine: Combine) -> bool {
+    /// Reads into `out`. Returns false if no byte is readable.
+    pub(super) fn read(&mut self, start: u16, out: &mut [u8], combine: ReadCombine) -> bool {
         let start = usize::from(start);
         let end = start + out.len();
         let mut any = false;
@@ -69,8 +70,8 @@ impl Esc {
                 && let Some(from) = self.mem.get(place..place + len)
             {
                 match combine {
-                    Combine::Replace => to.copy_from_slice(from),
-                    Combine::Or => to.iter_mut().zip(from).for_each(|(to, from)| *to |= from),
+                    ReadCombine::Replace => to.copy_from_slice(from),
+                    ReadCombine::Or => to.iter_mut().zip(from).for_each(|(to, from)| *to |= from),
                 }
                 any = true;
             }
@@ -79,10 +80,11 @@ impl Esc {
         any
     }
 
-    /// The next bytes from `at` on (below `end`) that are read alike, and where they are.
+    /// Returns the length and location of the next bytes from `at` (below `end`) with equal read
+    /// access. Without read access, the location is `None`.
     pub(super) fn readable(&mut self, at: usize, end: usize) -> (usize, Option<usize>) {
         if at >= reg::ADDRESS_SPACE {
-            return self.stretch(at, end, Filled::ByDevice);
+            return self.stretch(at, end, BufferOwner::ByDevice);
         }
         let end = end.min(reg::ADDRESS_SPACE);
         let answers = self.map.readable(at, end);
@@ -92,7 +94,8 @@ impl Esc {
         (end - at, answers.then_some(at))
     }
 
-    /// Registers that are made when they are read, and events that reading acknowledges.
+    /// Updates the registers that are computed on a read, and notes the events that the read
+    /// acknowledges.
     fn before_read(&mut self, start: usize, end: usize) {
         let read = |first: u16, len: usize| overlaps(start, end, first, len);
         if end > usize::from(reg::DC_RECEIVE_TIMES) {
@@ -111,7 +114,7 @@ impl Esc {
         }
     }
 
-    /// Values of more than a byte are frozen when their first byte is read.
+    /// Reading the first byte freezes a value of several bytes.
     fn before_dc_read(&mut self, start: usize, end: usize) {
         let Some(dc) = &self.dc else { return };
         let first = |register: u16| (start..end).contains(&usize::from(register));
@@ -159,13 +162,14 @@ impl Esc {
         }
     }
 
-    /// The next bytes of RAM from `at` on (below `end`) with one owner, and where they are in memory;
-    /// `None` where the MainDevice may not read (`filled` by the device) or write them (by itself).
+    /// Returns the length and memory location of the next RAM bytes from `at` (below `end`) with
+    /// one owner. The location is `None` without access for the MainDevice. It reads bytes that the
+    /// device fills, and writes bytes that it fills itself (`filled`).
     pub(super) fn stretch(
         &mut self,
         at: usize,
         end: usize,
-        filled: Filled,
+        filled: BufferOwner,
     ) -> (usize, Option<usize>) {
         let memory = self.mem.len();
         if at >= memory || at >= reg::PROCESS_RAM && !self.loaded {
@@ -190,14 +194,14 @@ impl Esc {
             }
         }
         if at < reg::PROCESS_RAM {
-            let write = filled == Filled::ByMainDevice;
+            let write = filled == BufferOwner::ByMainDevice;
             let (len, can) = self.map.run(at, end.min(reg::PROCESS_RAM), write);
             return (len, can.then_some(at));
         }
         (end - at, Some(at))
     }
 
-    /// Writes `data`; false where nothing of it is accepted.
+    /// Writes `data`. Returns false if no byte is accepted.
     pub(super) fn write(&mut self, start: u16, data: &[u8]) -> bool {
         let start = usize::from(start);
         let end = start + data.len();
@@ -215,7 +219,7 @@ impl Esc {
                 at = stop;
                 continue;
             }
-            let (len, place) = self.stretch(at, end, Filled::ByMainDevice);
+            let (len, place) = self.stretch(at, end, BufferOwner::ByMainDevice);
             let (from, to) = (at - start, at - start + len);
             if let (Some(place), Some(from)) = (place, data.get(from..to))
                 && let Some(to) = self.mem.get_mut(place..place + len)
@@ -228,7 +232,7 @@ impl Esc {
         any
     }
 
-    /// Whether write protection lets a write through.
+    /// True if write protection permits a write.
     pub(super) fn may_write(&self, start: usize, end: usize) -> bool {
         let protected = |register| self.byte_at(register) & 1 != 0;
         let registers = protected(reg::WRITE_PROTECTION);
@@ -236,7 +240,7 @@ impl Esc {
         self.guard.allows(start, end, registers, all)
     }
 
-    /// Puts what may be written now into the shadow; false where that is nothing.
+    /// Stores the permitted writes in the shadow buffer. Returns false if there are none.
     pub(super) fn write_registers(&mut self, start: usize, data: &[u8]) -> bool {
         self.guard.note(start, data);
         if start == usize::from(reg::DC_SYSTEM_TIME) && self.dc.is_some() {
@@ -261,7 +265,7 @@ impl Esc {
         any
     }
 
-    /// The control loop takes four bytes; those that were not written are taken as they are in the local copy.
+    /// Passes four bytes to the control loop. Bytes that were not written come from the local copy.
     fn write_system_time(&mut self, data: &[u8]) -> bool {
         let Some(dc) = &self.dc else { return false };
         let mut received = (dc.local_copy(self.frame.stamp) as u32).to_le_bytes();
@@ -279,7 +283,7 @@ impl Esc {
         self.map.writable(at) && (!self.map.conditional(at) || self.condition(at))
     }
 
-    /// Whether other registers allow writing this one.
+    /// True if other registers permit a write to this one.
     fn condition(&self, at: usize) -> bool {
         let within = |first: u16, len: usize| overlaps(at, at + 1, first, len);
         let cyclic_control = || self.byte_at(reg::DC_CYCLIC_CONTROL);
@@ -293,7 +297,7 @@ impl Esc {
             let n = (at - usize::from(reg::SM)) / 8;
             return self.sms.get(n).is_some_and(|sm| !sm.enabled);
         }
-        // SYNC1 may be assigned the other way than SYNC0.
+        // SYNC1 may belong to the other side than SYNC0.
         if within(reg::DC_SYNC1_CYCLE, 4) {
             return matches!(cyclic_control() & 3, 0 | 3);
         }
@@ -307,7 +311,7 @@ impl Esc {
     }
 }
 
-/// Whether `start..end` meets the `len` bytes from `first` on.
+/// True if `start..end` overlaps the `len` bytes from `first` on.
 pub(super) fn overlaps(start: usize, end: usize, first: u16, len: usize) -> bool {
     let first = usize::from(first);
     start < first + len && first < end

@@ -1,5 +1,5 @@
-//! The EtherCAT state machine (ETG.1000.6 §6.4) as a pure function. What a transition demands of
-//! SyncManagers and clocks is checked by the device.
+//! The EtherCAT state machine (ETG.1000.6 §6.4) as a pure function. The device checks the
+//! requirements of a transition on SyncManagers and clocks.
 
 use std::fmt;
 
@@ -44,7 +44,7 @@ impl fmt::Display for AlState {
     }
 }
 
-/// AL status codes used here (0x0134).
+/// The AL status codes of the simulator (0x0134).
 pub mod code {
     pub const INVALID_STATE_CHANGE: u16 = 0x0011;
     pub const UNKNOWN_STATE: u16 = 0x0012;
@@ -67,18 +67,19 @@ pub const ERROR: u16 = 0x10;
 /// Bit 5: explicit device identification.
 pub const DEVICE_ID: u16 = 0x20;
 
-/// What a write to AL control asks for.
+/// The effect of a write to AL control.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Request {
-    /// An error stands unacknowledged.
+    /// An error is pending and not acknowledged.
     Ignored,
-    /// Already there; the error, if any, is gone.
+    /// The device already is in the requested state. An error is cleared.
     Stay,
     Change(AlState),
     Refused(u16),
 }
 
-/// Judges AL control against the present state. An error must be acknowledged, except on the way to Init.
+/// Evaluates AL control in the current state. An error must be acknowledged, except for a request
+/// of Init.
 #[must_use]
 pub fn judge(current: AlState, error: bool, control: u16) -> Request {
     use AlState::{Boot, Init, Op, PreOp, SafeOp};
@@ -106,7 +107,7 @@ mod tests {
     use AlState::{Boot, Init, Op, PreOp, SafeOp};
 
     #[test]
-    fn the_table_row_by_row() {
+    fn al_control_follows_the_transition_table() {
         let bad = Request::Refused(code::INVALID_STATE_CHANGE);
         let go = Request::Change;
         let columns = [Init, PreOp, Boot, SafeOp, Op];
@@ -133,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn unlisted_codes_are_unknown_states() {
+    fn al_control_rejects_unknown_state_codes() {
         for control in [0, 5, 6, 7, 9, 15] {
             assert_eq!(
                 judge(Init, false, control),

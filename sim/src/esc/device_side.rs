@@ -1,15 +1,15 @@
-//! The controller as the device's own side (PDI) sees it: registers without access rights, buffers, states, pulses,
-//! inputs with time stamps.
+//! The controller on the side of the device (PDI): registers without access rights, buffers,
+//! states, SYNC pulses, and inputs with time stamps.
 
 use super::al::{self, AlState};
 use super::dc::sync::Edges;
 use super::eeprom::{self, Finished};
 use super::registers as reg;
-use super::sm::{Filled, SyncManager};
+use super::sm::{BufferOwner, SyncManager};
 use super::{Esc, event};
 
 impl Esc {
-    /// Register or RAM contents.
+    /// Returns the contents of registers or RAM.
     #[must_use]
     pub fn bytes(&self, start: u16, len: u16) -> &[u8] {
         let start = usize::from(start);
@@ -48,14 +48,14 @@ impl Esc {
         self.bytes(at, 8).try_into().map_or(0, u64::from_le_bytes)
     }
 
-    /// Whether the EEPROM's configuration was sound: without it no application runs.
+    /// True if the configuration in the EEPROM was valid. Without it, no application runs.
     #[must_use]
     pub fn is_loaded(&self) -> bool {
         self.loaded
     }
 
-    /// Device emulation (0x0141 bit 0): nobody stands behind the controller, and AL status follows AL control by
-    /// itself, as in simple I/O terminals.
+    /// True with device emulation (0x0141 bit 0): there is no application, and AL status follows AL
+    /// control. Simple I/O terminals use this mode.
     #[must_use]
     pub fn emulates_device(&self) -> bool {
         self.loaded && self.byte_at(reg::ESC_CONFIGURATION) & 1 != 0
@@ -80,13 +80,13 @@ impl Esc {
 
     // Application layer
 
-    /// The device reads AL control, and the MainDevice may write it again.
+    /// Notes that the device read AL control; the MainDevice may write it again.
     pub(crate) fn read_al_control(&mut self) {
         self.al_locked = false;
         self.al_event(event::AL_CONTROL, false);
     }
 
-    /// AL status and its code, as the application sets them.
+    /// Sets AL status and its code for the application.
     pub(crate) fn set_al(&mut self, state: AlState, code: u16) {
         let error = if code == 0 { 0 } else { al::ERROR };
         self.put_al_status(u16::from(state.code()) | error);
@@ -102,13 +102,13 @@ impl Esc {
 
     // EEPROM
 
-    /// 0x0500 offers the EEPROM to the device, or the device has taken it.
+    /// True if 0x0500 assigns the EEPROM to the device, or the device has taken it.
     pub(super) fn device_has_eeprom(&self) -> bool {
         (self.byte_at(reg::EEPROM_CONFIG) | self.byte_at(reg::EEPROM_PDI_ACCESS)) & 1 != 0
     }
 
-    /// The device takes or gives back the EEPROM (0x0501). It is given only what is offered; true if it has it
-    /// afterwards.
+    /// Takes or releases the EEPROM for the device (0x0501). The device gets only an offered
+    /// EEPROM. Returns true if the device owns it afterwards.
     pub fn claim_eeprom(&mut self, claim: bool) -> bool {
         let forced_off = self.byte_at(reg::EEPROM_CONFIG) & 2 != 0;
         if self.device_has_eeprom() && !forced_off {
@@ -132,7 +132,7 @@ impl Esc {
         self.put(reg::EEPROM_CONTROL, &status.to_le_bytes());
     }
 
-    /// The job under way is over.
+    /// Ends the current EEPROM job.
     pub(crate) fn finish_eeprom(&mut self) {
         match self.eeprom.finish() {
             Some(Finished::Read(data, len)) => {
@@ -149,7 +149,7 @@ impl Esc {
 
     // SyncManagers
 
-    /// A SyncManager was filled or emptied. Registers show it when they are read.
+    /// Marks a SyncManager as filled or emptied. A read updates the registers.
     pub(crate) fn refresh_sm(&mut self, n: usize) {
         if let Some(sm) = self.sms.get_mut(n) {
             sm.note_full();
@@ -157,7 +157,7 @@ impl Esc {
         }
     }
 
-    /// Shows the SyncManagers' status, and the events that follow from it, in the registers.
+    /// Updates the registers with the SyncManager status and the resulting events.
     pub(super) fn show_sms(&mut self) {
         if !std::mem::take(&mut self.sms_stale) {
             return;
@@ -179,7 +179,7 @@ impl Esc {
         self.put(reg::AL_EVENT, &events.to_le_bytes());
     }
 
-    /// Opens or closes a SyncManager (0x0807 bit 0); either empties it.
+    /// Opens or closes a SyncManager (0x0807 bit 0). Both empty it.
     pub(crate) fn close_sm(&mut self, n: usize, closed: bool) {
         if let Some(sm) = self.sms.get_mut(n) {
             sm.close(closed);
@@ -187,16 +187,17 @@ impl Esc {
         }
     }
 
-    /// The buffer that the device fills next, in a SyncManager that it may fill.
+    /// Returns the buffer that the device fills next, if it may fill the SyncManager.
     pub(crate) fn fill_buffer(&mut self, n: usize) -> Option<&mut [u8]> {
         let memory = self.mem.len();
-        let fills = |sm: &&SyncManager| sm.is_open() && sm.filled == Filled::ByDevice && !sm.full;
+        let fills =
+            |sm: &&SyncManager| sm.is_open() && sm.filled == BufferOwner::ByDevice && !sm.full;
         let sm = self.sms.get(n).filter(fills)?;
         let (at, len) = (sm.device_writes_at(memory), usize::from(sm.len));
         self.mem.get_mut(at..at + len)
     }
 
-    /// That buffer is complete, at this local time.
+    /// Completes the buffer of [`Self::fill_buffer`] at this local time.
     pub(crate) fn filled_buffer(&mut self, n: usize, local: u64) {
         if let Some(sm) = self.sms.get_mut(n) {
             sm.device_wrote();
@@ -205,10 +206,11 @@ impl Esc {
         }
     }
 
-    /// What the MainDevice wrote last, completely; `None` where it has not.
+    /// Returns the last complete data of the MainDevice, or `None` without data.
     pub(crate) fn fetch_buffer(&mut self, n: usize, local: u64) -> Option<&[u8]> {
         let memory = self.mem.len();
-        let fetches = |sm: &&mut SyncManager| sm.filled == Filled::ByMainDevice && sm.has_data();
+        let fetches =
+            |sm: &&mut SyncManager| sm.filled == BufferOwner::ByMainDevice && sm.has_data();
         let sm = self.sms.get_mut(n).filter(fetches)?;
         let (at, len) = (sm.device_reads_at(memory), usize::from(sm.len));
         self.sms_stale = true;
@@ -216,7 +218,7 @@ impl Esc {
         self.mem.get(at..at + len)
     }
 
-    /// Last complete contents, without fetching them.
+    /// Returns the last complete contents without fetching them.
     #[must_use]
     pub fn latest_buffer(&self, n: usize) -> &[u8] {
         let Some(sm) = self.sms.get(n) else {
@@ -228,7 +230,7 @@ impl Esc {
             .unwrap_or_default()
     }
 
-    /// 0x09F8 and 0x09FC, where the SyncManager asks for it.
+    /// Sets 0x09F8 and 0x09FC if the SyncManager requests it.
     fn stamp_device_access(&mut self, n: usize, local: u64) {
         let activate = self.byte_at(reg::SM + n as u16 * 8 + 6);
         if activate & 0x80 != 0 && self.dc.is_some() {
@@ -240,7 +242,7 @@ impl Esc {
 
     // Watchdogs
 
-    /// The process data watchdog has expired.
+    /// Expires the process data watchdog.
     pub(crate) fn expire_watchdog(&mut self) {
         self.watchdog.expire();
         self.put(reg::WD_STATUS, &[0]);
@@ -248,18 +250,19 @@ impl Esc {
         self.al_event(event::WATCHDOG, true);
     }
 
-    /// Error counters stop at 255.
+    /// Increments an error counter, which stops at 255.
     pub(super) fn count_up(&mut self, register: u16) {
         let count = self.byte_at(register).saturating_add(1);
         self.put(register, &[count]);
     }
 
-    /// There is a process data interface, and it is in use.
+    /// True if a process data interface exists and is in use.
     pub(super) fn pdi_runs(&self) -> bool {
         self.loaded && self.byte_at(reg::PDI_CONTROL) != 0 && !self.pdi_watchdog.expired()
     }
 
-    /// The device's own side stops at this local time, or goes on: nothing triggers the PDI watchdog.
+    /// Stops or resumes the device side at this local time. A stopped one does not trigger the PDI
+    /// watchdog.
     pub(crate) fn pdi_stops(&mut self, stops: bool, local: u64) {
         if stops {
             let divider = self.u16_at(reg::WD_DIVIDER);
@@ -284,7 +287,7 @@ impl Esc {
 
     // Distributed clocks
 
-    /// SYNC pulses due at this local time.
+    /// Fires the SYNC pulses due at this local time.
     pub(crate) fn fire_sync(&mut self, local: u64) -> Edges {
         let Some(dc) = &mut self.dc else {
             return Edges::default();
@@ -294,7 +297,7 @@ impl Esc {
         edges
     }
 
-    /// Shows pulses in the device's events, where 0x0151 maps them.
+    /// Sets the device events of the pulses, if 0x0151 maps them.
     pub(crate) fn note_sync(&mut self, edges: Edges) {
         let mapped = self.byte_at(reg::SYNC_CONFIG);
         if mapped & 0x88 == 0 {
@@ -307,7 +310,7 @@ impl Esc {
         }
     }
 
-    /// The application has served a pulse of SYNC0 (0) or SYNC1 (1): 0x098E, 0x098F.
+    /// Acknowledges a pulse of SYNC0 (0) or SYNC1 (1) for the application: 0x098E, 0x098F.
     pub(crate) fn acknowledge_sync(&mut self, n: u8) {
         if let Some(dc) = &mut self.dc {
             dc.sync.acknowledge(n);
@@ -315,7 +318,7 @@ impl Esc {
         }
     }
 
-    /// The LATCH0 (0) or LATCH1 (1) input has this level at this local time.
+    /// Sets the level of the LATCH0 (0) or LATCH1 (1) input at this local time.
     pub fn latch_input(&mut self, n: usize, level: bool, local: u64) {
         let Some(dc) = &mut self.dc else { return };
         let system = dc.system(local);
@@ -325,7 +328,8 @@ impl Esc {
         self.refresh_latch_events();
     }
 
-    /// The device has read a latch unit's times; events of a unit that it controls are gone.
+    /// Acknowledges latch events after the device read the times. Applies only to units that the
+    /// device controls.
     pub fn acknowledge_latch(&mut self, n: usize) {
         let control = self.byte_at(reg::DC_CYCLIC_CONTROL);
         let Some(dc) = &mut self.dc else { return };
@@ -338,7 +342,7 @@ impl Esc {
         self.refresh_latch_events();
     }
 
-    /// Latch events go to whoever controls the unit (0x0980 bits 4 and 5).
+    /// Updates the latch events for the side that controls the unit (0x0980 bits 4 and 5).
     pub(super) fn refresh_latch_events(&mut self) {
         let control = self.byte_at(reg::DC_CYCLIC_CONTROL);
         let Some(dc) = &self.dc else { return };

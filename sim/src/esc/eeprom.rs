@@ -1,9 +1,11 @@
-//! The SII EEPROM behind registers 0x0502–0x050F (Beckhoff ESC data sheet, section I, 11; section II, 2.11).
+//! The SII EEPROM behind registers 0x0502–0x050F.
+//!
+//! Source: Beckhoff ESC data sheet, section I, 11; section II, 2.11.
 
-use super::info::EscInfo;
-use super::info::eeprom::{EIGHT_BYTES, TWO_BYTE_ADDRESS};
+use super::chip::EscInfo;
+use super::chip::eeprom::{EIGHT_BYTES, TWO_BYTE_ADDRESS};
 
-/// Time a write takes.
+/// The duration of a write in ns.
 const WRITE_NS: u64 = 500_000;
 
 /// Bits of the control and status register 0x0502.
@@ -14,7 +16,7 @@ pub const COMMAND_ERROR: u16 = 0x2000;
 pub const WRITE_ENABLE_ERROR: u16 = 0x4000;
 pub const BUSY: u16 = 0x8000;
 
-/// A checksum that is taken for right, whatever the configuration.
+/// A checksum value that is always accepted.
 const ANY_CHECKSUM: u16 = 0x88a4;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,7 +27,7 @@ enum Job {
 }
 
 impl Job {
-    /// Command bits 10:8, which show while it is under way.
+    /// Returns command bits 10:8, which are visible while the job runs.
     fn code(self) -> u16 {
         match self {
             Self::Read(_) => 0x0100,
@@ -35,22 +37,22 @@ impl Job {
     }
 }
 
-/// What became of a job.
+/// The result of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Finished {
-    /// Bytes for the data register, and how many of them the controller brings.
+    /// Bytes for the data register, and the number of valid ones.
     Read([u8; 8], usize),
     Written,
-    /// The configuration area is to be taken over, if it is sound.
+    /// The configuration area was read again and applies if it is valid.
     Reloaded,
 }
 
 #[derive(Debug, Clone)]
 pub struct Eeprom {
     image: Vec<u8>,
-    /// Bits of the status that tell of the chip, see [`super::info::eeprom`].
+    /// The chip bits of the status, see [`super::chip::eeprom`].
     features: u16,
-    /// Time a read or reload takes.
+    /// The duration of a read or reload in ns.
     read_ns: u64,
     job: Option<(Job, u64)>,
     error: u16,
@@ -68,13 +70,13 @@ impl Eeprom {
         }
     }
 
-    /// Everything but the contents is forgotten.
+    /// Resets everything except the contents.
     pub fn power_on(&mut self) {
         (self.job, self.error) = (None, 0);
     }
 
-    /// Words 0 to 6, if the checksum in word 7 fits (ETG.2010: x^8 + x^2 + x + 1, start value 0xff).
-    /// Otherwise the error shows from now on.
+    /// Returns words 0 to 6 if the checksum in word 7 matches (ETG.2010: x^8 + x^2 + x + 1, start
+    /// value 0xff). Otherwise the status shows the error from now on.
     pub fn configuration(&mut self) -> Option<[u16; 7]> {
         let any = self.image.len() > 15 && self.word(7) == ANY_CHECKSUM;
         if !self.checksum_fits() && !any {
@@ -89,7 +91,7 @@ impl Eeprom {
         Some(words)
     }
 
-    /// Of the configuration area.
+    /// Returns the checksum of the configuration area.
     fn checksum(&self) -> Option<u8> {
         let head = self.image.get(..14)?;
         Some(head.iter().fold(0xff_u8, |crc, byte| {
@@ -120,7 +122,7 @@ impl Eeprom {
         }
     }
 
-    /// Overwrites the station alias, and renews a checksum that was right; for fault injection.
+    /// Overwrites the station alias and updates a valid checksum, for fault injection.
     pub fn patch_alias(&mut self, alias: u16) {
         let fits = self.checksum_fits();
         if let Some(word) = self.image.get_mut(8..10) {
@@ -133,14 +135,14 @@ impl Eeprom {
         }
     }
 
-    /// Overwrites a 32-bit value at a word address without the interface; for fault injection.
+    /// Overwrites a 32-bit value at a word address without the interface, for fault injection.
     pub fn patch(&mut self, word: usize, value: u32) {
         if let Some(bytes) = self.image.get_mut(word * 2..word * 2 + 4) {
             bytes.copy_from_slice(&value.to_le_bytes());
         }
     }
 
-    /// Word addresses that reach the chip.
+    /// Reduces a word address to the bits that the chip receives.
     fn address(&self, word: u32) -> u32 {
         let bits = if self.features & TWO_BYTE_ADDRESS != 0 {
             18
@@ -150,7 +152,8 @@ impl Eeprom {
         word & ((1 << bits) - 1)
     }
 
-    /// A command from the control register with what stands in the address and data registers.
+    /// Executes a command of the control register with the contents of the address and data
+    /// registers.
     pub fn command(&mut self, control: u16, address: u32, data: [u8; 2], local: u64) {
         if self.is_busy() {
             return;
@@ -184,7 +187,7 @@ impl Eeprom {
         self.job.map_or(u64::MAX, |(_, due)| due)
     }
 
-    /// Ends the running job.
+    /// Ends the current job.
     pub fn finish(&mut self) -> Option<Finished> {
         Some(match self.job.take()?.0 {
             Job::Read(word) => {
@@ -209,7 +212,7 @@ impl Eeprom {
         })
     }
 
-    /// 0x0502 without the write enable bit and the loading error.
+    /// Returns 0x0502 without the write enable bit and the loading error.
     #[must_use]
     pub fn status(&self) -> u16 {
         let job = self.job.map_or(0, |(job, _)| BUSY | job.code());
@@ -234,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn reads_as_many_bytes_as_the_controller_can_and_ones_beyond_the_end() {
+    fn eeprom_reads_4_or_8_bytes_and_ones_beyond_the_end() {
         let bytes = [28, 29, 30, 31, 0xff, 0xff, 0xff, 0xff];
         for (features, len) in [(EIGHT_BYTES, 8), (0, 4)] {
             let mut eeprom = with_features((0..32).collect(), features);
@@ -246,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_chip_sees_ten_bits_of_the_address() {
+    fn small_eeprom_uses_ten_bits_of_the_address() {
         let read = |features, word| {
             let mut eeprom = with_features((0..32).collect(), features);
             eeprom.command(0x0100, word, [0; 2], 0);
@@ -259,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_stay_until_the_next_valid_command() {
+    fn eeprom_errors_stay_until_the_next_valid_command() {
         // (control, error bits afterwards)
         let rows = [
             (0x0200, WRITE_ENABLE_ERROR),
@@ -280,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn writes_take_their_time_and_stay() {
+    fn eeprom_writes_take_time_and_persist() {
         let mut eeprom = eeprom(vec![0; 32]);
         eeprom.command(0x0201, 4, [1, 2], 0);
         assert_eq!(eeprom.word(4), 0);

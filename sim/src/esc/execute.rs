@@ -1,17 +1,17 @@
-//! One datagram at one SubDevice: addressing, data and working counter (Beckhoff ESC data sheet, section I, 2.4
-//! and 2.5).
+//! Processing of one datagram in one SubDevice: addressing, data and working counter (Beckhoff ESC
+//! data sheet, section I, 2.4 and 2.5).
 
 use super::Esc;
-use super::access::Combine;
+use super::access::ReadCombine;
+use super::chip::feature;
 use super::fmmu::{Overlap, Use};
-use super::info::feature;
 use super::registers as reg;
-use super::sm::Filled;
+use super::sm::BufferOwner;
 use crate::bits;
 use crate::frame::{Command, Datagram};
 
 impl Esc {
-    /// Processes a datagram of the frame that [`Esc::begin_frame`] announced, in place.
+    /// Processes a datagram in place. [`Esc::begin_frame`] must have announced its frame.
     pub fn execute(&mut self, frame: &mut [u8], datagram: &Datagram) {
         use Command as C;
         let adp = datagram.adp(frame);
@@ -45,11 +45,11 @@ impl Esc {
         };
         let count = |done: bool, n: u16| if done { n } else { 0 };
         let wkc = match datagram.command {
-            C::Aprd | C::Fprd if addressed => count(self.read(ado, data, Combine::Replace), 1),
-            C::Brd => count(self.read(ado, data, Combine::Or), 1),
+            C::Aprd | C::Fprd if addressed => count(self.read(ado, data, ReadCombine::Replace), 1),
+            C::Brd => count(self.read(ado, data, ReadCombine::Or), 1),
             C::Fpwr | C::Bwr if addressed => {
                 let done = self.write(ado, data);
-                // Only these two take the time at every port.
+                // Only these two commands latch the time at every port.
                 self.frame.latches_ports |= done && touches_receive_times(ado, data);
                 count(done, 1)
             }
@@ -59,9 +59,9 @@ impl Esc {
                 arrived.clear();
                 arrived.extend_from_slice(data);
                 let how = if datagram.command == C::Brw {
-                    Combine::Or
+                    ReadCombine::Or
                 } else {
-                    Combine::Replace
+                    ReadCombine::Replace
                 };
                 let read = self.read(ado, data, how);
                 let offset = self.u16_at(reg::READ_WRITE_OFFSET);
@@ -69,7 +69,7 @@ impl Esc {
                 self.scratch = arrived;
                 count(read, 1) + count(written, 2)
             }
-            C::Armw | C::Frmw if addressed => count(self.read(ado, data, Combine::Replace), 1),
+            C::Armw | C::Frmw if addressed => count(self.read(ado, data, ReadCombine::Replace), 1),
             C::Armw | C::Frmw => count(self.write(ado, data), 1),
             _ => 0,
         };
@@ -86,7 +86,7 @@ impl Esc {
         let wkc = match datagram.command {
             Command::Lrd => u16::from(self.logical_read(address, data)),
             Command::Lwr => u16::from(self.logical_write(address, data)),
-            // Reading comes first, and what arrived is written.
+            // The read comes first; the write uses the received data.
             _ if self.fmmus.looped() => {
                 let mut arrived = std::mem::take(&mut self.scratch);
                 arrived.clear();
@@ -96,7 +96,7 @@ impl Esc {
                 self.scratch = arrived;
                 u16::from(read) + u16::from(written) * 2
             }
-            // The same, without a copy: nothing that is read has been written.
+            // No byte is both read and written, so the order does not matter and no copy is needed.
             _ => {
                 let written = self.logical_write(address, data);
                 let read = self.logical_read(address, data);
@@ -171,7 +171,7 @@ impl Esc {
                 at = stop;
                 continue;
             }
-            let (len, place) = self.stretch(at, end, Filled::ByMainDevice);
+            let (len, place) = self.stretch(at, end, BufferOwner::ByMainDevice);
             if let Some(place) = place {
                 let part = overlap.within(at, at + len);
                 let to = place * 8 + part.physical_bit - at * 8;
@@ -183,7 +183,8 @@ impl Esc {
         any
     }
 
-    /// Registers are written in whole bytes; bits that are not mapped keep what they show.
+    /// Writes the mapped bits of registers. Registers are written in whole bytes; other bits keep
+    /// their readable value.
     fn write_register_bits(&mut self, at: usize, end: usize, part: &Overlap, data: &[u8]) -> bool {
         let mut bytes = std::mem::take(&mut self.register_bytes);
         bytes.clear();

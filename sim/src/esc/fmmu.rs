@@ -1,8 +1,10 @@
-//! Fieldbus memory management units: logical bits ↔ physical bits (Beckhoff ESC data sheet, section I, 7).
-//! Bits beside those mapped keep their value everywhere; real controllers promise that only for digital
-//! outputs and leave them undefined elsewhere.
+//! Fieldbus memory management units: logical bits ↔ physical bits (Beckhoff ESC data sheet, section
+//! I, 7).
+//!
+//! Bits next to the mapped bits keep their value everywhere. Real controllers guarantee that only
+//! for digital outputs.
 
-/// FMMUs that a controller here can have.
+/// Maximum number of FMMUs of a controller in the simulation.
 pub const COUNT: usize = 8;
 
 /// One configured FMMU.
@@ -18,25 +20,25 @@ pub struct Fmmu {
     pub write: bool,
 }
 
-/// Where a datagram's bits meet an FMMU's.
+/// The common bits of a datagram and an FMMU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Overlap {
-    /// First bit inside the datagram's data.
+    /// The first bit in the data of the datagram.
     pub data_bit: usize,
-    /// First bit in the physical address space.
+    /// The first bit in the physical address space.
     pub physical_bit: usize,
     pub bits: usize,
 }
 
 impl Overlap {
-    /// First physical byte and the one behind the last.
+    /// Returns the first physical byte and the one behind the last.
     #[must_use]
     pub fn physical_bytes(&self) -> (usize, usize) {
         let end = self.physical_bit + self.bits;
         (self.physical_bit / 8, end.div_ceil(8))
     }
 
-    /// What of it lies in these physical bytes.
+    /// Returns the part of the overlap in these physical bytes.
     #[must_use]
     pub fn within(&self, start: usize, end: usize) -> Self {
         let first = self.physical_bit.max(start * 8);
@@ -50,7 +52,7 @@ impl Overlap {
 }
 
 impl Fmmu {
-    /// From the 16 register bytes; `None` while it is not activated or maps nothing.
+    /// Parses the 16 register bytes. `None` if the FMMU is inactive or maps no bits.
     #[must_use]
     pub fn from_registers(r: &[u8; 16]) -> Option<Self> {
         let fmmu = Self {
@@ -71,7 +73,8 @@ impl Fmmu {
             .saturating_sub(8 + u64::from(self.start_bit))
     }
 
-    /// The bits a datagram of `len` bytes at logical address `start` shares with this FMMU.
+    /// Returns the common bits of this FMMU and a datagram of `len` bytes at logical address
+    /// `start`.
     #[must_use]
     pub fn overlap(&self, start: u32, len: usize) -> Option<Overlap> {
         let mine = u64::from(self.logical) * 8 + u64::from(self.start_bit);
@@ -89,7 +92,7 @@ impl Fmmu {
     }
 }
 
-/// Which way data go.
+/// The data direction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Use {
     Read,
@@ -112,14 +115,14 @@ fn meet(a: &std::ops::Range<u64>, b: &std::ops::Range<u64>) -> bool {
     a.start < b.end && b.start < a.end
 }
 
-/// Those of one controller that map something.
+/// The FMMUs of a controller that map bits.
 #[derive(Debug, Clone, Default)]
 pub struct Fmmus {
     reads: Vec<Fmmu>,
     writes: Vec<Fmmu>,
-    /// Two of the same use want one logical byte: the lower number gets it.
+    /// True if two FMMUs of the same direction map one logical byte; the lower number wins.
     contested: bool,
-    /// Memory that is read is also written.
+    /// True if some memory is both read and written.
     looped: bool,
 }
 
@@ -137,7 +140,7 @@ impl Fmmus {
         self.configure(&[]);
     }
 
-    /// From the registers of all of them.
+    /// Configures all FMMUs from their registers.
     pub fn configure(&mut self, registers: &[u8]) {
         self.reads.clear();
         self.writes.clear();
@@ -165,14 +168,14 @@ impl Fmmus {
         });
     }
 
-    /// Whether reading before writing makes a difference.
+    /// True if the order of reading and writing matters.
     #[must_use]
     pub fn looped(&self) -> bool {
         self.looped
     }
 
-    /// What the `n`th FMMU of this use maps of a datagram, from byte `from` of its data on, and where to go on
-    /// asking; `Err` where there is no such FMMU.
+    /// Returns the bits of a datagram that the `n`th FMMU of this direction maps, from byte `from`
+    /// of the data on. Also returns the `from` of the next call. `Err`: the FMMU does not exist.
     pub fn next_overlap(
         &self,
         n: usize,
@@ -180,12 +183,12 @@ impl Fmmus {
         address: u32,
         len: usize,
         from: usize,
-    ) -> Result<Option<(Overlap, usize)>, NoMore> {
+    ) -> Result<Option<(Overlap, usize)>, FmmuIndexError> {
         let list = match way {
             Use::Read => &self.reads,
             Use::Write => &self.writes,
         };
-        let fmmu = list.get(n).ok_or(NoMore)?;
+        let fmmu = list.get(n).ok_or(FmmuIndexError)?;
         if from >= len {
             return Ok(None);
         }
@@ -203,9 +206,9 @@ impl Fmmus {
     }
 }
 
-/// There are not so many FMMUs.
+/// The FMMU index is out of range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct NoMore;
+pub struct FmmuIndexError;
 
 #[cfg(test)]
 mod tests {
@@ -222,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn three_bits_in_the_middle_of_a_byte() {
+    fn fmmu_maps_three_bits_in_the_middle_of_a_byte() {
         let fmmu = Fmmu::from_registers(&registers(0x1000, 1, (2, 4), 0x1100, 0)).unwrap();
         let overlap = fmmu.overlap(0x0fff, 4).unwrap();
         assert_eq!(
@@ -237,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_datagram_may_cover_the_tail_only() {
+    fn fmmu_maps_a_datagram_that_covers_only_its_end() {
         let fmmu = Fmmu::from_registers(&registers(0x1000, 4, (0, 7), 0x1100, 0)).unwrap();
         let overlap = fmmu.overlap(0x1002, 8).unwrap();
         assert_eq!(
@@ -251,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn inactive_or_empty_maps_nothing() {
+    fn fmmu_that_is_inactive_or_empty_maps_nothing() {
         let mut r = registers(0, 1, (0, 7), 0x1100, 0);
         r[12] = 0;
         assert_eq!(Fmmu::from_registers(&r), None);
@@ -260,9 +263,9 @@ mod tests {
     }
 
     #[test]
-    fn the_lower_number_gets_a_contested_byte() {
+    fn lower_fmmu_number_gets_a_contested_byte() {
         let mut all = [0; 128];
-        // 0x1000–0x1001 and 0x1001–0x1002; a third of the other use does not matter.
+        // 0x1000–0x1001 and 0x1001–0x1002; the third FMMU has the other direction.
         all[..16].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
         all[16..32].copy_from_slice(&registers(0x1001, 2, (0, 7), 0x1200, 0));
         all[32..48].copy_from_slice(&registers(0x1001, 1, (0, 7), 0x1300, 0));
@@ -283,13 +286,13 @@ mod tests {
         assert_eq!(mapped(0, Use::Write), [(1, 0x1300, 8)]);
         assert_eq!(
             fmmus.next_overlap(2, Use::Read, 0x1000, 4, 0),
-            Err(NoMore),
+            Err(FmmuIndexError),
             "two that read"
         );
     }
 
     #[test]
-    fn uncontested_ones_map_in_one_go() {
+    fn uncontested_fmmus_map_in_one_step() {
         let mut all = [0; 48];
         all[..16].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));
         all[16..32].copy_from_slice(&registers(0x1000, 2, (0, 7), 0x1100, 0));

@@ -1,56 +1,58 @@
-//! An EtherCAT SubDevice controller: 4 KiB of registers, process RAM, and what accesses set in motion. Knows nothing
-//! of CoE or drives; it raises events for the device around it.
+//! An EtherCAT SubDevice controller: 4 KiB of registers, process RAM, and the effects of accesses.
+//! The controller knows neither CoE nor drives; it raises events for the device around it.
 //!
 //! From the wire inwards:
 //!
-//! * `execute`: a datagram; `access`: what it reads and writes; `guard`: what it may not
-//! * `apply`: a frame's beginning and end, and what register writes do
-//! * `fmmu`, `sm`: where logical addresses lead, and who may touch RAM
-//! * `al`, `eeprom`, `watchdog`, `dc`: what lives behind registers; `registers`, `info`: which of them there are
-//! * `ports`: links and loops; `device_side`: the controller as the device's own side sees it
+//! * `execute`: one datagram; `access`: its reads and writes; `write_protection`: rejected writes
+//! * `datagram`: start and end of a frame, and the effects of register writes
+//! * `fmmu`, `sm`: mapping of logical addresses, and access to RAM
+//! * `al`, `eeprom`, `watchdog`, `dc`: the functions behind registers
+//! * `registers`, `chip`: the existing registers
+//! * `ports`: links and loops
+//! * `device_side`: the controller on the side of the device
 
 pub mod al;
+pub mod chip;
 pub mod dc;
 pub mod eeprom;
 pub mod fmmu;
-pub mod info;
 pub mod ports;
 pub mod registers;
 pub mod sm;
 pub mod watchdog;
 
 mod access;
-mod apply;
+mod datagram;
 mod device_side;
 mod execute;
-mod guard;
 #[cfg(test)]
 mod sm_tests;
+mod write_protection;
 
 use crate::Nanos;
 use access::Shadow;
 use al::AlState;
-use apply::Frame;
+pub use chip::EscInfo;
+use datagram::Frame;
 use dc::sync::Edges;
 use dc::{Clock, Dc, Jitter, Width};
 use eeprom::Eeprom;
 use fmmu::Fmmus;
-use guard::Guard;
-pub use info::EscInfo;
 use ports::Ports;
 use registers as reg;
 use registers::RegisterMap;
 use sm::SyncManager;
 use watchdog::Watchdog;
+use write_protection::WriteProtection;
 
 /// Bits of the event registers.
 pub(crate) mod event {
-    /// MainDevice's events, 0x0210; SyncManagers follow from bit 4 on.
+    /// Events of the MainDevice, 0x0210; the SyncManagers start at bit 4.
     pub(crate) const DC_LATCH: u16 = 0x0001;
     pub(crate) const DL_STATUS: u16 = 0x0004;
     pub(crate) const AL_STATUS: u16 = 0x0008;
     pub(crate) const SYNC_MANAGERS: u16 = 0x0ff0;
-    /// Device's events, 0x0220; SyncManagers follow from bit 8 on.
+    /// Events of the device, 0x0220; the SyncManagers start at bit 8.
     pub(crate) const AL_CONTROL: u32 = 0x0001;
     pub(crate) const DEVICE_DC_LATCH: u32 = 0x0002;
     pub(crate) const SYNC0: u32 = 0x0004;
@@ -59,21 +61,21 @@ pub(crate) mod event {
     pub(crate) const DEVICE_SYNC_MANAGERS: u32 = 0xff00;
 }
 
-/// What the MainDevice's accesses mean to the device's application; taken after every frame.
+/// The events that accesses of the MainDevice raise for the application, taken after every frame.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Raised {
+pub struct PdiEvents {
     pub al_control: Option<u16>,
-    /// Bit per SyncManager: filled to its last byte by the MainDevice.
+    /// Bit per SyncManager that the MainDevice filled to its last byte.
     pub sm_written: u8,
-    /// Bit per SyncManager: read to its last byte by the MainDevice.
+    /// Bit per SyncManager that the MainDevice read to its last byte.
     pub sm_read: u8,
-    /// The activation byte of the mailbox-in SyncManager asks to repeat.
+    /// The repeat bit in the activation byte of the mailbox-in SyncManager.
     pub repeat_request: Option<bool>,
-    /// SyncManager configuration changed.
+    /// The SyncManager configuration changed.
     pub sm_configured: bool,
     /// 0x0981 changed.
     pub sync_changed: bool,
-    /// SYNC outputs that rose because a debug pulse was ordered.
+    /// The SYNC outputs that a debug pulse raised.
     pub ping: Edges,
     /// The reset sequence is complete.
     pub reset: bool,
@@ -81,17 +83,19 @@ pub struct Raised {
 
 const MAX_RAM_KIB: u8 = 60;
 
-/// Fixed properties of an ESC.
+/// The fixed properties of an ESC.
 #[derive(Debug, Clone, Copy)]
 pub struct EscConfig {
     pub info: EscInfo,
-    /// Two bits a port: 0 none, 1 not configured, 2 EBUS, 3 MII; counts where `info` leaves it open.
+    /// Two bits per port: 0 none, 1 not configured, 2 EBUS, 3 MII. Applies if `info` leaves the
+    /// ports open.
     pub ports: u8,
-    /// System time and SYNC units (0x0910–0x09FF) are switched on; the chip needs distributed clocks.
+    /// True if system time and SYNC units (0x0910–0x09FF) are switched on. The chip must have
+    /// distributed clocks.
     pub with_dc: bool,
     pub clock_offset_ns: u64,
     pub clock_drift_ppm: f64,
-    /// Noise on time stamps, ± nanoseconds, and its seed.
+    /// The noise on time stamps in ± ns. Its seed follows.
     pub clock_jitter_ns: u32,
     pub jitter_seed: u64,
 }
@@ -109,21 +113,22 @@ pub struct Esc {
     pub(crate) eeprom: Eeprom,
     /// Valid until the next frame begins.
     eeprom_write_enable: bool,
-    /// The configuration area has been taken from the EEPROM: there is an application and process RAM.
+    /// True if the configuration was loaded from the EEPROM: application and process RAM are
+    /// available.
     loaded: bool,
     pub(crate) watchdog: Watchdog,
     pdi_watchdog: Watchdog,
-    guard: Guard,
-    /// SyncManagers have changed since their status was last shown in registers.
+    guard: WriteProtection,
+    /// True if SyncManagers changed since the last update of their registers.
     sms_stale: bool,
     frame: Frame,
     shadow: Shadow,
     scratch: Vec<u8>,
     register_bytes: Vec<u8>,
-    raised: Raised,
+    raised: PdiEvents,
     station: u16,
     alias: Option<u16>,
-    /// AL control was written and the device has not read it yet.
+    /// True if AL control was written and the device has not read it yet.
     al_locked: bool,
     latch: bool,
     ports: Ports,
@@ -146,13 +151,13 @@ impl Esc {
             loaded: false,
             watchdog: Watchdog::default(),
             pdi_watchdog: Watchdog::default(),
-            guard: Guard::default(),
+            guard: WriteProtection::default(),
             sms_stale: false,
             frame: Frame::default(),
             shadow: Shadow::with_capacity(),
             scratch: Vec::with_capacity(1536),
             register_bytes: Vec::with_capacity(16),
-            raised: Raised::default(),
+            raised: PdiEvents::default(),
             station: 0,
             alias: None,
             al_locked: false,
@@ -164,7 +169,7 @@ impl Esc {
         esc
     }
 
-    /// Everything volatile back to its reset value, then the EEPROM is read.
+    /// Resets everything volatile and reads the EEPROM.
     pub fn power_on(&mut self, now: Nanos) {
         let EscConfig { info, .. } = self.config;
         self.mem.fill(0);
@@ -177,10 +182,10 @@ impl Esc {
         );
         self.dc = clock_width(&self.config).map(|width| Dc::new(width, 0));
         (self.watchdog, self.pdi_watchdog) = (Watchdog::default(), Watchdog::default());
-        self.guard = Guard::default();
+        self.guard = WriteProtection::default();
         self.frame = Frame::default();
         self.shadow.clear();
-        self.raised = Raised::default();
+        self.raised = PdiEvents::default();
         (self.station, self.alias, self.latch) = (0, None, false);
         (self.al_locked, self.eeprom_write_enable) = (false, false);
 
@@ -196,7 +201,7 @@ impl Esc {
         self.put(reg::WD_DIVIDER, &watchdog::DEFAULT_DIVIDER.to_le_bytes());
         self.put(reg::WD_PDI, &watchdog::DEFAULT_COUNT.to_le_bytes());
         self.put(reg::WD_PROCESS_DATA, &watchdog::DEFAULT_COUNT.to_le_bytes());
-        if info.has(info::feature::DC) {
+        if info.has(chip::feature::DC) {
             self.put(reg::DC_RECEIVE_TIMES, info.receive_times.as_flattened());
         }
         if self.dc.is_some() {
@@ -213,7 +218,7 @@ impl Esc {
         self.show_ports();
     }
 
-    /// Takes the configuration area over, if it is sound. The alias is taken once after power-on.
+    /// Loads the configuration area if it is valid. The alias is loaded only once after power-on.
     fn load_configuration(&mut self) {
         let Some([a0, a1, a2, a3, a4, ..]) = self.eeprom.configuration() else {
             return;
@@ -232,13 +237,13 @@ impl Esc {
         }
     }
 
-    /// End of process RAM.
+    /// Returns the end of process RAM.
     #[must_use]
     pub fn memory(&self) -> usize {
         self.mem.len()
     }
 
-    /// DL status without the ports.
+    /// Returns DL status without the ports.
     fn own_dl_status(&self) -> u16 {
         u16::from(self.loaded)
             | u16::from(self.pdi_runs()) << 1
@@ -250,20 +255,21 @@ impl Esc {
         self.station
     }
 
-    /// Whether the frame just seen asked to latch receive times; the network fills them in.
+    /// Returns true if the last frame requested latching of receive times. The network fills them
+    /// in.
     pub(crate) fn take_latch(&mut self) -> bool {
         std::mem::take(&mut self.latch)
     }
 
-    pub(crate) fn take_raised(&mut self) -> Raised {
+    pub(crate) fn take_raised(&mut self) -> PdiEvents {
         std::mem::take(&mut self.raised)
     }
 }
 
-/// How wide the clock is, if the chip has one and it is switched on.
+/// Returns the width of the clock if the chip has one and it is switched on.
 fn clock_width(config: &EscConfig) -> Option<Width> {
-    (config.with_dc && config.info.has(info::feature::DC)).then(|| {
-        if config.info.has(info::feature::DC_64_BIT) {
+    (config.with_dc && config.info.has(chip::feature::DC)).then(|| {
+        if config.info.has(chip::feature::DC_64_BIT) {
             Width::Bits64
         } else {
             Width::Bits32

@@ -9,18 +9,18 @@ use super::{Esc, event};
 use crate::Nanos;
 
 pub const PORTS: usize = 4;
-/// A frame leaves its processing unit towards port 3 and passes the ports in this order.
+/// The port order of a frame after the processing unit, which sends it towards port 3.
 pub const DOWNSTREAM: [u8; 3] = [3, 1, 2];
-/// How long loop settings marked temporary (0x0100 bit 1) are used.
+/// The duration of temporary loop settings (0x0100 bit 1) in ns.
 const TEMPORARY_NS: u64 = 1_000_000_000;
-/// DL control: frames other than EtherCAT are destroyed, source addresses marked.
+/// DL control bit: frames other than EtherCAT are destroyed, source addresses marked.
 const DESTROY_FOREIGN: u8 = 0x01;
 const TEMPORARY: u8 = 0x02;
 
-/// What a port is made of, register 0x0007.
+/// The medium of a port, register 0x0007.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Medium {
-    /// Not there, or not configured.
+    /// The port is missing or not configured.
     #[default]
     None,
     Ebus,
@@ -29,7 +29,7 @@ pub enum Medium {
 }
 
 impl Medium {
-    /// Register 0x0007: two bits a port, 0 none, 1 not configured, 2 EBUS, 3 MII.
+    /// Parses register 0x0007, two bits per port: 0 none, 1 not configured, 2 EBUS, 3 MII.
     #[must_use]
     pub fn from_descriptor(descriptor: u8) -> [Self; PORTS] {
         [0, 2, 4, 6].map(|shift| match descriptor >> shift & 3 {
@@ -39,8 +39,8 @@ impl Medium {
         })
     }
 
-    /// The ESI's `Physics`, one letter a port: `Y` MII, `H` MII with fast link-up, `K` EBUS,
-    /// anything else nothing. A device without `Physics` has two MII ports.
+    /// Parses the ESI's `Physics`, one letter per port: `Y` MII, `H` MII with fast link-up, `K`
+    /// EBUS, others no port. A device without `Physics` has two MII ports.
     #[must_use]
     pub fn from_physics(physics: &str) -> [Self; PORTS] {
         let mut media = [Self::None; PORTS];
@@ -59,7 +59,7 @@ impl Medium {
         media
     }
 
-    /// Register 0x0007.
+    /// Returns register 0x0007.
     #[must_use]
     pub fn descriptor(media: [Self; PORTS]) -> u8 {
         media.iter().rev().fold(0, |bits, medium| {
@@ -73,12 +73,12 @@ impl Medium {
     }
 }
 
-/// Two bits a port of register 0x0101.
+/// The loop setting of a port, two bits of register 0x0101.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum LoopControl {
-    /// As the link.
+    /// The loop follows the link.
     Auto,
-    /// Closes with the link, opens only when told to or when a frame arrives.
+    /// The loop closes with the link. It opens only on command or when a frame arrives.
     AutoClose,
     Open,
     Closed,
@@ -102,9 +102,9 @@ pub(super) struct Ports {
     open: [bool; PORTS],
     /// The loop settings in use, 0x0101.
     control: u8,
-    /// End of temporary settings, and those before them.
+    /// The end of temporary settings, and the previous settings.
     temporary: Option<(Nanos, u8)>,
-    /// 0x0100 to 0x0103 was written; whether 0x0101 was.
+    /// `Some` if 0x0100 to 0x0103 was written; true if 0x0101 was.
     written: Option<bool>,
 }
 
@@ -133,7 +133,7 @@ impl Ports {
         }
     }
 
-    /// True where a lost link is to be counted.
+    /// Sets the link. Returns true if the loss of the link is counted.
     fn set_link(&mut self, port: usize, up: bool) -> bool {
         if self.media[port] == Medium::None || self.link[port] == up {
             return false;
@@ -153,7 +153,7 @@ impl Ports {
         }
     }
 
-    /// 0x0110 without what does not concern ports.
+    /// Returns the port bits of 0x0110.
     fn status(&self) -> u16 {
         let bit = |set: bool, n: usize| u16::from(set) << n;
         (0..PORTS).fold(0, |status, port| {
@@ -165,7 +165,7 @@ impl Ports {
     }
 }
 
-/// As the network sees the ports.
+/// The ports for the network.
 impl Esc {
     #[must_use]
     pub fn media(&self) -> [Medium; PORTS] {
@@ -176,15 +176,15 @@ impl Esc {
         self.ports.link
     }
 
-    /// Frames are sent and received at the port. With every loop closed, port 0 stays open so that
-    /// the device can still be reached; DL status does not show it.
+    /// True if the port sends and receives frames. With every loop closed, port 0 stays open so
+    /// that the device remains reachable; DL status does not show it.
     pub(crate) fn port_open(&self, port: u8) -> bool {
         let open = &self.ports.open;
         open.get(usize::from(port)).copied().unwrap_or(false)
             || port == 0 && open.iter().all(|open| !open)
     }
 
-    /// Frames that pass here are going round in circles if they do so twice: port 0 has lost its link.
+    /// True if port 0 has lost its link. A frame that passes twice then circulates.
     pub(crate) fn marks_circulating(&self) -> bool {
         !self.port_open(0)
             && matches!(
@@ -193,13 +193,13 @@ impl Esc {
             )
     }
 
-    /// DL control bit 0: frames that are not EtherCAT end here, the others are marked.
+    /// True if DL control bit 0 is set: frames other than EtherCAT end here, others are marked.
     pub(crate) fn destroys_foreign(&self) -> bool {
         self.dl_control(0) & DESTROY_FOREIGN != 0
     }
 
-    /// How much sooner a frame that comes in at the port is passed on with a smaller receive FIFO
-    /// (DL control bits 16–18).
+    /// Returns the delay in ns that a smaller receive FIFO saves for frames at this port (DL
+    /// control bits 16–18).
     pub(crate) fn fifo_reduction_ns(&self, port: u8) -> u64 {
         let size = u64::from(self.dl_control(2) & 7);
         match self.ports.media.get(usize::from(port)) {
@@ -216,7 +216,7 @@ impl Esc {
             .unwrap_or(0)
     }
 
-    /// The cable at the port has got or lost its link.
+    /// Sets the link of the cable at the port.
     pub(crate) fn set_link(&mut self, port: u8, up: bool) {
         if usize::from(port) >= PORTS {
             return;
@@ -227,23 +227,23 @@ impl Esc {
         self.show_ports();
     }
 
-    /// A frame that makes no sense passed the processing unit.
+    /// Counts an invalid frame in the processing unit.
     pub(crate) fn count_processing_error(&mut self) {
         self.count_up(reg::PROCESSING_UNIT_ERRORS);
     }
 
-    /// A frame with a bit error came in at the port, as the first to see it.
+    /// Counts a frame with a bit error that this port detects first.
     pub(crate) fn count_rx_error(&mut self, port: u8) {
         self.count_up(reg::RX_ERRORS + 2 * u16::from(port));
         self.count_up(reg::RX_ERRORS + 2 * u16::from(port) + 1);
     }
 
-    /// A frame came in at the port that another device has found to be wrong and marked.
+    /// Counts an invalid frame that another device has already marked.
     pub(crate) fn count_forwarded_error(&mut self, port: u8) {
         self.count_up(reg::FORWARDED_ERRORS + u16::from(port));
     }
 
-    /// A valid frame has arrived at a closed port.
+    /// Handles a valid frame at a closed port.
     pub(crate) fn frame_at_closed_port(&mut self, port: u8) {
         let n = usize::from(port);
         let waits = LoopControl::of(self.ports.control, n & 3) == LoopControl::AutoClose;
@@ -257,7 +257,7 @@ impl Esc {
         }
     }
 
-    /// DL control has been written, to take effect now that the frame is over.
+    /// Applies a write to DL control after the end of the frame.
     pub(crate) fn settle_ports(&mut self, now: Nanos) {
         let Some(loops) = self.ports.written.take() else {
             return;
@@ -277,7 +277,7 @@ impl Esc {
         self.show_ports();
     }
 
-    /// When temporary loop settings end.
+    /// Returns the end of temporary loop settings.
     pub(crate) fn ports_due(&self) -> Option<Nanos> {
         self.ports.temporary.map(|(until, _)| until)
     }
@@ -295,8 +295,8 @@ impl Esc {
         }
     }
 
-    /// A frame that latches receive times came in at the port, perhaps on its way into the processing
-    /// unit, which has noted the time itself.
+    /// Latches the receive time of a frame at the port. `processed`: the frame enters the
+    /// processing unit, which has latched the time itself.
     pub(crate) fn latch_port(&mut self, port: u8, now: Nanos, processed: bool) {
         if usize::from(port) >= PORTS {
             return;
@@ -311,18 +311,18 @@ impl Esc {
     }
 }
 
-/// As the registers see them.
+/// The ports for the registers.
 impl Esc {
     pub(super) fn dl_control_written(&mut self, loops: bool) {
         self.ports.written = Some(loops || self.ports.written == Some(true));
     }
 
-    /// Whether DL control, and so perhaps the way of frames, changed.
+    /// True if DL control changed, which may change the path of frames.
     pub(crate) fn dl_control_changed(&self) -> bool {
         self.ports.written.is_some()
     }
 
-    /// Writes DL status; a change is an ECAT event.
+    /// Updates DL status; a change raises an ECAT event.
     pub(super) fn show_ports(&mut self) {
         let before = self.u16_at(reg::DL_STATUS);
         let status = self.own_dl_status() | self.ports.status();
@@ -332,7 +332,7 @@ impl Esc {
         }
     }
 
-    /// A write to any counter of a group clears the group, whatever is written.
+    /// Clears the counter groups with a written counter, regardless of the value.
     pub(super) fn clear_counters(&mut self, touched: impl Fn(u16, usize) -> bool) {
         for (first, len) in [
             (reg::RX_ERRORS, 12),

@@ -1,16 +1,17 @@
-//! The register map: addresses, which bytes exist and which the MainDevice may write (Beckhoff ESC data sheet,
-//! section II; ETG.1000.4, 6). What happens on an access is in `access` and `apply`.
+//! The register map: addresses, existing bytes and write access of the MainDevice (Beckhoff ESC
+//! data sheet, section II; ETG.1000.4, 6). `access` and `datagram` implement the effects of an
+//! access.
 
+use super::chip::{EscInfo, feature};
 use super::dc::Width;
-use super::info::{EscInfo, feature};
 
-/// Registers end here; digital outputs (0x0F00), user RAM (0x0F80) and process RAM follow.
+/// End of the registers. Digital outputs (0x0F00), user RAM (0x0F80) and process RAM follow.
 pub const ADDRESS_SPACE: usize = 0x0f00;
 pub const DIGITAL_OUTPUTS: usize = 0x0f00;
 pub const USER_RAM: usize = 0x0f80;
 pub const PROCESS_RAM: usize = 0x1000;
 
-/// FMMUs and SyncManagers that the simulator can hold.
+/// Maximum number of FMMUs and SyncManagers in the simulator.
 pub const MAX_UNITS: u8 = 8;
 
 pub const TYPE: u16 = 0x0000;
@@ -36,7 +37,7 @@ pub const ECAT_EVENT_MASK: u16 = 0x0200;
 pub const AL_EVENT_MASK: u16 = 0x0204;
 pub const ECAT_EVENT: u16 = 0x0210;
 pub const AL_EVENT: u16 = 0x0220;
-/// Invalid frame and RX error counter of each port, then forwarded RX errors.
+/// Counters of invalid frames and RX errors per port, then forwarded RX errors.
 pub const RX_ERRORS: u16 = 0x0300;
 pub const FORWARDED_ERRORS: u16 = 0x0308;
 pub const PROCESSING_UNIT_ERRORS: u16 = 0x030c;
@@ -83,7 +84,7 @@ pub const DC_PDI_BUFFER_CHANGE: u16 = 0x09fc;
 
 const EXISTS: u8 = 1;
 const WRITABLE: u8 = 2;
-/// Writable only while some other register allows it.
+/// Writable only while another register permits it.
 const CONDITIONAL: u8 = 4;
 
 const RO: u8 = EXISTS;
@@ -92,7 +93,7 @@ const RC: u8 = EXISTS | WRITABLE | CONDITIONAL;
 
 type Ranges = &'static [(u16, u16, u8)];
 
-/// (first, last, access) of what every controller here has.
+/// (first, last, access) of the registers of every controller.
 const BASE: Ranges = &[
     (0x0000, 0x0009, RO),
     (0x0010, 0x0011, RW),
@@ -129,10 +130,10 @@ const BASE: Ranges = &[
     (0x0f80, 0x0fff, RW),
 ];
 
-/// Reads of eight bytes from the EEPROM.
+/// The second half of the EEPROM data, for reads of eight bytes.
 const WIDE_EEPROM: Ranges = &[(0x050c, 0x050f, RO)];
 
-/// Receive times: in every controller with distributed clocks, used or not.
+/// Receive times. Every controller with distributed clocks has them.
 const RECEIVE_TIMES: Ranges = &[(0x0900, 0x0903, RW), (0x0904, 0x090f, RO)];
 
 /// System time, SYNC and latch units.
@@ -160,7 +161,7 @@ const DC: Ranges = &[
     (0x09f8, 0x09ff, RO),
 ];
 
-/// The upper halves of 64-bit clocks. Writes to 0x0914 reach nothing.
+/// The upper halves of 64-bit clocks. Writes to 0x0914 have no effect.
 const DC_64_BIT: Ranges = &[
     (0x0914, 0x0917, RO),
     (0x0924, 0x0927, RW),
@@ -175,12 +176,12 @@ const DC_64_BIT: Ranges = &[
 /// Enhanced SYNC activation.
 const ACTIVATION_STATUS: Ranges = &[(0x0984, 0x0984, RO)];
 
-/// What each byte below process RAM allows.
+/// The access rights of each byte below process RAM.
 #[derive(Debug, Clone)]
 pub struct RegisterMap(Vec<u8>);
 
 impl RegisterMap {
-    /// `dc`: how wide the clock is, if system time, SYNC and latch units are there.
+    /// Creates the map. `dc` is the clock width if system time, SYNC and latch units exist.
     #[must_use]
     pub fn new(info: &EscInfo, dc: Option<Width>) -> Self {
         let when = |condition: bool, ranges: Ranges| if condition { ranges } else { &[] };
@@ -188,7 +189,7 @@ impl RegisterMap {
         let parts = [
             BASE,
             when(
-                info.eeprom & super::info::eeprom::EIGHT_BYTES != 0,
+                info.eeprom & super::chip::eeprom::EIGHT_BYTES != 0,
                 WIDE_EEPROM,
             ),
             when(info.has(feature::DC), RECEIVE_TIMES),
@@ -204,7 +205,7 @@ impl RegisterMap {
         }
         let fmmus = usize::from(info.fmmus.min(MAX_UNITS)) * 16;
         map[usize::from(FMMU)..][..fmmus].fill(RW);
-        // Status and PDI control of each SyncManager belong to the device.
+        // Status and PDI control of each SyncManager are writable only for the device.
         let sms = usize::from(info.sync_managers.min(MAX_UNITS)) * 8;
         for sm in map[usize::from(SM)..][..sms].chunks_exact_mut(8) {
             sm.copy_from_slice(&[RC, RC, RC, RC, RC, RO, RW, RO]);
@@ -212,7 +213,7 @@ impl RegisterMap {
         Self(map)
     }
 
-    /// Any byte of the range exists.
+    /// True if any byte of the range exists.
     #[must_use]
     pub fn readable(&self, start: usize, end: usize) -> bool {
         self.0
@@ -220,7 +221,7 @@ impl RegisterMap {
             .is_some_and(|range| range.iter().any(|b| b & EXISTS != 0))
     }
 
-    /// Every byte of the range is writable whatever other registers say.
+    /// True if every byte of the range is writable regardless of other registers.
     #[must_use]
     pub fn freely_writable(&self, start: usize, end: usize) -> bool {
         self.0
@@ -238,7 +239,8 @@ impl RegisterMap {
         self.0.get(at).is_some_and(|b| b & CONDITIONAL != 0)
     }
 
-    /// How many bytes from `at` on (below `end`) can be read, or written, or cannot, and which.
+    /// Returns the number of bytes from `at` (below `end`) with equal access, and that access.
+    /// `write` selects write or read access.
     #[must_use]
     pub fn run(&self, at: usize, end: usize, write: bool) -> (usize, bool) {
         let bit = if write { WRITABLE } else { EXISTS };
@@ -254,7 +256,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_controller_answers_where_it_has_something() {
+    fn register_map_contains_the_registers_of_each_chip() {
         let et1100 = RegisterMap::new(&EscInfo::ET1100, Some(Width::Bits64));
         let et1200 = RegisterMap::new(&EscInfo::ET1200, None);
         let lan9252 = RegisterMap::new(&EscInfo::LAN9252, Some(Width::Bits32));

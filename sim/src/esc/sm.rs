@@ -1,7 +1,7 @@
-//! SyncManagers: who may touch process RAM, and when a buffer or mailbox changes hands (Beckhoff ESC data
-//! sheet, section I, 8; section II, 2.14).
+//! SyncManagers: access to process RAM, and the handover of buffers and mailboxes (Beckhoff ESC
+//! data sheet, section I, 8; section II, 2.14).
 
-/// How a SyncManager hands its area over.
+/// The handover mode of a SyncManager.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Mode {
     /// Three buffers: the consumer always gets the last complete one.
@@ -24,29 +24,29 @@ impl Mode {
     }
 }
 
-/// Who fills the area.
+/// The side that fills the area.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Filled {
+pub enum BufferOwner {
     /// The device writes, the MainDevice reads (inputs, mailbox in).
     #[default]
     ByDevice,
     ByMainDevice,
 }
 
-/// Three buffers go round: the producer has one, the consumer has one, the third holds the last complete
-/// data or is free.
+/// Rotation of three buffers: one of the producer, one of the consumer, and one that is free or has
+/// the last complete data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Rotation {
+struct TripleBuffer {
     producer: u8,
     between: u8,
     consumer: u8,
-    /// `between` is newer than what the consumer has.
+    /// True if `between` is newer than the buffer of the consumer.
     fresh: bool,
     /// Last complete buffer; 3: none yet.
     last: u8,
 }
 
-impl Default for Rotation {
+impl Default for TripleBuffer {
     fn default() -> Self {
         Self {
             producer: 0,
@@ -61,7 +61,7 @@ impl Default for Rotation {
 /// Status bits 5:4 before the first buffer is complete.
 const NONE_WRITTEN: u8 = 3;
 
-impl Rotation {
+impl TripleBuffer {
     fn produced(&mut self) {
         self.last = self.producer;
         std::mem::swap(&mut self.producer, &mut self.between);
@@ -82,27 +82,27 @@ pub struct SyncManager {
     /// Register byte 4, as last accepted.
     pub control: u8,
     pub mode: Mode,
-    pub filled: Filled,
+    pub filled: BufferOwner,
     pub watchdog: bool,
     /// The MainDevice enabled it (byte 6, bit 0).
     pub enabled: bool,
     /// The device holds it closed (byte 7, bit 0), as in states below SafeOp.
     pub closed_by_device: bool,
-    /// A mailbox with a message in it.
+    /// True if the mailbox contains a message.
     pub full: bool,
     was_full: bool,
-    rotation: Rotation,
-    /// An access of the MainDevice began with the first byte and has not reached the last.
+    rotation: TripleBuffer,
+    /// True if the MainDevice has accessed the first byte and not yet the last.
     open: bool,
-    /// The frame under way reached the last byte.
+    /// True if the current frame reached the last byte.
     closing: bool,
     interrupt_write: bool,
     interrupt_read: bool,
 }
 
 impl SyncManager {
-    /// The five configuration bytes and the activation byte, as registers hold them. True if it was
-    /// enabled or disabled by that.
+    /// Configures the SyncManager from its eight register bytes. Returns true if that enabled or
+    /// disabled it.
     pub fn configure(&mut self, r: &[u8; 8]) -> bool {
         let enable = r[6] & 1 != 0;
         if !self.enabled {
@@ -111,9 +111,9 @@ impl SyncManager {
             self.control = r[4];
             self.mode = Mode::from_control(r[4]);
             self.filled = if r[4] >> 2 & 3 == 1 {
-                Filled::ByMainDevice
+                BufferOwner::ByMainDevice
             } else {
-                Filled::ByDevice
+                BufferOwner::ByDevice
             };
             self.watchdog = r[4] & 0x40 != 0;
         }
@@ -125,15 +125,15 @@ impl SyncManager {
         changed
     }
 
-    /// Empties it, as enabling, disabling and closing do.
+    /// Empties the SyncManager. Enabling, disabling and closing do so.
     pub fn reset(&mut self) {
         (self.full, self.was_full) = (false, false);
-        self.rotation = Rotation::default();
+        self.rotation = TripleBuffer::default();
         (self.open, self.closing) = (false, false);
         (self.interrupt_write, self.interrupt_read) = (false, false);
     }
 
-    /// Opened or closed by the device.
+    /// Opens or closes the SyncManager for the device.
     pub fn close(&mut self, closed: bool) {
         if closed != self.closed_by_device {
             self.closed_by_device = closed;
@@ -141,7 +141,7 @@ impl SyncManager {
         }
     }
 
-    /// Whether it has a say over its area. One without a length has none.
+    /// True if it controls its area. A SyncManager without a length controls none.
     #[must_use]
     pub fn guards(&self) -> bool {
         self.len > 0 && (self.enabled || self.closed_by_device)
@@ -153,8 +153,8 @@ impl SyncManager {
         start..start + usize::from(self.len)
     }
 
-    /// Bytes of memory it takes: three buffers in process RAM, one for mailboxes and for the digital
-    /// outputs in front of it.
+    /// Returns the bytes of memory in use: three buffers in process RAM, one for mailboxes and for
+    /// digital outputs.
     #[must_use]
     pub fn footprint(&self) -> usize {
         let three = self.mode == Mode::Buffered && self.start >= 0x1000;
@@ -166,13 +166,14 @@ impl SyncManager {
         self.enabled && !self.closed_by_device && self.mode != Mode::Reserved
     }
 
-    /// Buffered, and something was written to it.
+    /// True if a buffer was written.
     #[must_use]
     pub fn has_data(&self) -> bool {
         self.rotation.last != NONE_WRITTEN
     }
 
-    /// A single byte needs no buffers and passes; it still triggers watchdog and events.
+    /// True for a single byte, which needs no buffers. Its accesses still trigger watchdog and
+    /// events.
     fn passes(&self) -> bool {
         self.len <= 1
     }
@@ -187,11 +188,12 @@ impl SyncManager {
         }
     }
 
-    /// Where in memory the MainDevice reads or writes (`filled`: by whom the area must be filled) from this
-    /// offset on, and how many of the `len` bytes; `None` where it may not.
+    /// Returns the accessible bytes of `len` from this offset on, and their memory location. The
+    /// location is `None` without access. `filled` is the side that must fill the area: the device
+    /// for reads, the MainDevice for writes.
     pub fn access(
         &mut self,
-        filled: Filled,
+        filled: BufferOwner,
         offset: usize,
         len: usize,
         memory: usize,
@@ -205,10 +207,10 @@ impl SyncManager {
             return (len, Some(self.buffer(0, memory)));
         }
         let allowed = match (self.mode, filled) {
-            (Mode::Mailbox, Filled::ByDevice) => self.full,
-            (Mode::Mailbox, Filled::ByMainDevice) => !self.full,
-            (Mode::Buffered, Filled::ByDevice) => self.has_data(),
-            (Mode::Buffered, Filled::ByMainDevice) => true,
+            (Mode::Mailbox, BufferOwner::ByDevice) => self.full,
+            (Mode::Mailbox, BufferOwner::ByMainDevice) => !self.full,
+            (Mode::Buffered, BufferOwner::ByDevice) => self.has_data(),
+            (Mode::Buffered, BufferOwner::ByMainDevice) => true,
             (Mode::Reserved, _) => false,
         };
         if filled != self.filled || !allowed || !(self.open || offset == 0) {
@@ -226,11 +228,11 @@ impl SyncManager {
         }
         if offset == 0 && !self.open {
             match filled {
-                Filled::ByDevice => {
+                BufferOwner::ByDevice => {
                     self.rotation.consume();
                     self.interrupt_write = false;
                 }
-                Filled::ByMainDevice => self.interrupt_read = false,
+                BufferOwner::ByMainDevice => self.interrupt_read = false,
             }
         }
         self.open = true;
@@ -241,22 +243,22 @@ impl SyncManager {
         )
     }
 
-    fn opened_by_main_device(&self, filled: Filled, memory: usize) -> usize {
+    fn opened_by_main_device(&self, filled: BufferOwner, memory: usize) -> usize {
         match filled {
-            Filled::ByDevice => self.buffer(self.rotation.consumer, memory),
-            Filled::ByMainDevice => self.buffer(self.rotation.producer, memory),
+            BufferOwner::ByDevice => self.buffer(self.rotation.consumer, memory),
+            BufferOwner::ByMainDevice => self.buffer(self.rotation.producer, memory),
         }
     }
 
-    /// The frame is over and was good; true if the area changed hands in it.
+    /// Ends a valid frame. Returns true if it handed over the area.
     pub fn end_frame(&mut self) -> bool {
         if !std::mem::take(&mut self.closing) {
             return false;
         }
         self.open = false;
         match self.filled {
-            Filled::ByMainDevice => self.produced(),
-            Filled::ByDevice => self.consumed(),
+            BufferOwner::ByMainDevice => self.produced(),
+            BufferOwner::ByDevice => self.consumed(),
         }
         true
     }
@@ -276,7 +278,7 @@ impl SyncManager {
         (self.interrupt_write, self.interrupt_read) = (false, true);
     }
 
-    /// A mailbox that was filled or emptied since the last call shows it in its event bits.
+    /// Updates the event bits after the mailbox was filled or emptied.
     pub fn note_full(&mut self) {
         if self.full != self.was_full {
             self.was_full = self.full;
@@ -284,26 +286,26 @@ impl SyncManager {
         }
     }
 
-    /// Where the device writes next. It does so at once, so nothing is ever half written.
+    /// Returns the address of the next device write. A device write is atomic.
     #[must_use]
     pub fn device_writes_at(&self, memory: usize) -> usize {
         self.buffer(self.rotation.producer, memory)
     }
 
-    /// The device filled a buffer or the mailbox.
+    /// Handles that the device filled a buffer or the mailbox.
     pub fn device_wrote(&mut self) {
         self.interrupt_read = false;
         self.produced();
     }
 
-    /// Where the device finds the last complete data.
+    /// Fetches the last complete data and returns their address.
     pub fn device_reads_at(&mut self, memory: usize) -> usize {
         self.rotation.consume();
         (self.interrupt_write, self.interrupt_read) = (false, true);
         self.buffer(self.rotation.consumer, memory)
     }
 
-    /// Where the last complete data are, without fetching them.
+    /// Returns the address of the last complete data without fetching them.
     #[must_use]
     pub fn latest_at(&self, memory: usize) -> usize {
         let n = if self.has_data() {
@@ -314,13 +316,13 @@ impl SyncManager {
         self.buffer(n, memory)
     }
 
-    /// Register byte 5.
+    /// Returns register byte 5.
     #[must_use]
     pub fn status(&self) -> u8 {
         let opened = match (self.open, self.filled) {
             (false, _) => 0,
-            (true, Filled::ByDevice) => 0x40,
-            (true, Filled::ByMainDevice) => 0x80,
+            (true, BufferOwner::ByDevice) => 0x40,
+            (true, BufferOwner::ByMainDevice) => 0x80,
         };
         let events = u8::from(self.interrupt_write) | u8::from(self.interrupt_read) << 1;
         let state = match self.mode {
@@ -330,22 +332,22 @@ impl SyncManager {
         state | events | opened
     }
 
-    /// Whether it shows in the MainDevice's event register 0x0210: what the other side did, if asked for.
+    /// True if the event register 0x0210 of the MainDevice reports an access of the device.
     #[must_use]
     pub fn main_device_event(&self) -> bool {
         let event = match self.filled {
-            Filled::ByDevice => self.interrupt_write,
-            Filled::ByMainDevice => self.interrupt_read,
+            BufferOwner::ByDevice => self.interrupt_write,
+            BufferOwner::ByMainDevice => self.interrupt_read,
         };
         event && self.enabled && self.control & 0x10 != 0
     }
 
-    /// Whether it shows in the device's event register 0x0220.
+    /// True if the event register 0x0220 of the device reports an access of the MainDevice.
     #[must_use]
     pub fn device_event(&self) -> bool {
         let event = match self.filled {
-            Filled::ByDevice => self.interrupt_read,
-            Filled::ByMainDevice => self.interrupt_write,
+            BufferOwner::ByDevice => self.interrupt_read,
+            BufferOwner::ByMainDevice => self.interrupt_write,
         };
         event && self.enabled && self.control & 0x20 != 0
     }

@@ -1,26 +1,26 @@
 //! The watchdogs for process data and for the process data interface (0x0400–0x0443).
 
-/// Reset values: 100 µs per unit, 1000 units.
+/// Reset values of divider and count: 100 µs per unit, 1000 units.
 pub const DEFAULT_DIVIDER: u16 = 0x09c2;
 pub const DEFAULT_COUNT: u16 = 0x03e8;
 
 #[derive(Debug, Clone, Default)]
 pub struct Watchdog {
-    /// Local time of expiry, `None` while it does not wait.
+    /// Local time of expiry; `None` while the watchdog is stopped or has expired.
     deadline: Option<u64>,
     expired: bool,
 }
 
 impl Watchdog {
-    /// Starts waiting anew; a count of 0 switches it off. Not before `divider` and `count` are over it
-    /// expires; real ones take up to one unit longer.
+    /// Restarts the watchdog; a count of 0 switches it off. It expires after `divider` and `count`;
+    /// real watchdogs take up to one unit longer.
     pub fn trigger(&mut self, local: u64, divider: u16, count: u16) {
         self.expired = false;
         let unit = (u64::from(divider) + 2) * 40;
         self.deadline = (count > 0).then(|| local.saturating_add(unit * u64::from(count)));
     }
 
-    /// Stops waiting, and is content.
+    /// Stops the watchdog and clears an expiry.
     pub fn stop(&mut self) {
         (self.deadline, self.expired) = (None, false);
     }
@@ -29,7 +29,7 @@ impl Watchdog {
         (self.deadline, self.expired) = (None, true);
     }
 
-    /// Expired, and not triggered since.
+    /// True if the watchdog expired and was not triggered since.
     #[must_use]
     pub fn expired(&self) -> bool {
         self.expired
@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn divider_and_count_make_the_time() {
+    fn watchdog_time_follows_divider_and_count() {
         // (divider, count, nanoseconds)
         let rows = [
             (DEFAULT_DIVIDER, DEFAULT_COUNT, 100_000_000),

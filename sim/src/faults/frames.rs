@@ -1,36 +1,37 @@
-//! What becomes of single frames.
+//! The effects of faults on single frames.
 
-use super::script::{FaultKind, Hits};
-use super::{Faults, Phase, Running};
+use super::script::{FaultKind, FrameSelection};
+use super::{ActiveFault, Faults, Phase};
 use crate::Nanos;
 use crate::esc::al::AlState;
 use crate::random::Random;
 
-/// What happens to one frame.
+/// The effects on one frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Fate {
+pub(crate) struct FrameFault {
     pub(crate) lost_on_the_way_out: bool,
     pub(crate) lost_on_the_way_back: bool,
-    pub(crate) corrupted: Option<Corrupted>,
-    /// Arrives at the MainDevice twice.
+    pub(crate) corrupted: Option<BitFlip>,
+    /// The frame arrives at the MainDevice twice.
     pub(crate) twice: bool,
-    /// Comes back so much later.
+    /// The additional delay of the returning frame in ns.
     pub(crate) delay: Nanos,
-    /// Another MainDevice's frame follows it; the state that it sends everybody to.
+    /// `Some`: a frame of another MainDevice follows. The inner value is the state that it requests
+    /// from all devices.
     pub(crate) other: Option<Option<AlState>>,
 }
 
-/// Where a bit turns over.
+/// The location of a bit error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Corrupted {
-    /// In front of the port.
+pub(crate) enum BitFlip {
+    /// In front of this port.
     At { device: usize, port: u8 },
-    /// Anywhere, drawn by lot.
+    /// At a random location, selected by this number.
     Somewhere(u64),
 }
 
 impl FaultKind {
-    pub(super) fn hits(&self) -> Option<Hits> {
+    pub(super) fn hits(&self) -> Option<FrameSelection> {
         match self {
             Self::FrameLoss { hits }
             | Self::FrameDuplicate { hits }
@@ -42,25 +43,25 @@ impl FaultKind {
     }
 }
 
-impl Running {
-    /// Whether it strikes the frame that is sent now.
+impl ActiveFault {
+    /// True if the fault affects the frame that is sent now.
     fn strikes(&mut self, random: &mut Random) -> bool {
         match self.fault.kind.hits() {
-            Some(Hits::Next(_)) => {
+            Some(FrameSelection::Next(_)) => {
                 let left = self.left > 0;
                 self.left = self.left.saturating_sub(1);
                 left
             }
-            Some(Hits::Each(probability)) => random.chance(probability),
+            Some(FrameSelection::Each(probability)) => random.chance(probability),
             None => false,
         }
     }
 }
 
 impl Faults {
-    /// Decides about the frame that is sent now.
-    pub(crate) fn fate(&mut self) -> Fate {
-        let mut fate = Fate::default();
+    /// Determines the effects on the frame that is sent now.
+    pub(crate) fn fate(&mut self) -> FrameFault {
+        let mut fate = FrameFault::default();
         if !self.concerns_frames {
             return fate;
         }
@@ -85,8 +86,8 @@ impl Faults {
                 FaultKind::OtherMainDevice { state, .. } => fate.other = Some(state),
                 FaultKind::FrameCorrupt { at, .. } => {
                     fate.corrupted = Some(match at {
-                        Some((device, port)) => Corrupted::At { device, port },
-                        None => Corrupted::Somewhere(random.next()),
+                        Some((device, port)) => BitFlip::At { device, port },
+                        None => BitFlip::Somewhere(random.next()),
                     });
                 }
                 _ => {}

@@ -1,44 +1,52 @@
-//! Faults on demand: a TOML script says what goes wrong, when, where and for how long. The same
-//! seed gives the same run.
+//! Fault injection. A TOML script defines each fault with its location, start and duration. The
+//! same seed reproduces a run.
 //!
 //! ```toml
 //! seed = 7
 //!
 //! [[fault]]
 //! at = "1.5s"           # omitted: from the start
-//! for = "200ms"         # omitted: for good
+//! for = "200ms"         # omitted: permanent
 //! device = 0
 //! kind = "refuse-state"
 //! state = "safeop"
 //! code = 0x001e
 //! ```
 //!
-//! | kind | keys | what happens |
-//! |---|---|---|
-//! | `frame-loss` | `count` or `probability` | frames vanish, half of them before any device has seen them |
-//! | `frame-corrupt` | `count` or `probability`; `device`, `port` | a bit turns over in front of the device's port (0), or anywhere; error counters |
-//! | `frame-delay` | `count` or `probability`; `delay` | frames come back late, and others before them |
-//! | `frame-duplicate` | `count` or `probability` | frames come back twice |
-//! | `link-break` | `device`, `port` | the cable at the port (0) is broken |
-//! | `silent` | | the MainDevice's cable is broken |
-//! | `power-off`, `absent` | `device` | no power; back in Init |
-//! | `swap` | `device`; `vendor`, `product`, `revision`, `serial`, `alias` | another device in its place, in Init, without alias |
-//! | `identity` | `device`; `vendor`, `product`, `revision` | EEPROM and 0x1018 say something else |
-//! | `refuse-state` | `device`, `state`, `code` | the state is refused with this AL status code |
-//! | `sdo-abort` | `device`, `index`, `sub`, `code` | the SDO is aborted |
-//! | `sdo-ignored` | `device`, `index`, `sub` | the SDO is confirmed, the object keeps its value |
-//! | `mailbox-silent` | `device` | requests stay in the mailbox and are not answered |
-//! | `watchdog` | `device` | the watchdog of its process data expires once, whatever comes |
-//! | `sync-late` | `device`, `delay` | SYNC0 begins so much later than its start time says |
-//! | `other-main-device` | `count` or `probability`; `state` | behind frames of ours comes one of another MainDevice: it reads AL status, or sends all devices to the state |
-//! | `drive-fault` | `device`, `code` | the drive detects this error |
-//! | `stuck` | `device`, `state` | the drive does not leave this CiA 402 state |
-//! | `load` | `device`, `torque` | a torque (N·m) pulls the shaft towards negative positions |
-//! | `blocked` | `device` | the shaft does not turn |
-//! | `emergency` | `device`, `code` | an emergency message, nothing else |
+//! The kinds with their keys and effects:
+//!
+//! * `frame-loss` (`count` or `probability`): frames are lost, half of them before they reach any
+//!   device
+//! * `frame-corrupt` (`count` or `probability`; `device`, `port`): a bit flips in front of the port
+//!   (default 0), or anywhere; error counters
+//! * `frame-delay` (`count` or `probability`; `delay`): frames return late, other frames overtake
+//!   them
+//! * `frame-duplicate` (`count` or `probability`): frames return twice
+//! * `link-break` (`device`, `port`): the cable at the port (default 0) is broken
+//! * `silent`: the cable of the MainDevice is broken
+//! * `power-off`, `absent` (`device`): no power; Init after the fault
+//! * `swap` (`device`; `vendor`, `product`, `revision`, `serial`, `alias`): another device replaces
+//!   it, in Init, without alias
+//! * `identity` (`device`; `vendor`, `product`, `revision`): EEPROM and 0x1018 contain another
+//!   identity
+//! * `refuse-state` (`device`, `state`, `code`): the device refuses the state with this AL status
+//!   code
+//! * `sdo-abort` (`device`, `index`, `sub`, `code`): the device aborts the SDO
+//! * `sdo-ignored` (`device`, `index`, `sub`): the device confirms the SDO, the object keeps its
+//!   value
+//! * `mailbox-silent` (`device`): requests stay in the mailbox without an answer
+//! * `watchdog` (`device`): the process data watchdog expires once, despite outputs
+//! * `sync-late` (`device`, `delay`): SYNC0 starts this much after its start time
+//! * `other-main-device` (`count` or `probability`; `state`): a frame of another MainDevice follows
+//!   ours: it reads AL status, or requests the state from all devices
+//! * `drive-fault` (`device`, `code`): the drive detects this error
+//! * `stuck` (`device`, `state`): the drive does not leave this CiA 402 state
+//! * `load` (`device`, `torque`): a torque (N·m) pulls the shaft towards negative positions
+//! * `blocked` (`device`): the shaft does not turn
+//! * `emergency` (`device`, `code`): the device sends an emergency message and has no error
 
 mod frames;
-mod kinds;
+mod inject;
 mod script;
 #[cfg(test)]
 mod tests;
@@ -46,8 +54,8 @@ mod tests;
 use crate::Nanos;
 use crate::device::{Identification, SimDevice};
 use crate::random::Random;
-pub(crate) use frames::Corrupted;
-pub use script::{Fault, FaultKind, FaultScript, Hits, NewIdentity, ScriptError};
+pub(crate) use frames::BitFlip;
+pub use script::{Fault, FaultKind, FaultScript, FrameSelection, NewIdentity, ScriptError};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
@@ -57,38 +65,38 @@ enum Phase {
 }
 
 #[derive(Debug)]
-struct Running {
+struct ActiveFault {
     fault: Fault,
     phase: Phase,
-    /// Frames still to strike.
+    /// The number of frames still to affect.
     left: u32,
-    /// Frames it has struck.
+    /// The number of frames affected so far.
     struck: u64,
-    /// What the device was known by before.
+    /// The previous identity of the device.
     saved: Identification,
 }
 
-/// What has become of a fault of the script.
+/// The progress of a fault of the script.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FaultReport {
-    /// Line of the script.
+    /// The line in the script.
     pub line: u32,
-    /// The kind as the script names it.
+    /// The kind as written in the script.
     pub name: &'static str,
     pub began: bool,
     pub ended: bool,
-    /// How many frames it has struck; `None` where it does not concern single frames.
+    /// The number of affected frames; `None` for faults that do not affect single frames.
     pub frames: Option<u64>,
 }
 
-/// The script while it runs.
+/// A running script.
 #[derive(Debug)]
 pub(crate) struct Faults {
-    running: Vec<Running>,
+    running: Vec<ActiveFault>,
     random: Random,
-    /// One that is active may strike frames.
+    /// True if an active fault may affect frames.
     concerns_frames: bool,
-    /// Devices that have been replaced since somebody asked.
+    /// Devices replaced since the last [`Self::take_replaced`].
     replaced: Vec<usize>,
 }
 
@@ -106,9 +114,9 @@ impl Faults {
         if let Some(seed) = script.seed {
             self.random = Random::new(seed);
         }
-        let running = script.faults.into_iter().map(|fault| Running {
+        let running = script.faults.into_iter().map(|fault| ActiveFault {
             left: match fault.kind.hits() {
-                Some(Hits::Next(count)) => count,
+                Some(FrameSelection::Next(count)) => count,
                 _ => 0,
             },
             fault,
@@ -116,7 +124,7 @@ impl Faults {
             struck: 0,
             saved: Identification::default(),
         });
-        // Those that still act must be ended first; they end now.
+        // Faults of the previous script that are still active end now.
         for old in &mut self.running {
             if old.phase == Phase::Active {
                 old.fault.duration = Some(0);
@@ -126,7 +134,7 @@ impl Faults {
         self.running.extend(running);
     }
 
-    /// Time of the next start or end that is still to be applied.
+    /// Returns the time of the next pending start or end of a fault.
     pub(crate) fn next_change(&self) -> Option<Nanos> {
         let due = self.running.iter().filter_map(|r| match r.phase {
             Phase::Pending => Some(r.fault.at),
@@ -200,7 +208,7 @@ impl Faults {
         })
     }
 
-    /// Devices that have become others since the last call.
+    /// Returns the devices replaced since the last call.
     pub(crate) fn take_replaced(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.replaced)
     }
@@ -212,25 +220,25 @@ impl Faults {
             .map(|r| &r.fault)
     }
 
-    /// The device has no power.
+    /// True if the device has no power.
     pub(crate) fn is_off(&self, device: usize) -> bool {
         self.active()
             .any(|fault| fault.device == device && fault.kind == FaultKind::PowerOff)
     }
 
-    /// The cable at the port is broken.
+    /// True if the cable at the port is broken.
     pub(crate) fn is_cut(&self, device: usize, port: u8) -> bool {
         self.active()
             .any(|fault| fault.device == device && fault.kind == FaultKind::LinkBreak { port })
     }
 
-    /// The cable at the MainDevice is unplugged.
+    /// True if the cable at the MainDevice is unplugged.
     pub(crate) fn is_silent(&self) -> bool {
         self.active().any(|fault| fault.kind == FaultKind::Silent)
     }
 }
 
-impl Running {
+impl ActiveFault {
     fn start(&mut self, device: &mut SimDevice) {
         match self.fault.kind {
             FaultKind::DriveFault { code } => {

@@ -1,9 +1,9 @@
-//! The fault script as written and as checked against the bus.
+//! The fault script: parsing, and its check against the segment.
 
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::kinds;
+use super::inject;
 use crate::Nanos;
 use crate::drive::State;
 use crate::esc::al::AlState;
@@ -16,7 +16,7 @@ pub struct FaultScript {
 }
 
 impl FaultScript {
-    /// Everything happens `by` later.
+    /// Delays all faults by `by` ns.
     pub(crate) fn delay(&mut self, by: Nanos) {
         for fault in &mut self.faults {
             fault.at = fault.at.saturating_add(by);
@@ -27,27 +27,27 @@ impl FaultScript {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fault {
     pub at: Nanos,
-    /// `None`: for good.
+    /// The duration in ns; `None`: permanent.
     pub duration: Option<Nanos>,
-    /// 0 where the kind concerns no device.
+    /// The device; 0 for kinds without a device.
     pub device: usize,
     pub kind: FaultKind,
-    /// Line of the script.
+    /// The line in the script.
     pub line: u32,
-    /// The kind as the script names it.
+    /// The kind as written in the script.
     pub name: &'static str,
 }
 
-/// Which of the frames sent while a fault lasts it strikes.
+/// The frames that a fault affects while it lasts.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Hits {
-    /// The next so many.
+pub enum FrameSelection {
+    /// The next frames, up to this number.
     Next(u32),
-    /// Each with this probability.
+    /// Each frame with this probability.
     Each(f64),
 }
 
-/// What a device is known by; `None`: as before.
+/// The identity of a new device; `None`: unchanged.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct NewIdentity {
     pub vendor: Option<u32>,
@@ -59,51 +59,52 @@ pub struct NewIdentity {
 
 #[derive(Debug, Clone, PartialEq)]
 pub enum FaultKind {
-    /// Frames vanish, on the way out or on the way back.
+    /// Frames are lost on the way out or on the way back.
     FrameLoss {
-        hits: Hits,
+        hits: FrameSelection,
     },
     /// Frames arrive at the MainDevice twice.
     FrameDuplicate {
-        hits: Hits,
+        hits: FrameSelection,
     },
-    /// Frames come back later than they should; others overtake them.
+    /// Frames return late; other frames overtake them.
     FrameDelay {
-        hits: Hits,
+        hits: FrameSelection,
         delay: Nanos,
     },
-    /// A bit of the frame is turned over on its way to the port of the device named, or to any. From
-    /// there on devices ignore and count it; the MainDevice never sees it.
+    /// A bit of the frame flips in front of a port, or anywhere if no port is given. Devices behind
+    /// that location ignore and count the frame. It never reaches the MainDevice.
     FrameCorrupt {
-        hits: Hits,
+        hits: FrameSelection,
         at: Option<(usize, u8)>,
     },
     /// The drive detects this error itself.
     DriveFault {
         code: u16,
     },
-    /// The SDO server answers one subindex with an abort.
+    /// The SDO server aborts accesses to one subindex.
     SdoAbort {
         index: u16,
         sub: u8,
         code: u32,
     },
-    /// The SDO server confirms what one subindex is written with, and keeps the old value.
+    /// The SDO server confirms writes to one subindex and keeps the old value.
     SdoIgnored {
         index: u16,
         sub: u8,
     },
-    /// Requests stay in the device's mailbox; nobody fetches or answers them.
+    /// Requests stay in the mailbox of the device without an answer.
     MailboxSilent,
-    /// The watchdog of the process data expires, whatever comes.
+    /// The process data watchdog expires, despite outputs.
     Watchdog,
-    /// SYNC0 begins so much later than its start time says.
+    /// SYNC0 starts `delay` ns after its start time.
     SyncLate {
         delay: Nanos,
     },
-    /// Another MainDevice sends a frame behind ours: it reads AL status, or sends everybody to a state.
+    /// A frame of another MainDevice follows ours. It reads AL status, or requests a state from all
+    /// devices.
     OtherMainDevice {
-        hits: Hits,
+        hits: FrameSelection,
         state: Option<AlState>,
     },
     /// The device refuses to enter a state.
@@ -111,31 +112,32 @@ pub enum FaultKind {
         state: AlState,
         code: u16,
     },
-    /// The drive's power state machine does not leave a state.
+    /// The CiA 402 state machine of the drive does not leave a state.
     Stuck {
         state: State,
     },
-    /// Pulls the shaft towards negative positions, N·m.
+    /// A torque in N·m pulls the shaft towards negative positions.
     Load {
         torque: f64,
     },
-    /// The shaft does not turn, whatever the motor does.
+    /// The shaft does not turn, regardless of the motor torque.
     Blocked,
-    /// EEPROM and 0x1018 name another device.
+    /// EEPROM and 0x1018 contain the identity of another device.
     Identity(NewIdentity),
-    /// Without power: its neighbours lose their link, what is behind it or fed by it through the
-    /// E-bus is out of reach; it comes back in Init. `absent` is another name for it: nobody on
-    /// the bus can tell the two apart.
+    /// The device has no power. Its neighbours lose their link. Devices behind it, or powered by it
+    /// through the E-bus, are unreachable. Afterwards it starts in Init. `absent` is a synonym,
+    /// since both look the same on the bus.
     PowerOff,
-    /// Another device takes its place and starts in Init; when the fault ends, the old one is back.
+    /// Another device replaces it and starts in Init. At the end of the fault, the old device
+    /// returns.
     Swap(NewIdentity),
     /// The cable at the MainDevice is unplugged.
     Silent,
-    /// The cable at the device's port carries nothing; both ends lose their link.
+    /// The cable at the port of the device is broken; both ends lose their link.
     LinkBreak {
         port: u8,
     },
-    /// A node behind a gateway has no power; it boots again when it has.
+    /// A node behind a gateway has no power. It boots again when the power returns.
     NodeSilent {
         node: u8,
     },
@@ -145,7 +147,7 @@ pub enum FaultKind {
 }
 
 impl Fault {
-    /// The device and port that must be there.
+    /// Returns the device and port that must exist.
     fn place(&self) -> Option<(usize, Option<u8>)> {
         match self.kind {
             FaultKind::FrameLoss { .. }
@@ -222,7 +224,7 @@ impl FaultScript {
             let line = text.bytes().take(at).filter(|b| *b == b'\n').count() + 1;
             let kind = fault.kind.get_ref().clone();
             let number = u32::try_from(line).unwrap_or(u32::MAX);
-            kinds::check(&fault, number).map_err(|problem| ScriptError::Fault {
+            inject::check(&fault, number).map_err(|problem| ScriptError::Fault {
                 line,
                 kind,
                 problem,
@@ -234,7 +236,7 @@ impl FaultScript {
         })
     }
 
-    /// Whether the bus has every device and every cable that the script names.
+    /// Checks that the segment has all devices and cables in the script.
     pub fn check(&self, bus: &Topology) -> Result<(), ScriptError> {
         for fault in &self.faults {
             let (line, devices) = (fault.line, bus.len());

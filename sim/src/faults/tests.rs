@@ -1,6 +1,6 @@
-//! What scripts are understood, and what is said of the others.
+//! Tests of valid scripts and of the errors of invalid ones.
 
-use super::kinds::al_state;
+use super::inject::al_state;
 use super::script::*;
 use crate::drive::State;
 use crate::esc::al::AlState;
@@ -8,7 +8,7 @@ use crate::esc::ports::Medium;
 use crate::network::topology::Topology;
 
 #[test]
-fn every_kind_parses() {
+fn script_with_every_kind_parses() {
     let script = FaultScript::parse(
         r#"
         seed = 9
@@ -92,10 +92,10 @@ fn every_kind_parses() {
     .unwrap();
     assert_eq!(script.seed, Some(9));
     let kinds: Vec<FaultKind> = script.faults.iter().map(|f| f.kind.clone()).collect();
-    let one = Hits::Next(1);
+    let one = FrameSelection::Next(1);
     let expected = [
         FaultKind::FrameLoss {
-            hits: Hits::Next(3),
+            hits: FrameSelection::Next(3),
         },
         FaultKind::DriveFault { code: 0x8611 },
         FaultKind::SdoAbort {
@@ -121,10 +121,10 @@ fn every_kind_parses() {
         FaultKind::NodeSilent { node: 5 },
         FaultKind::PowerOff,
         FaultKind::FrameDuplicate {
-            hits: Hits::Each(0.25),
+            hits: FrameSelection::Each(0.25),
         },
         FaultKind::FrameDelay {
-            hits: Hits::Next(2),
+            hits: FrameSelection::Next(2),
             delay: 1_500_000,
         },
         FaultKind::FrameCorrupt {
@@ -153,7 +153,7 @@ fn every_kind_parses() {
             state: Some(AlState::Init),
         },
         FaultKind::OtherMainDevice {
-            hits: Hits::Each(0.5),
+            hits: FrameSelection::Each(0.5),
             state: None,
         },
         FaultKind::Watchdog,
@@ -165,7 +165,7 @@ fn every_kind_parses() {
 }
 
 #[test]
-fn errors_name_line_and_field() {
+fn script_errors_name_line_and_field() {
     let error = |text: &str| FaultScript::parse(text).unwrap_err().to_string();
     assert_eq!(
         error("[[fault]]\nkind = \"sdo-abort\"\ncode = 1\n"),
@@ -193,13 +193,13 @@ fn errors_name_line_and_field() {
         ("kind = \"silent\"\nwhen = 1\n", "when"),
     ];
     for (lines, expected) in rows {
-        let told = error(&format!("[[fault]]\n{lines}"));
-        assert!(told.contains(expected), "{lines}: {told}");
+        let reported = error(&format!("[[fault]]\n{lines}"));
+        assert!(reported.contains(expected), "{lines}: {reported}");
     }
 }
 
 #[test]
-fn states_as_people_write_them() {
+fn al_state_accepts_common_spellings() {
     for (state, spellings) in [
         (AlState::Init, &["init", "Init", "INIT"][..]),
         (AlState::PreOp, &["PreOp", "pre-op", "preop", "PRE-OP"]),
@@ -218,7 +218,7 @@ fn states_as_people_write_them() {
 }
 
 #[test]
-fn a_device_that_is_not_there_is_named_with_its_line() {
+fn check_names_a_missing_device_and_its_line() {
     let script = FaultScript::parse(
         "[[fault]]\nkind = \"silent\"\n\n[[fault]]\ndevice = 2\nkind = \"absent\"\n",
     )
@@ -236,8 +236,8 @@ fn a_device_that_is_not_there_is_named_with_its_line() {
     for (device, port, cable) in [(0, 0, true), (1, 1, true), (2, 0, true), (2, 1, false)] {
         let script =
             format!("[[fault]]\nkind = \"link-break\"\ndevice = {device}\nport = {port}\n");
-        let told = FaultScript::parse(&script).unwrap().check(&line(3));
-        assert_eq!(told.is_ok(), cable, "device {device} port {port}");
+        let reported = FaultScript::parse(&script).unwrap().check(&line(3));
+        assert_eq!(reported.is_ok(), cable, "device {device} port {port}");
     }
     let nowhere = "[[fault]]\nkind = \"frame-corrupt\"\ncount = 1\ndevice = 1\nport = 2\n";
     assert_eq!(

@@ -1,20 +1,20 @@
-//! The processor: program or boot loader, and the objects that make it change between them.
+//! The processor with program or boot loader, and the objects that switch between them.
 
 use ecaxis_esi::model::{Access, ObjectCode, Writable};
 
 use super::{FirmwareHeader, FirmwareOptions, Flash};
 use crate::coe::Abort;
-use crate::coe::store::ObjectStore;
+use crate::coe::object_dictionary::ObjectStore;
 use crate::esc::al::AlState;
 
 const PROGRAM_DATA: u16 = 0x1f50;
 const PROGRAM_CONTROL: u16 = 0x1f51;
 pub(crate) const PROGRAM_IDENTIFICATION: u16 = 0x1f56;
 
-/// 0x1000 of a boot loader: no profile that knows axes.
+/// 0x1000 of a boot loader: a profile without axes.
 const BOOT_LOADER: u32 = 0x0000_012e;
 
-/// What is written to 0x1F51 (CiA 302-3).
+/// Commands in 0x1F51 (CiA 302-3).
 mod control {
     pub(super) const STOP: u8 = 0;
     pub(super) const START: u8 = 1;
@@ -22,27 +22,27 @@ mod control {
     pub(super) const CLEAR: u8 = 3;
 }
 
-/// What the processor does next.
+/// The next action of the processor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Next {
-    /// Restarts; whoever ordered it hears nothing.
+    /// Restarts the processor. The client gets no answer.
     Boot { stop: bool },
-    /// Clears the program memory and answers then.
+    /// Clears the program memory and then answers.
     Clear,
 }
 
-/// A device's processor, as far as it can have another program.
+/// A processor with a replaceable program.
 #[derive(Debug, Clone)]
-pub(crate) struct Processor {
+pub(crate) struct BootLoader {
     pub(crate) flash: Flash,
-    /// Its boot loader runs.
+    /// True while the boot loader runs.
     pub(crate) stopped: bool,
-    /// The program has 0x1F51.
+    /// True if the program has 0x1F51.
     has_control: bool,
     next: Option<Next>,
 }
 
-impl Processor {
+impl BootLoader {
     pub(crate) fn new(options: FirmwareOptions, store: &ObjectStore, device: (u32, u32)) -> Self {
         Self {
             flash: Flash::new(options, device),
@@ -52,12 +52,12 @@ impl Processor {
         }
     }
 
-    /// Whether a subindex is served here and not from the store.
+    /// True if the boot loader serves a subindex instead of the store.
     pub(crate) fn serves(&self, index: u16, sub: u8) -> bool {
         self.has_control && matches!(index, PROGRAM_DATA | PROGRAM_CONTROL) && sub == 1
     }
 
-    /// Most bytes that a download to it may have.
+    /// Returns the maximum bytes of a download to a served object.
     pub(crate) fn capacity(&self, index: u16) -> Result<usize, Abort> {
         match index {
             PROGRAM_DATA if !self.stopped => Err(Abort::WRONG_STATE),
@@ -66,7 +66,7 @@ impl Processor {
         }
     }
 
-    /// A download to an object that is served here.
+    /// Handles a download to a served object.
     pub(crate) fn write(&mut self, index: u16, data: &[u8], state: AlState) -> Result<(), Abort> {
         if state != AlState::PreOp {
             return Err(Abort::WRONG_STATE);
@@ -102,22 +102,23 @@ impl Processor {
         self.next.take()
     }
 
-    /// Starts anew: its program, unless it is to stop or there is none.
+    /// Restarts the processor. The program starts, unless `stop` is set or there is no program.
     pub(crate) fn restart(&mut self, stop: bool) {
         self.flash.restart();
         self.next = None;
         self.stopped = stop || self.flash.program.is_none();
     }
 
-    /// What the program says of itself, where it is not the one from the factory: its header, and 0x1F56.
+    /// Returns the header of the program and its 0x1F56; `None` for the factory program.
     pub(crate) fn program(&self) -> Option<(FirmwareHeader, u32)> {
         let program = self.flash.program.as_ref()?;
         Some((program.header?, program.checksum))
     }
 }
 
-/// What is left of a device while its program is stopped: the low words of product and revision belong to the program.
-pub(crate) fn boot_objects(of: &ObjectStore, processor: &Processor) -> ObjectStore {
+/// Returns the objects of the boot loader. Product and revision lack their low words, which belong
+/// to the program.
+pub(crate) fn boot_objects(of: &ObjectStore, processor: &BootLoader) -> ObjectStore {
     let mut store = ObjectStore::default();
     let ro = Access::default();
     let value = |index, sub| of.slot(index, sub).map_or(0, |slot| of.get(slot));

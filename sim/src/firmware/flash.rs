@@ -1,34 +1,34 @@
 //! The program memory.
 
 use super::FirmwareOptions;
-use super::image::{FirmwareHeader, HEADER, Unfit};
+use super::image::{FirmwareHeader, HEADER, ImageError};
 use crate::Nanos;
 use crate::coe::Abort;
 use crate::foe::FoeError;
 
-/// A program that can run.
+/// An executable program.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Program {
-    /// What the device is once it runs; `None`: what it was made as.
+    /// The header of the program; `None`: the factory program.
     pub(super) header: Option<FirmwareHeader>,
-    /// 0x1F56.
+    /// The checksum, 0x1F56.
     pub(super) checksum: u32,
-    /// As it was written; nothing of the one from the factory.
+    /// The file as written; empty for the factory program.
     file: Vec<u8>,
 }
 
-/// Times are the device's own.
+/// The program memory. All times are local times of the device.
 #[derive(Debug, Clone)]
 pub(crate) struct Flash {
     options: FirmwareOptions,
-    /// Whom a file must be for: vendor, product.
+    /// The vendor and product that a file must match.
     device: (u32, u32),
     pub(super) program: Option<Program>,
-    /// A program that starts when Bootstrap is left.
+    /// True if a new program starts on leaving Bootstrap.
     is_new: bool,
-    /// Erased, and nothing has been written since.
+    /// True while the memory is erased and unwritten.
     blank: bool,
-    /// The file that is on its way is for this device, and what was here has been erased for it.
+    /// True if the current file matches this device and the memory has been erased for it.
     accepted: bool,
     busy_from: Nanos,
     busy_until: Nanos,
@@ -52,7 +52,7 @@ impl Flash {
         self.options.capacity
     }
 
-    /// The file of the program, where one was written.
+    /// Returns the file of the program if one was written.
     pub(crate) fn file(&self) -> Option<&[u8]> {
         let file = self.program.as_ref().map(|program| &program.file[..]);
         file.filter(|file| !file.is_empty())
@@ -75,18 +75,18 @@ impl Flash {
         (self.blank, self.is_new) = (true, false);
     }
 
-    /// The local clock starts anew, and what was under way is over.
+    /// Cancels pending operations, because the local clock restarts.
     pub(super) fn restart(&mut self) {
         (self.busy_from, self.busy_until) = (0, 0);
         (self.accepted, self.is_new) = (false, false);
     }
 
-    /// A file begins to come.
+    /// Starts the reception of a file.
     pub(crate) fn begin(&mut self) {
         self.accepted = false;
     }
 
-    /// The next packet of a file. `Ok(Some)`: not now; so much of so much is done.
+    /// Takes the next packet of a file. `Ok(Some)`: busy, with the progress as (done, total).
     pub(crate) fn take(
         &mut self,
         so_far: &[u8],
@@ -124,7 +124,7 @@ impl Flash {
         (self.busy_from, self.busy_until) = (now, now.saturating_add(time));
     }
 
-    /// Percent.
+    /// Returns the progress in percent, as (done, 100).
     fn progress(&self, now: Nanos) -> (u16, u16) {
         let passed = now.saturating_sub(self.busy_from).saturating_mul(100);
         let all = self.busy_until.saturating_sub(self.busy_from);
@@ -132,16 +132,16 @@ impl Flash {
         (u16::try_from(done).unwrap_or(100), 100)
     }
 
-    fn check(&self, head: &[u8]) -> Result<(), Unfit> {
+    fn check(&self, head: &[u8]) -> Result<(), ImageError> {
         let header = FirmwareHeader::parse(head)?;
         if (header.vendor, header.product) == self.device {
             Ok(())
         } else {
-            Err(Unfit::OtherDevice)
+            Err(ImageError::OtherDevice)
         }
     }
 
-    fn program(&mut self, file: Vec<u8>) -> Result<(), Unfit> {
+    fn program(&mut self, file: Vec<u8>) -> Result<(), ImageError> {
         self.check(&file)?;
         self.blank = false;
         let (header, checksum) = FirmwareHeader::verify(&file)?;
@@ -153,29 +153,29 @@ impl Flash {
         Ok(())
     }
 
-    /// All of a file is here, by FoE.
+    /// Completes a file that was received through FoE.
     pub(crate) fn finish(&mut self, file: Vec<u8>) -> Result<(), FoeError> {
         self.program(file).map_err(refusal)?;
         self.is_new = true;
         Ok(())
     }
 
-    /// 0x1F50, into an erased memory.
+    /// Writes the program through 0x1F50. The memory must be erased.
     pub(super) fn download(&mut self, file: &[u8]) -> Result<(), Abort> {
         if self.program.is_some() {
             return Err(Abort::WRONG_STATE);
         }
         self.program(file.to_vec()).map_err(|unfit| match unfit {
-            Unfit::NoHeader | Unfit::OtherDevice => Abort::VALUE,
-            Unfit::Checksum => Abort::NOT_STORED,
+            ImageError::NoHeader | ImageError::OtherDevice => Abort::VALUE,
+            ImageError::Checksum => Abort::NOT_STORED,
         })
     }
 }
 
-fn refusal(unfit: Unfit) -> FoeError {
+fn refusal(unfit: ImageError) -> FoeError {
     match unfit {
-        Unfit::NoHeader => FoeError::NoHeader,
-        Unfit::OtherDevice => FoeError::OtherHardware,
-        Unfit::Checksum => FoeError::Checksum,
+        ImageError::NoHeader => FoeError::NoHeader,
+        ImageError::OtherDevice => FoeError::OtherHardware,
+        ImageError::Checksum => FoeError::Checksum,
     }
 }

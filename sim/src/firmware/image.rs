@@ -1,41 +1,42 @@
-//! Firmware files of simulated devices: a header of [`HEADER`] bytes, then what stands for the program. Little-endian.
+//! Firmware files of simulated devices: a header of [`HEADER`] bytes, then the program bytes. All
+//! values are little-endian.
 //!
 //! | bytes | |
 //! |---|---|
 //! | 0–7 | `ECAXISFW` |
-//! | 8–11, 12–15 | vendor and product that it is for |
-//! | 16–19 | revision of the device once it runs (0x1018:03, SII words 12 and 13) |
+//! | 8–11, 12–15 | vendor and product of the target device |
+//! | 16–19 | revision of the device with this program (0x1018:03, SII words 12 and 13) |
 //! | 20–23 | software version, four ASCII characters (0x100A) |
-//! | 24–27 | bytes of program |
-//! | 28–31 | CRC-32 (IEEE 802.3) of the bytes 0–27 and of the program; as 0x1F56 shows it |
+//! | 24–27 | length of the program in bytes |
+//! | 28–31 | CRC-32 (IEEE 802.3) of the bytes 0–27 and of the program, also in 0x1F56 |
 
-/// Bytes of the header.
+/// The length of the header in bytes.
 pub const HEADER: usize = 32;
 const MAGIC: &[u8; 8] = b"ECAXISFW";
 const CRC_AT: usize = 28;
 
-/// What a firmware file says of itself.
+/// The header of a firmware file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FirmwareHeader {
     pub vendor: u32,
     pub product: u32,
-    /// Of the device once it runs.
+    /// The revision of the device with this program.
     pub revision: u32,
-    /// Software version, ASCII.
+    /// The software version in ASCII.
     pub version: [u8; 4],
 }
 
-/// Why a file is no firmware for a device.
+/// The reason why a file does not suit a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Unfit {
+pub(crate) enum ImageError {
     NoHeader,
     OtherDevice,
-    /// The program is damaged, or not as long as the header says.
+    /// The program is damaged, or its length differs from the header.
     Checksum,
 }
 
 impl FirmwareHeader {
-    /// A firmware file with this program.
+    /// Returns a firmware file with this header and this program.
     #[must_use]
     pub fn file(&self, program: &[u8]) -> Vec<u8> {
         let mut file = MAGIC.to_vec();
@@ -51,10 +52,10 @@ impl FirmwareHeader {
         file
     }
 
-    /// The header at the beginning of a file, as far as it can be judged without the rest.
-    pub(crate) fn parse(file: &[u8]) -> Result<Self, Unfit> {
-        let rest = file.strip_prefix(MAGIC).ok_or(Unfit::NoHeader)?;
-        let words = rest.first_chunk::<24>().ok_or(Unfit::NoHeader)?;
+    /// Parses the header at the start of a file, without checks of the rest.
+    pub(crate) fn parse(file: &[u8]) -> Result<Self, ImageError> {
+        let rest = file.strip_prefix(MAGIC).ok_or(ImageError::NoHeader)?;
+        let words = rest.first_chunk::<24>().ok_or(ImageError::NoHeader)?;
         let word = |at: usize| {
             let bytes = words.get(at..).and_then(|rest| rest.first_chunk());
             bytes.map_or(0, |bytes| u32::from_le_bytes(*bytes))
@@ -67,11 +68,11 @@ impl FirmwareHeader {
         })
     }
 
-    /// As [`Self::parse`], of a whole file; with its checksum.
-    pub(crate) fn verify(file: &[u8]) -> Result<(Self, u32), Unfit> {
+    /// Like [`Self::parse`], for a complete file. Also returns the checksum.
+    pub(crate) fn verify(file: &[u8]) -> Result<(Self, u32), ImageError> {
         let header = Self::parse(file)?;
-        let (head, program) = file.split_at_checked(HEADER).ok_or(Unfit::NoHeader)?;
-        let (head, crc) = head.split_at_checked(CRC_AT).ok_or(Unfit::NoHeader)?;
+        let (head, program) = file.split_at_checked(HEADER).ok_or(ImageError::NoHeader)?;
+        let (head, crc) = head.split_at_checked(CRC_AT).ok_or(ImageError::NoHeader)?;
         let len = head
             .last_chunk()
             .map_or(0, |bytes| u32::from_le_bytes(*bytes));
@@ -79,13 +80,13 @@ impl FirmwareHeader {
             .first_chunk()
             .map_or(0, |bytes| u32::from_le_bytes(*bytes));
         if usize::try_from(len) != Ok(program.len()) || checksum(head, program) != crc {
-            return Err(Unfit::Checksum);
+            return Err(ImageError::Checksum);
         }
         Ok((header, crc))
     }
 }
 
-/// Reflected, polynomial 0x04C11DB7.
+/// Returns the CRC-32 (reflected, polynomial 0x04C11DB7).
 fn checksum(head: &[u8], program: &[u8]) -> u32 {
     let crc = head.iter().chain(program).fold(u32::MAX, |crc, byte| {
         (0..8).fold(crc ^ u32::from(*byte), |crc, _| {
@@ -107,12 +108,12 @@ mod tests {
     };
 
     #[test]
-    fn the_checksum_is_that_of_ethernet() {
+    fn checksum_equals_the_crc_32_of_ethernet() {
         assert_eq!(checksum(b"1234", b"56789"), 0xcbf4_3926);
     }
 
     #[test]
-    fn a_file_says_what_it_was_made_of() {
+    fn verify_returns_the_header_of_a_file() {
         let program: Vec<u8> = (0..=255).collect();
         let file = HEAD.file(&program);
         assert_eq!(file.len(), HEADER + 256);
@@ -124,15 +125,15 @@ mod tests {
     }
 
     #[test]
-    fn every_damaged_byte_and_every_cut_is_found() {
+    fn verify_detects_every_damaged_byte_and_truncation() {
         let file = HEAD.file(&[1, 2, 3, 4, 5]);
         for n in 0..file.len() {
             let mut damaged = file.clone();
             damaged[n] ^= 0x10;
             let expected = if n < MAGIC.len() {
-                Unfit::NoHeader
+                ImageError::NoHeader
             } else {
-                Unfit::Checksum
+                ImageError::Checksum
             };
             assert_eq!(FirmwareHeader::verify(&damaged), Err(expected), "byte {n}");
             assert!(FirmwareHeader::verify(&file[..n]).is_err(), "{n} bytes");

@@ -1,36 +1,41 @@
-//! Firmware of simulated devices: the program memory, and the boot loader that is left when there is no program in it.
+//! Firmware of simulated devices: the program memory and the boot loader.
 //!
 //! * `image`: firmware files
-//! * `flash`: what is in the program memory, and how a new program gets there
-//! * `boot`: the processor: program or boot loader, and the objects that make it change between them
+//! * `flash`: the program memory and its programming
+//! * `boot`: the processor with program or boot loader, and the objects that switch between them
 //!
-//! Two ways lead to a new program, as with drives on the market. Over FoE in Bootstrap; it starts when Bootstrap is left for Init, which
-//! resets the device. And by the objects of CiA 302-3: 0x1F51 stops the program, which leaves the boot loader in PreOp, clears it and starts the new one; 0x1F50 takes it.
-//! Stopping and starting restart the processor, so that neither of them is answered.
-//! What is in the program memory outlives the power, and so does what is not: a device that lost its power while it was written has
-//! only its boot loader. That one goes to Init, PreOp and Bootstrap, and knows few objects.
+//! Two methods write a new program, as in commercial drives:
+//!
+//! * FoE in Bootstrap. The program starts on the change from Bootstrap to Init, which resets the
+//!   device.
+//! * The objects of CiA 302-3. 0x1F51 stops the program, which leaves the boot loader in PreOp,
+//!   then clears the memory and starts the new program. 0x1F50 receives the program. Stop and start
+//!   restart the processor, so they have no answer.
+//!
+//! The program memory survives a power cycle. A power loss during programming leaves only the boot
+//! loader. The boot loader supports Init, PreOp and Bootstrap, and few objects.
 
 mod boot;
 mod flash;
 mod image;
 
-pub(crate) use boot::{Next, PROGRAM_IDENTIFICATION, Processor, boot_objects};
+pub(crate) use boot::{BootLoader, Next, PROGRAM_IDENTIFICATION, boot_objects};
 pub(crate) use flash::Flash;
 pub use image::{FirmwareHeader, HEADER};
 
 use crate::Nanos;
 
-/// How a device's program memory behaves.
+/// The behaviour of the program memory of a device.
 #[derive(Debug, Clone)]
 pub struct FirmwareOptions {
-    /// Bytes of the longest firmware file.
+    /// Maximum bytes of a firmware file.
     pub capacity: usize,
-    /// What erasing takes; over FoE the device says BUSY meanwhile.
+    /// The duration of erasing in ns. Over FoE, the device answers BUSY meanwhile.
     pub erase_ns: Nanos,
-    /// Bytes that are programmed at a time, and what that takes.
+    /// The bytes per programming step; the next field is its duration.
     pub page: usize,
     pub page_ns: Nanos,
-    /// From a reset until the processor looks after its controller again.
+    /// The time from a reset until the processor services its controller again, in ns.
     pub restart_ns: Nanos,
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-/// Files by name; what is in them survives a power cycle.
+/// Files by name. They survive a power cycle.
 #[derive(Debug, Clone, Default)]
 pub struct FileStore {
     files: BTreeMap<String, Vec<u8>>,
@@ -15,7 +15,7 @@ impl FileStore {
         self.files.get(name).map(Vec::as_slice)
     }
 
-    /// Names and contents, in the order of names.
+    /// Returns names and contents, sorted by name.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &[u8])> {
         self.files
             .iter()
@@ -36,7 +36,7 @@ impl FileStore {
         self.files.insert(name, data);
     }
 
-    /// As [`Self::put`], by a MainDevice.
+    /// Like [`Self::put`], for a write by a MainDevice.
     pub(super) fn write(&mut self, name: String, data: Vec<u8>) {
         self.written = Some(name.clone());
         self.put(name, data);
@@ -46,7 +46,7 @@ impl FileStore {
         self.written.take()
     }
 
-    /// Whether this file, in place of one of the same name, fits.
+    /// True if this file fits. It would replace a file of the same name.
     pub(crate) fn has_room(&self, name: &str, len: usize, capacity: usize) -> bool {
         let others = self.files.iter().filter(|(other, _)| *other != name);
         let used: usize = others.map(|(name, data)| name.len() + data.len()).sum();

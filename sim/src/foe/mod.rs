@@ -1,12 +1,13 @@
-//! File access over EtherCAT (ETG.1000.6 §5.8): a device's files and the server that hands them out and takes them in.
+//! File access over EtherCAT (ETG.1000.6 §5.8): the files of a device and their server.
 //!
 //! * `files`: the files, kept over a power cycle
 //! * `server`: one transfer at a time, packet by packet
 //!
-//! A device with a boot loader ([`crate::DeviceOptions::firmware`]) takes what is written in Bootstrap for firmware
-//! ([`crate::firmware`]). Without one a firmware update is a file like any other: it comes back byte for byte and changes
-//! nothing else. Whoever drives the simulation learns of it from [`crate::SimDevice::take_written_file`] and may then
-//! change what the device says of itself (0x1018, 0x100A) through [`crate::SimDevice::store_mut`].
+//! A device with a boot loader ([`crate::DeviceOptions::firmware`]) treats files written in
+//! Bootstrap as firmware ([`crate::firmware`]). Without a boot loader, a firmware update is stored
+//! like any other file and changes nothing else. [`crate::SimDevice::take_written_file`] reports
+//! such a file. The simulation may then change 0x1018 and 0x100A through
+//! [`crate::SimDevice::store_mut`].
 
 mod files;
 mod server;
@@ -16,15 +17,15 @@ pub(crate) use server::{FoeRequest, FoeServer, Target};
 
 #[derive(Debug, Clone)]
 pub struct FoeOptions {
-    /// Bytes that all files together may take, names included.
+    /// Maximum bytes of all files together, names included.
     pub capacity: usize,
-    /// What a request must carry; 0: anything.
+    /// The required password; 0: any password.
     pub password: u32,
-    /// Files that only Bootstrap may touch, as firmware is.
+    /// Files that are accessible only in Bootstrap, such as firmware.
     pub bootstrap_only: Vec<String>,
     /// Files that cannot be written.
     pub read_only: Vec<String>,
-    /// Every n-th data packet of a write is first answered with BUSY, as while flash is erased; 0: none.
+    /// Every n-th data packet of a write is first answered with BUSY, like during erasing; 0: none.
     pub busy_every: u32,
 }
 

@@ -1,11 +1,12 @@
-//! One transfer: packets counted from 1, each acknowledged; the first one shorter than the mailbox, perhaps empty, is the last.
+//! The FoE transfer: packets count from 1, and each is acknowledged. The first packet shorter than
+//! the mailbox ends the transfer; it may be empty.
 
 use super::{FileStore, FoeError, FoeOptions};
 use crate::Nanos;
-use crate::device::mailbox::{Answer, Detail, Room};
+use crate::device::mailbox::{Answer, Detail, MailboxCapacity};
 use crate::firmware::Flash;
 
-/// Opcode, a reserved byte, and password, packet number, error code or progress.
+/// Bytes of opcode, a reserved byte, and password, packet number, error code or progress.
 const HEADER: usize = 6;
 
 mod opcode {
@@ -21,16 +22,16 @@ mod opcode {
 enum Transfer {
     Read {
         data: Vec<u8>,
-        /// Start of the packet that waits for its acknowledgement.
+        /// The start of the packet that waits for its acknowledgement.
         at: usize,
         packet: u32,
     },
     Write {
         name: String,
         data: Vec<u8>,
-        /// The next one expected.
+        /// The number of the next packet.
         packet: u32,
-        /// It has been put off once.
+        /// True if the packet was already answered with BUSY.
         was_busy: bool,
     },
 }
@@ -40,23 +41,23 @@ pub(crate) struct FoeServer {
     transfer: Option<Transfer>,
 }
 
-/// A message and what it meets.
+/// A request and its context.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FoeRequest<'a> {
     pub(crate) options: &'a FoeOptions,
     pub(crate) bootstrap: bool,
-    /// The device's own time.
+    /// The local time of the device.
     pub(crate) now: Nanos,
-    /// Without the mailbox header.
+    /// The message without the mailbox header.
     pub(crate) message: &'a [u8],
-    pub(crate) room: Room,
+    pub(crate) room: MailboxCapacity,
 }
 
-/// Where files come from and go to.
+/// The source or destination of files.
 #[derive(Debug)]
 pub(crate) enum Target<'a> {
     Files(&'a mut FileStore),
-    /// Whatever it is called, a file is firmware.
+    /// The program memory. Files of any name are firmware.
     Program(&'a mut Flash),
 }
 
@@ -109,9 +110,9 @@ impl FoeServer {
             (opcode::BUSY, Some(transfer @ Transfer::Read { .. })) => {
                 self.send(transfer, request.room)
             }
-            // The client gives up; that is not answered.
+            // The client cancels; there is no answer.
             (opcode::ERROR, _) => Ok(None),
-            // Also a new request while a transfer is under way; that is over then.
+            // This includes a new request during a transfer; the transfer ends.
             _ => Err(FoeError::Illegal),
         };
         match reply {
@@ -143,8 +144,8 @@ impl FoeServer {
         self.send(first, request.room)
     }
 
-    /// The packet that is due, for the first time or once more.
-    fn send(&mut self, transfer: Transfer, room: Room) -> Reply {
+    /// Sends the current packet, for the first time or again.
+    fn send(&mut self, transfer: Transfer, room: MailboxCapacity) -> Reply {
         let Transfer::Read { data, at, packet } = &transfer else {
             return Err(FoeError::Illegal);
         };
@@ -156,7 +157,12 @@ impl FoeServer {
         Ok(Some(out))
     }
 
-    fn acknowledged(&mut self, mut transfer: Transfer, number: u32, room: Room) -> Reply {
+    fn acknowledged(
+        &mut self,
+        mut transfer: Transfer,
+        number: u32,
+        room: MailboxCapacity,
+    ) -> Reply {
         let Transfer::Read { data, at, packet } = &mut transfer else {
             return Err(FoeError::Illegal);
         };
@@ -227,7 +233,7 @@ impl FoeServer {
         let is_last = bytes.len() < request.room.receive - HEADER;
         let every = request.options.busy_every;
         let busy = match files {
-            // Half done: 50 of 100.
+            // The reported progress is 50 of 100.
             _ if every > 0 && packet.is_multiple_of(every) && !was_busy => Some((50, 100)),
             Target::Files(_) => None,
             Target::Program(flash) => flash.take(&data, bytes, is_last, request.now)?,
@@ -257,7 +263,8 @@ impl FoeServer {
     }
 }
 
-/// The file's name, if the request may touch it. Some clients end it with a zero byte; what is not UTF-8 is replaced.
+/// Returns the file name if the request may access the file. A trailing zero byte is removed;
+/// invalid UTF-8 is replaced.
 fn allowed(request: FoeRequest<'_>, password: u32, name: &[u8]) -> Result<String, FoeError> {
     let options = request.options;
     if options.password != 0 && password != options.password {

@@ -1,26 +1,27 @@
-//! The gateway's two faces (manual HMSI-168-81): what its ESI becomes with the data sizes it is set to (§5.4.1, §8),
-//! and its CANopen object dictionary (§7).
+//! The gateway's objects on both networks (manual HMSI-168-81): the EtherCAT side for the
+//! configured data sizes (§5.4.1, §8), and the CANopen object dictionary (§7).
 
 use ecaxis_esi::model::{Access as CoeAccess, Device, Direction, Entry, Pdo as EsiPdo};
 
 use super::dictionary::{Access, Dictionary, Kind};
 use super::pdo::{INVALID, mapping};
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 
-/// Process data each way at most.
+/// The largest process data size in each direction, in bytes.
 pub(super) const BUFFER: usize = 512;
 pub(super) const MIN_SIZE: u16 = 2;
 pub(super) const MAX_SIZE: u16 = 512;
-/// Bytes a PDO and an object of the EtherCAT side hold, and a byte object of the CANopen side.
+/// Bytes per PDO and object of the EtherCAT side, and per byte object of the CANopen side.
 pub(super) const BYTES_AN_OBJECT: u16 = 128;
 /// EtherCAT: input and output bytes.
 const INPUTS: u16 = 0x2000;
 const OUTPUTS: u16 = 0x2100;
-/// CANopen: what goes to, and what comes from the secondary network.
+/// CANopen: data to and from the secondary network.
 pub(super) const TRANSMIT_BUFFER: u16 = 0x2000;
 pub(super) const RECEIVE_BUFFER: u16 = 0x2100;
 
-/// A gateway by its process data: bytes of 0x2100 out, bytes of 0x2000 in.
+/// True if the process data is that of a gateway: bytes of 0x2100 as outputs, bytes of 0x2000 as
+/// inputs.
 #[must_use]
 pub fn is_gateway(device: &Device) -> bool {
     let begins = |pdos: &[EsiPdo], index: u16, object: u16| {
@@ -34,7 +35,7 @@ pub fn is_gateway(device: &Device) -> bool {
         && begins(&device.tx_pdos, 0x1a00, INPUTS)
 }
 
-/// Bytes that the ESI maps by default: inputs and outputs.
+/// Returns the numbers of input and output bytes that the ESI maps by default.
 pub(super) fn default_sizes(device: &Device) -> (u16, u16) {
     let bytes = |pdos: &[EsiPdo]| {
         let assigned = pdos.iter().filter(|pdo| pdo.sm.is_some());
@@ -45,7 +46,7 @@ pub(super) fn default_sizes(device: &Device) -> (u16, u16) {
     (bytes(&device.tx_pdos), bytes(&device.rx_pdos))
 }
 
-/// The device as it describes itself over CoE: only as many PDOs and bytes as the sizes need.
+/// Returns the device as CoE describes it, with only the PDOs and bytes that the sizes need.
 pub(super) fn shape(device: &Device, (inputs, outputs): (u16, u16)) -> Device {
     let mut shaped = device.clone();
     shaped.dictionary.objects.retain(|object| {
@@ -98,8 +99,8 @@ fn pdos(templates: &[EsiPdo], direction: Direction, size: u16) -> Vec<EsiPdo> {
         .collect()
 }
 
-/// Before PDOs are learnt from the shaped device: its manufacturer objects, read-only over SDO ("for consistency
-/// reasons"), and what they count.
+/// Adds the manufacturer objects before the PDOs of the shaped device. They are read-only over SDO
+/// ("for consistency reasons").
 pub(super) fn prepare(store: &mut ObjectStore, (inputs, outputs): (u16, u16), name: &str) {
     let ro = CoeAccess::default();
     for (object, size, word) in [(INPUTS, inputs, "Input"), (OUTPUTS, outputs, "Output")] {
@@ -135,8 +136,8 @@ pub(super) fn prepare(store: &mut ObjectStore, (inputs, outputs): (u16, u16), na
     }
 }
 
-/// Slots of the input and output bytes, in order.
-pub(super) fn slots(store: &ObjectStore, (inputs, outputs): (u16, u16)) -> [Vec<Slot>; 2] {
+/// Returns the slots of the input and output bytes, in order.
+pub(super) fn slots(store: &ObjectStore, (inputs, outputs): (u16, u16)) -> [Vec<EntryHandle>; 2] {
     [(INPUTS, inputs), (OUTPUTS, outputs)].map(|(object, size)| {
         let bytes = 0..size;
         let slot = |n: u16| {
@@ -149,8 +150,8 @@ pub(super) fn slots(store: &ObjectStore, (inputs, outputs): (u16, u16)) -> [Vec<
     })
 }
 
-/// Where a buffer object of the CANopen side lies: true for the receive buffer, offset and length in bytes. The
-/// first two bytes are control and status word and belong to no object.
+/// Returns the place of a buffer object of the CANopen side: true for the receive buffer, offset
+/// and length in bytes. No object holds the first two bytes, the control and status word.
 pub(super) fn buffer_place(index: u16, sub: u8) -> Option<(bool, usize, usize)> {
     let (receive, low) = match index {
         TRANSMIT_BUFFER..=0x20ff => (false, index - TRANSMIT_BUFFER),
@@ -170,7 +171,7 @@ pub(super) fn buffer_place(index: u16, sub: u8) -> Option<(bool, usize, usize)> 
     Some((receive, 2 + first + n * size, size))
 }
 
-/// Subindex 0 of a buffer object.
+/// Returns subindex 0 of a buffer object.
 pub(super) fn buffer_count(index: u16) -> Option<u8> {
     Some(match index & 0xfeff {
         0x2000..=0x2002 | 0x2010 | 0x2020 => 128,
@@ -180,7 +181,8 @@ pub(super) fn buffer_count(index: u16) -> Option<u8> {
     })
 }
 
-/// The CANopen dictionary as the factory leaves it, the buffers aside. `node` is the gateway's own number.
+/// Returns the factory CANopen dictionary without the buffers. `node` is the gateway's own node
+/// number.
 pub(super) fn factory(
     node: u8,
     vendor: u32,
@@ -257,8 +259,8 @@ pub(super) fn factory(
     d
 }
 
-/// PDO number `n` each way: the first four to the default identifiers, all on successive eights of the buffers
-/// (§6.2.4, default PDO mapping scheme).
+/// Adds PDO number `n` in each direction. The first four have the default identifiers; all map
+/// successive groups of eight buffer bytes (§6.2.4, default PDO mapping scheme).
 fn pdo_parameters(d: &mut Dictionary, n: u16, own: i64) {
     use Access::{Ro, Rw};
     use Kind::{U8, U16, U32};
@@ -278,7 +280,8 @@ fn pdo_parameters(d: &mut Dictionary, n: u16, own: i64) {
             d.add(communication, 3, U16, Rw, 0);
             d.add(communication, 5, U16, Rw, 0);
         }
-        // 510 bytes in eights fill 64 PDOs; the manual's table shows the last ones at 128, which leaves the rest open.
+        // 510 bytes in groups of eight fill 64 PDOs. The manual's table ends at PDO 128; the
+        // remaining PDOs stay empty.
         let first = n * 8;
         let used = 510u16.saturating_sub(first).min(8) as u8;
         d.ranged(contents, 0, U8, used.into(), (0, 8));
@@ -301,7 +304,7 @@ mod tests {
 
     /// The manual's tables of transmit and receive buffer, first and last line of each object.
     #[test]
-    fn buffer_objects() {
+    fn buffer_objects_match_the_manual() {
         for (index, sub, place) in [
             (0x2000, 1, Some((false, 2, 1))),
             (0x2000, 128, Some((false, 129, 1))),
@@ -329,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn default_pdos_of_the_secondary_network() {
+    fn default_pdos_match_the_manual() {
         let d = factory(42, 1, 2, 3, 4);
         for (n, cob) in [
             (0, 0x22a),

@@ -1,8 +1,10 @@
-//! The CAN bus: data frames of 11-bit identifiers, arbitration, and how long each of them takes on the wire.
+//! The CAN bus: data frames of 11-bit identifiers, arbitration, and the time of each frame on the
+//! wire.
 
-/// Longest a queue gets; a controller that cannot get rid of its frames loses the newest.
+/// The largest transmit queue. A controller that cannot send drops the newest frames.
 const QUEUE: usize = 256;
-/// Error flag, its echo, delimiter and intermission after a frame that nobody acknowledged (ISO 11898-1).
+/// Error flag, its echo, delimiter and intermission after a frame without acknowledgement (ISO
+/// 11898-1).
 const ERROR_BITS: u64 = 6 + 6 + 8 + 3;
 
 /// A frame with up to eight bytes, or a remote request for one.
@@ -15,7 +17,8 @@ pub struct CanFrame {
 }
 
 impl CanFrame {
-    /// Identifiers keep their low 11 bits, data their first eight bytes.
+    /// Returns a data frame with the low 11 bits of the identifier and the first eight bytes of
+    /// data.
     #[must_use]
     pub fn new(id: u16, bytes: &[u8]) -> Self {
         let mut data = [0; 8];
@@ -30,7 +33,7 @@ impl CanFrame {
         }
     }
 
-    /// Asks whoever owns the identifier to send it.
+    /// Returns a remote request for the frame with this identifier.
     #[must_use]
     pub fn request(id: u16) -> Self {
         Self {
@@ -44,13 +47,13 @@ impl CanFrame {
         self.data.get(..usize::from(self.len)).unwrap_or_default()
     }
 
-    /// All eight bytes, zero beyond the frame's end.
+    /// Returns all eight bytes, zero beyond the frame's end.
     #[must_use]
     pub fn padded(&self) -> [u8; 8] {
         self.data
     }
 
-    /// Bits from start of frame to the end of the intermission, stuff bits included.
+    /// Returns the bits from start of frame to the end of the intermission, stuff bits included.
     #[must_use]
     pub fn wire_bits(&self) -> u64 {
         let mut stuffed = Stuffer::default();
@@ -68,13 +71,13 @@ impl CanFrame {
         stuffed.bits + 1 + 1 + 1 + 7 + 3
     }
 
-    /// The lower wins; a data frame wins over a request for it.
+    /// The lower value wins. A data frame wins over a remote request with the same identifier.
     fn priority(&self) -> u16 {
         self.id << 1 | u16::from(self.remote)
     }
 }
 
-/// Counts bits: after five equal ones comes an opposite one.
+/// Counts bits. An opposite bit follows five equal ones.
 #[derive(Default)]
 struct Stuffer {
     bits: u64,
@@ -118,31 +121,31 @@ struct Queued {
     order: u64,
 }
 
-/// A frame that has gone over the wire.
+/// A frame that has been on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sent {
     pub frame: CanFrame,
-    /// Node that sent it.
+    /// The sender's node number.
     pub from: u8,
-    /// Nobody was there to acknowledge it; it is sent again.
+    /// No node acknowledged the frame; it is sent again.
     pub failed: bool,
 }
 
-/// One bus. Times are those of whoever steps it, in nanoseconds.
+/// One CAN bus. The caller of `step` provides the time, in ns.
 #[derive(Debug, Clone)]
 pub struct CanBus {
     bit_ns: u64,
     queue: Vec<Queued>,
-    /// What is on the wire, and until when.
+    /// The frame on the wire, and its end.
     current: Option<(Queued, u64)>,
     free: u64,
     order: u64,
-    /// Frames that found the queue full.
+    /// The number of frames that found the queue full.
     pub lost: u64,
 }
 
 impl CanBus {
-    /// Bits a second.
+    /// Creates a bus with this bit rate in bit/s.
     #[must_use]
     pub fn new(bit_rate: u32) -> Self {
         Self {
@@ -170,13 +173,13 @@ impl CanBus {
         });
     }
 
-    /// Nothing that a node had still to send will be.
+    /// Drops all frames that a node still had to send.
     pub fn forget(&mut self, from: u8) {
         self.queue.retain(|queued| queued.from != from);
         self.current.take_if(|(queued, _)| queued.from == from);
     }
 
-    /// When something happens next: an arbitration, or the end of a frame.
+    /// Returns the time of the next event: an arbitration, or the end of a frame.
     #[must_use]
     pub fn due(&self) -> u64 {
         match &self.current {
@@ -188,7 +191,7 @@ impl CanBus {
         }
     }
 
-    /// Lets that happen. `heard` says whether anybody acknowledges a node's frames.
+    /// Handles that event. `heard` returns true if another node acknowledges a node's frames.
     pub fn step(&mut self, heard: impl Fn(u8) -> bool) -> Option<Sent> {
         let now = self.due();
         if now == u64::MAX {
@@ -237,8 +240,8 @@ mod tests {
     }
 
     #[test]
-    fn frames_take_their_bits() {
-        // No run of five in identifier 0x555 and alternating data but those of the control field.
+    fn frame_length_includes_stuff_bits() {
+        // In identifier 0x555 and alternating data only the control field has a run of five.
         let short = CanFrame::new(0x555, &[]);
         assert!(
             (47..=55).contains(&short.wire_bits()),
@@ -250,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn the_crc_is_that_of_the_standard() {
+    fn crc_uses_the_standard_polynomial() {
         // x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1 over a single one bit.
         let mut stuffer = Stuffer::default();
         stuffer.push(1, 1);
@@ -258,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lowest_identifier_wins_and_a_frame_under_way_is_not_interrupted() {
+    fn arbitration_picks_the_lowest_identifier_without_interrupting_a_frame() {
         let mut bus = CanBus::new(1_000_000);
         bus.send(1, CanFrame::new(0x700, &[0]), 0);
         bus.send(2, CanFrame::new(0x181, &[0; 8]), 10);
@@ -275,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_alone_repeats_itself() {
+    fn frame_without_acknowledgement_is_repeated() {
         let mut bus = CanBus::new(125_000);
         bus.send(1, CanFrame::new(0x701, &[0]), 0);
         let mut tries = 0;
@@ -288,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_queue_loses_the_newest() {
+    fn full_queue_drops_the_newest_frame() {
         let mut bus = CanBus::new(1_000_000);
         for _ in 0..QUEUE + 3 {
             bus.send(1, CanFrame::new(1, &[]), 0);
@@ -300,7 +303,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_frame_lies_between_the_bounds_of_the_standard(
+        fn frame_length_stays_within_the_standard(
             id in 0u16..0x800, data in prop::collection::vec(any::<u8>(), 0..=8),
         ) {
             let frame = CanFrame::new(id, &data);

@@ -2,7 +2,7 @@
 
 use super::options::Setting;
 
-/// Count, then index, subindex, size and data of each.
+/// Emits the count, then index, subindex, size and data of each setting.
 pub(super) fn emit(settings: &[Setting]) -> Vec<u8> {
     let count = u32::try_from(settings.len()).unwrap_or(0);
     let mut out = count.to_le_bytes().to_vec();
@@ -15,7 +15,7 @@ pub(super) fn emit(settings: &[Setting]) -> Vec<u8> {
     out
 }
 
-/// `None` where the count or a size does not fit what is there.
+/// Returns `None` if the count or a size exceeds the data.
 pub(super) fn parse(bytes: &[u8]) -> Option<Vec<Setting>> {
     if bytes.is_empty() {
         return Some(Vec::new());
@@ -40,7 +40,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn concise_configurations_survive(
+        fn concise_configurations_survive_a_round_trip(
             settings in prop::collection::vec((any::<u16>(), any::<u8>(), prop::collection::vec(any::<u8>(), 0..9)), 0..9),
             cut in 0usize..40,
         ) {

@@ -1,11 +1,12 @@
-//! Control and status word, the first two bytes of the process data (manual HMSI-168-81 §6.2.1, §6.2.2).
+//! Control and status word, the first two bytes of the process data (manual HMSI-168-81 §6.2.1,
+//! §6.2.2).
 //!
-//! Byte 0 is a toggle bit, a command of three bits and its extension of four; byte 1 names a node in the
-//! control word and the lowest node in error in the status word.
+//! Byte 0 holds a toggle bit, a command of three bits and its extension of four. Byte 1 names a
+//! node in the control word and the lowest node in error in the status word.
 
 use super::nmt::{NmtCommand, NmtState};
 
-/// The command that stands while the primary network is not in Op.
+/// The command in the status word while the primary network is not in Op.
 pub(super) const NO_OPERATION: u8 = 7;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,13 +33,14 @@ pub(super) enum Target {
     Network,
 }
 
-/// Toggle bit of either word's first byte.
+/// Returns the toggle bit of either word's first byte.
 pub(super) fn toggle(byte: u8) -> bool {
     byte & 0x80 != 0
 }
 
 impl ControlWord {
-    /// `None` where the command, its extension or the node is reserved.
+    /// Decodes a control word. Returns `None` if the command, its extension or the node is
+    /// reserved.
     pub(super) fn decode([byte, node]: [u8; 2]) -> Option<Self> {
         let command = match (byte >> 4 & 7, byte & 0x0f) {
             (0, extension) => Command::SetState(match extension {
@@ -68,7 +70,7 @@ impl ControlWord {
     }
 }
 
-/// What "Get Node state" answers in the extension.
+/// The extension in the response to "Get Node state".
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReportedState {
     PreOperational = 0,
@@ -82,7 +84,7 @@ pub enum ReportedState {
 }
 
 impl ReportedState {
-    /// From what object 0x1F82 reads.
+    /// Converts a value read from object 0x1F82.
     pub(super) fn from_request_nmt(value: u8) -> Self {
         match value {
             0 => Self::Unknown,
@@ -99,7 +101,7 @@ impl ReportedState {
     }
 }
 
-/// "Get COPM general status": bits of the extension.
+/// Extension bits of "Get COPM general status".
 pub(super) mod general {
     pub(in super::super) const ERROR_PASSIVE: u8 = 1 << 1;
     pub(in super::super) const ERROR_CONTROL: u8 = 1 << 2;
@@ -110,7 +112,7 @@ pub(super) mod general {
 mod tests {
     use super::*;
 
-    /// The table of supported commands, row by row, both toggles.
+    /// The table of supported commands, row by row, with both toggle values.
     #[test]
     fn commands() {
         for toggled in [0, 0x80] {
@@ -157,7 +159,7 @@ mod tests {
         }
     }
 
-    /// The table of 0x1F82's read values against the table of responses.
+    /// The read values of 0x1F82 against the table of responses.
     #[test]
     fn node_states() {
         for (read, reported) in [

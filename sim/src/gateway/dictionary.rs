@@ -1,8 +1,8 @@
-//! An object dictionary as CANopen devices have it: small numbers, a few texts, now and then a block of bytes.
+//! The object dictionary of a CANopen device: numbers, texts and blocks of bytes.
 
 use super::Abort;
 
-/// What SDO clients may do.
+/// The access rights of SDO clients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Access {
     Ro,
@@ -10,7 +10,7 @@ pub(super) enum Access {
     Wo,
 }
 
-/// The type of a number: bytes and sign.
+/// The type of an entry: bytes and sign of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     U8,
@@ -48,7 +48,7 @@ impl Kind {
     }
 }
 
-/// An entry that exists; valid for the dictionary's life.
+/// An existing entry. Valid for the dictionary's lifetime.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Handle(usize);
 
@@ -85,7 +85,7 @@ impl Dictionary {
         });
     }
 
-    /// The same with the values a client may write.
+    /// Adds or replaces an entry with the range of values that a client may write.
     pub(super) fn ranged(
         &mut self,
         index: u16,
@@ -144,7 +144,7 @@ impl Dictionary {
         })
     }
 
-    /// A number; 0 where there is none.
+    /// Returns a number; 0 if the entry does not exist.
     pub(super) fn get(&self, index: u16, sub: u8) -> i64 {
         self.find(index, sub).map_or(0, |handle| self.at(handle))
     }
@@ -159,7 +159,7 @@ impl Dictionary {
         self.entries.get(handle.0).map_or(0, |entry| entry.value)
     }
 
-    /// Keeps what fits the entry's type.
+    /// Sets a number, truncated to the entry's type.
     pub(super) fn put(&mut self, handle: Handle, value: i64) {
         if let Some(entry) = self.entries.get_mut(handle.0) {
             entry.value = entry.kind.value(&value.to_le_bytes());
@@ -171,7 +171,7 @@ impl Dictionary {
             .map_or(&[], |entry| entry.bytes.as_slice())
     }
 
-    /// What an SDO upload carries.
+    /// Returns the data of an SDO upload.
     pub(super) fn read(&self, index: u16, sub: u8) -> Result<Vec<u8>, Abort> {
         let entry = self.entry(index, sub)?;
         match (entry.access, entry.kind) {
@@ -184,7 +184,7 @@ impl Dictionary {
         }
     }
 
-    /// Whether an SDO download would be taken; its value.
+    /// Checks an SDO download. Returns its value.
     pub(super) fn check(&self, index: u16, sub: u8, data: &[u8]) -> Result<i64, Abort> {
         let entry = self.entry(index, sub)?;
         if entry.access == Access::Ro {
@@ -206,7 +206,7 @@ impl Dictionary {
         }
     }
 
-    /// An SDO download.
+    /// Handles an SDO download.
     pub(super) fn write(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
         let value = self.check(index, sub, data)?;
         if let Some(entry) = self.entry_mut(index, sub) {
@@ -218,7 +218,7 @@ impl Dictionary {
         Ok(())
     }
 
-    /// Takes over all values of the same entries within a range of indices.
+    /// Copies all values of the same entries within a range of indices.
     pub(super) fn restore(&mut self, from: &Self, indices: std::ops::RangeInclusive<u16>) {
         for (to, from) in self.entries.iter_mut().zip(&from.entries) {
             let index = (to.key >> 8) as u16;
@@ -235,7 +235,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reads_and_writes_by_access_length_and_range() {
+    fn dictionary_checks_access_length_and_range() {
         let mut d = Dictionary::default();
         d.ranged(0x3000, 0, Kind::U16, 16, (2, 512));
         d.add(0x1000, 0, Kind::U32, Access::Ro, 0x20192);

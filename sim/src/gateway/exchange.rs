@@ -1,14 +1,15 @@
-//! Between EtherCAT's objects and the buffers; what the control word orders and the status word says (manual §6.2).
+//! Exchange between EtherCAT's objects and the buffers; execution of the control word, and the
+//! status word (manual §6.2).
 
 use super::control::{self, Command, ControlWord, NO_OPERATION, ReportedState, Target, general};
 use super::nmt::NmtState;
 use super::{ERROR_PASSIVE, Gateway};
 use crate::Nanos;
-use crate::coe::store::ObjectStore;
+use crate::coe::object_dictionary::ObjectStore;
 
 impl Gateway {
-    /// Passes data on, `now` in true time: outputs to the secondary network if EtherCAT is in Op, what has come from
-    /// there to the inputs.
+    /// Exchanges data between the networks; `now` is true time. Outputs pass only while EtherCAT is
+    /// in Op. Inputs always pass.
     pub(crate) fn forward(&mut self, store: &mut ObjectStore, in_op: bool, now: Nanos) {
         if in_op {
             for (byte, slot) in self.outputs.iter_mut().zip(&self.slots[1]) {
@@ -27,10 +28,10 @@ impl Gateway {
         }
     }
 
-    /// A new command is one whose toggle bit is not that of the last.
+    /// Executes a new command. A command is new if its toggle bit differs from the last one's.
     fn obey(&mut self, in_op: bool, now: u64) {
         if !in_op {
-            // Nothing that stands in the buffer may act when the fieldbus comes back.
+            // An old command in the buffer must not act when the fieldbus comes back.
             self.status = NO_OPERATION << 4 | u8::from(self.toggle) << 7;
             return;
         }
@@ -79,7 +80,7 @@ impl Gateway {
         bits
     }
 
-    /// Its PDOs wait for a SYNC that it does not send itself: nobody else does.
+    /// True if the PDOs need a SYNC that the gateway does not produce. No other node produces it.
     fn misses_sync(&self) -> bool {
         let producer = self.d.get(0x1005, 0) & 0x4000_0000 != 0;
         self.nmt == NmtState::Operational && self.d.get(0x1006, 0) > 0 && !producer

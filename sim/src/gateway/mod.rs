@@ -1,20 +1,20 @@
-//! A CANopen gateway on EtherCAT, after the Anybus X-gateway CANopen – EtherCAT (manual HMSI-168-81, rev. 2.10), with
-//! EPOS 24/1, 24/5 and 70/10 drives behind it.
+//! A CANopen gateway on EtherCAT, after the Anybus X-gateway CANopen – EtherCAT (manual
+//! HMSI-168-81, rev. 2.10), with EPOS 24/1, 24/5 and 70/10 drives on its CANopen side.
 //!
-//! Towards EtherCAT it is plain bytes: up to 512 each way in four fixed PDOs of 128. The first two are control and
-//! status word, the others are what CANopen PDOs carry.
+//! The EtherCAT side carries plain bytes: up to 512 in each direction, in four fixed PDOs of 128.
+//! The first two bytes are the control and status word; the others are the data of CANopen PDOs.
 //!
-//! * `options`, `concise`: what commissioning decides, and the objects that follow from it
-//! * `anybus`: the EtherCAT objects for the sizes it is set to; its CANopen dictionary
-//! * `control`, `exchange`: control and status word; data from one network to the other
-//! * `master`: NMT master: boots, watches and commands nodes
-//! * `process`, `objects`: its own PDOs and its SDO server
+//! * `options`, `concise`: settings from commissioning, and the objects that follow from them
+//! * `anybus`: the EtherCAT objects for the configured sizes; the CANopen dictionary
+//! * `control`, `exchange`: control and status word; data exchange between the networks
+//! * `master`: NMT master: boots, monitors and commands nodes
+//! * `process`, `objects`: the gateway's own PDOs and its SDO server
 //! * `node`: a drive as a CANopen node
-//! * `can`, `sdo`, `pdo`, `nmt`, `dictionary`: the bus and what both ends of it share
+//! * `can`, `sdo`, `pdo`, `nmt`, `dictionary`: the bus and the parts that both ends share
 //!
-//! The secondary network runs in true time, between the points at which the gateway forwards data. Bit errors do not
-//! happen on it, so that no controller goes bus-off; LSS has nobody to talk to, and a gateway that is not master
-//! finds no other master.
+//! The secondary network runs in true time between the points at which the gateway forwards data.
+//! The bus has no bit errors, so no controller goes bus-off. The bus has no LSS slave. A gateway
+//! that is not the NMT master finds no other master.
 
 mod anybus;
 mod can;
@@ -46,7 +46,7 @@ use ecaxis_esi::model::Device;
 
 use crate::Nanos;
 use crate::coe::Abort;
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use anybus::BUFFER;
 use can::CanBus;
 use control::NO_OPERATION;
@@ -54,14 +54,15 @@ use dictionary::Dictionary;
 use master::Master;
 use sdo::Objects;
 
-/// How often data are passed on between the two networks.
+/// The period at which data passes between the two networks, in ns.
 pub(crate) const FORWARD_NS: Nanos = 1_000_000;
-/// From power or a reset until the CANopen side runs.
+/// The time from power-on or a reset until the CANopen side runs, in ns.
 const INITIALISATION_NS: Nanos = 100_000_000;
 const MS: u64 = 1_000_000;
-/// Frames remembered by [`Gateway::frames`].
+/// The number of frames that [`Gateway::frames`] keeps.
 const LOG: usize = 256;
-/// Transmit errors from which a CAN controller is error passive, and what one failure adds.
+/// The transmit error count at which a CAN controller becomes error passive, and the increment per
+/// failure.
 const ERROR_PASSIVE: u16 = 128;
 const TRANSMIT_ERROR: u16 = 8;
 /// CAN in error passive mode.
@@ -73,11 +74,11 @@ pub struct Gateway {
     serial: u32,
     options: GatewayOptions,
     d: Dictionary,
-    /// What it starts from.
+    /// The dictionary at start.
     stored: Dictionary,
-    /// Input and output size in effect since power-on.
+    /// The input and output sizes in effect since power-on.
     sizes: (u16, u16),
-    slots: [Vec<Slot>; 2],
+    slots: [Vec<EntryHandle>; 2],
     inputs: [u8; BUFFER],
     outputs: [u8; BUFFER],
     bus: CanBus,
@@ -87,7 +88,7 @@ pub struct Gateway {
     receive: Vec<process::Receive>,
     transmit: Vec<process::Transmit>,
     server: sdo::Server,
-    /// Toggle bit and first byte of the status word.
+    /// The toggle bit and the first byte of the status word.
     toggle: bool,
     status: u8,
     now: u64,
@@ -163,7 +164,7 @@ impl Gateway {
         Ok(gateway)
     }
 
-    /// The ESI device with the PDOs and bytes that it now has, and the objects that go with them.
+    /// Returns the ESI device with the present PDOs and bytes, and their objects.
     pub(crate) fn shaped(&self) -> Device {
         anybus::shape(&self.esi, self.sizes)
     }
@@ -172,12 +173,12 @@ impl Gateway {
         anybus::prepare(store, self.sizes, &self.esi.type_name);
     }
 
-    /// Ties it to the device's objects.
+    /// Binds the gateway to the device's objects.
     pub(crate) fn bind(&mut self, store: &ObjectStore) {
         self.slots = anybus::slots(store, self.sizes);
     }
 
-    /// Power comes; data sizes written since the last time take effect. True if they changed.
+    /// Powers the gateway on. New data sizes take effect. True if they changed.
     pub(crate) fn power_on(&mut self, now: Nanos) -> bool {
         let size = |index| u16::try_from(self.stored.get(index, 0)).unwrap_or(anybus::MIN_SIZE);
         let sizes = (size(0x3000), size(0x3001));
@@ -189,7 +190,7 @@ impl Gateway {
         changed
     }
 
-    /// Initialisation: everything stored, or the communication objects alone, as it was stored.
+    /// Starts the initialisation: all stored objects, or only the stored communication objects.
     fn restart(&mut self, everything: bool, now: u64) {
         if everything {
             self.d = self.stored.clone();
@@ -207,7 +208,7 @@ impl Gateway {
         self.load_pdos();
     }
 
-    /// Lets the secondary network run.
+    /// Runs the secondary network up to this time.
     fn advance(&mut self, to: Nanos) {
         loop {
             let due = self.due();
@@ -303,13 +304,14 @@ impl Gateway {
         } else {
             before.saturating_sub(1)
         };
-        // One frame that gets through and one that does not are no news.
+        // The counter reaches the limit from below only once. A single success and failure at the
+        // limit do not count as a new event.
         if self.transmit_errors == ERROR_PASSIVE && before + TRANSMIT_ERROR == ERROR_PASSIVE {
             self.emergency(PASSIVE_MODE, 0, now);
         }
     }
 
-    /// A node's frame.
+    /// Handles a node's frame.
     fn hear(&mut self, frame: &CanFrame, now: u64) {
         let node = (frame.id & 0x7f) as u8;
         match (frame.id, frame.data()) {
@@ -324,7 +326,7 @@ impl Gateway {
             .send(self.options.node_id, CanFrame::new(id, data), now);
     }
 
-    /// Records an error and tells the secondary network.
+    /// Records an error and sends an emergency on the secondary network.
     fn emergency(&mut self, code: u16, additional: u16, now: u64) {
         for sub in (1..16).rev() {
             let older = self.d.get(0x1003, sub);
@@ -341,7 +343,7 @@ impl Gateway {
         self.send(0x80 + u16::from(self.options.node_id), &data, now);
     }
 
-    /// 0 is none; faster than the bus carries them makes no sense.
+    /// Returns the SYNC period, 0 without SYNC. The CAN bit rate limits it.
     fn sync_period(&self) -> u64 {
         match self.d.get(0x1006, 0).cast_unsigned() * 1000 {
             0 => 0,
@@ -379,17 +381,18 @@ impl Gateway {
         self.nodes.iter_mut().find(|node| node.id() == id)
     }
 
-    /// Writes an object of its CANopen dictionary as a configuration tool does.
+    /// Writes an object of the CANopen dictionary, as a configuration tool does.
     pub fn configure(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort> {
         self.write(index, sub, data)
     }
 
-    /// Reads an object of its CANopen dictionary.
+    /// Reads an object of the CANopen dictionary.
     pub fn configuration(&self, index: u16, sub: u8) -> Result<Vec<u8>, Abort> {
         self.read(index, sub)
     }
 
-    /// One request to its SDO server on the secondary network, eight bytes of a frame, and the answer.
+    /// Handles one request to the SDO server on the secondary network. Request and answer are the
+    /// eight bytes of a frame.
     pub fn serve_sdo(&mut self, request: &[u8; 8]) -> Option<[u8; 8]> {
         let mut server = std::mem::take(&mut self.server);
         let response = server.request(self, request);
@@ -397,23 +400,24 @@ impl Gateway {
         response
     }
 
-    /// The next transfer asked for with [`Self::request_sdo`] that has ended.
+    /// Returns the next finished transfer of [`Self::request_sdo`].
     pub fn take_sdo_result(&mut self) -> Option<SdoResult> {
         self.master.results.pop_front()
     }
 
-    /// Frames lost because a controller could not get rid of them.
+    /// Returns the number of frames that found the transmit queue full.
     #[must_use]
     pub fn lost_frames(&self) -> u64 {
         self.bus.lost
     }
 
-    /// The last frames of the secondary network with the true time at which they ended, oldest first.
+    /// Returns the last frames of the secondary network, oldest first, with the true time of their
+    /// end.
     pub fn frames(&self) -> impl Iterator<Item = (Nanos, CanFrame)> + '_ {
         self.log.iter().copied()
     }
 
-    /// A node loses its power, or has it again and boots.
+    /// Switches a node's power off or on. A node that gets power boots.
     pub fn set_node_silent(&mut self, id: u8, silent: bool) {
         let now = self.now;
         let Some(node) = self.nodes.iter_mut().find(|node| node.id() == id) else {

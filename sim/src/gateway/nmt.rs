@@ -1,6 +1,6 @@
 //! Network management: states and services (CiA 301 §7.2.8, §7.3.2).
 
-/// What a CANopen device is in. The numbers are those of heartbeats and of object 0x1F82.
+/// The state of a CANopen device. The numbers are those of heartbeats and of object 0x1F82.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum NmtState {
     #[default]
@@ -56,7 +56,7 @@ impl NmtCommand {
         self as u8
     }
 
-    /// Where it leads to; resets lead to initialisation.
+    /// Returns the target state. Resets lead to initialisation.
     #[must_use]
     pub fn leads_to(self) -> NmtState {
         match self {

@@ -1,4 +1,5 @@
-//! The gateway's CANopen objects as a configuration tool on the secondary network reads and writes them (manual §7).
+//! The gateway's CANopen objects, as a configuration tool on the secondary network accesses them
+//! (manual §7).
 
 use ecaxis_esi::model::SmUse;
 
@@ -12,7 +13,7 @@ use super::pdo;
 use super::sdo::Objects;
 use super::{Abort, anybus};
 
-/// Hardware error: the data sizes are more than the fieldbus side takes.
+/// Hardware error: the data sizes exceed the limits of the fieldbus side.
 const HARDWARE: u16 = 0x6600;
 /// "conf".
 const CONFIGURE: i64 = 0x666e_6f63;
@@ -100,7 +101,7 @@ impl Gateway {
         )
     }
 
-    /// Whether the SyncManagers of the EtherCAT side can be as long as 0x3000 and 0x3001 say.
+    /// True if the SyncManagers of the EtherCAT side can have the lengths of 0x3000 and 0x3001.
     fn sizes_fit(&self) -> bool {
         let most = |usage| {
             let sms = self.esi.sync_managers.iter();
@@ -134,7 +135,8 @@ impl Gateway {
         Ok(())
     }
 
-    /// Entries change while the PDO maps nothing, and are buffer objects of the PDO's own direction.
+    /// Checks a mapping entry. Entries change only while the PDO maps nothing. They must be buffer
+    /// objects of the PDO's direction.
     fn check_mapping(&self, index: u16, sub: u8, value: i64) -> Result<(), Abort> {
         let bytes = |value: i64| {
             let (object, object_sub, bits) = pdo::entry(value as u32);

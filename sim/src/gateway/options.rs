@@ -1,4 +1,5 @@
-//! What a configuration tool would write into a gateway and its nodes: from a short description to objects.
+//! The settings that a configuration tool writes to a gateway and its nodes: objects from a short
+//! description.
 
 use ecaxis_esi::model::Device;
 
@@ -10,25 +11,25 @@ use crate::drive::PlantParams;
 /// A value for one subindex.
 pub(super) type Setting = (u16, u8, Vec<u8>);
 
-/// Bit rates of the gateway's rotary switch.
+/// The bit rates of the gateway's rotary switch, in bit/s.
 pub const BIT_RATES: [u32; 7] = [
     20_000, 50_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
 ];
 
-/// A gateway as it leaves commissioning.
+/// The settings of a commissioned gateway.
 #[derive(Debug, Clone)]
 pub struct GatewayOptions {
-    /// Its own node number on the secondary network.
+    /// The gateway's node number on the secondary network.
     pub node_id: u8,
-    /// Bits a second, one of [`BIT_RATES`].
+    /// The bit rate in bit/s, one of [`BIT_RATES`].
     pub bit_rate: u32,
-    /// Bytes to and from EtherCAT (0x3000, 0x3001), 2 to 512 each, control and status word included; `None`: as
-    /// much as the ESI maps by default.
+    /// The bytes to and from EtherCAT (0x3000, 0x3001), 2 to 512 each, including control and status
+    /// word. `None`: the default mapping of the ESI.
     pub input_size: Option<u16>,
     pub output_size: Option<u16>,
-    /// 0x1006, microseconds; 0: no SYNC.
+    /// 0x1006, in µs. 0: no SYNC.
     pub sync_period_us: u32,
-    /// 0x1017, milliseconds; 0: no heartbeat of its own.
+    /// 0x1017, in ms. 0: the gateway sends no heartbeat.
     pub heartbeat_ms: u16,
     /// 0x1F80. Bit 0: NMT master; bit 3: the MainDevice starts the nodes one by one.
     pub start_up: u32,
@@ -53,15 +54,16 @@ impl Default for GatewayOptions {
     }
 }
 
-/// How the gateway notices that a node is gone.
+/// The error control of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Supervision {
     None,
-    /// The node sends every so many milliseconds and may be half that late.
+    /// The node sends a heartbeat with this period, in ms. It may be late by half a period.
     Heartbeat {
         period_ms: u16,
     },
-    /// The gateway asks every so many milliseconds and gives up after so many questions.
+    /// The gateway requests the state with this period, in ms. The node fails after this number of
+    /// unanswered requests.
     Guarding {
         period_ms: u16,
         retries: u8,
@@ -75,13 +77,13 @@ pub struct NodeOptions {
     pub drive: Epos,
     pub plant: PlantParams,
     pub supervision: Supervision,
-    /// The network must not be started without it.
+    /// The network must not start without this node.
     pub mandatory: bool,
-    /// It is configured and started again when it comes back.
+    /// The node is configured and started again when it comes back.
     pub restart: bool,
-    /// Its transmit PDOs into the input data.
+    /// Its transmit PDOs, mapped to the input data.
     pub inputs: Vec<PdoLink>,
-    /// Output data into its receive PDOs.
+    /// Its receive PDOs, mapped to the output data.
     pub outputs: Vec<PdoLink>,
     /// Further objects written at each boot.
     pub objects: Vec<(u16, u8, Vec<u8>)>,
@@ -107,13 +109,14 @@ impl NodeOptions {
 /// One PDO of a node and its place in the EtherCAT process data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PdoLink {
-    /// 1 to 3.
+    /// The PDO number, 1 to 3.
     pub pdo: u8,
-    /// Offset in the process data; bytes 0 and 1 are control and status word.
+    /// The offset in the process data. Bytes 0 and 1 are control and status word.
     pub at: u16,
-    /// (index, subindex, bits) of what it carries; empty: what it carries by default.
+    /// The mapped objects: (index, subindex, bits). Empty: the default mapping.
     pub contents: Vec<(u16, u8, u8)>,
-    /// With each SYNC. EPOS drives of this generation send asynchronous PDOs on request only.
+    /// True to send with each SYNC. EPOS drives of this generation send asynchronous PDOs on
+    /// request only.
     pub synchronous: bool,
 }
 
@@ -139,7 +142,7 @@ pub enum GatewayError {
     Pdo { id: u8, pdo: u8, problem: String },
 }
 
-/// Objects for the gateway, and for each node what it gets at boot.
+/// The objects of the gateway, and those that each node receives at boot.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Configuration {
     pub(super) gateway: Vec<Setting>,
@@ -158,7 +161,7 @@ fn u32_(index: u16, sub: u8, value: u32) -> Setting {
     (index, sub, value.to_le_bytes().to_vec())
 }
 
-/// A PDO's contents: emptied, filled, counted.
+/// Adds a PDO mapping: cleared, filled, then enabled by its count.
 fn contents(out: &mut Vec<Setting>, index: u16, entries: &[(u16, u8, u8)]) {
     out.push(u8_(index, 0, 0));
     for (sub, (object, object_sub, bits)) in (1..).zip(entries) {
@@ -171,10 +174,10 @@ fn contents(out: &mut Vec<Setting>, index: u16, entries: &[(u16, u8, u8)]) {
     out.push(u8_(index, 0, entries.len() as u8));
 }
 
-/// Which way a link goes, seen from the gateway.
+/// The direction of a link, seen from the gateway.
 #[derive(Clone, Copy)]
-struct Way {
-    /// Communication and mapping parameters at the gateway and at the node.
+struct PdoDirection {
+    /// The communication and mapping parameters at the gateway and at the node.
     gateway: (u16, u16),
     node: (u16, u16),
     buffer: u16,
@@ -183,7 +186,7 @@ struct Way {
     defaults: [u16; 3],
 }
 
-const INPUTS: Way = Way {
+const INPUTS: PdoDirection = PdoDirection {
     gateway: super::pdo::RECEIVE,
     node: super::pdo::TRANSMIT,
     buffer: super::anybus::RECEIVE_BUFFER,
@@ -191,7 +194,7 @@ const INPUTS: Way = Way {
     mappable: &TRANSMITTABLE,
     defaults: [2, 6, 3],
 };
-const OUTPUTS: Way = Way {
+const OUTPUTS: PdoDirection = PdoDirection {
     gateway: super::pdo::TRANSMIT,
     node: super::pdo::RECEIVE,
     buffer: super::anybus::TRANSMIT_BUFFER,
@@ -201,13 +204,13 @@ const OUTPUTS: Way = Way {
 };
 
 impl GatewayOptions {
-    /// Whether a device can be set up like this.
+    /// Checks the settings against a device.
     pub fn validate(&self, device: &Device) -> Result<(), GatewayError> {
         self.check()?;
         self.configuration(self.sizes(device)).map(drop)
     }
 
-    /// Input and output size.
+    /// Returns the input and output sizes.
     pub(super) fn sizes(&self, device: &Device) -> (u16, u16) {
         let (inputs, outputs) = super::anybus::default_sizes(device);
         let input_size = self.input_size.unwrap_or(inputs);
@@ -249,7 +252,7 @@ impl GatewayOptions {
         Ok(())
     }
 
-    /// Sizes are those of input and output data.
+    /// Returns the objects for these sizes of input and output data.
     pub(super) fn configuration(
         &self,
         (input_size, output_size): (u16, u16),
@@ -302,11 +305,11 @@ impl GatewayOptions {
 }
 
 impl PdoLink {
-    /// `n`: number of the gateway's PDO.
+    /// Configures a link. `n` is the number of the gateway's PDO.
     fn configure(
         &self,
         id: u8,
-        way: &Way,
+        way: &PdoDirection,
         n: u16,
         size: u16,
         gateway: &mut Vec<Setting>,
@@ -359,7 +362,7 @@ impl PdoLink {
             })
             .collect();
         let cob = u32::try_from(*cob).unwrap_or(0) + u32::from(id);
-        // What arrives is passed on at once, whenever it was sent.
+        // Received data is passed on at once, whenever it was sent.
         let own = if way.gateway == super::pdo::RECEIVE {
             255
         } else {

@@ -1,4 +1,4 @@
-//! Descriptions of gateways that cannot be, and what becomes of those that can.
+//! Invalid gateway descriptions, and the objects of valid ones.
 
 use super::*;
 
@@ -28,7 +28,7 @@ fn link(pdo: u8, at: u16, contents: &[(u16, u8, u8)]) -> PdoLink {
 }
 
 #[test]
-fn impossible_settings_are_named() {
+fn invalid_gateway_settings_are_rejected() {
     let node = |id, drive| GatewayOptions {
         nodes: vec![NodeOptions::new(id, drive)],
         ..GatewayOptions::default()
@@ -90,7 +90,7 @@ fn impossible_settings_are_named() {
 }
 
 #[test]
-fn a_link_becomes_objects_on_both_sides() {
+fn pdo_link_configures_gateway_and_node() {
     let options = with_link(link(2, 130, &[(0x6064, 0, 32)]));
     let configuration = options.configuration((512, 16)).unwrap();
     for setting in [

@@ -1,32 +1,32 @@
-//! PDO communication and mapping parameters (CiA 301 §7.5.2.35 on), whoever's dictionary they stand in.
+//! PDO communication and mapping parameters (CiA 301 §7.5.2.35 on), for the gateway and its nodes.
 
 use super::dictionary::Dictionary;
 
-/// First of the communication and of the mapping parameters.
+/// The first objects of the communication and of the mapping parameters.
 pub(super) const RECEIVE: (u16, u16) = (0x1400, 0x1600);
 pub(super) const TRANSMIT: (u16, u16) = (0x1800, 0x1a00);
 
 /// COB-ID bit 31: the PDO does not exist.
 pub(super) const INVALID: u32 = 0x8000_0000;
 
-/// One PDO; `T` is where a mapped object lives.
+/// One PDO. `T` is the location of a mapped object.
 #[derive(Debug, Clone)]
 pub(super) struct Pdo<T> {
     pub(super) cob: u16,
-    /// Transmission type.
+    /// The transmission type.
     pub(super) kind: u8,
-    /// 0.1 ms.
+    /// The inhibit time in 0.1 ms.
     pub(super) inhibit: u16,
-    /// Milliseconds.
+    /// The event timer in ms.
     pub(super) event_timer: u16,
-    /// Where, and bytes.
+    /// The location and length in bytes of each mapped object.
     pub(super) map: Vec<(T, u8)>,
-    /// Of all of them.
+    /// The length of all mapped objects, in bytes.
     pub(super) len: usize,
 }
 
 impl<T> Pdo<T> {
-    /// PDO number `n`, counted from 0; `None` if it is invalid or maps nothing.
+    /// Loads PDO number `n`, counted from 0. Returns `None` if it is invalid or maps nothing.
     pub(super) fn load(
         dictionary: &Dictionary,
         (communication, mapping): (u16, u16),
@@ -56,19 +56,19 @@ impl<T> Pdo<T> {
         (pdo.len <= 8).then_some(pdo)
     }
 
-    /// Sent or taken with a SYNC.
+    /// True if the PDO is sent or applied with a SYNC.
     pub(super) fn is_synchronous(&self) -> bool {
         self.kind <= 240
     }
 }
 
-/// Index, subindex and bits of a mapping entry.
+/// Returns index, subindex and bits of a mapping entry.
 pub(super) fn entry(mapping: u32) -> (u16, u8, u8) {
     let [bits, sub, low, high] = mapping.to_le_bytes();
     (u16::from_le_bytes([low, high]), sub, bits)
 }
 
-/// A mapping entry.
+/// Returns a mapping entry.
 pub(super) fn mapping(index: u16, sub: u8, bits: u8) -> i64 {
     i64::from(u32::from(index) << 16 | u32::from(sub) << 8 | u32::from(bits))
 }

@@ -1,4 +1,4 @@
-//! The gateway's own PDOs: between frames of the secondary network and the buffers (manual §6.2.4).
+//! The gateway's own PDOs, between frames of the secondary network and the buffers (manual §6.2.4).
 
 use super::Gateway;
 use super::anybus::{BUFFER, buffer_place};
@@ -12,13 +12,13 @@ const MS: u64 = 1_000_000;
 const TOO_SHORT: u16 = 0x8210;
 const TOO_LONG: u16 = 0x8220;
 
-/// A PDO over offsets of a buffer.
+/// A PDO whose objects are offsets in a buffer.
 type Mapped = Pdo<usize>;
 
 #[derive(Debug, Clone)]
 pub(super) struct Receive {
     pdo: Mapped,
-    /// Until the next SYNC.
+    /// A received frame that waits for the next SYNC.
     waiting: Option<CanFrame>,
 }
 
@@ -26,17 +26,17 @@ pub(super) struct Receive {
 pub(super) struct Transmit {
     pdo: Mapped,
     sent: [u8; 8],
-    /// Sent since Operational was entered.
+    /// True if sent since the gateway entered Operational.
     fresh: bool,
-    /// SYNCs since the last one.
+    /// SYNCs since the last transmission.
     syncs: u8,
-    /// Not before, and not later than.
+    /// The end of the inhibit time, and the expiry of the event timer.
     allowed: u64,
     event: u64,
 }
 
 impl Gateway {
-    /// Reads PDO parameters anew.
+    /// Reloads the PDO parameters.
     pub(super) fn load_pdos(&mut self) {
         let place = |receive: bool| {
             move |index, sub| {
@@ -63,7 +63,7 @@ impl Gateway {
             .collect();
     }
 
-    /// Entering Operational: event-driven PDOs show what there is.
+    /// Enters Operational. Every event-driven PDO is sent once.
     pub(super) fn start_pdos(&mut self) {
         for receive in &mut self.receive {
             receive.waiting = None;
@@ -74,7 +74,7 @@ impl Gateway {
         }
     }
 
-    /// A frame that may be one of the PDOs it receives.
+    /// Handles a frame that may be a receive PDO.
     pub(super) fn take_pdo(&mut self, frame: &CanFrame, now: u64) {
         if self.nmt != NmtState::Operational {
             return;
@@ -103,7 +103,7 @@ impl Gateway {
         }
     }
 
-    /// Sends those whose data changed or whose time has come.
+    /// Sends event-driven PDOs with changed data or an expired event timer.
     pub(super) fn poll_events(&mut self, now: u64) {
         if self.nmt != NmtState::Operational {
             return;
@@ -121,7 +121,7 @@ impl Gateway {
         }
     }
 
-    /// A SYNC has been on the bus.
+    /// Handles a SYNC on the bus.
     pub(super) fn synchronise(&mut self, now: u64) {
         if self.nmt != NmtState::Operational {
             return;
@@ -168,7 +168,7 @@ fn pack(pdo: &Mapped, buffer: &[u8; BUFFER]) -> [u8; 8] {
     let mut at = 0;
     for (offset, len) in &pdo.map {
         for n in 0..usize::from(*len) {
-            // The last long object reaches beyond the buffer: zeros.
+            // The last 32-bit object extends beyond the buffer; the missing bytes are zero.
             let byte = buffer.get(offset + n).copied().unwrap_or(0);
             if let Some(to) = data.get_mut(at) {
                 *to = byte;

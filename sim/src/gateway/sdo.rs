@@ -4,10 +4,10 @@ use super::Abort;
 
 pub(super) type Message = [u8; 8];
 
-/// Longest that is taken in segments.
+/// The largest segmented transfer, in bytes.
 const MAX_SIZE: usize = 0x1_0000;
 
-/// What a server reads and writes.
+/// The objects that a server reads and writes.
 pub(super) trait Objects {
     fn read(&self, index: u16, sub: u8) -> Result<Vec<u8>, Abort>;
     fn write(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<(), Abort>;
@@ -22,7 +22,7 @@ enum Transfer {
     },
     Download {
         data: Vec<u8>,
-        /// 0: the client did not say.
+        /// The announced size. 0: the client announced none.
         size: usize,
         toggle: bool,
     },
@@ -42,7 +42,7 @@ fn message(command: u8, index: u16, sub: u8, data: &[u8]) -> Message {
     out
 }
 
-/// One segment of up to seven bytes, and whether it is the last.
+/// Returns one segment of up to seven bytes, its length, and whether it is the last.
 fn segment(command: u8, rest: &[u8]) -> (Message, usize, bool) {
     let now = rest.len().min(7);
     let last = now == rest.len();
@@ -82,7 +82,7 @@ impl Server {
         self.transfer = None;
     }
 
-    /// The answer to one request; an abort by the client has none.
+    /// Returns the answer to one request. An abort by the client has no answer.
     pub(super) fn request(
         &mut self,
         objects: &mut impl Objects,
@@ -147,7 +147,7 @@ impl Server {
         let fail = |abort| (abort, (index, sub));
         self.transfer = None;
         if request[0] & 2 != 0 {
-            // Without a size the object's own length counts.
+            // Without an announced size the object's own length applies.
             let mut data = expedited(request);
             if request[0] & 1 == 0
                 && let Ok(now) = objects.read(index, sub)
@@ -217,7 +217,7 @@ pub(super) struct Client {
     toggle: bool,
 }
 
-/// What a client does with a response.
+/// The client's reaction to a response.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Progress {
     Send(Message),
@@ -225,7 +225,7 @@ pub(super) enum Progress {
 }
 
 impl Client {
-    /// An upload, or with data a download; the first message.
+    /// Starts an upload, or with data a download. Returns the first message.
     pub(super) fn start(index: u16, sub: u8, data: Option<Vec<u8>>) -> (Self, Message) {
         let download = data.is_some();
         let data = data.unwrap_or_default();
@@ -248,7 +248,7 @@ impl Client {
         (client, first)
     }
 
-    /// Tells the server that nothing more will come.
+    /// Returns the message that aborts the transfer.
     pub(super) fn give_up(&self) -> Message {
         message(0x80, self.index, self.sub, &Abort::TIMEOUT.0.to_le_bytes())
     }
@@ -308,9 +308,9 @@ mod tests {
     use proptest::prelude::*;
 
     #[derive(Default)]
-    struct One(Vec<u8>);
+    struct TestObject(Vec<u8>);
 
-    impl Objects for One {
+    impl Objects for TestObject {
         fn read(&self, index: u16, _: u8) -> Result<Vec<u8>, Abort> {
             match index {
                 0x2000 => Ok(self.0.clone()),
@@ -327,9 +327,9 @@ mod tests {
         }
     }
 
-    /// Result and messages sent.
+    /// Returns the result and the messages sent.
     fn transfer(
-        objects: &mut One,
+        objects: &mut TestObject,
         index: u16,
         data: Option<Vec<u8>>,
     ) -> (Result<Vec<u8>, Abort>, usize) {
@@ -349,7 +349,7 @@ mod tests {
     #[test]
     fn command_specifiers_of_expedited_transfers() {
         for (len, read, write) in [(1, 0x4f, 0x2f), (2, 0x4b, 0x2b), (4, 0x43, 0x23)] {
-            let mut objects = One(vec![0x5a; len]);
+            let mut objects = TestObject(vec![0x5a; len]);
             let answer = Server::default().request(&mut objects, &message(0x40, 0x2000, 0, &[]));
             assert_eq!(answer.unwrap()[0], read);
             let (_, request) = Client::start(0x2000, 0, Some(vec![1; len]));
@@ -361,8 +361,8 @@ mod tests {
     }
 
     #[test]
-    fn wrong_toggles_commands_and_lengths_abort() {
-        let mut objects = One(vec![7; 20]);
+    fn sdo_server_aborts_on_wrong_toggles_commands_and_lengths() {
+        let mut objects = TestObject(vec![7; 20]);
         let mut server = Server::default();
         let abort = |answer: Option<Message>| size(&answer.unwrap());
         server.request(&mut objects, &message(0x40, 0x2000, 0, &[]));
@@ -401,8 +401,8 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_length_goes_there_and_back(data in prop::collection::vec(any::<u8>(), 1..300)) {
-            let mut objects = One::default();
+        fn sdo_transfers_of_any_length_survive_a_round_trip(data in prop::collection::vec(any::<u8>(), 1..300)) {
+            let mut objects = TestObject::default();
             let (result, messages) = transfer(&mut objects, 0x2000, Some(data.clone()));
             prop_assert_eq!(result, Ok(Vec::new()));
             prop_assert_eq!(&objects.0, &data);
@@ -412,8 +412,8 @@ mod tests {
         }
 
         #[test]
-        fn random_messages_never_panic(messages in prop::collection::vec(any::<Message>(), 1..40)) {
-            let mut objects = One(vec![1; 30]);
+        fn sdo_server_survives_random_messages(messages in prop::collection::vec(any::<Message>(), 1..40)) {
+            let mut objects = TestObject(vec![1; 30]);
             let (mut server, mut client) = (Server::default(), Client::start(0x2000, 0, None).0);
             for message in messages {
                 server.request(&mut objects, &message);

@@ -1,12 +1,12 @@
-//! The network: devices, the cables between their ports, and a frame's way through them.
+//! The network: devices, cables between their ports, and the path of frames.
 //!
 //! * [`topology`]: which port leads to which device
-//! * `wiring`: the cables, and whether they carry anything
-//! * `route`: the way of a frame, worked out whenever links or loops change
-//! * `walk`: a frame on its way from device to device
+//! * `wiring`: the cables and their links
+//! * `route`: the path of a frame, computed on each change of links or loops
+//! * `walk`: the processing of a frame in device after device
 //!
-//! A frame is followed from end to end at once, with the time at which it passes each device; what
-//! it does there takes effect in that order.
+//! A frame is processed in one call, with the time of its arrival at each device. Its effects take
+//! place in that order.
 
 mod route;
 pub mod topology;
@@ -20,17 +20,17 @@ use crate::esc::ports::Medium;
 use crate::esc::registers as reg;
 use crate::faults::{FaultReport, FaultScript, Faults};
 use crate::frame::{self, Datagram, FrameBuilder};
-use route::{Goal, Route};
+use route::{Destination, Route};
 use topology::Topology;
 pub use wiring::Nic;
 use wiring::{End, Wiring};
 
 #[derive(Debug, Clone)]
 pub struct SegmentOptions {
-    /// Seed of everything random, unless the fault script brings its own.
+    /// The seed of all randomness, unless the fault script contains a seed.
     pub seed: u64,
-    /// Propagation on each cable, one way, unless the topology says otherwise; contacts of the
-    /// E-bus take 5 ns.
+    /// The one-way delay of each cable in ns, unless the topology defines one. E-bus contacts take
+    /// 5 ns.
     pub cable_ns: u64,
 }
 
@@ -43,56 +43,56 @@ impl Default for SegmentOptions {
     }
 }
 
-/// What became of a frame.
+/// The result of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Transit {
+pub enum FrameOutcome {
     Lost,
     Back {
-        /// Completely received by the MainDevice at this time.
+        /// The time at which the MainDevice has received the complete frame.
         at: Nanos,
         /// The port of the MainDevice that received it.
         nic: Nic,
-        /// The same frame arrives a second time.
+        /// The time at which the same frame arrives again.
         again: Option<Nanos>,
     },
 }
 
-/// As many as a frame can carry.
+/// The maximum number of datagrams in a frame.
 const DATAGRAMS: usize = 128;
 
-/// A bus of SubDevices; time starts with the first frame or step.
+/// A segment of SubDevices. Its time starts with the first frame or step.
 #[derive(Debug)]
 pub struct Segment {
     devices: Vec<SimDevice>,
     topology: Topology,
     wiring: Wiring,
-    /// From the MainDevice's first and second port.
+    /// The routes from the first and the second port of the MainDevice.
     routes: [Route; 2],
-    /// Switched off by hand; faults do so on their own account.
+    /// Devices switched off by [`Segment::power`], independent of faults.
     off: Vec<bool>,
     faults: Faults,
-    /// The caller's time that is this world's 0.
+    /// The caller's time at time 0 of the simulation.
     epoch: Option<Nanos>,
-    /// At each port, a frame cannot leave before the one in front of it has.
+    /// Per port: the time at which the previous frame has left.
     wire_free: [Nanos; 2],
     latest: Nanos,
-    /// Nothing happens to the network by itself before.
+    /// The time of the next change of the network itself.
     next_change: Nanos,
     /// Per device.
     rests: Vec<Rest>,
-    /// Of the frame under way.
+    /// The datagrams of the current frame.
     datagrams: Vec<Datagram>,
-    /// Per device: the frame under way latches receive times.
+    /// Per device: the current frame latches receive times.
     latches: Vec<bool>,
-    /// The frame under way wrote DL control.
+    /// True if the current frame wrote DL control.
     settles: bool,
-    /// Another MainDevice's frame on its way to ours, and when it arrives.
+    /// The frame of another MainDevice on its way to ours, and its arrival time.
     overheard: Option<(Nanos, Vec<u8>)>,
 }
 
 impl Segment {
-    /// Devices at the ports that [`Topology::by_order`] finds for them; one that finds none is not
-    /// connected.
+    /// Creates a segment with the devices at the ports of [`Topology::by_order`]. A device without
+    /// a suitable port stays unconnected.
     #[must_use]
     pub fn new(devices: Vec<SimDevice>, options: SegmentOptions) -> Self {
         let topology = Topology::possible(&topology::media(&devices));
@@ -127,20 +127,20 @@ impl Segment {
         segment
     }
 
-    /// Replaces the faults; times in the script count from the segment's first frame or step.
+    /// Replaces the faults. Times in the script count from the first frame or step of the segment.
     pub fn set_faults(&mut self, script: FaultScript) {
         self.faults.set(script);
         self.schedule();
     }
 
-    /// Replaces the faults; times in the script count from the caller's `now`.
+    /// Replaces the faults. Times in the script count from the caller's `now`.
     pub fn start_faults(&mut self, mut script: FaultScript, now: Nanos) {
         let begin = self.world_time(now).max(self.latest);
         script.delay(begin);
         self.set_faults(script);
     }
 
-    /// What has become of every fault of the script.
+    /// Returns the progress of every fault of the script.
     pub fn fault_reports(&self) -> impl Iterator<Item = FaultReport> + '_ {
         self.faults.reports()
     }
@@ -171,8 +171,8 @@ impl Segment {
         &self.topology
     }
 
-    /// How long a frame takes from the MainDevice's first port to a device's processing unit, first
-    /// bit to first bit; `None` where it does not come there.
+    /// Returns the delay of a frame from the first port of the MainDevice to the processing unit of
+    /// a device, first bit to first bit. `None` if the frame does not reach the device.
     #[must_use]
     pub fn delay_ns(&self, device: usize) -> Option<Nanos> {
         let route = self.routes.first()?;
@@ -180,7 +180,7 @@ impl Segment {
         visit.map(|visit| visit.after)
     }
 
-    /// Pulls the cable at a port, or plugs it in again; false where there is none.
+    /// Unplugs the cable at a port, or plugs it in again. Returns false without a cable.
     pub fn plug(&mut self, device: usize, port: u8, plugged: bool) -> bool {
         let cable = self.wiring.cable(End::Port { device, port });
         let Some(cable) = cable.and_then(|n| self.wiring.cables.get_mut(n)) else {
@@ -191,8 +191,8 @@ impl Segment {
         true
     }
 
-    /// Takes a device's power, or gives it back: it starts in Init. Devices that it feeds through the
-    /// E-bus go with it.
+    /// Switches a device off or on. A device that is switched on starts in Init. Devices that it
+    /// powers through the E-bus follow.
     pub fn power(&mut self, device: usize, on: bool) {
         if let Some(off) = self.off.get_mut(device) {
             *off = !on;
@@ -200,7 +200,7 @@ impl Segment {
         }
     }
 
-    /// Puts another device in a device's place, powered on, and returns the old one.
+    /// Replaces a device by another, powered on, and returns the old one.
     pub fn swap(&mut self, device: usize, other: SimDevice) -> Option<SimDevice> {
         let was_off = *self.off.get(device)?;
         self.power(device, false);
@@ -212,24 +212,24 @@ impl Segment {
         Some(old)
     }
 
-    /// The caller's time as true time of the simulated world.
+    /// Converts the caller's time to true time of the simulation.
     #[must_use]
     pub fn world_time(&self, now: Nanos) -> Nanos {
         now.saturating_sub(self.epoch.unwrap_or(now))
     }
 
-    /// Lets devices, clocks and faults run up to `now`.
+    /// Advances devices, clocks and faults to `now`.
     pub fn advance(&mut self, now: Nanos) {
         let to = self.strike(now);
         self.run_to(to);
     }
 
-    /// Lets everything up to `now` happen but what devices do after the last fault until then. Returns `now` as true
-    /// time.
+    /// Applies faults and other network changes up to `now`. The devices advance only to the last
+    /// change. Returns `now` as true time.
     fn strike(&mut self, now: Nanos) -> Nanos {
         let epoch = *self.epoch.get_or_insert(now);
         let to = now.saturating_sub(epoch).max(self.latest);
-        // Faults strike at their own time, not at the next frame.
+        // Faults occur at their own time, not at the next frame.
         while self.next_change <= to {
             let at = self.next_change.max(self.latest);
             self.run_to(at);
@@ -243,14 +243,14 @@ impl Segment {
         self.latest = self.latest.max(to);
     }
 
-    /// Whatever was known of devices at rest is known no longer.
+    /// Drops the cached facts about all devices.
     fn disturb(&mut self) {
         for (device, rest) in self.devices.iter_mut().zip(&mut self.rests) {
             device.disturb(rest);
         }
     }
 
-    /// Faults begin or end, temporary settings run out.
+    /// Starts and ends faults, and ends temporary loop settings.
     fn change(&mut self, at: Nanos) {
         self.disturb();
         self.faults.apply(at, &mut self.devices);
@@ -276,7 +276,7 @@ impl Segment {
         self.next_change = next.unwrap_or(Nanos::MAX);
     }
 
-    /// Power, then links, then the ways of frames follow from what is plugged in and switched on.
+    /// Updates power, then links, then routes from cables and switches.
     fn relink(&mut self) {
         self.disturb();
         for n in 0..self.devices.len() {
@@ -323,14 +323,14 @@ impl Segment {
         }
     }
 
-    /// The frame's walk through the devices and back, sent at `now` (never decreasing). In place.
-    pub fn transit(&mut self, bytes: &mut [u8], now: Nanos) -> Transit {
+    /// Sends a frame at `now` (never decreasing) through all devices and back, in place.
+    pub fn transit(&mut self, bytes: &mut [u8], now: Nanos) -> FrameOutcome {
         self.transit_from(Nic::Primary, bytes, now)
     }
 
-    /// As [`Segment::transit`], sent from either port of the MainDevice; from the second it is lost where
-    /// there is none or nobody listens.
-    pub fn transit_from(&mut self, nic: Nic, bytes: &mut [u8], now: Nanos) -> Transit {
+    /// Like [`Segment::transit`], from either port of the MainDevice. From the second port, the
+    /// frame is lost if that port does not exist or does not listen.
+    pub fn transit_from(&mut self, nic: Nic, bytes: &mut [u8], now: Nanos) -> FrameOutcome {
         let to = self.strike(now);
         let epoch = self.epoch.unwrap_or(now);
         let free = &mut self.wire_free[nic as usize];
@@ -340,7 +340,7 @@ impl Segment {
         let fate = self.faults.fate();
         if fate.lost_on_the_way_out {
             self.run_to(to);
-            return Transit::Lost;
+            return FrameOutcome::Lost;
         }
         let came_through = match fate.corrupted.and_then(|at| self.corrupted_pass(nic, at)) {
             Some(pass) => {
@@ -353,7 +353,7 @@ impl Segment {
         let route = &self.routes[nic as usize];
         let (goal, back) = (route.goal, start + route.time + wire);
         if came_through
-            && let Goal::Closed { device, port } = goal
+            && let Destination::Closed { device, port } = goal
             && let Some(device) = self.devices.get_mut(device)
         {
             device.esc.frame_at_closed_port(port);
@@ -364,20 +364,20 @@ impl Segment {
             self.other_main_device(nic, state, epoch);
         }
         match goal {
-            Goal::Back(nic) if came_through && !fate.lost_on_the_way_back => {
+            Destination::Back(nic) if came_through && !fate.lost_on_the_way_back => {
                 let at = (epoch + back).saturating_add(fate.delay);
-                Transit::Back {
+                FrameOutcome::Back {
                     at,
                     nic,
                     again: fate.twice.then(|| at.saturating_add(wire)),
                 }
             }
-            _ => Transit::Lost,
+            _ => FrameOutcome::Lost,
         }
     }
 
-    /// Another MainDevice at the same end of the wire sends a frame as soon as it is free: it reads AL status of all, or sends all to a
-    /// state.
+    /// Sends a frame of another MainDevice at the same end of the segment, as soon as the wire is
+    /// free. It reads AL status of all devices, or requests a state from all.
     fn other_main_device(&mut self, nic: Nic, state: Option<AlState>, epoch: Nanos) {
         let frame = FrameBuilder::from_source(OTHER);
         let mut frame = match state {
@@ -392,17 +392,18 @@ impl Segment {
         let came_through = self.walk(nic, &mut frame, start, self.latest);
         let route = &self.routes[nic as usize];
         let back = start + route.time + wire;
-        let returns = came_through && matches!(route.goal, Goal::Back(_));
+        let returns = came_through && matches!(route.goal, Destination::Back(_));
         self.settle(back);
         self.overheard = returns.then_some((epoch + back, frame));
     }
 
-    /// The last frame of another MainDevice that comes by the MainDevice's port, and when it is there completely.
+    /// Returns the last frame of another MainDevice that passes the port of the MainDevice, and the
+    /// time of its complete reception.
     pub fn take_overheard(&mut self) -> Option<(Nanos, Vec<u8>)> {
         self.overheard.take()
     }
 
-    /// DL control that the frame wrote takes effect when it is over.
+    /// Applies a write to DL control after the end of the frame.
     fn settle(&mut self, at: Nanos) {
         if !std::mem::take(&mut self.settles) {
             return;
@@ -415,7 +416,8 @@ impl Segment {
     }
 }
 
-/// Another MainDevice's source address: its own, where others take one that says nothing.
+/// The source address of the other MainDevice: an individual address, unlike that of most
+/// MainDevices.
 const OTHER: [u8; 6] = [0x00, 0x1b, 0x21, 0x0e, 0xca, 0x75];
 const BRD: u8 = 7;
 const BWR: u8 = 8;

@@ -1,5 +1,5 @@
-//! A frame's way through ports and processing units, worked out whenever links or loops change, so
-//! that a frame only has to follow it.
+//! The path of a frame through ports and processing units. It is computed on each change of links
+//! or loops, so a frame only follows it.
 
 use super::topology::SecondPort;
 use super::wiring::{End, Nic, Wiring};
@@ -7,38 +7,38 @@ use crate::Nanos;
 use crate::device::SimDevice;
 use crate::esc::ports::{Medium, PORTS};
 
-/// Through a device and out of a port with a PHY at either end of the cable.
+/// The delay through a device and out of a port with a PHY in ns, with both PHYs of the cable.
 const MII_NS: u64 = 500;
-/// Through a device and out of an E-bus port. Captured coupler and terminals, coupler included, take
-/// 145 to 155 ns from one device to the next.
+/// The delay through a device and out of an E-bus port in ns. Captures of a coupler with terminals
+/// show 145 to 155 ns from one device to the next.
 const EBUS_NS: u64 = 150;
 
-/// A frame passes a device's processing unit, so long after it was sent.
+/// A pass through the processing unit of a device, `after` ns after the frame was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Visit {
     pub(super) device: usize,
     pub(super) after: Nanos,
-    /// Port 0 lost its link: the second pass is the last.
+    /// True if port 0 has lost its link. A second pass then ends the frame.
     pub(super) marks_circulating: bool,
 }
 
-/// A frame arrives at a port, so long after it was sent.
+/// An arrival at a port, `after` ns after the frame was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Pass {
+pub(super) struct PortPass {
     pub(super) device: usize,
     pub(super) port: u8,
     pub(super) after: Nanos,
-    /// It goes on through the processing unit.
+    /// True if the frame enters the processing unit.
     pub(super) processed: bool,
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) enum Goal {
+pub(super) enum Destination {
     /// Out of an open port without a link.
     #[default]
     Nowhere,
     Back(Nic),
-    /// At a port whose loop is closed.
+    /// At a port with a closed loop.
     Closed {
         device: usize,
         port: u8,
@@ -48,17 +48,17 @@ pub(super) enum Goal {
 #[derive(Debug, Default)]
 pub(super) struct Route {
     pub(super) visits: Vec<Visit>,
-    pub(super) passes: Vec<Pass>,
-    pub(super) goal: Goal,
-    /// From the first bit out to the first bit in.
+    pub(super) passes: Vec<PortPass>,
+    pub(super) goal: Destination,
+    /// The time in ns from the first bit out to the first bit in.
     pub(super) time: Nanos,
-    /// The visits are to the first devices in their order, once each, and mark nothing.
+    /// True if the visits are to the first devices in order, once each, without a circulating mark.
     pub(super) straight: bool,
-    /// A device on the way destroys frames that are not EtherCAT and marks the others.
+    /// True if a device on the path destroys frames other than EtherCAT and marks the others.
     pub(super) ethercat_only: bool,
 }
 
-/// The port that follows in the order of processing.
+/// Returns the next port in the order of processing.
 fn next(port: u8) -> u8 {
     match port {
         0 => 3,
@@ -80,13 +80,13 @@ impl Route {
         self.passes.clear();
         self.ethercat_only = false;
         self.time = 0;
-        self.goal = Goal::Nowhere;
+        self.goal = Destination::Nowhere;
         if from == Nic::Secondary && wiring.second == SecondPort::Reflects {
-            // Nobody is there to send.
+            // The second port has no sender.
             return;
         }
         let mut leaves = End::MainDevice(from);
-        // No port is arrived at twice: every one has one cable, and every loop one way through.
+        // No port is reached twice: each port has one cable, and each loop has one path.
         for _ in 0..=PORTS * devices.len() + 2 {
             let Some((arrives, ns)) = wiring.other_end(leaves) else {
                 return;
@@ -95,7 +95,7 @@ impl Route {
             leaves = match arrives {
                 End::MainDevice(Nic::Secondary) if wiring.second == SecondPort::Reflects => arrives,
                 End::MainDevice(nic) => {
-                    self.goal = Goal::Back(nic);
+                    self.goal = Destination::Back(nic);
                     return;
                 }
                 End::Port { device, port } => {
@@ -103,20 +103,20 @@ impl Route {
                         return;
                     };
                     if !esc.port_open(port) {
-                        self.goal = Goal::Closed { device, port };
+                        self.goal = Destination::Closed { device, port };
                         return;
                     }
                     self.through(device, port, devices)
                 }
             };
         }
-        self.goal = Goal::Nowhere;
+        self.goal = Destination::Nowhere;
     }
 
-    /// From one open port to the next.
+    /// Follows the frame through a device to its next open port.
     fn through(&mut self, device: usize, arrived: u8, devices: &[SimDevice]) -> End {
         let pass = self.passes.len();
-        self.passes.push(Pass {
+        self.passes.push(PortPass {
             device,
             port: arrived,
             after: self.time,

@@ -1,19 +1,20 @@
-//! Which port leads to which device. Frames pass a device's ports in the order 0, 3, 1, 2 and back
-//! to 0, so that the order of devices is that of a tree's branches; connections that contradict it
-//! are refused.
+//! The connections between ports and devices.
+//!
+//! Frames pass the ports of a device in the order 0, 3, 1, 2 and back to 0. The order of devices
+//! therefore is the order of the branches of a tree. Contradicting connections are rejected.
 
 use crate::device::SimDevice;
 use crate::esc::ports::{DOWNSTREAM, Medium, PORTS};
 
-/// The media of a device's four ports.
+/// The media of the four ports of a device.
 pub type Media = [Medium; PORTS];
 
-/// What somebody asks of a device's place; a port left open is chosen.
+/// The requested position of a device. Without a port, the topology selects one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Wish {
-    /// The device that it is connected to.
+pub struct PortRequest {
+    /// The device to connect to.
     pub after: usize,
-    /// Which port of that device.
+    /// The port of that device.
     pub port: Option<u8>,
 }
 
@@ -24,22 +25,23 @@ pub struct Uplink {
     pub port: u8,
 }
 
-/// Every device with its port 0 at a port of a device in front of it, the first at the MainDevice.
+/// A tree of devices. Port 0 of each device connects to an earlier device, that of the first to the
+/// MainDevice.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topology {
     pub(super) uplinks: Vec<Option<Uplink>>,
-    /// Propagation to port 0, one way, where it is not that of all cables.
+    /// One-way delay of the cable at port 0 in ns; `None`: the default of all cables.
     pub(super) cable_ns: Vec<Option<u64>>,
     pub(super) ring: Option<(Uplink, SecondPort)>,
 }
 
-/// What a ring ends in.
+/// The end of a ring.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SecondPort {
-    /// A second port of the MainDevice, which receives what comes out there.
+    /// A second port of the MainDevice, which receives frames from the ring.
     Listens,
-    /// Nobody listens there: what comes out is sent back into the ring, past all processing units,
-    /// and arrives at the first port. For a MainDevice that knows of one port only.
+    /// No receiver. Frames at the end return through the ring, past all processing units, and
+    /// arrive at the first port. For a MainDevice that supports only one port.
     Reflects,
 }
 
@@ -87,7 +89,7 @@ pub enum TopologyError {
 }
 
 impl TopologyError {
-    /// The device that cannot be where it is to be.
+    /// Returns the device that cannot be connected as requested.
     #[must_use]
     pub fn device(&self) -> Option<usize> {
         match *self {
@@ -104,15 +106,15 @@ impl TopologyError {
     }
 }
 
-/// The devices whose downstream ports are still to be passed: the way to the latest device.
+/// The devices with downstream ports still to be passed: the path to the latest device.
 #[derive(Debug, Default)]
-struct Open {
-    /// Device, and how many of its [`DOWNSTREAM`] ports are passed already.
+struct FreePorts {
+    /// Device and number of its [`DOWNSTREAM`] ports already passed.
     path: Vec<(usize, usize)>,
 }
 
-impl Open {
-    /// Ports still open at one entry of the path, in the order frames pass them.
+impl FreePorts {
+    /// Returns the open ports of one entry of the path, in the order of frames.
     fn ports<'a>(
         &self,
         entry: usize,
@@ -143,7 +145,7 @@ impl Open {
         })
     }
 
-    /// Takes the port, and leaves for good what frames pass before it.
+    /// Uses a port. The ports that frames pass before it are no longer available.
     fn take(&mut self, entry: usize, nth: usize) {
         self.path.truncate(entry + 1);
         if let Some((_, passed)) = self.path.last_mut() {
@@ -153,21 +155,24 @@ impl Open {
 }
 
 impl Topology {
-    /// Every device at the deepest port still open, in processing order, whose medium fits; where
-    /// none fits, as through a media converter, at the deepest one that is open.
+    /// Connects every device, in processing order, to the deepest open port with a matching medium.
+    /// Without such a port, for example behind a media converter, it uses the deepest open port.
     ///
     /// # Errors
-    /// Where no port is left at all.
+    /// Fails if no port is left.
     pub fn by_order(media: &[Media]) -> Result<Self, Vec<TopologyError>> {
         Self::connect(media, &[])
     }
 
-    /// As [`Topology::by_order`], but for the n-th device as the n-th wish says.
+    /// Like [`Topology::by_order`], with the n-th request for the n-th device.
     ///
     /// # Errors
-    /// Every wish that cannot be met.
-    pub fn connect(media: &[Media], wishes: &[Option<Wish>]) -> Result<Self, Vec<TopologyError>> {
-        let (topology, errors) = Self::build(media, wishes);
+    /// Returns all requests that cannot be fulfilled.
+    pub fn connect(
+        media: &[Media],
+        requests: &[Option<PortRequest>],
+    ) -> Result<Self, Vec<TopologyError>> {
+        let (topology, errors) = Self::build(media, requests);
         if errors.is_empty() {
             Ok(topology)
         } else {
@@ -175,19 +180,19 @@ impl Topology {
         }
     }
 
-    /// As far as possible; a device that finds no port is left unconnected.
+    /// Connects as many devices as possible. A device without a suitable port stays unconnected.
     pub(super) fn possible(media: &[Media]) -> Self {
         Self::build(media, &[]).0
     }
 
-    fn build(media: &[Media], wishes: &[Option<Wish>]) -> (Self, Vec<TopologyError>) {
+    fn build(media: &[Media], requests: &[Option<PortRequest>]) -> (Self, Vec<TopologyError>) {
         let mut errors = Vec::new();
         let mut uplinks: Vec<Option<Uplink>> = Vec::with_capacity(media.len());
-        let mut open = Open::default();
+        let mut open = FreePorts::default();
         for device in 0..media.len() {
-            let wish = wishes.get(device).copied().flatten();
-            let granted = match wish {
-                Some(wish) => grant(device, wish, media, &uplinks, &open)
+            let request = requests.get(device).copied().flatten();
+            let granted = match request {
+                Some(request) => grant(device, request, media, &uplinks, &open)
                     .map_err(|error| errors.push(error))
                     .ok(),
                 None => None,
@@ -219,7 +224,7 @@ impl Topology {
     /// # Errors
     /// [`TopologyError::NoPortForRing`]
     pub fn closed(mut self, media: &[Media], second: SecondPort) -> Result<Self, TopologyError> {
-        let mut open = Open::default();
+        let mut open = FreePorts::default();
         for (device, uplink) in self.uplinks.iter().enumerate() {
             if let Some(uplink) = uplink {
                 let entry = open.path.iter().position(|(d, _)| *d == uplink.device);
@@ -238,7 +243,7 @@ impl Topology {
         Ok(self)
     }
 
-    /// Gives the cable to a device's port 0 a propagation time of its own, one way.
+    /// Sets the one-way delay of the cable at port 0 of a device.
     #[must_use]
     pub fn with_cable(mut self, device: usize, ns: u64) -> Self {
         if let Some(cable) = self.cable_ns.get_mut(device) {
@@ -247,7 +252,7 @@ impl Topology {
         self
     }
 
-    /// Number of devices.
+    /// Returns the number of devices.
     #[must_use]
     pub fn len(&self) -> usize {
         self.uplinks.len()
@@ -258,7 +263,7 @@ impl Topology {
         self.uplinks.is_empty()
     }
 
-    /// Whether something is connected to the port.
+    /// True if a cable is connected to the port.
     #[must_use]
     pub fn has_cable(&self, device: usize, port: u8) -> bool {
         if port == 0 {
@@ -268,7 +273,8 @@ impl Topology {
         self.uplinks.contains(&Some(end)) || self.ring.is_some_and(|(last, _)| last == end)
     }
 
-    /// Where a device's port 0 leads; `None` for the one at the MainDevice.
+    /// Returns the port that port 0 of a device connects to; `None` for the device at the
+    /// MainDevice.
     #[must_use]
     pub fn uplink(&self, device: usize) -> Option<Uplink> {
         self.uplinks.get(device).copied().flatten()
@@ -277,13 +283,13 @@ impl Topology {
 
 fn grant(
     device: usize,
-    wish: Wish,
+    request: PortRequest,
     media: &[Media],
     uplinks: &[Option<Uplink>],
-    open: &Open,
+    open: &FreePorts,
 ) -> Result<(usize, usize, Uplink), TopologyError> {
     use TopologyError as E;
-    let after = wish.after;
+    let after = request.after;
     if after >= device {
         return Err(E::NotBefore { device, after });
     }
@@ -296,7 +302,7 @@ fn grant(
         });
         uplinks.iter().position(|other| *other == uplink)
     };
-    if let Some(port) = wish.port {
+    if let Some(port) = request.port {
         if port == 0 {
             return Err(E::Upstream { device, after });
         }
@@ -324,7 +330,7 @@ fn grant(
             });
         }
     }
-    let fits = |port: u8, medium: Medium| match wish.port {
+    let fits = |port: u8, medium: Medium| match request.port {
         Some(wished) => port == wished,
         None => medium == own,
     };
@@ -344,12 +350,13 @@ fn grant(
     if let Some(found) = found {
         return Ok(found);
     }
-    // Which port would do, had it not been passed?
+    // Find a port that would fit if frames had not passed it.
     let passed = DOWNSTREAM.into_iter().find(|port| {
         let medium = there.get(usize::from(*port)).copied().unwrap_or_default();
         medium != Medium::None && taken(*port).is_none() && fits(*port, medium)
     });
-    // The device that frames reach only after the port: the next one beside `after`'s branch.
+    // Report the device that frames reach only after the port: the next one outside the branch of
+    // `after`.
     match passed {
         Some(port) => Err(E::OutOfOrder {
             device,
@@ -361,7 +368,7 @@ fn grant(
     }
 }
 
-/// The first device that frames reach after they have passed the port.
+/// Returns the first device that frames reach after the port.
 fn passed_by(after: usize, port: u8, uplinks: &[Option<Uplink>]) -> usize {
     let nth = |port: u8| DOWNSTREAM.iter().position(|p| *p == port);
     let (mut device, mut beyond) = (after, nth(port));
@@ -379,7 +386,7 @@ fn passed_by(after: usize, port: u8, uplinks: &[Option<Uplink>]) -> usize {
     }
 }
 
-/// The media of each device's ports, in order.
+/// Returns the media of the ports of each device, in order.
 #[must_use]
 pub fn media(devices: &[SimDevice]) -> Vec<Media> {
     devices.iter().map(|device| device.esc().media()).collect()
@@ -401,10 +408,11 @@ mod tests {
 
     #[test]
     #[rustfmt::skip] // one row a bus
-    fn devices_find_their_port_by_order() {
+    fn by_order_connects_each_device_to_the_expected_port() {
         for (physics, expected) in [
             (&["YY", "YY", "YY"][..], &[(0, 1), (1, 1)][..]),
-            // A coupler with terminals, then a drive at its second socket, and one behind that.
+            // A coupler with terminals, a drive at its second socket, and another drive behind
+            // that.
             (&["YKY", "KK", "KK", "YY", "YY"], &[(0, 1), (1, 1), (0, 2), (3, 1)]),
             // Two couplers, each with a terminal.
             (&["YKY", "KK", "YKY", "KK"], &[(0, 1), (0, 2), (2, 1)]),
@@ -412,9 +420,9 @@ mod tests {
             (&["YYYY", "YY", "YY", "Y", "Y"], &[(0, 3), (1, 1), (2, 1), (0, 1)]),
             // A terminal with an E-bus port 3 behind an Ethernet port 1.
             (&["YY K", "KK", "YY"], &[(0, 3), (0, 1)]),
-            // A junction terminal: its sockets first, then the terminals behind it.
+            // A junction terminal: first its sockets, then the terminals behind it.
             (&["YKY", "KYKY", "YY", "YY", "KK", "YY"], &[(0, 1), (1, 3), (2, 1), (1, 2), (0, 2)]),
-            // Nothing fits: as through a media converter.
+            // No medium matches, like behind a media converter.
             (&["YY", "KK", "YY"], &[(0, 1), (1, 1)]),
         ] {
             let topology = Topology::by_order(&list(physics)).unwrap();
@@ -423,50 +431,51 @@ mod tests {
     }
 
     #[test]
-    fn a_device_without_a_port_for_it_is_named() {
+    fn by_order_names_a_device_without_a_port() {
         let errors = Topology::by_order(&list(&["YY", "Y", "YY"])).unwrap_err();
         assert_eq!(errors, [TopologyError::NoPort { device: 2 }]);
     }
 
     #[test]
     #[rustfmt::skip] // one row a mistake
-    fn wishes_are_met_or_refused_with_the_reason() {
+    fn connect_fulfils_requests_or_returns_the_reason() {
         use TopologyError as E;
         let bus = list(&["YKY", "KK", "YY", "KK", "YY"]);
-        let wish = |device: usize, after: usize, port: Option<u8>| {
-            let mut wishes = vec![None; 5];
-            wishes[device] = Some(Wish { after, port });
-            Topology::connect(&bus, &wishes)
+        let request = |device: usize, after: usize, port: Option<u8>| {
+            let mut requests = vec![None; 5];
+            requests[device] = Some(PortRequest { after, port });
+            Topology::connect(&bus, &requests)
         };
-        assert_eq!(uplinks(&wish(2, 0, Some(2)).unwrap())[1], (0, 2));
-        assert_eq!(uplinks(&wish(2, 0, None).unwrap())[1], (0, 2));
+        assert_eq!(uplinks(&request(2, 0, Some(2)).unwrap())[1], (0, 2));
+        assert_eq!(uplinks(&request(2, 0, None).unwrap())[1], (0, 2));
         for (wished, error) in [
-            (wish(2, 2, Some(1)), E::NotBefore { device: 2, after: 2 }),
-            (wish(2, 9, None), E::NotBefore { device: 2, after: 9 }),
-            (wish(2, 0, Some(0)), E::Upstream { device: 2, after: 0 }),
-            (wish(2, 0, Some(3)), E::NoSuchPort { device: 2, after: 0, port: 3 }),
-            (wish(2, 0, Some(77)), E::NoSuchPort { device: 2, after: 0, port: 77 }),
-            (wish(3, 0, Some(1)), E::Taken { device: 3, after: 0, port: 1, by: 1 }),
-            (wish(2, 1, Some(1)), E::OtherMedium { device: 2, after: 1, port: 1 }),
-            (wish(2, 1, None), E::NoPortAt { device: 2, after: 1 }),
-            // The terminal's port is passed before the drive at the coupler's second socket.
-            (wish(3, 1, Some(1)), E::OutOfOrder { device: 3, after: 1, port: 1, by: 2 }),
+            (request(2, 2, Some(1)), E::NotBefore { device: 2, after: 2 }),
+            (request(2, 9, None), E::NotBefore { device: 2, after: 9 }),
+            (request(2, 0, Some(0)), E::Upstream { device: 2, after: 0 }),
+            (request(2, 0, Some(3)), E::NoSuchPort { device: 2, after: 0, port: 3 }),
+            (request(2, 0, Some(77)), E::NoSuchPort { device: 2, after: 0, port: 77 }),
+            (request(3, 0, Some(1)), E::Taken { device: 3, after: 0, port: 1, by: 1 }),
+            (request(2, 1, Some(1)), E::OtherMedium { device: 2, after: 1, port: 1 }),
+            (request(2, 1, None), E::NoPortAt { device: 2, after: 1 }),
+            // Frames pass the port of the terminal before the drive at the second socket of the
+            // coupler.
+            (request(3, 1, Some(1)), E::OutOfOrder { device: 3, after: 1, port: 1, by: 2 }),
         ] {
             assert_eq!(wished.unwrap_err(), [error]);
         }
     }
 
     #[test]
-    fn every_wrong_wish_is_reported() {
+    fn connect_returns_every_invalid_request() {
         let bus = list(&["YY", "YY", "YY"]);
-        let wish = |after, port| Some(Wish { after, port });
+        let request = |after, port| Some(PortRequest { after, port });
         let errors =
-            Topology::connect(&bus, &[None, wish(0, Some(2)), wish(0, Some(0))]).unwrap_err();
+            Topology::connect(&bus, &[None, request(0, Some(2)), request(0, Some(0))]).unwrap_err();
         assert_eq!(errors.len(), 2);
     }
 
     #[test]
-    fn a_ring_is_closed_at_the_last_port() {
+    fn closed_connects_the_ring_at_the_last_port() {
         let end = |physics: &[&str]| {
             let bus = list(physics);
             let topology = Topology::by_order(&bus).unwrap();
@@ -474,7 +483,7 @@ mod tests {
         };
         let at = |device, port| Ok(Some((Uplink { device, port }, SecondPort::Listens)));
         assert_eq!(end(&["YY", "YY"]), at(1, 1));
-        // Behind E-bus terminals the way back leads through the coupler.
+        // Behind E-bus terminals, the way back leads through the coupler.
         assert_eq!(end(&["YKY", "KK"]), at(0, 2));
         assert_eq!(end(&["YY", "Y"]), Err(TopologyError::NoPortForRing));
     }

@@ -1,21 +1,21 @@
-//! A frame on its way from device to device.
+//! The processing of a frame in device after device.
 
 use std::cmp::Ordering;
 
-use super::route::{Pass, Route};
+use super::route::{PortPass, Route};
 use super::{Nic, Segment};
 use crate::Nanos;
-use crate::device::{Seen, SimDevice};
-use crate::faults::Corrupted;
+use crate::device::{FrameEffects, SimDevice};
+use crate::faults::BitFlip;
 use crate::frame::{self, Datagram, Kind};
 
-/// Devices that live up to the frame's arrival before it visits them: their motors turn together, and what one of them
-/// needs is still in the cache when the frame comes.
+/// Devices that advance together before the frame visits them. Their motors turn together, and
+/// their data are still in the cache when the frame arrives.
 const STRETCH: usize = 4;
 
 impl Segment {
-    /// First bit sent at `start`; false where a device destroys the frame. Devices that it does not visit live up to
-    /// `to`.
+    /// Processes a frame whose first bit is sent at `start`. Returns false if a device destroys the
+    /// frame. Devices without a visit advance to `to`.
     pub(super) fn walk(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos, to: Nanos) -> bool {
         let kind = frame::kind(bytes);
         let straight = self.routes[nic as usize].straight && kind == Kind::EtherCat;
@@ -55,7 +55,7 @@ impl Segment {
         true
     }
 
-    /// The datagrams of a frame.
+    /// Parses the datagrams of a frame.
     fn read(&mut self, bytes: &[u8], kind: Kind) {
         self.datagrams.clear();
         let mut datagram = frame::next(bytes, None).filter(|_| kind == Kind::EtherCat);
@@ -65,7 +65,8 @@ impl Segment {
         }
     }
 
-    /// From device to device in their order. True if receive times are to be latched.
+    /// Processes the frame in the devices in order. Returns true if receive times are to be
+    /// latched.
     fn walk_straight(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos, to: Nanos) -> bool {
         let visits = &self.routes[nic as usize].visits;
         let (visited, others) = self.devices.split_at_mut(visits.len());
@@ -99,8 +100,8 @@ impl Segment {
         latches
     }
 
-    /// From device to device wherever the cables lead. True if receive times are to be latched, `None` if the frame
-    /// came by twice where it must not.
+    /// Processes the frame in the devices along the cables. Returns true if receive times are to be
+    /// latched, and `None` if a circulating frame was destroyed.
     fn walk_around(&mut self, nic: Nic, bytes: &mut [u8], start: Nanos) -> Option<bool> {
         let mut latches = false;
         for visit in &self.routes[nic as usize].visits {
@@ -127,20 +128,20 @@ impl Segment {
         Some(latches)
     }
 
-    /// How manieth port the frame arrives at is the first to see the error; one more than there are
-    /// for the MainDevice itself. `None` where the frame does not come by.
-    pub(super) fn corrupted_pass(&self, nic: Nic, at: Corrupted) -> Option<usize> {
+    /// Returns the index of the port pass that detects the error first. The number of passes stands
+    /// for the MainDevice itself. `None` if the frame does not pass the location.
+    pub(super) fn corrupted_pass(&self, nic: Nic, at: BitFlip) -> Option<usize> {
         let passes = &self.routes[nic as usize].passes;
         match at {
-            Corrupted::At { device, port } => passes
+            BitFlip::At { device, port } => passes
                 .iter()
                 .position(|pass| pass.device == device && pass.port == port),
-            Corrupted::Somewhere(lot) => usize::try_from(lot % (passes.len() as u64 + 1)).ok(),
+            BitFlip::Somewhere(lot) => usize::try_from(lot % (passes.len() as u64 + 1)).ok(),
         }
     }
 
-    /// As [`Segment::walk`] up to a port; from there on the frame is only counted. The first port
-    /// marks it, so that those behind it know that the error is not theirs.
+    /// Like [`Segment::walk`] up to port pass `first`. From there on, devices only count the frame.
+    /// The first port marks it, so later ports count a forwarded error.
     pub(super) fn walk_corrupted(
         &mut self,
         nic: Nic,
@@ -167,7 +168,7 @@ impl Segment {
             let seen = if processed {
                 device.process(bytes, &self.datagrams, at)
             } else {
-                Seen::default()
+                FrameEffects::default()
             };
             if pass.processed && !processed {
                 device.esc.count_processing_error();
@@ -183,7 +184,7 @@ impl Segment {
     }
 }
 
-/// SubDevices mark what they pass on: the source address becomes a local one.
+/// Marks the source address as locally administered, as SubDevices do.
 fn mark(route: &Route, bytes: &mut [u8]) {
     if route.ethercat_only
         && let Some(source) = bytes.get_mut(6)
@@ -192,8 +193,8 @@ fn mark(route: &Route, bytes: &mut [u8]) {
     }
 }
 
-/// Notes when a frame arrived at the ports of the devices that it told to.
-fn latch(passes: &[Pass], latches: &[bool], devices: &mut [SimDevice], start: Nanos) {
+/// Latches the receive times at the ports of the devices that the frame requested.
+fn latch(passes: &[PortPass], latches: &[bool], devices: &mut [SimDevice], start: Nanos) {
     for pass in passes {
         if latches.get(pass.device) == Some(&true)
             && let Some(device) = devices.get_mut(pass.device)

@@ -1,4 +1,4 @@
-//! Cables between ports, and whether they carry anything.
+//! The cables between ports and their links.
 
 use super::topology::{SecondPort, Topology};
 use crate::device::SimDevice;
@@ -8,7 +8,7 @@ use crate::esc::ports::{Medium, PORTS};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Nic {
     Primary,
-    /// The other end of a ring.
+    /// The port at the other end of a ring.
     Secondary,
 }
 
@@ -22,22 +22,22 @@ pub(super) enum End {
 pub(super) struct Cable {
     pub(super) ends: [End; 2],
     pub(super) ns: u64,
-    /// Pulled by hand; faults do so on their own account.
+    /// True if the cable was unplugged by [`super::Segment::plug`], independent of faults.
     pub(super) pulled: bool,
-    /// Both ends have a link.
+    /// True if both ends have a link.
     pub(super) up: bool,
 }
 
 #[derive(Debug)]
 pub(super) struct Wiring {
     pub(super) cables: Vec<Cable>,
-    /// Cable at each port of each device.
+    /// The cable at each port of each device.
     at: Vec<[Option<usize>; PORTS]>,
     nics: [Option<usize>; 2],
     pub(super) second: SecondPort,
 }
 
-/// Between two contacts of the E-bus, one way.
+/// The one-way delay between two E-bus contacts in ns.
 const EBUS_NS: u64 = 5;
 
 impl Wiring {
@@ -104,7 +104,7 @@ impl Wiring {
         }
     }
 
-    /// Number of the cable at an end.
+    /// Returns the number of the cable at an end.
     pub(super) fn cable(&self, end: End) -> Option<usize> {
         match end {
             End::MainDevice(nic) => self.nics[nic as usize],
@@ -112,7 +112,7 @@ impl Wiring {
         }
     }
 
-    /// Where a frame that leaves at `end` arrives, and how long it takes.
+    /// Returns the destination of a frame that leaves at `end`, and the delay in ns.
     pub(super) fn other_end(&self, end: End) -> Option<(End, u64)> {
         let cable = self.cables.get(self.cable(end)?)?;
         let [a, b] = cable.ends;

@@ -1,7 +1,7 @@
-//! The segment on a real network interface, in real time: other MainDevices may judge it.
+//! The segment on a real network interface, in real time, for any MainDevice.
 //!
 //! * `socket`: the raw socket
-//! * `stats`: what is counted
+//! * `stats`: statistics
 
 mod socket;
 mod stats;
@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::frame::{self, Kind};
 use crate::network::Nic;
-use crate::{Nanos, Segment, Transit};
+use crate::{FrameOutcome, Nanos, Segment};
 use socket::{RawSocket, Received, clock};
 pub use stats::{Histogram, ServeStats};
 
@@ -35,23 +35,24 @@ pub enum ServeError {
     },
 }
 
-/// Replies held back at once; more are lost, and counted as not sent.
+/// Maximum number of delayed replies. Further replies are dropped and counted as not sent.
 const MOST_HELD: usize = 4096;
-/// The simulation's own time passes at least this often.
+/// The maximum interval between two steps of the simulation in ns.
 const IDLE_NS: Nanos = 1_000_000;
-/// Idle rounds after which to see whether the interface is still there.
+/// The number of idle rounds between two checks of the interface.
 const CHECK: u64 = 100;
-/// A reply that a wire would bring this much later is held back; for less, timers are too coarse.
+/// The minimum delay of a reply in ns. Timers are too coarse for shorter delays.
 const HOLD_NS: Nanos = 100_000;
 
-/// Interfaces on which a segment answers.
+/// The network interfaces of a segment.
 #[derive(Debug)]
 pub struct Server {
     sockets: Vec<RawSocket>,
 }
 
 impl Server {
-    /// Opens an interface; a second one is the MainDevice's second port, for a segment whose ring ends there.
+    /// Opens the interfaces. A second interface is the second port of the MainDevice, for a segment
+    /// with a ring.
     pub fn open(nics: &[&str]) -> Result<Self, ServeError> {
         let sockets = nics.iter().map(|nic| RawSocket::open(nic));
         Ok(Self {
@@ -59,13 +60,13 @@ impl Server {
         })
     }
 
-    /// Answers every frame until `stop` is set. A frame reaches the devices at the time it reached the
-    /// interface.
+    /// Answers every frame until `stop` is set. A frame reaches the devices at the time of its
+    /// arrival at the interface.
     ///
-    /// The thread sleeps until a frame comes. One that spins answers 1.5 times as fast at the median and takes
-    /// ten times the processor's time; a MainDevice at 1 kHz would not notice.
+    /// The thread sleeps until a frame arrives. A spinning thread answers 1.5 times as fast at the
+    /// median and uses ten times the CPU time; a MainDevice at 1 kHz would not notice.
     ///
-    /// `between` is called between frames, once a millisecond at least, with the time.
+    /// `between` is called with the time between frames, at least once per ms.
     pub fn serve(
         &self,
         segment: &mut Segment,
@@ -106,12 +107,12 @@ impl Server {
 
 struct Replies<'a> {
     sockets: &'a [RawSocket],
-    /// Those whose time has not come.
-    held: Vec<Held>,
+    /// Replies that wait for their time.
+    held: Vec<DelayedReply>,
     stats: ServeStats,
 }
 
-struct Held {
+struct DelayedReply {
     at: Nanos,
     nic: Nic,
     bytes: Vec<u8>,
@@ -140,8 +141,8 @@ impl Replies<'_> {
         };
         stats.frames += u64::from(!foreign);
         match segment.transit_from(nic, bytes, received.at) {
-            Transit::Lost => stats.lost += u64::from(!foreign),
-            Transit::Back { at, nic, again } => {
+            FrameOutcome::Lost => stats.lost += u64::from(!foreign),
+            FrameOutcome::Back { at, nic, again } => {
                 self.back(nic, at, bytes);
                 if let Some(again) = again {
                     self.stats.duplicated += 1;
@@ -155,26 +156,26 @@ impl Replies<'_> {
         }
     }
 
-    /// How long to wait for a frame.
+    /// Returns the time to wait for a frame in ns.
     fn patience(&self, now: Nanos) -> Nanos {
         let due = self.held.iter().map(|held| held.at).min();
         due.map_or(IDLE_NS, |due| due.saturating_sub(now).min(IDLE_NS))
     }
 
-    /// Sends a reply, or holds it back until it would arrive.
+    /// Sends a reply, or delays it until its arrival time.
     fn back(&mut self, nic: Nic, at: Nanos, bytes: &[u8]) {
         if at < clock(libc::CLOCK_MONOTONIC).saturating_add(HOLD_NS) {
             self.send(nic, bytes);
         } else if self.held.len() < MOST_HELD {
             self.stats.delayed += 1;
             let bytes = bytes.to_vec();
-            self.held.push(Held { at, nic, bytes });
+            self.held.push(DelayedReply { at, nic, bytes });
         } else {
             self.stats.send_errors += 1;
         }
     }
 
-    /// Sends what is due, in the order of its time.
+    /// Sends the due replies in the order of their times.
     fn release(&mut self, now: Nanos) {
         while let Some((n, held)) = self.held.iter().enumerate().min_by_key(|(_, held)| held.at) {
             if held.at > now {
@@ -186,7 +187,7 @@ impl Replies<'_> {
     }
 
     fn send(&mut self, nic: Nic, bytes: &[u8]) {
-        // Where nobody listens at a ring's end, the segment sends nothing there.
+        // If the end of a ring has no receiver, the segment sends no frames there.
         let socket = self.sockets.get(nic as usize);
         if socket.is_some_and(|socket| socket.send(bytes)) {
             self.stats.answered += 1;
@@ -201,7 +202,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_missing_interface_is_named() {
+    fn open_names_a_missing_interface() {
         let error = Server::open(&["no-such-nic"]).unwrap_err();
         assert_eq!(
             error.to_string(),

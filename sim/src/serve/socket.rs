@@ -1,4 +1,4 @@
-//! A raw socket on one interface, with the kernel's time of arrival for every frame.
+//! A raw socket on one interface, with the kernel's arrival time of every frame.
 
 use std::ffi::CString;
 use std::io;
@@ -9,7 +9,7 @@ use std::ptr;
 use super::ServeError;
 use crate::Nanos;
 
-/// Room for one control message with a time stamp, aligned as its header wants it.
+/// A buffer for one control message with a time stamp, aligned for the message header.
 type Control = [u64; 8];
 
 #[derive(Debug)]
@@ -19,13 +19,13 @@ pub(super) struct RawSocket {
     index: u32,
 }
 
-/// A frame that is in the caller's buffer.
+/// A received frame in the caller's buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Received {
     pub(super) len: usize,
-    /// Monotonic time at which it reached the interface.
+    /// Monotonic time of the arrival at the interface.
     pub(super) at: Nanos,
-    /// It was longer than the buffer.
+    /// True if the frame was longer than the buffer.
     pub(super) cut: bool,
 }
 
@@ -45,7 +45,7 @@ impl RawSocket {
         if number == 0 {
             return Err(ServeError::NoSuchInterface(nic.to_owned()));
         }
-        // Without a protocol it receives nothing until `bind` names one; other interfaces' frames stay out.
+        // Without a protocol, the socket receives no frames of other interfaces until `bind`.
         // SAFETY: plain system call; the result is checked.
         let fd = unsafe {
             libc::socket(
@@ -70,13 +70,14 @@ impl RawSocket {
             index,
         };
 
-        // Without stamps the time of the receive call has to do.
+        // Without stamps, the time of the receive call applies.
         let _ = socket.set(libc::SOL_SOCKET, libc::SO_TIMESTAMPNS, &1_i32);
-        // Our own replies would otherwise come back; older kernels are covered by the packet type.
+        // The socket must not receive our own replies. On older kernels, the packet type excludes
+        // them.
         let _ = socket.set(libc::SOL_PACKET, libc::PACKET_IGNORE_OUTGOING, &1_i32);
         // Replies must not wait behind a traffic shaper.
         let _ = socket.set(libc::SOL_PACKET, libc::PACKET_QDISC_BYPASS, &1_i32);
-        // A MainDevice's destination address is the broadcast address, but need not be.
+        // The destination address of a MainDevice need not be the broadcast address.
         let everything = libc::packet_mreq {
             mr_ifindex: number,
             mr_type: libc::PACKET_MR_PROMISC as libc::c_ushort,
@@ -112,15 +113,15 @@ impl RawSocket {
                 &raw mut len,
             )
         };
-        // On the loopback interface every reply would be a request again.
+        // On the loopback interface, every reply would return as a request.
         if named == 0 && address.sll_hatype != libc::ARPHRD_ETHER {
             return Err(ServeError::NotEthernet(nic.to_owned()));
         }
         Ok(socket)
     }
 
-    /// An error once the interface has been removed, or another one has its name: its socket hears
-    /// nothing any more, and says nothing either.
+    /// Fails if the interface was removed or replaced by another of the same name. Its socket
+    /// receives no frames and reports no error.
     pub(super) fn check(&self) -> Result<(), ServeError> {
         // SAFETY: the name is NUL-terminated and lives through the call.
         if unsafe { libc::if_nametoindex(self.nic.as_ptr()) } == self.index {
@@ -147,7 +148,7 @@ impl RawSocket {
         }
     }
 
-    /// The next frame that has arrived.
+    /// Returns the next received frame.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<Option<Received>, ServeError> {
         // SAFETY: all-zero is a valid sockaddr_ll and a valid msghdr.
         let (mut from, mut message): (libc::sockaddr_ll, libc::msghdr) =
@@ -163,12 +164,13 @@ impl RawSocket {
         message.msg_iovlen = 1;
         message.msg_control = (&raw mut control).cast();
         message.msg_controllen = size_of_val(&control);
-        // SAFETY: every pointer in `message` is valid for the length beside it.
+        // SAFETY: every pointer in `message` is valid for the length next to it.
         let len = unsafe { libc::recvmsg(self.fd.as_raw_fd(), &raw mut message, 0) };
         let Ok(len) = usize::try_from(len) else {
             let source = io::Error::last_os_error();
             return match source.raw_os_error() {
-                // An interface that goes down and up again is a pulled cable, not the end.
+                // An interface that goes down and up again is an unplugged cable, not a removed
+                // interface.
                 Some(libc::EAGAIN | libc::EINTR | libc::ENETDOWN) => Ok(None),
                 _ => Err(ServeError::Io {
                     nic: self.nic.to_string_lossy().into_owned(),
@@ -181,7 +183,7 @@ impl RawSocket {
             return Ok(None);
         }
         let now = clock(libc::CLOCK_MONOTONIC);
-        // Stamps are of the clock that may be set; how long ago it was is not.
+        // Stamps use the adjustable clock, so only their age is used.
         let age =
             stamp(&message).map_or(0, |stamp| clock(libc::CLOCK_REALTIME).saturating_sub(stamp));
         Ok(Some(Received {
@@ -191,7 +193,7 @@ impl RawSocket {
         }))
     }
 
-    /// False if the interface does not take it.
+    /// Returns false if the interface rejects the frame.
     pub(super) fn send(&self, bytes: &[u8]) -> bool {
         // SAFETY: the buffer is valid for its length.
         let sent =
@@ -200,7 +202,7 @@ impl RawSocket {
     }
 }
 
-/// Until a frame has arrived at one of them, or the time is over, which makes it false.
+/// Waits for a frame at one of the sockets. Returns false on time-out.
 pub(super) fn wait(sockets: &[RawSocket], patience: Nanos) -> bool {
     let mut polled = [libc::pollfd {
         fd: -1,
@@ -218,7 +220,7 @@ pub(super) fn wait(sockets: &[RawSocket], patience: Nanos) -> bool {
     unsafe { libc::ppoll(polled.as_mut_ptr(), 2, &raw const timeout, ptr::null()) > 0 }
 }
 
-/// The kernel's time of arrival among the control messages.
+/// Returns the kernel's arrival time from the control messages.
 fn stamp(message: &libc::msghdr) -> Option<Nanos> {
     // SAFETY: the kernel has filled `msg_control` up to `msg_controllen`.
     let header = unsafe { libc::CMSG_FIRSTHDR(message).as_ref()? };
@@ -230,7 +232,7 @@ fn stamp(message: &libc::msghdr) -> Option<Nanos> {
     nanos(&time)
 }
 
-/// A clock's time in nanoseconds.
+/// Returns the time of a clock in ns.
 pub(super) fn clock(id: libc::clockid_t) -> Nanos {
     let mut time = libc::timespec {
         tv_sec: 0,

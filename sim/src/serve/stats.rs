@@ -1,8 +1,8 @@
-//! What was served, and how quickly.
+//! Statistics of the served frames.
 
 use crate::Nanos;
 
-/// Steps within each power of two.
+/// The buckets per power of two.
 const STEPS: usize = 8;
 const BUCKETS: usize = 64 * STEPS;
 
@@ -12,22 +12,22 @@ pub struct ServeStats {
     pub frames: u64,
     /// Replies sent.
     pub answered: u64,
-    /// Did not come back, as the fault script or an open ring has it.
+    /// Frames lost through the fault script or an open ring.
     pub lost: u64,
-    /// Answered twice, by the fault script.
+    /// Frames answered twice through the fault script.
     pub duplicated: u64,
-    /// Held back, as slow as the simulated wire.
+    /// Replies delayed to the time of the simulated wire.
     pub delayed: u64,
-    /// Went round unprocessed, as SubDevices pass on what they cannot read, or too long for that.
+    /// Frames passed on unprocessed because they were malformed, or too long even for that.
     pub malformed: u64,
-    /// Not EtherCAT; SubDevices destroy them unless told otherwise.
+    /// Frames other than EtherCAT. SubDevices destroy them unless configured otherwise.
     pub foreign: u64,
     pub send_errors: u64,
-    /// From a frame's arrival at the interface until its reply is sent, or held back.
+    /// The time from the arrival of a frame until its reply is sent or delayed.
     pub turnaround: Histogram,
 }
 
-/// Durations in buckets an eighth of a power of two wide: bounded, and exact to 12 %.
+/// Durations in buckets an eighth of a power of two wide: bounded memory, resolution 12 %.
 #[derive(Debug, Clone)]
 pub struct Histogram {
     counts: Vec<u64>,
@@ -56,7 +56,7 @@ impl Histogram {
         self.max
     }
 
-    /// The value that a share of all does not exceed; `None` where there is none.
+    /// Returns the value that `share` of all values do not exceed; `None` without values.
     #[must_use]
     pub fn quantile(&self, share: f64) -> Option<Nanos> {
         let all: u64 = self.counts.iter().sum();
@@ -70,16 +70,16 @@ impl Histogram {
     }
 }
 
-/// Below `STEPS` a bucket a value, above that `STEPS` buckets a power of two.
+/// Returns the bucket of a value: one per value below `STEPS`, then `STEPS` per power of two.
 fn bucket(value: Nanos) -> usize {
     let steps = STEPS as u64;
     let exponent = (value | steps).ilog2() - steps.ilog2();
     let within = (value >> exponent) as usize;
-    // From the first power of two on, `within` lies between STEPS and 2·STEPS.
+    // For values from STEPS on, `within` lies between STEPS and 2·STEPS.
     exponent as usize * STEPS + within
 }
 
-/// The largest value of a bucket.
+/// Returns the largest value of a bucket.
 fn upper(bucket: usize) -> Nanos {
     let exponent = (bucket / STEPS).saturating_sub(1);
     let within = (bucket - exponent * STEPS) as u128;
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn buckets_are_in_order_and_bound_their_values() {
+    fn histogram_buckets_are_ordered_and_bound_their_values() {
         let mut last = 0;
         for shift in 0..64 {
             for value in [
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_of_a_known_distribution() {
+    fn histogram_returns_the_quantiles_of_a_known_distribution() {
         let mut histogram = Histogram::default();
         assert_eq!(histogram.quantile(0.5), None);
         for value in 1..=1000 {

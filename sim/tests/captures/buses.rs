@@ -1,19 +1,20 @@
-//! The captured buses: who was there, and what a capture that starts in the middle takes for granted.
+//! The captured buses: their devices, and the state in which each capture starts.
 
-use ecaxis_sim::esc::info::{EscInfo, eeprom};
+use ecaxis_sim::esc::chip::{EscInfo, eeprom};
 
 pub struct Device {
     pub name: &'static str,
-    /// Under which the capture addresses it.
+    /// The station address in the capture.
     pub station: u16,
-    /// An image of the same product and revision; otherwise it is put together from the capture.
+    /// An image of the same product and revision. `None`: the image is built from the capture.
     pub image: Option<&'static str>,
-    /// Word 0 of an image put together: as the capture shows it in register 0x0140, else what working counters show:
-    /// device emulation (0x0100) where AL status copies the acknowledge bit, SYNC unit (0x0400) where 0x0910 answers.
+    /// Word 0 of an image built from the capture, from register 0x0140 or else from working
+    /// counters. Device emulation (0x0100) where AL status copies the acknowledge bit; SYNC unit
+    /// (0x0400) where 0x0910 answers.
     pub pdi_control: u16,
     pub esc: EscInfo,
-    /// What the firmware needs for a state change and for an answer in the mailbox: between the last poll that found it
-    /// at work and the first that did not, and never more than any poll allows.
+    /// The firmware's time for a state change and for a mailbox answer. It lies between the last
+    /// poll that found the firmware busy and the first that did not, and never exceeds any poll.
     pub firmware_ns: Firmware,
 }
 
@@ -32,7 +33,7 @@ const NO_FIRMWARE: Firmware = Firmware {
 pub struct Bus {
     pub file: &'static str,
     pub devices: &'static [Device],
-    /// Left from earlier sessions: (command, ADP, ADO, data).
+    /// Register contents from before the capture: (command, ADP, ADO, data).
     pub before: &'static [(u8, u16, u16, &'static [u8])],
 }
 
@@ -45,13 +46,13 @@ const EK1100: Device = Device {
     firmware_ns: NO_FIRMWARE,
 };
 
-/// Port 3 of the chip is there and not configured, which no image shows.
+/// Port 3 of the chip exists but is not configured, which no image shows.
 const ET1200: EscInfo = EscInfo {
     ports: Some(0x4a),
     ..EscInfo::ET1200
 };
 
-/// The next revision tells a feature and an EEPROM bit more.
+/// The next revision reports one more feature and one more EEPROM bit.
 const ET1200_REVISION_1: EscInfo = EscInfo {
     revision: 1,
     features: 0x01fc,
@@ -176,7 +177,7 @@ pub const BUSES: &[Bus] = &[
                 mailbox: 38_300_000,
             },
         }],
-        // The mask of an earlier run is still there.
+        // The mask of an earlier run is still set.
         before: &[(8, 0, 0x200, &[4, 0])],
     },
     Bus {

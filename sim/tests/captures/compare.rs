@@ -1,4 +1,4 @@
-//! Recorded answer against the simulator's: equal, or different for one of a few reasons.
+//! Compares recorded and simulated answers: equal, or different for one of a few reasons.
 
 use crate::recording::{Datagram, FPRD};
 
@@ -6,7 +6,7 @@ use crate::recording::{Datagram, FPRD};
 const CLOCK_TOLERANCE_NS: u64 = 100_000;
 /// Cables and E-bus contacts.
 const LOOP_TOLERANCE_NS: i64 = 50;
-/// How well a clock follows the reference depends on both crystals.
+/// The deviation of a clock from the reference depends on both crystals.
 const DIFFERENCE_TOLERANCE_NS: u64 = 1_000;
 
 /// Status of SyncManager 1.
@@ -14,16 +14,17 @@ const SEND_MAILBOX: u16 = 0x080d;
 
 /// A reason for which answers may differ.
 pub struct Excuse {
-    /// As docs/captures.md calls it.
+    /// The name in docs/captures.md.
     pub name: &'static str,
     explains: fn(&Case) -> bool,
 }
 
-/// A datagram whose answers differ.
+/// A datagram with different answers.
 pub struct Case<'a> {
     pub recorded: &'a Datagram,
     pub ours: &'a Datagram,
-    /// What was recorded for the same request, repeated without anything else in between.
+    /// The recorded answers to later repetitions of the same request, without other traffic in
+    /// between.
     pub later: &'a [Datagram],
 }
 
@@ -58,7 +59,7 @@ pub const EXCUSES: &[Excuse] = &[
     },
 ];
 
-/// The first reason that covers everything that differs.
+/// Returns the first reason that covers all differences.
 pub fn excuse(case: &Case) -> Option<usize> {
     EXCUSES.iter().position(|excuse| (excuse.explains)(case))
 }
@@ -73,7 +74,7 @@ impl Case<'_> {
     }
 }
 
-/// Mailbox status: the recorded device comes to the same answer while the MainDevice keeps asking.
+/// Mailbox status: the recorded device gives the same answer to a later poll.
 fn polled(case: &Case) -> bool {
     case.only_data_differs()
         && case.recorded.ado == SEND_MAILBOX
@@ -93,7 +94,7 @@ const DIFFERENCE: u16 = 0x092c;
 /// Receive times, system time and its difference.
 fn clocks(case: &Case) -> bool {
     let mut explained = vec![false; case.recorded.data.len()];
-    // How far the ports of one device are apart does not depend on when.
+    // The time between the ports of one device does not depend on the time of the latch.
     let mut loops = None;
     for (address, len) in CLOCK_FIELDS {
         let Some(at) = address.checked_sub(case.recorded.ado).map(usize::from) else {
@@ -124,7 +125,7 @@ fn clocks(case: &Case) -> bool {
     case.only_data_differs() && differs.all(|(_, explained)| explained)
 }
 
-/// Little-endian; the difference is a magnitude with a sign.
+/// Returns a little-endian number; the difference register is a magnitude with a sign.
 fn number(address: u16, bytes: &[u8]) -> i64 {
     let raw = bytes
         .iter()
@@ -137,7 +138,7 @@ fn number(address: u16, bytes: &[u8]) -> i64 {
     }
 }
 
-/// A mailbox keeps what was in the memory before; only the message itself counts.
+/// A mailbox keeps older memory contents; only the message itself counts.
 fn behind_message(case: &Case) -> bool {
     let [recorded, ours] = [case.recorded, case.ours].map(|d| d.data.as_slice());
     let &[low, high, ..] = recorded else {
@@ -151,7 +152,7 @@ fn behind_message(case: &Case) -> bool {
         && recorded.get(..end) == ours.get(..end)
 }
 
-/// SyncManager 1: the firmware has written the first byte of an answer to come.
+/// SyncManager 1: the firmware has already written the first byte of the next answer.
 fn opened(case: &Case) -> bool {
     case.only_data_differs()
         && case.recorded.ado == SEND_MAILBOX
@@ -160,7 +161,7 @@ fn opened(case: &Case) -> bool {
         && case.recorded.data[1..] == case.ours.data[1..]
 }
 
-/// Answers to downloads: some firmware leaves what was written in the four reserved bytes.
+/// Answers to downloads: some firmware leaves the written data in the four reserved bytes.
 fn reserved(case: &Case) -> bool {
     let cleared = |d: &Datagram| {
         let mut data = d.data.clone();
@@ -190,7 +191,7 @@ fn eeprom_bit(case: &Case) -> bool {
         && case.recorded.data[1..] == case.ours.data[1..]
 }
 
-/// It shows when a frame came in there last, which was before the capture.
+/// A port without a link shows the receive time of a frame before the capture.
 fn unlinked(case: &Case) -> bool {
     case.only_data_differs() && case.recorded.ado == 0x0904 && case.ours.data == [0; 4]
 }

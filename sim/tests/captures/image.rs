@@ -1,4 +1,4 @@
-//! EEPROM images and objects as a capture shows them.
+//! EEPROM images and objects from a capture.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ const EEPROM_DATA: u16 = 0x0508;
 const HEADER: usize = 0x80;
 const SIZE: usize = 2048;
 
-/// Byte address → value of everything a device's EEPROM was asked for.
+/// Returns the EEPROM bytes of a device that the capture contains, by byte address.
 pub fn recorded_bytes(recording: &Recording, station: u16) -> BTreeMap<usize, u8> {
     let mut word = 0;
     let mut known = BTreeMap::new();
@@ -34,8 +34,9 @@ pub fn recorded_bytes(recording: &Recording, station: u16) -> BTreeMap<usize, u8
     known
 }
 
-/// An image of what was read. Nobody reads the first seven words: the PDI control word is given, the others are 0 and
-/// the checksum is right. Bytes that were not read are 0 in the header and 0xff in the categories.
+/// Returns an image of the recorded bytes. No MainDevice reads the first seven words: the PDI
+/// control word is given, the others are 0, and the checksum is correct. Missing bytes are 0 in the
+/// header and 0xff in the categories.
 pub fn recorded_image(known: &BTreeMap<usize, u8>, pdi_control: u16, pdos: &Pdos) -> Vec<u8> {
     let end = known.keys().next_back().map_or(HEADER, |last| last + 1);
     let mut image = vec![0; HEADER];
@@ -50,12 +51,12 @@ pub fn recorded_image(known: &BTreeMap<usize, u8>, pdi_control: u16, pdos: &Pdos
     image
 }
 
-/// What mailbox traffic tells of a device's objects.
+/// A device's objects, as mailbox traffic shows them.
 #[derive(Debug, Default)]
 pub struct Objects {
-    /// (index, sub) → data of the first upload, and whether complete access brought it.
+    /// (index, sub) → data of the first upload, and whether it used complete access.
     uploads: BTreeMap<(u16, u8), (Vec<u8>, bool)>,
-    /// (index, sub) → length of the data written before any upload.
+    /// (index, sub) → data of a download before any upload.
     downloads: BTreeMap<(u16, u8), Vec<u8>>,
 }
 
@@ -75,7 +76,7 @@ impl Objects {
         objects
     }
 
-    /// An SDO download request; all in these captures are expedited.
+    /// Records an SDO download request. All requests in these captures are expedited.
     fn request(&mut self, message: &[u8]) {
         if let Some((command, key, data)) = sdo(message, 2)
             && command >> 5 == 1
@@ -94,8 +95,8 @@ impl Objects {
         }
     }
 
-    /// Puts what the image cannot yield into a device's dictionary: objects that were only read, with their value, and
-    /// objects that were written, writable and 0.
+    /// Adds objects that the image does not contain to a device's dictionary. Read objects get
+    /// their value; written objects are writable and 0.
     pub fn feed(&self, device: &mut SimDevice) {
         let store = device.store_mut();
         let mut ensure = |(index, sub): (u16, u8), len: usize, write, value: &[u8]| {
@@ -114,7 +115,7 @@ impl Objects {
     }
 }
 
-/// Command byte, object and data of an SDO message in a mailbox: expedited or normal.
+/// Returns command byte, object and data of an SDO message in a mailbox: expedited or normal.
 fn sdo(message: &[u8], service: u8) -> Option<(u8, (u16, u8), Vec<u8>)> {
     let len = usize::from(u16::from_le_bytes([*message.first()?, *message.get(1)?]));
     let body = message.get(6..6 + len)?;
@@ -137,13 +138,13 @@ fn sdo(message: &[u8], service: u8) -> Option<(u8, (u16, u8), Vec<u8>)> {
     Some((command, key, data))
 }
 
-/// PDO categories that nobody read in the EEPROM because CoE told about them.
+/// PDO categories that the capture's MainDevice read over CoE instead of from the EEPROM.
 #[derive(Debug, Default)]
 pub struct Pdos(Vec<(u16, u8, Vec<u32>)>);
 
 impl Pdos {
-    /// Assignment and mapping as read by complete access; assigned PDOs whose mapping was not read carry one
-    /// 16-bit value.
+    /// Returns assignment and mapping as read by complete access. Assigned PDOs without a recorded
+    /// mapping get one 16-bit value.
     pub fn recorded(objects: &Objects) -> Self {
         let mut pdos = Self::default();
         for (index, sm) in [(0x1c12_u16, 2), (0x1c13, 3)] {
@@ -167,7 +168,7 @@ impl Pdos {
         pdos
     }
 
-    /// In front of the end mark.
+    /// Inserts the categories before the end mark.
     fn append_to(&self, image: &mut [u8]) {
         if self.0.is_empty() {
             return;
@@ -201,7 +202,7 @@ fn words_of(data: &[u8]) -> impl Iterator<Item = u16> + '_ {
         .map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
 }
 
-/// Elements behind subindex 0, which takes 16 bits.
+/// Returns the elements after subindex 0, which takes 16 bits.
 fn words(list: &[u8]) -> impl Iterator<Item = u16> + '_ {
     words_of(list).skip(1)
 }

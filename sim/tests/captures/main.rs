@@ -1,7 +1,8 @@
-//! The simulator against captures of real buses: every recorded request goes to a simulated bus built from the same
-//! EEPROM contents, at the recorded time, and its answer must be the recorded one. docs/captures.md has the results.
+//! The simulator against captures of real buses. Every recorded request goes to a simulated bus
+//! with the same EEPROM contents at the recorded time. Its answer must equal the recorded one.
+//! docs/captures.md has the results.
 
-#![allow(clippy::print_stderr, reason = "tests say what they did")]
+#![allow(clippy::print_stderr, reason = "prints the results")]
 
 mod buses;
 #[path = "../common/mod.rs"]
@@ -16,13 +17,13 @@ use buses::{BUSES, Bus, Device};
 use common::fixture;
 use compare::{Case, EXCUSES, excuse};
 use ecaxis_sim::frame::FrameBuilder;
-use ecaxis_sim::{DeviceOptions, MailboxOptions, Segment, SegmentOptions, SimDevice, Transit};
+use ecaxis_sim::{DeviceOptions, FrameOutcome, MailboxOptions, Segment, SegmentOptions, SimDevice};
 use image::{Objects, Pdos, recorded_bytes, recorded_image};
 use recording::{Datagram, FPRD, Recording, datagrams};
 
-/// What the simulated firmware needs to find a request in its mailbox.
+/// The time until the simulated firmware finds a request in its mailbox.
 const FETCH_NS: u64 = 100_000;
-/// Virtual time of the first recorded frame.
+/// The virtual time of the first recorded frame.
 const START: u64 = 1_000_000_000;
 
 #[derive(Default)]
@@ -32,11 +33,12 @@ struct Tally {
     compared: usize,
     equal: usize,
     excused: [usize; EXCUSES.len()],
-    /// What is not explained → (first time in ns, how often).
+    /// Unexplained difference → (first time in ns, count).
     wrong: BTreeMap<String, (u64, usize)>,
 }
 
-/// The clock's reading when the capture latched receive times, as an offset to virtual time.
+/// Returns the clock's reading when the capture latched receive times, as an offset to virtual
+/// time.
 fn clock_offset(recording: &Recording, station: u16) -> u64 {
     let mut latched = 0;
     let mut offset = 0;
@@ -75,7 +77,7 @@ fn build(device: &Device, recording: &Recording) -> Option<SimDevice> {
         esc: Some(device.esc),
         clock_offset_ns: clock_offset(recording, device.station),
         state_change_ns: device.firmware_ns.state_change,
-        // The recorded firmware looks at AL control when it is about to follow it.
+        // The recorded firmware reads AL control just before it follows it.
         state_notice_ns: Some(device.firmware_ns.state_change),
         mailbox: MailboxOptions {
             processing_ns: device.firmware_ns.mailbox.saturating_sub(FETCH_NS),
@@ -108,12 +110,12 @@ fn replay(bus: &Bus, bytes: &[u8]) -> Option<Tally> {
         let mut frame = exchange.request.clone();
         let back = segment.transit(&mut frame, START + exchange.at);
         match (&exchange.answer, back) {
-            // Ethernet and EtherCAT headers; the source address marked.
-            (Some(recorded), Transit::Back { .. }) if recorded[..16] == frame[..16] => {
+            // Ethernet and EtherCAT headers, with the source address marked.
+            (Some(recorded), FrameOutcome::Back { .. }) if recorded[..16] == frame[..16] => {
                 let pairs = datagrams(recorded).into_iter().zip(datagrams(&frame));
                 answers.extend(pairs.map(|(recorded, ours)| (exchange.at, recorded, ours)));
             }
-            (None, Transit::Lost) => tally.unanswered += 1,
+            (None, FrameOutcome::Lost) => tally.unanswered += 1,
             // The recording ended before the answer came.
             (None, _) if n + 1 == recording.exchanges.len() => {}
             (recorded, back) => {
@@ -153,7 +155,7 @@ fn replay(bus: &Bus, bytes: &[u8]) -> Option<Tally> {
     Some(tally)
 }
 
-/// Without the time, so that repetitions can be counted.
+/// Describes a difference without the time, so that repetitions can be counted.
 fn difference(recorded: &Datagram, ours: &Datagram) -> String {
     let side = |d: &Datagram| {
         let data: Vec<_> = d.data.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -170,7 +172,7 @@ fn difference(recorded: &Datagram, ours: &Datagram) -> String {
     )
 }
 
-/// A row of the table in docs/captures.md.
+/// Returns a row of the table in docs/captures.md.
 fn row(bus: &Bus, tally: &Tally) -> String {
     let file = bus.file.rsplit('/').next().unwrap_or_default();
     let file = file.split('.').next().unwrap_or_default();
@@ -194,7 +196,7 @@ fn row(bus: &Bus, tally: &Tally) -> String {
 }
 
 #[test]
-fn simulated_buses_answer_as_the_captured_ones() {
+fn simulated_buses_answer_like_the_captured_ones() {
     let documented = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/captures.md");
     let documented = std::fs::read_to_string(documented).unwrap();
     let mut excused = [0; EXCUSES.len()];

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use pcap_file::pcapng::blocks::interface_description::InterfaceDescriptionOption;
 use pcap_file::pcapng::{Block, PcapNgReader};
 
-/// One datagram of a frame, with every header field as the wire has it.
+/// One datagram of a frame, with every header field as on the wire.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Datagram {
     pub command: u8,
@@ -23,7 +23,7 @@ pub const FPRD: u8 = 4;
 pub const FPWR: u8 = 5;
 
 impl Datagram {
-    /// What makes two requests the same, their index aside.
+    /// True if two requests are equal except for their index.
     pub fn same_request(&self, other: &Self) -> bool {
         let key = |d: &Self| (d.command, d.adp, d.ado, d.len);
         key(self) == key(other)
@@ -62,7 +62,7 @@ pub fn datagrams(frame: &[u8]) -> Vec<Datagram> {
 
 #[derive(Debug, Clone)]
 pub struct Exchange {
-    /// Since the first frame, in nanoseconds.
+    /// The time since the first frame, in ns.
     pub at: u64,
     pub request: Vec<u8>,
     pub answer: Option<Vec<u8>>,
@@ -75,8 +75,9 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Reads a capture and pairs every request with the first answer that carries the same commands and indices. Answers
-    /// are told from requests by the bit that SubDevices set in the source address.
+    /// Reads a capture and pairs every request with the first answer that carries the same commands
+    /// and indices. SubDevices set a bit in the source address, which distinguishes answers from
+    /// requests.
     pub fn read(bytes: &[u8]) -> Self {
         let frames = frames(bytes);
         let mut exchanges: Vec<Exchange> = Vec::new();
@@ -108,7 +109,7 @@ impl Recording {
         }
     }
 
-    /// Every answered datagram: when it was sent, as sent, as it came back.
+    /// Returns every answered datagram: send time, request, answer.
     pub fn answered(&self) -> impl Iterator<Item = (u64, Datagram, Datagram)> + '_ {
         self.exchanges.iter().flat_map(|x| {
             let answer = x.answer.as_deref().map(datagrams).unwrap_or_default();
@@ -118,7 +119,7 @@ impl Recording {
     }
 }
 
-/// (nanoseconds, bytes) of every packet.
+/// Returns (nanoseconds, bytes) of every packet.
 fn frames(bytes: &[u8]) -> Vec<(u64, Vec<u8>)> {
     let mut reader = PcapNgReader::new(bytes).expect("pcapng");
     let mut units: HashMap<u32, u64> = HashMap::new();
@@ -137,7 +138,7 @@ fn frames(bytes: &[u8]) -> Vec<(u64, Vec<u8>)> {
                 units.insert(number, 10_u64.pow(9 - u32::from(digits)));
             }
             Block::EnhancedPacket(packet) => {
-                // The reader takes every count for nanoseconds.
+                // The reader interprets every count as nanoseconds.
                 let count = u64::try_from(packet.timestamp.as_nanos()).unwrap();
                 found.push((count * units[&packet.interface_id], packet.data.to_vec()));
             }

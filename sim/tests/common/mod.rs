@@ -1,6 +1,6 @@
-//! A MainDevice just big enough to test SubDevices: one datagram at a time, virtual time.
+//! A minimal MainDevice for tests of SubDevices: one datagram at a time, virtual time.
 #![allow(dead_code, reason = "every test binary uses its own part")]
-#![allow(clippy::print_stderr, reason = "tests say why they skip")]
+#![allow(clippy::print_stderr, reason = "prints skipped tests")]
 
 use std::path::PathBuf;
 
@@ -9,7 +9,7 @@ use ecaxis_esi::model::{
     Object, ObjectItem, Pdo, PdoMapping, SmUse, SyncManager, Writable,
 };
 use ecaxis_sim::frame::{self, FrameBuilder};
-use ecaxis_sim::{DeviceOptions, Segment, SegmentOptions, SimDevice, Transit};
+use ecaxis_sim::{DeviceOptions, FrameOutcome, Segment, SegmentOptions, SimDevice};
 
 pub const INIT: u8 = 1;
 pub const PREOP: u8 = 2;
@@ -20,7 +20,7 @@ pub const OP: u8 = 8;
 pub struct Bus {
     pub segment: Segment,
     pub now: u64,
-    /// Address and length of the mailbox to write and the one to read, of all devices.
+    /// Address and length of the write and read mailbox of all devices.
     pub mailboxes: [(u16, u16); 2],
     counter: u8,
 }
@@ -46,22 +46,22 @@ impl Bus {
         }
     }
 
-    /// Sends a frame, waits for it; `None` if it was lost.
+    /// Sends a frame and waits for it. Returns `None` if it is lost.
     pub fn frame(&mut self, mut bytes: Vec<u8>) -> Option<Vec<u8>> {
         match self.segment.transit(&mut bytes, self.now) {
-            Transit::Back { at, .. } => {
+            FrameOutcome::Back { at, .. } => {
                 assert!(at > self.now);
                 self.now = at;
                 Some(bytes)
             }
-            Transit::Lost => {
+            FrameOutcome::Lost => {
                 self.now += 1_000_000;
                 None
             }
         }
     }
 
-    /// One datagram: data and working counter.
+    /// Sends one datagram. Returns data and working counter.
     pub fn datagram(&mut self, command: u8, adp: u16, ado: u16, data: &[u8]) -> (Vec<u8>, u16) {
         let bytes = self
             .frame(
@@ -101,7 +101,7 @@ impl Bus {
         self.segment.advance(self.now);
     }
 
-    /// Station addresses 0x1001, 0x1002 …
+    /// Sets station addresses 0x1001, 0x1002 …
     pub fn address_all(&mut self) -> u16 {
         let (_, n) = self.datagram(7, 0, 0, &[0]);
         for position in 0..n {
@@ -115,7 +115,7 @@ impl Bus {
         n
     }
 
-    /// Requests a state; (AL status, AL status code) afterwards.
+    /// Requests a state. Returns (AL status, AL status code) afterwards.
     pub fn request(&mut self, station: u16, control: u16) -> (u16, u16) {
         self.write(station, 0x120, &control.to_le_bytes());
         self.wait(1_000_000);
@@ -140,7 +140,7 @@ impl Bus {
         );
     }
 
-    /// Byte-aligned FMMU; kind 1 reads, 2 writes.
+    /// Sets a byte-aligned FMMU; kind 1 reads, 2 writes.
     pub fn fmmu(&mut self, station: u16, n: u16, logical: u32, len: u16, physical: u16, kind: u8) {
         let mut r = [0; 16];
         r[..4].copy_from_slice(&logical.to_le_bytes());
@@ -151,7 +151,8 @@ impl Bus {
         self.write(station, 0x600 + n * 16, &r);
     }
 
-    /// Mailboxes of [`coe_device`] and the EPOS4 unless said otherwise: 48 bytes at 0x1000 and 0x1030.
+    /// Goes to PreOp with the mailboxes of [`coe_device`] and the EPOS4 unless set otherwise: 48
+    /// bytes at 0x1000 and 0x1030.
     pub fn preop(&mut self, station: u16) {
         self.start_mailboxes(station);
         self.to(station, PREOP);
@@ -163,7 +164,7 @@ impl Bus {
         self.sm(station, 1, send.0, send.1, 0x22);
     }
 
-    /// Sends a mailbox message (header made here) and returns the reply without its header.
+    /// Sends a mailbox message with a generated header and returns the reply without its header.
     pub fn mailbox(&mut self, station: u16, kind: u8, payload: &[u8]) -> (u8, Vec<u8>) {
         self.send_mailbox(station, kind, payload);
         self.wait(1_000_000);
@@ -185,14 +186,14 @@ impl Bus {
         Some((data[5] & 0x0f, data[6..6 + len].to_vec()))
     }
 
-    /// A whole mailbox with its header; `None` while it is empty.
+    /// Returns a whole mailbox with its header; `None` while it is empty.
     pub fn fetch_raw(&mut self, station: u16) -> Option<Vec<u8>> {
         let (start, len) = self.mailboxes[1];
         let (data, wkc) = self.datagram(4, station, start, &vec![0; usize::from(len)]);
         (wkc == 1).then_some(data)
     }
 
-    /// One SDO request; everything after the CoE header.
+    /// Sends one SDO request. Returns everything after the CoE header.
     fn sdo(&mut self, station: u16, request: &[u8]) -> Result<Vec<u8>, Refusal> {
         let mut payload = vec![0, 0x20];
         payload.extend_from_slice(request);
@@ -250,7 +251,8 @@ impl Bus {
         self.download_with(station, 0, index, sub, data)
     }
 
-    /// `flags` 0x10: complete access. Up to 4 bytes go expedited, what fits one mailbox normal, else segmented.
+    /// `flags` 0x10: complete access. Up to 4 bytes go expedited, data that fits one mailbox
+    /// normal, else segmented.
     pub fn download_with(
         &mut self,
         station: u16,
@@ -288,7 +290,7 @@ impl Bus {
     }
 }
 
-/// A whole mailbox of this length with a header of one's own.
+/// Returns a whole mailbox of this length with the given header.
 pub fn message(len: usize, header: [u8; 6], payload: &[u8]) -> Vec<u8> {
     let mut out = header.to_vec();
     out.extend_from_slice(payload);
@@ -343,7 +345,7 @@ fn pdo(direction: Direction, index: u16, sm: u8, entries: &[(u16, u8, u16)]) -> 
     }
 }
 
-/// Digital I/O without a mailbox: 16 bits out at SM0, 16 bits in at SM1.
+/// Returns a digital I/O device without a mailbox: 16 bits out at SM0, 16 bits in at SM1.
 pub fn io_device() -> Device {
     Device {
         identity: Identity {
@@ -411,7 +413,8 @@ fn object(index: u16, items: Vec<ObjectItem>) -> Object {
     }
 }
 
-/// Mailboxes of 48 bytes, configurable PDOs, distributed clocks, some objects to play with.
+/// Returns a device with mailboxes of 48 bytes, configurable PDOs, distributed clocks and some test
+/// objects.
 pub fn coe_device() -> Device {
     let rw = Writable::Always;
     let mut limited = item(0, 32, 0, rw, &[5]);
@@ -500,7 +503,7 @@ pub fn sim_with(device: &Device, options: DeviceOptions) -> SimDevice {
     SimDevice::from_esi(device, &[], options).unwrap()
 }
 
-/// The device made for judging mailboxes.
+/// Returns the device for mailbox tests.
 pub fn mailbox_device() -> Device {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/judges/esi/mailbox.xml");
     let file = ecaxis_esi::parse(&std::fs::read(path).unwrap()).unwrap();
@@ -508,7 +511,7 @@ pub fn mailbox_device() -> Device {
     file.devices.into_iter().next().unwrap()
 }
 
-/// [`mailbox_device`] in PreOp with mailboxes of this many bytes each.
+/// Returns [`mailbox_device`] in PreOp with mailboxes of this many bytes each.
 pub fn mailbox_bus(len: u16, options: DeviceOptions) -> Bus {
     let mut bus = Bus::new(vec![sim_with(&mailbox_device(), options)]);
     bus.mailboxes = [(0x1000, len), (0x1600, len)];
@@ -524,7 +527,8 @@ pub fn fixtures() -> PathBuf {
     )
 }
 
-/// Bytes of a fixture; `None` (said aloud) where the fixtures are not there, a failure under CI.
+/// Returns the bytes of a fixture. A missing fixture is printed and gives `None`; on CI it is a
+/// failure.
 pub fn fixture(path: &str) -> Option<Vec<u8>> {
     match std::fs::read(fixtures().join(path)) {
         Ok(bytes) => Some(bytes),

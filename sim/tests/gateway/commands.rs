@@ -30,7 +30,7 @@ fn commands_and_node_states_row_by_row() {
     assert_eq!(states(&line), (op, [op, op, stopped]));
     assert_eq!(line.command(0x00, 1), Some(0x00));
     assert_eq!(states(&line), (op, [pre, op, stopped]));
-    // Get node state, after a heartbeat has told it.
+    // Get node state, after a heartbeat has reported it.
     line.cycles(120);
     for (target, state) in [(0, 1), (1, 0), (2, 1), (100, 4), (3, 5), (127, 5), (128, 5)] {
         assert_eq!(
@@ -39,7 +39,7 @@ fn commands_and_node_states_row_by_row() {
             "node {target}"
         );
     }
-    // Get general status: nothing is wrong.
+    // Get general status: no errors.
     assert_eq!(line.command(0x20, 0), Some(0x20));
     // No operation reflects the command.
     assert_eq!(line.command(0x73, 5), Some(0x73));
@@ -68,7 +68,7 @@ fn commands_and_node_states_row_by_row() {
         assert_eq!(line.command(0x10, 2), Some(0x10));
         line.command(0x01, 2);
     }
-    // Of the module: it initialises the network, nodes are configured anew.
+    // A reset of the module initialises the network and configures the nodes again.
     line.command(0x02, 0);
     line.cycles(400);
     assert_eq!(states(&line), (pre, [pre; 3]));
@@ -76,7 +76,7 @@ fn commands_and_node_states_row_by_row() {
 }
 
 #[test]
-fn a_command_needs_a_new_toggle_bit() {
+fn command_needs_a_new_toggle_bit() {
     let mut line = Line::new("GW16", three_drives());
     (line.outputs[0], line.outputs[1]) = (0x01, 128);
     line.cycles(50);
@@ -89,7 +89,7 @@ fn a_command_needs_a_new_toggle_bit() {
     line.cycles(50);
     assert_eq!(line.gateway().nmt_state(), NmtState::Operational);
     assert_eq!(line.status(), [0x81, 0]);
-    // The same, and another one with the same toggle, again and again.
+    // The same command, and another one with the same toggle, repeatedly.
     line.outputs[0] = 0x80;
     line.cycles(50);
     assert_eq!(line.gateway().nmt_state(), NmtState::Operational);
@@ -101,7 +101,7 @@ fn a_command_needs_a_new_toggle_bit() {
 }
 
 #[test]
-fn a_command_waits_for_the_end_of_the_initialisation() {
+fn command_waits_for_the_end_of_the_initialisation() {
     let mut line = Line::at_once("GW16", three_drives());
     assert_eq!(line.gateway().nmt_state(), NmtState::Initialising);
     (line.outputs[0], line.outputs[1]) = (0x81, 128);
@@ -115,7 +115,7 @@ fn a_command_waits_for_the_end_of_the_initialisation() {
 }
 
 #[test]
-fn outside_op_no_operation_stands() {
+fn status_word_shows_no_operation_outside_op() {
     let mut line = Line::new("GW16", three_drives());
     assert_eq!(line.command(0x01, 128), Some(0x01));
     line.bus.to(S, SAFEOP);
@@ -125,7 +125,7 @@ fn outside_op_no_operation_stands() {
         [0xf0, 0],
         "toggle bit kept"
     );
-    // What the buffer holds when the fieldbus is back is old: same toggle.
+    // The buffer's content is old when the fieldbus returns: same toggle.
     line.bus.to(S, OP);
     line.cycles(20);
     assert_eq!(line.gateway().nmt_state(), NmtState::Operational);
@@ -134,7 +134,7 @@ fn outside_op_no_operation_stands() {
 }
 
 #[test]
-fn nodes_start_with_the_module_unless_the_main_device_does_it() {
+fn nodes_start_with_the_module_unless_the_main_device_starts_them() {
     let mut line = Line::new("GW16", three_drives());
     assert_eq!(line.command(0x01, 0), Some(0x01));
     for id in [1, 2, 100] {
@@ -143,7 +143,7 @@ fn nodes_start_with_the_module_unless_the_main_device_does_it() {
 }
 
 #[test]
-fn as_a_slave_the_module_commands_only_itself() {
+fn slave_module_commands_only_itself() {
     let mut options = three_drives();
     options.start_up = 0;
     let mut line = Line::new("GW16", options);
@@ -156,7 +156,7 @@ fn as_a_slave_the_module_commands_only_itself() {
 }
 
 #[test]
-fn two_runs_are_the_same() {
+fn gateway_runs_are_reproducible() {
     let run = || {
         let mut line = Line::new("GW16", three_drives());
         line.command(0x01, 128);
@@ -174,7 +174,7 @@ fn two_runs_are_the_same() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(16))]
     #[test]
-    fn random_outputs_and_requests_never_stop_the_gateway(
+    fn gateway_survives_random_outputs_and_requests(
         outputs in prop::collection::vec(prop::array::uniform16(any::<u8>()), 1..40),
         requests in prop::collection::vec(
             (prop_oneof![Just(0x2fu8), Just(0x2b), Just(0x23), Just(0x22), Just(0x40), any::<u8>()],

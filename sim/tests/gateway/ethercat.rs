@@ -1,9 +1,9 @@
-//! What EtherCAT sees: sizes, PDOs, objects (manual §5.4, §7.3.4, §8).
+//! The EtherCAT side: sizes, PDOs, objects (manual §5.4, §7.3.4, §8).
 
 use super::*;
 
 #[test]
-fn the_gateway_maps_as_many_pdos_and_bytes_as_it_is_set_to() {
+fn gateway_maps_the_configured_pdos_and_bytes() {
     for (size, pdos) in [
         (2, vec![2]),
         (16, vec![16]),
@@ -57,7 +57,7 @@ fn the_gateway_maps_as_many_pdos_and_bytes_as_it_is_set_to() {
 }
 
 #[test]
-fn its_standard_objects_are_the_manuals() {
+fn gateway_standard_objects_match_the_manual() {
     let mut bus = Bus::new(vec![build("GW512", GatewayOptions::default()).unwrap()]);
     bus.address_all();
     let (learned, mapped) = bring_up(&mut bus, S).unwrap();
@@ -86,7 +86,7 @@ fn its_standard_objects_are_the_manuals() {
         assert_eq!(found, Ok(value), "{index:04x}:{sub:02x}");
     }
     assert_eq!(mailbox.upload(&mut bus, 0x1008, 0), Ok(b"GW512".to_vec()));
-    // Everything is fixed; process data are read-only when accessed acyclically.
+    // All PDOs are fixed; process data is read-only over SDO.
     for (index, sub, data) in [
         (0x1c12, 0, &[0][..]),
         (0x1600, 0, &[0]),
@@ -96,13 +96,13 @@ fn its_standard_objects_are_the_manuals() {
         let error = mailbox.download(&mut bus, index, sub, data).unwrap_err();
         assert!(error.contains("06010002"), "{error}");
     }
-    // Sizes belong to the secondary network's dictionary.
+    // The sizes are objects of the secondary network's dictionary.
     let error = mailbox.upload(&mut bus, 0x3000, 0).unwrap_err();
     assert!(error.contains("06020000"), "{error}");
 }
 
 #[test]
-fn outputs_and_inputs_are_read_by_sdo_too() {
+fn gateway_process_data_is_readable_by_sdo() {
     let mut line = Line::new("GW16", three_drives());
     line.outputs[40] = 0xa5;
     line.cycles(3);
@@ -117,7 +117,7 @@ fn outputs_and_inputs_are_read_by_sdo_too() {
 }
 
 #[test]
-fn sizes_written_by_a_configuration_tool_count_after_a_restart() {
+fn sizes_from_a_configuration_tool_apply_after_a_restart() {
     let mut line = Line::new("GW16", GatewayOptions::default());
     assert_eq!((line.outputs.len(), line.inputs.len()), (16, 16));
     for (index, value, expected) in [
@@ -158,7 +158,7 @@ fn sizes_written_by_a_configuration_tool_count_after_a_restart() {
     line.gateway_mut().configure(0x1010, 1, b"save").unwrap();
     let mapped = restart(&mut line);
     assert_eq!((mapped.outputs, mapped.inputs), (20, 300));
-    // A MainDevice that still believes in 16 bytes is refused.
+    // A MainDevice that still uses 16 bytes is refused.
     line.bus.to(S, PREOP);
     line.bus.write(S, 0x816, &[0]);
     line.bus.sm(S, 2, 0x1200, 16, 0x64);
@@ -192,7 +192,7 @@ fn sizes_beyond_the_fieldbus_are_not_stored() {
 }
 
 #[test]
-fn an_eeprom_image_is_enough_to_know_a_gateway_by() {
+fn gateway_is_detected_from_its_eeprom_image() {
     let image = build("GW512", GatewayOptions::default())
         .unwrap()
         .sii()
@@ -203,7 +203,7 @@ fn an_eeprom_image_is_enough_to_know_a_gateway_by() {
     bus.address_all();
     let (_, mapped) = bring_up(&mut bus, S).unwrap();
     assert_eq!((mapped.outputs, mapped.inputs), (512, 512));
-    // Nodes need a gateway in front of them.
+    // Nodes need a gateway.
     let options = DeviceOptions {
         gateway: Some(GatewayOptions::default()),
         ..DeviceOptions::default()

@@ -38,7 +38,8 @@ fn build(name: &str, gateway: GatewayOptions) -> Result<SimDevice, String> {
     SimDevice::from_esi(device, &[], options).map_err(|error| error.to_string())
 }
 
-/// A MainDevice's view of one gateway in Op: process data each millisecond, commands in the control word.
+/// A MainDevice with one gateway in Op: process data each millisecond, commands in the control
+/// word.
 struct Line {
     bus: Bus,
     learned: Learned,
@@ -89,8 +90,8 @@ impl Line {
         [self.inputs[0], self.inputs[1]]
     }
 
-    /// Issues a command with the toggle bit turned over, waits, returns the status word's first byte without toggle
-    /// bit; `None` if the command was not acknowledged.
+    /// Issues a command with the toggle bit inverted and waits. Returns the status word's first
+    /// byte without toggle bit; `None` without an acknowledgement.
     fn command(&mut self, command: u8, node: u8) -> Option<u8> {
         self.toggle = !self.toggle;
         let toggle = u8::from(self.toggle) << 7;
@@ -156,7 +157,8 @@ fn link(pdo: u8, at: u16, contents: &[(u16, u8, u8)]) -> PdoLink {
     }
 }
 
-/// Controlword and target position out, mode out, statusword and position in, mode in: ten bytes a node.
+/// Returns a node with ten bytes: Controlword, target position and mode out; Statusword, position
+/// and mode in.
 fn node(id: u8, drive: Epos, at: u16) -> NodeOptions {
     NodeOptions {
         outputs: vec![

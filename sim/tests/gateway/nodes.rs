@@ -1,11 +1,12 @@
-//! The drives behind it: objects, PDOs, motion (application note "CANopen Basic Information").
+//! The drives behind the gateway: objects, PDOs, motion (application note "CANopen Basic
+//! Information").
 
 use super::*;
 
-/// A node without a partner repeats its boot-up message until the gateway listens; the reset that the gateway then
-/// orders must take that message with it.
+/// A node without a partner repeats its boot-up message until the gateway listens. The gateway's
+/// reset must drop that message.
 #[test]
-fn one_node_alone_starts_whatever_its_model() {
+fn single_node_starts_for_every_model() {
     for (id, drive) in [(1, Epos::E24_1), (2, Epos::E24_5), (100, Epos::E70_10)] {
         for supervision in [
             Supervision::None,
@@ -27,14 +28,14 @@ fn one_node_alone_starts_whatever_its_model() {
             let mut line = Line::new("GW16", options);
             assert_eq!(line.command(0x01, 0x80), Some(0x01), "{drive:?}");
             line.cycles(100);
-            // The Statusword that the drive itself put into its PDO.
+            // The Statusword that the drive sends in its PDO.
             assert_eq!(line.input(2, 2) & 0x4f, 0x40, "{drive:?} {supervision:?}");
         }
     }
 }
 
 #[test]
-fn three_models_differ_as_they_do() {
+fn epos_models_report_their_hardware() {
     let mut line = Line::new("GW16", three_drives());
     for (id, hardware) in [(1, 0x6010), (2, 0x6210), (100, 0x6410)] {
         let mut read = |index, sub| line.sdo(id, index, sub, None);
@@ -58,11 +59,7 @@ fn three_models_differ_as_they_do() {
         Err(0x0607_0012)
     );
     assert_eq!(line.sdo(1, 0x6041, 0, Some(&[1, 2])), Err(0x0601_0002));
-    assert_eq!(
-        line.sdo(7, 0x1000, 0, None),
-        Err(0x0504_0000),
-        "nobody there"
-    );
+    assert_eq!(line.sdo(7, 0x1000, 0, None), Err(0x0504_0000), "no node");
     let too_high = NodeOptions::new(16, Epos::E24_1);
     let options = GatewayOptions {
         nodes: vec![too_high],
@@ -73,11 +70,11 @@ fn three_models_differ_as_they_do() {
 
 /// PDO configuration, the application note step by step.
 #[test]
-fn pdos_of_a_node_are_configured_as_the_note_says() {
+fn node_pdos_are_configured_as_in_the_application_note() {
     let mut line = Line::new("GW16", three_drives());
     let u32_ = u32::to_le_bytes;
     let mut write = |index, sub, data: &[u8]| line.sdo(2, index, sub, Some(data)).map(drop);
-    // COB-IDs lie in their range.
+    // COB-IDs have a range.
     assert_eq!(write(0x1401, 1, &u32_(0x333)), Ok(()));
     assert_eq!(write(0x1401, 1, &u32_(0x300)), Err(0x0609_0032));
     assert_eq!(write(0x1401, 1, &u32_(0x380)), Err(0x0609_0031));
@@ -85,7 +82,7 @@ fn pdos_of_a_node_are_configured_as_the_note_says() {
     assert_eq!(write(0x1401, 2, &[1]), Ok(()));
     assert_eq!(write(0x1401, 2, &[255]), Ok(()));
     assert_eq!(write(0x1401, 2, &[2]), Err(0x0609_0030));
-    // Disabled, filled, counted.
+    // Disabled, filled, enabled by the count.
     assert_eq!(write(0x1601, 1, &u32_(0x60ff_0020)), Err(0x0800_0022));
     assert_eq!(write(0x1601, 0, &[0]), Ok(()));
     for mapping in [
@@ -123,13 +120,13 @@ fn pdos_of_a_node_are_configured_as_the_note_says() {
         assert_eq!(write(0x1a01, 1, &u32_(mapping)), Ok(()), "{mapping:08x}");
         assert_eq!(write(0x1a01, 0, &[1]), Ok(()));
     }
-    // Operational: too late.
+    // In Operational the mapping is fixed.
     line.command(0x01, 128);
     assert_eq!(line.sdo(2, 0x1a01, 0, Some(&[0])), Err(0x0800_0022));
 }
 
 #[test]
-fn drives_move_through_the_buffers() {
+fn drives_move_through_the_gateway_buffers() {
     let mut line = Line::new("GW16", three_drives());
     line.command(0x01, 128);
     for (at, id) in [(2, 1), (12, 2), (22, 100)] {
@@ -173,7 +170,7 @@ fn maxon_modes_follow_their_own_set_points() {
     options.nodes[0].outputs[0].contents = vec![(0x6040, 0, 16), (0x2062, 0, 32)];
     let mut line = Line::new("GW16", options);
     line.command(0x01, 128);
-    // Position mode: the set-point itself, no profile.
+    // Position mode: the set-point itself, without a profile.
     enable(&mut line, 2, -1);
     line.output(4, 500, 4);
     line.cycles(200);
@@ -188,7 +185,7 @@ fn maxon_modes_follow_their_own_set_points() {
         "{}",
         line.input(14, 4)
     );
-    // Current mode: mA; a blocked shaft holds it there.
+    // Current mode: mA. The blocked shaft keeps the current constant.
     line.gateway_mut()
         .node_mut(100)
         .unwrap()
@@ -206,7 +203,7 @@ fn maxon_modes_follow_their_own_set_points() {
 }
 
 #[test]
-fn a_faulted_drive_sends_its_emergency() {
+fn faulted_drive_sends_its_emergency() {
     let mut line = Line::new("GW16", three_drives());
     line.command(0x01, 128);
     enable(&mut line, 12, 1);
@@ -225,7 +222,7 @@ fn a_faulted_drive_sends_its_emergency() {
 }
 
 #[test]
-fn the_bus_keeps_its_order_and_its_time() {
+fn can_frames_keep_their_order_and_timing() {
     let mut line = Line::new("GW16", three_drives());
     line.command(0x01, 128);
     line.cycles(100);
@@ -235,7 +232,7 @@ fn the_bus_keeps_its_order_and_its_time() {
         let ((before, first), (after, second)) = (pair[0], pair[1]);
         let least = second.wire_bits() * 1000;
         assert!(after - before >= least, "{first:?} {second:?}");
-        // PDOs that a SYNC sets off come by identifier, one right after the other.
+        // PDOs of one SYNC follow each other directly, ordered by identifier.
         if first.id >= 0x181 && second.id < 0x500 && second.id > 0x180 && after - before == least {
             assert!(first.id < second.id, "{first:?} {second:?}");
         }
@@ -253,7 +250,7 @@ fn the_bus_keeps_its_order_and_its_time() {
 }
 
 #[test]
-fn an_sdo_client_of_the_secondary_network_reads_texts_in_segments() {
+fn sdo_client_of_the_secondary_network_reads_texts_in_segments() {
     let mut line = Line::new("GW16", GatewayOptions::default());
     let mut ask = |request: [u8; 8]| line.gateway_mut().serve_sdo(&request).unwrap();
     let first = ask([0x40, 0x08, 0x10, 0, 0, 0, 0, 0]);

@@ -1,16 +1,16 @@
-//! Booting and watching over nodes (manual §6.4, §7.2.3).
+//! Booting and monitoring of nodes (manual §6.4, §7.2.3).
 
 use super::*;
 
 #[test]
-fn a_silent_node_is_missed_after_its_heartbeat_time() {
+fn silent_node_is_reported_after_its_heartbeat_time() {
     let mut line = Line::new("GW16", three_drives());
     line.command(0x01, 128);
     line.cycles(200);
     assert_eq!(line.status(), [0x81, 0]);
     let position = line.inputs[12..18].to_vec();
     line.gateway_mut().set_node_silent(2, true);
-    // 100 ms of heartbeat, half of it patience; the last one may just have come.
+    // A heartbeat of 100 ms plus half of it as tolerance. The last heartbeat may just have come.
     line.cycles(45);
     assert_eq!(line.status()[1], 0);
     line.cycles(110);
@@ -20,14 +20,14 @@ fn a_silent_node_is_missed_after_its_heartbeat_time() {
     assert_eq!(line.command(0x20, 0), Some(0x24), "heartbeat error");
     assert_eq!(line.inputs[12..18], position, "frozen");
     assert_eq!(line.gateway().configuration(0x1f82, 2), Ok(vec![1]));
-    // The emergency, on the bus and in the list.
+    // The emergency is on the bus and in the error list.
     let error = number(&line.gateway().configuration(0x1003, 1).unwrap());
     assert_eq!(error, 0x0002_8130);
-    // The lowest of several.
+    // The lowest of several nodes.
     line.gateway_mut().set_node_silent(1, true);
     line.cycles(200);
     assert_eq!(line.status()[1], 1);
-    // Back: it boots, is configured and started, and sends again.
+    // A returning node boots, is configured and started, and sends again.
     line.gateway_mut().set_node_silent(1, false);
     line.gateway_mut().set_node_silent(2, false);
     line.cycles(400);
@@ -39,7 +39,7 @@ fn a_silent_node_is_missed_after_its_heartbeat_time() {
 }
 
 #[test]
-fn a_fault_script_silences_nodes() {
+fn fault_script_silences_nodes() {
     let mut line = Line::new("GW16", three_drives());
     line.command(0x01, 128);
     let script = "[[fault]]\nkind = \"node-silent\"\nnode = 100\nfor = \"300ms\"\n";
@@ -65,7 +65,7 @@ fn a_fault_script_silences_nodes() {
 }
 
 #[test]
-fn what_a_lost_mandatory_node_does_to_the_others() {
+fn mandatory_node_loss_acts_on_the_others_by_0x1f80() {
     let run = |start_up: u32, mandatory: bool| {
         let mut options = three_drives();
         options.start_up = start_up;
@@ -86,7 +86,7 @@ fn what_a_lost_mandatory_node_does_to_the_others() {
 }
 
 #[test]
-fn without_a_mandatory_node_the_network_is_not_started() {
+fn network_does_not_start_without_a_mandatory_node() {
     let mut options = three_drives();
     options.nodes[1].mandatory = true;
     let mut line = Line::new("GW16", options);
@@ -95,7 +95,7 @@ fn without_a_mandatory_node_the_network_is_not_started() {
     line.cycles(400);
     assert_eq!(line.command(0x01, 128), None);
     assert_eq!(line.gateway().nmt_state(), NmtState::PreOperational);
-    // The command stands; it is done as soon as it can be.
+    // The command stays pending and runs as soon as possible.
     line.gateway_mut().set_node_silent(2, false);
     line.cycles(400);
     assert_eq!(line.gateway().nmt_state(), NmtState::Operational);
@@ -103,8 +103,8 @@ fn without_a_mandatory_node_the_network_is_not_started() {
 }
 
 #[test]
-fn node_guarding_asks_and_gives_up() {
-    // No PDOs, so that the frames remembered reach further back.
+fn node_guarding_fails_after_unanswered_requests() {
+    // Without PDOs the frame log reaches further back.
     let nodes = [1, 2].map(|id| NodeOptions::new(id, Epos::E24_1));
     let mut options = GatewayOptions {
         nodes: nodes.into(),
@@ -138,12 +138,12 @@ fn node_guarding_asks_and_gives_up() {
     line.cycles(120);
     assert_eq!(line.status()[1], 0);
     line.cycles(130);
-    assert_eq!(line.status()[1], 1, "node 2 is missed by nobody");
+    assert_eq!(line.status()[1], 1, "node 2 is not monitored");
     assert_eq!(line.command(0x10, 1), Some(0x16));
 }
 
 #[test]
-fn a_node_that_is_not_what_it_should_be_stays_in_pre_operational() {
+fn node_with_a_wrong_identity_stays_in_pre_operational() {
     let mut options = three_drives();
     let revision = |minor: u32| (0x2033_0000 + minor).to_le_bytes().to_vec();
     options.objects = vec![
@@ -165,7 +165,7 @@ fn a_node_that_is_not_what_it_should_be_stays_in_pre_operational() {
 }
 
 #[test]
-fn a_refused_configuration_is_a_software_error() {
+fn refused_configuration_is_a_software_error() {
     let mut options = three_drives();
     options.nodes[1].objects = vec![(0x6041, 0, vec![0, 0])];
     let line = Line::new("GW16", options);
@@ -174,7 +174,7 @@ fn a_refused_configuration_is_a_software_error() {
 }
 
 #[test]
-fn a_node_that_dies_while_it_boots_is_a_timeout() {
+fn node_lost_during_boot_causes_a_timeout() {
     let mut line = Line::at_once("GW16", three_drives());
     // The gateway resets the communication of all nodes when it starts; they boot a second time.
     while sent(&line, 0x764).len() < 2 {
@@ -184,14 +184,14 @@ fn a_node_that_dies_while_it_boots_is_a_timeout() {
     line.cycles(700);
     let error = number(&line.gateway().configuration(0x1003, 1).unwrap());
     assert_eq!(error, 0x0764_6161, "SDO timeout, node 100");
-    // The others are not held up for good.
+    // The other nodes are not blocked.
     assert_eq!(line.command(0x01, 0), Some(0x01));
     let states = [1, 2].map(|id| line.node(id).nmt_state());
     assert_eq!(states, [NmtState::Operational; 2]);
 }
 
 #[test]
-fn a_gateway_alone_is_error_passive() {
+fn gateway_alone_becomes_error_passive() {
     let mut line = Line::new("GW16", GatewayOptions::default());
     assert_eq!(line.command(0x20, 0), Some(0x22));
     assert_eq!(line.gateway().configuration(0x1003, 0), Ok(vec![1]));
@@ -199,11 +199,11 @@ fn a_gateway_alone_is_error_passive() {
         line.gateway().configuration(0x1003, 1),
         Ok(vec![0x20, 0x81, 0, 0])
     );
-    // A node appears: what has waited goes out, the emergency too.
+    // When a node appears, the waiting frames are sent, including the emergency.
     assert_eq!(line.command(0x10, 128), Some(0x15));
     let mut line = Line::new("GW16", three_drives());
     assert_eq!(line.command(0x20, 0), Some(0x20));
-    // A node at another bit rate neither hears nor acknowledges.
+    // A node at another bit rate neither receives nor acknowledges.
     line.sdo(2, 0x2001, 0, Some(&[2, 0])).unwrap();
     line.sdo(2, 0x1010, 1, Some(b"save")).unwrap();
     line.command(0x02, 2);

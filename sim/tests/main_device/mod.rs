@@ -1,11 +1,11 @@
-//! A MainDevice that knows nothing but the standard: it learns a SubDevice from its EEPROM and, over CoE,
-//! from its PDO assignment, configures SyncManagers and FMMUs and takes it to Op. No ESI, no code of the
-//! simulator's and none of the project's own MainDevice.
+//! A MainDevice that follows only the standard. It learns a SubDevice from its EEPROM and, over
+//! CoE, from its PDO assignment. It then configures SyncManagers and FMMUs and goes to Op. It uses
+//! no ESI and shares no code with the simulator or the project's own MainDevice.
 #![allow(dead_code, reason = "every test binary uses its own part")]
 
 use super::common::{Bus, INIT, OP, PREOP, SAFEOP};
 
-/// Where a SyncManager's area is and what it is for.
+/// The area and usage of a SyncManager.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sm {
     pub start: u16,
@@ -13,7 +13,7 @@ pub struct Sm {
     pub control: u8,
     /// 1 mailbox out, 2 mailbox in, 3 outputs, 4 inputs.
     pub usage: u8,
-    /// Of process data.
+    /// The bits of process data.
     pub bits: usize,
 }
 
@@ -24,9 +24,9 @@ pub struct Learned {
     pub sms: Vec<Sm>,
     /// Protocols of SII word 0x1C.
     pub protocols: u16,
-    /// Receive and send mailbox: start and length; zero without mailbox.
+    /// Receive and send mailbox: start and length; zero without a mailbox.
     pub mailbox: [(u16, u16); 2],
-    /// Of the last mailbox message sent.
+    /// The counter of the last mailbox message sent.
     counter: u8,
 }
 
@@ -34,14 +34,15 @@ pub struct Learned {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Mapped {
     pub logical: u32,
-    /// Bytes.
+    /// The output size in bytes.
     pub outputs: usize,
     pub inputs: usize,
     fmmus: u16,
 }
 
 impl Mapped {
-    /// Of an LRW over all of it: 2 for outputs, 1 for inputs, whatever number of FMMUs carries them.
+    /// Returns the working counter of an LRW over the whole area: 2 for outputs plus 1 for inputs,
+    /// regardless of the number of FMMUs.
     pub fn working_counter(&self) -> u16 {
         2 * u16::from(self.outputs > 0) + u16::from(self.inputs > 0)
     }
@@ -59,7 +60,7 @@ fn word(image: &[u8], at: usize) -> u16 {
         .map_or(0, |b| u16::from_le_bytes([b[0], b[1]]))
 }
 
-/// The EEPROM through its registers, 4 or 8 bytes at a time, up to the end of the categories.
+/// Reads the EEPROM through its registers, 4 or 8 bytes at a time, up to the end of the categories.
 pub fn read_eeprom(bus: &mut Bus, station: u16) -> Vec<u8> {
     bus.write(station, 0x500, &[0]);
     let mut image = Vec::new();
@@ -88,7 +89,7 @@ pub fn read_eeprom(bus: &mut Bus, station: u16) -> Vec<u8> {
     }
 }
 
-/// Categories 40 to 51 as far as they matter here.
+/// Reads the parts of categories 40 to 51 that are needed here.
 pub fn learn(bus: &mut Bus, station: u16) -> Learned {
     let image = read_eeprom(bus, station);
     let pair = |at| (word(&image, at), word(&image, at + 1));
@@ -138,7 +139,7 @@ pub fn learn(bus: &mut Bus, station: u16) -> Learned {
     learned
 }
 
-/// A request to the mailbox and its reply, at whatever place and length the mailboxes have.
+/// A mailbox client for mailboxes at any address and of any length.
 pub struct Mailbox {
     station: u16,
     areas: [(u16, u16); 2],
@@ -179,7 +180,7 @@ impl Mailbox {
         Err("no reply".into())
     }
 
-    /// An SDO upload; an abort is an error with its code.
+    /// Runs an SDO upload. An abort is an error with its code.
     pub fn upload(&mut self, bus: &mut Bus, index: u16, sub: u8) -> Result<Vec<u8>, String> {
         let [low, high] = index.to_le_bytes();
         let first = self.exchange(bus, &[0, 0x20, 0x40, low, high, sub, 0, 0, 0, 0])?;
@@ -209,7 +210,7 @@ impl Mailbox {
         Ok(data)
     }
 
-    /// An expedited SDO download of 1 to 4 bytes.
+    /// Runs an expedited SDO download of 1 to 4 bytes.
     pub fn download(
         &mut self,
         bus: &mut Bus,
@@ -245,7 +246,7 @@ fn step(bus: &mut Bus, station: u16, state: u8) -> Result<(), String> {
     }
 }
 
-/// Init → PreOp with the mailboxes the EEPROM names.
+/// Goes from Init to PreOp with the mailboxes of the EEPROM.
 pub fn to_preop(bus: &mut Bus, station: u16, learned: &Learned) -> Result<(), String> {
     if learned.mailbox[0].1 > 0 {
         for (n, area) in (0..).zip(learned.mailbox) {
@@ -256,7 +257,7 @@ pub fn to_preop(bus: &mut Bus, station: u16, learned: &Learned) -> Result<(), St
     step(bus, station, PREOP)
 }
 
-/// Bits each process-data SyncManager carries, read from 0x1C10 + n and the PDOs assigned there.
+/// Reads the bits of each process-data SyncManager from 0x1C10 + n and the PDOs assigned there.
 fn ask_assignment(bus: &mut Bus, station: u16, learned: &mut Learned) -> Result<(), String> {
     let mut mailbox = Mailbox::new(station, learned);
     for (n, sm) in (0..).zip(&mut learned.sms) {
@@ -277,7 +278,7 @@ fn ask_assignment(bus: &mut Bus, station: u16, learned: &mut Learned) -> Result<
     Ok(())
 }
 
-/// Process-data SyncManagers and FMMUs; areas that follow each other share an FMMU.
+/// Configures process-data SyncManagers and FMMUs. Adjacent areas share an FMMU.
 pub fn map(bus: &mut Bus, station: u16, learned: &Learned, logical: u32) -> Result<Mapped, String> {
     let mut mapped = Mapped {
         logical,
@@ -323,8 +324,9 @@ pub fn map(bus: &mut Bus, station: u16, learned: &Learned, logical: u32) -> Resu
     Ok(mapped)
 }
 
-/// Init → Op; what stood in the way otherwise. Working counters are looked at in every state: in PreOp an
-/// application holds its SyncManagers closed, which nobody does where the ESC emulates the device.
+/// Goes from Init to Op, or returns the cause of the failure. Checks working counters in every
+/// state: in PreOp an application keeps its SyncManagers closed, but an ESC with device emulation
+/// does not.
 pub fn bring_up(bus: &mut Bus, station: u16) -> Result<(Learned, Mapped), String> {
     let mut learned = learn(bus, station);
     step(bus, station, INIT)?;

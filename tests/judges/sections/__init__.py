@@ -1,4 +1,4 @@
-"""What the judges look at, section by section; each serves a bus of its own."""
+"""The sections of the judges; each section runs its own bus."""
 
 import contextlib
 import os
@@ -30,7 +30,7 @@ OWN = rig.ROOT / "configs/esi"
 
 @contextlib.contextmanager
 def patience(master):
-    """SOEM takes an answer that it has given up for that of its next question; this computer may stall for a second."""
+    """SOEM takes a late reply for that of its next request, and this computer may stall for a second."""
     timeouts = pysoem.settings.timeouts
     names = ("ret", "eeprom", "tx_mailbox", "rx_mailbox")
     before = {name: getattr(timeouts, name) for name in names}
@@ -46,16 +46,16 @@ def patience(master):
 
 @dataclass
 class Bench:
-    """Where a section works."""
+    """The environment of a section."""
 
     program: Path
-    # The simulated bus answers here …
+    # The interface of the simulated bus.
     bus: str
-    # … and the MainDevice asks here.
+    # The interface of the MainDevice.
     nic: str
     folder: Path
     report: Report
-    # No samples where there is much of a kind.
+    # Checks every item instead of samples.
     everything: bool = False
     on_ci: bool = bool(os.environ.get("CI"))
 
@@ -76,21 +76,21 @@ class Bench:
 
     @contextlib.contextmanager
     def serve(self, machine, name, faults=None, options=(), steady=True):
-        """The bus, served, recorded, and the recording judged."""
+        """Runs and records the bus, then judges the recording."""
         recording = self.folder / f"{name}.pcapng"
         with rig.served(self.program, machine, self.bus, faults, options) as bus:
             with rig.recorded(self.nic, recording, steady):
                 yield bus
             code, output = bus.end()
             self.report.equal("the simulated bus ends in order on SIGINT", code, 0)
-            # What a section reads itself, as JSON, is not worth reading.
+            # JSON output is read by the section itself and not printed.
             for line in output.strip().splitlines() if output[:1] != "{" else []:
                 self.report.note(line)
         judge(self, recording, [device.dc for device in machine.devices], steady)
 
     @contextlib.contextmanager
     def master(self, second=None, patient=True):
-        """pysoem; with a second interface, with cable redundancy. Where frames are meant to vanish it is not to wait for them."""
+        """Opens pysoem, with cable redundancy over a second NIC. If frames are lost on purpose, it does not wait."""
         master = pysoem.Master()
         master.open(self.nic, second)
         try:
@@ -102,7 +102,7 @@ class Bench:
             master.close()
 
     def found(self, master, machine):
-        """Every device, with the identity its ESI gives."""
+        """Checks every device against the identity in its ESI."""
         self.report.equal("config_init finds all", master.config_init(), len(machine.devices))
         if len(master.slaves) != len(machine.devices):
             return

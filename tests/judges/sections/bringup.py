@@ -1,4 +1,4 @@
-"""The way to Op, cyclic exchange, and a drive that moves."""
+"""Bring-up to Op, cyclic exchange, and a moving drive."""
 
 import math
 
@@ -28,7 +28,7 @@ def mapped(bench, master, machine, size):
 
 
 def many(bench, cycle, count):
-    """A stretch in which the computer stalled is left behind by the next; a wrong working counter never is."""
+    """A time with a stall is repeated; a wrong working counter always fails."""
     cycle.forget()
     for _ in range(3):
         missed = -cycle.missed
@@ -53,7 +53,7 @@ def bringup(bench):
             if device.dc:
                 slave.dc_sync(True, cyclic.PERIOD)
             if device.rx_bits:
-                # Longer than this computer may stall.
+                # Longer than any stall of this computer.
                 slave.set_watchdog("processdata", 2_000)
         wkc = expected_wkc(machine)
         cycle = cyclic.to_op(master, wkc)

@@ -1,4 +1,4 @@
-"""Emitted EEPROM images, read by other people's MainDevices: each is the device that its ESI file describes."""
+"""Emitted EEPROM images, read by other MainDevices: each matches the ESI file of its device."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ import soem
 from .ethercrab import TRIES
 from .ethercrab import program as crab_program
 
-# Of a file with more, so many evenly spread; `--all` for every one.
+# The maximum number of devices per file, evenly spread; `--all` for every device.
 SAMPLE = 40
 # Devices on one bus.
 BUS = 40
@@ -52,7 +52,7 @@ class Machine:
 
 
 def sample(devices):
-    """Always the same ones: first, last and evenly between."""
+    """Returns a fixed sample: first, last and evenly between."""
     if len(devices) <= SAMPLE:
         return devices
     return [devices[n * (len(devices) - 1) // (SAMPLE - 1)] for n in range(SAMPLE)]
@@ -106,7 +106,7 @@ def buses(report, everything):
 
 
 class Disagreements:
-    """What differs, by kind of fact; each kind becomes one check."""
+    """The differences by kind; each kind becomes one check."""
 
     def __init__(self):
         self.compared = {}
@@ -127,7 +127,7 @@ class Disagreements:
 
 
 def used(fmmus):
-    """Without what fills the word up."""
+    """Removes the padding to a whole word."""
     while fmmus and not fmmus[-1]:
         fmmus = fmmus[:-1]
     return fmmus
@@ -138,7 +138,7 @@ def text_same(limit):
 
 
 def crc(config):
-    """CRC-8, polynomial 0x07, begun with 0xff."""
+    """CRC-8, polynomial 0x07, start value 0xff."""
     value = 0xFF
     for byte in config:
         value ^= byte

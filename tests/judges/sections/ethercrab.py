@@ -1,4 +1,4 @@
-"""A second MainDevice that nobody here wrote: ethercrab with its own tasks."""
+"""A second, independent MainDevice: ethercrab with its own tasks."""
 
 import os
 import subprocess
@@ -6,12 +6,12 @@ import subprocess
 import rig
 
 CYCLES = 500
-# Answers that come late end ethercrab's tasks for good; one more try on a stalling computer.
+# Late replies end ethercrab's tasks permanently, so a stalling computer gets one more try.
 TRIES = 2
 
 
 def program():
-    """Built by cargo, as the program under test is."""
+    """Returns the program, built by cargo like the program under test."""
     manifest = rig.HERE / "ethercrab/Cargo.toml"
     target = rig.target()
     build = ["cargo", "build", "--quiet", "--manifest-path", str(manifest), "--target-dir", str(target)]

@@ -1,4 +1,4 @@
-"""What goes wrong, and the way back to Op with `recover` and `reconfig`."""
+"""Faults, and the return to Op with `recover` and `reconfig`."""
 
 import json
 import time
@@ -38,7 +38,7 @@ def watchdog(bench):
         report.equal("the watchdog reads back", master.slaves[0].get_watchdog("processdata"), 300.0)
         time.sleep(1)
         for name, device, state in zip(machine.names, machine.devices, cyclic.states(master)):
-            # Without an application behind it the controller clears the outputs and says nothing.
+            # Without an application, the controller clears the outputs and reports no error.
             watched = device.rx_bits > 0 and device.mailbox
             report.equal(f"{name} after a second's silence", state, "SafeOp+Error" if watched else "Op")
         codes = {s.al_status for s, d in zip(master.slaves, machine.devices) if d.rx_bits and d.mailbox}
@@ -47,7 +47,7 @@ def watchdog(bench):
 
 
 def noise(bench):
-    """Frames that are lost, late, doubled or broken: cycles are missed, but none is answered wrongly."""
+    """Lost, late, duplicated or damaged frames: cycles are missed, but no reply is wrong."""
     report = bench.report
     report.section("a noisy line")
     machine = bench.machine()
@@ -66,9 +66,9 @@ def noise(bench):
             if missed < 270:
                 break
         report.check("no working counter is wrong", not cycle.wrong, cycle)
-        # Lost, broken and late ones; twice as many come for what the computer adds.
+        # Lost, damaged and late frames; twice as many are permitted because of the computer.
         report.check("about 3 % of the cycles are missed", 30 < missed < 270, missed)
-        # The question may be lost, too; who has left Op stays out of it.
+        # The state request may be lost as well, and a device that has left Op stays out of Op.
         asked = (set(cyclic.states(master)) for _ in range(5))
         report.check("nobody left Op", any(states == {"Op"} for states in asked))
         broken = [slave._fprd(0x0300, 8, 100_000) for slave in master.slaves]
@@ -95,7 +95,7 @@ def outage(bench, what, fault):
 
 
 def back(bench, cycle, master):
-    """SOEM's usual way: acknowledge, ask for Op, reconfigure, recover, until all are there."""
+    """SOEM's usual sequence: acknowledge, request Op, reconfigure, recover, until all devices are in Op."""
     report = bench.report
     used = {}
 

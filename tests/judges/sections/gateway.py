@@ -27,13 +27,13 @@ outputs   = [{ pdo = 1, at = 12, objects = ["0x6040", "0x206B"] }]
 inputs    = [{ pdo = 1, at = 12, objects = ["0x6041", "0x606C"] }]
 """
 TOGGLE = 0x80
-# Manual HMSI-168-81 §6.2: command in bits 4 to 6, extension in bits 0 to 3; node 128 is all.
+# Manual HMSI-168-81 §6.2: command in bits 4 to 6, extension in bits 0 to 3; node 128 means all nodes.
 START, NODE_STATE, GENERAL_STATUS, ALL = 0x01, 0x10, 0x20, 128
 OPERATIONAL = 1
 
 
 class Gateway:
-    """Control and status word, and a node's bytes behind them."""
+    """Control and status word, followed by a node's bytes."""
 
     def __init__(self, slave, cycle):
         self.slave = slave
@@ -44,7 +44,7 @@ class Gateway:
         self.slave.output = bytes(self.outputs)
 
     def command(self, command, node):
-        """The answer's seven bits; None where the toggle bit does not come back."""
+        """Returns the seven bits of the answer, or None without the matching toggle bit."""
         toggle = ~self.slave.input[0] & TOGGLE
         self.outputs[0:2] = bytes([toggle | command, node])
         self.send()
@@ -57,7 +57,7 @@ def gateway(bench):
     report.section("CANopen gateway, several frames a cycle")
     machine = rig.Machine()
     machine.add("nodes", ESI, "GW64", more=NODES)
-    # 512 bytes in one device are too much for SOEM, which keeps 4096 of an EEPROM that would take 16384.
+    # 512 bytes in one device exceed SOEM, which stores 4096 bytes of an EEPROM of 16384.
     for n in range(11):
         machine.add(f"other{n}", ESI, "GW64")
     with bench.serve(machine, "gateway"), bench.master() as master:
@@ -68,7 +68,7 @@ def gateway(bench):
             slave.set_watchdog("processdata", 2_000)
         cycle = cyclic.to_op(master, sum(device.wkc for device in machine.devices))
         report.need("Op", cycle is not None, cyclic.states(master))
-        # Where one of the two frames is late, SOEM counts the other alone; a computer that stalls leaves that behind.
+        # If one of the two frames is late, SOEM counts only the other; a stalling computer causes this.
         for _ in range(5):
             cycle.forget()
             cycle.run(500)
@@ -77,7 +77,7 @@ def gateway(bench):
         report.check("500 cycles of two frames, none with a wrong working counter", not cycle.wrong, cycle)
         slave = master.slaves[0]
         nodes(bench, Gateway(slave, cycle))
-        # What it receives from the network is read at 0x2000, a byte a subindex, 128 an object.
+        # Data from the network is readable at 0x2000: one byte per subindex, 128 per object.
         status = slave.sdo_read(0x2000, 3) + slave.sdo_read(0x2000, 4)
         report.equal("0x2000 reads the process data", status, bytes(slave.input[2:4]))
 
@@ -86,7 +86,7 @@ def nodes(bench, device):
     report = bench.report
     report.equal("all nodes are started", device.command(START, ALL), START, hex)
     for node in (1, 2):
-        # A heartbeat tells it.
+        # A heartbeat reports the state.
         end = time.monotonic() + 10
         while device.command(NODE_STATE, node) != NODE_STATE | OPERATIONAL and time.monotonic() < end:
             pass

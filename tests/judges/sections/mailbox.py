@@ -89,7 +89,7 @@ def large_objects(bench, slave, how):
 
 
 def resize(bench, master, slave, size):
-    """Other mailboxes than the EEPROM names, as amended in Init."""
+    """Mailboxes that differ from the EEPROM, as changed in Init."""
     reach(master, pysoem.INIT_STATE)
     slave.amend_mbx("out", 0x1000, size)
     slave.amend_mbx("in", 0x1600, size)
@@ -100,7 +100,7 @@ def resize(bench, master, slave, size):
 def files(bench, slave, how):
     report = bench.report
     data = BLOB * 3
-    # What fills the last packet needs an empty one behind it; 36 and 1012 bytes are a packet.
+    # A full last packet must be followed by an empty one; a packet has 36 or 1012 bytes.
     for size in (0, 1, 36, 72, 1012, 1500):
         written = slave.foe_write("judge.bin", 0, data[:size], PATIENCE_US)
         back = slave.foe_read("judge.bin", 0, 2000, PATIENCE_US)
@@ -110,7 +110,7 @@ def files(bench, slave, how):
 
 
 def file_errors(bench):
-    """pysoem keeps FoE's errors to itself; the recording shows them."""
+    """pysoem does not return FoE errors; the recording contains them."""
     exchanges, _ = pcapng.exchanges(bench.folder / "mailbox.pcapng")
     codes = set()
     for exchange in exchanges:
@@ -122,7 +122,7 @@ def file_errors(bench):
 
 
 def bootstrap(bench, master, slave):
-    """A firmware update, with the mailboxes that the vendor's ESI gives for Bootstrap."""
+    """A firmware update with the Bootstrap mailboxes of the vendor's ESI."""
     report = bench.report
     reach(master, pysoem.INIT_STATE)
     slave.amend_mbx("out", 0x1000, 100)
@@ -143,7 +143,7 @@ def bootstrap(bench, master, slave):
 
 
 def dictionary(bench, slave):
-    """SDO Information against the ESI. SOEM takes a description from a single message, hence large mailboxes."""
+    """SDO Information compared with the ESI. SOEM reads a description from a single message, so mailboxes are large."""
     report = bench.report
     expected = esi.objects(ESI, "Mailbox")
     described = {entry.index: entry for entry in slave.od}
@@ -154,7 +154,7 @@ def dictionary(bench, slave):
         entry = described.get(index)
         if entry is None:
             continue
-        # SOEM keeps 40 characters.
+        # SOEM stores 40 characters.
         if entry.name.decode() != name[:40]:
             wrong.append(f"{index:#06x}: {entry.name}")
         for sub, item, bits in items:
@@ -182,7 +182,7 @@ def eeprom(bench, master, machine, images):
 
 
 def eeprom_words(slave, word, expected):
-    """SOEM yields zeros where a read took too long; then it is asked again. What is wrong is wrong every time."""
+    """SOEM returns zeros if a read took too long, so the read is repeated. A real error occurs every time."""
     for _ in range(3):
         read = slave.eeprom_read(word)[: len(expected)]
         if read == expected:

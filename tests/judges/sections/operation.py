@@ -1,4 +1,4 @@
-"""What MainDevices do besides the cycle: own mappings, SDOs in Op, clocks, starting anew."""
+"""Operations in addition to the cycle: custom mappings, SDOs in Op, clocks, restart."""
 
 import struct
 import threading
@@ -55,7 +55,7 @@ def remap(slave):
 
 
 def sdo_in_op(bench, cycle, master, machine):
-    """A thread reads large objects while the cycle goes on."""
+    """A thread reads large objects while the cycle continues."""
     report = bench.report
     large = master.slaves[machine.index("mailbox")]
     done, errors = [], []
@@ -77,7 +77,7 @@ def sdo_in_op(bench, cycle, master, machine):
 
 
 def clocks(bench, master, machine):
-    """With FRMW in every frame, the simulated clocks follow the reference in their own time."""
+    """With FRMW in every frame, the simulated clocks follow the reference at their own rate."""
     report = bench.report
     delays = []
     for name, slave, device in zip(machine.names, master.slaves, machine.devices):
@@ -91,7 +91,7 @@ def clocks(bench, master, machine):
 
 
 def again(bench, master, machine):
-    """A MainDevice that was killed comes back to a bus that is still in Op."""
+    """A killed MainDevice restarts on a bus that is still in Op."""
     report = bench.report
     report.equal("config_init once more, from Op", master.config_init(), len(machine.devices))
     # SOEM acknowledges with every request; controllers without an application show that as an error.

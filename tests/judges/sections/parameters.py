@@ -1,4 +1,4 @@
-"""`ecaxis sdo` and `ecaxis eeprom` against pysoem, on the same simulated device with mailboxes of 48 bytes."""
+"""Compares `ecaxis sdo` and `ecaxis eeprom` with pysoem, on one simulated device with mailboxes of 48 bytes."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ RECORD = 0x3000
 
 
 def described(folder):
-    """The judges' mailbox device with 420 objects more, one of 64 KiB and a record of 60 entries."""
+    """The judges' mailbox device with 420 more objects, one of 64 KiB and a record of 60 entries."""
     bits = 16 + 32 * ENTRIES
     entries = "".join(
         f"<SubItem><SubIdx>{n}</SubIdx><Name>Entry {n}</Name><Type>UDINT</Type><BitSize>32</BitSize>"
@@ -52,7 +52,7 @@ def described(folder):
     return path
 
 
-# What SDO Information's codes are called (ETG.1020), as far as this device has them.
+# The names of the SDO Information codes of this device (ETG.1020).
 NAMES = {1: "BOOL", 2: "SINT", 3: "INT", 4: "DINT", 5: "USINT", 6: "UINT", 7: "UDINT", 8: "REAL", 9: "STRING",
          10: "OCTET_STRING", 17: "LREAL", 21: "LINT", 27: "ULINT", 0x31: "BIT2", 0x32: "BIT3"}
 
@@ -67,7 +67,7 @@ def parameters(bench):
     given.write_bytes(data)
     with bench.serve(machine, "parameters", steady=False):
         place = ["--nic", bench.nic, "--position", "0"]
-        # As it is found: in Init, with no address.
+        # The initial condition: Init, without an address.
         ran(bench, ["sdo", "write", *place, hex(LARGE), "--from", str(given)])
         back = bench.folder / "back.bin"
         ran(bench, ["sdo", "read", *place, hex(LARGE), "--to", str(back)])
@@ -90,7 +90,7 @@ def parameters(bench):
 
 
 def ran(bench, arguments):
-    """What the program printed; None where it is no JSON."""
+    """Returns the program's output as JSON; None for other output."""
     command = [str(bench.program), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=bench.folder)
     good = bench.report.check(f"ecaxis {arguments[0]} {arguments[1]}", done.returncode == 0, done.stderr[-300:])
@@ -104,11 +104,11 @@ def compare(report, listed, objects):
     report.equal("the same objects as pysoem", indices, {entry.index for entry in objects}, len)
     wrong = []
     for entry in objects:
-        # pysoem lists the entries of arrays and records alone; a variable is its own.
+        # pysoem lists entries only for arrays and records; a variable is its own entry.
         entries = enumerate(entry.entries) if entry.entries else [(0, entry)]
         for sub, item in entries:
             mine = ours.get((entry.index, sub))
-            # What is not there has no length; SOEM keeps a place for it.
+            # Missing entries have no length; SOEM lists them nevertheless.
             if mine is None and item.bit_length == 0:
                 continue
             name = NAMES.get(item.data_type, "?")

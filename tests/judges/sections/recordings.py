@@ -1,4 +1,4 @@
-"""What a recording proves: tshark dissects it, and every working counter is as predicted."""
+"""Checks of a recording: tshark dissects it, and every working counter matches its prediction."""
 
 import random
 import subprocess
@@ -8,12 +8,12 @@ import pcapng
 import rig
 import wkc
 
-# Predictions that are a range, because nothing in the recording tells more.
+# Predictions that are a range, because the recording contains no more information.
 RANGES_RATIO = 0.05
 
 
 def judge(bench, path, clocks, steady=True):
-    """A recording of these devices, given by their clocks; with `steady`, none of them comes or goes."""
+    """Checks a recording of devices, described by their clocks. With `steady`, the devices stay constant."""
     report = bench.report
     if dissect.available():
         frames, ethercat, malformed, remarks = dissect.dissect(path)
@@ -35,7 +35,7 @@ def judge(bench, path, clocks, steady=True):
 
 
 def falsified(bench, path, clocks):
-    """One wrong counter of each command is noticed; otherwise the walk would prove nothing."""
+    """Checks that one wrong counter of each command is detected; otherwise the check has no value."""
     places = wkc.walk(path, clocks).places
     found, _ = pcapng.exchanges(path)
     dice = random.Random(1)
@@ -50,7 +50,7 @@ def falsified(bench, path, clocks):
 
 
 def recordings(bench):
-    """Our own MainDevice on the simulated bus, under virtual time."""
+    """Records the MainDevice of ecaxis on the simulated bus, in virtual time."""
     report = bench.report
     for name, clocks in (("demo", [True] * 2), ("modes", [True] * 3)):
         report.section(f"recording of `ecaxis run configs/{name}.toml`")

@@ -1,4 +1,4 @@
-"""Cable redundancy: a ring that breaks and heals under SOEM's redundant mode."""
+"""Cable redundancy: a ring that opens and closes again in SOEM's redundant mode."""
 
 import cycle as cyclic
 import rig
@@ -24,7 +24,7 @@ def ring(bench):
             report.need("Op", cycle is not None, cyclic.states(master))
             cycle.forget()
             served.strike()
-            # Over the break and the healing.
+            # Covers the break and its repair.
             cycle.run(3_000)
             lost = cycle.missed + sum(cycle.wrong.values())
             report.check("all cycles but a few have the full working counter", lost < 100, cycle)

@@ -1,4 +1,4 @@
-/* What SOEM reads from every EEPROM on a bus: eeprom IF
+/* Prints what SOEM reads from every EEPROM on a bus: eeprom IF
  *
  * SOEM's own example slaveinfo does the reading; it shows PDOs of devices with CoE as their objects
  * tell them, here they come from the EEPROM as well.
@@ -58,7 +58,7 @@ int main(int argc, char **argv)
       return fprintf(stderr, "no device answers\n"), 1;
    for (int n = 1; n <= ec_slavecount; n++)
       eeprom(n);
-   /* What the EEPROM alone yields, without a word by mailbox. */
+   /* The contents of the EEPROM alone, without mailbox data. */
    for (int n = 1; n <= ec_slavecount; n++)
       ec_slave[n].mbx_proto = 0;
    ec_config_map(image);

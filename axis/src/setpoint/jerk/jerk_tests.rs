@@ -10,15 +10,15 @@ const LIMITS: MotionLimits = MotionLimits {
     jerk: 40_000.0,
 };
 
-/// Checks the sequence of positions that reaches a drive, and nothing that the source says about itself.
+/// Checks the positions sent to a drive, independently of the source's own values.
 struct Watch {
     limits: MotionLimits,
     dt: f64,
     motion: Motion,
-    /// Differences of the positions.
+    /// Derived from positions.
     velocity: f64,
     acceleration: f64,
-    /// Of the jerk promised.
+    /// True: the jerk is checked as well.
     check_jerk: bool,
 }
 
@@ -36,7 +36,7 @@ impl Watch {
 
     fn cycle(&mut self, source: &mut JerkLimited) -> Result<(), TestCaseError> {
         let next = source.advance(self.motion, self.dt);
-        // Of a position whose parts are 1000 and 400 long.
+        // Rounding for a position of at most 1400.
         let rounding = 1400.0 * 4.0 * f64::EPSILON;
         let velocity = (next.position - self.motion.position) / self.dt;
         let acceleration = (velocity - self.velocity) / self.dt;
@@ -76,10 +76,10 @@ impl Watch {
     }
 }
 
-fn go(target: f64, limits: MotionLimits) -> Order {
-    Order {
+fn go(target: f64, limits: MotionLimits) -> MoveRequest {
+    MoveRequest {
         ceiling: LIMITS,
-        ..Order::within(Goal::Position(target), limits)
+        ..MoveRequest::within(Goal::Position(target), limits)
     }
 }
 
@@ -92,14 +92,15 @@ fn part() -> impl Strategy<Value = MotionLimits> {
 }
 
 #[test]
-fn takes_as_long_as_it_should() {
+fn move_takes_the_calculated_time() {
     // Seven segments: v/a + a/j + s/v = 0.1 + 0.05 + 0.5 s.
     let mut source = JerkLimited::new(go(100.0, LIMITS), Motion::at(0.0), DT).unwrap();
     assert!((source.duration_s() - 0.65).abs() < 1e-4);
     let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
     let cycles = watch.finish(&mut source).unwrap();
     assert!((651..=652).contains(&cycles), "{cycles}");
-    // Four: neither velocity nor acceleration is reached; s = 2·j·t³ with t a quarter of the time.
+    // Four segments: neither velocity nor acceleration reaches its limit; s = 2·j·t³ with t a
+    // quarter of the time.
     let source = JerkLimited::new(go(0.01, LIMITS), Motion::at(0.0), DT).unwrap();
     let expected = 4.0 * (0.01f64 / (2.0 * 40_000.0)).cbrt();
     assert!((source.duration_s() - expected).abs() < 1e-6);
@@ -107,21 +108,21 @@ fn takes_as_long_as_it_should() {
 }
 
 #[test]
-fn stops_where_it_stands_already() {
+fn move_to_the_present_position_takes_no_time() {
     let source = JerkLimited::new(go(3.0, LIMITS), Motion::at(3.0), DT).unwrap();
     assert_eq!(source.duration_s(), 0.0);
     assert!(source.finished(Motion::at(3.0)));
 }
 
 #[test]
-fn goes_on_from_rest_after_an_interruption() {
+fn move_continues_from_rest_after_an_interruption() {
     let mut source = JerkLimited::new(go(50.0, LIMITS), Motion::at(0.0), DT).unwrap();
     let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
     for _ in 0..200 {
         watch.cycle(&mut source).unwrap();
     }
     assert!(watch.motion.velocity > 190.0);
-    // What an axis does while frames are lost.
+    // The behaviour of an axis while frames are lost.
     watch.motion.velocity = 0.0;
     watch.motion.acceleration = 0.0;
     (watch.velocity, watch.acceleration) = (0.0, 0.0);
@@ -130,10 +131,10 @@ fn goes_on_from_rest_after_an_interruption() {
 }
 
 #[test]
-fn a_gentler_successor_neither_overshoots_nor_speeds_up() {
+fn move_with_lower_limits_neither_overshoots_nor_speeds_up() {
     let mut source = JerkLimited::new(go(50.0, LIMITS), Motion::at(0.0), DT).unwrap();
     let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
-    // Accelerating, cruising, braking.
+    // Accelerating, at constant velocity, braking.
     for cycles in [30, 100, 120, 130] {
         for _ in 0..cycles {
             watch.cycle(&mut source).unwrap();
@@ -153,14 +154,14 @@ fn a_gentler_successor_neither_overshoots_nor_speeds_up() {
 }
 
 #[test]
-fn the_range_is_kept_or_the_order_refused() {
-    // Full speed, 1 before the end of the range: it takes 15 to stop, a little less to turn round.
+fn move_keeps_the_range_or_is_rejected() {
+    // Full speed, 1 before the end of the range: a stop takes 15, reversing a little less.
     let motion = Motion {
         position: 49.0,
         velocity: 200.0,
         acceleration: 0.0,
     };
-    let order = Order {
+    let order = MoveRequest {
         range: Some([-50.0, 50.0]),
         ..go(0.0, LIMITS)
     };
@@ -169,14 +170,15 @@ fn the_range_is_kept_or_the_order_refused() {
         matches!(refused, Err(SetpointError::LeavesRange { reaches, .. }) if (reaches - 63.9).abs() < 0.15),
         "{refused:?}"
     );
-    // Outside already, and on the way back.
+    // Already outside, and on the way back.
     let outside = Motion::at(60.0);
     assert!(JerkLimited::new(order, outside, DT).is_ok());
 }
 
-/// Turning round without standing still takes less room than a gentle stop. The stop must be possible all the same.
+/// Reversing without a standstill needs less room than a gentle stop. The stop must still be
+/// possible.
 #[test]
-fn a_stop_on_the_way_back_stays_in_the_range() {
+fn stop_during_a_reversal_stays_in_the_range() {
     let motion = Motion {
         position: 15.0,
         velocity: 116.0,
@@ -187,14 +189,14 @@ fn a_stop_on_the_way_back_stays_in_the_range() {
         acceleration: 680.0,
         jerk: 1250.0,
     };
-    let order = Order {
+    let order = MoveRequest {
         range: Some([-50.0, 50.0]),
         ..go(0.0, gentle)
     };
     let mut source = JerkLimited::new(order, motion, DT).unwrap();
-    let stop = Order {
+    let stop = MoveRequest {
         range: order.range,
-        ..Order::within(Goal::Velocity(0.0), *source.used())
+        ..MoveRequest::within(Goal::Velocity(0.0), *source.used())
     };
     let mut watch = Watch::at(motion, LIMITS, DT);
     for _ in 0..50 {
@@ -208,11 +210,11 @@ fn a_stop_on_the_way_back_stays_in_the_range() {
 }
 
 #[test]
-fn nonsense_is_refused() {
+fn invalid_requests_are_rejected() {
     for value in [f64::NAN, f64::INFINITY, 1e300] {
         for order in [
             go(value, LIMITS),
-            Order::within(Goal::Velocity(value), LIMITS),
+            MoveRequest::within(Goal::Velocity(value), LIMITS),
         ] {
             assert!(JerkLimited::new(order, Motion::at(0.0), DT).is_err());
         }
@@ -241,7 +243,7 @@ fn nonsense_is_refused() {
 
 proptest! {
     #[test]
-    fn from_rest(
+    fn move_from_rest_keeps_the_limits(
         start in -1e3..1e3f64, way in -200.0..200.0f64, limits in part(),
         dt in prop::sample::select(vec![0.000_25, 0.001, 0.004]),
     ) {
@@ -254,9 +256,10 @@ proptest! {
         prop_assert!((f64::from(cycles) * dt - source.duration_s()).abs() <= 2.0 * dt);
     }
 
-    /// A new order in any cycle of another, and another in any cycle of that: the axis' limits hold throughout, jerk included.
+    /// New requests in any cycle of other requests: the limits of the axis hold throughout, jerk
+    /// included.
     #[test]
-    fn redirected(
+    fn redirected_moves_keep_the_limits(
         targets in prop::collection::vec((-50.0..50.0f64, part(), 0u32..400), 2..6),
         stop in any::<bool>(),
     ) {
@@ -264,7 +267,7 @@ proptest! {
         let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
         let mut source = JerkLimited::new(go(0.0, LIMITS), Motion::at(0.0), DT).unwrap();
         for (target, limits, cycles) in targets {
-            let order = Order { range, ..go(target, limits) };
+            let order = MoveRequest { range, ..go(target, limits) };
             source = match source.redirect(order, watch.motion, DT) {
                 Ok(next) => next,
                 Err(error) => return Err(TestCaseError::fail(format!("{error}: {order:?} {source:?}"))),
@@ -275,7 +278,7 @@ proptest! {
             }
         }
         if stop {
-            let order = Order { range, ..Order::within(Goal::Velocity(0.0), source.used) };
+            let order = MoveRequest { range, ..MoveRequest::within(Goal::Velocity(0.0), source.used) };
             source = source.redirect(order, watch.motion, DT).unwrap();
         }
         let at = watch.motion;
@@ -287,9 +290,10 @@ proptest! {
         }
     }
 
-    /// From any motion of any source: velocity and acceleration hold from the first cycle on.
+    /// From any motion of any source: velocity and acceleration limits hold from the first cycle
+    /// on.
     #[test]
-    fn takes_over(
+    fn move_takes_over_from_any_motion(
         velocity in -200.0..200.0f64, acceleration in -2000.0..2000.0f64, target in -50.0..50.0f64, limits in part(),
     ) {
         let motion = Motion { position: 0.0, velocity, acceleration };
@@ -303,18 +307,18 @@ proptest! {
         prop_assert!(watch.motion.stands_at(target));
     }
 
-    /// Sent on by velocities alone, an axis stays in its range, and stops at its end if it is not sent elsewhere.
+    /// With velocity requests only, an axis stays in its range and stops at its end.
     #[test]
-    fn velocities_in_a_range(
+    fn velocities_stay_in_the_range(
         changes in prop::collection::vec((-1.0..1.0f64, part(), 0u32..600), 1..6), start in -49.0..49.0f64,
     ) {
         let mut watch = Watch::at(Motion::at(start), LIMITS, DT);
         let range = Some([-50.0, 50.0]);
-        let still = Order { range, ..Order::within(Goal::Velocity(0.0), LIMITS) };
+        let still = MoveRequest { range, ..MoveRequest::within(Goal::Velocity(0.0), LIMITS) };
         let mut source = JerkLimited::new(still, Motion::at(start), DT).unwrap();
         for (part, limits, cycles) in changes {
             let goal = Goal::Velocity(limits.velocity * part);
-            let order = Order { ceiling: LIMITS, range, ..Order::within(goal, limits) };
+            let order = MoveRequest { ceiling: LIMITS, range, ..MoveRequest::within(goal, limits) };
             source = source.redirect(order, watch.motion, DT).unwrap();
             for _ in 0..cycles {
                 watch.cycle(&mut source)?;
@@ -330,7 +334,8 @@ proptest! {
                 }
             }
             prop_assert!(source.stopped_by_range() && watch.motion.velocity == 0.0, "{source:?}");
-            // Not long before the end of it: one cycle more adds its way, and the stop from what it gains in velocity and acceleration.
+            // The axis stops only near the end of the range. One more cycle adds its way, and the
+            // stop grows with velocity and acceleration.
             prop_assert!(watch.motion.position.abs() <= 50.0 + 1e-9);
             let room = 50.0 - watch.motion.position.abs();
             prop_assert!(room < LIMITS.velocity * 6.0 * DT, "{room} {velocity}");
@@ -338,14 +343,14 @@ proptest! {
     }
 
     #[test]
-    fn velocities(
+    fn velocities_keep_the_limits(
         changes in prop::collection::vec((-1.0..1.0f64, part(), 0u32..300), 1..6),
     ) {
         let mut watch = Watch::at(Motion::at(0.0), LIMITS, DT);
-        let mut source = JerkLimited::new(Order::within(Goal::Velocity(0.0), LIMITS), Motion::at(0.0), DT).unwrap();
+        let mut source = JerkLimited::new(MoveRequest::within(Goal::Velocity(0.0), LIMITS), Motion::at(0.0), DT).unwrap();
         for (part, limits, cycles) in changes {
             let goal = Goal::Velocity(limits.velocity * part);
-            let order = Order { ceiling: LIMITS, ..Order::within(goal, limits) };
+            let order = MoveRequest { ceiling: LIMITS, ..MoveRequest::within(goal, limits) };
             source = source.redirect(order, watch.motion, DT).unwrap();
             for _ in 0..cycles {
                 watch.cycle(&mut source)?;
@@ -359,16 +364,16 @@ proptest! {
         }
     }
 
-    /// Whatever the numbers, an accepted order gives finite motions.
+    /// With any numbers, an accepted request gives finite motions.
     #[test]
-    fn any_numbers(
+    fn accepted_requests_stay_finite(
         numbers in prop::array::uniform9(any::<f64>()), dts in prop::collection::vec(any::<f64>(), 1..20), fast in any::<bool>(),
     ) {
         let [a, b, c, d, e, f, g, h, i] = numbers;
         let limits = MotionLimits { velocity: a.abs(), acceleration: b.abs(), jerk: c.abs() };
         let goal = if fast { Goal::Velocity(d) } else { Goal::Position(e) };
         let motion = Motion { position: f, velocity: g, acceleration: h };
-        if let Ok(mut source) = JerkLimited::new(Order::within(goal, limits), motion, i) {
+        if let Ok(mut source) = JerkLimited::new(MoveRequest::within(goal, limits), motion, i) {
             let mut motion = motion;
             for dt in dts {
                 motion = source.advance(motion, dt.abs().min(0.1));
@@ -377,16 +382,17 @@ proptest! {
         }
     }
 
-    /// Limits and states decades apart: planned in any case, finite, and at the target at the end.
+    /// Limits and states of very different magnitude: always planned, finite, and at the target in
+    /// the end.
     #[test]
-    fn anything_that_can_be_reckoned_with(
+    fn moves_with_extreme_limits_arrive(
         exponents in prop::array::uniform4(-9.0..12.0f64), fractions in (-1.0..1.0f64, -1.0..1.0f64), back in any::<bool>(), cycles in 1u32..50,
     ) {
         let [v, a, j, d] = exponents.map(|exponent| 10f64.powf(exponent));
         let limits = MotionLimits { velocity: v, acceleration: a, jerk: j };
         let target = if back { -d } else { d };
         let motion = Motion { position: 0.0, velocity: v * fractions.0, acceleration: a * fractions.1 };
-        let mut source = JerkLimited::new(Order::within(Goal::Position(target), limits), motion, 0.0).unwrap();
+        let mut source = JerkLimited::new(MoveRequest::within(Goal::Position(target), limits), motion, 0.0).unwrap();
         prop_assert!(source.duration_s().is_finite());
         let farthest = source.span().iter().fold(d, |far, end| far.max(end.abs()));
         let slack = farthest * 1e-9;

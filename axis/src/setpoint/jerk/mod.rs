@@ -1,12 +1,12 @@
 //! Moves and changes of velocity with bounded velocity, acceleration and jerk.
 //!
-//! `profile` is what there is to follow: segments of constant jerk, and the change from one velocity to another; `plan` finds the
-//! profile that ends at a position. Here a profile is followed, one cycle at a time.
+//! `profile` contains segments of constant jerk and the change from one velocity to another. `plan`
+//! finds the profile that ends at a position. This file follows a profile, one cycle at a time.
 //!
-//! What reaches the drive is a continuous profile, seen once per cycle. Each difference of positions is then a mean over
-//! neighbouring cycles, so velocity, acceleration and jerk of the sequence keep the profile's limits, exactly, whatever the
-//! cycle. That holds across a change of plan as well, because the new profile starts from the old one's state within
-//! the cycle and not from the cycle's means.
+//! The drive gets a continuous profile, sampled once per cycle. Each difference of positions is a
+//! mean over neighbouring cycles. So velocity, acceleration and jerk of the samples keep the
+//! profile's limits exactly, with any cycle time. A change of plan keeps them as well: the new
+//! profile starts from the state of the old one, not from means of the cycle.
 
 mod plan;
 mod profile;
@@ -14,30 +14,32 @@ mod profile;
 use super::{Motion, MotionLimits, Setpoint, SetpointError};
 use profile::{Profile, State, coasting, velocity_change};
 
-/// Rounding of positions shows in their differences; this much of every limit is left to it.
+/// Fraction of every limit used for planning. The rest covers the rounding of positions in their
+/// differences.
 const PLANNED: f64 = 1.0 - 1e-6;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
-    /// Rest at a position.
+    /// Standstill at a position.
     Position(f64),
-    /// A velocity that is kept; 0 is a stop.
+    /// A constant velocity; 0 is a stop.
     Velocity(f64),
 }
 
-/// What is to be done, and what may be used for it.
+/// The goal of a motion and its limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Order {
+pub struct MoveRequest {
     pub goal: Goal,
     pub limits: MotionLimits,
-    /// The axis' own limits, none below `limits`. Its acceleration and jerk are used where the present motion would otherwise
-    /// carry the axis beyond the target or its velocity limit.
+    /// The axis limits, none below `limits`. Their acceleration and jerk apply if the present
+    /// motion would otherwise pass the target or exceed the velocity limit.
     pub ceiling: MotionLimits,
-    /// Positions that may be reached on the way, or by a stop on it. A velocity is given up for a stop in time to keep it.
+    /// Range of positions during the motion and during a stop from it. A motion with constant
+    /// velocity stops in time to stay in the range.
     pub range: Option<[f64; 2]>,
 }
 
-impl Order {
+impl MoveRequest {
     #[must_use]
     pub const fn within(goal: Goal, limits: MotionLimits) -> Self {
         Self {
@@ -49,16 +51,16 @@ impl Order {
     }
 }
 
-/// Follows an [`Order`]. Copying it is cheap (some 400 bytes); nothing is allocated.
+/// Follows a [`MoveRequest`]. Cheap to copy (some 400 bytes); allocates nothing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JerkLimited {
-    order: Order,
-    /// The limits the profile was made with, apart from [`PLANNED`].
+    order: MoveRequest,
+    /// The limits of the profile, without the factor [`PLANNED`].
     used: MotionLimits,
     origin: f64,
     profile: Profile,
     index: usize,
-    /// Where the segment began, and how long ago.
+    /// State at the start of the segment, and the time since then.
     base: State,
     elapsed: f64,
     now: State,
@@ -70,19 +72,25 @@ pub struct JerkLimited {
 }
 
 impl JerkLimited {
-    /// From `motion`, whatever source it comes from; `dt_s`: the cycle it was the result of. O(1): some microseconds, no
-    /// allocation.
+    /// Plans from `motion` of any source; `dt_s` is the cycle time that produced it. O(1): some
+    /// microseconds, no allocation.
     ///
-    /// The acceleration is taken over as far as it leaves the velocity within its limit; from then on the jerk is bounded.
-    pub fn new(order: Order, motion: Motion, dt_s: f64) -> Result<Self, SetpointError> {
+    /// Keeps the present acceleration as far as the velocity stays within its limit. From then on
+    /// the jerk is bounded.
+    pub fn new(order: MoveRequest, motion: Motion, dt_s: f64) -> Result<Self, SetpointError> {
         check(&order, motion)?;
         let start = entry(motion, order.ceiling.scaled(PLANNED), dt_s);
         Self::plan(order, start, motion, None)
     }
 
-    /// From what this source is doing, with bounded jerk at the change as well; from `motion` if that is not this source's.
-    /// O(1), like [`JerkLimited::new`].
-    pub fn redirect(&self, order: Order, motion: Motion, dt_s: f64) -> Result<Self, SetpointError> {
+    /// Plans from the state of this source, with bounded jerk at the change as well. Plans from
+    /// `motion` if it is not this source's last result. O(1), like [`JerkLimited::new`].
+    pub fn redirect(
+        &self,
+        order: MoveRequest,
+        motion: Motion,
+        dt_s: f64,
+    ) -> Result<Self, SetpointError> {
         if !self.continues(motion) {
             return Self::new(order, motion, dt_s);
         }
@@ -91,23 +99,24 @@ impl JerkLimited {
     }
 
     #[must_use]
-    pub const fn order(&self) -> &Order {
+    pub const fn order(&self) -> &MoveRequest {
         &self.order
     }
 
-    /// The limits it moves with: of the order, or more where those would not have done.
+    /// Returns the limits of the motion: those of the request, or higher ones if these did not
+    /// suffice.
     #[must_use]
     pub const fn used(&self) -> &MotionLimits {
         &self.used
     }
 
-    /// A velocity was given up for a stop at the end of the range.
+    /// Returns true if a constant velocity was replaced by a stop at the end of the range.
     #[must_use]
     pub const fn stopped_by_range(&self) -> bool {
         self.stopped_by_range
     }
 
-    /// Seconds from the start to the arrival.
+    /// Returns the time from start to arrival, seconds.
     #[must_use]
     pub const fn duration_s(&self) -> f64 {
         self.duration
@@ -118,13 +127,14 @@ impl JerkLimited {
         (self.duration - self.total).max(0.0)
     }
 
-    /// Lowest and highest position from the start to the arrival.
+    /// Returns the lowest and highest position from start to arrival.
     #[must_use]
     pub fn span(&self) -> [f64; 2] {
         self.span.map(|position| self.origin + position)
     }
 
-    /// The shortest time that can be met for sure, and with it every longer one. At least [`JerkLimited::duration_s`].
+    /// Returns a duration such that every longer duration is possible as well. At least
+    /// [`JerkLimited::duration_s`].
     pub(crate) fn any_duration_from(&self) -> f64 {
         match self.order.goal {
             Goal::Position(target)
@@ -136,7 +146,8 @@ impl JerkLimited {
         }
     }
 
-    /// The same move, taking `duration_s` from its start. `None` if it cannot be made to. Only before the first cycle.
+    /// Returns the same move stretched to `duration_s` from its start, or `None` if impossible.
+    /// Only before the first cycle.
     pub(crate) fn lasting(&self, duration_s: f64) -> Option<Self> {
         let Goal::Position(target) = self.order.goal else {
             return None;
@@ -163,7 +174,7 @@ impl JerkLimited {
     }
 
     fn plan(
-        order: Order,
+        order: MoveRequest,
         start: State,
         motion: Motion,
         earlier: Option<MotionLimits>,
@@ -202,11 +213,11 @@ impl JerkLimited {
             };
             let outside = leaves(&order, origin, [way, stop]);
             chosen = Some((limits, profile, span, outside));
-            if outside.is_none() && keeps_to(&order, origin, start, planned.jerk, span) {
+            if outside.is_none() && stays_within(&order, origin, start, planned.jerk, span) {
                 break;
             }
         }
-        // The loop has three rounds.
+        // The loop has three iterations.
         let (used, profile, span, outside) = chosen.ok_or(SetpointError::NoTime)?;
         outside.map_or(Ok(()), Err)?;
         Ok(Self {
@@ -226,7 +237,8 @@ impl JerkLimited {
         })
     }
 
-    /// `motion` is what the last cycle returned. A velocity has no position of its own: that may be the drive's.
+    /// Returns true if `motion` is the result of the last cycle. A velocity goal accepts any
+    /// position, because it may be the drive's.
     fn continues(&self, motion: Motion) -> bool {
         let same_place = match self.order.goal {
             Goal::Position(_) => motion.position == self.last.position,
@@ -235,9 +247,9 @@ impl JerkLimited {
         same_place && motion.velocity == self.last.velocity
     }
 
-    /// The plan was interrupted: the same goal from here, with everything the axis has.
+    /// Plans again to the same goal after an interruption, with the full limits of the axis.
     fn resume(&mut self, motion: Motion, dt_s: f64) {
-        let order = Order {
+        let order = MoveRequest {
             range: None,
             ..self.order
         };
@@ -249,7 +261,8 @@ impl JerkLimited {
         }
     }
 
-    /// One more cycle at this velocity, and a stop would no longer end inside the range.
+    /// Returns true if, after one more cycle at this velocity, a stop would no longer end inside
+    /// the range.
     fn must_stop(&self, motion: Motion, dt_s: f64) -> bool {
         if matches!(self.order.goal, Goal::Position(_) | Goal::Velocity(0.0)) {
             return false;
@@ -263,10 +276,10 @@ impl JerkLimited {
     }
 
     fn stop(&mut self, motion: Motion) {
-        let order = Order {
+        let order = MoveRequest {
             goal: Goal::Velocity(0.0),
             limits: self.used,
-            // What this stop is for; nothing else could refuse it.
+            // This stop exists to keep the range. A check of the range could only reject it.
             range: None,
             ..self.order
         };
@@ -313,7 +326,7 @@ impl JerkLimited {
 }
 
 impl Setpoint for JerkLimited {
-    /// RT: O(1). Plans anew if `motion` is not what this source returned last.
+    /// RT: O(1). Plans again if `motion` is not the last result of this source.
     fn advance(&mut self, motion: Motion, dt_s: f64) -> Motion {
         if dt_s.is_nan() || dt_s <= 0.0 {
             return motion;
@@ -353,7 +366,7 @@ impl Setpoint for JerkLimited {
         self.last
     }
 
-    /// A velocity is finished when it is reached.
+    /// A velocity goal is finished when it is reached.
     fn finished(&self, motion: Motion) -> bool {
         match self.order.goal {
             Goal::Position(target) => motion.stands_at(target),
@@ -362,7 +375,7 @@ impl Setpoint for JerkLimited {
     }
 }
 
-fn check(order: &Order, motion: Motion) -> Result<(), SetpointError> {
+fn check(order: &MoveRequest, motion: Motion) -> Result<(), SetpointError> {
     order.limits.check()?;
     order.ceiling.check()?;
     motion.check()?;
@@ -381,8 +394,9 @@ fn check(order: &Order, motion: Motion) -> Result<(), SetpointError> {
     Ok(())
 }
 
-/// Not faster than necessary, and not beyond a target that the axis is moving to.
-fn keeps_to(order: &Order, origin: f64, start: State, jerk: f64, span: [f64; 2]) -> bool {
+/// Returns true if the way is not faster than necessary and does not pass a target that the axis is
+/// moving to.
+fn stays_within(order: &MoveRequest, origin: f64, start: State, jerk: f64, span: [f64; 2]) -> bool {
     let fastest = order.limits.velocity.max(start.velocity.abs());
     if coasting(start, jerk).abs() > fastest {
         return false;
@@ -400,11 +414,12 @@ fn keeps_to(order: &Order, origin: f64, start: State, jerk: f64, span: [f64; 2])
     !beyond
 }
 
-/// Where the way, or a stop on it, leads outside the range and farther out than where it begins.
+/// Returns an error if the way, or a stop on it, leaves the range and goes farther out than its
+/// start.
 ///
-/// The shortest way back turns round without standing still, and so before the place where a stop would end; it must be
-/// possible to stop all the same.
-fn leaves(order: &Order, origin: f64, spans: [[f64; 2]; 2]) -> Option<SetpointError> {
+/// The shortest way back reverses without a standstill, before the position where a stop would end.
+/// A stop must still be possible.
+fn leaves(order: &MoveRequest, origin: f64, spans: [[f64; 2]; 2]) -> Option<SetpointError> {
     let [low, high] = order.range?;
     let inside = low.min(origin)..=high.max(origin);
     spans
@@ -415,10 +430,11 @@ fn leaves(order: &Order, origin: f64, spans: [[f64; 2]; 2]) -> Option<SetpointEr
         .map(|reaches| SetpointError::LeavesRange { reaches, low, high })
 }
 
-/// The state at the end of a cycle of which only the means are known. With a constant acceleration a cycle's mean velocity is
-/// that of its middle; so continued, the velocity stays within its limit.
+/// Returns the state at the end of a cycle with known means. With constant acceleration, a cycle's
+/// mean velocity is that of its middle. Extrapolated in this way, the velocity stays within its
+/// limit.
 fn entry(motion: Motion, limits: MotionLimits, dt_s: f64) -> State {
-    // Held where it is, or turning: then as well from rest.
+    // Interrupted at this position, or reversing: start from rest.
     if motion.velocity == 0.0 {
         return State::default();
     }
@@ -439,7 +455,7 @@ fn entry(motion: Motion, limits: MotionLimits, dt_s: f64) -> State {
     }
 }
 
-/// A lower velocity limit that makes the way take `duration`.
+/// Returns a profile with a lower velocity limit that takes `duration`.
 fn slower(start: State, distance: f64, limits: MotionLimits, duration: f64) -> Option<Profile> {
     let (mut slow, mut fast) = (0.0, limits.velocity);
     for _ in 0..64 {

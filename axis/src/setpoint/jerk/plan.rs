@@ -1,18 +1,19 @@
 //! The shortest jerk-limited way from any state to rest at a position.
 //!
-//! Every way is a change to some velocity, a cruise, and a stop; what is sought is that velocity. The direct stop divides the
-//! targets: to those ahead of it the way leads forwards, to the others, mirrored, too. Ahead of it the distance grows with the
-//! velocity between the changes, apart from two corners:
+//! Every way consists of a change to some velocity, a cruise, and a stop; the search finds this
+//! velocity. The direct stop divides the targets: a target ahead of it is reached forwards, any
+//! other mirrored. Ahead of the stop, the distance grows with the velocity, except in two cases:
 //!
-//! - While braking, a target a little ahead of the stop needs no velocity without acceleration at all: the brake is
-//!   released for a moment and applied again.
-//! - With a limit below the present velocity, slowing down to it takes longer, and so leads further, than the direct stop; then
-//!   some velocity in between fits.
+//! - While braking, a target slightly ahead of the stop needs no velocity without acceleration: the
+//!   brake is released for a moment and applied again.
+//! - With a limit below the present velocity, slowing down to the limit takes longer and farther
+//!   than the direct stop. Then some velocity in between fits.
 
-use super::profile::{Profile, Segment, State, coasting, facing, travel, velocity_change};
+use super::profile::{Profile, Segment, State, coasting, mirrored, travel, velocity_change};
 use crate::setpoint::MotionLimits;
 
-/// `start.position` is 0, `distance` where to. The limits are usable ([`MotionLimits::check`]).
+/// Plans from `start` (position 0) to `distance`. The limits must be usable
+/// ([`MotionLimits::check`]).
 pub(crate) fn to_position(start: State, distance: f64, limits: MotionLimits) -> Profile {
     let stop = stopping(start, limits);
     let reached = travel(start, &stop).position;
@@ -22,11 +23,12 @@ pub(crate) fn to_position(start: State, distance: f64, limits: MotionLimits) -> 
     if distance > reached {
         forwards(start, distance, limits)
     } else {
-        forwards(facing(start, -1.0), -distance, limits).mirrored()
+        forwards(mirrored(start, -1.0), -distance, limits).mirrored()
     }
 }
 
-/// Stops, then goes to `distance` so slowly that everything takes `duration`. `None`: it cannot be done so quickly.
+/// Plans a stop and then a move to `distance` that is slow enough to take `duration` in total.
+/// Returns `None` if `duration` is too short.
 pub(crate) fn stop_then_go(
     start: State,
     distance: f64,
@@ -45,7 +47,7 @@ pub(crate) fn stop_then_go(
     Some(Profile::of(&[&stop, go.segments()]))
 }
 
-/// How long [`stop_then_go`] takes at least.
+/// Returns the minimum duration of [`stop_then_go`].
 pub(crate) fn stop_then_go_time(start: State, distance: f64, limits: MotionLimits) -> f64 {
     let stop = stopping(start, limits);
     let stopped = travel(start, &stop).position;
@@ -53,7 +55,7 @@ pub(crate) fn stop_then_go_time(start: State, distance: f64, limits: MotionLimit
     Profile::of(&[&stop]).duration() + go.duration()
 }
 
-/// Lowest and highest position of the shortest stop.
+/// Returns the lowest and highest position of the shortest stop.
 pub(crate) fn stop_span(start: State, limits: MotionLimits) -> [f64; 2] {
     Profile::of(&[&stopping(start, limits)]).span(start)
 }
@@ -62,7 +64,7 @@ fn stopping(start: State, limits: MotionLimits) -> [Segment; 3] {
     velocity_change(start, 0.0, limits.acceleration, limits.jerk)
 }
 
-/// The target lies ahead of the direct stop.
+/// Plans to a target ahead of the direct stop.
 fn forwards(start: State, distance: f64, limits: MotionLimits) -> Profile {
     let MotionLimits {
         velocity,
@@ -85,7 +87,7 @@ fn forwards(start: State, distance: f64, limits: MotionLimits) -> Profile {
         let left = (distance - reached).max(0.0);
         let cruise = if v > 0.0 { left / v } else { 0.0 };
         let profile = Profile::of(&[&first, &[Segment::cruise(cruise)], &last]);
-        // Once more with what rounding makes of it.
+        // Corrects the cruise by the rounding error.
         let missing = distance - profile.end(start).position;
         let cruise = if v > 0.0 { cruise + missing / v } else { 0.0 };
         Profile::of(&[&first, &[Segment::cruise(cruise)], &last])
@@ -110,12 +112,14 @@ fn forwards(start: State, distance: f64, limits: MotionLimits) -> Profile {
     with_cruise(find(lowest, velocity, distance, |v| through(v).2))
 }
 
-/// A third of them halve the bracket: enough for all bits of an f64.
+/// A third of the tries halve the bracket: enough for all bits of an f64.
 const TRIES: u32 = 180;
 
-/// Where `function` has the value `wanted`, between `below`, where it has less, and `above`, where it has more.
+/// Returns the argument at which `function` has the value `wanted`. The value at `below` is lower,
+/// at `above` higher.
 ///
-/// The secant with the Illinois correction, and every third time the middle, so that the bracket shrinks whatever the function.
+/// Uses the secant with the Illinois correction, and bisects at every third step, so that the
+/// bracket shrinks for any function.
 fn find(mut below: f64, mut above: f64, wanted: f64, mut function: impl FnMut(f64) -> f64) -> f64 {
     let mut low = function(below) - wanted;
     let mut high = function(above) - wanted;
@@ -150,7 +154,7 @@ fn find(mut below: f64, mut above: f64, wanted: f64, mut function: impl FnMut(f6
         } else {
             (above, high) = (at, value);
         }
-        // The end that stays a second time weighs half.
+        // Illinois correction: an end that remains twice gets half its weight.
         if last_below == Some(is_below) {
             if is_below {
                 high *= 0.5;

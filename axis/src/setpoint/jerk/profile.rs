@@ -1,7 +1,7 @@
-//! Segments of constant jerk, one after the other.
+//! Segments of constant jerk in sequence.
 
-/// Position relative to where the profile began, velocity and acceleration at one moment. Unlike [`super::Motion`], whose
-/// velocity is the mean of a cycle.
+/// Position relative to the start of the profile, velocity and acceleration at one moment. The
+/// velocity of [`super::Motion`] is the mean of a cycle instead.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct State {
     pub(crate) position: f64,
@@ -36,13 +36,13 @@ impl State {
 pub(crate) struct Segment {
     pub(crate) jerk: f64,
     pub(crate) time: f64,
-    /// Begins without acceleration. What rounding has left of it would add up over a long cruise.
+    /// Starts with acceleration 0. A rounding residue would add up over a long cruise.
     level: bool,
 }
 
 impl Segment {
     pub(crate) fn new(jerk: f64, time: f64) -> Self {
-        // Rounding makes some times a hair negative.
+        // Rounding makes some times slightly negative.
         Self {
             jerk,
             time: time.max(0.0),
@@ -50,7 +50,7 @@ impl Segment {
         }
     }
 
-    /// Constant velocity.
+    /// Creates a segment of constant velocity.
     pub(crate) fn cruise(time: f64) -> Self {
         Self {
             level: true,
@@ -66,7 +66,7 @@ impl Segment {
     }
 }
 
-/// A change of velocity, a cruise, another change; before them perhaps a stop.
+/// An optional stop, a change of velocity, a cruise, another change.
 pub(crate) const SEGMENTS: usize = 10;
 
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -109,7 +109,8 @@ impl Profile {
         self
     }
 
-    /// The same way, slower by `factor`. Only from rest: another start would have another velocity.
+    /// Returns the same way, slower by `factor`. Only from rest: another start would change its
+    /// velocity.
     pub(crate) fn slowed(mut self, factor: f64) -> Self {
         for segment in &mut self.segments {
             segment.time *= factor;
@@ -118,7 +119,7 @@ impl Profile {
         self
     }
 
-    /// Lowest and highest position on the way.
+    /// Returns the lowest and highest position on the way.
     pub(crate) fn span(&self, start: State) -> [f64; 2] {
         let mut span = [start.position, start.position];
         let mut state = start;
@@ -145,7 +146,8 @@ pub(crate) fn travel(start: State, segments: &[Segment]) -> State {
         .fold(start, |state, s| s.enter(state).after(s.jerk, s.time))
 }
 
-/// Where the velocity is zero: v + a·t + j·t²/2 = 0. What is no moment is negative or not a number.
+/// Returns the times at which the velocity is zero: v + a·t + j·t²/2 = 0. A missing solution is
+/// negative or NaN.
 fn turning_points(state: State, jerk: f64) -> [f64; 2] {
     let State {
         velocity: v,
@@ -160,7 +162,7 @@ fn turning_points(state: State, jerk: f64) -> [f64; 2] {
     [q / jerk, 2.0 * v / q]
 }
 
-/// From (v₀, a₀) to a velocity without acceleration, in the shortest time.
+/// Returns the fastest change from (v₀, a₀) to `velocity` with acceleration 0.
 pub(crate) fn velocity_change(
     start: State,
     velocity: f64,
@@ -201,12 +203,12 @@ pub(crate) fn velocity_change(
     ]
 }
 
-/// The velocity that is left when the acceleration has been taken back to zero.
+/// Returns the velocity that remains once the acceleration is reduced to zero.
 pub(crate) fn coasting(state: State, jerk: f64) -> f64 {
     state.velocity + state.acceleration * state.acceleration.abs() / (2.0 * jerk)
 }
 
-/// `state` seen so that `sign` is forwards.
-pub(crate) fn facing(state: State, sign: f64) -> State {
+/// Returns `state` mirrored such that `sign` is forwards.
+pub(crate) fn mirrored(state: State, sign: f64) -> State {
     if sign < 0.0 { state.mirrored() } else { state }
 }

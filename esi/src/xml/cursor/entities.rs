@@ -8,7 +8,8 @@ use super::problems::MAX_WARNINGS;
 use crate::model::Warning;
 
 impl<'a> Cursor<'a> {
-    /// Character references and XML's own five; everything else stays as written, with a warning.
+    /// Expands character references and the five predefined entities of XML. Other references stay
+    /// as written and cause a warning.
     pub(super) fn expanded(&mut self, text: &'a str) -> Cow<'a, str> {
         if !text.contains('&') {
             return Cow::Borrowed(text);
@@ -39,7 +40,7 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// Line ends of other systems become one character, as XML wants it.
+/// Converts line ends of other systems to one character, as XML requires.
 pub(super) fn line_ends(text: Cow<'_, str>) -> Cow<'_, str> {
     match text.contains('\r') {
         true => Cow::Owned(text.replace("\r\n", "\n").replace('\r', "\n")),
@@ -47,7 +48,8 @@ pub(super) fn line_ends(text: Cow<'_, str>) -> Cow<'_, str> {
     }
 }
 
-/// Tells the names of entities that nobody knows, and nothing (`""`) for an `&` that begins none.
+/// Expands references. Calls `unknown` with the names of unknown entities, and with `""` for an `&`
+/// without a reference.
 pub(super) fn expand(text: &str, mut unknown: impl FnMut(&str)) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;
@@ -85,7 +87,7 @@ pub(super) fn expand(text: &str, mut unknown: impl FnMut(&str)) -> String {
     out
 }
 
-/// `#228` or `#xe4`.
+/// Decodes `#228` or `#xe4`.
 fn character(reference: &str) -> Option<char> {
     let digits = reference.strip_prefix('#')?;
     let code = match digits.strip_prefix(['x', 'X']) {

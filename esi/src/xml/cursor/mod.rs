@@ -1,8 +1,8 @@
-//! A pull cursor over the scanner's pieces that knows line, column and element path, refuses to nest without
-//! bound and meters how much a file may make us allocate.
+//! A pull cursor over the scanner's events. The cursor tracks line, column and element path, and
+//! limits nesting depth and allocated memory.
 //!
-//! Here: walking from element to element. `values` reads text, numbers and flags, `entities` expands references,
-//! `path` names elements in messages, `problems` are these messages.
+//! This file moves from element to element. `values` reads text, numbers and flags, `entities`
+//! expands references, `path` formats element paths, and `problems` creates warnings and errors.
 
 mod entities;
 mod path;
@@ -10,7 +10,7 @@ mod problems;
 mod values;
 
 use super::lines::Lines;
-use super::scan::{Malformed, Piece, Scanner, local_name};
+use super::scan::{Malformed, XmlEvent, XmlReader, local_name};
 use crate::error::{EsiError, EsiProblem};
 use crate::model::{Position, Warning};
 use path::{NUMBERED, shorten};
@@ -18,32 +18,32 @@ use path::{NUMBERED, shorten};
 const MAX_DEPTH: usize = 64;
 
 pub(super) struct Cursor<'a> {
-    scanner: Scanner<'a>,
+    scanner: XmlReader<'a>,
     lines: Lines<'a>,
-    /// Levels beyond `depth` are kept for their memory.
+    /// The open elements. Levels beyond `depth` stay allocated for reuse.
     stack: Vec<Level<'a>>,
     depth: usize,
-    /// The root's siblings, for numbering.
+    /// The siblings of the root, for numbering.
     top: Level<'a>,
-    /// The element on top of the stack was written `<…/>`.
+    /// True if the element on top of the stack has the form `<…/>`.
     ends_at_once: bool,
     spent: usize,
     pub warnings: Vec<Warning>,
-    /// The first problem that cost an element.
+    /// The first error that caused an element to be skipped.
     pub first_left_out: Option<EsiError>,
 }
 
 #[derive(Default)]
 struct Level<'a> {
-    /// With its prefix, as the end tag must have it.
+    /// The name with its prefix, as the end tag must contain it.
     qualified: &'a str,
     number: u32,
     offset: usize,
-    /// How many of each numbered element below have begun.
+    /// The number of children so far, for each numbered element name.
     seen: [u32; NUMBERED],
 }
 
-/// A start tag. Whoever receives it reads its children or its text; what is left unread is skipped.
+/// A start tag. The receiver reads its children or its text; unread parts are skipped.
 #[derive(Clone, Copy)]
 pub(super) struct Element<'a> {
     pub name: &'a str,
@@ -54,7 +54,7 @@ pub(super) struct Element<'a> {
 }
 
 impl Element<'_> {
-    /// Where it starts, for [`Cursor::at`].
+    /// Returns the start offset, for [`Cursor::at`].
     pub fn offset(&self) -> usize {
         self.offset
     }
@@ -62,7 +62,7 @@ impl Element<'_> {
 
 enum Token<'a> {
     Start(Element<'a>),
-    /// References as they are written.
+    /// Text with unexpanded references.
     Text(&'a str),
     CData(&'a str),
     End,
@@ -72,7 +72,7 @@ enum Token<'a> {
 impl<'a> Cursor<'a> {
     pub fn new(text: &'a str) -> Self {
         Self {
-            scanner: Scanner::new(text),
+            scanner: XmlReader::new(text),
             lines: Lines::new(text),
             stack: Vec::new(),
             depth: 0,
@@ -84,18 +84,18 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Where the element starts.
+    /// Returns the position at which the element starts.
     pub fn position(&self, element: &Element<'_>) -> Position {
         self.at(element.offset)
     }
 
-    /// Line and column of a byte of the text.
+    /// Returns line and column of a byte offset in the text.
     pub fn at(&self, offset: usize) -> Position {
         let (line, column) = self.lines.position(offset);
         Position { line, column }
     }
 
-    /// The first element of the document.
+    /// Returns the first element of the document.
     pub fn root(&mut self) -> Result<Element<'a>, EsiError> {
         loop {
             match self.tag()? {
@@ -125,7 +125,8 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// An element that cannot be read is left out, and what follows it is read; `Err` where the text behind it cannot be.
+    /// Skips an unreadable element and continues after it. Fails if the text after the element is
+    /// unreadable.
     pub fn leave_out(
         &mut self,
         element: &Element<'a>,
@@ -141,7 +142,8 @@ impl<'a> Cursor<'a> {
         self.finish(element.depth)
     }
 
-    /// As [`Self::leave_out`]; where the text itself is damaged, it is read on behind the next end tag of that name.
+    /// Same as [`Self::leave_out`], but damaged text is skipped up to the next end tag of the same
+    /// name.
     pub fn leave_out_damaged(
         &mut self,
         element: &Element<'a>,
@@ -163,7 +165,7 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Reads on until the element at `depth` is closed.
+    /// Reads until the element at `depth` is closed.
     fn finish(&mut self, depth: usize) -> Result<(), EsiError> {
         while self.depth >= depth {
             if let Token::Eof = self.tag()? {
@@ -182,7 +184,7 @@ impl<'a> Cursor<'a> {
         self.take(piece)
     }
 
-    /// The next token that is not text.
+    /// Returns the next token that is not text.
     fn tag(&mut self) -> Result<Token<'a>, EsiError> {
         if std::mem::take(&mut self.ends_at_once) {
             self.depth = self.depth.saturating_sub(1);
@@ -193,9 +195,9 @@ impl<'a> Cursor<'a> {
     }
 
     #[inline(always)]
-    fn take(&mut self, piece: Result<Piece<'a>, Malformed>) -> Result<Token<'a>, EsiError> {
+    fn take(&mut self, piece: Result<XmlEvent<'a>, Malformed>) -> Result<Token<'a>, EsiError> {
         match piece {
-            Ok(Piece::Start {
+            Ok(XmlEvent::Start {
                 name,
                 attributes,
                 offset,
@@ -205,10 +207,10 @@ impl<'a> Cursor<'a> {
                 let element = self.open((name, local_name(name)), attributes, offset);
                 element.map(Token::Start)
             }
-            Ok(Piece::End { name, offset }) => self.close(name, offset),
-            Ok(Piece::Text(text)) => Ok(Token::Text(text)),
-            Ok(Piece::CData(text)) => Ok(Token::CData(text)),
-            Ok(Piece::Eof) => Ok(Token::Eof),
+            Ok(XmlEvent::End { name, offset }) => self.close(name, offset),
+            Ok(XmlEvent::Text(text)) => Ok(Token::Text(text)),
+            Ok(XmlEvent::CData(text)) => Ok(Token::CData(text)),
+            Ok(XmlEvent::Eof) => Ok(Token::Eof),
             Err(Malformed { offset, what }) => {
                 let problem = match what {
                     Some(what) => EsiProblem::Syntax(what),
@@ -249,7 +251,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// The number of a child that begins in the element that was begun last.
+    /// Returns the number of a child that starts in the innermost open element.
     #[inline]
     fn count(&mut self, name: &str) -> u32 {
         let parent = match self.depth.checked_sub(1) {
@@ -280,7 +282,7 @@ impl<'a> Cursor<'a> {
         ))
     }
 
-    /// The element that was begun last and not closed.
+    /// Returns the innermost open element.
     fn within(&self) -> &Level<'a> {
         let last = self.depth.checked_sub(1).and_then(|at| self.stack.get(at));
         last.unwrap_or(&self.top)

@@ -1,12 +1,12 @@
-//! Element paths as warnings and errors tell them, `EtherCATInfo/Descriptions/Devices/Device[2]/Sm[3]`.
+//! Element paths for warnings and errors, `EtherCATInfo/Descriptions/Devices/Device[2]/Sm[3]`.
 
 use super::super::scan;
 use super::{Cursor, Element, Level};
 
-/// Elements that occur several times and therefore carry their number in a path.
+/// The number of element names that may occur several times and therefore carry a number in a path.
 pub(super) const NUMBERED: usize = 16;
 
-/// Which of them.
+/// Returns the slot of a numbered element name.
 fn numbered(name: &str) -> Option<usize> {
     Some(match name {
         "Sm" => 0,
@@ -42,7 +42,8 @@ impl Level<'_> {
 }
 
 impl<'a> Cursor<'a> {
-    /// Also of an element that was left already; what is around it is still open.
+    /// Returns the path of an element, even if the element is already closed. Its parents must
+    /// still be open.
     pub fn path_of(&self, element: &Element<'a>) -> String {
         let mut path = self.path(element.depth.saturating_sub(1));
         append(&mut path, element.name, element.number);
@@ -57,7 +58,7 @@ impl<'a> Cursor<'a> {
         path
     }
 
-    /// Of what is read right now; before and behind the root that is the file.
+    /// Returns the path of the innermost open element, or `(file)` outside the root.
     pub(super) fn current_path(&self) -> String {
         match self.depth {
             0 => "(file)".to_owned(),
@@ -78,7 +79,7 @@ fn append(path: &mut String, name: &str, number: u32) {
     }
 }
 
-/// Keeps what a damaged file may put into an error text short.
+/// Shortens text from a damaged file for an error message.
 pub(super) fn shorten(text: &str) -> String {
     short(text).to_owned()
 }

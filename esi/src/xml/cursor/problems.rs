@@ -1,4 +1,4 @@
-//! Warnings, errors, and how much a file may make us allocate.
+//! Warnings, errors and the memory limit.
 
 use super::super::scan;
 use super::path::shorten;
@@ -7,8 +7,8 @@ use crate::error::{EsiError, EsiProblem};
 use crate::model::{Position, Warning};
 
 pub(super) const MAX_WARNINGS: usize = 500;
-/// Bytes of data that one file's objects may expand to; the largest known file needs a tenth of it. A choice
-/// copies them.
+/// The maximum size in bytes to which the objects of one file may expand. The largest known file
+/// needs a tenth of it. A selection copies the objects.
 const MAX_EXPANSION: usize = 32 << 20;
 
 impl<'a> Cursor<'a> {
@@ -16,7 +16,8 @@ impl<'a> Cursor<'a> {
         self.warn_at(self.position(element), element, message);
     }
 
-    /// For oddities found after the element itself was left; `within` names the part of the file.
+    /// Adds a warning for a problem found after the element was closed. `within` is an enclosing
+    /// open element.
     pub fn warn_at(&mut self, position: Position, within: &Element<'a>, message: String) {
         if self.warnings.len() < MAX_WARNINGS {
             let path = self.path_of(within);
@@ -30,7 +31,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Tells of what could not be read.
+    /// Adds a warning about an unreadable element.
     pub fn left_out(&mut self, error: &EsiError) {
         if self.warnings.len() < MAX_WARNINGS {
             self.warnings.push(Warning {
@@ -44,7 +45,7 @@ impl<'a> Cursor<'a> {
         self.first_left_out.get_or_insert_with(|| error.clone());
     }
 
-    /// Accounts for `bytes` of data built from what stands at `position`.
+    /// Counts `bytes` of data for the element at `position`. Fails above the limit.
     pub fn spend(
         &mut self,
         bytes: usize,
@@ -58,7 +59,8 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// For what is found after the element itself was left; `within` names the part of the file.
+    /// Returns an error for a problem found after the element was closed. `within` is an enclosing
+    /// open element.
     pub fn error_within(
         &self,
         position: Position,

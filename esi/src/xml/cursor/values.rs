@@ -10,12 +10,12 @@ use crate::error::{EsiError, EsiProblem};
 use crate::model::SlotDependence;
 
 impl<'a> Cursor<'a> {
-    /// The element's own text, trimmed.
+    /// Returns the element's own text, trimmed.
     pub fn text(&mut self, element: &Element<'a>) -> Result<String, EsiError> {
         self.content(element).map(Cow::into_owned)
     }
 
-    /// The same, borrowed where it stands in the file in one piece.
+    /// Same as [`Self::text`], but borrowed if the file contains the text in one piece.
     pub fn content(&mut self, element: &Element<'a>) -> Result<Cow<'a, str>, EsiError> {
         let mut content = Cow::Borrowed("");
         while self.depth >= element.depth {
@@ -50,7 +50,7 @@ impl<'a> Cursor<'a> {
         self.to_number(element, what, &text)
     }
 
-    /// Like [`Self::number`]; an empty element counts as absent.
+    /// Same as [`Self::number`], but an empty element counts as absent.
     pub fn optional_number<T>(
         &mut self,
         element: &Element<'a>,
@@ -88,7 +88,7 @@ impl<'a> Cursor<'a> {
         Ok(self.value(element, name)?.map(Cow::into_owned))
     }
 
-    /// The same, borrowed where it needs no change.
+    /// Returns an attribute value, borrowed if it needs no change.
     pub fn value(
         &self,
         element: &Element<'a>,
@@ -115,14 +115,14 @@ impl<'a> Cursor<'a> {
         });
         match unknown.filter(|entity| !entity.is_empty()) {
             Some(entity) => {
-                let problem = format!("attribute {name}: nobody knows the entity &{entity};");
+                let problem = format!("attribute {name}: unknown entity &{entity};");
                 Err(self.error_at(element, EsiProblem::Syntax(problem)))
             }
             None => Ok(Some(Cow::Owned(expanded))),
         }
     }
 
-    /// A numeric attribute; an empty one counts as absent.
+    /// Returns a numeric attribute; an empty one counts as absent.
     pub fn attribute_number<T>(
         &self,
         element: &Element<'a>,
@@ -146,7 +146,7 @@ impl<'a> Cursor<'a> {
         element: &Element<'a>,
         name: &str,
     ) -> Result<Option<bool>, EsiError> {
-        // Some makers write Default="".
+        // Some vendors write Default="".
         let Some(text) = self
             .value(element, name)?
             .filter(|text| !text.trim().is_empty())
@@ -164,7 +164,7 @@ impl<'a> Cursor<'a> {
         Ok(flag)
     }
 
-    /// `DependOnSlot` and `DependOnSlotGroup` of an index.
+    /// Reads `DependOnSlot` and `DependOnSlotGroup` of an index.
     pub fn slot_dependence(&mut self, element: &Element<'a>) -> Result<SlotDependence, EsiError> {
         if element.attributes.is_empty() {
             return Ok(SlotDependence::default());
@@ -175,7 +175,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// The element's text as true or false; anything else is false, with a warning.
+    /// Returns the element's text as a Boolean. Invalid text counts as false and causes a warning.
     pub fn flag(&mut self, element: &Element<'a>) -> Result<bool, EsiError> {
         let text = self.content(element)?;
         if let Some(flag) = number::boolean(&text) {

@@ -1,21 +1,22 @@
-//! Devices, story and transfers, from what the segment kept.
+//! Devices, events and transfers of the report, from the segment.
 
-use super::cyclic::{axes, clocks, cycle};
-use super::{DeviceReport, FileReport, Line, Report, SyncManagerReport, TransferReport, trouble};
-use crate::analyze::events::{Event, Of, What};
-use crate::analyze::mailbox::{Ended, Way};
+use super::process_data::{axes, clocks, cycle};
+use super::{DeviceReport, FileReport, Line, Report, SyncManagerReport, TransferReport, problems};
+use crate::analyze::events::{Event, EventKind, EventScope};
+use crate::analyze::mailbox::{TransferDirection, TransferOutcome};
 use crate::analyze::segment::{Device, Segment};
 use crate::analyze::values::value;
-use crate::analyze::{Counted, Known};
+use crate::analyze::{Context, PacketCounts};
 use crate::mailbox::object_name;
-use crate::recording::frame::Carrier;
+use crate::recording::frame::Encapsulation;
+use ecaxis_ecat::registers;
 
-/// Transfers that are listed; they are counted beyond.
+/// The maximum number of listed transfers; further ones are counted.
 const TRANSFERS: usize = 20_000;
-/// Lines that are looked back for one that says the same.
+/// The number of lines searched backwards for an identical one.
 const TOGETHER: usize = 256;
 
-/// Seconds since the recording's first frame.
+/// The time in s since the first frame of the recording.
 pub(super) struct Since(u64);
 
 impl Since {
@@ -26,11 +27,11 @@ impl Since {
 
 pub(in crate::analyze) fn report(
     remarks: Vec<String>,
-    counted: &Counted,
+    counted: &PacketCounts,
     mut segment: Segment,
 ) -> Report {
     let since = Since(counted.first.unwrap_or(0));
-    // As they are cabled, as far as that is known.
+    // In cabling order, if known.
     let mut order: Vec<usize> = (0..segment.devices.len()).collect();
     order.sort_by_key(|n| {
         let device = segment.devices.get(*n);
@@ -46,7 +47,7 @@ pub(in crate::analyze) fn report(
         let own = segment
             .events
             .iter()
-            .filter(|event| event.of == Of::Device(*n));
+            .filter(|event| event.of == EventScope::Device(*n));
         devices.push(device_report(device, &mut segment.known, own));
     }
     let (transfers, more_transfers) = transfers(&segment, &since, place);
@@ -69,11 +70,11 @@ pub(in crate::analyze) fn report(
         axes: axes(&segment, &order, &devices, &since),
         devices,
     };
-    report.trouble = trouble::of(&report);
+    report.trouble = problems::of(&report);
     report
 }
 
-fn file(mut remarks: Vec<String>, counted: &Counted, segment: &Segment) -> FileReport {
+fn file(mut remarks: Vec<String>, counted: &PacketCounts, segment: &Segment) -> FileReport {
     let mut remark = |count: u64, text: &str| {
         if count > 0 {
             remarks.push(format!("{count} {text}"));
@@ -109,9 +110,11 @@ fn file(mut remarks: Vec<String>, counted: &Counted, segment: &Segment) -> FileR
     }
     for carrier in &counted.carriers {
         match carrier {
-            Carrier::Ethernet => {}
-            Carrier::Vlan(vlan) => remarks.push(format!("frames carry the tag of VLAN {vlan}")),
-            Carrier::Udp => remarks.push("frames are carried in UDP".to_owned()),
+            Encapsulation::Ethernet => {}
+            Encapsulation::Vlan(vlan) => {
+                remarks.push(format!("frames carry the tag of VLAN {vlan}"))
+            }
+            Encapsulation::Udp => remarks.push("frames are carried in UDP".to_owned()),
         }
     }
     let began = counted.first.unwrap_or(0);
@@ -132,7 +135,7 @@ fn file(mut remarks: Vec<String>, counted: &Counted, segment: &Segment) -> FileR
 
 fn device_report<'e>(
     device: &Device,
-    known: &mut Known,
+    known: &mut Context,
     events: impl Iterator<Item = &'e Event>,
 ) -> DeviceReport {
     let configuration = device.configuration();
@@ -163,9 +166,9 @@ fn device_report<'e>(
         (Some(vendor), Some(product)) => known.type_name(vendor, product, revision.unwrap_or(0)),
         _ => None,
     };
-    // Cyclic operation of SYNC0 is bit 1 of what activates it.
+    // Bit 1 of the activation register enables cyclic SYNC0.
     let sync0 = configuration
-        .u8(0x0981)
+        .u8(registers::DC_ACTIVATION)
         .is_some_and(|activation| activation & 2 != 0);
     let mut report = DeviceReport {
         position: device.position,
@@ -190,7 +193,9 @@ fn device_report<'e>(
         input_bytes: bytes("inputs"),
         sync_managers,
         fmmus: configuration.fmmus().count(),
-        sync0_ns: configuration.u32(0x09a0).filter(|ns| sync0 && *ns > 0),
+        sync0_ns: configuration
+            .u32(registers::DC_SYNC0_CYCLE)
+            .filter(|ns| sync0 && *ns > 0),
         eeprom_words: eeprom.words(),
         errors: errors(device),
         reads: 0,
@@ -202,23 +207,23 @@ fn device_report<'e>(
     };
     for event in events {
         match &event.what {
-            What::Transfer(transfer) => {
+            EventKind::Transfer(transfer) => {
                 match transfer.way {
-                    Way::Read => report.reads += 1,
-                    Way::Write => report.writes += 1,
+                    TransferDirection::Read => report.reads += 1,
+                    TransferDirection::Write => report.writes += 1,
                 }
-                report.failed_transfers += u64::from(transfer.ended != Ended::Done);
+                report.failed_transfers += u64::from(transfer.ended != TransferOutcome::Done);
             }
-            What::Emergency(emergency) => {
+            EventKind::Emergency(emergency) => {
                 report.emergencies += 1;
                 if !emergency.is_reset() {
                     once(&mut report.emergency_codes, emergency.code);
                 }
             }
-            What::State {
+            EventKind::State {
                 code: Some(code), ..
             }
-            | What::Code(code)
+            | EventKind::Code(code)
                 if *code != 0 =>
             {
                 once(&mut report.al_errors, *code);
@@ -229,7 +234,7 @@ fn device_report<'e>(
     report
 }
 
-/// Codes of one kind that a device is told to have had.
+/// The maximum number of codes of one kind per device.
 const CODES: usize = 16;
 
 fn once(codes: &mut Vec<u16>, code: u16) {
@@ -238,20 +243,38 @@ fn once(codes: &mut Vec<u16>, code: u16) {
     }
 }
 
-/// Error counters from 0x0300 on.
+/// Returns the error counters from 0x0300 on.
 fn errors(device: &Device) -> Vec<(String, u8)> {
     let ports = 0..4_u16;
     let of_port = |port: u16| {
         [
-            (0x0300 + 2 * port, format!("invalid frames at port {port}")),
-            (0x0301 + 2 * port, format!("receive errors at port {port}")),
-            (0x0308 + port, format!("errors forwarded to port {port}")),
-            (0x0310 + port, format!("links lost at port {port}")),
+            (
+                registers::RX_ERROR_COUNTERS + 2 * port,
+                format!("invalid frames at port {port}"),
+            ),
+            (
+                registers::RX_ERROR_COUNTERS + 1 + 2 * port,
+                format!("receive errors at port {port}"),
+            ),
+            (
+                registers::FORWARDED_ERROR_COUNTERS + port,
+                format!("errors forwarded to port {port}"),
+            ),
+            (
+                registers::LOST_LINK_COUNTERS + port,
+                format!("links lost at port {port}"),
+            ),
         ]
     };
     let unit = [
-        (0x030c, "errors of the processing unit".to_owned()),
-        (0x030d, "errors of the process data interface".to_owned()),
+        (
+            registers::PROCESSING_UNIT_ERRORS,
+            "errors of the processing unit".to_owned(),
+        ),
+        (
+            registers::PDI_ERRORS,
+            "errors of the process data interface".to_owned(),
+        ),
     ];
     let all = ports.flat_map(of_port).chain(unit);
     let counted = all.filter_map(|(register, what)| Some((what, device.registers.u8(register)?)));
@@ -265,7 +288,7 @@ fn lines<'e>(
 ) -> Vec<Line> {
     let line = |event: &Event| {
         let axis = match event.what {
-            What::Axis { axis: n @ 1.., .. } | What::AxisError { axis: n @ 1.., .. } => {
+            EventKind::Axis { axis: n @ 1.., .. } | EventKind::AxisError { axis: n @ 1.., .. } => {
                 format!("axis {n}: ")
             }
             _ => String::new(),
@@ -273,8 +296,8 @@ fn lines<'e>(
         Line {
             at: since.seconds(event.at),
             devices: match event.of {
-                Of::Bus => Vec::new(),
-                Of::Device(n) => vec![place(n)],
+                EventScope::Bus => Vec::new(),
+                EventScope::Device(n) => vec![place(n)],
             },
             text: format!("{axis}{}", event.what),
             trouble: event.what.is_trouble(),
@@ -284,7 +307,7 @@ fn lines<'e>(
     events.map(line).collect()
 }
 
-/// Lines that say the same of several devices become one: bring-up does everything device by device.
+/// Merges identical lines of several devices, because bring-up repeats each action per device.
 fn together(lines: Vec<Line>) -> Vec<Line> {
     let mut kept: Vec<Line> = Vec::new();
     for line in lines {
@@ -294,7 +317,7 @@ fn together(lines: Vec<Line>) -> Vec<Line> {
             last.times += 1;
             continue;
         }
-        // Back to what was said of the same device, or of the whole bus.
+        // Search back to the last line of the same device or of the whole bus.
         let other = |old: &&mut Line| {
             old.devices.is_empty() || line.devices.iter().any(|n| old.devices.contains(n))
         };
@@ -324,7 +347,7 @@ fn transfers(
         .events
         .iter()
         .filter_map(|event| match (&event.what, event.of) {
-            (What::Transfer(transfer), Of::Device(n)) => Some((n, transfer)),
+            (EventKind::Transfer(transfer), EventScope::Device(n)) => Some((n, transfer)),
             _ => None,
         });
     let (mut listed, mut more) = (Vec::new(), 0);
@@ -334,26 +357,26 @@ fn transfers(
             continue;
         }
         let names = segment.devices.get(n).map(|device| &device.mailbox.names);
-        let told = names.and_then(|names| {
+        let reported = names.and_then(|names| {
             let own = names.get(&(transfer.index, u16::from(transfer.sub)));
             own.or_else(|| names.get(&(transfer.index, u16::MAX)))
         });
         let standard = object_name(transfer.index, transfer.sub).map(ToOwned::to_owned);
         let (ended, code) = match transfer.ended {
-            Ended::Done => ("done", None),
-            Ended::Aborted { code, .. } => ("aborted", Some(code)),
-            Ended::Refused(code) => ("refused", Some(u32::from(code))),
-            Ended::Unanswered => ("no answer", None),
+            TransferOutcome::Done => ("done", None),
+            TransferOutcome::Aborted { code, .. } => ("aborted", Some(code)),
+            TransferOutcome::Refused(code) => ("refused", Some(u32::from(code))),
+            TransferOutcome::Unanswered => ("no answer", None),
         };
         listed.push(TransferReport {
             at: since.seconds(transfer.began),
             device: place(n),
             took_ns: transfer.ended_at.saturating_sub(transfer.began),
-            write: transfer.way == Way::Write,
+            write: transfer.way == TransferDirection::Write,
             index: transfer.index,
             sub: transfer.sub,
             complete: transfer.complete,
-            name: standard.or_else(|| told.cloned()),
+            name: standard.or_else(|| reported.cloned()),
             bytes: transfer.len,
             segments: transfer.segments,
             value: value(transfer),

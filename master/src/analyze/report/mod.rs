@@ -1,30 +1,31 @@
-//! Everything that was found, as it is printed, written as JSON or drawn.
+//! The result of an analysis for text, JSON and HTML.
 //!
-//! - `build`: devices, story and transfers of a segment; `cyclic`: cycle, clocks and axes;
-//! - `trouble`: what of it wants looking at.
+//! - `build`: devices, events and transfers of a segment;
+//! - `process_data`: cycle, clocks and axes;
+//! - `problems`: the problems, worst first.
 
 use serde::Serialize;
 
 use crate::bringup::AlState;
 
 mod build;
-mod cyclic;
-mod trouble;
+mod problems;
+mod process_data;
 
 pub(super) use build::report;
 
-/// A recording in words and numbers.
+/// The result of an analysis.
 #[derive(Debug, Serialize)]
 pub struct Report {
     pub file: FileReport,
-    /// What went wrong, the worst first.
+    /// The problems, worst first.
     pub trouble: Vec<String>,
-    /// Devices that answered a broadcast read, at most.
+    /// The maximum number of devices that answered a broadcast read.
     pub answering: Option<u16>,
     pub devices: Vec<DeviceReport>,
-    /// What happened, in order: changes of state, refusals, emergencies.
+    /// The main events in order: state changes, refusals, emergencies.
     pub story: Vec<Line>,
-    /// Likewise, with every transfer.
+    /// All events, including every transfer.
     pub events: Vec<Line>,
     pub more_events: u64,
     pub transfers: Vec<TransferReport>,
@@ -39,17 +40,17 @@ pub struct FileReport {
     pub packets: u64,
     pub ethercat_frames: u64,
     pub other_packets: u64,
-    /// When the first EtherCAT frame passed, nanoseconds since 1970.
+    /// The time of the first EtherCAT frame in ns since 1970.
     pub began_ns: u64,
     pub seconds: f64,
     pub sent: u64,
     pub answered: u64,
     pub lost: u64,
-    /// Answers whose request is not in the recording.
+    /// The number of answers whose request is not in the recording.
     pub without_request: u64,
-    /// Requests that the recording's end cut off from their answer.
+    /// The number of requests whose answer is behind the end of the recording.
     pub open: u64,
-    /// What is odd about the file itself.
+    /// Problems of the file itself.
     pub remarks: Vec<String>,
 }
 
@@ -58,33 +59,33 @@ pub struct DeviceReport {
     pub position: Option<u16>,
     pub station: Option<u16>,
     pub alias: Option<u16>,
-    /// By machine file, ESI, EEPROM or 0x1008, whatever there is first.
+    /// The name from machine file, ESI, EEPROM or 0x1008, in this order.
     pub name: Option<String>,
     pub vendor: Option<u32>,
     pub product: Option<u32>,
     pub revision: Option<u32>,
     pub serial: Option<u32>,
-    /// States in the order in which they were reached.
+    /// The states in order.
     pub states: Vec<String>,
-    /// The last one.
+    /// The last state.
     pub state: Option<String>,
     pub al_error: bool,
     pub al_code: Option<u16>,
-    /// Bytes of process data from and to the MainDevice.
+    /// The process data from the MainDevice in bytes.
     pub output_bytes: u32,
     pub input_bytes: u32,
     pub sync_managers: Vec<SyncManagerReport>,
     pub fmmus: usize,
-    /// SYNC0's cycle where it is started, nanoseconds.
+    /// The SYNC0 cycle in ns, if started.
     pub sync0_ns: Option<u32>,
     pub eeprom_words: usize,
-    /// Error counters that are not 0: what is counted and how often.
+    /// Error counters other than 0: name and count.
     pub errors: Vec<(String, u8)>,
     pub reads: u64,
     pub writes: u64,
     pub failed_transfers: u64,
     pub emergencies: u64,
-    /// AL status codes of errors, and codes of emergencies, each once and in the order in which they came first.
+    /// The AL status codes, each once in order of first occurrence.
     pub al_errors: Vec<u16>,
     pub emergency_codes: Vec<u16>,
 }
@@ -98,16 +99,16 @@ pub struct SyncManagerReport {
     pub usage: &'static str,
 }
 
-/// One line of the story.
+/// One event line.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Line {
-    /// Seconds since the first frame.
+    /// The time in s since the first frame.
     pub at: f64,
-    /// Empty: the bus.
+    /// The devices; empty: the bus.
     pub devices: Vec<usize>,
     pub text: String,
     pub trouble: bool,
-    /// How often in a row.
+    /// The number of consecutive occurrences.
     pub times: u32,
 }
 
@@ -137,25 +138,25 @@ pub struct CycleReport {
     pub bytes: usize,
     pub count: u64,
     pub lost: u64,
-    /// The interval that is usual.
+    /// The usual interval in ns.
     pub cycle_ns: u64,
     pub interval_min_ns: u64,
     pub interval_p1_ns: u64,
     pub interval_p99_ns: u64,
     pub interval_max_ns: u64,
-    /// Intervals in which at least one cycle was left out: when they ended, and how long they were.
+    /// Intervals with at least one skipped cycle: end and length.
     pub gaps: Vec<(f64, u64)>,
     pub round_trip_p50_ns: Option<u64>,
     pub round_trip_max_ns: Option<u64>,
     pub usual_wkc: Option<u16>,
-    /// How many answers had which working counter.
+    /// Working counters and their number of answers.
     pub wkc: Vec<(u16, u64)>,
-    /// When it changed.
+    /// The changes of the working counter.
     pub runs: Vec<WkcRun>,
     pub more_runs: u64,
 }
 
-/// Cycles in a row with one working counter; none where there was no answer.
+/// Consecutive cycles with one working counter; `None`: no answer.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct WkcRun {
     pub at: f64,
@@ -165,17 +166,17 @@ pub struct WkcRun {
 
 #[derive(Debug, Serialize)]
 pub struct ClocksReport {
-    /// Station of the clock whose time is distributed.
+    /// The station address of the reference clock.
     pub reference: Option<u16>,
     pub readings: u64,
     pub rate_ppm: Option<f64>,
-    /// How much intervals of the reference clock differ from those of the recording.
+    /// The median difference between intervals of the reference clock and of the recording.
     pub jitter_p50_ns: Option<u64>,
     pub jitter_p99_ns: Option<u64>,
     pub differences: Vec<ClockReport>,
 }
 
-/// System time differences of a device, without sign but for the last.
+/// The system time differences of a device. Absolute values, except the last.
 #[derive(Debug, Serialize)]
 pub struct ClockReport {
     pub station: u16,
@@ -191,29 +192,29 @@ pub struct AxisReport {
     pub device: usize,
     pub name: String,
     pub cycles: u64,
-    /// When which CiA 402 state began.
+    /// The CiA 402 states and their start times.
     pub states: Vec<(f64, String)>,
     pub modes: Vec<(f64, String)>,
     pub error_code: Option<u16>,
-    /// Of positions: counts, or the machine file's unit.
+    /// The unit of positions: counts, or that of the machine file.
     pub unit: String,
-    /// Greatest distance between target and actual position in CSP while Operation enabled.
+    /// The largest difference between target and actual position in CSP while Operation enabled.
     pub largest_following_error: Option<f64>,
     pub travelled: Option<(f64, f64)>,
     pub plots: Vec<Plot>,
 }
 
-/// Two curves that belong together: target and actual.
+/// The curves of a target and an actual value.
 #[derive(Debug, Serialize)]
 pub struct Plot {
     pub title: &'static str,
     pub unit: String,
-    /// Seconds, least, greatest.
+    /// Time in s, minimum, maximum.
     pub target: Vec<(f64, f64, f64)>,
     pub actual: Vec<(f64, f64, f64)>,
 }
 
-/// How a device is called where there is no room for more.
+/// Returns a short name of a device.
 #[must_use]
 pub fn called(place: usize, device: &DeviceReport) -> String {
     device
@@ -222,7 +223,7 @@ pub fn called(place: usize, device: &DeviceReport) -> String {
         .unwrap_or_else(|| format!("device {place}"))
 }
 
-/// The highest of the states that a device reached.
+/// Returns the highest state that a device reached.
 #[must_use]
 pub fn highest(device: &DeviceReport) -> Option<&str> {
     let rank = |name: &&String| {

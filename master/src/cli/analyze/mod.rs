@@ -1,9 +1,9 @@
-//! `ecaxis analyze`: what a recording tells, as a page of text, as JSON, or as HTML with pictures of the axes.
+//! `ecaxis analyze`: reports on a recording as text, JSON, or HTML with plots of the axes.
 
 use std::path::{Path, PathBuf};
 
-use ecaxis::analyze::{self as analysis, DeviceReport, Known};
-use ecaxis::words::counted;
+use ecaxis::analyze::{self as analysis, Context, DeviceReport};
+use ecaxis::text::pluralize;
 use ecaxis::{config, recording};
 
 use super::{Failure, files, hints, note, result, unwritable};
@@ -12,18 +12,18 @@ mod text;
 
 const EXAMPLES: &str = "\
 Examples:
-  ecaxis analyze run.pcapng                        the story on one page
+  ecaxis analyze run.pcapng                        the report on one page
   ecaxis analyze run.pcapng --all                  every event and transfer
   ecaxis analyze run.pcapng --machine m.toml       with its names and units
   ecaxis analyze run.pcapng --html report.html     with pictures of each axis
-  ecaxis analyze other.pcap --esi esi/ --json      somebody else's, for a script
+  ecaxis analyze other.pcap --esi esi/ --json      from any MainDevice, as JSON
   ecaxis analyze night.pcapng night.0*.pcapng      parts of one recording
 
 Reads pcap and pcapng of any MainDevice: `ecaxis run --record`, Wireshark,
 tcpdump. A file that is cut or damaged is read as far as it can be.
 Exit code: 0 read, 1 there is no EtherCAT in it, 2 it cannot be opened.";
 
-/// Tell what a recording shows: devices, states, SDO transfers, cycle, clocks, axes
+/// Analyze a recording: devices, states, SDO transfers, cycle, clocks, axes
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -36,16 +36,16 @@ pub(crate) struct Args {
     /// Take names and default process data from this ESI file or folder
     #[arg(long, value_name = "PATH")]
     esi: Option<PathBuf>,
-    /// Only what this interface of the recording saw
+    /// Use only this interface of the recording
     #[arg(long, value_name = "N")]
     interface: Option<u32>,
     /// Print every event, transfer and SyncManager
     #[arg(long)]
     all: bool,
-    /// Print what was found as JSON
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
-    /// Write a report with pictures of the axes here
+    /// Write an HTML report with plots of the axes to this file
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
 }
@@ -69,7 +69,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let begins = reader.peek().and_then(|packet| packet.at);
         parts.push((path, reader, begins));
     }
-    // However the shell sorted them.
+    // Sort by time, because the shell may have sorted by name.
     parts.sort_by_cached_key(|(_, _, begins)| *begins);
     let shown = parts.first().map_or(Path::new(""), |(path, ..)| path);
     let name = shown
@@ -103,10 +103,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// A machine file, and its devices' names.
+/// A machine file and the names of its devices.
 type Expected<'a> = (&'a Path, Vec<String>);
 
-/// Where a machine file is not of the machine that was recorded: devices are only named where position and product fit.
+/// Returns a warning if the machine file does not match the recorded machine. Devices get names
+/// only if position and product match.
 fn other_machine(names: &[String], devices: &[DeviceReport]) -> Option<String> {
     let known = |device: &&DeviceReport| {
         let name = device.name.as_ref();
@@ -118,13 +119,13 @@ fn other_machine(names: &[String], devices: &[DeviceReport]) -> Option<String> {
     }
     Some(format!(
         "of its {}, {fitting} fit the recording, which shows {}: is it of this machine?",
-        counted(names.len(), "device"),
+        pluralize(names.len(), "device"),
         devices.len()
     ))
 }
 
-fn known(args: &Args) -> Result<(Known, Option<Expected<'_>>), Failure> {
-    let mut known = Known::default();
+fn known(args: &Args) -> Result<(Context, Option<Expected<'_>>), Failure> {
+    let mut known = Context::default();
     let mut expected = None;
     if let Some(file) = &args.machine {
         let machine = config::load(file).map_err(|e| hints::config(file, &e))?;

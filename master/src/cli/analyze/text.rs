@@ -1,4 +1,4 @@
-//! The report as text of 80 columns, the most important first.
+//! The report as text of 80 columns, most important facts first.
 
 use ecaxis::analyze::{CycleReport, DeviceReport, Line, Report, called, highest, time};
 
@@ -7,14 +7,14 @@ use ecaxis_esi::address;
 use super::super::hints;
 use super::super::table::Table;
 
-/// Columns of a line.
+/// The line width in columns.
 const WIDTH: usize = 80;
-/// Lines of the story that a page has room for: the first and the last.
+/// The number of first and last events on a page.
 const FIRST: usize = 24;
 const LAST: usize = 12;
-/// Transfers that a page lists.
+/// The maximum number of SDO transfers on a page.
 const TRANSFERS: usize = 12;
-/// Changes of a working counter that a page lists.
+/// The maximum number of working counter changes on a page.
 const RUNS: usize = 8;
 
 pub(super) fn page(name: &str, report: &Report, all: bool) -> String {
@@ -39,7 +39,7 @@ pub(super) fn page(name: &str, report: &Report, all: bool) -> String {
     out
 }
 
-/// Wrapped, with what follows the first line below its text.
+/// Wraps text and aligns continuation lines with its start.
 fn item(mark: &str, text: &str) -> String {
     let indent = 2 + mark.chars().count();
     let mut out = format!("  {mark}");
@@ -93,7 +93,8 @@ fn head(name: &str, report: &Report) -> String {
     out
 }
 
-/// Civil date of the Gregorian calendar; days are counted from March on, so that a leap day is a year's last.
+/// Formats a UTC date (Gregorian calendar). Years begin in March, so that the leap day is the last
+/// day.
 fn utc(nanos: u64) -> String {
     let seconds = nanos / 1_000_000_000;
     let (days, rest) = (seconds / 86_400, seconds % 86_400);
@@ -119,7 +120,7 @@ fn utc(nanos: u64) -> String {
     )
 }
 
-/// What to look at for each code.
+/// Adds the advice for each error code.
 fn help(report: &Report, out: &mut String) {
     for (place, device) in report.devices.iter().enumerate() {
         let states = device
@@ -215,7 +216,7 @@ fn devices(report: &Report, all: bool, out: &mut String) {
     }
 }
 
-/// Whom a line is about: numbers of devices, rows of them in short.
+/// Formats the devices of an event; consecutive numbers become ranges.
 fn whom(line: &Line, report: &Report) -> String {
     match line.devices.as_slice() {
         [] => "bus".to_owned(),
@@ -260,12 +261,12 @@ fn story(report: &Report, all: bool, out: &mut String) {
         .iter()
         .take(if left > 0 { FIRST } else { lines.len() })
     {
-        *out += &told(line, report);
+        *out += &describe(line, report);
     }
     if left > 0 {
         *out += &format!("  … {left} more, `--all` shows them\n");
         for line in lines.iter().skip(FIRST + left) {
-            *out += &told(line, report);
+            *out += &describe(line, report);
         }
     }
     if all && report.more_events > 0 {
@@ -273,8 +274,8 @@ fn story(report: &Report, all: bool, out: &mut String) {
     }
 }
 
-/// The time in a column of its own, what happened wrapped beside it.
-fn told(line: &Line, report: &Report) -> String {
+/// Formats an event: the time in its own column, the wrapped text next to it.
+fn describe(line: &Line, report: &Report) -> String {
     let times = match line.times {
         1 => String::new(),
         n => format!(" ({n} times)"),

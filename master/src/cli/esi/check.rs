@@ -1,9 +1,9 @@
-//! `ecaxis esi check`: every mistake in a file, with its place.
+//! `ecaxis esi check`: lists all problems in an ESI file.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use ecaxis::words::counted;
+use ecaxis::text::pluralize;
 use ecaxis_esi::{Finding, Severity, lint};
 use serde_json::json;
 
@@ -14,14 +14,14 @@ Examples:
   ecaxis esi check f.xml
   ecaxis esi check f.xml --json             for an editor or a script";
 
-/// Tell every mistake in an ESI file, with its line, element and weight
+/// List all problems in an ESI file with line, element path and severity
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// ESI file
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Print the findings as JSON
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
@@ -55,14 +55,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     } else {
         page(&text)
     }?;
-    let devices = counted(file.devices.len(), "device");
-    let mut warnings = counted(count(Severity::Warning), "warning");
+    let devices = pluralize(file.devices.len(), "device");
+    let mut warnings = pluralize(count(Severity::Warning), "warning");
     match count(Severity::Note) {
         0 => {}
-        notes => warnings = format!("{warnings}, {}", counted(notes, "note")),
+        notes => warnings = format!("{warnings}, {}", pluralize(notes, "note")),
     }
     if errors > 0 {
-        let errors = counted(errors, "error");
+        let errors = pluralize(errors, "error");
         let message = format!("{}: {devices}, {errors}, {warnings}", args.file.display());
         return Err(Failure::new(hints::WRONG, message));
     }
@@ -73,7 +73,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Files that a file refers to lie beside it.
+/// Returns the path of a referenced file, which lies next to the file.
 fn place(file: &Path, other: Option<&str>) -> PathBuf {
     other.map_or_else(|| file.to_owned(), |other| file.with_file_name(other))
 }

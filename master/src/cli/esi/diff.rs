@@ -1,26 +1,26 @@
-//! `ecaxis esi diff`: an EEPROM image against the ESI of its device.
+//! `ecaxis esi diff`: compares an EEPROM image with the ESI of its device.
 
 use std::path::PathBuf;
 
-use ecaxis::words::counted;
-use ecaxis_esi::sii::{self, Aspect, Difference, Sii, SiiOptions};
+use ecaxis::text::pluralize;
+use ecaxis_esi::sii::{self, Difference, DifferenceKind, Sii, SiiOptions};
 use serde_json::json;
 
 use super::super::report::Table;
 use super::super::{Failure, hints, note, result};
-use super::Which;
+use super::DeviceArgs;
 
 const EXAMPLES: &str = "\
 Examples:
   ecaxis esi diff f.xml eeprom.bin
   ecaxis esi diff f.xml eeprom.bin --revision 0x1700000 --json";
 
-/// Compare an EEPROM image with what the ESI file says; exit code 1 if the device would behave differently
+/// Compare an EEPROM image with an ESI file; exit code 1 if the device would behave differently
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
-    which: Which,
+    which: DeviceArgs,
     /// EEPROM image
     #[arg(value_name = "IMAGE")]
     image: PathBuf,
@@ -29,7 +29,7 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// No EEPROM holds more.
+/// The maximum size of an EEPROM in bytes.
 const MAX_BYTES: u64 = 512 * 1024;
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -60,21 +60,24 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     result(&text)?;
     let count = |aspect| differences.iter().filter(|d| d.aspect == aspect).count();
-    let (identity, behaviour) = (count(Aspect::Identity), count(Aspect::Behaviour));
-    let told = format!(
+    let (identity, behaviour) = (
+        count(DifferenceKind::Identity),
+        count(DifferenceKind::Behaviour),
+    );
+    let reported = format!(
         "{name} against {}: {} of identity, {behaviour} of behaviour, {} of description",
         device.name,
-        counted(identity, "difference"),
-        count(Aspect::Description),
+        pluralize(identity, "difference"),
+        count(DifferenceKind::Description),
     );
     if identity + behaviour > 0 {
-        return Err(Failure::new(hints::FAILED, told));
+        return Err(Failure::new(hints::FAILED, reported));
     }
-    note(&told);
+    note(&reported);
     Ok(())
 }
 
-/// The device that the image names, unless the user says which.
+/// Returns the device named by the image or selected by the user.
 fn device<'e>(
     args: &Args,
     file: &'e ecaxis_esi::EsiFile,
@@ -102,12 +105,12 @@ fn table(differences: &[Difference]) -> String {
     table.shown(0) + "\n"
 }
 
-fn aspect(aspect: Aspect) -> &'static str {
+fn aspect(aspect: DifferenceKind) -> &'static str {
     match aspect {
-        Aspect::Identity => "identity",
-        Aspect::Behaviour => "behaviour",
-        Aspect::Description => "description",
-        Aspect::Instance => "this piece",
+        DifferenceKind::Identity => "identity",
+        DifferenceKind::Behaviour => "behaviour",
+        DifferenceKind::Description => "description",
+        DifferenceKind::Instance => "this piece",
     }
 }
 

@@ -1,8 +1,8 @@
-//! `ecaxis esi list`: the devices of a file or of a folder of files, and which of them fits a device best.
+//! `ecaxis esi list`: lists the devices of ESI files and finds the best match for a device.
 
 use std::path::PathBuf;
 
-use ecaxis::library::{self, Library, LoadError, Match};
+use ecaxis::esi_library::{self, Library, LoadError, RevisionMatch};
 use ecaxis_esi::Identity;
 use serde_json::json;
 
@@ -15,26 +15,27 @@ Examples:
   ecaxis esi list esi/ --vendor 0xfb        of one vendor
   ecaxis esi list esi/ --vendor 0xfb --product 0x63500000 --revision 0x1700000";
 
-/// List the devices in a file or in a folder of ESI files; with an identity, the description that fits it best
+/// List the devices in a file or folder of ESI files; with an identity, show the best match
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// ESI file, or a folder of them
     #[arg(value_name = "PATH")]
     path: PathBuf,
-    /// Vendor id, decimal or 0x…
+    /// Vendor ID, decimal or 0x…
     #[arg(long, value_parser = super::number)]
     vendor: Option<u32>,
     /// Product code, decimal or 0x…
     #[arg(long, value_parser = super::number)]
     product: Option<u32>,
-    /// Revision of the device at hand, decimal or 0x…; needs `--vendor` and `--product`
+    /// Revision of the device, decimal or 0x…; needs `--vendor` and `--product`
     #[arg(long, value_parser = super::number, requires = "vendor", requires = "product")]
     revision: Option<u32>,
-    /// Which described revisions fit it: equal, newer (the device may be newer than its description), high-word, low-word, ignore
+    /// Match rule for revisions: equal, newer (the device may be newer than its description),
+    /// high-word, low-word, ignore
     #[arg(long = "match", default_value = "newer")]
-    rule: Match,
-    /// Read every file, and leave the index of the last time alone
+    rule: RevisionMatch,
+    /// Read every file and do not use the cached index
     #[arg(long)]
     no_cache: bool,
     /// Print as JSON
@@ -50,7 +51,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             library.folder().join(file).display()
         ));
     }
-    let entries: Vec<&library::Entry> = match (args.vendor, args.product, args.revision) {
+    let entries: Vec<&esi_library::Entry> = match (args.vendor, args.product, args.revision) {
         (Some(vendor), Some(product), Some(revision)) => {
             let device = Identity {
                 vendor,
@@ -61,7 +62,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             vec![found.ok_or_else(|| missing(&library, device, args.rule))?]
         }
         (vendor, product, _) => {
-            let fits = |e: &&library::Entry| {
+            let fits = |e: &&esi_library::Entry| {
                 vendor.is_none_or(|vendor| e.vendor == vendor)
                     && product.is_none_or(|product| e.product == product)
             };
@@ -89,7 +90,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     result(&(table.shown(0) + "\n"))
 }
 
-/// Of whom there is something.
+/// Lists the vendors in the library.
 fn vendors(library: &Library) -> String {
     let mut all: Vec<String> = library
         .entries()
@@ -109,12 +110,12 @@ fn open(args: &Args) -> Result<Library, LoadError> {
     if args.path.is_file() {
         return Library::of_file(&args.path);
     }
-    let cache = library::cache_file(&args.path).filter(|_| !args.no_cache);
+    let cache = esi_library::cache_file(&args.path).filter(|_| !args.no_cache);
     Library::open(&args.path, cache.as_deref())
 }
 
-fn missing(library: &Library, device: Identity, rule: Match) -> Failure {
-    let same = |e: &&library::Entry| (e.vendor, e.product) == (device.vendor, device.product);
+fn missing(library: &Library, device: Identity, rule: RevisionMatch) -> Failure {
+    let same = |e: &&esi_library::Entry| (e.vendor, e.product) == (device.vendor, device.product);
     let described: Vec<String> = library
         .entries()
         .iter()
@@ -127,7 +128,7 @@ fn missing(library: &Library, device: Identity, rule: Match) -> Failure {
     );
     let failure = Failure::new(hints::WRONG, message);
     if described.is_empty() {
-        failure.hint("nothing of that vendor and product is there; the maker's site has the file")
+        failure.hint("no file of that vendor and product; download it from the vendor's site")
     } else {
         failure.hint(format!("there are revisions {}", described.join(", ")))
     }

@@ -1,11 +1,11 @@
-//! `ecaxis esi …`: what an ESI file says, what is wrong with it, and the EEPROM image that follows from it.
+//! `ecaxis esi …`: shows and checks ESI files, and generates EEPROM images from them.
 
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use ecaxis::config::nearest;
-use ecaxis::library::{self, LoadError};
-use ecaxis::words::counted;
+use ecaxis::esi_library::{self, LoadError};
+use ecaxis::text::pluralize;
 use ecaxis_esi::{self as esi, Device, DeviceQuery, EsiFile, Mode, SelectError};
 
 use super::{Failure, hints, note};
@@ -21,10 +21,10 @@ const EXAMPLES: &str = "\
 Examples:
   ecaxis esi list esi/                      devices of a folder of files
   ecaxis esi show f.xml --device EPOS4 --mode csp
-  ecaxis esi check f.xml                    mistakes, with line and column
+  ecaxis esi check f.xml                    problems, with line and column
   ecaxis esi sii f.xml --device 0x63500000 -o eeprom.bin";
 
-/// Look into ESI files: devices, PDOs, modes, mistakes, EEPROM images
+/// Inspect ESI files: devices, PDOs, modes, problems, EEPROM images
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -53,24 +53,24 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// A file, and which device of it.
+/// An ESI file and one of its devices.
 #[derive(Debug, clap::Args)]
-struct Which {
+struct DeviceArgs {
     /// ESI file
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Device: its type or name, 0x… for its product code, or its number in the file; needed where there are several
+    /// Device: type, name, product code (0x…), or number in the file; required if there are several
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
     /// Product code, decimal or 0x…
     #[arg(long, value_parser = number)]
     product: Option<u32>,
-    /// Revision, decimal or 0x…; otherwise the newest
+    /// Revision, decimal or 0x… [default: the newest]
     #[arg(long, value_parser = number)]
     revision: Option<u32>,
 }
 
-impl Which {
+impl DeviceArgs {
     fn load(&self) -> Result<EsiFile, Failure> {
         load(&self.file)
     }
@@ -79,7 +79,7 @@ impl Which {
         self.device.is_some() || self.product.is_some() || self.revision.is_some()
     }
 
-    /// Of several revisions the newest, which is told.
+    /// Returns the selected device. Without a revision, it picks the newest and prints a note.
     fn device<'e>(&self, file: &'e EsiFile) -> Result<&'e Device, Failure> {
         let device = self
             .find(file)
@@ -132,7 +132,8 @@ impl Which {
         }
     }
 
-    /// The device that a plain number counts to, from 1 as in element paths. What is called so goes first.
+    /// Returns the device with this number in the file, from 1 as in element paths. Device names
+    /// take precedence.
     fn number_of<'e>(&self, file: &'e EsiFile, text: &str) -> Option<&'e Device> {
         let place = format!("/Device[{}]", text.parse::<usize>().ok()?);
         let mut devices = file.devices.iter();
@@ -161,7 +162,7 @@ impl Which {
             ) => {
                 let mut types: Vec<&str> = file.devices.iter().map(|d| &*d.type_name).collect();
                 types.dedup();
-                let count = counted(file.devices.len(), "device");
+                let count = pluralize(file.devices.len(), "device");
                 let failure = failure(format!("none of its {count} matches {query}{unreadable}"));
                 match nearest(name, types.iter().copied()) {
                     Some(known) => failure.hint(format!("did you mean `{known}`?")),
@@ -174,7 +175,7 @@ impl Which {
             (SelectError::NoSuchDevice { .. } | SelectError::Ambiguous { .. }, _) => {
                 let message = match error {
                     SelectError::Ambiguous { .. } if !self.says_which() => {
-                        format!("it describes {}", counted(file.devices.len(), "device"))
+                        format!("it describes {}", pluralize(file.devices.len(), "device"))
                     }
                     _ => error.to_string(),
                 };
@@ -188,7 +189,7 @@ impl Which {
 }
 
 fn load(path: &Path) -> Result<EsiFile, Failure> {
-    library::load(path).map_err(|error| {
+    esi_library::load(path).map_err(|error| {
         let failure = Failure::new(hints::WRONG, error.to_string());
         match error {
             LoadError::Esi { source, .. } => failure.hint(match source.problem() {
@@ -196,7 +197,9 @@ fn load(path: &Path) -> Result<EsiFile, Failure> {
                 esi::EsiProblem::Truncated(_) | esi::EsiProblem::TruncatedTag => {
                     "the file is not complete; fetch it again"
                 }
-                _ => "the file is damaged or is not an ESI file; its maker has the right one",
+                _ => {
+                    "the file is damaged or is not an ESI file; download it from the vendor's site"
+                }
             }),
             LoadError::Read { .. } => failure,
         }

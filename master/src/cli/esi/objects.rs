@@ -1,13 +1,13 @@
-//! `ecaxis esi objects`: the object dictionary of a device.
+//! `ecaxis esi objects`: shows the object dictionary of a device.
 
 use ecaxis_esi::{
-    Bytes, Choice, Dictionary, Mode, ObjectItem, PdoMapping, Writable, address, select,
+    Bytes, Dictionary, Mode, ObjectItem, PdoMapping, SelectOptions, Writable, address, select,
 };
 use serde_json::json;
 
 use super::super::report::Table;
 use super::super::{Failure, hints, result};
-use super::Which;
+use super::DeviceArgs;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -15,13 +15,13 @@ Examples:
   ecaxis esi objects f.xml --mode csp       with the objects of a module
   ecaxis esi objects f.xml --json           for a script";
 
-/// Show the object dictionary: types, access, defaults, ranges, what can be mapped
+/// Show the object dictionary: types, access, defaults, ranges, PDO mapping
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
-    which: Which,
-    /// With the objects of this mode's module: pp, pv, hm, csp, csv, cst
+    which: DeviceArgs,
+    /// Include the objects of this mode's module: pp, pv, hm, csp, csv, cst
     #[arg(long, value_parser = super::mode)]
     mode: Option<Mode>,
     /// Print as JSON
@@ -32,12 +32,12 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let file = args.which.load()?;
     let device = args.which.device(&file)?;
-    let choice = Choice {
+    let choice = SelectOptions {
         mode: args.mode,
         cycle_ns: 1_000_000,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
-    // Where the default configuration is impossible the device's own objects are still there.
+    // If the default configuration is invalid, use the device's own objects.
     let dictionary = match (select(&file, device, &choice), args.mode) {
         (Ok(selection), _) => selection.dictionary,
         (Err(error), Some(_)) => return Err(Failure::new(hints::WRONG, error.to_string())),
@@ -51,7 +51,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     result(&listed(&dictionary, args.json))
 }
 
-/// Every subindex, as a table or as JSON.
+/// Formats every subindex as a table or as JSON.
 pub(crate) fn listed(dictionary: &Dictionary, json: bool) -> String {
     let mut table = Table::new(&[
         "object", "type", "bits", "access", "PDO", "default", "min", "max", "name",
@@ -126,7 +126,7 @@ fn mapping(mapping: PdoMapping) -> &'static str {
     }
 }
 
-/// A number as its type says, text as text, everything else as bytes.
+/// Formats numbers by type, text as text, everything else as bytes.
 fn value(type_name: &str, bytes: &[u8]) -> String {
     if type_name.contains("STRING") && !type_name.contains("OCTET") {
         let text = String::from_utf8_lossy(bytes);
@@ -163,7 +163,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_as_their_type_says() {
+    fn value_formats_bytes_by_type() {
         for (type_name, bytes, text) in [
             ("USINT", &[200][..], "200"),
             ("SINT", &[0xfd], "-3"),

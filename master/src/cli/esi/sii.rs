@@ -1,23 +1,23 @@
-//! `ecaxis esi sii`: the EEPROM image of a device.
+//! `ecaxis esi sii`: generates the EEPROM image of a device.
 
 use std::path::PathBuf;
 
 use ecaxis_esi::sii::{self, SiiOptions};
 
 use super::super::{Failure, hints, note};
-use super::Which;
+use super::DeviceArgs;
 
 const EXAMPLES: &str = "\
 Examples:
   ecaxis esi sii f.xml --output eeprom.bin
   ecaxis esi sii f.xml --device EPOS4 --serial 7 --alias 1001 -o eeprom.bin";
 
-/// Write the EEPROM image (SII) that follows from an ESI file
+/// Generate the EEPROM image (SII) from an ESI file
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
-    which: Which,
+    which: DeviceArgs,
     /// Image file; it must not exist yet
     #[arg(short, long, value_name = "IMAGE")]
     output: PathBuf,

@@ -1,12 +1,12 @@
-//! An axis in `ecaxis explain`: units and how they come about, limits, loops, supervision, homing.
+//! An axis in `ecaxis explain`: units and their origin, limits, loops, supervision, homing.
 
 use std::fmt::Write;
 
-use ecaxis::config::{AxisSetup, HomingSetup, TorqueUnit, UnitFrom, duration};
+use ecaxis::config::{AxisSetup, HomingSetup, TorqueUnit, UnitSource, duration};
 use ecaxis_axis::Mode;
 use ecaxis_axis::StopMethod;
 use ecaxis_axis::homing;
-use ecaxis_axis::scale::Way;
+use ecaxis_axis::scale::ModuloDirection;
 use ecaxis_axis::supervision::FaultReset;
 
 use super::super::report::Table;
@@ -23,7 +23,7 @@ pub(super) fn axis(axis: &AxisSetup, out: &mut String) -> std::fmt::Result {
     writeln!(out, "\n{}", table.shown(2))
 }
 
-/// Six significant digits are enough to read.
+/// Rounds to six significant digits.
 fn rounded(x: f64) -> f64 {
     format!("{x:.5e}").parse().unwrap_or(x)
 }
@@ -32,13 +32,13 @@ fn time(seconds: f64) -> String {
     duration::show((seconds * 1e9).round() as u64)
 }
 
-fn from(from: UnitFrom, key: &'static str, object: &str) -> String {
+fn from(from: UnitSource, key: &'static str, object: &str) -> String {
     match from {
-        UnitFrom::File => format!("`{key}`; the drive is asked"),
-        UnitFrom::Sdo => format!("{object} from `sdo`"),
-        UnitFrom::Esi => format!("{object} in the ESI, until the drive is asked"),
-        UnitFrom::Drive => format!("{object} in the drive"),
-        UnitFrom::Nothing => format!("assumed, until the drive is asked for {object}"),
+        UnitSource::File => format!("`{key}`; the drive is asked"),
+        UnitSource::Sdo => format!("{object} from `sdo`"),
+        UnitSource::Esi => format!("{object} in the ESI, until the drive is asked"),
+        UnitSource::Drive => format!("{object} in the drive"),
+        UnitSource::Nothing => format!("assumed, until the drive is asked for {object}"),
     }
 }
 
@@ -59,8 +59,8 @@ fn units(axis: &AxisSetup, table: &mut Table) {
     }
     if let Some(length) = scale.modulo() {
         let way = match axis.way {
-            Way::Positive => "always forwards",
-            Way::Negative => "always backwards",
+            ModuloDirection::Positive => "always forwards",
+            ModuloDirection::Negative => "always backwards",
             _ => "the shorter way",
         };
         table.row([
@@ -77,7 +77,7 @@ fn units(axis: &AxisSetup, table: &mut Table) {
     let origin = from(axis.velocity_unit_from, "velocity_unit", "0x60A9");
     table.row(["velocity", &velocity, &origin]);
     let origin = match axis.acceleration_unit_from {
-        UnitFrom::Nothing => "that of the velocity, until the drive is asked".to_owned(),
+        UnitSource::Nothing => "that of the velocity, until the drive is asked".to_owned(),
         known => from(known, "acceleration_unit", "0x60AA"),
     };
     let acceleration = format!("in {}", scale.acceleration_unit());

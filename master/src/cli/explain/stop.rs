@@ -1,8 +1,8 @@
-//! How the machine stops, and what stops together.
+//! The stop reactions of the machine and its axis groups in `ecaxis explain`.
 
 use std::fmt::Write;
 
-use ecaxis::config::{Machine, Outside};
+use ecaxis::config::{GroupStopScope, Machine};
 use ecaxis_axis::StopMethod;
 
 use super::Table;
@@ -44,8 +44,8 @@ pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
     };
     for (index, group) in stop.groups.iter().enumerate() {
         let outside = match group.outside {
-            Outside::Stop => "stops",
-            Outside::Continue => "continues",
+            GroupStopScope::Stop => "stops",
+            GroupStopScope::Continue => "continues",
         };
         table.row([
             &group.name,

@@ -1,9 +1,9 @@
-//! `ecaxis firmware info`: who a device is, what runs in it, and how it takes another program.
+//! `ecaxis firmware info`: identity, running software and update methods of a device.
 
 use ecaxis::firmware;
 
 use super::show;
-use super::target::Where;
+use super::target::DeviceArgs;
 use crate::cli::{Failure, bus, hints, result};
 
 const EXAMPLES: &str = "\
@@ -15,7 +15,7 @@ const USAGE: &str = "\
 ecaxis firmware info [OPTIONS] <MACHINE> <DEVICE>
        ecaxis firmware info [OPTIONS] --nic <IF> --position <N>";
 
-/// Show what runs in a device and how it takes another program; changes nothing
+/// Show the software of a device and its update methods; changes nothing
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = USAGE)]
 pub(crate) struct Args {
@@ -23,8 +23,8 @@ pub(crate) struct Args {
     #[arg(value_names = ["MACHINE", "DEVICE"], num_args = 0..=2)]
     words: Vec<String>,
     #[command(flatten)]
-    at: Where,
-    /// Print it as JSON
+    at: DeviceArgs,
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
@@ -33,7 +33,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let target = args.at.target(&args.words, None)?;
     let (which, name, nic) = (target.which, target.name.clone(), target.nic());
     let found = target.visit(async move |wire, others| {
-        bus::warn_of(others);
+        bus::warn_foreign_frames(others);
         firmware::examine(&wire, which, &name).await
     })?;
     let examined = found.map_err(|error| hints::firmware(&error, &nic))?;

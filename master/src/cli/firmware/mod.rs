@@ -1,8 +1,8 @@
-//! `ecaxis firmware`: what runs in a device, and another program for it.
+//! `ecaxis firmware`: shows and updates the firmware of a device.
 //!
-//! - `target`: which device on which bus;
-//! - `info`, `update`, `sample`: one file a subcommand;
-//! - `show`: what is printed of a device.
+//! - `target`: selects device and bus;
+//! - `info`, `update`, `sample`: one file per subcommand;
+//! - `show`: formats a device.
 
 use clap::Subcommand;
 
@@ -23,21 +23,21 @@ Examples:
   ecaxis firmware update --nic enp3s0 --position 0 new.bin --via foe --yes
   ecaxis firmware sample m.toml x -o new.bin        for the simulated bus
 
-An update that breaks off leaves the device with its boot loader; the same
-command tries again. Nobody may drive the bus meanwhile.";
+An interrupted update leaves the device with its boot loader; the same
+command tries again. No other program may drive the bus during the update.";
 
 /// Show and update the firmware of a device
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(subcommand)]
-    what: What,
+    what: FirmwareCommand,
     #[command(flatten)]
     pub verbosity: super::Verbosity,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum FirmwareCommand {
     Info(info::Args),
     Update(update::Args),
     Sample(sample::Args),
@@ -45,8 +45,8 @@ enum What {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
-        What::Info(info) => info::run(info),
-        What::Update(update) => update::run(update, args.verbosity.plain()),
-        What::Sample(sample) => sample::run(sample),
+        FirmwareCommand::Info(info) => info::run(info),
+        FirmwareCommand::Update(update) => update::run(update, args.verbosity.plain()),
+        FirmwareCommand::Sample(sample) => sample::run(sample),
     }
 }

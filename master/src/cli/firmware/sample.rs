@@ -1,4 +1,4 @@
-//! `ecaxis firmware sample`: a firmware file that a simulated device takes.
+//! `ecaxis firmware sample`: writes a firmware file for a simulated device.
 
 use std::path::PathBuf;
 
@@ -7,9 +7,9 @@ use ecaxis_sim::FirmwareHeader;
 
 use super::target;
 use crate::cli::esi::number;
-use crate::cli::{Failure, hints, keep, note};
+use crate::cli::{Failure, hints, note, write_new};
 
-/// Longest program that is made.
+/// The maximum program size in bytes.
 const MOST: usize = 16 << 20;
 
 const EXAMPLES: &str = "\
@@ -17,7 +17,7 @@ Examples:
   ecaxis firmware sample configs/demo.toml x -o new.bin --size 1MiB
   ecaxis firmware update configs/demo.toml x new.bin --sim --yes";
 
-/// Write a firmware file for a device of the simulated bus (no real device takes it)
+/// Write a firmware file for a device of the simulated bus (real devices reject it)
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -30,13 +30,13 @@ pub(crate) struct Args {
     /// File to write, which must not exist yet
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Bytes of program, such as 65536, 64KiB or 1MiB
+    /// Program size in bytes, such as 65536, 64KiB or 1MiB
     #[arg(long, value_name = "SIZE", default_value = "64KiB", value_parser = size)]
     size: usize,
-    /// Revision that the device has once it runs it
+    /// Revision of the device with this program
     #[arg(long, value_name = "N", default_value = "0x00020000", value_parser = number)]
     revision: u32,
-    /// Software version that it shows then: four characters
+    /// Software version of the device with this program: four characters
     #[arg(long, value_name = "TEXT", default_value = "2.00", value_parser = version)]
     software: [u8; 4],
 }
@@ -71,7 +71,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         version: args.software,
     };
     let file = header.file(&program(args.size));
-    keep(&args.output, &file)?;
+    write_new(&args.output, &file)?;
     note(&format!(
         "{}: {} bytes for the simulated `{}`",
         args.output.display(),
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Bytes that do not repeat soon, the same every time: a linear congruential generator.
+/// Returns reproducible pseudo-random bytes from a linear congruential generator.
 fn program(len: usize) -> Vec<u8> {
     let mut state = 1_u32;
     let mut next = || {

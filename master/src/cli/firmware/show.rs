@@ -1,14 +1,17 @@
-//! What is printed of a device.
+//! Formats a device and its software.
 
-use ecaxis::firmware::{Examined, Runs, Spoken, Via};
+use ecaxis::firmware::{CoeIdentity, DeviceIdentity, RunningProgram, UpdateMethod};
 use serde_json::{Value, json};
 
 use crate::cli::table::Table;
 
-const WAYS: [(Via, &str); 2] = [(Via::Foe, "foe"), (Via::Program, "program")];
+const WAYS: [(UpdateMethod, &str); 2] = [
+    (UpdateMethod::Foe, "foe"),
+    (UpdateMethod::Program, "program"),
+];
 
-/// What differs from one program to the next: what it is, and the value before or now.
-type Row = (&'static str, fn(&Examined) -> Option<String>);
+/// A property that depends on the program: its name and its value.
+type Row = (&'static str, fn(&DeviceIdentity) -> Option<String>);
 
 const VERSION: [Row; 7] = [
     ("product (0x1018:02)", |e| hex(spoken(e)?.identity[1])),
@@ -30,7 +33,7 @@ const VERSION: [Row; 7] = [
     }),
 ];
 
-fn spoken(examined: &Examined) -> Option<&Spoken> {
+fn spoken(examined: &DeviceIdentity) -> Option<&CoeIdentity> {
     examined.spoken.as_ref()
 }
 
@@ -42,8 +45,8 @@ fn shown(value: Option<String>) -> String {
     value.unwrap_or_else(|| "-".to_owned())
 }
 
-/// What changed, and that all is the same where nothing did.
-pub(super) fn change(before: &Examined, now: &Examined) -> String {
+/// Formats the properties before and after an update.
+pub(super) fn change(before: &DeviceIdentity, now: &DeviceIdentity) -> String {
     let mut table = Table::new(&["", "before", "now"]);
     for (what, of) in VERSION {
         let (before, now) = (of(before), of(now));
@@ -58,8 +61,8 @@ pub(super) fn change(before: &Examined, now: &Examined) -> String {
     text
 }
 
-/// Everything that is known of it.
-pub(super) fn info(examined: &Examined) -> String {
+/// Formats all known properties.
+pub(super) fn info(examined: &DeviceIdentity) -> String {
     let identity = examined.sii.identity;
     let mut table = Table::new(&["", ""]);
     let mut row = |what: &str, value: String| table.row([what, &value]);
@@ -67,9 +70,9 @@ pub(super) fn info(examined: &Examined) -> String {
     row(
         "what runs",
         match examined.runs() {
-            Runs::Program => "its program",
-            Runs::BootLoader => "its boot loader alone",
-            Runs::Unknown => "not known",
+            RunningProgram::Program => "its program",
+            RunningProgram::BootLoader => "its boot loader alone",
+            RunningProgram::Unknown => "not known",
         }
         .to_owned(),
     );
@@ -98,7 +101,7 @@ pub(super) fn info(examined: &Examined) -> String {
     for (via, _) in WAYS {
         let offered = match examined.offers(via) {
             Ok(()) if examined.in_use => "not known: its EEPROM says it".to_owned(),
-            Ok(()) if via == Via::Foe => {
+            Ok(()) if via == UpdateMethod::Foe => {
                 let boot = examined.sii.bootstrap;
                 let (out, back) = (boot.receive_size, boot.send_size);
                 format!("yes, mailboxes of {out} and {back} bytes")
@@ -118,21 +121,21 @@ pub(super) fn info(examined: &Examined) -> String {
     text
 }
 
-fn state(examined: &Examined) -> String {
+fn state(examined: &DeviceIdentity) -> String {
     let mut text = examined.state.to_string();
     if examined.error {
         let code = examined.code;
-        let meaning = ecaxis::al_status::al_status_text(code);
+        let meaning = ecaxis_ecat::al_status_code::al_status_text(code);
         text += &format!(", AL status code 0x{code:04x}: {meaning}");
     }
     text
 }
 
-/// The same for a script.
-pub(super) fn as_json(examined: &Examined) -> Value {
+/// Formats the properties as JSON.
+pub(super) fn as_json(examined: &DeviceIdentity) -> Value {
     let identity = examined.sii.identity;
     let spoken = spoken(examined);
-    // Of one that keeps its EEPROM to itself it is not known.
+    // The EEPROM is unknown if it is in use by another owner.
     let known = !examined.in_use;
     let offers = known.then(|| -> Vec<&str> {
         let offered = WAYS.into_iter();
@@ -147,9 +150,9 @@ pub(super) fn as_json(examined: &Examined) -> Value {
         "state": examined.state.to_string(),
         "al_status_code": examined.error.then_some(examined.code),
         "runs": match examined.runs() {
-            Runs::Program => "program",
-            Runs::BootLoader => "boot-loader",
-            Runs::Unknown => "unknown",
+            RunningProgram::Program => "program",
+            RunningProgram::BootLoader => "boot-loader",
+            RunningProgram::Unknown => "unknown",
         },
         "eeprom": known.then(|| json!({
             "vendor": identity.vendor,
@@ -174,8 +177,8 @@ pub(super) fn as_json(examined: &Examined) -> Value {
     })
 }
 
-/// As `--via` has it.
-pub(super) fn name(via: Via) -> &'static str {
+/// Returns the method's name as used by `--via`.
+pub(super) fn name(via: UpdateMethod) -> &'static str {
     WAYS.iter()
         .find(|(known, _)| *known == via)
         .map_or("", |(_, name)| name)

@@ -1,53 +1,54 @@
-//! Which device on which bus.
+//! Selects device and bus.
 
 use std::path::{Path, PathBuf};
 
+use ecaxis::acyclic::DatagramClient;
+use ecaxis::acyclic::enumerate::DeviceSelector;
 use ecaxis::clock::Clock;
 use ecaxis::config::{self, DeviceConfig, Locator, Machine, Nic};
 use ecaxis::firmware::Expected;
-use ecaxis::service::Datagrams;
-use ecaxis::service::station::Which;
 use ecaxis::session::Options;
 
 use crate::cli::bus::Bus;
 use crate::cli::{Failure, hints, record, run};
 
 #[derive(Debug, clap::Args)]
-pub(super) struct Where {
-    /// Network interface, in place of the machine file's or without one
+pub(super) struct DeviceArgs {
+    /// Use this network interface instead of the file's, or without a machine file
     #[arg(long, value_name = "IF", conflicts_with = "sim")]
     nic: Option<String>,
-    /// The device's position on the bus; the first one is 0
+    /// Position of the device on the bus, counted from 0
     #[arg(long, value_name = "N", conflicts_with = "alias")]
     position: Option<u16>,
-    /// The device's alias
+    /// Station alias of the device
     #[arg(long, value_name = "N")]
     alias: Option<u16>,
-    /// Use the machine file's bus, simulated
+    /// Use the simulated bus of the machine file
     #[arg(long)]
     sim: bool,
-    /// In virtual time: as fast as possible (simulated bus only)
+    /// Use virtual time: as fast as possible (simulated bus only)
     #[arg(long = "virtual")]
     virtual_time: bool,
     /// Fault script for the simulated bus
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
-    /// Keep every frame in this pcapng file
+    /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
 }
 
 pub(super) struct Target {
     bus: Bus,
-    pub which: Which,
-    /// In the machine file; else what it was found by.
+    pub which: DeviceSelector,
+    /// The name in the machine file, else the position or alias.
     pub name: String,
-    /// By the machine file.
+    /// The identity from the machine file.
     pub expected: Expected,
 }
 
-impl Where {
-    /// `words`: machine file and device, or nothing. `input` is a file that is read, too, and what it is.
+impl DeviceArgs {
+    /// Returns the target. `words`: machine file and device, or nothing. `input`: a file that is
+    /// read, with its description.
     pub fn target(
         &self,
         words: &[String],
@@ -67,10 +68,10 @@ impl Where {
         };
         let device = device.as_ref();
         let which = match (self.position, self.alias, device.map(|device| device.at)) {
-            (Some(position), ..) => Which::Position(position),
-            (None, Some(alias), _) => Which::Alias(alias),
-            (None, None, Some(Locator::Position(position))) => Which::Position(position),
-            (None, None, Some(Locator::Alias(alias))) => Which::Alias(alias),
+            (Some(position), ..) => DeviceSelector::Position(position),
+            (None, Some(alias), _) => DeviceSelector::Alias(alias),
+            (None, None, Some(Locator::Position(position))) => DeviceSelector::Position(position),
+            (None, None, Some(Locator::Alias(alias))) => DeviceSelector::Alias(alias),
             (None, None, Some(Locator::Id(_))) => {
                 return Err(wrong("a device with `id` is not searched for here")
                     .hint("say where it is with `--position`"));
@@ -100,7 +101,7 @@ impl Where {
             _ => None,
         };
         if let Some(path) = &self.record {
-            record::check_beside(path, machine.as_ref(), self.faults.as_deref(), input)?;
+            record::check_distinct(path, machine.as_ref(), self.faults.as_deref(), input)?;
         }
         let mut options = Options {
             clock: if self.virtual_time {
@@ -137,22 +138,23 @@ impl Where {
 }
 
 impl Target {
-    /// Hints depend on it.
+    /// The interface; hints depend on it.
     pub fn nic(&self) -> Nic {
         self.bus.nic()
     }
 
-    /// Nobody may drive a machine beside the work.
+    /// Requires that no other program drives the interface.
     pub fn alone(self) -> Self {
         let bus = self.bus.alone();
         Self { bus, ..self }
     }
 
-    /// Does a piece of work on the bus; `work` is told how many frames of others came in before anything was sent.
+    /// Runs `work` on the bus. `work` receives the number of foreign frames seen before the first
+    /// transmission.
     pub fn visit<T, W>(self, work: W) -> Result<T, Failure>
     where
         T: Send + 'static,
-        W: AsyncFnOnce(Datagrams, u64) -> T + Send + 'static,
+        W: AsyncFnOnce(DatagramClient, u64) -> T + Send + 'static,
     {
         self.bus.visit(work)
     }

@@ -1,24 +1,26 @@
-//! `ecaxis firmware update`: another program for a device.
+//! `ecaxis firmware update`: writes a program to a device.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
-use ecaxis::firmware::{self, Done, Examined, Order, ReadBack, Step, Told, Via};
+use ecaxis::firmware::{
+    self, DeviceIdentity, ReadBack, Step, UpdateMethod, UpdateProgress, UpdateReport, UpdateRequest,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::show;
-use super::target::{self, Where};
+use super::target::{self, DeviceArgs};
 use crate::cli::esi::number;
-use crate::cli::{Failure, bus, hints, note, result, screen, style};
+use crate::cli::{Failure, bus, hints, note, output, result, style};
 
-/// No program memory of a drive is larger.
+/// The maximum file size in bytes.
 const MOST: u64 = 256 << 20;
-/// Where lines stay, one a so many percent.
+/// The progress step in percent without a terminal.
 const PERCENT: usize = 10;
-/// A pause is worth no line of its own, a wait is.
+/// A busy device is reported after this time; shorter pauses are not.
 const BUSY: Duration = Duration::from_secs(1);
 
 const EXAMPLES: &str = "\
@@ -32,7 +34,7 @@ const USAGE: &str = "\
 ecaxis firmware update [OPTIONS] <MACHINE> <DEVICE> <FILE>
        ecaxis firmware update [OPTIONS] --nic <IF> --position <N> <FILE>";
 
-/// Put another program into a device and start it
+/// Write a program to a device and start it
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = USAGE)]
 pub(crate) struct Args {
@@ -40,29 +42,29 @@ pub(crate) struct Args {
     #[arg(value_names = ["MACHINE", "DEVICE", "FILE"], num_args = 1..=3, required = true)]
     words: Vec<String>,
     #[command(flatten)]
-    at: Where,
-    /// The way [default: FoE, where the device offers it]
+    at: DeviceArgs,
+    /// Update method [default: FoE, if the device supports it]
     #[arg(long, value_enum)]
-    via: Option<Way>,
-    /// What the file is called over FoE [default: its own name]
+    via: Option<MethodArg>,
+    /// File name for FoE [default: the name of the file]
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// Password over FoE
+    /// Password for FoE
     #[arg(long, value_name = "N", default_value = "0", value_parser = number)]
     password: u32,
-    /// Vendor that the device must have [default: the machine file's]
+    /// Required vendor of the device [default: the machine file's]
     #[arg(long, value_name = "N", value_parser = number)]
     expect_vendor: Option<u32>,
-    /// Product code that the device must have [default: the machine file's]
+    /// Required product code of the device [default: the machine file's]
     #[arg(long, value_name = "N", value_parser = number)]
     expect_product: Option<u32>,
-    /// Read the file back over FoE and compare it, where the device hands it out
+    /// Read the file back over FoE and compare it, if the device supports it
     #[arg(long)]
     read_back: bool,
-    /// Check everything and write nothing
+    /// Run all checks, but write nothing
     #[arg(long)]
     dry_run: bool,
-    /// Write; without it nothing is written
+    /// Confirm writing; without it nothing is written
     #[arg(long, conflicts_with = "dry_run")]
     yes: bool,
     /// Print the result as JSON
@@ -71,28 +73,28 @@ pub(crate) struct Args {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Way {
-    /// File access in Bootstrap
+enum MethodArg {
+    /// File access over EtherCAT (FoE) in Bootstrap
     Foe,
-    /// Program download by 0x1F50 and 0x1F51 (CiA 302-3)
+    /// Program download with 0x1F50 and 0x1F51 (CiA 302-3)
     Program,
 }
 
-impl From<Way> for Via {
-    fn from(way: Way) -> Self {
+impl From<MethodArg> for UpdateMethod {
+    fn from(way: MethodArg) -> Self {
         match way {
-            Way::Foe => Self::Foe,
-            Way::Program => Self::Program,
+            MethodArg::Foe => Self::Foe,
+            MethodArg::Program => Self::Program,
         }
     }
 }
 
-/// What the bus was visited for.
-struct Visited {
-    before: Examined,
-    via: Via,
-    /// `None` where nothing was to be written.
-    done: Option<Done>,
+/// The result of the visit.
+struct UpdateOutcome {
+    before: DeviceIdentity,
+    via: UpdateMethod,
+    /// `None` if nothing was to be written.
+    done: Option<UpdateReport>,
 }
 
 pub(crate) fn run(args: &Args, plain: bool) -> Result<(), Failure> {
@@ -128,19 +130,19 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
     };
     let (which, expected, nic) = (target.which, target.expected, target.nic());
     let device = target.name.clone();
-    let chosen = args.via.map(Via::from);
+    let chosen = args.via.map(UpdateMethod::from);
     let (password, read_back, write) = (args.password, args.read_back, args.yes);
-    let teller = Teller::new(plain);
+    let teller = ProgressReporter::new(plain);
     let target = if write { target.alone() } else { target };
     let visited = target.visit(async move |wire, others| {
         if others > 0 && write {
             return Err(hints::shared_bus());
         }
-        bus::warn_of(others);
+        bus::warn_foreign_frames(others);
         let visited = async {
             let before = firmware::examine(&wire, which, &device).await?;
             let via = before.way(chosen)?;
-            let order = Order {
+            let order = UpdateRequest {
                 via,
                 file,
                 name,
@@ -149,12 +151,12 @@ fn update(args: &Args, plain: bool) -> Result<(), Failure> {
             };
             before.ready(&order, expected)?;
             let done = if write {
-                let mut tell = |told| teller.tell(&told);
-                Some(firmware::update(&wire, &before, expected, &order, &mut tell).await?)
+                let mut report = |reported| teller.report(&reported);
+                Some(firmware::update(&wire, &before, expected, &order, &mut report).await?)
             } else {
                 None
             };
-            Ok(Visited { before, via, done })
+            Ok(UpdateOutcome { before, via, done })
         };
         visited.await.map_err(|error| hints::firmware(&error, &nic))
     })?;
@@ -184,12 +186,12 @@ fn read(path: &Path) -> Result<Vec<u8>, Failure> {
     let file = ecaxis::file::read(path, MOST).map_err(|e| failed(e.to_string()))?;
     if file.is_empty() {
         return Err(target::wrong(&format!("{} is empty", path.display()))
-            .hint("name the file that the device's maker made for it"));
+            .hint("name a firmware file from the device's vendor"));
     }
     Ok(file)
 }
 
-fn planned(visited: &Visited, bytes: usize, path: &Path) -> String {
+fn planned(visited: &UpdateOutcome, bytes: usize, path: &Path) -> String {
     format!(
         "{}{} ({bytes} bytes) would be written by {}.\n",
         show::info(&visited.before),
@@ -198,7 +200,7 @@ fn planned(visited: &Visited, bytes: usize, path: &Path) -> String {
     )
 }
 
-fn planned_json(visited: &Visited, bytes: usize, path: &Path) -> Value {
+fn planned_json(visited: &UpdateOutcome, bytes: usize, path: &Path) -> Value {
     json!({
         "ok": true,
         "written": false,
@@ -209,8 +211,8 @@ fn planned_json(visited: &Visited, bytes: usize, path: &Path) -> Value {
     })
 }
 
-fn done_text(visited: &Visited, done: &Done, bytes: usize) -> String {
-    let Visited { before, via, .. } = visited;
+fn done_text(visited: &UpdateOutcome, done: &UpdateReport, bytes: usize) -> String {
+    let UpdateOutcome { before, via, .. } = visited;
     let mut text = format!(
         "{}: {bytes} bytes in {:.1} s, {}, by {via}\n{}",
         done.after.device,
@@ -227,7 +229,7 @@ fn done_text(visited: &Visited, done: &Done, bytes: usize) -> String {
     text
 }
 
-fn done_json(visited: &Visited, done: &Done, bytes: usize) -> Value {
+fn done_json(visited: &UpdateOutcome, done: &UpdateReport, bytes: usize) -> Value {
     json!({
         "ok": true,
         "written": true,
@@ -252,20 +254,20 @@ fn rate(bytes: usize, took: Duration) -> String {
     }
 }
 
-/// Progress on stderr: a bar on a terminal, lines elsewhere.
-struct Teller {
+/// Shows progress on stderr: a bar on a terminal, otherwise lines.
+struct ProgressReporter {
     bar: Option<ProgressBar>,
-    said: Mutex<Said>,
+    said: Mutex<ProgressState>,
 }
 
 #[derive(Default)]
-struct Said {
+struct ProgressState {
     percent: Option<usize>,
-    /// Since when the device has been busy, or since that was said last.
+    /// The start of the busy time, or the time of its last report.
     busy: Option<Instant>,
 }
 
-impl Teller {
+impl ProgressReporter {
     fn new(plain: bool) -> Self {
         let bar = (style::rewrites() && !plain).then(|| {
             let bar = ProgressBar::new(0);
@@ -273,7 +275,7 @@ impl Teller {
                 "{msg} {bar:20} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}";
             let style = ProgressStyle::with_template(template);
             let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-            screen::put_up(&bar);
+            output::attach_bar(&bar);
             bar
         });
         Self {
@@ -282,17 +284,17 @@ impl Teller {
         }
     }
 
-    fn tell(&self, told: &Told) {
+    fn report(&self, reported: &UpdateProgress) {
         let Ok(mut said) = self.said.lock() else {
             return;
         };
-        match (told, &self.bar) {
-            (Told::Step(step), Some(bar)) => {
+        match (reported, &self.bar) {
+            (UpdateProgress::Step(step), Some(bar)) => {
                 note(&step.to_string());
                 bar.set_message("");
             }
-            (Told::Step(step), None) => note(&step.to_string()),
-            (Told::Moved { done, of }, Some(bar)) => {
+            (UpdateProgress::Step(step), None) => note(&step.to_string()),
+            (UpdateProgress::Moved { done, of }, Some(bar)) => {
                 let number = |n: usize| u64::try_from(n).unwrap_or(u64::MAX);
                 if bar.length() != Some(number(*of)) {
                     bar.set_length(number(*of));
@@ -300,7 +302,7 @@ impl Teller {
                 bar.set_message("");
                 bar.set_position(number(*done));
             }
-            (Told::Moved { done, of }, None) => {
+            (UpdateProgress::Moved { done, of }, None) => {
                 let percent = (done * 100).checked_div(*of).unwrap_or(100);
                 let step = percent / PERCENT * PERCENT;
                 if said.percent != Some(step) {
@@ -308,8 +310,8 @@ impl Teller {
                     said.percent = Some(step);
                 }
             }
-            (Told::Busy { .. }, Some(bar)) => bar.set_message("busy"),
-            (Told::Busy { done, entire }, None) => {
+            (UpdateProgress::Busy { .. }, Some(bar)) => bar.set_message("busy"),
+            (UpdateProgress::Busy { done, entire }, None) => {
                 let since = said.busy.get_or_insert_with(Instant::now);
                 if since.elapsed() >= BUSY {
                     *since = Instant::now();
@@ -317,20 +319,20 @@ impl Teller {
                 }
             }
         }
-        if !matches!(told, Told::Busy { .. }) {
+        if !matches!(reported, UpdateProgress::Busy { .. }) {
             said.busy = None;
         }
-        if matches!(told, Told::Step(Step::Check)) {
+        if matches!(reported, UpdateProgress::Step(Step::Check)) {
             self.clear();
         }
     }
 
     fn clear(&self) {
-        screen::take_down();
+        output::detach_bar();
     }
 }
 
-impl Drop for Teller {
+impl Drop for ProgressReporter {
     fn drop(&mut self) {
         self.clear();
     }

@@ -1,14 +1,14 @@
-//! Advice for a firmware update that was refused or broke off.
+//! Advice for a firmware update that was refused or interrupted.
 
 use ecaxis::config::Nic;
-use ecaxis::firmware::{Cause, FirmwareError, Left, Via};
+use ecaxis::firmware::{Cause, FinalDeviceState, FirmwareError, UpdateMethod};
 use ecaxis::mailbox::FoeError;
 
 use super::{FAILED, Failure, INTERRUPTED, WRONG, service, state};
 
-/// Nobody else may be on the bus while a program is written.
+/// The failure if another MainDevice is active: a firmware update needs the bus alone.
 pub(crate) fn shared_bus() -> Failure {
-    let message = "another MainDevice is at work on this bus: nothing was written";
+    let message = "another MainDevice is active on this bus: nothing was written";
     Failure::new(FAILED, message).hint("end the program that drives the bus, then try again")
 }
 
@@ -24,26 +24,26 @@ pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     match error {
         FirmwareError::Service(error) => service(error, nic),
         FirmwareError::Eeprom { .. } => {
-            failure.hint("the device's EEPROM is damaged: its maker's tools can write it anew")
+            failure.hint("the device's EEPROM is damaged: rewrite it with its vendor's tools")
         }
         FirmwareError::Identity { .. } => failure
-            .hint("`ecaxis firmware info` shows what is there; name the device that is meant")
-            .hint("where this is the right one, name its ESI file in the machine file, or `--expect-product`"),
+            .hint("`ecaxis firmware info` shows the device; select the intended one")
+            .hint("if this is the right one, name its ESI file in the machine file, or `--expect-product`"),
         FirmwareError::Changed { .. } => failure
             .hint("the file was made for another device: write the one for this device"),
         FirmwareError::Driven { .. } => {
             failure.hint("end the program that drives the bus, then try again")
         }
         FirmwareError::NotOffered { via, .. } => failure.hint(match via {
-            Via::Foe => "`--via program` takes the other way",
-            Via::Program => "`--via foe` takes the other way",
+            UpdateMethod::Foe => "use the other method: `--via program`",
+            UpdateMethod::Program => "use the other method: `--via foe`",
         }),
         FirmwareError::NoWay { .. } => {
-            failure.hint("this device cannot be updated over EtherCAT; its maker's tools may")
+            failure.hint("this device cannot be updated over EtherCAT; use its vendor's tools")
         }
         FirmwareError::Name { .. } => wrong(failure)
-            .hint("`--name` says what the file is called in the device, as its maker has it"),
-        FirmwareError::Empty => wrong(failure).hint("name the file that the device's maker made for it"),
+            .hint("set the file name that the vendor specifies with `--name`"),
+        FirmwareError::Empty => wrong(failure).hint("name a firmware file from the device's vendor"),
         FirmwareError::Failed { cause, left, .. } => {
             let failure = match self::cause(cause) {
                 Some(hint) => failure.hint(hint),
@@ -54,7 +54,7 @@ pub(crate) fn firmware(error: &FirmwareError, nic: &Nic) -> Failure {
     }
 }
 
-/// The error's text, with the device once: what failed at it mostly names it, too.
+/// Returns the error text with the device name once. Most causes repeat it.
 fn message(error: &FirmwareError) -> String {
     let text = error.to_string();
     let FirmwareError::Failed { device, .. } = error else {
@@ -79,21 +79,17 @@ fn cause(cause: &Cause) -> Option<String> {
     let hint = match cause {
         Cause::Foe(error) => foe(error)?,
         Cause::Sdo(_) => {
-            "the device refuses this file or this order: take the file that its maker names for it"
+            "the device refuses this file or this order: use the file that its vendor specifies"
         }
         Cause::State(error) => return Some(state(error)),
-        Cause::Control { .. } => {
-            "the device does not obey 0x1F51: look whether `--via foe` is offered"
-        }
+        Cause::Control { .. } => "the device ignores 0x1F51: check whether it supports `--via foe`",
         Cause::Differs { .. } => {
-            "the device did not keep what it was sent; its program memory may be worn"
+            "the device did not store the sent data; its program memory may be worn"
         }
         Cause::NotRunning { .. } => {
-            "the device took the file but does not run it: switch it off and on, then look with `ecaxis firmware info`"
+            "the device took the file but does not run it: switch it off and on, then run `ecaxis firmware info`"
         }
-        Cause::NotBack { .. } => {
-            "switch the device off and on, then look with `ecaxis firmware info`"
-        }
+        Cause::NotBack { .. } => "switch the device off and on, then run `ecaxis firmware info`",
         Cause::Service(_) | Cause::Interrupted => return None,
     };
     Some(hint.to_owned())
@@ -103,21 +99,21 @@ fn foe(error: &FoeError) -> Option<&'static str> {
     match error {
         FoeError::Refused { code, .. } => Some(match code {
             0x8001 | 0x8006 | 0x8009 => {
-                "the device expects another name: `--name` says what the file is called in it"
+                "the device expects another file name: set it with `--name`"
             }
             0x8002 | 0x8007 | 0x800a => {
                 "the device wants a password or another name: `--password`, `--name`"
             }
             0x8003 => "the file is larger than the device's program memory",
             0x800b | 0x8011 => {
-                "the device could not write its program memory: try again, then ask its maker"
+                "the device could not write its program memory: try again, then ask its vendor"
             }
             _ => {
-                "the file is damaged or made for another device: take the one that its maker names for it"
+                "the file is damaged or for another device: use the file that its vendor specifies"
             }
         }),
         FoeError::Busy { .. } | FoeError::Timeout { .. } => {
-            Some("the device did not go on: switch it off and on")
+            Some("the device stopped responding: switch it off and on")
         }
         FoeError::Gone { .. } | FoeError::Wire { .. } => {
             Some("check the device's power and the cable to it")
@@ -126,14 +122,14 @@ fn foe(error: &FoeError) -> Option<&'static str> {
     }
 }
 
-fn again(left: Left) -> String {
+fn again(left: FinalDeviceState) -> String {
     match left {
-        Left::In { .. } => {
+        FinalDeviceState::In { .. } => {
             "its boot loader waits for a program; the same command tries again from there"
                 .to_owned()
         }
-        Left::Silent => {
-            "once it answers again, it has its boot loader at least; the same command tries again"
+        FinalDeviceState::Silent => {
+            "when it answers again, at least its boot loader runs; the same command tries again"
                 .to_owned()
         }
     }

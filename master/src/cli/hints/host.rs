@@ -1,14 +1,14 @@
-//! Advice about the computer: its interfaces, and what it permits.
+//! Advice about the computer: interfaces and permissions.
 
-use ecaxis::link::{Concern, OpenError};
-use ecaxis::rt::thread::Denied;
+use ecaxis::link::{NicWarning, OpenError};
+use ecaxis::sys::rt_thread::RtSetupError;
 
 use super::{Failure, WRONG};
 
 pub(crate) fn interface(failure: Failure, error: &OpenError) -> Failure {
     match error {
         OpenError::NoSuchInterface { .. } => {
-            // The file or the command line names it.
+            // The interface name is a user input.
             Failure {
                 code: WRONG,
                 ..failure
@@ -32,32 +32,30 @@ pub(crate) fn interface(failure: Failure, error: &OpenError) -> Failure {
                 None => "Ctrl-C there".to_owned(),
             };
             failure
-                .hint(format!(
-                    "{stop} brings its axes to rest and its bus to Init"
-                ))
-                .hint("`ecaxis scan`, `sdo` and `eeprom` go beside a machine that runs")
+                .hint(format!("{stop} stops its axes and brings its bus to Init"))
+                .hint("`ecaxis scan`, `sdo` and `eeprom` can be used while a machine runs")
         }
         OpenError::Driven { .. } => failure
             .hint("two of them move the same drives: bring its axes to rest and end it first")
-            .hint("`ecaxis scan` goes beside a machine that runs"),
+            .hint("`ecaxis scan` can be used while a machine runs"),
         OpenError::NoRing { .. } => failure.hint("write `link = \"packet\"` into [bus]"),
         OpenError::Io { .. } => failure,
     }
 }
 
-/// What mends something about an interface.
-pub(crate) fn concern(concern: &Concern) -> Option<String> {
+/// Returns the command that fixes a problem of an interface.
+pub(crate) fn concern(concern: &NicWarning) -> Option<String> {
     match concern {
-        Concern::Addresses { nic, .. } => Some(format!(
+        NicWarning::Addresses { nic, .. } => Some(format!(
             "sudo ip addr flush dev {nic} && sudo sysctl -w net.ipv6.conf.{nic}.disable_ipv6=1; where NetworkManager runs, \
              sudo nmcli device set {nic} managed no"
         )),
-        Concern::Member { nic, .. } => Some(format!("sudo ip link set {nic} nomaster")),
-        Concern::NoRing { .. } => None,
+        NicWarning::Member { nic, .. } => Some(format!("sudo ip link set {nic} nomaster")),
+        NicWarning::NoRing { .. } => None,
     }
 }
 
-/// The interfaces of this computer.
+/// Lists the interfaces of this computer.
 pub(super) fn interfaces() -> String {
     let names = ecaxis::link::interface::interfaces();
     if names.is_empty() {
@@ -67,7 +65,7 @@ pub(super) fn interfaces() -> String {
     format!("this computer has {}", names.join(", "))
 }
 
-/// How to permit raw sockets, real-time priority and locked memory without being root.
+/// Returns the command that permits raw sockets, real-time priority and locked memory without root.
 pub(crate) fn capabilities() -> String {
     let exe = std::env::current_exe().unwrap_or_else(|_| "ecaxis".into());
     format!(
@@ -76,22 +74,22 @@ pub(crate) fn capabilities() -> String {
     )
 }
 
-/// What permits what the operating system denied.
-pub(crate) fn denied(denied: &Denied) -> String {
+/// Returns the command or setting that permits what the operating system denied.
+pub(crate) fn denied(denied: &RtSetupError) -> String {
     match denied {
-        Denied::Priority { .. } | Denied::MemoryLock { .. } => capabilities(),
-        Denied::Affinity { .. } => {
+        RtSetupError::Priority { .. } | RtSetupError::MemoryLock { .. } => capabilities(),
+        RtSetupError::Affinity { .. } => {
             let last = std::thread::available_parallelism().map_or(0, |n| n.get() - 1);
             format!("`cpu` in [bus] must be one that this process may use: often 0 to {last}")
         }
-        Denied::CpuLatency { .. } => {
-            "sudo setfacl -m u:$USER:w /dev/cpu_dma_latency, or a udev rule for good".to_owned()
+        RtSetupError::CpuLatency { .. } => {
+            "sudo setfacl -m u:$USER:w /dev/cpu_dma_latency, or add a udev rule".to_owned()
         }
-        Denied::Awake { .. } => "leave `idle` out of [bus]".to_owned(),
+        RtSetupError::Awake { .. } => "omit `idle` in [bus]".to_owned(),
     }
 }
 
-/// What gives a real-time thread some air.
+/// Returns the advice for a real-time thread that uses too much CPU time.
 pub(crate) fn overload() -> &'static str {
-    "a longer `cycle` or a shorter `spin` in [bus] takes less of the CPU; `sudo sysctl -w kernel.sched_rt_runtime_us=-1` lifts the limit, for a CPU that nobody else needs"
+    "a longer `cycle` or a shorter `spin` in [bus] uses less CPU time; `sudo sysctl -w kernel.sched_rt_runtime_us=-1` removes the limit, for a CPU without other work"
 }

@@ -1,4 +1,4 @@
-//! Panel, messages and keys → rows. 80 × 24 is enough; what does not fit is left out at the end.
+//! Panel, messages and keys → rows. 80 × 24 is sufficient; rows that do not fit are cut at the end.
 
 use anstyle::{AnsiColor, Style};
 use ecaxis_axis::State;
@@ -12,7 +12,7 @@ const GOOD: Style = AnsiColor::Green.on_default();
 const BAD: Style = AnsiColor::Red.on_default().bold();
 const FAINT: Style = Style::new().dimmed();
 
-/// The smallest terminal in which an axis and the keys can be seen.
+/// The smallest terminal that shows an axis and the keys.
 const SMALLEST: (usize, usize) = (60, 16);
 const KEYS: [&str; 4] = [
     "hold ←/→ jog   , . step   [ ] step size   - + speed   m move to   h home",
@@ -21,25 +21,25 @@ const KEYS: [&str; 4] = [
     "x: EMERGENCY STOP, the shortest way to no motion and no power",
 ];
 
-/// Everything that is drawn.
+/// The inputs of a drawing.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Picture<'p> {
-    /// Machine file and bus.
+pub(super) struct Screen<'p> {
+    /// The names of machine file and bus.
     pub title: &'p str,
     pub panel: Option<&'p Panel>,
     pub messages: &'p Messages,
     pub ui: &'p Ui,
-    /// Milliseconds, as the keys have them.
+    /// The time in ms on the clock of the keys.
     pub now: u64,
     /// Columns and rows.
     pub size: (usize, usize),
     pub colours: bool,
 }
 
-/// Text in pieces, each in its style.
+/// Pieces of text, each with its style.
 type Row = Vec<(Style, String)>;
 
-impl Picture<'_> {
+impl Screen<'_> {
     pub fn rows(&self) -> Vec<String> {
         let (columns, rows) = self.size;
         if columns < SMALLEST.0 || rows < SMALLEST.1 {
@@ -95,7 +95,7 @@ impl Picture<'_> {
             "   {:<9}{:<23}{:<5}{:>12}{:>11}{:>9}",
             "axis", "state", "mode", "position", "velocity", "torque"
         );
-        // The selected one is always among them.
+        // The selected axis is always visible.
         let first = (self.ui.selected + 1).saturating_sub(room);
         let shown = panel.axes.iter().enumerate().skip(first).take(room);
         let mut rows = vec![vec![(FAINT, head)]];
@@ -187,7 +187,7 @@ impl Picture<'_> {
         rows
     }
 
-    /// Within the terminal's width. What could move its cursor is not passed on.
+    /// Formats a row within the terminal's width. Control characters are removed.
     fn shown(&self, row: &Row) -> String {
         let mut room = self.size.0;
         let mut text = String::new();

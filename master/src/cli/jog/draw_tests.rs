@@ -1,11 +1,11 @@
-//! Whatever there is to be shown fits, and moves no cursor.
+//! All content fits the terminal and contains no control sequences that move the cursor.
 
 use super::super::panel::tests::panel;
 use super::*;
 
 fn drawn(panel: &Panel, messages: &Messages, size: (usize, usize)) -> Vec<String> {
     let ui = Ui::default();
-    let picture = Picture {
+    let picture = Screen {
         title: "jog  configs/demo.toml  the simulated bus",
         panel: Some(panel),
         messages,
@@ -18,13 +18,13 @@ fn drawn(panel: &Panel, messages: &Messages, size: (usize, usize)) -> Vec<String
 }
 
 #[test]
-fn the_whole_picture() {
+fn screen_draws_all_rows() {
     let mut panel = panel(2);
     panel.axes[1].trouble = Some("drive fault 0x8611: following error".to_owned());
     let mut messages = Messages::default();
-    messages.tell("bus in Op".to_owned(), false);
+    messages.show("bus in Op".to_owned(), false);
     for _ in 0..3 {
-        messages.tell("a0: refused: the axis is not enabled".to_owned(), true);
+        messages.show("a0: refused: the axis is not enabled".to_owned(), true);
     }
     let rows = drawn(&panel, &messages, (80, 24));
     let expected = "\
@@ -57,7 +57,7 @@ fn the_whole_picture() {
 }
 
 #[test]
-fn it_fits_whatever_there_is() {
+fn screen_fits_any_terminal() {
     let mut many = panel(100);
     for axis in &mut many.axes {
         axis.name = "a very long name of an axis\u{1b}[2J\n".to_owned();
@@ -66,7 +66,7 @@ fn it_fits_whatever_there_is() {
     }
     let mut messages = Messages::default();
     for n in 0..200 {
-        messages.tell(format!("{n} {}", "much\r\n\u{7}".repeat(50)), n % 2 == 0);
+        messages.show(format!("{n} {}", "much\r\n\u{7}".repeat(50)), n % 2 == 0);
     }
     for size in [(80, 24), (60, 16), (200, 60), (20, 5), (1, 1)] {
         let rows = drawn(&many, &messages, size);
@@ -80,9 +80,9 @@ fn it_fits_whatever_there_is() {
 }
 
 #[test]
-fn colours_say_nothing_that_text_does_not() {
+fn screen_is_complete_without_colours() {
     let (panel, messages, ui) = (panel(2), Messages::default(), Ui::default());
-    let picture = Picture {
+    let picture = Screen {
         title: "jog",
         panel: Some(&panel),
         messages: &messages,
@@ -93,7 +93,7 @@ fn colours_say_nothing_that_text_does_not() {
     };
     let coloured = picture.rows().join("\n");
     assert!(coloured.contains("\u{1b}["));
-    let plain = Picture {
+    let plain = Screen {
         colours: false,
         ..picture
     };

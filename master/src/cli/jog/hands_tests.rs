@@ -1,14 +1,14 @@
-//! What has waited too long is no longer wanted.
+//! Requests older than the hold-to-run time-out are dropped, except stops.
 
-use ecaxis::supervise::manual::Request;
+use ecaxis::supervise::jog::Request;
 
 use super::*;
 
 const NOW: Nanos = 10_000_000_000;
 
-fn hands() -> (Sender<(Instant, Ask)>, Hands) {
+fn hands() -> (Sender<(Instant, UiAction)>, MachineSide) {
     let (asks, asked) = channel();
-    let hands = Hands {
+    let hands = MachineSide {
         asked,
         shared: Arc::default(),
         heard: None,
@@ -25,13 +25,13 @@ fn ago(ms: u64) -> Instant {
     Instant::now().checked_sub(age).expect("up for longer")
 }
 
-fn told(hands: &Hands) -> Vec<String> {
+fn messages(hands: &MachineSide) -> Vec<String> {
     let seen = hands.shared.seen();
     seen.messages.last(9).map(|m| m.text.clone()).collect()
 }
 
 #[test]
-fn keys_from_a_stall_do_nothing_but_stop() {
+fn stale_requests_are_dropped_except_stops() {
     let (axis, speed) = (0, 0.1);
     let wanted = [
         Request::Jog {
@@ -56,24 +56,25 @@ fn keys_from_a_stall_do_nothing_but_stop() {
     for (age, passed) in [(0, true), (200, true), (400, false), (5_000, false)] {
         let (asks, mut hands) = hands();
         for request in wanted.into_iter().chain(stops) {
-            asks.send((ago(age), Ask::For(request))).expect("heard");
+            asks.send((ago(age), UiAction::For(request)))
+                .expect("heard");
         }
         let mut expected = stops.to_vec();
         if passed {
             expected.splice(0..0, wanted);
         }
         assert_eq!(hands.hear(NOW), expected, "{age} ms");
-        assert_eq!(told(&hands).len(), usize::from(!passed));
+        assert_eq!(messages(&hands).len(), usize::from(!passed));
     }
 }
 
 #[test]
-fn a_sign_of_life_is_as_old_as_it_is() {
+fn sign_of_life_counts_from_its_send_time() {
     for (age, away) in [(0, false), (400, false), (700, true)] {
         let (asks, mut hands) = hands();
-        // In whatever order.
+        // The order of arrival does not matter.
         for age in [age + 2_000, age, age + 1_000] {
-            asks.send((ago(age), Ask::Alive)).expect("heard");
+            asks.send((ago(age), UiAction::Alive)).expect("heard");
         }
         hands.hear(NOW);
         assert_eq!(hands.away, away, "{age} ms");
@@ -81,11 +82,11 @@ fn a_sign_of_life_is_as_old_as_it_is() {
 }
 
 #[test]
-fn who_leaves_has_left() {
+fn leave_or_closed_channel_ends_the_session() {
     for leave in [true, false] {
         let (asks, mut hands) = hands();
         if leave {
-            asks.send((ago(60_000), Ask::Leave)).expect("heard");
+            asks.send((ago(60_000), UiAction::Leave)).expect("heard");
         } else {
             drop(asks);
         }

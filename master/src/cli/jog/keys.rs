@@ -1,6 +1,6 @@
 //! Bytes from a terminal → keys.
 
-/// A key, or what a terminal tells in the same way.
+/// A key, or a terminal event such as a focus change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Key {
     Char(char),
@@ -15,15 +15,15 @@ pub(super) enum Key {
     Leave,
     FocusGained,
     FocusLost,
-    /// One that means nothing here.
+    /// A key without function.
     Other,
 }
 
-/// A sequence that is longer is none.
+/// The maximum length of an escape sequence.
 const LONGEST: usize = 32;
 const PASTE_ENDS: &[u8] = b"\x1b[201~";
 
-/// What has come and is not a whole key yet.
+/// A decoder that buffers incomplete sequences.
 #[derive(Debug, Default)]
 pub(super) struct Keys {
     bytes: Vec<u8>,
@@ -31,7 +31,7 @@ pub(super) struct Keys {
 }
 
 impl Keys {
-    /// The keys that are complete with these bytes. What is pasted is none.
+    /// Returns the keys that these bytes complete. Pasted text produces no keys.
     pub fn take(&mut self, bytes: &[u8]) -> Vec<Key> {
         self.bytes.extend_from_slice(bytes);
         let mut keys = Vec::new();
@@ -40,7 +40,7 @@ impl Keys {
                 let end = self.bytes.windows(PASTE_ENDS.len());
                 let end = end.into_iter().position(|w| w == PASTE_ENDS);
                 let Some(end) = end else {
-                    // The end itself may have come in two pieces.
+                    // The end marker itself may arrive in two pieces.
                     let keep = self.bytes.len().saturating_sub(PASTE_ENDS.len() - 1);
                     self.bytes.drain(..keep);
                     return keys;
@@ -59,7 +59,7 @@ impl Keys {
         }
     }
 
-    /// Nothing has followed: what is there is all of it.
+    /// Decodes the remaining bytes after a pause.
     pub fn flush(&mut self) -> Option<Key> {
         if self.pasting || self.bytes.is_empty() {
             return None;
@@ -70,7 +70,7 @@ impl Keys {
     }
 }
 
-/// The first key and its bytes, where it is complete; no key where something pasted begins.
+/// Returns the first complete key and its length; no key at the start of pasted text.
 fn first(bytes: &[u8]) -> Option<(Option<Key>, usize)> {
     let key = |key, length| Some((Some(key), length));
     match *bytes.first()? {
@@ -100,7 +100,7 @@ fn first(bytes: &[u8]) -> Option<(Option<Key>, usize)> {
     }
 }
 
-/// Of an escape sequence (ECMA-48: CSI parameters final, SS3 final).
+/// Decodes an escape sequence (ECMA-48: CSI parameters final, SS3 final).
 fn sequence(bytes: &[u8]) -> Option<(Option<Key>, usize)> {
     let key = |key, length| Some((Some(key), length));
     match *bytes.get(1)? {
@@ -121,9 +121,9 @@ fn sequence(bytes: &[u8]) -> Option<(Option<Key>, usize)> {
                 _ => key(Key::Other, length),
             }
         }
-        // Two keys, the first of them Escape.
+        // Two keys; the first is Escape.
         0x1b => key(Key::Escape, 1),
-        // Alt and something.
+        // Alt with another key.
         _ => key(Key::Other, 2),
     }
 }
@@ -146,7 +146,7 @@ mod tests {
     };
 
     #[test]
-    fn keys_of_terminals() {
+    fn keys_decodes_terminal_sequences() {
         for (bytes, expected) in [
             (&b"a Z"[..], &[Char('a'), Char(' '), Char('Z')][..]),
             (b"\x1b[A\x1b[B\x1b[C\x1b[D", &[Up, Down, Right, Left]),
@@ -169,13 +169,13 @@ mod tests {
     }
 
     #[test]
-    fn in_pieces_it_is_the_same() {
+    fn keys_decodes_split_input() {
         let bytes = b"a\x1b[Cb\x1b[200~xe\x1b[Cq\x1b[201~\x1b[D\xc2\xb5";
         let whole = Keys::default().take(bytes);
         assert_eq!(
             whole,
             [Char('a'), Right, Char('b'), Left, Char('µ')],
-            "what is pasted is no key"
+            "pasted text is not a key"
         );
         let mut keys = Keys::default();
         let pieces: Vec<Key> = bytes.iter().flat_map(|b| keys.take(&[*b])).collect();
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn escape_is_what_nothing_follows() {
+    fn lone_escape_is_a_key() {
         let mut keys = Keys::default();
         assert_eq!(keys.take(b"\x1b"), []);
         assert_eq!(keys.flush(), Some(Escape));
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_grows_without_end() {
+    fn keys_buffer_is_bounded() {
         let mut keys = Keys::default();
         for _ in 0..1000 {
             keys.take(b"\x1b[1111111111111111");

@@ -1,4 +1,4 @@
-//! Commands as lines: for scripts, and where there is no terminal.
+//! Commands as lines, for scripts and without a terminal.
 
 use std::io::{self, BufRead, IsTerminal, Read, Write};
 use std::sync::atomic::AtomicBool;
@@ -9,17 +9,17 @@ use std::thread;
 use ecaxis::clock::{Clock, Nanos};
 use ecaxis::config::{Machine, duration, nearest};
 use ecaxis::session::{self, Observer, Options, Progress};
-use ecaxis::supervise::manual::{MOST_SPEED, Operator, Presence, Request, Turn, View};
+use ecaxis::supervise::jog::{MAX_MANUAL_SPEED, Operator, OperatorInput, Presence, Request, View};
 use ecaxis_axis::Mode;
 use serde_json::json;
 
-use super::super::progress::Teller;
+use super::super::progress::ProgressPrinter;
 use super::super::{Failure, hints};
 use super::panel::{AxisPanel, Panel, number};
 
-/// Lines that have been read ahead; whoever writes more waits.
+/// The number of lines read ahead; then the writer blocks.
 const AHEAD: usize = 64;
-/// Longer ones are not understood.
+/// The maximum length of a line in bytes.
 const LONGEST: usize = 1_000;
 const SPEED: f64 = 0.05;
 
@@ -41,14 +41,14 @@ const VERBS: [&str; 15] = [
     "wait", "status", "help", "quit",
 ];
 
-/// A line that is understood.
+/// A parsed line.
 #[derive(Debug, Clone, PartialEq)]
 enum Line {
     For(Vec<Request>),
     Speed(f64),
     Status,
     Help,
-    /// `None`: until everything is done.
+    /// `None`: until all requests are done.
     Wait(Option<Nanos>),
     Quit,
     Nothing,
@@ -62,7 +62,7 @@ pub(super) fn run(
 ) -> Result<(), Failure> {
     let (lines, read) = sync_channel(AHEAD);
     let (say, said) = channel::<String>();
-    // Ends with the program: it may wait for a line for ever.
+    // The thread ends with the process, because reading may block forever.
     thread::Builder::new()
         .name("lines".to_owned())
         .spawn(move || {
@@ -74,25 +74,25 @@ pub(super) fn run(
             }
         })
         .map_err(|e| Failure::new(hints::FAILED, format!("starting a thread: {e}")))?;
-    // A reader that does not read must not hold the machine up.
+    // A slow reader of stdout must not block the machine.
     let printer = thread::Builder::new()
         .name("answers".to_owned())
         .spawn(move || {
             let mut out = io::stdout().lock();
             for text in said {
-                // A reader that has gone is no reason to stop.
+                // A closed stdout does not stop the machine.
                 let _ = writeln!(out, "{text}").and_then(|()| out.flush());
             }
         })
         .map_err(|e| Failure::new(hints::FAILED, format!("starting a thread: {e}")))?;
     let failure = Arc::default();
     let nic = machine.bus.nic.clone();
-    let mut teller = Quiet(Teller::new(options.clock, &machine.bus, true));
+    let mut teller = QuietObserver(ProgressPrinter::new(options.clock, &machine.bus, true));
     let script = Script {
         lines: read,
         patient: options.clock == Clock::Virtual,
         answers: Answers { say, json },
-        // Somebody who types makes mistakes, a script that goes wrong must not go on.
+        // A script must stop at the first error; an interactive user may go on.
         strict: !io::stdin().is_terminal(),
         failure: Arc::clone(&failure),
         speed: SPEED,
@@ -100,7 +100,7 @@ pub(super) fn run(
         began: None,
         read: 0,
     };
-    let outcome = session::run_by_hand(machine, options, stop, &mut teller, Box::new(script));
+    let outcome = session::run_with_operator(machine, options, stop, &mut teller, Box::new(script));
     drop(teller);
     let _ = printer.join();
     outcome.result.map_err(|error| hints::run(&error, &nic))?;
@@ -114,7 +114,8 @@ pub(super) fn run(
     }
 }
 
-/// `None`: the end. A line that is too long comes in pieces, none of which is understood.
+/// Returns the next line, or `None` at the end of input. An overlong line is split, and no part is
+/// accepted.
 fn next_line(input: &mut impl BufRead) -> Option<String> {
     let mut bytes = Vec::new();
     let mut part = input.take(LONGEST as u64 + 2);
@@ -124,10 +125,10 @@ fn next_line(input: &mut impl BufRead) -> Option<String> {
     }
 }
 
-/// A run's progress, without what `status` tells.
-struct Quiet(Teller);
+/// Progress of a run without the status lines, which the command `status` prints.
+struct QuietObserver(ProgressPrinter);
 
-impl Observer for Quiet {
+impl Observer for QuietObserver {
     fn progress(&mut self, progress: &Progress) {
         if !matches!(progress, Progress::Status(_)) {
             self.0.progress(progress);
@@ -135,7 +136,7 @@ impl Observer for Quiet {
     }
 }
 
-/// What is printed.
+/// The printer of answers.
 #[derive(Debug)]
 struct Answers {
     say: Sender<String>,
@@ -191,26 +192,26 @@ impl Answers {
     }
 }
 
-/// Line after line; one that waits keeps those behind it waiting.
+/// Executes lines one by one. A waiting line delays the following lines.
 #[derive(Debug)]
 struct Script {
     lines: Receiver<String>,
-    /// Time stands still until the next line is there.
+    /// True if time stands still until the next line arrives.
     patient: bool,
     answers: Answers,
     strict: bool,
     failure: Arc<Mutex<Option<Failure>>>,
-    /// Fraction of the velocity limit.
+    /// The fraction of the velocity limit.
     speed: f64,
-    /// Until then, or until everything is done.
+    /// The time until which it waits; `Some(None)`: until all requests are done.
     waiting: Option<Option<Nanos>>,
     began: Option<Nanos>,
-    /// Lines so far.
+    /// The number of lines read.
     read: u64,
 }
 
 impl Script {
-    /// `true`: it is not to go on.
+    /// Handles a failed line. Returns `true` if the run must end.
     fn fail(&self, code: u8, message: String) -> bool {
         let failure = Failure::new(code, message);
         if self.strict {
@@ -222,7 +223,7 @@ impl Script {
         self.strict
     }
 
-    /// Whether there is another line: `None` for not yet.
+    /// Returns the next line, `None` if it has not arrived, or an error at the end of input.
     fn next(&self) -> Option<Result<String, RecvError>> {
         if self.patient {
             return Some(self.lines.recv());
@@ -236,17 +237,17 @@ impl Script {
 }
 
 impl Operator for Script {
-    fn turn(&mut self, view: &View<'_>) -> Turn {
-        let mut turn = Turn::default();
-        let gone = Turn {
+    fn turn(&mut self, view: &View<'_>) -> OperatorInput {
+        let mut turn = OperatorInput::default();
+        let gone = OperatorInput {
             presence: Presence::Gone,
             requests: Vec::new(),
         };
         let began = *self.began.get_or_insert(view.now);
         for news in view.news {
             let (axis, text) = (view.name(news.axis()), news.to_string());
-            self.answers.news(axis, &text, news.bad());
-            if news.bad() && self.fail(hints::FAILED, format!("{axis}: {text}")) {
+            self.answers.news(axis, &text, news.is_failure());
+            if news.is_failure() && self.fail(hints::FAILED, format!("{axis}: {text}")) {
                 return gone;
             }
         }
@@ -256,7 +257,7 @@ impl Operator for Script {
                 Some(Some(until)) => view.now < until,
                 None => false,
             };
-            // Whoever types another line waits no longer.
+            // Interactive input ends the wait.
             if waits && self.strict {
                 return turn;
             }
@@ -267,7 +268,7 @@ impl Operator for Script {
             };
             self.read = self.read.saturating_add(1);
             self.waiting = None;
-            // What follows is judged by what this one does.
+            // The next line is checked after this one took effect.
             match parse(&line, view, self.speed) {
                 Ok(Line::For(requests)) => {
                     turn.requests.extend(requests);
@@ -278,7 +279,7 @@ impl Operator for Script {
                 Ok(Line::Help) => self.answers.say(HELP),
                 Ok(Line::Wait(time)) => {
                     self.waiting = Some(time.map(|time| view.now.saturating_add(time)));
-                    // Whoever types is not waited for with this one.
+                    // Interactive input is not awaited in this cycle.
                     return turn;
                 }
                 Ok(Line::Quit) => return gone,
@@ -317,7 +318,7 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
             }
         })
     };
-    // All of them where none is named.
+    // Without names, the command applies to all axes.
     let each = |request: fn(usize) -> Request| -> Result<Line, String> {
         let named: Result<Vec<usize>, String> = rest.iter().map(|name| axis(name)).collect();
         let mut axes = named?;
@@ -375,7 +376,7 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
         "mode" => match rest {
             [name, mode] => {
                 let mode = mode_named(mode).ok_or_else(|| {
-                    format!("`{mode}` is no mode; there are csp, csv, cst, pp and pv")
+                    format!("`{mode}` is not a mode; use csp, csv, cst, pp or pv")
                 })?;
                 let axis = axis(name)?;
                 Ok(Line::For(vec![Request::SetMode { axis, mode }]))
@@ -388,9 +389,9 @@ fn parse(line: &str, view: &View<'_>, speed: f64) -> Result<Line, String> {
                 _ => None,
             };
             let part = percent.map(|percent| percent / 100.0);
-            let part = part.filter(|part| *part > 0.0 && *part <= MOST_SPEED);
+            let part = part.filter(|part| *part > 0.0 && *part <= MAX_MANUAL_SPEED);
             part.map(Line::Speed).ok_or_else(|| {
-                let most = MOST_SPEED * 100.0;
+                let most = MAX_MANUAL_SPEED * 100.0;
                 format!("`speed` takes percent of the velocity limit, above 0 and up to {most}")
             })
         }

@@ -1,16 +1,17 @@
-//! `ecaxis jog`: a machine in somebody's hands.
+//! `ecaxis jog`: manual operation of the axes.
 //!
 //! | file | |
 //! |---|---|
-//! | here | arguments, the run, and what stands between terminal and machine |
-//! | `terminal` | the terminal: taken, read, drawn on, given back |
+//! | `mod` | arguments, the run, and the channel between terminal and machine |
+//! | `terminal` | the terminal: set-up, input, output, restoring |
 //! | `keys` | bytes → keys |
 //! | `ui` | keys → requests |
 //! | `panel`, `draw` | the machine → rows |
-//! | `lines` | the same without a terminal: commands as lines |
+//! | `lines` | operation without a terminal: commands as lines |
 //!
-//! The terminal has a thread of its own, the machine is asked beside the cycle, and what goes to and fro never waits: a
-//! terminal that hangs cannot hold the machine up, and is missed after half a second.
+//! The terminal has its own thread; the machine polls requests outside the cycle. Neither side
+//! waits for the other: a terminal that hangs cannot block the machine, and the axes stop after 0.5
+//! s without it.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,14 +23,16 @@ use std::time::{Duration, Instant};
 use ecaxis::clock::{Clock, Nanos};
 use ecaxis::config::{Machine, Nic};
 use ecaxis::session::{self, Observer, Options, Outcome, Progress, RunError};
-use ecaxis::supervise::manual::{LET_GO, Operator, Presence, Request, Turn, View};
+use ecaxis::supervise::jog::{
+    HOLD_TO_RUN_TIMEOUT, Operator, OperatorInput, Presence, Request, View,
+};
 
 use super::{Failure, hints, record, report, result, run, signals, style};
-use draw::Picture;
+use draw::Screen;
 use keys::Keys;
 use panel::{Messages, Panel};
 use terminal::Terminal;
-use ui::{Ask, Ui};
+use ui::{Ui, UiAction};
 
 mod draw;
 mod keys;
@@ -38,14 +41,14 @@ mod panel;
 pub(super) mod terminal;
 mod ui;
 
-/// Nothing heard of the terminal for so long: nobody is there.
+/// The maximum silence of the terminal in ns; then the operator counts as absent.
 const AWAY: Nanos = 500_000_000;
-/// What has waited for longer, while devices were asked or this computer stalled, is no longer what somebody wants, unless it
-/// stops something.
-const TOO_OLD: Duration = Duration::from_nanos(LET_GO);
-/// How often what is shown is looked at anew.
+/// The maximum age of a request. Older ones, from a stall of a device or of the computer, are
+/// dropped unless they stop something.
+const TOO_OLD: Duration = Duration::from_nanos(HOLD_TO_RUN_TIMEOUT);
+/// The refresh period of the display in ns.
 const SHOWN: Nanos = 50_000_000;
-/// How long a key is waited for, milliseconds; also what may lie between the bytes of one.
+/// The time to wait for a key in ms; also the maximum gap between the bytes of one key.
 const WAIT: u32 = 40;
 
 const EXAMPLES: &str = "\
@@ -56,16 +59,16 @@ Examples:
                                    `help` lists them
   ecaxis jog m.toml --lines < script.txt
 
-An axis jogs only while the key is held down: a key that has not come again for
-0.3 s lets the axis brake, as does a terminal that hangs, closes or loses the
+An axis jogs only while the key is held down: a key that does not repeat for
+0.3 s stops the axis, as does a terminal that hangs, closes or loses the
 focus. No motion is faster than a quarter of the velocity limit. This is not a
-safety function: emergency stop belongs into hardware of its own.";
+safety function: implement emergency stop in dedicated safety hardware.";
 
-/// Enable, jog, move and home axes by hand, in a terminal
+/// Enable, jog, move and home axes by hand in a terminal
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Machine file; its program is not run
+    /// Machine file; its program does not run
     #[arg(value_name = "FILE")]
     file: PathBuf,
     /// Use this network interface instead of the file's
@@ -74,19 +77,20 @@ pub(crate) struct Args {
     /// Use the simulated bus instead of the file's interface
     #[arg(long)]
     sim: bool,
-    /// Take commands as lines from standard input
+    /// Read commands as lines from standard input
     #[arg(long)]
     lines: bool,
-    /// With --lines: in virtual time, which stands still until the next line is there (simulated bus only)
+    /// With --lines: use virtual time, which stands still until the next line arrives (simulated
+    /// bus only)
     #[arg(long = "virtual", requires = "lines")]
     virtual_time: bool,
-    /// With --lines: answer in JSON, an object a line
+    /// With --lines: answer in JSON, one object per line
     #[arg(long, requires = "lines")]
     json: bool,
     /// Fault script for the simulated bus
     #[arg(long, value_name = "FILE")]
     faults: Option<PathBuf>,
-    /// Keep every frame in this pcapng file
+    /// Record all frames to this pcapng file
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
 }
@@ -117,7 +121,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let text = summary.as_ref().map(report::summary).unwrap_or_default();
     let written = result(&text);
     match ended {
-        // Whoever leaves with a key has not been interrupted; a terminal that closes interrupts.
+        // Leaving with a key is not an interruption; closing the terminal is.
         Ok(()) | Err(RunError::Interrupted) if left => written,
         Ok(()) => Err(Failure::interrupted()),
         Err(error) => Err(hints::run(&error, &nic)),
@@ -162,7 +166,7 @@ fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
     })
 }
 
-/// Runs the machine with the terminal beside it.
+/// Runs the machine and, on another thread, the terminal.
 fn on(
     terminal: Terminal,
     machine: Machine,
@@ -177,7 +181,7 @@ fn on(
     };
     let title = format!("jog  {}  {bus}", args.file.display());
     let (asks, asked) = channel();
-    let hands = Hands {
+    let hands = MachineSide {
         asked,
         shared: Arc::clone(shared),
         heard: None,
@@ -191,7 +195,7 @@ fn on(
         nic: machine.bus.nic.clone(),
     };
     thread::scope(|scope| {
-        let seat = Seat {
+        let seat = TerminalSide {
             terminal,
             asks,
             shared,
@@ -204,7 +208,7 @@ fn on(
         if let Err(error) = seat {
             return RunError::Thread(error.to_string()).into();
         }
-        let outcome = session::run_by_hand(
+        let outcome = session::run_with_operator(
             machine,
             options,
             Arc::clone(stop),
@@ -216,12 +220,12 @@ fn on(
     })
 }
 
-/// What both ends see.
+/// State shared by both sides.
 #[derive(Debug, Default)]
 struct Shared {
     seen: Mutex<Seen>,
     over: AtomicBool,
-    /// The user has left with a key.
+    /// True after the user has left with a key.
     left: AtomicBool,
 }
 
@@ -232,22 +236,22 @@ struct Seen {
 }
 
 impl Shared {
-    /// What is in it is whole whoever panicked.
+    /// Locks the state. It is consistent even after a panic of the other side.
     fn seen(&self) -> MutexGuard<'_, Seen> {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn tell(&self, text: impl Into<String>, bad: bool) {
-        self.seen().messages.tell(text.into(), bad);
+    fn show(&self, text: impl Into<String>, bad: bool) {
+        self.seen().messages.show(text.into(), bad);
     }
 }
 
-/// The machine's end: asked beside the cycle.
+/// The machine's side, polled outside the cycle.
 #[derive(Debug)]
-struct Hands {
-    asked: Receiver<(Instant, Ask)>,
+struct MachineSide {
+    asked: Receiver<(Instant, UiAction)>,
     shared: Arc<Shared>,
-    /// When the terminal last gave a sign of life.
+    /// The time of the last sign of life of the terminal.
     heard: Option<Nanos>,
     shown: Option<Nanos>,
     began: Option<Nanos>,
@@ -255,8 +259,8 @@ struct Hands {
     gone: bool,
 }
 
-impl Hands {
-    /// What has been asked for since the last turn, as far as it still counts.
+impl MachineSide {
+    /// Returns the requests since the last poll that are still valid.
     fn hear(&mut self, now: Nanos) -> Vec<Request> {
         let mut requests = Vec::new();
         let mut too_late = false;
@@ -264,39 +268,41 @@ impl Hands {
             let (age, ask) = match self.asked.try_recv() {
                 Ok((at, ask)) => (at.elapsed(), ask),
                 Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => (Duration::ZERO, Ask::Leave),
+                Err(TryRecvError::Disconnected) => (Duration::ZERO, UiAction::Leave),
             };
             match ask {
-                Ask::Alive => {
+                UiAction::Alive => {
                     let age = u64::try_from(age.as_nanos()).unwrap_or(u64::MAX);
                     let at = now.saturating_sub(age);
                     self.heard = Some(self.heard.map_or(at, |heard| heard.max(at)));
                 }
-                Ask::For(request) if age < TOO_OLD || request.stops() => requests.push(request),
-                Ask::For(_) => too_late = true,
-                Ask::Leave => self.gone = true,
+                UiAction::For(request) if age < TOO_OLD || request.stops() => {
+                    requests.push(request)
+                }
+                UiAction::For(_) => too_late = true,
+                UiAction::Leave => self.gone = true,
             }
         }
         if too_late {
             self.shared
-                .tell("too late, not done: keys from before", true);
+                .show("too late, not done: keys from before", true);
         }
         let away = now.saturating_sub(*self.heard.get_or_insert(now)) > AWAY;
         if away && !self.away {
-            self.shared.tell("the terminal hangs: axes brake", true);
+            self.shared.show("the terminal hangs: axes brake", true);
         }
         self.away = away;
         requests
     }
 }
 
-impl Operator for Hands {
-    fn turn(&mut self, view: &View<'_>) -> Turn {
+impl Operator for MachineSide {
+    fn turn(&mut self, view: &View<'_>) -> OperatorInput {
         let now = view.now;
         let requests = self.hear(now);
         for news in view.news {
             let text = format!("{}: {news}", view.name(news.axis()));
-            self.shared.tell(text, news.bad());
+            self.shared.show(text, news.is_failure());
         }
         let shown = self
             .shown
@@ -312,11 +318,11 @@ impl Operator for Hands {
             (_, true) => Presence::Away,
             _ => Presence::Here,
         };
-        Turn { presence, requests }
+        OperatorInput { presence, requests }
     }
 }
 
-/// Progress as messages.
+/// Shows progress as messages.
 struct Listener {
     shared: Arc<Shared>,
     nic: Nic,
@@ -338,7 +344,7 @@ impl Observer for Listener {
             Progress::GroupStopped { group, cause } => {
                 let hint = hints::run(cause, &self.nic).hints.into_iter().next();
                 let group = format!("the group `{group}` stops: {cause}");
-                self.shared.tell(group, true);
+                self.shared.show(group, true);
                 (hint.unwrap_or_else(|| "r resets it".to_owned()), false)
             }
             Progress::GroupReleased { group } => {
@@ -347,27 +353,27 @@ impl Observer for Listener {
             }
             _ => return,
         };
-        self.shared.tell(text, bad);
+        self.shared.show(text, bad);
     }
 }
 
-/// The terminal's end.
-struct Seat<'s> {
+/// The terminal's side.
+struct TerminalSide<'s> {
     terminal: Terminal,
-    asks: Sender<(Instant, Ask)>,
+    asks: Sender<(Instant, UiAction)>,
     shared: &'s Shared,
     stop: &'s AtomicBool,
     title: &'s str,
 }
 
-impl Seat<'_> {
-    /// Until the run is over, or the terminal is gone.
+impl TerminalSide<'_> {
+    /// Runs until the run is over or the terminal is gone.
     fn serve(mut self) {
         let began = Instant::now();
         let (mut keys, mut ui) = (Keys::default(), Ui::default());
         let colours = style::on_stdout();
         while !self.shared.over.load(Ordering::Relaxed) {
-            // A panic elsewhere has given it back.
+            // A panic elsewhere has restored the terminal.
             let Ok(bytes) = self.terminal.read(WAIT) else {
                 break;
             };
@@ -380,13 +386,13 @@ impl Seat<'_> {
             }
             let Seen { panel, messages } = self.shared.seen().clone();
             let now = u64::try_from(began.elapsed().as_millis()).unwrap_or(u64::MAX);
-            self.send(Ask::Alive);
+            self.send(UiAction::Alive);
             for key in typed {
                 for ask in ui.key(key, now, panel.as_ref()) {
                     self.ask(ask, panel.is_some());
                 }
             }
-            let picture = Picture {
+            let picture = Screen {
                 title: self.title,
                 panel: panel.as_ref(),
                 messages: &messages,
@@ -400,14 +406,14 @@ impl Seat<'_> {
                 break;
             }
         }
-        // Whoever listens takes the silence for leaving; nobody listens before the bus is up.
+        // The machine detects a missing terminal itself, but only after the bus is up.
         if !self.shared.over.load(Ordering::Relaxed) && self.shared.seen().panel.is_none() {
             self.stop.store(true, Ordering::Relaxed);
         }
     }
 
-    fn ask(&self, ask: Ask, attended: bool) {
-        if ask == Ask::Leave {
+    fn ask(&self, ask: UiAction, attended: bool) {
+        if ask == UiAction::Leave {
             self.shared.left.store(true, Ordering::Relaxed);
             if !attended {
                 self.stop.store(true, Ordering::Relaxed);
@@ -416,7 +422,7 @@ impl Seat<'_> {
         self.send(ask);
     }
 
-    fn send(&self, ask: Ask) {
+    fn send(&self, ask: UiAction) {
         let _ = self.asks.send((Instant::now(), ask));
     }
 }

@@ -1,19 +1,20 @@
-//! What is shown of the machine: taken from the view beside the cycle, drawn elsewhere.
+//! The displayed state of the machine: copied from the view outside the cycle, drawn on another
+//! thread.
 
 use std::collections::VecDeque;
 
 use ecaxis::config::{AxisSetup, TorqueUnit};
-use ecaxis::supervise::manual::{Doing, View};
+use ecaxis::supervise::jog::{Activity, View};
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, HomingStatus, Mode, State};
 use serde::Serialize;
 
-/// Modes that an axis can be told to be in.
+/// The modes that an axis can be switched to.
 const MODES: [Mode; 5] = [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv];
 
 #[derive(Debug, Clone, Default)]
 pub(super) struct Panel {
-    /// Of the run.
+    /// The time since the start of the run in s.
     pub time_s: f64,
     pub lost_frames: u64,
     pub wkc_errors: u64,
@@ -21,14 +22,14 @@ pub(super) struct Panel {
     pub axes: Vec<AxisPanel>,
 }
 
-/// One axis; values in its units.
+/// One axis; values in user units.
 #[derive(Debug, Clone)]
 pub(super) struct AxisPanel {
     pub name: String,
     pub unit: String,
     pub state: State,
     pub mode: Mode,
-    /// That it can be switched to, `mode` among them.
+    /// The available modes, including `mode`.
     pub modes: Vec<Mode>,
     pub position: f64,
     pub velocity: f64,
@@ -37,11 +38,11 @@ pub(super) struct AxisPanel {
     pub following_error: f64,
     pub target: f64,
     pub limits: Limits,
-    pub doing: Doing,
+    pub doing: Activity,
     pub enabled: bool,
     pub homed: bool,
     pub held_by_range: bool,
-    /// Fault, trip, or why it waits.
+    /// The fault, the trip, or the reason for waiting.
     pub trouble: Option<String>,
 }
 
@@ -84,7 +85,7 @@ impl AxisPanel {
         name: &str,
         setup: &AxisSetup,
         status: &AxisStatus,
-        doing: Doing,
+        doing: Activity,
         stopped: bool,
     ) -> Self {
         let config = &setup.config;
@@ -94,7 +95,7 @@ impl AxisPanel {
             (Some(fault), ..) => Some(fault.to_string()),
             (_, Some(trip), _) => Some(trip.to_string()),
             _ if stopped => Some("its group has been stopped".to_owned()),
-            (.., Some(waiting)) if doing == Doing::Enabling => Some(waiting.to_string()),
+            (.., Some(waiting)) if doing == Activity::Enabling => Some(waiting.to_string()),
             _ => None,
         };
         Self {
@@ -123,27 +124,29 @@ impl AxisPanel {
         }
     }
 
-    /// What an axis is doing for the operator, with its unit.
+    /// Returns the axis' current motion with its unit.
     pub fn doing(&self) -> String {
         let unit = &self.unit;
         match self.doing {
-            Doing::Nothing if self.enabled => "holds".to_owned(),
-            Doing::Nothing => "no power".to_owned(),
-            Doing::Jogging { .. } if self.held_by_range => "jogs, at the end of its range".into(),
-            Doing::Jogging { velocity } => format!("jogs at {} {unit}/s", number(velocity)),
-            Doing::Moving { by: true, value } => format!("moves by {} {unit}", number(value)),
-            Doing::Moving { by: false, value } => format!("moves to {} {unit}", number(value)),
-            Doing::Enabling => "is being enabled".to_owned(),
-            Doing::Disabling => "is being disabled".to_owned(),
-            Doing::Homing => "looks for home".to_owned(),
-            Doing::Switching { to } => format!("is switched to {to}"),
-            Doing::Resetting => "is being reset".to_owned(),
-            Doing::Stopping => "brakes".to_owned(),
+            Activity::Nothing if self.enabled => "holds".to_owned(),
+            Activity::Nothing => "no power".to_owned(),
+            Activity::Jogging { .. } if self.held_by_range => {
+                "jogs, at the end of its range".into()
+            }
+            Activity::Jogging { velocity } => format!("jogs at {} {unit}/s", number(velocity)),
+            Activity::Moving { by: true, value } => format!("moves by {} {unit}", number(value)),
+            Activity::Moving { by: false, value } => format!("moves to {} {unit}", number(value)),
+            Activity::Enabling => "is being enabled".to_owned(),
+            Activity::Disabling => "is being disabled".to_owned(),
+            Activity::Homing => "looks for home".to_owned(),
+            Activity::Switching { to } => format!("is switched to {to}"),
+            Activity::Resetting => "is being reset".to_owned(),
+            Activity::Stopping => "brakes".to_owned(),
         }
     }
 }
 
-/// Without zeros at its end, and without a negative zero.
+/// Formats a number without trailing zeros and without negative zero.
 pub(super) fn number(x: f64) -> String {
     let text = format!("{x:.4}");
     let text = text.trim_end_matches('0').trim_end_matches('.');
@@ -154,7 +157,7 @@ pub(super) fn number(x: f64) -> String {
     }
 }
 
-/// The last things that happened.
+/// The latest messages.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Messages(VecDeque<Message>);
 
@@ -168,7 +171,7 @@ pub(super) struct Message {
 impl Messages {
     const MOST: usize = 50;
 
-    pub fn tell(&mut self, text: String, bad: bool) {
+    pub fn show(&mut self, text: String, bad: bool) {
         match self.0.back_mut() {
             Some(last) if last.text == text => {
                 last.times = last.times.saturating_add(1);
@@ -193,7 +196,7 @@ impl Messages {
 pub(super) mod tests {
     use super::*;
 
-    /// `a0`, `a1` …: enabled at 1.5 mm of −50 to 50, at most 100 mm/s.
+    /// Returns axes `a0`, `a1` …: enabled, at 1.5 mm, range −50 to 50 mm, at most 100 mm/s.
     pub fn panel(axes: usize) -> Panel {
         let axis = |n: usize| AxisPanel {
             name: format!("a{n}"),
@@ -213,7 +216,7 @@ pub(super) mod tests {
                 torque: 100.0,
                 following_error: None,
             },
-            doing: Doing::Nothing,
+            doing: Activity::Nothing,
             enabled: true,
             homed: false,
             held_by_range: false,

@@ -1,8 +1,7 @@
-//! The terminal while it is ours: raw, on the other screen, and given back on every way out.
+//! The terminal in raw mode on the alternate screen. It is restored on every exit.
 //!
-//! `Terminal` gives it back when it is dropped, a panic anywhere gives it back before it is told, and [`restore`] does
-//! for those who leave without unwinding. No library does the drawing: rows are written whole, and what the
-//! terminal shows already is not sent again.
+//! `Terminal` restores it when dropped. The panic hook restores it before printing, and [`restore`]
+//! serves exits without unwinding. Rows are written as a whole; unchanged rows are not sent again.
 
 use std::io::{self, IsTerminal, Write};
 use std::sync::{Mutex, Once, PoisonError};
@@ -10,17 +9,17 @@ use std::sync::{Mutex, Once, PoisonError};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{OptionalActions, Termios, tcgetattr, tcgetwinsize, tcsetattr};
 
-/// The other screen; no cursor; tell when the focus comes and goes; mark what is pasted.
+/// Alternate screen; hide cursor; report focus changes; bracket pasted text.
 const ENTER: &[u8] = b"\x1b[?1049h\x1b[?25l\x1b[?1004h\x1b[?2004h\x1b[2J";
 const LEAVE: &[u8] = b"\x1b[?2004l\x1b[?1004l\x1b[?25h\x1b[?1049l";
 
-/// What to give back, as long as it has not been.
+/// The settings to restore, until they are restored.
 static TAKEN: Mutex<Option<Termios>> = Mutex::new(None);
 
-/// Why there is no terminal to draw on.
+/// Why a terminal cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum NoTerminal {
-    #[error("standard input or output is no terminal")]
+    #[error("standard input or output is not a terminal")]
     None,
     #[error("this terminal (TERM=dumb) cannot be drawn on")]
     Dumb,
@@ -30,7 +29,7 @@ pub(super) enum NoTerminal {
 
 #[derive(Debug)]
 pub(super) struct Terminal {
-    /// As it is shown.
+    /// The rows currently shown.
     rows: Vec<String>,
     size: (usize, usize),
 }
@@ -48,7 +47,7 @@ impl Terminal {
         raw.make_raw();
         *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) = Some(before);
         restore_on_panic();
-        // From here on dropping it gives back what was taken.
+        // From here on, dropping it restores the settings.
         let terminal = Self {
             rows: Vec::new(),
             size: (0, 0),
@@ -61,7 +60,7 @@ impl Terminal {
         Ok(terminal)
     }
 
-    /// Columns and rows; 80 × 24 where it does not say.
+    /// Columns and rows; 80 × 24 if unknown.
     pub fn size(&self) -> (usize, usize) {
         match tcgetwinsize(io::stdout()) {
             Ok(size) if size.ws_col > 0 && size.ws_row > 0 => {
@@ -71,7 +70,7 @@ impl Terminal {
         }
     }
 
-    /// Shows rows with their escape sequences, no wider than the terminal.
+    /// Shows rows with their escape sequences. No row is wider than the terminal.
     pub fn show(&mut self, rows: Vec<String>) -> io::Result<()> {
         let size = self.size();
         let mut bytes = Vec::new();
@@ -96,10 +95,10 @@ impl Terminal {
         out.flush()
     }
 
-    /// What has been typed within the time. Nothing: time is over.
+    /// Returns the bytes typed within the time, or nothing after a time-out.
     ///
     /// # Errors
-    /// The terminal is gone.
+    /// Fails if the terminal is gone.
     pub fn read(&mut self, milliseconds: u32) -> io::Result<Vec<u8>> {
         let stdin = io::stdin();
         let time = Timespec {
@@ -131,17 +130,17 @@ impl Drop for Terminal {
     }
 }
 
-/// Whether the terminal is still ours.
+/// True if the terminal settings are not restored yet.
 pub(super) fn ours() -> bool {
     let taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
     taken.is_some()
 }
 
-/// Gives the terminal back, if it was taken. Whoever calls it first does it.
+/// Restores the terminal if it was set up. Only the first call has an effect.
 pub(crate) fn restore() {
     let mut taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(before) = taken.take() {
-        // A terminal that is gone needs nothing back.
+        // A closed terminal needs no restoring.
         let _ = rustix::io::write(io::stdout(), LEAVE);
         let _ = tcsetattr(io::stdin(), OptionalActions::Flush, &before);
     }
@@ -150,10 +149,10 @@ pub(crate) fn restore() {
 fn restore_on_panic() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
-        let tell = std::panic::take_hook();
+        let report = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |panic| {
             restore();
-            tell(panic);
+            report(panic);
         }));
     });
 }

@@ -1,32 +1,32 @@
-//! Keys → what is asked for. Knows no terminal and no clock.
+//! Keys → requests. Independent of terminal and clock.
 
-use ecaxis::supervise::manual::{Doing, LET_GO, MOST_SPEED, Request};
+use ecaxis::supervise::jog::{Activity, HOLD_TO_RUN_TIMEOUT, MAX_MANUAL_SPEED, Request};
 
 use super::keys::Key;
 use super::panel::{AxisPanel, Panel};
 
-/// Fractions of the velocity limit, and which of them comes first.
-const SPEEDS: [f64; 7] = [0.01, 0.02, 0.05, 0.1, 0.15, 0.2, MOST_SPEED];
+/// The fractions of the velocity limit; the default follows.
+const SPEEDS: [f64; 7] = [0.01, 0.02, 0.05, 0.1, 0.15, 0.2, MAX_MANUAL_SPEED];
 const FIRST_SPEED: usize = 2;
-/// A key that is held down begins to repeat within this time, milliseconds.
+/// The maximum delay in ms before a held key repeats.
 const REPEATS_WITHIN: u64 = 1_000;
-/// Longest number that is typed.
+/// The maximum length of a typed number.
 const LONGEST: usize = 16;
 
-/// What the keyboard's end asks of the machine's.
+/// Requests of the terminal's side to the machine's side.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Ask {
-    /// Somebody is there.
+pub(super) enum UiAction {
+    /// A sign of life.
     Alive,
     For(Request),
     Leave,
 }
 
-/// A key that jogs.
+/// A held key that jogs.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Held {
+struct HeldKey {
     key: Key,
-    /// When it last came, milliseconds.
+    /// The time of its last occurrence in ms.
     at: u64,
     repeats: bool,
 }
@@ -35,11 +35,11 @@ struct Held {
 pub(super) struct Ui {
     pub selected: usize,
     speed: usize,
-    /// Powers of ten that the step is larger than at first.
+    /// The power of ten by which the user enlarged the step.
     decades: i32,
-    /// What has been typed of a position.
+    /// The typed part of a position.
     pub typed: Option<String>,
-    held: Option<Held>,
+    held: Option<HeldKey>,
 }
 
 impl Default for Ui {
@@ -55,13 +55,13 @@ impl Default for Ui {
 }
 
 impl Ui {
-    /// Fraction of the velocity limit.
+    /// The fraction of the velocity limit.
     pub fn speed(&self) -> f64 {
         SPEEDS.get(self.speed).copied().unwrap_or(SPEEDS[0])
     }
 
-    /// User units: a power of ten, at first about a hundredth of the axis' range, or what it travels at full
-    /// speed in a tenth of a second.
+    /// The step in user units: a power of ten. The default is about 1 % of the axis' range, or the
+    /// travel in 0.1 s at full speed.
     pub fn step(&self, axis: &AxisPanel) -> f64 {
         let way = match axis.limits.position {
             Some([low, high]) => (high - low) * 0.01,
@@ -71,30 +71,30 @@ impl Ui {
         10_f64.powf(first + f64::from(self.decades))
     }
 
-    /// A key for moving has come once; held down it moves.
+    /// True if a motion key came once; it moves when it repeats.
     pub fn armed(&self, now: u64) -> bool {
         self.held
             .is_some_and(|held| !held.repeats && now.saturating_sub(held.at) < REPEATS_WITHIN)
     }
 
-    /// `now`: milliseconds.
-    pub fn key(&mut self, key: Key, now: u64, panel: Option<&Panel>) -> Vec<Ask> {
-        let stop_all = || vec![Ask::For(Request::StopAll)];
+    /// Handles a key. `now` is in ms.
+    pub fn key(&mut self, key: Key, now: u64, panel: Option<&Panel>) -> Vec<UiAction> {
+        let stop_all = || vec![UiAction::For(Request::StopAll)];
         if matches!(key, Key::FocusGained) {
             return Vec::new();
         }
         let (leave, typing) = (key == Key::Leave, self.typed.is_some());
         if leave || (key == Key::Char('q') && !typing) {
-            return vec![Ask::Leave];
+            return vec![UiAction::Leave];
         }
         let Some((panel, axis)) = panel.and_then(|p| Some((p, p.axes.get(self.selected)?))) else {
             return Vec::new();
         };
         let selected = self.selected;
-        // Whatever is being typed.
+        // The emergency stop works during number input as well.
         if key == Key::Char('x') {
             (self.typed, self.held) = (None, None);
-            return vec![Ask::For(Request::EmergencyStop)];
+            return vec![UiAction::For(Request::EmergencyStop)];
         }
         if let Some(typed) = &mut self.typed {
             match key {
@@ -110,7 +110,7 @@ impl Ui {
                     let position = self.typed.take().and_then(|typed| typed.parse().ok());
                     let speed = self.speed();
                     return match position {
-                        Some(position) => vec![Ask::For(Request::MoveTo {
+                        Some(position) => vec![UiAction::For(Request::MoveTo {
                             axis: selected,
                             position,
                             speed,
@@ -129,7 +129,7 @@ impl Ui {
             let sign = if key == Key::Left { -1.0 } else { 1.0 };
             let velocity = sign * self.speed() * axis.limits.velocity;
             return match self.hold(key, now) {
-                true => vec![Ask::For(Request::Jog {
+                true => vec![UiAction::For(Request::Jog {
                     axis: selected,
                     velocity,
                 })],
@@ -139,7 +139,7 @@ impl Ui {
         self.held = None;
         let all = |request: fn(usize) -> Request| {
             (0..panel.axes.len())
-                .map(|axis| Ask::For(request(axis)))
+                .map(|axis| UiAction::For(request(axis)))
                 .collect()
         };
         let enable = |axis| Request::Enable { axis };
@@ -195,24 +195,24 @@ impl Ui {
                 distance: if c == ',' { -1.0 } else { 1.0 } * self.step(axis),
                 speed: self.speed(),
             },
-            // Space, Escape, the focus is elsewhere, or a slip of the hand.
+            // Space, Escape, focus loss or an unknown key.
             _ => return stop_all(),
         };
-        vec![Ask::For(axis_request)]
+        vec![UiAction::For(axis_request)]
     }
 
-    /// Whether the key is being held down: it has come before, and soon enough.
+    /// True if the key is held: it came before, and within the repeat time.
     fn hold(&mut self, key: Key, now: u64) -> bool {
         let before = self.held.filter(|held| held.key == key);
         let repeats = before.is_some_and(|held| {
             let within = if held.repeats {
-                LET_GO / 1_000_000
+                HOLD_TO_RUN_TIMEOUT / 1_000_000
             } else {
                 REPEATS_WITHIN
             };
             now.saturating_sub(held.at) <= within
         });
-        self.held = Some(Held {
+        self.held = Some(HeldKey {
             key,
             at: now,
             repeats,
@@ -221,12 +221,12 @@ impl Ui {
     }
 }
 
-/// Who looks at another axis sees no longer what the first one does.
-fn stop_if_moving(panel: &Panel) -> Vec<Ask> {
-    let jogs = |axis: &AxisPanel| matches!(axis.doing, Doing::Jogging { .. });
+/// Switching to another axis stops the current one, because its motion is no longer in view.
+fn stop_if_moving(panel: &Panel) -> Vec<UiAction> {
+    let jogs = |axis: &AxisPanel| matches!(axis.doing, Activity::Jogging { .. });
     let jogging = panel.axes.iter().enumerate().filter(|(_, axis)| jogs(axis));
     jogging
-        .map(|(axis, _)| Ask::For(Request::Stop { axis }))
+        .map(|(axis, _)| UiAction::For(Request::Stop { axis }))
         .collect()
 }
 

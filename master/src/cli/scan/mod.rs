@@ -1,10 +1,10 @@
-//! `ecaxis scan`: who is on a bus, and a machine file for it.
+//! `ecaxis scan`: lists the devices of a bus and writes a machine file for it.
 
 use std::path::{Path, PathBuf};
 
 use ecaxis::config::{self, Nic};
-use ecaxis::library::{self, Library};
-use ecaxis::scan::{self, Described, Scan, Sign, described};
+use ecaxis::esi_library::{self, Library};
+use ecaxis::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
 
 use super::bus::{self, Bus};
 use super::{Failure, hints, note, result};
@@ -15,15 +15,17 @@ mod write;
 
 const EXAMPLES: &str = "\
 Examples:
-  ecaxis scan enp3s0                        who is there
-  ecaxis scan enp3s0 --tree                 how they are connected
-  ecaxis scan enp3s0 --write machine.toml   a machine file to begin with
+  ecaxis scan enp3s0                        list the devices
+  ecaxis scan enp3s0 --tree                 draw the topology
+  ecaxis scan enp3s0 --write machine.toml   generate a machine file
   ecaxis scan --sim configs/demo.toml       the simulated bus of a machine file";
 
-/// Show who is on a bus: place, identity, state, ports, clocks, mailboxes, and the ESI files that fit
+/// Show the devices of a bus: position, identity, state, ports, clocks, mailboxes, and matching ESI
+/// files
 ///
-/// Registers and EEPROMs are read, nothing is changed: a bus that another master drives goes on as it was. With `--ask`, and for `--write`,
-/// the devices are asked over their mailboxes too; those in Init are in PreOp meanwhile. That is left undone where another master shows.
+/// Only reads registers and EEPROMs: a bus that another MainDevice drives is not disturbed. `--ask`
+/// and `--write` use the mailboxes as well; devices in Init are in PreOp meanwhile. This is skipped
+/// if another MainDevice is active.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -33,16 +35,16 @@ pub(crate) struct Args {
     /// Scan the simulated bus of this machine file instead
     #[arg(long, value_name = "FILE", conflicts_with = "nic")]
     sim: Option<PathBuf>,
-    /// ESI file or folder to look for descriptions in, `esi` where nothing is said
+    /// ESI file or folder to search [default: esi]
     #[arg(long, value_name = "PATH")]
     esi: Option<PathBuf>,
     /// Ask the devices over their mailboxes: modules, modes, units, limits
     #[arg(long)]
     ask: bool,
-    /// Ask even where another master shows
+    /// Use the mailboxes even if another MainDevice is active
     #[arg(long)]
     intrude: bool,
-    /// Draw how the devices are connected
+    /// Draw the topology
     #[arg(long, conflicts_with = "json")]
     tree: bool,
     /// Write a machine file; implies `--ask`
@@ -74,7 +76,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let nic = bus.nic();
     let scan = look(bus, args.ask || args.write.is_some(), args.intrude)?;
-    let seen = Seen::new(&nic, scan, library.as_ref());
+    let seen = ScanResult::new(&nic, scan, library.as_ref());
     seen.warn(args.intrude);
     if let Some(path) = &args.write {
         return write::machine_file(&seen, path, library.is_some());
@@ -88,7 +90,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     })
 }
 
-/// Scans a bus, and tells how far it is.
+/// Scans a bus and shows the progress.
 pub(super) fn look(bus: Bus, ask: bool, intrude: bool) -> Result<Scan, Failure> {
     let nic = bus.nic();
     let done = bus.visit(async move |wire, heard| {
@@ -97,29 +99,29 @@ pub(super) fn look(bus: Bus, ask: bool, intrude: bool) -> Result<Scan, Failure> 
             intrude,
             heard,
         };
-        let mut tell = |step: scan::Step| {
+        let mut report = |step: scan::Step| {
             let (what, position, of) = (step.what, step.position, step.of);
             bus::passing(&format!("{what} position {position}, {of} in all"));
         };
-        scan::scan(&wire, options, &mut tell).await
+        scan::scan(&wire, options, &mut report).await
     });
     bus::passed();
     bus::done(done?, &nic)
 }
 
-/// A bus with what is known of its devices.
-pub(super) struct Seen {
+/// A bus and the ESI descriptions of its devices.
+pub(super) struct ScanResult {
     pub nic: String,
     pub scan: Scan,
-    /// One for each device.
-    pub described: Vec<Option<Described>>,
+    /// One per device.
+    pub described: Vec<Option<EsiMatch>>,
     unreadable: Vec<String>,
 }
 
-impl Seen {
+impl ScanResult {
     pub fn new(nic: &Nic, scan: Scan, library: Option<&Library>) -> Self {
         let (described, unreadable) = match library {
-            Some(library) => described::describe(&scan, library),
+            Some(library) => esi_match::describe(&scan, library),
             None => (scan.devices.iter().map(|_| None).collect(), Vec::new()),
         };
         Self {
@@ -133,20 +135,20 @@ impl Seen {
         }
     }
 
-    /// Every device with its description.
-    pub fn devices(&self) -> impl Iterator<Item = (&scan::Device, Option<&Described>)> {
+    /// Iterates over the devices with their descriptions.
+    pub fn devices(&self) -> impl Iterator<Item = (&scan::Device, Option<&EsiMatch>)> {
         let described = self.described.iter().map(Option::as_ref);
         self.scan.devices.iter().zip(described)
     }
 
-    /// What is not as it should be, on stderr.
+    /// Prints warnings on stderr.
     pub fn warn(&self, intrude: bool) {
         for problem in &self.unreadable {
             bus::warn(problem);
         }
         let others = &self.scan.others;
         if !others.is_empty() {
-            let there = if others.iter().any(Sign::is_live) {
+            let there = if others.iter().any(MainDeviceEvidence::is_live) {
                 "another master is driving this bus"
             } else {
                 "another master has left this bus running"
@@ -175,8 +177,8 @@ impl Seen {
     }
 }
 
-/// The first signs in words.
-fn in_short(signs: &[Sign]) -> String {
+/// Formats the first pieces of evidence.
+fn in_short(signs: &[MainDeviceEvidence]) -> String {
     const SHOWN: usize = 3;
     let shown: Vec<String> = signs.iter().take(SHOWN).map(ToString::to_string).collect();
     let more = signs.len().saturating_sub(SHOWN);
@@ -187,15 +189,16 @@ fn in_short(signs: &[Sign]) -> String {
     text
 }
 
-/// ESI files: those that are named, else the folder `esi` here, beside the file that is written or the simulated machine's.
+/// Returns the ESI library: `--esi`, else the folder `esi` here, next to the written file, or next
+/// to the simulated machine's file.
 fn library(args: &Args) -> Result<Option<Library>, Failure> {
     if let Some(path) = &args.esi {
         return open(path).map(Some);
     }
-    let beside = |file: &Option<PathBuf>| Some(file.as_deref()?.parent()?.join("esi"));
+    let during = |file: &Option<PathBuf>| Some(file.as_deref()?.parent()?.join("esi"));
     let places = [
-        beside(&args.write),
-        beside(&args.sim),
+        during(&args.write),
+        during(&args.sim),
         Some(PathBuf::from("esi")),
     ];
     let place = places.into_iter().flatten().find(|place| place.is_dir());
@@ -206,7 +209,7 @@ pub(super) fn open(path: &Path) -> Result<Library, Failure> {
     let opened = if path.is_file() {
         Library::of_file(path)
     } else {
-        Library::open(path, library::cache_file(path).as_deref())
+        Library::open(path, esi_library::cache_file(path).as_deref())
     };
     opened.map_err(|error| Failure::new(hints::WRONG, error.to_string()))
 }

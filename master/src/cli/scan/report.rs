@@ -1,12 +1,12 @@
-//! What was found, for programs.
+//! The result of a scan as JSON.
 
-use ecaxis::scan::{Answers, Described, Device, DriveAnswers, registers};
+use ecaxis::scan::{CoeInfo, Device, DriveInfo, EsiMatch, registers};
 use ecaxis_esi as esi;
 use serde_json::{Value, json};
 
-use super::Seen;
+use super::ScanResult;
 
-pub(super) fn json(seen: &Seen) -> Value {
+pub(super) fn json(seen: &ScanResult) -> Value {
     let devices: Vec<Value> = seen.devices().map(|(d, esi)| device(d, esi)).collect();
     let others: Vec<Value> = seen
         .scan
@@ -24,7 +24,7 @@ pub(super) fn json(seen: &Seen) -> Value {
     })
 }
 
-fn device(device: &Device, described: Option<&Described>) -> Value {
+fn device(device: &Device, described: Option<&EsiMatch>) -> Value {
     let found = &device.found;
     let sii = device.sii.as_ref().ok();
     let ports: Vec<Value> = registers::ports(device.dl_status)
@@ -44,7 +44,7 @@ fn device(device: &Device, described: Option<&Described>) -> Value {
         "state": found.state.to_string(),
         "error": found.error,
         "al_status_code": found.code,
-        "al_status": ecaxis::al_status::al_status_text(found.code),
+        "al_status": ecaxis_ecat::al_status_code::al_status_text(found.code),
         "vendor": sii.map(|s| s.identity.vendor),
         "product": sii.map(|s| s.identity.product),
         "revision": sii.map(|s| s.identity.revision),
@@ -72,7 +72,7 @@ fn device(device: &Device, described: Option<&Described>) -> Value {
     })
 }
 
-fn described(described: &Described) -> Value {
+fn described(described: &EsiMatch) -> Value {
     let bytes = described.default_bytes();
     let modes = esi::offered_modes(&described.file, &described.device);
     json!({
@@ -86,7 +86,7 @@ fn described(described: &Described) -> Value {
     })
 }
 
-fn answers(answers: &Answers) -> Value {
+fn answers(answers: &CoeInfo) -> Value {
     json!({
         "device_type": answers.device_type,
         "name": answers.name,
@@ -97,7 +97,7 @@ fn answers(answers: &Answers) -> Value {
     })
 }
 
-fn drive(drive: &DriveAnswers) -> Value {
+fn drive(drive: &DriveInfo) -> Value {
     let units = &drive.units;
     json!({
         "encoder_resolution": units.encoder_resolution,

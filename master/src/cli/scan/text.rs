@@ -1,26 +1,26 @@
-//! What was found, for people.
+//! The result of a scan as text.
 
-use ecaxis::al_status::al_status_text;
-use ecaxis::scan::{Answers, Described, Device, registers};
+use ecaxis::scan::{CoeInfo, Device, EsiMatch, registers};
 use ecaxis_axis::VelocityUnit;
+use ecaxis_ecat::al_status_code::al_status_text;
 use ecaxis_esi as esi;
 
 use super::super::table::Table;
-use super::Seen;
+use super::ScanResult;
 
-/// A page for what has long cells.
+/// The page width for tables with long cells.
 const PAGE: usize = 80;
 
-/// As its ESI or its EEPROM calls it.
-pub(super) fn type_name(device: &Device, described: Option<&Described>) -> String {
+/// Returns the type name from the ESI, else from the EEPROM.
+pub(super) fn type_name(device: &Device, described: Option<&EsiMatch>) -> String {
     if let Some(described) = described {
         return described.device.type_name.clone();
     }
     device.own_name().unwrap_or_else(|| "?".to_owned())
 }
 
-pub(super) fn is_drive(device: &Device, described: Option<&Described>) -> bool {
-    device.says_drive() || described.is_some_and(Described::is_drive)
+pub(super) fn is_drive(device: &Device, described: Option<&EsiMatch>) -> bool {
+    device.says_drive() || described.is_some_and(EsiMatch::is_drive)
 }
 
 fn hex(number: Option<u32>) -> String {
@@ -31,7 +31,7 @@ fn or_dash<T: ToString>(value: Option<T>) -> String {
     value.map_or_else(|| "-".to_owned(), |value| value.to_string())
 }
 
-pub(super) fn tables(seen: &Seen) -> String {
+pub(super) fn tables(seen: &ScanResult) -> String {
     let mut text = head(seen);
     for table in [identities(seen), places(seen), descriptions(seen)] {
         text += &format!("\n{}\n", table.shown(2));
@@ -42,14 +42,14 @@ pub(super) fn tables(seen: &Seen) -> String {
     text + &notes(seen)
 }
 
-fn head(seen: &Seen) -> String {
+fn head(seen: &ScanResult) -> String {
     match seen.scan.devices.len() {
         1 => format!("1 SubDevice on `{}`\n", seen.nic),
         n => format!("{n} SubDevices on `{}`\n", seen.nic),
     }
 }
 
-fn identities(seen: &Seen) -> Table {
+fn identities(seen: &ScanResult) -> Table {
     let head = [
         "pos", "type", "vendor", "product", "revision", "serial", "state",
     ];
@@ -70,7 +70,7 @@ fn identities(seen: &Seen) -> Table {
     table
 }
 
-fn places(seen: &Seen) -> Table {
+fn places(seen: &ScanResult) -> Table {
     let head = [
         "pos",
         "address",
@@ -111,10 +111,10 @@ fn places(seen: &Seen) -> Table {
     table
 }
 
-fn descriptions(seen: &Seen) -> Table {
+fn descriptions(seen: &ScanResult) -> Table {
     let mut table = Table::new(&["pos", "ESI file", "revision", "out", "in", "axis"]);
     for (device, described) in seen.devices() {
-        let both = described.and_then(Described::default_bytes);
+        let both = described.and_then(EsiMatch::default_bytes);
         let file = described.map(|d| {
             let name = d.path.file_name().unwrap_or_default();
             name.to_string_lossy().into_owned()
@@ -131,8 +131,8 @@ fn descriptions(seen: &Seen) -> Table {
     table
 }
 
-/// What devices said over their mailboxes.
-fn asked(seen: &Seen) -> String {
+/// Formats the answers of the mailboxes.
+fn asked(seen: &ScanResult) -> String {
     let mut all = Table::new(&["pos", "name", "hardware", "software", "modules"]);
     let mut drives = Table::new(&[
         "pos",
@@ -195,7 +195,7 @@ fn asked(seen: &Seen) -> String {
     text
 }
 
-/// A drive that may go through all that it can count has no ends.
+/// Formats a position range. The full 32-bit range means no limits.
 fn range([low, high]: [i32; 2]) -> String {
     match i64::from(high) - i64::from(low) {
         wide if wide >= i64::from(i32::MAX) => "no ends".to_owned(),
@@ -203,8 +203,8 @@ fn range([low, high]: [i32; 2]) -> String {
     }
 }
 
-/// What is plugged, else what the device was told of; by their names where the ESI file has them.
-fn modules(answers: &Answers, described: Option<&Described>) -> Option<String> {
+/// Formats the detected modules, else the configured ones, by name if the ESI describes them.
+fn modules(answers: &CoeInfo, described: Option<&EsiMatch>) -> Option<String> {
     let lists = [&answers.detected, &answers.configured];
     let plugged = |idents: &&Vec<u32>| idents.iter().any(|ident| *ident != 0);
     let idents = lists.into_iter().flatten().find(plugged)?;
@@ -224,7 +224,7 @@ fn modules(answers: &Answers, described: Option<&Described>) -> Option<String> {
     Some(names.collect::<Vec<_>>().join(" "))
 }
 
-/// 0x6502 (CiA 402-2, supported drive modes).
+/// Formats 0x6502 (CiA 402-2, supported drive modes).
 fn mode_names(bits: u32) -> String {
     const NAMES: [(u32, &str); 10] = [
         (0, "pp"),
@@ -246,8 +246,8 @@ fn mode_names(bits: u32) -> String {
     }
 }
 
-/// The ESI's revision beside the device's.
-fn fit(device: &Device, described: &Described) -> String {
+/// Formats the ESI's revision and whether it fits the device.
+fn fit(device: &Device, described: &EsiMatch) -> String {
     let ours = described.device.identity.revision;
     let theirs = device.identity().map_or(ours, |i| i.revision);
     match theirs.cmp(&ours) {
@@ -257,7 +257,7 @@ fn fit(device: &Device, described: &Described) -> String {
     }
 }
 
-fn axis(device: &Device, described: Option<&Described>) -> String {
+fn axis(device: &Device, described: Option<&EsiMatch>) -> String {
     if !is_drive(device, described) {
         return "-".to_owned();
     }
@@ -269,8 +269,8 @@ fn axis(device: &Device, described: Option<&Described>) -> String {
     }
 }
 
-/// What wants more than a cell.
-fn notes(seen: &Seen) -> String {
+/// Formats remarks that need more than a table cell.
+fn notes(seen: &ScanResult) -> String {
     let mut text = String::new();
     for device in seen.scan.devices.iter().filter(|d| d.found.error) {
         let (position, found) = (device.position(), &device.found);
@@ -291,10 +291,11 @@ fn notes(seen: &Seen) -> String {
     }
 }
 
-/// Drawn from port to port.
-pub(super) fn tree(seen: &Seen) -> String {
+/// Draws the topology from port to port.
+pub(super) fn tree(seen: &ScanResult) -> String {
     let mut text = format!("{}\n", seen.nic);
-    // Devices in the order of the segment are a tree walked branch by branch, so that lines need only be known above each one.
+    // Devices are in segment order, which is a depth-first walk. Lines are therefore known from the
+    // rows above.
     let parent = |n: usize| {
         let device = seen.scan.devices.get(n)?;
         device.uplink.map(|u| usize::from(u.device))
@@ -303,7 +304,7 @@ pub(super) fn tree(seen: &Seen) -> String {
     for (n, (device, described)) in seen.devices().enumerate() {
         let mut branches = Vec::new();
         let mut at = Some(n);
-        // No deeper than there are devices.
+        // The depth never exceeds the number of devices.
         for _ in 0..=count {
             let Some(here) = at else { break };
             let up = parent(here);

@@ -1,15 +1,15 @@
-//! Writes what was found as a machine file.
+//! Writes the result of a scan as a machine file.
 
 use std::path::Path;
 
 use ecaxis::config::{self, ConfigError};
-use ecaxis::scan::write::{self, MARK, Place};
+use ecaxis::scan::write::{self, MARK, OutputPath};
 
-use super::super::files::{Old, replace};
+use super::super::files::{BackupPolicy, replace};
 use super::super::{Failure, bus, hints, note, result};
-use super::Seen;
+use super::ScanResult;
 
-/// A machine file is somebody's work.
+/// Fails if the file exists, because it may contain manual changes.
 pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
     if force || !path.exists() {
         return Ok(());
@@ -20,17 +20,17 @@ pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
     ))
 }
 
-pub(super) fn machine_file(seen: &Seen, path: &Path, library: bool) -> Result<(), Failure> {
-    let place = Place {
+pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Result<(), Failure> {
+    let place = OutputPath {
         nic: &seen.nic,
         folder: path.parent().unwrap_or(Path::new("")),
     };
     let text = write::machine_file(&seen.scan, &seen.described, place);
-    replace(path, &text, Old::Lost)?;
+    replace(path, &text, BackupPolicy::Lost)?;
     let devices = seen.scan.devices.len();
     let axes = text.matches("[device.axis]").count();
     let plural = |n: usize| if n == 1 { "" } else { "s" };
-    let mut told = format!(
+    let mut reported = format!(
         "{}: {devices} device{}, {axes} of them {}\n",
         path.display(),
         plural(devices),
@@ -39,16 +39,16 @@ pub(super) fn machine_file(seen: &Seen, path: &Path, library: bool) -> Result<()
     let checks = text.lines().filter(|line| line.contains(MARK));
     // The first lines of the file explain the mark.
     let checks = checks.filter(|line| !line.starts_with("# Written")).count();
-    told += &format!("{checks} lines are marked \"{MARK}\" and want a look\n");
+    reported += &format!("{checks} lines are marked \"{MARK}\" and need a check\n");
     let file = path.display();
-    told += &format!("next: `ecaxis check {file}`, then `ecaxis run {file} --no-enable`\n");
+    reported += &format!("next: `ecaxis check {file}`, then `ecaxis run {file} --no-enable`\n");
     if !seen.scan.asked {
         bus::warn("the devices were not asked: units, limits and modules in the file are guesses");
     }
     if seen.described.iter().any(Option::is_none) {
         bus::warn("some devices have no ESI file, so the file cannot be run yet");
         note(if library {
-            "  = help: put their makers' files into the folder of ESI files, and scan again with --force"
+            "  = help: put their vendors' files into the folder of ESI files, and scan again with --force"
         } else {
             "  = help: name the folder of ESI files with `--esi`"
         });
@@ -59,5 +59,5 @@ pub(super) fn machine_file(seen: &Seen, path: &Path, library: bool) -> Result<()
             plural(problems.len()),
         ));
     }
-    result(&told)
+    result(&reported)
 }

@@ -1,10 +1,10 @@
 //! `ecaxis sdo store`, `ecaxis sdo defaults`.
 
-use ecaxis::mailbox::Wire;
+use ecaxis::mailbox::MailboxTransport;
 use ecaxis::parameters::command::Command;
 use serde_json::json;
 
-use super::super::device::{Open, Place};
+use super::super::device::{DeviceArgs, Open};
 use super::super::{Failure, hints, note, result};
 
 const STORE_EXAMPLES: &str = "\
@@ -14,11 +14,11 @@ Examples:
 
 const DEFAULTS_EXAMPLES: &str = "\
 Examples:
-  ecaxis sdo dump machine.toml x x.toml       keeps the present ones
+  ecaxis sdo dump machine.toml x x.toml       back up the present ones
   ecaxis sdo defaults machine.toml x --yes
   ecaxis sdo defaults --nic enp3s0 --position 0 --yes";
 
-/// Keep the parameters over power cycles (0x1010 "save")
+/// Store the parameters in non-volatile memory (0x1010 `save`)
 #[derive(Debug, clap::Args)]
 #[command(after_help = STORE_EXAMPLES)]
 pub(super) struct StoreArgs {
@@ -26,11 +26,11 @@ pub(super) struct StoreArgs {
     which: Which,
 }
 
-/// Back to the maker's parameters at the next start (0x1011 "load")
+/// Restore default parameters at the next power-up (0x1011 `load`)
 #[derive(Debug, clap::Args)]
 #[command(after_help = DEFAULTS_EXAMPLES)]
 pub(super) struct DefaultsArgs {
-    /// Really forget the present parameters
+    /// Confirm the loss of the present parameters
     #[arg(long)]
     yes: bool,
     #[command(flatten)]
@@ -43,7 +43,7 @@ struct Which {
     #[arg(value_name = "WORD")]
     words: Vec<String>,
     #[command(flatten)]
-    place: Place,
+    place: DeviceArgs,
     /// Print as JSON
     #[arg(long)]
     json: bool,
@@ -55,7 +55,7 @@ pub(super) fn store(args: &StoreArgs) -> Result<(), Failure> {
 
 pub(super) fn defaults(args: &DefaultsArgs) -> Result<(), Failure> {
     if !args.yes {
-        let failure = Failure::new(hints::WRONG, "nothing was written: say `--yes`");
+        let failure = Failure::new(hints::WRONG, "nothing was written: add `--yes`");
         return Err(failure.hint("`ecaxis sdo dump` keeps the present parameters in a file first"));
     }
     give(&args.which, Command::Defaults)
@@ -76,12 +76,12 @@ fn give(which: &Which, command: Command) -> Result<(), Failure> {
     let device = target.open(step, async move |open: &mut Open<'_>| {
         let at = open.at;
         at.at_rest(what)?;
-        // A device that has begun goes on, whether somebody waits or not.
+        // The device completes the command even after a cancellation.
         let given = at
             .wire
             .stop()
-            .hold(command.give(open.coe, &at.wire, &at.device));
-        at.told(given.await)?;
+            .shield(command.give(open.coe, &at.wire, &at.device));
+        at.map_error(given.await)?;
         Ok(at.device.clone())
     })?;
     if which.json {
@@ -91,7 +91,7 @@ fn give(which: &Which, command: Command) -> Result<(), Failure> {
     note(&match command {
         Command::Store => format!("{device}: the parameters are kept over power cycles"),
         Command::Defaults => {
-            format!("{device}: the maker's parameters count when it is switched on again")
+            format!("{device}: default parameters take effect after the next power-up")
         }
     });
     Ok(())

@@ -13,19 +13,19 @@ Examples:
   ecaxis sdo compare x.toml y.toml
   ecaxis sdo compare machine.toml x x.toml --all    actual values too";
 
-/// Compare a file of parameters with a device, or with another file
+/// Compare a parameter file with a device or with another file
 ///
-/// Settings are compared: what can be written and commands nothing. Prints nothing and ends with 0 where they are equal; with 1 where
-/// they are not.
+/// Only settings are compared: writable objects that are not commands. Prints nothing and exits
+/// with 0 if all are equal, else with 1.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo compare FILE DEVICE DUMP.toml\n       \
     ecaxis sdo compare --nic IF --position N DUMP.toml\n       \
     ecaxis sdo compare DUMP.toml DUMP.toml")]
 pub(super) struct Args {
-    /// Machine file, device, and a file of `sdo dump`; or two files of `sdo dump`
+    /// Machine file, device, and a file from `sdo dump`; or two files from `sdo dump`
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
-    /// Also what is no setting: actual values, commands, what cannot be written
+    /// Compare actual values, commands and read-only objects as well
     #[arg(long)]
     all: bool,
     #[command(flatten)]

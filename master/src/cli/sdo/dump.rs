@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use ecaxis::parameters::collect::collect;
 use ecaxis::parameters::dump::Dump;
+use ecaxis::parameters::upload::collect;
 use serde_json::json;
 
 use super::super::device::{Open, address, counter};
-use super::super::{Failure, bus, hints, keep, note, result};
+use super::super::{Failure, bus, hints, note, result, write_new};
 use super::{Common, refusal};
 
 const EXAMPLES: &str = "\
@@ -15,7 +15,7 @@ Examples:
   ecaxis sdo dump machine.toml x x.toml
   ecaxis sdo dump --nic enp3s0 --position 0 --esi esi x.toml";
 
-/// Keep every readable object in a file: name, type, value
+/// Save every readable object to a file: name, type, value
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo dump FILE DEVICE DUMP.toml\n       \
     ecaxis sdo dump --nic IF --position N DUMP.toml")]
@@ -34,14 +34,14 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     };
     let path = PathBuf::from(path);
     if path.exists() {
-        return Err(super::super::in_the_way(&path));
+        return Err(super::super::already_exists(&path));
     }
     let ask = args.common.ask;
     let (dump, refused) = target.open(
         "reading its parameters",
         async move |open: &mut Open<'_>| taken(open, ask).await,
     )?;
-    keep(&path, dump.to_toml().as_bytes())?;
+    write_new(&path, dump.to_toml().as_bytes())?;
     for (at, code) in &refused {
         note(&format!("{} was {}", address(*at), refusal(*code)));
     }
@@ -60,9 +60,9 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-type Refused = Vec<(ecaxis::mailbox::ObjectAddress, u32)>;
+type Refused = Vec<(ecaxis::mailbox::NamedObject, u32)>;
 
-/// All that a device tells.
+/// Reads all objects of a device.
 pub(super) async fn taken(open: &mut Open<'_>, ask: bool) -> Result<(Dump, Refused), Failure> {
     let dictionary = open.dictionary(ask).await?;
     let device = open.origin().await?;
@@ -70,7 +70,7 @@ pub(super) async fn taken(open: &mut Open<'_>, ask: bool) -> Result<(Dump, Refus
     let at = open.at;
     let collected = collect(open.coe, &at.wire, &at.device, &dictionary, &mut progress).await;
     bus::passed();
-    let collected = at.told(collected)?;
+    let collected = at.map_error(collected)?;
     let dump = Dump {
         device,
         parameters: collected.parameters,

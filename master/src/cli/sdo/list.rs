@@ -8,12 +8,13 @@ use super::Common;
 const EXAMPLES: &str = "\
 Examples:
   ecaxis sdo list machine.toml x
-  ecaxis sdo list machine.toml x --ask    what the device itself says
+  ecaxis sdo list machine.toml x --ask    read from the device
   ecaxis sdo list --nic enp3s0 --position 0 --json";
 
-/// List the objects of a device: types, access, what can be mapped, names
+/// List the objects of a device: types, access, PDO mapping, names
 ///
-/// By the ESI file, or by the device's own account (SDO Information) where there is none, or with --ask.
+/// The list comes from the ESI file. Without one, or with --ask, it comes from the device (SDO
+/// Information).
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo list FILE DEVICE\n       \
     ecaxis sdo list --nic IF --position N")]

@@ -1,16 +1,17 @@
-//! `ecaxis sdo`: the parameters of a device, read, written, listed, kept in a file and brought back. One file a command.
+//! `ecaxis sdo`: reads, writes, lists, saves and restores the parameters of a device. One file per
+//! subcommand.
 
 use std::path::Path;
 
 use clap::Subcommand;
-use ecaxis::mailbox::{ObjectAddress, abort_text};
+use ecaxis::mailbox::{NamedObject, abort_text};
 use ecaxis::parameters::compare::Difference;
 use ecaxis::parameters::dump::Dump;
-use ecaxis::parameters::find::{FindError, Wanted, find};
+use ecaxis::parameters::lookup::{FindError, ObjectQuery, find};
 use ecaxis_esi::Dictionary;
 use serde_json::{Value, json};
 
-use super::device::{Place, address};
+use super::device::{DeviceArgs, address};
 use super::table::Table;
 use super::{Failure, Verbosity, hints};
 
@@ -27,18 +28,18 @@ Examples:
   ecaxis sdo read machine.toml x Statusword 0x1018
   ecaxis sdo write machine.toml x 0x6065 2000
   ecaxis sdo list --nic enp3s0 --position 0
-  ecaxis sdo dump machine.toml x x.toml       every readable object in a file
-  ecaxis sdo compare machine.toml x x.toml    prints what differs
-  ecaxis sdo restore machine.toml x x.toml    writes the settings back
-  ecaxis sdo store machine.toml x             keeps them over a power cycle
+  ecaxis sdo dump machine.toml x x.toml       save all readable objects
+  ecaxis sdo compare machine.toml x x.toml    print the differences
+  ecaxis sdo restore machine.toml x x.toml    restore the settings
+  ecaxis sdo store machine.toml x             store them in non-volatile memory
 
 Values are decimal, hexadecimal (0x10), text, or bytes ([01 02]). An object is
 a number (0x6065, 0x1018:01) or a name (Statusword, \"Identity: Vendor ID\").";
 
-/// Read and write the parameters of a device, keep them in a file, bring them back
+/// Read and write the parameters of a device, save and restore them
 ///
-/// The device is named by a machine file and its name in it, or by --nic with --position or --alias. It is taken as it is found: one in
-/// Init is in PreOp meanwhile, one in Op stays there.
+/// Select the device by machine file and name, or by --nic with --position or --alias. Its state is
+/// kept: a device in Init is in PreOp during the access, a device in Op stays in Op.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -73,12 +74,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// What every command has.
+/// The options of every subcommand.
 #[derive(Debug, Clone, clap::Args)]
 struct Common {
     #[command(flatten)]
-    place: Place,
-    /// Ask the device itself for its objects (SDO Information), even where an ESI file describes them
+    place: DeviceArgs,
+    /// Read the object dictionary from the device (SDO Information), even if an ESI file describes
+    /// it
     #[arg(long)]
     ask: bool,
     /// Print as JSON
@@ -86,8 +88,8 @@ struct Common {
     json: bool,
 }
 
-/// An object that was asked for by number or name.
-fn wanted(dictionary: Option<&Dictionary>, text: &str) -> Result<Wanted, Failure> {
+/// Parses an object given by number or name.
+fn wanted(dictionary: Option<&Dictionary>, text: &str) -> Result<ObjectQuery, Failure> {
     find(dictionary, text).map_err(|error| {
         let failure = Failure::new(hints::WRONG, error.to_string());
         match error {
@@ -104,9 +106,9 @@ fn wanted(dictionary: Option<&Dictionary>, text: &str) -> Result<Wanted, Failure
     })
 }
 
-/// A file of parameters.
+/// Loads a parameter file.
 fn load(path: &Path) -> Result<Dump, Failure> {
-    /// No dump is longer.
+    /// The maximum size of a dump in bytes.
     const MAX_BYTES: u64 = 64 << 20;
     let shown = path.display();
     let wrong = |what: String| Failure::new(hints::WRONG, what);
@@ -118,12 +120,12 @@ fn load(path: &Path) -> Result<Dump, Failure> {
     })
 }
 
-/// The only line of a value that stands alone, and the row of one among others.
+/// One value, printed alone or as a row of a table.
 struct Line {
-    at: ObjectAddress,
+    at: NamedObject,
     name: String,
     data_type: String,
-    /// As text, and as a number in hexadecimal where it is one.
+    /// The value as text, and in hexadecimal if it is a number; or the abort code.
     value: Result<(String, Option<String>), u32>,
 }
 
@@ -161,7 +163,7 @@ fn refusal(code: u32) -> String {
     format!("refused with {code:#010x}: {}", abort_text(code))
 }
 
-/// Differences between two sides, for people.
+/// Formats the differences between two sides as a table.
 fn differences(sides: [&str; 2], all: &[Difference]) -> String {
     if all.is_empty() {
         return String::new();

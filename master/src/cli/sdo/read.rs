@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use ecaxis::mailbox::{ObjectAddress, SdoError, object_name};
-use ecaxis::parameters::find::Wanted;
-use ecaxis::parameters::{DataType, learn, name_of, type_of};
-use ecaxis::service::ServiceError;
+use ecaxis::acyclic::ServiceError;
+use ecaxis::mailbox::{NamedObject, SdoError, object_name};
+use ecaxis::parameters::lookup::ObjectQuery;
+use ecaxis::parameters::{DataType, dictionary, name_of, type_of};
 use ecaxis_esi::Object;
 use serde_json::json;
 
@@ -20,9 +20,9 @@ Examples:
   ecaxis sdo read --nic enp3s0 --position 0 0x1018
   ecaxis sdo read machine.toml x 0x2100 --to large.bin";
 
-/// Read objects: by number (0x6064, 0x1018:01) or by name
+/// Read objects by number (0x6064, 0x1018:01) or by name
 ///
-/// An object without subindex is read with all that it has.
+/// An object without subindex is read with all its subindices.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo read FILE DEVICE OBJECT...\n       \
     ecaxis sdo read --nic IF --position N OBJECT...")]
@@ -30,13 +30,14 @@ pub(super) struct Args {
     /// Machine file, device, and one or more objects
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
-    /// Take the object for this type: u16, i32, f32, text, bytes, or a name of ETG.2000 such as UDINT
+    /// Interpret the object as this type: u16, i32, f32, text, bytes, or a name from ETG.2000 such
+    /// as UDINT
     #[arg(long = "type", value_name = "TYPE")]
     data_type: Option<String>,
-    /// Read each object in one piece (complete access)
+    /// Read each object in one transfer (complete access)
     #[arg(long)]
     complete: bool,
-    /// Write the bytes of the one object to this file, which must not exist yet
+    /// Write the bytes of one object to this file, which must not exist yet
     #[arg(long, value_name = "FILE", conflicts_with_all = ["complete", "json"])]
     to: Option<PathBuf>,
     #[command(flatten)]
@@ -73,9 +74,9 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
                 refused.push(wanted.to_string());
             }
         }
-        // One value that is refused is why somebody asked; among others it is one of them.
+        // A refused single value is an error; among others it is a row.
         match out.as_slice() {
-            [(at, .., Err(code))] => open.at.told(Err(ServiceError::Sdo {
+            [(at, .., Err(code))] => open.at.map_error(Err(ServiceError::Sdo {
                 device: open.at.device.clone(),
                 source: SdoError::Abort {
                     station: open.at.device.station,
@@ -93,7 +94,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
     })?;
     let (read, refused) = read;
     if let (Some(path), [(_, _, _, Ok(value))]) = (&args.to, read.as_slice()) {
-        super::super::keep(path, value)?;
+        super::super::write_new(path, value)?;
         note(&format!("{}: {} bytes", path.display(), value.len()));
         return Ok(());
     }
@@ -116,10 +117,10 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         return Ok(());
     }
     let message = format!("the device refused {}", refused.join(", "));
-    Err(Failure::new(hints::FAILED, message).hint("`ecaxis sdo list` shows what it has"))
+    Err(Failure::new(hints::FAILED, message).hint("`ecaxis sdo list` shows its objects"))
 }
 
-/// A value that is not as long as the type that it should be taken for.
+/// Returns a failure if a value's length differs from the requested type.
 fn misfit(given: DataType, values: &[Read]) -> Option<Failure> {
     let width = given.width()?;
     let bytes = |n: usize| format!("{n} byte{}", if n == 1 { "" } else { "s" });
@@ -131,18 +132,14 @@ fn misfit(given: DataType, values: &[Read]) -> Option<Failure> {
             bytes(found)
         );
         (found != width).then(|| {
-            Failure::new(hints::WRONG, message)
-                .hint("leave `--type` out, or give a type of that length; `--type bytes` takes any")
+            Failure::new(hints::WRONG, message).hint(
+                "omit `--type`, or give a type of that length; `--type bytes` accepts any length",
+            )
         })
     })
 }
 
-type Read = (
-    ObjectAddress,
-    String,
-    Option<DataType>,
-    Result<Vec<u8>, u32>,
-);
+type Read = (NamedObject, String, Option<DataType>, Result<Vec<u8>, u32>);
 
 fn line((at, name, data_type, value): Read) -> Line {
     let data_type = data_type.unwrap_or(DataType::BYTES);
@@ -157,7 +154,7 @@ fn line((at, name, data_type, value): Read) -> Line {
     }
 }
 
-/// Numbers of more than one bit.
+/// Formats a number of more than one bit in hexadecimal.
 pub(super) fn hex(data_type: DataType, bytes: &[u8]) -> Option<String> {
     data_type.integer(bytes).filter(|_| data_type.bits > 1)?;
     let digits: String = bytes
@@ -178,12 +175,13 @@ pub(super) fn data_type(name: Option<&str>) -> Result<Option<DataType>, Failure>
     })
 }
 
-/// The objects that are meant, each with what is known of it. The whole dictionary is only asked for where a name needs it.
+/// Returns the requested objects with their descriptions. The whole dictionary is read only if a
+/// name requires it.
 pub(super) async fn describe(
     open: &mut Open<'_>,
     ask: bool,
     objects: &[String],
-) -> Result<Vec<(Wanted, Option<Object>)>, Failure> {
+) -> Result<Vec<(ObjectQuery, Option<Object>)>, Failure> {
     let mut dictionary = open.described(ask)?;
     let mut all = Vec::new();
     for text in objects {
@@ -191,7 +189,8 @@ pub(super) async fn describe(
             (Err(failure), None) if !text.starts_with(|c: char| c.is_ascii_digit()) => {
                 note("asking the device for the names of its objects");
                 let own = open.dictionary(true).await;
-                // What the device does not tell is no news; that there is no such name is.
+                // Report the unknown name; that the device has no dictionary either is not
+                // important.
                 let own = own.map_err(|_| failure)?;
                 wanted(Some(dictionary.insert(own)), text)?
             }
@@ -200,8 +199,8 @@ pub(super) async fn describe(
         let known = dictionary.as_ref().and_then(|d| d.object(found.index));
         let object = match (known, &dictionary) {
             (Some(object), _) => Some(object.clone()),
-            // An object that an ESI does not know may be there all the same.
-            (None, _) => learn::object(open.coe, &open.at.wire, found.index)
+            // The device may have an object that its ESI does not describe.
+            (None, _) => dictionary::object(open.coe, &open.at.wire, found.index)
                 .await
                 .ok(),
         };
@@ -210,14 +209,14 @@ pub(super) async fn describe(
     Ok(all)
 }
 
-type Part = (ObjectAddress, String, Option<DataType>);
+type Part = (NamedObject, String, Option<DataType>);
 
-/// The subindices that are meant.
-pub(super) fn parts(wanted: Wanted, object: Option<&Object>) -> Vec<Part> {
+/// Returns the requested subindices.
+pub(super) fn parts(wanted: ObjectQuery, object: Option<&Object>) -> Vec<Part> {
     let index = wanted.index;
     let nameless = |sub: u8| {
         let name = object_name(index, sub).unwrap_or_default().to_owned();
-        (ObjectAddress { index, sub }, name, None)
+        (NamedObject { index, sub }, name, None)
     };
     let Some(object) = object else {
         return vec![nameless(wanted.sub.unwrap_or(0))];
@@ -228,7 +227,7 @@ pub(super) fn parts(wanted: Wanted, object: Option<&Object>) -> Vec<Part> {
     });
     let known: Vec<Part> = items
         .map(|item| {
-            let at = ObjectAddress {
+            let at = NamedObject {
                 index,
                 sub: item.sub,
             };
@@ -241,34 +240,34 @@ pub(super) fn parts(wanted: Wanted, object: Option<&Object>) -> Vec<Part> {
     }
 }
 
-/// By complete access, taken apart by the dictionary.
+/// Reads by complete access and splits the data according to the dictionary.
 async fn whole(
     open: &mut Open<'_>,
-    wanted: Wanted,
+    wanted: ObjectQuery,
     object: Option<&Object>,
     data_type: Option<DataType>,
 ) -> Result<Vec<Read>, Failure> {
     let index = wanted.index;
     let first = wanted.sub.unwrap_or(0);
     let read = open.coe.upload(&open.at.wire, index, first, true).await;
-    let bytes = open.at.told(read.map_err(|source| ServiceError::Sdo {
+    let bytes = open.at.map_error(read.map_err(|source| ServiceError::Sdo {
         device: open.at.device.clone(),
         source,
     }))?;
-    let at = ObjectAddress { index, sub: first };
+    let at = NamedObject { index, sub: first };
     let Some(object) = object.filter(|object| object.items.len() > 1 && data_type.is_none()) else {
         let name = object
             .map(|object| object.name.to_string())
             .unwrap_or_default();
         return Ok(vec![(at, name, data_type, Ok(bytes))]);
     };
-    // Subindex 0 takes 16 bits.
+    // Subindex 0 occupies 16 bits.
     let start = if first == 0 { 0 } else { 16 };
     let items = object.items.iter().filter(|item| item.sub >= first);
     let known = items.map_while(|item| {
         let from = usize::try_from(item.bit_offset.checked_sub(start)?).ok()?;
         let value = bits(&bytes, from, usize::try_from(item.bit_len).ok()?)?;
-        let at = ObjectAddress {
+        let at = NamedObject {
             index,
             sub: item.sub,
         };
@@ -277,7 +276,7 @@ async fn whole(
     Ok(known.collect())
 }
 
-/// `len` bits from bit `from` on; `None` beyond the end.
+/// Returns `len` bits starting at bit `from`; `None` beyond the end.
 fn bits(bytes: &[u8], from: usize, len: usize) -> Option<Vec<u8>> {
     let end = from
         .checked_add(len)
@@ -295,7 +294,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bits_are_cut_out() {
+    fn bits_returns_a_bit_range() {
         let bytes = [0b1010_0110, 0xff, 0x01];
         assert_eq!(bits(&bytes, 1, 3), Some(vec![0b011]));
         assert_eq!(bits(&bytes, 4, 12), Some(vec![0xfa, 0x0f]));
@@ -305,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_in_hexadecimal_have_all_their_digits() {
+    fn hex_keeps_leading_zeros() {
         let ty = |name: &str| DataType::named(name, 0).expect("a type");
         assert_eq!(hex(ty("UINT"), &[0x50, 2]).as_deref(), Some("0x0250"));
         assert_eq!(hex(ty("SINT"), &[0xfe]).as_deref(), Some("0xfe"));

@@ -14,17 +14,18 @@ Examples:
   ecaxis sdo restore machine.toml x x.toml
   ecaxis sdo restore machine.toml x old.toml --other-device";
 
-/// Write the settings of a file back into a device, in a safe order, and read them back
+/// Write the settings of a file to a device in a safe order and read them back
 ///
-/// Only what differs is written. Commands are never: Controlword, mode, targets, outputs, store and load.
+/// Only differing values are written. Commands are never written: Controlword, mode, targets,
+/// outputs, store and load.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo restore FILE DEVICE DUMP.toml\n       \
     ecaxis sdo restore --nic IF --position N DUMP.toml")]
 pub(super) struct Args {
-    /// Machine file, device, and a file of `sdo dump`
+    /// Machine file, device, and a file from `sdo dump`
     #[arg(required = true, value_name = "WORD")]
     words: Vec<String>,
-    /// Even where the file is of another product or revision
+    /// Write even if the file is from another product or revision
     #[arg(long)]
     other_device: bool,
     #[command(flatten)]
@@ -105,7 +106,7 @@ fn report(args: &Args, file: &str, done: &Restored) -> Result<(), Failure> {
         done.written, done.same
     ));
     if done.written > 0 {
-        note("`ecaxis sdo store` keeps them over a power cycle");
+        note("`ecaxis sdo store` store them in non-volatile memory");
     }
     Ok(())
 }

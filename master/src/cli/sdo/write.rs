@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
+use ecaxis::acyclic::ServiceError;
 use ecaxis::file;
-use ecaxis::mailbox::Wire;
+use ecaxis::mailbox::MailboxTransport;
 use ecaxis::parameters::{DataType, ValueError};
-use ecaxis::service::ServiceError;
 use serde_json::json;
 
 use super::super::device::{Open, address};
@@ -19,9 +19,9 @@ Examples:
   ecaxis sdo write --nic enp3s0 --alias 1001 0x6065 2000
   ecaxis sdo write machine.toml x 0x2100 --from large.bin";
 
-/// Write an object: in decimal, hexadecimal (0x10), as text, or as bytes ([01 02])
+/// Write an object: decimal, hexadecimal (0x10), text, or bytes ([01 02])
 ///
-/// The value is read back. `sdo store` keeps it over a power cycle.
+/// The value is read back. Use `sdo store` to keep it over a power cycle.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, override_usage = "ecaxis sdo write FILE DEVICE OBJECT VALUE\n       \
     ecaxis sdo write --nic IF --position N OBJECT VALUE")]
@@ -29,20 +29,21 @@ pub(super) struct Args {
     /// Machine file, device, object, and the value
     #[arg(required = true, value_name = "WORD", allow_negative_numbers = true)]
     words: Vec<String>,
-    /// Take the object for this type: u16, i32, f32, text, bytes, or a name of ETG.2000 such as UDINT
+    /// Interpret the object as this type: u16, i32, f32, text, bytes, or a name from ETG.2000 such
+    /// as UDINT
     #[arg(long = "type", value_name = "TYPE")]
     data_type: Option<String>,
-    /// Write the object in one piece (complete access); the value is bytes
+    /// Write the object in one transfer (complete access); the value is bytes
     #[arg(long)]
     complete: bool,
-    /// The value is what this file holds
+    /// Read the value from this file
     #[arg(long, value_name = "FILE")]
     from: Option<PathBuf>,
     #[command(flatten)]
     common: Common,
 }
 
-/// No object is longer.
+/// The maximum size of an object in bytes.
 const MAX_BYTES: u64 = 256 << 20;
 
 pub(super) fn run(args: &Args) -> Result<(), Failure> {
@@ -64,7 +65,7 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         (_, Some(_)) => {
             return Err(Failure::new(
                 hints::WRONG,
-                "one object, and no value beside --from",
+                "one object, and no value in addition to --from",
             ));
         }
         (_, None) => {
@@ -96,13 +97,13 @@ pub(super) fn run(args: &Args) -> Result<(), Failure> {
         let wire = &open.at.wire;
         let before = open.coe.upload(wire, at.index, at.sub, complete).await.ok();
         let download = open.coe.download(wire, at.index, at.sub, complete, &value);
-        // All of it or nothing.
-        let sent = wire.stop().hold(download).await;
-        open.at.told(sent.map_err(|source| ServiceError::Sdo {
+        // A started download is not cancelled.
+        let sent = wire.stop().shield(download).await;
+        open.at.map_error(sent.map_err(|source| ServiceError::Sdo {
             device: open.at.device.clone(),
             source,
         }))?;
-        // What cannot be read back was taken all the same.
+        // A value that cannot be read back was still accepted.
         let after = open.coe.upload(wire, at.index, at.sub, complete).await.ok();
         Ok((at, name, shown, value, before, after))
     })?;

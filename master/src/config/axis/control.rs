@@ -1,4 +1,4 @@
-//! How an axis is controlled and watched: loops, brake, supervision, fault reset, homing.
+//! Control and supervision of an axis: loops, brake, supervision, fault reset, homing.
 
 use ecaxis_axis::homing::{self, Homing, ParameterError};
 use ecaxis_axis::supervision::{Brake, FaultReset, StopMethod, Supervision, TorqueWatch};
@@ -11,7 +11,7 @@ use super::super::raw::{RawAxis, RawHoming, RawLoops};
 use super::super::{HomingSetup, TorqueSetup};
 use super::{MAXON, positive};
 
-/// How long torque may be above its supervised limit where the file does not say.
+/// The default time in s for which torque may exceed its supervised limit.
 const TORQUE_TIME_S: f64 = 0.1;
 const RESET_DELAY_S: f64 = 1.0;
 const HOMING_TIMEOUT_NS: u64 = 60_000_000_000;
@@ -71,7 +71,7 @@ pub(super) fn loops(
     Some(Loops { csp, csv, cst })
 }
 
-/// A weight from 0 to 1.
+/// Returns a weight from 0 to 1.
 fn part(
     value: Option<&Spanned<f64>>,
     default: f64,
@@ -92,7 +92,7 @@ fn part(
     None
 }
 
-/// Brake, fault reset, supervision.
+/// Reads brake, fault reset and supervision.
 pub(super) fn guards(
     raw: &RawAxis,
     config: &mut AxisConfig,
@@ -146,15 +146,14 @@ pub(super) fn guards(
     Some(())
 }
 
-/// A word of a few, or the default.
-/// How an axis may be brought to rest, as the machine file names it.
+/// The stop methods of an axis, as the machine file names them.
 pub(crate) const STOP_METHODS: [(&str, StopMethod); 3] = [
     ("quick-stop", StopMethod::QuickStop),
     ("ramp", StopMethod::Ramp),
     ("no-power", StopMethod::DisableVoltage),
 ];
 
-/// Those that a drive carries out by itself.
+/// The stop methods that a drive carries out by itself.
 pub(crate) const STOPS_BY_DRIVE: [(&str, StopMethod); 2] = [
     ("quick-stop", StopMethod::QuickStop),
     ("no-power", StopMethod::DisableVoltage),
@@ -182,7 +181,7 @@ pub(crate) fn one_of<T: Copy + Default>(
     known.map(|(_, value)| *value)
 }
 
-/// The homing with the SDOs that set it up.
+/// Returns the homing with its SDOs.
 pub(super) fn homing(
     raw: &RawHoming,
     config: &AxisConfig,

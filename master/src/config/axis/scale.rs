@@ -1,6 +1,7 @@
-//! What the axis counts in: encoder, gear and feed, modulo; the drive's velocities, accelerations and torques.
+//! The scaling of an axis: encoder, gear, feed, modulo; the drive's units of velocity, acceleration
+//! and torque.
 
-use ecaxis_axis::scale::{TorqueScale, Way};
+use ecaxis_axis::scale::{ModuloDirection, TorqueScale};
 use ecaxis_axis::units::{Amperes, NewtonMetres};
 use ecaxis_axis::{AccelerationUnit, Scale, ScaleError, VelocityUnit};
 use ecaxis_esi as esi;
@@ -9,11 +10,11 @@ use toml::Spanned;
 use super::super::problem::{Problems, suggestion};
 use super::super::raw::{RawAxis, RawSdo, SdoValue};
 use super::super::units::is_turn;
-use super::super::{TorqueSetup, TorqueUnit, UnitFrom};
+use super::super::{TorqueSetup, TorqueUnit, UnitSource};
 use super::control::one_of;
 use super::{MAXON, positive};
 
-/// Counts of a motor turn.
+/// The maximum number of counts per motor turn.
 const MOST_COUNTS: f64 = 2_147_483_648.0;
 
 pub(super) fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<Scale> {
@@ -63,7 +64,7 @@ pub(super) fn scale(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<S
     modulo(raw, scale, unit, p)
 }
 
-/// User units per motor turn: as they are given, or through the gear.
+/// Returns the user units per motor turn, given directly or by gear and feed.
 fn per_turn(raw: &RawAxis, unit: &str, p: &mut Problems<'_>) -> Option<f64> {
     let geared = raw.gear.as_ref().map(Spanned::span);
     let geared = geared.or(raw.feed.as_ref().map(Spanned::span));
@@ -133,13 +134,13 @@ fn modulo(raw: &RawAxis, scale: Scale, unit: &str, p: &mut Problems<'_>) -> Opti
     }
 }
 
-const WAYS: [(&str, Way); 3] = [
-    ("shortest", Way::Shortest),
-    ("positive", Way::Positive),
-    ("negative", Way::Negative),
+const WAYS: [(&str, ModuloDirection); 3] = [
+    ("shortest", ModuloDirection::Shortest),
+    ("positive", ModuloDirection::Positive),
+    ("negative", ModuloDirection::Negative),
 ];
 
-pub(super) fn way(raw: &RawAxis, p: &mut Problems<'_>) -> Option<Way> {
+pub(super) fn way(raw: &RawAxis, p: &mut Problems<'_>) -> Option<ModuloDirection> {
     one_of(raw.way.as_ref(), &WAYS, "way", p)
 }
 
@@ -154,13 +155,13 @@ const SI_UNIT_VELOCITY: u16 = 0x60a9;
 const SI_UNIT_ACCELERATION: u16 = 0x60aa;
 const RATED_TORQUE: u16 = 0x6076;
 
-/// What 0x60A9 will say: the file's word, the file's SDO, or the ESI's default.
+/// Returns the unit in 0x60A9, from the file's key, the file's SDO or the ESI's default.
 pub(super) fn velocity_unit(
     raw: &RawAxis,
     sdos: &[RawSdo],
     selection: Option<&esi::Selection>,
     p: &mut Problems<'_>,
-) -> Option<(VelocityUnit, UnitFrom)> {
+) -> Option<(VelocityUnit, UnitSource)> {
     if let Some(text) = &raw.velocity_unit {
         let known = VELOCITY_UNITS
             .iter()
@@ -174,10 +175,10 @@ pub(super) fn velocity_unit(
                 suggestion(text.get_ref(), names, "units"),
             );
         }
-        return known.map(|(_, unit)| (*unit, UnitFrom::File));
+        return known.map(|(_, unit)| (*unit, UnitSource::File));
     }
-    let Some((code, from)) = will_be(SI_UNIT_VELOCITY, sdos, selection) else {
-        return Some((VelocityUnit::default(), UnitFrom::Nothing));
+    let Some((code, from)) = startup_value(SI_UNIT_VELOCITY, sdos, selection) else {
+        return Some((VelocityUnit::default(), UnitSource::Nothing));
     };
     let unit = VelocityUnit::from_si_code(code);
     if unit.is_none() {
@@ -189,35 +190,36 @@ pub(super) fn velocity_unit(
     Some((unit?, from))
 }
 
-/// What an object of 32 bits will hold: the file's SDO, or the ESI's default.
-fn will_be(
+/// Returns the value of a 32-bit object after start-up, from the file's SDO or the ESI's default.
+fn startup_value(
     index: u16,
     sdos: &[RawSdo],
     selection: Option<&esi::Selection>,
-) -> Option<(u32, UnitFrom)> {
+) -> Option<(u32, UnitSource)> {
     let written = sdos.iter().rev().find(|s| s.index == index && s.sub == 0);
     let written = written.and_then(|s| match s.value.get_ref() {
         SdoValue::Integer(n) => u32::try_from(*n).ok(),
         _ => None,
     });
     if let Some(value) = written {
-        return Some((value, UnitFrom::Sdo));
+        return Some((value, UnitSource::Sdo));
     }
     let item = selection?.dictionary.item(index, 0)?;
     let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
     item.has_default
-        .then_some((u32::from_le_bytes(bytes), UnitFrom::Esi))
+        .then_some((u32::from_le_bytes(bytes), UnitSource::Esi))
 }
 
-/// What 0x60AA will say, where that is known and understood; else that of 0x60A9 per second.
+/// Returns the unit in 0x60AA if it is known and supported, otherwise the unit of 0x60A9 per
+/// second.
 pub(super) fn acceleration_unit(
     velocity: VelocityUnit,
     sdos: &[RawSdo],
     selection: Option<&esi::Selection>,
-) -> (AccelerationUnit, UnitFrom) {
-    let known = will_be(SI_UNIT_ACCELERATION, sdos, selection)
+) -> (AccelerationUnit, UnitSource) {
+    let known = startup_value(SI_UNIT_ACCELERATION, sdos, selection)
         .and_then(|(code, from)| Some((AccelerationUnit::from_si_code(code)?, from)));
-    known.unwrap_or((velocity.into(), UnitFrom::Nothing))
+    known.unwrap_or((velocity.into(), UnitSource::Nothing))
 }
 
 const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
@@ -226,7 +228,7 @@ const TORQUE_UNITS: [(&str, TorqueUnit); 3] = [
     ("A", TorqueUnit::Amperes),
 ];
 
-/// The unit of torques, and what is known of the motor.
+/// Returns the torque unit and the known motor data.
 pub(super) fn torque(
     raw: &RawAxis,
     sdos: &[RawSdo],
@@ -242,12 +244,12 @@ pub(super) fn torque(
     let said = known(&raw.rated_torque, "rated_torque", "Nm");
     let (constant, said) = (constant?, said?);
     let counts_per_newton_metre = counts_per_newton_metre(selection);
-    let (rated, rated_from) = match (said, will_be(RATED_TORQUE, sdos, selection)) {
-        (Some(rated), _) => (Some(rated), UnitFrom::File),
+    let (rated, rated_from) = match (said, startup_value(RATED_TORQUE, sdos, selection)) {
+        (Some(rated), _) => (Some(rated), UnitSource::File),
         (None, Some((count, from))) if count > 0 => {
             (Some(f64::from(count) / counts_per_newton_metre), from)
         }
-        _ => (None, UnitFrom::Nothing),
+        _ => (None, UnitSource::Nothing),
     };
     let at = raw
         .torque_unit
@@ -266,15 +268,15 @@ pub(super) fn torque(
         rated_from,
         constant,
         constant_from: if constant.is_some() {
-            UnitFrom::File
+            UnitSource::File
         } else {
-            UnitFrom::Nothing
+            UnitSource::Nothing
         },
         counts_per_newton_metre,
         percent_per_unit: 1.0,
         limit_said: raw.limits.torque.is_some(),
     };
-    // The drive will tell; until then torques are known as parts of the limit.
+    // The drive reports the rated torque later. Until then torques are fractions of the limit.
     let limit = raw.limits.torque.as_ref().map(|n| *n.get_ref());
     match (unit, rated, limit) {
         (TorqueUnit::Percent, ..) => Some(torque),
@@ -303,7 +305,8 @@ pub(super) fn torque(
     }
 }
 
-/// What 0x6076 counts in a Nm: as the ESI says in its `Unit`, else µNm of maxon's drives and mNm of all others.
+/// Returns the counts of 0x6076 per Nm from the ESI's `Unit`. Without it, µNm for maxon drives and
+/// mNm otherwise.
 fn counts_per_newton_metre(selection: Option<&esi::Selection>) -> f64 {
     const NEWTON_METRE: u8 = 0x56;
     let Some(selection) = selection else {
@@ -319,14 +322,14 @@ fn counts_per_newton_metre(selection: Option<&esi::Selection>) -> f64 {
     if is_maxon(selection) { 1e6 } else { 1e3 }
 }
 
-/// Whether maxon's own objects mean what maxon's documents say.
+/// Returns `true` if the device has maxon's objects.
 pub(crate) fn is_maxon(selection: &esi::Selection) -> bool {
     selection.dictionary.item(0x30b0, 0).is_some() || selection.identity.vendor == MAXON
 }
 
 impl TorqueSetup {
-    /// With the motor's rated torque in Nm.
-    pub(crate) fn with_rated(self, rated: f64, from: UnitFrom) -> Option<Self> {
+    /// Returns the setup with the motor's rated torque in Nm.
+    pub(crate) fn with_rated(self, rated: f64, from: UnitSource) -> Option<Self> {
         let scale = TorqueScale::new(Some(rated), self.constant).ok()?;
         let percent_per_unit = match self.unit {
             TorqueUnit::Percent => 1.0,
@@ -341,13 +344,13 @@ impl TorqueSetup {
         })
     }
 
-    /// Percent of rated torque, from the file's unit.
+    /// Converts a torque from the file's unit to percent of rated torque.
     #[must_use]
     pub fn percent(&self, torque: f64) -> f64 {
         torque * self.percent_per_unit
     }
 
-    /// In the file's unit, from percent of rated torque.
+    /// Converts percent of rated torque to the file's unit.
     #[must_use]
     pub fn shown(&self, percent: f64) -> f64 {
         percent / self.percent_per_unit

@@ -10,11 +10,11 @@ pub(crate) struct RawAxis {
     pub span: Span,
     pub unit: Option<Spanned<String>>,
     pub per_turn: Option<Spanned<f64>>,
-    /// Motor turns, and the turns of the shaft that they make.
+    /// Motor turns and the resulting turns of the output shaft.
     pub gear: Option<Spanned<[u32; 2]>>,
-    /// User units per turn of that shaft.
+    /// User units per turn of the output shaft.
     pub feed: Option<Spanned<f64>>,
-    /// `per_turn` or `feed` is there, understood or not.
+    /// `true` if `per_turn` or `feed` is present, valid or not.
     pub scaled: bool,
     pub modulo: Option<Spanned<f64>>,
     pub way: Option<Spanned<String>>,
@@ -41,7 +41,7 @@ pub(crate) struct RawAxis {
 
 #[derive(Debug, Default)]
 pub(crate) struct RawBrake {
-    /// `io.Output 3`.
+    /// The output, for example `io.Output 3`.
     pub output: Option<Spanned<String>>,
     pub release: Option<Spanned<u64>>,
     pub engage: Option<Spanned<u64>>,
@@ -87,10 +87,10 @@ pub(crate) struct RawLimits {
     pub following_error: Option<Spanned<f64>>,
 }
 
-/// What an axis does with its set-point in each mode.
+/// The control loops of an axis for each mode.
 #[derive(Debug, Default)]
 pub(crate) struct RawLoops {
-    /// Of CSP: to 0x60B1 and 0x60B2.
+    /// CSP: written to 0x60B1 and 0x60B2.
     pub velocity_offset: Option<Spanned<f64>>,
     pub torque_offset: Option<Spanned<f64>>,
     pub csv: Option<RawVelocityLoop>,

@@ -1,4 +1,4 @@
-//! The machine file as written: types are right, nothing is looked up or compared yet.
+//! The machine file as written. Types are checked; references are not resolved.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -9,7 +9,7 @@ use super::fields::{self, Fields};
 use super::problem::{Problems, Span};
 use super::sim::{self, RawSim};
 
-/// Reads `$field`, where it stands, with one of the readers of [`fields`].
+/// Reads `$field` with one of the readers of [`fields`] if it is present.
 macro_rules! optional {
     ($p:expr, $f:expr, $key:literal, $($reader:tt)+) => {
         match $f.get($key) {
@@ -48,7 +48,7 @@ pub(crate) struct RawBus {
     pub lost_frames: Option<Spanned<u32>>,
     pub cpu: Option<Spanned<u32>>,
     pub priority: Option<Spanned<u8>>,
-    /// `None` inside: `"auto"`.
+    /// An inner `None` means `"auto"`.
     pub spin: Option<Spanned<Option<u64>>>,
     pub idle: Option<Spanned<String>>,
     pub op_timeout: Option<Spanned<u64>>,
@@ -57,7 +57,7 @@ pub(crate) struct RawBus {
     pub clock_window: Option<Spanned<u64>>,
     pub exchange: Option<Spanned<String>>,
     pub link: Option<Spanned<String>>,
-    /// Keys that are there, each with its line.
+    /// Keys that are present, each with its line.
     pub written: Vec<(&'static str, u32)>,
 }
 
@@ -66,7 +66,7 @@ pub(crate) struct RawDevice {
     pub span: Span,
     pub name: Option<Spanned<String>>,
     pub esi: Option<Spanned<String>>,
-    /// Something says where it is, understood or not.
+    /// `true` if a locator is present, valid or not.
     pub placed: bool,
     pub position: Option<Spanned<u16>>,
     pub alias: Option<Spanned<u16>>,
@@ -84,7 +84,7 @@ pub(crate) struct RawDevice {
     pub rx: Option<Spanned<Vec<RawEntry>>>,
     pub tx: Option<Spanned<Vec<RawEntry>>>,
     pub sdo: Vec<RawSdo>,
-    /// `startup`: of all start-up SDOs.
+    /// `startup`: the defaults for all start-up SDOs.
     pub startup: RawStartup,
     pub axis: Option<RawAxis>,
     pub sim: Option<RawSim>,
@@ -107,7 +107,7 @@ pub(crate) struct RawSdo {
     pub startup: RawStartup,
 }
 
-/// What is done beside writing; `None`: the file does not say.
+/// What is done in addition to writing; `None`: not in the file.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RawStartup {
     pub verify: Option<bool>,
@@ -125,7 +125,7 @@ pub(crate) enum SdoValue {
 
 type Value<'d> = &'d Spanned<DeValue<'d>>;
 
-/// Tables and keys of the whole file that are none.
+/// Reports unknown tables and keys of the whole file.
 pub(crate) fn names(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) {
     let mut f = Fields::new(document.get_ref(), 0..0, "the machine file");
     for known in ["repeat", "enable", "bus", "device", "stop", "step"] {
@@ -171,7 +171,7 @@ pub(crate) fn read(document: &Spanned<DeTable<'_>>, p: &mut Problems<'_>) -> Raw
     machine
 }
 
-/// The tables of an array of tables.
+/// Returns the tables of an array of tables.
 fn tables<'d>(
     p: &mut Problems<'_>,
     value: Option<Value<'d>>,
@@ -208,7 +208,7 @@ fn read_bus(mut f: Fields<'_>, p: &mut Problems<'_>) -> RawBus {
     bus
 }
 
-/// `"auto"`, a time, or a plain 0.
+/// Reads `"auto"`, a duration, or a plain 0.
 fn spin(p: &mut Problems<'_>, value: Value<'_>) -> Option<Spanned<Option<u64>>> {
     match value.get_ref() {
         DeValue::String(s) if s == "auto" => Some(Spanned::new(value.span(), None)),
@@ -283,7 +283,7 @@ fn read_device(mut f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> RawDevice
     device
 }
 
-/// One name a slot.
+/// Reads one name per slot.
 fn read_modules(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<Vec<String>>> {
     let names = fields::array(p, value, "a list of modules, one a slot, \"-\" for none")?;
     let names = names.into_iter().map(|v| fields::string(p, v));
@@ -291,7 +291,7 @@ fn read_modules(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<Vec<St
     Some(Spanned::new(value.span(), names?))
 }
 
-/// Objects as `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.
+/// Reads objects as `"0x607A:00"`, `"0x607A"` or `{ index = 0x607A, sub = 0 }`.
 pub(crate) fn read_entries(
     value: Value<'_>,
     p: &mut Problems<'_>,

@@ -1,4 +1,4 @@
-//! Steps that say more of an axis than a target: waves, gears, probing.
+//! Steps with several parameters per axis: waves, gears, probing.
 
 use toml::Spanned;
 
@@ -7,7 +7,7 @@ use super::super::problem::Problems;
 use super::Value;
 use super::step::{RawAction, only};
 
-/// `probe`: one of `to` and `by` is given.
+/// `probe`: exactly one of `to` and `by` is given.
 #[derive(Debug)]
 pub(crate) struct RawProbe {
     pub axis: Spanned<String>,

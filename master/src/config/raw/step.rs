@@ -1,4 +1,4 @@
-//! `[[step]]` as written: one verb each, and what belongs to it.
+//! `[[step]]` as written: one verb each, with its parameters.
 
 use toml::Spanned;
 use toml::de::DeValue;
@@ -20,7 +20,7 @@ pub(crate) struct RawTarget {
     pub value: Spanned<f64>,
 }
 
-/// `io."Input 3"`: a device, and one of its process data.
+/// `io."Input 3"`: a device and one of its signals.
 #[derive(Debug)]
 pub(crate) struct RawSignal {
     pub device: Spanned<String>,
@@ -37,7 +37,7 @@ pub(crate) struct RawCondition {
 
 #[derive(Debug)]
 pub(crate) enum RawAction {
-    /// `None`: every axis.
+    /// `None`: all axes.
     Enable(Option<Vec<Spanned<String>>>),
     Disable(Option<Vec<Spanned<String>>>),
     Reset(Option<Vec<Spanned<String>>>),
@@ -100,7 +100,7 @@ pub(crate) enum RawAction {
     },
 }
 
-/// Each with an example; the first key of a step that is one of these says what the step is.
+/// The verbs, each with an example. The first key of a step that is a verb defines the action.
 const VERBS: [(&str, &str); 21] = [
     ("enable", "enable = [\"x\"]"),
     ("disable", "disable = true"),
@@ -131,10 +131,10 @@ const VERBS: [(&str, &str); 21] = [
     ("repeat", "repeat = 3"),
 ];
 
-/// Keys that stand beside a verb.
+/// Keys that may follow a verb.
 const COMPANIONS: [&str; 5] = ["speed", "ramp", "arrive", "timeout", "step"];
 
-/// Steps in steps, as deep as anybody can still read.
+/// The maximum depth of nested steps.
 const DEEPEST: usize = 8;
 
 pub(super) fn read(f: Fields<'_>, span: Span, p: &mut Problems<'_>) -> Option<RawStep> {
@@ -151,7 +151,7 @@ fn read_at(mut f: Fields<'_>, span: Span, depth: usize, p: &mut Problems<'_>) ->
             f.get(key);
         }
         if f.unknown() {
-            // It was probably meant to be a verb.
+            // The unknown key was probably meant as a verb.
             f.done(p);
         } else {
             let examples = VERBS.map(|(_, example)| format!("`{example}`")).join(", ");
@@ -284,8 +284,8 @@ fn action(
     })
 }
 
-/// `true`, a name, or a list of names.
-#[allow(clippy::option_option, reason = "wrong, or every axis")]
+/// Reads `true`, a name, or a list of names.
+#[allow(clippy::option_option, reason = "invalid, or all axes")]
 fn axes(value: Value<'_>, p: &mut Problems<'_>) -> Option<Option<Vec<Spanned<String>>>> {
     let named = |v: Value<'_>, p: &mut Problems<'_>| fields::string(p, v);
     match value.get_ref() {
@@ -313,7 +313,7 @@ fn targets(value: Value<'_>, p: &mut Problems<'_>) -> Option<Vec<RawTarget>> {
     )
 }
 
-/// One axis and something for it.
+/// Reads one axis and its parameter.
 pub(super) fn only<'d>(
     value: Value<'d>,
     example: &str,
@@ -330,7 +330,7 @@ pub(super) fn only<'d>(
     None
 }
 
-/// Axes, and something for each.
+/// Reads axes and a parameter for each.
 fn named<T>(
     value: Value<'_>,
     example: &str,
@@ -354,7 +354,7 @@ fn named<T>(
     Some(all)
 }
 
-/// `{ io."Input 3" = … }`: by device, then by signal.
+/// Reads `{ io."Input 3" = … }`: by device, then by signal.
 fn signals<'d>(value: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<(RawSignal, Value<'d>)>> {
     let example = "write `{ io.\"Input 1\" = true }`: device, signal, value";
     let DeValue::Table(devices) = value.get_ref() else {
@@ -382,7 +382,7 @@ fn signals<'d>(value: Value<'d>, p: &mut Problems<'_>) -> Option<Vec<(RawSignal,
     Some(all)
 }
 
-/// A number; `true` is 1.
+/// Reads a number; `true` is 1.
 fn level(value: Value<'_>, p: &mut Problems<'_>) -> Option<Spanned<f64>> {
     match value.get_ref() {
         DeValue::Boolean(on) => Some(Spanned::new(value.span(), f64::from(u8::from(*on)))),

@@ -5,17 +5,17 @@ use ecaxis_axis::setpoint::{
 };
 use toml::Spanned;
 
-use super::Checker;
-use super::target::What;
+use super::ProgramChecker;
+use super::target::TargetKind;
 use crate::config::problem::{Problems, unreadable};
 use crate::config::{Action, AxisSetup, TableFile};
 use crate::file;
 
-/// No table is longer.
+/// The maximum length of a table in bytes.
 const MAX_TABLE_BYTES: u64 = 64 << 20;
 
-impl Checker<'_> {
-    /// An axis that follows positions at some time.
+impl ProgramChecker<'_> {
+    /// Returns an axis that follows positions in at least one of its modes.
     pub(super) fn positioned(
         &self,
         name: &Spanned<String>,
@@ -23,7 +23,7 @@ impl Checker<'_> {
         p: &mut Problems<'_>,
     ) -> Option<(usize, &AxisSetup)> {
         let (index, axis) = self.axis(name, p)?;
-        if self.ever(index, |mode| What::SetPoint.possible(mode, axis)) {
+        if self.any_mode(index, |mode| TargetKind::SetPoint.possible(mode, axis)) {
             return Some((index, axis));
         }
         let message = format!(

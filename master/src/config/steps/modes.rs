@@ -1,14 +1,14 @@
-//! Steps that change what an axis does with targets: homing, modes of operation.
+//! Steps that change how an axis handles targets: homing, modes of operation.
 
 use ecaxis_axis::Mode;
 use ecaxis_esi as esi;
 use toml::Spanned;
 
-use super::Checker;
+use super::ProgramChecker;
 use crate::config::Action;
 use crate::config::problem::{Problems, Span, list};
 
-impl Checker<'_> {
+impl ProgramChecker<'_> {
     pub(super) fn home(
         &self,
         names: Option<Vec<Spanned<String>>>,

@@ -1,10 +1,10 @@
-//! Probing: a target, an input, and the drive's objects for both in the process data.
+//! Probing: a target, an input, and the drive's probe objects in the process data.
 
 use ecaxis_axis::{Edge, Probe};
 use toml::Spanned;
 
-use super::Checker;
-use super::target::{What, fraction, within};
+use super::ProgramChecker;
+use super::target::{TargetKind, fraction, within};
 use crate::config::axis::control::one_of;
 use crate::config::problem::Problems;
 use crate::config::raw::RawProbe;
@@ -12,11 +12,11 @@ use crate::config::{Action, DeviceConfig};
 use ecaxis_esi::address;
 use ecaxis_esi::layout::Field;
 
-/// 0x60B8, 0x60B9.
+/// Touch probe function 0x60B8 and status 0x60B9.
 const FUNCTION: u16 = 0x60b8;
 const STATUS: u16 = 0x60b9;
 
-/// Where the drive puts the position of an edge: 0x60BA to 0x60BD.
+/// Returns the object with the position of an edge: 0x60BA to 0x60BD.
 const fn position_object(probe: Probe, edge: Edge) -> u16 {
     match (probe, edge) {
         (Probe::First, Edge::Positive) => 0x60ba,
@@ -26,7 +26,7 @@ const fn position_object(probe: Probe, edge: Edge) -> u16 {
     }
 }
 
-impl Checker<'_> {
+impl ProgramChecker<'_> {
     pub(super) fn probe(&self, raw: &RawProbe, p: &mut Problems<'_>) -> Option<Action> {
         let (speed, ramp) = (
             fraction(raw.speed.clone(), "speed", p),
@@ -43,13 +43,13 @@ impl Checker<'_> {
         };
         let (index, axis) = self.axis(&raw.axis, p)?;
         let (what, value) = match (&raw.to, &raw.by) {
-            (Some(to), _) => (What::Position, to),
-            (None, Some(by)) => (What::Way, by),
-            // It was no number.
+            (Some(to), _) => (TargetKind::Position, to),
+            (None, Some(by)) => (TargetKind::Way, by),
+            // An invalid number has been reported.
             (None, None) => return None,
         };
-        if !self.ever(index, |mode| What::Position.possible(mode, axis)) {
-            let (_, hint) = What::Position.impossible(raw.axis.get_ref(), axis);
+        if !self.any_mode(index, |mode| TargetKind::Position.possible(mode, axis)) {
+            let (_, hint) = TargetKind::Position.impossible(raw.axis.get_ref(), axis);
             let message = format!(
                 "`probe` is nothing that `{}` does in mode \"{}\"",
                 raw.axis.get_ref(),
@@ -67,7 +67,7 @@ impl Checker<'_> {
             axis: index,
             probe,
             edge,
-            relative: what == What::Way,
+            relative: what == TargetKind::Way,
             target: *value.get_ref(),
             speed,
             ramp,
@@ -80,7 +80,7 @@ fn known(word: &Spanned<String>, edges: &[(&str, Edge)], p: &mut Problems<'_>) -
     one_of(Some(word), &all, "edge", p).flatten()
 }
 
-/// Reports what of a probe's objects is not in the process data, or not in the drive.
+/// Reports probe objects missing from the process data or from the drive.
 fn mapped(
     device: &DeviceConfig,
     name: &Spanned<String>,
@@ -100,10 +100,10 @@ fn mapped(
     }
     let all = no_output.then_some(FUNCTION).into_iter();
     let all: Vec<u16> = all.chain(missing.iter().copied()).collect();
-    // A file without a dictionary says nothing about it.
+    // An ESI file without a dictionary does not list objects.
     let dictionary = &device.selection.dictionary;
-    let told = dictionary.item(0x6041, 0).is_some();
-    let has = |index: &u16| !told || dictionary.item(*index, 0).is_some();
+    let reported = dictionary.item(0x6041, 0).is_some();
+    let has = |index: &u16| !reported || dictionary.item(*index, 0).is_some();
     if let Some(unknown) = all.iter().find(|index| !has(index)) {
         let message = format!(
             "by its ESI file `{}` has no touch probe {} that captures such an edge: there is no 0x{unknown:04X}",
@@ -133,7 +133,7 @@ fn mapped(
     None
 }
 
-/// The list that there is, and more.
+/// Returns the present entries and the missing ones.
 fn with(fields: &[Field], more: &[u16]) -> String {
     let there = fields.iter().filter(|field| field.index != 0);
     let there = there.map(|field| match field.sub {

@@ -1,19 +1,22 @@
-//! `[stop]`: how the machine stops, and what stops together.
+//! `[stop]`: how the machine stops, and which axes stop together.
 
 use toml::Spanned;
 
-use super::Checker;
+use super::ProgramChecker;
 use crate::config::axis::control::one_of;
 use crate::config::axis::control::{STOP_METHODS, STOPS_BY_DRIVE};
 use crate::config::problem::{Problems, suggestion};
 use crate::config::raw::{RawGroup, RawStop};
-use crate::config::{Outside, StopGroup, StopSetup};
+use crate::config::{GroupStopScope, StopGroup, StopSetup};
 use ecaxis_axis::StopMethod;
 
-const OUTSIDE: [(&str, Outside); 2] = [("stop", Outside::Stop), ("continue", Outside::Continue)];
+const OUTSIDE: [(&str, GroupStopScope); 2] = [
+    ("stop", GroupStopScope::Stop),
+    ("continue", GroupStopScope::Continue),
+];
 
-impl Checker<'_> {
-    /// What is wrong in it has been said, and the machine does not run.
+impl ProgramChecker<'_> {
+    /// Returns the stop settings. Mistakes are reported and replaced by defaults.
     pub(super) fn stop(&mut self, raw: &RawStop, p: &mut Problems<'_>) -> StopSetup {
         let others = match &raw.others {
             Some(_) => one_of(raw.others.as_ref(), &STOP_METHODS, "others", p).unwrap_or_default(),
@@ -31,7 +34,7 @@ impl Checker<'_> {
             };
             let device = self.inputs[condition.input].device;
             let group = groups.iter().find(|g| g.devices.contains(&device));
-            if let Some(group) = group.filter(|g| g.outside == Outside::Continue) {
+            if let Some(group) = group.filter(|g| g.outside == GroupStopScope::Continue) {
                 let message = format!(
                     "`{}` is in the group `{}`, without which the machine goes on: an emergency would go unseen",
                     raw.signal.device.get_ref(),
@@ -115,7 +118,7 @@ impl Checker<'_> {
         group
     }
 
-    /// A device is in one group at most.
+    /// Adds a device to a group; a device is in one group at most.
     fn join(
         &self,
         group: &mut StopGroup,

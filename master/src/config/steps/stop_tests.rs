@@ -1,10 +1,10 @@
 use crate::config::tests::{GOOD, with_esi};
 use ecaxis_axis::StopMethod;
 
-use crate::config::{ConfigError, Outside, StopGroup};
+use crate::config::{ConfigError, GroupStopScope, StopGroup};
 
 #[test]
-fn groups_of_axes() {
+fn stop_groups_are_parsed_with_their_defaults() {
     let machine = with_esi(GOOD).unwrap();
     assert!(machine.stop.groups.is_empty());
     assert_eq!([0, 1].map(|device| machine.group_of(device)), [0, 0]);
@@ -21,15 +21,15 @@ fn groups_of_axes() {
     assert_eq!(
         machine.stop.groups,
         [
-            group("g", 1, StopMethod::DisableVoltage, Outside::Continue),
-            group("h", 0, StopMethod::QuickStop, Outside::Stop),
+            group("g", 1, StopMethod::DisableVoltage, GroupStopScope::Continue),
+            group("h", 0, StopMethod::QuickStop, GroupStopScope::Stop),
         ]
     );
 }
 
 #[test]
-#[rustfmt::skip] // one row a mistake
-fn every_wrong_group() {
+#[rustfmt::skip] // one row per mistake
+fn stop_rejects_invalid_groups() {
     let io = "\n[[device]]\nname = \"io\"\nesi = \"D1.xml\"\nposition = 2\n";
     let group = "[[stop.group]]\nname = \"g\"\naxes = [\"x\"]\n";
     for (text, message, hint, marked) in [

@@ -1,19 +1,19 @@
-//! Targets: within the axis' limits, and something that it does in one of its modes.
+//! Checks that targets are within limits and possible in one of the axis's modes.
 
 use toml::Spanned;
 
-use super::Checker;
+use super::ProgramChecker;
 use crate::config::AxisSetup;
 use crate::config::axis::too_long;
 use crate::config::problem::{Problems, Span};
 use crate::config::raw::RawTarget;
 use ecaxis_axis::Mode;
 
-impl Checker<'_> {
+impl ProgramChecker<'_> {
     pub(super) fn targets(
         &self,
         targets: Vec<RawTarget>,
-        what: What,
+        what: TargetKind,
         p: &mut Problems<'_>,
     ) -> Option<Vec<(usize, f64)>> {
         let count = targets.len();
@@ -22,12 +22,12 @@ impl Checker<'_> {
             let Some((index, axis)) = self.axis(&name, p) else {
                 continue;
             };
-            if !self.ever(index, |mode| what.possible(mode, axis)) {
+            if !self.any_mode(index, |mode| what.possible(mode, axis)) {
                 let (message, hint) = what.impossible(name.get_ref(), axis);
                 p.add_hint(name.span(), message, hint);
             } else if within(&value, what, axis, p) {
                 let value = value.into_inner();
-                let torque = what == What::Torque;
+                let torque = what == TargetKind::Torque;
                 resolved.push((
                     index,
                     if torque {
@@ -42,8 +42,8 @@ impl Checker<'_> {
         (count > 0 && resolved.len() == count).then_some(resolved)
     }
 
-    /// Reports an axis that would take more than an hour to reach its velocity.
-    pub(super) fn not_too_slow(
+    /// Reports an axis that would take more than one hour to reach its velocity.
+    pub(super) fn check_ramp_time(
         &self,
         targets: &[(usize, f64)],
         ramp: f64,
@@ -86,19 +86,19 @@ pub(super) fn fraction(
     None
 }
 
-/// What a target is a target of.
+/// The kind of a target.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum What {
+pub(super) enum TargetKind {
     Position,
-    /// A position that has to come from here in every cycle.
+    /// A position set-point that is computed in every cycle.
     SetPoint,
-    /// Relative to where the axis is.
+    /// A distance from the present position.
     Way,
     Velocity,
     Torque,
 }
 
-impl What {
+impl TargetKind {
     fn verb(self) -> &'static str {
         match self {
             Self::Position | Self::SetPoint => "move",
@@ -108,7 +108,7 @@ impl What {
         }
     }
 
-    /// Whether an axis takes it in this mode.
+    /// Returns `true` if the axis accepts the target in this mode.
     pub(super) fn possible(self, mode: Mode, axis: &AxisSetup) -> bool {
         let loops = &axis.config.loops;
         let position = match mode {
@@ -146,7 +146,7 @@ impl What {
 
 pub(super) fn within(
     value: &Spanned<f64>,
-    what: What,
+    what: TargetKind,
     axis: &AxisSetup,
     p: &mut Problems<'_>,
 ) -> bool {
@@ -154,18 +154,18 @@ pub(super) fn within(
     let unit = &axis.unit;
     let range = limits.position.unwrap_or(axis.config.scale.range());
     let (low, high, unit) = match what {
-        What::Position | What::SetPoint => (range[0], range[1], unit.clone()),
-        // Where it ends is known when it begins; it cannot be longer than the whole range.
-        What::Way => (range[0] - range[1], range[1] - range[0], unit.clone()),
-        What::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
-        What::Torque => {
+        TargetKind::Position | TargetKind::SetPoint => (range[0], range[1], unit.clone()),
+        // The end position is only known at run time, but the distance cannot exceed the range.
+        TargetKind::Way => (range[0] - range[1], range[1] - range[0], unit.clone()),
+        TargetKind::Velocity => (-limits.velocity, limits.velocity, format!("{unit}/s")),
+        TargetKind::Torque => {
             let limit = axis.torque.shown(limits.torque);
             (-limit, limit, axis.torque.unit.to_string())
         }
     };
     let n = *value.get_ref();
-    // A limit that was converted there and back may be off by a rounding.
-    let rounding = if what == What::Torque {
+    // A limit converted twice may have a rounding error.
+    let rounding = if what == TargetKind::Torque {
         high * 1e-9
     } else {
         0.0
@@ -174,7 +174,7 @@ pub(super) fn within(
         return true;
     }
     let message = match what {
-        What::Way => format!(
+        TargetKind::Way => format!(
             "a way of {n} {unit} is longer than the axis' range, {} to {} {unit}",
             range[0], range[1]
         ),

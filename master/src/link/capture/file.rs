@@ -1,4 +1,4 @@
-//! The file of a recording, or its parts.
+//! The file or files of a recording.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use super::Dir;
 use crate::link::{MAX_FRAME, Nanos};
 
-/// A recording with a limit: how many parts there are at a time.
+/// The maximum number of parts of a recording with a limit.
 const PARTS: u64 = 4;
 
-/// The part of a recording with this number.
+/// Returns the path of the part with this number.
 fn part_name(path: &Path, number: u32) -> PathBuf {
     let mut name = path
         .file_stem()
@@ -24,10 +24,10 @@ fn part_name(path: &Path, number: u32) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Numbered parts of a recording of this name that exist, whatever they are.
+/// Returns the existing paths that match numbered parts of a recording of this name.
 ///
 /// # Errors
-/// Where the folder cannot be read.
+/// Fails if the folder cannot be read.
 pub fn parts_of(path: &Path) -> io::Result<Vec<PathBuf>> {
     let folder = match path.parent() {
         Some(folder) if folder != Path::new("") => folder,
@@ -36,7 +36,7 @@ pub fn parts_of(path: &Path) -> io::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder)? {
         let name = entry?.file_name();
-        // The number is what remains of the stem.
+        // The number is the extension of the remaining stem.
         let number = Path::new(&name)
             .file_stem()
             .and_then(|stem| Path::new(stem).extension());
@@ -51,15 +51,15 @@ pub fn parts_of(path: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// The file or files of a recording.
-pub(super) struct Parts {
+/// Writes the file or files of a recording.
+pub(super) struct RotatingWriter {
     file: Pcapng<BufWriter<File>>,
     path: PathBuf,
-    /// Bytes of a part.
+    /// Maximum bytes per part.
     each: Option<u64>,
-    /// Of the part that is being written; 0 is the first.
+    /// The number of the current part; 0 is the first.
     number: u32,
-    /// Frames in parts before this one.
+    /// Frames in earlier parts.
     before: u64,
 }
 
@@ -67,7 +67,7 @@ fn open_part(path: &Path) -> io::Result<Pcapng<BufWriter<File>>> {
     Pcapng::new(BufWriter::with_capacity(1 << 20, File::create(path)?))
 }
 
-impl Parts {
+impl RotatingWriter {
     pub fn create(path: &Path, limit: Option<u64>) -> io::Result<Self> {
         let file = open_part(path)?;
         if limit.is_some() {
@@ -96,7 +96,7 @@ impl Parts {
         self.file.packet(dir, at, frame)
     }
 
-    /// Goes on in a new part, and removes the one that is too old.
+    /// Continues in a new part and removes the oldest one.
     fn turn(&mut self) -> io::Result<()> {
         let next = open_part(&part_name(&self.path, self.number + 1))?;
         self.before += std::mem::replace(&mut self.file, next).finish()?;
@@ -111,24 +111,24 @@ impl Parts {
         Ok(())
     }
 
-    /// How many frames were written, those of removed parts as well.
+    /// Returns how many frames were written, including those in removed parts.
     pub fn finish(self) -> io::Result<u64> {
         Ok(self.before + self.file.finish()?)
     }
 }
 
-/// pcapng blocks, written by hand: one section, one Ethernet interface, nanoseconds.
+/// A pcapng writer: one section, one Ethernet interface, nanosecond timestamps.
 struct Pcapng<W> {
     out: W,
-    /// One block, so that the file is written once a frame.
+    /// The buffer of one block, so that each frame is one write.
     block: Vec<u8>,
     written: u64,
-    /// Of the file so far.
+    /// Bytes written to the file so far.
     bytes: u64,
 }
 
 const SECTION: u32 = 0x0a0d_0d0a;
-/// The longest block.
+/// Bytes of the longest block.
 const BLOCK_MOST: u64 = 48 + MAX_FRAME as u64;
 const LINKTYPE_ETHERNET: u16 = 1;
 const EPB_FLAGS: u16 = 2;
@@ -137,7 +137,7 @@ const IF_TSRESOL: u16 = 9;
 impl<W: Write> Pcapng<W> {
     fn new(mut out: W) -> io::Result<Self> {
         let mut head = Vec::with_capacity(64);
-        // Section header; the length of the section is not known (-1).
+        // Section header; the length of the section is unknown (-1).
         for word in [SECTION, 28, 0x1a2b_3c4d, 1, u32::MAX, u32::MAX, 28_u32] {
             head.extend(word.to_le_bytes());
         }
@@ -165,7 +165,7 @@ impl<W: Write> Pcapng<W> {
         let too_long = || io::Error::from(io::ErrorKind::InvalidInput);
         let len = u32::try_from(frame.len()).map_err(|_| too_long())?;
         let padding = frame.len().next_multiple_of(4) - frame.len();
-        // 28 before the data, 12 of options and 4 after it.
+        // 28 bytes before the data, 12 bytes of options and 4 bytes after the data.
         let total = u32::try_from(44 + frame.len() + padding).map_err(|_| too_long())?;
         let [t0, t1, t2, t3, t4, t5, t6, t7] = at.to_le_bytes();
 
@@ -202,16 +202,16 @@ impl<W: Write> Pcapng<W> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Mode, Recorder};
+    use super::super::{Recorder, WriterMode};
     use super::*;
 
     #[test]
-    fn a_limit_keeps_the_beginning_and_the_newest() {
+    fn limited_recording_keeps_the_first_and_newest_parts() {
         const LIMIT: u64 = 200_000;
-        for mode in [Mode::Inline, Mode::Background] {
+        for mode in [WriterMode::Inline, WriterMode::Background] {
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("a night.pcapng");
-            // Of an older recording, and of somebody else.
+            // One file of an older recording, and one that is not a recording.
             let old = dir.path().join("a night.0042.pcapng");
             let other = dir.path().join("a night.0043.pcapng");
             fs::write(&old, SECTION.to_le_bytes()).unwrap();

@@ -1,28 +1,28 @@
-//! Why a file did not get through.
+//! File transfer errors.
 
 use std::fmt;
 use std::time::Duration;
 
 use super::super::abort::mailbox_error_text;
-use super::super::error::Lost;
-use super::super::{Phase, WireError};
+use super::super::error::LostDatagram;
+use super::super::{DatagramError, Phase};
 
-/// `station` is the SubDevice's configured address, `file` the name that it was asked for. The transfer is over in every
-/// case; the next one starts clean.
+/// A file transfer error. `station` is the SubDevice's configured address, `file` the requested
+/// name. The transfer has ended in every case, and the next one starts clean.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FoeError {
-    /// The SubDevice said ERROR.
-    #[error("station {station:#06x}: file `{file}`: was refused{} with {code:#06x}: {}{}", At(*packet), foe_error_text(*code), Words(text))]
+    /// The SubDevice sent ERROR.
+    #[error("station {station:#06x}: file `{file}`: was refused{} with {code:#06x}: {}{}", Context(*packet), foe_error_text(*code), DeviceText(text))]
     Refused {
         station: u16,
         file: String,
-        /// How far it was; 0: at the request itself.
+        /// The packet at which the transfer failed; 0 is the request itself.
         packet: u32,
         code: u32,
-        /// The SubDevice's own words.
+        /// The SubDevice's own text.
         text: String,
     },
-    #[error("station {station:#06x}: file `{file}`: {phase} within {after:?}{}", At(*packet))]
+    #[error("station {station:#06x}: file `{file}`: {phase} within {after:?}{}", Context(*packet))]
     Timeout {
         station: u16,
         file: String,
@@ -30,8 +30,8 @@ pub enum FoeError {
         phase: Phase,
         after: Duration,
     },
-    /// It says BUSY and nothing else.
-    #[error("station {station:#06x}: file `{file}`: is busy for more than {after:?}{}, with {done} of {entire} done", At(*packet))]
+    /// The SubDevice answers BUSY for too long.
+    #[error("station {station:#06x}: file `{file}`: is busy for more than {after:?}{}, with {done} of {entire} done", Context(*packet))]
     Busy {
         station: u16,
         file: String,
@@ -40,7 +40,7 @@ pub enum FoeError {
         done: u16,
         entire: u16,
     },
-    /// The SubDevice's mailbox refused the message itself.
+    /// The SubDevice's mailbox rejected the message itself.
     #[error("station {station:#06x}: file `{file}`: the mailbox refused the message with {code:#06x}: {}", mailbox_error_text(*code))]
     Mailbox {
         station: u16,
@@ -56,21 +56,21 @@ pub enum FoeError {
         expected: u32,
         found: u32,
     },
-    #[error("station {station:#06x}: file `{file}`: the answer{} makes no sense: {what}", At(*packet))]
+    #[error("station {station:#06x}: file `{file}`: the answer{} makes no sense: {what}", Context(*packet))]
     Malformed {
         station: u16,
         file: String,
         packet: u32,
         what: String,
     },
-    /// Of a file that is read.
+    /// The file to read is too long.
     #[error("station {station:#06x}: file `{file}` has more than {most} bytes")]
     TooLarge {
         station: u16,
         file: String,
         most: usize,
     },
-    /// It would be empty or cut, or ends early.
+    /// The name would be empty or truncated, or contains a zero byte.
     #[error(
         "station {station:#06x}: `{file}` is no name for a file here: 1 to {room} bytes without a zero byte"
     )]
@@ -79,8 +79,8 @@ pub enum FoeError {
         file: String,
         room: usize,
     },
-    /// Frames come back, but this SubDevice touched none of them.
-    #[error("station {station:#06x}: file `{file}`: the device does not answer{}: it is off, or has lost its address", At(*packet))]
+    /// Frames come back, but this SubDevice processed none of them.
+    #[error("station {station:#06x}: file `{file}`: the device does not answer{}: it is off, or has lost its address", Context(*packet))]
     Gone {
         station: u16,
         file: String,
@@ -95,18 +95,18 @@ pub enum FoeError {
         out_len: u16,
         in_len: u16,
     },
-    /// Frames do not come back.
-    #[error("station {station:#06x}: file `{file}`: {}{}", Lost(source), At(*packet))]
+    /// No frames come back.
+    #[error("station {station:#06x}: file `{file}`: {}{}", LostDatagram(source), Context(*packet))]
     Wire {
         station: u16,
         file: String,
         packet: u32,
-        source: WireError,
+        source: DatagramError,
     },
 }
 
 impl FoeError {
-    /// The SubDevice's error code, where it gave one.
+    /// Returns the SubDevice's error code, if there is one.
     pub fn code(&self) -> Option<u32> {
         match self {
             Self::Refused { code, .. } => Some(*code),
@@ -115,7 +115,7 @@ impl FoeError {
     }
 }
 
-/// What an FoE error code means (ETG.1000.6 Table 92, ETG.1020 for 0x800C and above).
+/// Returns the text of an FoE error code (ETG.1000.6 Table 92, ETG.1020 for 0x800C and above).
 pub fn foe_error_text(code: u32) -> &'static str {
     match code {
         0x8000 => "not defined",
@@ -140,9 +140,9 @@ pub fn foe_error_text(code: u32) -> &'static str {
     }
 }
 
-struct At(u32);
+struct Context(u32);
 
-impl fmt::Display for At {
+impl fmt::Display for Context {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             0 => f.write_str(" at the request"),
@@ -151,9 +151,9 @@ impl fmt::Display for At {
     }
 }
 
-struct Words<'a>(&'a str);
+struct DeviceText<'a>(&'a str);
 
-impl fmt::Display for Words<'_> {
+impl fmt::Display for DeviceText<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             "" => Ok(()),

@@ -1,10 +1,11 @@
-//! The bytes of FoE messages (ETG.1000.6 §5.8). Parsing borrows; what a SubDevice may not say is a [`Flaw`].
+//! The bytes of FoE messages (ETG.1000.6 §5.8). Parsing borrows; an invalid message from a
+//! SubDevice is a [`DecodeError`].
 
-use super::super::coe::{self, Flaw, MAILBOX_HEADER};
-use super::super::port::Emit;
+use super::super::coe::{self, DecodeError, MAILBOX_HEADER};
+use super::super::transport::Encode;
 
 const TYPE_FOE: u8 = 4;
-/// Opcode, a reserved byte, and four bytes whose meaning the opcode decides.
+/// Opcode, a reserved byte, and four bytes whose meaning depends on the opcode.
 pub(super) const FOE_HEADER: usize = 6;
 
 const READ: u8 = 1;
@@ -14,13 +15,13 @@ const ACK: u8 = 4;
 const ERROR: u8 = 5;
 const BUSY: u8 = 6;
 
-/// Bytes of a file, or of its name, that a mailbox of so many bytes carries.
+/// Returns the bytes of a file, or of its name, that fit into a mailbox of this size.
 #[must_use]
 pub fn room(mailbox: u16) -> usize {
     usize::from(mailbox).saturating_sub(MAILBOX_HEADER + FOE_HEADER)
 }
 
-/// What this client sends.
+/// A message from this client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Request<'a> {
     Read {
@@ -44,7 +45,7 @@ pub(super) enum Request<'a> {
     },
 }
 
-impl Emit for Request<'_> {
+impl Encode for Request<'_> {
     fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>) {
         let (opcode, number, data) = match *self {
             Self::Read { password, name } => (READ, password, name.as_bytes()),
@@ -63,7 +64,7 @@ impl Emit for Request<'_> {
     }
 }
 
-/// What a SubDevice says.
+/// A message from a SubDevice.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Message<'a> {
     Data {
@@ -73,31 +74,31 @@ pub(super) enum Message<'a> {
     Ack {
         packet: u32,
     },
-    /// With the SubDevice's own words, if it has any.
+    /// With the SubDevice's own text, if there is one.
     Error {
         code: u32,
         text: &'a [u8],
     },
-    /// So much of so much is done.
+    /// `done` of `entire` is completed.
     Busy {
         done: u16,
         entire: u16,
     },
-    /// The SubDevice's mailbox refused a message, with this code.
+    /// The SubDevice's mailbox rejected a message, with this code.
     Refused(u16),
     /// Another protocol.
     Other,
 }
 
-/// Reads one whole mailbox.
-pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
+/// Parses one whole mailbox.
+pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, DecodeError> {
     let body = match coe::open(mailbox)? {
         (TYPE_FOE, body) => body,
         (coe::TYPE_ERROR, body) => return coe::refused(body).map(Message::Refused),
         _ => return Ok(Message::Other),
     };
     let Some((&[opcode, _, a, b, c, d], data)) = body.split_first_chunk() else {
-        return Err(Flaw::Short {
+        return Err(DecodeError::Short {
             what: "an FoE message",
             length: body.len(),
         });
@@ -117,7 +118,7 @@ pub(super) fn parse(mailbox: &[u8]) -> Result<Message<'_>, Flaw> {
             done: u16::from_le_bytes([a, b]),
             entire: u16::from_le_bytes([c, d]),
         }),
-        // A SubDevice that asks for files, or nonsense.
-        _ => Err(Flaw::Opcode(opcode)),
+        // A SubDevice that requests files, or an invalid opcode.
+        _ => Err(DecodeError::Opcode(opcode)),
     }
 }

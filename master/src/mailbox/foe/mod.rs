@@ -3,15 +3,16 @@
 //! - `message`: the bytes.
 //! - `error`: [`FoeError`].
 //!
-//! A file goes in packets, counted from 1 and acknowledged one by one; the first one that does not fill the mailbox is the
-//! last, so that a file whose last packet is full is followed by an empty one. What lost frames do to that is the mailbox's
-//! business (`port`); packets that come twice all the same are recognised by their number.
+//! A file is transferred in packets, counted from 1 and acknowledged one by one. The first packet
+//! that does not fill the mailbox is the last. A file whose last packet is full is followed by an
+//! empty one. The mailbox layer (`transport`) handles lost frames. Packets that still arrive twice
+//! are recognised by their number.
 
 use std::time::Duration;
 
 use super::error::Phase;
-use super::port::{Deadline, Port, Trouble};
-use super::{MailboxLayout, Timeouts, Wire};
+use super::transport::{Deadline, Port, TransportError};
+use super::{MailboxLayout, MailboxTransport, Timeouts};
 
 mod error;
 mod message;
@@ -20,11 +21,11 @@ pub use error::{FoeError, foe_error_text};
 pub use message::room;
 use message::{Message, Request, parse};
 
-/// Messages that are cleared away before a transfer at most.
+/// The maximum number of old messages that are read before a transfer.
 const DRAIN: usize = 64;
-/// How often one packet may come twice.
+/// How often one packet may be repeated.
 const REPEATS: u32 = 3;
-/// Between BUSY and asking again.
+/// The pause between BUSY and the next attempt.
 const BUSY_PAUSE: Duration = Duration::from_millis(10);
 
 const ILLEGAL: u32 = 0x8004;
@@ -32,14 +33,15 @@ const PACKET_NUMBER: u32 = 0x8005;
 const NOT_DEFINED: u32 = 0x8000;
 const DISK_FULL: u32 = 0x8003;
 
-/// How long to wait, each for one packet. Erasing a flash memory takes seconds, and not every SubDevice says BUSY then.
+/// Timeouts per packet. Erasing a flash memory takes seconds, and not every SubDevice answers BUSY
+/// meanwhile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FoeTimeouts {
-    /// Until the SubDevice has taken the previous message out of its mailbox.
+    /// Until the SubDevice has fetched the previous message from its mailbox.
     pub request: Duration,
     /// Until it answers.
     pub answer: Duration,
-    /// Until it answers with anything else than BUSY.
+    /// Until it sends an answer other than BUSY.
     pub busy: Duration,
 }
 
@@ -53,28 +55,28 @@ impl Default for FoeTimeouts {
     }
 }
 
-/// A transfer goes on.
+/// The progress of a transfer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FoeProgress {
-    /// Bytes that have got through.
+    /// Bytes transferred so far.
     Bytes(usize),
-    /// The SubDevice puts the client off, with what it says of how much it has done.
+    /// The SubDevice answers BUSY, with its own progress.
     Busy { done: u16, entire: u16 },
 }
 
-/// One SubDevice's files. One transfer at a time. A transfer that failed, or whose future was dropped, leaves nothing
-/// behind that the next one would take for its answer.
+/// The files of one SubDevice, for one transfer at a time. After a transfer that failed or was
+/// dropped, the next one never takes an old answer for its own.
 #[derive(Debug)]
 pub struct FoeClient {
     port: Port,
     busy: Duration,
-    /// A transfer has ended without its last answer; it may still come.
+    /// A transfer has ended without its last answer, which may still arrive.
     unsettled: bool,
     /// The SubDevice still waits for the rest of a transfer.
     under_way: bool,
 }
 
-/// What a transfer is about, and how far it is.
+/// The file of a transfer, and its progress.
 #[derive(Debug)]
 struct Transfer<'a> {
     station: u16,
@@ -82,12 +84,12 @@ struct Transfer<'a> {
     packet: u32,
 }
 
-/// What an answer is to the client.
-enum Pick<T> {
+/// How an answer relates to the last request.
+enum ReplyMatch<T> {
     Take(T),
-    /// To something that is over; the right one may follow.
+    /// An answer to an earlier packet; the right one may follow.
     Stale,
-    /// The last packet once more: the SubDevice has not seen its acknowledgement.
+    /// The last packet again: the SubDevice has not received its acknowledgement.
     Again,
     Wrong {
         expected: u32,
@@ -96,15 +98,18 @@ enum Pick<T> {
     Nonsense(&'static str),
 }
 
-/// Why a transfer ended, and what the SubDevice is told where it still waits.
-struct Ended {
+/// Why a transfer ended, and the error code to send if the SubDevice still waits.
+struct FoeFailure {
     error: FoeError,
-    tell: Option<u32>,
+    report: Option<u32>,
 }
 
-impl From<FoeError> for Ended {
+impl From<FoeError> for FoeFailure {
     fn from(error: FoeError) -> Self {
-        Self { error, tell: None }
+        Self {
+            error,
+            report: None,
+        }
     }
 }
 
@@ -120,7 +125,7 @@ impl FoeClient {
         client
     }
 
-    /// The same with other timeouts.
+    /// Returns the client with other timeouts.
     #[must_use]
     pub fn with_timeouts(mut self, timeouts: FoeTimeouts) -> Self {
         self.set_timeouts(timeouts);
@@ -136,8 +141,8 @@ impl FoeClient {
         self.busy = timeouts.busy;
     }
 
-    /// Writes a file. `password` 0 is none.
-    pub async fn write<W: Wire>(
+    /// Writes a file. A `password` of 0 means no password.
+    pub async fn write<W: MailboxTransport>(
         &mut self,
         w: &W,
         file: &str,
@@ -152,8 +157,8 @@ impl FoeClient {
         self.end(w, result).await
     }
 
-    /// Reads a file of at most `most` bytes. `password` 0 is none.
-    pub async fn read<W: Wire>(
+    /// Reads a file of at most `most` bytes. A `password` of 0 means no password.
+    pub async fn read<W: MailboxTransport>(
         &mut self,
         w: &W,
         file: &str,
@@ -168,7 +173,11 @@ impl FoeClient {
         self.end(w, result).await
     }
 
-    async fn begin<'a, W: Wire>(&mut self, w: &W, file: &'a str) -> Result<Transfer<'a>, FoeError> {
+    async fn begin<'a, W: MailboxTransport>(
+        &mut self,
+        w: &W,
+        file: &'a str,
+    ) -> Result<Transfer<'a>, FoeError> {
         let transfer = Transfer {
             station: self.port.layout.station,
             file,
@@ -196,14 +205,18 @@ impl FoeClient {
         Ok(transfer)
     }
 
-    async fn end<W: Wire, T>(&mut self, w: &W, result: Result<T, Ended>) -> Result<T, FoeError> {
+    async fn end<W: MailboxTransport, T>(
+        &mut self,
+        w: &W,
+        result: Result<T, FoeFailure>,
+    ) -> Result<T, FoeError> {
         match result {
             Ok(value) => {
                 (self.unsettled, self.under_way) = (false, false);
                 Ok(value)
             }
-            Err(Ended { error, tell }) => {
-                match tell {
+            Err(FoeFailure { error, report }) => {
+                match report {
                     Some(code) => self.give_up(w, code).await,
                     None => self.under_way = false,
                 }
@@ -212,19 +225,20 @@ impl FoeClient {
         }
     }
 
-    /// The SubDevice may not hear it; what matters to the caller is the first error. It is told before the next transfer, then.
-    async fn give_up<W: Wire>(&mut self, w: &W, code: u32) {
+    /// Sends an error code to the SubDevice. If it cannot be sent now, it is sent before the next
+    /// transfer. The caller gets the first error.
+    async fn give_up<W: MailboxTransport>(&mut self, w: &W, code: u32) {
         self.under_way = self.port.send(w, &Request::Error { code }).await.is_err();
     }
 
-    async fn write_in<W: Wire>(
+    async fn write_in<W: MailboxTransport>(
         &mut self,
         w: &W,
         transfer: &mut Transfer<'_>,
         password: u32,
         data: &[u8],
         progress: &mut dyn FnMut(FoeProgress),
-    ) -> Result<(), Ended> {
+    ) -> Result<(), FoeFailure> {
         let full = room(self.port.layout.out_len);
         let name = transfer.file;
         let mut request = Request::Write { password, name };
@@ -233,13 +247,15 @@ impl FoeClient {
         loop {
             let packet = transfer.packet;
             self.ask(w, transfer, &request, progress, |said| match said {
-                Message::Ack { packet: acked } if *acked == packet => Pick::Take(()),
-                Message::Ack { packet: acked } if acked.wrapping_add(1) == packet => Pick::Stale,
-                Message::Ack { packet: found } => Pick::Wrong {
+                Message::Ack { packet: acked } if *acked == packet => ReplyMatch::Take(()),
+                Message::Ack { packet: acked } if acked.wrapping_add(1) == packet => {
+                    ReplyMatch::Stale
+                }
+                Message::Ack { packet: found } => ReplyMatch::Wrong {
                     expected: packet,
                     found: *found,
                 },
-                _ => Pick::Nonsense("data where an acknowledgement is due"),
+                _ => ReplyMatch::Nonsense("data where an acknowledgement is due"),
             })
             .await?;
             progress(FoeProgress::Bytes(done));
@@ -258,14 +274,14 @@ impl FoeClient {
         }
     }
 
-    async fn read_in<W: Wire>(
+    async fn read_in<W: MailboxTransport>(
         &mut self,
         w: &W,
         transfer: &mut Transfer<'_>,
         password: u32,
         most: usize,
         progress: &mut dyn FnMut(FoeProgress),
-    ) -> Result<Vec<u8>, Ended> {
+    ) -> Result<Vec<u8>, FoeFailure> {
         let full = room(self.port.layout.in_len);
         let name = transfer.file;
         let mut request = Request::Read { password, name };
@@ -274,26 +290,28 @@ impl FoeClient {
             let due = transfer.packet.wrapping_add(1);
             let part = self
                 .ask(w, transfer, &request, progress, |said| match said {
-                    Message::Data { packet, data } if *packet == due => Pick::Take(data.to_vec()),
-                    Message::Data { packet, .. } if packet.wrapping_add(1) == due && due > 1 => {
-                        Pick::Again
+                    Message::Data { packet, data } if *packet == due => {
+                        ReplyMatch::Take(data.to_vec())
                     }
-                    Message::Data { packet: found, .. } => Pick::Wrong {
+                    Message::Data { packet, .. } if packet.wrapping_add(1) == due && due > 1 => {
+                        ReplyMatch::Again
+                    }
+                    Message::Data { packet: found, .. } => ReplyMatch::Wrong {
                         expected: due,
                         found: *found,
                     },
-                    _ => Pick::Nonsense("an acknowledgement where data are due"),
+                    _ => ReplyMatch::Nonsense("an acknowledgement where data are due"),
                 })
                 .await?;
             transfer.packet = due;
             if file.len() + part.len() > most {
-                return Err(Ended {
+                return Err(FoeFailure {
                     error: FoeError::TooLarge {
                         station: transfer.station,
                         file: transfer.file.to_owned(),
                         most,
                     },
-                    tell: Some(DISK_FULL),
+                    report: Some(DISK_FULL),
                 });
             }
             file.extend_from_slice(&part);
@@ -309,15 +327,16 @@ impl FoeClient {
         }
     }
 
-    /// Sends a message until its answer comes, and again while the SubDevice is busy. `pick` judges what is neither an error nor BUSY.
-    async fn ask<W: Wire, T>(
+    /// Sends a message and waits for its answer; repeats it while the SubDevice is busy. `pick`
+    /// classifies answers other than errors and BUSY.
+    async fn ask<W: MailboxTransport, T>(
         &mut self,
         w: &W,
         transfer: &Transfer<'_>,
         request: &Request<'_>,
         progress: &mut dyn FnMut(FoeProgress),
-        pick: impl Fn(&Message<'_>) -> Pick<T>,
-    ) -> Result<T, Ended> {
+        pick: impl Fn(&Message<'_>) -> ReplyMatch<T>,
+    ) -> Result<T, FoeFailure> {
         let mut busy: Option<Deadline> = None;
         let mut repeats = 0;
         loop {
@@ -328,13 +347,15 @@ impl FoeClient {
                 Answer::Is(value) => return Ok(value),
                 Answer::Again if repeats < REPEATS => repeats += 1,
                 Answer::Again => {
-                    return Err(transfer.trouble(&self.port, Trouble::Timeout(Phase::Repeat)));
+                    return Err(
+                        transfer.trouble(&self.port, TransportError::Timeout(Phase::Repeat))
+                    );
                 }
                 Answer::Busy { done, entire } => {
                     progress(FoeProgress::Busy { done, entire });
                     let busy = busy.get_or_insert_with(|| Deadline::after(w, self.busy));
                     if busy.passed(w) {
-                        return Err(Ended {
+                        return Err(FoeFailure {
                             error: FoeError::Busy {
                                 station: transfer.station,
                                 file: transfer.file.to_owned(),
@@ -343,7 +364,7 @@ impl FoeClient {
                                 done,
                                 entire,
                             },
-                            tell: Some(NOT_DEFINED),
+                            report: Some(NOT_DEFINED),
                         });
                     }
                     w.delay(BUSY_PAUSE).await;
@@ -352,12 +373,12 @@ impl FoeClient {
         }
     }
 
-    async fn answer<W: Wire, T>(
+    async fn answer<W: MailboxTransport, T>(
         &mut self,
         w: &W,
         transfer: &Transfer<'_>,
-        pick: &impl Fn(&Message<'_>) -> Pick<T>,
-    ) -> Result<Answer<T>, Ended> {
+        pick: &impl Fn(&Message<'_>) -> ReplyMatch<T>,
+    ) -> Result<Answer<T>, FoeFailure> {
         let mut deadline = Deadline::after(w, self.port.timeouts.answer);
         loop {
             if let Err(trouble) = self.port.receive(w, &mut deadline).await {
@@ -373,13 +394,13 @@ impl FoeClient {
                 Ok(Message::Refused(code)) => return Err(transfer.mailbox(code)),
                 Ok(Message::Other) => None,
                 Ok(said) => match pick(&said) {
-                    Pick::Take(value) => Some(Answer::Is(value)),
-                    Pick::Again => Some(Answer::Again),
-                    Pick::Stale => None,
-                    Pick::Wrong { expected, found } => {
+                    ReplyMatch::Take(value) => Some(Answer::Is(value)),
+                    ReplyMatch::Again => Some(Answer::Again),
+                    ReplyMatch::Stale => None,
+                    ReplyMatch::Wrong { expected, found } => {
                         return Err(transfer.wrong(expected, found));
                     }
-                    Pick::Nonsense(what) => return Err(transfer.malformed(what)),
+                    ReplyMatch::Nonsense(what) => return Err(transfer.malformed(what)),
                 },
                 Err(flaw) => return Err(transfer.malformed(flaw)),
             };
@@ -389,7 +410,7 @@ impl FoeClient {
             }
             self.port.set_aside(w);
             if deadline.passed(w) {
-                return Err(transfer.trouble(&self.port, Trouble::Timeout(Phase::Answer)));
+                return Err(transfer.trouble(&self.port, TransportError::Timeout(Phase::Answer)));
             }
             deadline.pause(w).await;
         }
@@ -403,12 +424,12 @@ enum Answer<T> {
 }
 
 impl Transfer<'_> {
-    fn trouble(&self, port: &Port, trouble: Trouble) -> Ended {
+    fn trouble(&self, port: &Port, trouble: TransportError) -> FoeFailure {
         let Self {
             station, packet, ..
         } = *self;
         match trouble {
-            Trouble::Timeout(phase) => Ended {
+            TransportError::Timeout(phase) => FoeFailure {
                 error: FoeError::Timeout {
                     station,
                     file: self.file.to_owned(),
@@ -419,22 +440,22 @@ impl Transfer<'_> {
                         Phase::Answer | Phase::Transfer => port.timeouts.answer,
                     },
                 },
-                tell: Some(NOT_DEFINED),
+                report: Some(NOT_DEFINED),
             },
-            Trouble::Gone => FoeError::Gone {
+            TransportError::Gone => FoeError::Gone {
                 station,
                 file: self.file.to_owned(),
                 packet,
             }
             .into(),
-            Trouble::Wire(source) => FoeError::Wire {
+            TransportError::Wire(source) => FoeError::Wire {
                 station,
                 file: self.file.to_owned(),
                 packet,
                 source,
             }
             .into(),
-            Trouble::Layout => FoeError::Layout {
+            TransportError::Layout => FoeError::Layout {
                 station,
                 file: self.file.to_owned(),
                 out_len: port.layout.out_len,
@@ -454,49 +475,49 @@ impl Transfer<'_> {
         }
     }
 
-    fn mailbox(&self, code: u16) -> Ended {
-        Ended {
+    fn mailbox(&self, code: u16) -> FoeFailure {
+        FoeFailure {
             error: FoeError::Mailbox {
                 station: self.station,
                 file: self.file.to_owned(),
                 code,
             },
-            tell: Some(NOT_DEFINED),
+            report: Some(NOT_DEFINED),
         }
     }
 
-    fn wrong(&self, expected: u32, found: u32) -> Ended {
-        Ended {
+    fn wrong(&self, expected: u32, found: u32) -> FoeFailure {
+        FoeFailure {
             error: FoeError::Packet {
                 station: self.station,
                 file: self.file.to_owned(),
                 expected,
                 found,
             },
-            tell: Some(PACKET_NUMBER),
+            report: Some(PACKET_NUMBER),
         }
     }
 
-    fn malformed(&self, what: impl ToString) -> Ended {
-        Ended {
+    fn malformed(&self, what: impl ToString) -> FoeFailure {
+        FoeFailure {
             error: FoeError::Malformed {
                 station: self.station,
                 file: self.file.to_owned(),
                 packet: self.packet,
                 what: what.to_string(),
             },
-            tell: Some(ILLEGAL),
+            report: Some(ILLEGAL),
         }
     }
 }
 
-/// Whether a file can be asked for by this name through a mailbox with [`room`] for so many bytes.
+/// True if `name` is a valid file name for a mailbox with [`room`] for `room` bytes.
 #[must_use]
 pub fn is_name(name: &str, room: usize) -> bool {
     (1..=room).contains(&name.len()) && !name.contains('\0')
 }
 
-/// A SubDevice's own words, as far as a terminal can show them.
+/// Returns the SubDevice's error text, limited to printable characters.
 fn words(text: &[u8]) -> String {
     let text = text.split(|b| *b == 0).next().unwrap_or_default();
     let text = String::from_utf8_lossy(text);

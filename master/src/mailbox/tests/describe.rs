@@ -1,4 +1,4 @@
-//! The server's SDO Information: objects and subindices as they are stored, each with a name made of its address.
+//! The server's SDO Information: its stored objects and subindices, each named after its address.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,8 @@ pub fn entry_name(index: u16, sub: u8) -> String {
     format!("Item {sub} of {index:#06x}, also with a name too long for one")
 }
 
-/// The messages behind their CoE headers. A message has 12 bytes of headers in a mailbox of `len`.
+/// Returns the messages without their CoE headers. A message has 12 bytes of headers in a mailbox
+/// of `len`.
 pub fn answers(objects: &Objects, request: &[u8], len: usize) -> Vec<Vec<u8>> {
     let (opcode, answer) = match answer(objects, request[0], &request[4..]) {
         Ok(answer) => (request[0] + 1, answer),
@@ -52,7 +53,7 @@ fn answer(objects: &Objects, opcode: u8, body: &[u8]) -> Result<Vec<u8>, u32> {
             let sub = body[2];
             let value = objects.get(&(index, sub)).ok_or(0x0609_0011_u32)?;
             let bits = u16::try_from(8 * value.len()).unwrap();
-            // Tells a unit and a default, although nobody asked.
+            // Sends a unit and a default that were not requested.
             out.extend([sub, 0x1f, 0x05, 0x00]);
             out.extend(bits.to_le_bytes());
             out.extend([0x3f, 0x01]);

@@ -1,13 +1,14 @@
-//! Transfers that fail, each with its own error, and a client that is usable afterwards.
+//! Transfers that fail, each with its own error; the client stays usable afterwards.
 
 use std::cell::Cell;
 use std::time::Duration;
 
-use super::mischief::{Mischief, emergency};
+use super::fault_injection::{Mischief, emergency};
 use super::server::Server;
 use super::{STATION, block_on, client, layout};
 use crate::mailbox::{
-    About, CoeClient, FoeClient, MAX_OBJECT, ObjectAddress, Phase, SdoError, Wire, WireError,
+    CoeClient, DatagramError, FoeClient, MAX_OBJECT, MailboxTransport, NamedObject, Phase,
+    SdoError, Subject,
 };
 
 const LONG: &[u8] = &[7; 100];
@@ -21,7 +22,8 @@ fn server(mischief: &[Mischief]) -> Server {
     Server::new(48, OBJECTS, mischief)
 }
 
-/// What the first upload of `index` ends with; the next one must succeed once the mischief is over.
+/// Returns the error of the first upload of `index`. The next upload must succeed without the
+/// faults.
 fn upload_error(index: u16, mischief: &[Mischief]) -> (SdoError, Vec<Vec<u8>>) {
     let server = server(mischief);
     let mut client = client();
@@ -49,7 +51,7 @@ fn download_error(index: u16, data: &[u8], mischief: &[Mischief]) -> (SdoError, 
 }
 
 #[test]
-fn aborts_carry_their_code_and_say_what_it_means() {
+fn abort_error_contains_code_and_text() {
     let (error, _) = upload_error(0x6060, &[]);
     assert_eq!(
         error,
@@ -70,9 +72,9 @@ fn aborts_carry_their_code_and_say_what_it_means() {
     assert_eq!(error.abort_code(), Some(0x0602_0000));
 }
 
-/// ETG.1000.6 files the abort under the request service, some stacks under the response service.
+/// ETG.1000.6 assigns the abort to the request service, some stacks to the response service.
 #[test]
-fn an_abort_is_understood_under_either_service() {
+fn abort_is_parsed_under_either_service() {
     for service in [0x20, 0x30] {
         let abort = [
             10, 0, 0, 0, 0, 0x13, 0, service, 0x80, 0x41, 0x60, 0, 0xc0, 0xff, 0x00, 0x0f,
@@ -84,7 +86,7 @@ fn an_abort_is_understood_under_either_service() {
 }
 
 #[test]
-fn an_abort_among_segments_ends_the_transfer_whatever_its_address() {
+fn abort_among_segments_ends_the_transfer_at_any_address() {
     let abort = [
         10, 0, 0, 0, 0, 0x13, 0, 0x20, 0x80, 0, 0, 0, 0x22, 0x00, 0x00, 0x08,
     ];
@@ -114,7 +116,7 @@ fn a_mute_device_times_out() {
 fn a_mailbox_that_stays_full_times_out() {
     let server = server(&[Mischief::Deaf]);
     let mut client = client();
-    // The first request finds room and no answer, the second finds no room.
+    // The first request fits but is not answered; the second finds the mailbox full.
     let first = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
     assert!(
         matches!(
@@ -150,12 +152,12 @@ fn a_mailbox_that_stays_full_times_out() {
 fn gone(index: u16) -> SdoError {
     SdoError::Gone {
         station: STATION,
-        asked: About::Object(ObjectAddress { index, sub: 0 }),
+        asked: Subject::Object(NamedObject { index, sub: 0 }),
     }
 }
 
 #[test]
-fn a_device_that_is_gone_is_not_waited_for() {
+fn missing_device_fails_without_timeout() {
     let server = server(&[Mischief::Off]);
     let error = block_on(client().upload(&server, 0x6041, 0, false)).unwrap_err();
     assert_eq!(error, gone(0x6041));
@@ -163,14 +165,14 @@ fn a_device_that_is_gone_is_not_waited_for() {
         block_on(client().drain(&server)),
         Err(SdoError::Gone {
             station: STATION,
-            asked: About::Emptying
+            asked: Subject::Emptying
         })
     );
     assert!(server.now() < 10_000_000, "{}", server.now());
 }
 
 #[test]
-fn a_device_that_goes_in_mid_transfer_is_not_waited_for() {
+fn device_lost_in_mid_transfer_fails_without_timeout() {
     let server = server(&[Mischief::Mute]);
     let mut client = client();
     block_on(client.drain(&server)).unwrap();
@@ -236,7 +238,7 @@ fn answers_that_end_too_early_are_malformed() {
 }
 
 #[test]
-fn an_answer_to_something_else_only_is_a_timeout_that_says_so() {
+fn timeout_error_counts_unrelated_answers() {
     let other = [
         10, 0, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x64, 0x60, 0, 1, 0, 0, 0,
     ];
@@ -260,7 +262,8 @@ fn an_answer_to_something_else_only_is_a_timeout_that_says_so() {
     );
 }
 
-/// The answer to a request that timed out must not be taken for that to the same request made later.
+/// A late answer to a timed-out request must not be taken for the answer to the same request made
+/// later.
 #[test]
 fn a_late_answer_is_not_taken_for_the_next_one() {
     let server = server(&[Mischief::Deaf]);
@@ -278,10 +281,10 @@ fn a_late_answer_is_not_taken_for_the_next_one() {
     assert_eq!(client.set_aside(), 1);
 }
 
-/// A device that does not take the old request before its emergencies are fetched, of which there are too many for
-/// one go.
+/// A device that fetches the old request only after its emergencies were read. There are more of
+/// them than one call drains.
 #[test]
-fn a_device_that_has_much_to_say_first_is_heard() {
+fn upload_works_after_many_pending_emergencies() {
     let server = server(&[Mischief::Deaf]);
     let mut client = client();
     block_on(async {
@@ -300,12 +303,12 @@ fn a_device_that_has_much_to_say_first_is_heard() {
     assert_eq!(kept + client.lost_emergencies(), 70);
 }
 
-/// Time passes only where the client waits, and there is always another message.
+/// Time passes only while the client waits, and there is always another message.
 #[test]
-fn a_flood_on_a_wire_that_takes_no_time_ends() {
+fn endless_messages_end_in_bounded_time() {
     struct Flood(Cell<u64>);
-    impl Wire for Flood {
-        async fn read(&self, _: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+    impl MailboxTransport for Flood {
+        async fn read(&self, _: u16, register: u16, buf: &mut [u8]) -> Result<u16, DatagramError> {
             if register < 0x1000 {
                 buf.fill(u8::from(register == 0x080d) << 3);
             } else {
@@ -314,7 +317,7 @@ fn a_flood_on_a_wire_that_takes_no_time_ends() {
             }
             Ok(1)
         }
-        async fn write(&self, _: u16, _: u16, _: &[u8]) -> Result<u16, WireError> {
+        async fn write(&self, _: u16, _: u16, _: &[u8]) -> Result<u16, DatagramError> {
             Ok(1)
         }
         async fn delay(&self, duration: Duration) {
@@ -341,7 +344,7 @@ fn a_flood_on_a_wire_that_takes_no_time_ends() {
 }
 
 #[test]
-fn a_wrong_toggle_bit_ends_the_transfer_and_the_device_is_told() {
+fn wrong_toggle_bit_ends_the_transfer_with_an_abort() {
     let toggle = [0x00, 0x20, 0x80, 0x00, 0x20, 0, 0x00, 0x00, 0x03, 0x05];
     let (error, _) = upload_error(0x2000, &[Mischief::WrongToggle]);
     assert!(error.to_string().contains("toggle"), "{error}");
@@ -359,7 +362,7 @@ fn a_wrong_toggle_bit_ends_the_transfer_and_the_device_is_told() {
 }
 
 #[test]
-fn sizes_that_are_not_kept_are_malformed() {
+fn wrong_announced_sizes_are_malformed() {
     let (error, _) = upload_error(0x2000, &[Mischief::AnnounceSize(101)]);
     assert!(
         error
@@ -382,7 +385,7 @@ fn sizes_that_are_not_kept_are_malformed() {
 }
 
 #[test]
-fn objects_beyond_all_measure_are_refused_before_they_are_read_or_written() {
+fn oversized_objects_are_rejected_before_the_transfer() {
     let (error, log) = upload_error(0x2000, &[Mischief::AnnounceSize(u32::MAX)]);
     assert!(
         matches!(
@@ -401,7 +404,7 @@ fn objects_beyond_all_measure_are_refused_before_they_are_read_or_written() {
 }
 
 #[test]
-fn an_answer_lost_for_good_times_out() {
+fn unrepeated_lost_answer_times_out() {
     let (error, _) = upload_error(0x6041, &[Mischief::LoseAnswer(1), Mischief::NoRepeat]);
     assert!(
         matches!(
@@ -428,7 +431,7 @@ fn an_answer_lost_for_good_times_out() {
 }
 
 #[test]
-fn a_flood_of_emergencies_does_not_hold_the_client_up() {
+fn endless_emergencies_do_not_block_the_client() {
     let server = server(&[Mischief::Mute]);
     for _ in 0..10_000 {
         server.say(&emergency(0x8130));
@@ -459,7 +462,7 @@ fn mailboxes_that_cannot_carry_coe_are_refused_before_anything_is_sent() {
             out_len: len,
             in_len: len,
         };
-        let object = About::Object(ObjectAddress {
+        let object = Subject::Object(NamedObject {
             index: 0x6041,
             sub: 0,
         });
@@ -469,22 +472,22 @@ fn mailboxes_that_cannot_carry_coe_are_refused_before_anything_is_sent() {
         );
         assert_eq!(
             block_on(client.drain(&server)).unwrap_err(),
-            refused(About::Emptying)
+            refused(Subject::Emptying)
         );
         assert_eq!(server.datagrams.get(), 0);
     }
 }
 
-/// No frame comes back.
+/// A wire on which no frame comes back.
 struct Silent;
 
-impl Wire for Silent {
-    async fn read(&self, station: u16, register: u16, _: &mut [u8]) -> Result<u16, WireError> {
-        Err(WireError::Timeout { station, register })
+impl MailboxTransport for Silent {
+    async fn read(&self, station: u16, register: u16, _: &mut [u8]) -> Result<u16, DatagramError> {
+        Err(DatagramError::Timeout { station, register })
     }
 
-    async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, WireError> {
-        Err(WireError::Timeout { station, register })
+    async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, DatagramError> {
+        Err(DatagramError::Timeout { station, register })
     }
 
     async fn delay(&self, _: Duration) {}
@@ -501,7 +504,7 @@ fn a_silent_bus_is_reported_as_such() {
         matches!(
             error,
             SdoError::Wire {
-                source: WireError::Timeout {
+                source: DatagramError::Timeout {
                     station: STATION,
                     ..
                 },
@@ -512,9 +515,9 @@ fn a_silent_bus_is_reported_as_such() {
     );
 }
 
-/// Whatever fails, it is told of what, and no register is shown that looks like an object.
+/// Every error names its object or file, and shows no register that looks like an object.
 #[test]
-fn every_error_has_its_object_or_its_file() {
+fn every_error_names_its_object_or_file() {
     const NAMED: &str = "station 0x1001: 0x6065:00 (Following error window)";
     let named = |text: String| {
         assert!(text.starts_with(NAMED), "{text}");
@@ -535,8 +538,8 @@ fn every_error_has_its_object_or_its_file() {
     assert!(named(error.to_string()).ends_with("it is off, or has lost its address"));
 
     let (index, sub, station) = (0x6065, 0, STATION);
-    let asked = About::Object(ObjectAddress { index, sub });
-    let source = WireError::Other("a frame was too long".to_owned());
+    let asked = Subject::Object(NamedObject { index, sub });
+    let source = DatagramError::Other("a frame was too long".to_owned());
     for error in [
         SdoError::Abort {
             station,

@@ -1,21 +1,21 @@
-//! The files of the test's SubDevice, after ETG.1000.6 §5.8 and without a glance at the client.
+//! The file server of the tests, written from ETG.1000.6 §5.8 independently of the client.
 
 use std::collections::BTreeMap;
 
-/// What the file server does beside its duty.
+/// Deviations of the file server from the standard.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Manner {
-    /// Answers packet n (0: the request) with BUSY so many times.
+    /// Answers packet n (0: the request) with BUSY this many times.
     Busy(u32, u32),
-    /// Refuses packet n (0: the request) with this code, in these words.
+    /// Refuses packet n (0: the request) with this code and this text.
     Refuse(u32, u32, &'static [u8]),
     /// Acknowledges packet n with another number.
     Misnumber(u32, u32),
-    /// Acknowledges the packet before once more, then packet n.
+    /// Acknowledges the previous packet again, then packet n.
     StaleAck(u32),
-    /// Sends packet n so many times more than it should.
+    /// Sends packet n this many times more than it should.
     DataAgain(u32, u32),
-    /// Answers packet n (0: the request) with this opcode, and with data.
+    /// Answers packet n (0: the request) with this opcode and with data.
     Opcode(u32, u8),
 }
 
@@ -37,8 +37,8 @@ pub struct Files {
     pub stored: BTreeMap<String, Vec<u8>>,
     pub password: u32,
     pub manners: Vec<Manner>,
-    /// Error codes that the client told.
-    pub told: Vec<u32>,
+    /// Error codes that the client sent.
+    pub reported: Vec<u32>,
     transfer: Option<Transfer>,
 }
 
@@ -51,7 +51,7 @@ impl Files {
         self.transfer.is_none()
     }
 
-    /// `room`: what a mailbox holds behind its header, both ways.
+    /// `room` is the number of bytes behind a mailbox header, in both directions.
     pub fn answer(&mut self, body: &[u8], room: usize) -> Vec<Vec<u8>> {
         let full = room - 6;
         let number = u32::from_le_bytes(body[2..6].try_into().unwrap());
@@ -136,7 +136,7 @@ impl Files {
                 Some(message(3, packet, &next))
             }
             (5, _) => {
-                self.told.push(number);
+                self.reported.push(number);
                 None
             }
             (3 | 4, Some(_)) => Some(message(5, 0x8005, &[])),

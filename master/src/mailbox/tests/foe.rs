@@ -1,19 +1,20 @@
-//! The file client: every length, lost frames, a SubDevice that is busy, rude or gone; whatever arrives, an end in bounded time.
+//! The FoE client: every length, lost frames, SubDevices that are busy, faulty or gone. Every
+//! transfer ends in bounded time.
 
 use std::time::Duration;
 
 use proptest::prelude::*;
 
+use super::fault_injection::{Mischief, emergency};
 use super::files::Manner;
 use super::hostile::Noise;
-use super::mischief::{Mischief, emergency};
 use super::server::Server;
 use super::{block_on, layout};
 use crate::mailbox::foe::{FoeProgress, FoeTimeouts, foe_error_text};
-use crate::mailbox::{FoeClient, FoeError, Phase, Wire};
+use crate::mailbox::{FoeClient, FoeError, MailboxTransport, Phase};
 
 const NAME: &str = "app.bin";
-/// A 48-byte mailbox carries so much of a file.
+/// The file bytes that a 48-byte mailbox carries.
 const FULL: usize = 36;
 
 fn client(len: u16) -> FoeClient {
@@ -40,17 +41,17 @@ fn read(client: &mut FoeClient, server: &Server) -> Result<Vec<u8>, FoeError> {
     block_on(client.read(server, NAME, 0, 1 << 20, &mut |_| {}))
 }
 
-/// What the client said last.
-fn told(server: &Server) -> Vec<u32> {
+/// Returns the error codes that the client sent.
+fn error_codes(server: &Server) -> Vec<u32> {
     block_on(server.delay(Duration::from_millis(1)));
-    server.files(|files| files.told.clone())
+    server.files(|files| files.reported.clone())
 }
 
 fn stored(server: &Server) -> Option<Vec<u8>> {
     server.files(|files| files.stored.get(NAME).cloned())
 }
 
-/// What failed must not be in the way of what follows.
+/// A failed transfer must not affect the next one.
 #[track_caller]
 fn next_transfer_works(client: &mut FoeClient, server: &Server) {
     server.forgive();
@@ -59,12 +60,12 @@ fn next_transfer_works(client: &mut FoeClient, server: &Server) {
     assert_eq!(write(client, server, &data), Ok(()));
     assert_eq!(stored(server), Some(data.clone()));
     assert_eq!(read(client, server), Ok(data));
-    told(server);
+    error_codes(server);
     assert!(server.files(|files| files.is_idle()));
 }
 
 #[test]
-fn files_of_every_length_go_there_and_back() {
+fn files_of_every_length_round_trip() {
     for mailbox in [32u16, 48, 100, 1486] {
         let full = usize::from(mailbox) - 12;
         let server = Server::new(mailbox, &[], &[]);
@@ -79,7 +80,7 @@ fn files_of_every_length_go_there_and_back() {
 }
 
 #[test]
-fn progress_tells_every_packet_and_every_busy() {
+fn progress_reports_every_packet_and_every_busy() {
     let server = server(&[]);
     server.files(|files| files.manners = vec![Manner::Busy(0, 1), Manner::Busy(2, 2)]);
     let mut heard = Vec::new();
@@ -106,7 +107,7 @@ fn progress_tells_every_packet_and_every_busy() {
 }
 
 #[test]
-fn lost_frames_cost_time_and_nothing_else() {
+fn lost_frames_only_delay_transfers() {
     for n in 1..8 {
         for mischief in [
             Mischief::LoseAnswer(n),
@@ -127,7 +128,7 @@ fn lost_frames_cost_time_and_nothing_else() {
 }
 
 #[test]
-fn packets_that_come_twice_are_known_by_their_number() {
+fn repeated_packets_are_recognised_by_number() {
     let server = server(&[]);
     let data = bytes(3 * FULL + 1);
     let mut client = client(48);
@@ -136,7 +137,7 @@ fn packets_that_come_twice_are_known_by_their_number() {
     server.files(|files| files.manners = vec![Manner::DataAgain(1, 1), Manner::DataAgain(3, 3)]);
     assert_eq!(read(&mut client, &server), Ok(data.clone()));
     assert_eq!(stored(&server), Some(data));
-    // Not for ever.
+    // The number of repetitions is limited.
     server.files(|files| files.manners = vec![Manner::DataAgain(2, 9)]);
     let error = read(&mut client, &server).unwrap_err();
     assert!(
@@ -153,7 +154,7 @@ fn packets_that_come_twice_are_known_by_their_number() {
 }
 
 #[test]
-fn a_subdevice_that_stays_busy_is_given_up() {
+fn transfer_fails_if_the_subdevice_stays_busy() {
     for packet in [0, 2] {
         let server = server(&[]);
         server.files(|files| files.manners = vec![Manner::Busy(packet, u32::MAX)]);
@@ -170,13 +171,13 @@ fn a_subdevice_that_stays_busy_is_given_up() {
         };
         assert_eq!(at, packet);
         assert!((3_000_000_000..5_000_000_000).contains(&server.now()));
-        assert_eq!(told(&server), [0x8000]);
+        assert_eq!(error_codes(&server), [0x8000]);
         next_transfer_works(&mut client, &server);
     }
 }
 
 #[test]
-fn refusals_row_by_row() {
+fn refusals_have_code_text_and_packet() {
     for (code, text) in [
         (0x8001, "not found"),
         (0x8002, "access denied"),
@@ -209,7 +210,7 @@ fn refusals_row_by_row() {
                 assert!(shown.contains(part), "`{part}` is not in `{shown}`");
             }
             assert!(!shown.contains("rest"), "{shown}");
-            assert_eq!(told(&server), [0; 0], "ERROR is not answered");
+            assert_eq!(error_codes(&server), [0; 0], "ERROR is not answered");
             next_transfer_works(&mut client, &server);
         }
         assert!(foe_error_text(code).contains(text));
@@ -217,7 +218,7 @@ fn refusals_row_by_row() {
 }
 
 #[test]
-fn passwords_and_names() {
+fn passwords_are_sent_and_names_are_checked() {
     let server = server(&[]);
     server.files(|files| files.password = 0x1234_5678);
     let mut client = client(48);
@@ -241,7 +242,7 @@ fn passwords_and_names() {
 }
 
 #[test]
-fn nonsense_ends_a_transfer_and_the_subdevice_is_told() {
+fn invalid_answer_ends_the_transfer_and_sends_an_error() {
     for (manner, code, part) in [
         (
             Manner::Misnumber(2, 7),
@@ -262,7 +263,7 @@ fn nonsense_ends_a_transfer_and_the_subdevice_is_told() {
         let mut client = client(48);
         let error = write(&mut client, &server, &bytes(3 * FULL)).unwrap_err();
         assert!(error.to_string().contains(part), "{error}");
-        assert_eq!(told(&server), [code], "{manner:?}");
+        assert_eq!(error_codes(&server), [code], "{manner:?}");
         next_transfer_works(&mut client, &server);
     }
     let server = server(&[]);
@@ -277,14 +278,14 @@ fn nonsense_ends_a_transfer_and_the_subdevice_is_told() {
 }
 
 #[test]
-fn a_subdevice_that_says_nothing() {
+fn silent_subdevice_times_out() {
     for (mischief, phase) in [
         (Mischief::Mute, Phase::Answer),
         (Mischief::Deaf, Phase::Request),
     ] {
         let server = server(std::slice::from_ref(&mischief));
         let mut client = client(48);
-        // The first request of a deaf one still finds room.
+        // The first request to a SubDevice that does not read its mailbox still fits.
         let first = write(&mut client, &server, &bytes(10)).unwrap_err();
         let error = if phase == Phase::Request {
             write(&mut client, &server, &bytes(10)).unwrap_err()
@@ -330,18 +331,18 @@ fn other_messages_in_between_are_set_aside() {
 }
 
 #[test]
-fn a_transfer_whose_future_was_dropped_is_ended_before_the_next() {
+fn dropped_transfer_is_ended_before_the_next() {
     use std::task::{Context, Waker};
 
-    /// Never comes back from its n-th delay.
+    /// Never returns from its n-th delay.
     struct Stops<'a>(&'a Server, std::cell::Cell<u32>);
-    impl Wire for Stops<'_> {
+    impl MailboxTransport for Stops<'_> {
         async fn read(
             &self,
             station: u16,
             register: u16,
             buf: &mut [u8],
-        ) -> Result<u16, crate::mailbox::WireError> {
+        ) -> Result<u16, crate::mailbox::DatagramError> {
             self.0.read(station, register, buf).await
         }
         async fn write(
@@ -349,7 +350,7 @@ fn a_transfer_whose_future_was_dropped_is_ended_before_the_next() {
             station: u16,
             register: u16,
             data: &[u8],
-        ) -> Result<u16, crate::mailbox::WireError> {
+        ) -> Result<u16, crate::mailbox::DatagramError> {
             self.0.write(station, register, data).await
         }
         async fn delay(&self, duration: Duration) {
@@ -382,7 +383,7 @@ fn a_transfer_whose_future_was_dropped_is_ended_before_the_next() {
     }
 }
 
-/// Bytes that look like FoE often enough to get past the first checks.
+/// Bytes that often resemble FoE enough to pass the first checks.
 fn mailbox() -> impl Strategy<Value = Vec<u8>> {
     let noise = prop::collection::vec(any::<u8>(), 48);
     let plausible =
@@ -397,7 +398,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn noise_neither_panics_nor_holds_up(
+    fn random_answers_end_in_bounded_time_without_panic(
         mailboxes in prop::collection::vec(mailbox(), 0..12),
         seed in 1u64..,
         lost in prop::sample::select(vec![0u8, 10, 100]),
@@ -410,14 +411,15 @@ proptest! {
             let begin = noise.now();
             let _ = block_on(client.write(&noise, NAME, 0, &data, &mut |_| {}));
             let _ = block_on(client.read(&noise, NAME, 0, 1000, &mut |_| {}));
-            // At most 7 packets out and 29 in, each with its own limits.
+            // At most 7 packets out and 29 in, each with its own timeouts.
             prop_assert!(noise.now() - begin < 36 * 5_000_000_000);
         }
     }
 
-    /// Whatever byte of whatever answer changes, the file is whole or there is an error; and the next transfer works.
+    /// After any changed byte in any answer, the file is correct or there is an error, and the next
+    /// transfer works.
     #[test]
-    fn one_wrong_byte_is_survived(answer in 1u32..7, position in 0usize..48, value: u8) {
+    fn one_changed_byte_never_yields_wrong_data(answer in 1u32..7, position in 0usize..48, value: u8) {
         let server = server(&[Mischief::Corrupt(answer, position, value)]);
         let mut client = client(48);
         let data = bytes(150);
@@ -428,7 +430,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_written_is_read(
+    fn written_file_is_read_back(
         mailbox in 20u16..300,
         data in prop::collection::vec(any::<u8>(), 0..3000),
         busy in prop::collection::vec((0u32..20, 0u32..3), 0..4),

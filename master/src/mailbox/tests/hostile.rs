@@ -1,24 +1,24 @@
-//! Whatever arrives: no panic, and an end in bounded time.
+//! Random answers: no panic, and an end in bounded time.
 
 use std::cell::{Cell, RefCell};
 use std::time::Duration;
 
 use proptest::prelude::*;
 
-use super::mischief::Mischief;
+use super::fault_injection::Mischief;
 use super::server::Server;
 use super::{block_on, client};
-use crate::mailbox::{EMERGENCY_QUEUE, ObjectList, Wire, WireError};
+use crate::mailbox::{DatagramError, EMERGENCY_QUEUE, MailboxTransport, ObjectList};
 
-/// Answers every datagram with anything. Time passes only where the client waits, so that a loop without a pause
-/// never ends, and runs into the limit.
+/// Answers every datagram with random data. Time passes only while the client waits, so that an
+/// endless loop without a pause reaches the datagram limit.
 pub struct Noise {
     now: Cell<u64>,
     datagrams: Cell<u64>,
     random: Cell<u64>,
     /// Whole mailboxes to answer with, in turn.
     mailboxes: RefCell<Vec<Vec<u8>>>,
-    /// In 256: frames that are lost, or come back untouched.
+    /// Of 256 frames: how many are lost, and how many come back unprocessed.
     lost: u8,
     untouched: u8,
 }
@@ -47,7 +47,7 @@ impl Noise {
         x
     }
 
-    fn datagram(&self, station: u16, register: u16) -> Result<u16, WireError> {
+    fn datagram(&self, station: u16, register: u16) -> Result<u16, DatagramError> {
         self.datagrams.set(self.datagrams.get() + 1);
         assert!(
             self.datagrams.get() < DATAGRAMS,
@@ -55,7 +55,7 @@ impl Noise {
         );
         let [dice, counter, ..] = self.next().to_le_bytes();
         if dice < self.lost {
-            Err(WireError::Timeout { station, register })
+            Err(DatagramError::Timeout { station, register })
         } else if dice < self.lost.saturating_add(self.untouched) {
             Ok(0)
         } else {
@@ -64,8 +64,13 @@ impl Noise {
     }
 }
 
-impl Wire for Noise {
-    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+impl MailboxTransport for Noise {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
         let result = self.datagram(station, register);
         if register >= 0x1000 {
             let mut mailboxes = self.mailboxes.borrow_mut();
@@ -81,7 +86,7 @@ impl Wire for Noise {
         result
     }
 
-    async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, WireError> {
+    async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, DatagramError> {
         self.datagram(station, register)
     }
 
@@ -95,7 +100,7 @@ impl Wire for Noise {
     }
 }
 
-/// Bytes that look like CoE often enough to get past the first checks.
+/// Bytes that often resemble CoE enough to pass the first checks.
 fn mailbox() -> impl Strategy<Value = Vec<u8>> {
     let noise = prop::collection::vec(any::<u8>(), 48);
     let plausible = (
@@ -121,7 +126,7 @@ fn mailbox() -> impl Strategy<Value = Vec<u8>> {
             bytes[..9].copy_from_slice(&[length, 0, 0, 0, 0, 0x13, 0, 0x30, u8::from(toggle) << 4]);
             bytes
         });
-    // Fragments of descriptions, in whatever number.
+    // Fragments of descriptions, in any number.
     let fragment =
         (noise.clone(), 0u8..46, 0u8..8, 0u8..4).prop_map(|(mut bytes, length, opcode, left)| {
             bytes[..12].copy_from_slice(&[length, 0, 0, 0, 0, 0x13, 0, 0x80, opcode, 0, left, 0]);
@@ -135,7 +140,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 1000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn noise_neither_panics_nor_holds_up(
+    fn random_answers_end_in_bounded_time_without_panic(
         mailboxes in prop::collection::vec(mailbox(), 0..12),
         seed in 1u64..,
         lost in prop::sample::select(vec![0u8, 10, 100]),
@@ -150,7 +155,8 @@ proptest! {
             let _ = block_on(client.upload(&noise, 0x2000, 1, complete));
             let _ = block_on(client.download(&noise, 0x2000, 1, complete, &data));
             let _ = block_on(client.drain(&noise));
-            // Two transfers of 10 s each at most, one last message of each, and what draining takes.
+            // Two transfers of at most 10 s each, one last message of each, and the time for
+            // draining.
             prop_assert!(noise.now() - begin < 60_000_000_000);
             let begin = noise.now();
             let _ = block_on(client.object_list(&noise, ObjectList::All));
@@ -161,15 +167,16 @@ proptest! {
         prop_assert!(client.take_emergencies().count() <= EMERGENCY_QUEUE);
     }
 
-    /// Whatever byte of whatever answer changes, the data is right or there is an error; and the next transfer works.
+    /// After any changed byte in any answer, the data is correct or there is an error, and the next
+    /// transfer works.
     #[test]
-    fn one_wrong_byte_is_survived(answer in 1u32..8, position in 0usize..48, value: u8) {
+    fn one_changed_byte_never_yields_wrong_data(answer in 1u32..8, position in 0usize..48, value: u8) {
         let data: Vec<u8> = (0..150).collect();
         let mischief = [Mischief::Corrupt(answer, position, value)];
         let server = Server::new(48, &[(0x2000, 0, &data), (0x6041, 0, &[0x37, 2])], &mischief);
         let mut client = client();
         if let Ok(read) = block_on(client.upload(&server, 0x2000, 0, false)) {
-            // A shorter announced size is a shorter object; nothing on the wire tells otherwise.
+            // A smaller announced size means a shorter object; nothing on the wire contradicts it.
             prop_assert!(read.len() <= data.len());
         }
         server.forgive();

@@ -1,14 +1,15 @@
-//! SDO Information: answers in any number of fragments, and everything that can be wrong with them.
+//! SDO Information: answers in any number of fragments, and their possible faults.
 
 use super::describe::{entry_name, object_name};
-use super::mischief::{Mischief, emergency};
+use super::fault_injection::{Mischief, emergency};
 use super::server::Server;
 use super::{STATION, block_on, layout};
 use crate::mailbox::{
-    Asked, CoeClient, EntryDescription, InfoError, ObjectDescription, ObjectList, Phase, Timeouts,
+    CoeClient, EntryDescription, InfoError, InfoRequest, ObjectDescription, ObjectList, Phase,
+    Timeouts,
 };
 
-/// As in a drive: 440 objects, some with subindices.
+/// A server like a drive: 440 objects, some with subindices.
 fn server(len: u16, mischief: &[Mischief]) -> Server {
     let objects: Vec<(u16, u8, &[u8])> = (0..440)
         .map(|n| (0x2000 + n, 0, &[1_u8, 2][..]))
@@ -26,7 +27,7 @@ fn client(len: u16) -> CoeClient {
 
 #[test]
 fn lists_and_descriptions_come_through_mailboxes_of_every_size() {
-    // Of 15 data bytes an index is torn apart in every other fragment.
+    // With 15 data bytes, an index is split in every other fragment.
     for len in [16, 18, 27, 48, 49, 128, 1486] {
         let (server, mut client) = (server(len, &[]), client(len));
         let all = block_on(client.object_list(&server, ObjectList::All)).unwrap();
@@ -56,7 +57,7 @@ fn lists_and_descriptions_come_through_mailboxes_of_every_size() {
     }
 }
 
-/// What the list ends with; then the next question must be answered.
+/// Returns the error of the list. The next request must be answered.
 fn list_error(mischief: &[Mischief]) -> InfoError {
     let (server, mut client) = (server(48, mischief), client(48));
     let error = block_on(client.object_list(&server, ObjectList::All)).unwrap_err();
@@ -70,7 +71,7 @@ fn list_error(mischief: &[Mischief]) -> InfoError {
 }
 
 #[test]
-fn refusals_say_what_was_asked() {
+fn refusal_names_the_request() {
     let (server, mut client) = (server(48, &[]), client(48));
     let error = block_on(client.entry_description(&server, 0x2003, 2)).unwrap_err();
     assert_eq!(
@@ -83,7 +84,7 @@ fn refusals_say_what_was_asked() {
 }
 
 #[test]
-fn a_mailbox_without_the_service_says_so() {
+fn mailbox_without_sdo_info_refuses() {
     let error = list_error(&[Mischief::Replace(1, vec![4, 0, 0, 0, 0, 0x10, 1, 0, 4, 0])]);
     assert_eq!(
         error.to_string(),
@@ -101,21 +102,21 @@ fn a_mailbox_without_the_service_says_so() {
 }
 
 #[test]
-fn a_missing_fragment_is_no_shorter_list() {
-    // 882 bytes in 25 fragments of 36; each time another is missing.
+fn missing_fragment_fails_the_list() {
+    // 882 bytes in 25 fragments of 36; each time another fragment is missing.
     let skips = |first: u32| [0, 1, 2].map(|n| Mischief::Skip(first + 25 * n));
     let error = list_error(&[Mischief::Skip(3), Mischief::Skip(29), Mischief::Skip(62)]);
     assert!(
         error.to_string().contains("fragments to come where"),
         "{error}"
     );
-    // Of the last one nothing tells but time.
+    // Only a timeout reveals that the last fragment is missing.
     let error = list_error(&skips(25));
     assert_eq!(
         error,
         InfoError::Timeout {
             station: STATION,
-            asked: Asked::List(ObjectList::All),
+            asked: InfoRequest::List(ObjectList::All),
             phase: Phase::Answer,
             after: std::time::Duration::from_millis(500),
         }
@@ -143,7 +144,7 @@ fn fragments_that_are_lost_are_repeated() {
 }
 
 #[test]
-fn fragments_that_contradict_themselves() {
+fn inconsistent_fragments_are_malformed() {
     let fragment = |left: u8, data: &[u8]| {
         let mut message = vec![
             6 + data.len() as u8,
@@ -163,7 +164,8 @@ fn fragments_that_contradict_themselves() {
         message
     };
     for (mischief, part) in [
-        // The second again, the count not counting, one without data, an error without a code.
+        // The second fragment again, a wrong count, a fragment without data, an error without a
+        // code.
         (Mischief::Replace(2, fragment(24, &[1; 36])), "24 fragments"),
         (Mischief::Replace(2, fragment(23, &[])), "without data"),
         (
@@ -182,7 +184,7 @@ fn fragments_that_contradict_themselves() {
 }
 
 #[test]
-fn an_answer_to_another_question_is_set_aside() {
+fn answer_to_another_request_is_set_aside() {
     let other = [8, 0, 0, 0, 0, 0x13, 0, 0x80, 2, 0, 0, 0, 2, 0];
     let server = server(48, &[Mischief::Before(1, other.to_vec())]);
     let mut client = client(48);
@@ -192,7 +194,7 @@ fn an_answer_to_another_question_is_set_aside() {
 }
 
 #[test]
-fn silence_and_absence_end_in_time() {
+fn silent_and_missing_devices_end_in_time() {
     for (mischief, phase) in [
         (Mischief::Mute, Phase::Answer),
         (Mischief::Deaf, Phase::Answer),

@@ -1,4 +1,4 @@
-//! The clients against a small SDO and file server that shares no code with them.
+//! Tests of the clients against a small SDO and file server that shares no code with them.
 
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
@@ -6,14 +6,14 @@ use std::time::Duration;
 
 use super::{CoeClient, MailboxLayout, Timeouts};
 
-mod beside;
 mod describe;
+mod during_operation;
 mod errors;
+pub(crate) mod fault_injection;
 mod files;
 mod foe;
 mod hostile;
 mod info;
-pub(crate) mod mischief;
 mod recorded;
 pub(crate) mod server;
 mod transfers;
@@ -40,7 +40,7 @@ pub(crate) fn client() -> CoeClient {
     })
 }
 
-/// Nothing in these tests waits for anything but virtual time, so a future is ready at once.
+/// The tests wait only for virtual time, so a future is ready at once.
 pub(crate) fn block_on<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     match future

@@ -1,9 +1,10 @@
-//! What real devices and another MainDevice said: an EK1914 and an EL3004 to ethercrab, a LAN9252 to SOEM.
+//! Recorded messages of real devices and MainDevices: an EK1914 and an EL3004 with ethercrab, a
+//! LAN9252 with SOEM.
 
 use crate::mailbox::coe::{Answer, Message, Request, parse};
-use crate::mailbox::port::Emit;
+use crate::mailbox::transport::Encode;
 
-/// Mailbox header and CoE message as recorded, without the padding that fills the mailbox.
+/// The mailbox header and CoE message, without the padding of the mailbox.
 fn emitted(request: &Request<'_>, counter: u8) -> Vec<u8> {
     let mut out = vec![0xa5; 7];
     request.emit(counter, 128, &mut out);
@@ -20,7 +21,7 @@ fn bytes(hex: &str) -> Vec<u8> {
 }
 
 #[test]
-fn requests_are_those_of_other_main_devices() {
+fn requests_match_recordings_of_other_main_devices() {
     let up = |index, sub, complete| Request::Upload {
         index,
         sub,
@@ -60,7 +61,7 @@ fn requests_are_those_of_other_main_devices() {
 }
 
 #[test]
-fn answers_of_real_devices_are_understood() {
+fn answers_of_real_devices_are_parsed() {
     let up = |index, sub, size, data| Answer::Upload {
         index,
         sub,

@@ -1,4 +1,5 @@
-//! A SubDevice with two mailboxes and an object dictionary, written from ETG.1000.4 and .6 without a glance at the client.
+//! A SubDevice with two mailboxes and an object dictionary, written from ETG.1000.4 and ETG.1000.6
+//! independently of the client.
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -6,9 +7,9 @@ use std::time::Duration;
 
 use super::STATION;
 use super::describe;
+use super::fault_injection::Mischief;
 use super::files::Files;
-use super::mischief::Mischief;
-use crate::mailbox::{Wire, WireError};
+use crate::mailbox::{DatagramError, MailboxTransport};
 
 #[derive(Debug)]
 enum Segmented {
@@ -54,7 +55,7 @@ pub struct Server {
     inner: RefCell<Inner>,
     now: Cell<u64>,
     pub datagrams: Cell<u64>,
-    /// How long a request lies in the mailbox.
+    /// How long a request stays in the mailbox.
     pub thinking: Cell<u64>,
     len: usize,
 }
@@ -107,12 +108,12 @@ impl Server {
             .insert((index, sub), value.to_vec());
     }
 
-    /// The requests that were worked on, duplicates left out.
+    /// Returns the processed requests without duplicates.
     pub fn log(&self) -> Vec<Vec<u8>> {
         self.inner.borrow().log.clone()
     }
 
-    /// Its files, and how they are handed out.
+    /// Gives access to the file server.
     pub fn files<T>(&self, with: impl FnOnce(&mut Files) -> T) -> T {
         with(&mut self.inner.borrow_mut().files)
     }
@@ -132,13 +133,13 @@ impl Server {
         self.inner.borrow_mut().mischief.push(mischief);
     }
 
-    /// Since when a message has been waiting.
+    /// Returns since when a message has been waiting.
     pub fn full_since(&self) -> Option<u64> {
         let inner = self.inner.borrow();
         inner.in_mailbox.as_ref().map(|_| inner.filled_at)
     }
 
-    /// Something that the device says unasked.
+    /// Queues a message without a request.
     pub fn say(&self, bytes: &[u8]) {
         self.inner.borrow_mut().queue.push_back(bytes.to_vec());
         self.pass(0);
@@ -470,11 +471,16 @@ fn abort(index: u16, sub: u8, code: u32) -> Vec<u8> {
     answer
 }
 
-impl Wire for Server {
-    async fn read(&self, station: u16, register: u16, buf: &mut [u8]) -> Result<u16, WireError> {
+impl MailboxTransport for Server {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
         self.datagrams.set(self.datagrams.get() + 1);
         self.pass(FRAME_TIME);
-        let lost = Err(WireError::Timeout { station, register });
+        let lost = Err(DatagramError::Timeout { station, register });
         let mut inner = self.inner.borrow_mut();
         if inner.is(&Mischief::Off) || station != STATION {
             return Ok(0);
@@ -508,10 +514,10 @@ impl Wire for Server {
         Ok(1)
     }
 
-    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, WireError> {
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
         self.datagrams.set(self.datagrams.get() + 1);
         self.pass(FRAME_TIME);
-        let lost = Err(WireError::Timeout { station, register });
+        let lost = Err(DatagramError::Timeout { station, register });
         let mut inner = self.inner.borrow_mut();
         if inner.is(&Mischief::Off) || station != STATION {
             return Ok(0);

@@ -1,6 +1,6 @@
 //! Transfers that succeed.
 
-use super::mischief::{Mischief, emergency};
+use super::fault_injection::{Mischief, emergency};
 use super::server::Server;
 use super::{block_on, client, layout};
 use crate::mailbox::CoeClient;
@@ -18,7 +18,7 @@ const IDENTITY: &[(u16, u8, &[u8])] = &[
 ];
 
 #[test]
-fn every_length_arrives_both_ways_through_mailboxes_of_every_size() {
+fn every_length_round_trips_through_mailboxes_of_every_size() {
     for mailbox in [16u16, 17, 24, 48, 128, 512] {
         for len in (0..=70).chain([111, 112, 113, 400, 1000]) {
             let data = bytes(len);
@@ -42,7 +42,7 @@ fn every_length_arrives_both_ways_through_mailboxes_of_every_size() {
 }
 
 #[test]
-fn an_expedited_download_looks_as_the_standard_says() {
+fn expedited_download_matches_the_standard() {
     let server = Server::new(48, &[(0x6060, 0, &[0])], &[]);
     block_on(client().download(&server, 0x6060, 0, false, &[8])).unwrap();
     // ETG.1000.6 "SDO download expedited": CoE service 2, command 0x2f for one byte.
@@ -84,7 +84,7 @@ fn the_mailbox_counter_goes_from_1_to_7_and_never_repeats() {
     let server = Server::new(48, &[(0x6041, 0, &[0x37, 0x02])], &[]);
     let mut client = client();
     for _ in 0..20 {
-        // A counter used twice would be ignored as a duplicate, and this would time out.
+        // The server would drop a repeated counter as a duplicate, and this upload would time out.
         assert_eq!(
             block_on(client.upload(&server, 0x6041, 0, false)).unwrap(),
             [0x37, 0x02]
@@ -115,7 +115,7 @@ fn emergencies_in_the_middle_are_kept_in_order() {
 }
 
 #[test]
-fn of_too_many_emergencies_the_first_stay_and_the_rest_are_counted() {
+fn emergency_queue_keeps_the_first_and_counts_the_rest() {
     let server = Server::new(48, &[], &[]);
     for code in 0x1000..0x1000 + 40 {
         server.say(&emergency(code));
@@ -130,7 +130,7 @@ fn of_too_many_emergencies_the_first_stay_and_the_rest_are_counted() {
     );
 }
 
-/// A device whose mailbox handler does not go on before its emergency is fetched.
+/// A device whose mailbox handler continues only after its emergency was read.
 #[test]
 fn a_full_mailbox_does_not_block_a_request() {
     let server = Server::new(48, &[(0x6041, 0, &[1, 0])], &[Mischief::Blocked]);
@@ -144,7 +144,8 @@ fn a_full_mailbox_does_not_block_a_request() {
     assert_eq!(client.take_emergencies().count(), 2);
 }
 
-/// The request arrived, its echo did not; the device answers before, while or after it is sent again.
+/// The request arrived but its echo was lost. The device answers before, while or after it is sent
+/// again.
 #[test]
 fn the_answer_to_a_request_sent_twice_is_not_set_aside() {
     for thinking in 0..100 {
@@ -198,7 +199,7 @@ fn an_answer_of_another_object_is_set_aside() {
 }
 
 #[test]
-fn lost_frames_cost_time_and_nothing_else() {
+fn lost_frames_only_delay_transfers() {
     let data = bytes(200);
     for n in 1..=6 {
         for mischief in [
@@ -235,7 +236,7 @@ fn lost_frames_cost_time_and_nothing_else() {
     }
 }
 
-/// Some devices spend 4 bytes on short strings announced in a normal transfer, and pad.
+/// Some devices use 4 bytes for short strings announced in a normal transfer, and pad them.
 #[test]
 fn padding_after_a_normal_upload_is_cut_off() {
     let padded = [

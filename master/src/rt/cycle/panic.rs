@@ -1,7 +1,8 @@
-//! A panic in the cycle: the machine stops all the same.
+//! Stops the machine after a panic in the cycle.
 //!
-//! After the first one the cycle goes on, and stops the machine as for any other cause. After a second one nothing of the
-//! axes is relied on any more: their drives get "quick stop" by plain frames, and "disable voltage" once they stand.
+//! After the first panic the cycle continues and stops the machine as for any other cause. After a
+//! second panic the axis state is no longer trusted. The drives then receive "quick stop" in plain
+//! frames, and "disable voltage" once they stand still.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -9,38 +10,38 @@ use ecaxis_axis::{Controlword, State, Statusword};
 
 use super::{Engine, Nanos};
 use crate::clock;
-use crate::rt::guard::StopCause;
-use crate::rt::handover::Order;
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::RtCommand;
 
-/// An axis whose position has not changed for so long stands.
+/// An axis stands still if its position has not changed for this time.
 const STANDING: Nanos = 100_000_000;
-/// Changes of a position that are noise, counts.
+/// Position changes up to this many counts are noise.
 const NOISE: u64 = 2;
-/// Added to the time that the slowest axis takes to rest.
+/// Added to the stopping time of the slowest axis.
 const MARGIN_S: f64 = 2.0;
 
-/// How far the axes have come after a second panic.
+/// The progress of the stop after a second panic.
 #[derive(Debug, Default)]
 pub(super) struct Plain {
     since: Option<Nanos>,
-    /// Of each axis, where it was last, and since when.
+    /// For each axis, the last position and the time since which it is unchanged.
     rest: Vec<(i64, Nanos)>,
-    /// From full speed to rest.
+    /// The longest time from full speed to rest.
     slowest_s: f64,
-    /// Panics since.
+    /// The number of panics.
     panics: u32,
 }
 
-/// A link that panics so often carries nothing any more.
+/// After this many panics the link is considered unusable.
 const MOST_PANICS: u32 = 100;
 
 impl Plain {
     #[allow(
         clippy::disallowed_macros,
         clippy::disallowed_methods,
-        reason = "prepares"
+        reason = "runs before the loop"
     )]
-    pub(super) fn new(axes: &[super::AxisSlot]) -> Self {
+    pub(super) fn new(axes: &[super::RtAxis]) -> Self {
         let times = axes.iter().map(|slot| {
             let config = slot.axis.config();
             config.stop_time_s(config.mode, config.limits.velocity)
@@ -55,7 +56,8 @@ impl Plain {
 }
 
 impl Engine {
-    /// One cycle. RT: blocks on the clock and the wire only; O(image + axes). A panic in it stops the machine.
+    /// Runs one cycle. RT: blocks on the clock and the wire only; O(image + axes). A panic inside
+    /// stops the machine.
     pub fn cycle(&mut self) {
         let due = self.next;
         if self.plain.since.is_some() {
@@ -76,7 +78,7 @@ impl Engine {
                 engine.stop(None, StopCause::Panicked);
                 if engine.next == due {
                     engine.exchange.stage();
-                    engine.plan_next(0);
+                    engine.schedule_next_cycle(0);
                 }
             });
         if failed {
@@ -85,7 +87,7 @@ impl Engine {
         }
     }
 
-    /// `true`: it panicked.
+    /// Returns true if `work` panicked.
     fn catch(&mut self, work: impl FnOnce(&mut Self)) -> bool {
         let panicked = catch_unwind(AssertUnwindSafe(|| work(self))).is_err();
         self.plain.panics += u32::from(panicked);
@@ -97,7 +99,7 @@ impl Engine {
         let woke = clock::now();
         self.catch(|engine| engine.send(0));
         self.catch(|engine| engine.receive(woke));
-        self.catch(|engine| engine.answer = engine.exchange.answer());
+        self.catch(|engine| engine.answer = engine.exchange.evaluate());
         let mut ended = true;
         self.catch(|engine| ended = engine.write_plain_words(woke));
         ended |= self.plain.panics > MOST_PANICS;
@@ -106,7 +108,7 @@ impl Engine {
         self.catch(|engine| {
             while let Ok(order) = engine.end.orders.pop() {
                 engine.orders_taken += 1;
-                engine.halted |= order == Order::Halt;
+                engine.halted |= order == RtCommand::Halt;
             }
             engine.halted |= engine.end.orders.is_abandoned() && ended;
         });
@@ -117,7 +119,7 @@ impl Engine {
         }
     }
 
-    /// `true`: nothing more can be done.
+    /// Writes the Controlwords. Returns true if nothing more can be done.
     fn write_plain_words(&mut self, now: Nanos) -> bool {
         let since = self.plain.since.unwrap_or(now);
         let most_ns = ((self.plain.slowest_s + MARGIN_S) * 1e9) as Nanos;
@@ -142,7 +144,7 @@ impl Engine {
             let outputs = self.exchange.outputs_mut();
             slot.bits.controlword.set(outputs, i64::from(word.bits()));
         }
-        // One more second for the drives to take the word.
+        // One more second for the drives to receive the Controlword.
         ended || now.saturating_sub(since) > most_ns + 1_000_000_000
     }
 

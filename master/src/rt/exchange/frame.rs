@@ -1,6 +1,6 @@
-//! The bytes of the cycle's frames: Ethernet header, datagrams one behind the other.
+//! The bytes of the cycle's frames: Ethernet header, then the datagrams.
 
-use crate::link::port::ETHERCAT;
+use crate::link::pdu_loop::ETHERCAT;
 
 pub(super) const MAC_TAIL: u8 = 0x20;
 const ETHERNET_HEADER: usize = 14;
@@ -8,16 +8,16 @@ pub(super) const FIRST_DATAGRAM: usize = 16;
 pub(super) const DATAGRAM_HEADER: usize = 10;
 pub(super) const WKC: usize = 2;
 
-/// Where a datagram lies in its frame.
+/// The position of a datagram in its frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct DatagramSlot {
     pub frame: usize,
     /// Offset of the datagram's header.
     pub offset: usize,
     pub len: usize,
 }
 
-impl Place {
+impl DatagramSlot {
     pub fn data(self) -> std::ops::Range<usize> {
         let start = self.offset + DATAGRAM_HEADER;
         start..start + self.len
@@ -38,9 +38,9 @@ impl Place {
 
 #[derive(Debug)]
 pub(super) struct Frame {
-    /// As it will be sent.
+    /// The frame as it will be sent.
     pub bytes: Vec<u8>,
-    /// As it came back, if it is answered; as long as it was sent.
+    /// The frame as it came back, if `answered`. It is as long as the sent frame.
     pub answer: Box<[u8]>,
     pub answered: bool,
 }
@@ -48,7 +48,7 @@ pub(super) struct Frame {
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
-    reason = "prepares"
+    reason = "runs before the loop"
 )]
 pub(super) fn new_frames(count: usize) -> Vec<Frame> {
     (0..count).map(|_| new_frame()).collect()
@@ -57,7 +57,7 @@ pub(super) fn new_frames(count: usize) -> Vec<Frame> {
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
-    reason = "prepares"
+    reason = "runs before the loop"
 )]
 fn new_frame() -> Frame {
     let mut bytes = Vec::with_capacity(crate::link::MAX_FRAME);
@@ -79,8 +79,8 @@ pub(super) fn push(
     command: u8,
     address: u32,
     len: usize,
-) -> Place {
-    let place = Place {
+) -> DatagramSlot {
+    let place = DatagramSlot {
         frame: number,
         offset: frame.bytes.len(),
         len,
@@ -98,30 +98,31 @@ pub(super) fn write_header(frame: &mut [u8], offset: usize, command: u8, address
     }
 }
 
-pub(super) fn clear_wkc(frame: &mut [u8], place: Place) {
+pub(super) fn clear_wkc(frame: &mut [u8], place: DatagramSlot) {
     if let Some(wkc) = frame.get_mut(place.data().end..place.end()) {
         wkc.fill(0);
     }
 }
 
-/// Bits of a tag that hold the number of one of `count` frames.
+/// Returns the number of tag bits that hold the frame number of `count` frames.
 fn number_bits(count: usize) -> u32 {
     count.next_power_of_two().trailing_zeros().min(8)
 }
 
-/// The byte of the source address that tells the frames of a cycle apart: number of the frame, and above it the bits of the
-/// cycle's number that follow the lowest eight.
+/// Returns the byte of the source address that distinguishes the frames of a cycle. It holds the
+/// frame number. Above it are the bits of the cycle number that follow the lowest eight.
 pub(super) fn frame_tag(number: usize, count: usize, cycle: u32) -> u8 {
     let bits = number_bits(count);
     (number as u32 | (cycle >> 8) << bits) as u8
 }
 
-/// The number of the frame in a tag.
+/// Returns the frame number in a tag.
 pub(super) fn frame_number(tag: u8, count: usize) -> usize {
     usize::from(tag) & ((1 << number_bits(count)) - 1)
 }
 
-/// Writes the tag, the EtherCAT header, the cycle's index and the "more follows" flags of all datagrams.
+/// Writes the tag, the EtherCAT header, the cycle's index and the "more follows" flags of all
+/// datagrams.
 pub(super) fn number(frame: &mut [u8], tag: u8, cycle: u32) {
     frame[10] = tag;
     let [low, high] = u16::try_from(frame.len() - FIRST_DATAGRAM)
@@ -139,8 +140,8 @@ pub(super) fn number(frame: &mut [u8], tag: u8, cycle: u32) {
     }
 }
 
-/// Whether an answer has, in this place, the datagram that was sent there, whatever the cycle.
-pub(super) fn same_datagram(sent: &[u8], answer: &[u8], place: Place) -> bool {
+/// True if an answer contains the datagram that was sent in this position, regardless of the cycle.
+pub(super) fn same_datagram(sent: &[u8], answer: &[u8], place: DatagramSlot) -> bool {
     let header = |frame: &[u8]| {
         let header = frame.get(place.offset..place.offset + 8)?;
         let mut header: [u8; 8] = header.try_into().ok()?;
@@ -150,8 +151,8 @@ pub(super) fn same_datagram(sent: &[u8], answer: &[u8], place: Place) -> bool {
     answer.len() >= place.end() && header(sent).is_some() && header(sent) == header(answer)
 }
 
-/// Whether an answer has our datagrams in our places. SubDevices change addresses (APRD, BRD),
-/// data, working counters and the circulating bit, nothing else.
+/// True if an answer contains all sent datagrams in their positions. SubDevices change only
+/// addresses (APRD, BRD), data, working counters and the circulating bit.
 pub(super) fn same_headers(sent: &[u8], answer: &[u8]) -> bool {
     if answer.len() < sent.len() {
         return false;

@@ -1,27 +1,27 @@
-//! Where each SubDevice's process data lies: logical addresses, datagrams and frames ([`plan`]); the bits of objects.
+//! The process image: logical addresses, datagrams and frames ([`mod@plan`]), and the bits of objects.
 
 use ecaxis_esi::address;
 use ecaxis_esi::layout::{Field, Layout};
 
-use crate::config::Kind;
+use crate::config::NumericFormat;
 
 pub mod plan;
 
 pub use plan::{
-    Access, DatagramPlan, ImagePlan, MailboxPlan, ProcessData, Region, TooLarge, of, plan,
+    Access, DatagramPlan, DeviceRegion, ImagePlan, MailboxPlan, ProcessData, TooLarge, of, plan,
     process_data,
 };
 
-/// Bits of one object in the image.
+/// The bits of one object in the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Bits {
+pub struct BitField {
     byte: usize,
     shift: u8,
     len: u8,
 }
 
-impl Bits {
-    /// `None` where the field is longer than 64 bits or lies outside the region.
+impl BitField {
+    /// Returns `None` if the field is longer than 64 bits or lies outside the region.
     #[must_use]
     pub fn new(field: &Field, offset: usize, region_len: usize) -> Option<Self> {
         let bit = usize::try_from(field.bit_offset).ok()?;
@@ -36,10 +36,10 @@ impl Bits {
         })
     }
 
-    /// The bits as a sign-extended number. RT.
+    /// Returns the bits as a sign-extended number. RT.
     #[must_use]
     pub fn get(self, image: &[u8]) -> i64 {
-        // Whole objects of the usual lengths; the rest in general.
+        // Fast path for whole objects of common lengths.
         let at = image.get(self.byte..).unwrap_or_default();
         match (self.shift, self.len) {
             (0, 8) => return at.first_chunk().map_or(0, |b| i8::from_le_bytes(*b).into()),
@@ -65,7 +65,7 @@ impl Bits {
         ((value << unused) as i64) >> unused
     }
 
-    /// Replaces the bits, leaving their neighbours. RT.
+    /// Replaces the bits and leaves their neighbours unchanged. RT.
     pub fn set(self, image: &mut [u8], value: i64) {
         if self.shift == 0 && matches!(self.len, 8 | 16 | 32) {
             let len = usize::from(self.len / 8);
@@ -90,31 +90,33 @@ impl Bits {
     }
 }
 
-/// Bits that are a number for the program.
+/// Bits that the program reads or sets as a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SignalBits {
-    pub bits: Bits,
-    pub kind: Kind,
+    pub bits: BitField,
+    pub kind: NumericFormat,
 }
 
 impl SignalBits {
-    /// RT.
+    /// Returns the value. RT.
     #[must_use]
     pub fn get(self, image: &[u8]) -> f64 {
         let raw = self.bits.get(image);
         match self.kind {
-            Kind::Signed => raw as f64,
-            Kind::Unsigned => (raw as u64 & (u64::MAX >> (64 - u32::from(self.bits.len)))) as f64,
-            Kind::Real => f64::from(f32::from_bits(raw as u32)),
+            NumericFormat::Signed => raw as f64,
+            NumericFormat::Unsigned => {
+                (raw as u64 & (u64::MAX >> (64 - u32::from(self.bits.len)))) as f64
+            }
+            NumericFormat::Real => f64::from(f32::from_bits(raw as u32)),
         }
     }
 
-    /// What does not fit is cut down to the nearest value that does. RT.
+    /// Sets the value, clamped to the range of the bits. RT.
     pub fn set(self, image: &mut [u8], value: f64) {
         let raw = match self.kind {
-            Kind::Signed => value as i64,
-            Kind::Unsigned => value as u64 as i64,
-            Kind::Real => i64::from((value as f32).to_bits()),
+            NumericFormat::Signed => value as i64,
+            NumericFormat::Unsigned => value as u64 as i64,
+            NumericFormat::Real => i64::from((value as f32).to_bits()),
         };
         self.bits.set(image, raw);
     }
@@ -123,28 +125,28 @@ impl SignalBits {
 /// The objects of a cyclic synchronous axis in the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AxisBits {
-    pub controlword: Bits,
-    pub statusword: Bits,
-    pub mode: Option<Bits>,
-    pub mode_display: Option<Bits>,
-    pub target_position: Option<Bits>,
-    pub target_velocity: Option<Bits>,
-    pub target_torque: Option<Bits>,
-    pub velocity_offset: Option<Bits>,
-    pub torque_offset: Option<Bits>,
-    pub error_code: Option<Bits>,
-    pub profile_velocity: Option<Bits>,
-    pub profile_acceleration: Option<Bits>,
-    pub profile_deceleration: Option<Bits>,
-    pub touch_probe_function: Option<Bits>,
-    pub touch_probe_status: Option<Bits>,
-    pub touch_probe_positions: [Option<Bits>; 4],
-    pub position: Option<Bits>,
-    pub velocity: Option<Bits>,
-    pub torque: Option<Bits>,
+    pub controlword: BitField,
+    pub statusword: BitField,
+    pub mode: Option<BitField>,
+    pub mode_display: Option<BitField>,
+    pub target_position: Option<BitField>,
+    pub target_velocity: Option<BitField>,
+    pub target_torque: Option<BitField>,
+    pub velocity_offset: Option<BitField>,
+    pub torque_offset: Option<BitField>,
+    pub error_code: Option<BitField>,
+    pub profile_velocity: Option<BitField>,
+    pub profile_acceleration: Option<BitField>,
+    pub profile_deceleration: Option<BitField>,
+    pub touch_probe_function: Option<BitField>,
+    pub touch_probe_status: Option<BitField>,
+    pub touch_probe_positions: [Option<BitField>; 4],
+    pub position: Option<BitField>,
+    pub velocity: Option<BitField>,
+    pub torque: Option<BitField>,
 }
 
-/// An object without which an axis cannot be run is not in the process data.
+/// An object that an axis requires is not in the process data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("object {} is not in the process data", address(*index, *sub))]
 pub struct NotMapped {
@@ -153,16 +155,16 @@ pub struct NotMapped {
 }
 
 impl AxisBits {
-    pub fn new(layout: &Layout, region: &Region) -> Result<Self, NotMapped> {
+    pub fn new(layout: &Layout, region: &DeviceRegion) -> Result<Self, NotMapped> {
         let out = |index| {
             layout
                 .rx_field(index, 0)
-                .and_then(|f| Bits::new(f, region.offset, region.out_len))
+                .and_then(|f| BitField::new(f, region.offset, region.out_len))
         };
         let inp = |index| {
             layout
                 .tx_field(index, 0)
-                .and_then(|f| Bits::new(f, region.offset, region.in_len))
+                .and_then(|f| BitField::new(f, region.offset, region.in_len))
         };
         Ok(Self {
             controlword: out(0x6040).ok_or(NotMapped {
@@ -200,8 +202,8 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn signals_are_numbers_of_their_kind() {
-        let bits = Bits {
+    fn signals_convert_to_their_numeric_format() {
+        let bits = BitField {
             byte: 1,
             shift: 3,
             len: 1,
@@ -209,33 +211,33 @@ mod tests {
         let mut image = [0_u8; 8];
         let flag = SignalBits {
             bits,
-            kind: Kind::Unsigned,
+            kind: NumericFormat::Unsigned,
         };
         flag.set(&mut image, 1.0);
         assert_eq!((image[1], flag.get(&image)), (0x08, 1.0));
-        let bits = Bits {
+        let bits = BitField {
             byte: 2,
             shift: 0,
             len: 16,
         };
         for (kind, value, raw) in [
-            (Kind::Signed, -2.0, 0xfffe_u16),
-            (Kind::Unsigned, 65_534.0, 0xfffe),
-            (Kind::Unsigned, -5.0, 0),
-            (Kind::Signed, f64::NAN, 0),
+            (NumericFormat::Signed, -2.0, 0xfffe_u16),
+            (NumericFormat::Unsigned, 65_534.0, 0xfffe),
+            (NumericFormat::Unsigned, -5.0, 0),
+            (NumericFormat::Signed, f64::NAN, 0),
         ] {
             let signal = SignalBits { bits, kind };
             signal.set(&mut image, value);
             assert_eq!(image[2..4], raw.to_le_bytes(), "{kind:?} {value}");
         }
-        let bits = Bits {
+        let bits = BitField {
             byte: 4,
             shift: 0,
             len: 32,
         };
         let real = SignalBits {
             bits,
-            kind: Kind::Real,
+            kind: NumericFormat::Real,
         };
         real.set(&mut image, -0.5);
         assert_eq!(
@@ -246,20 +248,20 @@ mod tests {
 
     proptest! {
         #[test]
-        fn bits_come_back_and_neighbours_stay(
+        fn bit_field_round_trips_and_keeps_neighbours(
             byte in 0_usize..8, shift in 0_u8..8, len in 1_u8..=64, value: i64, fill: u8,
         ) {
-            let bits = Bits { byte, shift, len };
+            let bits = BitField { byte, shift, len };
             let mut image = [fill; 24];
             bits.set(&mut image, value);
             let unused = 64 - u32::from(len);
             prop_assert_eq!(bits.get(&image), (value << unused) >> unused);
-            let before = Bits { byte: 0, shift: 0, len: 8 };
+            let before = BitField { byte: 0, shift: 0, len: 8 };
             if byte > 0 {
                 prop_assert_eq!(before.get(&image) as u8, fill);
             }
             let mut again = image;
-            bits.set(&mut again, Bits { byte, shift, len }.get(&[fill; 24]));
+            bits.set(&mut again, BitField { byte, shift, len }.get(&[fill; 24]));
             prop_assert_eq!(again, [fill; 24]);
         }
     }

@@ -1,37 +1,37 @@
-//! The layout of the process image: which SubDevice at which logical address, in which datagram of which frame.
+//! The layout of the process image: the logical address, datagram and frame of each SubDevice.
 
 use crate::config::Machine;
 
 /// First logical address of the process image.
 pub const LOGICAL_BASE: u32 = 0x0001_0000;
 
-/// Room for process data in the first frame of a cycle, beside the clock, AL status and diagnostic
-/// datagrams: 1514 − 16 (headers) − 20 − 14 − 20.
+/// Bytes for process data in the first frame of a cycle: 1514 − 16 (headers) − 20 − 14 − 20. The
+/// last three are the clock, AL status and diagnostic datagrams.
 const FIRST_FRAME: usize = 1444;
-/// Room for process data in every further frame.
+/// Bytes for process data in every further frame.
 const NEXT_FRAME: usize = 1498;
-/// Header and working counter.
+/// Bytes of a datagram's header and working counter.
 const DATAGRAM: usize = 12;
 
-/// What one SubDevice has to exchange.
+/// The process data of one SubDevice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ProcessData {
     pub out_len: usize,
     pub in_len: usize,
-    /// The group whose working counters its own are among.
+    /// The group to whose working counters it contributes.
     pub group: usize,
-    /// It processes LRW; otherwise it is reached by LWR and LRD of its own.
+    /// True if it supports LRW; otherwise it is accessed by its own LWR and LRD.
     pub lrw: bool,
-    /// It has an FMMU for the status of its mailbox.
+    /// True if it has an FMMU for the status of its mailbox.
     pub mailbox: bool,
 }
 
-/// The place of one SubDevice's outputs and inputs. Both start at the same logical address, so one
-/// byte of an LRW carries an output out and an input back.
+/// The position of one SubDevice's outputs and inputs. Both start at the same logical address, so
+/// one byte of an LRW carries an output out and an input back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Region {
+pub struct DeviceRegion {
     pub logical: u32,
-    /// Frame of the cycle that carries it; where LWR and LRD do, the first of them.
+    /// The frame of the cycle that carries it; with LWR and LRD, the first of them.
     pub frame: usize,
     /// Offset in the image.
     pub offset: usize,
@@ -39,7 +39,7 @@ pub struct Region {
     pub in_len: usize,
 }
 
-/// How a datagram reaches the image.
+/// The command by which a datagram accesses the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
     /// LRW: outputs out, inputs back.
@@ -53,37 +53,39 @@ pub enum Access {
 /// One datagram of process data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DatagramPlan {
-    /// Frame of the cycle that carries it.
+    /// The frame of the cycle that carries it.
     pub frame: usize,
-    /// The group whose SubDevices it reaches, and no others.
+    /// The group whose SubDevices it addresses, and no others.
     pub group: usize,
     pub access: Access,
     pub logical: u32,
     /// Offset of its data in the image.
     pub offset: usize,
     pub len: usize,
-    /// Sum over its SubDevices: in an LRW, 1 for inputs and 2 for outputs; else 1 (ETG.1000.4).
+    /// Sum over its SubDevices. In an LRW, inputs count 1 and outputs 2; otherwise each counts 1
+    /// (ETG.1000.4).
     pub expected_wkc: u16,
 }
 
-/// Where the status of mailboxes is mapped to: a byte each, the SyncManager's status register. It lies beside the process data,
-/// because a status that is always there would hide inputs that are missing from the working counter.
+/// The mapping of mailbox status: one byte each, the SyncManager's status register. It lies outside
+/// the process data. There, a status that is always present would hide missing inputs from the
+/// working counter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MailboxPlan {
     pub logical: u32,
-    /// The devices whose bytes follow each other, by index.
+    /// The device indices, in the order of their bytes.
     pub devices: Vec<usize>,
 }
 
 impl MailboxPlan {
-    /// The logical address of a device's status.
+    /// Returns the logical address of a device's status.
     #[must_use]
     pub fn logical_of(&self, device: usize) -> Option<u32> {
         let place = self.devices.iter().position(|&other| other == device)?;
         Some(self.address(place))
     }
 
-    /// The logical address of the status in this place.
+    /// Returns the logical address of the status at `place`.
     #[must_use]
     pub fn address(&self, place: usize) -> u32 {
         let place = u32::try_from(place).unwrap_or(u32::MAX);
@@ -94,20 +96,20 @@ impl MailboxPlan {
 /// The whole image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ImagePlan {
-    /// In the order of the devices given; `None` where a device has no process data.
-    pub regions: Vec<Option<Region>>,
+    /// In the order of the given devices; `None` if a device has no process data.
+    pub regions: Vec<Option<DeviceRegion>>,
     /// The group of each device.
     pub groups: Vec<usize>,
     pub datagrams: Vec<DatagramPlan>,
-    /// The same image with datagrams of its own for each device, so that each has a working counter of its own. Empty where
-    /// the cycle has no time for their frames.
+    /// The same image with separate datagrams for each device, so that each has its own working
+    /// counter. Empty if the cycle is too short for their frames.
     pub separate: Vec<DatagramPlan>,
-    /// `None` where no device has an FMMU for it.
+    /// `None` if no device has an FMMU for it.
     pub mailboxes: Option<MailboxPlan>,
     pub len: usize,
 }
 
-/// A device whose process data does not fit into one frame.
+/// The process data of a device does not fit into one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{len} bytes of process data do not fit into one frame of {}", NEXT_FRAME - DATAGRAM)]
 pub struct TooLarge {
@@ -117,22 +119,23 @@ pub struct TooLarge {
 }
 
 impl ImagePlan {
-    /// Frames of a cycle; the first is sent whatever it carries.
+    /// Returns the number of frames per cycle; the first is always sent, even without process data.
     #[must_use]
     pub fn frames(&self) -> usize {
         frames(&self.datagrams)
     }
 }
 
-/// Frames that carry these datagrams; the first is sent whatever it carries.
+/// Returns the number of frames for these datagrams; the first is always sent, even without process
+/// data.
 #[must_use]
 pub fn frames(datagrams: &[DatagramPlan]) -> usize {
     datagrams.last().map_or(0, |last| last.frame) + 1
 }
 
-/// Nanoseconds that the frames of a cycle are on the wire: 100 Mbit/s, about a microsecond in each device.
+/// Returns the time of a cycle's frames on the wire in ns: 100 Mbit/s, and about 1 µs per device.
 fn wire_ns(datagrams: &[DatagramPlan], devices: usize) -> u64 {
-    // What the first frame carries besides, headers, FCS, preamble and gap.
+    // The other content of the first frame. `FRAME` is headers, FCS, preamble and gap.
     const FIRST: usize = 54;
     const FRAME: usize = 16 + 4 + 20;
     let data: usize = datagrams.iter().map(|d| d.len + DATAGRAM).sum();
@@ -140,8 +143,8 @@ fn wire_ns(datagrams: &[DatagramPlan], devices: usize) -> u64 {
     80 * bytes as u64 + 1000 * devices as u64
 }
 
-/// What the SubDevices of a machine exchange, as their ESIs say.
-#[allow(clippy::disallowed_methods, reason = "prepares")]
+/// Returns the process data of a machine's SubDevices according to their ESIs.
+#[allow(clippy::disallowed_methods, reason = "runs before the loop")]
 #[must_use]
 pub fn process_data(machine: &Machine) -> Vec<ProcessData> {
     let each = machine.devices.iter().enumerate().map(|(index, device)| {
@@ -157,7 +160,7 @@ pub fn process_data(machine: &Machine) -> Vec<ProcessData> {
     each.collect()
 }
 
-/// The image of a machine, as far as its ESIs know.
+/// Returns the image of a machine according to its ESIs.
 pub fn of(machine: &Machine) -> Result<ImagePlan, TooLarge> {
     let mut image = plan(&process_data(machine))?;
     if wire_ns(&image.separate, machine.devices.len()) > machine.bus.cycle_ns / 2 {
@@ -166,12 +169,12 @@ pub fn of(machine: &Machine) -> Result<ImagePlan, TooLarge> {
     Ok(image)
 }
 
-/// Lays devices out group by group, so that each group's working counters are its own. No device is split over two frames, and where
-/// it lies does not depend on how it is reached.
+/// Lays devices out group by group, so that each group has its own working counters. No device is
+/// split over two frames. The position of a device does not depend on its access commands.
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
-    reason = "prepares"
+    reason = "runs before the loop"
 )]
 pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
     let separate = lay_out(devices, false)?.datagrams;
@@ -179,11 +182,11 @@ pub fn plan(devices: &[ProcessData]) -> Result<ImagePlan, TooLarge> {
     Ok(ImagePlan { separate, ..image })
 }
 
-/// `shared`: neighbours share a datagram.
+/// If `shared`, adjacent devices share a datagram.
 #[allow(
     clippy::disallowed_methods,
     clippy::disallowed_macros,
-    reason = "prepares"
+    reason = "runs before the loop"
 )]
 fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge> {
     let mut image = ImagePlan {
@@ -193,7 +196,7 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
     };
     let mut order: Vec<(usize, &ProcessData)> = devices.iter().enumerate().collect();
     order.sort_by_key(|(_, device)| device.group);
-    let mut frames = Frames {
+    let mut frames = FramePacker {
         last: 0,
         room: FIRST_FRAME,
     };
@@ -249,7 +252,7 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
                 image.datagrams[first].frame
             }
         };
-        image.regions[index] = Some(Region {
+        image.regions[index] = Some(DeviceRegion {
             logical: datagram.logical,
             frame,
             offset: image.len,
@@ -270,13 +273,13 @@ fn lay_out(devices: &[ProcessData], shared: bool) -> Result<ImagePlan, TooLarge>
 }
 
 /// The frame that is being filled.
-struct Frames {
+struct FramePacker {
     last: usize,
     room: usize,
 }
 
-impl Frames {
-    /// Takes the room of a new datagram; its frame.
+impl FramePacker {
+    /// Reserves space for a new datagram and returns its frame.
     fn place(&mut self, len: usize) -> usize {
         if len + DATAGRAM > self.room {
             self.last += 1;
@@ -346,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn a_group_has_datagrams_of_its_own() {
+    fn group_has_separate_datagrams() {
         let sizes = [(12, 13), (0, 1), (12, 13), (0, 0), (12, 13)];
         let image = plan(&grouped(lrw(&sizes), &[1, 0, 2, 1, 1])).expect("fits");
         let datagrams: Vec<_> = image
@@ -364,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn a_device_without_lrw_is_reached_by_two_datagrams_and_lies_where_it_would() {
+    fn device_without_lrw_uses_two_datagrams_at_the_same_position() {
         let mut devices = lrw(&[(12, 13), (4, 6), (0, 2), (12, 13)]);
         let places = |devices: &[ProcessData]| {
             let image = plan(devices).expect("fits");
@@ -396,9 +399,10 @@ mod tests {
     }
 
     proptest! {
-        /// Every byte of every device in one datagram of its group each way, none over another, every frame within its room.
+        /// Every byte of every device is in one datagram of its group per direction. No datagrams
+        /// overlap, and every frame has enough space.
         #[test]
-        fn whatever_is_laid_out_fits(
+        fn plan_fits_any_devices_without_overlap(
             devices in proptest::collection::vec((0_usize..900, 0_usize..1486, 0_usize..4, any::<bool>(), any::<bool>()), 0..40),
         ) {
             let devices: Vec<ProcessData> = devices

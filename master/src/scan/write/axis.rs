@@ -1,26 +1,26 @@
-//! What a drive's answers say of its axis.
+//! The axis section of a drive, from its answers.
 
 use ecaxis_axis::scale::{AccelerationUnit, Scale, VelocityUnit};
 use ecaxis_axis::units::{RawAcceleration, RawVelocity};
 use ecaxis_esi as esi;
 
 use super::MARK;
-use super::lines::Lines;
-use crate::scan::{Described, Device, DriveAnswers};
+use super::lines::TomlWriter;
+use crate::scan::{Device, DriveInfo, EsiMatch};
 
-/// Where nobody says otherwise: 500 lines of an incremental encoder.
+/// The default encoder resolution: 500 lines with quadrature.
 const USUAL_ENCODER: f64 = 2000.0;
-/// Turns a second, and a second squared.
+/// Turns per second, and per second squared.
 const USUAL_VELOCITY: f64 = 1.0;
 const USUAL_ACCELERATION: f64 = 10.0;
-/// A drive cannot tell more counts apart.
+/// The maximum number of counts that a drive can distinguish.
 const MOST_COUNTS: f64 = 2_147_483_648.0;
-/// Percent of the rated torque that every motor stands.
+/// Percent of the rated torque, which every motor tolerates.
 const TORQUE: f64 = 100.0;
 const SILENT: &str = "the drive does not say";
 
-/// The mode to begin with: the first that the ESI offers and the drive does not deny.
-pub(super) fn mode(device: &Device, described: Option<&Described>) -> Option<esi::Mode> {
+/// Returns the initial mode: the first of the ESI that the drive does not exclude.
+pub(super) fn mode(device: &Device, described: Option<&EsiMatch>) -> Option<esi::Mode> {
     let described = described?;
     if !device.says_drive() && !described.is_drive() {
         return None;
@@ -37,14 +37,14 @@ pub(super) fn mode(device: &Device, described: Option<&Described>) -> Option<esi
     wanted.into_iter().find(possible)
 }
 
-fn drive(device: &Device) -> Option<&DriveAnswers> {
+fn drive(device: &Device) -> Option<&DriveInfo> {
     match &device.answers {
         Some(Ok(answers)) => answers.drive.as_ref(),
         _ => None,
     }
 }
 
-/// Why a value is a guess. `silent`: what it means that a drive that was asked does not say.
+/// Returns why a value is a guess. `silent`: the meaning of a missing answer.
 fn unsaid(device: &Device, silent: &'static str) -> &'static str {
     match device.answers {
         Some(Ok(_)) => silent,
@@ -53,11 +53,11 @@ fn unsaid(device: &Device, silent: &'static str) -> &'static str {
     }
 }
 
-/// `[device.axis]`, in turns of the motor.
-pub(super) fn section(device: &Device, described: &Described) -> String {
-    let unknown = DriveAnswers::default();
+/// Returns `[device.axis]` in turns of the motor.
+pub(super) fn section(device: &Device, described: &EsiMatch) -> String {
+    let unknown = DriveInfo::default();
     let drive = drive(device).unwrap_or(&unknown);
-    let mut lines = Lines::default();
+    let mut lines = TomlWriter::default();
     lines.header("[device.axis]");
     let comment = format!("{MARK} of the motor; or your own, with `per_turn`");
     lines.add("unit", "\"turn\"", &comment);
@@ -80,7 +80,7 @@ pub(super) fn section(device: &Device, described: &Described) -> String {
     lines.text()
 }
 
-fn encoder(device: &Device, drive: &DriveAnswers, lines: &mut Lines) -> f64 {
+fn encoder(device: &Device, drive: &DriveInfo, lines: &mut TomlWriter) -> f64 {
     let sensor = drive.sensor_resolution.filter(|counts| *counts > 0);
     let said = drive.units.counts_per_turn();
     let said = said.filter(|(_, counts)| (1.0..=MOST_COUNTS).contains(counts));
@@ -102,8 +102,8 @@ fn encoder(device: &Device, drive: &DriveAnswers, lines: &mut Lines) -> f64 {
     counts
 }
 
-/// As the drive counts velocities and accelerations.
-fn scale_of(drive: &DriveAnswers, scale: Scale, described: &Described) -> Scale {
+/// Returns the drive's scale of velocities and accelerations.
+fn scale_of(drive: &DriveInfo, scale: Scale, described: &EsiMatch) -> Scale {
     let default = |index: u16| {
         let item = described.device.dictionary.item(index, 0)?;
         let bytes = <[u8; 4]>::try_from(item.default.as_slice()).ok()?;
@@ -119,7 +119,7 @@ fn scale_of(drive: &DriveAnswers, scale: Scale, described: &Described) -> Scale 
         .with_acceleration_unit(acceleration.unwrap_or(velocity.into()))
 }
 
-fn limits(device: &Device, drive: &DriveAnswers, scale: Scale, lines: &mut Lines) {
+fn limits(device: &Device, drive: &DriveInfo, scale: Scale, lines: &mut TomlWriter) {
     if let Some([low, high]) = range(drive) {
         let [low, high] = [low, high].map(|n| number(scale.units_of_counts(f64::from(n))));
         let comment = format!("{MARK} the drive's own, 0x607D");
@@ -129,7 +129,7 @@ fn limits(device: &Device, drive: &DriveAnswers, scale: Scale, lines: &mut Lines
         lines.comment(&format!("limits.position = [-10.0, 10.0]  {MARK} {why}"));
     }
 
-    // The smaller of two that stand for the same.
+    // The smaller of two equivalent limits.
     let profile = drive.max_profile_velocity.filter(|n| *n > 0);
     let profile = profile.and_then(|n| i32::try_from(n).ok());
     let profile = profile.map(|n| (scale.velocity_to_user(RawVelocity(n)).0, "0x607F"));
@@ -137,7 +137,7 @@ fn limits(device: &Device, drive: &DriveAnswers, scale: Scale, lines: &mut Lines
     let motor = motor.map(|rpm| (f64::from(rpm) / 60.0, "0x6080"));
     let both = [profile, motor].into_iter().flatten();
     let slowest = both.min_by(|a, b| a.0.total_cmp(&b.0));
-    // What a drive cannot be told is no limit either.
+    // A value beyond the range of the object is not a limit.
     let most = scale.velocity_to_user(RawVelocity(i32::MAX)).0;
     let velocity = slowest.filter(|(velocity, _)| *velocity <= most);
     said_or(
@@ -190,21 +190,21 @@ fn limits(device: &Device, drive: &DriveAnswers, scale: Scale, lines: &mut Lines
     }
 }
 
-/// The drive's software limits, where they are narrower than all that it can count.
-fn range(drive: &DriveAnswers) -> Option<[i32; 2]> {
+/// Returns the drive's software limits, unless they are the full range.
+fn range(drive: &DriveInfo) -> Option<[i32; 2]> {
     let [low, high] = drive.software_limits?;
     let wide = i64::from(high) - i64::from(low);
     (low < high && low > i32::MIN && high < i32::MAX && wide < i64::from(i32::MAX))
         .then_some([low, high])
 }
 
-/// `words`: the unit, and why nothing is said.
+/// Formats a value. `words`: the unit, and the reason for a guess.
 fn said_or(
     key: &str,
     said: Option<(f64, &str)>,
     usual: f64,
     words: (&str, &str),
-    lines: &mut Lines,
+    lines: &mut TomlWriter,
 ) {
     let (unit, unsaid) = words;
     let (value, comment) = match said {
@@ -214,16 +214,16 @@ fn said_or(
     lines.add(key, &number(value), &comment);
 }
 
-/// A whole number without a point.
+/// Formats a whole number without a decimal point.
 fn plain(value: f64) -> String {
     let text = number(value);
     text.strip_suffix(".0").map_or(text.clone(), str::to_owned)
 }
 
-/// With a point, as far as it means something.
+/// Formats a number with a decimal point and significant digits only.
 fn number(value: f64) -> String {
     let rounded = (value * 1e4).round() / 1e4;
-    // Below that the digits begin to count.
+    // Rounding to zero would remove all significant digits.
     let shown = if rounded == 0.0 { value } else { rounded };
     format!("{shown:?}")
 }

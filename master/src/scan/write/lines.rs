@@ -1,21 +1,21 @@
-//! Keys, values and comments in columns.
+//! Formats keys, values and comments in columns.
 
-/// Column at which comments begin where the value leaves room.
+/// The column of comments if the value leaves room.
 const COMMENTS: usize = 36;
 
 #[derive(Debug, Default)]
-pub(super) struct Lines {
+pub(super) struct TomlWriter {
     header: Option<&'static str>,
-    /// Key, value, comment; without a key a comment alone.
+    /// Key, value, comment; without a key, only a comment.
     lines: Vec<(String, String, String)>,
 }
 
-impl Lines {
+impl TomlWriter {
     pub fn header(&mut self, header: &'static str) {
         self.header = Some(header);
     }
 
-    /// `comment` may be empty.
+    /// Adds a line. `comment` may be empty.
     pub fn add(&mut self, key: &str, value: &str, comment: &str) {
         self.lines
             .push((key.to_owned(), value.to_owned(), one_line(comment)));
@@ -46,7 +46,7 @@ impl Lines {
     }
 }
 
-/// Names come from ESI files and EEPROMs.
+/// Removes control characters: names come from ESI files and EEPROMs.
 fn one_line(comment: &str) -> String {
     let plain = |c: char| if c.is_control() { ' ' } else { c };
     comment.chars().map(plain).collect()

@@ -1,46 +1,47 @@
-//! The machine file that follows from a scan. Pure: a scan and descriptions in, text out.
+//! Generates a machine file from a scan. Pure: the input is a scan with ESI descriptions, the
+//! output is text.
 //!
-//! `axis` is what a drive's answers say of its axis; `lines` lays keys and comments out.
+//! `axis` writes a drive's axis; `lines` formats keys and comments.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use ecaxis_esi as esi;
 
-use super::{Described, Device, Scan};
+use super::{Device, EsiMatch, Scan};
 use crate::config::duration;
-use crate::library::Match;
+use crate::esi_library::RevisionMatch;
 
 mod axis;
 mod lines;
 
-use lines::Lines;
+use lines::TomlWriter;
 
-/// What every doubtful line says, for people to search for.
+/// The marker of uncertain lines, which users can search for.
 pub const MARK: &str = "CHECK:";
 
-/// Cycles to begin with, nanoseconds: the first that all devices take.
+/// Preferred cycle times in ns: the first that all devices support is used.
 const CYCLES: [u64; 5] = [1_000_000, 2_000_000, 4_000_000, 500_000, 250_000];
 
-/// Where the file will be.
+/// The location of the file.
 #[derive(Debug, Clone, Copy)]
-pub struct Place<'a> {
+pub struct OutputPath<'a> {
     /// `"sim"`, or a network interface.
     pub nic: &'a str,
-    /// The machine file's folder: paths in it are relative.
+    /// The machine file's folder; paths in the file are relative to it.
     pub folder: &'a Path,
 }
 
-/// How a device of the scan is called in the file.
+/// The name of a scanned device in the file.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Named {
+pub struct DeviceName {
     pub name: String,
     pub mode: Option<esi::Mode>,
 }
 
-/// A whole machine file. Lines with [`MARK`] want a look.
+/// Returns a complete machine file. Lines with [`MARK`] need a check.
 #[must_use]
-pub fn machine_file(scan: &Scan, described: &[Option<Described>], place: Place<'_>) -> String {
+pub fn machine_file(scan: &Scan, described: &[Option<EsiMatch>], place: OutputPath<'_>) -> String {
     let described = || described.iter().map(Option::as_ref);
     let named = names(scan.devices.iter().zip(described()), &[]);
     let cycle_ns = cycle(described().zip(&named));
@@ -53,13 +54,13 @@ pub fn machine_file(scan: &Scan, described: &[Option<Described>], place: Place<'
     text + &steps(&named)
 }
 
-fn head(named: &[Named], place: Place<'_>, cycle_ns: u64) -> String {
+fn head(named: &[DeviceName], place: OutputPath<'_>, cycle_ns: u64) -> String {
     let mut text = format!(
-        "# Written by `ecaxis scan`. Lines with \"{MARK}\" want a look.\n\
+        "# Written by `ecaxis scan`. Lines with \"{MARK}\" need a check.\n\
          # `ecaxis check FILE` finds mistakes, `ecaxis explain FILE` shows what follows,\n\
-         # `ecaxis compare FILE` tells whether the bus is still as it was.\n\n",
+         # `ecaxis compare FILE` reports whether the bus has changed.\n\n",
     );
-    let mut lines = Lines::default();
+    let mut lines = TomlWriter::default();
     if named.iter().any(|named| named.mode.is_some()) {
         let comment =
             format!("{MARK} look at the limits first; then take this out, or `run --enable`");
@@ -67,7 +68,7 @@ fn head(named: &[Named], place: Place<'_>, cycle_ns: u64) -> String {
         text += &lines.text();
         text += "\n";
     }
-    let mut lines = Lines::default();
+    let mut lines = TomlWriter::default();
     lines.header("[bus]");
     let nic = quoted(place.nic);
     lines.add("nic", &nic, "`ecaxis run FILE --sim` simulates the bus");
@@ -78,8 +79,8 @@ fn head(named: &[Named], place: Place<'_>, cycle_ns: u64) -> String {
     text + &lines.text()
 }
 
-/// The first cycle that every device can be configured with.
-fn cycle<'d>(devices: impl Iterator<Item = (Option<&'d Described>, &'d Named)> + Clone) -> u64 {
+/// Returns the first cycle time that every device supports.
+fn cycle<'d>(devices: impl Iterator<Item = (Option<&'d EsiMatch>, &'d DeviceName)> + Clone) -> u64 {
     let takes = |cycle_ns: &u64| {
         devices.clone().all(|(described, named)| {
             described.is_none_or(|d| selection(d, named.mode, *cycle_ns).is_some())
@@ -90,23 +91,24 @@ fn cycle<'d>(devices: impl Iterator<Item = (Option<&'d Described>, &'d Named)> +
 }
 
 fn selection(
-    described: &Described,
+    described: &EsiMatch,
     mode: Option<esi::Mode>,
     cycle_ns: u64,
 ) -> Option<esi::Selection> {
-    let choice = esi::Choice {
+    let choice = esi::SelectOptions {
         mode,
         cycle_ns,
-        ..esi::Choice::default()
+        ..esi::SelectOptions::default()
     };
     esi::select(&described.file, &described.device, &choice).ok()
 }
 
-/// Axes are counted, other devices are called what they are. `taken`: names that are not free.
+/// Returns the names of the devices: numbered axes, and type names for others. `taken`: names
+/// already in use.
 pub fn names<'d>(
-    devices: impl Iterator<Item = (&'d Device, Option<&'d Described>)>,
+    devices: impl Iterator<Item = (&'d Device, Option<&'d EsiMatch>)>,
     taken: &[String],
-) -> Vec<Named> {
+) -> Vec<DeviceName> {
     let mut taken: Vec<String> = taken.to_vec();
     let mut all = Vec::new();
     for (device, described) in devices {
@@ -115,7 +117,7 @@ pub fn names<'d>(
             Some(_) => "axis".to_owned(),
             None => word(device, described),
         };
-        // The first axis is axis1; the first terminal is what it is, the second has a 2.
+        // Axes start with axis1. The second terminal of a type gets a 2.
         let first = if mode.is_some() { 1 } else { 0 };
         let numbered = |n: usize| match (n, word.ends_with(|c: char| c.is_ascii_digit())) {
             (0, _) => word.clone(),
@@ -123,20 +125,20 @@ pub fn names<'d>(
             (n, false) if mode.is_none() => format!("{word}{}", n + 1),
             (n, false) => format!("{word}{n}"),
         };
-        // No more are taken than there are.
+        // There are at most as many names in use.
         let free = (first..=first + taken.len()).map(numbered);
         let name = free
             .into_iter()
             .find(|name| !taken.contains(name))
             .unwrap_or(word.clone());
         taken.push(name.clone());
-        all.push(Named { name, mode });
+        all.push(DeviceName { name, mode });
     }
     all
 }
 
-/// A word for a key: letters, digits and underscores.
-fn word(device: &Device, described: Option<&Described>) -> String {
+/// Returns a name for a key: letters, digits and underscores.
+fn word(device: &Device, described: Option<&EsiMatch>) -> String {
     let type_name = described.map(|d| d.device.type_name.clone());
     let type_name = type_name.or_else(|| device.own_name()).unwrap_or_default();
     let mut word = String::new();
@@ -155,7 +157,7 @@ fn word(device: &Device, described: Option<&Described>) -> String {
     }
 }
 
-/// Aliases and device identifications, each with how many devices have it.
+/// Aliases and device identifications with their number of devices.
 #[derive(Debug, Default)]
 pub struct Aliases {
     aliases: BTreeMap<u16, usize>,
@@ -174,17 +176,17 @@ pub fn aliases(scan: &Scan) -> Aliases {
     all
 }
 
-/// One `[[device]]` with what belongs to it.
+/// Returns one `[[device]]` section.
 #[must_use]
 pub fn device_section(
     device: &Device,
-    described: Option<&Described>,
-    named: &Named,
+    described: Option<&EsiMatch>,
+    named: &DeviceName,
     aliases: &Aliases,
-    place: Place<'_>,
+    place: OutputPath<'_>,
     cycle_ns: u64,
 ) -> String {
-    let mut lines = Lines::default();
+    let mut lines = TomlWriter::default();
     lines.header("[[device]]");
     let what = described.map(|d| d.device.name.as_str());
     lines.add("name", &quoted(&named.name), what.unwrap_or_default());
@@ -227,12 +229,17 @@ pub fn device_section(
     text
 }
 
-/// `esi`, and which of its devices.
-fn esi_keys(device: &Device, described: Option<&Described>, place: Place<'_>, lines: &mut Lines) {
+/// Adds `esi` and the keys that select the device.
+fn esi_keys(
+    device: &Device,
+    described: Option<&EsiMatch>,
+    place: OutputPath<'_>,
+    lines: &mut TomlWriter,
+) {
     let identity = device.identity().unwrap_or_default();
     let Some(described) = described else {
         let comment = format!(
-            "{MARK} no ESI file here describes {identity}: get it from its maker, put it here"
+            "{MARK} no ESI file here describes {identity}: get it from its vendor, put it here"
         );
         lines.add("esi", &quoted("esi/MISSING.xml"), &comment);
         return;
@@ -258,9 +265,13 @@ fn esi_keys(device: &Device, described: Option<&Described>, place: Place<'_>, li
         lines.add("revision", &format!("0x{:08x}", ours.revision), "");
     }
     match described.rule {
-        Match::Equal => {}
+        RevisionMatch::Equal => {}
         rule => {
-            let rule = if rule == Match::Newer { ">=" } else { "ignore" };
+            let rule = if rule == RevisionMatch::Newer {
+                ">="
+            } else {
+                "ignore"
+            };
             let comment = format!(
                 "{MARK} the device has revision 0x{:08x}, the file 0x{:08x}",
                 identity.revision, ours.revision
@@ -270,8 +281,8 @@ fn esi_keys(device: &Device, described: Option<&Described>, place: Place<'_>, li
     }
 }
 
-/// How it is found: by what stays with it, if it has that.
-fn locator(device: &Device, aliases: &Aliases, lines: &mut Lines) {
+/// Adds the locator: a unique alias or identification if available, else the position.
+fn locator(device: &Device, aliases: &Aliases, lines: &mut TomlWriter) {
     let position = device.position();
     let alias = device.found.alias;
     if alias != 0 && aliases.aliases.get(&alias) == Some(&1) {
@@ -293,11 +304,11 @@ fn locator(device: &Device, aliases: &Aliases, lines: &mut Lines) {
     lines.add("position", &position.to_string(), &comment);
 }
 
-/// The modules that were found, and a comment. Where a mode picks the module nothing needs to be said.
+/// Returns the modules that were found, and a comment. Empty if the mode selects the module.
 #[must_use]
 pub fn modules(
     device: &Device,
-    described: &Described,
+    described: &EsiMatch,
     mode: Option<esi::Mode>,
 ) -> Option<(String, String)> {
     described.device.slots.as_ref()?;
@@ -334,8 +345,8 @@ pub fn modules(
     Some((format!("[{}]", names.join(", ")), comment))
 }
 
-/// A first move for the axes that can be sent somewhere.
-fn steps(named: &[Named]) -> String {
+/// Returns a first move for the axes in a position mode.
+fn steps(named: &[DeviceName]) -> String {
     let axes: Vec<&str> = named
         .iter()
         .filter(|named| named.mode == Some(esi::Mode::Csp))
@@ -358,7 +369,7 @@ fn steps(named: &[Named]) -> String {
     )
 }
 
-/// From a folder to a file, both as they are from here.
+/// Returns the path from a folder to a file, both relative to the present folder.
 pub(crate) fn relative(file: &Path, folder: &Path) -> PathBuf {
     let absolute = |path: &Path| {
         let path = if path.as_os_str().is_empty() {
@@ -382,7 +393,7 @@ pub(crate) fn relative(file: &Path, folder: &Path) -> PathBuf {
         shared += 1;
     }
     let ups = from.count();
-    // Far apart, or with nothing but the root in common: the whole path is clearer.
+    // If the paths have little in common, the absolute path is clearer.
     if shared <= 1 || ups > 3 {
         return file_at;
     }
@@ -391,7 +402,7 @@ pub(crate) fn relative(file: &Path, folder: &Path) -> PathBuf {
         .collect()
 }
 
-/// As TOML writes a text.
+/// Quotes a text for TOML.
 fn quoted(text: &str) -> String {
     toml::Value::String(text.to_owned()).to_string()
 }

@@ -1,16 +1,17 @@
-//! Axes to targets of their own, and into other modes.
+//! Steps that move axes to their own targets or change their modes.
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{AxisStatus, Command, Mode};
 
-use super::{Aim, Settling, Supervisor};
+use super::{Settling, Supervisor, TargetKind};
 use crate::clock::Nanos;
 use crate::config::Step;
-use crate::rt::handover::Snapshot;
+use crate::rt::channel::Snapshot;
 use crate::session::RunError;
 
 impl Supervisor {
-    /// All begin in the same cycle and arrive when they arrive. `part`: of the velocity and acceleration limits.
+    /// Starts all moves in the same cycle; each arrives on its own. `part`: fraction of the
+    /// velocity and acceleration limits.
     pub(super) async fn move_each(
         &mut self,
         step: &Step,
@@ -20,7 +21,7 @@ impl Supervisor {
         [speed, ramp]: [f64; 2],
     ) -> Result<(), RunError> {
         let targets = self.destinations(relative, targets).await?;
-        self.reach(step, start, Aim::Position, &targets, |position| {
+        self.move_and_wait(step, start, TargetKind::Position, &targets, |position| {
             Command::MoveTo {
                 position,
                 speed,
@@ -30,7 +31,7 @@ impl Supervisor {
         .await
     }
 
-    /// Positions of axes that are sent somewhere, from where their set-points are.
+    /// Returns target positions, relative ones from the axes' present set-points.
     pub(in crate::supervise) async fn destinations(
         &mut self,
         relative: bool,
@@ -39,7 +40,7 @@ impl Supervisor {
         let targets = self.targets(targets);
         let turning = targets.iter().any(|&(axis, _)| self.modulo(axis));
         let origin = if relative || turning {
-            self.tick().await?.axes
+            self.poll_and_query().await?.axes
         } else {
             Vec::new()
         };
@@ -48,7 +49,7 @@ impl Supervisor {
             let target = if relative {
                 from + target
             } else {
-                self.place_to_go(axis, from, target)
+                self.resolve_target(axis, from, target)
             };
             (axis, target)
         });
@@ -83,13 +84,13 @@ impl Supervisor {
         self.until(step, start, there, &axes).await
     }
 
-    /// Orders every axis to its target and waits until all have arrived; an axis whose set-point has arrived but which
-    /// does not follow fails the step.
-    pub(in crate::supervise) async fn reach(
+    /// Commands every axis to its target and waits until all have arrived. Fails if an axis does
+    /// not follow its arrived set-point.
+    pub(in crate::supervise) async fn move_and_wait(
         &mut self,
         step: &Step,
         start: Nanos,
-        aim: Aim,
+        aim: TargetKind,
         targets: &[(usize, f64)],
         command: impl Fn(f64) -> Command,
     ) -> Result<(), RunError> {
@@ -100,7 +101,7 @@ impl Supervisor {
         )
         .await;
         let mut settling = Settling::default();
-        self.watch(step, start, |this, snapshot| {
+        self.wait_until(step, start, |this, snapshot| {
             let status = |axis: usize| &snapshot.axes[axis];
             let late = targets.iter().find(|(axis, _)| !status(*axis).in_target);
             let Some(&(axis, target)) = late else {
@@ -111,7 +112,7 @@ impl Supervisor {
                 settling = Settling::default();
                 return Ok(false);
             }
-            if settling.over() {
+            if settling.time_limit_reached() {
                 return Err(this.not_reached(step, axis, aim, target, status(axis)));
             }
             Ok(false)
@@ -119,16 +120,16 @@ impl Supervisor {
         .await
     }
 
-    /// `target`: as [`Command`]s have it.
+    /// Returns the error of an axis that missed its target. `target`: as in [`Command`].
     pub(in crate::supervise) fn not_reached(
         &self,
         step: &Step,
         axis: usize,
-        aim: Aim,
+        aim: TargetKind,
         target: f64,
         last: &AxisStatus,
     ) -> RunError {
-        let (target, actual, unit) = self.in_users_terms(axis, aim, target, last);
+        let (target, actual, unit) = self.to_display_unit(axis, aim, target, last);
         RunError::NotReached {
             device: self.device_of(axis),
             step: step.into(),
@@ -138,11 +139,12 @@ impl Supervisor {
         }
     }
 
-    /// A target and what is reported of it, in the file's unit; positions of a modulo axis as places.
-    fn in_users_terms(
+    /// Converts a target and the reported value to the file's unit; positions of a modulo axis lie
+    /// within one turn.
+    fn to_display_unit(
         &self,
         axis: usize,
-        aim: Aim,
+        aim: TargetKind,
         target: f64,
         last: &AxisStatus,
     ) -> (f64, f64, String) {
@@ -150,13 +152,13 @@ impl Supervisor {
             return (target, last.position, String::new());
         };
         match aim {
-            Aim::Velocity => (target, last.velocity, format!("{}/s", setup.unit)),
-            Aim::Torque => {
+            TargetKind::Velocity => (target, last.velocity, format!("{}/s", setup.unit)),
+            TargetKind::Torque => {
                 let torque = &setup.torque;
                 let unit = torque.unit.to_string();
                 (torque.shown(target), torque.shown(last.torque), unit)
             }
-            Aim::Position => {
+            TargetKind::Position => {
                 let scale = &setup.config.scale;
                 let place = |position| scale.place(UserUnits(position)).0;
                 (place(target), place(last.position), setup.unit.clone())

@@ -1,31 +1,32 @@
-//! A move that an edge at a touch probe's input ends.
+//! A move that ends at an edge of a touch probe's input.
 //!
-//! The drive takes the position of the edge in hardware; the axis stops in the cycle in which the drive shows it. What is
-//! looked at here comes later, and only decides whether the step has done what it is for.
+//! The drive captures the position of the edge in hardware. The axis stops in the cycle in which
+//! the drive shows the edge. The code here runs later and only decides whether the step has
+//! succeeded.
 
 use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Command, Edge, Probe, ProbeStatus, Source};
 
-use super::{Aim, Settling, Supervisor};
+use super::{Settling, Supervisor, TargetKind};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
-use crate::rt::handover::Snapshot;
-use crate::session::{Capture, Progress, RunError};
+use crate::rt::channel::Snapshot;
+use crate::session::{ProbeCapture, Progress, RunError};
 
-/// How long the drive may take to show in 0x60B9 that it watches the input.
+/// The timeout in ns until 0x60B9 shows that the drive watches the input.
 const ARM_TIMEOUT: Nanos = 1_000_000_000;
-/// How long after the arrival an edge may still be shown that came on the way.
+/// The time in ns after arrival during which an edge from the move may still appear.
 const LATE_EDGE: Nanos = 50_000_000;
 
-/// What is searched, and where.
+/// The target, input and edge of a search.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Search {
+pub(super) struct ProbeMove {
     pub device: usize,
     pub probe: Probe,
     pub edge: Edge,
     pub relative: bool,
     pub target: f64,
-    /// Fractions of the axis' limits.
+    /// Fractions of the axis's limits.
     pub speed: f64,
     pub ramp: f64,
 }
@@ -36,9 +37,9 @@ impl Supervisor {
         step: &Step,
         start: Nanos,
         run: u32,
-        search: Search,
+        search: ProbeMove,
     ) -> Result<(), RunError> {
-        let Search {
+        let ProbeMove {
             device,
             probe,
             speed,
@@ -56,12 +57,12 @@ impl Supervisor {
             return Ok(());
         }
         let target = there.first().map_or(search.target, |&(_, target)| target);
-        // An edge that came meanwhile leaves nothing to search.
+        // An edge may already have occurred; then no move is needed.
         let found = |status: ProbeStatus| match status {
             ProbeStatus::Captured { position } => Some(position),
             _ => None,
         };
-        if found(self.tick().await?.axes[axis].probes[probe.index()]).is_none() {
+        if found(self.poll_and_query().await?.axes[axis].probes[probe.index()]).is_none() {
             let go = Command::MoveTo {
                 position: target,
                 speed,
@@ -72,7 +73,7 @@ impl Supervisor {
         let mut settling = Settling::default();
         let mut arrived = None;
         let mut captured = None;
-        self.watch(step, start, |this, snapshot| {
+        self.wait_until(step, start, |this, snapshot| {
             let status = &snapshot.axes[axis];
             captured = found(status.probes[probe.index()]);
             if captured.is_some() {
@@ -86,8 +87,8 @@ impl Supervisor {
                 if clock::now().saturating_sub(since) > LATE_EDGE {
                     return Err(this.not_probed(step, axis, target, &search));
                 }
-            } else if settling.over() {
-                return Err(this.not_reached(step, axis, Aim::Position, target, status));
+            } else if settling.time_limit_reached() {
+                return Err(this.not_reached(step, axis, TargetKind::Position, target, status));
             }
             Ok(false)
         })
@@ -95,7 +96,7 @@ impl Supervisor {
         let Some(position) = captured else {
             return Ok(());
         };
-        // It stops already, unless the edge came in the very cycle that took the move.
+        // The axis already stops, unless the edge came in the cycle that accepted the move.
         self.command([(axis, Command::Stop)].into_iter()).await;
         let resting = |s: &Snapshot, axis: usize| !s.axes[axis].moving && s.axes[axis].at_rest;
         self.until(step, start, resting, &[axis]).await?;
@@ -103,13 +104,13 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Until the drive says that it watches the input.
+    /// Waits until the drive reports that it watches the input.
     async fn arm(
         &mut self,
         step: &Step,
         start: Nanos,
         axis: usize,
-        search: &Search,
+        search: &ProbeMove,
     ) -> Result<(), RunError> {
         let arm = Command::ArmProbe {
             probe: search.probe,
@@ -120,7 +121,7 @@ impl Supervisor {
         self.command([(axis, arm)].into_iter()).await;
         let begun = clock::now();
         let at = search.probe.index();
-        self.watch(step, start, |this, snapshot| {
+        self.wait_until(step, start, |this, snapshot| {
             let status = snapshot.axes[axis].probes[at];
             if matches!(status, ProbeStatus::Armed | ProbeStatus::Captured { .. }) {
                 return Ok(true);
@@ -138,7 +139,7 @@ impl Supervisor {
         .await
     }
 
-    fn not_probed(&self, step: &Step, axis: usize, target: f64, search: &Search) -> RunError {
+    fn not_probed(&self, step: &Step, axis: usize, target: f64, search: &ProbeMove) -> RunError {
         let setup = self.setup(axis);
         let place = |position| match setup {
             Some(setup) => setup.config.scale.place(UserUnits(position)).0,
@@ -154,11 +155,11 @@ impl Supervisor {
         }
     }
 
-    /// Tells what was captured, and keeps it for the summary.
-    fn keep(&mut self, step: &Step, run: u32, axis: usize, search: &Search, position: f64) {
+    /// Reports what was captured and stores it for the summary.
+    fn keep(&mut self, step: &Step, run: u32, axis: usize, search: &ProbeMove, position: f64) {
         let setup = self.setup(axis);
         let scale = setup.map(|setup| &setup.config.scale);
-        let found = Capture {
+        let found = ProbeCapture {
             step: step.number.clone(),
             axis: self.axis_name(axis),
             input: search.probe.number(),
@@ -170,14 +171,14 @@ impl Supervisor {
                 .map(|scale| scale.place(UserUnits(position)).0),
             unit: setup.map_or(String::new(), |setup| setup.unit.clone()),
         };
-        self.tell(Progress::Captured {
+        self.report(Progress::Captured {
             run,
             capture: found.clone(),
         });
-        let same = |known: &&mut Capture| known.step == found.step;
+        let same = |known: &&mut ProbeCapture| known.step == found.step;
         match self.captures.iter_mut().find(same) {
             Some(known) => {
-                *known = Capture {
+                *known = ProbeCapture {
                     times: known.times.saturating_add(1),
                     ..found
                 }

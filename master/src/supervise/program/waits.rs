@@ -1,4 +1,4 @@
-//! Steps that are over when something holds: states, homing, inputs.
+//! Steps that wait for a condition: states, homing, inputs.
 
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, Mode};
@@ -6,11 +6,12 @@ use ecaxis_axis::{AxisStatus, Command, Mode};
 use super::{SETTLE_TIMEOUT, STANDS, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, Condition, Step};
-use crate::rt::handover::Snapshot;
+use crate::rt::channel::Snapshot;
 use crate::session::RunError;
 
 impl Supervisor {
-    /// Until something holds of every axis, or the time an axis may take to be enabled is over.
+    /// Waits until `holds` is true for every axis. Fails after the enable timeout or the longest
+    /// stop.
     pub(super) async fn until(
         &mut self,
         step: &Step,
@@ -20,7 +21,7 @@ impl Supervisor {
     ) -> Result<(), RunError> {
         let begun = clock::now();
         let timeout = self.machine.bus.enable_timeout_ns.max(self.longest_stop());
-        self.watch(step, start, |this, snapshot| {
+        self.wait_until(step, start, |this, snapshot| {
             let Some(&axis) = axes.iter().find(|&&axis| !holds(snapshot, axis)) else {
                 return Ok(true);
             };
@@ -47,8 +48,8 @@ impl Supervisor {
         .await
     }
 
-    /// Until axes whose set-point has come to rest have come to rest themselves; some orders are for standing axes only. One that swings
-    /// around its target is slow at each turn, too: it stands when it stays slow.
+    /// Waits until axes whose set-point rests are at rest. Some commands require standstill. An
+    /// axis that oscillates is also slow at each turning point, so it must stay slow.
     pub(in crate::supervise) async fn settle(
         &mut self,
         axes: &[usize],
@@ -57,9 +58,10 @@ impl Supervisor {
         let begun = clock::now();
         let mut moved = begun;
         loop {
-            let snapshot = self.tick().await?;
+            let snapshot = self.poll_and_query().await?;
             let status = axes.iter().filter_map(|&axis| snapshot.axes.get(axis));
-            // One at a constant velocity has arrived as well, and never stands. In other modes the velocity is the reported one.
+            // At constant velocity an axis has arrived but never rests. In other modes the velocity
+            // is the reported one.
             let led = |s: &AxisStatus| matches!(s.mode, Mode::Csp | Mode::Csv | Mode::Pv);
             let turns = |s: &AxisStatus| led(s) && s.target_velocity != 0.0;
             let rests = |s: &&AxisStatus| s.enabled && !s.moving && !turns(s);
@@ -75,7 +77,7 @@ impl Supervisor {
         }
     }
 
-    /// Each by its own timeout, which the axis keeps.
+    /// Homes all axes. Each axis supervises its own timeout.
     pub(super) async fn home(
         &mut self,
         step: &Step,
@@ -93,7 +95,7 @@ impl Supervisor {
         let commands = axes.iter().zip(&timeouts);
         self.command(commands.map(|(&axis, &timeout_s)| (axis, Command::Home { timeout_s })))
             .await;
-        self.watch(step, start, |this, snapshot| {
+        self.wait_until(step, start, |this, snapshot| {
             let mut homed = true;
             for &axis in &axes {
                 let status = &snapshot.axes[axis];
@@ -124,7 +126,7 @@ impl Supervisor {
         setup.map_or(0, |setup| setup.homing.method)
     }
 
-    /// Until every condition holds in one and the same cycle.
+    /// Waits until all conditions hold in the same cycle.
     pub(super) async fn wait(
         &mut self,
         step: &Step,
@@ -134,7 +136,7 @@ impl Supervisor {
     ) -> Result<(), RunError> {
         let begun = clock::now();
         loop {
-            let snapshot = self.tick().await?;
+            let snapshot = self.poll_and_query().await?;
             let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
             let open = conditions.iter().find(|c| !c.holds(value(c.input)));
             let Some(open) = open else { return Ok(()) };

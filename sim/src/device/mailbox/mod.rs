@@ -1,10 +1,12 @@
-//! The device's end of the mailbox (ETG.1000.4 §5.6): requests in, one at a time; answers and emergencies out in order.
+//! The device side of the mailbox (ETG.1000.4 §5.6). It processes requests one at a time and sends
+//! answers and emergencies in order.
 //!
-//! * `queue`: messages on their way out, counters, what is sent again
-//! * `options`: what the ESI leaves open
+//! * `queue`: outgoing messages, counters, repetition
+//! * `options`: mailbox properties that the ESI leaves open
 //!
-//! CoE and FoE are [`crate::coe`] and [`crate::foe`]. A request stays in its SyncManager until the device comes round to
-//! fetch it; while it works, or while too many answers wait, the next one stays there too, and the mailbox is full.
+//! [`crate::coe`] and [`crate::foe`] implement CoE and FoE. A request stays in its SyncManager
+//! until the device fetches it. While the device processes a request or too many answers wait, the
+//! next request stays there and the mailbox is full.
 
 mod options;
 mod queue;
@@ -19,7 +21,7 @@ use crate::esc::al::AlState;
 use crate::esc::registers as reg;
 use crate::foe::{FoeRequest, FoeServer, Target};
 
-/// Between a request arriving and the device fetching it.
+/// The time in ns from the arrival of a request until the device fetches it.
 const FETCH_NS: u64 = 100_000;
 const HEADER: usize = 6;
 
@@ -33,19 +35,19 @@ mod protocol {
 /// Mailbox error details (ETG.1000.4 table 30).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Detail {
-    /// The mailbox header itself.
+    /// Error in the mailbox header itself.
     Syntax = 1,
     UnsupportedProtocol = 2,
     InvalidChannel = 3,
     ServiceNotSupported = 4,
-    /// The protocol's header.
+    /// Error in the header of the protocol.
     InvalidHeader = 5,
     TooShort = 6,
     NoMoreMemory = 7,
     InvalidSize = 8,
 }
 
-/// What a protocol makes of a request. Messages without the mailbox header.
+/// The answer of a protocol to a request. Messages lack the mailbox header.
 #[derive(Debug)]
 pub(crate) enum Answer {
     None,
@@ -54,18 +56,18 @@ pub(crate) enum Answer {
     Error(Detail),
 }
 
-/// Bytes that a message may have, mailbox header aside.
+/// Maximum bytes of a message without the mailbox header.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Room {
-    /// From the MainDevice.
+pub(crate) struct MailboxCapacity {
+    /// Capacity for messages from the MainDevice.
     pub(crate) receive: usize,
-    /// To the MainDevice.
+    /// Capacity for messages to the MainDevice.
     pub(crate) send: usize,
 }
 
 #[derive(Debug, Clone)]
 pub(super) struct Mailbox {
-    /// SyncManager numbers.
+    /// The SyncManager numbers.
     pub(super) receive: usize,
     pub(super) send: usize,
     queue: Queue,
@@ -73,7 +75,7 @@ pub(super) struct Mailbox {
     fetch_due: u64,
     answer_due: u64,
     transfer_due: u64,
-    /// What is being worked on.
+    /// The request in progress.
     request: Vec<u8>,
     coe: CoeServer,
     foe: FoeServer,
@@ -94,12 +96,12 @@ impl Mailbox {
         }
     }
 
-    /// Leaving or entering Init forgets everything under way.
+    /// Drops all pending work, as entering or leaving Init does.
     pub(super) fn reset(&mut self) {
         *self = Self::new(self.receive, self.send);
     }
 
-    /// Nothing happens before this time.
+    /// Postpones all work to this local time or later.
     pub(super) fn rest_until(&mut self, local: u64) {
         for due in [
             &mut self.fetch_due,
@@ -110,7 +112,7 @@ impl Mailbox {
         }
     }
 
-    /// When [`SimDevice::serve_mailbox`] has something to do, in local time.
+    /// Returns the local time of the next work for [`SimDevice::serve_mailbox`].
     pub(super) fn due(&self) -> u64 {
         self.fetch_due.min(self.answer_due).min(self.transfer_due)
     }
@@ -121,7 +123,8 @@ impl Mailbox {
 }
 
 impl SimDevice {
-    /// The MainDevice filled or emptied a mailbox, or asks for the last message again.
+    /// Handles mailbox events of the MainDevice: a mailbox was filled or emptied, or a repeat
+    /// requested.
     pub(super) fn mailbox_events(
         &mut self,
         written: u8,
@@ -129,7 +132,7 @@ impl SimDevice {
         repeat: Option<bool>,
         local: u64,
     ) {
-        // In Init nobody looks after mailboxes.
+        // In Init no application services the mailboxes.
         let Some(mailbox) = self
             .mailbox
             .as_mut()
@@ -157,7 +160,7 @@ impl SimDevice {
         self.plan_fetch(local);
     }
 
-    /// A request that lies there is fetched as soon as there is room for its answer.
+    /// Schedules the fetch of a waiting request once the queue has room for its answer.
     pub(super) fn plan_fetch(&mut self, local: u64) {
         let Some(mailbox) = &mut self.mailbox else {
             return;
@@ -173,7 +176,7 @@ impl SimDevice {
         }
     }
 
-    /// Moves the next message into the send SyncManager if that is free.
+    /// Moves the next message into the send SyncManager if that is empty.
     pub(super) fn pump_mailbox(&mut self) {
         if self.is_restarting() {
             return;
@@ -203,7 +206,7 @@ impl SimDevice {
         self.esc.refresh_sm(n);
     }
 
-    /// Something is due: a request to fetch, an answer, the end of a transfer that the client gave up.
+    /// Performs due work: a request to fetch, an answer, or the time-out of a segmented transfer.
     pub(super) fn serve_mailbox(&mut self, local: u64) {
         let Some(mailbox) = &mut self.mailbox else {
             return;
@@ -226,7 +229,7 @@ impl SimDevice {
         self.plan_fetch(local);
     }
 
-    /// What has become due while nobody looked after the mailbox is due now.
+    /// Schedules overdue work for now, after a time without mailbox service.
     pub(super) fn resume_mailbox(&mut self) {
         let now = self.local;
         let Some(mailbox) = &mut self.mailbox else {
@@ -309,14 +312,14 @@ impl SimDevice {
         }
     }
 
-    fn protocol_answer(&mut self, protocol: u8, payload: &[u8], room: Room) -> Answer {
+    fn protocol_answer(&mut self, protocol: u8, payload: &[u8], room: MailboxCapacity) -> Answer {
         let state = self.al.state;
         let options = &self.mailbox_options;
         let Some(mailbox) = &mut self.mailbox else {
             return Answer::None;
         };
         match protocol {
-            // In Bootstrap there is nothing but files.
+            // Bootstrap supports only FoE.
             protocol::COE if self.has_coe && state != AlState::Boot => {
                 let services = CoeServices {
                     sdo_info: options.sdo_info.unwrap_or(self.sdo_info),
@@ -366,12 +369,12 @@ impl SimDevice {
         }
     }
 
-    fn room(&self) -> Room {
+    fn room(&self) -> MailboxCapacity {
         let room = |n: Option<usize>| {
             let sm = n.and_then(|n| self.esc.sms.get(n));
             sm.map_or(0, |sm| usize::from(sm.len).saturating_sub(HEADER))
         };
-        Room {
+        MailboxCapacity {
             receive: room(self.mailbox.as_ref().map(|mailbox| mailbox.receive)),
             send: room(self.mailbox.as_ref().map(|mailbox| mailbox.send)),
         }

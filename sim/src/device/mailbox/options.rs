@@ -1,25 +1,26 @@
-//! What an ESI does not say about a device's mailbox.
+//! Mailbox properties of a device that an ESI does not contain.
 
 use crate::foe::FoeOptions;
 
 #[derive(Debug, Clone)]
 pub struct MailboxOptions {
-    /// From fetching a request to its answer.
+    /// The time in ns from fetching a request to its answer.
     pub processing_ns: u64,
-    /// SDO Information whatever the ESI says.
+    /// Overrides the ESI: support of SDO Information.
     pub sdo_info: Option<bool>,
-    /// Complete access whatever the ESI says.
+    /// Overrides the ESI: support of complete access.
     pub complete_access: Option<bool>,
-    /// Without it, objects longer than a mailbox are refused (abort 0x06010005). Most ESI files of devices that have it do
-    /// not say so.
+    /// Support of segmented transfers. Without it, objects longer than a mailbox are rejected
+    /// (abort 0x06010005). Most ESI files do not mention existing support.
     pub segmented: bool,
-    /// Longest object, in bytes, that segments may carry (abort 0x05040005).
+    /// Maximum bytes of an object in a segmented transfer (abort 0x05040005).
     pub sdo_buffer: usize,
-    /// Pause of the client in a segmented transfer after which the device aborts it (0x05040000); `None`: it waits for ever.
+    /// The pause of the client after which the device aborts a segmented transfer (0x05040000).
+    /// `None`: no time-out.
     pub sdo_timeout_ns: Option<u64>,
-    /// Refuses downloads to objects that process data write (abort 0x06010006).
+    /// Rejects downloads to objects that process data write (abort 0x06010006).
     pub refuse_mapped: bool,
-    /// File access whatever the ESI says.
+    /// Overrides the ESI: support of FoE.
     pub has_foe: Option<bool>,
     pub foe: FoeOptions,
 }

@@ -1,23 +1,24 @@
-//! Messages on their way to the MainDevice.
+//! The queue of messages to the MainDevice.
 
 use std::collections::VecDeque;
 
 use super::{Detail, HEADER, protocol};
 
-/// Emergencies kept for a MainDevice that does not fetch them; later ones are lost.
+/// Maximum number of waiting emergencies; later ones are lost.
 const EMERGENCIES: usize = 16;
-/// Requests whose answers may wait. The last place is for saying that there is no more.
+/// Maximum number of requests with waiting answers. The last place is for the "no more memory"
+/// error.
 const ANSWERS: usize = 4;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Class {
-    /// To the last request.
+    /// The only answer to the last request.
     Answer,
-    /// One of several that answer the last request.
+    /// One of several answers to the last request.
     Part,
-    /// There is no room for an answer.
+    /// The error reply that the queue has no room for an answer.
     Full,
-    /// What nobody asked for.
+    /// A message without a request.
     Notice,
     Emergency,
 }
@@ -31,7 +32,7 @@ impl Class {
 #[derive(Debug, Clone)]
 struct Message {
     class: Class,
-    /// Which request it answers.
+    /// The number of the request that the message answers.
     request: u64,
     bytes: Vec<u8>,
 }
@@ -39,19 +40,19 @@ struct Message {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Queue {
     waiting: VecDeque<Message>,
-    /// In the send SyncManager now.
+    /// The message in the send SyncManager.
     current: Option<Message>,
-    /// Fetched last: what a repeat request wants again.
+    /// The last fetched message, which a repeat request sends again.
     previous: Option<Message>,
-    /// Of the last message.
+    /// The counter of the last message.
     counter: u8,
     repeat: bool,
-    /// Header and contents of the last request, where it has a counter by which a repetition is known.
+    /// Header and contents of the last request. The counter in it identifies a repetition.
     last_request: Vec<u8>,
-    /// What the last request was answered with.
+    /// The answers to the last request.
     last_answer: Vec<Message>,
     requests: u64,
-    /// Before the request was written that is fetched next.
+    /// True if the last answer was fetched before the next request was written.
     answer_was_fetched: bool,
 }
 
@@ -63,7 +64,7 @@ impl Queue {
                 return;
             }
         }
-        // 1 to 7; 0 means "no counter".
+        // Counters run from 1 to 7; 0 means "no counter".
         self.counter = self.counter % 7 + 1;
         let mut bytes = Vec::with_capacity(HEADER + payload.len());
         bytes.extend_from_slice(&u16::try_from(payload.len()).unwrap_or(0).to_le_bytes());
@@ -80,7 +81,7 @@ impl Queue {
         self.waiting.push_back(message);
     }
 
-    /// A new answer in parts takes the place of one that nobody has finished fetching.
+    /// Adds an answer in parts. It replaces the unfetched parts of an earlier answer.
     pub(super) fn push_parts(&mut self, kind: u8, parts: &[Vec<u8>]) {
         self.waiting.retain(|message| message.class != Class::Part);
         for part in parts {
@@ -97,7 +98,7 @@ impl Queue {
         self.push(protocol::ERROR, &[1, 0, low, high], class);
     }
 
-    /// Requests that still wait for (the rest of) their answers to be put into the mailbox.
+    /// Returns the number of requests with waiting answers.
     fn unanswered(&self) -> usize {
         let mut requests = 0;
         let mut last = None;
@@ -109,7 +110,7 @@ impl Queue {
         requests
     }
 
-    /// Not after it said that there is no room, until there is some.
+    /// True unless the queue has reported that it is full and is still full.
     pub(super) fn takes_requests(&self) -> bool {
         let is_full = self.waiting.iter().any(|m| m.class == Class::Full);
         !(is_full && self.is_last_place())
@@ -124,14 +125,14 @@ impl Queue {
         messages.any(|m| m.class.is_answer() && m.request == self.requests)
     }
 
-    /// A request was written; whether its sender can have seen the last answer is known only now.
+    /// Notes the arrival of a request, and whether its sender can have seen the last answer.
     pub(super) fn written(&mut self, is_working: bool) {
         self.answer_was_fetched = !is_working && !self.has_answer_on_the_way();
     }
 
-    /// Whether this is the last request once more, as a MainDevice sends it that did not see it arrive: same counter
-    /// (0: none, never a repetition). It must not be executed twice. If it came after its answer had been fetched, that
-    /// got lost and goes out again; otherwise the answer on its way will do.
+    /// True for a repetition of the last request: the same counter, except 0 (no counter). The
+    /// device must not execute it twice. If the answer was already fetched, it got lost and is sent
+    /// again. Otherwise the pending answer is enough.
     pub(super) fn is_repeated(&mut self, counter: u8, message: &[u8]) -> bool {
         let before = self.last_request.get(HEADER - 1).map(|kind| kind >> 4 & 7);
         if counter == 0 || before != Some(counter) {
@@ -147,7 +148,7 @@ impl Queue {
         true
     }
 
-    /// The next message for a mailbox of `room` bytes; those that never fit are left out.
+    /// Returns the next message for a mailbox of `room` bytes; longer messages are dropped.
     pub(super) fn next(&mut self, room: usize) -> Option<&[u8]> {
         loop {
             let message = self.waiting.pop_front()?;
@@ -157,15 +158,15 @@ impl Queue {
         }
     }
 
-    /// The MainDevice emptied the mailbox.
+    /// Handles that the MainDevice emptied the mailbox.
     pub(super) fn fetched(&mut self) {
         if let Some(message) = self.current.take() {
             self.previous = Some(message);
         }
     }
 
-    /// The repeat bit (0x080E.1) has this value now; true if that asks for the last message again. What lies in the mailbox
-    /// unread follows after it.
+    /// Sets the repeat bit (0x080E.1). True if the change requests the last message again. An
+    /// unread message in the mailbox follows after that message.
     pub(super) fn repeat(&mut self, toggle: bool, unread: bool) -> bool {
         if toggle == self.repeat {
             return false;

@@ -1,21 +1,21 @@
-//! The current loop: PI every 0.04 ms, and what the winding stands.
+//! The current loop: PI every 0.04 ms, and the I²t model of the winding.
 
 use super::Tuning;
 use super::gains::CurrentGains;
 use crate::drive::CONTROL_STEP;
 use crate::drive::plant::CURRENT_STEP;
 
-/// `C(s) = P + I/s`. The integral never exceeds what the output stage has (anti-windup as in the IDX
-/// application notes, 2.3.1).
+/// `C(s) = P + I/s`. The integral never exceeds the voltage of the output stage (anti-windup as in
+/// the IDX application notes, 2.3.1).
 #[derive(Debug, Clone)]
 pub(super) struct CurrentLoop {
     pub(super) p: f64,
-    /// Per step.
+    /// The integral gain per step.
     pub(super) i: f64,
     pub(super) supply: f64,
-    /// V.
+    /// The integral, in V.
     pub(super) integral: f64,
-    /// A, a step ago.
+    /// The current one step earlier, in A.
     pub(super) before: f64,
 }
 
@@ -34,14 +34,14 @@ impl CurrentLoop {
 
     pub(super) fn tune(&mut self, gains: &CurrentGains) {
         self.i = gains.i * CURRENT_STEP;
-        // The voltage holds for a step, while the integral would go on growing: half a step's growth is
-        // its mean.
+        // The voltage holds for a step while a continuous integral would keep growing. Half a
+        // step's growth is the mean.
         self.p = gains.p + 0.5 * self.i;
     }
 
-    /// The voltage for the next step.
+    /// Returns the voltage for the next step.
     pub(super) fn step(&mut self, wanted: f64, current: f64) -> f64 {
-        // What a voltage held for a step meets on the whole.
+        // The mean current during the next step, extrapolated.
         let ahead = current + 0.5 * (current - self.before);
         self.before = current;
         let error = wanted - ahead;
@@ -60,18 +60,19 @@ impl CurrentLoop {
     }
 }
 
-/// I²t: how warm the winding is. More than the nominal current is for a while only.
+/// I²t model: the temperature of the winding. It allows more than the nominal current for a limited
+/// time.
 #[derive(Debug, Clone)]
-pub(super) struct Winding {
-    /// 1: as warm as nominal current makes it in the long run.
+pub(super) struct I2tModel {
+    /// 1 is the steady state at nominal current.
     level: f64,
     nominal: f64,
-    // Per control cycle: what a square ampere adds, and what share goes.
+    // Per control cycle: heating per square ampere, and the share that cools off.
     heating: f64,
     cooling: f64,
 }
 
-impl Winding {
+impl I2tModel {
     pub(super) fn new(tuning: &Tuning) -> Self {
         let mut cold = Self {
             level: 0.0,
@@ -89,13 +90,13 @@ impl Winding {
         self.heating = self.cooling / (self.nominal * self.nominal);
     }
 
-    /// One control cycle at this current.
+    /// Updates the model by one control cycle at this current.
     pub(super) fn warm(&mut self, current: f64) {
         self.level += self.heating * current * current - self.cooling * self.level;
         super::flush(&mut self.level);
     }
 
-    /// A. What of the limit may be used.
+    /// Returns the usable part of the current limit, in A.
     pub(super) fn allow(&self, limit: f64) -> f64 {
         if self.level < 1.0 {
             limit

@@ -1,5 +1,5 @@
-//! How fast the shaft turns, from an encoder that counts: by the time between edges and a low-pass
-//! filter, or by an observer that knows the motor. (IDX application notes, 2.3.2.)
+//! Shaft speed from encoder counts (IDX application notes, 2.3.2). It comes from the time between
+//! edges with a low-pass filter, or from an observer with a motor model.
 
 use super::Tuning;
 use crate::drive::CONTROL_STEP as DT;
@@ -19,12 +19,12 @@ pub(super) struct Estimator {
     feedback: Feedback,
     filter: Filter,
     observer: Observer,
-    /// The count seen last.
+    /// The last count.
     counts: i64,
     counts_per_rad: f64,
-    /// rad/s.
+    /// The estimated speed, in rad/s.
     velocity: f64,
-    /// Of both, in the last control cycle.
+    /// The change of count and speed in the last control cycle.
     counted: f64,
     gained: f64,
 }
@@ -64,8 +64,8 @@ impl Estimator {
         self.counts
     }
 
-    /// What an output held for a control cycle meets on the whole: the count and the speed half a cycle
-    /// from now, if they go on as in the last one.
+    /// Returns the count half a control cycle ahead, extrapolated from the last cycle. An output
+    /// that holds for a cycle acts on this count on average.
     pub(super) fn counts_ahead(&self) -> f64 {
         float(self.counts) + 0.5 * self.counted
     }
@@ -74,12 +74,12 @@ impl Estimator {
         self.velocity + 0.5 * self.gained
     }
 
-    /// rad/s.
+    /// Returns the estimated speed, in rad/s.
     pub(super) fn velocity(&self) -> f64 {
         self.velocity
     }
 
-    /// A control cycle has passed, with this mean current.
+    /// Updates the estimate after a control cycle with this mean current.
     pub(super) fn observe(&mut self, plant: &Plant, current: f64) {
         let counts = plant.counts();
         self.counted = float(counts - self.counts);
@@ -102,22 +102,22 @@ impl Estimator {
     }
 }
 
-/// Share of a new value in a low-pass filter `2πf / (s + 2πf)`. Between edges there is a mean speed only,
-/// which is half a cycle old: the filter lags by that much less.
+/// Returns the share of a new value in a low-pass filter `2πf / (s + 2πf)`. The mean speed between
+/// edges is half a cycle old, so the filter lags by half a cycle less.
 fn share(cut_off: f64) -> f64 {
     let x = std::f64::consts::TAU * cut_off * DT;
     (x / (1.0 + 0.5 * x)).min(1.0)
 }
 
-/// So long without an edge, s, and the shaft stands.
+/// The time without an edge after which the shaft counts as standing, in s.
 const STANDS: f64 = 0.05;
 
 #[derive(Debug, Clone)]
 struct Filter {
-    /// The edge seen last, in counts, and how long ago it was.
+    /// The position of the last edge in counts, and its age.
     edge: f64,
     since: f64,
-    /// Counts/s between the last two edges.
+    /// The speed between the last two edges, in counts/s.
     speed: f64,
     share: f64,
 }
@@ -125,7 +125,7 @@ struct Filter {
 impl Filter {
     fn measure(&mut self, plant: &Plant, counted: f64) -> f64 {
         self.since += DT;
-        // What the count alone says: no edge more than there were, and one that may be about to come.
+        // The count alone bounds the speed: at most the counted edges and one that may follow.
         let most = if counted != 0.0 {
             (counted.abs() + 1.0) / DT
         } else if self.since < STANDS {
@@ -146,18 +146,18 @@ impl Filter {
     }
 }
 
-/// Far beyond every motor, and near enough to stay finite whatever the gains are.
+/// A speed far beyond every motor that stays finite with any gains.
 const FASTEST: f64 = 1e6;
 const HEAVIEST: f64 = 1e6;
 const FARTHEST: f64 = 1e9;
 
 #[derive(Debug, Clone)]
 struct Observer {
-    /// Counts that the observed position is off from the count seen last.
+    /// The observed position minus the last count, in counts.
     ahead: f64,
-    /// N·m.
+    /// The observed load torque, in N·m.
     load: f64,
-    // Per control cycle: what is left of the speed, what a newton metre adds, what a radian corrects.
+    // Per control cycle: decay of the speed, gain per N·m, correction per rad.
     decay: f64,
     per_torque: f64,
     torque_constant: f64,
@@ -186,7 +186,7 @@ impl Observer {
 
     fn tune(&mut self, tuning: &Tuning) {
         let gains = &tuning.gains.observer;
-        // No inertia is no model, not infinite acceleration.
+        // An inertia of zero means "no model", not infinite acceleration.
         let x = DT * gains.friction / gains.inertia.max(1e-10);
         let gain = if x > 0.0 { -(-x).exp_m1() / x } else { 1.0 };
         self.decay = (-x).exp();
@@ -202,8 +202,8 @@ impl Observer {
         (velocity * self.decay + torque * self.per_torque).clamp(-FASTEST, FASTEST)
     }
 
-    /// The notes add the load correction although the load slows the prediction down; that way round it
-    /// would run away, so it is taken off here.
+    /// The notes add the load correction although the load decelerates the prediction. That sign
+    /// would be unstable, so the correction is subtracted here.
     fn correct(&mut self, before: f64, predicted: f64, counted: f64) -> f64 {
         let moved = 0.5 * (before + predicted) * DT * self.counts_per_rad;
         let error = counted - (self.ahead + moved);

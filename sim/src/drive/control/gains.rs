@@ -1,10 +1,10 @@
-//! What the loops are tuned to, in SI units, and how commissioning tunes a motor.
+//! The gains of the loops, in SI units, and the tuning of a motor at commissioning.
 
 use std::f64::consts::TAU;
 
 use crate::drive::plant::PlantParams;
 
-/// Everything the control loops are told. Currents in A, angles of the motor shaft in rad.
+/// The parameters of the control loops. Currents in A, angles of the motor shaft in rad.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::drive) struct Gains {
     pub current: CurrentGains,
@@ -20,7 +20,7 @@ pub(in crate::drive) struct CurrentGains {
     pub i: f64,
 }
 
-/// A per rad, rad·s, rad/s; feed-forwards in A per rad/s and rad/s².
+/// Gains in A per rad, A per rad·s and A per rad/s; feed-forwards in A per rad/s and rad/s².
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::drive) struct PositionGains {
     pub p: f64,
@@ -29,13 +29,13 @@ pub(in crate::drive) struct PositionGains {
     pub feed: FeedGains,
 }
 
-/// A per rad/s and rad.
+/// Gains in A per rad/s and A per rad.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::drive) struct VelocityGains {
     pub p: f64,
     pub i: f64,
     pub feed: FeedGains,
-    /// Cut-off of the low-pass filter behind the encoder, Hz.
+    /// The cut-off frequency of the low-pass filter behind the encoder, in Hz.
     pub cut_off: f64,
 }
 
@@ -45,42 +45,44 @@ pub(in crate::drive) struct FeedGains {
     pub acceleration: f64,
 }
 
-/// Corrections per control cycle and rad of position error, and the model.
+/// Corrections per control cycle and rad of position error, and the motor model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::drive) struct ObserverGains {
-    /// rad.
+    /// Position correction, in rad.
     pub position: f64,
-    /// rad/s.
+    /// Velocity correction, in rad/s.
     pub velocity: f64,
-    /// N·m.
+    /// Load torque correction, in N·m.
     pub load: f64,
-    /// N·m·s/rad.
+    /// Viscous friction, in N·m·s/rad.
     pub friction: f64,
-    /// kg·m².
+    /// Inertia, in kg·m².
     pub inertia: f64,
 }
 
-/// Bandwidth of the position loop, rad/s: no more than the loops inside can follow, no less than a
-/// machine is of use with.
+/// The range of the position loop's bandwidth, in rad/s. The inner loops limit the upper end; a
+/// slower machine is of no use.
 const POSITION_BANDWIDTH: (f64, f64) = (60.0, 100.0);
-/// Share of the nominal current that one encoder count may kick the position loop by.
+/// The largest reaction of the position loop to one encoder count, as a share of the nominal
+/// current.
 const KICK: f64 = 0.2;
-/// Of the other loops and filters, as multiples of the position loop's.
+/// Bandwidths of the other loops and filters, as multiples of the position loop's.
 const VELOCITY: f64 = 1.5;
 const OBSERVER: f64 = 4.5;
 const FILTER: f64 = 45.0;
 const CURRENT: f64 = 33.0;
-/// rad/s. Beyond this the current loop's sampling would show.
+/// The largest bandwidth of the current loop, in rad/s. Beyond it, sampling affects the response.
 const MAX_CURRENT_BANDWIDTH: f64 = 2000.0;
 
 impl Gains {
-    /// As auto-tuning finds them: a triple pole for the position loop, a double one for the velocity
-    /// loop, a single one for the current loop.
+    /// Returns the gains of auto-tuning: a triple pole for the position loop, a double pole for the
+    /// velocity loop, a single pole for the current loop.
     pub(in crate::drive) fn tuned(plant: &PlantParams) -> Self {
         let inertia = plant.inertia.max(1e-9);
         let torque_constant = plant.torque_constant.max(1e-9);
         let per_torque = 1.0 / torque_constant;
-        // The D part, limited to ten times the P part, meets a count like a step: 30·J·w² a rad.
+        // The D part is limited to ten times the P part and reacts to a count as to a step: 30·J·w²
+        // per rad.
         let count = 1.0 / plant.counts_per_rad();
         let quiet = (KICK * plant.rated_torque() / (30.0 * inertia * count)).sqrt();
         let w = quiet.clamp(POSITION_BANDWIDTH.0, POSITION_BANDWIDTH.1);
@@ -113,7 +115,7 @@ impl Gains {
 }
 
 impl ObserverGains {
-    /// Corrections that let every error die like e^(−bandwidth·t).
+    /// Returns corrections with which every error decays like e^(−bandwidth·t).
     fn triple_pole(bandwidth: f64, inertia: f64, friction: f64) -> Self {
         let step = crate::drive::CONTROL_STEP;
         let pole = (-bandwidth * step).exp();

@@ -1,20 +1,20 @@
-//! The control loops, as the controller architecture of the IDX application notes (chapter 2) has them:
-//! a position PID and a velocity PI every 0.4 ms, each straight onto a current PI every 0.04 ms.
+//! The control loops, as in the controller architecture of the IDX application notes (chapter 2). A
+//! position PID and a velocity PI run every 0.4 ms. Each drives a current PI every 0.04 ms.
 //!
-//! * `gains`: what they are tuned to, in SI units
+//! * `gains`: control parameters, in SI units
 //! * `outer`: position and velocity loop
 //! * `current`: current loop, I²t
-//! * `lanes`: current loops and motors of several drives at once
+//! * `batch`: current loops and motors of several drives at once
 //! * `estimate`: speed from counts
 //!
-//! A sampled loop acts half a period late on the whole, as what it puts out holds until the next sample.
-//! Each makes up for that by taking what it measures half a period ahead, so that the drive responds as
-//! the notes' transfer functions do.
+//! The output of a sampled loop holds until the next sample and so acts half a period late on
+//! average. Each loop compensates: it extrapolates its measurement by half a period. The drive then
+//! responds as the transfer functions of the notes.
 
+mod batch;
 mod current;
 mod estimate;
 mod gains;
-mod lanes;
 mod outer;
 #[cfg(test)]
 mod tests;
@@ -22,24 +22,24 @@ mod tests;
 use super::objects::CurrentLimits;
 use super::plant::{Plant, PlantParams};
 
-use current::{CurrentLoop, Winding};
+use current::{CurrentLoop, I2tModel};
 use estimate::Estimator;
 pub(super) use estimate::Feedback;
 pub(super) use gains::{
     CurrentGains, FeedGains, Gains, ObserverGains, PositionGains, VelocityGains,
 };
-use outer::Outer;
+use outer::OuterLoop;
 
 /// Current-loop steps in one control cycle.
 const SUBSTEPS: u32 = 10;
 
-/// Low-pass filter of what is shown as averaged, as the share of the new value: 10 ms.
+/// The low-pass coefficient of averaged values, as the share of the new value: 10 ms.
 const AVERAGE: f64 = 0.04;
 
-/// What the loops are asked for in one control cycle. Velocities in counts/s, torque as offset in N·m.
+/// The demand on the loops for one control cycle. Velocities in counts/s, torque offset in N·m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Demand {
-    /// Output stage off.
+    /// The output stage is off.
     Off,
     Position {
         position: f64,
@@ -54,47 +54,47 @@ pub(super) enum Demand {
     Torque(f64),
 }
 
-/// What the feed-forwards are told: counts/s and counts/s². Of profiles only (2.3.4); the cyclic modes
-/// leave it to the MainDevice.
+/// Inputs of the feed-forwards, in counts/s and counts/s². Only profile modes use them (2.3.4); in
+/// cyclic modes the MainDevice adds offsets.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Feed {
     pub velocity: f64,
     pub acceleration: f64,
 }
 
-/// What limits the loops.
+/// The limits of the loops.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bounds {
     pub current: CurrentLimits,
-    /// Counts/s.
+    /// The speed limit, in counts/s.
     pub speed: f64,
 }
 
-/// What the loops are told about themselves and the motor.
+/// Parameters of the loops and the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Tuning {
     pub gains: Gains,
     pub feedback: Feedback,
-    /// N·m/A.
+    /// The torque constant, in N·m/A.
     pub torque_constant: f64,
-    /// A; more than that is for a while only.
+    /// The nominal current, in A. A larger current is possible for a limited time only.
     pub nominal_current: f64,
-    /// s.
+    /// The thermal time constant, in s.
     pub thermal_time_constant: f64,
 }
 
 #[derive(Debug, Clone)]
 pub(super) struct Controller {
-    outer: Outer,
+    outer: OuterLoop,
     current_loop: CurrentLoop,
-    winding: Winding,
+    winding: I2tModel,
     estimator: Estimator,
     counts_per_rad: f64,
-    /// A; `None`: output stage off.
+    /// The current demand, in A. `None`: output stage off.
     wanted: Option<f64>,
-    /// A, over the last control cycle.
+    /// The mean current of the last control cycle, in A.
     current: f64,
-    /// rad/s.
+    /// The averaged velocity, in rad/s.
     averaged_velocity: f64,
     averaged_current: f64,
 }
@@ -103,9 +103,9 @@ impl Controller {
     pub(super) fn new(tuning: &Tuning, params: &PlantParams, plant: &Plant) -> Self {
         let counts_per_rad = params.counts_per_rad();
         Self {
-            outer: Outer::new(tuning, counts_per_rad),
+            outer: OuterLoop::new(tuning, counts_per_rad),
             current_loop: CurrentLoop::new(&tuning.gains.current, params.supply_voltage),
-            winding: Winding::new(tuning),
+            winding: I2tModel::new(tuning),
             estimator: Estimator::new(tuning, plant, counts_per_rad),
             counts_per_rad,
             wanted: None,
@@ -115,7 +115,7 @@ impl Controller {
         }
     }
 
-    /// Other gains from the next step on. What has been integrated stays.
+    /// Applies new gains from the next step on. The integrals keep their values.
     pub(super) fn tune(&mut self, tuning: &Tuning) {
         self.outer.tune(tuning, self.counts_per_rad);
         self.current_loop.tune(&tuning.gains.current);
@@ -123,42 +123,42 @@ impl Controller {
         self.winding.tune(tuning);
     }
 
-    /// What the encoder counts now.
+    /// Returns the present encoder count.
     pub(super) fn counts(&self) -> i64 {
         self.estimator.counts()
     }
 
-    /// Counts/s, as estimated.
+    /// Returns the estimated velocity, in counts/s.
     pub(super) fn velocity(&self) -> f64 {
         self.estimator.velocity() * self.counts_per_rad
     }
 
-    /// Counts/s.
+    /// Returns the averaged velocity, in counts/s.
     pub(super) fn averaged_velocity(&self) -> f64 {
         self.averaged_velocity * self.counts_per_rad
     }
 
-    /// A.
+    /// Returns the mean current of the last control cycle, in A.
     pub(super) fn current(&self) -> f64 {
         self.current
     }
 
-    /// A. What the current loop is asked for.
+    /// Returns the demand on the current loop, in A.
     pub(super) fn current_demand(&self) -> f64 {
         self.wanted.unwrap_or(0.0)
     }
 
-    /// A.
+    /// Returns the averaged current, in A.
     pub(super) fn averaged_current(&self) -> f64 {
         self.averaged_current
     }
 
-    /// 1: the winding is as warm as it may be.
+    /// Returns the thermal level. At 1 the winding has its maximum temperature.
     pub(super) fn thermal_level(&self) -> f64 {
         self.winding.level()
     }
 
-    /// The control cycle that has passed: current loop and motor.
+    /// Simulates one control cycle of current loop and motor.
     pub(super) fn turn(&mut self, plant: &mut Plant) {
         match self.wanted {
             Some(current) => self.drive(plant, current),
@@ -166,14 +166,14 @@ impl Controller {
         }
     }
 
-    /// As [`Controller::turn`] of each. Several at once take less time than one after the other.
+    /// As [`Controller::turn`] for each drive. A batch is faster than one drive after the other.
     pub(super) fn turn_together<const N: usize>(mut together: [(&mut Self, &mut Plant); N]) {
         let wanted = together.each_ref().map(|(controller, plant)| {
             let driven = !plant.blocked;
             controller.wanted.filter(|_| driven)
         });
         if wanted.iter().all(Option::is_some) {
-            lanes::drive(&mut together, wanted.map(Option::unwrap_or_default));
+            batch::drive(&mut together, wanted.map(Option::unwrap_or_default));
             return;
         }
         for (controller, plant) in together {
@@ -181,7 +181,7 @@ impl Controller {
         }
     }
 
-    /// What was seen of the control cycle that has passed.
+    /// Updates the measurements after a control cycle.
     pub(super) fn observe(&mut self, plant: &Plant) {
         self.winding.warm(self.current);
         self.estimator.observe(plant, self.current);
@@ -192,8 +192,8 @@ impl Controller {
         flush(&mut self.averaged_current);
     }
 
-    /// What the current loop works at until the next control cycle. True if a limit kept the loops
-    /// from asking for what they should.
+    /// Sets the demand on the current loop until the next control cycle. True if a limit reduced
+    /// the demand.
     pub(super) fn ask(&mut self, demand: Demand, bounds: &Bounds) -> bool {
         let bounds = Bounds {
             current: CurrentLimits {
@@ -217,14 +217,14 @@ impl Controller {
         self.driven(plant, sum);
     }
 
-    /// A control cycle's steps are over, with this sum of their currents.
+    /// Ends a control cycle with this sum of step currents.
     fn driven(&mut self, plant: &mut Plant, sum: f64) {
         plant.flush();
         self.current_loop.flush();
         self.current = sum / f64::from(SUBSTEPS);
     }
 
-    /// One control period with the output stage off.
+    /// Runs one control period with the output stage off.
     pub(super) fn coast(&mut self, plant: &mut Plant) {
         self.current_loop.reset();
         self.current = 0.0;
@@ -236,7 +236,7 @@ impl Controller {
     }
 }
 
-/// What decays towards zero would end as a subnormal number, which is slow to calculate with.
+/// Sets tiny values to zero. Subnormal numbers slow the calculation down.
 pub(super) fn flush(value: &mut f64) {
     if value.abs() < 1e-30 {
         *value = 0.0;

@@ -1,21 +1,21 @@
-//! Position PID and velocity PI. Both put out current, and share one integral, so that changing over
-//! between them is without a bump.
+//! Position PID and velocity PI. Both output a current and share one integral, so that switching
+//! between them is bumpless.
 
 use super::estimate::Estimator;
 use super::{Bounds, Demand, Feed, FeedGains, Tuning};
 use crate::drive::CONTROL_STEP as DT;
 
 #[derive(Debug, Clone)]
-pub(super) struct Outer {
+pub(super) struct OuterLoop {
     position: Pid,
     velocity: Pi,
     torque_constant: f64,
     counts_per_rad: f64,
-    /// A.
+    /// The integral, in A.
     integral: f64,
-    /// Position error, in counts, of the cycle before; `None`: there was no position to hold.
+    /// The position error of the previous cycle, in counts. `None`: no position was controlled.
     error: Option<f64>,
-    /// A, of the D part.
+    /// The D part, in A.
     derivative: f64,
 }
 
@@ -24,7 +24,7 @@ pub(super) struct Outer {
 struct Pid {
     p: f64,
     i: f64,
-    /// What a change of the error adds to the D part, and what is left of that a cycle later.
+    /// The step of the D part per change of the error, and its decay factor per cycle.
     d: f64,
     d_decay: f64,
     feed: FeedGains,
@@ -38,7 +38,7 @@ struct Pi {
     feed: FeedGains,
 }
 
-/// Per count.
+/// Converts the gains to A per count.
 fn per_count(feed: &FeedGains, counts_per_rad: f64) -> FeedGains {
     FeedGains {
         velocity: feed.velocity / counts_per_rad,
@@ -55,7 +55,7 @@ impl FeedGains {
 impl Pid {
     fn new(tuning: &Tuning, counts_per_rad: f64) -> Self {
         let g = &tuning.gains.position;
-        // Without a P part the filter's time constant is infinite, and no D part is left.
+        // Without a P part the filter's time constant is infinite and the D part vanishes.
         let (d, d_decay) = if g.p > 0.0 && g.d > 0.0 {
             let decay = (-DT * 10.0 * g.p / g.d).exp();
             (g.d * (1.0 - decay) / DT, decay)
@@ -86,7 +86,7 @@ impl Pi {
     }
 }
 
-impl Outer {
+impl OuterLoop {
     pub(super) fn new(tuning: &Tuning, counts_per_rad: f64) -> Self {
         Self {
             position: Pid::new(tuning, counts_per_rad),
@@ -105,7 +105,8 @@ impl Outer {
         self.torque_constant = tuning.torque_constant;
     }
 
-    /// The current to ask for, and whether it was cut; `None`: output stage off. Speed limit in rad/s.
+    /// Returns the current demand and whether it was limited. `None`: output stage off. The speed
+    /// limit is in rad/s.
     pub(super) fn ask(
         &mut self,
         demand: Demand,
@@ -151,7 +152,7 @@ impl Outer {
         };
         let total = wanted + self.integral;
         let cut = bounds.current.clamp(total);
-        // Wind-up: while the output is cut, the integral may only come back.
+        // Anti-windup: while the output is limited, the integral may only decrease in magnitude.
         if total == cut || total * step < 0.0 {
             self.integral = bounds.current.clamp(self.integral + step);
         }
@@ -160,7 +161,7 @@ impl Outer {
 
     fn torque(&self, torque: f64, velocity: f64, bounds: &Bounds) -> (f64, bool) {
         let wanted = torque / self.torque_constant;
-        // Near the speed limit the current that would go on accelerating fades out.
+        // The accelerating current fades out near the speed limit.
         let upper = self.velocity.p * (bounds.speed - velocity);
         let lower = self.velocity.p * (-bounds.speed - velocity);
         let allowed = wanted.min(upper).max(lower);

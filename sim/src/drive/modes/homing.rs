@@ -1,38 +1,38 @@
-//! Homing: from a method's number to the place it looks for, and from there to the home position.
+//! Homing, from the method's number to the home position.
 //!
-//! Every method is the same three steps, of which some are left out: search a switch or an obstacle,
-//! leave it, go on to the index pulse. The place found last is home.
+//! Every method consists of the same three steps, some of which may be skipped: search a switch or
+//! an obstacle, leave it, move to the index pulse. The last position found is home.
 
-use super::{Cycle, Frame, Motion, bit};
+use super::{Cycle, Motion, PositionFrame, bit};
 use crate::drive::io::input;
 use crate::drive::objects::float;
 use crate::drive::profile::Dynamics;
 
-/// What the search ends at.
+/// The reference that ends the search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Mark {
+enum HomingReference {
     Input(u8),
     /// A current above 0x30B2.
     Obstacle,
 }
 
-/// Which way, +1 or −1.
-type Way = i8;
+/// The direction of motion, +1 or −1.
+type Direction = i8;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Method {
-    search: Option<(Mark, Way)>,
-    /// Away from the mark and on to the index pulse. 0: the axis stays where it is.
-    leave: Way,
+    search: Option<(HomingReference, Direction)>,
+    /// The direction away from the reference and to the index pulse. 0: the axis does not move.
+    leave: Direction,
     index: bool,
 }
 
-/// CiA 402-2, "homing method"; the negative ones are maxon's.
+/// CiA 402-2, "homing method". Negative methods are specific to maxon.
 pub(in crate::drive) const METHODS: &[i64] =
     &[-4, -3, -2, -1, 1, 2, 7, 11, 17, 18, 23, 27, 33, 34, 35, 37];
 
 fn method(code: i64) -> Option<Method> {
-    use Mark::{Input, Obstacle};
+    use HomingReference::{Input, Obstacle};
     let (search, leave, index) = match code {
         -4 => (Some((Obstacle, -1)), 1, false),
         -3 => (Some((Obstacle, 1)), -1, false),
@@ -64,9 +64,9 @@ enum Phase {
     #[default]
     Idle,
     Search {
-        mark: Mark,
-        way: Way,
-        /// A limit switch came first; there is no second time.
+        mark: HomingReference,
+        way: Direction,
+        /// The axis has reversed at a limit switch. A second limit switch is an error.
         turned: bool,
     },
     Leave {
@@ -77,7 +77,7 @@ enum Phase {
     Index {
         from: i64,
     },
-    /// Home is known; the axis goes there, or as far from it as 0x30B1 says.
+    /// Home is known. The axis moves there, offset by 0x30B1.
     Travel {
         target: i64,
     },
@@ -85,7 +85,7 @@ enum Phase {
     Failed,
 }
 
-/// Turns without an index pulse before it is given up.
+/// Turns without an index pulse until homing fails.
 const INDEX_TURNS: i64 = 2;
 
 #[derive(Debug, Clone, Default)]
@@ -100,7 +100,7 @@ impl Homing {
         !matches!(self.phase, Phase::Idle | Phase::Attained | Phase::Failed)
     }
 
-    /// What is left of it when something else takes the axis.
+    /// Returns the status that remains after another function takes over the axis.
     pub(super) fn interrupted(&self) -> Self {
         match self.phase {
             Phase::Attained | Phase::Failed => self.clone(),
@@ -114,8 +114,8 @@ impl Homing {
         }
     }
 
-    /// Statusword bits 10, 12 and 13 (CiA 402-2, "definition of bit 10, 12 and 13" of homing mode).
-    /// A halt interrupts it.
+    /// Returns Statusword bits 10, 12 and 13 (CiA 402-2, "definition of bit 10, 12 and 13" of
+    /// homing mode). A halt interrupts homing.
     pub(super) fn bits(&self, stands: bool, halted: bool) -> u16 {
         let resting = if stands { bit::TARGET_REACHED } else { 0 };
         match self.phase {
@@ -129,8 +129,8 @@ impl Homing {
 }
 
 impl Motion {
-    /// A rising edge of Controlword bit 4.
-    pub(super) fn begin_homing(&mut self, cycle: &Cycle, frame: &mut Frame) {
+    /// Starts homing on a rising edge of Controlword bit 4.
+    pub(super) fn begin_homing(&mut self, cycle: &Cycle, frame: &mut PositionFrame) {
         let method = method(cycle.homing.method);
         self.referenced = false;
         self.homing = Homing {
@@ -155,8 +155,8 @@ impl Motion {
         };
     }
 
-    /// One control cycle of homing mode: moves the profile.
-    pub(super) fn home(&mut self, cycle: &Cycle, frame: &mut Frame) {
+    /// Runs one control cycle of homing mode: moves the profile.
+    pub(super) fn home(&mut self, cycle: &Cycle, frame: &mut PositionFrame) {
         if !cycle.set_points.starts() && self.homing.runs() {
             self.homing = Homing::default();
         }
@@ -184,28 +184,30 @@ impl Motion {
         self.look_for_home(leave, cycle, frame);
     }
 
-    fn look_for_home(&mut self, leave: Way, cycle: &Cycle, frame: &mut Frame) {
+    fn look_for_home(&mut self, leave: Direction, cycle: &Cycle, frame: &mut PositionFrame) {
         let inputs = cycle.inputs;
         let index = self.homing.method.is_some_and(|method| method.index);
         let counts = cycle.counts;
         match self.homing.phase {
             Phase::Search { mark, way, turned } => {
                 let there = match mark {
-                    Mark::Input(bit) => inputs.is_on(bit),
-                    Mark::Obstacle => cycle.current.abs() >= cycle.homing.current_threshold,
+                    HomingReference::Input(bit) => inputs.is_on(bit),
+                    HomingReference::Obstacle => {
+                        cycle.current.abs() >= cycle.homing.current_threshold
+                    }
                 };
                 if there {
                     match mark {
-                        Mark::Input(mark) => {
+                        HomingReference::Input(mark) => {
                             self.homing.phase = Phase::Leave { mark, armed: false };
                         }
-                        Mark::Obstacle if index => {
+                        HomingReference::Obstacle if index => {
                             self.homing.phase = Phase::Index { from: counts };
                         }
-                        Mark::Obstacle => self.found(counts, cycle, frame),
+                        HomingReference::Obstacle => self.found(counts, cycle, frame),
                     }
                 } else if cycle.at_limit(way) {
-                    self.homing.phase = if turned || mark != Mark::Input(input::HOME) {
+                    self.homing.phase = if turned || mark != HomingReference::Input(input::HOME) {
                         Phase::Failed
                     } else {
                         Phase::Search {
@@ -248,13 +250,13 @@ impl Motion {
         }
     }
 
-    fn found(&mut self, counts: i64, cycle: &Cycle, frame: &mut Frame) {
+    fn found(&mut self, counts: i64, cycle: &Cycle, frame: &mut PositionFrame) {
         let target = counts.saturating_add(cycle.homing.distance);
         self.take_as_home(target, cycle, frame);
         self.homing.phase = Phase::Travel { target };
     }
 
-    fn take_as_home(&mut self, counts: i64, cycle: &Cycle, frame: &mut Frame) {
+    fn take_as_home(&mut self, counts: i64, cycle: &Cycle, frame: &mut PositionFrame) {
         frame.shift = cycle.homing.home_position - counts;
         self.referenced = true;
     }
@@ -272,8 +274,8 @@ impl Motion {
 }
 
 impl Cycle<'_> {
-    /// The limit switch on that side is on.
-    fn at_limit(&self, way: Way) -> bool {
+    /// True if the limit switch in that direction is on.
+    fn at_limit(&self, way: Direction) -> bool {
         self.inputs.is_on(if way > 0 {
             input::POSITIVE_LIMIT
         } else {
@@ -287,7 +289,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_method_is_known_if_it_is_listed() {
+    fn homing_methods_are_supported_exactly_if_listed() {
         for code in i64::from(i8::MIN)..=i64::from(i8::MAX) {
             assert_eq!(method(code).is_some(), METHODS.contains(&code), "{code}");
         }

@@ -1,10 +1,10 @@
-//! The modes of operation: from set-points to what the control loops are asked for in one control
-//! cycle. Counts and seconds; positions are unwrapped encoder counts.
+//! The modes of operation, from set-points to the demand on the control loops for one control
+//! cycle. Units are counts and seconds; positions are unwrapped encoder counts.
 //!
-//! * here: what a mode is told, the cyclic modes, the Statusword's bits
+//! * here: the input of a mode, the cyclic modes, the Statusword's bits
 //! * `position`, `velocity`: profile position and profile velocity
-//! * `homing`: home, by whatever method
-//! * `stop`: coming to rest, for halts and the power state machine's stops
+//! * `homing`: all homing methods
+//! * `stop`: deceleration to standstill for halts and the power state machine's stops
 
 mod homing;
 mod position;
@@ -18,7 +18,7 @@ use super::profile::{Interpolator, Profile};
 use homing::Homing;
 pub(super) use homing::METHODS;
 use position::PointToPoint;
-use velocity::Reached;
+use velocity::VelocityWindow;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Mode {
@@ -62,7 +62,7 @@ impl Mode {
     }
 }
 
-/// Process data as the last SYNC found it, in the objects' own units.
+/// Process data at the last SYNC, in the objects' own units.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct SetPoints {
     pub controlword: u16,
@@ -75,40 +75,40 @@ pub(super) struct SetPoints {
 }
 
 impl SetPoints {
-    /// Bit 4: new set-point, or homing operation start.
+    /// True with bit 4: new set-point, or homing operation start.
     fn starts(&self) -> bool {
         self.controlword & 1 << 4 != 0
     }
 
-    /// Bit 5.
+    /// True with bit 5: change set immediately.
     fn change_at_once(&self) -> bool {
         self.controlword & 1 << 5 != 0
     }
 
-    /// Bit 6.
+    /// True with bit 6: relative target.
     fn relative(&self) -> bool {
         self.controlword & 1 << 6 != 0
     }
 
-    /// Bit 9: pass one target on the way to the next.
+    /// True with bit 9: pass one target at speed and go on to the next.
     fn change_on_set_point(&self) -> bool {
         self.controlword & 1 << 9 != 0
     }
 
-    /// Bit 8.
+    /// True with bit 8: halt.
     pub(super) fn halt(&self) -> bool {
         self.controlword & 1 << 8 != 0
     }
 }
 
-/// How encoder counts appear in 0x6064.
+/// The mapping of encoder counts to 0x6064.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Frame {
+pub(super) struct PositionFrame {
     pub min: i64,
     pub width: i64,
-    /// What homing added.
+    /// The shift that homing added.
     pub shift: i64,
-    /// 0x607E: what the bus sees of positions, and of velocities, has the other sign.
+    /// 0x607E: positions and velocities on the bus have the opposite sign.
     pub polarity: Polarity,
 }
 
@@ -127,7 +127,7 @@ impl Polarity {
         }
     }
 
-    /// There and back.
+    /// Converts a velocity between bus and drive, in either direction.
     pub(super) fn velocity(self, value: i64) -> i64 {
         if self.velocity { -value } else { value }
     }
@@ -137,8 +137,8 @@ impl Polarity {
     }
 }
 
-impl Frame {
-    /// Between the bus and the drive, there and back.
+impl PositionFrame {
+    /// Converts a position between bus and drive, in either direction.
     pub(super) fn turned(&self, shown: i64) -> i64 {
         if !self.polarity.position {
             return shown;
@@ -157,7 +157,7 @@ impl Frame {
         self.min + (counts + self.shift - self.min).rem_euclid(self.width)
     }
 
-    /// From one shown position to another, the short way round.
+    /// Returns the shortest distance from one shown position to another.
     fn way(&self, from: i64, to: i64) -> i64 {
         if self.width == 1 << 32 {
             return (to - from) << 32 >> 32;
@@ -167,11 +167,11 @@ impl Frame {
     }
 }
 
-/// Statusword bits 8–15 as far as a mode sets them.
+/// Statusword bits 8–15 that depend on the mode.
 pub(super) mod bit {
     pub const TARGET_REACHED: u16 = 1 << 10;
     pub const INTERNAL_LIMIT: u16 = 1 << 11;
-    /// Follows the command value, set-point acknowledged, speed is zero, homing attained.
+    /// Drive follows the command value, set-point acknowledged, speed is zero, homing attained.
     pub const MODE_12: u16 = 1 << 12;
     /// Following error, homing error, slippage.
     pub const MODE_13: u16 = 1 << 13;
@@ -180,7 +180,7 @@ pub(super) mod bit {
 
 #[derive(Debug, Clone)]
 pub(super) struct Motion {
-    /// CSP: target as received last, and what it means in unwrapped counts.
+    /// CSP: the last received target, and the same target in unwrapped counts.
     received: i64,
     target: i64,
     position: Interpolator,
@@ -188,21 +188,21 @@ pub(super) struct Motion {
     /// The moving point of PP, PV, CSP under 0x6080, and of every stop.
     profile: Profile,
     point_to_point: PointToPoint,
-    speed: Reached,
-    /// A stop at the current limit came to its end: the point that the axis now holds.
+    speed: VelocityWindow,
+    /// A stop at the current limit has ended, and the axis holds its position.
     held: bool,
     halted: bool,
     reached: bool,
     homing: Homing,
     referenced: bool,
-    /// A set-point was cut by a position or speed limit.
+    /// A position or speed limit reduced a set-point.
     cut: bool,
     /// The target position is outside the software limits.
     ignored: bool,
     torque: f64,
 }
 
-/// What a mode is told in one control cycle.
+/// The input of a mode for one control cycle.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cycle<'a> {
     pub parameters: &'a Parameters,
@@ -211,13 +211,13 @@ pub(super) struct Cycle<'a> {
     pub set_points: &'a SetPoints,
     /// Controlword bit 4 rose.
     pub start: bool,
-    /// Controlword bit 8, where the mode obeys it.
+    /// Controlword bit 8, if the mode obeys it.
     pub halted: bool,
     pub counts: i64,
-    /// Counts/s.
+    /// The estimated velocity, in counts/s.
     pub velocity: f64,
     pub stands: bool,
-    /// A.
+    /// The mean current, in A.
     pub current: f64,
 }
 
@@ -230,7 +230,7 @@ impl Motion {
             velocity: Interpolator::default(),
             profile: Profile::at(float(counts), 0.0),
             point_to_point: PointToPoint::at(counts),
-            speed: Reached::default(),
+            speed: VelocityWindow::default(),
             held: false,
             halted: false,
             reached: true,
@@ -242,12 +242,12 @@ impl Motion {
         }
     }
 
-    /// Forgets every set-point: the axis is taken over as it stands or moves.
-    pub(super) fn restart(&mut self, counts: i64, velocity: f64, frame: &Frame) {
+    /// Drops every set-point and continues from the actual position and velocity.
+    pub(super) fn restart(&mut self, counts: i64, velocity: f64, frame: &PositionFrame) {
         *self = Self {
             received: frame.show(counts),
             velocity: Interpolator::at(velocity),
-            // One cycle back, so that the first step of a ramp comes out where the axis is now.
+            // One cycle back, so that the first step of a ramp ends at the present position.
             profile: Profile::at(float(counts) - velocity * super::CONTROL_STEP, velocity),
             homing: self.homing.interrupted(),
             referenced: self.referenced,
@@ -255,13 +255,13 @@ impl Motion {
         };
     }
 
-    /// A SYNC while the operation is enabled.
+    /// Takes the set-points of a SYNC while the operation is enabled.
     pub(super) fn take(
         &mut self,
         mode: Mode,
         set_points: &SetPoints,
         p: &Parameters,
-        frame: &Frame,
+        frame: &PositionFrame,
     ) {
         match mode {
             Mode::CyclicPosition => {
@@ -292,8 +292,13 @@ impl Motion {
         }
     }
 
-    /// One control cycle with the operation enabled. Homing may move the frame.
-    pub(super) fn demand(&mut self, mode: Mode, cycle: &Cycle, frame: &mut Frame) -> Demand {
+    /// Runs one control cycle with the operation enabled. Homing may shift the frame.
+    pub(super) fn demand(
+        &mut self,
+        mode: Mode,
+        cycle: &Cycle,
+        frame: &mut PositionFrame,
+    ) -> Demand {
         let p = cycle.parameters;
         let torque = float(cycle.set_points.torque_offset) * p.torque_unit;
         match mode {
@@ -306,7 +311,7 @@ impl Motion {
             let ramp = p.options.halt_ramp();
             let (demand, stands) = self.stop(ramp, Some(mode), cycle);
             self.reached = stands;
-            // Goes on from here once the halt is over.
+            // Motion continues from here when the halt ends.
             self.position = Interpolator::at(self.profile.position);
             self.velocity = Interpolator::at(self.profile.velocity);
             return demand;
@@ -357,7 +362,7 @@ impl Motion {
         }
     }
 
-    /// Holds the point where it is.
+    /// Holds the present point.
     pub(super) fn hold(&mut self) -> Demand {
         self.profile = Profile::at(self.profile.position, 0.0);
         self.profile_demand(0.0)
@@ -371,17 +376,17 @@ impl Motion {
         }
     }
 
-    /// An error ends homing, not only the motion.
+    /// Ends homing with an error.
     pub(super) fn fail_homing(&mut self) {
         self.homing.fail();
     }
 
-    /// What homing said last is history.
+    /// Resets the homing status.
     pub(super) fn forget_homing(&mut self) {
         self.homing = Homing::default();
     }
 
-    /// Counts between demand and position; zero where no position is demanded.
+    /// Returns demand minus position in counts; zero without a position demand.
     pub(super) fn following_error(&self, demand: &Demand, counts: i64) -> f64 {
         match demand {
             Demand::Position { position, .. } => position - float(counts),
@@ -389,12 +394,12 @@ impl Motion {
         }
     }
 
-    /// Demanded position and speed, for 0x6062 and 0x606B.
+    /// Returns the demanded position and speed, for 0x6062 and 0x606B.
     pub(super) fn demanded(&self) -> (f64, f64) {
         (self.profile.position, self.profile.velocity)
     }
 
-    /// The mode's Statusword bits. `follows`: enabled and not stopping.
+    /// Returns the mode's Statusword bits. `follows`: enabled and not stopping.
     pub(super) fn status(&self, mode: Mode, follows: bool, velocity: f64, p: &Parameters) -> u16 {
         let mut bits = 0;
         let mut set = |on: bool, bit: u16| bits |= if on { bit } else { 0 };
@@ -402,7 +407,8 @@ impl Motion {
         set(self.referenced, bit::REFERENCED);
         match mode {
             Mode::CyclicPosition | Mode::CyclicVelocity | Mode::CyclicTorque => {
-                // A target that is limited in speed is followed; one outside the software limits is not.
+                // Bit 12 stays set for a target limited in speed, not for one outside the software
+                // limits.
                 set(follows && !self.ignored && !self.halted, bit::MODE_12);
             }
             Mode::ProfilePosition => {

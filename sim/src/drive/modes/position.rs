@@ -1,6 +1,6 @@
 //! Profile position: set-points by handshake, one move after the other.
 
-use super::{Cycle, Frame, Motion};
+use super::{Cycle, Motion, PositionFrame};
 use crate::drive::objects::float;
 use crate::drive::profile::Dynamics;
 
@@ -12,12 +12,12 @@ struct Move {
     passing: bool,
 }
 
-/// The set-point under way and the one that waits.
+/// The active set-point and the waiting one.
 #[derive(Debug, Clone)]
 pub(super) struct PointToPoint {
     active: Option<Move>,
     next: Option<Move>,
-    /// The target accepted last.
+    /// The last accepted target.
     target: i64,
     acknowledged: bool,
     settled_cycles: u32,
@@ -34,15 +34,17 @@ impl PointToPoint {
         }
     }
 
-    /// Statusword bit 12. Stays while the buffer is full, whatever Controlword bit 4 does.
+    /// Returns Statusword bit 12. It stays set while the buffer is full, independent of Controlword
+    /// bit 4.
     pub(super) fn acknowledged(&self) -> bool {
         self.acknowledged
     }
 }
 
 impl Motion {
-    /// The handshake: Controlword bit 4 against Statusword bit 12, also while the axis is halted.
-    pub(super) fn take_set_point(&mut self, cycle: &Cycle, frame: &Frame) {
+    /// Runs the handshake of Controlword bit 4 and Statusword bit 12, also while the axis is
+    /// halted.
+    pub(super) fn take_set_point(&mut self, cycle: &Cycle, frame: &PositionFrame) {
         let full = self.point_to_point.next.is_some();
         if cycle.start && (!full || cycle.set_points.change_at_once()) {
             self.accept(cycle, frame);
@@ -99,7 +101,7 @@ impl Motion {
         }
     }
 
-    /// Towards a target at full speed. True once it is passed.
+    /// Moves towards a target at full speed. True once it is passed.
     fn pass(&mut self, target: f64, dynamics: &Dynamics) -> bool {
         let way = (target - self.profile.position).signum();
         self.profile.ramp(
@@ -110,7 +112,7 @@ impl Motion {
         (target - self.profile.position) * way <= 0.0
     }
 
-    fn accept(&mut self, cycle: &Cycle, frame: &Frame) {
+    fn accept(&mut self, cycle: &Cycle, frame: &PositionFrame) {
         let (p, set) = (cycle.parameters, cycle.set_points);
         let last = self.point_to_point.target;
         let target = if set.relative() {

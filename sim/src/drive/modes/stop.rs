@@ -1,4 +1,4 @@
-//! Coming to rest: for Controlword bit 8 and for the stops of the power state machine.
+//! Deceleration to standstill, for Controlword bit 8 and for stops of the power state machine.
 
 use super::{Cycle, Mode, Motion};
 use crate::drive::control::{Demand, Feed};
@@ -7,7 +7,7 @@ use crate::drive::profile::Profile;
 use crate::drive::state::Ramp;
 
 impl Motion {
-    /// One control cycle of a stop. True when the demanded speed is zero.
+    /// Runs one control cycle of a stop. True when the demanded speed is zero.
     pub(in crate::drive) fn stop(
         &mut self,
         ramp: Ramp,
@@ -25,8 +25,8 @@ impl Motion {
         (self.profile_demand(0.0), there)
     }
 
-    /// No ramp: the velocity loop is asked to stand and takes all the current there is. Where the axis
-    /// then stands, it is held.
+    /// Stops without a ramp: the velocity loop demands zero speed and uses the full current. The
+    /// axis then holds its position.
     fn stop_at_the_limit(&mut self, cycle: &Cycle) -> (Demand, bool) {
         if !self.held && !cycle.stands {
             self.profile = Profile::at(float(cycle.counts), cycle.velocity);

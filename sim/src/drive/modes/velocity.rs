@@ -1,29 +1,29 @@
-//! Profile velocity: a ramp to the target, and what is said about how well it is kept.
+//! Profile velocity: a ramp to the target, and the status of the speed.
 
 use super::{Cycle, Motion};
 use crate::drive::control::Demand;
 use crate::drive::objects::{Parameters, float};
 
-/// How long the speed has been inside its window, above zero and slipping; in control cycles.
+/// Control cycles for which the speed has been inside its window, above zero, and slipping.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Reached {
+pub(super) struct VelocityWindow {
     inside: u32,
     turning: u32,
     slipping: bool,
 }
 
-/// Without 0x606D and 0x606F: as shares of the greatest speed and of the target.
+/// The windows without 0x606D and 0x606F, as shares of the maximum speed and of the target.
 const SPEED_SHARE: f64 = 0.002;
 const TARGET_SHARE: f64 = 0.02;
 
-impl Reached {
-    /// Statusword bit 12: 0x606F, and 0x6070 if the axis must turn longer than that.
+impl VelocityWindow {
+    /// Returns Statusword bit 12: the speed is below 0x606F, or above it for at most 0x6070.
     pub(super) fn is_zero(&self, velocity: f64, p: &Parameters) -> bool {
         let grace = 1..=p.velocity.threshold_time;
         velocity.abs() <= zero(p) || grace.contains(&self.turning)
     }
 
-    /// Statusword bit 13: 0x60F8.
+    /// Returns Statusword bit 13: slippage beyond 0x60F8.
     pub(super) fn slips(&self) -> bool {
         self.slipping
     }

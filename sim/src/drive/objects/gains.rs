@@ -1,14 +1,14 @@
-//! The control parameters a maxon drive shows: 0x30A0–0x30A3, and which estimate of the speed is fed
-//! back. Written over SDO they act within 10 ms.
+//! The control parameters of a maxon drive: 0x30A0–0x30A3, and the selection of the speed estimate.
+//! Values written by SDO act within 10 ms.
 //!
-//! The IDX application notes (chapter 2, tables 2-7 to 2-10) name the units that EPOS Studio shows; an
-//! object holds thousandths of them (µV/A, µA/rad, ‰, mHz, …), the filter's cut-off frequency whole
-//! hertz.
+//! The IDX application notes (chapter 2, tables 2-7 to 2-10) name the units that EPOS Studio shows.
+//! An object holds thousandths of them (µV/A, µA/rad, ‰, mHz, …); the filter's cut-off frequency is
+//! in whole hertz.
 
-use super::binder::Binder;
+use super::bind::Binder;
 use super::units::prefix;
 use super::{float, whole};
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::control::{
     CurrentGains, FeedGains, Feedback, Gains, ObserverGains, PositionGains, Tuning, VelocityGains,
 };
@@ -21,7 +21,7 @@ struct Row {
     sub: u8,
     name: &'static str,
     bits: u32,
-    /// What 1 in the object is in SI units.
+    /// The SI value of 1 in the object.
     unit: f64,
 }
 
@@ -35,10 +35,10 @@ const fn row(index: u16, sub: u8, name: &'static str, bits: u32, unit: f64) -> R
     }
 }
 
-/// N·m per rad/s that 1 nN·m per rpm is.
+/// 1 nN·m per rpm, in N·m per rad/s.
 const FRICTION: f64 = 1e-9 * 30.0 / std::f64::consts::PI;
 
-/// Where the table has the position loop's I gain, whose unit 0x30A1:09 may change by powers of ten.
+/// The row of the position loop's I gain. 0x30A1:09 changes its unit by powers of ten.
 const POSITION_I: usize = 3;
 const POSITION_I_UNIT: &str = "SI unit position controller I gain";
 const MICROAMPERE_PER_S: i64 = 0xfa04_0300;
@@ -46,7 +46,7 @@ const MILLIAMPERE_PER_S: i64 = 0xfd04_0300;
 const LARGEST: f64 = 4_294_967_295.0;
 
 /// 0x3000:02: PI current controller, PI velocity controller with low-pass filter, PID position
-/// controller. The second digit tells how the speed is estimated.
+/// controller. The second digit selects the speed estimate.
 const FILTERED: i64 = 0x0001_0111;
 const OBSERVER: i64 = 2;
 
@@ -113,7 +113,7 @@ const OBJECTS: [(u16, &str); 4] = [
     (0x30a3, "Velocity observer parameter set"),
 ];
 
-/// In the table's order.
+/// Returns the gains in the table's order.
 fn to_table(g: &Gains) -> [f64; ROWS.len()] {
     [
         g.current.p,
@@ -186,14 +186,14 @@ fn from_table(table: [f64; ROWS.len()]) -> Gains {
 
 #[derive(Debug, Clone)]
 pub(super) struct TuningSlots {
-    /// In the table's order; `None`: the dictionary has no such object, and what commissioning found
-    /// stays.
-    gains: [Option<Slot>; ROWS.len()],
-    position_i_unit: Option<Slot>,
-    torque_constant: Option<Slot>,
-    nominal_current: Option<Slot>,
-    thermal_time_constant: Option<Slot>,
-    control_structure: Option<Slot>,
+    /// In the table's order. `None`: the dictionary has no such object, and the value from
+    /// commissioning stays.
+    gains: [Option<EntryHandle>; ROWS.len()],
+    position_i_unit: Option<EntryHandle>,
+    torque_constant: Option<EntryHandle>,
+    nominal_current: Option<EntryHandle>,
+    thermal_time_constant: Option<EntryHandle>,
+    control_structure: Option<EntryHandle>,
     commissioned: Tuning,
 }
 
@@ -207,7 +207,7 @@ impl TuningSlots {
         }
     }
 
-    /// Finds the objects and writes what tuning this motor would have left there.
+    /// Finds the objects and writes the result of tuning this motor.
     pub(super) fn bind(b: &mut Binder<'_>, plant: &PlantParams) -> Self {
         let commissioned = Tuning {
             gains: Gains::tuned(plant),
@@ -251,7 +251,7 @@ impl TuningSlots {
         units
     }
 
-    /// What the objects say now.
+    /// Returns the present values of the objects.
     pub(super) fn read(&self, store: &ObjectStore) -> Tuning {
         let mut table = to_table(&self.commissioned.gains);
         for ((value, slot), unit) in table.iter_mut().zip(self.gains).zip(self.units(store)) {
@@ -262,7 +262,7 @@ impl TuningSlots {
         let observed = self
             .control_structure
             .is_some_and(|slot| store.get(slot) >> 4 & 0xf == OBSERVER);
-        let motor = |slot: Option<Slot>, unit: f64, commissioned: f64| {
+        let motor = |slot: Option<EntryHandle>, unit: f64, commissioned: f64| {
             slot.map(|slot| float(store.get(slot)) * unit)
                 .filter(|value| *value > 0.0)
                 .unwrap_or(commissioned)
@@ -286,9 +286,9 @@ impl TuningSlots {
 mod tests {
     use super::*;
 
-    /// 2.3.1–2.3.3, "conversion of … parameters (EPOS4/IDX to SI units)": index, subindex, and what the
-    /// value in the unit of EPOS Studio is multiplied by. The objects hold thousandths of that unit; only
-    /// the cut-off frequency is in whole hertz.
+    /// 2.3.1–2.3.3, "conversion of … parameters (EPOS4/IDX to SI units)": index, subindex, and the
+    /// factor from EPOS Studio's unit to SI. The objects hold thousandths of that unit; only the
+    /// cut-off frequency is in whole hertz.
     const NOTES: [(u16, u8, f64); 17] = [
         (0x30a0, 1, 0.001),
         (0x30a0, 2, 1.0),
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn objects_convert_as_the_application_notes_say() {
+    fn gain_objects_convert_as_in_the_application_notes() {
         let (mut store, slots) = drive(&PlantParams::default());
         for (n, (index, sub, factor)) in NOTES.into_iter().enumerate() {
             let slot = store.slot(index, sub).unwrap();
@@ -337,7 +337,7 @@ mod tests {
 
     /// 2.3.4: FF_ω = r / k_m, FF_α = J / k_m.
     #[test]
-    fn tuning_leaves_the_motor_in_the_objects() {
+    fn tuning_writes_motor_values_to_the_objects() {
         let plant = PlantParams::default();
         let (store, slots) = drive(&plant);
         let value = |index, sub| store.get(store.slot(index, sub).unwrap());
@@ -358,7 +358,7 @@ mod tests {
         ] {
             assert_eq!(value(index, sub), expected, "0x{index:04x}:{sub}");
         }
-        // What rounding to the objects leaves of the gains.
+        // Only the rounding in the objects changes the gains.
         let tuned = to_table(&Gains::tuned(&plant));
         for (read, tuned) in to_table(&slots.read(&store).gains).into_iter().zip(tuned) {
             assert!((read / tuned - 1.0).abs() < 3e-3, "{read}, not {tuned}");
@@ -366,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn the_position_i_gain_has_its_own_unit() {
+    fn position_i_gain_unit_is_configurable() {
         let (mut store, slots) = drive(&PlantParams::default());
         let gain = store.slot(0x30a1, 2).unwrap();
         let unit = store.slot(0x30a1, 9).unwrap();
@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn the_control_structure_picks_the_estimate() {
+    fn control_structure_selects_the_speed_estimate() {
         let (mut store, slots) = drive(&PlantParams::default());
         let structure = store.slot(0x3000, 2).unwrap();
         for (value, feedback) in [
@@ -401,9 +401,9 @@ mod tests {
     }
 
     #[test]
-    fn the_same_index_in_another_makers_drive_is_left_alone() {
+    fn vendor_objects_of_other_drives_stay_unchanged() {
         let mut store = ObjectStore::default();
-        let access = super::super::binder::RW;
+        let access = super::super::bind::RW;
         let slot = store.ensure(0x30a0, 1, "Brake delay", 32, access, &[7]);
         let plant = PlantParams::default();
         let slots = TuningSlots::bind(&mut Binder(&mut store), &plant);

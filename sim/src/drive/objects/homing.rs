@@ -1,41 +1,41 @@
 //! Homing: 0x6098–0x609A, the home position, and maxon's 0x30B0–0x30B2.
 
-use super::binder::{Binder, RW};
+use super::bind::{Binder, RW};
 use super::{float, int, uint, whole};
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::modes::METHODS;
 
 #[derive(Debug, Clone)]
 pub(super) struct HomingSlots {
-    method: Slot,
-    search_speed: Slot,
-    zero_speed: Slot,
-    acceleration: Slot,
-    /// 0x30B0, else 0x607C.
-    home_position: Option<Slot>,
-    distance: Option<Slot>,
-    current_threshold: Option<Slot>,
+    method: EntryHandle,
+    search_speed: EntryHandle,
+    zero_speed: EntryHandle,
+    acceleration: EntryHandle,
+    /// 0x30B0, or 0x607C without it.
+    home_position: Option<EntryHandle>,
+    distance: Option<EntryHandle>,
+    current_threshold: Option<EntryHandle>,
 }
 
-/// In counts and seconds.
+/// Homing parameters, in counts and seconds.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::drive) struct HomingParameters {
     pub method: i64,
-    /// Counts/s, 0x6099:01.
+    /// 0x6099:01, in counts/s.
     pub search_speed: f64,
-    /// Counts/s, 0x6099:02.
+    /// 0x6099:02, in counts/s.
     pub zero_speed: f64,
-    /// Counts/s², 0x609A.
+    /// 0x609A, in counts/s².
     pub acceleration: f64,
-    /// What 0x6064 shows where the axis ends up.
+    /// The value of 0x6064 at the end of homing.
     pub home_position: i64,
-    /// Counts from the place found to where the axis ends up, 0x30B1.
+    /// 0x30B1: the distance from the reference found to the end position, in counts.
     pub distance: i64,
-    /// A, 0x30B2.
+    /// 0x30B2, in A.
     pub current_threshold: f64,
 }
 
-/// 0x60E3, as far as the ESI has room; 35 does what 37 does.
+/// Fills 0x60E3 as far as the ESI has entries. Method 35 does the same as 37.
 fn list_methods(b: &mut Binder<'_>) {
     let listed = METHODS.iter().filter(|&&code| code != 35);
     for (sub, code) in (1..).zip(listed) {
@@ -47,10 +47,11 @@ fn list_methods(b: &mut Binder<'_>) {
 
 const DISTANCE: (u16, &str, u32) = (0x30b1, "Home offset move distance", 32);
 const THRESHOLD: (u16, &str, u32) = (0x30b2, "Current threshold for homing mode", 16);
-/// mA.
+/// The default of 0x30B2, in mA.
 const THRESHOLD_MA: i64 = 500;
 
-/// For a dictionary that says nothing about its maker's objects. Not 0x30B0: such a dictionary has 0x607C.
+/// Adds maxon's objects to a dictionary without vendor-specific objects. 0x30B0 is not added: such
+/// a dictionary has 0x607C.
 pub(super) fn add(b: &mut Binder<'_>) {
     for (index, name, bits) in [DISTANCE, THRESHOLD] {
         b.bind(index, 0, name, bits, RW);
@@ -58,7 +59,7 @@ pub(super) fn add(b: &mut Binder<'_>) {
 }
 
 impl HomingSlots {
-    /// `per_rpm`, `per_rpm_s`: the drive's units of speed and acceleration.
+    /// Binds the objects. `per_rpm`, `per_rpm_s`: the drive's units of speed and acceleration.
     pub(super) fn bind(b: &mut Binder<'_>, per_rpm: f64, per_rpm_s: f64) -> Self {
         let units = |value: f64| whole(value).clamp(1, 0xffff_ffff);
         let method = b.with_default(0x6098, 0, "Homing method", 8, 37);
@@ -95,14 +96,14 @@ impl HomingSlots {
         }
     }
 
-    /// Counts/s and counts/s² a unit.
+    /// Reads the parameters. Speed and acceleration units are in counts/s and counts/s².
     pub(super) fn read(
         &self,
         store: &ObjectStore,
         velocity_unit: f64,
         acceleration_unit: f64,
     ) -> HomingParameters {
-        let signed = |slot: Option<Slot>| slot.map_or(0, |slot| int(store, slot));
+        let signed = |slot: Option<EntryHandle>| slot.map_or(0, |slot| int(store, slot));
         HomingParameters {
             method: int(store, self.method),
             search_speed: float(uint(store, self.search_speed)) * velocity_unit,

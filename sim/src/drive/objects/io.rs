@@ -1,23 +1,23 @@
 //! Digital inputs and outputs: 0x60FD, 0x60FE and, of maxon drives, 0x3141, 0x3142, 0x3150.
 
-use super::binder::{Binder, RO, RW};
-use crate::coe::store::{ObjectStore, Slot};
+use super::bind::{Binder, RO, RW};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::io::input;
 
-/// Inputs that 0x3142 assigns; what is not among them is always wired.
+/// Inputs that 0x3142 assigns. All other inputs are always connected.
 const ASSIGNED: u32 = 1 << input::NEGATIVE_LIMIT | 1 << input::POSITIVE_LIMIT | 1 << input::HOME;
 
 #[derive(Debug, Clone)]
 pub(in crate::drive) struct IoSlots {
-    pub inputs: Slot,
-    pub outputs: Slot,
-    /// 0x60FE:02: which outputs are driven. Without it, all.
-    output_mask: Option<Slot>,
-    polarity: Option<Slot>,
-    /// 0x3142:n: the bit of 0x60FD that input n is for.
-    configuration: [Option<Slot>; 8],
+    pub inputs: EntryHandle,
+    pub outputs: EntryHandle,
+    /// 0x60FE:02: the outputs that are driven. Without it, all outputs are driven.
+    output_mask: Option<EntryHandle>,
+    polarity: Option<EntryHandle>,
+    /// 0x3142:n: the bit of 0x60FD that input n drives.
+    configuration: [Option<EntryHandle>; 8],
     /// 0x3141:01.
-    logic: Option<Slot>,
+    logic: Option<EntryHandle>,
 }
 
 impl IoSlots {
@@ -47,7 +47,7 @@ impl IoSlots {
         }
     }
 
-    /// Bits of 0x60FD whose polarity is inverted, and bits that have an input.
+    /// Returns the bits of 0x60FD with inverted polarity, and the bits that have an input.
     pub(in crate::drive) fn wiring(&self, store: &ObjectStore) -> (u32, u32) {
         if self.configuration.iter().all(Option::is_none) {
             return (0, u32::MAX);
@@ -63,7 +63,7 @@ impl IoSlots {
         (inverted, live)
     }
 
-    /// 0x60FD, and the same by input in 0x3141:01.
+    /// Writes 0x60FD, and the same levels by input to 0x3141:01.
     pub(in crate::drive) fn publish(&self, store: &mut ObjectStore, inputs: u32) {
         store.show(self.inputs, i64::from(inputs));
         if let Some(slot) = self.logic {
@@ -75,7 +75,7 @@ impl IoSlots {
         }
     }
 
-    /// Inputs in use, and their bits in 0x60FD.
+    /// Returns the assigned inputs with their bits in 0x60FD.
     fn lines<'a>(&'a self, store: &'a ObjectStore) -> impl Iterator<Item = (usize, u32)> + 'a {
         self.configuration
             .iter()
@@ -86,7 +86,7 @@ impl IoSlots {
             })
     }
 
-    /// 0x60FE as it reaches the terminals.
+    /// Returns 0x60FE as driven at the terminals.
     pub(in crate::drive) fn outputs(&self, store: &ObjectStore) -> u32 {
         let mask = self.output_mask.map_or(-1, |slot| store.get(slot));
         let [a, b, c, d, ..] = (store.get(self.outputs) & mask).to_le_bytes();

@@ -1,18 +1,19 @@
-//! The objects the drive reads and writes, as slots; power-on values for those an ESI leaves empty.
+//! The objects that the drive reads and writes, as slots. An object without an ESI default gets a
+//! power-on value.
 //!
-//! * `binder`: from a dictionary's entries to slots
+//! * `bind`: dictionary entries as slots
 //! * `motor`: motor data
 //! * `gains`: control parameters
-//! * `parameters`: limits, profiles, and what the other files read
-//! * `homing`: where home is and how to get there
+//! * `parameters`: limits, profiles, and the results of the other modules
+//! * `homing`: home position and method
 //! * `io`: digital inputs and outputs
 //! * `probe`: touch probes
 //! * `options`: option codes
-//! * `velocity`: when a speed is reached, zero or slipping
-//! * `torque`: what limits the current
+//! * `velocity`: thresholds for target speed, zero speed and slippage
+//! * `torque`: current limits
 //! * `units`: SI unit codes, interpolation time
 
-mod binder;
+mod bind;
 mod gains;
 mod homing;
 mod io;
@@ -28,9 +29,9 @@ use std::ops::RangeInclusive;
 
 use super::control::Tuning;
 use super::plant::PlantParams;
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 
-use binder::{Binder, RO, RW};
+use bind::{Binder, RO, RW};
 use gains::TuningSlots;
 use io::IoSlots;
 use parameters::ParameterSlots;
@@ -44,40 +45,41 @@ pub(super) use torque::CurrentLimits;
 /// PP, PV, HM, CSP, CSV, CST.
 const SUPPORTED_MODES: i64 = 1 | 1 << 2 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9;
 
-/// An ESI that lists none of these leaves out its maker's objects; one that lists some means others
-/// than a maxon drive's, or has them itself.
-const MAKERS_OWN: RangeInclusive<u16> = 0x2000..=0x5fff;
+/// The manufacturer-specific area. An ESI without any of these objects omits them, and the drive
+/// adds maxon's. An ESI with some of them is left as it is.
+const MANUFACTURER_SPECIFIC: RangeInclusive<u16> = 0x2000..=0x5fff;
 
 #[derive(Debug, Clone)]
 pub(super) struct Objects {
-    pub error_register: Slot,
-    pub error_code: Slot,
-    /// 0x1003:0 and the entries behind it, where the ESI has them.
-    history: [Option<Slot>; 6],
-    pub controlword: Slot,
-    pub statusword: Slot,
-    pub mode: Slot,
-    pub mode_display: Slot,
-    pub position_demand: Slot,
-    pub position: Slot,
-    pub velocity_demand: Slot,
-    pub velocity: Slot,
-    pub velocity_averaged: Option<Slot>,
-    pub torque: Slot,
-    pub torque_averaged: Option<Slot>,
-    pub current: Option<Slot>,
-    pub current_averaged: Option<Slot>,
-    pub current_demand: Option<Slot>,
-    pub thermal_level: Option<Slot>,
-    pub following_error: Slot,
-    pub target_position: Slot,
-    pub target_velocity: Slot,
-    pub target_torque: Slot,
-    pub position_offset: Slot,
-    pub velocity_offset: Slot,
-    pub torque_offset: Slot,
+    pub error_register: EntryHandle,
+    pub error_code: EntryHandle,
+    /// 0x1003:0 and its entries, if the ESI has them.
+    history: [Option<EntryHandle>; 6],
+    pub controlword: EntryHandle,
+    pub statusword: EntryHandle,
+    pub mode: EntryHandle,
+    pub mode_display: EntryHandle,
+    pub position_demand: EntryHandle,
+    pub position: EntryHandle,
+    pub velocity_demand: EntryHandle,
+    pub velocity: EntryHandle,
+    pub velocity_averaged: Option<EntryHandle>,
+    pub torque: EntryHandle,
+    pub torque_averaged: Option<EntryHandle>,
+    pub current: Option<EntryHandle>,
+    pub current_averaged: Option<EntryHandle>,
+    pub current_demand: Option<EntryHandle>,
+    pub thermal_level: Option<EntryHandle>,
+    pub following_error: EntryHandle,
+    pub target_position: EntryHandle,
+    pub target_velocity: EntryHandle,
+    pub target_torque: EntryHandle,
+    pub position_offset: EntryHandle,
+    pub velocity_offset: EntryHandle,
+    pub torque_offset: EntryHandle,
     parameters: ParameterSlots,
-    /// Process data carries parameters, too, and not only what [`super::Drive::sync`] takes.
+    /// True if process data carries parameters in addition to the objects of
+    /// [`super::Drive::sync`].
     parameters_are_mapped: bool,
     pub io: IoSlots,
     pub probes: Option<ProbeSlots>,
@@ -89,23 +91,23 @@ fn whole(value: f64) -> i64 {
     value.round() as i64
 }
 
-/// A signed object. The standard has none longer than 32 bits; a dictionary may.
-pub(super) fn int(store: &ObjectStore, slot: Slot) -> i64 {
+/// Returns a signed object. The standard has none longer than 32 bits; a dictionary may.
+pub(super) fn int(store: &ObjectStore, slot: EntryHandle) -> i64 {
     let value = store.get_signed(slot);
     value.clamp(i32::MIN.into(), i32::MAX.into())
 }
 
-/// An unsigned object.
-fn uint(store: &ObjectStore, slot: Slot) -> i64 {
+/// Returns an unsigned object.
+fn uint(store: &ObjectStore, slot: EntryHandle) -> i64 {
     store.get(slot).clamp(0, u32::MAX.into())
 }
 
-/// Milliseconds in control cycles of 0.4 ms.
+/// Converts milliseconds to control cycles of 0.4 ms.
 fn cycles(ms: i64) -> u32 {
     u32::try_from((ms * 5 + 1) / 2).unwrap_or(u32::MAX)
 }
 
-/// Fits whatever the dictionary's type is; a store value never needs more than 53 bits here.
+/// Converts any store value. Values here never need more than 53 bits.
 #[expect(clippy::cast_precision_loss, reason = "32-bit objects")]
 pub(super) fn float(value: i64) -> f64 {
     value as f64
@@ -115,7 +117,7 @@ impl Objects {
     pub(super) fn bind(store: &mut ObjectStore, plant: &PlantParams) -> Self {
         let mut b = Binder(store);
         let history = [0, 1, 2, 3, 4, 5].map(|sub| b.0.slot(0x1003, sub));
-        if !b.0.has_any(MAKERS_OWN) {
+        if !b.0.has_any(MANUFACTURER_SPECIFIC) {
             motor::add(&mut b);
             TuningSlots::add(&mut b);
             homing::add(&mut b);
@@ -159,8 +161,8 @@ impl Objects {
         }
     }
 
-    /// Which outputs the process data now carries.
-    pub(super) fn set_mapped(&mut self, mapped: &[Slot]) {
+    /// Sets the objects that the output process data carries.
+    pub(super) fn set_mapped(&mut self, mapped: &[EntryHandle]) {
         self.parameters.set_mapped(|slot| mapped.contains(&slot));
         let commands = [
             self.controlword,
@@ -177,17 +179,17 @@ impl Objects {
         self.parameters_are_mapped = mapped.iter().any(|slot| !commands.contains(slot));
     }
 
-    /// Process data may change any parameter.
+    /// True if process data may change any parameter.
     pub(super) fn parameters_are_mapped(&self) -> bool {
         self.parameters_are_mapped
     }
 
-    /// Parameters change with the process data.
+    /// True if parameters change with the process data.
     pub(super) fn limits_are_mapped(&self) -> bool {
         self.parameters.limits_are_mapped()
     }
 
-    /// 0x1003: the newest error first.
+    /// Adds an error to 0x1003, newest first.
     pub(super) fn record(&self, store: &mut ObjectStore, code: u16) {
         let [Some(count), entries @ ..] = self.history else {
             return;

@@ -1,10 +1,10 @@
-//! Motor and supply data that commissioning has entered: 0x3000–0x3002, 0x3010 and 0x2200 of a maxon drive.
+//! Motor and supply data from commissioning: 0x3000–0x3002, 0x3010 and 0x2200 of a maxon drive.
 
-use super::binder::Binder;
+use super::bind::Binder;
 use super::whole;
 use crate::drive::plant::PlantParams;
 
-/// Index, subindex, name, bits, and what it holds of this plant; `None`: not known here.
+/// Index, subindex, name, bits, and the value for this plant. `None`: no known value.
 type Row = (u16, u8, &'static str, u32, Option<fn(&PlantParams) -> f64>);
 
 const ROWS: [Row; 12] = [
@@ -84,7 +84,7 @@ const OBJECTS: [(u16, &str); 5] = [
     (0x3002, "Electrical system parameters"),
 ];
 
-/// For a dictionary that says nothing about its maker's objects.
+/// Adds the objects to a dictionary without vendor-specific objects.
 pub(super) fn add(b: &mut Binder<'_>) {
     for (index, name) in OBJECTS {
         let rows = ROWS.iter().filter(|row| row.0 == index);

@@ -1,18 +1,18 @@
 //! Option codes 0x6007 and 0x605A–0x605E.
 
-use super::binder::{Binder, RW};
-use crate::coe::store::{ObjectStore, Slot};
+use super::bind::{Binder, RW};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::state::OptionCodes;
 
 #[derive(Debug, Clone)]
 pub(super) struct OptionSlots {
-    quick_stop: Slot,
-    shutdown: Slot,
-    disable: Slot,
-    /// Where there is none, a halt takes the slow-down ramp, and the cyclic modes know no halt.
-    halt: Option<Slot>,
-    fault: Slot,
-    abort: Slot,
+    quick_stop: EntryHandle,
+    shutdown: EntryHandle,
+    disable: EntryHandle,
+    /// Without 0x605D a halt uses the slow-down ramp, and the cyclic modes ignore halts.
+    halt: Option<EntryHandle>,
+    fault: EntryHandle,
+    abort: EntryHandle,
 }
 
 impl OptionSlots {

@@ -1,13 +1,13 @@
-//! What a drive is told once and then works by: option codes, limits, profiles, units.
+//! Parameters of the drive: option codes, limits, profiles, units.
 
-use super::binder::{Binder, RW};
+use super::bind::{Binder, RW};
 use super::homing::{HomingParameters, HomingSlots};
 use super::options::OptionSlots;
 use super::torque::{CurrentLimits, TorqueSlots};
 use super::units::{RPM, RPM_AND_FINER, RPM_PER_S, acceleration_unit, period_ns, velocity_unit};
 use super::velocity::{VelocitySlots, VelocityWindows};
 use super::{cycles, float, int, uint, whole};
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::modes::Polarity;
 use crate::drive::plant::PlantParams;
 use crate::drive::profile::Dynamics;
@@ -17,33 +17,33 @@ use crate::drive::state::OptionCodes;
 pub(super) struct ParameterSlots {
     options: OptionSlots,
     velocity: VelocitySlots,
-    following_window: Slot,
-    following_timeout: Slot,
-    position_window: Slot,
-    position_window_time: Slot,
+    following_window: EntryHandle,
+    following_timeout: EntryHandle,
+    position_window: EntryHandle,
+    position_window_time: EntryHandle,
     torque: TorqueSlots,
-    range: [Slot; 2],
-    limits: [Slot; 2],
-    max_profile_velocity: Slot,
-    max_motor_speed: Slot,
-    /// 0x3003:03, rpm.
-    max_gear_speed: Option<Slot>,
-    profile_velocity: Slot,
-    profile_acceleration: Slot,
-    profile_deceleration: Slot,
-    quick_stop_deceleration: Slot,
-    max_acceleration: Slot,
+    range: [EntryHandle; 2],
+    limits: [EntryHandle; 2],
+    max_profile_velocity: EntryHandle,
+    max_motor_speed: EntryHandle,
+    /// 0x3003:03, in rpm.
+    max_gear_speed: Option<EntryHandle>,
+    profile_velocity: EntryHandle,
+    profile_acceleration: EntryHandle,
+    profile_deceleration: EntryHandle,
+    quick_stop_deceleration: EntryHandle,
+    max_acceleration: EntryHandle,
     homing: HomingSlots,
-    /// A drive without 0x60A9 and 0x60AA counts in encoder counts and seconds.
-    unit_velocity: Option<Slot>,
-    unit_acceleration: Option<Slot>,
-    /// 0x607E, where the ESI has it.
-    polarity: Option<Slot>,
-    period_value: Slot,
-    period_index: Slot,
-    /// 0x6080 comes with the process data: then zero means zero, where an unset object means "no limit".
+    /// Without 0x60A9 and 0x60AA the units are counts/s and counts/s².
+    unit_velocity: Option<EntryHandle>,
+    unit_acceleration: Option<EntryHandle>,
+    /// 0x607E, if the ESI has it.
+    polarity: Option<EntryHandle>,
+    period_value: EntryHandle,
+    period_index: EntryHandle,
+    /// Process data carries 0x6080. Zero then means zero; in an unset object it means "no limit".
     speed_is_mapped: bool,
-    /// It does, or a limit of the torque.
+    /// Process data carries 0x6080 or a torque limit.
     limits_are_mapped: bool,
 }
 
@@ -51,26 +51,26 @@ pub(super) struct ParameterSlots {
 #[derive(Debug, Clone, Copy)]
 pub(in crate::drive) struct Parameters {
     pub options: OptionCodes,
-    /// Counts; `None`: not supervised.
+    /// The following error window, in counts. `None`: not supervised.
     pub following_window: Option<f64>,
-    /// Control cycles.
+    /// The following error time-out, in control cycles.
     pub following_timeout: u32,
     pub position_window: Option<f64>,
     pub position_window_time: u32,
-    /// Smallest and largest 0x6064 can show, and how many values that are.
+    /// The smallest value of 0x6064, and the number of its values.
     pub range_min: i64,
     pub range_width: i64,
     pub software_limits: Option<(i64, i64)>,
-    /// 0x6080, and 0x3003:03.
+    /// The lower of 0x6080 and 0x3003:03.
     pub max_speed: f64,
-    /// 0x607F, and [`Self::max_speed`].
+    /// The lower of 0x607F and [`Self::max_speed`].
     pub max_profile_speed: f64,
     pub velocity: VelocityWindows,
     pub profile: Dynamics,
     pub quick_stop_deceleration: f64,
-    /// Counts/s that one unit of 0x60FF and 0x606C is.
+    /// The unit of 0x60FF and 0x606C, in counts/s.
     pub velocity_unit: f64,
-    /// N·m that a thousandth of rated torque is.
+    /// A thousandth of the rated torque, in N·m.
     pub torque_unit: f64,
     pub current: CurrentLimits,
     /// 0x607E.
@@ -85,7 +85,7 @@ impl ParameterSlots {
         b.motor_data(max_motor_speed, i64::from(plant.max_motor_speed));
         let (unit_velocity, unit_acceleration) = (b.0.slot(0x60a9, 0), b.0.slot(0x60aa, 0));
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
-        let mut unit = |slot: Option<Slot>, default, of: fn(i64, f64) -> f64| {
+        let mut unit = |slot: Option<EntryHandle>, default, of: fn(i64, f64) -> f64| {
             slot.map_or(1.0, |slot| {
                 b.fill(slot, default);
                 of(b.0.get(slot), counts_per_turn)
@@ -162,18 +162,18 @@ impl ParameterSlots {
         }
     }
 
-    /// Which outputs the process data now carries.
-    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) {
+    /// Sets the objects that the output process data carries.
+    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(EntryHandle) -> bool) {
         self.speed_is_mapped = is_mapped(self.max_motor_speed);
         self.limits_are_mapped = self.torque.set_mapped(is_mapped) || self.speed_is_mapped;
     }
 
-    /// Parameters change with the process data.
+    /// True if parameters change with the process data.
     pub(super) fn limits_are_mapped(&self) -> bool {
         self.limits_are_mapped
     }
 
-    /// Counts/s and counts/s² that a unit of speed and of acceleration is.
+    /// Returns the units of speed and acceleration, in counts/s and counts/s².
     fn units(&self, store: &ObjectStore, counts_per_turn: f64) -> (f64, f64) {
         let velocity = self
             .unit_velocity
@@ -184,7 +184,7 @@ impl ParameterSlots {
         (velocity, acceleration)
     }
 
-    /// Needed only in homing mode, hence apart.
+    /// Reads the homing parameters. They are needed only in homing mode.
     pub(super) fn read_homing(&self, store: &ObjectStore, plant: &PlantParams) -> HomingParameters {
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
         let (velocity_unit, acceleration_unit) = self.units(store, counts_per_turn);
@@ -196,7 +196,7 @@ impl ParameterSlots {
         }
     }
 
-    /// What the objects say now.
+    /// Returns the present values of the objects.
     pub(super) fn read(&self, store: &ObjectStore, plant: &PlantParams) -> Parameters {
         let p = self;
         let counts_per_turn = f64::from(plant.counts_per_turn.max(1));
@@ -210,12 +210,12 @@ impl ParameterSlots {
         };
         let polarity = Polarity::of(p.polarity.map_or(0, |slot| uint(store, slot)));
         let cycles = |slot| cycles(uint(store, slot));
-        let pair = |[min, max]: [Slot; 2]| (int(store, min), int(store, max));
+        let pair = |[min, max]: [EntryHandle; 2]| (int(store, min), int(store, max));
         let (range_min, range_max) = match pair(p.range) {
             (min, max) if min < max => (min, max),
             _ => (i64::from(i32::MIN), i64::from(i32::MAX)),
         };
-        // 0x6080 is in rpm whatever 0x60A9 says.
+        // 0x6080 is always in rpm, independent of 0x60A9.
         let max_speed = match uint(store, p.max_motor_speed) {
             0 if !self.speed_is_mapped => i64::from(plant.max_motor_speed),
             rpm => rpm,

@@ -1,18 +1,18 @@
-//! Touch probe objects, where the ESI has them.
+//! Touch probe objects, if the ESI has them.
 
-use super::binder::Binder;
-use crate::coe::store::{ObjectStore, Slot};
+use super::bind::Binder;
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 
 #[derive(Debug, Clone)]
 pub(in crate::drive) struct ProbeSlots {
-    pub function: Slot,
-    pub status: Slot,
-    /// By probe, then positive and negative edge: 0x60BA–0x60BD.
-    positions: [[Option<Slot>; 2]; 2],
+    pub function: EntryHandle,
+    pub status: EntryHandle,
+    /// 0x60BA–0x60BD, by probe, then positive and negative edge.
+    positions: [[Option<EntryHandle>; 2]; 2],
     /// 0x60D5–0x60D8.
-    counters: [[Option<Slot>; 2]; 2],
+    counters: [[Option<EntryHandle>; 2]; 2],
     /// 0x60D0.
-    sources: [Option<Slot>; 2],
+    sources: [Option<EntryHandle>; 2],
 }
 
 impl ProbeSlots {
@@ -30,14 +30,14 @@ impl ProbeSlots {
         })
     }
 
-    /// A probe without a place for its positions is none.
+    /// True if the probe has an object for its positions.
     pub(in crate::drive) fn exists(&self, probe: usize) -> bool {
         self.positions
             .get(probe)
             .is_some_and(|edges| edges.iter().any(Option::is_some))
     }
 
-    /// 0x60D0.
+    /// Returns 0x60D0.
     pub(in crate::drive) fn source(&self, store: &ObjectStore, probe: usize) -> Option<i64> {
         let slot = (*self.sources.get(probe)?)?;
         Some(store.get_signed(slot))
@@ -50,7 +50,7 @@ impl ProbeSlots {
         edge: usize,
         position: i64,
     ) {
-        let at = |slots: &[[Option<Slot>; 2]; 2]| *slots.get(probe)?.get(edge)?;
+        let at = |slots: &[[Option<EntryHandle>; 2]; 2]| *slots.get(probe)?.get(edge)?;
         if let Some(slot) = at(&self.positions) {
             store.show(slot, position);
         }

@@ -1,31 +1,31 @@
-//! What limits the current: 0x3001:02, 0x6072, 0x6073, 0x60E0 and 0x60E1.
+//! The limits of the current: 0x3001:02, 0x6072, 0x6073, 0x60E0 and 0x60E1.
 
-use super::binder::{Binder, RW};
+use super::bind::{Binder, RW};
 use super::{float, uint, whole};
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::plant::PlantParams;
 
-/// A limit that a drive may have. Zero means zero where it comes with the process data; an object that
-/// was never written means "no limit".
+/// An optional limit of the drive. In process data zero means zero; in an object that was never
+/// written it means "no limit".
 #[derive(Debug, Clone, Copy)]
 struct Limit {
-    slot: Slot,
+    slot: EntryHandle,
     mapped: bool,
 }
 
 #[derive(Debug, Clone)]
 pub(super) struct TorqueSlots {
-    rated_torque: Slot,
-    /// Of 0x6076.
+    rated_torque: EntryHandle,
+    /// Counts of 0x6076 per N·m.
     counts_per_newton_metre: f64,
-    output_current_limit: Option<Slot>,
+    output_current_limit: Option<EntryHandle>,
     max_torque: Option<Limit>,
     max_current: Option<Limit>,
     /// 0x60E0, 0x60E1.
     directions: [Option<Limit>; 2],
 }
 
-/// A, either way; neither is negative.
+/// The current limits of both directions, in A. Neither is negative.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::drive) struct CurrentLimits {
     pub forward: f64,
@@ -39,16 +39,17 @@ impl CurrentLimits {
 }
 
 impl Limit {
-    /// Thousandths, if it limits.
+    /// Returns the limit in thousandths, if it is active.
     fn get(self, store: &ObjectStore) -> Option<f64> {
         let value = uint(store, self.slot);
         (value > 0 || self.mapped).then(|| float(value))
     }
 }
 
-/// As the dictionary's unit says (ETG.1004: newton metre is 0x56, the highest byte a power of ten); else a maxon drive counts µNm, any
-/// other mNm. A dictionary that does not say whose it is counts as maxon's.
-fn counts_per_newton_metre(b: &Binder<'_>, rated_torque: Slot) -> f64 {
+/// Returns the counts of 0x6076 per N·m. The unit comes from the dictionary (ETG.1004: newton metre
+/// is 0x56, the highest byte a power of ten). Without one, the unit is µNm for a maxon drive and mNm
+/// otherwise. A dictionary without a vendor counts as maxon's.
+fn counts_per_newton_metre(b: &Binder<'_>, rated_torque: EntryHandle) -> f64 {
     const NEWTON_METRE: u32 = 0x56;
     const MAXON: i64 = 0xfb;
     let unit = b.0.item(rated_torque).map_or(0, |item| item.unit);
@@ -98,8 +99,8 @@ impl TorqueSlots {
         .flatten()
     }
 
-    /// True if a limit changes with the process data.
-    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(Slot) -> bool) -> bool {
+    /// Sets the mapped limits. True if a limit changes with the process data.
+    pub(super) fn set_mapped(&mut self, is_mapped: impl Fn(EntryHandle) -> bool) -> bool {
         let mut any = false;
         for limit in self.limits() {
             limit.mapped = is_mapped(limit.slot);
@@ -108,7 +109,7 @@ impl TorqueSlots {
         any
     }
 
-    /// N·m.
+    /// Returns the rated torque, in N·m.
     pub(super) fn rated(&self, store: &ObjectStore) -> f64 {
         float(uint(store, self.rated_torque)) / self.counts_per_newton_metre
     }

@@ -2,7 +2,7 @@
 
 /// rpm, the power-on value of 0x60A9.
 pub(super) const RPM: i64 = 0x00b4_4700;
-/// rpm and tenths to millionths of it: what a drive that starts with rpm takes.
+/// rpm and its tenths to millionths: the values of 0x60A9 that a drive with rpm accepts.
 pub(super) const RPM_AND_FINER: &[i64] = &[
     RPM,
     rpm_by_ten_to(-1),
@@ -13,17 +13,17 @@ pub(super) const RPM_AND_FINER: &[i64] = &[
     rpm_by_ten_to(-6),
 ];
 
-/// As the 32-bit two's complement that the object holds.
+/// Returns the code as the 32-bit two's complement that the object holds.
 const fn rpm_by_ten_to(power: i64) -> i64 {
     (power << 24) + RPM
 }
 
-/// rpm/s, of 0x60AA.
+/// rpm/s, for 0x60AA.
 pub(super) const RPM_PER_S: i64 = 0x00c0_0300;
 /// Encoder counts, the only value of 0x60A8.
 pub(super) const COUNTS: i64 = 0x00b5_0000;
 
-/// 0x60C2 in nanoseconds; what cannot be a cycle time counts as "no interpolation".
+/// Returns 0x60C2 in ns. An invalid cycle time means "no interpolation".
 pub(super) fn period_ns(value: i64, index: i64) -> i64 {
     let Some(power) = index.checked_add(9).and_then(|e| u32::try_from(e).ok()) else {
         return 0;
@@ -35,13 +35,14 @@ pub(super) fn period_ns(value: i64, index: i64) -> i64 {
         .unwrap_or(0)
 }
 
-/// SI unit codes: prefix (power of ten, pico to tera), numerator, denominator, reserved; high byte first.
+/// Returns the factor of the prefix (power of ten, pico to tera). SI unit codes are prefix,
+/// numerator, denominator, reserved, high byte first.
 pub(super) fn prefix(code: i64) -> f64 {
     let prefix = i32::from(((code >> 24) & 0xff) as u8 as i8);
     10f64.powi(prefix.clamp(-12, 12))
 }
 
-/// Counts/s per unit of velocity.
+/// Returns the counts/s per unit of velocity.
 pub(super) fn velocity_unit(code: i64, counts_per_turn: f64) -> f64 {
     let numerator = match (code >> 16) & 0xff {
         0xb5 => 1.0,
@@ -54,7 +55,7 @@ pub(super) fn velocity_unit(code: i64, counts_per_turn: f64) -> f64 {
     prefix(code) * numerator / denominator
 }
 
-/// Counts/s² per unit of acceleration; 0xC0 is revolutions per minute, per second.
+/// Returns the counts/s² per unit of acceleration. 0xC0 is revolutions per minute, per second.
 pub(super) fn acceleration_unit(code: i64, counts_per_turn: f64) -> f64 {
     let numerator = match (code >> 16) & 0xff {
         0xb5 => 1.0,
@@ -69,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn units_by_code() {
+    fn unit_codes_scale_velocity_and_acceleration() {
         let rpm = 2000.0 / 60.0;
         assert_eq!(velocity_unit(0x00b4_4700, 2000.0), rpm);
         assert!((velocity_unit(0xfdb4_4700, 2000.0) - rpm * 1e-3).abs() < 1e-12);

@@ -1,20 +1,20 @@
-//! When a speed counts as reached, as zero, as slipping: 0x606D–0x6070 and 0x60F8, where the ESI has
+//! Thresholds for target speed, zero speed and slippage: 0x606D–0x6070 and 0x60F8, if the ESI has
 //! them.
 
-use super::binder::Binder;
+use super::bind::Binder;
 use super::{cycles, float, uint};
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 
 #[derive(Debug, Clone)]
 pub(super) struct VelocitySlots {
-    window: Option<Slot>,
-    window_time: Option<Slot>,
-    threshold: Option<Slot>,
-    threshold_time: Option<Slot>,
-    max_slippage: Option<Slot>,
+    window: Option<EntryHandle>,
+    window_time: Option<EntryHandle>,
+    threshold: Option<EntryHandle>,
+    threshold_time: Option<EntryHandle>,
+    max_slippage: Option<EntryHandle>,
 }
 
-/// Counts/s and control cycles. `None`: not given, or zero.
+/// Thresholds in counts/s and control cycles. `None`: no value, or zero.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::drive) struct VelocityWindows {
     pub window: Option<f64>,
@@ -36,11 +36,11 @@ impl VelocitySlots {
     }
 
     pub(super) fn read(&self, store: &ObjectStore, velocity_unit: f64) -> VelocityWindows {
-        let speed = |slot: Option<Slot>| {
+        let speed = |slot: Option<EntryHandle>| {
             let value = uint(store, slot?);
             (value > 0).then(|| float(value) * velocity_unit)
         };
-        let time = |slot: Option<Slot>| slot.map_or(0, |slot| cycles(uint(store, slot)));
+        let time = |slot: Option<EntryHandle>| slot.map_or(0, |slot| cycles(uint(store, slot)));
         VelocityWindows {
             window: speed(self.window),
             window_time: time(self.window_time),

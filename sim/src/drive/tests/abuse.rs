@@ -1,4 +1,4 @@
-//! Whatever is written to a drive's objects, in whatever order: no panic, and the axis stays a number.
+//! Random writes to a drive's objects: no panic, and the position stays finite.
 
 use proptest::prelude::*;
 
@@ -62,7 +62,7 @@ const OBJECTS: [(u16, u8); 52] = [
 
 const RESULTS: [u16; 5] = [0x60b9, 0x60ba, 0x60bb, 0x60bc, 0x60bd];
 
-/// As a dictionary might have it that was not made for a drive: every object as long as this.
+/// Returns a drive on a dictionary in which every object has this length and sign.
 fn rig_of(bits: u32, signed: bool) -> Rig {
     let mut rig = rig();
     rig.store = ObjectStore::default();
@@ -106,7 +106,7 @@ fn value() -> impl Strategy<Value = i64> {
     ]
 }
 
-/// What a MainDevice does in one step: an object, or a Controlword that makes sense, then some cycles.
+/// One step of a MainDevice: an object or a valid Controlword, then some cycles.
 #[derive(Debug, Clone)]
 enum Step {
     Write(usize, i64),
@@ -133,7 +133,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
 
     #[test]
-    fn no_objects_value_breaks_the_drive(
+    fn drive_survives_any_object_value(
         bits in prop::sample::select(vec![8, 16, 32, 64]),
         signed in any::<bool>(),
         mode in prop::sample::select(vec![1, 3, 6, 8, 9, 10]),

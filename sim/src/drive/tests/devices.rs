@@ -6,8 +6,8 @@ use ecaxis_esi::model::{Dictionary, EsiFile};
 
 use super::*;
 
-/// From `ECAXIS_FIXTURES`, or `../shared/fixtures` beside the workspace. Absent: says so; on CI that is
-/// a failure.
+/// Reads an ESI file from `ECAXIS_FIXTURES`, or from `../shared/fixtures` next to the workspace. A
+/// missing file is reported; on CI it is a failure.
 fn esi(path: &str) -> Option<EsiFile> {
     let root = std::env::var_os("ECAXIS_FIXTURES").map_or_else(
         || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/fixtures"),
@@ -45,7 +45,7 @@ fn moves_a_turn(rig: &mut Rig) {
 }
 
 #[test]
-fn epos4_with_its_csp_module() {
+fn epos4_moves_with_its_csp_module() {
     let Some(file) = esi("maxon/maxon_motor_EPOS4_0170h_6950h_0000h_0000h_ESI.xml") else {
         return;
     };
@@ -87,7 +87,7 @@ fn epos4_with_its_csp_module() {
 }
 
 #[test]
-fn drives_of_other_makers() {
+fn drives_of_other_vendors_move() {
     for path in [
         "elmo/Elmo_ECAT_00010420_V11.xml",
         "synapticon/SOMANET_CiA_402_v4.xml",
@@ -100,7 +100,7 @@ fn drives_of_other_makers() {
         let device = file.devices.first().unwrap();
         let mut rig = rig_of(&[&device.dictionary]);
         moves_a_turn(&mut rig);
-        // Only one of them has 0x60A9; the others count in counts per second.
+        // Only one of them has 0x60A9; the others use counts per second.
         let rpm = rig.store.slot(0x60a9, 0).is_some();
         assert_eq!(rpm, path.starts_with("synapticon"), "{path}");
         rig.set(0x60ff, 0, if rpm { 600 } else { 20_000 });
@@ -110,9 +110,9 @@ fn drives_of_other_makers() {
     }
 }
 
-/// Its factory limits (0x607D, 7,129,736 to 9,713,015) leave out the zero it stands at.
+/// The factory limits (0x607D, 7,129,736 to 9,713,015) exclude the position 0 of the axis.
 #[test]
-fn factory_limits_beside_the_axis_are_not_meant() {
+fn factory_limits_that_exclude_the_position_are_widened() {
     let Some(file) = esi("myactuator/MT-Device_250702.xml") else {
         return;
     };
@@ -124,7 +124,7 @@ fn factory_limits_beside_the_axis_are_not_meant() {
 }
 
 #[test]
-fn a_drive_without_unit_objects_has_the_same_dynamics_in_counts() {
+fn drive_without_unit_objects_has_the_same_dynamics_in_counts() {
     let mut store = ObjectStore::default();
     Drive::new(&mut store, PlantParams::default());
     let value = |index| store.get(store.slot(index, 0).unwrap());

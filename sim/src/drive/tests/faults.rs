@@ -1,8 +1,8 @@
-//! Faults: what causes them, what they do to a moving axis, how they are left.
+//! Faults: their causes, the reaction of a moving axis, and the reset.
 
 use super::*;
 
-/// CSV at this speed.
+/// Returns a drive in CSV at this speed.
 fn turning(rpm: i64) -> Rig {
     let mut rig = rig();
     rig.enable(9);
@@ -11,7 +11,8 @@ fn turning(rpm: i64) -> Rig {
     rig
 }
 
-/// Milliseconds until the state, at most a second; the largest step of speed between two cycles.
+/// Returns the milliseconds until the state, at most a second, and the largest speed step between
+/// two cycles.
 fn until(rig: &mut Rig, state: State) -> (u32, f64) {
     let (mut ms, mut jerk) = (0, 0.0_f64);
     while rig.drive.state() != state {
@@ -49,14 +50,14 @@ fn leaving_op_while_moving_decelerates_then_faults() {
             data: [0; 5]
         })
     );
-    // Back in Op it stays in Fault until it is reset.
+    // Back in Op the drive stays in Fault until a reset.
     rig.in_op = true;
     rig.cycles(20);
     assert_eq!(rig.drive.state(), State::Fault);
 }
 
 #[test]
-fn leaving_op_while_not_enabled_is_no_fault() {
+fn leaving_op_while_not_enabled_raises_no_fault() {
     let mut rig = rig();
     rig.set(0x6040, 0, 0x06);
     rig.cycles(10);
@@ -69,7 +70,7 @@ fn leaving_op_while_not_enabled_is_no_fault() {
 }
 
 #[test]
-fn process_data_counts_only_in_op() {
+fn process_data_acts_only_in_op() {
     let mut rig = rig();
     rig.in_op = false;
     for word in [0x06, 0x07, 0x0f] {
@@ -96,14 +97,14 @@ fn abort_connection_option_chooses_the_reaction() {
     let mut rig = turning(1500);
     rig.set(0x6007, 0, 0);
     rig.cycles(5);
-    // The power-on value fills in for zero only once, at power-on.
+    // The power-on value replaces zero only once, at power-on.
     rig.in_op = false;
     rig.cycles(50);
     assert_eq!(rig.drive.state(), State::OperationEnabled);
 }
 
 #[test]
-fn a_blocked_shaft_is_a_following_error() {
+fn blocked_shaft_raises_a_following_error() {
     let mut rig = rig();
     rig.enable(8);
     rig.drive.set_blocked(true);
@@ -115,7 +116,7 @@ fn a_blocked_shaft_is_a_following_error() {
         rig.cycle();
         assert!(n < 100);
     }
-    // The window is 2000 counts, the time-out none.
+    // The window is 2000 counts, without a time-out.
     assert!((40..44).contains(&n), "{n}");
     assert_ne!(rig.word() & 1 << 13, 0);
     rig.cycles(300);
@@ -127,7 +128,7 @@ fn a_blocked_shaft_is_a_following_error() {
 }
 
 #[test]
-fn the_following_error_has_a_time_out_and_an_off_switch() {
+fn following_error_honours_time_out_and_disabled_window() {
     let mut rig = rig();
     rig.set(0x6066, 0, 50);
     rig.enable(8);
@@ -149,7 +150,7 @@ fn the_following_error_has_a_time_out_and_an_off_switch() {
 }
 
 #[test]
-fn a_jump_of_the_target_trips() {
+fn target_jump_raises_a_following_error() {
     let mut rig = rig();
     rig.enable(8);
     rig.set(0x607a, 0, 1_000_000);
@@ -180,7 +181,7 @@ fn reset_needs_an_edge() {
 }
 
 #[test]
-fn an_edge_shorter_than_a_control_cycle_resets() {
+fn reset_accepts_an_edge_shorter_than_a_control_cycle() {
     let mut rig = turning(0);
     rig.drive.inject_fault(0x2310);
     until(&mut rig, State::Fault);
@@ -193,7 +194,7 @@ fn an_edge_shorter_than_a_control_cycle_resets() {
 }
 
 #[test]
-fn a_cause_that_stays_refuses_the_reset() {
+fn reset_is_refused_while_the_cause_persists() {
     let mut rig = turning(0);
     rig.drive.set_fault_cause(Some(0x4210));
     until(&mut rig, State::Fault);
@@ -289,7 +290,7 @@ fn software_limits_keep_csp_inside_and_trip_csv() {
 }
 
 #[test]
-fn software_limits_of_the_esi_hold_if_the_axis_stands_between_them() {
+fn software_limits_of_the_esi_apply_if_the_axis_is_inside() {
     let limits = |initial_position, min: i32, max: i32| {
         let mut store = ObjectStore::default();
         for (sub, value) in [(1, min), (2, max)] {
@@ -318,7 +319,7 @@ fn software_limits_of_the_esi_hold_if_the_axis_stands_between_them() {
 }
 
 #[test]
-fn the_history_has_the_newest_first() {
+fn error_history_lists_the_newest_first() {
     let mut store = ObjectStore::default();
     for sub in 0..=5 {
         let bits = if sub == 0 { 8 } else { 32 };

@@ -1,4 +1,4 @@
-//! Controlword bit 8 by mode, and what Statusword bit 10 says about it.
+//! Controlword bit 8 by mode, and Statusword bit 10 during a halt.
 
 use super::*;
 
@@ -6,7 +6,7 @@ const HALT: i64 = 0x010f;
 const GO: i64 = 0x000f;
 
 #[test]
-fn profile_position_halts_on_the_way_and_goes_on() {
+fn profile_position_continues_after_a_halt() {
     let mut rig = rig();
     rig.set(0x6084, 0, 5_000);
     rig.set(0x6081, 0, 3000);
@@ -30,7 +30,7 @@ fn profile_position_halts_on_the_way_and_goes_on() {
 }
 
 #[test]
-fn a_set_point_that_comes_during_a_halt_waits_for_its_end() {
+fn set_point_during_a_halt_starts_after_it() {
     let mut rig = rig();
     rig.enable(1);
     rig.set(0x607a, 0, 1000);
@@ -44,7 +44,7 @@ fn a_set_point_that_comes_during_a_halt_waits_for_its_end() {
 }
 
 #[test]
-fn profile_velocity_halts_and_goes_on() {
+fn profile_velocity_continues_after_a_halt() {
     let mut rig = rig();
     rig.enable(3);
     rig.set(0x60ff, 0, 1000);
@@ -61,7 +61,8 @@ fn profile_velocity_halts_and_goes_on() {
     assert_eq!(rig.word() & 0x1400, 0x0400, "the speed is reached");
 }
 
-/// CiA 402 leaves it open, maxon's drives know no halt there: a drive without 0x605D goes on.
+/// CiA 402 leaves halt in cyclic modes open, and maxon's drives do not support it. A drive without
+/// 0x605D continues.
 #[test]
 fn cyclic_modes_halt_only_where_there_is_0x605d() {
     let halt_option = (0x605d, 0, 16, "Halt option code");
@@ -91,7 +92,7 @@ fn cyclic_modes_halt_only_where_there_is_0x605d() {
 }
 
 #[test]
-fn csp_takes_up_its_targets_again_after_a_halt() {
+fn csp_follows_its_targets_again_after_a_halt() {
     let mut rig = Rig::with(
         PlantParams::default(),
         &[(0x605d, 0, 16, "Halt option code")],

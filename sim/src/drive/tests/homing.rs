@@ -1,4 +1,4 @@
-//! Homing: every method from every side, what the Statusword says on the way, and what goes wrong.
+//! Homing: every method from every side, the Statusword during homing, and errors.
 
 use super::*;
 use crate::drive::{Track, input};
@@ -19,7 +19,7 @@ const THRESHOLD: Extra = (0x30b2, 0, 16, "Current threshold for homing mode");
 const POSITION: Extra = (0x30b0, 0, 32, "Home position");
 const DISTANCE: Extra = (0x30b1, 0, 32, "Home offset move distance");
 
-/// Standing at a count, in homing mode, enabled.
+/// Returns an enabled drive in homing mode at this count.
 fn at(initial_position: i32, track: Track, method: i64) -> Rig {
     let mut rig = Rig::with(
         PlantParams {
@@ -38,7 +38,7 @@ fn at(initial_position: i32, track: Track, method: i64) -> Rig {
     rig
 }
 
-/// Bits 13, 12 and 10.
+/// Returns bits 13, 12 and 10.
 fn bits(rig: &Rig) -> (bool, bool, bool) {
     let word = rig.word();
     (
@@ -54,7 +54,7 @@ const COMPLETED: (bool, bool, bool) = (false, true, true);
 const FAILED_MOVING: (bool, bool, bool) = (true, false, false);
 const FAILED: (bool, bool, bool) = (true, false, true);
 
-/// Starts, and runs to the end or for 20 seconds. The bits that were shown, in order.
+/// Starts homing and runs it to the end, at most 20 seconds. Returns the sequence of bits.
 fn run(rig: &mut Rig) -> Vec<(bool, bool, bool)> {
     let mut shown = vec![bits(rig)];
     rig.set(0x6040, 0, 0x1f);
@@ -71,8 +71,8 @@ fn run(rig: &mut Rig) -> Vec<(bool, bool, bool)> {
 }
 
 #[test]
-fn every_method_from_every_side() {
-    // The places that homing by a method can begin at, and where home is.
+fn homing_finds_home_by_every_method_from_every_side() {
+    // Valid start positions by method, and the home position.
     let anywhere = [-19_500, 0, 2500, 3100, 3400, 3600, 19_500];
     let on_negative = [-20_500, -20_000, -19_900, 0, 19_000];
     let on_positive = [20_500, 20_000, 19_900, 0, -19_000];
@@ -95,7 +95,7 @@ fn every_method_from_every_side() {
     for (method, starts, home) in rows {
         for &start in starts {
             let home = match (method, start) {
-                // From on the index to the next one.
+                // From an index pulse the axis moves to the next one.
                 (33, 2700) => 700,
                 _ => home,
             };
@@ -109,8 +109,8 @@ fn every_method_from_every_side() {
             };
             assert_eq!(shown, expected, "method {method} from {start}");
             rig.run_ms(200);
-            // In the track's counts the axis is where the switch or index is. Switches are looked at once
-            // a control cycle, in which the axis still slowing down makes five counts.
+            // In the track's counts the axis stands at the switch or index. Switches are read once
+            // per control cycle, in which a decelerating axis moves five counts.
             let off = rig.drive.plant.counts() - home;
             let bound = if method == 33 || method == 34 || home % 100 == 0 {
                 1
@@ -128,7 +128,7 @@ fn every_method_from_every_side() {
 }
 
 #[test]
-fn obstacles_are_found_by_their_current() {
+fn homing_finds_obstacles_by_current() {
     let rows = [
         (-3, 19_000, 21_000),
         (-4, -19_000, -21_000),
@@ -157,7 +157,7 @@ fn obstacles_are_found_by_their_current() {
 }
 
 #[test]
-fn the_offset_move_ends_at_the_home_position() {
+fn homing_offset_move_ends_at_the_home_position() {
     let mut rig = at(0, TRACK, 17);
     rig.set(0x30b1, 0, 5000);
     rig.set(0x30b0, 0, -123);
@@ -169,7 +169,7 @@ fn the_offset_move_ends_at_the_home_position() {
 
 /// A drive without maxon's objects shows its home offset at home.
 #[test]
-fn home_offset_0x607c_is_what_home_shows() {
+fn home_offset_0x607c_is_the_position_at_home() {
     let mut rig = Rig::with(
         PlantParams {
             initial_position: 777,
@@ -184,10 +184,10 @@ fn home_offset_0x607c_is_what_home_shows() {
     assert_eq!(rig.get(0x6064), -5000);
 }
 
-/// Braking from the search takes more counts than the switch has: 0.5 of a turn at 6000 counts/s and
-/// 33,333 counts/s² against 20 counts.
+/// The braking distance exceeds the switch: 0.5 of a turn at 6000 counts/s and 33,333 counts/s²,
+/// against 20 counts.
 #[test]
-fn a_switch_narrower_than_the_braking_distance_is_found_again() {
+fn homing_finds_a_switch_narrower_than_the_braking_distance() {
     let track = Track {
         home: Some((3000, 3020)),
         ..TRACK
@@ -205,13 +205,13 @@ fn a_switch_narrower_than_the_braking_distance_is_found_again() {
         assert_eq!(run(&mut rig), [NOT_STARTED, UNDER_WAY, COMPLETED]);
         rig.run_ms(200);
         let off = rig.drive.plant.counts() - home;
-        // It leaves the switch faster than it would search it, still slowing down.
+        // The axis leaves the switch faster than the search speed, because it still decelerates.
         assert!(off.abs() <= 4, "method {method} from {start}: {off}");
     }
 }
 
 #[test]
-fn what_cannot_be_found_is_a_homing_error() {
+fn homing_fails_without_its_reference() {
     let nowhere = Track {
         home: None,
         ..TRACK
@@ -225,10 +225,10 @@ fn what_cannot_be_found_is_a_homing_error() {
         ..TRACK
     };
     let rows = [
-        // Both ends and no home switch.
+        // Limit switches at both ends, but no home switch.
         (7, nowhere, 0),
         (27, nowhere, 0),
-        // Only the other end's switch.
+        // Only the switch at the other end.
         (11, TRACK, 19_990),
         (33, no_index, 0),
         (1, no_index, 0),
@@ -238,7 +238,7 @@ fn what_cannot_be_found_is_a_homing_error() {
     for (method, track, start) in rows {
         let mut rig = at(start, track, method);
         if method == 11 {
-            // Between the switches it turns round once; there is no home switch to find.
+            // The axis reverses once between the limit switches, and finds no home switch.
             rig = at(start, nowhere, method);
         }
         let shown = run(&mut rig);
@@ -252,7 +252,7 @@ fn what_cannot_be_found_is_a_homing_error() {
         rig.run_ms(100);
         assert_eq!(rig.drive.velocity_rev_s(), 0.0);
     }
-    // Without the switch in front of it, the mechanical end is struck: a following error.
+    // Without the limit switch the axis hits the mechanical end: a following error.
     let mut rig = at(-19_000, on_the_wrong_side, 17);
     rig.set(0x6040, 0, 0x1f);
     rig.run_ms(3000);
@@ -261,10 +261,10 @@ fn what_cannot_be_found_is_a_homing_error() {
     assert_ne!(rig.word() & 1 << 13, 0);
 }
 
-/// Bit 4 down, a halt, a quick stop, another mode, another state: homing ends or waits, and the
-/// Statusword says so.
+/// A falling bit 4, a halt, a quick stop, another mode or another state interrupts homing. The
+/// Statusword shows it.
 #[test]
-fn homing_is_interrupted() {
+fn homing_shows_interruptions_in_the_statusword() {
     let searching = || {
         let mut rig = at(0, TRACK, 18);
         rig.set(0x6040, 0, 0x1f);
@@ -285,7 +285,7 @@ fn homing_is_interrupted() {
     let mut rig = searching();
     rig.set(0x6040, 0, 0x0f);
     stops(&mut rig, NOT_STARTED);
-    assert_eq!(run(&mut rig), [NOT_STARTED, UNDER_WAY, COMPLETED], "anew");
+    assert_eq!(run(&mut rig), [NOT_STARTED, UNDER_WAY, COMPLETED], "again");
 
     let mut rig = searching();
     rig.set(0x6040, 0, 0x11f);
@@ -328,7 +328,7 @@ fn homing_is_interrupted() {
 }
 
 #[test]
-fn bit_12_stays_until_homing_is_started_again() {
+fn homing_keeps_bit_12_until_the_next_start() {
     let mut rig = at(0, TRACK, 37);
     run(&mut rig);
     rig.set(0x6040, 0, 0x0f);
@@ -342,10 +342,10 @@ fn bit_12_stays_until_homing_is_started_again() {
     assert_eq!(rig.word() & 1 << 15, 0, "no longer referenced");
 }
 
-/// Between home found and home reached the standard has bit 12 without bit 10; this drive says nothing
-/// until it stands there, as a client that looks at bit 12 alone needs.
+/// Between home found and home reached the standard sets bit 12 without bit 10. This drive sets bit
+/// 12 only at the end position, for clients that read bit 12 alone.
 #[test]
-fn completed_is_said_where_the_axis_ends_up() {
+fn homing_reports_completion_at_the_end_position() {
     let mut rig = at(0, TRACK, 18);
     rig.set(0x30b1, 0, -10_000);
     rig.set(0x6040, 0, 0x1f);
@@ -362,7 +362,7 @@ fn completed_is_said_where_the_axis_ends_up() {
 }
 
 #[test]
-fn wires_from_outside_are_switches_too() {
+fn homing_uses_external_switches() {
     let mut rig = at(0, Track::default(), 23);
     rig.set(0x6040, 0, 0x1f);
     rig.run_ms(300);

@@ -1,4 +1,4 @@
-//! 0x60FD and 0x60FE, limit switches and the software's limits.
+//! 0x60FD and 0x60FE, limit switches and software limits.
 
 use super::*;
 use crate::drive::Track;
@@ -25,7 +25,7 @@ fn inputs(rig: &Rig) -> i64 {
     rig.store.get(rig.slot(0x60fd, 0))
 }
 
-/// CSV at this speed until a fault, at most two seconds.
+/// Runs CSV at this speed until a fault, at most two seconds.
 fn run_into(rig: &mut Rig, rpm: i64) {
     rig.set(0x60ff, 0, rpm);
     for _ in 0..2000 {
@@ -38,7 +38,7 @@ fn run_into(rig: &mut Rig, rpm: i64) {
 }
 
 #[test]
-fn switches_show_where_the_axis_is() {
+fn switches_follow_the_axis_position() {
     for (at, expected) in [
         (-2001, 0b001),
         (-2000, 0b001),
@@ -66,7 +66,7 @@ fn switches_show_where_the_axis_is() {
 }
 
 #[test]
-fn wires_from_outside_appear_in_the_next_control_cycle() {
+fn external_inputs_appear_in_the_next_control_cycle() {
     let mut rig = on(TRACK);
     for (bit, value) in [(16, 1 << 16), (31, 1 << 31), (2, 1 << 2), (24, 1 << 24)] {
         rig.drive.set_input(bit, true, 0.0);
@@ -83,7 +83,7 @@ fn wires_from_outside_appear_in_the_next_control_cycle() {
 }
 
 #[test]
-fn a_limit_switch_struck_while_moving_stops_the_axis_with_its_error() {
+fn limit_switch_stops_a_moving_axis_with_its_fault() {
     for (rpm, code, bit) in [(-600, 0x8a80, 0b001), (600, 0x8a81, 0b010)] {
         let mut rig = on(TRACK);
         rig.enable(9);
@@ -92,10 +92,10 @@ fn a_limit_switch_struck_while_moving_stops_the_axis_with_its_error() {
         assert_eq!(rig.get(0x1001), 0x21);
         assert_eq!(inputs(&rig), bit);
         let at = rig.get(0x6064).abs();
-        // 20,000 counts/s come to rest in 600 counts at 333,333 counts/s².
+        // From 20,000 counts/s the axis stops within 600 counts at 333,333 counts/s².
         assert!((2550..2700).contains(&at), "{at}");
 
-        // It may be reset while it stands there, further it must not go, back it may.
+        // A reset succeeds on the switch. The axis may move back, but not further.
         let reset = |rig: &mut Rig| {
             for word in [0x00, 0x80, 0x06, 0x0f] {
                 rig.set(0x60ff, 0, 0);
@@ -119,7 +119,7 @@ fn a_limit_switch_struck_while_moving_stops_the_axis_with_its_error() {
 }
 
 #[test]
-fn every_mode_minds_the_limit_switches() {
+fn limit_switches_act_in_every_mode() {
     for mode in [1, 3, 8, 9, 10] {
         let mut rig = on(TRACK);
         rig.set(0x6081, 0, 600);
@@ -142,7 +142,7 @@ fn every_mode_minds_the_limit_switches() {
 }
 
 #[test]
-fn maxons_objects_invert_and_take_away_inputs() {
+fn maxon_objects_invert_and_disable_inputs() {
     let names = [
         (0x3141, 1, 16, "Digital inputs logic state"),
         (0x3141, 2, 16, "Digital inputs polarity"),
@@ -177,7 +177,7 @@ fn maxons_objects_invert_and_take_away_inputs() {
 }
 
 #[test]
-fn outputs_pass_their_mask() {
+fn outputs_are_masked_by_0x60fe() {
     let mut rig = rig();
     rig.set(0x60fe, 1, 0x0005_0001);
     assert_eq!(
@@ -196,7 +196,7 @@ fn outputs_pass_their_mask() {
 }
 
 #[test]
-fn the_mechanics_end_where_they_end() {
+fn mechanical_ends_stop_the_axis() {
     let mut rig = on(Track {
         ends: Some((-100, 100)),
         ..Track::default()
@@ -211,7 +211,7 @@ fn the_mechanics_end_where_they_end() {
 }
 
 #[test]
-fn a_warning_shows_in_bit_7_of_every_state() {
+fn warning_sets_bit_7_in_every_state() {
     let mut rig = rig();
     rig.run_ms(5);
     assert_eq!(rig.word() & 1 << 7, 0);

@@ -1,4 +1,4 @@
-//! The drive on its own: a store without an ESI, process data written by hand.
+//! The drive alone: a store without an ESI, and process data written by the test.
 
 mod abuse;
 mod devices;
@@ -17,9 +17,9 @@ mod transitions;
 use ecaxis_esi::model::Access;
 
 use super::*;
-use crate::coe::store::Slot;
+use crate::coe::object_dictionary::EntryHandle;
 
-/// A drive with a bus around it: one SYNC a bus cycle, a control cycle every 0.4 ms.
+/// A drive with a minimal bus: one SYNC per bus cycle, a control cycle every 0.4 ms.
 pub(super) struct Rig {
     pub(super) store: ObjectStore,
     pub(super) drive: Drive,
@@ -32,7 +32,7 @@ pub(super) struct Rig {
 
 const MS: u64 = 1_000_000;
 
-/// An object that a drive has only where its ESI says so: index, subindex, bits, name.
+/// An object that a drive has only if its ESI lists it: index, subindex, bits, name.
 type Extra = (u16, u8, u32, &'static str);
 
 impl Rig {
@@ -62,7 +62,7 @@ impl Rig {
         rig
     }
 
-    pub(super) fn slot(&self, index: u16, sub: u8) -> Slot {
+    pub(super) fn slot(&self, index: u16, sub: u8) -> EntryHandle {
         self.store.slot(index, sub).expect("the drive made it")
     }
 
@@ -75,7 +75,7 @@ impl Rig {
         self.store.get_signed(self.slot(index, 0))
     }
 
-    /// Emergencies since the last call.
+    /// Returns the emergencies since the last call.
     fn emergencies(&mut self) -> Vec<u16> {
         std::iter::from_fn(|| self.drive.take_emergency())
             .map(|emergency| emergency.code)
@@ -86,7 +86,7 @@ impl Rig {
         self.store.get(self.slot(0x6041, 0))
     }
 
-    /// One bus cycle: SYNC, then the control cycles that fall into it.
+    /// Runs one bus cycle: SYNC, then the control cycles of that period.
     fn cycle(&mut self) {
         self.drive.sync(&self.store);
         self.now_ns += self.cycle_ns;
@@ -102,7 +102,7 @@ impl Rig {
         }
     }
 
-    /// One SYNC and one control cycle: at most one transition.
+    /// Runs one SYNC and one control cycle: at most one transition.
     fn step(&mut self, controlword: i64) -> State {
         self.set(0x6040, 0, controlword);
         self.drive.sync(&self.store);

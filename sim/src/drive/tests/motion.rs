@@ -1,9 +1,9 @@
-//! How well the cyclic modes follow.
+//! The accuracy of the cyclic modes.
 
 use super::*;
 use crate::drive::objects::float;
 
-/// A trapezoid in turns: position at a time, and how long it takes.
+/// A trapezoidal profile in turns: the position at a time, and the duration.
 struct Trapezoid {
     distance: f64,
     speed: f64,
@@ -36,8 +36,8 @@ const TRAPEZOID: Trapezoid = Trapezoid {
     acceleration: 150.0,
 };
 
-/// Runs the trapezoid in CSP, then half a second of rest. Largest following error while moving, range
-/// of the position at rest relative to the target.
+/// Runs the trapezoid in CSP, then half a second of rest. Returns the largest following error while
+/// moving, and the range of the resting position relative to the target.
 fn csp(rig: &mut Rig) -> (i64, i64, i64) {
     let start = rig.get(0x6064);
     let turn = f64::from(rig.counts_per_turn);
@@ -120,12 +120,12 @@ fn csp_stands_still_with_other_motors() {
     ];
     for plant in plants {
         let mut rig = Rig::new(plant);
-        // The window is in counts, too.
+        // The following error window is in counts, too.
         rig.set(0x6065, 0, i64::from(plant.counts_per_turn));
         rig.enable(8);
         let (worst, low, high) = csp(&mut rig);
         let bound = i64::from(plant.counts_per_turn) / 20;
-        // What friction holds back goes on creeping, below what a coarser encoder sees.
+        // Friction leaves a slow creep, below the resolution of a coarser encoder.
         let rest = (i64::from(plant.counts_per_turn) / 10_000).max(1);
         assert!(
             worst < bound && low >= -rest && high <= rest,
@@ -135,7 +135,7 @@ fn csp_stands_still_with_other_motors() {
 }
 
 #[test]
-fn csp_positions_wrap_like_the_32_bit_counter_they_are() {
+fn csp_positions_wrap_at_32_bits() {
     let mut rig = Rig::new(PlantParams {
         initial_position: i32::MAX - 100,
         ..PlantParams::default()
@@ -210,7 +210,7 @@ fn cst_accelerates_against_friction_to_a_bounded_speed() {
 }
 
 #[test]
-fn two_runs_are_the_same_to_the_bit() {
+fn drive_runs_are_reproducible_to_the_bit() {
     let run = || {
         let mut rig = rig();
         rig.enable(8);
@@ -220,7 +220,8 @@ fn two_runs_are_the_same_to_the_bit() {
     assert_eq!(run(), run());
 }
 
-/// A drive with 0x6072, in CSV, asked for 10 rev/s with these limits; rev/s after 0.3 s.
+/// Returns the speed after 0.3 s, in rev/s: CSV at 10 rev/s with these limits on a drive with
+/// 0x6072.
 fn speed_with(max_torque: i64, max_speed: i64, mapped: &[u16]) -> f64 {
     let mut store = ObjectStore::default();
     for unit in [0x60a9, 0x60aa] {
@@ -230,7 +231,7 @@ fn speed_with(max_torque: i64, max_speed: i64, mapped: &[u16]) -> f64 {
     let mut rig = rig();
     rig.drive = Drive::new(&mut store, PlantParams::default());
     rig.store = store;
-    let slots: Vec<Slot> = mapped.iter().map(|index| rig.slot(*index, 0)).collect();
+    let slots: Vec<EntryHandle> = mapped.iter().map(|index| rig.slot(*index, 0)).collect();
     rig.drive.set_mapped(&slots);
     rig.set(0x60c2, 1, 1);
     rig.set(0x6065, 0, 0xffff_ffff);
@@ -243,7 +244,7 @@ fn speed_with(max_torque: i64, max_speed: i64, mapped: &[u16]) -> f64 {
 }
 
 #[test]
-fn limits_of_zero_act_only_if_they_are_received() {
+fn limits_of_zero_act_only_if_mapped() {
     let moves = |speed: f64| (speed - 10.0).abs() < 0.1;
     assert!(moves(speed_with(0, 0, &[])));
     assert!(moves(speed_with(1000, 6000, &[0x6072, 0x6080])));
@@ -259,7 +260,7 @@ fn limits_of_zero_act_only_if_they_are_received() {
 
 /// A mapped limit changes with the process data, not with the drive's background task.
 #[test]
-fn a_received_torque_limit_acts_in_the_next_control_cycle() {
+fn mapped_torque_limit_acts_in_the_next_control_cycle() {
     let mut store = ObjectStore::default();
     let limit = store.ensure(0x6072, 0, "Max torque", 16, Access::default(), &[]);
     let mut drive = Drive::new(&mut store, PlantParams::default());
@@ -273,7 +274,7 @@ fn a_received_torque_limit_acts_in_the_next_control_cycle() {
     }
 }
 
-/// 0x6072, 0x6073, 0x60E0, 0x60E1: of the rated 118.4 mN·m and 3.2 A what a blocked shaft is given.
+/// 0x6072, 0x6073, 0x60E0, 0x60E1: the torque on a blocked shaft, with 118.4 mN·m and 3.2 A rated.
 #[test]
 fn torque_and_current_limits_act_in_their_direction() {
     let objects = [

@@ -1,9 +1,10 @@
-//! Option codes 0x605A–0x605E and 0x6007, code by code: the way to rest, and the state at its end.
+//! Option codes 0x605A–0x605E and 0x6007, code by code: the deceleration, and the final state.
 
 use super::*;
 use State as S;
 
-/// 3000 rpm in CSV. Slow-down ramp 5000 rpm/s, quick stop ramp 20,000 rpm/s: 600 ms and 150 ms.
+/// Returns a drive at 3000 rpm in CSV. Slow-down ramp 5000 rpm/s, quick stop ramp 20,000 rpm/s: 600
+/// ms and 150 ms.
 fn turning(options: &[(u16, i64)]) -> Rig {
     let mut rig = Rig::with(
         PlantParams::default(),
@@ -22,7 +23,7 @@ fn turning(options: &[(u16, i64)]) -> Rig {
     rig
 }
 
-/// How the axis came to rest.
+/// The deceleration of the axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
     SlowDown,
@@ -32,7 +33,7 @@ enum Way {
     Coast,
 }
 
-/// Lets it come to rest while the output stage is on; what it took.
+/// Waits for standstill while the output stage is on. Returns the deceleration from its duration.
 fn way(rig: &mut Rig) -> Way {
     let mut ms = 0;
     while rig.drive.velocity_rev_s().abs() > 0.2 && ms < 900 {
@@ -173,7 +174,7 @@ fn abort_connection_option_0x6007() {
         (DeviceError::BusDown, 0x8180),
     ];
     for (error, emergency) in errors {
-        // Fault signal: the reaction is 0x605E's.
+        // Fault signal: the reaction is that of 0x605E.
         let rows = [(1, Way::SlowDown), (2, Way::Coast), (3, Way::QuickStop)];
         for (code, expected) in rows {
             let mut rig = turning(&[(0x6007, code), (0x605e, 1)]);
@@ -194,9 +195,9 @@ fn abort_connection_option_0x6007() {
     }
 }
 
-/// In states without power the option codes have nothing to stop.
+/// In states without power the option codes have no effect.
 #[test]
-fn option_codes_matter_to_a_powered_axis_only() {
+fn option_codes_act_only_on_a_powered_axis() {
     for code in 0..=8 {
         for (words, word, end) in [
             (&[0x06][..], 0x02, S::SwitchOnDisabled),
@@ -217,9 +218,9 @@ fn option_codes_matter_to_a_powered_axis_only() {
     }
 }
 
-/// A stop under way gives way to a faster end, never to a slower one's state.
+/// A faster stop replaces an active one, never the reverse; the final state follows the same rule.
 #[test]
-fn stops_under_way_are_overtaken() {
+fn faster_stops_replace_active_ones() {
     let ramp_first = [(0x605a, 5), (0x605c, 1), (0x605e, 2)];
     // A slow quick stop, then a fault: the fault's ramp, then Fault.
     let mut rig = turning(&ramp_first);
@@ -243,7 +244,7 @@ fn stops_under_way_are_overtaken() {
     assert_eq!(rig.drive.state(), S::QuickStopActive);
     assert_eq!(way(&mut rig), Way::QuickStop);
 
-    // Disable voltage ends any of them at once.
+    // Disable voltage ends any stop at once.
     for word in [0x07, 0x0b] {
         let mut rig = turning(&ramp_first);
         rig.set(0x6040, 0, word);
@@ -255,7 +256,7 @@ fn stops_under_way_are_overtaken() {
         assert_eq!(way(&mut rig), Way::Coast);
     }
 
-    // Enabled again in the middle of the ramp: it goes on from there.
+    // Enabled again during the ramp: the axis continues from there.
     let mut rig = turning(&ramp_first);
     rig.set(0x6040, 0, 0x07);
     rig.run_ms(100);
@@ -266,9 +267,9 @@ fn stops_under_way_are_overtaken() {
     assert!((rig.drive.velocity_rev_s() - 50.0).abs() < 0.5);
 }
 
-/// 0x60C5 bounds the profile's ramps.
+/// 0x60C5 limits the profile's ramps.
 #[test]
-fn no_profile_is_steeper_than_0x60c5() {
+fn profiles_never_exceed_0x60c5() {
     for (limit, ms) in [(0xffff_ffff_i64, 300), (5_000, 600)] {
         let mut rig = rig();
         rig.set(0x60c5, 0, limit);

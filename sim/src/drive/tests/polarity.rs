@@ -1,4 +1,4 @@
-//! 0x607E turns round what the bus sees; 0x6076 is in the unit of its drive.
+//! 0x607E inverts positions and velocities on the bus; 0x6076 has the drive's unit.
 
 use super::*;
 use crate::drive::Track;
@@ -27,14 +27,14 @@ fn turned(polarity: i64, mode: i64) -> Rig {
 }
 
 #[test]
-fn positions_by_bit_7() {
+fn polarity_bit_7_inverts_positions() {
     for (polarity, sign) in [(0x00, 1), (0x40, 1), (0x80, -1), (0xc0, -1)] {
         for mode in [1, 8] {
             let mut rig = turned(polarity, mode);
             assert_eq!(rig.get(0x6064), sign * 100, "0x{polarity:02x}");
             rig.set(0x6081, 0, 1000);
             rig.set(0x60b8, 0, 0x0011);
-            // In CSP a way that a following error may have.
+            // In CSP the steps stay within the following error window.
             for target in [700, 1200, 1700, 2000].map(|at| sign * at) {
                 rig.set(0x607a, 0, target);
                 for word in [0x1f, 0x0f] {
@@ -66,7 +66,7 @@ fn positions_by_bit_7() {
 }
 
 #[test]
-fn velocities_by_bit_6() {
+fn polarity_bit_6_inverts_velocities() {
     for (polarity, sign) in [(0x00, 1.0), (0x80, 1.0), (0x40, -1.0), (0xc0, -1.0)] {
         for mode in [3, 9] {
             let mut rig = turned(polarity, mode);
@@ -87,7 +87,7 @@ fn velocities_by_bit_6() {
 }
 
 #[test]
-fn software_limits_are_the_users() {
+fn software_limits_apply_to_user_positions() {
     for (polarity, sign) in [(0x00, 1), (0xc0, -1)] {
         let mut rig = turned(polarity, 1);
         rig.set(0x607d, 1, -500);
@@ -115,7 +115,7 @@ fn software_limits_are_the_users() {
 }
 
 #[test]
-fn rated_torque_in_the_unit_of_the_drive() {
+fn rated_torque_has_the_unit_of_the_drive() {
     let newton_metres = PlantParams::default().rated_torque();
     for (vendor, per_newton_metre) in [(Some(0xfb), 1e6), (Some(0xe0a), 1e3), (None, 1e6)] {
         let mut store = ObjectStore::default();

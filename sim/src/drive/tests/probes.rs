@@ -15,7 +15,7 @@ const OBJECTS: [Extra; 9] = [
     (0x60d5, 0, 16, "Touch probe 1 positive edge counter"),
 ];
 
-/// Probe 1 sees something at 1003…1010, probe 2 at 1500…1507; the index is at 250.
+/// Probe 1 is on at 1003…1010, probe 2 at 1500…1507; the index is at 250.
 fn probing() -> Rig {
     let mut rig = Rig::with(
         PlantParams {
@@ -52,8 +52,8 @@ fn latched(rig: &Rig) -> [i64; 4] {
 }
 
 #[test]
-fn rows_of_the_function_object() {
-    // Function; what lies in the four objects and in the status after a way to 2000 and back.
+fn touch_probe_functions_latch_row_by_row() {
+    // Function, then the four position objects and the status after a move to 2000 and back.
     let rows = [
         (0x0000, [0, 0, 0, 0], 0x0000),
         // Edges without the probe, the probe without edges.
@@ -65,14 +65,15 @@ fn rows_of_the_function_object() {
         (0x0031, [1003, 1011, 0, 0], 0x0007),
         (0x3100, [0, 0, 1500, 1508], 0x0700),
         (0x3131, [1003, 1011, 1500, 1508], 0x0707),
-        // Continuously: what the way back passed last. Each value turned its bit over twice.
+        // Continuous: the last edge of the return move. Each value inverted its toggle bit, twice
+        // in total.
         (0x0033, [1010, 1002, 0, 0], 0x0007),
         (0x3300, [0, 0, 1507, 1499], 0x0700),
-        // Zero impulse: 250 on the way there, the way back does not count any more.
+        // Zero impulse: 250 on the way out. The return move does not store again.
         (0x0015, [250, 0, 0, 0], 0x0003),
         (0x0017, [250, 0, 0, 0], 0x0003),
         (0x0025, [0, 0, 0, 0], 0x0001),
-        // By 0x60D0: probe 1 looks at input 2, probe 2 at the zero impulse.
+        // 0x60D0: probe 1 uses input 2, probe 2 the zero impulse.
         (0x0019, [1500, 0, 0, 0], 0x0003),
         (0x1900, [0, 0, 250, 0], 0x0300),
         // Reserved source.
@@ -91,7 +92,7 @@ fn rows_of_the_function_object() {
 }
 
 #[test]
-fn continuous_sampling_toggles_and_counts() {
+fn touch_probe_toggles_and_counts_in_continuous_mode() {
     let mut rig = probing();
     rig.set(0x60b8, 0, 0x0013);
     for (n, target, position) in [(1, 2000, 1003), (2, 0, 1010), (3, 1200, 1003)] {
@@ -103,7 +104,7 @@ fn continuous_sampling_toggles_and_counts() {
 }
 
 #[test]
-fn a_probe_is_armed_anew_by_switching_it_or_an_edge() {
+fn touch_probe_stores_again_after_enabling_it_or_an_edge() {
     let mut rig = probing();
     rig.set(0x60b8, 0, 0x0011);
     go(&mut rig, 2000);
@@ -121,9 +122,10 @@ fn a_probe_is_armed_anew_by_switching_it_or_an_edge() {
     }
 }
 
-/// The wire's edge comes somewhere in the control cycle; the position is the one of that moment.
+/// An external edge may come at any time in the control cycle. The latched position is that of the
+/// edge.
 #[test]
-fn edges_from_outside_latch_between_two_control_cycles() {
+fn touch_probe_latches_external_edges_between_control_cycles() {
     for after in [0.0, 0.25, 0.5, 0.99] {
         let mut rig = probing();
         rig.set(0x6060, 0, 9);
@@ -140,7 +142,7 @@ fn edges_from_outside_latch_between_two_control_cycles() {
         assert!(off.abs() <= 1, "{after}: off by {off}");
         assert_eq!(status(&rig), 0x03);
 
-        // Two edges within one cycle are two positions.
+        // Two edges within one cycle store two positions.
         rig.set(0x60b8, 0, 0);
         rig.drive.set_input(input::TOUCH_PROBE_1, false, 0.0);
         rig.drive.control(&mut rig.store, true);
@@ -156,7 +158,7 @@ fn edges_from_outside_latch_between_two_control_cycles() {
 }
 
 #[test]
-fn without_the_second_probes_objects_there_is_no_second_probe() {
+fn touch_probe_2_needs_its_objects() {
     let mut rig = Rig::with(PlantParams::default(), &OBJECTS[..4]);
     rig.enable(1);
     rig.set(0x60b8, 0, 0x3131);

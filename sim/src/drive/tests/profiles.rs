@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// Milliseconds until Statusword bit 10.
+/// Returns the milliseconds until Statusword bit 10.
 fn until_reached(rig: &mut Rig) -> u32 {
     let mut ms = 0;
     while rig.word() & 1 << 10 == 0 {
@@ -72,19 +72,19 @@ fn pp_buffers_one_set_point_or_changes_at_once() {
     assert!((rig.get(0x6064) - 1500).abs() <= 1, "relative");
 }
 
-/// Controlword bits 4 to 6 and 9, row by row: where the axis is seen on its way to rest.
+/// Controlword bits 4 to 6 and 9, row by row: the positions of the axis during the move.
 #[test]
-fn rows_of_the_set_point_handshake() {
+fn set_point_handshake_row_by_row() {
     struct Row {
         word: i64,
-        /// Relative to the first target of 4000, or absolute.
+        /// The second target, relative to the first target of 4000, or absolute.
         second: i64,
         end: i64,
-        /// Whether it came to rest at 4000 first.
+        /// True if the axis stops at 4000 first.
         rests: bool,
     }
     let rows = [
-        // One after the other; at once; the same relative to the target accepted last.
+        // One after the other; immediately; immediately and relative to the last accepted target.
         Row {
             word: 0x1f,
             second: 9000,
@@ -109,7 +109,7 @@ fn rows_of_the_set_point_handshake() {
             end: 9000,
             rests: false,
         },
-        // On set-point: past 4000 at full speed.
+        // Change on set-point: past 4000 at full speed.
         Row {
             word: 0x21f,
             second: 9000,
@@ -122,7 +122,7 @@ fn rows_of_the_set_point_handshake() {
             end: 9000,
             rests: false,
         },
-        // Bit 5 decides before bit 9.
+        // Bit 5 has priority over bit 9.
         Row {
             word: 0x23f,
             second: 9000,
@@ -183,7 +183,7 @@ fn pp_targets_beyond_the_software_limits_end_there() {
 
 /// 0x6067 and 0x6068.
 #[test]
-fn a_position_is_reached_after_its_time_in_the_window() {
+fn position_is_reached_after_its_time_in_the_window() {
     let reached = |window, time| {
         let mut rig = rig();
         rig.set(0x6067, 0, window);
@@ -200,7 +200,7 @@ fn a_position_is_reached_after_its_time_in_the_window() {
 }
 
 #[test]
-fn pp_halts_and_goes_on() {
+fn pp_continues_after_a_halt() {
     let mut rig = rig();
     rig.enable(1);
     rig.set(0x607a, 0, 20_000);
@@ -232,7 +232,7 @@ fn pv_ramps_to_its_speed() {
 }
 
 #[test]
-fn homing_here() {
+fn homing_method_37_takes_the_present_position() {
     let mut rig = Rig::new(PlantParams {
         initial_position: 777,
         ..PlantParams::default()
@@ -254,7 +254,7 @@ fn homing_here() {
 }
 
 #[test]
-fn an_unsupported_mode_leaves_the_old_one() {
+fn unsupported_mode_keeps_the_old_one() {
     let mut rig = rig();
     rig.enable(8);
     for code in [0, 2, -1, 11] {
@@ -266,7 +266,7 @@ fn an_unsupported_mode_leaves_the_old_one() {
 }
 
 #[test]
-fn changing_the_mode_while_enabled_takes_over_where_the_axis_is() {
+fn mode_change_while_enabled_starts_at_the_actual_position() {
     let mut rig = rig();
     rig.enable(9);
     rig.set(0x60ff, 0, 300);

@@ -1,4 +1,4 @@
-//! Profile velocity: when a speed counts as reached, as zero, as slipping.
+//! Profile velocity: target speed reached, zero speed, slippage.
 
 use super::*;
 
@@ -24,7 +24,7 @@ fn profile_velocity(values: &[(u16, i64)]) -> Rig {
     rig
 }
 
-/// Milliseconds until a bit changes, from when the target is set.
+/// Returns the milliseconds from the new target until a bit changes.
 fn until(rig: &mut Rig, bit: i64, on: bool) -> u32 {
     let mut ms = 0;
     while (rig.word() & bit != 0) != on {
@@ -36,7 +36,7 @@ fn until(rig: &mut Rig, bit: i64, on: bool) -> u32 {
 }
 
 #[test]
-fn a_speed_is_reached_after_its_time_in_the_window() {
+fn speed_is_reached_after_its_time_in_the_window() {
     for (window, time, expected) in [(50, 0, 95..110), (50, 200, 295..310), (1, 0, 100..130)] {
         let mut rig = profile_velocity(&[(0x606d, window), (0x606e, time)]);
         rig.run_ms(300);

@@ -3,7 +3,7 @@
 use super::*;
 use State as S;
 
-/// A drive in the state, with the option codes written, ready for the next Controlword.
+/// Returns a drive in the state, with the option codes written, ready for the next Controlword.
 fn brought_to(state: State, options: &[(u16, i64)]) -> Rig {
     let mut rig = Rig::new(PlantParams {
         enable_cycles: 0,
@@ -38,7 +38,7 @@ fn brought_to(state: State, options: &[(u16, i64)]) -> Rig {
 }
 
 #[test]
-fn rows_of_the_transition_table() {
+fn transitions_row_by_row() {
     let rows = [
         (2, S::SwitchOnDisabled, 0x06, S::ReadyToSwitchOn),
         (3, S::ReadyToSwitchOn, 0x07, S::SwitchedOn),
@@ -103,7 +103,7 @@ fn transitions_13_and_14_from_every_state() {
 }
 
 #[test]
-fn nothing_else_moves_it() {
+fn state_machine_ignores_other_controlwords() {
     let stays = [
         (S::SwitchOnDisabled, 0x00),
         (S::SwitchOnDisabled, 0x02),
@@ -128,7 +128,7 @@ fn nothing_else_moves_it() {
 }
 
 #[test]
-fn statuswords_by_mask_and_value() {
+fn statusword_matches_mask_and_value_in_every_state() {
     let rows = [
         (S::NotReadyToSwitchOn, 0x4f, 0x00),
         (S::SwitchOnDisabled, 0x4f, 0x40),
@@ -146,7 +146,7 @@ fn statuswords_by_mask_and_value() {
 
 /// Bits 4 (voltage enabled), 7 (warning), 9 (remote) and 11 (internal limit).
 #[test]
-fn the_other_bits_by_state() {
+fn statusword_other_bits_by_state() {
     let rows = [
         (S::NotReadyToSwitchOn, 0),
         (S::SwitchOnDisabled, 0),
@@ -206,7 +206,7 @@ fn held_states_are_never_left() {
 }
 
 #[test]
-fn enabling_takes_the_output_stage_its_time() {
+fn enabling_waits_for_the_output_stage() {
     let mut rig = rig();
     for word in [0, 0, 0, 0, 0, 0x06, 0x07] {
         rig.step(word);

@@ -1,12 +1,12 @@
-//! A crystal that drifts.
+//! A device clock with a drifting crystal.
 
 use crate::Nanos;
 
-/// Fixed point: 2^-40 ns per ns resolves a rate of 10^-12.
+/// Fraction bits of the fixed-point rate: 2^-40 ns per ns resolves 10^-12.
 const FRACTION: u32 = 40;
 const ONE: f64 = (1_u64 << FRACTION) as f64;
 
-/// A device's own clock as a function of true time; counts nanoseconds since power-on.
+/// The clock of a device as a function of true time, in ns since power-on.
 #[derive(Debug, Clone)]
 pub struct Clock {
     base_true: Nanos,
@@ -34,18 +34,18 @@ impl Clock {
         self.base_local + i128::from(now.saturating_sub(self.base_true)) * self.rate()
     }
 
-    /// Local time at a true time.
+    /// Returns the local time at a true time.
     #[must_use]
     pub fn local(&self, now: Nanos) -> u64 {
         (self.fixed(now) >> FRACTION) as u64
     }
 
-    /// The first true time at which the clock shows `local`.
+    /// Returns the first true time at which the clock shows `local`.
     #[must_use]
     pub fn true_time(&self, local: u64) -> Nanos {
         let ahead = ((i128::from(local) << FRACTION) - self.base_local).max(0);
         let rate = self.rate().max(1);
-        // Soon after a bend 64 bits are enough; dividing more takes much longer.
+        // Shortly after a rate change, 64 bits are enough; a wider division is much slower.
         let ns = match (u64::try_from(ahead), u64::try_from(rate)) {
             (Ok(ahead), Ok(rate)) => ahead / rate,
             _ => u64::try_from(ahead / rate).unwrap_or(u64::MAX),
@@ -53,17 +53,18 @@ impl Clock {
         self.base_true.saturating_add(ns)
     }
 
-    /// True time that passes at least until the clock, as it runs now, shows so much more.
+    /// Returns a lower bound of the true time until the clock, at its present rate, advances by
+    /// `local` ns.
     #[must_use]
     pub fn at_least(&self, local: u64) -> Nanos {
-        // Without a division: as if it were a 64th fast.
+        // Assumes a clock that is 1/64 fast, which avoids a division.
         if self.rate() > (1 << FRACTION) + (1 << FRACTION) / 64 {
             return 0;
         }
         local.saturating_sub(1 + local / 64)
     }
 
-    /// From now on the clock runs off its crystal by this share.
+    /// Changes the rate relative to the crystal from `now` on.
     pub(super) fn bend(&mut self, now: Nanos, correction: f64) {
         self.base_local = self.fixed(now);
         self.base_true = self.base_true.max(now);
@@ -71,7 +72,7 @@ impl Clock {
     }
 }
 
-/// Seeded noise on time stamps, as PHYs and clock domains make it.
+/// Seeded noise on time stamps, as caused by PHYs and clock domains.
 #[derive(Debug, Clone)]
 pub struct Jitter {
     amplitude: u32,
@@ -79,7 +80,7 @@ pub struct Jitter {
 }
 
 impl Jitter {
-    /// Evenly spread over ±`amplitude` nanoseconds.
+    /// Creates noise that is uniformly distributed over ±`amplitude` ns.
     #[must_use]
     pub fn new(amplitude: u32, seed: u64) -> Self {
         Self {
@@ -88,18 +89,18 @@ impl Jitter {
         }
     }
 
-    /// Time stamps are exact.
+    /// True if time stamps are exact.
     #[must_use]
     pub fn is_none(&self) -> bool {
         self.amplitude == 0
     }
 
-    /// A time stamp of `local`.
+    /// Returns a noisy time stamp of `local`.
     pub fn stamp(&mut self, local: u64) -> u64 {
         if self.amplitude == 0 {
             return local;
         }
-        // splitmix64
+        // The splitmix64 generator.
         self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.state;
         z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -1,22 +1,22 @@
-//! LATCH0 and LATCH1: system time of the edges of an input (Beckhoff ESC data sheet, section II, 2.15.5).
+//! LATCH0 and LATCH1: the system time of input edges (Beckhoff ESC data sheet, section II, 2.15.5).
 
-/// Edges of one input; bit 0 stands for the positive one, bit 1 for the negative one.
+/// The edges of one input. Bit 0 is the positive edge, bit 1 the negative one.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Latch {
-    /// 0x09A8: bit set: single event, else continuous.
+    /// 0x09A8. A set bit selects single event mode, otherwise continuous mode.
     pub control: u8,
-    /// Edges seen in single event mode and not read since.
+    /// Unread edges in single event mode.
     events: u8,
     level: bool,
-    /// System time of the positive and the negative edge.
+    /// The system times of the positive and the negative edge.
     times: [u64; 2],
 }
 
-/// Bit 2 of the status: the input's level.
+/// Bit 2 of the status: the level of the input.
 const LEVEL: u8 = 0x04;
 
 impl Latch {
-    /// The input has this level at this system time. True if that was an edge which counts.
+    /// Sets the level of the input at this system time. Returns true for an edge that is recorded.
     pub fn input(&mut self, level: bool, system: u64) -> bool {
         if std::mem::replace(&mut self.level, level) == level {
             return false;
@@ -36,7 +36,7 @@ impl Latch {
         single
     }
 
-    /// 0x09AE.
+    /// Returns the status register 0x09AE.
     #[must_use]
     pub fn status(&self) -> u8 {
         self.events | if self.level { LEVEL } else { 0 }
@@ -47,12 +47,13 @@ impl Latch {
         self.times.get(edge).copied().unwrap_or(0)
     }
 
-    /// Whoever controls the unit has read an edge's time: the next one may come.
+    /// Enables the next event of an edge after its time was read by the side that controls the
+    /// unit.
     pub fn acknowledge(&mut self, edge: usize) {
         self.events &= !(1 << edge.min(1));
     }
 
-    /// Edges wait to be read.
+    /// True while unread edges exist.
     #[must_use]
     pub fn pending(&self) -> bool {
         self.events != 0
@@ -64,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn continuous_keeps_the_last_edge_and_has_no_events() {
+    fn latch_in_continuous_mode_keeps_the_last_edge_without_events() {
         let mut latch = Latch::default();
         for (level, at) in [(true, 10), (true, 11), (false, 20), (true, 30)] {
             assert!(!latch.input(level, at));
@@ -74,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_event_waits_to_be_read() {
+    fn latch_in_single_event_mode_keeps_the_edge_until_read() {
         let mut latch = Latch {
             control: 0b01,
             ..Latch::default()

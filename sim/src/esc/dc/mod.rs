@@ -1,13 +1,13 @@
-//! Distributed clocks: system time and the loop that keeps it, SYNC0 and SYNC1, latches.
+//! Distributed clocks: system time and its control loop, SYNC0 and SYNC1, latches.
 //!
 //! * `clock`: the crystal
 //! * `sync`: SYNC0 and SYNC1
 //! * `latch`: time stamps of inputs
 //!
-//! Data sheets do not say how the control loop works inside. Here it is a PI controller: the proportional part
-//! closes a difference, the integral part is the "speed counter difference" that makes up for the crystal. Like the
-//! real one it keeps what it has learnt when no more system times arrive; only writing the speed counter start
-//! (0x0930) lets the clock run on its bare crystal again.
+//! Data sheets do not describe the control loop. Here it is a PI controller. The proportional part
+//! removes a difference. The integral part is the "speed counter difference", which compensates the
+//! crystal. Like real hardware, the loop keeps its rate when no more system times arrive. Only a
+//! write to the speed counter start (0x0930) restores the bare crystal rate.
 
 pub mod clock;
 pub mod latch;
@@ -18,19 +18,19 @@ pub use clock::{Clock, Jitter};
 use latch::Latch;
 use sync::SyncUnit;
 
-/// The proportional part closes this share of a difference per second, the integral part is
-/// critically damped against it; with the default speed counter start.
+/// The share of a difference that the proportional part removes per second, for the default speed
+/// counter start. The integral part is critically damped against it.
 const KP: f64 = 50.0;
-/// A clock is never bent by more than this, so a wrong offset never converges in useful time;
-/// the same holds for real hardware.
+/// The limit of the rate correction. As in real hardware, a wrong offset therefore does not
+/// converge in useful time.
 const MAX_BEND: f64 = 500e-6;
 const MAX_LEARNT: f64 = 300e-6;
-/// 0x0930 after reset: the bandwidth that [`KP`] stands for.
+/// 0x0930 after reset: the bandwidth of `KP`.
 pub const DEFAULT_SPEED_START: u16 = 0x1000;
 /// 0x0934 and 0x0935 after reset.
 pub const DEFAULT_FILTERS: [u8; 2] = [4, 12];
 
-/// Bits of the system time.
+/// The number of bits of the system time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Width {
     Bits32,
@@ -39,7 +39,7 @@ pub enum Width {
 }
 
 impl Width {
-    /// What the clock shows of a time.
+    /// Reduces a time to the bits of the clock.
     #[must_use]
     pub fn cut(self, time: u64) -> u64 {
         match self {
@@ -48,7 +48,7 @@ impl Width {
         }
     }
 
-    /// How far `target` lies ahead of `now`, going round once at most.
+    /// Returns the time from `now` until `target`, with at most one wrap of the clock.
     #[must_use]
     pub fn ahead(self, target: u64, now: u64) -> u64 {
         self.cut(target.wrapping_sub(now))
@@ -63,7 +63,7 @@ impl Width {
     }
 }
 
-/// Registers 0x0910–0x09CF that do something.
+/// The functional registers in 0x0910–0x09CF.
 #[derive(Debug, Clone)]
 pub struct Dc {
     pub width: Width,
@@ -77,13 +77,13 @@ pub struct Dc {
 
 #[derive(Debug, Clone)]
 struct Control {
-    /// 0x0930, in its valid range.
+    /// 0x0930, limited to its valid range.
     start: u16,
     filters: [u8; 2],
-    /// Mean difference, local copy − received, in ns; `None` before the first.
+    /// Mean difference, local copy − received time, in ns; `None` before the first value.
     mean: Option<f64>,
     learnt: f64,
-    /// [`Self::learnt`], averaged for 0x0932.
+    /// The average of [`Self::learnt`] for 0x0932.
     shown: f64,
     last_write: Option<u64>,
 }
@@ -101,7 +101,7 @@ impl Default for Control {
     }
 }
 
-/// A mean that moves by 1/2^depth of the difference.
+/// Moves a mean by 1/2^depth of the difference.
 fn average(mean: f64, value: f64, depth: u8) -> f64 {
     mean + (value - mean) / f64::from(1_u32 << depth.min(15))
 }
@@ -124,14 +124,15 @@ impl Dc {
         self.width.cut(local.wrapping_add(self.offset))
     }
 
-    /// What a read of 0x0910 shows: the time when the frame passed the reference clock.
+    /// Returns the value of a read of 0x0910: the time at which the frame passed the reference
+    /// clock.
     #[must_use]
     pub fn local_copy(&self, local: u64) -> u64 {
         let delay = u64::from(self.delay);
         self.width.cut(self.system(local).wrapping_sub(delay))
     }
 
-    /// 0x0920 was written: pulses that were due stay due at their system time.
+    /// Handles a write to 0x0920. Pending pulses keep their system time.
     pub fn set_offset(&mut self, offset: u64, local: u64) {
         if self.offset != offset {
             self.offset = offset;
@@ -140,7 +141,8 @@ impl Dc {
         }
     }
 
-    /// A write to 0x0910: compare (32 bits, as the hardware does) and bend the clock.
+    /// Handles a write to 0x0910: compares 32 bits, as the hardware does, and adjusts the clock
+    /// rate.
     pub fn compare(&mut self, clock: &mut Clock, now: Nanos, local: u64, received: u32) {
         let difference = (self.local_copy(local) as u32)
             .wrapping_sub(received)
@@ -156,7 +158,7 @@ impl Dc {
         if dt <= 0.0 {
             return;
         }
-        // Rarer frames must not make the loop oscillate.
+        // The loop must not oscillate with less frequent frames.
         let bandwidth = f64::from(DEFAULT_SPEED_START) / f64::from(control.start);
         let gain = (KP * bandwidth).min(0.5 / dt);
         let error = difference * 1e-9;
@@ -169,7 +171,7 @@ impl Dc {
         clock.bend(now, bend.clamp(-MAX_BEND, MAX_BEND));
     }
 
-    /// 0x0930 was written: the loop starts anew, from the bare crystal.
+    /// Handles a write to 0x0930: the loop restarts from the bare crystal rate.
     pub fn restart(&mut self, clock: &mut Clock, now: Nanos, start: u16) {
         self.control = Control {
             start: start.clamp(0x0080, 0x3fff),
@@ -179,14 +181,15 @@ impl Dc {
         clock.bend(now, 0.0);
     }
 
-    /// 0x0934 or 0x0935 was written: what they average starts anew.
+    /// Handles a write to 0x0934 or 0x0935: the averages restart.
     pub fn set_filters(&mut self, filters: [u8; 2]) {
         self.control.filters = filters.map(|depth| depth & 0x0f);
         self.control.mean = None;
         self.control.shown = self.control.learnt;
     }
 
-    /// 0x092C: magnitude; bit 31 is set where the local copy is not less than what was received.
+    /// Returns 0x092C: the magnitude, with bit 31 set if the local copy is at least the received
+    /// time.
     #[must_use]
     pub fn difference_register(&self) -> u32 {
         let Some(mean) = self.control.mean else {
@@ -200,8 +203,8 @@ impl Dc {
         }
     }
 
-    /// 0x0932: with d this register and s 0x0930, the local clock's bare period is the reference's times
-    /// 1 − d / (5 · (s + d + 2) · (s − d + 2)).
+    /// Returns 0x0932. With d = 0x0932 and s = 0x0930, the bare period of the local clock is the
+    /// period of the reference times 1 − d / (5 · (s + d + 2) · (s − d + 2)).
     #[must_use]
     pub fn speed_register(&self) -> i16 {
         let deviation = -self.control.shown;
@@ -218,7 +221,7 @@ impl Dc {
 mod tests {
     use super::*;
 
-    /// A second of system times each millisecond from a reference that shows true time.
+    /// Sends system times every millisecond from a reference that shows true time.
     fn discipline(clock: &mut Clock, dc: &mut Dc, from_ms: u64, to_ms: u64) {
         for ms in from_ms..to_ms {
             let now = ms * 1_000_000;
@@ -228,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn follows_a_reference_through_100_ppm() {
+    fn clock_follows_a_reference_with_100_ppm_deviation() {
         for start in [0x0400, DEFAULT_SPEED_START, 0x3fff] {
             let (mut clock, mut dc) = (Clock::new(0, 0, 100.0), Dc::new(Width::Bits64, 0));
             dc.restart(&mut clock, 0, start);
@@ -239,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_larger_speed_counter_start_means_a_smaller_bandwidth() {
+    fn larger_speed_counter_start_reduces_the_bandwidth() {
         let left_after_20_ms = |start| {
             let (mut clock, mut dc) = (Clock::new(0, 500, 0.0), Dc::new(Width::Bits64, 0));
             dc.restart(&mut clock, 0, start);
@@ -251,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn the_speed_register_says_how_far_the_crystal_is_off() {
+    fn speed_register_shows_the_deviation_of_the_crystal() {
         for ppm in [-80.0, -3.0, 0.0, 20.0, 100.0] {
             let (mut clock, mut dc) = (Clock::new(0, 0, ppm), Dc::new(Width::Bits64, 0));
             dc.set_filters([0, 4]);
@@ -259,14 +262,14 @@ mod tests {
             let d = f64::from(dc.speed_register());
             let s = f64::from(DEFAULT_SPEED_START);
             let deviation = d / (5.0 * (s + d + 2.0) * (s - d + 2.0));
-            // A period shorter by that share is a clock faster by it.
+            // A period shorter by this share is a clock faster by the same share.
             let seen = (1.0 / (1.0 - deviation) - 1.0) * 1e6;
             assert!((seen - ppm).abs() < 0.05, "{seen} for {ppm}");
         }
     }
 
     #[test]
-    fn the_difference_register_has_a_sign_bit_for_clocks_ahead() {
+    fn difference_register_sets_the_sign_bit_for_clocks_ahead() {
         for (offset, sign) in [(400, 0x8000_0000_u32), (0_u64.wrapping_sub(400), 0)] {
             let (mut clock, mut dc) = (Clock::new(0, 0, 0.0), Dc::new(Width::Bits64, 0));
             assert_eq!(dc.difference_register(), 0, "nothing received yet");
@@ -278,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn restarting_forgets_what_was_learnt() {
+    fn restart_returns_to_the_bare_crystal_rate() {
         let (mut clock, mut dc) = (Clock::new(0, 0, 60.0), Dc::new(Width::Bits64, 0));
         discipline(&mut clock, &mut dc, 1, 3_000);
         let kept = clock.local(4_000_000_000).abs_diff(4_000_000_000);
@@ -290,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_of_32_bits_wraps() {
+    fn system_time_of_32_bits_wraps() {
         let mut dc = Dc::new(Width::Bits32, 0);
         dc.set_offset(0xffff_ffff, 0);
         assert_eq!(dc.system(1), 0);

@@ -10,33 +10,33 @@ pub mod activation {
     pub const SYNC1: u8 = 0x04;
     /// Writing the start time sets [`UNIT`].
     pub const AUTO: u8 = 0x08;
-    /// A start time of 32 bits is completed to 64.
+    /// A start time of 32 bits is extended to 64.
     pub const EXTEND: u8 = 0x10;
-    /// A start time outside the near future starts at once.
+    /// A start time outside the near future starts the unit at once.
     pub const PLAUSIBILITY: u8 = 0x20;
-    /// The near future is 2^31 ns, not half of the clock's range.
+    /// The near future is 2^31 ns, instead of half the range of the clock.
     pub const NEAR: u8 = 0x40;
     /// One pulse now, for debugging.
     pub const PING: u8 = 0x80;
 }
 
-/// Pulses come no denser than this: an application that is interrupted faster sees no more of them.
+/// The minimum pulse interval of an application. Faster pulses are counted and not served.
 const DENSEST_NS: u64 = 10_000;
-/// A cyclic unit that runs at all needs this long.
+/// The minimum cycle time of a running cyclic unit.
 const SHORTEST_CYCLE_NS: u32 = 60;
 
-/// The base of SYNC0 and SYNC1.
+/// The time base of SYNC0 and SYNC1.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 enum Base {
     #[default]
     Off,
-    /// Next pulse in system time.
+    /// The unit runs; `next` is the system time of the next pulse.
     Running { next: u64 },
-    /// A single shot has been fired.
+    /// A single shot has fired.
     Done,
 }
 
-/// Which outputs rose.
+/// The outputs with a rising edge.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Edges {
     pub sync0: bool,
@@ -46,27 +46,27 @@ pub struct Edges {
 #[derive(Debug, Clone, Default)]
 pub struct SyncUnit {
     width: Width,
-    /// 0x0981.
+    /// The activation register 0x0981.
     activation: u8,
-    /// 0x0984.
+    /// The activation status 0x0984.
     status: u8,
-    /// 0x0990 as written.
+    /// The start time 0x0990 as written.
     start: u64,
     pub cycle0: u32,
     pub cycle1: u32,
-    /// 0x0982, units of 10 ns; 0: acknowledge mode.
+    /// The pulse length 0x0982 in units of 10 ns; 0: acknowledge mode.
     pub pulse_length: u16,
     base: Base,
-    /// Local times; `u64::MAX`: never.
+    /// Local times of the next pulses; `u64::MAX`: never.
     due0: u64,
     due1: u64,
-    /// System time of the SYNC1 pulse under way.
+    /// System time of the pending SYNC1 pulse.
     next1: Option<u64>,
-    /// Acknowledge mode: pulses that nobody has acknowledged; bit 0 for SYNC0, bit 1 for SYNC1.
+    /// Pulses without acknowledgement in acknowledge mode. Bit 0: SYNC0, bit 1: SYNC1.
     unacknowledged: u8,
     /// SYNC0 pulses since activation.
     pub pulses: u64,
-    /// The first pulse comes so much later than the start time says: a fault.
+    /// The delay of the first pulse against the start time in ns, for fault injection.
     pub(crate) late: u64,
 }
 
@@ -87,31 +87,31 @@ impl SyncUnit {
         self.activation
     }
 
-    /// Whether SYNC0 is switched on, be it that it never fires.
+    /// True if SYNC0 is switched on, even if it never fires.
     #[must_use]
     pub fn sync0_on(&self) -> bool {
         let on = activation::UNIT | activation::SYNC0;
         self.activation & on == on
     }
 
-    /// 0x0984.
+    /// Returns the activation status 0x0984.
     #[must_use]
     pub fn status(&self) -> u8 {
         self.status
     }
 
-    /// 0x098E (0) or 0x098F (1): whether a pulse waits to be acknowledged.
+    /// Returns 0x098E (0) or 0x098F (1): true if a pulse waits for its acknowledgement.
     #[must_use]
     pub fn waits(&self, n: u8) -> bool {
         self.unacknowledged >> n & 1 != 0
     }
 
-    /// The application has read 0x098E (0) or 0x098F (1).
+    /// Acknowledges a pulse after the application read 0x098E (0) or 0x098F (1).
     pub fn acknowledge(&mut self, n: u8) {
         self.unacknowledged &= !(1 << n);
     }
 
-    /// 0x0990: the next SYNC0 pulse, or the start time while there is none.
+    /// Returns 0x0990: the next SYNC0 pulse, or the start time if the unit does not run.
     #[must_use]
     pub fn next_sync0(&self) -> u64 {
         match self.base {
@@ -120,7 +120,7 @@ impl SyncUnit {
         }
     }
 
-    /// 0x0998.
+    /// Returns 0x0998: the next SYNC1 pulse.
     #[must_use]
     pub fn next_sync1(&self) -> u64 {
         match (self.next1, self.base) {
@@ -132,13 +132,14 @@ impl SyncUnit {
         }
     }
 
-    /// Local time of the next pulse, `u64::MAX` if there is none.
+    /// Returns the local time of the next pulse; `u64::MAX` if there is none.
     #[must_use]
     pub fn due(&self) -> u64 {
         self.due0.min(self.due1)
     }
 
-    /// 0x0990 was written; `complete` with its last byte, `low` with the last of its lower half.
+    /// Handles a write to 0x0990. `complete`: the last byte was written. `low`: the last byte of
+    /// the lower half was written.
     pub fn write_start(&mut self, start: u64, low: bool, complete: bool, local: u64, system: u64) {
         self.start = self.width.cut(start);
         let extends = self.activation & activation::EXTEND != 0 && self.width == Width::Bits64;
@@ -160,7 +161,7 @@ impl SyncUnit {
         }
     }
 
-    /// 0x0981 was written. The bits beyond the first three exist where `enhanced`.
+    /// Handles a write to 0x0981. The bits above the first three exist only if `enhanced`.
     pub fn write_activation(
         &mut self,
         value: u8,
@@ -210,11 +211,12 @@ impl SyncUnit {
         self.aim(local, system);
     }
 
-    /// The clock's offset changed, or a start time was set: when will the comparators match?
+    /// Computes the local times of the next pulses, after a change of the clock offset or start
+    /// time.
     pub fn aim(&mut self, local: u64, system: u64) {
         let when = |target: u64| {
             let ahead = self.width.ahead(target, system);
-            // A comparator that has been passed matches again when the clock has wrapped.
+            // A 32-bit comparator that was passed matches again after the clock has wrapped.
             match (ahead, self.width) {
                 (0, Width::Bits32) => local.saturating_add(1 << 32),
                 (0, Width::Bits64) => u64::MAX,
@@ -229,13 +231,13 @@ impl SyncUnit {
         self.due1 = self.next1.map_or(u64::MAX, when);
     }
 
-    /// Whether the start time was missed: nothing will come for centuries.
+    /// True if the start time was missed, so that no pulse comes for centuries.
     #[must_use]
     pub fn never_starts(&self) -> bool {
         self.sync0_on() && self.pulses == 0 && self.due0 == u64::MAX
     }
 
-    /// Everything due at `local`.
+    /// Fires all pulses that are due at `local`.
     pub fn fire(&mut self, local: u64) -> Edges {
         let mut edges = Edges::default();
         // SYNC1 counts from the first SYNC0 that is not before its own pulse.
@@ -279,7 +281,7 @@ impl SyncUnit {
         edges
     }
 
-    /// Whether output `n` rises. It does not if it is high still.
+    /// Returns true if output `n` rises. An output that is still high does not rise.
     fn edge(&mut self, n: u8, enable: u8, repeated: bool) -> bool {
         if self.activation & enable == 0 {
             return false;
@@ -307,7 +309,7 @@ mod tests {
         unit
     }
 
-    /// Fires until `end`, with a local clock that is the system clock.
+    /// Fires until `end`, with a local clock equal to the system clock.
     fn pulses(unit: &mut SyncUnit, end: u64) -> (Vec<u64>, Vec<u64>) {
         let (mut sync0, mut sync1) = (Vec::new(), Vec::new());
         while unit.due() <= end {
@@ -350,7 +352,7 @@ mod tests {
         unit.write_start(1_000, true, true, 0, 0);
         unit.write_activation(ON, true, 0, 0);
         assert_eq!(pulses(&mut unit, 1_000_000), (vec![1_000], vec![1_500]));
-        // Only switching off and on again rearms it.
+        // The unit fires again only after a new activation.
         unit.write_start(2_000_000, true, true, 1_000_000, 1_000_000);
         unit.write_activation(ON, true, 1_000_000, 1_000_000);
         assert_eq!(unit.due(), u64::MAX);
@@ -360,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn a_start_time_in_the_past_is_met_when_the_clock_has_wrapped() {
+    fn sync0_with_a_past_start_time_fires_after_the_clock_has_wrapped() {
         let mut wide = unit(500, 0);
         wide.write_start(1_000, true, true, 2_000, 2_000);
         wide.write_activation(ON, true, 2_000, 2_000);
@@ -374,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn an_implausible_start_time_starts_at_once_where_that_is_asked_for() {
+    fn sync0_with_an_implausible_start_time_fires_at_once_if_enabled() {
         let near = activation::PLAUSIBILITY | activation::NEAR;
         // (activation, start, expected local time of the first pulse) at 10 s.
         let rows = [
@@ -394,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn writing_the_start_time_activates_where_that_is_asked_for() {
+    fn writing_the_start_time_activates_the_unit_if_enabled() {
         let auto = activation::AUTO | activation::SYNC0;
         let mut unit = unit(1_000, 0);
         unit.write_activation(auto, true, 0, 0);
@@ -413,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn in_acknowledge_mode_an_output_stays_high_until_acknowledged() {
+    fn output_in_acknowledge_mode_stays_high_until_acknowledged() {
         let mut unit = unit(100_000, 0);
         unit.pulse_length = 0;
         unit.write_start(1_000_000, true, true, 0, 0);
@@ -425,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pulse_longer_than_the_cycle_never_ends() {
+    fn pulse_longer_than_the_cycle_keeps_the_output_high() {
         let mut unit = unit(100_000, 0);
         unit.pulse_length = 10_001;
         unit.write_start(1_000_000, true, true, 0, 0);
@@ -438,7 +440,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ping_is_one_pulse_now() {
+    fn ping_fires_one_pulse_at_once() {
         let mut unit = unit(0, 0);
         let ping = activation::PING | activation::SYNC1;
         let edges = unit.write_activation(ping, true, 0, 0);
@@ -447,7 +449,7 @@ mod tests {
     }
 
     #[test]
-    fn pulses_denser_than_an_application_can_follow_are_counted_not_served() {
+    fn pulses_above_the_maximum_rate_are_counted_and_not_served() {
         let mut unit = unit(1, 0);
         unit.write_start(1, true, true, 0, 0);
         unit.write_activation(ON, true, 0, 0);
@@ -457,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_past_the_next_pulse_misses_it() {
+    fn sync0_misses_a_pulse_that_an_offset_change_skips() {
         let mut unit = unit(1_000, 0);
         unit.write_start(5_000, true, true, 0, 0);
         unit.write_activation(ON, true, 0, 0);

@@ -1,4 +1,5 @@
-//! The way of a slave from its boot-up message to where it may be started: identity, configuration, error control.
+//! The boot of a slave, from its boot-up message until it may be started: identity, configuration,
+//! error control.
 
 use super::super::concise;
 use super::super::{Abort, Gateway};
@@ -10,7 +11,7 @@ const INCONSISTENT: u8 = 4;
 const SDO_TIMEOUT: u8 = 7;
 const SDO_ERROR: u8 = 8;
 
-/// Object of a slave and where its expected value stands.
+/// An object of a slave, and the object with its expected value.
 const IDENTITY: [(u16, u8, u16); 5] = [
     (0x1000, 0, 0x1f84),
     (0x1018, 1, 0x1f85),
@@ -29,11 +30,11 @@ impl Gateway {
         let Some(slave) = self.master.slave(node) else {
             return;
         };
-        // One that comes back by itself is only booted again if it is meant to be.
+        // A slave that restarts by itself boots again only if its assignment says so.
         if slave.boot != Boot::Waiting && assignment & 1 << 2 == 0 {
             return;
         }
-        // What a node was asked before it started again, it does not answer any more.
+        // A restarted node does not answer earlier requests.
         self.master.forget(Some(node));
         let Some(slave) = self.master.slave(node) else {
             return;
@@ -51,14 +52,14 @@ impl Gateway {
         }
     }
 
-    /// The next request of a slave's boot, or its end.
+    /// Sends the next request of a slave's boot, or ends the boot.
     fn boot_on(&mut self, node: u8, now: u64) {
         let Some(slave) = self.master.slaves.get_mut(usize::from(node)) else {
             return;
         };
         if let Boot::Identity(line) = &mut slave.boot {
             let next = IDENTITY.iter().enumerate().skip(*line);
-            // The device type is looked at in any case: that shows whether somebody is there.
+            // The device type is always read: the answer shows that the node exists.
             let mut asked =
                 next.filter(|(n, (.., expected))| *n == 0 || self.d.get(*expected, node) != 0);
             if let Some((n, (index, sub, _))) = asked.next() {
@@ -108,7 +109,7 @@ impl Gateway {
                     *line += 1;
                     self.boot_on(node, now);
                 } else {
-                    // It stays in Pre-Operational.
+                    // The node stays in Pre-Operational.
                     slave.boot = Boot::Refused;
                 }
             }
@@ -120,7 +121,7 @@ impl Gateway {
         }
     }
 
-    /// Object 0x1F25: configures a slave, or all of them, once more.
+    /// Object 0x1F25: configures one slave or all slaves again.
     pub(in super::super) fn reconfigure(&mut self, sub: u8) {
         let now = self.now;
         for node in 1..=127 {
@@ -138,7 +139,8 @@ impl Gateway {
     }
 }
 
-/// Expected against found: 0 expects nothing; of a revision the major part is equal, the minor at least that.
+/// Compares expected and found identity. An expected 0 matches everything. Of a revision, the major
+/// part must be equal and the minor part at least the expected one.
 fn matches(line: usize, expected: u32, found: u32) -> bool {
     match (line, expected) {
         (_, 0) => true,

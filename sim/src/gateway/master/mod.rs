@@ -1,7 +1,7 @@
-//! The gateway as NMT master of the secondary network (CiA 302-2): it boots its slaves (identity, configuration, error
-//! control), watches over them and does what the control word asks.
+//! The gateway as NMT master of the secondary network (CiA 302-2). It boots its slaves (identity,
+//! configuration, error control), monitors them and executes the control word.
 //!
-//! * here: what is known of each node, NMT services, states
+//! * here: the data of each node, NMT services, states
 //! * `boot`, `watch`: a slave's boot; error control
 //! * `requests`: SDO transfers
 
@@ -22,9 +22,9 @@ use super::{Abort, Gateway};
 enum Boot {
     #[default]
     Waiting,
-    /// Looking at this line of the identity.
+    /// Reads this line of the identity.
     Identity(usize),
-    /// Writing this one of its settings.
+    /// Writes this setting.
     Settings(usize),
     Ready,
     Refused,
@@ -33,11 +33,11 @@ enum Boot {
 #[derive(Debug, Clone)]
 struct Guard {
     period: u64,
-    /// Questions without an answer before the node is given up.
+    /// Unanswered requests until the node fails.
     patience: u8,
     unanswered: u8,
     next: u64,
-    /// Of the next answer; `None` takes either.
+    /// The toggle bit of the next answer. `None` accepts either value.
     toggle: Option<bool>,
 }
 
@@ -46,11 +46,11 @@ struct Guard {
 struct Slave {
     boot: Boot,
     settings: Vec<Setting>,
-    /// Heartbeats are expected within; 0: none are.
+    /// The heartbeat consumer time. 0: no heartbeat is expected.
     consumer: u64,
     deadline: u64,
     guard: Option<Guard>,
-    /// What it last said to be in.
+    /// The last reported state.
     state: Option<u8>,
     error: bool,
 }
@@ -72,7 +72,7 @@ impl Default for Slave {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Purpose {
     Boot,
-    /// Asked for through [`Gateway::request_sdo`].
+    /// A transfer of [`Gateway::request_sdo`].
     Tool,
 }
 
@@ -85,13 +85,13 @@ struct Request {
     purpose: Purpose,
 }
 
-/// An SDO transfer with a node that has ended.
+/// A finished SDO transfer with a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SdoResult {
     pub node: u8,
     pub index: u16,
     pub sub: u8,
-    /// Of an upload; empty after a download.
+    /// The data of an upload; empty after a download.
     pub data: Result<Vec<u8>, Abort>,
 }
 
@@ -115,7 +115,8 @@ impl Default for Master {
 }
 
 impl Master {
-    /// The state that all assigned slaves are in, as 0x1F82 would show it: missing if one is, unknown if they differ.
+    /// Returns the common state of all assigned slaves, as in 0x1F82: missing if one is missing,
+    /// unknown if they differ.
     fn common(states: impl Iterator<Item = u8>) -> u8 {
         let mut common = None;
         for state in states {
@@ -142,13 +143,13 @@ impl Master {
         self.slaves.get_mut(usize::from(node))
     }
 
-    /// The lowest node in error, 0 if there is none.
+    /// Returns the lowest node in error, or 0.
     pub(super) fn error_node(&self) -> u8 {
         let first = self.slaves.iter().position(|slave| slave.error);
         first.map_or(0, |node| node as u8)
     }
 
-    /// A reset has been ordered: what was known no longer counts.
+    /// Drops the states and boot requests of nodes that are being reset.
     fn forget(&mut self, node: Option<u8>) {
         for (n, slave) in self.slaves.iter_mut().enumerate() {
             if node.is_none_or(|node| usize::from(node) == n) {
@@ -185,7 +186,7 @@ impl Gateway {
         }
     }
 
-    /// Initialised: all slaves begin anew.
+    /// Boots all slaves after the initialisation.
     pub(super) fn start_network(&mut self, now: u64) {
         self.load_consumers();
         if self.is_master() {
@@ -193,7 +194,7 @@ impl Gateway {
         }
     }
 
-    /// Object 0x1F82: only nodes that are watched have a state.
+    /// Returns the state of a node as in 0x1F82. Only monitored nodes have a state.
     pub(super) fn node_state(&self, node: u8) -> u8 {
         if node == self.options.node_id {
             return self.nmt.code();
@@ -205,7 +206,7 @@ impl Gateway {
         }
     }
 
-    /// The same of the whole network.
+    /// Returns the state of the whole network.
     pub(super) fn network_state(&self) -> u8 {
         let assigned = (1..=127).filter(|node| self.assignment(*node) & 1 != 0);
         Master::common(assigned.map(|node| self.node_state(node)))
@@ -216,14 +217,15 @@ impl Gateway {
         slave.is_some_and(|slave| slave.guard.is_some())
     }
 
-    /// A service for the module, one node or all of them; false if it must not be done now.
+    /// Executes an NMT service for the module, one node or all nodes. Returns false if the service
+    /// is not permitted now.
     pub(super) fn set_state(&mut self, command: NmtCommand, target: Target, now: u64) -> bool {
         if self.nmt == NmtState::Initialising {
             return false;
         }
         match target {
             Target::Module => self.change_own(command, now),
-            // As a slave the module can command nobody but itself.
+            // A module that is not the master can command only itself.
             _ if !self.is_master() => return false,
             Target::Node(node) if node == self.options.node_id => self.change_own(command, now),
             Target::Node(node) => self.nmt(command, node, now),
@@ -262,7 +264,7 @@ impl Gateway {
         })
     }
 
-    /// Slaves that have booted become operational with the master, unless the MainDevice starts them.
+    /// Starts booted slaves together with the master, unless the MainDevice starts them.
     fn start_slaves(&mut self, now: u64) {
         let allowed = self.nmt == NmtState::Operational
             && self.is_master()

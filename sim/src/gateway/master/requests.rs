@@ -1,16 +1,16 @@
-//! SDO transfers with nodes, one at a time: those of their boot, and those that a configuration tool asks for.
+//! SDO transfers with nodes, one at a time: those of their boot, and those of a configuration tool.
 
 use super::super::can::CanFrame;
 use super::super::sdo::{Client, Progress};
 use super::super::{Abort, Gateway, MS};
 use super::{Purpose, Request, SdoResult};
 
-/// Patience with an SDO server.
+/// The response time-out of an SDO server, in ns.
 const SDO_NS: u64 = 500 * MS;
 
 impl Gateway {
-    /// Reads from or writes to a node's dictionary over the secondary network, as a configuration tool does through
-    /// the master; the result comes through [`Gateway::take_sdo_result`].
+    /// Reads or writes an object of a node over the secondary network, as a configuration tool does
+    /// through the master. [`Gateway::take_sdo_result`] returns the result.
     pub fn request_sdo(&mut self, node: u8, index: u16, sub: u8, data: Option<Vec<u8>>) {
         self.enqueue(node, index, sub, data, Purpose::Tool, self.now);
     }
@@ -53,7 +53,7 @@ impl Gateway {
         self.bus.send(self.options.node_id, frame, now);
     }
 
-    /// A frame of a node's SDO server.
+    /// Handles a frame of a node's SDO server.
     pub(in super::super) fn sdo_response(&mut self, node: u8, frame: &CanFrame, now: u64) {
         let awaited = |(request, ..): &(Request, Client, u64)| request.node == node;
         if frame.data().len() != 8 || !self.master.active.as_ref().is_some_and(awaited) {

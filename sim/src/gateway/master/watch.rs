@@ -1,4 +1,4 @@
-//! Error control: heartbeats that are expected, questions that are asked, and what follows when a node is missed.
+//! Error control: heartbeats, guarding requests, and the reaction to a missing node.
 
 use super::super::can::CanFrame;
 use super::super::control::Target;
@@ -10,7 +10,7 @@ use super::Guard;
 const ERROR_CONTROL: u16 = 0x8130;
 
 impl Gateway {
-    /// 0x1016, in whatever order.
+    /// Loads 0x1016; its entries may be in any order.
     pub(in super::super) fn load_consumers(&mut self) {
         for slave in &mut self.master.slaves {
             slave.consumer = 0;
@@ -24,7 +24,7 @@ impl Gateway {
         }
     }
 
-    /// A boot-up message, a heartbeat or the answer to a guarding request.
+    /// Handles a boot-up message, a heartbeat or the answer to a guarding request.
     pub(in super::super) fn heard(&mut self, node: u8, byte: u8, now: u64) {
         if byte == 0 {
             return self.booted(node, now);
@@ -65,7 +65,7 @@ impl Gateway {
         Ok(())
     }
 
-    /// With the values of 0x1F81, unless a heartbeat is expected.
+    /// Starts guarding with the values of 0x1F81, unless a heartbeat is expected.
     pub(super) fn start_guarding(&mut self, node: u8, now: u64) {
         let [_, retries, low, high] = self.assignment(node).to_le_bytes();
         let period = u64::from(u16::from_le_bytes([low, high])) * MS;
@@ -82,7 +82,7 @@ impl Gateway {
         }
     }
 
-    /// What is due: missing heartbeats, questions, an SDO server that does not answer.
+    /// Handles due events: missing heartbeats, guarding requests, SDO time-outs.
     pub(in super::super) fn step_master(&mut self, now: u64) {
         if self
             .master
@@ -118,7 +118,7 @@ impl Gateway {
         }
     }
 
-    /// A node is missing, or does not say what it should.
+    /// Handles a node that is missing or reports a wrong state.
     fn error_event(&mut self, node: u8, now: u64) {
         let assignment = self.assignment(node);
         let Some(slave) = self.master.slave(node) else {
@@ -139,7 +139,7 @@ impl Gateway {
         } else if mandatory && self.start_up() & 1 << 4 != 0 {
             self.set_state(NmtCommand::ResetNode, Target::Network, now);
         } else if assignment & 1 << 2 != 0 {
-            // Should it still listen, it boots again.
+            // A node that still receives boots again.
             self.nmt(NmtCommand::ResetCommunication, node, now);
         }
     }

@@ -1,14 +1,14 @@
-//! What an EPOS 24/1, 24/5 or 70/10 has in its object dictionary, and how that is tied to the drive behind it.
+//! The object dictionary of an EPOS 24/1, 24/5 or 70/10, and its connection to the drive.
 //!
-//! Communication objects, PDO contents and ranges are those of the application note "CANopen Basic Information"
-//! (EPOS 24/1, 24/5, 70/10, firmware 2000h and later). Where the note is silent (identity, defaults of
-//! mappings and of controller gains) the values here are the simulator's own.
+//! Communication objects, PDO contents and ranges follow the application note "CANopen Basic
+//! Information" (EPOS 24/1, 24/5, 70/10, firmware 2000h and later). Values that the note does not
+//! define (identity, default mappings and controller gains) are the simulator's own.
 
 use ecaxis_esi::model::{Access as CoeAccess, Writable};
 
 use super::super::dictionary::{Access, Dictionary, Handle, Kind};
 use super::super::pdo::mapping;
-use crate::coe::store::{ObjectStore, Slot};
+use crate::coe::object_dictionary::{EntryHandle, ObjectStore};
 use crate::drive::PlantParams;
 
 /// The drives of the first EPOS generation.
@@ -27,7 +27,7 @@ const DEVICE_TYPE: i64 = 0x0002_0192;
 impl Epos {
     pub const ALL: [Self; 3] = [Self::E24_1, Self::E24_5, Self::E70_10];
 
-    /// As the maker writes it.
+    /// Returns the vendor's product name.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -42,7 +42,7 @@ impl Epos {
         Self::ALL.into_iter().find(|model| model.name() == name)
     }
 
-    /// Bits of an object that PDO 1 and 2 can carry; `None` for all others.
+    /// Returns the bits of an object that PDO 1 and 2 can carry; `None` for all others.
     #[must_use]
     pub fn mappable_bits(index: u16, sub: u8) -> Option<u8> {
         let mut all = RECEIVABLE.iter().chain(&TRANSMITTABLE);
@@ -50,7 +50,7 @@ impl Epos {
             .map(|object| object.2)
     }
 
-    /// Object 0x2003:02.
+    /// Returns object 0x2003:02.
     pub(super) fn hardware(self) -> i64 {
         match self {
             Self::E24_1 => 0x6010,
@@ -59,7 +59,8 @@ impl Epos {
         }
     }
 
-    /// What its DIP switch can code: four bits on the smallest, seven on the others.
+    /// Returns the node numbers of its DIP switch: four bits on the smallest drive, seven on the
+    /// others.
     #[must_use]
     pub fn node_ids(self) -> std::ops::RangeInclusive<u8> {
         match self {
@@ -68,7 +69,8 @@ impl Epos {
         }
     }
 
-    /// Volts, continuous and peak amperes; motor and load are scaled to the current.
+    /// Returns the plant from volts, continuous and peak amperes. Motor and load scale with the
+    /// current.
     #[must_use]
     pub fn plant(self) -> PlantParams {
         let (volts, current) = match self {
@@ -97,7 +99,8 @@ impl Epos {
     }
 }
 
-/// Objects that PDO 1 and 2 may carry, step 4 of the note's PDO configuration; bits as in the mapping entry.
+/// Objects that PDO 1 and 2 may carry, step 4 of the note's PDO configuration. Bits are as in the
+/// mapping entry.
 pub(in super::super) const RECEIVABLE: [(u16, u8, u8); 7] = [
     (0x6040, 0, 16),
     (0x607a, 0, 32),
@@ -119,19 +122,19 @@ pub(in super::super) const TRANSMITTABLE: [(u16, u8, u8); 9] = [
     (0x2021, 0, 16),
 ];
 
-/// Commands, which no "save" keeps.
+/// Commands, which "save" does not store.
 pub(super) const VOLATILE: [u16; 6] = [0x2030, 0x2062, 0x206b, 0x6040, 0x607a, 0x60ff];
 
-/// Default COB-IDs without the node, PDO 1 to 3.
+/// The default COB-IDs of PDO 1 to 3, without the node number.
 pub(in super::super) const RECEIVE_COBS: [i64; 3] = [0x200, 0x300, 0x400];
 pub(in super::super) const TRANSMIT_COBS: [i64; 3] = [0x180, 0x280, 0x380];
 
-/// Values of 0x2001 and the bit rates they stand for, step 4.
+/// The bit rates of the values of 0x2001, in bit/s (step 4).
 pub(super) const BIT_RATES: [u32; 7] = [
     1_000_000, 800_000, 500_000, 250_000, 125_000, 50_000, 20_000,
 ];
 
-/// The dictionary as the factory leaves it.
+/// Returns the factory dictionary.
 pub(super) fn dictionary(model: Epos, id: u8, serial: u32, bit_rate: u32) -> Dictionary {
     use Access::{Ro, Rw};
     use Kind::{I8, I16, I32, U8, U16, U32};
@@ -210,7 +213,7 @@ pub(super) fn dictionary(model: Epos, id: u8, serial: u32, bit_rate: u32) -> Dic
         (0x6085, 0, U32, 10_000),
         (0x6086, 0, I16, 0),
         (0x6098, 0, I8, 35),
-        // Gains in the maker's units; the loops behind run on gains of their own.
+        // Gains in the vendor's units. The simulated loops use their own gains.
         (0x60f6, 1, I16, 400),
         (0x60f6, 2, I16, 80),
         (0x60f9, 1, I16, 1000),
@@ -251,7 +254,7 @@ fn pdos(d: &mut Dictionary, node: i64) {
     }
 }
 
-/// The third PDO is static.
+/// Adds the contents of a PDO. The third PDO is static.
 fn contents_of(d: &mut Dictionary, index: u16, n: u16, contents: &[i64; 2]) {
     let access = if n == 2 { Access::Ro } else { Access::Rw };
     let used = if n == 0 { 1 } else { 2 };
@@ -264,7 +267,7 @@ fn contents_of(d: &mut Dictionary, index: u16, n: u16, contents: &[i64; 2]) {
     }
 }
 
-/// Values that both have, as they are: (here, index and subindex in the drive).
+/// Values that dictionary and drive share unchanged: (index and subindex in the drive).
 const COMMANDS: [(u16, u8); 15] = [
     (0x6040, 0),
     (0x6065, 0),
@@ -295,17 +298,17 @@ const CURRENT_ACTUAL: (u16, u8) = (0x30d1, 2);
 /// Remote: the Controlword comes over the network.
 const REMOTE: i64 = 1 << 9;
 
-/// Objects of the dictionary tied to objects of the drive.
+/// Objects of the dictionary bound to objects of the drive.
 #[derive(Debug, Clone)]
-pub(super) struct Ties {
-    commands: Vec<(Handle, Slot)>,
-    actuals: Vec<(Handle, Slot)>,
-    /// mA.
+pub(super) struct ObjectBindings {
+    commands: Vec<(Handle, EntryHandle)>,
+    actuals: Vec<(Handle, EntryHandle)>,
+    /// The nominal current, in mA.
     nominal_current: f64,
     counts_per_turn: i64,
 }
 
-/// The store of the drive behind, before the drive takes it: velocities in rpm, the current in mA.
+/// Returns the store for the drive: velocities in rpm, the current in mA.
 pub(super) fn store() -> ObjectStore {
     let mut store = ObjectStore::default();
     let rw = CoeAccess {
@@ -327,7 +330,7 @@ pub(super) fn store() -> ObjectStore {
     store
 }
 
-impl Ties {
+impl ObjectBindings {
     pub(super) fn new(d: &Dictionary, store: &ObjectStore, plant: &PlantParams) -> Self {
         let pairs = |list: &[(u16, u8)]| {
             list.iter()
@@ -342,8 +345,8 @@ impl Ties {
         }
     }
 
-    /// Dictionary → drive. Position, velocity and current mode (-1, -2, -3) follow set-points of their own,
-    /// without a profile: the cyclic modes of the drive behind.
+    /// Copies commands from the dictionary to the drive. Position, velocity and current mode (-1,
+    /// -2, -3) have their own set-points without a profile. They use the drive's cyclic modes.
     #[expect(clippy::cast_precision_loss, reason = "16 bits")]
     #[expect(clippy::cast_possible_truncation, reason = "saturates")]
     pub(super) fn command(&self, d: &Dictionary, store: &mut ObjectStore) {
@@ -376,7 +379,7 @@ impl Ties {
         }
     }
 
-    /// Drive → dictionary.
+    /// Copies actual values from the drive to the dictionary.
     pub(super) fn publish(&self, store: &ObjectStore, d: &mut Dictionary, operational: bool) {
         for (to, from) in &self.actuals {
             d.put(*to, store.get_signed(*from));
@@ -409,7 +412,7 @@ impl Ties {
     }
 }
 
-/// The drive's error codes in EPOS 24/1, 24/5 and 70/10 numbering.
+/// Converts the drive's error codes to EPOS 24/1, 24/5 and 70/10 numbering.
 pub(super) fn error_code(code: u16) -> u16 {
     match code {
         0x8a80 => 0xff06,

@@ -1,9 +1,9 @@
-//! A CANopen node: an EPOS 24/1, 24/5 or 70/10 with its dictionary, NMT state, SDO server and PDOs, in front of
-//! a CiA 402 drive down to the motor shaft.
+//! A CANopen node: an EPOS 24/1, 24/5 or 70/10 with its dictionary, NMT state, SDO server and PDOs,
+//! in front of a CiA 402 drive with motor.
 //!
-//! * here: its life on the bus
-//! * `epos`: its objects, and how they are tied to the drive
-//! * `objects`: what SDO clients may do
+//! * here: states and communication on the bus
+//! * `epos`: its objects, and their connection to the drive
+//! * `objects`: access by SDO clients
 
 mod epos;
 mod objects;
@@ -20,27 +20,27 @@ use super::nmt::{NmtCommand, NmtState};
 use super::pdo::{self, Pdo};
 use super::sdo::Server;
 use crate::Nanos;
-use crate::coe::store::ObjectStore;
+use crate::coe::object_dictionary::ObjectStore;
 use crate::drive::{CONTROL_PERIOD_NS, Drive, PlantParams};
-use epos::{Ties, error_code};
+use epos::{ObjectBindings, error_code};
 
-/// From power or a reset to the boot-up message.
+/// The time from power-on or a reset to the boot-up message, in ns.
 const BOOT_NS: Nanos = 50_000_000;
-/// The same after a reset of the communication alone.
+/// The time from a communication reset to the boot-up message, in ns.
 const COMMUNICATION_BOOT_NS: Nanos = 5_000_000;
 /// CAN life guard error.
 pub(super) const LIFE_GUARD: u16 = 0x8130;
 const MS: u64 = 1_000_000;
 const HISTORY: u8 = 5;
 
-/// What makes a node.
+/// The parameters of a node.
 #[derive(Debug, Clone)]
 pub(super) struct Settings {
     pub(super) id: u8,
     pub(super) drive: Epos,
     pub(super) plant: PlantParams,
     pub(super) serial: u32,
-    /// Bits a second.
+    /// The bit rate in bit/s.
     pub(super) bit_rate: u32,
 }
 
@@ -48,24 +48,25 @@ pub(super) struct Settings {
 pub struct Node {
     settings: Settings,
     nmt: NmtState,
-    /// It has power and is plugged in.
+    /// The node has power and is connected.
     alive: bool,
-    /// Its CAN controller runs: it acknowledges, also while the communication is reset.
+    /// The CAN controller runs: it acknowledges frames, also while the communication is reset.
     online: bool,
-    /// End of the initialisation.
+    /// The end of the initialisation.
     ready: u64,
     d: Dictionary,
-    /// What power-on starts from: factory values, or those of "save".
+    /// The dictionary at power-on: factory values, or those of "save".
     stored: Dictionary,
     store: ObjectStore,
     drive: Drive,
-    ties: Ties,
+    ties: ObjectBindings,
     receive: [Option<Pdo<Handle>>; 3],
     transmit: [Option<Pdo<Handle>>; 3],
-    /// Synchronous PDOs received, until the next SYNC.
+    /// Synchronous PDOs that wait for the next SYNC.
     waiting: [Option<CanFrame>; 3],
     sdo: Server,
-    /// The next control cycle, heartbeat, end of life time without guarding, missing heartbeat.
+    /// The times of the next control cycle, the next heartbeat, the end of life time without
+    /// guarding, and a missing heartbeat.
     tick: u64,
     heartbeat: u64,
     life: u64,
@@ -84,7 +85,7 @@ impl Node {
         );
         let mut store = epos::store();
         let drive = Drive::new(&mut store, settings.plant);
-        let ties = Ties::new(&factory, &store, &settings.plant);
+        let ties = ObjectBindings::new(&factory, &store, &settings.plant);
         let mut node = Self {
             nmt: NmtState::Initialising,
             alive: true,
@@ -135,23 +136,23 @@ impl Node {
         &mut self.drive
     }
 
-    /// An object's number, access rights aside; 0 where there is none.
+    /// Returns an object's number regardless of access rights; 0 if it does not exist.
     #[must_use]
     pub fn object(&self, index: u16, sub: u8) -> i64 {
         self.d.get(index, sub)
     }
 
-    /// Sets it, as a signal at an analogue input would.
+    /// Sets an object's number, as a signal at an analogue input does.
     pub fn set_object(&mut self, index: u16, sub: u8, value: i64) {
         self.d.set(index, sub, value);
     }
 
-    /// Its controller takes part in the traffic.
+    /// True if the CAN controller takes part in the traffic.
     pub(super) fn is_on_bus(&self, bit_rate: u32) -> bool {
         self.alive && self.online && self.bit_rate == bit_rate
     }
 
-    /// Power comes: everything volatile is what it was when parameters were stored.
+    /// Switches the power on: all volatile values are those at the last "save".
     pub(super) fn power_on(&mut self, now: u64) {
         (self.alive, self.online) = (true, false);
         self.d = self.stored.clone();
@@ -163,7 +164,7 @@ impl Node {
         self.initialise(now + BOOT_NS);
     }
 
-    /// Power goes, or the plug is pulled: nothing more comes from it.
+    /// Switches the power off or disconnects the node. Queued frames are dropped.
     pub(super) fn power_off(&mut self, bus: &mut CanBus) {
         self.alive = false;
         bus.forget(self.settings.id);
@@ -204,7 +205,7 @@ impl Node {
             .min(self.master)
     }
 
-    /// Does what is due at `now`.
+    /// Handles all events that are due at `now`.
     pub(super) fn step(&mut self, now: u64, bus: &mut CanBus) {
         if self.tick <= now {
             self.tick += CONTROL_PERIOD_NS;
@@ -254,7 +255,7 @@ impl Node {
         }
     }
 
-    /// The error history, newest first.
+    /// Adds a code to the error history, newest first.
     fn record(&mut self, code: u16) {
         for sub in (1..HISTORY).rev() {
             let older = self.d.get(0x1003, sub);
@@ -265,13 +266,13 @@ impl Node {
         self.d.set(0x1003, 0, count);
     }
 
-    /// Sends with its own node number in the identifier.
+    /// Sends a frame with the node's own number in the identifier.
     fn send(&mut self, bus: &mut CanBus, base: u16, data: &[u8], now: u64) {
         let id = base + u16::from(self.settings.id);
         bus.send(self.settings.id, CanFrame::new(id, data), now);
     }
 
-    /// A frame of somebody else's.
+    /// Handles a frame from another node.
     pub(super) fn receive(&mut self, frame: &CanFrame, now: u64, bus: &mut CanBus) {
         if self.nmt == NmtState::Initialising {
             return;
@@ -301,7 +302,7 @@ impl Node {
         }
         let command = NmtCommand::from_specifier(specifier);
         if command.is_some_and(|command| command.leads_to() == NmtState::Initialising) {
-            // The CAN controller starts again, without what it had still to send.
+            // The CAN controller restarts and drops its queued frames.
             bus.forget(self.settings.id);
         }
         match command {
@@ -318,9 +319,9 @@ impl Node {
         }
     }
 
-    /// The master asks whether it lives.
+    /// Handles a guarding request of the master.
     fn guarded(&mut self, now: u64, bus: &mut CanBus) {
-        // With a heartbeat there is no guarding.
+        // A node with a heartbeat ignores guarding requests.
         if self.d.get(0x1017, 0) > 0 {
             return;
         }
@@ -389,7 +390,7 @@ impl Node {
         self.take_set_points();
     }
 
-    /// What has been written counts from now on.
+    /// Applies the written set-points.
     fn take_set_points(&mut self) {
         self.ties.command(&self.d, &mut self.store);
         self.drive.sync(&self.store);
@@ -408,7 +409,7 @@ impl Node {
         }
     }
 
-    /// Asynchronous PDOs go on request only.
+    /// Sends asynchronous PDOs, which go on request only.
     fn requested(&mut self, id: u16, now: u64, bus: &mut CanBus) {
         for n in 0..self.transmit.len() {
             let asked = self.transmit[n]

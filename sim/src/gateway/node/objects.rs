@@ -1,4 +1,4 @@
-//! What SDO clients may read and write in a node, and what a write sets in motion.
+//! Access of SDO clients to a node's objects, and the effects of a write.
 
 use super::super::Abort;
 use super::super::dictionary::Dictionary;
@@ -34,7 +34,7 @@ impl Objects for Node {
                 for index in epos::VOLATILE {
                     self.stored.set(index, 0, 0);
                 }
-                // Reads as "can be saved on command", not as the word written.
+                // A read returns "can be saved on command", not the written word.
                 return Ok(());
             }
             (0x1011, 1) => {
@@ -68,7 +68,7 @@ impl Node {
         epos::dictionary(s.drive, s.id, s.serial, s.bit_rate)
     }
 
-    /// Contents change in Pre-Operational, while the PDO maps nothing.
+    /// Checks a mapping entry. Contents change in Pre-Operational, while the PDO maps nothing.
     fn check_mapping(&self, index: u16, sub: u8, value: i64) -> Result<(), Abort> {
         if self.nmt != NmtState::PreOperational {
             return Err(Abort::WRONG_STATE);

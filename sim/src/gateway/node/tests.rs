@@ -68,7 +68,7 @@ fn frame() -> impl Strategy<Value = CanFrame> {
 
 proptest! {
     #[test]
-    fn random_frames_never_stop_a_node(frames in prop::collection::vec(frame(), 1..60)) {
+    fn node_survives_random_frames(frames in prop::collection::vec(frame(), 1..60)) {
         let (mut node, mut bus) = node();
         let mut now = BOOT_NS;
         for frame in frames {
@@ -81,7 +81,7 @@ proptest! {
             now = until;
             bus.forget(3);
         }
-        // It still boots.
+        // The node still boots.
         node.receive(&CanFrame::new(0, &[0x81, 0]), now, &mut bus);
         while node.due() <= now + BOOT_NS {
             let at = node.due();

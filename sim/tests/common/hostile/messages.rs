@@ -1,8 +1,8 @@
-//! Mailbox messages: CoE and FoE as a MainDevice sends them, and not quite so.
+//! Mailbox messages: CoE and FoE as a MainDevice sends them, partly invalid.
 
 use super::Dice;
 
-/// A mailbox of this size with a message in it whose lengths may lie.
+/// Returns a mailbox of this size with a message whose lengths may be wrong.
 pub fn message(dice: &mut Dice, size: usize) -> Vec<u8> {
     let kind = dice.pick(&[3, 3, 3, 3, 3, 3, 4, 4, 0, 1, 2, 5, 15, 9]);
     let mut body = match kind {
@@ -26,7 +26,7 @@ pub fn message(dice: &mut Dice, size: usize) -> Vec<u8> {
     message.extend_from_slice(&[0, 0, dice.roll() as u8 & 3]);
     message.push(kind | (dice.below(8) as u8) << 4);
     message.extend_from_slice(&body);
-    // Handing over takes the last byte.
+    // Access to the last byte completes the mailbox.
     message.resize(size, 0);
     message
 }

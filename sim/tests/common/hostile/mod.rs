@@ -1,5 +1,5 @@
-//! Frames that mean harm: random commands, addresses, lengths and contents, most of them just right
-//! enough to get past the first check. One seed, one sequence.
+//! Hostile frames: random commands, addresses, lengths and contents, most of them valid enough to
+//! pass the first check. A seed determines the sequence.
 #![allow(dead_code, reason = "every fuzz target uses its own part")]
 
 mod dice;
@@ -8,9 +8,9 @@ mod messages;
 use std::path::Path;
 
 use ecaxis_esi::model::EsiFile;
-use ecaxis_esi::{Choice, Mode, select};
+use ecaxis_esi::{Mode, SelectOptions, select};
 use ecaxis_sim::frame::{self, Command, FrameBuilder, Kind};
-use ecaxis_sim::{AlState, DeviceOptions, FaultScript, Segment, SimDevice, Transit};
+use ecaxis_sim::{AlState, DeviceOptions, FaultScript, FrameOutcome, Segment, SimDevice};
 
 use crate::common::{Bus, INIT, OP, PREOP, SAFEOP};
 pub use dice::Dice;
@@ -20,35 +20,35 @@ const ETHERNET: usize = 14;
 const HEADER: usize = 10;
 const MAX_FRAME: usize = 1514;
 
-/// What the attacker knows of a device.
+/// The attacker's knowledge of a device.
 #[derive(Debug, Clone)]
 struct Victim {
     station: u16,
-    /// Address and length of the mailbox to write and the one to read.
+    /// Address and length of the write and read mailbox.
     mailboxes: Option<[(u16, u16); 2]>,
     /// SyncManager number, start, length, control byte.
     process: Vec<(u16, u16, u16, u8)>,
-    /// The same of all, mailboxes included.
+    /// The same for all SyncManagers, mailboxes included.
     sync_managers: Vec<(u16, u16, u16, u8)>,
 }
 
-/// A bus that was brought up in order and is then attacked.
+/// A bus that is brought up normally and then attacked.
 pub struct Hostile {
     pub dice: Dice,
     pub bus: Bus,
     victims: Vec<Victim>,
     fresh: Vec<SimDevice>,
     files: Vec<EsiFile>,
-    /// Frames to come first, as a MainDevice would go on.
+    /// Frames to send first, as a MainDevice would continue.
     queue: Vec<Vec<u8>>,
     pub answered: u64,
     pub processed: u64,
     pub rebuilt: u64,
-    /// Frames after which some device was in Op.
+    /// The number of frames after which some device was in Op.
     pub in_op: u64,
 }
 
-/// One device of one of the project's own ESI files.
+/// Returns one device of one of the project's ESI files.
 fn own(path: &str, type_name: &str) -> EsiFile {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let mut file = ecaxis_esi::parse(&std::fs::read(root.join(path)).unwrap()).unwrap();
@@ -58,7 +58,7 @@ fn own(path: &str, type_name: &str) -> EsiFile {
 }
 
 impl Hostile {
-    /// Two drives, a device that is mailbox above all, a coupler, digital terminals and a gateway.
+    /// Returns two drives, a mailbox test device, a coupler, digital terminals and a gateway.
     pub fn new(seed: u64) -> Self {
         let terminals = "configs/esi/terminals.xml";
         let files = vec![
@@ -94,7 +94,7 @@ impl Hostile {
         hostile
     }
 
-    /// Everything anew: what is left after some hundred hostile frames answers little.
+    /// Rebuilds the bus. After some hundred hostile frames few devices still answer.
     pub fn rebuild(&mut self) {
         self.rebuilt += 1;
         self.queue.clear();
@@ -105,10 +105,10 @@ impl Hostile {
         for (n, file) in self.files.iter().enumerate() {
             let device = &file.devices[0];
             let station = 0x1001 + n as u16;
-            let choice = Choice {
+            let choice = SelectOptions {
                 mode: (device.profile == Some(402)).then_some(Mode::Csp),
                 cycle_ns: 1_000_000,
-                ..Choice::default()
+                ..SelectOptions::default()
             };
             let selection = select(file, device, &choice).unwrap();
             let mut victim = Victim {
@@ -150,24 +150,24 @@ impl Hostile {
         }
     }
 
-    /// Another device in the place of one, and nobody has brought the bus up.
+    /// Replaces one device. The bus is not brought up.
     pub fn replace(&mut self, position: usize, device: SimDevice) {
         let mut devices = self.fresh.clone();
         devices[position] = device;
         self.bus = Bus::new(devices);
     }
 
-    /// A bus that nobody has brought up, with faults.
+    /// Rebuilds the bus with faults, without bringing it up.
     pub fn rebuild_with(&mut self, faults: FaultScript) {
         self.bus = Bus::new(self.fresh.clone());
         self.bus.segment.set_faults(faults);
     }
 
-    /// One frame there and back, with all that has to hold of any frame.
+    /// Sends one frame and checks the invariants of every answer.
     pub fn attack(&mut self) {
         let sent = match self.queue.pop() {
             Some(frame) => frame,
-            None if self.dice.percent(6) => self.mend(),
+            None if self.dice.percent(6) => self.corrected(),
             None => self.frame(),
         };
         let back = exchange(&mut self.bus.segment, self.bus.now, &sent);
@@ -183,9 +183,9 @@ impl Hostile {
         self.bus.now += step as u64;
     }
 
-    /// Brings a device a step back to where an attack does most harm: own address, own SyncManagers,
-    /// and on towards Op.
-    fn mend(&mut self) -> Vec<u8> {
+    /// Sets a device up for the most effective attack: its own address, its own SyncManagers, then
+    /// towards Op.
+    fn corrected(&mut self) -> Vec<u8> {
         let n = self.dice.below(self.victims.len());
         let victim = &self.victims[n];
         let position = 0_u16.wrapping_sub(n as u16);
@@ -244,7 +244,7 @@ impl Hostile {
         bytes
     }
 
-    /// Lengths and flags that do not fit together, and frames that end too early.
+    /// Creates inconsistent lengths and flags, and truncated frames.
     fn spoil(&mut self, bytes: &mut Vec<u8>) {
         match self.dice.below(3) {
             0 => bytes.truncate(self.dice.below(bytes.len())),
@@ -253,7 +253,7 @@ impl Hostile {
                 bytes[at] ^= 1 << self.dice.below(8);
             }
             _ => {
-                // A length field, wherever the first datagram has it.
+                // The length field of the first datagram.
                 let at = ETHERNET + 2 + 6 + self.dice.below(2);
                 bytes[at] = self.dice.roll() as u8;
             }
@@ -307,7 +307,7 @@ impl Hostile {
         bytes.extend_from_slice(&[0, 0]);
     }
 
-    /// Address and contents of an access that a device could take seriously.
+    /// Returns address and contents of an access that a device accepts.
     fn aim(&mut self, victim: &Victim, position: usize) -> (u16, Vec<u8>) {
         let len = self.dice.pick(&[1, 2, 2, 4, 4, 8, 8, 16, 32]);
         let random = self.dice.bytes(len);
@@ -358,7 +358,7 @@ impl Hostile {
                     0x92c, 0x930, 0x934, 0x980, 0x981, 0x984, 0x990, 0x998, 0x9a0, 0x9a8, 0x9b0,
                     0xe00, 0xf00, 0xf80, 0x1000, 0x2ffe, 0xfffe,
                 ]);
-                // Wild writes to the loop control and station address silence a device at once.
+                // Random writes to the loop control and station address silence a device at once.
                 (register, random)
             }
             _ => (self.dice.roll() as u16, random),
@@ -384,7 +384,7 @@ impl Hostile {
         r
     }
 
-    /// Distributed clocks, with start times that may come.
+    /// Returns distributed clock settings with future start times.
     fn clock(&mut self, position: usize) -> (u16, Vec<u8>) {
         let now = self.bus.now;
         let device = self.bus.segment.device(position);
@@ -421,12 +421,13 @@ impl Hostile {
     }
 }
 
-/// Sends a frame and holds the answer to what no frame may change; `None` where it is lost.
+/// Sends a frame and checks the parts of the answer that must not change. Returns `None` if the
+/// frame is lost.
 pub fn exchange(segment: &mut Segment, now: u64, sent: &[u8]) -> Option<Vec<u8>> {
     let mut back = sent.to_vec();
     match segment.transit(&mut back, now) {
-        Transit::Lost => None,
-        Transit::Back { at, .. } => {
+        FrameOutcome::Lost => None,
+        FrameOutcome::Back { at, .. } => {
             assert!(at > now, "back before it was sent");
             compare(segment.len(), sent, &back);
             Some(back)
@@ -434,7 +435,7 @@ pub fn exchange(segment: &mut Segment, now: u64, sent: &[u8]) -> Option<Vec<u8>>
     }
 }
 
-/// Working counter of the first datagram.
+/// Returns the working counter of the first datagram.
 fn wkc(bytes: &[u8]) -> u16 {
     frame::next(bytes, None).map_or(0, |d| d.wkc(bytes))
 }
@@ -442,7 +443,7 @@ fn wkc(bytes: &[u8]) -> u16 {
 fn compare(devices: usize, sent: &[u8], back: &[u8]) {
     assert_eq!(sent.len(), back.len(), "length");
     let mut expected = sent.to_vec();
-    // Unless DL control says that other protocols may pass, the source is marked.
+    // The source is marked unless DL control lets other protocols pass.
     if let (Some(source), Some(back)) = (expected.get_mut(6), back.get(6))
         && *back == *source | 0x02
     {
@@ -452,7 +453,7 @@ fn compare(devices: usize, sent: &[u8], back: &[u8]) {
         assert_eq!(expected, back, "what is not well-formed passes untouched");
         return;
     }
-    // Whatever may change is taken from the answer; the rest has to be equal.
+    // Fields that may change are taken from the answer; the rest must be equal.
     let mut datagram = frame::next(sent, None);
     while let Some(d) = datagram {
         let header = d.data.start - HEADER;

@@ -1,4 +1,5 @@
-//! What ethercrab makes of every EEPROM on a bus: what it reads of it, and the registers that it writes by it.
+//! Reads every EEPROM on a bus with ethercrab, and the registers that ethercrab writes from its
+//! contents.
 
 use std::error::Error;
 
@@ -7,7 +8,7 @@ use ethercrab::{MainDevice, SubDeviceRef};
 
 const MAX_SUBDEVICES: usize = 64;
 const PDI: usize = 16384;
-// Most controllers have less than eight of each.
+// Most controllers have fewer than eight FMMUs and fewer than eight SyncManagers.
 const FMMUS: u16 = 0x0600;
 const SYNC_MANAGERS: u16 = 0x0800;
 

@@ -1,8 +1,8 @@
-//! ethercrab's own MainDevice, with its own tasks, on an interface: judge-ethercrab IF CYCLES.
-//! Or `IF PreOp`, `IF SafeOp`: that far, and it tells what the EEPROMs said
+//! ethercrab's own MainDevice, with its own tasks, on an interface: `judge-ethercrab IF CYCLES`.
+//! With `IF PreOp` or `IF SafeOp`, stops in that state and prints the contents of the EEPROMs.
 //!
-//! Brings every device to Op, exchanges process data, copies a pattern to the last device's outputs,
-//! and prints one line per finding for the judges to compare.
+//! Brings every device to Op, exchanges process data, copies a pattern to the last device's
+//! outputs, and prints one line per finding for the judges to compare.
 
 mod eeprom;
 
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let nic = arguments.next().ok_or("judge-ethercrab IF CYCLES")?;
     let how_far = arguments.next().ok_or("judge-ethercrab IF CYCLES")?;
     let (tx, rx, pdu_loop) = STORAGE.try_split().map_err(|()| "split twice")?;
-    // Longer than this computer may stall.
+    // Longer than any stall of this computer.
     let timeouts = Timeouts {
         pdu: Duration::from_secs(1),
         eeprom: Duration::from_secs(1),

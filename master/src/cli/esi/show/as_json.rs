@@ -1,14 +1,14 @@
-//! What `show` shows, for programs.
+//! The output of `show` as JSON.
 
 use ecaxis_esi::{
-    Choice, Device, EsiFile, Field, Mode, Pdo, SelectError, Selection, SmLayout, StartupSdo,
+    Device, EsiFile, Field, Mode, Pdo, SelectError, SelectOptions, Selection, SmLayout, StartupSdo,
     offered_modes,
 };
 use serde_json::{Value, json};
 
 use super::{head, offers};
 
-/// The devices of a file, in short.
+/// Formats a summary of the devices in a file.
 pub(super) fn devices(file: &EsiFile) -> String {
     let devices: Vec<Value> = file
         .devices
@@ -27,7 +27,7 @@ pub(super) fn devices(file: &EsiFile) -> String {
 pub(super) fn device(
     file: &EsiFile,
     device: &Device,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     selection: &Result<Selection, SelectError>,
 ) -> String {
     let mut value = identity(file, device);

@@ -3,15 +3,15 @@
 use std::fmt::Write;
 
 use ecaxis::config::duration;
-use ecaxis_esi::{Choice, Device, Selection, SmUse};
+use ecaxis_esi::{Device, SelectOptions, Selection, SmUse};
 
+use super::super::super::pdo_table::{fields, startup};
 use super::super::super::report::Table;
-use super::super::super::tables::{fields, startup};
 
 pub(super) fn write(
     device: &Device,
     selection: &Selection,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     out: &mut String,
 ) -> std::fmt::Result {
     let what = match (selection.mode, selection.modules.as_slice()) {

@@ -1,4 +1,4 @@
-//! Who the device is and how it is reached.
+//! Identity, interfaces and mailbox protocols of a device.
 
 use std::fmt::Write;
 
@@ -89,7 +89,7 @@ fn ports(device: &Device) -> String {
             .collect()
     };
     if names.is_empty() {
-        "not told".to_owned()
+        "unknown".to_owned()
     } else {
         names.join(", ")
     }

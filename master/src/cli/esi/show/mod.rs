@@ -1,17 +1,17 @@
-//! `ecaxis esi show`: a device as an engineer wants to see it.
+//! `ecaxis esi show`: shows a device.
 //!
-//! `head` says who the device is, `offers` what there is to choose from, `chosen` what one choice comes to; `as_json`
-//! says the same to programs.
+//! `head` shows the identity, `offers` the options, `chosen` one configuration; `as_json` formats
+//! all as JSON.
 
 use std::fmt::Write;
 
 use ecaxis::config::duration;
-use ecaxis::words::counted;
-use ecaxis_esi::{Choice, EsiFile, Mode, SelectError, offered_modes, select};
+use ecaxis::text::pluralize;
+use ecaxis_esi::{EsiFile, Mode, SelectError, SelectOptions, offered_modes, select};
 
 use super::super::report::Table;
 use super::super::{Failure, hints, note, page, result};
-use super::Which;
+use super::DeviceArgs;
 
 mod as_json;
 mod chosen;
@@ -20,30 +20,30 @@ mod offers;
 
 const EXAMPLES: &str = "\
 Examples:
-  ecaxis esi show f.xml                     what devices there are
-  ecaxis esi show f.xml --device EPOS4      one of them, as it comes
+  ecaxis esi show f.xml                     list the devices
+  ecaxis esi show f.xml --device EPOS4      one device
   ecaxis esi show f.xml --device EPOS4 --mode csp --cycle 2ms
   ecaxis esi show f.xml --device 2 --modules CSP,- --json";
 
-/// Show a device: identity, modes, PDOs, SyncManagers, clocks, start-up commands
+/// Show a device: identity, modes, PDOs, SyncManagers, clocks, start-up SDOs
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     #[command(flatten)]
-    which: Which,
-    /// In this mode: pp, pv, hm, csp, csv, cst; otherwise its default
+    which: DeviceArgs,
+    /// Use this mode: pp, pv, hm, csp, csv, cst [default: the device's default mode]
     #[arg(long, value_parser = super::mode)]
     mode: Option<Mode>,
-    /// Modules slot by slot, `-` for none
+    /// Modules by slot, `-` for an empty slot
     #[arg(long, value_delimiter = ',', value_name = "MODULE,…")]
     modules: Vec<String>,
-    /// PDO assignment by its name
+    /// PDO assignment by name
     #[arg(long, value_name = "NAME")]
     assignment: Option<String>,
-    /// Clock mode by its name, or `off`
+    /// Clock mode by name, or `off`
     #[arg(long, value_name = "NAME")]
     dc: Option<String>,
-    /// Bus cycle
+    /// Bus cycle time
     #[arg(long, default_value = "1ms", value_parser = duration::parse)]
     cycle: u64,
     /// Print as JSON
@@ -53,7 +53,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let file = args.which.load()?;
-    // Without a word on which, a file of several devices is shown as what it is.
+    // Without a selection, a file with several products is shown as a list.
     let one_product = file
         .devices
         .windows(2)
@@ -69,13 +69,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let device = args.which.device(&file)?;
     let modules: Vec<&str> = args.modules.iter().map(String::as_str).collect();
-    let choice = Choice {
+    let choice = SelectOptions {
         mode: args.mode,
         modules: &modules,
         assignment: args.assignment.as_deref(),
         dc_mode: args.dc.as_deref(),
         cycle_ns: args.cycle,
-        ..Choice::default()
+        ..SelectOptions::default()
     };
     let chosen = args.mode.is_some()
         || !modules.is_empty()
@@ -126,8 +126,8 @@ fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
         "{} (0x{:08x}): {}, {}\n",
         file.vendor.name,
         file.vendor.id,
-        counted(file.devices.len(), "device"),
-        counted(file.modules.len(), "module"),
+        pluralize(file.devices.len(), "device"),
+        pluralize(file.modules.len(), "module"),
     )?;
     if file.devices.is_empty() {
         return modules(file, out);
@@ -155,7 +155,7 @@ fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
     writeln!(out, "\n`--device TYPE` shows one of them.")
 }
 
-/// A file of modules alone, which another file's devices take.
+/// Shows a file that only contains modules for devices of another file.
 fn modules(file: &EsiFile, out: &mut String) -> std::fmt::Result {
     let mut table = Table::new(&["module", "identity", "PDOs", "name"]);
     for module in &file.modules {

@@ -1,11 +1,11 @@
-//! What the device offers to choose from: modes, slots, assignments, clock modes, PDOs.
+//! The options of a device: modes, slots, assignments, clock modes, PDOs.
 
 use std::fmt::Write;
 
 use ecaxis::config::duration;
 use ecaxis_esi::{
-    Choice, Device, EsiFile, Field, Layout, Mode, Pdo, SelectError, Selection, SyncTime, address,
-    offered_modes, select,
+    Device, EsiFile, Field, Layout, Mode, Pdo, SelectError, SelectOptions, Selection, SyncTime,
+    address, offered_modes, select,
 };
 
 use super::super::super::report::Table;
@@ -13,7 +13,7 @@ use super::super::super::report::Table;
 pub(super) fn write(
     file: &EsiFile,
     device: &Device,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     out: &mut String,
 ) -> std::fmt::Result {
     modes(file, device, choice, out)?;
@@ -23,14 +23,14 @@ pub(super) fn write(
     pdo_list(file, device, out)
 }
 
-/// What a mode comes to, whatever else the user chose.
+/// Returns the configuration of each mode, independent of the user's other choices.
 pub(super) fn by_mode(
     file: &EsiFile,
     device: &Device,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
 ) -> Vec<(Mode, Result<Selection, SelectError>)> {
     let selected = |mode| {
-        let choice = Choice {
+        let choice = SelectOptions {
             mode: Some(mode),
             modules: &[],
             assignment: None,
@@ -46,7 +46,7 @@ pub(super) fn by_mode(
 fn modes(
     file: &EsiFile,
     device: &Device,
-    choice: &Choice<'_>,
+    choice: &SelectOptions<'_>,
     out: &mut String,
 ) -> std::fmt::Result {
     let offered = by_mode(file, device, choice);
@@ -88,7 +88,7 @@ fn modes(
     Ok(())
 }
 
-/// Which object each mode maps, and at which byte.
+/// Shows the mapped objects of each mode with their byte offsets.
 fn mapped(what: &str, modes: &[Mode], fields: Vec<&[Field]>, out: &mut String) -> std::fmt::Result {
     let mut head = vec![what.to_owned(), "bits".to_owned()];
     head.extend(modes.iter().map(Mode::to_string));
@@ -187,7 +187,7 @@ fn slots(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Result 
             .map(|m| m.type_name.clone());
         let takes: Vec<String> = named.chain(classes).collect();
         let takes = takes.join(", ");
-        // Gateways have dozens of slots that are all the same.
+        // Gateways can have dozens of identical slots.
         match rows.last_mut() {
             Some([name, last_count, last]) if *last_count == count && *last == takes => {
                 let first = name.split(" … ").next().unwrap_or_default();
@@ -266,7 +266,7 @@ fn pdo_list(file: &EsiFile, device: &Device, out: &mut String) -> std::fmt::Resu
             .collect();
         let objects = pdo.entries.iter().filter(|entry| !entry.is_gap());
         let objects: Vec<String> = objects
-            // A whole column of them says what they are.
+            // Without `0x`, because the column holds only objects.
             .map(|e| address(e.index, e.sub).to_string().split_off(2))
             .collect();
         let more = objects.len().saturating_sub(6);

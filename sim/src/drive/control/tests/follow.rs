@@ -1,11 +1,11 @@
-//! Profiles and interpolated set-points: feed-forward, and what 0x60C2 does to a move.
+//! Profiles and interpolated set-points: feed-forward, and the effect of 0x60C2 on a move.
 
-#![allow(clippy::print_stdout, reason = "how rough a move is, is worth seeing")]
+#![allow(clippy::print_stdout, reason = "prints the roughness of the moves")]
 
 use super::*;
 
-/// Largest deviation from a ramp to 1000 rpm in profile velocity mode, as share of the speed: of the
-/// motor from the ramp, and of the motor from the reference.
+/// Returns the largest deviations from a ramp to 1000 rpm in profile velocity mode, as a share of
+/// the speed: motor from ramp, and motor from reference.
 fn ramp(case: &Case) -> (f64, f64) {
     let (mut rig, gains) = case.rig(3);
     rig.set(0x3000, 2, structure(true));
@@ -72,7 +72,7 @@ fn feed_forward_lets_velocity_follow_a_ramp() {
 
 /// 2.3.4: feed-forward acts in profile modes. In CSP the same gains change nothing.
 #[test]
-fn position_feed_forward_acts_in_profile_position_mode_alone() {
+fn position_feed_forward_acts_only_in_profile_position_mode() {
     let worst = |mode: i64, scale: i64| {
         let mut rig = Rig::new(PlantParams::default());
         for sub in [4, 5] {
@@ -99,18 +99,18 @@ fn position_feed_forward_acts_in_profile_position_mode_alone() {
     assert_eq!(worst(8, 1), worst(8, 0));
 }
 
-/// How rough a move is: rms of what the torque (‰ of rated) changes by from one control cycle to the
-/// next, and of the jerk of the shaft, rev/s³.
+/// Returns the roughness of a move: the rms change of the torque (‰ of rated) per control cycle,
+/// and the rms jerk of the shaft in rev/s³.
 fn roughness(mode: i64, cycle_ms: u64, interpolation: i64) -> (f64, f64) {
     let mut rig = Rig::new(PlantParams::default());
     rig.set(0x60c2, 1, interpolation);
-    // Thousandths of rpm: whole ones are steps of their own.
+    // Thousandths of rpm: whole rpm would add steps.
     rig.set(0x60a9, 0, 0xfdb4_4700);
     rig.enable(mode);
     let (mut torque, mut speed) = ([0.0; 2], [0.0; 3]);
     let (mut changes, mut jerks, mut samples) = (0.0, 0.0, 0.0);
     let mut bus_us = 0;
-    // 0.6 s up to 15 rev/s and back down again, with a control cycle every 400 µs.
+    // 0.6 s up to 15 rev/s and down again, with a control cycle every 400 µs.
     for control in 0..1500 {
         let now_us = 400 * control;
         while bus_us <= now_us {
@@ -139,9 +139,10 @@ fn roughness(mode: i64, cycle_ms: u64, interpolation: i64) -> (f64, f64) {
     ((changes / samples).sqrt(), (jerks / samples).sqrt())
 }
 
-/// 6.6 and 6.7, note b: a value of 0 makes the motion "interrupted and noisy" at cycles of 1 ms and more.
+/// 6.6 and 6.7, note b: a value of 0 makes the motion "interrupted and noisy" at cycles of 1 ms and
+/// more.
 #[test]
-fn a_move_without_interpolation_is_rough() {
+fn interpolation_smooths_cyclic_moves() {
     for mode in [8, 9] {
         for cycle_ms in [1_u64, 2] {
             let right = roughness(mode, cycle_ms, i64::try_from(cycle_ms).unwrap());
@@ -152,7 +153,7 @@ fn a_move_without_interpolation_is_rough() {
                  times; jerk {:.0} against {:.0} rev/s³, {:.1} times",
                 zero.0, right.0, ratio.0, zero.1, right.1, ratio.1
             );
-            // A speed that steps is less of a jerk than a position that does.
+            // A step in speed causes less jerk than a step in position.
             let least = if mode == 8 { 5.0 } else { 1.5 };
             assert!(
                 ratio.0 > least && ratio.1 > least,

@@ -1,4 +1,4 @@
-//! The loops against the transfer functions they stand for.
+//! The loops against their transfer functions.
 
 mod follow;
 mod reference;
@@ -13,12 +13,12 @@ use crate::drive::objects::float;
 use crate::drive::tests::Rig;
 use reference::{Asked, Model, Objects, Sample};
 
-/// Fine enough that counting does not show.
+/// A resolution at which quantisation does not show.
 const COUNTS: u32 = 4_000_000;
-/// What is allowed of the step.
+/// The tolerance, as a share of the step.
 const TOLERANCE: f64 = 0.02;
 
-/// A motor, and the gains it is run with.
+/// A motor and its gains.
 #[derive(Clone, Copy)]
 struct Case {
     name: &'static str,
@@ -34,8 +34,8 @@ fn ideal(plant: PlantParams) -> PlantParams {
     }
 }
 
-/// The motor of the default plant, tuned by the drive; a flat motor of 90 mm with gear and the gains
-/// that EPOS Studio found for it; a small motor with a drive's factory gains.
+/// Three cases: the motor of the default plant, tuned by the drive; a flat motor of 90 mm with gear
+/// and gains from EPOS Studio; a small motor with a drive's factory gains.
 fn cases() -> [Case; 3] {
     let default = PlantParams::default();
     [
@@ -90,7 +90,7 @@ fn structure(observed: bool) -> i64 {
     if observed { 0x0001_0121 } else { 0x0001_0111 }
 }
 
-/// What the drive's objects say of this motor when it is new.
+/// Returns the control parameters of a new drive with this motor.
 fn as_tuned(plant: &PlantParams) -> Objects {
     read_objects(&Rig::new(*plant))
 }
@@ -110,7 +110,7 @@ fn read_objects(rig: &Rig) -> Objects {
 }
 
 impl Case {
-    /// A drive with these gains in its objects, enabled and at rest, and the gains it has.
+    /// Returns a drive with these gains in its objects, enabled and at rest, and the gains.
     fn rig(&self, mode: i64) -> (Rig, Objects) {
         let mut rig = Rig::new(self.plant);
         if let Some(gains) = self.gains {
@@ -127,7 +127,7 @@ impl Case {
             }
         }
         let gains = read_objects(&rig);
-        // No interpolation: a step is a step. And no following error, however large it is.
+        // No interpolation, so that a step stays a step. No following error supervision.
         rig.set(0x60c2, 1, 0);
         rig.set(0x6065, 0, 0xffff_ffff);
         rig.enable(mode);
@@ -135,7 +135,8 @@ impl Case {
     }
 }
 
-/// Motor state at t = 0, 0.4 ms, 0.8 ms, … , where set-points written before take effect at t = 0.
+/// Returns the motor state at t = 0, 0.4 ms, 0.8 ms, … . Set-points written before the call take
+/// effect at t = 0.
 fn respond(rig: &mut Rig, seconds: f64) -> Vec<Sample> {
     let start = rig.drive.position_counts();
     let mut out = Vec::new();
@@ -154,7 +155,7 @@ fn respond(rig: &mut Rig, seconds: f64) -> Vec<Sample> {
     out
 }
 
-/// Largest deviation between the two, as share of the step. The reference has 0.04 ms between samples.
+/// Returns the largest deviation as a share of the step. The reference has 0.04 ms between samples.
 fn deviation(got: &[Sample], reference: &[Sample], step: f64, of: fn(&Sample) -> f64) -> f64 {
     let mut worst = 0.0_f64;
     let mut largest = 0.0_f64;

@@ -1,6 +1,6 @@
-//! The drive on paper: winding and rotor as differential equations, the loops as the continuous
-//! transfer functions of the application notes, integrated in steps far below every time constant.
-//! Shares nothing with the simulation but the plant's data.
+//! A reference model of the drive: differential equations for winding and rotor, the continuous
+//! transfer functions of the application notes for the loops. The integration step is far below
+//! every time constant. The model shares only the plant's data with the simulation.
 
 use std::f64::consts::{PI, TAU};
 
@@ -11,7 +11,7 @@ const STEP: f64 = 2e-6;
 /// Sampling of the observer, 0.4 ms.
 const SAMPLE: u32 = 200;
 
-/// Control parameters as the objects hold them.
+/// Control parameters in the units of the objects.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Objects {
     /// 0x30A0:01–02.
@@ -24,29 +24,29 @@ pub(super) struct Objects {
     pub observer: [f64; 5],
 }
 
-/// What the loop under test is asked for, as a function of time.
+/// The demand on the loop under test, as a function of time.
 #[derive(Clone, Copy)]
 pub(super) enum Asked<'a> {
-    /// A.
+    /// The current, in A.
     Current(&'a dyn Fn(f64) -> f64),
-    /// rad/s, and acceleration for the feed-forward; `fed`: profile velocity mode.
+    /// The speed in rad/s, and the acceleration for the feed-forward. `fed`: profile velocity mode.
     Velocity {
         speed: &'a dyn Fn(f64) -> (f64, f64),
         fed: bool,
         observed: bool,
     },
-    /// rad.
+    /// The angle, in rad.
     Position(&'a dyn Fn(f64) -> f64),
 }
 
-/// What is compared.
+/// The compared values.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
-    /// A.
+    /// The current, in A.
     pub current: f64,
-    /// rad/s.
+    /// The speed, in rad/s.
     pub speed: f64,
-    /// rad.
+    /// The angle, in rad.
     pub angle: f64,
 }
 
@@ -67,12 +67,12 @@ pub(super) struct Model<'a> {
     pub plant: PlantParams,
     pub gains: Objects,
     pub asked: Asked<'a>,
-    /// N·m.
+    /// The load torque, in N·m.
     pub load: f64,
 }
 
 impl Model<'_> {
-    /// After 0.04 ms, 0.08 ms, … .
+    /// Returns samples after 0.04 ms, 0.08 ms, … .
     pub(super) fn run(&self, seconds: f64) -> Vec<Sample> {
         let mut state = State::default();
         let mut out = Vec::new();
@@ -191,9 +191,9 @@ impl State {
     }
 }
 
-/// A first-order lag has a response one can look up: a check of the integrator itself.
+/// Checks the integrator against the known response of a first-order lag.
 #[test]
-fn the_reference_is_the_exponential_where_there_is_one() {
+fn reference_matches_the_exponential_response() {
     let plant = PlantParams {
         torque_constant: 0.0,
         ..PlantParams::default()

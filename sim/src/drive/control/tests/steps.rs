@@ -1,8 +1,8 @@
-//! Small steps: what the motor does, against what the transfer functions say.
+//! Small steps: the motor's response against the transfer functions.
 
 #![allow(
     clippy::print_stdout,
-    reason = "how near the response comes is worth seeing"
+    reason = "prints the largest deviation of the responses"
 )]
 
 use super::*;
@@ -28,9 +28,9 @@ fn current_steps_like_its_transfer_function() {
     }
 }
 
-/// The same at the current loop's own pace, where most of the response lies between two control cycles.
+/// The response at the current loop's sample rate. Most of it lies between two control cycles.
 #[test]
-fn current_steps_like_its_transfer_function_at_every_one_of_its_samples() {
+fn current_steps_like_its_transfer_function_at_every_sample() {
     for case in cases() {
         for integral in [0.3, 1.0, 3.0] {
             let (rig, mut gains) = case.rig(10);
@@ -109,8 +109,8 @@ fn position_steps_like_its_transfer_function() {
     }
 }
 
-/// 0.3 of rated torque pulls at a motor that is to stand; the observer's model has two thirds of the
-/// inertia there is.
+/// A load of 0.3 of the rated torque acts on a motor at speed zero. The observer's model has two
+/// thirds of the real inertia.
 #[test]
 fn velocity_yields_to_a_load_like_its_transfer_function() {
     for mut case in cases() {
@@ -122,7 +122,7 @@ fn velocity_yields_to_a_load_like_its_transfer_function() {
             rig.run_ms(20);
             let load = 0.3 * case.plant.rated_torque();
             rig.drive.set_load_torque(load);
-            // The load pulls during the first control cycle already.
+            // The load acts already in the first control cycle.
             let mut got = respond(&mut rig, 0.25);
             got.insert(0, got[0]);
             let speed = |_| (0.0, 0.0);
@@ -145,9 +145,9 @@ fn velocity_yields_to_a_load_like_its_transfer_function() {
     }
 }
 
-/// More than the nominal current until the winding is warm: `1 − e^(−t/τ)` of the square.
+/// The current exceeds the nominal current until the winding is warm: `1 − e^(−t/τ)` of the square.
 #[test]
-fn overload_lasts_as_long_as_the_winding_takes_to_warm_up() {
+fn overload_lasts_until_the_winding_is_warm() {
     let plant = PlantParams {
         thermal_time_constant: 2.0,
         ..PlantParams::default()
@@ -166,7 +166,7 @@ fn overload_lasts_as_long_as_the_winding_takes_to_warm_up() {
     assert_ne!(rig.get(0x6041) & 1 << 11, 0, "internal limit");
     rig.run_ms(2000);
     assert_eq!(rig.get(0x6077), 1000);
-    // Rested, it can do so again.
+    // After a rest the overload is possible again.
     rig.set(0x6071, 0, 0);
     rig.run_ms(2000);
     rig.set(0x6071, 0, 2500);

@@ -1,4 +1,4 @@
-//! Gains written while the drive runs.
+//! Gains written during operation.
 
 use proptest::prelude::*;
 
@@ -15,7 +15,7 @@ fn gains_written_in_operation_act_within_10_ms() {
     let asked = |rig: &Rig| rig.drive.controller.current_demand();
     let holding = asked(&rig);
     assert!((holding - 0.03 / 37e-3).abs() < 0.15, "{holding}");
-    // Without P, I and D nothing but the integral is left, and that is no longer fed.
+    // Without P, I and D only the integral remains, and it no longer changes.
     for sub in [1, 2, 3] {
         rig.set(0x30a1, sub, 0);
     }
@@ -27,7 +27,8 @@ fn gains_written_in_operation_act_within_10_ms() {
     assert!(rig.get(0x6064) < -100, "nothing holds it");
 }
 
-/// Position, speed and current after an instruction that is as bad as it can be.
+/// Runs a move with these gains: every value stays finite. With good gains the drive then works
+/// again.
 fn survives(values: &[u32], mode: i64, structure: i64) -> Result<(), TestCaseError> {
     let mut rig = Rig::new(PlantParams::default());
     rig.set(0x6065, 0, 0xffff_ffff);
@@ -54,7 +55,7 @@ fn survives(values: &[u32], mode: i64, structure: i64) -> Result<(), TestCaseErr
     ] {
         prop_assert!(value.is_finite());
     }
-    // Nothing that was broken stays so.
+    // With good gains again, the drive must recover.
     let tuned = Rig::new(PlantParams::default());
     for (index, subs) in GAINS {
         for sub in 1..=subs {
@@ -76,7 +77,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
     #[test]
-    fn no_gains_break_the_drive(
+    fn drive_survives_any_gains(
         values in proptest::collection::vec(
             prop_oneof![Just(0), Just(1), Just(u32::MAX), any::<u32>(), 0..100_000_u32],
             17,
@@ -88,7 +89,7 @@ proptest! {
     }
 }
 
-/// Numbers a plant may be described with, sensible or not.
+/// Plant parameters, plausible or not.
 fn number() -> impl Strategy<Value = f64> {
     prop_oneof![
         Just(0.0),
@@ -103,9 +104,9 @@ fn number() -> impl Strategy<Value = f64> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(60))]
 
-    /// Motors that cannot exist do not end the simulation.
+    /// Impossible motors do not end the simulation.
     #[test]
-    fn no_plant_panics(
+    fn drive_survives_any_plant(
         n in proptest::collection::vec(number(), 10),
         counts_per_turn in prop_oneof![Just(0), Just(1), Just(u32::MAX), 16..100_000_u32],
         initial_position in any::<i32>(),

@@ -1,0 +1,242 @@
+//! Control laws: conversion of the set-point to the drive's targets in each mode.
+
+use super::feedback::FILTER_S;
+use super::{Axis, AxisConfig, ControlledQuantity, Outputs, Plan};
+use crate::cia402::{Controlword, Mode, ModeCommand};
+use crate::position_loop::{Deviation, Integral, bounded};
+use crate::scale::Scale;
+use crate::setpoint::Ramp;
+use crate::units::{
+    PerMille, Percent, RawAcceleration, RawVelocity, UserAcceleration, UserUnits, UserVelocity,
+};
+
+/// The last outputs of the loops, user units and percent.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct LoopState {
+    velocity: f64,
+    /// The part of `velocity` added by the position loop. Only its own change is limited, by the
+    /// acceleration limit. A limit on the sum would leave no correction while the set-point
+    /// accelerates at the limit.
+    correction: f64,
+    pub(super) torque: f64,
+    integral: Integral,
+    /// True: the PID loop continues from `torque`.
+    takes_over: bool,
+    velocity_offset: f64,
+}
+
+/// Values derived from the configuration and needed in every cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct DerivedConstants {
+    /// 0x6081 and 0x6083 without a goal.
+    speed: u32,
+    acceleration: u32,
+    /// Error from the resolution of a velocity, user units per second: of reported velocities, and
+    /// of velocities derived from positions.
+    pub(super) slack: [f64; 2],
+}
+
+impl DerivedConstants {
+    pub(super) fn new(config: &AxisConfig) -> Self {
+        let scale = &config.scale;
+        Self {
+            speed: speed(scale, config.limits.velocity),
+            acceleration: acceleration(scale, config.limits.acceleration),
+            slack: [
+                2.0 * scale.velocity_resolution(),
+                scale.units_of_counts(2.0) / FILTER_S,
+            ],
+        }
+    }
+}
+
+impl LoopState {
+    /// Lets the loops continue from the last outputs.
+    pub(super) const fn take_over(&mut self) {
+        self.takes_over = true;
+    }
+
+    /// Enters a mode: the velocity prepared for the switch contains no correction.
+    pub(super) const fn enter(&mut self) {
+        self.correction = 0.0;
+        self.takes_over = true;
+    }
+}
+
+impl Axis {
+    /// Returns the position that a drive without following error would report now. `late_s`: time
+    /// since the set-point left.
+    pub(super) fn expected(&self, late_s: f64) -> f64 {
+        let motion = &self.motion;
+        let late_s = late_s.max(0.0);
+        motion.position - (motion.velocity - motion.acceleration * late_s * 0.5) * late_s
+    }
+
+    /// Closes the loops of the active mode, after the set-point has advanced. RT: O(1).
+    pub(super) fn close_loops(&mut self, fresh: bool, dt_s: f64) {
+        let limits = self.config.limits;
+        let loops = self.config.loops;
+        let switch = self.other_mode();
+        let velocity = self.motion.velocity;
+        match self.mode {
+            Mode::Csp if switch.is_none() => {
+                let ramp = Ramp {
+                    target: loops.csp.velocity * velocity,
+                    slope: limits.acceleration,
+                };
+                self.given.velocity_offset = ramp.advance(self.given.velocity_offset, dt_s);
+            }
+            Mode::Csv => match loops.csv {
+                None => self.given.velocity = velocity,
+                Some(law) => {
+                    if fresh {
+                        let error = self.expected(self.config.dead_time_s) - self.actual.position();
+                        let ramp = Ramp {
+                            target: bounded(law.correction(error), limits.velocity),
+                            slope: limits.acceleration,
+                        };
+                        self.given.correction = ramp.advance(self.given.correction, dt_s);
+                    }
+                    let wanted = law.feed_forward * velocity + self.given.correction;
+                    self.given.velocity = bounded(wanted, limits.velocity);
+                }
+            },
+            Mode::Cst if fresh && !matches!(self.plan, Plan::Torque(_)) => self.close_torque(dt_s),
+            _ => {}
+        }
+        if self.mode != Mode::Csp || switch.is_some() {
+            self.given.velocity_offset = 0.0;
+        }
+        self.preload_next_mode();
+    }
+
+    /// Sets the targets of the other mode of a switch. Runs also while frames are lost, because the
+    /// drive may already have changed its mode.
+    pub(super) fn preload_next_mode(&mut self) {
+        let limits = self.config.limits;
+        match self.other_mode() {
+            Some(Mode::Csv | Mode::Pv) if self.mode != Mode::Csv => {
+                self.given.velocity = bounded(self.motion.velocity, limits.velocity);
+            }
+            Some(Mode::Cst) => self.given.torque = bounded(self.actual.torque(), limits.torque),
+            _ => {}
+        }
+    }
+
+    fn close_torque(&mut self, dt_s: f64) {
+        let Some(pid) = self.config.loops.cst else {
+            return;
+        };
+        let limit = self.config.limits.torque;
+        let seen = Deviation {
+            position: self.expected(self.config.dead_time_s) - self.actual.position(),
+            velocity: self.motion.velocity - self.actual.velocity(),
+            acceleration: self.motion.acceleration,
+        };
+        if core::mem::take(&mut self.given.takes_over) {
+            self.given.integral = pid.starting_with(self.given.torque, seen);
+        }
+        let slope = self.config.torque_slope;
+        (self.given.integral, self.given.torque) =
+            pid.advance(self.given.integral, seen, limit, slope, dt_s);
+    }
+
+    pub(super) fn outputs(&self) -> Outputs {
+        let scale = &self.config.scale;
+        let mode = self.other_mode().unwrap_or(self.mode);
+        let actual = self.actual.counts().unwrap_or_default();
+        let mut out = Outputs {
+            controlword: self.controlword.bits(),
+            mode: self.mode_asked().code(),
+            target_position: actual.wrapped(),
+            touch_probe_function: if self.probe_mapped {
+                self.probes.function()
+            } else {
+                0
+            },
+            brake_open: self.brake_state.open,
+            profile_velocity: self.fixed.speed,
+            profile_acceleration: self.fixed.acceleration,
+            ..Outputs::default()
+        };
+        if !self.active {
+            return out;
+        }
+        if self.mode_command_counts() {
+            self.profile_outputs(&mut out);
+        }
+        let counts = |wanted: Mode| self.mode == wanted || mode == wanted;
+        if counts(Mode::Csp) && self.controlled_quantity() == ControlledQuantity::Position {
+            out.target_position = self.sent.wrapped();
+        } else if mode == Mode::Csp {
+            out.target_position = scale
+                .position_to_counts(UserUnits(self.motion.position))
+                .wrapped();
+        }
+        if counts(Mode::Csv) || (mode == Mode::Pv && self.mode != Mode::Pv) {
+            let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(self.given.velocity));
+            out.target_velocity = raw;
+        }
+        if counts(Mode::Cst) {
+            let PerMille(raw) = scale.torque_to_raw(Percent(self.given.torque));
+            out.target_torque = raw;
+        }
+        if self.mode == Mode::Csp && self.switch.is_none() {
+            let loops = self.config.loops.csp;
+            if loops.velocity != 0.0 {
+                let offset = UserVelocity(self.given.velocity_offset);
+                out.velocity_offset = scale.velocity_to_raw(offset).0;
+            }
+            if loops.acceleration != 0.0 {
+                let torque = loops.acceleration * self.motion.acceleration;
+                let torque = Percent(bounded(torque, self.config.limits.torque));
+                out.torque_offset = scale.torque_to_raw(torque).0;
+            }
+        }
+        out
+    }
+
+    /// True if mode-specific bits may be set: only together with "enable operation".
+    fn mode_command_counts(&self) -> bool {
+        self.controlword == Controlword::ENABLE_OPERATION_COMMAND
+    }
+
+    /// Sets the bits and goals of PP, PV and HM.
+    fn profile_outputs(&self, out: &mut Outputs) {
+        let scale = &self.config.scale;
+        let goal = self.profile.goal();
+        let command = match self.mode {
+            Mode::Pp => {
+                if let Some(goal) = goal {
+                    let target = scale.position_to_counts(UserUnits(goal.target));
+                    out.target_position = target.wrapped();
+                    out.profile_velocity = speed(scale, goal.velocity);
+                }
+                self.profile.position_bits()
+            }
+            Mode::Pv => {
+                if let Some(goal) = goal {
+                    out.target_velocity = scale.velocity_to_raw(UserVelocity(goal.target)).0;
+                }
+                self.profile.velocity_bits()
+            }
+            Mode::Hm => self.home.bits(),
+            _ => ModeCommand::Nothing,
+        };
+        if let (Mode::Pp | Mode::Pv, Some(goal)) = (self.mode, goal) {
+            out.profile_acceleration = acceleration(scale, goal.acceleration);
+        }
+        out.controlword = self.controlword.with(command).bits();
+    }
+}
+
+/// Returns the profile velocity. At least 1, because 0 would prevent any motion.
+fn speed(scale: &Scale, velocity: f64) -> u32 {
+    let RawVelocity(raw) = scale.velocity_to_raw(UserVelocity(velocity));
+    raw.unsigned_abs().max(1)
+}
+
+fn acceleration(scale: &Scale, acceleration: f64) -> u32 {
+    let RawAcceleration(raw) = scale.acceleration_to_raw(UserAcceleration(acceleration));
+    raw.max(1)
+}

@@ -1,0 +1,368 @@
+//! Supervision of the feedback, and the final limits of the set-point.
+
+use super::stop::PowerGoal;
+use super::{Axis, ControlledQuantity};
+use crate::cia402::{Mode, ModeStatus, State};
+use crate::limits::Limits;
+use crate::position_loop::bounded;
+use crate::setpoint::{Motion, braking_velocity};
+use crate::status::{DriveFault, Trip};
+use crate::units::Counts;
+
+/// Factor on the velocity limit, and consecutive fresh cycles above it until the axis trips.
+const OVER_VELOCITY: f64 = 1.2;
+const OVER_VELOCITY_CYCLES: u8 = 5;
+
+/// Consecutive fresh cycles without Statusword bit 12 until the axis counts as not following.
+const FOLLOW_CYCLES: u8 = 10;
+
+/// Fresh cycles after a lost frame until the drive has the newest target and reports it.
+const CATCH_UP_CYCLES: u8 = 2;
+
+/// Rounding of a product of f64s.
+const ROUNDING: f64 = 1.0 + 1e-9;
+
+/// Rounding of a second difference of positions: of the difference, and of the positions.
+const LOOSE: f64 = 2e-6;
+const ROUNDED: f64 = 4.0 * f64::EPSILON;
+
+/// Fraction of the acceleration used to plan braking at the end of the range. The rest covers
+/// rounding.
+const PLANNED: f64 = 1.0 - 1e-4;
+
+/// The range of an axis without position limits.
+const EVERYWHERE: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+
+/// State of supervision while an axis is enabled.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct SupervisionState {
+    pub(super) following_error: f64,
+    pub(super) max_following_error: f64,
+    fast_cycles: u8,
+    steep_cycles: u8,
+    /// Time in seconds for which the torque has exceeded its limit.
+    strained_s: f64,
+    /// The last target that the drive surely has, and the consecutive fresh cycles since.
+    known: Option<Counts>,
+    fresh_cycles: u8,
+    /// The configured range, widened to the position at enabling. So an axis outside its range can
+    /// return; the range narrows again as it does.
+    range: Option<[f64; 2]>,
+}
+
+impl SupervisionState {
+    pub(super) fn starting_at(position: f64, limits: &Limits) -> Self {
+        Self {
+            range: limits
+                .position
+                .map(|[low, high]| [low.min(position), high.max(position)]),
+            ..Self::default()
+        }
+    }
+
+    /// Records a lost frame; `sent` is the target of the last answered frame.
+    pub(super) fn lost(&mut self, sent: Counts) {
+        if self.known.is_none() || self.fresh_cycles > 0 {
+            self.known = Some(sent);
+        }
+        self.fresh_cycles = 0;
+    }
+
+    fn narrow(&mut self, position: f64, limits: &Limits) {
+        if let (Some(range), Some([low, high])) = (&mut self.range, limits.position) {
+            range[0] = range[0].max(low.min(position));
+            range[1] = range[1].min(high.max(position));
+        }
+    }
+}
+
+impl Axis {
+    /// Supervises fresh inputs: unrequested state changes, and values outside the limits.
+    pub(super) fn supervise(&mut self) {
+        let before = self.state;
+        self.state = State::from_statusword(self.statusword);
+        self.unfollowed_cycles = if self.follows_now() {
+            0
+        } else {
+            self.unfollowed_cycles.saturating_add(1)
+        };
+        if self.state.is_fault() {
+            if !before.is_fault() {
+                self.fault.get_or_insert(DriveFault {
+                    statusword: self.statusword.bits(),
+                    code: None,
+                });
+                self.stop_by_fault();
+                self.reset = false;
+            }
+            return;
+        }
+        if self.reset {
+            self.reset = false;
+            self.fault = None;
+        }
+        if !self.active {
+            return;
+        }
+        if self.state != State::OperationEnabled {
+            if self.goal == PowerGoal::On {
+                self.trip(Trip::PowerLost { state: self.state });
+            }
+            return;
+        }
+        if let Some(display) = self.mode_display
+            && !self.mode_confirmed()
+        {
+            self.trip(Trip::ModeLost {
+                expected: self.mode,
+                display: Mode::from_code(display),
+            });
+            return;
+        }
+        // At standstill, targets follow actual values again. In motion the axis has lost control.
+        if !self.reported_to_follow() && !self.setpoint_at_rest() {
+            self.trip(Trip::NotFollowing { mode: self.mode });
+            return;
+        }
+        if let Some(trip) = self.check_limits() {
+            self.trip(trip);
+        }
+    }
+
+    /// Returns true if the drive follows in CSP, CSV or CST. Enabling requires Statusword bit 12.
+    /// Afterwards the bit may be missing for a few cycles. A drive that catches up after a lost
+    /// frame may limit the step and clear the bit.
+    pub(super) fn reported_to_follow(&self) -> bool {
+        let most = if self.active { FOLLOW_CYCLES } else { 1 };
+        self.unfollowed_cycles < most
+    }
+
+    /// Returns Statusword bit 12 if it has this meaning in the mode that 0x6061 shows.
+    pub(super) fn follows_now(&self) -> bool {
+        let mode = self.mode_display.map_or(self.mode, Mode::from_code);
+        match self.statusword.in_mode(mode) {
+            ModeStatus::Csp { follows, .. }
+            | ModeStatus::Csv { follows }
+            | ModeStatus::Cst { follows } => follows || !self.config.follows_bit,
+            _ => true,
+        }
+    }
+
+    /// Trips the axis. The first cause remains.
+    fn trip(&mut self, trip: Trip) {
+        self.trip.get_or_insert(trip);
+        self.stop_by(self.config.supervision.reaction);
+    }
+
+    pub(super) fn emergency_stop(&mut self) {
+        self.trip.get_or_insert(Trip::EmergencyStop);
+        self.stop_by(self.config.supervision.emergency);
+    }
+
+    fn check_limits(&mut self) -> Option<Trip> {
+        let limits = self.config.limits;
+        let position = self.actual.position();
+        let mut cause = None;
+        // A motion of the drive without a set-point is not a following error.
+        let unknown = self.interrupted && (self.mode != Mode::Csp || self.left_csp());
+        if self.controlled_quantity() == ControlledQuantity::Position && !unknown {
+            let scale = &self.config.scale;
+            // This set-point is already one cycle old.
+            let commanded = self.expected(self.config.dead_time_s - self.dt_s);
+            self.watch.following_error = commanded - position;
+            // Lost frames took their targets with them: the axis may be anywhere between the last
+            // known and the present target.
+            let error = match self.watch.known {
+                None => commanded - position,
+                Some(known) => {
+                    let known = scale.position_to_user(known).0;
+                    let nearest = position.max(commanded.min(known)).min(commanded.max(known));
+                    nearest - position
+                }
+            };
+            self.watch.max_following_error = self.watch.max_following_error.max(error.abs());
+            self.watch.fresh_cycles = self.watch.fresh_cycles.saturating_add(1);
+            if self.watch.fresh_cycles >= CATCH_UP_CYCLES {
+                self.watch.known = None;
+            }
+            if let Some(limit) = limits.following_error
+                && error.abs() > limit
+            {
+                cause = Some(Trip::FollowingError { error, limit });
+            }
+        } else {
+            self.watch.following_error = 0.0;
+        }
+        if self.mode == Mode::Pp && self.profile.not_taken() {
+            cause = Some(Trip::SetPointNotTaken);
+        }
+        // While homing, positions have no defined origin.
+        if self.mode != Mode::Hm
+            && self.actual.counts().is_some()
+            && let Some([low, high]) = self.watch.range
+        {
+            let margin = limits.position_margin();
+            if position < low - margin || position > high + margin {
+                cause = cause.or(Some(Trip::PositionLimit {
+                    position,
+                    low,
+                    high,
+                }));
+            }
+            self.watch.narrow(position, &limits);
+        }
+        let velocity = self.actual.velocity();
+        let slack = self.velocity_slack();
+        let fast = velocity.abs() > limits.velocity * OVER_VELOCITY + slack;
+        if let Some(watch) = self.config.supervision.torque {
+            let torque = self.actual.torque();
+            self.watch.strained_s = if torque.abs() > watch.percent {
+                self.watch.strained_s + self.dt_s
+            } else {
+                0.0
+            };
+            if self.watch.strained_s > watch.time_s {
+                cause = cause.or(Some(Trip::OverTorque {
+                    torque,
+                    limit: watch.percent,
+                    time_s: watch.time_s,
+                }));
+            }
+        }
+        if let Some(limit) = self.config.supervision.acceleration {
+            let acceleration = self.actual.acceleration();
+            self.watch.steep_cycles = if acceleration.abs() > limit {
+                self.watch.steep_cycles.saturating_add(1)
+            } else {
+                0
+            };
+            if self.watch.steep_cycles >= OVER_VELOCITY_CYCLES {
+                cause = cause.or(Some(Trip::OverAcceleration {
+                    acceleration,
+                    limit,
+                }));
+            }
+        }
+        self.watch.fast_cycles = if fast {
+            self.watch.fast_cycles.saturating_add(1)
+        } else {
+            0
+        };
+        if self.watch.fast_cycles >= OVER_VELOCITY_CYCLES {
+            cause = cause.or(Some(Trip::OverVelocity {
+                velocity,
+                limit: limits.velocity,
+            }));
+        }
+        cause
+    }
+
+    /// Returns the error from the resolution of the velocity, user units per second.
+    fn velocity_slack(&self) -> f64 {
+        let [measured, derived] = self.fixed.slack;
+        if self.actual.velocity_is_measured() {
+            measured
+        } else {
+            derived
+        }
+    }
+
+    /// Returns true if the reported velocity is within the standstill window.
+    pub(super) fn at_standstill(&self) -> bool {
+        self.actual.velocity().abs() <= self.standstill_window()
+    }
+
+    pub(super) fn standstill_window(&self) -> f64 {
+        let window = self.config.supervision.standstill;
+        let window = window.unwrap_or(self.config.limits.velocity * 0.01);
+        self.velocity_slack().max(window)
+    }
+
+    /// Returns true within 2 % of the target or within 10 motor rpm, whichever is larger. The 10
+    /// rpm count at most a tenth of the velocity limit.
+    pub(super) fn velocity_reached(&self, target: f64) -> bool {
+        let ten_rpm = self.config.scale.units_per_turn() * 10.0 / 60.0;
+        let floor = ten_rpm.min(self.config.limits.velocity * 0.1);
+        let slack = self.velocity_slack();
+        let window = (target.abs() * 0.02).max(floor).max(slack);
+        (self.actual.velocity() - target).abs() <= window
+    }
+
+    /// Returns the lowest and highest velocity of the next cycle from which the axis can stop
+    /// inside its range.
+    pub(super) fn allowed_by_range(&self) -> [f64; 2] {
+        let Some([low, high]) = self.config.limits.position else {
+            return [f64::NEG_INFINITY, f64::INFINITY];
+        };
+        if self.actual.counts().is_none() {
+            return [f64::NEG_INFINITY, f64::INFINITY];
+        }
+        let (acceleration, ahead) = if self.controlled_quantity() == ControlledQuantity::Position {
+            (
+                self.config.limits.acceleration * PLANNED,
+                self.motion.position,
+            )
+        } else {
+            // The reported position is one cycle old, and the next set-point takes effect one cycle
+            // later.
+            let ahead = self.actual.position() + self.motion.velocity * self.dt_s * 2.0;
+            (self.config.limits.acceleration, ahead)
+        };
+        let up = braking_velocity((high - ahead).max(0.0), acceleration, self.dt_s);
+        let down = braking_velocity((ahead - low).max(0.0), acceleration, self.dt_s);
+        [-down, up]
+    }
+
+    /// Limits the set-point before the outputs, independently of the plan.
+    pub(super) fn clamp_setpoint(&mut self, grip: ControlledQuantity, before: Motion, dt_s: f64) {
+        let limits = self.config.limits;
+        let planned = (self.motion, self.given.torque);
+        match grip {
+            ControlledQuantity::Position => {
+                let most = limits.velocity * dt_s * ROUNDING;
+                let coasting = before.position + before.velocity * dt_s;
+                let change = limits.acceleration * dt_s * dt_s;
+                let rounded = change * LOOSE + (coasting.abs() + before.position.abs()) * ROUNDED;
+                // A motion taken over too near to the end of the range passes the end while
+                // braking.
+                let [low, high] = limits.position.map_or(EVERYWHERE, |[low, high]| {
+                    [
+                        low.min(before.position).min(coasting + change - rounded),
+                        high.max(before.position).max(coasting - change + rounded),
+                    ]
+                });
+                let position = self.motion.position;
+                if (position - before.position).abs() <= most
+                    && (position - coasting).abs() <= change + rounded
+                    && position >= low
+                    && position <= high
+                {
+                    return;
+                }
+                // Not `clamp`: it panics if a bound is NaN.
+                let least = (coasting - change - rounded).max(before.position - most);
+                let most = (coasting + change + rounded).min(before.position + most);
+                let position = position.max(low).min(high).max(least).min(most);
+                if position != self.motion.position {
+                    let velocity = if dt_s > 0.0 {
+                        (position - before.position) / dt_s
+                    } else {
+                        before.velocity
+                    };
+                    self.motion = before.then(position, velocity, dt_s);
+                }
+            }
+            ControlledQuantity::Velocity => {
+                let velocity = bounded(self.motion.velocity, limits.velocity);
+                self.motion.velocity = velocity;
+            }
+            ControlledQuantity::Drive => {}
+            ControlledQuantity::Torque => {
+                self.given.torque = bounded(self.given.torque, limits.torque)
+            }
+        }
+        if planned != (self.motion, self.given.torque) {
+            self.guarded_cycles = self.guarded_cycles.saturating_add(1);
+        }
+    }
+}

@@ -1,0 +1,420 @@
+//! Switch to homing mode and back, as a pure state machine.
+//!
+//! Bit 4 acts on its rising edge, so it is low for at least one cycle first. Until the drive can
+//! have seen the edge, its state refers to the previous homing. However a homing ends, the axis
+//! stands before the mode changes back.
+
+use crate::cia402::{HomingState, Mode};
+
+/// Longest time in seconds after the start in which "attained" or "error" may refer to the previous
+/// homing.
+const STALE_S: f64 = 0.1;
+
+/// Time in seconds after a halt or an error until the sequence ends even if the axis still moves.
+const HALT_S: f64 = 2.0;
+
+/// Time in seconds that an axis must stand before the mode changes back. A mode that takes over
+/// earlier would end the deceleration at that position, perhaps with a last step further onto a
+/// limit switch.
+const REST_S: f64 = 0.05;
+
+/// The reason why the home position is unknown.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum HomingError {
+    #[error("home was not found within {timeout_s} s")]
+    Timeout { timeout_s: f64 },
+    #[error("the drive reports a homing error")]
+    Drive,
+    #[error("homing was aborted")]
+    Aborted,
+    #[error("the drive did not change to homing mode")]
+    ModeRefused,
+    #[error("the axis lost its power while homing")]
+    PowerLost,
+}
+
+/// Inputs of the sequence in one cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HomingInputs {
+    /// The active mode, as 0x6061 shows it.
+    pub mode: Mode,
+    /// True if the last requested mode switch has failed.
+    pub mode_failed: bool,
+    /// Bits 13, 12 and 10; only valid in homing mode.
+    pub state: HomingState,
+    pub standing: bool,
+    /// False after a lost frame: the inputs are old.
+    pub fresh: bool,
+}
+
+/// Requests of the sequence in one cycle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HomingOutputs {
+    pub mode: Mode,
+    /// Controlword bit 4.
+    pub start: bool,
+    /// Controlword bit 8.
+    pub halt: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Outcome {
+    Running,
+    /// Home is known, and the axis is back in its mode.
+    Attained,
+    /// Homing failed. The axis is back in its mode, or still in homing mode if
+    /// [`HomingInputs::mode_failed`] is set.
+    Failed(HomingError),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Phase {
+    Enter,
+    /// Homing mode with bit 4 low.
+    Prepare,
+    Search {
+        /// The drive still shows its state from before the start.
+        stale: bool,
+        elapsed_s: f64,
+    },
+    /// Halted because of `error`.
+    Halt {
+        error: HomingError,
+        elapsed_s: f64,
+        stood_s: f64,
+    },
+    Leave {
+        result: Result<(), HomingError>,
+    },
+    Done {
+        result: Result<(), HomingError>,
+    },
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sequence {
+    phase: Phase,
+    back: Mode,
+    timeout_s: f64,
+}
+
+impl Sequence {
+    /// Creates a sequence from mode `back` into homing and back. `timeout_s` limits the search.
+    #[must_use]
+    pub const fn new(back: Mode, timeout_s: f64) -> Self {
+        Self {
+            phase: Phase::Enter,
+            back,
+            timeout_s,
+        }
+    }
+
+    /// Returns the mode before and after homing.
+    #[must_use]
+    pub const fn back(&self) -> Mode {
+        self.back
+    }
+
+    /// Returns true once home was found: positions then refer to the new origin.
+    #[must_use]
+    pub const fn attained(&self) -> bool {
+        matches!(
+            self.phase,
+            Phase::Leave { result: Ok(()) } | Phase::Done { result: Ok(()) }
+        )
+    }
+
+    /// Halts the axis and switches back. Has no effect after the end of the search.
+    pub fn abort(&mut self) {
+        let error = HomingError::Aborted;
+        self.phase = match self.phase {
+            Phase::Enter | Phase::Prepare => Phase::Leave { result: Err(error) },
+            Phase::Search { .. } => Phase::halt(error),
+            over => over,
+        };
+    }
+
+    /// Runs one cycle. Pure.
+    #[must_use]
+    pub fn step(mut self, seen: &HomingInputs, dt_s: f64) -> (Self, HomingOutputs, Outcome) {
+        self.phase = self.phase.next(seen, self.back, self.timeout_s, dt_s);
+        let homing = |start, halt| HomingOutputs {
+            mode: Mode::Hm,
+            start,
+            halt,
+        };
+        let back = HomingOutputs {
+            mode: self.back,
+            start: false,
+            halt: false,
+        };
+        let (order, outcome) = match self.phase {
+            Phase::Enter | Phase::Prepare => (homing(false, false), Outcome::Running),
+            Phase::Search { .. } => (homing(true, false), Outcome::Running),
+            Phase::Halt { .. } => (homing(true, true), Outcome::Running),
+            Phase::Leave { .. } => (back, Outcome::Running),
+            Phase::Done { result: Ok(()) } => (back, Outcome::Attained),
+            Phase::Done { result: Err(error) } => (back, Outcome::Failed(error)),
+        };
+        (self, order, outcome)
+    }
+}
+
+impl Phase {
+    fn next(self, seen: &HomingInputs, back: Mode, timeout_s: f64, dt_s: f64) -> Self {
+        match self {
+            Self::Enter if seen.mode_failed => Self::Done {
+                result: Err(HomingError::ModeRefused),
+            },
+            Self::Enter if seen.fresh && seen.mode == Mode::Hm => Self::Prepare,
+            Self::Prepare if seen.fresh => Self::Search {
+                stale: seen.state.is_attained() || seen.state.is_error(),
+                elapsed_s: 0.0,
+            },
+            Self::Search { stale, elapsed_s } => {
+                let elapsed_s = elapsed_s + dt_s;
+                let said = seen.state.is_attained() || seen.state.is_error();
+                let stale = stale && (!seen.fresh || said) && elapsed_s < STALE_S;
+                let news = seen.fresh && !stale;
+                if news && seen.state.is_error() {
+                    Self::halt(HomingError::Drive)
+                } else if news && seen.state.is_attained() && seen.standing {
+                    Self::Leave { result: Ok(()) }
+                } else if elapsed_s > timeout_s {
+                    Self::halt(HomingError::Timeout { timeout_s })
+                } else {
+                    Self::Search { stale, elapsed_s }
+                }
+            }
+            Self::Halt {
+                error,
+                elapsed_s,
+                stood_s,
+            } => {
+                let stood_s = match (seen.fresh, seen.standing) {
+                    (false, _) => stood_s,
+                    (true, true) => stood_s + dt_s,
+                    (true, false) => 0.0,
+                };
+                if stood_s > REST_S || elapsed_s > HALT_S {
+                    Self::Leave { result: Err(error) }
+                } else {
+                    Self::Halt {
+                        error,
+                        elapsed_s: elapsed_s + dt_s,
+                        stood_s,
+                    }
+                }
+            }
+            Self::Leave { result } if seen.mode == back || seen.mode_failed => {
+                Self::Done { result }
+            }
+            same => same,
+        }
+    }
+
+    const fn halt(error: HomingError) -> Self {
+        Self::Halt {
+            error,
+            elapsed_s: 0.0,
+            stood_s: 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DT: f64 = 0.001;
+
+    fn seen(mode: Mode, state: HomingState, standing: bool) -> HomingInputs {
+        HomingInputs {
+            mode,
+            mode_failed: false,
+            state,
+            standing,
+            fresh: true,
+        }
+    }
+
+    /// Steps over rows of (mode, state, standing) × cycles. Returns the sequence, the last request
+    /// and the outcome.
+    fn run(
+        mut sequence: Sequence,
+        rows: &[(Mode, HomingState, bool, u32)],
+    ) -> (Sequence, HomingOutputs, Outcome) {
+        let mut last = None;
+        for &(mode, state, standing, cycles) in rows {
+            for _ in 0..cycles {
+                let (next, order, outcome) = sequence.step(&seen(mode, state, standing), DT);
+                sequence = next;
+                last = Some((order, outcome));
+            }
+        }
+        let (order, outcome) = last.unwrap();
+        (sequence, order, outcome)
+    }
+
+    fn new() -> Sequence {
+        Sequence::new(Mode::Csp, 5.0)
+    }
+
+    const HM: Mode = Mode::Hm;
+    const CSP: Mode = Mode::Csp;
+
+    #[test]
+    fn sequence_switches_to_homing_and_back() {
+        use HomingState::*;
+        let order = |mode, start, halt| HomingOutputs { mode, start, halt };
+        let rows: &[(Mode, HomingState, bool, u32, HomingOutputs, Outcome)] = &[
+            (
+                CSP,
+                NotStarted,
+                true,
+                10,
+                order(HM, false, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                NotStarted,
+                true,
+                1,
+                order(HM, false, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                NotStarted,
+                true,
+                1,
+                order(HM, true, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                InProgress,
+                false,
+                2000,
+                order(HM, true, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                AttainedNotReached,
+                false,
+                300,
+                order(HM, true, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                Completed,
+                true,
+                1,
+                order(CSP, false, false),
+                Outcome::Running,
+            ),
+            (
+                HM,
+                NotStarted,
+                true,
+                5,
+                order(CSP, false, false),
+                Outcome::Running,
+            ),
+            (
+                CSP,
+                NotStarted,
+                true,
+                1,
+                order(CSP, false, false),
+                Outcome::Attained,
+            ),
+        ];
+        let mut sequence = new();
+        for &(mode, state, standing, cycles, expected, outcome) in rows {
+            let (next, order, now) = run(sequence, &[(mode, state, standing, cycles)]);
+            assert_eq!((order, now), (expected, outcome), "{state:?}");
+            sequence = next;
+        }
+        assert!(sequence.attained());
+    }
+
+    #[test]
+    fn state_of_the_previous_homing_is_ignored() {
+        use HomingState::*;
+        for old in [Completed, ErrorStanding] {
+            let before = [(HM, old, true, 2), (HM, old, true, 50)];
+            let (sequence, order, outcome) = run(new(), &before);
+            assert_eq!((order.start, outcome), (true, Outcome::Running));
+            let (_, order, _) = run(
+                sequence,
+                &[(HM, InProgress, false, 10), (HM, Completed, true, 1)],
+            );
+            assert_eq!(order.mode, CSP);
+        }
+        // A method that ends at once may never show "in progress".
+        let (sequence, _, _) = run(new(), &[(HM, Completed, true, 150)]);
+        assert!(sequence.attained());
+    }
+
+    #[test]
+    fn sequence_reports_each_failure() {
+        use HomingState::*;
+        let start = (HM, NotStarted, true, 3);
+        let search = (HM, InProgress, false, 100);
+        // An error while moving: halt, stand, switch back.
+        let (sequence, order, _) = run(new(), &[start, search, (HM, ErrorMoving, false, 5)]);
+        assert!(order.halt && order.mode == HM);
+        let (sequence, order, _) = run(sequence, &[(HM, ErrorStanding, true, 60)]);
+        assert_eq!(order.mode, CSP);
+        let (_, _, outcome) = run(sequence, &[(CSP, NotStarted, true, 1)]);
+        assert_eq!(outcome, Outcome::Failed(HomingError::Drive));
+        // Home is never found, and the axis never stands.
+        let (sequence, order, _) = run(new(), &[start, (HM, InProgress, false, 5010)]);
+        assert!(order.halt);
+        let (_, _, outcome) = run(
+            sequence,
+            &[(HM, InProgress, false, 2100), (CSP, NotStarted, false, 1)],
+        );
+        let timeout = HomingError::Timeout { timeout_s: 5.0 };
+        assert_eq!(outcome, Outcome::Failed(timeout));
+        assert_eq!(timeout.to_string(), "home was not found within 5 s");
+        // Aborted in each phase.
+        for rows in [
+            &[(CSP, NotStarted, true, 3)][..],
+            &[start],
+            &[start, search],
+        ] {
+            let (mut sequence, _, _) = run(new(), rows);
+            sequence.abort();
+            let rest = [(HM, NotStarted, true, 60), (CSP, NotStarted, true, 1)];
+            let (_, order, outcome) = run(sequence, &rest);
+            assert_eq!(outcome, Outcome::Failed(HomingError::Aborted));
+            assert!(!order.start && !order.halt);
+        }
+        // The mode is not available.
+        let refused = HomingInputs {
+            mode_failed: true,
+            ..seen(CSP, NotStarted, true)
+        };
+        let (_, _, outcome) = new().step(&refused, DT);
+        assert_eq!(outcome, Outcome::Failed(HomingError::ModeRefused));
+    }
+
+    #[test]
+    fn abort_after_the_end_changes_nothing() {
+        let (mut sequence, _, _) = run(
+            new(),
+            &[
+                (HM, HomingState::NotStarted, true, 3),
+                (HM, HomingState::Completed, true, 1),
+            ],
+        );
+        sequence.abort();
+        let (_, _, outcome) = run(sequence, &[(CSP, HomingState::NotStarted, true, 1)]);
+        assert_eq!(outcome, Outcome::Attained);
+    }
+}

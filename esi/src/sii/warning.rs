@@ -1,0 +1,180 @@
+//! Problems in a readable image.
+
+use std::fmt;
+
+use super::category;
+use super::parse::{Category, byte};
+use super::strings::Table;
+
+/// The maximum number of reported warnings.
+const MOST: usize = 100;
+
+/// One problem and its location.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SiiWarning {
+    /// The offset from the start of the image.
+    pub offset: usize,
+    /// `None`: in the header, or in the image as a whole.
+    pub category: Option<u16>,
+    pub remark: WarningKind,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum WarningKind {
+    /// The checksum is wrong, so a controller ignores the configuration.
+    Checksum { found: u8, right: u8 },
+    /// The end mark is missing.
+    NoEnd,
+    /// The end mark comes first: the image contains only the header.
+    NoCategories,
+    /// A category that must be unique occurs again.
+    Repeated,
+    /// The remaining bytes do not form a whole record.
+    LeftOver { bytes: usize, record: usize },
+    /// The category ends before its last text.
+    Strings { claimed: u8, found: usize },
+    /// The referenced text does not exist; it reads as empty.
+    NoString { number: u8, strings: usize },
+    /// Not a direction and not the mailbox state.
+    Fmmu { code: u8 },
+    /// Not a type of ETG.2010.
+    SyncManager { code: u8 },
+}
+
+impl fmt::Display for SiiWarning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "byte 0x{:x}", self.offset)?;
+        if let Some(category) = self.category {
+            write!(f, ", category {category}")?;
+        }
+        f.write_str(": ")?;
+        match self.remark {
+            WarningKind::Checksum { found, right } => {
+                write!(
+                    f,
+                    "the checksum is 0x{found:02x}, right would be 0x{right:02x}; a controller ignores its configuration"
+                )
+            }
+            WarningKind::NoEnd => f.write_str("the image stops without an end mark"),
+            WarningKind::NoCategories => f.write_str("there are no categories, the header is all"),
+            WarningKind::Repeated => f.write_str("the category is there a second time"),
+            WarningKind::LeftOver { bytes, record } => {
+                write!(f, "{bytes} bytes are left over, records have {record}")
+            }
+            WarningKind::Strings { claimed, found } => {
+                write!(f, "the category claims {claimed} texts and holds {found}")
+            }
+            WarningKind::NoString { number, strings } => {
+                write!(f, "text {number} is named, there are {strings}")
+            }
+            WarningKind::Fmmu { code } => write!(f, "{code} is no use of an FMMU"),
+            WarningKind::SyncManager { code } => write!(f, "{code} is no type of a SyncManager"),
+        }
+    }
+}
+
+#[derive(Default)]
+pub(super) struct Warnings(pub Vec<SiiWarning>);
+
+impl Warnings {
+    pub fn add(&mut self, offset: usize, category: Option<u16>, remark: WarningKind) {
+        if self.0.len() < MOST {
+            self.0.push(SiiWarning {
+                offset,
+                category,
+                remark,
+            });
+        }
+    }
+}
+
+/// The texts that one category references.
+pub(super) struct StringRefs<'a> {
+    pub table: &'a Table,
+    pub here: Category<'a>,
+    pub notes: &'a mut Warnings,
+}
+
+impl StringRefs<'_> {
+    /// Returns the text whose number is at offset `at` of the category.
+    pub fn text(&mut self, at: usize) -> String {
+        let number = byte(self.here.data, at);
+        let strings = self.table.len();
+        if usize::from(number) > strings {
+            let remark = WarningKind::NoString { number, strings };
+            self.notes
+                .add(self.here.offset + at, Some(self.here.kind), remark);
+        }
+        self.table.text(number)
+    }
+}
+
+pub(super) fn strings_of(here: &Category<'_>, notes: &mut Warnings) -> Table {
+    let table = Table::parse(here.data);
+    let (claimed, found) = (byte(here.data, 0), table.len());
+    if usize::from(claimed) > found {
+        notes.add(
+            here.offset,
+            Some(here.kind),
+            WarningKind::Strings { claimed, found },
+        );
+    }
+    table
+}
+
+pub(super) fn repeated(found: &[Category<'_>], notes: &mut Warnings) {
+    const ONCE: [u16; 7] = [
+        category::STRINGS,
+        category::GENERAL,
+        category::FMMU,
+        category::SYNC_MANAGER,
+        category::FMMU_DETAILS,
+        category::SYNC_UNIT,
+        category::DC,
+    ];
+    for kind in ONCE {
+        for again in found.iter().filter(|c| c.kind == kind).skip(1) {
+            notes.add(again.offset, Some(kind), WarningKind::Repeated);
+        }
+    }
+}
+
+/// Reports incomplete records and invalid codes.
+pub(super) fn trailing_bytes(here: &Category<'_>, notes: &mut Warnings) {
+    let record = match here.kind {
+        category::SYNC_MANAGER | category::TX_PDO | category::RX_PDO => 8,
+        category::FMMU_DETAILS => 4,
+        category::DC => 24,
+        _ => 1,
+    };
+    let bytes = here.data.len() % record;
+    if bytes != 0 {
+        let at = here.offset + here.data.len() - bytes;
+        notes.add(at, Some(here.kind), WarningKind::LeftOver { bytes, record });
+    }
+    match here.kind {
+        category::FMMU => {
+            for (at, &code) in here.data.iter().enumerate() {
+                // 0 and 0xff: unused.
+                if !matches!(code, 0..=3 | 0xff) {
+                    notes.add(
+                        here.offset + at,
+                        Some(here.kind),
+                        WarningKind::Fmmu { code },
+                    );
+                }
+            }
+        }
+        category::SYNC_MANAGER => {
+            for (n, sm) in here.data.chunks_exact(8).enumerate() {
+                let code = byte(sm, 7);
+                if code > 4 {
+                    let at = here.offset + n * 8 + 7;
+                    notes.add(at, Some(here.kind), WarningKind::SyncManager { code });
+                }
+            }
+        }
+        _ => {}
+    }
+}

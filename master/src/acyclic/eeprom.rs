@@ -1,0 +1,369 @@
+//! The EEPROM interface of one SubDevice: registers 0x0500 to 0x050F (SII clause of ETG.1000.4).
+
+use std::time::Duration;
+
+use super::{Registers, ServiceError};
+use crate::bringup::{AlState, DeviceRef};
+use crate::cancel::CancelToken;
+use crate::mailbox::MailboxTransport;
+use ecaxis_ecat::registers;
+
+/// 0x0500: the PDI has access to the EEPROM; the MainDevice can take it by force.
+const LENT: u8 = 0x01;
+const FORCE: u8 = 0x02;
+/// 0x0501: the PDI is using the EEPROM.
+const IN_USE: u8 = 0x01;
+
+const WRITE_ENABLE: u16 = 0x0001;
+const EIGHT_BYTES: u16 = 0x0040;
+const READ: u16 = 0x0100;
+const WRITE: u16 = 0x0200;
+const RELOAD: u16 = 0x0400;
+const NOT_LOADED: u16 = 0x1000;
+const REFUSED: u16 = 0x2000;
+const NOT_ENABLED: u16 = 0x4000;
+const BUSY: u16 = 0x8000;
+
+/// The word address of the size, in KiBit minus one.
+const SIZE: u32 = 0x3e;
+/// The start of the categories in bytes; the minimum length of an image.
+const HEADER_BYTES: usize = 0x80;
+/// The maximum length of an image in bytes: 4 MiBit, more than the interface can address.
+const MAX_BYTES: usize = 512 * 1024;
+
+const POLL: Duration = Duration::from_micros(200);
+/// The timeout for one word; a write takes at most 10 ms.
+const TIMEOUT: Duration = Duration::from_secs(1);
+/// The number of attempts. A chip that is still writing does not acknowledge.
+const TRIES: u32 = 5;
+const RETRY: Duration = Duration::from_millis(10);
+
+/// An error of the EEPROM interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum EepromError {
+    #[error("the device's own processor is using it")]
+    InUse,
+    #[error("word 0x{word:04x}: still busy after {} ms", TIMEOUT.as_millis())]
+    Busy { word: u32 },
+    #[error("word 0x{word:04x}: the chip does not acknowledge (status 0x{status:04x})")]
+    NotAcknowledged { word: u32, status: u16 },
+    #[error("word 0x{word:04x}: writing is not permitted (status 0x{status:04x})")]
+    WriteProtected { word: u32, status: u16 },
+    /// The chip is smaller than the image: reads beyond its end return its beginning.
+    #[error("the image is longer than the chip, which holds {bytes} bytes")]
+    Smaller { bytes: usize },
+    #[error("word 0x{word:04x}: 0x{wanted:04x} was written, 0x{found:04x} is there")]
+    NotKept { word: u32, wanted: u16, found: u16 },
+}
+
+/// Whether the MainDevice may take the EEPROM from the PDI.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EepromAccess {
+    /// Only if the PDI does not have access.
+    IfFree,
+    Force,
+}
+
+impl EepromAccess {
+    /// Returns the access for an AL state. In Init a device does not need its EEPROM, but some
+    /// MainDevices leave it assigned to the PDI.
+    #[must_use]
+    pub fn of(state: AlState) -> Self {
+        match state {
+            AlState::Init => Self::Force,
+            _ => Self::IfFree,
+        }
+    }
+}
+
+/// Returns the size of a chip in bytes according to its image; the header's length if the image is
+/// too short.
+#[must_use]
+pub fn size_of(image: &[u8]) -> usize {
+    let at = usize::try_from(SIZE * 2).unwrap_or(usize::MAX);
+    let word = image.get(at..).and_then(<[u8]>::first_chunk);
+    word.map_or(HEADER_BYTES, |word| declared_size(*word))
+}
+
+fn declared_size(word: [u8; 2]) -> usize {
+    let kibit = usize::from(u16::from_le_bytes(word)).saturating_add(1);
+    kibit.saturating_mul(128).clamp(HEADER_BYTES, MAX_BYTES)
+}
+
+/// Runs `work` on a device's EEPROM. Afterwards the PDI has its access again, even after an error.
+/// `step` describes the operation.
+///
+/// # Errors
+/// As [`Eeprom::claim`] and [`Eeprom::release`]; [`ServiceError::Stopped`]. Errors of the work take
+/// precedence.
+pub async fn with_eeprom<W: MailboxTransport, T, E: From<ServiceError>>(
+    wire: &W,
+    device: &DeviceRef,
+    step: &'static str,
+    claim: EepromAccess,
+    work: impl AsyncFnOnce(&Eeprom<'_, W>) -> Result<T, E>,
+) -> Result<T, E> {
+    let stop = wire.stop();
+    let whole = async {
+        let eeprom = Eeprom::claim(wire, device, step, claim).await?;
+        let done = match stop.run_until_cancelled(work(&eeprom)).await {
+            Some(done) => done,
+            None => Err(eeprom.stopped().into()),
+        };
+        let back = eeprom.release().await;
+        let done = done?;
+        back?;
+        Ok(done)
+    };
+    stop.shield(whole).await
+}
+
+/// Access to the EEPROM of one device, held until [`Eeprom::release`].
+#[derive(Debug)]
+pub struct Eeprom<'a, W> {
+    registers: Registers<'a, W>,
+    /// 0x0500 before the access.
+    access: u8,
+}
+
+impl<'a, W: MailboxTransport> Eeprom<'a, W> {
+    /// Takes access to the EEPROM. `step` describes the operation.
+    ///
+    /// # Errors
+    /// [`EepromError::InUse`] if the PDI has access and may not lose it.
+    pub async fn claim(
+        wire: &'a W,
+        device: &'a DeviceRef,
+        step: &'static str,
+        claim: EepromAccess,
+    ) -> Result<Self, ServiceError> {
+        let registers = Registers { wire, device, step };
+        let [access, in_use] = registers.read(registers::EEPROM_CONFIGURATION).await?;
+        let eeprom = Self { registers, access };
+        if access & LENT != 0 || in_use & IN_USE != 0 {
+            if claim == EepromAccess::IfFree {
+                return Err(eeprom.failed(EepromError::InUse));
+            }
+            eeprom
+                .registers
+                .write(registers::EEPROM_CONFIGURATION, &[FORCE])
+                .await?;
+            eeprom
+                .registers
+                .write(registers::EEPROM_CONFIGURATION, &[0])
+                .await?;
+        }
+        Ok(eeprom)
+    }
+
+    /// Returns access to the PDI if it had it before.
+    ///
+    /// # Errors
+    /// As [`Registers::write`].
+    pub async fn release(self) -> Result<(), ServiceError> {
+        if self.access & LENT == 0 {
+            return Ok(());
+        }
+        self.registers
+            .write(registers::EEPROM_CONFIGURATION, &[LENT])
+            .await
+    }
+
+    /// Reads bytes from a word on.
+    ///
+    /// # Errors
+    /// [`ServiceError::Eeprom`], and as [`Registers::read`].
+    pub async fn read(&self, word: u32, bytes: &mut [u8]) -> Result<(), ServiceError> {
+        let mut word = word;
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            let status = self.command(word, READ).await?;
+            let data: [u8; 8] = self.registers.read(registers::EEPROM_DATA).await?;
+            let brought = if status & EIGHT_BYTES != 0 { 8 } else { 4 };
+            let (now, later) = rest.split_at_mut(brought.min(rest.len()));
+            for (to, from) in now.iter_mut().zip(data) {
+                *to = from;
+            }
+            rest = later;
+            word = word.saturating_add(if brought == 8 { 4 } else { 2 });
+        }
+        Ok(())
+    }
+
+    /// Reads the image up to the end mark of its categories, independent of its size word. Without
+    /// an end mark, reads everything that can be addressed. `progress` receives the bytes read and
+    /// the expected maximum.
+    ///
+    /// # Errors
+    /// As [`Eeprom::read`].
+    pub async fn image(
+        &self,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Vec<u8>, ServiceError> {
+        let size = self.size().await?;
+        let mut image = vec![0; HEADER_BYTES];
+        self.read(0, &mut image).await?;
+        loop {
+            let at = image.len();
+            progress(at, size.max(at));
+            let Some(head) = self.next(&mut image, MAX_BYTES, 4).await? else {
+                return Ok(image);
+            };
+            let [k0, k1, n0, n1] = head;
+            // The end mark is one word, so the rest is cut off. Zeros beyond the declared size are
+            // not categories.
+            if u16::from_le_bytes([k0, k1]) == 0xffff || head == [0; 4] && at >= size {
+                image.truncate(at + 2);
+                return Ok(image);
+            }
+            let bytes = usize::from(u16::from_le_bytes([n0, n1])) * 2;
+            if self.next(&mut image, MAX_BYTES, bytes).await?.is_none() {
+                return Ok(image);
+            }
+        }
+    }
+
+    /// Reads the whole chip according to its size word, at least the whole image.
+    ///
+    /// # Errors
+    /// As [`Eeprom::read`].
+    pub async fn all(
+        &self,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Vec<u8>, ServiceError> {
+        let size = self.size().await?;
+        let image = self.image(progress).await?;
+        self.longer(image, size, progress).await
+    }
+
+    /// Extends an image to `bytes` bytes, at most what can be addressed.
+    ///
+    /// # Errors
+    /// As [`Eeprom::read`].
+    pub async fn longer(
+        &self,
+        mut image: Vec<u8>,
+        bytes: usize,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Vec<u8>, ServiceError> {
+        let bytes = bytes.min(MAX_BYTES);
+        while image.len() < bytes && self.next(&mut image, bytes, 64).await?.is_some() {
+            progress(image.len(), bytes);
+        }
+        Ok(image)
+    }
+
+    /// Returns the size of the chip in bytes according to its size word.
+    ///
+    /// # Errors
+    /// As [`Eeprom::read`].
+    pub async fn size(&self) -> Result<usize, ServiceError> {
+        let mut size = [0; 2];
+        self.read(SIZE, &mut size).await?;
+        Ok(declared_size(size))
+    }
+
+    /// Appends up to `bytes` bytes, `size` in total; returns `None` at the end.
+    async fn next(
+        &self,
+        image: &mut Vec<u8>,
+        size: usize,
+        bytes: usize,
+    ) -> Result<Option<[u8; 4]>, ServiceError> {
+        let at = image.len();
+        let end = at.saturating_add(bytes).min(size);
+        if end == at && bytes > 0 {
+            return Ok(None);
+        }
+        image.resize(end, 0xff);
+        let word = u32::try_from(at / 2).unwrap_or(u32::MAX);
+        let new = image.get_mut(at..).unwrap_or_default();
+        self.read(word, new).await?;
+        let mut head = [0xff; 4];
+        for (to, from) in head.iter_mut().zip(new) {
+            *to = *from;
+        }
+        Ok(Some(head))
+    }
+
+    /// Writes one word without reading it back.
+    ///
+    /// # Errors
+    /// [`ServiceError::Eeprom`], and as [`Registers::write`].
+    pub async fn write(&self, word: u32, value: [u8; 2]) -> Result<(), ServiceError> {
+        self.registers.write(registers::EEPROM_DATA, &value).await?;
+        self.command(word, WRITE | WRITE_ENABLE).await.map(drop)
+    }
+
+    /// Makes the controller reload its configuration. The alias may take effect only later.
+    ///
+    /// # Errors
+    /// As [`Eeprom::write`].
+    pub async fn reload(&self) -> Result<(), ServiceError> {
+        self.command(0, RELOAD).await.map(drop)
+    }
+
+    /// Runs a command and returns the status when it is done.
+    async fn command(&self, word: u32, command: u16) -> Result<u16, ServiceError> {
+        let [c0, c1] = command.to_le_bytes();
+        let [a0, a1, a2, a3] = word.to_le_bytes();
+        let mut status = 0;
+        for attempt in 0..TRIES {
+            if attempt > 0 {
+                self.registers.wire.delay(RETRY).await;
+            }
+            self.registers
+                .write(registers::EEPROM_CONTROL, &[c0, c1, a0, a1, a2, a3])
+                .await?;
+            status = self.done(word).await?;
+            let failed = status & (REFUSED | NOT_ENABLED);
+            if failed == 0 {
+                return Ok(status);
+            }
+            // The error remains until an empty command is written.
+            self.registers
+                .write(registers::EEPROM_CONTROL, &[0, 0])
+                .await?;
+            if failed & NOT_ENABLED != 0 {
+                return Err(self.failed(EepromError::WriteProtected { word, status }));
+            }
+        }
+        Err(self.failed(EepromError::NotAcknowledged { word, status }))
+    }
+
+    async fn done(&self, word: u32) -> Result<u16, ServiceError> {
+        let wire = self.registers.wire;
+        let time = u64::try_from(TIMEOUT.as_nanos()).unwrap_or(u64::MAX);
+        let end = wire.now().saturating_add(time);
+        loop {
+            let status = u16::from_le_bytes(self.registers.read(registers::EEPROM_CONTROL).await?);
+            if status & BUSY == 0 {
+                // Reads work even if the controller failed to load its own configuration.
+                return Ok(status & !NOT_LOADED);
+            }
+            if wire.now() >= end {
+                return Err(self.failed(EepromError::Busy { word }));
+            }
+            wire.delay(POLL).await;
+        }
+    }
+
+    pub(super) fn stop(&self) -> &CancelToken {
+        self.registers.wire.stop()
+    }
+
+    pub(super) fn stopped(&self) -> ServiceError {
+        ServiceError::Stopped {
+            device: self.registers.device.clone(),
+            step: self.registers.step,
+        }
+    }
+
+    pub(super) fn failed(&self, source: EepromError) -> ServiceError {
+        ServiceError::Eeprom {
+            device: self.registers.device.clone(),
+            step: self.registers.step,
+            source,
+        }
+    }
+}

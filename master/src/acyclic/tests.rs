@@ -1,0 +1,548 @@
+//! Tests on a simulated segment in virtual time, without a bring-up.
+
+use std::cell::Cell;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use ecaxis_esi::sii;
+
+use super::device::{information, locate, with_mailbox};
+use super::eeprom::{Eeprom, EepromAccess, EepromError, with_eeprom};
+use super::enumerate::{DeviceSelector, EnumeratedDevice, address, enumerate};
+use super::image::{WriteError, write};
+use super::{DatagramClient, ServiceError, mailbox, run_on_link};
+use crate::bringup::{AlState, DeviceRef};
+use crate::clock::Clock;
+use crate::config::{self, Locator};
+use crate::link::sim::SimLink;
+use crate::mailbox::{DatagramError, MailboxTransport};
+use crate::parameters::upload::collect;
+use crate::session::{RunError, simulated_bus};
+
+/// Runs `work` on a segment of two drives.
+fn with_drives<T: Send + 'static>(
+    work: impl AsyncFnOnce(DatagramClient) -> T + Send + 'static,
+) -> (T, SimLink) {
+    let there = std::thread::Builder::new().stack_size(super::STACK);
+    let done = there.spawn(move || {
+        Clock::Virtual.enter();
+        let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+        let machine = config::load(&demo).expect("a machine");
+        let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
+        let done = run_on_link(&mut link, Clock::Virtual, &AtomicBool::new(false), work);
+        (done.expect("carried"), link)
+    });
+    done.expect("a thread").join().expect("no panic")
+}
+
+async fn addressed(wire: &DatagramClient) -> Vec<EnumeratedDevice> {
+    let mut found = enumerate(wire).await.expect("a census");
+    address(wire, &mut found).await.expect("addresses");
+    found
+}
+
+#[test]
+fn address_assigns_addresses_and_keeps_existing_ones() {
+    let ((first, second), _) = with_drives(async |wire| {
+        let before = enumerate(&wire).await.expect("a census");
+        assert_eq!(before.len(), 2);
+        assert!(
+            before
+                .iter()
+                .all(|f| f.station == 0 && f.state == AlState::Init)
+        );
+        let first = addressed(&wire).await;
+        wire.write_at(0, 0x0010, &0x2345_u16.to_le_bytes())
+            .await
+            .expect("written");
+        (first, addressed(&wire).await)
+    });
+    assert_eq!(
+        first.iter().map(|f| f.station).collect::<Vec<_>>(),
+        [0x1000, 0x1001]
+    );
+    assert_eq!(
+        second.iter().map(|f| f.station).collect::<Vec<_>>(),
+        [0x2345, 0x1001]
+    );
+}
+
+#[test]
+fn address_replaces_duplicate_addresses() {
+    let (stations, _) = with_drives(async |wire| {
+        for position in 0..2 {
+            wire.write_at(position, 0x0010, &0x1000_u16.to_le_bytes())
+                .await
+                .expect("written");
+        }
+        addressed(&wire)
+            .await
+            .iter()
+            .map(|f| f.station)
+            .collect::<Vec<_>>()
+    });
+    assert_eq!(stations, [0x1000, 0x1001]);
+}
+
+#[test]
+fn eeprom_reads_image_and_whole_chip() {
+    let (read, link) = with_drives(async |wire| {
+        let found = addressed(&wire).await;
+        let device = found[1].named("y");
+        let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree)
+            .await
+            .expect("free");
+        let mut reported = Vec::new();
+        let image = eeprom
+            .image(&mut |at, of| reported.push((at, of)))
+            .await
+            .expect("read");
+        assert!(reported.iter().all(|(at, of)| at <= of), "{reported:?}");
+        let all = eeprom.all(&mut |_, _| {}).await.expect("read");
+        eeprom.release().await.expect("given back");
+        (image, all)
+    });
+    let (image, all) = read;
+    let there = link.segment().device(1).expect("a device").sii().to_vec();
+    assert_eq!(all.get(..there.len()), Some(&there[..]));
+    assert_eq!(there.get(..image.len()), Some(&image[..]));
+    assert_eq!(sii::parse(&image), sii::parse(&there));
+    assert!(sii::parse(&image).expect("an image").ended);
+}
+
+#[test]
+fn eeprom_writes_a_word() {
+    let (word, _) = with_drives(async |wire| {
+        let found = addressed(&wire).await;
+        let device = found[0].named("x");
+        let eeprom = Eeprom::claim(&wire, &device, "writing", EepromAccess::IfFree)
+            .await
+            .expect("free");
+        eeprom.write(4, [0x34, 0x12]).await.expect("written");
+        let mut word = [0; 2];
+        eeprom.read(4, &mut word).await.expect("read");
+        word
+    });
+    assert_eq!(word, [0x34, 0x12]);
+}
+
+#[test]
+fn eeprom_of_the_pdi_is_claimed_only_by_force_and_released() {
+    let (access, _) = with_drives(async |wire| {
+        let found = addressed(&wire).await;
+        let device = found[0].named("x");
+        wire.write(device.station, 0x0500, &[1])
+            .await
+            .expect("written");
+        let refused = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree).await;
+        assert!(matches!(
+            refused,
+            Err(ServiceError::Eeprom {
+                source: EepromError::InUse,
+                ..
+            })
+        ));
+        let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::Force)
+            .await
+            .expect("taken");
+        let mut vendor = [0; 4];
+        eeprom.read(8, &mut vendor).await.expect("read");
+        assert_ne!(vendor, [0; 4]);
+        eeprom.release().await.expect("given back");
+        let mut access = [0; 1];
+        wire.read(device.station, 0x0500, &mut access)
+            .await
+            .expect("read");
+        access
+    });
+    assert_eq!(access, [1]);
+}
+
+/// A device left in PreOp by another program remembers the counter of that program's last request.
+#[test]
+fn mailbox_of_another_program_answers_the_first_request() {
+    let (answers, _) = with_drives(async |wire| {
+        let found = addressed(&wire).await;
+        let device = found[0].named("x");
+        let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree)
+            .await
+            .expect("free");
+        let image = eeprom.image(&mut |_, _| {}).await.expect("read");
+        eeprom.release().await.expect("given back");
+        let sii = sii::parse(&image).expect("an image");
+        let mut first = mailbox::open(&wire, &device, &sii).await.expect("lent");
+        let mut answers = Vec::new();
+        // The loop covers all seven counter values.
+        for _ in 0..8 {
+            let read = first.coe.upload(&wire, 0x1018, 1, false).await;
+            read.expect("read");
+            let mut next = mailbox::open(&wire, &device, &sii).await.expect("lent");
+            answers.push(next.coe.upload(&wire, 0x1018, 1, false).await);
+            first = next;
+            for _ in 0..answers.len() {
+                let read = first.coe.upload(&wire, 0x1018, 1, false).await;
+                read.expect("read");
+            }
+        }
+        answers
+    });
+    for answer in answers {
+        assert_eq!(answer.expect("an answer").len(), 4);
+    }
+}
+
+#[test]
+fn mailbox_session_restores_init() {
+    let (done, link) = with_drives(async |wire| {
+        let found = addressed(&wire).await;
+        let device = found[0].named("x");
+        let eeprom = Eeprom::claim(&wire, &device, "reading", EepromAccess::IfFree)
+            .await
+            .expect("free");
+        let image = eeprom.image(&mut |_, _| {}).await.expect("read");
+        let sii = sii::parse(&image).expect("an image");
+        let mut lent = mailbox::open(&wire, &device, &sii).await.expect("lent");
+        let vendor = lent
+            .coe
+            .upload(&wire, 0x1018, 1, false)
+            .await
+            .expect("read");
+        // A second session uses the mailbox as configured and leaves the state unchanged.
+        let mut again = mailbox::open(&wire, &device, &sii).await.expect("lent");
+        assert_eq!(again.found, AlState::PreOp);
+        assert_eq!(again.coe.layout(), lent.coe.layout());
+        let same = again
+            .coe
+            .upload(&wire, 0x1018, 1, false)
+            .await
+            .expect("read");
+        again.close(&wire).await.expect("given back");
+        lent.close(&wire).await.expect("given back");
+        (vendor, same, sii.identity.vendor)
+    });
+    assert_eq!(done.0, done.2.to_le_bytes());
+    assert_eq!(done.0, done.1);
+    assert_eq!(
+        link.segment()
+            .device(0)
+            .expect("a device")
+            .al_state()
+            .to_string(),
+        "Init"
+    );
+}
+
+#[test]
+fn device_selector_finds_devices_or_reports_why_not() {
+    let found: Vec<EnumeratedDevice> = [(0, 5), (1, 0), (2, 5)]
+        .map(|(position, alias)| EnumeratedDevice {
+            position,
+            station: 0x1000 + position,
+            alias,
+            state: AlState::Init,
+            error: false,
+            code: 0,
+        })
+        .into();
+    let position = |which: DeviceSelector| {
+        which
+            .select_from(&found)
+            .map(|f| f.position)
+            .map_err(|e| e.to_string())
+    };
+    assert_eq!(position(DeviceSelector::Position(2)), Ok(2));
+    assert_eq!(position(DeviceSelector::Station(0x1001)), Ok(1));
+    assert_eq!(
+        position(DeviceSelector::Position(3)),
+        Err("no SubDevice has position 3; 3 answer, at positions 0 to 2".to_owned())
+    );
+    let nameless = found
+        .get(1..2)
+        .map(<[EnumeratedDevice]>::to_vec)
+        .unwrap_or_default();
+    let nameless = [nameless.clone(), nameless].concat();
+    let none = DeviceSelector::Alias(7)
+        .select_from(&nameless)
+        .map_err(|e| e.to_string());
+    assert_eq!(
+        none.map(|found| found.position),
+        Err("no SubDevice has alias 7; none of the 2 has one".to_owned())
+    );
+    assert_eq!(
+        position(DeviceSelector::Alias(7)),
+        Err("no SubDevice has alias 7; their aliases are 5, 0, 5".to_owned())
+    );
+    assert_eq!(
+        position(DeviceSelector::Alias(5)),
+        Err("2 SubDevices have alias 5: at positions 0, 2".to_owned())
+    );
+}
+
+#[test]
+fn run_on_link_returns_interrupted_when_stopped() {
+    std::thread::spawn(|| {
+        Clock::Virtual.enter();
+        let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+        let machine = config::load(&demo).expect("a machine");
+        let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
+        let stop = AtomicBool::new(true);
+        let done = run_on_link(&mut link, Clock::Virtual, &stop, async |wire| {
+            enumerate(&wire).await
+        });
+        assert!(matches!(done, Err(RunError::Interrupted)));
+    })
+    .join()
+    .expect("no panic");
+}
+
+/// Runs `work` on the first of two drives until `stop` is set. Returns the AL state and 0x0500
+/// afterwards. 0x0500 is `access` before.
+fn stopped<T: Send + 'static>(
+    access: u8,
+    work: impl AsyncFnOnce(DatagramClient, EnumeratedDevice, DeviceRef, &AtomicBool) -> T
+    + Send
+    + 'static,
+) -> (Result<T, RunError>, (String, u8), Vec<u8>) {
+    let there = std::thread::Builder::new().stack_size(super::STACK);
+    let done = there.spawn(move || {
+        Clock::Virtual.enter();
+        let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+        let machine = config::load(&demo).expect("a machine");
+        let mut link = SimLink::new(simulated_bus(&machine, 1, None, None).expect("a bus"));
+        let stop = AtomicBool::new(false);
+        let done = run_on_link(
+            &mut link,
+            Clock::Virtual,
+            &stop,
+            async |wire: DatagramClient| {
+                let at = locate(&wire, Locator::Position(0), None).await;
+                let (found, device) = at.expect("located");
+                let written = wire.write(device.station, 0x0500, &[access]).await;
+                assert_eq!(written, Ok(1));
+                work(wire, found, device, &stop).await
+            },
+        );
+        let never = AtomicBool::new(false);
+        let access = run_on_link(&mut link, Clock::Virtual, &never, async |wire| {
+            let mut access = [0];
+            let read = wire.read_at(0, 0x0500, &mut access).await;
+            read.map(|_| access[0]).expect("read")
+        });
+        let device = link.segment().device(0).expect("a device");
+        let left = (device.al_state().to_string(), access.expect("carried"));
+        (done, left, device.sii().to_vec())
+    });
+    done.expect("a thread").join().expect("no panic")
+}
+
+#[test]
+fn with_mailbox_restores_the_device_when_stopped() {
+    for access in [0, 1] {
+        let work = async |wire: DatagramClient,
+                          found: EnumeratedDevice,
+                          at: DeviceRef,
+                          stop: &AtomicBool| {
+            let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
+            let machine = config::load(&demo).expect("a machine");
+            let dictionary = &machine.devices[0].selection.dictionary;
+            let sii = information(&wire, &found, &at).await?;
+            let mut reached = 0;
+            let step = "reading its parameters";
+            let all = with_mailbox(&wire, &at, &sii, step, async |lent| {
+                let mut progress = |n, _| {
+                    reached = n;
+                    stop.store(n >= 10, Ordering::Relaxed);
+                };
+                collect(&mut lent.coe, &wire, &at, dictionary, &mut progress).await
+            });
+            let ended = all.await;
+            assert_eq!(reached, 10, "at once");
+            ended
+        };
+        let (done, left, _) = stopped(access, work);
+        let error = done.expect("a report").expect_err("ended");
+        assert_eq!(
+            error.to_string(),
+            "`device 0` (position 0, station 0x1000): reading its parameters: interrupted"
+        );
+        assert_eq!(left, ("Init".to_owned(), access));
+    }
+}
+
+#[test]
+fn with_eeprom_restores_access_when_stopped() {
+    let (done, left, _) = stopped(1, async |wire, found: EnumeratedDevice, at, stop| {
+        let claim = EepromAccess::of(found.state);
+        let read = with_eeprom(&wire, &at, "reading its EEPROM", claim, async |eeprom| {
+            let mut reported = 0;
+            let mut progress = |_, _| {
+                reported += 1;
+                stop.store(reported == 3, Ordering::Relaxed);
+            };
+            eeprom.image(&mut progress).await
+        });
+        read.await
+    });
+    let error = done.expect("a report").expect_err("ended");
+    assert!(matches!(error, ServiceError::Stopped { .. }), "{error}");
+    assert!(
+        error
+            .to_string()
+            .contains("reading its EEPROM: interrupted")
+    );
+    assert_eq!(left, ("Init".to_owned(), 1));
+}
+
+/// Returns the first drive's image with ten changed words in a reserved area.
+fn changed(there: &[u8]) -> Vec<u8> {
+    let mut image = there.to_vec();
+    for byte in &mut image[0x50..0x64] {
+        *byte ^= 0x5a;
+    }
+    image
+}
+
+#[test]
+fn eeprom_write_completes_after_its_first_word() {
+    // Ten words; after the first written word, `stop` has no effect.
+    for stop_at in [0, 5] {
+        let (done, left, sii) = stopped(1, async move |wire, found: EnumeratedDevice, at, stop| {
+            let claim = EepromAccess::of(found.state);
+            let written = with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
+                let image = changed(&eeprom.image(&mut |_, _| {}).await?);
+                let mut progress = |n, _| stop.store(n == stop_at, Ordering::Relaxed);
+                let written = write(eeprom, &image, &mut progress).await;
+                Ok::<_, ServiceError>((written.map_err(|e| e.to_string()), image))
+            });
+            written.await
+        });
+        let (written, image) = done.expect("a report").expect("written");
+        assert_eq!(written, Ok(10), "stopped at {stop_at}");
+        assert_eq!(sii[..image.len()], image);
+        assert_eq!(left, ("Init".to_owned(), 1));
+    }
+}
+
+/// A transport that loses datagrams. `loses` decides for each one, from its register and the data
+/// to write.
+struct Lossy<'w, F> {
+    wire: &'w DatagramClient,
+    loses: F,
+}
+
+impl<F: Fn(u16, Option<&[u8]>) -> bool> MailboxTransport for Lossy<'_, F> {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
+        match (self.loses)(register, None) {
+            true => Err(DatagramError::Timeout { station, register }),
+            false => self.wire.read(station, register, buf).await,
+        }
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        match (self.loses)(register, Some(data)) {
+            true => Err(DatagramError::Timeout { station, register }),
+            false => self.wire.write(station, register, data).await,
+        }
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.wire.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.wire.now()
+    }
+}
+
+#[test]
+fn eeprom_write_error_reports_the_words_written() {
+    for (words, reported) in [
+        (0, "; nothing was written"),
+        (6, "; 6 of 10 words were written"),
+    ] {
+        let (done, _, _) = stopped(0, async move |wire, _, at, _| {
+            // All datagrams from the word after `words` on are lost.
+            let (left, is_cut) = (Cell::<usize>::new(words), Cell::new(false));
+            let cut = Lossy {
+                wire: &wire,
+                loses: |register, written: Option<&[u8]>| {
+                    if register == 0x0508 && written.is_some() {
+                        is_cut.set(is_cut.get() || left.get() == 0);
+                        left.set(left.get().saturating_sub(1));
+                    }
+                    is_cut.get()
+                },
+            };
+            let claim = EepromAccess::IfFree;
+            let written = with_eeprom(&cut, &at, "writing its EEPROM", claim, async |eeprom| {
+                let image = changed(&eeprom.image(&mut |_, _| {}).await?);
+                Ok::<_, ServiceError>(write(eeprom, &image, &mut |_, _| {}).await)
+            });
+            written.await
+        });
+        let failed: Result<usize, WriteError> = done.expect("a report").expect("a result");
+        let error = failed.expect_err("cut");
+        assert_eq!((error.written, error.of), (words, 10));
+        let text = error.to_string();
+        assert!(
+            text.contains("writing its EEPROM") && text.ends_with(reported),
+            "{text}"
+        );
+    }
+}
+
+/// A small chip ignores the upper address bits: addresses beyond its end wrap around to its
+/// beginning.
+#[test]
+fn eeprom_write_rejects_an_image_beyond_the_chip() {
+    for more in [4, 2048] {
+        let (done, _, sii) = stopped(0, async move |wire, _, at, _| {
+            let claim = EepromAccess::IfFree;
+            let written = with_eeprom(&wire, &at, "writing its EEPROM", claim, async |eeprom| {
+                let there = eeprom.all(&mut |_, _| {}).await?;
+                let mut image = changed(&there);
+                image.resize(there.len() + more, 0x5a);
+                Ok::<_, ServiceError>((there, write(eeprom, &image, &mut |_, _| {}).await))
+            });
+            written.await
+        });
+        let (there, failed) = done.expect("a report").expect("a result");
+        let error = failed.expect_err("no room");
+        let smaller = EepromError::Smaller { bytes: there.len() };
+        assert!(
+            matches!(&error.source, ServiceError::Eeprom { source, .. } if *source == smaller),
+            "{error}"
+        );
+        assert_eq!(error.written, 0);
+        assert_eq!(sii, there);
+    }
+}
+
+#[test]
+fn mailbox_open_restores_init_after_a_lost_frame() {
+    let (done, left, _) = stopped(0, async |wire, found, at, _| {
+        let sii = information(&wire, &found, &at).await?;
+        // The first answer after the request for PreOp is lost.
+        let asked = Cell::new(false);
+        let lossy = Lossy {
+            wire: &wire,
+            loses: |register, written: Option<&[u8]>| match written {
+                None => asked.take(),
+                Some(data) => {
+                    asked.set((register, data) == (0x0120, &[2, 0][..]));
+                    false
+                }
+            },
+        };
+        mailbox::open(&lossy, &at, &sii).await.map(|_| ())
+    });
+    let error = done.expect("carried").expect_err("a frame was lost");
+    assert!(matches!(error, ServiceError::State(_)), "{error}");
+    assert_eq!(left, ("Init".to_owned(), 0));
+}

@@ -1,0 +1,120 @@
+//! The problems of a report, worst first.
+
+use super::{CycleReport, Report, WkcRun, called};
+use crate::html::time;
+
+/// Clocks with a larger difference in ns are not synchronized.
+const CLOCK_NS: u64 = 10_000;
+/// The maximum number of lines of one kind; further ones are counted.
+const LINES: usize = 5;
+
+fn plural(count: u64, one: &str, many: &str) -> String {
+    if count == 1 {
+        format!("1 {one}")
+    } else {
+        format!("{count} {many}")
+    }
+}
+
+pub(super) fn of(report: &Report) -> Vec<String> {
+    let mut found = Vec::new();
+    let file = &report.file;
+    if file.ethercat_frames == 0 {
+        found.push("there is no EtherCAT in this file".to_owned());
+    } else if file.answered == 0 {
+        found.push(
+            "no frame came back: no device answered, or the recording shows only what was sent"
+                .to_owned(),
+        );
+    }
+    story(report, &mut found);
+    if file.lost > 0 && file.answered > 0 {
+        found.push(format!(
+            "{} of {} sent did not come back",
+            plural(file.lost, "frame", "frames"),
+            file.sent
+        ));
+    }
+    for cycle in report.cycle.iter().take(LINES) {
+        let name = format!("{} 0x{:08x}", cycle.command, cycle.logical_address);
+        let (odd, first) = odd(cycle);
+        if odd > 0 {
+            found.push(format!(
+                "{name}: {} another working counter than {}, the first at {first:.6} s",
+                plural(odd, "cycle has", "cycles have"),
+                cycle.usual_wkc.unwrap_or(0)
+            ));
+        }
+        if let Some((at, longest)) = cycle.gaps.first() {
+            found.push(format!(
+                "{name}: {} longer than the cycle of {}, the longest {} at {at:.6} s",
+                plural(cycle.gaps.len() as u64, "interval is", "intervals are"),
+                time(cycle.cycle_ns),
+                time(*longest),
+            ));
+        }
+    }
+    for (place, device) in report.devices.iter().enumerate() {
+        if !device.errors.is_empty() {
+            let counters: Vec<String> = device
+                .errors
+                .iter()
+                .map(|(what, count)| format!("{count} {what}"))
+                .collect();
+            found.push(format!(
+                "{}: {}",
+                called(place, device),
+                counters.join(", ")
+            ));
+        }
+    }
+    for clock in report
+        .clocks
+        .differences
+        .iter()
+        .filter(|clock| clock.last_ns.unsigned_abs() > CLOCK_NS)
+        .take(LINES)
+    {
+        found.push(format!(
+            "the clock of station 0x{:04x} is {} from the reference",
+            clock.station,
+            time(clock.last_ns.unsigned_abs())
+        ));
+    }
+    found
+}
+
+/// Returns the number of cycles with an unusual working counter and the time of the first. Cycles
+/// before the first and after the last usual one are excluded: devices start up or shut down there.
+fn odd(cycle: &CycleReport) -> (u64, f64) {
+    let usual = |run: &WkcRun| run.wkc == cycle.usual_wkc;
+    let first = cycle.runs.iter().position(usual).unwrap_or(0);
+    let last = cycle.runs.iter().rposition(usual).unwrap_or(0);
+    let between = cycle.runs.iter().take(last).skip(first);
+    let odd: Vec<&WkcRun> = between
+        .filter(|run| run.wkc.is_some() && !usual(run))
+        .collect();
+    let count = odd.iter().map(|run| run.cycles).sum();
+    (count, odd.first().map_or(0.0, |run| run.at))
+}
+
+/// Adds AL errors, refused transfers, emergencies and faults in order of occurrence.
+fn story(report: &Report, found: &mut Vec<String>) {
+    let troubles: Vec<_> = report.story.iter().filter(|line| line.trouble).collect();
+    for line in troubles.iter().take(LINES) {
+        let names = line
+            .devices
+            .iter()
+            .filter_map(|n| Some(called(*n, report.devices.get(*n)?)));
+        let names: Vec<String> = names.take(LINES).collect();
+        found.push(format!(
+            "{:.6} s, {}: {}",
+            line.at,
+            names.join(", "),
+            line.text
+        ));
+    }
+    if let Some(more @ 1..) = troubles.len().checked_sub(LINES) {
+        found.push(format!("{more} more such events"));
+    }
+}

@@ -1,0 +1,111 @@
+//! The units of a drive (0x608F, 0x6091, 0x6092, 0x60A8–0x60AA, 0x6076, 0x607E; maxon's 0x3001:05).
+//! They are read after the start-up SDOs and before the first target is sent.
+
+use ecaxis_axis::scale::DriveUnits;
+
+use super::{BringUpError, BusDevice, Step, device};
+use crate::config::{DeviceConfig, TorqueUnit, is_maxon};
+use crate::mailbox::{CoeClient, MailboxTransport, SdoError};
+
+/// Adopts the drive's units where the configuration only assumed them. Rejects units that would
+/// move the axis wrongly.
+pub(super) async fn compare(
+    wire: &impl MailboxTransport,
+    config: &DeviceConfig,
+    device: &mut BusDevice,
+    progress: &mut dyn FnMut(Step),
+) -> Result<(), BringUpError> {
+    let (Some(axis), Some(coe)) = (&config.axis, device.coe.as_mut()) else {
+        return Ok(());
+    };
+    let torque = &axis.torque;
+    let constant = torque.unit == TorqueUnit::Amperes || torque.constant.is_some();
+    let constant = constant && is_maxon(&config.selection);
+    let offered = ask(wire, coe, constant)
+        .await
+        .map_err(|source| BringUpError::ReadUnits {
+            device: device.at.clone(),
+            source,
+        })?;
+    tracing::debug!(device = %device.at, "{offered:?}");
+    let adopted = axis.adopt(&offered);
+    if !adopted.wrong.is_empty() {
+        return Err(BringUpError::Units {
+            device: device.at.clone(),
+            problems: adopted.wrong,
+        });
+    }
+    for what in &adopted.taken {
+        progress(Step::Adopted {
+            device: config.name.clone(),
+            what: what.clone(),
+        });
+    }
+    for found in &adopted.doubtful {
+        progress(Step::Warning(format!(
+            "{}: {found}: {}",
+            device.at,
+            found.advice()
+        )));
+    }
+    for sdo in adopted.changed(&config.selection.startup) {
+        device::download(wire, &device.at, coe, &sdo).await?;
+    }
+    device.adopted = Some(Box::new(adopted));
+    Ok(())
+}
+
+/// If `constant`, also reads the motor's torque constant.
+pub(crate) async fn ask(
+    wire: &impl MailboxTransport,
+    coe: &mut CoeClient,
+    constant: bool,
+) -> Result<DriveUnits, SdoError> {
+    Ok(DriveUnits {
+        encoder_resolution: ratio(wire, coe, 0x608f).await?,
+        gear_ratio: ratio(wire, coe, 0x6091).await?,
+        feed_constant: ratio(wire, coe, 0x6092).await?,
+        position_unit: value(wire, coe, 0x60a8, 0).await?,
+        velocity_unit: value(wire, coe, 0x60a9, 0).await?,
+        acceleration_unit: value(wire, coe, 0x60aa, 0).await?,
+        rated_torque: value(wire, coe, 0x6076, 0).await?,
+        torque_constant: match constant {
+            true => value(wire, coe, 0x3001, 5).await?,
+            false => None,
+        },
+        polarity: value(wire, coe, 0x607e, 0)
+            .await?
+            .map(|n| n.to_le_bytes()[0]),
+    })
+}
+
+async fn ratio(
+    wire: &impl MailboxTransport,
+    coe: &mut CoeClient,
+    index: u16,
+) -> Result<Option<[u32; 2]>, SdoError> {
+    let Some(above) = value(wire, coe, index, 1).await? else {
+        return Ok(None);
+    };
+    let below = value(wire, coe, index, 2).await?;
+    Ok(below.map(|below| [above, below]))
+}
+
+/// Returns `None` if the drive does not have the object or does not allow reading it.
+pub(crate) async fn value(
+    wire: &impl MailboxTransport,
+    coe: &mut CoeClient,
+    index: u16,
+    sub: u8,
+) -> Result<Option<u32>, SdoError> {
+    match coe.upload(wire, index, sub, false).await {
+        Ok(data) => Ok(Some(
+            data.iter()
+                .take(4)
+                .rev()
+                .fold(0, |value, byte| value << 8 | u32::from(*byte)),
+        )),
+        Err(SdoError::Abort { .. }) => Ok(None),
+        Err(error) => Err(error),
+    }
+}

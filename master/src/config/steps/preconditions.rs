@@ -1,0 +1,472 @@
+//! Simulates the program before the bus starts and finds steps that are certain to fail.
+//!
+//! The state of an axis before a step (mode, power, master, position) is either known exactly or
+//! unknown. Only a known state rejects a step. The axis would reject such a step as well, but only
+//! after all steps before it.
+
+use ecaxis_axis::Mode;
+
+use super::ProgramChecker;
+use super::target::TargetKind;
+use crate::config::problem::{Problems, Span};
+use crate::config::{Action, AxisSetup, Step};
+
+/// The maximum number of steps checked, with repetitions expanded.
+const MOST_VISITS: u32 = 200_000;
+
+/// The tolerance for comparing range ends with sums of the file's numbers.
+const ROUNDING: f64 = 1e-9;
+
+/// Returns `true` if the program itself enables axes.
+pub(crate) fn enables(steps: &[Step]) -> bool {
+    steps.iter().any(|step| match &step.action {
+        Action::Enable { .. } => true,
+        Action::Repeat { steps, .. } => enables(steps),
+        _ => false,
+    })
+}
+
+/// The state of an axis between two steps.
+#[derive(Debug, Clone, PartialEq)]
+struct State {
+    mode: Mode,
+    /// The step that switched the mode.
+    switched_by: Option<String>,
+    power: bool,
+    /// The step that removed the power.
+    disabled_by: Option<String>,
+    /// The step since which the axis follows another axis.
+    follows_since: Option<String>,
+    /// The step since which the axis moves at constant velocity, unless the end of its range may
+    /// have stopped it.
+    turns_since: Option<String>,
+    /// The position of its set-point after arrival, if known.
+    position: Option<f64>,
+    /// `true` after a rejected step: later steps are not reached.
+    given_up: bool,
+}
+
+/// What a step requires of an axis.
+#[derive(Debug, Clone, Copy)]
+struct Precondition {
+    verb: &'static str,
+    what: Option<TargetKind>,
+    /// The axis must be at rest.
+    rest: bool,
+    /// The axis must not follow another axis.
+    free: bool,
+}
+
+struct ProgramState<'w, 'c, 'p, 's> {
+    checker: &'w ProgramChecker<'c>,
+    axes: Vec<Option<State>>,
+    visits: u32,
+    /// `true` if a step is being repeated.
+    again: bool,
+    p: &'p mut Problems<'s>,
+}
+
+impl ProgramChecker<'_> {
+    pub(super) fn flow(&self, steps: &[Step], repeat: u32, p: &mut Problems<'_>) {
+        let power = !enables(steps);
+        let axes = self.devices.iter().map(|device| {
+            let axis = device.axis.ok()?;
+            Some(State {
+                mode: axis.config.mode,
+                switched_by: None,
+                power,
+                disabled_by: None,
+                follows_since: None,
+                turns_since: None,
+                position: None,
+                given_up: false,
+            })
+        });
+        let mut walk = ProgramState {
+            checker: self,
+            axes: axes.collect(),
+            visits: 0,
+            again: false,
+            p,
+        };
+        walk.times(repeat, steps);
+    }
+}
+
+impl ProgramState<'_, '_, '_, '_> {
+    /// Runs the steps repeatedly until a round changes nothing.
+    fn times(&mut self, times: u32, steps: &[Step]) {
+        let again = self.again;
+        for round in 0..times {
+            let before = self.axes.clone();
+            self.again = again || round > 0;
+            for step in steps {
+                self.visits += 1;
+                if self.visits > MOST_VISITS {
+                    return;
+                }
+                self.step(step);
+            }
+            if self.axes == before {
+                break;
+            }
+        }
+        self.again = again;
+    }
+
+    fn step(&mut self, step: &Step) {
+        let number = &step.number;
+        match &step.action {
+            Action::Repeat { times, steps } => self.times(*times, steps),
+            Action::Enable { axes } => self.each(axes, |state| {
+                if !state.power {
+                    state.power = true;
+                    state.position = None;
+                }
+            }),
+            Action::Disable { axes } => self.each(axes, |state| {
+                state.power = false;
+                state.disabled_by = Some(number.clone());
+                state.stops();
+            }),
+            Action::Stop { axes } => self.each(axes, State::stops),
+            Action::Home { axes } => {
+                let need = Precondition {
+                    verb: "home",
+                    what: None,
+                    rest: true,
+                    free: true,
+                };
+                for &axis in axes {
+                    self.need(step, axis, need);
+                }
+                self.each(axes, State::stops);
+            }
+            Action::Move {
+                relative,
+                targets,
+                together,
+                ..
+            } => {
+                let what = if *together {
+                    TargetKind::SetPoint
+                } else {
+                    TargetKind::Position
+                };
+                let verb = if *relative { "move_by" } else { "move" };
+                let verb = match (together, relative) {
+                    (true, true) => "move_by` with `arrive = \"together\"",
+                    (true, false) => "move` with `arrive = \"together\"",
+                    _ => verb,
+                };
+                self.moved(step, verb, what, *together, *relative, targets);
+            }
+            Action::Line {
+                relative, targets, ..
+            } => {
+                let verb = if *relative { "line_by" } else { "line" };
+                self.moved(step, verb, TargetKind::SetPoint, true, *relative, targets);
+            }
+            Action::Probe {
+                axis,
+                relative,
+                target,
+                ..
+            } => {
+                let targets = [(*axis, *target)];
+                self.moved(
+                    step,
+                    "probe",
+                    TargetKind::Position,
+                    false,
+                    *relative,
+                    &targets,
+                );
+                // The position of the edge is unknown.
+                self.each(&[*axis], |state| state.position = None);
+            }
+            Action::Wave { axis, .. } => {
+                self.follow_setpoints(step, "sine` or `square", *axis, true)
+            }
+            Action::Table { axis, .. } => self.follow_setpoints(step, "table", *axis, false),
+            Action::Gear { axis, master, .. } => {
+                let need = Precondition {
+                    verb: "gear",
+                    what: None,
+                    rest: false,
+                    free: false,
+                };
+                self.need(step, *master, need);
+                self.follow_setpoints(step, "gear", *axis, false);
+                self.each(&[*axis], |state| {
+                    state.follows_since = Some(number.clone());
+                    state.position = None;
+                });
+            }
+            Action::Velocity { targets, .. } => {
+                for &(axis, velocity) in targets {
+                    self.need(
+                        step,
+                        axis,
+                        Precondition::of("velocity", TargetKind::Velocity),
+                    );
+                    let endless = self.limits(axis).is_none();
+                    self.each(&[axis], |state| {
+                        state.stops();
+                        let turns = endless && velocity != 0.0;
+                        state.turns_since = turns.then(|| number.clone());
+                    });
+                }
+            }
+            Action::Torque { targets, .. } => {
+                for &(axis, _) in targets {
+                    self.need(step, axis, Precondition::of("torque", TargetKind::Torque));
+                    self.each(&[axis], State::stops);
+                }
+            }
+            Action::Mode { targets } => {
+                for &(axis, mode) in targets {
+                    self.switch(step, axis, mode);
+                }
+            }
+            Action::Reset { .. }
+            | Action::Dwell { .. }
+            | Action::Wait { .. }
+            | Action::Set { .. } => {}
+        }
+    }
+
+    fn switch(&mut self, step: &Step, axis: usize, mode: Mode) {
+        let powered = self.state(axis).is_some_and(|s| s.power);
+        if powered {
+            let need = Precondition {
+                verb: "mode",
+                what: None,
+                rest: mode == Mode::Pp,
+                free: true,
+            };
+            self.need(step, axis, need);
+        }
+        self.each(&[axis], |state| {
+            if state.mode != mode {
+                state.mode = mode;
+                state.switched_by = Some(step.number.clone());
+                state.position = None;
+            }
+            // Whether the motion continues depends on the mode.
+            state.turns_since = None;
+        });
+    }
+
+    /// Handles a step that ends with its axes at their targets.
+    fn moved(
+        &mut self,
+        step: &Step,
+        verb: &'static str,
+        what: TargetKind,
+        rest: bool,
+        relative: bool,
+        targets: &[(usize, f64)],
+    ) {
+        for &(axis, target) in targets {
+            self.need(
+                step,
+                axis,
+                Precondition {
+                    rest,
+                    ..Precondition::of(verb, what)
+                },
+            );
+            let from = self.state(axis).and_then(|state| state.position);
+            let to = if relative {
+                from.map(|from| from + target)
+            } else {
+                Some(target)
+            };
+            if let (Some([low, high]), Some(to), Some(from), true) =
+                (self.limits(axis), to, from, relative)
+            {
+                let rounding = ROUNDING * (high - low);
+                if to < low - rounding || to > high + rounding {
+                    let unit = self.axis(axis).map_or("", |axis| axis.unit.as_str());
+                    let message = format!(
+                        "`{verb}` of {target} {unit} leads `{}` from {from} to {to} {unit}, outside its limits, {low} to {high} {unit}{}",
+                        self.name(axis),
+                        self.round(),
+                    );
+                    let hint = "go back before, or repeat it less often";
+                    self.refuse(step, axis, message, hint.to_owned());
+                }
+            }
+            let modulo = self
+                .axis(axis)
+                .is_some_and(|axis| axis.config.scale.modulo().is_some());
+            self.each(&[axis], |state| {
+                state.stops();
+                state.position = to.filter(|_| !modulo);
+            });
+        }
+    }
+
+    /// Handles a step that sets every set-point of an axis. `back`: it ends where it began.
+    fn follow_setpoints(&mut self, step: &Step, verb: &'static str, axis: usize, back: bool) {
+        self.need(step, axis, Precondition::of(verb, TargetKind::SetPoint));
+        self.each(&[axis], |state| {
+            let position = state.position.filter(|_| back);
+            state.stops();
+            state.position = position;
+        });
+    }
+
+    fn each(&mut self, axes: &[usize], change: impl Fn(&mut State)) {
+        for &axis in axes {
+            if let Some(Some(state)) = self.axes.get_mut(axis) {
+                change(state);
+            }
+        }
+    }
+
+    fn state(&self, axis: usize) -> Option<&State> {
+        self.axes.get(axis)?.as_ref()
+    }
+
+    fn axis(&self, axis: usize) -> Option<&AxisSetup> {
+        self.checker.devices.get(axis)?.axis.ok()
+    }
+
+    fn limits(&self, axis: usize) -> Option<[f64; 2]> {
+        self.axis(axis)?.config.limits.position
+    }
+
+    fn name(&self, axis: usize) -> &str {
+        self.checker.devices.get(axis).map_or("", |d| d.name)
+    }
+
+    fn round(&self) -> &'static str {
+        if self.again {
+            ", when it is repeated"
+        } else {
+            ""
+        }
+    }
+
+    /// Rejects the step if the axis cannot run it.
+    fn need(&mut self, step: &Step, axis: usize, need: Precondition) {
+        let (Some(state), Some(setup)) = (self.state(axis), self.axis(axis)) else {
+            return;
+        };
+        let (name, round, verb) = (self.name(axis), self.round(), need.verb);
+        let (message, hint) = if !state.power {
+            let message = match &state.disabled_by {
+                Some(by) => format!(
+                    "`{verb}` needs `{name}` to have power, which step {by} has taken away{round}"
+                ),
+                None => format!(
+                    "`{verb}` needs `{name}` to have power, and no step before has enabled it{round}"
+                ),
+            };
+            let hint = format!("let a step enable it before: `enable = [\"{name}\"]`");
+            (message, hint)
+        } else if let Some(by) = state.follows_since.as_ref().filter(|_| need.free) {
+            let message = format!(
+                "`{verb}` needs `{name}` to be free, but since step {by} it follows another axis{round}"
+            );
+            (
+                message,
+                format!("let a step stop it before: `stop = [\"{name}\"]`"),
+            )
+        } else if let Some(by) = state.turns_since.as_ref().filter(|_| need.rest) {
+            let message =
+                format!("`{verb}` needs `{name}` at rest, but since step {by} it turns{round}");
+            let hint = format!(
+                "let a step stop it before: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
+            );
+            (message, hint)
+        } else if let Some(what) = need.what.filter(|what| !what.possible(state.mode, setup)) {
+            let by = match &state.switched_by {
+                Some(by) => format!(", to which step {by} has switched it"),
+                None => String::new(),
+            };
+            let message = format!(
+                "`{verb}` is nothing that `{name}` does in mode \"{}\"{by}{round}",
+                word(state.mode)
+            );
+            (message, better(name, setup, what))
+        } else {
+            return;
+        };
+        self.refuse(step, axis, message, hint);
+    }
+
+    fn refuse(&mut self, step: &Step, axis: usize, message: String, hint: String) {
+        let Some(Some(state)) = self.axes.get_mut(axis) else {
+            return;
+        };
+        if !std::mem::replace(&mut state.given_up, true) {
+            let at = self.checker.place(&step.number, axis);
+            self.p.add_hint(at, message, hint);
+        }
+    }
+}
+
+impl Precondition {
+    const fn of(verb: &'static str, what: TargetKind) -> Self {
+        Self {
+            verb,
+            what: Some(what),
+            rest: false,
+            free: false,
+        }
+    }
+}
+
+impl State {
+    /// Ends the previous motion because of a new command.
+    fn stops(&mut self) {
+        self.follows_since = None;
+        self.turns_since = None;
+        self.position = None;
+    }
+}
+
+impl ProgramChecker<'_> {
+    /// Returns the place of the axis's name in a step, otherwise of the step.
+    fn place(&self, number: &str, axis: usize) -> Span {
+        let places = self.places.borrow();
+        let of = |axis| places.get(&(number.to_owned(), axis)).cloned();
+        of(Some(axis)).or_else(|| of(None)).unwrap_or_default()
+    }
+}
+
+/// Returns the mode as the machine file writes it.
+fn word(mode: Mode) -> String {
+    ecaxis_esi::Mode::ALL
+        .into_iter()
+        .find(|known| known.code() == mode.code())
+        .map_or_else(|| mode.to_string(), |known| known.name().to_owned())
+}
+
+/// Returns the mode to switch to, or another remedy.
+fn better(name: &str, setup: &AxisSetup, what: TargetKind) -> String {
+    let modes = ecaxis_esi::Mode::ALL.into_iter().filter(|mode| {
+        let mode = Mode::from_code(mode.code());
+        let offered = setup.config.modes.contains(mode) || setup.config.mode == mode;
+        offered && what.possible(mode, setup)
+    });
+    let names: Vec<String> = modes.map(|mode| format!("\"{}\"", mode.name())).collect();
+    match names.as_slice() {
+        [] => what.impossible(name, setup).1,
+        [first, rest @ ..] => {
+            let more = if rest.is_empty() {
+                String::new()
+            } else {
+                format!(", or {}", rest.join(", "))
+            };
+            format!("let a step switch it before: `mode = {{ {name} = {first} }}`{more}")
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "preconditions_tests.rs"]
+mod tests;

@@ -1,0 +1,251 @@
+//! Raw datagrams through ethercrab's PDU loop: the interface under bring-up, mailboxes and
+//! recovery.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecaxis_ecat::registers;
+use ethercrab::error::Error;
+use ethercrab::{Command, MainDevice};
+
+use crate::cancel::CancelToken;
+use crate::clock::{self, Nanos};
+use crate::mailbox::{DatagramError, MailboxStatus, MailboxTransport};
+use crate::rt::exchange::BusStatus;
+use limiter::InFlightLimiter;
+
+mod limiter;
+
+/// Sends datagrams to configured station addresses, one per frame, in order of request.
+#[derive(Debug, Clone, Copy)]
+pub struct DatagramClient {
+    device: &'static MainDevice<'static>,
+    turns: &'static InFlightLimiter,
+    stop: &'static CancelToken,
+}
+
+impl DatagramClient {
+    /// Copies share one limiter and one cancel token. Both live as long as the MainDevice, that is,
+    /// as long as the process.
+    #[must_use]
+    pub fn new(device: &'static MainDevice<'static>) -> Self {
+        Self {
+            device,
+            turns: Box::leak(Box::default()),
+            stop: Box::leak(Box::default()),
+        }
+    }
+
+    #[must_use]
+    pub fn main_device(&self) -> &'static MainDevice<'static> {
+        self.device
+    }
+
+    /// Returns how many SubDevices answer a broadcast read.
+    pub async fn count(&self) -> Result<u16, DatagramError> {
+        let _turn = self.turns.take().await;
+        let answer = Command::brd(0)
+            .with_wkc(0)
+            .receive_slice(self.device, 1)
+            .await;
+        working_counter(answer.map(|_| ()), 0, 0, 0)
+    }
+
+    /// Reads by position in the segment (APRD), for use before station addresses are verified.
+    /// Returns the working counter.
+    ///
+    /// # Errors
+    /// [`DatagramError`], with the position in place of the station.
+    pub async fn read_at(
+        &self,
+        position: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
+        let len = length(buf)?;
+        let _turn = self.turns.take().await;
+        let answer = Command::aprd(position, register)
+            .receive_slice(self.device, len)
+            .await;
+        working_counter(answer.map(|pdu| copy(&pdu, buf)), 1, position, register)
+    }
+
+    /// Writes by position in the segment (APWR). Returns the working counter.
+    ///
+    /// # Errors
+    /// As [`DatagramClient::read_at`].
+    pub async fn write_at(
+        &self,
+        position: u16,
+        register: u16,
+        data: &[u8],
+    ) -> Result<u16, DatagramError> {
+        let _turn = self.turns.take().await;
+        let answer = Command::apwr(position, register)
+            .send_receive_slice(self.device, data)
+            .await;
+        working_counter(answer.map(|_| ()), 1, position, register)
+    }
+}
+
+impl DatagramClient {
+    /// Writes to all SubDevices (BWR). Returns the working counter.
+    ///
+    /// # Errors
+    /// [`DatagramError`], without a station.
+    pub async fn write_all(&self, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        let answer = Command::bwr(register)
+            .with_wkc(0)
+            .send_receive_slice(self.device, data)
+            .await;
+        working_counter(answer.map(|_| ()), 0, 0, register)
+    }
+}
+
+impl DatagramClient {
+    /// Copies the system time of one device to all devices behind it (FRMW 0x0910). Returns the
+    /// working counter.
+    ///
+    /// # Errors
+    /// [`DatagramError`].
+    pub async fn distribute_time(&self, station: u16) -> Result<u16, DatagramError> {
+        let answer = Command::frmw(station, registers::DC_SYSTEM_TIME)
+            .with_wkc(1)
+            .receive_slice(self.device, 8)
+            .await;
+        working_counter(answer.map(|_| ()), 1, station, registers::DC_SYSTEM_TIME)
+    }
+}
+
+fn length(buf: &[u8]) -> Result<u16, DatagramError> {
+    u16::try_from(buf.len())
+        .map_err(|_| DatagramError::Other(format!("a datagram cannot read {} bytes", buf.len())))
+}
+
+fn copy(from: &[u8], to: &mut [u8]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to = *from;
+    }
+}
+
+impl MailboxTransport for DatagramClient {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
+        let len = length(buf)?;
+        let _turn = self.turns.take().await;
+        let answer = Command::fprd(station, register)
+            .receive_slice(self.device, len)
+            .await;
+        working_counter(answer.map(|pdu| copy(&pdu, buf)), 1, station, register)
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        let _turn = self.turns.take().await;
+        let answer = Command::fpwr(station, register)
+            .send_receive_slice(self.device, data)
+            .await;
+        working_counter(answer.map(|_| ()), 1, station, register)
+    }
+
+    async fn delay(&self, duration: Duration) {
+        clock::delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        clock::now()
+    }
+
+    fn stop(&self) -> &CancelToken {
+        self.stop
+    }
+}
+
+/// The age in cycles beyond which an observed mailbox status is stale. On a bus that polls a
+/// mailbox less often, a transfer reads the status itself. An unsolicited message counts at any
+/// age.
+const MAX_STATUS_AGE_CYCLES: Nanos = 4;
+
+/// The mailbox datagrams of one SubDevice during operation, and the status that the cycle reads.
+#[derive(Debug, Clone)]
+pub struct CyclicMailboxTransport {
+    datagrams: DatagramClient,
+    bus_status: Arc<BusStatus>,
+    member: usize,
+    old_ns: Nanos,
+}
+
+impl CyclicMailboxTransport {
+    /// Returns one transport for each member of the exchange.
+    #[must_use]
+    pub fn all(
+        datagrams: DatagramClient,
+        bus_status: &Arc<BusStatus>,
+        members: usize,
+        cycle_ns: Nanos,
+    ) -> Vec<Self> {
+        let each = (0..members).map(|member| Self {
+            datagrams,
+            bus_status: Arc::clone(bus_status),
+            member,
+            old_ns: cycle_ns.saturating_mul(MAX_STATUS_AGE_CYCLES),
+        });
+        each.collect()
+    }
+}
+
+impl MailboxTransport for CyclicMailboxTransport {
+    async fn read(
+        &self,
+        station: u16,
+        register: u16,
+        buf: &mut [u8],
+    ) -> Result<u16, DatagramError> {
+        self.datagrams.read(station, register, buf).await
+    }
+
+    async fn write(&self, station: u16, register: u16, data: &[u8]) -> Result<u16, DatagramError> {
+        self.datagrams.write(station, register, data).await
+    }
+
+    async fn delay(&self, duration: Duration) {
+        self.datagrams.delay(duration).await;
+    }
+
+    fn now(&self) -> u64 {
+        self.datagrams.now()
+    }
+
+    fn seen(&self) -> Option<MailboxStatus> {
+        self.bus_status.mailbox(self.member)
+    }
+
+    fn seen_lately(&self) -> Option<MailboxStatus> {
+        let seen = self.seen()?;
+        (clock::now().saturating_sub(seen.at) <= self.old_ns).then_some(seen)
+    }
+}
+
+/// ethercrab compares the working counter but does not return it.
+fn working_counter(
+    answer: Result<(), Error>,
+    expected: u16,
+    station: u16,
+    register: u16,
+) -> Result<u16, DatagramError> {
+    match answer {
+        Ok(()) => Ok(expected),
+        Err(Error::WorkingCounter { received, .. }) => Ok(received),
+        Err(error) => Err(failed(error, station, register)),
+    }
+}
+
+fn failed(error: Error, station: u16, register: u16) -> DatagramError {
+    match error {
+        Error::Timeout(_) => DatagramError::Timeout { station, register },
+        other => DatagramError::Other(other.to_string()),
+    }
+}

@@ -1,0 +1,157 @@
+//! Connects ethercrab to a link. ethercrab builds its own frames. The owner of the link moves them:
+//! the pump during bring-up, the cycle afterwards.
+
+use std::future::Future;
+use std::pin::pin;
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+
+use ethercrab::{MainDevice, MainDeviceConfig, PduRx, PduStorage, PduTx, RetryBehaviour, Timeouts};
+
+use super::{Link, LinkError, MAX_DATA, MAX_FRAME};
+use crate::clock::{self, Clock, Nanos};
+
+/// EtherType of EtherCAT frames.
+pub const ETHERCAT: [u8; 2] = [0x88, 0xa4];
+
+/// Last byte of the source MAC of ethercrab's frames; cyclic frames have another one, see
+/// `rt::exchange`.
+const ETHERCRAB_MAC_TAIL: u8 = 0x10;
+
+/// The maximum of ethercrab frames in flight; each awaited datagram takes one.
+const FRAMES: usize = 16;
+/// Bytes per frame: the maximum, so that the largest mailbox fits.
+const FRAME_BYTES: usize = PduStorage::element_size(MAX_DATA as usize);
+const _: () = assert!(FRAME_BYTES == MAX_FRAME);
+
+/// The largest step of virtual time while no frame is in flight.
+const IDLE_STEP: Nanos = 20_000;
+
+/// The minimum timeout of a datagram; a busy host answers late.
+const PDU_TIMEOUT: Duration = Duration::from_millis(30);
+
+/// The timeout for all SubDevices to reach a state in ethercrab's part of the bring-up.
+pub(crate) const STATE_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Cycles of static drift compensation; the cyclic exchange continues the compensation.
+const STATIC_SYNC_CYCLES: u32 = 1_000;
+
+/// Both ends of ethercrab's PDU loop.
+pub struct PduLoop {
+    tx: PduTx<'static>,
+    rx: PduRx<'static>,
+    /// Frames that ethercrab rejected: late, unknown or damaged.
+    pub refused: u64,
+}
+
+impl std::fmt::Debug for PduLoop {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Port")
+            .field("refused", &self.refused)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Returns a MainDevice and the PDU loop that carries its frames. The storage lives as long as the
+/// process: a process drives one bus once, and ethercrab's futures borrow the storage for
+/// `'static`.
+///
+/// During operation, a datagram leaves in one cycle and returns in the next. Its timeout must
+/// therefore exceed a few cycles.
+#[must_use]
+pub fn main_device(cycle_ns: Nanos) -> (&'static MainDevice<'static>, PduLoop) {
+    let storage: &'static PduStorage<FRAMES, FRAME_BYTES> = Box::leak(Box::new(PduStorage::new()));
+    let Ok((tx, rx, pdu_loop)) = storage.try_split() else {
+        unreachable!("a new storage splits once");
+    };
+    let timeouts = Timeouts {
+        pdu: Duration::from_nanos(cycle_ns.saturating_mul(5)).max(PDU_TIMEOUT),
+        // Timeouts of whole operations must exceed the repetition of a lost datagram.
+        eeprom: Duration::from_secs(1),
+        state_transition: STATE_TIMEOUT,
+        wait_loop_delay: Duration::from_micros(200),
+        ..Timeouts::default()
+    };
+    let config = MainDeviceConfig {
+        dc_static_sync_iterations: STATIC_SYNC_CYCLES,
+        retry_behaviour: RetryBehaviour::Count(3),
+    };
+    let device = Box::leak(Box::new(MainDevice::new(pdu_loop, timeouts, config)));
+    (device, PduLoop { tx, rx, refused: 0 })
+}
+
+impl PduLoop {
+    /// Sends at most `most` frames that ethercrab has ready; returns how many. RT.
+    pub fn send(&mut self, link: &mut dyn Link, most: usize) -> Result<usize, LinkError> {
+        let mut sent = 0;
+        while sent < most {
+            let Some(frame) = self.tx.next_sendable_frame() else {
+                break;
+            };
+            let mut failure = None;
+            let result = frame.send_blocking(|bytes| match link.send(bytes) {
+                Ok(()) => Ok(bytes.len()),
+                Err(error) => {
+                    failure = Some(error);
+                    Err(ethercrab::error::Error::SendFrame)
+                }
+            });
+            if let Some(error) = failure {
+                return Err(error);
+            }
+            if result.is_err() {
+                break;
+            }
+            sent += 1;
+        }
+        Ok(sent)
+    }
+
+    /// Passes a received frame to ethercrab if it is an ethercrab frame. Frames that ethercrab
+    /// rejects (late or damaged answers) are counted and dropped. RT.
+    pub fn receive(&mut self, frame: &[u8]) {
+        if belongs_to_ethercrab(frame) && self.rx.receive_frame(frame).is_err() {
+            self.refused += 1;
+        }
+    }
+}
+
+/// True if a frame is EtherCAT with ethercrab's source address.
+fn belongs_to_ethercrab(frame: &[u8]) -> bool {
+    frame.get(12..14) == Some(&ETHERCAT[..]) && frame.get(11) == Some(&ETHERCRAB_MAC_TAIL)
+}
+
+/// Runs `future` to completion while carrying ethercrab's frames. The executor of the bring-up.
+pub fn drive_pdu_loop<F: Future>(
+    port: &mut PduLoop,
+    link: &mut dyn Link,
+    clock: Clock,
+    future: F,
+) -> Result<F::Output, LinkError> {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    let mut buf = [0; MAX_FRAME];
+    let mut idle: u32 = 0;
+    loop {
+        if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
+            return Ok(output);
+        }
+        let mut moved = port.send(link, usize::MAX)? > 0;
+        while let Some(len) = link.recv(&mut buf)? {
+            port.receive(&buf[..len]);
+            moved = true;
+        }
+        idle = if moved { 0 } else { idle.saturating_add(1) };
+        match clock {
+            Clock::Virtual => {
+                let next = link
+                    .next_arrival()
+                    .unwrap_or_else(|| clock::now() + IDLE_STEP);
+                clock.relax(next);
+            }
+            // Frames come back within microseconds, but a working device takes milliseconds.
+            Clock::Real if idle > 2_000 => std::thread::sleep(Duration::from_micros(50)),
+            Clock::Real => std::hint::spin_loop(),
+        }
+    }
+}

@@ -1,0 +1,651 @@
+//! Finds the device and the cause. The error that ended a run says what was noticed; the evidence
+//! may reveal the cause.
+
+use std::path::Path;
+
+use ecaxis_axis::Trip;
+
+use ecaxis_esi::address;
+
+use super::cause::{Cause, Diagnosis};
+use super::evidence::{DeviceEvidence, Evidence, Lateness, place};
+use super::snapshot::SyncSnapshot;
+use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
+use crate::mailbox::SdoError;
+use crate::session::RunError;
+use ecaxis_ecat::al_status_code::al_status_text;
+
+/// AL status codes that follow from a lost synchronization (ETG.1020).
+const SYNC_CODES: [u16; 5] = [0x001a, 0x002c, 0x002d, 0x0032, 0x0034];
+const WATCHDOG: u16 = 0x001b;
+/// AL status Init: the state of a device after a power cycle.
+const INIT: u8 = 1;
+const OP: u8 = 8;
+const AL_ERROR: u8 = 0x10;
+/// Error codes for a following error (CiA 402), used by drives of all vendors.
+const FOLLOWING_ERROR: [u16; 2] = [0x8611, 0x8600];
+
+/// An observation, and whether it explains what stopped the run.
+struct Seen {
+    cause: Cause,
+    explains: bool,
+}
+
+impl Seen {
+    fn when(explains: bool, cause: Cause) -> Self {
+        Self { cause, explains }
+    }
+}
+
+/// Returns the diagnosis of an error. A pure function: the same error and evidence give the same
+/// answer.
+#[must_use]
+pub fn diagnose(error: &RunError, evidence: &Evidence) -> Diagnosis {
+    if let Some(cause) = error.cause() {
+        return diagnose(cause, evidence);
+    }
+    let class = Class::of(error, evidence);
+    let on_the_bus = class == Class::Bus;
+    // Certain causes come first. Occasional trouble also occurs in good runs: late wake-ups,
+    // damaged frames. It counts only if it explains what stopped the run.
+    let seen = [
+        interface(evidence, class),
+        restarted(evidence, class),
+        out_of_reach(error, evidence, class),
+        other_main_device(error, evidence, class),
+        no_response(error, evidence),
+        overload(error, evidence, class),
+        damaged_frames(error, evidence, class),
+        loose_link(error, evidence, class),
+        late_frames(error, evidence),
+        silence(error, evidence).filter(|_| on_the_bus),
+    ];
+    let mut seen: Vec<Seen> = seen.into_iter().flatten().collect();
+    let cause = match seen.iter().position(|seen| seen.explains) {
+        Some(first) => {
+            let cause = seen.remove(first).cause;
+            // A missing device takes its link with it.
+            if matches!(cause, Cause::Restarted { .. } | Cause::OutOfReach { .. }) {
+                let follows =
+                    |c: &Cause| matches!(c, Cause::OutOfReach { .. } | Cause::LinkFlapping { .. });
+                seen.retain(|seen| !follows(&seen.cause));
+            }
+            cause
+        }
+        None => device_cause(error, evidence).unwrap_or_else(|| Cause::Unexplained {
+            text: match error {
+                RunError::BringUp(error) => error.to_string(),
+                error => error.to_string(),
+            },
+        }),
+    };
+    // The other observations imply the outage.
+    seen.retain(|seen| !matches!(seen.cause, Cause::TemporaryOutage { .. }));
+    Diagnosis {
+        cause,
+        also: seen.into_iter().map(|seen| seen.cause).collect(),
+    }
+}
+
+/// The class of causes that an error can have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Class {
+    /// Frames, cables, missing devices, watchdogs.
+    Bus,
+    /// The arrival time of frames.
+    Timing,
+    /// One device, drive or axis, or the machine file.
+    Device,
+}
+
+impl Class {
+    fn of(error: &RunError, evidence: &Evidence) -> Self {
+        match error {
+            RunError::BusLost { .. }
+            | RunError::Gone { .. }
+            | RunError::LeftOpBriefly { .. }
+            | RunError::NoProcessData { .. } => Self::Bus,
+            RunError::DriveFault {
+                code: Some(code), ..
+            } => match code {
+                0x7500..=0x75ff | 0x8100..=0x81ff | 0x8250 | 0x8280..=0x82ff => {
+                    Self::said_by_device(evidence)
+                }
+                0x8700..=0x87ff => Self::Timing,
+                _ => Self::Device,
+            },
+            RunError::LeftOp {
+                device,
+                state,
+                code: WATCHDOG,
+            } if *state != AlState::Op => Self::of_watchdog(&device.name, evidence),
+            RunError::LeftOp { state, code, .. } => Self::of_state(*state, *code, evidence),
+            RunError::State(error) => Self::of_change(error, evidence),
+            RunError::BringUp(error) => match error.as_ref() {
+                BringUpError::NoAnswer
+                | BringUpError::Scan { .. }
+                | BringUpError::Missing { .. }
+                | BringUpError::Wire { .. }
+                | BringUpError::NotTaken { .. } => Self::Bus,
+                BringUpError::State(error) => Self::of_change(error, evidence),
+                BringUpError::NoStart { .. } => Self::Timing,
+                BringUpError::StartUp { source, .. }
+                | BringUpError::Mailbox { source, .. }
+                | BringUpError::ReadBack { source, .. }
+                | BringUpError::ReadUnits { source, .. } => match source {
+                    SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
+                    // A device that another MainDevice sets to Init loses its mailbox.
+                    SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
+                    _ => Self::Device,
+                },
+                _ => Self::Device,
+            },
+            RunError::FollowLost { reason, .. }
+                if reason == crate::rt::setpoint_generator::HELD_UP =>
+            {
+                Self::Bus
+            }
+            RunError::PhaseNotLocked { .. } | RunError::ClockNotSettled { .. } => Self::Timing,
+            _ => Self::Device,
+        }
+    }
+
+    /// Returns the class of an error by which a device blames the bus. The cycle must have seen
+    /// trouble on the bus as well.
+    fn said_by_device(evidence: &Evidence) -> Self {
+        let Lateness { missed, longest } = evidence.lateness();
+        let late = missed > 0 || longest > evidence.cycle_ns;
+        let seen = late
+            || evidence.without_data() > evidence.cycle_ns
+            || evidence.other_frames() > 0
+            || evidence.stop.is_none();
+        if seen { Self::Bus } else { Self::Device }
+    }
+
+    /// Returns the class of a watchdog error. A watchdog expires only if process data was missing
+    /// for about its time.
+    fn of_watchdog(device: &str, evidence: &Evidence) -> Self {
+        let look = evidence.named(device).and_then(|found| found.look.watchdog);
+        let enough = look.map_or(0, |watchdog| watchdog.time_ns / 2);
+        let without = evidence.without_data().max(evidence.lateness().longest);
+        if without > 0 && without >= enough {
+            Self::Bus
+        } else {
+            Self::Device
+        }
+    }
+
+    fn of_change(error: &StateError, evidence: &Evidence) -> Self {
+        // Invalid requested state change and invalid mailbox configuration: another MainDevice may
+        // have set the device to Init during bring-up.
+        const SENT_ELSEWHERE: [u16; 2] = [0x0011, 0x0016];
+        let others = evidence.other_frames() > 0;
+        match error {
+            StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
+            StateError::Refused { code, .. } if others && SENT_ELSEWHERE.contains(code) => {
+                Self::Bus
+            }
+            StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code, evidence),
+            StateError::Timeout { wanted, actual, .. } => {
+                // The bring-up itself never leaves a device in Init.
+                let moved = *wanted == AlState::Op && *actual != AlState::SafeOp;
+                if others && (moved || *actual == AlState::Init) {
+                    Self::Bus
+                } else {
+                    Self::Device
+                }
+            }
+        }
+    }
+
+    fn of_state(state: AlState, code: u16, evidence: &Evidence) -> Self {
+        if code == 0 || code == WATCHDOG {
+            Self::Bus
+        } else if !SYNC_CODES.contains(&code) || state != AlState::SafeOp {
+            Self::Device
+        } else if evidence.stop.is_some() && evidence.without_data() > evidence.cycle_ns {
+            Self::Bus
+        } else {
+            Self::Timing
+        }
+    }
+}
+
+/// Finds skipped cycles, or wake-ups so late that a device must have noticed.
+fn overload(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    // The default number of lost cycles that the bus monitor tolerates.
+    const MISSED: u64 = 3;
+    let late = |found: &Lateness| found.missed >= MISSED || found.longest > evidence.cycle_ns;
+    let found = evidence.lateness();
+    let explains = match class {
+        Class::Bus => late(&evidence.lateness_at_stop()),
+        Class::Timing => true,
+        Class::Device => false,
+    };
+    late(&found).then(|| {
+        let then = explains.then(|| short(error));
+        let Lateness { missed, longest } = found;
+        Seen::when(
+            explains,
+            Cause::Overload {
+                missed,
+                longest_ns: longest,
+                then,
+            },
+        )
+    })
+}
+
+fn other_main_device(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    let frames = evidence.other_frames();
+    if frames == 0 {
+        return None;
+    }
+    // A device that was set to another state has no error; one that left Op by itself has one.
+    let sent = |device: &&DeviceEvidence| {
+        device
+            .look
+            .al_status
+            // A device in Init may have an error, because it rejected later requests.
+            .is_some_and(|status| {
+                status & AL_ERROR == 0 && status != OP || status & !AL_ERROR == INIT
+            })
+            && device.look.station != Some(0)
+    };
+    let sent = evidence
+        .devices
+        .iter()
+        .find(sent)
+        .filter(|_| class == Class::Bus && !evidence.all_in_op());
+    let silent = matches!(
+        error,
+        RunError::BusLost {
+            answered: false,
+            ..
+        }
+    );
+    Some(Seen::when(
+        class == Class::Bus && (sent.is_some() || !silent),
+        Cause::OtherMainDevice {
+            frames,
+            device: sent.map(DeviceEvidence::place),
+            state: sent
+                .and_then(|device| device.look.al_status)
+                .map(|status| AlState::from_status(status).to_string()),
+        },
+    ))
+}
+
+/// Finds a device that lost power: in Init, without an error and without its station address.
+fn restarted(evidence: &Evidence, class: Class) -> Option<Seen> {
+    let mut devices = evidence.devices.iter().enumerate();
+    let (index, device) = devices.find(|(_, device)| {
+        let look = &device.look;
+        look.station == Some(0) && look.al_status.is_some_and(|status| status & 0x0f == INIT)
+    })?;
+    // If no device has an address, the bring-up has not assigned any yet.
+    let addressed = |device: &DeviceEvidence| device.look.station.is_some_and(|at| at != 0);
+    let all = !evidence.devices.iter().any(addressed) && evidence.notes.is_empty();
+    let cause = || Cause::Restarted {
+        device: device.place(),
+        behind: downstream(evidence, index).count(),
+    };
+    (!all).then(|| Seen::when(class == Class::Bus && !evidence.all_in_op(), cause()))
+}
+
+fn damaged_frames(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    // Without a cycle, the counters may hold old errors.
+    let some = if evidence.stop.is_none() { 8 } else { 1 };
+    let devices = evidence.devices.iter().enumerate();
+    let ports = devices.flat_map(|(index, device)| {
+        (0..4u8).map(move |port| (device.damaged(usize::from(port)), index, port))
+    });
+    // Of equal counts, the port nearest to the MainDevice wins.
+    let (count, index, port) =
+        ports.max_by_key(|(count, index, port)| (*count, std::cmp::Reverse((*index, *port))))?;
+    let device = evidence.devices.get(index)?;
+    // A single error may be a disturbance. A bad cable damages one frame per lost cycle.
+    let enough = match error {
+        RunError::BusLost { .. } => u64::from(count) >= evidence.lost_at_stop(),
+        _ => count > 1,
+    };
+    let cause = || Cause::DamagedFrames {
+        device: device.place(),
+        port,
+        partner: evidence.partner(index, port),
+        count,
+    };
+    let explains = class == Class::Bus && (enough || count == u8::MAX);
+    (count >= some).then(|| Seen::when(explains, cause()))
+}
+
+/// Finds devices that do not process frames although the frames return.
+fn out_of_reach(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    let missing = |device: &DeviceEvidence| device.look.absent || device.look.came_back;
+    let mut devices = evidence.devices.iter().enumerate();
+    let (index, device) = devices.find(|(_, device)| missing(device))?;
+    // Before station addresses are assigned, devices behind a missing one move up by one position.
+    let known = match error {
+        RunError::BringUp(error) => match error.as_ref() {
+            BringUpError::Missing { missing, .. } => missing.first() == Some(&device.place()),
+            _ => true,
+        },
+        _ => true,
+    };
+    if !known {
+        return None;
+    }
+    let link = device.parent.and_then(|(parent, port)| {
+        let status = evidence.devices.get(parent)?.look.dl_status?;
+        Some(super::ports::has_link(status, port))
+    });
+    Some(Seen::when(
+        class == Class::Bus && !evidence.all_in_op(),
+        Cause::OutOfReach {
+            device: device.place(),
+            behind: downstream(evidence, index).filter(|d| missing(d)).count(),
+            upstream: evidence.upstream(device),
+            link: link.filter(|_| !device.look.came_back),
+        },
+    ))
+}
+
+/// Finds a dead bus: no frame to any device returned.
+fn no_response(error: &RunError, evidence: &Evidence) -> Option<Seen> {
+    let silent = matches!(
+        error,
+        RunError::BusLost {
+            answered: false,
+            ..
+        } | RunError::Gone { .. }
+    );
+    let unknown = |device: &DeviceEvidence| !device.look.answers && !device.look.absent;
+    let first = evidence.devices.first()?;
+    let cause = || Cause::NoResponse {
+        first: Some(first.place()),
+    };
+    (silent && evidence.devices.iter().all(unknown)).then(|| Seen::when(true, cause()))
+}
+
+/// Finds frames that return a cycle late: most of those missing at the stop arrived afterwards.
+fn late_frames(error: &RunError, evidence: &Evidence) -> Option<Seen> {
+    let silent = matches!(
+        error,
+        RunError::BusLost {
+            answered: false,
+            ..
+        } | RunError::NoProcessData { .. }
+    );
+    let late = evidence.late_at_stop();
+    (late > 0).then(|| {
+        Seen::when(
+            silent && late * 2 >= evidence.lost_at_stop(),
+            Cause::LateFrames {
+                late,
+                cycle_ns: evidence.cycle_ns,
+            },
+        )
+    })
+}
+
+/// Finds a temporary outage: all devices answered when asked after the stop.
+fn silence(error: &RunError, evidence: &Evidence) -> Option<Seen> {
+    let silent = match error {
+        RunError::BusLost { answered, .. } => !answered,
+        // The AL status code says that the device noticed the outage.
+        RunError::LeftOp { code, .. } => SYNC_CODES.contains(code),
+        _ => false,
+    };
+    let silence_ns = evidence.silence();
+    let back = !evidence.devices.is_empty() && evidence.devices.iter().all(|d| d.look.answers);
+    let there = silent && silence_ns > 0 && (back || evidence.all_in_op());
+    there.then(|| Seen::when(true, Cause::TemporaryOutage { silence_ns }))
+}
+
+/// Finds refusals of the network interface.
+fn interface(evidence: &Evidence, class: Class) -> Option<Seen> {
+    // A few refusals may come from a full queue.
+    const SOME: u64 = 3;
+    let refused = match evidence.stop {
+        Some(_) => evidence.refused(),
+        None => evidence.counters.link_errors,
+    };
+    (refused >= SOME).then(|| Seen::when(class == Class::Bus, Cause::Interface { refused }))
+}
+
+fn loose_link(error: &RunError, evidence: &Evidence, class: Class) -> Option<Seen> {
+    let devices = evidence.devices.iter().enumerate();
+    let mut ports = devices.flat_map(|(index, device)| {
+        let counters = device.recent.lost_links.into_iter().zip(0u8..);
+        counters.map(move |(count, port)| (count, index, port))
+    });
+    let (count, index, port) = ports.find(|(count, ..)| *count > 0)?;
+    // A lost link behind the first device shortens the path of the frames, but they still return.
+    let silent = matches!(
+        error,
+        RunError::BusLost {
+            answered: false,
+            ..
+        }
+    );
+    let first_cable = (index, port) == (0, 0);
+    Some(Seen::when(
+        class == Class::Bus && (first_cable || !silent || evidence.lost_at_stop() <= 2),
+        Cause::LinkFlapping {
+            device: evidence.devices.get(index)?.place(),
+            port,
+            partner: evidence.partner(index, port),
+            count,
+        },
+    ))
+}
+
+/// Returns all devices behind this device.
+fn downstream(evidence: &Evidence, index: usize) -> impl Iterator<Item = &DeviceEvidence> {
+    let hangs = move |device: &&DeviceEvidence| {
+        let mut at = device.parent;
+        // A parent always precedes its children.
+        while let Some((parent, _)) = at {
+            if parent == index {
+                return true;
+            }
+            at = evidence.devices.get(parent).and_then(|d| d.parent);
+        }
+        false
+    };
+    evidence.devices.iter().filter(hangs)
+}
+
+fn device_cause(error: &RunError, evidence: &Evidence) -> Option<Cause> {
+    match error {
+        RunError::LeftOp {
+            device,
+            state,
+            code,
+        } => Some(left_op(device, *state, *code, evidence)),
+        RunError::State(StateError::Refused { device, code, .. }) => {
+            sync(device, *code, true, evidence)
+        }
+        RunError::State(StateError::Timeout {
+            device,
+            wanted: AlState::Op,
+            actual: AlState::SafeOp,
+            ..
+        }) => late_sync(device, evidence),
+        RunError::BusLost { .. } | RunError::LeftOpBriefly { .. } if evidence.all_in_op() => None,
+        RunError::BusLost { .. } | RunError::LeftOpBriefly { .. } => {
+            let bad = |device: &&DeviceEvidence| {
+                let look = &device.look;
+                look.al_status.is_some_and(|status| status != OP)
+            };
+            let device = evidence.devices.iter().find(bad)?;
+            let state = AlState::from_status(device.look.al_status?);
+            let code = device.look.al_code.unwrap_or(0);
+            // A watchdog error is a consequence of a lost bus.
+            let cause = code != WATCHDOG || evidence.silence() == 0;
+            cause.then(|| left_op(&device.at, state, code, evidence))
+        }
+        RunError::Trip {
+            device,
+            trip: Trip::FollowingError { .. },
+            ..
+        } => interpolation(device, error, evidence),
+        RunError::DriveFault {
+            device,
+            code: Some(code),
+            ..
+        } if FOLLOWING_ERROR.contains(code) => interpolation(device, error, evidence),
+        RunError::NotEnabled { device, .. } => {
+            let watchdog = evidence.named(&device.name)?.look.watchdog?;
+            let expired = watchdog.time_ns > 0 && watchdog.expired > 0 && !watchdog.in_time;
+            expired.then(|| Cause::OutputsNotTaken {
+                device: place(device),
+                watchdog_ns: watchdog.time_ns,
+            })
+        }
+        RunError::BringUp(error) => bring_up(error, evidence),
+        _ => None,
+    }
+}
+
+fn left_op(device: &DeviceRef, state: AlState, code: u16, evidence: &Evidence) -> Cause {
+    if code == WATCHDOG {
+        let others = evidence.devices.iter().filter(|other| {
+            other.at.position != device.position && other.look.al_code == Some(WATCHDOG)
+        });
+        let look = evidence.named(&device.name).map(|found| &found.look);
+        return Cause::Watchdog {
+            device: place(device),
+            others: others.count(),
+            silence_ns: evidence.silence(),
+            watchdog_ns: look.and_then(|look| Some(look.watchdog?.time_ns)),
+        };
+    }
+    sync(device, code, false, evidence).unwrap_or_else(|| Cause::LeftOp {
+        device: place(device),
+        state: state.to_string(),
+        code,
+    })
+}
+
+fn sync(device: &DeviceRef, code: u16, refused: bool, evidence: &Evidence) -> Option<Cause> {
+    if !SYNC_CODES.contains(&code) {
+        return None;
+    }
+    let look = evidence.named(&device.name).map(|found| &found.look);
+    let sync = look.and_then(|look| look.sync);
+    Some(Cause::Sync {
+        device: place(device),
+        code,
+        refused,
+        activation: sync.map(|sync| sync.activation),
+        next_ns: sync.map(|SyncSnapshot { next_ns, .. }| next_ns),
+    })
+}
+
+/// Finds a device that waits for a SYNC0 that never arrives.
+fn late_sync(device: &DeviceRef, evidence: &Evidence) -> Option<Cause> {
+    let sync = evidence.named(&device.name)?.look.sync?;
+    let cycle = i64::from(sync.cycle_ns);
+    let off = sync.activation & 3 != 3 || sync.next_ns < 0 || sync.next_ns > 2 * cycle;
+    (cycle > 0 && off).then(|| Cause::Sync {
+        device: place(device),
+        code: 0,
+        refused: true,
+        activation: Some(sync.activation),
+        next_ns: Some(sync.next_ns),
+    })
+}
+
+fn interpolation(device: &DeviceRef, error: &RunError, evidence: &Evidence) -> Option<Cause> {
+    let drive_ns = evidence.named(&device.name)?.look.interpolation_ns?;
+    (drive_ns != evidence.cycle_ns).then(|| Cause::Interpolation {
+        device: place(device),
+        drive_ns,
+        cycle_ns: evidence.cycle_ns,
+        then: short(error),
+    })
+}
+
+fn bring_up(error: &BringUpError, evidence: &Evidence) -> Option<Cause> {
+    match error {
+        BringUpError::StartUp {
+            device,
+            index,
+            sub,
+            name,
+            source: SdoError::Timeout { .. },
+            ..
+        } => Some(Cause::Mailbox {
+            device: place(device),
+            doing: format!("start-up SDO {} {name}", address(*index, *sub)),
+        }),
+        BringUpError::Mailbox {
+            device,
+            source: SdoError::Timeout { .. },
+        } => Some(Cause::Mailbox {
+            device: place(device),
+            doing: "emptying it".to_owned(),
+        }),
+        BringUpError::ReadBack {
+            device,
+            source: SdoError::Timeout { .. },
+        } => Some(Cause::Mailbox {
+            device: place(device),
+            doing: "reading the PDO mapping back".to_owned(),
+        }),
+        BringUpError::ReadUnits {
+            device,
+            source: SdoError::Timeout { .. },
+        } => Some(Cause::Mailbox {
+            device: place(device),
+            doing: "asking for its units".to_owned(),
+        }),
+        BringUpError::Identity {
+            device,
+            esi,
+            revisions: Some((expected, found)),
+            ..
+        } => Some(Cause::Revision {
+            device: place(device),
+            expected: *expected,
+            found: *found,
+            esi: Path::new(esi)
+                .file_name()
+                .map_or_else(|| esi.clone(), |name| name.to_string_lossy().into_owned()),
+        }),
+        BringUpError::State(StateError::Refused { device, code, .. }) => {
+            sync(device, *code, true, evidence)
+        }
+        _ => None,
+    }
+}
+
+/// Returns the error's text without its address.
+fn short(error: &RunError) -> String {
+    match error {
+        RunError::LeftOp {
+            device,
+            state,
+            code,
+        } => format!(
+            "`{}` left Op for {state}, AL status code 0x{code:04x} ({})",
+            device.name,
+            al_status_text(*code)
+        ),
+        RunError::Trip { device, trip, .. } => format!("`{}`: {trip}", device.name),
+        RunError::BusLost {
+            answered: true,
+            cycles,
+            ..
+        } => {
+            format!("{cycles} cycles in a row without all of the process data")
+        }
+        RunError::BusLost { cycles, .. } => format!("{cycles} cycles in a row without an answer"),
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+#[path = "diagnose_tests.rs"]
+mod tests;

@@ -1,0 +1,138 @@
+//! One axis in the cycle, between its process data and its set-point generator.
+
+use ecaxis_axis::{Axis, AxisStatus, Command, CommandError, Inputs, Outputs};
+
+use super::image::{AxisBits, SignalBits};
+use super::setpoint_generator::SetpointGenerator;
+use crate::clock::Nanos;
+
+/// One axis and the location of its objects.
+#[derive(Debug)]
+pub struct RtAxis {
+    pub axis: Axis,
+    pub bits: AxisBits,
+    /// Index of its SubDevice.
+    pub device: usize,
+    /// The output that opens its brake; it may be on any device.
+    pub brake: Option<SignalBits>,
+    /// Index of its reaction group.
+    pub group: usize,
+    pub feed: SetpointGenerator,
+    /// Largest following error while enabled, and the status of the last enabled cycle.
+    pub largest_following_error: f64,
+    pub last_enabled: Option<AxisStatus>,
+    /// Due time of the last cycle with fresh inputs.
+    pub heard: Option<Nanos>,
+    /// The axis was enabled by command and its drive had no fault since: a fault now stops the
+    /// group.
+    pub(super) armed: bool,
+    pub(super) ordered: bool,
+    /// The axis was processed in this cycle.
+    pub(super) acted: bool,
+}
+
+impl RtAxis {
+    #[must_use]
+    pub fn new(axis: Axis, bits: AxisBits, device: usize, group: usize) -> Self {
+        Self {
+            axis,
+            bits,
+            device,
+            brake: None,
+            group,
+            feed: SetpointGenerator::default(),
+            largest_following_error: 0.0,
+            last_enabled: None,
+            heard: None,
+            armed: false,
+            ordered: false,
+            acted: false,
+        }
+    }
+
+    /// Clears the armed state after a stop and reset: faults are ignored until the axis is enabled
+    /// again.
+    pub(super) fn disarm(&mut self) {
+        (self.armed, self.ordered) = (false, false);
+    }
+
+    pub(super) fn command(&mut self, command: Command) -> Result<(), CommandError> {
+        if self.feed.runs() && matches!(command, Command::SetMode(_) | Command::Home { .. }) {
+            return Err(CommandError::Following);
+        }
+        self.ordered |= command == Command::Enable;
+        self.axis.command(command)?;
+        // These commands do not affect the set-point.
+        let aside = matches!(
+            command,
+            Command::Enable
+                | Command::ResetFault
+                | Command::SetMode(_)
+                | Command::ArmProbe { .. }
+                | Command::DisarmProbe { .. }
+        );
+        if !aside {
+            self.feed.end();
+        }
+        Ok(())
+    }
+
+    pub(super) fn read(&self, image: &[u8], fresh: bool, late: bool) -> Inputs {
+        let bits = &self.bits;
+        Inputs {
+            statusword: bits.statusword.get(image) as u16,
+            position: bits.position.map(|b| b.get(image) as i32),
+            velocity: bits.velocity.map(|b| b.get(image) as i32),
+            torque: bits.torque.map(|b| b.get(image) as i16),
+            mode_display: bits.mode_display.map(|b| b.get(image) as i8),
+            error_code: bits.error_code.map(|b| b.get(image) as u16),
+            touch_probe_status: bits.touch_probe_status.map(|b| b.get(image) as u16),
+            touch_probe_positions: bits
+                .touch_probe_positions
+                .map(|b| b.map(|b| b.get(image) as i32)),
+            fresh,
+            late,
+        }
+    }
+
+    pub(super) fn write(&self, image: &mut [u8], outputs: &Outputs) {
+        let bits = &self.bits;
+        bits.controlword.set(image, i64::from(outputs.controlword));
+        for (to, value) in [
+            (bits.mode, i64::from(outputs.mode)),
+            (bits.target_position, i64::from(outputs.target_position)),
+            (bits.target_velocity, i64::from(outputs.target_velocity)),
+            (bits.target_torque, i64::from(outputs.target_torque)),
+            (bits.velocity_offset, i64::from(outputs.velocity_offset)),
+            (bits.torque_offset, i64::from(outputs.torque_offset)),
+            (bits.profile_velocity, i64::from(outputs.profile_velocity)),
+            (
+                bits.profile_acceleration,
+                i64::from(outputs.profile_acceleration),
+            ),
+            (
+                bits.profile_deceleration,
+                i64::from(outputs.profile_acceleration),
+            ),
+            (
+                bits.touch_probe_function,
+                i64::from(outputs.touch_probe_function),
+            ),
+        ] {
+            if let Some(to) = to {
+                to.set(image, value);
+            }
+        }
+        if let Some(brake) = self.brake {
+            let open = outputs.brake_open && keeps_power(outputs.controlword);
+            brake.set(image, f64::from(u8::from(open)));
+        }
+    }
+}
+
+/// Returns whether this Controlword keeps power on the motor of a drive in Operation enabled (CiA
+/// 402-2, commands of the device control). "Enable operation" and "Quick stop" do. With any other
+/// command the brake must be closed.
+const fn keeps_power(controlword: u16) -> bool {
+    controlword & 0x0f == 0x0f || controlword & 0x06 == 0x02
+}

@@ -1,0 +1,308 @@
+//! Counts bad cycles and decides when they stop the machine or a group.
+
+use super::exchange::{CycleResult, Evidence, GroupResult};
+
+/// AL status that every SubDevice must show while the machine runs.
+pub const OP: u8 = 0x08;
+/// Cycles for which the AL status may differ before the machine stops: one lost broadcast is not a
+/// fault.
+const AL_CYCLES: u32 = 2;
+
+/// The cause of a stop.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum StopCause {
+    /// A stop was requested.
+    Requested,
+    /// The drive of this axis reported a fault.
+    DriveFault { axis: usize },
+    /// The axis stopped itself.
+    Trip {
+        axis: usize,
+        trip: ecaxis_axis::Trip,
+    },
+    /// This number of cycles in a row had no valid answer.
+    BusLost {
+        cycles: u32,
+        last_wkc: (u16, u16),
+        answered: bool,
+    },
+    /// An emergency stop condition of the machine file is true.
+    EmergencyStop,
+    /// The axis can no longer follow its master or its set-point source.
+    FollowLost { axis: usize },
+    /// The user's controller panicked.
+    Controller,
+    /// The cycle itself panicked.
+    Panicked,
+    /// The supervisor thread no longer runs.
+    Unsupervised,
+    /// The drive of this axis keeps power although it was commanded to remove it.
+    Powered { axis: usize },
+    /// At least one SubDevice is no longer in Op.
+    LeftOp { al_status: u8 },
+}
+
+impl StopCause {
+    /// True unless the stop was requested.
+    #[must_use]
+    pub fn is_failure(&self) -> bool {
+        !matches!(self, Self::Requested)
+    }
+}
+
+/// Counts consecutive bad cycles of each group and each device.
+#[derive(Debug, Clone)]
+pub struct BusMonitor {
+    lost_frames: u32,
+    groups: Vec<GroupCounters>,
+    /// For each device, the cycles in which its own evidence showed it missing.
+    missing: Vec<u32>,
+    /// Cycles in which AL status was wrong and no group's working counter identified the device.
+    al: u32,
+    /// Cycles in which fewer SubDevices answered than the working counters explain.
+    absent: u32,
+    al_status: u8,
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct GroupCounters {
+    /// The number of devices that must answer.
+    devices: u16,
+    /// Cycles without the group's process data.
+    bad: u32,
+    /// Cycles in which both AL status and the group's working counter were wrong.
+    al: u32,
+    last: GroupResult,
+}
+
+impl BusMonitor {
+    /// Creates a monitor that stops a group after `lost_frames` bad cycles in a row. `groups` holds
+    /// the group of each SubDevice.
+    #[must_use]
+    #[allow(clippy::disallowed_macros, reason = "runs before the loop")]
+    pub fn new(lost_frames: u32, groups: &[usize]) -> Self {
+        // The first group exists even without SubDevices.
+        let count = groups.iter().max().map_or(1, |last| last + 1);
+        let mut watches = vec![GroupCounters::default(); count];
+        for &group in groups {
+            watches[group].devices = watches[group].devices.saturating_add(1);
+        }
+        Self {
+            lost_frames: lost_frames.max(1),
+            groups: watches,
+            missing: vec![0; groups.len()],
+            al: 0,
+            absent: 0,
+            al_status: OP,
+        }
+    }
+
+    /// Evaluates one cycle. RT: O(groups + devices).
+    pub fn update(&mut self, answer: &CycleResult, shares: &[GroupResult], evidence: &[Evidence]) {
+        for (watch, share) in self.groups.iter_mut().zip(shares) {
+            watch.last = *share;
+            watch.bad = if share.fresh {
+                0
+            } else {
+                watch.bad.saturating_add(1)
+            };
+        }
+        for (missing, evidence) in self.missing.iter_mut().zip(evidence) {
+            *missing = match evidence {
+                Evidence::Fresh => 0,
+                Evidence::Unknown => *missing,
+                Evidence::Missing => missing.saturating_add(1),
+            };
+        }
+        let Some((status, answering)) = answer.al_status else {
+            return;
+        };
+        self.al_status = status;
+        let devices = |groups: &mut dyn Iterator<Item = &GroupCounters>| -> u16 {
+            groups.map(|g| g.devices).fold(0, u16::saturating_add)
+        };
+        let expected = devices(&mut self.groups.iter());
+        // A device outside Op ignores its outputs, and an absent device processes nothing. The bad
+        // groups can explain at most as many missing answers as they have devices.
+        let bad = devices(&mut self.groups.iter().filter(|g| g.bad > 0));
+        let accounted = answering >= expected.saturating_sub(bad);
+        let known = bad > 0 && accounted;
+        let left_op = status != OP;
+        for watch in &mut self.groups {
+            let guilty = left_op && known && watch.bad > 0;
+            watch.al = if guilty {
+                watch.al.saturating_add(1)
+            } else {
+                0
+            };
+        }
+        self.al = if left_op && !known {
+            self.al.saturating_add(1)
+        } else {
+            0
+        };
+        // A missing answer counts as a lost frame until the limit is reached.
+        self.absent = if accounted {
+            0
+        } else {
+            self.absent.saturating_add(1)
+        };
+    }
+
+    /// Returns the cause to stop the whole machine: SubDevices left Op or do not answer, and no
+    /// working counter identifies them.
+    #[must_use]
+    pub fn left_op(&self) -> Option<StopCause> {
+        let al_status = self.al_status;
+        let left = self.al >= AL_CYCLES || self.absent >= self.lost_frames;
+        left.then_some(StopCause::LeftOp { al_status })
+    }
+
+    /// Returns the cause to stop a group.
+    #[must_use]
+    pub fn lost(&self, group: usize) -> Option<StopCause> {
+        let watch = self.groups.get(group)?;
+        if watch.bad >= self.lost_frames {
+            return Some(StopCause::BusLost {
+                cycles: watch.bad,
+                last_wkc: watch.last.wkc,
+                answered: watch.last.answered,
+            });
+        }
+        let al_status = self.al_status;
+        (watch.al >= AL_CYCLES).then_some(StopCause::LeftOp { al_status })
+    }
+
+    /// True once the device has been missing for too long: it may not receive its outputs.
+    #[must_use]
+    pub fn device_lost(&self, device: usize) -> bool {
+        self.missing
+            .get(device)
+            .is_some_and(|missing| *missing >= self.lost_frames)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SHARE: GroupResult = GroupResult::new(true, true, (3, 3));
+    const BAD: GroupResult = GroupResult::new(true, false, (0, 3));
+    const GONE: GroupResult = GroupResult::new(false, false, (0, 3));
+
+    fn answer(al_status: Option<(u8, u16)>) -> CycleResult {
+        CycleResult {
+            al_status,
+            ..CycleResult::default()
+        }
+    }
+
+    fn good() -> CycleResult {
+        answer(Some((OP, 2)))
+    }
+
+    #[test]
+    fn bus_monitor_tolerates_fewer_bad_cycles_than_the_limit() {
+        let mut guard = BusMonitor::new(3, &[0, 0]);
+        for _ in 0..10 {
+            for share in [GONE, GONE, SHARE] {
+                let back = share.answered.then_some((OP, 2));
+                guard.update(&answer(back), &[share], &[]);
+                assert_eq!((guard.lost(0), guard.left_op()), (None, None));
+            }
+        }
+        guard.update(&answer(None), &[GONE], &[]);
+        guard.update(&answer(None), &[GONE], &[]);
+        guard.update(&answer(None), &[GONE], &[]);
+        let lost = StopCause::BusLost {
+            cycles: 3,
+            last_wkc: (0, 3),
+            answered: false,
+        };
+        assert_eq!((guard.lost(0), guard.left_op()), (Some(lost), None));
+    }
+
+    /// A device outside Op stops the machine after two cycles, an absent one after the limit of
+    /// lost frames.
+    #[test]
+    fn a_device_that_leaves_op_stops_the_machine() {
+        for (al, cycles) in [((0x1c, 2), AL_CYCLES), ((OP, 1), 5)] {
+            let mut guard = BusMonitor::new(5, &[0, 0]);
+            for _ in 1..cycles {
+                guard.update(&answer(Some(al)), &[SHARE], &[]);
+                assert_eq!(guard.left_op(), None);
+            }
+            guard.update(&answer(Some(al)), &[SHARE], &[]);
+            let left = Some(StopCause::LeftOp { al_status: al.0 });
+            assert_eq!((guard.lost(0), guard.left_op()), (None, left));
+            guard.update(&good(), &[SHARE], &[]);
+            assert_eq!(guard.left_op(), None);
+        }
+    }
+
+    #[test]
+    fn device_is_lost_only_by_its_own_evidence() {
+        let mut guard = BusMonitor::new(2, &[0, 0, 0]);
+        for evidence in [Evidence::Unknown; 5] {
+            guard.update(
+                &good(),
+                &[BAD],
+                &[evidence, Evidence::Missing, Evidence::Fresh],
+            );
+        }
+        let lost = [0, 1, 2].map(|device| guard.device_lost(device));
+        assert_eq!(lost, [false, true, false]);
+        guard.update(&good(), &[SHARE], &[Evidence::Fresh; 3]);
+        assert!(!guard.device_lost(1));
+    }
+
+    /// Devices 0, 1 and 2 are in groups 0, 1 and 2. The wrong working counter identifies whose AL
+    /// status is wrong.
+    #[test]
+    fn wrong_al_status_is_attributed_to_the_group_with_a_wrong_counter() {
+        let left = |al_status| Some(StopCause::LeftOp { al_status });
+        for (al, shares, groups, machine) in [
+            (
+                (0x1c, 3),
+                [SHARE, BAD, SHARE],
+                [None, left(0x1c), None],
+                None,
+            ),
+            // More devices left Op than the group has.
+            (
+                (0x1c, 1),
+                [SHARE, SHARE, BAD],
+                [None, None, None],
+                left(0x1c),
+            ),
+            // An absent device counts by its process data.
+            ((OP, 2), [SHARE, SHARE, BAD], [None, None, None], None),
+            ((OP, 1), [SHARE, BAD, BAD], [None, None, None], None),
+            ((OP, 3), [SHARE, BAD, SHARE], [None, None, None], None),
+        ] {
+            let mut guard = BusMonitor::new(10, &[0, 1, 2]);
+            for _ in 0..AL_CYCLES {
+                guard.update(&answer(Some(al)), &shares, &[]);
+            }
+            let found = [0, 1, 2].map(|group| guard.lost(group));
+            assert_eq!((found, guard.left_op()), (groups, machine), "{al:?}");
+        }
+    }
+
+    #[test]
+    fn a_group_without_its_process_data_is_lost_alone() {
+        let mut guard = BusMonitor::new(2, &[1]);
+        for _ in 0..2 {
+            guard.update(&answer(Some((OP, 1))), &[SHARE, BAD], &[]);
+        }
+        assert_eq!(guard.lost(0), None);
+        assert!(matches!(
+            guard.lost(1),
+            Some(StopCause::BusLost {
+                cycles: 2,
+                last_wkc: (0, 3),
+                answered: true
+            })
+        ));
+    }
+}

@@ -1,0 +1,174 @@
+//! The only paths into and out of the real-time thread: bounded and wait-free.
+
+use ecaxis_axis::{AxisStatus, Command, CommandError};
+
+use super::bus_monitor::StopCause;
+use super::exchange::SubDeviceDiagnostics;
+use super::heartbeat::Heartbeat;
+use super::reaction_group::GroupStatus;
+use super::setpoint_generator::{GeneratorRequest, GeneratorState};
+use super::stats::Counters;
+use crate::clock::Nanos;
+
+/// Capacity of the command queue; a batch holds at most one command per axis.
+const ORDERS: usize = 512;
+/// Commands taken per cycle; one batch never exceeds this.
+pub const ORDERS_A_CYCLE: usize = 256;
+/// Capacity of the event queue; events beyond it are counted and dropped.
+const EVENTS: usize = 256;
+
+/// A command to the cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a box would have to be freed in the cycle"
+)]
+pub enum RtCommand {
+    Axis {
+        axis: usize,
+        command: Command,
+    },
+    /// Starts set-point generation for an axis.
+    Feed {
+        axis: usize,
+        start: GeneratorRequest,
+    },
+    /// Sets an output that no axis drives; `output` is an index into
+    /// [`super::cycle::Signals::outputs`].
+    Output {
+        output: usize,
+        value: f64,
+    },
+    /// Starts the bus monitor: from now on too many bad cycles stop the machine.
+    Guard,
+    /// Stops the bus monitor: the segment is about to leave Op, so wrong working counters are
+    /// expected.
+    Unguard,
+    /// Brings every axis of the machine to rest within its limits, then disables it.
+    Stop,
+    /// Reports a drive's error code that was read outside the cycle.
+    ErrorCode {
+        axis: usize,
+        code: u16,
+    },
+    /// Ends the loop after this cycle.
+    Halt,
+}
+
+/// An event reported by the cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Event {
+    Refused {
+        cycle: u64,
+        axis: usize,
+        reason: CommandError,
+    },
+    /// The machine begins to stop.
+    Stopping {
+        cycle: u64,
+        cause: StopCause,
+    },
+    /// A group begins to stop; the machine continues.
+    GroupStopping {
+        cycle: u64,
+        group: usize,
+        cause: StopCause,
+    },
+    /// A stopped group was reset and may be enabled again.
+    GroupReleased {
+        cycle: u64,
+        group: usize,
+    },
+    PhaseLocked {
+        cycle: u64,
+    },
+    PhaseLost {
+        cycle: u64,
+    },
+    /// The clock of a SubDevice differs from the reference clock by more than the window.
+    ClockOff {
+        cycle: u64,
+        device: usize,
+        /// Own clock minus reference.
+        difference_ns: i32,
+    },
+}
+
+/// The state of the machine after one cycle.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    pub time: Nanos,
+    pub counters: Counters,
+    /// `None` without distributed clocks.
+    pub phase: Option<PhaseStatus>,
+    pub inputs_fresh: bool,
+    pub al_status: Option<(u8, u16)>,
+    pub axes: Vec<AxisStatus>,
+    pub feeds: Vec<GeneratorState>,
+    /// The program's input signals, in the order of [`super::cycle::Signals::inputs`]. Each value
+    /// is from the last cycle in which it was fresh.
+    pub inputs: Vec<f64>,
+    /// The controller has called `finish`.
+    pub finished: bool,
+    pub diagnoses: Vec<SubDeviceDiagnostics>,
+    /// The first cause, once the machine is stopping.
+    pub stopping: Option<StopCause>,
+    /// A failure during a requested stop.
+    pub failure: Option<StopCause>,
+    /// True once the stop has ended for every axis: the cycle can do nothing more.
+    pub stop_ended: bool,
+    /// The first entry is the group of all axes without a group of their own.
+    pub groups: Vec<GroupStatus>,
+    /// Events dropped because the queue was full.
+    pub events_lost: u64,
+    /// Commands taken so far.
+    pub orders_taken: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PhaseStatus {
+    pub locked: bool,
+    pub error_ns: i64,
+    pub drift_ppm: f64,
+}
+
+/// The real-time end.
+#[derive(Debug)]
+pub struct RtEndpoint {
+    pub orders: rtrb::Consumer<RtCommand>,
+    pub events: rtrb::Producer<Event>,
+    pub snapshots: triple_buffer::Input<Snapshot>,
+    pub heartbeat: Heartbeat,
+}
+
+/// The end of all other threads.
+#[derive(Debug)]
+pub struct HostEndpoint {
+    pub orders: rtrb::Producer<RtCommand>,
+    pub events: rtrb::Consumer<Event>,
+    pub snapshots: triple_buffer::Output<Snapshot>,
+    pub heartbeat: Heartbeat,
+}
+
+/// Creates both ends. `first` determines the size of the snapshots.
+#[must_use]
+pub fn channel(first: &Snapshot) -> (RtEndpoint, HostEndpoint) {
+    let (order_in, order_out) = rtrb::RingBuffer::new(ORDERS);
+    let (event_in, event_out) = rtrb::RingBuffer::new(EVENTS);
+    let (snapshot_in, snapshot_out) = triple_buffer::triple_buffer(first);
+    let heartbeat = Heartbeat::default();
+    (
+        RtEndpoint {
+            orders: order_out,
+            events: event_in,
+            snapshots: snapshot_in,
+            heartbeat: heartbeat.clone(),
+        },
+        HostEndpoint {
+            orders: order_in,
+            events: event_out,
+            snapshots: snapshot_out,
+            heartbeat,
+        },
+    )
+}

@@ -1,0 +1,104 @@
+//! Steps every axis once per cycle, from its inputs to its outputs.
+
+use ecaxis_axis::StopPhase;
+
+use super::{Engine, Nanos};
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::setpoint_generator;
+
+impl Engine {
+    /// Handles skipped cycles, in which nothing was sent. Drives kept the last output, so the axes
+    /// continue from there. This runs before the staged frames are sent, because they date from
+    /// before.
+    pub(super) fn handle_skipped_cycles(&mut self, woke: Nanos) {
+        let before = self.woke.replace(woke).unwrap_or(woke);
+        let silent = woke.saturating_sub(before) / self.timing.cycle_ns;
+        if silent < 2 {
+            return;
+        }
+        let skipped = u32::try_from(silent - 1).unwrap_or(u32::MAX);
+        for slot in &mut self.axes {
+            let outputs = slot.axis.skipped(skipped);
+            slot.write(self.exchange.outputs_mut(), &outputs);
+        }
+        self.exchange.refresh_outputs();
+    }
+
+    /// Steps masters before the axes that follow them, so that a follower's set-point is of the
+    /// same cycle.
+    pub(super) fn act(&mut self) {
+        self.stop_missing_axes();
+        // Gears form no loops, so every pass steps at least one axis.
+        for _ in 0..self.axes.len() {
+            let mut waiting = false;
+            for index in 0..self.axes.len() {
+                let Some(slot) = self.axes.get(index) else {
+                    continue;
+                };
+                if slot.acted {
+                    continue;
+                }
+                let followed = slot.feed.master().and_then(|(m, _)| self.axes.get(m));
+                if followed.is_some_and(|master| !master.acted) {
+                    waiting = true;
+                } else {
+                    self.step_axis(index);
+                }
+            }
+            if !waiting {
+                break;
+            }
+        }
+        for group in 0..self.groups.len() {
+            if let Some(cause) = self.groups.get_mut(group).and_then(|g| g.found.take()) {
+                // If an axis cannot be stopped, the machine must not continue without its group.
+                let own = !matches!(cause, StopCause::Powered { .. });
+                self.stop(own.then_some(group), cause);
+            }
+        }
+    }
+
+    /// Steps one axis. A cause that must stop its group is stored in the group.
+    fn step_axis(&mut self, index: usize) {
+        let dt_s = self.timing.cycle_ns as f64 * 1e-9;
+        let master = self.axes.get(index).and_then(|slot| {
+            let (master, actual) = slot.feed.master()?;
+            let status = self.axes.get(master)?.axis.status();
+            setpoint_generator::master_motion(&status, actual)
+        });
+        let Some(slot) = self.axes.get_mut(index) else {
+            return;
+        };
+        let Some(group) = self.groups.get_mut(slot.group) else {
+            return;
+        };
+        slot.acted = true;
+        let lost = slot
+            .feed
+            .advance(&mut slot.axis, &self.tables, master, dt_s);
+        let outputs = slot.axis.act();
+        slot.write(self.exchange.outputs_mut(), &outputs);
+        let status = slot.axis.status();
+        slot.armed |= slot.ordered && status.fault.is_none();
+        if status.enabled {
+            slot.largest_following_error =
+                slot.largest_following_error.max(status.max_following_error);
+            slot.last_enabled = Some(status);
+        }
+        if group.stop().is_some() {
+            if status.stop.is_some_and(|s| s.phase == StopPhase::PowerKept) {
+                group.found = Some(StopCause::Powered { axis: index });
+            }
+            // Reset by command, or automatically if the machine file says so.
+            if status.resetting {
+                group.acknowledge();
+            }
+        }
+        let cause = match (status.fault, status.trip) {
+            (Some(_), _) if slot.armed => Some(StopCause::DriveFault { axis: index }),
+            (None, Some(trip)) if slot.armed => Some(StopCause::Trip { axis: index, trip }),
+            _ => lost.then_some(StopCause::FollowLost { axis: index }),
+        };
+        group.found = group.found.or(cause);
+    }
+}

@@ -1,0 +1,266 @@
+//! Commands to the cycle, and stops.
+
+use ecaxis_axis::{Command, CommandError, StopMethod};
+
+use super::Engine;
+use crate::rt::axis::RtAxis;
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::{Event, ORDERS_A_CYCLE, RtCommand};
+use crate::rt::flight_recorder::Trigger;
+use crate::rt::reaction_group::{ActiveStop, ReactionGroup, check_permitted};
+use crate::rt::setpoint_generator::{self, GeneratorRequest};
+
+impl Engine {
+    /// Takes all queued commands, so that commands of one batch take effect in the same cycle.
+    pub(super) fn take_orders(&mut self) {
+        for _ in 0..ORDERS_A_CYCLE {
+            let Ok(order) = self.end.orders.pop() else {
+                if self.end.orders.is_abandoned() && !self.halted {
+                    self.stop_without_supervisor();
+                }
+                return;
+            };
+            self.orders_taken += 1;
+            self.take(order);
+        }
+    }
+
+    fn take(&mut self, order: RtCommand) {
+        match order {
+            RtCommand::Axis { axis, command } => {
+                let Some(slot) = self.axes.get_mut(axis) else {
+                    return;
+                };
+                let admitted = check_permitted(&mut self.groups, slot.group, command);
+                if let Err(reason) = admitted.and_then(|()| slot.command(command)) {
+                    // A stopping machine rejects motion. The sender receives the stop event
+                    // instead.
+                    if self.stopping().is_some() {
+                        return;
+                    }
+                    let cycle = self.stats.counters.cycles;
+                    self.report(Event::Refused {
+                        cycle,
+                        axis,
+                        reason,
+                    });
+                }
+            }
+            RtCommand::Feed { axis, start } => self.start_generator(axis, start),
+            RtCommand::Output { output, value } => {
+                if let Some(signal) = self.signals.outputs.get(output) {
+                    signal.set(self.exchange.outputs_mut(), value);
+                }
+            }
+            RtCommand::Guard => {
+                self.guarding = true;
+                self.exchange.expect_op(true);
+            }
+            RtCommand::Unguard => {
+                self.guarding = false;
+                self.exchange.expect_op(false);
+                self.axes.iter_mut().for_each(RtAxis::disarm);
+            }
+            RtCommand::Stop => self.stop(None, StopCause::Requested),
+            RtCommand::ErrorCode { axis, code } => {
+                if let Some(slot) = self.axes.get_mut(axis) {
+                    slot.axis.note_error_code(code);
+                }
+            }
+            RtCommand::Halt => self.halted = true,
+        }
+    }
+
+    /// The supervisor ended without a halt command: stop the machine, then end the loop.
+    fn stop_without_supervisor(&mut self) {
+        self.stop(None, StopCause::Requested);
+        self.halted = self.stop_ended();
+    }
+
+    /// Returns the stop of the machine.
+    pub(super) fn stopping(&self) -> Option<ActiveStop> {
+        self.groups.first().and_then(ReactionGroup::stop)
+    }
+
+    /// Stops `own`, or all groups if `own` is `None`. A cause of one group stops that group by its
+    /// configured method. The rest of the machine stops within the limits of its axes, unless it
+    /// may continue.
+    pub(super) fn stop(&mut self, own: Option<usize>, cause: StopCause) {
+        let goes_on = own
+            .and_then(|own| self.groups.get(own))
+            .is_some_and(ReactionGroup::continues_without);
+        let machine_stops = self.stopping().is_some();
+        if cause != StopCause::Requested {
+            self.exchange.stop_windows(own.filter(|_| goes_on));
+        }
+        if !goes_on {
+            self.history.stopping(match cause {
+                StopCause::Requested => Trigger::Requested,
+                _ => Trigger::Failure,
+            });
+        }
+        if let Some(own) = own.filter(|_| goes_on) {
+            self.abort_lines(own);
+        }
+        for group in 0..self.groups.len() {
+            if own.is_none_or(|own| own == group) {
+                let first = self.stop_group(group, cause, None);
+                if first && goes_on && !machine_stops {
+                    if let Some(group) = self.groups.get_mut(group) {
+                        group.stops = group.stops.saturating_add(1);
+                    }
+                    let cycle = self.stats.counters.cycles;
+                    self.report(Event::GroupStopping {
+                        cycle,
+                        group,
+                        cause,
+                    });
+                }
+            } else if !goes_on {
+                self.stop_group(group, cause, Some(StopMethod::Ramp));
+            }
+        }
+        if !machine_stops && !goes_on {
+            let cycle = self.stats.counters.cycles;
+            self.report(Event::Stopping { cycle, cause });
+        }
+    }
+
+    /// Ends the lines that share an axis with a stopped group: the other axes can no longer follow
+    /// them.
+    fn abort_lines(&mut self, own: usize) {
+        let mut slots = self.axes.iter();
+        if !slots.any(|slot| slot.group == own && slot.feed.on_line()) {
+            return;
+        }
+        for (axis, slot) in self.axes.iter_mut().enumerate() {
+            if slot.group == own || !slot.feed.on_line() {
+                continue;
+            }
+            slot.feed.abort_line();
+            if let Some(group) = self.groups.get_mut(slot.group) {
+                group.found = group.found.or(Some(StopCause::FollowLost { axis }));
+            }
+        }
+    }
+
+    /// Stops a group by `method`, or as the cause demands. An axis that is already stopping never
+    /// stops more gently. Returns true if the group was not stopping before.
+    fn stop_group(&mut self, index: usize, cause: StopCause, method: Option<StopMethod>) -> bool {
+        let Some(group) = self.groups.get_mut(index) else {
+            return false;
+        };
+        // A consequence of another group's failure is not a failure of this group.
+        let failure = |group: &ReactionGroup| group.stop().and_then(|stop| stop.failure);
+        let before = failure(group);
+        let first = if method.is_none() || group.stop().is_none() {
+            group.begin(cause, self.next)
+        } else {
+            false
+        };
+        let failed = before.is_none() && failure(group).is_some();
+        let method = method.unwrap_or_else(|| group.method(cause));
+        for slot in self.axes.iter_mut().filter(|slot| slot.group == index) {
+            if cause == StopCause::EmergencyStop {
+                let _ = slot.axis.command(Command::EmergencyStop);
+            } else {
+                slot.axis.stop_by(method);
+            }
+            slot.feed.end();
+        }
+        if failed {
+            self.history.stopping(Trigger::Failure);
+            let cycle = self.stats.counters.cycles;
+            self.report(Event::Stopping { cycle, cause });
+        }
+        first
+    }
+
+    /// Stops axes whose group is stopping and whose device is missing. Such a drive stops by itself
+    /// if it no longer receives frames.
+    pub(super) fn stop_missing_axes(&mut self) {
+        for slot in &mut self.axes {
+            let stopping = self
+                .groups
+                .get(slot.group)
+                .and_then(ReactionGroup::stop)
+                .is_some();
+            if stopping && self.guarding && self.guard.device_lost(slot.device) {
+                slot.axis.stop_by(self.stop_setup.bus_lost);
+            }
+        }
+    }
+
+    /// True once nothing more can be done to stop any axis.
+    pub(super) fn stop_ended(&self) -> bool {
+        self.axes.iter().all(|slot| slot.axis.stop_ended())
+    }
+
+    /// Releases groups that were reset. Their axes must be at rest without power, without a fault
+    /// or trip, and their process data must be fresh.
+    pub(super) fn release(&mut self) {
+        if self.stopping().is_some() {
+            return;
+        }
+        for index in 0..self.groups.len() {
+            let there = self.exchange.shares().get(index).is_some_and(|s| s.fresh)
+                && self.guard.lost(index).is_none();
+            let idle = |slot: &RtAxis| {
+                let status = slot.axis.status();
+                let sound = status.fault.is_none() && status.trip.is_none();
+                sound && !status.state.has_power()
+            };
+            let mut own = self.axes.iter().filter(|slot| slot.group == index);
+            let Some(group) = self.groups.get_mut(index) else {
+                continue;
+            };
+            if group.stop().is_none() || !there || !own.all(idle) || !group.release() {
+                continue;
+            }
+            for slot in self.axes.iter_mut().filter(|slot| slot.group == index) {
+                slot.disarm();
+            }
+            self.exchange.release_windows(index);
+            let cycle = self.stats.counters.cycles;
+            let group = index;
+            self.report(Event::GroupReleased { cycle, group });
+        }
+    }
+
+    fn start_generator(&mut self, axis: usize, start: GeneratorRequest) {
+        if self.stopping().is_some() {
+            return;
+        }
+        let master = match start {
+            GeneratorRequest::Gear { master, actual, .. } => self
+                .axes
+                .get(master)
+                .and_then(|slot| setpoint_generator::master_motion(&slot.axis.status(), actual)),
+            _ => None,
+        };
+        let ring =
+            matches!(start, GeneratorRequest::Gear { master, .. } if self.follows(master, axis));
+        if let Some(slot) = self.axes.get_mut(axis) {
+            let stopped = |group: &ReactionGroup| group.stop().is_some();
+            if self.groups.get(slot.group).is_some_and(stopped) {
+                slot.feed.refuse(CommandError::GroupStopped);
+                return;
+            }
+            let status = slot.axis.status();
+            slot.feed.begin(start, &status, master, ring);
+        }
+    }
+
+    /// True if an axis follows `leader`, directly or through other gears.
+    fn follows(&self, axis: usize, leader: usize) -> bool {
+        let mut at = Some(axis);
+        for _ in 0..=self.axes.len() {
+            match at {
+                Some(axis) if axis == leader => return true,
+                Some(axis) => at = self.axes.get(axis).and_then(|s| Some(s.feed.master()?.0)),
+                None => return false,
+            }
+        }
+        true
+    }
+}

@@ -1,0 +1,105 @@
+//! The status of mailboxes and the bus time as the cycle sees them, for other threads. Atomics keep
+//! the cost of reading them away from the cycle.
+
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+
+use crate::clock::Nanos;
+use crate::mailbox::MailboxStatus;
+
+/// Bit 3 of a SyncManager's status.
+const MAILBOX_FULL: u8 = 0x08;
+/// No distributed clock has answered yet.
+const NO_CLOCK: i64 = i64::MIN;
+
+#[derive(Debug)]
+pub struct BusStatus {
+    /// For each member: the time of the last status, shifted left by one; bit 0: the mailbox was
+    /// full. 0: never seen.
+    mailboxes: Box<[AtomicU64]>,
+    /// System time minus session clock.
+    clock: AtomicI64,
+}
+
+impl BusStatus {
+    /// The fill byte of every diagnostic read. No SyncManager has this status, so it marks data
+    /// that no SubDevice wrote.
+    pub(super) const UNSEEN: u8 = 0xff;
+
+    #[must_use]
+    #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
+    pub fn new(members: usize) -> Self {
+        Self {
+            mailboxes: (0..members).map(|_| AtomicU64::new(0)).collect(),
+            clock: AtomicI64::new(NO_CLOCK),
+        }
+    }
+
+    /// Stores the status register of a mailbox, read by a frame sent at `at`. RT: O(1).
+    pub(super) fn store_mailbox_status(&self, member: usize, at: Nanos, status: u8) {
+        if status == Self::UNSEEN {
+            return;
+        }
+        if let Some(seen) = self.mailboxes.get(member) {
+            let full = u64::from(status & MAILBOX_FULL != 0);
+            seen.store(at << 1 | full, Ordering::Relaxed);
+        }
+    }
+
+    /// Stores the system time at which a frame sent at `at` passed the reference clock. RT: O(1).
+    pub(super) fn set_clock(&self, at: Nanos, system_time: u64) {
+        let offset = system_time.wrapping_sub(at) as i64;
+        self.clock.store(offset, Ordering::Relaxed);
+    }
+
+    /// Returns the last status of a member's mailbox.
+    #[must_use]
+    pub fn mailbox(&self, member: usize) -> Option<MailboxStatus> {
+        let seen = self.mailboxes.get(member)?.load(Ordering::Relaxed);
+        (seen != 0).then_some(MailboxStatus {
+            at: seen >> 1,
+            full: seen & 1 != 0,
+        })
+    }
+
+    /// Returns the DC system time in ns at a time of the session's clock; `None` without
+    /// distributed clocks.
+    #[must_use]
+    pub fn system_time(&self, at: Nanos) -> Option<u64> {
+        let offset = self.clock.load(Ordering::Relaxed);
+        (offset != NO_CLOCK).then(|| at.wrapping_add_signed(offset))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unprocessed_mailbox_status_is_ignored() {
+        let bus_status = BusStatus::new(2);
+        assert_eq!(bus_status.mailbox(0), None);
+        bus_status.store_mailbox_status(0, 5_000, 0x48);
+        bus_status.store_mailbox_status(0, 6_000, BusStatus::UNSEEN);
+        bus_status.store_mailbox_status(7, 6_000, 0x08);
+        let full = MailboxStatus {
+            at: 5_000,
+            full: true,
+        };
+        assert_eq!(
+            (bus_status.mailbox(0), bus_status.mailbox(1)),
+            (Some(full), None)
+        );
+        bus_status.store_mailbox_status(0, 7_000, 0x40);
+        assert!(bus_status.mailbox(0).is_some_and(|seen| !seen.full));
+    }
+
+    #[test]
+    fn system_time_advances_between_frames() {
+        let bus_status = BusStatus::new(0);
+        assert_eq!(bus_status.system_time(5), None);
+        bus_status.set_clock(1_000, 700_000_000);
+        assert_eq!(bus_status.system_time(1_250), Some(700_000_250));
+        bus_status.set_clock(9_000, 1_000);
+        assert_eq!(bus_status.system_time(9_100), Some(1_100));
+    }
+}

@@ -1,0 +1,110 @@
+//! The frames of one cycle, from staging until their answers are evaluated.
+
+use super::frame::{FIRST_DATAGRAM, Frame, frame_number, frame_tag, number, same_headers};
+use super::poll_schedule::PollDatagram;
+use crate::clock::{self, Nanos};
+use crate::link::{Link, LinkError};
+
+#[derive(Debug)]
+pub(super) struct FrameSet {
+    /// The frames of each layout.
+    forms: Vec<Vec<Frame>>,
+    /// The layout in use.
+    pub form: usize,
+    /// The number of its cycle; the low byte is the index of every datagram.
+    cycle: u32,
+    /// The delay after the planned release; `None` until sent.
+    pub sent_late: Option<Nanos>,
+    /// The session clock's time when it was sent.
+    pub sent_at: Nanos,
+    /// The diagnostic read that it carries.
+    pub turn: Option<PollDatagram>,
+}
+
+impl FrameSet {
+    pub fn new(forms: Vec<Vec<Frame>>) -> Self {
+        Self {
+            forms,
+            form: 0,
+            cycle: 0,
+            sent_late: None,
+            sent_at: 0,
+            turn: None,
+        }
+    }
+
+    pub fn form_frames(&self, form: usize) -> &[Frame] {
+        self.forms.get(form).map_or(&[], Vec::as_slice)
+    }
+
+    pub fn frames(&self) -> &[Frame] {
+        self.form_frames(self.form)
+    }
+
+    pub fn frames_mut(&mut self) -> &mut [Frame] {
+        self.forms
+            .get_mut(self.form)
+            .map_or(&mut [], Vec::as_mut_slice)
+    }
+
+    /// Marks the frames as ready to send; their data is already in place.
+    pub fn stage(&mut self, cycle: u32) {
+        self.cycle = cycle;
+        self.sent_late = None;
+        let frames = self.frames_mut();
+        let count = frames.len();
+        for (index, frame) in frames.iter_mut().enumerate() {
+            frame.answered = false;
+            number(&mut frame.bytes, frame_tag(index, count, cycle), cycle);
+        }
+    }
+
+    pub fn send(&mut self, link: &mut dyn Link, late: Nanos) -> Result<(), LinkError> {
+        self.sent_late = Some(late);
+        self.sent_at = clock::now();
+        for frame in self.frames() {
+            link.send(&frame.bytes)?;
+        }
+        Ok(())
+    }
+
+    /// Stores an answer to one of its frames. Rejects repeated answers and answers of another cycle
+    /// or with other datagrams.
+    pub fn receive(&mut self, answer: &[u8]) -> bool {
+        let count = self.frames().len();
+        let tag = answer.get(10).copied().unwrap_or(0);
+        let number = frame_number(tag, count);
+        let awaited = self.sent_late.is_some()
+            && answer.get(FIRST_DATAGRAM + 1) == Some(&(self.cycle as u8))
+            && tag == frame_tag(number, count, self.cycle);
+        let Some(frame) = self
+            .frames_mut()
+            .get_mut(number)
+            .filter(|f| awaited && !f.answered)
+        else {
+            return false;
+        };
+        let Some(answer) = answer.get(..frame.bytes.len()) else {
+            return false;
+        };
+        if !same_headers(&frame.bytes, answer) {
+            return false;
+        }
+        let Some(kept) = frame.answer.get_mut(..answer.len()) else {
+            return false;
+        };
+        kept.copy_from_slice(answer);
+        frame.answered = true;
+        true
+    }
+
+    pub fn complete(&self) -> bool {
+        self.frames().iter().all(|frame| frame.answered)
+    }
+
+    /// Returns the answer to a frame, if it has arrived.
+    pub fn answer(&self, number: usize) -> Option<&[u8]> {
+        let frame = self.frames().get(number).filter(|frame| frame.answered)?;
+        frame.answer.get(..frame.bytes.len())
+    }
+}

@@ -1,0 +1,218 @@
+//! The schedule of the diagnostic slot. If mailboxes are polled, every other read is theirs. The
+//! cost per cycle does not depend on the number of mailboxes.
+
+use super::diagnostics::DiagnosticRegister;
+use super::frame::{DATAGRAM_HEADER, WKC};
+use super::{ExchangeDevice, FPRD, LRD};
+use crate::rt::image::MailboxPlan;
+use ecaxis_ecat::registers;
+
+/// Data bytes of the longest read.
+const LONGEST: usize = 8;
+/// Bytes of the longest datagram in the diagnostic slot.
+pub const LONGEST_LOOK: usize = DATAGRAM_HEADER + LONGEST + WKC;
+
+/// The target of one read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum PollTarget {
+    /// A register block of one member.
+    At {
+        device: usize,
+        probe: DiagnosticRegister,
+    },
+    /// The status of mailboxes, a byte each, starting at this index of
+    /// [`PollSchedule::mailbox_devices`].
+    Mailboxes { first: usize },
+}
+
+/// One read of the diagnostic slot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct PollDatagram {
+    pub look: PollTarget,
+    pub command: u8,
+    pub address: u32,
+    pub len: usize,
+}
+
+/// The sequence of reads.
+#[derive(Debug)]
+pub(super) struct PollSchedule {
+    diagnosis: Box<[PollDatagram]>,
+    mailboxes: Box<[PollDatagram]>,
+    /// The devices whose status the mailbox reads contain, in order.
+    pub mailbox_devices: Box<[usize]>,
+    /// The next diagnosis read and the next mailbox read.
+    next: (usize, usize),
+    mailbox_is_next: bool,
+}
+
+impl PollSchedule {
+    /// Creates the schedule: each register block of all members in turn, and the status of
+    /// mailboxes. One read covers up to eight mailboxes where an FMMU maps them.
+    #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
+    pub fn new(members: &[ExchangeDevice], mapped: Option<&MailboxPlan>) -> Self {
+        let registers =
+            |station: u16, register: u16| u32::from(register) << 16 | u32::from(station);
+        let diagnosis = DiagnosticRegister::ALL.iter().flat_map(|&probe| {
+            let (register, len) = probe.register_and_len();
+            members
+                .iter()
+                .enumerate()
+                .map(move |(device, member)| PollDatagram {
+                    look: PollTarget::At { device, probe },
+                    command: FPRD,
+                    address: registers(member.station, register),
+                    len,
+                })
+        });
+        let mut mailbox_devices = mapped.map_or_else(Vec::new, |plan| plan.devices.clone());
+        let mut mailboxes: Vec<PollDatagram> = mailbox_devices
+            .chunks(LONGEST)
+            .scan(0, |at, window| {
+                let first = *at;
+                *at += window.len();
+                Some((first, window.len()))
+            })
+            .map(|(first, len)| PollDatagram {
+                look: PollTarget::Mailboxes { first },
+                command: LRD,
+                address: mapped.map_or(0, |plan| plan.address(first)),
+                len,
+            })
+            .collect();
+        for (device, member) in members.iter().enumerate() {
+            if let Some(sm) = member.mailbox
+                && !mapped.is_some_and(|plan| plan.devices.contains(&device))
+            {
+                mailboxes.push(PollDatagram {
+                    look: PollTarget::Mailboxes {
+                        first: mailbox_devices.len(),
+                    },
+                    command: FPRD,
+                    address: registers(
+                        member.station,
+                        registers::SYNC_MANAGER_STATUS + 8 * u16::from(sm),
+                    ),
+                    len: 1,
+                });
+                mailbox_devices.push(device);
+            }
+        }
+        Self {
+            diagnosis: diagnosis.collect(),
+            mailboxes: mailboxes.into(),
+            mailbox_devices: mailbox_devices.into(),
+            next: (0, 0),
+            mailbox_is_next: false,
+        }
+    }
+
+    /// Returns the next read; `None` without members. RT.
+    pub fn next(&mut self) -> Option<PollDatagram> {
+        let mailbox = self.mailbox_is_next && !self.mailboxes.is_empty();
+        self.mailbox_is_next = !mailbox;
+        let (turns, next) = if mailbox {
+            (&self.mailboxes, &mut self.next.1)
+        } else {
+            (&self.diagnosis, &mut self.next.0)
+        };
+        let turn = turns.get(*next).copied();
+        *next = if *next + 1 < turns.len() {
+            *next + 1
+        } else {
+            0
+        };
+        turn
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn members(mailboxes: &[Option<u8>]) -> Vec<ExchangeDevice> {
+        let each = mailboxes
+            .iter()
+            .zip(1001..)
+            .map(|(&mailbox, station)| ExchangeDevice {
+                station,
+                clock: true,
+                mailbox,
+            });
+        each.collect()
+    }
+
+    #[test]
+    fn poll_schedule_reads_mailboxes_every_other_cycle() {
+        let members = members(&[Some(1), None, Some(3)]);
+        let mut schedule = PollSchedule::new(&members, None);
+        let looks: Vec<PollDatagram> = std::iter::from_fn(|| schedule.next()).take(64).collect();
+        let mut probes = Vec::new();
+        let mut mailboxes = Vec::new();
+        for (n, turn) in looks.iter().enumerate() {
+            match turn.look {
+                PollTarget::At { device, probe } => {
+                    assert_eq!(n % 2, 0);
+                    assert_eq!(turn.address & 0xffff, 1001 + device as u32);
+                    probes.push((probe, device));
+                }
+                PollTarget::Mailboxes { first } => {
+                    mailboxes.push((schedule.mailbox_devices[first], turn.address, turn.len));
+                }
+            }
+        }
+        let first = (0, 0x080d_03e9, 1);
+        let second = (2, 0x081d_03eb, 1);
+        assert_eq!(mailboxes[..4], [first, second, first, second]);
+        assert_eq!(
+            probes[..4].iter().map(|p| p.1).collect::<Vec<_>>(),
+            [0, 1, 2, 0]
+        );
+        // The schedule has visited all members and starts again.
+        assert_eq!(probes[0], probes[15]);
+        for probe in DiagnosticRegister::ALL {
+            assert_eq!(probes[..15].iter().filter(|p| p.0 == probe).count(), 3);
+        }
+    }
+
+    #[test]
+    fn poll_schedule_reads_eight_mapped_mailboxes_at_once() {
+        let members = members(&[Some(1); 12]);
+        let plan = MailboxPlan {
+            logical: 0x0001_0100,
+            devices: (0..12).filter(|n| *n != 4).collect(),
+        };
+        let mut schedule = PollSchedule::new(&members, Some(&plan));
+        let looks = std::iter::from_fn(|| schedule.next())
+            .take(8)
+            .collect::<Vec<_>>();
+        let mailboxes: Vec<_> = looks
+            .iter()
+            .filter_map(|turn| match turn.look {
+                PollTarget::Mailboxes { first } => {
+                    Some((first, turn.command, turn.address, turn.len))
+                }
+                PollTarget::At { .. } => None,
+            })
+            .collect();
+        let expected = [
+            (0, LRD, 0x0001_0100, 8),
+            (8, LRD, 0x0001_0108, 3),
+            (11, FPRD, 0x080d_03ed, 1),
+            (0, LRD, 0x0001_0100, 8),
+        ];
+        assert_eq!(mailboxes, expected);
+        assert_eq!(schedule.mailbox_devices[11], 4);
+    }
+
+    #[test]
+    fn poll_datagrams_fit_the_diagnostic_slot() {
+        for members in [members(&[None]), members(&[Some(1); 20])] {
+            let mut schedule = PollSchedule::new(&members, None);
+            for _ in 0..200 {
+                assert!(schedule.next().expect("a turn").len <= LONGEST);
+            }
+        }
+        assert_eq!(PollSchedule::new(&[], None).next(), None);
+    }
+}

@@ -1,0 +1,313 @@
+//! Set-points that depend on more than the axis itself: a line with other axes, a table, the motion
+//! of another axis.
+//!
+//! A generator gives its axis one position per cycle through `Axis::set_point`, like a user
+//! controller. The limits of the axis therefore apply to each position. Any other motion command to
+//! the axis ends its generator.
+
+use ecaxis_axis::group::LinePath;
+use ecaxis_axis::setpoint::{
+    Gear, GearConfig, JerkLimited, Motion, Playback, PositionWave, Setpoint, SetpointError, Table,
+};
+use ecaxis_axis::{Axis, AxisStatus, CommandError, HomingStatus};
+
+/// A request to start following a set-point source.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum GeneratorRequest {
+    /// The axis' part of a straight line.
+    Line(LinePath),
+    /// A move of its own, synchronised in time with other axes.
+    Move(JerkLimited),
+    Wave(PositionWave),
+    /// A table; `table` is an index into the machine's tables.
+    Table {
+        table: usize,
+        playback: Playback,
+    },
+    /// The motion of another axis.
+    Gear {
+        master: usize,
+        /// True for the master's reported position, false for its set-point.
+        actual: bool,
+        config: GearConfig,
+    },
+}
+
+/// The source that an axis follows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Source {
+    Line(LinePath),
+    Move(JerkLimited),
+    Wave(PositionWave),
+    Table {
+        table: usize,
+        playback: Playback,
+    },
+    Gear {
+        master: usize,
+        actual: bool,
+        gear: Gear,
+    },
+}
+
+/// Smaller differences between two velocities are rounding; a stop by lost frames exceeds this.
+const ROUNDING: f64 = 1e-6;
+
+const RING: &str = "the axes would follow each other";
+const NO_MASTER: &str = "the axis that is followed has no power, or searches its home";
+/// For time-based sources. A line continues where it was interrupted, but points in time are past.
+pub(crate) const HELD_UP: &str = "lost frames held the axis up, and its time is past";
+const NO_PARTNER: &str = "an axis of the same line has stopped";
+const SLIPS: &str = "the axis cannot follow within its limits";
+
+/// The longest time that an engaged gear may lag.
+const SLIP_S: f64 = 0.02;
+/// The same for reported positions. They change in steps, and a drive that catches up accelerates
+/// more than its set-point.
+const SLIP_ACTUAL_S: f64 = 0.5;
+
+/// The state of the last generator of an axis.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum GeneratorState {
+    #[default]
+    None,
+    Running,
+    /// A gear that has reached its ratio and offset.
+    Engaged,
+    /// The end is reached.
+    Finished,
+    /// Not started: the axis was at another position or in motion.
+    NotBegun(SetpointError),
+    /// The axis rejected a set-point and decelerates.
+    Refused(CommandError),
+    /// The source has ended or cannot be followed, for this reason.
+    Lost(&'static str),
+}
+
+/// The set-point generator of one axis.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SetpointGenerator {
+    source: Option<Source>,
+    state: GeneratorState,
+    /// The last motion that the source gave.
+    given: Option<Motion>,
+    /// How long an engaged gear has lagged.
+    slipping_s: f64,
+}
+
+/// Returns the set-point of an axis.
+#[must_use]
+pub fn commanded(status: &AxisStatus) -> Motion {
+    Motion {
+        position: status.target_position,
+        velocity: status.target_velocity,
+        acceleration: status.target_acceleration,
+    }
+}
+
+/// Returns the motion of a master: its set-point, or its reported values. Returns `None` if the
+/// master has no power or is homing, because its position may jump.
+#[must_use]
+pub fn master_motion(status: &AxisStatus, actual: bool) -> Option<Motion> {
+    if !status.enabled || matches!(status.homing, HomingStatus::Running) {
+        return None;
+    }
+    Some(if actual {
+        Motion {
+            position: status.position,
+            velocity: status.velocity,
+            acceleration: 0.0,
+        }
+    } else {
+        commanded(status)
+    })
+}
+
+impl SetpointGenerator {
+    #[must_use]
+    pub fn state(&self) -> GeneratorState {
+        self.state
+    }
+
+    /// True while the axis follows a source.
+    #[must_use]
+    pub fn runs(&self) -> bool {
+        self.source.is_some()
+    }
+
+    /// Starts a source. `master` is the motion of the gear's master. `ring` is true if the master
+    /// follows this axis. RT: O(1).
+    pub fn begin(
+        &mut self,
+        start: GeneratorRequest,
+        axis: &AxisStatus,
+        master: Option<Motion>,
+        ring: bool,
+    ) {
+        self.slipping_s = 0.0;
+        if ring || (matches!(start, GeneratorRequest::Gear { .. }) && master.is_none()) {
+            let why = if ring { RING } else { NO_MASTER };
+            (self.source, self.state) = (None, GeneratorState::Lost(why));
+            return;
+        }
+        let source = match start {
+            GeneratorRequest::Line(along) => Ok(Source::Line(along)),
+            GeneratorRequest::Move(planned) => Ok(Source::Move(planned)),
+            GeneratorRequest::Wave(wave) => Ok(Source::Wave(wave)),
+            GeneratorRequest::Table { table, playback } => Ok(Source::Table { table, playback }),
+            GeneratorRequest::Gear {
+                master: index,
+                actual,
+                config,
+            } => Gear::new(config, master.unwrap_or_default(), commanded(axis)).map(|gear| {
+                Source::Gear {
+                    master: index,
+                    actual,
+                    gear,
+                }
+            }),
+        };
+        self.given = None;
+        (self.source, self.state) = match source {
+            Ok(source) => (Some(source), GeneratorState::Running),
+            Err(error) => (None, GeneratorState::NotBegun(error)),
+        };
+    }
+
+    /// True while the axis follows a line. All axes on lines at the same time are on the same line.
+    #[must_use]
+    pub fn on_line(&self) -> bool {
+        matches!(self.source, Some(Source::Line(_)))
+    }
+
+    /// Ends the line because another axis on it has stopped.
+    pub fn abort_line(&mut self) {
+        (self.source, self.state) = (None, GeneratorState::Lost(NO_PARTNER));
+    }
+
+    /// Rejects the start because the axis may not move.
+    pub fn refuse(&mut self, reason: CommandError) {
+        (self.source, self.state) = (None, GeneratorState::Refused(reason));
+    }
+
+    /// Ends the source because the axis received another command.
+    pub fn end(&mut self) {
+        if self.source.take().is_some() {
+            self.state = GeneratorState::None;
+        }
+    }
+
+    /// Returns the index of the followed axis, and whether its reported values are followed.
+    #[must_use]
+    pub fn master(&self) -> Option<(usize, bool)> {
+        match self.source {
+            Some(Source::Gear { master, actual, .. }) => Some((master, actual)),
+            _ => None,
+        }
+    }
+
+    /// Returns where the source left the axis, if it is still there. The axis computes its velocity
+    /// from positions with rounding, which the source would take for a disturbance.
+    fn resume_motion(&self, axis: &Axis, dt_s: f64) -> Motion {
+        let now = commanded(&axis.status());
+        let Some(given) = self.given.filter(|given| given.position == now.position) else {
+            return now;
+        };
+        let smallest = axis.config().limits.acceleration * dt_s;
+        if (given.velocity - now.velocity).abs() <= ROUNDING * (given.velocity.abs() + smallest) {
+            given
+        } else {
+            now
+        }
+    }
+
+    /// Gives the axis this cycle's set-point; call it between the axis' `observe` and `act`.
+    /// Returns true if the source has just ended without a command. RT: O(1), for a table O(rows in
+    /// a cycle).
+    pub fn advance(
+        &mut self,
+        axis: &mut Axis,
+        tables: &[Table],
+        master: Option<Motion>,
+        dt_s: f64,
+    ) -> bool {
+        let Some(mut source) = self.source else {
+            return false;
+        };
+        if self.master().is_some() && master.is_none() {
+            (self.source, self.state) = (None, GeneratorState::Lost(NO_MASTER));
+            return true;
+        }
+        let before = self.resume_motion(axis, dt_s);
+        let mut interrupted = false;
+        let (next, finished, state) = match &mut source {
+            Source::Line(along) => {
+                let next = along.advance(before, dt_s);
+                (next, along.finished(next), GeneratorState::Running)
+            }
+            Source::Move(planned) => {
+                let next = planned.advance(before, dt_s);
+                (next, planned.finished(next), GeneratorState::Running)
+            }
+            Source::Wave(wave) => {
+                let next = wave.advance(before, dt_s);
+                interrupted = wave.interrupted();
+                (next, wave.finished(next), GeneratorState::Running)
+            }
+            Source::Table { table, playback } => match tables.get(*table) {
+                Some(table) => {
+                    let next = playback.advance(table, before, dt_s);
+                    interrupted = playback.interrupted();
+                    (next, playback.finished(next), GeneratorState::Running)
+                }
+                None => (before, true, GeneratorState::Running),
+            },
+            Source::Gear { gear, .. } => {
+                let next = gear.advance(master.unwrap_or_default(), before, dt_s);
+                let state = if gear.engaged() {
+                    GeneratorState::Engaged
+                } else {
+                    GeneratorState::Running
+                };
+                if self.state == GeneratorState::Engaged && state == GeneratorState::Running {
+                    self.slipping_s = dt_s;
+                } else if self.slipping_s > 0.0 && state == GeneratorState::Running {
+                    self.slipping_s += dt_s;
+                } else {
+                    self.slipping_s = 0.0;
+                }
+                (next, false, state)
+            }
+        };
+        let patience = match source {
+            Source::Gear { actual: true, .. } => SLIP_ACTUAL_S,
+            _ => SLIP_S,
+        };
+        if self.slipping_s > patience {
+            (self.source, self.state) = (None, GeneratorState::Lost(SLIPS));
+            return true;
+        }
+        if interrupted {
+            (self.source, self.state) = (None, GeneratorState::Lost(HELD_UP));
+            return true;
+        }
+        match axis.set_point(next.position) {
+            Ok(()) if finished => (self.source, self.state) = (None, GeneratorState::Finished),
+            Ok(()) => {
+                (self.source, self.state) = (Some(source), state);
+                self.given = Some(next);
+            }
+            // The axis waits, and so does its source.
+            Err(CommandError::FramesLost) => {}
+            Err(reason) => {
+                (self.source, self.state) = (None, GeneratorState::Refused(reason));
+                return true;
+            }
+        }
+        false
+    }
+}
+
+#[cfg(test)]
+#[path = "setpoint_generator_tests.rs"]
+mod tests;

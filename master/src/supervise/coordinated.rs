@@ -1,0 +1,273 @@
+//! Steps in which axes follow more than a target: lines, waves, tables, other axes.
+
+use ecaxis_axis::group::{Line, LineAxis, arrive_together};
+use ecaxis_axis::setpoint::{
+    GearConfig, Goal, JerkLimited, MotionLimits, MoveRequest as Way, Playback, PositionWave,
+    SetpointError, Wave,
+};
+use ecaxis_axis::{Command, Limits};
+
+use super::Supervisor;
+use super::program::{Settling, TargetKind};
+use crate::clock::{self, Nanos};
+use crate::config::Step;
+use crate::rt::channel::RtCommand;
+use crate::rt::setpoint_generator::{GeneratorRequest, GeneratorState, commanded};
+use crate::session::RunError;
+
+/// The timeout in ns for a follower to catch up.
+const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;
+
+/// The maximum fraction of an axis's limits in a step. Products of `f64` are rounded, so it is
+/// slightly below 1.
+const WHOLE: f64 = 1.0 - 1e-9;
+
+impl Supervisor {
+    /// Returns the limits of a device's axis.
+    pub(super) fn limits(&self, device: usize) -> Limits {
+        let axis = self.machine.devices[device].axis.as_ref();
+        // The configuration check ensures that steps name only devices with an axis.
+        axis.map_or(
+            Limits {
+                position: None,
+                velocity: 0.0,
+                acceleration: 0.0,
+                jerk: None,
+                torque: 0.0,
+                following_error: None,
+            },
+            |axis| axis.config.limits,
+        )
+    }
+
+    /// Moves along a straight line. `part`: fraction of the velocity limits, and of the
+    /// acceleration and jerk limits.
+    pub(super) async fn line(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        relative: bool,
+        targets: &[(usize, f64)],
+        part: [f64; 2],
+    ) -> Result<(), RunError> {
+        let places = self.targets(targets);
+        let axes: Vec<usize> = places.iter().map(|&(axis, _)| axis).collect();
+        self.settle(&axes, start).await?;
+        let snapshot = self.poll_and_query().await?;
+        let mut line_axes = Vec::with_capacity(axes.len());
+        for (&(axis, target), &(device, _)) in places.iter().zip(targets) {
+            let from = commanded(&snapshot.axes[axis]);
+            line_axes.push(LineAxis {
+                from,
+                target: if relative {
+                    from.position + target
+                } else {
+                    self.resolve_target(axis, from.position, target)
+                },
+                limits: self.part_of(device, part),
+                range: self.limits(device).position,
+            });
+        }
+        let line = Line::plan(&line_axes)
+            .map_err(|error| self.refusal(step, axes[error.axis], &error.error))?;
+        let feeds = axes.iter().zip(&line_axes);
+        let feeds: Vec<_> = feeds
+            .map(|(&axis, part)| (axis, GeneratorRequest::Line(line.along(part))))
+            .collect();
+        self.follow(step, start, &feeds, GeneratorState::Finished)
+            .await
+    }
+
+    /// Moves every axis on its own path, jerk-limited, so that all arrive with the slowest one.
+    /// `part` as in `line`.
+    pub(super) async fn together(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        relative: bool,
+        targets: &[(usize, f64)],
+        part: [f64; 2],
+    ) -> Result<(), RunError> {
+        let axes = self.places(
+            &targets
+                .iter()
+                .map(|&(device, _)| device)
+                .collect::<Vec<_>>(),
+        );
+        self.settle(&axes, start).await?;
+        let there = self.destinations(relative, targets).await?;
+        let snapshot = self.poll_and_query().await?;
+        let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
+        let mut moves = Vec::with_capacity(axes.len());
+        for (&(axis, target), &(device, _)) in there.iter().zip(targets) {
+            let from = commanded(&snapshot.axes[axis]);
+            let order = Way {
+                range: self.limits(device).position,
+                ..Way::within(Goal::Position(target), self.part_of(device, part))
+            };
+            let planned = if from.velocity == 0.0 {
+                JerkLimited::new(order, from, dt_s)
+            } else {
+                let velocity = from.velocity;
+                Err(SetpointError::NotAtRest { velocity })
+            };
+            moves.push(planned.map_err(|error| self.refusal(step, axis, &error))?);
+        }
+        let first = axes.first().copied().unwrap_or_default();
+        arrive_together(&mut moves).map_err(|error| self.refusal(step, first, &error))?;
+        let feeds = axes.iter().zip(&moves);
+        let feeds: Vec<_> = feeds
+            .map(|(&axis, &planned)| (axis, GeneratorRequest::Move(planned)))
+            .collect();
+        self.follow(step, start, &feeds, GeneratorState::Finished)
+            .await
+    }
+
+    /// Returns fractions of the velocity limit, and of the acceleration and jerk limits of a
+    /// device's axis.
+    fn part_of(&self, device: usize, part: [f64; 2]) -> MotionLimits {
+        let [speed, ramp] = part.map(|part| part * WHOLE);
+        let limits = self.limits(device);
+        MotionLimits {
+            velocity: limits.velocity * speed,
+            acceleration: limits.acceleration * ramp,
+            jerk: limits.jerk() * ramp,
+        }
+    }
+
+    /// Makes one axis follow another. `devices`: the follower and its master.
+    pub(super) async fn gear(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        devices: [usize; 2],
+        actual: bool,
+        config: GearConfig,
+    ) -> Result<(), RunError> {
+        let feed = match *self.places(&devices) {
+            [axis, master] => Some((
+                axis,
+                GeneratorRequest::Gear {
+                    master,
+                    actual,
+                    config,
+                },
+            )),
+            _ => None,
+        };
+        let feeds: Vec<_> = feed.into_iter().collect();
+        self.follow(step, start, &feeds, GeneratorState::Engaged)
+            .await
+    }
+
+    pub(super) async fn wave(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        device: usize,
+        wave: Wave,
+    ) -> Result<(), RunError> {
+        let axes = self.places(&[device]);
+        self.settle(&axes, start).await?;
+        let snapshot = self.poll_and_query().await?;
+        let limits = self.limits(device);
+        let dt_s = self.machine.bus.cycle_ns as f64 * 1e-9;
+        let mut feeds = Vec::new();
+        for axis in axes {
+            let at = commanded(&snapshot.axes[axis]);
+            let wave = PositionWave::new(wave, at, limits.motion(), limits.position, dt_s)
+                .map_err(|error| self.refusal(step, axis, &error))?;
+            feeds.push((axis, GeneratorRequest::Wave(wave)));
+        }
+        self.follow(step, start, &feeds, GeneratorState::Finished)
+            .await
+    }
+
+    /// Moves to the first row of a table, then plays the table.
+    pub(super) async fn play(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        [device, table]: [usize; 2],
+        [speed, ramp]: [f64; 2],
+    ) -> Result<(), RunError> {
+        let axes = self.places(&[device]);
+        let [first, _] = self.machine.tables[table].table.ends();
+        let there: Vec<_> = axes.iter().map(|&axis| (axis, first)).collect();
+        self.move_and_wait(step, start, TargetKind::Position, &there, |position| {
+            Command::MoveTo {
+                position,
+                speed,
+                ramp,
+            }
+        })
+        .await?;
+        if self.over(start) {
+            return Ok(());
+        }
+        let snapshot = self.poll_and_query().await?;
+        let limits = self.limits(device).motion();
+        let mut feeds = Vec::new();
+        for axis in axes {
+            let at = commanded(&snapshot.axes[axis]);
+            let playback = Playback::new(&self.machine.tables[table].table, at, limits, 0.0)
+                .map_err(|error| self.refusal(step, axis, &error))?;
+            feeds.push((axis, GeneratorRequest::Table { table, playback }));
+        }
+        self.follow(step, start, &feeds, GeneratorState::Finished)
+            .await
+    }
+
+    /// Starts all generators in one cycle. Waits until each reaches the state `until` and its axis
+    /// is in target.
+    pub(super) async fn follow(
+        &mut self,
+        step: &Step,
+        start: Nanos,
+        feeds: &[(usize, GeneratorRequest)],
+        until: GeneratorState,
+    ) -> Result<(), RunError> {
+        let orders = feeds
+            .iter()
+            .map(|&(axis, start)| RtCommand::Feed { axis, start });
+        self.orders(&orders.collect::<Vec<_>>()).await;
+        let begun = clock::now();
+        let mut settling = Settling::default();
+        self.wait_until(step, start, |this, snapshot| {
+            let mut done = true;
+            let mut late = None;
+            for &(axis, _) in feeds {
+                match snapshot.feeds[axis] {
+                    GeneratorState::NotBegun(error) => return Err(this.refusal(step, axis, &error)),
+                    GeneratorState::Refused(reason) => {
+                        return Err(this.refusal(step, axis, &reason));
+                    }
+                    GeneratorState::Lost(why) => return Err(this.refusal(step, axis, &why)),
+                    // Another command has taken over the axis.
+                    GeneratorState::None => {}
+                    state => done &= state == until,
+                }
+                if until == GeneratorState::Finished && !snapshot.axes[axis].in_target {
+                    late = Some(axis);
+                }
+            }
+            if !done {
+                let waited = clock::now().saturating_sub(begun);
+                if until == GeneratorState::Engaged && waited > ENGAGE_TIMEOUT {
+                    let axis = feeds.first().map_or(0, |&(axis, _)| axis);
+                    return Err(this.refusal(step, axis, &"it does not catch up"));
+                }
+                settling = Settling::default();
+                return Ok(false);
+            }
+            let Some(axis) = late else { return Ok(true) };
+            let status = &snapshot.axes[axis];
+            let target = status.target_position;
+            if settling.time_limit_reached() {
+                return Err(this.not_reached(step, axis, TargetKind::Position, target, status));
+            }
+            Ok(false)
+        })
+        .await
+    }
+}

@@ -1,0 +1,316 @@
+//! Explains what stopped the machine, by reading the devices while they still answer.
+
+use std::future::{Future, poll_fn};
+use std::pin::pin;
+use std::sync::Arc;
+use std::task::Poll;
+use std::time::Duration;
+
+use ecaxis_axis::{AxisStatus, State, Trip};
+
+use super::{Supervisor, diagnosis_history};
+use crate::bringup::al;
+use crate::clock::{self, Nanos};
+use crate::config::LimitConflict;
+use crate::post_mortem::snapshot::{self, Depth};
+use crate::post_mortem::{DeviceSnapshot, Witnessed};
+use crate::rt::bus_monitor::StopCause;
+use crate::rt::channel::{RtCommand, Snapshot};
+use crate::rt::setpoint_generator::GeneratorState;
+use crate::session::{DriveReport, Progress, RunError};
+
+const ERROR_CODE: u16 = 0x603f;
+pub(super) const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;
+
+/// The timeout of one mailbox read while a stop is explained. The device may hang or be busy with a
+/// long transfer.
+const ASK_TIMEOUT: Duration = Duration::from_millis(500);
+/// The time before a fault in ns within which a device's messages belong to the fault.
+const BEFORE_A_FAULT: Nanos = 1_000_000_000;
+
+impl Supervisor {
+    /// Returns the error for a stop. `group` is the stopped group if the machine continues.
+    pub(super) async fn explain_stop(
+        &mut self,
+        cause: StopCause,
+        group: Option<usize>,
+        snapshot: &Snapshot,
+    ) -> RunError {
+        match cause {
+            // Not reached for requested stops: callers pass only failures.
+            StopCause::Requested => RunError::Interrupted,
+            StopCause::EmergencyStop => {
+                let value = |input: usize| snapshot.inputs.get(input).copied().unwrap_or(f64::NAN);
+                let all = &self.machine.stop.emergency;
+                let pressed = all.iter().find(|c| c.holds(value(c.input))).or(all.first());
+                RunError::EmergencyStop {
+                    condition: pressed.map_or(String::new(), |c| self.machine.condition(c)),
+                }
+            }
+            StopCause::FollowLost { axis } => RunError::FollowLost {
+                device: self.device_of(axis),
+                cause: self.cause_of_others(axis, group, snapshot).await,
+                reason: match snapshot.feeds.get(axis) {
+                    Some(GeneratorState::Refused(reason)) => reason.to_string(),
+                    Some(GeneratorState::Lost(why)) => (*why).to_owned(),
+                    _ => "of another command".to_owned(),
+                },
+            },
+            StopCause::Controller => RunError::Controller,
+            StopCause::Panicked => RunError::Panicked("the cycle".to_owned()),
+            StopCause::Unsupervised => RunError::Unsupervised,
+            StopCause::Powered { axis } => RunError::NotDisabled {
+                device: self.device_of(axis),
+                state: snapshot
+                    .axes
+                    .get(axis)
+                    .map_or(State::OperationEnabled, |s| s.state),
+            },
+            StopCause::DriveFault { axis } => {
+                let since = clock::now().saturating_sub(BEFORE_A_FAULT);
+                let code = self.error_code(axis).await;
+                if let Some(code) = code {
+                    self.order(RtCommand::ErrorCode { axis, code }).await;
+                }
+                RunError::DriveFault {
+                    device: self.device_of(axis),
+                    code,
+                    statusword: snapshot
+                        .axes
+                        .get(axis)
+                        .and_then(|s| s.fault)
+                        .map_or(0, |fault| fault.statusword),
+                    report: self.drive_report(axis, since).await,
+                }
+            }
+            StopCause::Trip { axis, trip } => RunError::Trip {
+                device: self.device_of(axis),
+                trip,
+                limits: self.exceeded_limits(axis),
+            },
+            StopCause::BusLost {
+                cycles,
+                last_wkc,
+                answered,
+            } => {
+                if answered && let Some(missing) = self.find_missing(group).await {
+                    return missing;
+                }
+                RunError::BusLost {
+                    group: group.map(|group| self.group_name(group)),
+                    cycles,
+                    wkc: last_wkc,
+                    answered,
+                }
+            }
+            StopCause::LeftOp { al_status } => match self.find_missing(group).await {
+                Some(missing) => missing,
+                None => RunError::LeftOpBriefly { al_status },
+            },
+        }
+    }
+
+    /// Returns the first SubDevice of a group, or of all, that does not answer or is not in Op.
+    /// Skips groups already stopped.
+    async fn find_missing(&mut self, group: Option<usize>) -> Option<RunError> {
+        for (index, device) in self.bus.addresses().into_iter().enumerate() {
+            let own = self.machine.group_of(index);
+            if group.is_some_and(|group| group != own) || self.is_stopped(own) {
+                continue;
+            }
+            match al::read_status(&self.wire, device.station).await {
+                Ok(Some((status, code))) if status != 8 => {
+                    let state = al::AlState::from_status(status);
+                    return Some(RunError::LeftOp {
+                        device,
+                        state,
+                        code,
+                    });
+                }
+                Ok(None) => return Some(RunError::Gone { device }),
+                _ => {}
+            }
+        }
+        None
+    }
+
+    /// Returns the error that stopped the group whose axis this one may have followed.
+    async fn cause_of_others(
+        &mut self,
+        axis: usize,
+        group: Option<usize>,
+        snapshot: &Snapshot,
+    ) -> Option<Arc<RunError>> {
+        // The other group may have stopped in the same cycle, so its stop is reported first. Boxed
+        // because of the recursion.
+        if group.is_none() {
+            Box::pin(self.report_stopped_groups(snapshot)).await;
+        }
+        let own = self.group_of(axis);
+        let mut others = self.stopped.iter().rev();
+        let last = others.find(|stop| !stop.released && stop.group != own)?;
+        Some(Arc::clone(&last.cause))
+    }
+
+    pub(super) async fn not_enabled(
+        &mut self,
+        axis: usize,
+        status: AxisStatus,
+        timeout: Nanos,
+    ) -> RunError {
+        let code = self.error_code(axis).await.filter(|code| *code != 0);
+        RunError::NotEnabled {
+            device: self.device_of(axis),
+            state: status.state,
+            statusword: status.statusword,
+            mode_confirmed: status.mode_confirmed,
+            code,
+            timeout_ms: timeout / 1_000_000,
+        }
+    }
+
+    /// Reports a fault from before this run; enabling clears it.
+    pub(super) async fn report_preexisting_fault(&mut self, axis: usize) {
+        let name = self.axis_name(axis);
+        let code = self.error_code(axis).await.unwrap_or(0);
+        let text = ecaxis_axis::cia402::describe(code).text;
+        self.report(Progress::Warning(format!(
+            "`{name}` was in fault 0x{code:04x} ({text}) before this run; it is reset"
+        )));
+    }
+
+    /// Reads the error code (0x603F) over CoE.
+    async fn error_code(&mut self, axis: usize) -> Option<u16> {
+        match self.upload(axis, ERROR_CODE).await?.as_slice() {
+            &[low, high] => Some(u16::from_le_bytes([low, high])),
+            _ => None,
+        }
+    }
+
+    /// Reads an object of an axis's device. Returns `None` after a timeout.
+    async fn upload(&mut self, axis: usize, index: u16) -> Option<Vec<u8>> {
+        let mailbox = self.mailboxes.urgent(*self.axes.get(axis)?)?;
+        with_timeout(ASK_TIMEOUT, mailbox.upload(index, 0))
+            .await?
+            .ok()
+    }
+
+    /// Returns the station addresses in segment order.
+    pub(super) fn stations(&self) -> Vec<u16> {
+        let mut devices = self.bus.addresses();
+        devices.sort_by_key(|device| device.position);
+        devices.iter().map(|device| device.station).collect()
+    }
+
+    /// Stores the state of the bus at a failure. Reads it now if no group's stop has stored it.
+    pub(super) async fn witness(&mut self, error: &RunError) {
+        let group = error.shared_cause().and_then(|cause| {
+            let mut stops = self.stopped.iter();
+            stops.find(|stop| Arc::ptr_eq(&stop.cause, cause))
+        });
+        match group {
+            Some(stop) => self.witnessed = Some(stop.witnessed.clone()),
+            None => {
+                let looks = self.look(Depth::Whole).await;
+                self.witnessed = Some(Witnessed::of_machine(looks));
+            }
+        }
+    }
+
+    /// Reads the failure data of all SubDevices, and the fault objects of drives with a fault.
+    pub(super) async fn look(&mut self, depth: Depth) -> Vec<DeviceSnapshot> {
+        if self.outer.orders.is_abandoned() {
+            return Vec::new();
+        }
+        let mut looks = vec![DeviceSnapshot::default(); self.bus.devices.len()];
+        snapshot::read_registers(&self.wire, &self.stations(), &mut looks, depth).await;
+        let snapshot = self.outer.snapshots.read().clone();
+        let end = clock::now().saturating_add(snapshot::PATIENCE);
+        for (&device, status) in self.axes.iter().zip(&snapshot.axes) {
+            let following = matches!(status.trip, Some(Trip::FollowingError { .. }));
+            let ask = snapshot::ObjectSelection {
+                error_code: status.fault.is_some(),
+                interpolation: status.fault.is_some() || following,
+            };
+            let (Some(mailbox), Some(found)) =
+                (self.mailboxes.urgent(device), self.bus.devices.get(device))
+            else {
+                continue;
+            };
+            let Some(look) = looks.get_mut(usize::from(found.at.position)) else {
+                continue;
+            };
+            if look.answers && ask != snapshot::ObjectSelection::default() && clock::now() < end {
+                snapshot::read_objects(&mailbox, ask, look).await;
+            }
+        }
+        looks
+    }
+
+    /// Returns the limits of an axis's drive that the machine file exceeds.
+    fn exceeded_limits(&self, axis: usize) -> Vec<LimitConflict> {
+        let device = self.axes.get(axis).and_then(|&at| self.bus.devices.get(at));
+        device.map_or(Vec::new(), |device| device.limits.clone())
+    }
+
+    /// Returns the failed device's own report. Best effort: the machine stops meanwhile.
+    async fn drive_report(&mut self, axis: usize, since: Nanos) -> Box<DriveReport> {
+        let device = self.axes.get(axis).copied().unwrap_or(usize::MAX);
+        let mut history = Vec::new();
+        if let (Some(mailbox), Some(config)) = (
+            self.mailboxes.urgent(device),
+            self.machine.devices.get(device),
+        ) && let Some(Ok(messages)) =
+            with_timeout(ASK_TIMEOUT, diagnosis_history::read(&mailbox, config)).await
+        {
+            history = messages;
+        }
+        Box::new(DriveReport {
+            emergencies: self.log.last_of(&self.axis_name(axis), since),
+            history,
+            limits: self.exceeded_limits(axis),
+        })
+    }
+
+    /// Checks the mode of each axis over CoE if 0x6061 is not in its process data. Otherwise the
+    /// cycle checks it.
+    pub(super) async fn confirm_modes(&mut self, axes: &[usize]) -> Result<(), RunError> {
+        for &axis in axes {
+            let device = &self.machine.devices[self.axes[axis]];
+            let Some(setup) = &device.axis else { continue };
+            let expected = setup.config.mode.code();
+            if device
+                .selection
+                .layout
+                .tx_field(MODES_OF_OPERATION_DISPLAY, 0)
+                .is_some()
+            {
+                continue;
+            }
+            if let Some(&[display]) = self
+                .upload(axis, MODES_OF_OPERATION_DISPLAY)
+                .await
+                .as_deref()
+                && i8::from_le_bytes([display]) != expected
+            {
+                return Err(RunError::WrongMode {
+                    device: self.device_of(axis),
+                    expected,
+                    display: i8::from_le_bytes([display]),
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns `None` if the future takes longer than `time`.
+async fn with_timeout<F: Future>(time: Duration, future: F) -> Option<F::Output> {
+    let mut future = pin!(future);
+    let mut over = pin!(clock::delay(time));
+    poll_fn(|context| match future.as_mut().poll(context) {
+        Poll::Ready(output) => Poll::Ready(Some(output)),
+        Poll::Pending => over.as_mut().poll(context).map(|()| None),
+    })
+    .await
+}

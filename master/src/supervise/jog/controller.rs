@@ -1,0 +1,481 @@
+//! Turns requests, time and the axes' status into commands. No I/O, no clock.
+
+use std::fmt;
+
+use ecaxis_axis::units::UserUnits;
+use ecaxis_axis::{AxisStatus, Command, CommandError, HomingStatus, Mode};
+
+use super::{HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, Pending, Presence, RAMP, Request};
+use crate::clock::Nanos;
+use crate::config::{AxisSetup, Machine};
+use crate::rt::channel::Snapshot;
+
+/// The timeout in ns for an axis to follow after its set-point has arrived.
+const SETTLE: Nanos = 5_000_000_000;
+const STOPPED: &str = "its group has been stopped";
+
+/// The activity of an axis in manual mode.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Activity {
+    #[default]
+    Nothing,
+    Enabling,
+    Disabling,
+    /// Moves at this velocity while requests continue.
+    Jogging {
+        velocity: f64,
+    },
+    /// Moves to a position, or by a distance.
+    Moving {
+        by: bool,
+        value: f64,
+    },
+    Homing,
+    Switching {
+        to: Mode,
+    },
+    Resetting,
+    Stopping,
+}
+
+impl Activity {
+    fn moves(self) -> bool {
+        matches!(
+            self,
+            Self::Jogging { .. } | Self::Moving { .. } | Self::Homing
+        )
+    }
+}
+
+impl fmt::Display for Activity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Nothing => f.write_str("nothing"),
+            Self::Enabling => f.write_str("enable"),
+            Self::Disabling => f.write_str("disable"),
+            Self::Jogging { velocity } => write!(f, "jog at {velocity}"),
+            Self::Moving { by: true, value } => write!(f, "move by {value}"),
+            Self::Moving { by: false, value } => write!(f, "move to {value}"),
+            Self::Homing => f.write_str("home"),
+            Self::Switching { to } => write!(f, "mode {to}"),
+            Self::Resetting => f.write_str("reset"),
+            Self::Stopping => f.write_str("stop"),
+        }
+    }
+}
+
+/// The state of one axis in manual mode.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct JogAxis {
+    pub doing: Activity,
+    /// The time of the request. For a jog, the last request; for a move, the last time its
+    /// set-point moved.
+    pub since: Nanos,
+}
+
+/// The state of all axes in manual mode.
+#[derive(Debug)]
+pub(super) struct JogController {
+    pub hands: Vec<JogAxis>,
+    pub news: Pending,
+    /// The maximum time in ns to wait for a drive.
+    patience: Nanos,
+}
+
+/// The inputs of [`JogController`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct JogContext<'s> {
+    pub now: Nanos,
+    pub machine: &'s Machine,
+    /// Indices into the machine's devices, as in [`super::View`].
+    pub axes: &'s [usize],
+    pub snapshot: &'s Snapshot,
+}
+
+impl JogContext<'_> {
+    fn setup(&self, axis: usize) -> Option<&AxisSetup> {
+        let device = self.machine.devices.get(*self.axes.get(axis)?)?;
+        device.axis.as_ref()
+    }
+
+    fn group(&self, axis: usize) -> usize {
+        let device = self.axes.get(axis);
+        device.map_or(0, |&device| self.machine.group_of(device))
+    }
+
+    fn enabled(&self, axis: usize) -> bool {
+        let status = self.snapshot.axes.get(axis);
+        status.is_some_and(|status| status.enabled)
+    }
+
+    /// Returns `true` while the set-point moves. At constant velocity the set-point has arrived but
+    /// still moves.
+    fn moving(&self, axis: usize) -> bool {
+        let status = self.snapshot.axes.get(axis);
+        status.is_some_and(|s| s.enabled && (s.moving || s.target_velocity != 0.0))
+    }
+
+    fn stopped(&self, axis: usize) -> bool {
+        let group = self.snapshot.groups.get(self.group(axis));
+        group.is_some_and(|group| group.stopped.is_some())
+    }
+}
+
+/// Commands with the indices of their axes.
+pub(super) type Commands = Vec<(usize, Command)>;
+
+impl JogController {
+    pub fn new(axes: usize, patience: Nanos) -> Self {
+        Self {
+            hands: vec![JogAxis::default(); axes],
+            news: Pending::new(),
+            patience,
+        }
+    }
+
+    /// Handles a command that the cycle refused. The snapshot may not show yet what the axis does
+    /// instead.
+    pub fn refused(
+        &mut self,
+        axis: usize,
+        reason: CommandError,
+        scene: &JogContext<'_>,
+        out: &mut Commands,
+    ) {
+        if let Some(hand) = self.hands.get_mut(axis) {
+            let moved = hand.doing.moves();
+            if moved && scene.moving(axis) {
+                hand.stop(axis, scene.now, out);
+            } else {
+                hand.doing = Activity::Nothing;
+                if moved && scene.enabled(axis) {
+                    out.push((axis, Command::Stop));
+                }
+            }
+        }
+        let why = reason.to_string();
+        self.news.push_back(JogEvent::Refused { axis, why });
+    }
+
+    /// Reports finished activities. The snapshot must already show the effect of all commands.
+    pub fn look(&mut self, scene: &JogContext<'_>, out: &mut Commands) {
+        for (axis, hand) in self.hands.iter_mut().enumerate() {
+            let Some(status) = scene.snapshot.axes.get(axis) else {
+                continue;
+            };
+            let what = hand.doing;
+            let Some(end) = hand.end(status, scene.stopped(axis), scene.now, self.patience) else {
+                continue;
+            };
+            hand.doing = Activity::Nothing;
+            self.news.push_back(match end {
+                Ok(()) => JogEvent::Done { axis, what },
+                Err(why) => {
+                    if what == Activity::Enabling {
+                        out.push((axis, Command::Disable));
+                    }
+                    JogEvent::Failed { axis, what, why }
+                }
+            });
+        }
+    }
+
+    /// Stops motion without an operator or a repeated jog request. Must be called before `take`.
+    pub fn watch(&mut self, scene: &JogContext<'_>, presence: Presence, out: &mut Commands) {
+        for (axis, hand) in self.hands.iter_mut().enumerate() {
+            let late = scene.now.saturating_sub(hand.since) >= HOLD_TO_RUN_TIMEOUT;
+            let moving = scene.moving(axis);
+            match hand.doing {
+                Activity::Jogging { .. } if late && presence == Presence::Here => {
+                    self.news.push_back(JogEvent::LetGo { axis });
+                    hand.stop(axis, scene.now, out);
+                }
+                Activity::Enabling if presence != Presence::Here => {
+                    hand.begin(Activity::Disabling, scene.now);
+                    out.push((axis, Command::Disable));
+                }
+                Activity::Stopping | Activity::Disabling => {}
+                doing if presence != Presence::Here && (doing.moves() || moving) => {
+                    self.news.push_back(JogEvent::LetGo { axis });
+                    hand.stop(axis, scene.now, out);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// Returns `true` while anything moves that the operator must supervise.
+    pub fn moves(&self) -> bool {
+        self.hands.iter().any(|hand| hand.doing.moves())
+    }
+
+    /// Stops everything that moves.
+    pub fn brake(&mut self, scene: &JogContext<'_>, out: &mut Commands) {
+        for (axis, hand) in self.hands.iter_mut().enumerate() {
+            if hand.doing.moves() {
+                hand.stop(axis, scene.now, out);
+            }
+        }
+    }
+
+    /// Executes one request of a present operator, or reports why it is refused.
+    pub fn take(&mut self, request: Request, scene: &JogContext<'_>, out: &mut Commands) {
+        match request {
+            Request::StopAll => {
+                for (axis, hand) in self.hands.iter_mut().enumerate() {
+                    if scene.enabled(axis) {
+                        hand.stop(axis, scene.now, out);
+                    }
+                }
+            }
+            Request::EmergencyStop => {
+                for (axis, hand) in self.hands.iter_mut().enumerate() {
+                    hand.begin(Activity::Stopping, scene.now);
+                    out.push((axis, Command::EmergencyStop));
+                }
+            }
+            Request::Reset { axis } => self.reset(axis, scene, out),
+            Request::Enable { axis } => {
+                self.begin(axis, Activity::Enabling, Command::Enable, scene, out);
+            }
+            Request::Disable { axis } => {
+                self.begin(axis, Activity::Disabling, Command::Disable, scene, out);
+            }
+            Request::Stop { axis } => {
+                self.begin(axis, Activity::Stopping, Command::Stop, scene, out);
+            }
+            Request::SetMode { axis, mode } => {
+                let doing = Activity::Switching { to: mode };
+                self.begin(axis, doing, Command::SetMode(mode), scene, out);
+            }
+            Request::Jog { axis, velocity } => self.jog(axis, velocity, scene, out),
+            Request::MoveBy { .. } | Request::MoveTo { .. } | Request::Home { .. } => {
+                match motion(request, scene) {
+                    Ok((axis, doing, command)) => self.begin(axis, doing, command, scene, out),
+                    Err((axis, why)) => self.news.push_back(JogEvent::Refused { axis, why }),
+                }
+            }
+        }
+    }
+
+    fn begin(
+        &mut self,
+        axis: usize,
+        doing: Activity,
+        command: Command,
+        scene: &JogContext<'_>,
+        out: &mut Commands,
+    ) {
+        if let Some(hand) = self.hands.get_mut(axis) {
+            hand.preempt(doing, axis, out);
+            hand.begin(doing, scene.now);
+            out.push((axis, command));
+        }
+    }
+
+    fn jog(&mut self, axis: usize, velocity: f64, scene: &JogContext<'_>, out: &mut Commands) {
+        let (Some(hand), Some(setup)) = (self.hands.get_mut(axis), scene.setup(axis)) else {
+            return;
+        };
+        let most = MAX_MANUAL_SPEED * setup.config.limits.velocity;
+        // Written so that NaN is rejected, too.
+        if !(-most..=most).contains(&velocity) {
+            let unit = &setup.unit;
+            let why = format!("{velocity} {unit}/s is more than the {most} {unit}/s of a jog");
+            self.news.push_back(JogEvent::Refused { axis, why });
+            return;
+        }
+        if velocity == 0.0 {
+            hand.stop(axis, scene.now, out);
+            return;
+        }
+        let doing = Activity::Jogging { velocity };
+        let goes_on = hand.doing == doing;
+        hand.begin(doing, scene.now);
+        if !goes_on {
+            let ramp = RAMP;
+            out.push((axis, Command::Velocity { velocity, ramp }));
+        }
+    }
+
+    /// Resets an axis and everything that stopped with it.
+    fn reset(&mut self, axis: usize, scene: &JogContext<'_>, out: &mut Commands) {
+        let group = scene.group(axis);
+        let stopped = scene.stopped(axis);
+        for (other, hand) in self.hands.iter_mut().enumerate() {
+            let status = scene.snapshot.axes.get(other);
+            let ill = status.is_some_and(|s| s.fault.is_some() || s.trip.is_some());
+            let with_it = group != 0 && scene.group(other) == group && (ill || stopped);
+            if other == axis || with_it {
+                hand.preempt(Activity::Resetting, other, out);
+                hand.begin(Activity::Resetting, scene.now);
+                out.push((other, Command::ResetFault));
+            }
+        }
+    }
+}
+
+impl JogAxis {
+    fn begin(&mut self, doing: Activity, now: Nanos) {
+        (self.doing, self.since) = (doing, now);
+    }
+
+    /// Stops the present motion before the next activity. Most activities leave the set-point
+    /// alone, and a motion may be refused. Without this stop the axis would move unsupervised. A
+    /// motion accepted in the same cycle takes over without braking.
+    fn preempt(&self, next: Activity, axis: usize, out: &mut Commands) {
+        let jogs = matches!(self.doing, Activity::Jogging { .. });
+        let brakes = matches!(next, Activity::Stopping | Activity::Disabling);
+        if !brakes && (jogs || (self.doing.moves() && !next.moves())) {
+            out.push((axis, Command::Stop));
+        }
+    }
+
+    fn stop(&mut self, axis: usize, now: Nanos, out: &mut Commands) {
+        self.begin(Activity::Stopping, now);
+        out.push((axis, Command::Stop));
+    }
+
+    /// Returns the result of the current activity once it has ended.
+    fn end(
+        &mut self,
+        status: &AxisStatus,
+        stopped: bool,
+        now: Nanos,
+        patience: Nanos,
+    ) -> Option<Result<(), String>> {
+        let waited = now.saturating_sub(self.since);
+        if self.doing.moves() && (stopped || !status.enabled) {
+            let why = if stopped {
+                STOPPED
+            } else {
+                "the axis has no power any more"
+            };
+            return Some(Err(why.to_owned()));
+        }
+        let done = match self.doing {
+            // A jog ends when its requests end.
+            Activity::Nothing | Activity::Jogging { .. } => return None,
+            Activity::Enabling if stopped => return Some(Err(STOPPED.to_owned())),
+            Activity::Enabling => status.ready,
+            Activity::Disabling => !status.state.has_power(),
+            Activity::Stopping => !(status.enabled && status.moving),
+            Activity::Moving { .. } => {
+                if status.moving && !status.held_by_range {
+                    self.since = now;
+                } else if !status.in_target && waited > SETTLE {
+                    return Some(Err(format!(
+                        "not reached, stands at {:.4}",
+                        status.position
+                    )));
+                }
+                return status.in_target.then_some(Ok(()));
+            }
+            Activity::Homing => {
+                return match status.homing {
+                    HomingStatus::Failed(error) => Some(Err(error.to_string())),
+                    HomingStatus::None => Some(Err("the axis has not begun it".to_owned())),
+                    HomingStatus::Attained if status.switching.is_none() && status.ready => {
+                        Some(Ok(()))
+                    }
+                    _ => None,
+                };
+            }
+            Activity::Switching { to } => {
+                if status.switch_failed == Some(to) {
+                    return Some(Err("the drive does not show it".to_owned()));
+                }
+                status.mode == to && status.switching.is_none()
+            }
+            Activity::Resetting => {
+                if status.reset_failed {
+                    return Some(Err(status.fault.map_or_else(
+                        || "the drive stays in Fault".to_owned(),
+                        |fault| fault.to_string(),
+                    )));
+                }
+                !status.resetting && status.fault.is_none() && status.trip.is_none() && !stopped
+            }
+        };
+        if done {
+            return Some(Ok(()));
+        }
+        (waited > patience).then(|| {
+            Err(match status.waiting {
+                Some(waiting) if self.doing == Activity::Enabling => waiting.to_string(),
+                _ => format!("not done in time; the drive is in {}", status.state),
+            })
+        })
+    }
+}
+
+type Motion = (usize, Activity, Command);
+
+/// Returns a motion that ends by itself.
+fn motion(request: Request, scene: &JogContext<'_>) -> Result<Motion, (usize, String)> {
+    let ramp = RAMP;
+    let slow = |axis: usize, speed: f64| {
+        if speed > 0.0 && speed <= MAX_MANUAL_SPEED {
+            return Ok(());
+        }
+        let [speed, most] = [speed, MAX_MANUAL_SPEED].map(|part| part * 100.0);
+        Err((
+            axis,
+            format!("{speed} % is not a speed above 0 and up to {most} %"),
+        ))
+    };
+    match request {
+        Request::MoveBy {
+            axis,
+            distance,
+            speed,
+        } => {
+            slow(axis, speed)?;
+            let doing = Activity::Moving {
+                by: true,
+                value: distance,
+            };
+            let command = Command::MoveBy {
+                distance,
+                speed,
+                ramp,
+            };
+            Ok((axis, doing, command))
+        }
+        Request::MoveTo {
+            axis,
+            position,
+            speed,
+        } => {
+            slow(axis, speed)?;
+            let doing = Activity::Moving {
+                by: false,
+                value: position,
+            };
+            let there = scene.setup(axis).zip(scene.snapshot.axes.get(axis));
+            let there = there.map_or(position, |(setup, status)| {
+                let from = UserUnits(status.target_position);
+                let scale = &setup.config.scale;
+                scale.destination(from, UserUnits(position), setup.way).0
+            });
+            let command = Command::MoveTo {
+                position: there,
+                speed,
+                ramp,
+            };
+            Ok((axis, doing, command))
+        }
+        Request::Home { axis } => {
+            let setup = scene.setup(axis).and_then(|setup| setup.homing.as_ref());
+            let Some(homing) = setup else {
+                return Err((
+                    axis,
+                    "the machine file says nothing of its homing".to_owned(),
+                ));
+            };
+            let timeout_s = homing.timeout_ns as f64 * 1e-9;
+            Ok((axis, Activity::Homing, Command::Home { timeout_s }))
+        }
+        _ => Err((0, "not a motion".to_owned())),
+    }
+}

@@ -1,0 +1,117 @@
+//! The loop that serves the operator.
+
+use std::sync::Arc;
+
+use ecaxis_axis::Command;
+
+use super::controller::{Activity, Commands, JogContext, JogController};
+use super::{JogEvent, Operator, Presence, View};
+use crate::clock;
+use crate::rt::channel::RtCommand;
+use crate::rt::reaction_group::GroupStatus;
+use crate::session::RunError;
+use crate::supervise::Supervisor;
+use crate::supervise::explain::MODES_OF_OPERATION_DISPLAY;
+
+/// The maximum number of requests per call, not counting stops.
+const MOST_REQUESTS: usize = 64;
+
+impl Supervisor {
+    /// Runs until the operator leaves. Axes are enabled on request.
+    pub(in crate::supervise) async fn run_operator(
+        &mut self,
+        operator: &mut dyn Operator,
+    ) -> Result<(), RunError> {
+        let patience = self.machine.bus.enable_timeout_ns + self.longest_stop();
+        let all: Vec<usize> = (0..self.axes.len()).collect();
+        let patience = patience + self.longest_release(&all);
+        let mut worker = JogController::new(self.axes.len(), patience);
+        let (machine, axes) = (Arc::clone(&self.machine), self.axes.clone());
+        // Enabled axes whose mode must be read over CoE because it is not in their process data.
+        let mut enabled: Vec<usize> = Vec::new();
+        let hidden = |axis: usize| {
+            let device = axes.get(axis).and_then(|&d| machine.devices.get(d));
+            let layout = device.map(|device| &device.selection.layout);
+            layout.is_some_and(|layout| layout.tx_field(MODES_OF_OPERATION_DISPLAY, 0).is_none())
+        };
+        let just_enabled = |news: &JogEvent| match *news {
+            JogEvent::Done {
+                axis,
+                what: Activity::Enabling,
+            } if hidden(axis) => Some(axis),
+            _ => None,
+        };
+        loop {
+            let snapshot = self.poll_snapshot().await?;
+            let mut commands = Commands::new();
+            let scene = JogContext {
+                now: clock::now(),
+                machine: &machine,
+                axes: &axes,
+                snapshot: &snapshot,
+            };
+            for (axis, reason) in self.refused.drain(..) {
+                worker.refused(axis, reason, &scene, &mut commands);
+            }
+            // Before this, the snapshot does not show the effect of the commands.
+            if snapshot.orders_taken >= self.orders_given {
+                worker.look(&scene, &mut commands);
+            }
+            let news: Vec<JogEvent> = worker.news.drain(..).collect();
+            let turn = operator.turn(&View {
+                now: scene.now,
+                machine: scene.machine,
+                axes: scene.axes,
+                snapshot: &snapshot,
+                hands: &worker.hands,
+                news: &news,
+            });
+            worker.watch(&scene, turn.presence, &mut commands);
+            let there = turn.presence == Presence::Here;
+            for (index, request) in turn.requests.into_iter().enumerate() {
+                if request.stops() || (there && index < MOST_REQUESTS) {
+                    worker.take(request, &scene, &mut commands);
+                }
+            }
+            let stopped = |group: (usize, &GroupStatus)| {
+                group.1.stopped.is_some() && !self.is_stopped(group.0)
+            };
+            let just_stopped = snapshot.groups.iter().enumerate().any(stopped);
+            enabled.extend(news.iter().filter_map(just_enabled));
+            // Mailbox reads may take long, and the jog timeout is not checked meanwhile.
+            if just_stopped || !enabled.is_empty() {
+                worker.brake(&scene, &mut commands);
+            }
+            let orders = commands.into_iter();
+            let orders = orders.map(|(axis, command)| RtCommand::Axis { axis, command });
+            let orders: Vec<RtCommand> = orders.collect();
+            if !orders.is_empty() {
+                self.orders(&orders).await;
+            }
+            if turn.presence == Presence::Gone {
+                // The operator has seen these faults, so the shutdown does not report them.
+                let ill = |axis: &usize| {
+                    let status = snapshot.axes.get(*axis);
+                    status.is_some_and(|s| s.fault.is_some() || s.trip.is_some())
+                };
+                self.seen = all.iter().copied().filter(ill).collect();
+                return Ok(());
+            }
+            if worker.moves() {
+                continue;
+            }
+            self.report_stopped_groups(&snapshot).await;
+            for axis in enabled.drain(..) {
+                let own = self.setup(axis).map(|setup| setup.config.mode);
+                let other = own != snapshot.axes.get(axis).map(|status| status.mode);
+                if !other && let Err(error) = self.confirm_modes(&[axis]).await {
+                    let what = Activity::Enabling;
+                    let why = error.to_string();
+                    worker.news.push_back(JogEvent::Failed { axis, what, why });
+                    let command = Command::Disable;
+                    self.order(RtCommand::Axis { axis, command }).await;
+                }
+            }
+        }
+    }
+}
