@@ -7,7 +7,9 @@ use std::pin::pin;
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use ecaxis::mailbox::{CoeClient, FoeClient, MailboxLayout, ObjectList, Wire, WireError};
+use ecaxis::mailbox::{
+    CoeClient, DatagramError, FoeClient, MailboxLayout, MailboxTransport, ObjectList,
+};
 use libfuzzer_sys::fuzz_target;
 
 const LEN: u16 = 48;
@@ -73,8 +75,8 @@ impl Device<'_> {
     }
 }
 
-impl Wire for Device<'_> {
-    async fn read(&self, _: u16, register: u16, buffer: &mut [u8]) -> Result<u16, WireError> {
+impl MailboxTransport for Device<'_> {
+    async fn read(&self, _: u16, register: u16, buffer: &mut [u8]) -> Result<u16, DatagramError> {
         self.passed();
         if register == LAYOUT.in_address {
             self.say(buffer);
@@ -85,7 +87,7 @@ impl Wire for Device<'_> {
         Ok(1)
     }
 
-    async fn write(&self, _: u16, _: u16, _: &[u8]) -> Result<u16, WireError> {
+    async fn write(&self, _: u16, _: u16, _: &[u8]) -> Result<u16, DatagramError> {
         self.passed();
         Ok(1)
     }

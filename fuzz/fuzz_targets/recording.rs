@@ -1,11 +1,11 @@
 //! A recording and its analysis: the report as JSON and as a page.
 #![no_main]
 
-use ecaxis::analyze::{Known, analyze, html};
+use ecaxis::analyze::{Context, analyze, html};
 use ecaxis::recording::Reader;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|file: &[u8]| {
-    let report = analyze(vec![Reader::new(file)], None, Known::default());
+    let report = analyze(vec![Reader::new(file)], None, Context::default());
     assert!(html("x", &report).ends_with("</html>\n"));
 });
