@@ -7,11 +7,11 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::channel;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use ecaxis::clock::Clock;
-use ecaxis::config;
-use ecaxis::rt::cycle::Engine;
-use ecaxis::session::{Options, RunBuilder};
 use ecaxis_axis::{Axis, AxisConfig, Command, Inputs, Limits, Mode, Scale};
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config;
+use ecaxis_master::rt::cycle::Engine;
+use ecaxis_master::session::{Options, RunBuilder};
 
 /// Returns a machine of `count` CSP axes at 1 ms.
 fn machine(count: usize) -> String {

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use ecaxis::esi_library;
+use ecaxis_master::esi_library;
 use rustix::time::{ClockId, clock_gettime};
 
 const ROUNDS: usize = 21;

@@ -10,13 +10,13 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use ecaxis::bench::wakeup::{Cyclictest, Wakeups};
-use ecaxis::clock::Nanos;
-use ecaxis::rt::exchange::ExchangeMode;
-use ecaxis::rt::spin::{Spin, SpinWindow};
-use ecaxis::rt::stats::{LatencyHistogram, Percentiles};
-use ecaxis::sys::idle_spinner::IdleSpinner;
-use ecaxis::sys::rt_thread::{self, CpuWakeGuard};
+use ecaxis_master::clock::Nanos;
+use ecaxis_master::rt::exchange::ExchangeMode;
+use ecaxis_master::rt::spin::{Spin, SpinWindow};
+use ecaxis_master::rt::stats::{LatencyHistogram, Percentiles};
+use ecaxis_master::sys::idle_spinner::IdleSpinner;
+use ecaxis_master::sys::rt_thread::{self, CpuWakeGuard};
+use ecaxis_tools::bench::wakeup::{Cyclictest, Wakeups};
 
 const PRIORITY: u8 = 80;
 const ROUNDS: u32 = 3;

@@ -17,11 +17,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 
-use ecaxis::bench::veth::VethPair;
-use ecaxis::config;
-use ecaxis::mailbox::Mailboxes;
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{self, Observer, Options, Progress, Summary};
+use ecaxis_master::config;
+use ecaxis_master::mailbox::Mailboxes;
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{self, Observer, Options, Progress, Summary};
+use ecaxis_tools::bench::veth::VethPair;
 
 /// Identity, state, position and settings, as a commissioning tool reads them.
 const OBJECTS: [(u16, u8); 10] = [

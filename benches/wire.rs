@@ -6,13 +6,13 @@
 
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
-use ecaxis::bench::exchange::Exchanges;
-use ecaxis::bench::reflector::{Reflector, ReplyTiming};
-use ecaxis::bench::veth::VethPair;
-use ecaxis::link::{self, SocketKind};
-use ecaxis::rt::exchange::ExchangeMode;
-use ecaxis::rt::spin::{Spin, SpinWindow};
-use ecaxis::sys::rt_thread::{self, CpuWakeGuard};
+use ecaxis_master::link::{self, SocketKind};
+use ecaxis_master::rt::exchange::ExchangeMode;
+use ecaxis_master::rt::spin::{Spin, SpinWindow};
+use ecaxis_master::sys::rt_thread::{self, CpuWakeGuard};
+use ecaxis_tools::bench::exchange::Exchanges;
+use ecaxis_tools::bench::reflector::{Reflector, ReplyTiming};
+use ecaxis_tools::bench::veth::VethPair;
 
 const PRIORITY: u8 = 80;
 const ROUNDS: usize = 6;

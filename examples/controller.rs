@@ -22,9 +22,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use ecaxis::config::{self, AxisRef, OutputRef};
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{self, Observer, Options, Progress, SignalReport};
+use ecaxis_master::config::{self, AxisRef, OutputRef};
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{self, Observer, Options, Progress, SignalReport};
 
 /// In user units; the other constants are in seconds and swings.
 const AMPLITUDE: f64 = 20.0;

@@ -12,15 +12,15 @@ use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
 use common::{axes, faults, load, machine, virtual_time};
-use ecaxis::clock::{self, Clock, Nanos};
-use ecaxis::config::{AxisRef, Machine};
-use ecaxis::link::capture::{Dir, Recorder, WriterMode};
-use ecaxis::link::{Link, LinkError, MAX_FRAME};
-use ecaxis::mailbox::DeviceMailbox;
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::rt::cycle::{Engine, EngineReport};
-use ecaxis::session::{Options, Prepared, Progress, RunBuilder, RunError};
 use ecaxis_axis::Command;
+use ecaxis_master::clock::{self, Clock, Nanos};
+use ecaxis_master::config::{AxisRef, Machine};
+use ecaxis_master::link::capture::{Dir, Recorder, WriterMode};
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
+use ecaxis_master::mailbox::DeviceMailbox;
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::rt::cycle::{Engine, EngineReport};
+use ecaxis_master::session::{Options, Prepared, Progress, RunBuilder, RunError};
 
 thread_local! {
     static METERED: Cell<bool> = const { Cell::new(false) };

@@ -17,11 +17,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use common::{axes, fixture, load, machine, root, run, run_well, virtual_time};
-use ecaxis::analyze::{self, Context, Report};
-use ecaxis::config::Machine;
-use ecaxis::recording::Reader;
-use ecaxis::recording::frame::{Content, Frame, content};
-use ecaxis::session::Options;
+use ecaxis_master::config::Machine;
+use ecaxis_master::recording::Reader;
+use ecaxis_master::recording::frame::{Content, Frame, content};
+use ecaxis_master::session::Options;
+use ecaxis_tools::analyze::{self, Context, Report};
 
 const CAPTURES: [&str; 11] = [
     "ethercrab-dumps/rs-example-sii-el2004.ecat-only.pcapng",
@@ -423,7 +423,7 @@ fn parts_of_a_recording_are_joined() {
         ..virtual_time()
     };
     let first = recorded(folder.path(), load("demo.toml"), options);
-    let parts = ecaxis::link::capture::parts_of(&first).expect("a folder");
+    let parts = ecaxis_master::link::capture::parts_of(&first).expect("a folder");
     assert_eq!(parts.len(), 3);
     // In shell sort order, the first part is the last argument.
     let mut arguments: Vec<&str> = parts.iter().filter_map(|path| path.to_str()).collect();

@@ -9,9 +9,9 @@ use std::path::Path;
 
 use common::script::{self, Act, move_to, perform_well, process_images, velocity};
 use common::{faults, load, virtual_time};
-use ecaxis::config::Machine;
-use ecaxis::session::Options;
 use ecaxis_axis::{AxisStatus, Command, Mode};
+use ecaxis_master::config::Machine;
+use ecaxis_master::session::Options;
 
 /// The axes of `tuned.toml` with their counts per turn.
 const AXES: [(&str, f64); 2] = [("x", 2000.0), ("y", 4096.0)];

@@ -12,17 +12,17 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use ecaxis::bench::bus::{Bus, Counts, FaultInjection, Options, ReplyDelay};
-use ecaxis::bench::fixture::{self, Setup};
-use ecaxis::bench::in_process::InProcess;
-use ecaxis::bench::measure::{self, Measured, Thread};
-use ecaxis::bench::veth::{VethPair, leftovers};
-use ecaxis::config::Exchange;
-use ecaxis::link::capture::{Recorder, WriterMode};
-use ecaxis::link::tee::CapturingLink;
-use ecaxis::link::{self, Link, SocketKind};
-use ecaxis::rt::spin::Spin;
+use ecaxis_master::config::Exchange;
+use ecaxis_master::link::capture::{Recorder, WriterMode};
+use ecaxis_master::link::tee::CapturingLink;
+use ecaxis_master::link::{self, Link, SocketKind};
+use ecaxis_master::rt::spin::Spin;
 use ecaxis_sim::frame::{self, Command};
+use ecaxis_tools::bench::bus::{Bus, Counts, FaultInjection, Options, ReplyDelay};
+use ecaxis_tools::bench::fixture::{self, Setup};
+use ecaxis_tools::bench::in_process::InProcess;
+use ecaxis_tools::bench::measure::{self, Measured, Thread};
+use ecaxis_tools::bench::veth::{VethPair, leftovers};
 use wire::over_a_pair;
 
 /// Two real-time threads on two processors leave no capacity for a second bench.
@@ -173,7 +173,7 @@ fn recorded_frames(axes: usize) -> Vec<Vec<u8>> {
     let setup = setup(axes, 2_000_000);
     let (parts, outer) = fixture::parts(setup, link).expect("fits");
     let _alone = alone();
-    let mut engine = ecaxis::rt::cycle::Engine::new(parts);
+    let mut engine = ecaxis_master::rt::cycle::Engine::new(parts);
     for _ in 0..700 {
         engine.cycle();
     }

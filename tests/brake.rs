@@ -6,7 +6,7 @@ mod common;
 use std::path::Path;
 
 use common::{axes, machine, run, virtual_time};
-use ecaxis::session::Options;
+use ecaxis_master::session::Options;
 use ecaxis_sim::faults::FaultScript;
 use pcap_file::pcapng::{Block, PcapNgReader};
 

@@ -6,11 +6,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, atomic::AtomicBool};
 
 use common::{Heard, faults, load, virtual_time};
-use ecaxis::clock::{self, Clock};
-use ecaxis::config::{AxisRef, InputRef, Machine, OutputRef};
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{Options, Outcome, RunError, run_with};
 use ecaxis_axis::{Command, CommandError};
+use ecaxis_master::clock::{self, Clock};
+use ecaxis_master::config::{AxisRef, InputRef, Machine, OutputRef};
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{Options, Outcome, RunError, run_with};
 
 fn control(machine: Machine, controller: impl Controller + 'static) -> Outcome {
     control_with(virtual_time(), machine, controller)

@@ -3,7 +3,7 @@
 mod common;
 
 use common::{axes, machine, root, run_badly, run_well, virtual_time};
-use ecaxis::config;
+use ecaxis_master::config;
 
 /// Returns the machine of `axes` with another cycle.
 fn at(cycle: &str) -> String {

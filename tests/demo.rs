@@ -3,8 +3,8 @@
 mod common;
 
 use common::{axes, fixture, load, machine, run, run_well, virtual_time};
-use ecaxis::bringup::{AlState, Step};
-use ecaxis::session::{Options, Progress};
+use ecaxis_master::bringup::{AlState, Step};
+use ecaxis_master::session::{Options, Progress};
 
 #[test]
 fn the_demo_moves_both_axes_ten_turns_and_back_twice() {

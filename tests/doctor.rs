@@ -10,9 +10,9 @@ mod machines;
 use std::path::Path;
 use std::process::Command;
 
-use ecaxis::doctor::wakeup::{WaitMethod, WakeUp};
-use ecaxis::doctor::{Report, Severity, examine};
-use ecaxis::sys::rt_thread::RtSetupError;
+use ecaxis_master::sys::rt_thread::RtSetupError;
+use ecaxis_tools::doctor::wakeup::{WaitMethod, WakeUp};
+use ecaxis_tools::doctor::{Report, Severity, examine};
 use machines::Machine;
 
 fn ids(report: &Report) -> Vec<String> {
@@ -486,7 +486,11 @@ fn doctor_checks_an_existing_and_a_missing_interface() {
     assert_eq!(code, Some(2));
     assert_eq!(text, "");
     assert!(stderr.contains("`nonet7` does not exist"), "{stderr}");
-    let Some(nic) = ecaxis::doctor::Host::here().interfaces().into_iter().next() else {
+    let Some(nic) = ecaxis_tools::doctor::Host::here()
+        .interfaces()
+        .into_iter()
+        .next()
+    else {
         println!("skipped: this computer has no network interface");
         return;
     };
@@ -501,7 +505,7 @@ fn doctor_uses_the_settings_of_a_machine_file() {
     let file = demo.to_str().expect("UTF-8");
     let (_, text, _) = ecaxis(&["doctor", "--machine", file, "--seconds", "0", "--json"]);
     let report: serde_json::Value = serde_json::from_str(&text).expect("JSON");
-    let machine = ecaxis::config::load(&demo).expect("the demonstration");
+    let machine = ecaxis_master::config::load(&demo).expect("the demonstration");
     assert_eq!(report["intent"]["cycle_ns"], machine.bus.cycle_ns);
     assert_eq!(report["intent"]["priority"], machine.bus.priority);
     assert_eq!(report["wake_up"], serde_json::Value::Null);

@@ -15,11 +15,11 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use common::{Heard, axes, faults, fixture, machine, root, run, run_well, virtual_time};
-use ecaxis::clock::{self, Clock};
-use ecaxis::config::Machine;
-use ecaxis::post_mortem::{Cause, FaultReport};
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{Options, run_with};
+use ecaxis_master::clock::{self, Clock};
+use ecaxis_master::config::Machine;
+use ecaxis_master::post_mortem::{Cause, FaultReport};
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{Options, run_with};
 
 /// Runs a machine that must fail and returns its fault report.
 #[track_caller]
@@ -233,8 +233,9 @@ fn the_cycles_around_the_stop_are_kept() {
     let numbers: Vec<u64> = story.cycles.iter().map(|page| page.cycle.number).collect();
     assert_eq!(numbers.len(), 200);
     assert_eq!((numbers[0], numbers[199]), (stop - 150, stop + 49));
-    let fault =
-        |page: &ecaxis::post_mortem::report::CycleRecord| page.axes[1].statusword & 0x08 != 0;
+    let fault = |page: &ecaxis_master::post_mortem::report::CycleRecord| {
+        page.axes[1].statusword & 0x08 != 0
+    };
     let first = story.cycles.iter().find(|page| fault(page));
     assert_eq!(first.map(|page| page.cycle.number), Some(stop));
     // The other axis is on its ramp, and its target changes within the limits.
@@ -349,6 +350,6 @@ fn a_successful_or_interrupted_run_has_no_report() {
     assert!(outcome.result.is_ok() && outcome.story.is_none());
     let stop = Arc::new(AtomicBool::new(true));
     let mut heard = Heard::default();
-    let outcome = ecaxis::session::run(machine(&axes(1)), virtual_time(), stop, &mut heard);
+    let outcome = ecaxis_master::session::run(machine(&axes(1)), virtual_time(), stop, &mut heard);
     assert!(outcome.result.is_err() && outcome.story.is_none());
 }

@@ -3,7 +3,7 @@
 mod common;
 
 use common::{axes, faults, machine, run, run_badly, run_well, virtual_time};
-use ecaxis::session::Options;
+use ecaxis_master::session::Options;
 
 /// Checks that the error contains all parts.
 #[track_caller]

@@ -9,21 +9,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::load;
-use ecaxis::acyclic::enumerate::DeviceSelector;
-use ecaxis::acyclic::{DatagramClient, device, mailbox, run_on_link};
-use ecaxis::bringup::{AlState, al};
-use ecaxis::clock::Clock;
-use ecaxis::config::Locator;
-use ecaxis::firmware::{
-    self, BOOT_LOADER, Cause, DeviceIdentity, Expected, FinalDeviceState, FirmwareError, ReadBack,
-    RunningProgram, START_TIMEOUT, Step, UpdateMethod, UpdateProgress, UpdateReport, UpdateRequest,
-};
-use ecaxis::link::sim::SimLink;
-use ecaxis::link::{Link, LinkError, MAX_FRAME, Nanos};
-use ecaxis::mailbox::{FoeError, MailboxTransport, SdoError};
-use ecaxis::session::simulated_bus;
+use ecaxis_master::acyclic::enumerate::DeviceSelector;
+use ecaxis_master::acyclic::{DatagramClient, device, mailbox, run_on_link};
+use ecaxis_master::bringup::{AlState, al};
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::Locator;
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME, Nanos};
+use ecaxis_master::mailbox::{FoeError, MailboxTransport, SdoError};
+use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::{
     DeviceOptions, FaultScript, FirmwareHeader, FirmwareOptions, Segment, SegmentOptions, SimDevice,
+};
+use ecaxis_tools::firmware::{
+    self, BOOT_LOADER, Cause, DeviceIdentity, Expected, FinalDeviceState, FirmwareError, ReadBack,
+    RunningProgram, START_TIMEOUT, Step, UpdateMethod, UpdateProgress, UpdateReport, UpdateRequest,
 };
 
 /// The simulated bus with a power switch for one device.

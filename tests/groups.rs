@@ -6,9 +6,9 @@ mod common;
 mod cycles;
 
 use common::{faults, load, machine, run_badly, run_well, virtual_time};
-use ecaxis::config::Machine;
-use ecaxis::session::Progress;
 use ecaxis_axis::State;
+use ecaxis_master::config::Machine;
+use ecaxis_master::session::Progress;
 
 /// `z` is first on the bus, so a cable break behind `z` affects only the gantry of `x` and `y`.
 const AXES: [&str; 3] = ["z", "x", "y"];

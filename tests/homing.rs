@@ -7,10 +7,10 @@ mod common;
 
 use common::script::{Act, Trace, home, move_to, perform, perform_well, process_images};
 use common::{load, machine, run_badly, virtual_time};
-use ecaxis::config::Machine;
-use ecaxis::session::Options;
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command, HomingError, Mode};
+use ecaxis_master::config::Machine;
+use ecaxis_master::session::Options;
 
 /// The position of home.
 const HOME: f64 = 3.0;
@@ -336,7 +336,7 @@ fn an_impossible_homing_is_rejected_with_the_file() {
             if pdo == no_position { "csv" } else { "csp" },
         );
         let path = common::root().join("configs/test.toml");
-        let error = ecaxis::config::parse(&path, &text)
+        let error = ecaxis_master::config::parse(&path, &text)
             .expect_err(axis)
             .to_string();
         assert!(error.contains(expected), "{axis}: {error}");

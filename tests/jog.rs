@@ -13,11 +13,11 @@ mod lines;
 mod terminal;
 
 use common::{axes, faults, machine, virtual_time};
-use ecaxis::supervise::jog::{
+use ecaxis_axis::{Mode, State, Trip};
+use ecaxis_master::supervise::jog::{
     Activity, HOLD_TO_RUN_TIMEOUT, JogEvent, MAX_MANUAL_SPEED, OperatorInput, Presence, Request,
     View,
 };
-use ecaxis_axis::{Mode, State, Trip};
 use hands::{Seen, by_hand, here, request};
 
 /// Limits of the machines of `common::axes`, in turns/s and turns/s².

@@ -6,8 +6,8 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use common::{Heard, faults, root, run, virtual_time};
-use ecaxis::config::{self, Machine};
-use ecaxis::session::Options;
+use ecaxis_master::config::{self, Machine};
+use ecaxis_master::session::Options;
 use pcap_file::pcapng::{Block, PcapNgReader};
 
 const FPRD: u8 = 4;

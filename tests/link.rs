@@ -9,10 +9,10 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use ecaxis::bench::reflector::{Reflector, ReplyTiming};
-use ecaxis::bench::veth::VethPair;
-use ecaxis::link::{self, Link, LinkError, LinkStats, MAX_FRAME, NicWarning, SocketKind};
-use ecaxis::sys::packet::{PacketSocket, interface_index};
+use ecaxis_master::link::{self, Link, LinkError, LinkStats, MAX_FRAME, NicWarning, SocketKind};
+use ecaxis_master::sys::packet::{PacketSocket, interface_index};
+use ecaxis_tools::bench::reflector::{Reflector, ReplyTiming};
+use ecaxis_tools::bench::veth::VethPair;
 use wire::over_a_pair;
 
 const PATIENCE: Duration = Duration::from_secs(5);

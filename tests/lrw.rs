@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use common::{root, run_badly, run_well, virtual_time};
-use ecaxis::config::{self, Machine};
-use ecaxis::session::Options;
+use ecaxis_master::config::{self, Machine};
+use ecaxis_master::session::Options;
 use ecaxis_sim::FaultScript;
 use pcap_file::pcapng::{Block, PcapNgReader};
 

@@ -7,9 +7,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::{Heard, axes, faults, machine, virtual_time};
-use ecaxis::bringup::Step;
-use ecaxis::mailbox::{MailboxError, Mailboxes, SdoError};
-use ecaxis::session::{self, EmergencyReport, Observer, Options, Outcome, Progress, RunError};
+use ecaxis_master::bringup::Step;
+use ecaxis_master::mailbox::{MailboxError, Mailboxes, SdoError};
+use ecaxis_master::session::{
+    self, EmergencyReport, Observer, Options, Outcome, Progress, RunError,
+};
 
 fn emergencies(heard: &Heard) -> Vec<&EmergencyReport> {
     let each = heard.0.iter().filter_map(|progress| match progress {
@@ -38,7 +40,7 @@ fn with_and_without_status_fmmu() -> [(&'static str, String); 2] {
 
 /// Parses a machine file. `NO_STATUS` stands for the demonstration drive's ESI without its third
 /// FMMU.
-fn parsed(text: &str) -> (ecaxis::config::Machine, tempfile::TempDir) {
+fn parsed(text: &str) -> (ecaxis_master::config::Machine, tempfile::TempDir) {
     with_esi(text, "NO_STATUS", "<Fmmu>MBoxState</Fmmu>", "")
 }
 
@@ -49,7 +51,7 @@ fn with_esi(
     name: &str,
     old: &str,
     new: &str,
-) -> (ecaxis::config::Machine, tempfile::TempDir) {
+) -> (ecaxis_master::config::Machine, tempfile::TempDir) {
     let folder = tempfile::tempdir().expect("a folder");
     let configs = common::root().join("configs");
     let esi = std::fs::read_to_string(configs.join("esi/EPOS4.xml")).expect("an ESI file");
@@ -351,7 +353,7 @@ fn mailbox_access_fails_after_the_run() {
 }
 
 /// Returns the devices of `axes` with additional keys in each table.
-fn with_start_up(more: &str) -> ecaxis::config::Machine {
+fn with_start_up(more: &str) -> ecaxis_master::config::Machine {
     let text = axes(2);
     let mode = "mode = \"csp\"\n";
     assert!(text.contains(mode), "{text}");

@@ -9,25 +9,27 @@ use std::sync::atomic::AtomicBool;
 use std::thread;
 
 use common::{fixture, machine, root};
-use ecaxis::acyclic::eeprom::{Eeprom, EepromAccess};
-use ecaxis::acyclic::image::{with_alias, write};
-use ecaxis::acyclic::{DatagramClient, Registers, ServiceError, device, mailbox, run_on_link};
-use ecaxis::bringup::{AlState, al, bring_up};
-use ecaxis::clock::Clock;
-use ecaxis::config::{self, Locator, Machine};
-use ecaxis::link::sim::SimLink;
-use ecaxis::mailbox::worker::EmergencySink;
-use ecaxis::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
-use ecaxis::parameters::compare::compare;
-use ecaxis::parameters::dump::Dump;
-use ecaxis::parameters::restore::restore;
-use ecaxis::parameters::restore_order::is_setting;
-use ecaxis::parameters::upload::{UploadResult, collect};
-use ecaxis::parameters::{DataType, Kind, dictionary, items};
-use ecaxis::rt::image::{plan, process_data};
-use ecaxis::session::simulated_bus;
 use ecaxis_esi::Dictionary;
+use ecaxis_master::acyclic::eeprom::{Eeprom, EepromAccess};
+use ecaxis_master::acyclic::image::{with_alias, write};
+use ecaxis_master::acyclic::{
+    DatagramClient, Registers, ServiceError, device, mailbox, run_on_link,
+};
+use ecaxis_master::bringup::{AlState, al, bring_up};
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::{self, Locator, Machine};
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::mailbox::worker::EmergencySink;
+use ecaxis_master::mailbox::{CoeClient, Emergencies, FoeClient, MailboxTransport, ObjectList};
+use ecaxis_master::rt::image::{plan, process_data};
+use ecaxis_master::session::simulated_bus;
 use ecaxis_sim::FirmwareHeader;
+use ecaxis_tools::parameters::compare::compare;
+use ecaxis_tools::parameters::dump::Dump;
+use ecaxis_tools::parameters::restore::restore;
+use ecaxis_tools::parameters::restore_order::is_setting;
+use ecaxis_tools::parameters::upload::{UploadResult, collect};
+use ecaxis_tools::parameters::{DataType, Kind, dictionary, items};
 
 /// Ignores emergencies.
 #[derive(Debug)]

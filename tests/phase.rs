@@ -13,12 +13,12 @@ use std::sync::{Arc, Mutex};
 use std::task::{Context, Waker};
 
 use common::{machine, virtual_time};
-use ecaxis::clock::{self, Nanos};
-use ecaxis::link::sim::SimLink;
-use ecaxis::link::{Link, LinkError, MAX_FRAME};
-use ecaxis::rt::cycle::Engine;
-use ecaxis::rt::phase::{Gains, Phase};
-use ecaxis::session::{Prepared, Progress, RunBuilder, simulated_bus};
+use ecaxis_master::clock::{self, Nanos};
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
+use ecaxis_master::rt::cycle::Engine;
+use ecaxis_master::rt::phase::{Gains, Phase};
+use ecaxis_master::session::{Prepared, Progress, RunBuilder, simulated_bus};
 
 const DRIVES: usize = 3;
 const SECOND: Nanos = 1_000_000_000;

@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Heard, load, machine, run, run_badly, run_well, virtual_time};
-use ecaxis::session::{Progress, Summary};
+use ecaxis_master::session::{Progress, Summary};
 
 /// One count of the axis below, mm.
 const COUNT: f64 = 5.0 / 2000.0;

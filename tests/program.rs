@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Heard, load, machine, run, virtual_time};
-use ecaxis::session::{Progress, RunError};
+use ecaxis_master::session::{Progress, RunError};
 
 const HEAD: &str = r#"
 [bus]
@@ -52,7 +52,13 @@ fn steps(heard: &Heard) -> Vec<String> {
 }
 
 /// Runs the steps. Returns the result, the numbers of the started steps, and the summary.
-fn program(text: &str) -> (Result<(), RunError>, Vec<String>, ecaxis::session::Summary) {
+fn program(
+    text: &str,
+) -> (
+    Result<(), RunError>,
+    Vec<String>,
+    ecaxis_master::session::Summary,
+) {
     let (outcome, heard) = run(machine(&format!("{HEAD}{text}")), virtual_time());
     let summary = outcome.summary.expect("the cycle has run");
     (outcome.result, steps(&heard), summary)
@@ -167,7 +173,8 @@ fn a_move_of_an_axis_without_power_fails_its_step() {
     let text =
         "[[step]]\nenable = [\"y\"]\n[[step]]\nrepeat = 2\n[[step.step]]\nmove = { x = 1.0 }\n";
     let path = common::root().join("configs/test.toml");
-    let error = ecaxis::config::parse(&path, &format!("{HEAD}{text}")).expect_err("x has no power");
+    let error =
+        ecaxis_master::config::parse(&path, &format!("{HEAD}{text}")).expect_err("x has no power");
     assert!(
         error.to_string().contains("no step before has enabled it"),
         "{error}"

@@ -6,8 +6,8 @@ mod common;
 
 use common::script::{Act, move_to, perform_well, velocity};
 use common::{Heard, load, run, virtual_time};
-use ecaxis::session::{AxisLine, Progress, Summary};
 use ecaxis_axis::{Command, Mode};
+use ecaxis_master::session::{AxisLine, Progress, Summary};
 
 /// Runs one of the samples. Returns the summary, the reported lines (one per second), and the
 /// started steps.

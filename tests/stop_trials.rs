@@ -25,7 +25,7 @@ use std::time::Duration;
 
 use common::root;
 use common::wire::{ProgramOutput, over_a_pair};
-use ecaxis::bench::veth::VethPair;
+use ecaxis_tools::bench::veth::VethPair;
 use library::{Injected, Library};
 use rustix::process::Signal;
 use trace::{Stop, Table, Trace};

@@ -11,8 +11,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::{axes, faults, machine, run_badly, run_well, virtual_time};
-use ecaxis::config::Machine;
-use ecaxis::session::{self, Observer, Options, Progress, RunError, Summary};
+use ecaxis_master::config::Machine;
+use ecaxis_master::session::{self, Observer, Options, Progress, RunError, Summary};
 use pcap_file::pcapng::{Block, PcapNgReader};
 
 /// Counts per turn. STEP is the largest set-point change in a cycle of 1 ms at 50 turns/s.

@@ -3,9 +3,9 @@
 mod common;
 
 use common::{machine, root, run, run_badly, run_well, virtual_time};
-use ecaxis::bringup::Step;
-use ecaxis::config::{self, Machine};
-use ecaxis::session::Progress;
+use ecaxis_master::bringup::Step;
+use ecaxis_master::config::{self, Machine};
+use ecaxis_master::session::Progress;
 
 const HEAD: &str = r#"
 [bus]

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use common::root;
 use common::wire::{ProgramOutput, over_a_pair};
-use ecaxis::bench::veth::VethPair;
-use ecaxis::link::SocketKind;
+use ecaxis_master::link::SocketKind;
+use ecaxis_tools::bench::veth::VethPair;
 
 /// The demo's bus at one end of the pair, and the machine file for the other end.
 struct Served {

@@ -2,5 +2,9 @@
 #![cfg_attr(not(test), no_std)]
 #![deny(missing_docs)]
 
+extern crate alloc;
+
 pub mod al_status_code;
+pub mod data_type;
 pub mod registers;
+pub mod value;

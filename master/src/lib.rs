@@ -11,15 +11,8 @@
 //! - [`rt`]: the cycle; must not block or allocate;
 //! - [`mailbox`]: CoE and FoE over raw datagrams, also during operation;
 //! - [`acyclic`]: access to a bus without a cycle, in the state in which it is;
-//! - [`scan`]: the SubDevices of a segment, and a machine file generated from them;
-//! - [`compare`]: compares a machine file with a bus;
-//! - [`firmware`]: firmware updates;
-//! - [`parameters`]: object names and values; saved to files, compared, restored;
 //! - [`link`]: transports for Ethernet frames;
-//! - [`doctor`]: checks of host settings that delay the cycle;
-//! - [`mod@bench`]: the measurements of the benchmark;
 //! - [`recording`]: recording files, in this project's format and others;
-//! - [`analyze`]: analysis of recordings;
 //! - [`cancel`]: cooperative cancellation;
 //! - [`clock`]: monotonic or virtual time;
 //! - [`text`]: formatting of counts with nouns;
@@ -28,26 +21,18 @@
 #![deny(unsafe_code)]
 
 pub mod acyclic;
-pub mod analyze;
-pub mod bench;
 pub mod bringup;
 pub mod cancel;
 pub mod clock;
-pub mod compare;
 pub mod config;
 mod datagram;
-pub mod doctor;
 pub mod esi_library;
 pub mod file;
-pub mod firmware;
-mod html;
 pub mod link;
 pub mod mailbox;
-pub mod parameters;
 pub mod post_mortem;
 pub mod recording;
 pub mod rt;
-pub mod scan;
 pub mod session;
 pub mod supervise;
 pub mod sys;

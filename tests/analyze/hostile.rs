@@ -1,7 +1,7 @@
 //! Any file content causes at most a remark.
 
-use ecaxis::analyze::{self, Context};
-use ecaxis::session::Options;
+use ecaxis_master::session::Options;
+use ecaxis_tools::analyze::{self, Context};
 use proptest::prelude::*;
 
 use super::common::{axes, machine, virtual_time};

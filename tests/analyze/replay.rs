@@ -1,6 +1,6 @@
 //! A recording replaces the bus.
 
-use ecaxis::session::{Options, Progress};
+use ecaxis_master::session::{Options, Progress};
 
 use super::common::{axes, load, machine, root, run, virtual_time};
 use super::recorded;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::process::Command;
 
-use ecaxis::analyze::Report;
+use ecaxis_tools::analyze::Report;
 
 use super::{captures, of_file, text};
 

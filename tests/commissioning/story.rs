@@ -5,11 +5,11 @@ use std::process::Stdio;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use ecaxis::acyclic::{DatagramClient, run_on_link};
-use ecaxis::bench::veth::VethPair;
-use ecaxis::clock::Clock;
-use ecaxis::link::{self, SocketKind};
-use ecaxis::mailbox::MailboxTransport;
+use ecaxis_master::acyclic::{DatagramClient, run_on_link};
+use ecaxis_master::clock::Clock;
+use ecaxis_master::link::{self, SocketKind};
+use ecaxis_master::mailbox::MailboxTransport;
+use ecaxis_tools::bench::veth::VethPair;
 
 use crate::bench::{Bench, root};
 use crate::wire::{ProgramOutput, over_a_pair};

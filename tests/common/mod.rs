@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use ecaxis::clock::Clock;
-use ecaxis::config::{self, Machine};
-use ecaxis::session::{self, Observer, Options, Outcome, Progress, Summary};
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::{self, Machine};
+use ecaxis_master::session::{self, Observer, Options, Outcome, Progress, Summary};
 use ecaxis_sim::FaultScript;
 
 /// Returns the root of the workspace.

@@ -43,7 +43,7 @@ fn watch(cpu: usize, ended: &AtomicBool) -> Taken {
         ThreadPriority::Crossplatform(priority),
         ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo),
     );
-    let pinned = ecaxis::sys::rt_thread::pin(cpu);
+    let pinned = ecaxis_master::sys::rt_thread::pin(cpu);
     let mut taken = Taken {
         certain: granted.is_ok() && pinned.is_ok(),
         ..Taken::default()

@@ -3,12 +3,12 @@
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
-use ecaxis::config::{AxisRef, Machine};
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{Options, Outcome, run_with};
 use ecaxis_axis::cia402::Mode;
 use ecaxis_axis::status::HomingStatus;
 use ecaxis_axis::{AxisStatus, Command};
+use ecaxis_master::config::{AxisRef, Machine};
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{Options, Outcome, run_with};
 
 use super::Heard;
 

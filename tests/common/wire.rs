@@ -9,7 +9,7 @@ use std::sync::Mutex;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-use ecaxis::bench::veth::VethPair;
+use ecaxis_tools::bench::veth::VethPair;
 use rustix::process::{Pid, Signal, kill_process};
 
 #[path = "retry_on_stall.rs"]

@@ -5,8 +5,8 @@ use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
-use ecaxis::doctor::ethtool::{Answers, Coalescing, EnergyEfficient};
-use ecaxis::doctor::{Host, Measurements, Report, RunProfile, examine};
+use ecaxis_tools::doctor::ethtool::{Answers, Coalescing, EnergyEfficient};
+use ecaxis_tools::doctor::{Host, Measurements, Report, RunProfile, examine};
 
 pub struct Machine {
     files: BTreeMap<String, Vec<u8>>,

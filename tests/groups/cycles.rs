@@ -3,11 +3,11 @@
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
-use ecaxis::config::{AxisRef, Machine};
-use ecaxis::rt::bus_monitor::StopCause;
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{Options, Outcome, run_with};
 use ecaxis_axis::{AxisStatus, Command, CommandError, State};
+use ecaxis_master::config::{AxisRef, Machine};
+use ecaxis_master::rt::bus_monitor::StopCause;
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{Options, Outcome, run_with};
 use proptest::prelude::*;
 
 use crate::common::{Heard, faults, machine};

@@ -3,10 +3,10 @@
 use std::fmt;
 use std::sync::{Arc, Mutex};
 
-use ecaxis::config::Machine;
-use ecaxis::session::{self, Options, Outcome};
-use ecaxis::supervise::jog::{JogEvent, Operator, OperatorInput, Presence, Request, View};
 use ecaxis_axis::AxisStatus;
+use ecaxis_master::config::Machine;
+use ecaxis_master::session::{self, Options, Outcome};
+use ecaxis_master::supervise::jog::{JogEvent, Operator, OperatorInput, Presence, Request, View};
 
 use super::common::Heard;
 

@@ -1,8 +1,8 @@
 //! Requests that replace a jog, and rejected requests: unattended motion stops, and every rejection
 //! is reported.
 
-use ecaxis::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 use ecaxis_axis::Mode;
+use ecaxis_master::supervise::jog::{Activity, JogEvent, OperatorInput, Presence, Request, View};
 
 use super::common::{axes, machine, virtual_time};
 use super::hands::{Seen, by_hand, gone, here, request};

@@ -6,11 +6,11 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread::{JoinHandle, sleep};
 use std::time::{Duration, Instant};
 
-use ecaxis::config::{self, AxisRef, Machine, Nic};
-use ecaxis::link::{self, Link, LinkError, LinkStats, MAX_FRAME, capture::RecordStats};
-use ecaxis::rt::controller::{Controller, CycleContext};
-use ecaxis::session::{self, Options};
 use ecaxis_axis::Command;
+use ecaxis_master::config::{self, AxisRef, Machine, Nic};
+use ecaxis_master::link::{self, Link, LinkError, LinkStats, MAX_FRAME, capture::RecordStats};
+use ecaxis_master::rt::controller::{Controller, CycleContext};
+use ecaxis_master::session::{self, Options};
 
 use super::SPEED;
 use super::common::Heard;

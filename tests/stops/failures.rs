@@ -11,11 +11,11 @@ use std::task::{Context, Poll, Waker};
 
 use super::common::{faults, machine, run, run_badly, run_well, virtual_time};
 use super::record;
-use ecaxis::clock::Nanos;
-use ecaxis::link::sim::SimLink;
-use ecaxis::link::{Link, LinkError, MAX_FRAME};
-use ecaxis::rt::cycle::Engine;
-use ecaxis::session::{Options, RunBuilder, RunError, simulated_bus};
+use ecaxis_master::clock::Nanos;
+use ecaxis_master::link::sim::SimLink;
+use ecaxis_master::link::{Link, LinkError, MAX_FRAME};
+use ecaxis_master::rt::cycle::Engine;
+use ecaxis_master::session::{Options, RunBuilder, RunError, simulated_bus};
 use pcap_file::pcapng::{Block, PcapNgReader};
 
 const COUNTS: f64 = 2000.0;

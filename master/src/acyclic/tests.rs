@@ -17,7 +17,6 @@ use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
 use crate::mailbox::{DatagramError, MailboxTransport};
-use crate::parameters::upload::collect;
 use crate::session::{RunError, simulated_bus};
 
 /// Runs `work` on a segment of two drives.
@@ -343,20 +342,21 @@ fn with_mailbox_restores_the_device_when_stopped() {
                           found: EnumeratedDevice,
                           at: DeviceRef,
                           stop: &AtomicBool| {
-            let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/demo.toml");
-            let machine = config::load(&demo).expect("a machine");
-            let dictionary = &machine.devices[0].selection.dictionary;
             let sii = information(&wire, &found, &at).await?;
             let mut reached = 0;
             let step = "reading its parameters";
-            let all = with_mailbox(&wire, &at, &sii, step, async |lent| {
-                let mut progress = |n, _| {
-                    reached = n;
-                    stop.store(n >= 10, Ordering::Relaxed);
-                };
-                collect(&mut lent.coe, &wire, &at, dictionary, &mut progress).await
+            let all = with_mailbox(&wire, &at, &sii, step, async |lent| -> Result<(), ServiceError> {
+                loop {
+                    reached += 1;
+                    stop.store(reached >= 10, Ordering::Relaxed);
+                    let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
+                    read.map_err(|source| ServiceError::Sdo {
+                        device: at.clone(),
+                        source,
+                    })?;
+                }
             });
-            let ended = all.await;
+            let ended: Result<(), ServiceError> = all.await;
             assert_eq!(reached, 10, "at once");
             ended
         };

@@ -54,7 +54,7 @@ pub(super) async fn start_up(
     let mut held = 0;
     for (done, sdo) in list.iter().enumerate() {
         let way = config.startup.way(sdo.index, sdo.sub);
-        match start_up_one(wire, &device.at, coe, sdo, way).await? {
+        match write_startup_sdo(wire, &device.at, coe, sdo, way).await? {
             SdoOutcome::Held => held += 1,
             SdoOutcome::Unreadable => progress(Step::Warning(format!(
                 "{}: {} cannot be read, so it is not verified",
@@ -81,7 +81,7 @@ pub(super) async fn start_up(
 
 /// The result of one start-up SDO.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum SdoOutcome {
+pub enum SdoOutcome {
     /// Written, and verified if requested.
     Written,
     /// The device already had the value.
@@ -92,7 +92,10 @@ enum SdoOutcome {
 
 /// Writes one start-up SDO, unless the device already has the value and that suffices. Reads it
 /// back if requested.
-async fn start_up_one(
+///
+/// # Errors
+/// Names the device and the object.
+pub async fn write_startup_sdo(
     wire: &impl MailboxTransport,
     at: &DeviceRef,
     coe: &mut CoeClient,
@@ -322,106 +325,5 @@ fn taken(
             step,
             source,
         }),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::mailbox::tests::fault_injection::Mischief;
-    use crate::mailbox::tests::server::Server;
-    use crate::mailbox::tests::{STATION, block_on, client};
-
-    const HELD: (u16, u8) = (0x6065, 0);
-    const WRITE_ONLY: (u16, u8) = (0x2000, 1);
-
-    fn sdo((index, sub): (u16, u8), data: &[u8], name: &str) -> StartupSdo {
-        StartupSdo {
-            transition: "PS",
-            index,
-            sub,
-            complete_access: false,
-            data: data.to_vec(),
-            name: name.to_owned(),
-            origin: "a test".to_owned(),
-        }
-    }
-
-    /// Returns the result of one SDO, and how many requests the device received.
-    fn done(
-        sdo: &StartupSdo,
-        verify: bool,
-        skip_equal: bool,
-        mischief: &[Mischief],
-    ) -> (Result<SdoOutcome, String>, usize) {
-        let server = Server::new(
-            48,
-            &[
-                (HELD.0, HELD.1, &[7, 0, 0, 0]),
-                (WRITE_ONLY.0, WRITE_ONLY.1, &[0]),
-            ],
-            mischief,
-        );
-        let at = DeviceRef {
-            name: "x".to_owned(),
-            position: 0,
-            station: STATION,
-        };
-        let way = StartupOptions { verify, skip_equal };
-        let done = block_on(start_up_one(&server, &at, &mut client(), sdo, way));
-        (done.map_err(|error| error.to_string()), server.log().len())
-    }
-
-    #[test]
-    fn start_up_sdo_is_skipped_if_the_device_has_the_value() {
-        let (same, other) = (sdo(HELD, &[7, 0, 0, 0], ""), sdo(HELD, &[8, 0, 0, 0], ""));
-        assert_eq!(done(&same, false, true, &[]), (Ok(SdoOutcome::Held), 1));
-        assert_eq!(done(&same, true, true, &[]), (Ok(SdoOutcome::Held), 1));
-        assert_eq!(done(&same, false, false, &[]), (Ok(SdoOutcome::Written), 1));
-        assert_eq!(done(&other, false, true, &[]), (Ok(SdoOutcome::Written), 2));
-        assert_eq!(done(&other, true, true, &[]), (Ok(SdoOutcome::Written), 3));
-    }
-
-    #[test]
-    fn verification_failure_names_the_object() {
-        let forgets = [Mischief::Forgetful];
-        let known = sdo(HELD, &[8, 0, 0, 0], "");
-        let (reported, _) = done(&known, true, false, &forgets);
-        let reported = reported.expect_err("it holds another value");
-        assert!(
-            reported.contains("0x6065:00 (Following error window)")
-                && reported.contains("0x00000008")
-                && reported.contains("0x00000007"),
-            "{reported}"
-        );
-        let named = sdo(HELD, &[8, 0, 0, 0], "Window");
-        let reported = done(&named, true, false, &forgets).0.expect_err("likewise");
-        assert!(reported.contains("0x6065:00 (Window)"), "{reported}");
-        assert_eq!(
-            done(&known, false, false, &forgets),
-            (Ok(SdoOutcome::Written), 1)
-        );
-    }
-
-    #[test]
-    fn unreadable_start_up_sdo_is_written_and_reported() {
-        let secret = sdo(WRITE_ONLY, &[1], "");
-        let hidden = [Mischief::WriteOnly(WRITE_ONLY.0)];
-        assert_eq!(
-            done(&secret, true, true, &hidden),
-            (Ok(SdoOutcome::Unreadable), 3)
-        );
-    }
-
-    #[test]
-    fn errors_name_the_object() {
-        let missing = sdo((0x607d, 2), &[0; 4], "");
-        let reported = done(&missing, false, false, &[])
-            .0
-            .expect_err("it is not there");
-        assert!(
-            reported.contains("0x607d:02 Max position limit"),
-            "{reported}"
-        );
     }
 }

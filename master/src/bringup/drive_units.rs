@@ -56,7 +56,7 @@ pub(super) async fn compare(
 }
 
 /// If `constant`, also reads the motor's torque constant.
-pub(crate) async fn ask(
+pub async fn ask(
     wire: &impl MailboxTransport,
     coe: &mut CoeClient,
     constant: bool,
@@ -92,7 +92,7 @@ async fn ratio(
 }
 
 /// Returns `None` if the drive does not have the object or does not allow reading it.
-pub(crate) async fn value(
+pub async fn value(
     wire: &impl MailboxTransport,
     coe: &mut CoeClient,
     index: u16,

@@ -33,7 +33,7 @@ mod device;
 mod identify;
 mod output_defaults;
 pub(crate) use identify::FIRST_STATION;
-pub(crate) mod drive_units;
+pub mod drive_units;
 mod limits;
 mod mailbox;
 mod mapping;
@@ -41,6 +41,7 @@ mod watchdog;
 
 pub use al::{AlState, StateError};
 use device::StartupPhase;
+pub use device::{SdoOutcome, write_startup_sdo};
 
 /// The maximum number of SubDevices in ethercrab's group; a power of two.
 pub(crate) const MAX_SUBDEVICES: usize = 512;

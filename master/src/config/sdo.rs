@@ -4,7 +4,7 @@
 use ecaxis_esi::{ObjectItem, Writable};
 
 use super::raw::SdoValue;
-use crate::parameters::{DataType, Kind};
+use ecaxis_ecat::data_type::{DataType, Kind};
 
 /// The problem with a value, and a hint.
 pub(crate) type ValueProblem = (String, Option<String>);

@@ -22,7 +22,7 @@ pub struct Emergency {
 }
 
 impl Emergency {
-    pub(crate) fn parse(content: &[u8]) -> Option<Self> {
+    pub fn parse(content: &[u8]) -> Option<Self> {
         let ([low, high, register, data @ ..], _) = content.split_first_chunk::<8>()?;
         Some(Self {
             code: u16::from_le_bytes([*low, *high]),

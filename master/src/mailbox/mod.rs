@@ -21,10 +21,10 @@ mod emergency;
 mod error;
 pub mod foe;
 mod object_names;
+#[cfg(test)]
+pub(crate) mod recorded_tests;
 mod sdo;
 mod sdo_info;
-#[cfg(test)]
-pub(crate) mod tests;
 mod transfer;
 mod transport;
 pub mod worker;

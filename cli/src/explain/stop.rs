@@ -1,0 +1,74 @@
+//! The stop reactions of the machine and its axis groups in `ecaxis explain`.
+
+use std::fmt::Write;
+
+use ecaxis_axis::StopMethod;
+use ecaxis_master::config::{GroupStopScope, Machine};
+
+use super::Table;
+
+pub(super) fn stop(machine: &Machine, out: &mut String) -> std::fmt::Result {
+    let stop = &machine.stop;
+    let by_drive = match stop.bus_lost {
+        StopMethod::Ramp | StopMethod::QuickStop => "the drives' quick stop",
+        StopMethod::DisableVoltage => "no power",
+    };
+    let conditions = stop.emergency.iter().map(|c| machine.condition(c));
+    let emergency = match conditions.collect::<Vec<_>>() {
+        none if none.is_empty() => "no condition".to_owned(),
+        all => all.join(", or "),
+    };
+    let lost = format!(
+        "{} cycles: {by_drive}; if they answer, a ramp",
+        machine.bus.lost_frames
+    );
+    let mut table = Table::new(&["when", "what happens", "key"]);
+    table.row([
+        "an axis faults or trips",
+        &format!("the others: {}", way(stop.others)),
+        "`others`",
+    ]);
+    table.row(["no process data", &lost, "`bus_lost`"]);
+    table.row(["emergency stop", &emergency, "`emergency`"]);
+    writeln!(out, "\nstop\n{}", table.shown(2))?;
+    if stop.groups.is_empty() {
+        return writeln!(out, "\n  all axes stop together");
+    }
+    let mut table = Table::new(&["group", "axes", "devices", "others", "outside"]);
+    let names = |axes: bool, group: usize| {
+        let devices = machine.devices.iter().enumerate();
+        let own = devices.filter(|(device, _)| machine.group_of(*device) == group);
+        let kind = own.filter(|(_, device)| device.axis.is_some() == axes);
+        let names: Vec<_> = kind.map(|(_, device)| device.name.as_str()).collect();
+        names.join(" ")
+    };
+    for (index, group) in stop.groups.iter().enumerate() {
+        let outside = match group.outside {
+            GroupStopScope::Stop => "stops",
+            GroupStopScope::Continue => "continues",
+        };
+        table.row([
+            &group.name,
+            &names(true, index + 1),
+            &names(false, index + 1),
+            way(group.others),
+            outside,
+        ]);
+    }
+    table.row([
+        "(the rest)",
+        &names(true, 0),
+        &names(false, 0),
+        way(stop.others),
+        "stops",
+    ]);
+    writeln!(out, "\n{}", table.shown(2))
+}
+
+fn way(way: StopMethod) -> &'static str {
+    match way {
+        StopMethod::Ramp => "within their limits",
+        StopMethod::QuickStop => "quick stop",
+        StopMethod::DisableVoltage => "no power",
+    }
+}

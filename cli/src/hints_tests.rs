@@ -1,0 +1,364 @@
+use ecaxis_master::bringup::{AlState, DeviceRef};
+use ecaxis_master::link::OpenError;
+
+use super::*;
+
+fn device() -> DeviceRef {
+    DeviceRef {
+        name: "x".into(),
+        position: 0,
+        station: 0x1001,
+    }
+}
+
+fn hints_of(error: &RunError) -> (u8, String) {
+    let failure = run(error, &Nic::Interface("eth9".into()));
+    (failure.code, failure.hints.join("\n"))
+}
+
+#[test]
+fn every_failure_has_a_hint() {
+    let sdo = |code| SdoError::Abort {
+        station: 0x1001,
+        index: 0x60c2,
+        sub: 1,
+        code,
+    };
+    let start_up = |code, origin: &str| {
+        RunError::BringUp(Box::new(BringUpError::StartUp {
+            device: device(),
+            index: 0x60c2,
+            sub: 1,
+            name: String::new(),
+            value: "1".into(),
+            origin: origin.into(),
+            source: sdo(code),
+        }))
+    };
+    let bring_up = |error| RunError::BringUp(Box::new(error));
+    let refused = |code| {
+        bring_up(BringUpError::State(StateError::Refused {
+            device: device(),
+            wanted: AlState::SafeOp,
+            actual: AlState::PreOp,
+            code,
+        }))
+    };
+    let not_enabled = |state, code| RunError::NotEnabled {
+        device: device(),
+        state,
+        statusword: 0,
+        mode_confirmed: true,
+        code,
+        timeout_ms: 5000,
+    };
+    let missing = BringUpError::Missing {
+        expected: 2,
+        found: 1,
+        missing: vec!["`y`".into()],
+    };
+    let units = |problem| {
+        bring_up(BringUpError::Units {
+            device: device(),
+            problems: vec![problem],
+        })
+    };
+    let contradicts = |found| units(UnitProblem::Contradiction(found));
+    for (error, code, hint) in [
+        (
+            contradicts(UnitMismatch::VelocityUnit {
+                expected: VelocityUnit::MILLI_RPM,
+                found: VelocityUnit::RPM.si_code(),
+            }),
+            FAILED,
+            "value = 0xFDB44700 }]`, or `velocity_unit = \"rpm\"`",
+        ),
+        (
+            contradicts(UnitMismatch::CountsPerTurn {
+                index: 0x608f,
+                expected: 2000.0,
+                found: 4096.0,
+            }),
+            FAILED,
+            "write `encoder = 4096`",
+        ),
+        (
+            contradicts(UnitMismatch::CountsPerTurn {
+                index: 0x6091,
+                expected: 2000.0,
+                found: 1000.0,
+            }),
+            FAILED,
+            "gear ratio to 1:1",
+        ),
+        (
+            units(UnitProblem::NoRatedTorque { unit: "Nm" }),
+            FAILED,
+            "rated_torque = 0.1",
+        ),
+        (
+            RunError::Open(OpenError::NoSuchInterface { nic: "x".into() }),
+            WRONG,
+            "this computer has",
+        ),
+        (
+            RunError::Open(OpenError::NotPermitted { nic: "x".into() }),
+            FAILED,
+            "sudo setcap cap_net_raw",
+        ),
+        (
+            RunError::Open(OpenError::Down { nic: "x".into() }),
+            FAILED,
+            "ip link set x up",
+        ),
+        (
+            RunError::Open(OpenError::Unfit {
+                nic: "lo".into(),
+                what: "is the loopback",
+            }),
+            WRONG,
+            "this computer has",
+        ),
+        (
+            bring_up(BringUpError::NoAnswer),
+            FAILED,
+            "is `eth9` the right interface?",
+        ),
+        (bring_up(missing), FAILED, "the first one missing"),
+        (
+            start_up(0x0609_0030, "bus.cycle"),
+            FAILED,
+            "another `cycle`",
+        ),
+        (start_up(0x0602_0000, "ESI"), FAILED, "firmware"),
+        (start_up(0x0601_0002, "mode csp"), FAILED, "firmware"),
+        (start_up(0x0601_0002, OWN_SDO), FAILED, "from `sdo`"),
+        (start_up(0x0602_0000, OWN_SDO), FAILED, "`index`"),
+        (
+            start_up(0x0604_0041, "pdo.rx in RxPdo 0x1600"),
+            FAILED,
+            "from `pdo.rx`",
+        ),
+        (refused(0x001e), FAILED, "assigned TxPDOs"),
+        (refused(0x0035), FAILED, "cycle time"),
+        (not_enabled(State::SwitchOnDisabled, None), FAILED, "STO"),
+        (
+            not_enabled(State::Fault, Some(0x8611)),
+            FAILED,
+            describe(0x8611).hint,
+        ),
+        (
+            RunError::DriveFault {
+                device: device(),
+                code: Some(0x2310),
+                statusword: 8,
+                report: Box::default(),
+            },
+            FAILED,
+            describe(0x2310).hint,
+        ),
+        (
+            RunError::Trip {
+                device: device(),
+                trip: Trip::FollowingError {
+                    error: 2.0,
+                    limit: 1.0,
+                },
+                limits: Vec::new(),
+            },
+            FAILED,
+            "following_error",
+        ),
+        (
+            RunError::BusLost {
+                group: None,
+                cycles: 3,
+                wkc: (0, 6),
+                answered: false,
+            },
+            FAILED,
+            "cables",
+        ),
+    ] {
+        let (got, text) = hints_of(&error);
+        assert_eq!(got, code, "{error}");
+        assert!(text.contains(hint), "{error}: {text}");
+    }
+}
+
+#[test]
+fn sdo_hint_names_the_sdo_key_only_for_user_sdos() {
+    for code in (0x0503_0000..0x0504_0010).chain(0x0601_0000..0x060a_0030) {
+        let error = SdoError::Abort {
+            station: 0x1001,
+            index: 0x6060,
+            sub: 0,
+            code,
+        };
+        for origin in ["mode csp", "bus.cycle", "Sm 2 (line 3)"] {
+            assert!(!sdo(&error, origin).contains("`sdo`"), "{code:#x}");
+        }
+    }
+}
+
+#[test]
+fn message_names_an_address_once() {
+    let abort = SdoError::Abort {
+        station: 0x1001,
+        index: 0x6060,
+        sub: 0,
+        code: 0x0601_0002,
+    };
+    let timeout = SdoError::Timeout {
+        station: 0x1001,
+        index: 0x6060,
+        sub: 0,
+        phase: ecaxis_master::mailbox::Phase::Answer,
+        after: std::time::Duration::from_secs(1),
+        set_aside: 0,
+    };
+    for (source, end) in [
+        (
+            abort.clone(),
+            "(from mode csp): was refused with 0x06010002: ",
+        ),
+        (timeout, "(from mode csp): no answer came within 1s"),
+    ] {
+        let error = RunError::BringUp(Box::new(BringUpError::StartUp {
+            device: device(),
+            index: 0x6060,
+            sub: 0,
+            name: "Modes of operation".into(),
+            value: "0x08".into(),
+            origin: "mode csp".into(),
+            source,
+        }));
+        let text = message(&error);
+        assert!(text.contains(end), "{text}");
+        assert_eq!(text.matches("0x1001").count(), 1, "{text}");
+        assert_eq!(text.matches("0x6060").count(), 1, "{text}");
+    }
+    let error = RunError::BringUp(Box::new(BringUpError::ReadBack {
+        device: device(),
+        source: abort,
+    }));
+    let text = message(&error);
+    assert_eq!(text.matches("0x1001").count(), 1, "{text}");
+    assert!(text.contains("back: 0x6060"), "{text}");
+}
+
+/// True if the key exists in [bus], [[device]] or [device.axis] of the machine file.
+fn is_a_key(key: &str) -> bool {
+    let takes = |text: &str| {
+        let Err(ConfigError::Problems(problems)) =
+            ecaxis_master::config::parse(Path::new("m.toml"), text)
+        else {
+            return true;
+        };
+        let unknown = |p: &ecaxis_master::config::Problem| p.message.contains("unknown key");
+        !problems.iter().any(unknown)
+    };
+    takes(&format!("[bus]\n{key} = 1"))
+        || takes(&format!("[[device]]\n{key} = 1"))
+        || takes(&format!("[device.axis]\n{key} = 1").replace("[device", "[[device]]\n[device"))
+}
+
+#[test]
+fn hints_name_keys_that_exist() {
+    assert!(is_a_key("pdo.rx") && is_a_key("cycle") && is_a_key("per_turn"));
+    assert!(!is_a_key("pdo.xr") && !is_a_key("cycel"));
+    for code in 0..=u16::MAX {
+        for key in al_status(code).split('`').skip(1).step_by(2) {
+            assert!(is_a_key(key), "{code:#06x}: {key}");
+        }
+    }
+}
+
+#[test]
+fn config_suggests_files_only_for_a_missing_file() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("m.toml"), "[bus]").unwrap();
+    std::fs::write(folder.path().join("noise.toml"), [0xff, 0xfe, 0]).unwrap();
+    for (name, message, hint) in [
+        ("n.toml", "cannot read", Some("m.toml")),
+        ("", "is a folder", None),
+        ("noise.toml", "is not text", None),
+    ] {
+        let path = folder.path().join(name);
+        let failure = config(&path, &ecaxis_master::config::load(&path).unwrap_err());
+        assert_eq!(failure.code, WRONG);
+        assert!(failure.message.contains(message), "{failure:?}");
+        let nearby = failure.hints.iter().any(|h| h.contains("nearby"));
+        assert_eq!(nearby, hint.is_some(), "{failure:?}");
+    }
+}
+
+/// A time-out caused by another MainDevice must not suggest switching the drive off.
+#[test]
+fn hints_keep_drives_on_with_another_main_device() {
+    let nic = Nic::Interface("eth9".into());
+    let timeout = SdoError::Timeout {
+        station: 0x1001,
+        index: 0x6065,
+        sub: 0,
+        phase: ecaxis_master::mailbox::Phase::Answer,
+        after: std::time::Duration::from_secs(6),
+        set_aside: 0,
+    };
+    let refused = SdoError::Abort {
+        station: 0x1001,
+        index: 0x6065,
+        sub: 0,
+        code: 0x0609_0030,
+    };
+    for (source, takes_away) in [(timeout, true), (refused, false)] {
+        let error = ecaxis_master::acyclic::ServiceError::Sdo {
+            device: device(),
+            source,
+        };
+        let alone = service(&error, &nic);
+        let during = with_other_main_device(service(&error, &nic), &error);
+        let reported = during.hints.join("\n");
+        assert_eq!(
+            reported.contains("takes the answers away"),
+            takes_away,
+            "{reported}"
+        );
+        assert!(!reported.contains("off and on"), "{reported}");
+        assert_eq!(during.hints != alone.hints, takes_away, "{reported}");
+        assert_eq!((during.code, during.message), (alone.code, alone.message));
+    }
+}
+
+#[test]
+fn firmware_error_names_its_device_once() {
+    use ecaxis_tools::firmware::{Cause, FinalDeviceState, FirmwareError, Step};
+    let abort = SdoError::Abort {
+        station: 0x1001,
+        index: 0x1f51,
+        sub: 1,
+        code: 0x0601_0002,
+    };
+    let state = StateError::Gone {
+        device: device(),
+        wanted: AlState::PreOp,
+    };
+    for (step, cause) in [
+        (Step::Clear, Cause::Sdo(abort)),
+        (Step::PreOp, Cause::State(state)),
+    ] {
+        let error = FirmwareError::Failed {
+            device: device(),
+            step,
+            cause,
+            left: FinalDeviceState::Silent,
+        };
+        let text = firmware(&error, &Nic::Sim).message;
+        assert!(
+            text.starts_with(&format!("{}: {step}: ", device())),
+            "{text}"
+        );
+        assert_eq!(text.matches("0x1001").count(), 1, "{text}");
+        assert!(text.ends_with("; the device does not answer"), "{text}");
+    }
+}

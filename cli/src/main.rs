@@ -1,0 +1,349 @@
+//! The command line: one file per subcommand, each with its arguments and `run`.
+//!
+//! Results go to stdout, progress and errors to stderr.
+//!
+//! - `hints`: exit code, message and advice for each failure;
+//! - `report`: the summary of a run; `progress`: its status during operation;
+//! - `fault_report`: the fault report of a failed run;
+//! - `files`, `record`: protect other files from being overwritten;
+//! - `style`: colours; `output`: status line and line width;
+//! - `bus`: access to a bus without a cycle.
+
+use std::io::{self, IsTerminal, Write};
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use tracing_subscriber::EnvFilter;
+
+mod analyze;
+mod bench;
+mod bus;
+mod check;
+mod compare;
+mod completions;
+mod device;
+mod doctor;
+mod eeprom;
+mod emergencies;
+mod esi;
+mod explain;
+mod fault_report;
+mod files;
+mod firmware;
+mod hints;
+mod jog;
+mod man;
+mod output;
+mod pdo_table;
+mod progress;
+mod record;
+mod report;
+mod run;
+mod scan;
+mod sdo;
+mod signals;
+mod sim;
+mod style;
+mod table;
+mod trace;
+
+pub(crate) use files::{already_exists, unwritable, write_new};
+pub(crate) use hints::Failure;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis scan enp3s0                 the devices on the bus
+  ecaxis check machine.toml          all problems in the machine file
+  ecaxis explain machine.toml        the derived configuration
+  ecaxis run machine.toml --sim      its program on the simulated bus
+  ecaxis run machine.toml            on the file's network interface
+  ecaxis analyze run.pcapng          what a recording shows
+  ecaxis help run                    the options of a subcommand, with examples
+
+Exit code: 0 done, 1 the machine or the bus failed, 2 the file or the command
+line is wrong, 130 interrupted.
+NO_COLOR=1 switches colours off, CLICOLOR_FORCE=1 on.";
+
+/// An EtherCAT master for CiA 402 drives in the cyclic synchronous modes.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true, max_term_width = 100, after_help = EXAMPLES)]
+struct Cli {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    Run(run::Args),
+    Check(check::Args),
+    Explain(explain::Args),
+    Scan(scan::Args),
+    Compare(compare::Args),
+    Sdo(sdo::Args),
+    Eeprom(eeprom::Args),
+    Esi(esi::Args),
+    Sim(sim::Args),
+    Doctor(doctor::Args),
+    Bench(bench::Args),
+    Analyze(analyze::Args),
+    Firmware(firmware::Args),
+    Jog(jog::Args),
+    Completions(completions::Args),
+    Man(man::Args),
+}
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Verbosity {
+    /// Log events to stderr; repeat for more detail; RUST_LOG overrides it
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    verbose: u8,
+}
+
+impl Verbosity {
+    /// True if log lines are mixed with the output, so that no line is rewritten.
+    pub fn plain(&self) -> bool {
+        self.verbose > 0
+    }
+
+    fn start_logging(&self) {
+        let level = match self.verbose {
+            0 => "warn,ethercrab=error",
+            1 => "info,ecaxis=debug",
+            2 => "debug,ecaxis=trace",
+            _ => "trace",
+        };
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+        tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(|| output::Log)
+            .with_ansi(style::on_stderr())
+            .with_timer(tracing_subscriber::fmt::time::uptime())
+            .init();
+    }
+}
+
+/// Runs the command line. Exit codes: 0 done, 1 the machine or the bus failed, 2 the file or the
+/// command line is wrong, 130 interrupted.
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    match &cli.verb {
+        Verb::Run(run::Args { verbosity, .. })
+        | Verb::Scan(scan::Args { verbosity, .. })
+        | Verb::Compare(compare::Args { verbosity, .. })
+        | Verb::Sdo(sdo::Args { verbosity, .. })
+        | Verb::Eeprom(eeprom::Args { verbosity, .. })
+        | Verb::Sim(sim::Args { verbosity, .. })
+        | Verb::Bench(bench::Args { verbosity, .. })
+        | Verb::Firmware(firmware::Args { verbosity, .. }) => {
+            verbosity.start_logging();
+        }
+        Verb::Check(_)
+        | Verb::Explain(_)
+        | Verb::Esi(_)
+        | Verb::Doctor(_)
+        | Verb::Jog(_)
+        | Verb::Completions(_)
+        | Verb::Man(_)
+        | Verb::Analyze(_) => {}
+    }
+    let done = match cli.verb {
+        Verb::Run(args) => run::run(&args),
+        Verb::Check(args) => check::run(&args),
+        Verb::Explain(args) => explain::run(&args),
+        Verb::Scan(args) => scan::run(&args),
+        Verb::Compare(args) => compare::run(&args),
+        Verb::Sdo(args) => sdo::run(&args),
+        Verb::Eeprom(args) => eeprom::run(&args),
+        Verb::Esi(args) => esi::run(&args),
+        Verb::Sim(args) => sim::run(&args),
+        Verb::Doctor(args) => doctor::run(&args),
+        Verb::Bench(args) => bench::run(&args),
+        Verb::Firmware(args) => firmware::run(&args),
+        Verb::Jog(args) => jog::run(&args),
+        Verb::Completions(args) => completions::run(&args),
+        Verb::Man(args) => man::run(&args),
+        Verb::Analyze(args) => analyze::run(&args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            failure.print();
+            ExitCode::from(failure.code)
+        }
+    }
+}
+
+/// Prints a result on stdout.
+pub(crate) fn result(text: &str) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
+}
+
+/// Prints prose on stdout. On a terminal, long lines are wrapped.
+pub(crate) fn page(text: &str) -> Result<(), Failure> {
+    result(&output::wrapped(text, output::stdout_width()))
+}
+
+/// Maps a write result. A closed pipe (`| head`) is not a failure.
+fn written(done: io::Result<()>) -> Result<(), Failure> {
+    match done {
+        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Failure::new(
+            hints::FAILED,
+            format!("cannot write the result: {e}"),
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Prints a line on stderr.
+pub(crate) fn note(text: &str) {
+    let text = output::wrapped(text, output::stderr_width());
+    let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
+}
+
+/// Returns the definition of the command line.
+fn command() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
+}
+
+pub(crate) fn stderr_is_terminal() -> bool {
+    io::stderr().is_terminal()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn output_ignores_only_a_closed_pipe() {
+        assert_eq!(written(Ok(())), Ok(()));
+        let gone = io::Error::from(io::ErrorKind::BrokenPipe);
+        assert_eq!(written(Err(gone)), Ok(()));
+        let full = written(Err(io::Error::from(io::ErrorKind::StorageFull))).unwrap_err();
+        assert_eq!(full.code, hints::FAILED);
+        assert!(full.message.contains("cannot write the result"));
+    }
+
+    #[test]
+    fn every_subcommand_has_valid_examples() {
+        fn look(verb: &clap::Command, path: &str) {
+            let path = format!("{path} {}", verb.get_name());
+            if verb.get_name() == "help" {
+                return;
+            }
+            let help = verb.get_after_help().map(ToString::to_string);
+            let help = help.unwrap_or_default();
+            assert!(help.contains("Examples:\n"), "{path} has no examples");
+            for line in help.lines() {
+                assert!(line.chars().count() <= 80, "{path}: `{line}` is too wide");
+                let Some(example) = line.trim().strip_prefix("ecaxis ") else {
+                    continue;
+                };
+                // Two or more spaces separate the example from its description.
+                let words = example.split("  ").next().unwrap_or_default();
+                let words = words.split(['<', '>', '|']).next().unwrap_or_default();
+                let line = std::iter::once("ecaxis").chain(words.split_whitespace());
+                match Cli::try_parse_from(line) {
+                    Ok(_) => {}
+                    Err(e) if e.kind() == clap::error::ErrorKind::DisplayHelp => {}
+                    Err(e) => panic!("{path}: `{words}`: {e}"),
+                }
+            }
+            for verb in verb.get_subcommands() {
+                look(verb, &path);
+            }
+        }
+        look(&command(), "");
+    }
+
+    #[test]
+    fn arguments_are_consistent() {
+        command().debug_assert();
+        for (line, good) in [
+            ("ecaxis run", true),
+            (
+                "ecaxis run m.toml --sim --virtual --for 1h --repeat 2 --seed 7 --json",
+                true,
+            ),
+            ("ecaxis run --nic eth0 --sim", false),
+            ("ecaxis run --for 10", false),
+            ("ecaxis run --repeat 0", false),
+            ("ecaxis check", false),
+            ("ecaxis compare", false),
+            ("ecaxis compare m.toml --sim o.toml --apply", true),
+            ("ecaxis compare m.toml --apply --json", false),
+            ("ecaxis scan", false),
+            ("ecaxis scan eth0 --tree", true),
+            ("ecaxis scan --sim m.toml --ask --json", true),
+            ("ecaxis scan eth0 --sim m.toml", false),
+            ("ecaxis scan eth0 --force", false),
+            ("ecaxis scan eth0 --tree --json", false),
+            ("ecaxis run m.toml --enable --no-enable", false),
+            (
+                "ecaxis esi show f.xml --device EPOS4 --mode csp --cycle 2ms",
+                true,
+            ),
+            ("ecaxis esi sii f.xml", false),
+            (
+                "ecaxis esi list d --vendor 0xfb --product 1 --revision 2 --match high-word",
+                true,
+            ),
+            ("ecaxis esi list d --revision 2", false),
+            ("ecaxis esi list d --match roughly", false),
+            (
+                "ecaxis sdo read m.toml x 0x6064 Statusword --sim --json",
+                true,
+            ),
+            ("ecaxis sdo read --nic eth0 --position 1 0x6064", true),
+            ("ecaxis sdo read --position 1 0x6064", false),
+            (
+                "ecaxis sdo read --nic eth0 --position 1 --alias 2 0x6064",
+                false,
+            ),
+            ("ecaxis sdo read", false),
+            ("ecaxis sdo write m.toml x 0x6065 -5", true),
+            ("ecaxis sdo store --nic eth0 --alias 0x10", true),
+            ("ecaxis sdo compare a.toml b.toml --all", true),
+            ("ecaxis eeprom alias m.toml x 1001 --yes", true),
+            (
+                "ecaxis eeprom read m.toml x image.bin --category 30 --all",
+                false,
+            ),
+            ("ecaxis sim m.toml --nic veth0", true),
+            ("ecaxis analyze run.pcapng --all --html r.html", true),
+            ("ecaxis analyze a.pcapng b.pcap --interface 1 --json", true),
+            ("ecaxis analyze", false),
+            ("ecaxis run --record r.pcapng --record-limit 100MB", true),
+            ("ecaxis run --record r.pcapng --record-limit 100", false),
+            ("ecaxis run --record-limit 100MB", false),
+            ("ecaxis run --replay r.pcapng --record again.pcapng", true),
+            ("ecaxis run --replay r.pcapng --nic eth0", false),
+            ("ecaxis firmware", false),
+            ("ecaxis firmware info m.toml x --sim --json", true),
+            ("ecaxis firmware info --nic eth0 --position 0", true),
+            ("ecaxis firmware info --nic eth0 --sim", false),
+            (
+                "ecaxis firmware update m.toml x f.bin --via foe --yes",
+                true,
+            ),
+            (
+                "ecaxis firmware update f.bin --nic eth0 --alias 7 --dry-run",
+                true,
+            ),
+            ("ecaxis firmware update f.bin --dry-run --yes", false),
+            ("ecaxis firmware update", false),
+            ("ecaxis firmware sample m.toml x -o f.bin --size 1MiB", true),
+            ("ecaxis firmware sample m.toml x -o f.bin --size 1MB", false),
+            ("ecaxis doctor", true),
+            (
+                "ecaxis doctor eth0 --machine m.toml --cpu 3 --cycle 250us --seconds 0 --json",
+                true,
+            ),
+            ("ecaxis doctor --priority 100", false),
+            ("ecaxis doctor --cycle 1us", false),
+            ("ecaxis doctor --seconds -1", false),
+        ] {
+            assert_eq!(Cli::try_parse_from(line.split(' ')).is_ok(), good, "{line}");
+        }
+    }
+}

@@ -1,0 +1,616 @@
+//! Transfers that fail, each with its own error; the client stays usable afterwards.
+
+use std::cell::Cell;
+use std::time::Duration;
+
+use ecaxis_master::mailbox::{
+    CoeClient, DatagramError, FoeClient, MAX_OBJECT, MailboxTransport, NamedObject, Phase,
+    SdoError, Subject,
+};
+use ecaxis_test_support::mailbox::fault_injection::{Mischief, emergency};
+use ecaxis_test_support::mailbox::server::Server;
+use ecaxis_test_support::mailbox::{STATION, block_on, client, layout};
+
+const LONG: &[u8] = &[7; 100];
+const OBJECTS: &[(u16, u8, &[u8])] = &[
+    (0x1000, 0, &[0x92, 1, 2, 0]),
+    (0x6041, 0, &[0x37, 0x02]),
+    (0x2000, 0, LONG),
+];
+
+fn server(mischief: &[Mischief]) -> Server {
+    Server::new(48, OBJECTS, mischief)
+}
+
+/// Returns the error of the first upload of `index`. The next upload must succeed without the
+/// faults.
+fn upload_error(index: u16, mischief: &[Mischief]) -> (SdoError, Vec<Vec<u8>>) {
+    let server = server(mischief);
+    let mut client = client();
+    let error = block_on(client.upload(&server, index, 0, false)).unwrap_err();
+    let log = server.log();
+    server.forgive();
+    assert_eq!(
+        block_on(client.upload(&server, 0x6041, 0, false)).unwrap(),
+        [0x37, 0x02]
+    );
+    (error, log)
+}
+
+fn download_error(index: u16, data: &[u8], mischief: &[Mischief]) -> (SdoError, Vec<Vec<u8>>) {
+    let server = server(mischief);
+    let mut client = client();
+    let error = block_on(client.download(&server, index, 0, false, data)).unwrap_err();
+    let log = server.log();
+    server.forgive();
+    assert_eq!(
+        block_on(client.upload(&server, 0x6041, 0, false)).unwrap(),
+        [0x37, 0x02]
+    );
+    (error, log)
+}
+
+#[test]
+fn abort_error_contains_code_and_text() {
+    let (error, _) = upload_error(0x6060, &[]);
+    assert_eq!(
+        error,
+        SdoError::Abort {
+            station: STATION,
+            index: 0x6060,
+            sub: 0,
+            code: 0x0602_0000
+        }
+    );
+    assert_eq!(
+        error.to_string(),
+        "station 0x1001: 0x6060:00 (Modes of operation) was refused with 0x06020000: the object does not exist"
+    );
+    let (error, _) = download_error(0x1000, &[1], &[]);
+    assert_eq!(error.abort_code(), Some(0x0601_0002));
+    let (error, _) = download_error(0x2abc, LONG, &[]);
+    assert_eq!(error.abort_code(), Some(0x0602_0000));
+}
+
+/// ETG.1000.6 assigns the abort to the request service, some stacks to the response service.
+#[test]
+fn abort_is_parsed_under_either_service() {
+    for service in [0x20, 0x30] {
+        let abort = [
+            10, 0, 0, 0, 0, 0x13, 0, service, 0x80, 0x41, 0x60, 0, 0xc0, 0xff, 0x00, 0x0f,
+        ];
+        let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, abort.to_vec())]);
+        assert_eq!(error.abort_code(), Some(0x0f00_ffc0));
+        assert!(error.to_string().contains("wrong NMT state"), "{error}");
+    }
+}
+
+#[test]
+fn abort_among_segments_ends_the_transfer_at_any_address() {
+    let abort = [
+        10, 0, 0, 0, 0, 0x13, 0, 0x20, 0x80, 0, 0, 0, 0x22, 0x00, 0x00, 0x08,
+    ];
+    let (error, _) = upload_error(0x2000, &[Mischief::Replace(2, abort.to_vec())]);
+    assert_eq!(error.abort_code(), Some(0x0800_0022));
+    let (error, _) = download_error(0x2000, LONG, &[Mischief::Replace(3, abort.to_vec())]);
+    assert_eq!(error.abort_code(), Some(0x0800_0022));
+}
+
+#[test]
+fn a_mute_device_times_out() {
+    let (error, log) = upload_error(0x6041, &[Mischief::Mute]);
+    let after = Duration::from_millis(500);
+    let timeout = SdoError::Timeout {
+        station: STATION,
+        index: 0x6041,
+        sub: 0,
+        phase: Phase::Answer,
+        after,
+        set_aside: 0,
+    };
+    assert_eq!(error, timeout);
+    assert_eq!(log.len(), 1, "a request that came back is not sent again");
+}
+
+#[test]
+fn a_mailbox_that_stays_full_times_out() {
+    let server = server(&[Mischief::Deaf]);
+    let mut client = client();
+    // The first request fits but is not answered; the second finds the mailbox full.
+    let first = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            first,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                ..
+            }
+        ),
+        "{first}"
+    );
+    let before = server.now();
+    let second = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            second,
+            SdoError::Timeout {
+                phase: Phase::Request,
+                ..
+            }
+        ),
+        "{second}"
+    );
+    assert!(
+        second
+            .to_string()
+            .contains("the mailbox was not free within 100ms"),
+        "{second}"
+    );
+    assert!(server.now() - before < 150_000_000);
+}
+
+fn gone(index: u16) -> SdoError {
+    SdoError::Gone {
+        station: STATION,
+        asked: Subject::Object(NamedObject { index, sub: 0 }),
+    }
+}
+
+#[test]
+fn missing_device_fails_without_timeout() {
+    let server = server(&[Mischief::Off]);
+    let error = block_on(client().upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert_eq!(error, gone(0x6041));
+    assert_eq!(
+        block_on(client().drain(&server)),
+        Err(SdoError::Gone {
+            station: STATION,
+            asked: Subject::Emptying
+        })
+    );
+    assert!(server.now() < 10_000_000, "{}", server.now());
+}
+
+#[test]
+fn device_lost_in_mid_transfer_fails_without_timeout() {
+    let server = server(&[Mischief::Mute]);
+    let mut client = client();
+    block_on(client.drain(&server)).unwrap();
+    server.commit(Mischief::Off);
+    let error = block_on(client.download(&server, 0x2000, 0, false, LONG)).unwrap_err();
+    assert_eq!(error, gone(0x2000));
+}
+
+#[test]
+fn a_mailbox_error_reply_ends_the_transfer() {
+    let reply = [4, 0, 0, 0, 0, 0x10, 1, 0, 2, 0];
+    let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, reply.to_vec())]);
+    assert_eq!(
+        error,
+        SdoError::Refused {
+            station: STATION,
+            index: 0x6041,
+            sub: 0,
+            code: 2
+        }
+    );
+    assert!(
+        error.to_string().contains("protocol is not supported"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_length_beyond_the_mailbox_is_malformed() {
+    for length in [43u16, 0x1000, 0xffff] {
+        let [low, high] = length.to_le_bytes();
+        let answer = [
+            low, high, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x41, 0x60, 0, 0, 0, 0, 0,
+        ];
+        let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, answer.to_vec())]);
+        assert!(
+            matches!(error, SdoError::Malformed { index: 0x6041, .. }),
+            "{error}"
+        );
+        assert!(
+            error
+                .to_string()
+                .contains(&format!("says {length}, the mailbox holds 42")),
+            "{error}"
+        );
+    }
+}
+
+#[test]
+fn answers_that_end_too_early_are_malformed() {
+    let answer = [
+        0, 0, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x41, 0x60, 0, 0x37, 0x02, 0, 0,
+    ];
+    for length in 0..10 {
+        let mut answer = answer;
+        answer[0] = length;
+        let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, answer.to_vec())]);
+        assert!(
+            matches!(error, SdoError::Malformed { .. }),
+            "{length}: {error}"
+        );
+    }
+}
+
+#[test]
+fn timeout_error_counts_unrelated_answers() {
+    let other = [
+        10, 0, 0, 0, 0, 0x13, 0, 0x30, 0x4b, 0x64, 0x60, 0, 1, 0, 0, 0,
+    ];
+    let (error, _) = upload_error(0x6041, &[Mischief::Replace(1, other.to_vec())]);
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                set_aside: 1,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert!(
+        error
+            .to_string()
+            .ends_with("(1 answer to something else was set aside)"),
+        "{error}"
+    );
+}
+
+/// A late answer to a timed-out request must not be taken for the answer to the same request made
+/// later.
+#[test]
+fn a_late_answer_is_not_taken_for_the_next_one() {
+    let server = server(&[Mischief::Deaf]);
+    let mut client = client();
+    block_on(async {
+        client.upload(&server, 0x6041, 0, false).await.unwrap_err();
+        server.forgive();
+        server.delay(Duration::from_millis(5)).await;
+        server.set(0x6041, 0, &[0x50, 0x02]);
+        assert_eq!(
+            client.upload(&server, 0x6041, 0, false).await.unwrap(),
+            [0x50, 0x02]
+        );
+    });
+    assert_eq!(client.set_aside(), 1);
+}
+
+/// A device that fetches the old request only after its emergencies were read. There are more of
+/// them than one call drains.
+#[test]
+fn upload_works_after_many_pending_emergencies() {
+    let server = server(&[Mischief::Deaf]);
+    let mut client = client();
+    block_on(async {
+        client.upload(&server, 0x6041, 0, false).await.unwrap_err();
+        server.commit(Mischief::Blocked);
+        for _ in 0..70 {
+            server.say(&emergency(0x8130));
+        }
+        server.pardon(&Mischief::Deaf);
+        assert_eq!(
+            client.upload(&server, 0x1000, 0, false).await.unwrap(),
+            [0x92, 1, 2, 0]
+        );
+    });
+    let kept = u64::try_from(client.take_emergencies().count()).unwrap();
+    assert_eq!(kept + client.lost_emergencies(), 70);
+}
+
+/// Time passes only while the client waits, and there is always another message.
+#[test]
+fn endless_messages_end_in_bounded_time() {
+    struct Flood(Cell<u64>);
+    impl MailboxTransport for Flood {
+        async fn read(&self, _: u16, register: u16, buf: &mut [u8]) -> Result<u16, DatagramError> {
+            if register < 0x1000 {
+                buf.fill(u8::from(register == 0x080d) << 3);
+            } else {
+                let sdo_info = [10, 0, 0, 0, 0, 0x13, 0, 0x80, 2, 0, 0, 0, 0, 0, 0, 0];
+                buf[..16].copy_from_slice(&sdo_info);
+            }
+            Ok(1)
+        }
+        async fn write(&self, _: u16, _: u16, _: &[u8]) -> Result<u16, DatagramError> {
+            Ok(1)
+        }
+        async fn delay(&self, duration: Duration) {
+            self.0
+                .set(self.0.get() + u64::try_from(duration.as_nanos()).unwrap());
+        }
+        fn now(&self) -> u64 {
+            self.0.get()
+        }
+    }
+    let wire = Flood(Cell::new(0));
+    let error = block_on(client().upload(&wire, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert_eq!(block_on(client().drain(&wire)), Ok(64));
+}
+
+#[test]
+fn wrong_toggle_bit_ends_the_transfer_with_an_abort() {
+    let toggle = [0x00, 0x20, 0x80, 0x00, 0x20, 0, 0x00, 0x00, 0x03, 0x05];
+    let (error, _) = upload_error(0x2000, &[Mischief::WrongToggle]);
+    assert!(error.to_string().contains("toggle"), "{error}");
+    let server = server(&[Mischief::WrongToggle]);
+    let mut client = client();
+    block_on(async {
+        let error = client
+            .download(&server, 0x2000, 0, false, LONG)
+            .await
+            .unwrap_err();
+        assert!(error.to_string().contains("toggle"), "{error}");
+        server.delay(Duration::from_millis(5)).await;
+    });
+    assert_eq!(server.log().last().unwrap()[..10], toggle);
+}
+
+#[test]
+fn wrong_announced_sizes_are_malformed() {
+    let (error, _) = upload_error(0x2000, &[Mischief::AnnounceSize(101)]);
+    assert!(
+        error
+            .to_string()
+            .contains("101 bytes were announced, 100 came"),
+        "{error}"
+    );
+    let (error, _) = upload_error(0x2000, &[Mischief::AnnounceSize(60)]);
+    assert!(
+        error
+            .to_string()
+            .contains("60 bytes were announced, 71 came"),
+        "{error}"
+    );
+    let (error, _) = upload_error(0x2000, &[Mischief::EmptySegments]);
+    assert!(
+        error.to_string().contains("a segment without data"),
+        "{error}"
+    );
+}
+
+#[test]
+fn oversized_objects_are_rejected_before_the_transfer() {
+    let (error, log) = upload_error(0x2000, &[Mischief::AnnounceSize(u32::MAX)]);
+    assert!(
+        matches!(
+            error,
+            SdoError::TooLarge {
+                size: 0xffff_ffff,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert_eq!(log.len(), 1);
+    let (error, log) = download_error(0x2000, &vec![0; MAX_OBJECT + 1], &[]);
+    assert!(matches!(error, SdoError::TooLarge { .. }), "{error}");
+    assert!(log.is_empty());
+}
+
+#[test]
+fn unrepeated_lost_answer_times_out() {
+    let (error, _) = upload_error(0x6041, &[Mischief::LoseAnswer(1), Mischief::NoRepeat]);
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Repeat,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    let again: Vec<_> = (1..=9).map(Mischief::LoseAnswer).collect();
+    let (error, _) = upload_error(0x6041, &again);
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Repeat,
+                ..
+            }
+        ),
+        "{error}"
+    );
+}
+
+#[test]
+fn endless_emergencies_do_not_block_the_client() {
+    let server = server(&[Mischief::Mute]);
+    for _ in 0..10_000 {
+        server.say(&emergency(0x8130));
+    }
+    let mut client = client();
+    let error = block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            SdoError::Timeout {
+                phase: Phase::Answer,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert!(server.now() < 700_000_000, "{}", server.now());
+}
+
+#[test]
+fn mailboxes_that_cannot_carry_coe_are_refused_before_anything_is_sent() {
+    for len in [0, 6, 15, 1487] {
+        let server = server(&[]);
+        let mut client = CoeClient::new(layout(len));
+        let refused = |asked| SdoError::Mailbox {
+            station: STATION,
+            asked,
+            out_len: len,
+            in_len: len,
+        };
+        let object = Subject::Object(NamedObject {
+            index: 0x6041,
+            sub: 0,
+        });
+        assert_eq!(
+            block_on(client.upload(&server, 0x6041, 0, false)).unwrap_err(),
+            refused(object)
+        );
+        assert_eq!(
+            block_on(client.drain(&server)).unwrap_err(),
+            refused(Subject::Emptying)
+        );
+        assert_eq!(server.datagrams.get(), 0);
+    }
+}
+
+/// A wire on which no frame comes back.
+struct Silent;
+
+impl MailboxTransport for Silent {
+    async fn read(&self, station: u16, register: u16, _: &mut [u8]) -> Result<u16, DatagramError> {
+        Err(DatagramError::Timeout { station, register })
+    }
+
+    async fn write(&self, station: u16, register: u16, _: &[u8]) -> Result<u16, DatagramError> {
+        Err(DatagramError::Timeout { station, register })
+    }
+
+    async fn delay(&self, _: Duration) {}
+
+    fn now(&self) -> u64 {
+        0
+    }
+}
+
+#[test]
+fn a_silent_bus_is_reported_as_such() {
+    let error = block_on(client().upload(&Silent, 0x6041, 0, false)).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            SdoError::Wire {
+                source: DatagramError::Timeout {
+                    station: STATION,
+                    ..
+                },
+                ..
+            }
+        ),
+        "{error}"
+    );
+}
+
+/// Every error names its object or file, and shows no register that looks like an object.
+#[test]
+fn every_error_names_its_object_or_file() {
+    const NAMED: &str = "station 0x1001: 0x6065:00 (Following error window)";
+    let named = |text: String| {
+        assert!(text.starts_with(NAMED), "{text}");
+        assert!(!text.contains("register"), "{text}");
+        text
+    };
+    let silent = [
+        block_on(client().upload(&Silent, 0x6065, 0, false)).map(|_| ()),
+        block_on(client().download(&Silent, 0x6065, 0, false, &[1])),
+        block_on(client().download(&Silent, 0x6065, 0, false, LONG)),
+    ];
+    for error in silent {
+        let text = named(error.unwrap_err().to_string());
+        assert_eq!(text, format!("{NAMED}: no frame came back"));
+    }
+    let off = server(&[Mischief::Off]);
+    let error = block_on(client().upload(&off, 0x6065, 0, false)).unwrap_err();
+    assert!(named(error.to_string()).ends_with("it is off, or has lost its address"));
+
+    let (index, sub, station) = (0x6065, 0, STATION);
+    let asked = Subject::Object(NamedObject { index, sub });
+    let source = DatagramError::Other("a frame was too long".to_owned());
+    for error in [
+        SdoError::Abort {
+            station,
+            index,
+            sub,
+            code: 1,
+        },
+        SdoError::Timeout {
+            station,
+            index,
+            sub,
+            phase: Phase::Answer,
+            after: Duration::ZERO,
+            set_aside: 0,
+        },
+        SdoError::Refused {
+            station,
+            index,
+            sub,
+            code: 1,
+        },
+        SdoError::Malformed {
+            station,
+            index,
+            sub,
+            what: String::new(),
+        },
+        SdoError::TooLarge {
+            station,
+            index,
+            sub,
+            size: 1,
+        },
+        SdoError::Gone { station, asked },
+        SdoError::Mailbox {
+            station,
+            asked,
+            out_len: 1,
+            in_len: 1,
+        },
+        SdoError::Wire {
+            station,
+            asked,
+            source,
+        },
+    ] {
+        named(error.to_string());
+    }
+
+    let asked = "station 0x1001: the description of 0x6065:00 (Following error window): ";
+    for error in [
+        block_on(client().entry_description(&Silent, 0x6065, 0)).unwrap_err(),
+        block_on(client().entry_description(&off, 0x6065, 0)).unwrap_err(),
+        block_on(CoeClient::new(layout(6)).entry_description(&off, 0x6065, 0)).unwrap_err(),
+    ] {
+        let text = error.to_string();
+        assert!(
+            text.starts_with(asked) && !text.contains("register"),
+            "{text}"
+        );
+    }
+    for error in [
+        block_on(FoeClient::new(layout(48)).write(&Silent, "new.bin", 0, &[1], &mut |_| {})),
+        block_on(FoeClient::new(layout(48)).write(&off, "new.bin", 0, &[1], &mut |_| {})),
+        block_on(FoeClient::new(layout(6)).write(&off, "new.bin", 0, &[1], &mut |_| {})),
+    ] {
+        let text = error.unwrap_err().to_string();
+        assert!(
+            text.starts_with("station 0x1001: file `new.bin`: "),
+            "{text}"
+        );
+        assert!(!text.contains("register"), "{text}");
+    }
+}

@@ -1,0 +1,9 @@
+//! The mailbox clients against a small SDO and file server that shares no code with them.
+
+mod during_operation;
+mod errors;
+mod foe;
+mod hostile;
+mod info;
+mod start_up;
+mod transfers;

@@ -1,0 +1,152 @@
+//! Analysis of a recording: devices, bring-up, mailbox transfers, cycle regularity and axes. It
+//! reads recordings of any MainDevice and sends nothing. Memory is bounded for recordings of any
+//! length.
+//!
+//! - `match_frames`: matches answers with requests;
+//! - `segment`: the devices and the evaluation of each datagram; `registers`, `eeprom`, `mailbox`,
+//!   `objects`: parts of a device;
+//! - `cycle`, `clocks`, `axes`: process data, distributed clocks, CiA 402;
+//! - `context`: machine file and ESI files;
+//! - `events`, `values`: events as text;
+//! - `report`: the [`Report`]; `html`, `plot`: an HTML page with plots.
+
+use std::io::Read;
+
+use ecaxis_master::recording::frame::{Content, Encapsulation, content};
+use ecaxis_master::recording::{Packet, Reader};
+
+mod axes;
+mod clocks;
+mod context;
+mod cycle;
+mod eeprom;
+mod events;
+mod html;
+mod mailbox;
+mod match_frames;
+mod objects;
+mod plot;
+mod registers;
+mod report;
+mod segment;
+mod values;
+
+pub use context::{Context, library};
+pub use html::html;
+pub use report::{
+    AxisReport, ClockReport, ClocksReport, CycleReport, DeviceReport, FileReport, Line, Report,
+    SyncManagerReport, TransferReport, WkcRun, called, highest,
+};
+
+pub use crate::html::time;
+
+use match_frames::Pairing;
+use segment::Segment;
+
+/// The maximum number of distinguished VLANs.
+const CARRIERS: usize = 16;
+
+/// The packets of a recording by content.
+#[derive(Debug, Default)]
+struct PacketCounts {
+    packets: u64,
+    frames: u64,
+    /// EtherCAT frames without datagrams.
+    other_ethercat: u64,
+    /// Packets other than EtherCAT.
+    other: u64,
+    /// EtherCAT frames with missing datagrams.
+    cut: u64,
+    /// The time of the first EtherCAT frame in ns since 1970.
+    first: Option<u64>,
+    last: u64,
+    /// Frames with an earlier time than the frame before.
+    back: u64,
+    interfaces: Vec<u32>,
+    carriers: Vec<Encapsulation>,
+}
+
+/// Analyzes one file, or its parts in order. Never fails: problems of the files are part of the
+/// report. With `interface`, only its packets are used.
+pub fn analyze<R: Read>(parts: Vec<Reader<R>>, interface: Option<u32>, known: Context) -> Report {
+    let mut counted = PacketCounts::default();
+    let mut pairing = Pairing::default();
+    let mut segment = Segment::new(known);
+    let mut remarks = Vec::new();
+    let several = parts.len() > 1;
+    for (number, mut reader) in (1..).zip(parts) {
+        // Frames may be missing between two parts.
+        let next = reader.peek().and_then(|packet| packet.at);
+        if next.is_some_and(|at| at > counted.last.saturating_add(match_frames::PATIENCE_NS)) {
+            pairing.end();
+            drain(&mut pairing, &mut segment);
+            segment.cycle.pause();
+        }
+        while let Some(packet) = reader.next() {
+            counted.packets += 1;
+            if interface.is_some_and(|wanted| wanted != packet.interface) {
+                continue;
+            }
+            if let Some(frame) = counted.frame(packet) {
+                pairing.push(frame);
+            }
+            drain(&mut pairing, &mut segment);
+        }
+        let which = if several {
+            format!("file {number}: ")
+        } else {
+            String::new()
+        };
+        remarks.extend(
+            reader
+                .remarks()
+                .iter()
+                .map(|remark| format!("{which}{remark}")),
+        );
+        if reader.more_remarks() > 0 {
+            remarks.push(format!(
+                "{which}{} further places are damaged",
+                reader.more_remarks()
+            ));
+        }
+    }
+    pairing.end();
+    drain(&mut pairing, &mut segment);
+    segment.end();
+    report::report(remarks, &counted, segment)
+}
+
+fn drain(pairing: &mut Pairing, segment: &mut Segment) {
+    while let Some(exchange) = pairing.next() {
+        segment.exchange(&exchange);
+    }
+}
+
+impl PacketCounts {
+    fn frame(&mut self, packet: Packet) -> Option<ecaxis_master::recording::frame::Frame> {
+        match content(packet) {
+            Content::Frame(frame) => {
+                self.frames += 1;
+                self.cut += u64::from(frame.cut);
+                self.first = Some(self.first.map_or(frame.at, |first| first.min(frame.at)));
+                self.back += u64::from(frame.at < self.last);
+                self.last = self.last.max(frame.at);
+                if !self.interfaces.contains(&frame.interface) && self.interfaces.len() < CARRIERS {
+                    self.interfaces.push(frame.interface);
+                }
+                if !self.carriers.contains(&frame.carrier) && self.carriers.len() < CARRIERS {
+                    self.carriers.push(frame.carrier);
+                }
+                Some(frame)
+            }
+            Content::OtherEthercat(_) => {
+                self.other_ethercat += 1;
+                None
+            }
+            Content::Other => {
+                self.other += 1;
+                None
+            }
+        }
+    }
+}

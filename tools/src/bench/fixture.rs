@@ -1,0 +1,274 @@
+//! A machine with axes on a [`Segment`] without a bring-up: the parts of the real cycle and a
+//! minimal supervisor.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use ecaxis_axis::setpoint::{Motion, PositionWave, SetpointError, Shape, Wave};
+use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, Scale, StopMethod};
+use ecaxis_esi::layout::{Field, Layout};
+
+use super::segment::{DRIVE_BYTES, FIRST_STATION, Segment};
+use ecaxis_master::clock::{Clock, Nanos};
+use ecaxis_master::config::{self, StopSetup};
+use ecaxis_master::link::Link;
+use ecaxis_master::link::pdu_loop::main_device;
+use ecaxis_master::rt::axis::RtAxis;
+use ecaxis_master::rt::bus_monitor::BusMonitor;
+use ecaxis_master::rt::channel::{HostEndpoint, RtCommand, channel};
+use ecaxis_master::rt::cycle::{EngineConfig, Signals, Timing, first_snapshot};
+use ecaxis_master::rt::exchange::{Exchange, ExchangeDevice};
+use ecaxis_master::rt::image::{self, AxisBits, ImagePlan, ProcessData};
+use ecaxis_master::rt::phase::{ClockPlan, Phase};
+use ecaxis_master::rt::reaction_group::ReactionGroup;
+use ecaxis_master::rt::setpoint_generator::GeneratorRequest;
+use ecaxis_master::rt::spin::Spin;
+
+/// The maximum number of axes, limited by working counters and station addresses.
+pub const MOST_AXES: usize = 1000;
+
+/// The drift of the drives' clocks against the computer's clock in ppm.
+const DRIFT_PPM: i64 = 20;
+/// The unit of position, velocity and so on is one turn.
+const COUNTS_PER_TURN: f64 = 2000.0;
+const LIMITS: Limits = Limits {
+    position: None,
+    velocity: 50.0,
+    acceleration: 500.0,
+    jerk: None,
+    torque: 100.0,
+    following_error: None,
+};
+/// The amplitude in turns and the frequency in Hz of every axis.
+const AMPLITUDE: f64 = 1.0;
+const FREQUENCY: f64 = 1.0;
+/// The number of periods; longer than any bench.
+const PERIODS: u32 = 1_000_000;
+
+/// The time-out for phase lock and enabling of all axes.
+const PATIENCE: Duration = Duration::from_secs(20);
+const TICK: Duration = Duration::from_millis(5);
+/// The settling time after the start of motion.
+const SETTLE: Duration = Duration::from_millis(300);
+
+/// Why the axes of a bench do not move.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    #[error("{0} axes do not fit: one frame holds the process data of a device whole")]
+    TooMany(usize),
+    #[error("{what} after {} s ({cycles} cycles, {lost} without an answer)", PATIENCE.as_secs())]
+    NotReady {
+        what: &'static str,
+        cycles: u64,
+        lost: u64,
+    },
+    #[error("the axes cannot be moved at this cycle time: {0}")]
+    Wave(#[from] SetpointError),
+    #[error("{0}")]
+    Axis(#[from] ecaxis_axis::ConfigError),
+    #[error("{0}")]
+    Scale(#[from] ecaxis_axis::ScaleError),
+    #[error("{0}")]
+    NotMapped(#[from] image::NotMapped),
+}
+
+/// Outputs: Controlword, target position, mode. Inputs: Statusword, position, mode.
+fn layout() -> Layout {
+    let field = |pdo, index, bit_offset, bit_len| Field {
+        pdo,
+        index,
+        sub: 0,
+        bit_offset,
+        bit_len,
+        name: String::new(),
+        data_type: String::new(),
+    };
+    Layout {
+        rx: vec![
+            field(0x1600, 0x6040, 0, 16),
+            field(0x1600, 0x607a, 16, 32),
+            field(0x1600, 0x6060, 48, 8),
+        ],
+        tx: vec![
+            field(0x1a00, 0x6041, 0, 16),
+            field(0x1a00, 0x6064, 16, 32),
+            field(0x1a00, 0x6061, 48, 8),
+        ],
+        ..Layout::default()
+    }
+}
+
+fn plan(axes: usize) -> Result<ImagePlan, RigError> {
+    let drive = ProcessData {
+        out_len: DRIVE_BYTES,
+        in_len: DRIVE_BYTES,
+        group: 0,
+        lrw: true,
+        mailbox: false,
+    };
+    image::plan(&vec![drive; axes]).map_err(|_| RigError::TooMany(axes))
+}
+
+/// Returns the bus for this number of axes.
+///
+/// # Errors
+/// Fails if there are too many axes.
+pub fn segment(axes: usize) -> Result<Segment, RigError> {
+    let plan = plan(axes)?;
+    let regions = plan.regions.iter().flatten();
+    Ok(Segment::new(
+        regions.map(|region| region.logical),
+        DRIFT_PPM,
+    ))
+}
+
+/// The parameters of the cycle.
+#[derive(Debug, Clone, Copy)]
+pub struct Setup {
+    pub axes: usize,
+    pub cycle_ns: Nanos,
+    pub spin: Spin,
+    pub exchange: config::Exchange,
+}
+
+/// Returns the engine configuration and the host side of the cycle.
+///
+/// # Errors
+/// Fails if there are too many axes.
+pub fn parts(setup: Setup, link: Box<dyn Link>) -> Result<(EngineConfig, HostEndpoint), RigError> {
+    let Setup {
+        axes,
+        cycle_ns,
+        spin,
+        exchange,
+    } = setup;
+    let plan = plan(axes)?;
+    let layout = layout();
+    let scale = Scale::new(COUNTS_PER_TURN, 1.0)?;
+    let config = AxisConfig::new(Mode::Csp, scale, LIMITS);
+    let mut slots = Vec::with_capacity(axes);
+    for region in plan.regions.iter().flatten() {
+        let bits = AxisBits::new(&layout, region)?;
+        slots.push(RtAxis::new(Axis::new(config)?, bits, slots.len(), 0));
+    }
+    let devices = u16::try_from(axes).unwrap_or(u16::MAX);
+    let members: Vec<ExchangeDevice> = (0..devices)
+        .map(|n| ExchangeDevice {
+            station: FIRST_STATION + n,
+            clock: true,
+            mailbox: None,
+        })
+        .collect();
+    let clock = ClockPlan {
+        reference: FIRST_STATION,
+        cycle_ns,
+        // The middle between two SYNC0 pulses, which are at whole cycles.
+        release: cycle_ns / 2,
+    };
+    let signals = Signals::default();
+    let (end, outer) = channel(&first_snapshot(&slots, 1, &signals, members.len()));
+    let parts = EngineConfig {
+        clock: Clock::Real,
+        timing: Timing {
+            cycle_ns,
+            clock_window_ns: config::Bus::default().clock_window_ns,
+            spin,
+        },
+        link,
+        port: main_device(cycle_ns).1,
+        exchange: Exchange::new(&plan, Some(&clock), &members, exchange),
+        axes: slots,
+        groups: vec![ReactionGroup::machine(StopMethod::Ramp)],
+        signals,
+        controller: None,
+        tables: Box::default(),
+        stop: StopSetup::default(),
+        phase: Some(Phase::new(&clock)),
+        // Losses are counted only; a stopped machine would end the measurement.
+        guard: BusMonitor::new(u32::MAX, &plan.groups),
+        end,
+    };
+    Ok((parts, outer))
+}
+
+/// Waits for the bus, then starts all axes. Returns `Ok(false)` if `stop` ends it.
+///
+/// # Errors
+/// Fails if the phase is not locked or an axis is not enabled in time.
+pub fn set_in_motion(
+    outer: &mut HostEndpoint,
+    setup: Setup,
+    stop: &AtomicBool,
+) -> Result<bool, RigError> {
+    order(outer, RtCommand::Guard);
+    let locked = wait(outer, stop, "the phase is not locked", |outer| {
+        let snapshot = outer.snapshots.read();
+        snapshot.inputs_fresh && snapshot.phase.is_some_and(|phase| phase.locked)
+    })?;
+    if !locked {
+        return Ok(false);
+    }
+    for axis in 0..setup.axes {
+        order(
+            outer,
+            RtCommand::Axis {
+                axis,
+                command: Command::Enable,
+            },
+        );
+    }
+    let enabled = wait(outer, stop, "not every axis is enabled", |outer| {
+        outer.snapshots.read().axes.iter().all(|axis| axis.enabled)
+    })?;
+    if !enabled {
+        return Ok(false);
+    }
+    let dt_s = setup.cycle_ns as f64 * 1e-9;
+    let wave = Wave::new(Shape::Sine, AMPLITUDE, FREQUENCY, PERIODS, dt_s)?;
+    for axis in 0..setup.axes {
+        let at = outer.snapshots.read().axes[axis].target_position;
+        let wave = PositionWave::new(wave, Motion::at(at), LIMITS.motion(), None, dt_s)?;
+        order(
+            outer,
+            RtCommand::Feed {
+                axis,
+                start: GeneratorRequest::Wave(wave),
+            },
+        );
+    }
+    thread::sleep(SETTLE);
+    Ok(true)
+}
+
+/// Sends a command and waits for space in the queue, which the cycle empties.
+fn order(outer: &mut HostEndpoint, order: RtCommand) {
+    let start = Instant::now();
+    while outer.orders.push(order).is_err() && start.elapsed() < PATIENCE {
+        thread::sleep(TICK);
+    }
+}
+
+fn wait(
+    outer: &mut HostEndpoint,
+    stop: &AtomicBool,
+    what: &'static str,
+    mut done: impl FnMut(&mut HostEndpoint) -> bool,
+) -> Result<bool, RigError> {
+    let start = Instant::now();
+    while !done(outer) {
+        if stop.load(Ordering::Relaxed) {
+            return Ok(false);
+        }
+        if start.elapsed() > PATIENCE {
+            let counters = outer.snapshots.read().counters;
+            return Err(RigError::NotReady {
+                what,
+                cycles: counters.cycles,
+                lost: counters.lost_frames,
+            });
+        }
+        thread::sleep(TICK);
+    }
+    Ok(true)
+}

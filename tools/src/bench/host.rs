@@ -1,0 +1,172 @@
+//! The computer that runs a bench.
+
+use std::fs;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+
+use rustix::thread::{CpuSet, sched_getaffinity};
+
+use super::plan::Plan;
+use super::report::Fact;
+use crate::doctor::{self, Host, Measurements, RunProfile, Severity};
+use ecaxis_master::sys::rt_thread::pin;
+
+fn read(path: &str) -> Option<String> {
+    let text = fs::read_to_string(path).ok()?;
+    let text = text.trim();
+    (!text.is_empty()).then(|| text.to_owned())
+}
+
+/// Returns the CPU for the cycle, isolated if possible, and the CPU for all other work. Both are
+/// CPUs that this process may use.
+#[must_use]
+pub fn cpus() -> (usize, Option<usize>) {
+    let allowed: Vec<usize> = sched_getaffinity(None).map_or_else(
+        |_| vec![0],
+        |set| {
+            (0..CpuSet::MAX_CPU)
+                .filter(|cpu| set.is_set(*cpu))
+                .collect()
+        },
+    );
+    let isolated = read("/sys/devices/system/cpu/isolated").map_or_else(Vec::new, |l| list(&l));
+    let last = allowed.iter().rev();
+    let cycle = last
+        .clone()
+        .find(|cpu| isolated.contains(cpu))
+        .or(allowed.last())
+        .copied()
+        .unwrap_or(0);
+    let other = last.copied().find(|cpu| *cpu != cycle);
+    (cycle, other)
+}
+
+/// Returns the online CPUs in the kernel's notation if `cpu` is not one of them.
+#[must_use]
+pub fn without(cpu: usize) -> Option<String> {
+    let online = read("/sys/devices/system/cpu/online")?;
+    (!list(&online).contains(&cpu)).then_some(online)
+}
+
+/// Parses the kernel's notation `0,2-4`.
+fn list(text: &str) -> Vec<usize> {
+    let mut cpus = Vec::new();
+    for part in text.split(',') {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        if let (Ok(first), Ok(last)) = (first.trim().parse(), last.trim().parse::<usize>()) {
+            cpus.extend(first..=last.min(CpuSet::MAX_CPU));
+        }
+    }
+    cpus
+}
+
+/// True on a virtual machine.
+#[must_use]
+pub fn is_virtual() -> bool {
+    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let flags = info.lines().find(|line| line.starts_with("flags"));
+    flags.is_some_and(|flags| flags.split_whitespace().any(|flag| flag == "hypervisor"))
+}
+
+/// Returns facts about the computer and the findings of `ecaxis doctor`, which explain the figures.
+#[must_use]
+pub fn examined(plan: &Plan) -> (Vec<Fact>, Vec<String>) {
+    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = info.lines().find_map(|line| {
+        let (name, value) = line.split_once(':')?;
+        (name.trim() == "model name").then(|| value.trim().to_owned())
+    });
+    let mut facts = Vec::new();
+    let mut add = |name, value: Option<String>| {
+        if let Some(value) = value {
+            facts.push(Fact { name, value });
+        }
+    };
+    add("processor", model);
+    let intent = RunProfile {
+        nic: None,
+        cpu: Some(plan.cpu),
+        priority: plan.priority,
+        cycle_ns: plan.cycle_ns,
+        spin: plan.spin,
+        program: std::env::current_exe().unwrap_or_default(),
+    };
+    let report = doctor::examine(&Host::here(), &intent, Measurements::default());
+    for fact in report.facts {
+        add(fact.name, Some(fact.value));
+    }
+    let load = read("/proc/loadavg");
+    add(
+        "load at the end",
+        load.and_then(|l| Some(l.split_whitespace().next()?.to_owned())),
+    );
+    let bad = |f: &doctor::Finding| f.severity != Severity::Note;
+    let findings = report.findings.into_iter().filter(bad);
+    (facts, findings.map(|finding| finding.found).collect())
+}
+
+/// A SCHED_OTHER thread that loads a CPU and the memory bus until dropped.
+#[derive(Debug)]
+pub struct Hog {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// Larger than most caches, in words.
+const HOG_WORDS: usize = 1 << 20;
+
+impl Hog {
+    /// Starts the thread on `cpu`.
+    ///
+    /// # Errors
+    /// Fails if no thread can be started.
+    pub fn start(cpu: usize) -> std::io::Result<Self> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let ended = Arc::clone(&stop);
+        let thread = thread::Builder::new()
+            .name("ecaxis-hog".to_owned())
+            .spawn(move || {
+                if pin(cpu).is_ok() {
+                    let mut words = vec![0_u64; HOG_WORDS];
+                    while !ended.load(Ordering::Relaxed) {
+                        for word in words.iter_mut().step_by(8) {
+                            *word = word.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                        }
+                        std::hint::black_box(&mut words);
+                    }
+                }
+            })?;
+        Ok(Self {
+            stop,
+            thread: Some(thread),
+        })
+    }
+}
+
+impl Drop for Hog {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn list_parses_kernel_lists() {
+        assert_eq!(list("0,2-4"), [0, 2, 3, 4]);
+        assert!(list("").is_empty());
+        assert!(list("x,3-1,5-").is_empty());
+    }
+
+    #[test]
+    fn examined_returns_facts_about_this_computer() {
+        let (cpu, other) = cpus();
+        assert_ne!(Some(cpu), other);
+    }
+}

@@ -1,0 +1,523 @@
+//! Compares a machine file with a bus: missing, added, and displaced devices. Pure, except
+//! [`parameters`].
+//!
+//! - this module: assigns bus devices to file devices, and compares each pair;
+//! - `parameters`: compares the start-up SDO values;
+//! - [`apply`]: rewrites the file to match the bus.
+
+use std::fmt;
+
+use ecaxis_esi::{Mode, address};
+
+use crate::scan::{Device, Scan};
+use ecaxis_master::config::{DeviceConfig, Locator, Machine};
+
+mod align;
+pub mod apply;
+mod parameters;
+
+pub use parameters::parameters;
+
+/// A difference between bus and file. File devices are indices into [`Machine::devices`], bus
+/// devices are positions.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Difference {
+    /// No device on the bus matches this one.
+    Missing { device: usize },
+    /// The file does not contain this device.
+    Added { position: u16 },
+    /// Two devices are in each other's position.
+    Swapped {
+        devices: [usize; 2],
+        positions: [u16; 2],
+    },
+    /// The device is in another position; those in between may have moved as well.
+    Moved { device: usize, from: u16, to: u16 },
+    /// A revision that the device's `identity` does not accept.
+    Revision {
+        device: usize,
+        position: u16,
+        expected: u32,
+        found: u32,
+    },
+    /// The device has another alias or device identification.
+    Alias {
+        device: usize,
+        position: u16,
+        expected: Locator,
+        found: u16,
+    },
+    Serial {
+        device: usize,
+        position: u16,
+        expected: u32,
+        found: u32,
+    },
+    /// Module names by slot.
+    Modules {
+        device: usize,
+        position: u16,
+        expected: Vec<String>,
+        found: Vec<String>,
+    },
+    /// A start-up SDO value and the value in the device.
+    Parameter {
+        device: usize,
+        position: u16,
+        index: u16,
+        sub: u8,
+        name: String,
+        expected: Vec<u8>,
+        found: Vec<u8>,
+    },
+}
+
+/// The result of a comparison.
+#[derive(Debug, Clone, Default)]
+pub struct Comparison {
+    pub differences: Vec<Difference>,
+    /// The bus position of each file device.
+    pub places: Vec<Option<u16>>,
+    /// Items that could not be compared.
+    pub unknown: Vec<String>,
+}
+
+/// Compares a machine with a scanned bus.
+#[must_use]
+pub fn compare(machine: &Machine, scan: &Scan) -> Comparison {
+    let mut comparison = Comparison {
+        places: vec![None; machine.devices.len()],
+        ..Comparison::default()
+    };
+    let mut free: Vec<bool> = vec![true; scan.devices.len()];
+    by_serial(machine, scan, &mut comparison.places, &mut free);
+    by_alias(machine, scan, &mut comparison.places, &mut free);
+    by_order(machine, scan, &mut comparison.places, &mut free);
+    match_moved(machine, scan, &mut comparison, &mut free);
+
+    let missing = comparison.places.iter().enumerate();
+    let missing = missing.filter(|(_, place)| place.is_none());
+    comparison
+        .differences
+        .extend(missing.map(|(device, _)| Difference::Missing { device }));
+    for (device, _) in scan.devices.iter().zip(&free).filter(|(_, free)| **free) {
+        let position = device.position();
+        comparison.differences.push(Difference::Added { position });
+    }
+    order(machine, &mut comparison);
+    for (index, config) in machine.devices.iter().enumerate() {
+        let place = comparison.places.get(index).copied().flatten();
+        if let Some(device) = place.and_then(|at| scan.devices.get(usize::from(at))) {
+            compare_device(index, config, device, scan.asked, &mut comparison);
+        }
+    }
+    comparison
+}
+
+fn is_product(config: &DeviceConfig, device: &Device) -> bool {
+    let ours = config.selection.identity;
+    device
+        .identity()
+        .is_some_and(|i| (i.vendor, i.product) == (ours.vendor, ours.product))
+}
+
+type Positions = [Option<u16>];
+
+/// Assigns devices by serial number, which is always unique.
+fn by_serial(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
+    assign(machine, scan, places, free, |config, device| {
+        config.serial.is_some() && config.serial == device.serial()
+    });
+}
+
+fn by_alias(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
+    assign(machine, scan, places, free, |config, device| {
+        match config.at {
+            Locator::Position(_) => false,
+            Locator::Alias(alias) => device.found.alias == alias,
+            Locator::Id(id) => device.id == Some(id),
+        }
+    });
+}
+
+/// Assigns each remaining file device the first free bus device that has its product and satisfies
+/// `fits`.
+fn assign(
+    machine: &Machine,
+    scan: &Scan,
+    places: &mut Positions,
+    free: &mut [bool],
+    fits: impl Fn(&DeviceConfig, &Device) -> bool,
+) {
+    for (config, place) in machine.devices.iter().zip(places) {
+        if place.is_some() {
+            continue;
+        }
+        let mut all = scan.devices.iter().zip(free.iter_mut());
+        let found =
+            all.find(|(device, free)| **free && is_product(config, device) && fits(config, device));
+        if let Some((device, free)) = found {
+            *free = false;
+            *place = Some(device.position());
+        }
+    }
+}
+
+/// Assigns devices by the longest common subsequence, so that a missing or added device only shifts
+/// the others.
+fn by_order(machine: &Machine, scan: &Scan, places: &mut Positions, free: &mut [bool]) {
+    let mut expected: Vec<(u16, usize)> = machine
+        .devices
+        .iter()
+        .enumerate()
+        .filter_map(|(index, config)| match config.at {
+            Locator::Position(position) => Some((position, index)),
+            _ => None,
+        })
+        .filter(|(_, index)| places.get(*index).is_some_and(Option::is_none))
+        .collect();
+    expected.sort_unstable();
+    let there: Vec<usize> = (0..scan.devices.len())
+        .filter(|at| free.get(*at).copied().unwrap_or(false))
+        .collect();
+    let same = |e: usize, t: usize| {
+        let config = expected.get(e).and_then(|(_, i)| machine.devices.get(*i));
+        let device = there.get(t).and_then(|at| scan.devices.get(*at));
+        config
+            .zip(device)
+            .is_some_and(|(config, device)| is_product(config, device))
+    };
+    for (e, t) in align::longest(expected.len(), there.len(), same) {
+        let (Some((_, index)), Some(at)) = (expected.get(e), there.get(t)) else {
+            continue;
+        };
+        if let (Some(place), Some(free)) = (places.get_mut(*index), free.get_mut(*at)) {
+            *place = u16::try_from(*at).ok();
+            *free = false;
+        }
+    }
+}
+
+/// Assigns the remaining devices of a product to other positions or aliases.
+fn match_moved(machine: &Machine, scan: &Scan, comparison: &mut Comparison, free: &mut [bool]) {
+    let before = comparison.places.clone();
+    assign(machine, scan, &mut comparison.places, free, |_, _| true);
+    for (index, config) in machine.devices.iter().enumerate() {
+        let now = comparison.places.get(index).copied().flatten();
+        let (Some(None), Some(position)) = (before.get(index), now) else {
+            continue;
+        };
+        let device = scan.devices.get(usize::from(position));
+        let found = match (config.at, device) {
+            (Locator::Alias(_), Some(device)) => device.found.alias,
+            (Locator::Id(_), Some(device)) => device.id.unwrap_or(0),
+            _ => continue,
+        };
+        comparison.differences.push(Difference::Alias {
+            device: index,
+            position,
+            expected: config.at,
+            found,
+        });
+    }
+}
+
+/// Reports devices that are located by position and have another order.
+fn order(machine: &Machine, comparison: &mut Comparison) {
+    let mut all: Vec<(u16, u16, usize)> = machine
+        .devices
+        .iter()
+        .zip(&comparison.places)
+        .enumerate()
+        .filter_map(|(index, (config, place))| match config.at {
+            Locator::Position(position) => Some((position, (*place)?, index)),
+            _ => None,
+        })
+        .collect();
+    all.sort_unstable();
+    // Use ranks, so that missing or added devices do not count as moves.
+    let mut places: Vec<u16> = all.iter().map(|(_, place, _)| *place).collect();
+    places.sort_unstable();
+    let rank = |place: u16| places.iter().position(|other| *other == place);
+    let ranks: Vec<Option<usize>> = all.iter().map(|(_, place, _)| rank(*place)).collect();
+    for (n, ((from, to, device), found)) in all.iter().zip(&ranks).enumerate() {
+        let Some(found) = *found else { continue };
+        if found == n {
+            continue;
+        }
+        let back = ranks.get(found).copied().flatten() == Some(n);
+        match all.get(found) {
+            Some((_, other_to, other)) if back => {
+                // Reported once, by the first of the two.
+                if found > n {
+                    comparison.differences.push(Difference::Swapped {
+                        devices: [*device, *other],
+                        positions: [*to, *other_to],
+                    });
+                }
+            }
+            _ => comparison.differences.push(Difference::Moved {
+                device: *device,
+                from: *from,
+                to: *to,
+            }),
+        }
+    }
+}
+
+/// Compares a device that was found.
+fn compare_device(
+    index: usize,
+    config: &DeviceConfig,
+    device: &Device,
+    asked: bool,
+    comparison: &mut Comparison,
+) {
+    let position = device.position();
+    let expected = config.selection.identity.revision;
+    if let Some(found) = device.identity().map(|i| i.revision)
+        && !config.identity.accepts(expected, found)
+    {
+        comparison.differences.push(Difference::Revision {
+            device: index,
+            position,
+            expected,
+            found,
+        });
+    }
+    if let (Some(expected), Some(found)) = (config.serial, device.serial())
+        && expected != found
+    {
+        comparison.differences.push(Difference::Serial {
+            device: index,
+            position,
+            expected,
+            found,
+        });
+    }
+    modules(index, config, device, asked, comparison);
+}
+
+/// Compares the modules, unless the mode selects the module.
+fn modules(
+    index: usize,
+    config: &DeviceConfig,
+    device: &Device,
+    asked: bool,
+    comparison: &mut Comparison,
+) {
+    let selection = &config.selection;
+    if config.device.slots.is_none() || selection.mode.is_some_and(Mode::is_cyclic) {
+        return;
+    }
+    let detected = match &device.answers {
+        Some(Ok(answers)) => answers.detected.as_ref(),
+        _ => None,
+    };
+    let Some(detected) = detected else {
+        if !asked {
+            let text = format!("`{}`: its modules, which it was not asked for", config.name);
+            comparison.unknown.push(text);
+        }
+        return;
+    };
+    let mut expected: Vec<u32> = Vec::new();
+    for module in &selection.modules {
+        let Some(new) = module.place.checked_add(1).filter(|n| *n <= 255) else {
+            continue;
+        };
+        expected.resize(expected.len().max(new), 0);
+        if let Some(ident) = expected.get_mut(module.place) {
+            *ident = module.ident;
+        }
+    }
+    let trimmed = |idents: &[u32]| {
+        let end = idents.iter().rposition(|ident| *ident != 0);
+        idents
+            .get(..end.map_or(0, |end| end + 1))
+            .unwrap_or_default()
+            .to_vec()
+    };
+    let (expected, found) = (trimmed(&expected), trimmed(detected));
+    if expected == found {
+        return;
+    }
+    let name = |ident: &u32| match ident {
+        0 => "-".to_owned(),
+        ident => {
+            let known = config.esi.modules.iter().find(|m| m.ident == *ident);
+            known.map_or_else(|| format!("0x{ident:08x}"), |m| m.type_name.clone())
+        }
+    };
+    comparison.differences.push(Difference::Modules {
+        device: index,
+        position: device.position(),
+        expected: expected.iter().map(name).collect(),
+        found: found.iter().map(name).collect(),
+    });
+}
+
+impl Difference {
+    /// Returns the difference as text.
+    #[must_use]
+    pub fn display<'a>(&'a self, machine: &'a Machine, scan: &'a Scan) -> impl fmt::Display + 'a {
+        DifferenceDisplay {
+            difference: self,
+            machine,
+            scan,
+        }
+    }
+}
+
+struct DifferenceDisplay<'a> {
+    difference: &'a Difference,
+    machine: &'a Machine,
+    scan: &'a Scan,
+}
+
+impl DifferenceDisplay<'_> {
+    fn name(&self, device: usize) -> &str {
+        let device = self.machine.devices.get(device);
+        device.map_or("?", |device| device.name.as_str())
+    }
+
+    fn kind(&self, device: usize) -> String {
+        let device = self.machine.devices.get(device);
+        device.map_or_else(String::new, |d| d.device.type_name.clone())
+    }
+
+    /// Describes the device at a position.
+    fn there(&self, position: u16) -> String {
+        let device = self.scan.devices.get(usize::from(position));
+        let Some(identity) = device.and_then(Device::identity) else {
+            return "an unknown device".to_owned();
+        };
+        let esi = self.machine.devices.iter().flat_map(|d| &d.esi.devices);
+        let mut of_product = esi.filter(|d| {
+            (d.identity.vendor, d.identity.product) == (identity.vendor, identity.product)
+        });
+        let known = of_product.next().map(|d| d.type_name.clone());
+        match known.or_else(|| device.and_then(Device::own_name)) {
+            Some(name) => format!("{name}, {identity}"),
+            None => identity.to_string(),
+        }
+    }
+}
+
+impl fmt::Display for DifferenceDisplay<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.difference {
+            Difference::Missing { device } => {
+                let at = self.machine.devices.get(*device).map(|d| d.at.to_string());
+                write!(
+                    f,
+                    "`{}` ({}) is missing: no {} is left on the bus for it",
+                    self.name(*device),
+                    at.unwrap_or_default(),
+                    self.kind(*device)
+                )
+            }
+            Difference::Added { position } => write!(
+                f,
+                "position {position} is not in the file: {}",
+                self.there(*position)
+            ),
+            Difference::Swapped { devices, positions } => write!(
+                f,
+                "`{}` and `{}` are swapped: `{}` is at position {}, `{}` at position {}",
+                self.name(devices[0]),
+                self.name(devices[1]),
+                self.name(devices[0]),
+                positions[0],
+                self.name(devices[1]),
+                positions[1]
+            ),
+            Difference::Moved { device, from, to } => write!(
+                f,
+                "`{}` is at position {to}, in the file at position {from}",
+                self.name(*device)
+            ),
+            Difference::Revision {
+                device,
+                position,
+                expected,
+                found,
+            } => {
+                let rule = self.machine.devices.get(*device).map(|d| d.identity);
+                write!(
+                    f,
+                    "`{}` (position {position}) has revision 0x{found:08x}, its ESI describes 0x{expected:08x} (identity = \"{}\")",
+                    self.name(*device),
+                    rule.unwrap_or_default()
+                )
+            }
+            Difference::Alias {
+                device,
+                position,
+                expected,
+                found,
+            } => {
+                let what = match expected {
+                    Locator::Id(_) => "device identification",
+                    _ => "alias",
+                };
+                write!(
+                    f,
+                    "`{}`: no device has {expected}; the {} at position {position} has {what} {found}",
+                    self.name(*device),
+                    self.kind(*device)
+                )
+            }
+            Difference::Serial {
+                device,
+                position,
+                expected,
+                found,
+            } => write!(
+                f,
+                "`{}` (position {position}) has serial number {found}, the file says {expected}",
+                self.name(*device)
+            ),
+            Difference::Modules {
+                device,
+                position,
+                expected,
+                found,
+            } => write!(
+                f,
+                "`{}` (position {position}) holds the modules [{}], the file says [{}]",
+                self.name(*device),
+                found.join(", "),
+                expected.join(", ")
+            ),
+            Difference::Parameter {
+                device,
+                position,
+                index,
+                sub,
+                name,
+                expected,
+                found,
+            } => write!(
+                f,
+                "`{}` (position {position}): {} {name} is {}, start-up writes {}",
+                self.name(*device),
+                address(*index, *sub),
+                number(found),
+                number(expected)
+            ),
+        }
+    }
+}
+
+/// Formats little-endian bytes as a number.
+fn number(bytes: &[u8]) -> String {
+    if bytes.len() > 8 {
+        return format!("{} bytes", bytes.len());
+    }
+    let value = bytes
+        .iter()
+        .rev()
+        .fold(0_u64, |value, byte| value << 8 | u64::from(*byte));
+    format!("{value} (0x{value:0width$x})", width = bytes.len() * 2)
+}

@@ -1,0 +1,270 @@
+//! Measures the wake-up latency of a real-time thread with two methods in turn: sleep only, and
+//! sleep with a final spin.
+
+use std::io;
+use std::thread;
+
+use serde::Serialize;
+
+use super::fix::Fix;
+use super::host::Host;
+use super::{ReportBuilder, Severity, interrupts};
+use ecaxis_master::clock::{self, Clock};
+use ecaxis_master::config::duration;
+use ecaxis_master::rt::exchange::ExchangeMode;
+use ecaxis_master::rt::spin::{Spin, SpinWindow};
+use ecaxis_master::rt::stats::{LatencyHistogram, Percentiles};
+use ecaxis_master::sys::process::ThreadUsage;
+use ecaxis_master::sys::rt_thread::{CpuWakeGuard, RtSetupError, become_realtime};
+
+/// The time of one turn in ns.
+const TURN_NS: u64 = 250_000_000;
+/// The fraction of a cycle that a late wake-up may use; replies may take three quarters.
+const SHARE: u64 = 4;
+/// Typical cycle times in ns.
+const CYCLES_NS: [u64; 10] = [
+    62_500, 125_000, 250_000, 500_000, 1_000_000, 2_000_000, 4_000_000, 5_000_000, 10_000_000,
+    20_000_000,
+];
+
+/// The result of one wait method.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct WaitMethod {
+    pub lateness: Percentiles,
+    /// The number of wake-ups later than a quarter of the cycle.
+    pub too_late: u64,
+    /// The number of times the thread was preempted.
+    pub involuntary_switches: u64,
+    /// Interrupts on the CPU during the measurement, or on all CPUs if the thread is not pinned.
+    pub interrupts: Option<u64>,
+    /// Stolen time in ms with a resolution of 10 ms, of the CPU or of all.
+    pub stolen_ms: Option<u64>,
+}
+
+/// The complete measurement.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct WakeUp {
+    pub cycle_ns: u64,
+    /// The final spin time before the release in ns.
+    pub spin_ns: u64,
+    pub seconds: u32,
+    /// The CPU of the thread, if pinned.
+    pub cpu: Option<usize>,
+    pub priority: u8,
+    pub sleep: WaitMethod,
+    pub sleep_and_spin: WaitMethod,
+    #[serde(skip)]
+    pub denied: Vec<RtSetupError>,
+    /// [`Self::denied`] as text.
+    pub denials: Vec<String>,
+}
+
+/// The parameters of a measurement.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Setup {
+    pub seconds: u32,
+    pub cpu: Option<usize>,
+    pub priority: u8,
+    pub cycle_ns: u64,
+    pub spin: Spin,
+}
+
+/// Measures for `setup.seconds`. Fails if no thread can be started.
+pub fn measure(setup: Setup) -> io::Result<WakeUp> {
+    let thread = thread::Builder::new().name("wake-up".to_owned());
+    let running = thread.spawn(move || run(setup))?;
+    running
+        .join()
+        .map_err(|_| io::Error::other("the measuring thread has panicked"))
+}
+
+fn run(setup: Setup) -> WakeUp {
+    let (held, mut denied) = CpuWakeGuard::take(None);
+    denied.extend(become_realtime(setup.priority, setup.cpu));
+    let affine = !denied
+        .iter()
+        .any(|d| matches!(d, RtSetupError::Affinity { .. }));
+    let cpu = setup.cpu.filter(|_| affine);
+    let host = Host::here();
+    let mut sleeping = Sampling::new(Spin::For(0), setup.cycle_ns);
+    let mut spinning = Sampling::new(setup.spin, setup.cycle_ns);
+    let end = clock::now() + u64::from(setup.seconds) * 1_000_000_000;
+    while clock::now() < end {
+        sleeping.turn(&host, cpu, setup.cycle_ns);
+        spinning.turn(&host, cpu, setup.cycle_ns);
+    }
+    drop(held);
+    WakeUp {
+        cycle_ns: setup.cycle_ns,
+        spin_ns: spinning.margin.get(),
+        seconds: setup.seconds,
+        cpu,
+        priority: setup.priority,
+        sleep: sleeping.way(),
+        sleep_and_spin: spinning.way(),
+        denials: denied.iter().map(ToString::to_string).collect(),
+        denied,
+    }
+}
+
+#[derive(Debug)]
+struct Sampling {
+    margin: SpinWindow,
+    lateness: LatencyHistogram,
+    way: WaitMethod,
+}
+
+impl Sampling {
+    fn new(spin: Spin, cycle: u64) -> Self {
+        Self {
+            margin: SpinWindow::new(spin, cycle, ExchangeMode::SameCycle),
+            lateness: LatencyHistogram::new(),
+            way: WaitMethod::default(),
+        }
+    }
+
+    fn turn(&mut self, host: &Host, cpu: Option<usize>, cycle: u64) {
+        let before = Interference::now(host, cpu);
+        let mut next = clock::now() + cycle;
+        for _ in 0..(TURN_NS / cycle).max(4) {
+            let slept = Clock::Real.sleep_until(next, self.margin.get());
+            self.margin.record_wakeup(slept);
+            let now = clock::now();
+            let late = now.saturating_sub(next);
+            self.lateness.record(late);
+            self.way.too_late += u64::from(late > cycle / SHARE);
+            // Skip cycles that are already over.
+            next += cycle * (1 + late / cycle);
+        }
+        let after = Interference::now(host, cpu);
+        let way = &mut self.way;
+        way.involuntary_switches += after.switches.saturating_sub(before.switches);
+        way.interrupts = more(way.interrupts, before.interrupts, after.interrupts);
+        way.stolen_ms = more(way.stolen_ms, before.stolen_ms, after.stolen_ms);
+    }
+
+    fn way(self) -> WaitMethod {
+        WaitMethod {
+            lateness: self.lateness.summary(),
+            ..self.way
+        }
+    }
+}
+
+fn more(sum: Option<u64>, before: Option<u64>, after: Option<u64>) -> Option<u64> {
+    Some(sum.unwrap_or(0) + after?.saturating_sub(before?))
+}
+
+/// Counters of interference by the computer.
+#[derive(Debug)]
+struct Interference {
+    switches: u64,
+    interrupts: Option<u64>,
+    stolen_ms: Option<u64>,
+}
+
+impl Interference {
+    fn now(host: &Host, cpu: Option<usize>) -> Self {
+        let stat = host.text("proc/stat").unwrap_or_default();
+        let name = cpu.map_or("cpu".to_owned(), |cpu| format!("cpu{cpu}"));
+        let line = stat
+            .lines()
+            .find(|line| line.split_whitespace().next() == Some(&name));
+        // The eighth value after the name, in ticks of USER_HZ (100).
+        let ticks = line.and_then(|line| line.split_whitespace().nth(8)?.parse::<u64>().ok());
+        Self {
+            switches: ThreadUsage::now().map_or(0, |used| used.involuntary_switches),
+            interrupts: interrupts::taken(host, cpu),
+            stolen_ms: ticks.map(|ticks| ticks.saturating_mul(10)),
+        }
+    }
+}
+
+/// Returns the shortest typical cycle of which this latency is at most a quarter.
+fn good_for(late_ns: u64) -> Option<u64> {
+    CYCLES_NS.into_iter().find(|cycle| late_ns <= cycle / SHARE)
+}
+
+impl WakeUp {
+    /// Returns the shortest typical cycles for 99.9 % of the wake-ups, and for all of them.
+    #[must_use]
+    pub fn good_for(&self) -> (Option<u64>, Option<u64>) {
+        let lateness = &self.sleep_and_spin.lateness;
+        (good_for(lateness.p99_9_ns), good_for(lateness.max_ns))
+    }
+}
+
+pub(super) fn examine(wake_up: &WakeUp, notes: &mut ReportBuilder) {
+    let way = &wake_up.sleep_and_spin;
+    let count = way.lateness.count;
+    if way.too_late == 0 || count == 0 {
+        return;
+    }
+    let share = way.too_late as f64 / count as f64;
+    let severity = match share {
+        s if s > 0.01 => Severity::Bad,
+        s if s > 0.001 => Severity::Warning,
+        _ => Severity::Note,
+    };
+    let stolen = way.stolen_ms.filter(|ms| *ms > 0);
+    let mut fix = vec![Fix::advice(match stolen {
+        Some(ms) => format!(
+            "The host of this virtual machine took {ms} ms meanwhile: give it CPUs of its own there, or take a computer of metal."
+        ),
+        None => {
+            "Fix the other findings, then measure again with the machine's usual load.".to_owned()
+        }
+    })];
+    if let Some(cycle) = wake_up.good_for().0.filter(|c| *c > wake_up.cycle_ns) {
+        fix.push(Fix::advice(format!(
+            "`cycle = \"{}\"` would have lost fewer than one in a thousand.",
+            duration::show(cycle).replace(' ', ""),
+        )));
+    }
+    notes.find(
+        severity,
+        "wake-up",
+        format!(
+            "{} of {count} wake-ups came later than a quarter of the cycle of {}",
+            way.too_late,
+            duration::show(wake_up.cycle_ns),
+        ),
+        "The reply then has too little time left: a lost frame. `lost_frames` of them in a row stop the machine.",
+        fix,
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn good_for_returns_the_shortest_cycle() {
+        for (late, expected) in [
+            (0, Some(62_500)),
+            (15_625, Some(62_500)),
+            (15_626, Some(125_000)),
+            (250_000, Some(1_000_000)),
+            (5_000_000, Some(20_000_000)),
+            (5_000_001, None),
+        ] {
+            assert_eq!(good_for(late), expected, "{late}");
+        }
+    }
+
+    #[test]
+    fn measure_runs_both_methods_equally() {
+        let setup = Setup {
+            seconds: 1,
+            cpu: None,
+            priority: 80,
+            cycle_ns: 1_000_000,
+            spin: Spin::Auto,
+        };
+        let wake_up = measure(setup).unwrap();
+        let (sleep, spin) = (wake_up.sleep.lateness, wake_up.sleep_and_spin.lateness);
+        assert_eq!(sleep.count, spin.count);
+        assert!(sleep.count >= 250 && sleep.count % 250 == 0, "{sleep:?}");
+        assert!(sleep.max_ns >= sleep.p50_ns && sleep.max_ns > 0);
+    }
+}

@@ -1,0 +1,103 @@
+//! Firmware update over FoE in Bootstrap: Init, Bootstrap with its own mailboxes from the EEPROM,
+//! the file, and back to Init, where the device starts the new program.
+
+use std::time::Duration;
+
+use super::error::{Cause, Step, StepFailure};
+use super::{DeviceIdentity, INIT_TIMEOUT, ReadBack, UpdateProgress, UpdateRequest, since};
+use ecaxis_master::acyclic::{DatagramClient, Registers, mailbox};
+use ecaxis_master::bringup::al::{self, AlState};
+use ecaxis_master::mailbox::foe::FoeProgress;
+use ecaxis_master::mailbox::{FoeClient, FoeError, MailboxTransport};
+
+pub(super) async fn send(
+    wire: &DatagramClient,
+    before: &DeviceIdentity,
+    order: &UpdateRequest,
+    report: &mut dyn FnMut(UpdateProgress),
+) -> Result<(ReadBack, Duration), StepFailure> {
+    let devices = std::slice::from_ref(&before.device);
+    report(UpdateProgress::Step(Step::Prepare));
+    al::change_state(wire, devices, AlState::Init, INIT_TIMEOUT)
+        .await
+        .map_err(|error| Step::Prepare.failed(error))?;
+
+    report(UpdateProgress::Step(Step::Bootstrap));
+    let registers = Registers {
+        wire,
+        device: &before.device,
+        step: "setting up the mailboxes of Bootstrap",
+    };
+    let layout = mailbox::configure(&registers, &before.sii, before.sii.bootstrap)
+        .await
+        .map_err(|error| Step::Bootstrap.failed(error))?;
+    al::change_state(wire, devices, AlState::Bootstrap, mailbox::PRE_OP_TIMEOUT)
+        .await
+        .map_err(|error| Step::Bootstrap.failed(error))?;
+
+    report(UpdateProgress::Step(Step::Send));
+    let mut foe = FoeClient::new(layout);
+    let of = order.file.len();
+    let mut progress = |progress| {
+        report(match progress {
+            FoeProgress::Bytes(done) => UpdateProgress::Moved { done, of },
+            FoeProgress::Busy { done, entire } => UpdateProgress::Busy { done, entire },
+        });
+    };
+    let begin = wire.now();
+    foe.write(
+        wire,
+        &order.name,
+        order.password,
+        &order.file,
+        &mut progress,
+    )
+    .await
+    .map_err(|error| Step::Send.failed(error))?;
+    let took = since(wire, begin);
+
+    let read_back = if order.read_back {
+        progress(FoeProgress::Bytes(0));
+        compare(wire, &mut foe, order, &mut progress)
+            .await
+            .map_err(|cause| Step::ReadBack.failed(cause))?
+    } else {
+        ReadBack::NotAsked
+    };
+
+    report(UpdateProgress::Step(Step::Leave));
+    // A device that resets itself cannot confirm Init; a later check detects whether it returns.
+    match al::change_state(wire, devices, AlState::Init, al::BACK_TIMEOUT).await {
+        Err(error @ ecaxis_master::bringup::StateError::Refused { .. }) => {
+            Err(Step::Leave.failed(error))
+        }
+        Ok(()) | Err(_) => Ok((read_back, took)),
+    }
+}
+
+async fn compare(
+    wire: &DatagramClient,
+    foe: &mut FoeClient,
+    order: &UpdateRequest,
+    progress: &mut dyn FnMut(FoeProgress),
+) -> Result<ReadBack, Cause> {
+    // One more byte detects a longer file.
+    let most = order.file.len().saturating_add(1);
+    let read = foe
+        .read(wire, &order.name, order.password, most, progress)
+        .await;
+    match read {
+        Ok(file) if file == order.file => Ok(ReadBack::Same),
+        Ok(file) => {
+            let same = file.iter().zip(&order.file).take_while(|(a, b)| a == b);
+            Err(Cause::Differs { at: same.count() })
+        }
+        Err(FoeError::TooLarge { .. }) => Err(Cause::Differs {
+            at: order.file.len(),
+        }),
+        Err(error @ (FoeError::Refused { .. } | FoeError::Mailbox { .. })) => {
+            Ok(ReadBack::Refused(error.to_string()))
+        }
+        Err(error) => Err(error.into()),
+    }
+}

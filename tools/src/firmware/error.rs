@@ -1,0 +1,212 @@
+//! The failed step and the final state of the device.
+
+use std::fmt;
+use std::time::Duration;
+
+use ecaxis_esi::sii::SiiError;
+
+use super::{RunningProgram, UpdateMethod};
+use ecaxis_master::acyclic::{DatagramClient, ServiceError, enumerate};
+use ecaxis_master::bringup::al::AlState;
+use ecaxis_master::bringup::{DeviceRef, StateError};
+use ecaxis_master::mailbox::{FoeError, SdoError};
+
+/// A step of an update.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Step {
+    /// To Init from any state.
+    Prepare,
+    Bootstrap,
+    Send,
+    ReadBack,
+    Leave,
+    PreOp,
+    Stop,
+    Clear,
+    Download,
+    Start,
+    Check,
+}
+
+impl fmt::Display for Step {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Prepare => "going to Init",
+            Self::Bootstrap => "going to Bootstrap",
+            Self::Send => "sending the file",
+            Self::ReadBack => "reading the file back",
+            Self::Leave => "leaving Bootstrap",
+            Self::PreOp => "going to PreOp",
+            Self::Stop => "stopping the program (0x1F51)",
+            Self::Clear => "clearing the program (0x1F51)",
+            Self::Download => "downloading the program (0x1F50)",
+            Self::Start => "starting the program (0x1F51)",
+            Self::Check => "waiting for the device to run its program",
+        })
+    }
+}
+
+/// Why a step failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Cause {
+    #[error(transparent)]
+    Foe(#[from] FoeError),
+    #[error(transparent)]
+    Sdo(#[from] SdoError),
+    #[error(transparent)]
+    State(#[from] StateError),
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+    /// 0x1F51 did not reach the expected value.
+    #[error("0x1F51:01 is not {wanted} within {after:?}: {last}{}", Refusal(refused.as_deref()))]
+    Control {
+        wanted: u8,
+        after: Duration,
+        /// The last value, or why it was not readable.
+        last: String,
+        /// The device's answer to the command, if any.
+        refused: Option<Box<SdoError>>,
+    },
+    #[error("interrupted")]
+    Interrupted,
+    #[error("the file read back differs from byte {at} on")]
+    Differs { at: usize },
+    #[error("after {after:?} it is in {state} and {runs}")]
+    NotRunning {
+        state: AlState,
+        runs: RunningProgram,
+        after: Duration,
+    },
+    #[error("after {after:?} it is not back: {error}")]
+    NotBack {
+        error: Box<FirmwareError>,
+        after: Duration,
+    },
+}
+
+struct Refusal<'a>(Option<&'a SdoError>);
+
+impl fmt::Display for Refusal<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            Some(error @ SdoError::Abort { .. }) => write!(f, "; {error}"),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// The final state of a device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FinalDeviceState {
+    In { state: AlState, code: u16 },
+    Silent,
+}
+
+impl fmt::Display for FinalDeviceState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::In { state, code: 0 } => write!(f, "the device is in {state}"),
+            Self::In { state, code } => {
+                let text = ecaxis_ecat::al_status_code::al_status_text(*code);
+                write!(
+                    f,
+                    "the device is in {state}, AL status code {code:#06x} ({text})"
+                )
+            }
+            Self::Silent => f.write_str("the device does not answer"),
+        }
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum FirmwareError {
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+    #[error("{device}: its EEPROM: {source}")]
+    Eeprom { device: DeviceRef, source: SiiError },
+    #[error("{device}: is {found} by {by}, {expected} is meant")]
+    Identity {
+        device: DeviceRef,
+        by: &'static str,
+        expected: String,
+        found: String,
+    },
+    #[error("{device}: was {before} and is {now} after the update")]
+    Changed {
+        device: DeviceRef,
+        before: String,
+        now: String,
+    },
+    #[error("{device}: is in Op: another MainDevice drives it")]
+    Driven { device: DeviceRef },
+    #[error("{device}: does not offer {via}: {reason}")]
+    NotOffered {
+        device: DeviceRef,
+        via: UpdateMethod,
+        reason: &'static str,
+    },
+    #[error("{device}: no firmware update method available: {foe}, and {program}")]
+    NoWay {
+        device: DeviceRef,
+        foe: &'static str,
+        program: &'static str,
+    },
+    #[error("{device}: `{name}` is not a valid file name: 1 to {room} bytes")]
+    Name {
+        device: DeviceRef,
+        name: String,
+        room: usize,
+    },
+    #[error("the file is empty")]
+    Empty,
+    /// Any failure after the first change.
+    #[error("{device}: {step}: {cause}; {left}")]
+    Failed {
+        device: DeviceRef,
+        step: Step,
+        cause: Cause,
+        left: FinalDeviceState,
+    },
+}
+
+/// A failed step.
+#[derive(Debug)]
+pub(super) struct StepFailure {
+    step: Step,
+    cause: Cause,
+}
+
+impl Step {
+    pub(super) fn failed(self, cause: impl Into<Cause>) -> StepFailure {
+        StepFailure {
+            step: self,
+            cause: cause.into(),
+        }
+    }
+}
+
+impl StepFailure {
+    /// Adds the final state of the device, whose address may have changed.
+    pub(super) async fn at(self, wire: &DatagramClient, device: &DeviceRef) -> FirmwareError {
+        let seen = enumerate::at(
+            wire,
+            device.position,
+            "looking after it",
+            ecaxis_ecat::registers::AL_STATUS,
+        )
+        .await;
+        let left = match seen {
+            Ok([status, _, _, _, c0, c1]) => FinalDeviceState::In {
+                state: AlState::from_status(status),
+                code: u16::from_le_bytes([c0, c1]),
+            },
+            Err(_) => FinalDeviceState::Silent,
+        };
+        FirmwareError::Failed {
+            device: device.clone(),
+            step: self.step,
+            cause: self.cause,
+            left,
+        }
+    }
+}

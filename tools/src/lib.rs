@@ -1,0 +1,20 @@
+//! Work on a bus or on files without a run.
+//!
+//! - [`scan`]: the SubDevices of a segment, and a machine file generated from them;
+//! - [`compare`]: compares a machine file with a bus;
+//! - [`parameters`]: object names and values; saved to files, compared, restored;
+//! - [`firmware`]: firmware updates;
+//! - [`doctor`]: checks of host settings that delay the cycle;
+//! - [`mod@bench`]: the measurements of the benchmark;
+//! - [`analyze`]: analysis of recordings.
+
+#![forbid(unsafe_code)]
+
+pub mod analyze;
+pub mod bench;
+pub mod compare;
+pub mod doctor;
+pub mod firmware;
+mod html;
+pub mod parameters;
+pub mod scan;

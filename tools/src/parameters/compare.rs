@@ -1,0 +1,45 @@
+//! Compares two sets of values.
+
+use std::collections::BTreeMap;
+
+use super::Parameter;
+use super::restore_order::{is_setting, settings_only};
+use ecaxis_master::mailbox::NamedObject;
+
+/// A value that differs; `None` if a side does not have the object.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    pub at: NamedObject,
+    pub name: String,
+    pub left: Option<String>,
+    pub right: Option<String>,
+}
+
+/// Returns the differing settings by index and subindex; with `all` also actual values and
+/// commands.
+#[must_use]
+pub fn compare(left: &[Parameter], right: &[Parameter], all: bool) -> Vec<Difference> {
+    let mut both: BTreeMap<(u16, u8), [Option<&Parameter>; 2]> = BTreeMap::new();
+    for (side, parameters) in [left, right].into_iter().enumerate() {
+        for parameter in settings_only(parameters) {
+            let key = (parameter.at.index, parameter.at.sub);
+            if let Some(place) = both.entry(key).or_default().get_mut(side) {
+                *place = Some(parameter);
+            }
+        }
+    }
+    let differ = both.into_values().filter_map(|[left, right]| {
+        let of_interest = all || left.is_some_and(is_setting) || right.is_some_and(is_setting);
+        if !of_interest || left.map(|p| &p.value) == right.map(|p| &p.value) {
+            return None;
+        }
+        let some = left.or(right)?;
+        Some(Difference {
+            at: some.at,
+            name: some.name.clone(),
+            left: left.map(Parameter::shown),
+            right: right.map(Parameter::shown),
+        })
+    });
+    differ.collect()
+}

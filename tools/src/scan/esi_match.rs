@@ -1,0 +1,94 @@
+//! The ESI descriptions of scanned devices.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use ecaxis_esi as esi;
+
+use super::{Device, Scan};
+use ecaxis_master::esi_library::{self, Library, LoadError, RevisionMatch};
+
+/// The best description of a device.
+#[derive(Debug, Clone)]
+pub struct EsiMatch {
+    /// The ESI file.
+    pub path: PathBuf,
+    pub file: Arc<esi::EsiFile>,
+    pub device: Arc<esi::Device>,
+    /// The strictest revision rule that accepts the description.
+    pub rule: RevisionMatch,
+}
+
+impl EsiMatch {
+    /// True if the ESI declares a drive by its profile or modes.
+    #[must_use]
+    pub fn is_drive(&self) -> bool {
+        const CIA_402: u32 = 402;
+        self.device.profile == Some(CIA_402)
+            || esi::offered_modes(&self.file, &self.device)
+                .iter()
+                .any(|mode| mode.is_cyclic())
+    }
+
+    /// Returns the default process data in bytes out and in; `None` if an option must be selected.
+    #[must_use]
+    pub fn default_bytes(&self) -> Option<(usize, usize)> {
+        let choice = esi::SelectOptions {
+            cycle_ns: 1_000_000,
+            ..esi::SelectOptions::default()
+        };
+        let selection = esi::select(&self.file, &self.device, &choice).ok()?;
+        Some((selection.layout.rx_bytes(), selection.layout.tx_bytes()))
+    }
+}
+
+/// Returns the best description of each device, if the library has one, and the files that cannot
+/// be read.
+#[must_use]
+pub fn describe(scan: &Scan, library: &Library) -> (Vec<Option<EsiMatch>>, Vec<LoadError>) {
+    let mut files = BTreeMap::new();
+    let mut unreadable = Vec::new();
+    let all = scan
+        .devices
+        .iter()
+        .map(|device| one(device, library, &mut files, &mut unreadable))
+        .collect();
+    (all, unreadable)
+}
+
+type Files = BTreeMap<PathBuf, Option<Arc<esi::EsiFile>>>;
+
+fn one(
+    device: &Device,
+    library: &Library,
+    files: &mut Files,
+    unreadable: &mut Vec<LoadError>,
+) -> Option<EsiMatch> {
+    let identity = device.identity()?;
+    let rules = [
+        RevisionMatch::Equal,
+        RevisionMatch::Newer,
+        RevisionMatch::Ignore,
+    ];
+    let (entry, rule) = rules
+        .into_iter()
+        .find_map(|rule| Some((library.find(identity, rule)?, rule)))?;
+    let path = library.folder().join(&entry.file);
+    let file = files.entry(path.clone()).or_insert_with(|| {
+        let read = esi_library::load(&path).map_err(|error| unreadable.push(error));
+        read.ok().map(Arc::new)
+    });
+    let file = file.clone()?;
+    let of = |device: &&esi::Device| {
+        let id = device.identity;
+        (id.vendor, id.product, id.revision) == (entry.vendor, entry.product, entry.revision)
+    };
+    let described = Arc::new(file.devices.iter().find(of)?.clone());
+    Some(EsiMatch {
+        path,
+        device: described,
+        file,
+        rule,
+    })
+}

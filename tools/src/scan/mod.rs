@@ -1,0 +1,385 @@
+//! Enumerates the SubDevices of a segment: identity, state, ports, clocks, mailbox, and on request
+//! the parameters of drives. MAY BLOCK AND ALLOCATE.
+//!
+//! A segment that another MainDevice drives is not disturbed. Registers are read, and EEPROMs if
+//! they are free. States and mailboxes are not used unless [`Options::intrude`] is set.
+//!
+//! - [`registers`]: the controller's registers;
+//! - [`topology`]: connections and propagation delays;
+//! - [`other_main_device`]: evidence of another MainDevice;
+//! - [`coe_info`]: answers over the CoE mailbox;
+//! - [`esi_match`]: matching ESI files;
+//! - [`mod@write`]: generates a machine file.
+
+use std::time::Duration;
+
+use ecaxis_ecat::registers as esc;
+use ecaxis_esi::Identity;
+use ecaxis_esi::sii::{self, General, Protocols, Sii};
+
+use ecaxis_master::acyclic::device::with_mailbox;
+use ecaxis_master::acyclic::eeprom::{EepromAccess, with_eeprom};
+use ecaxis_master::acyclic::enumerate::{self, EnumeratedDevice};
+use ecaxis_master::acyclic::{DatagramClient, ServiceError};
+use ecaxis_master::bringup::DeviceRef;
+use ecaxis_master::bringup::al::{self, AlState};
+use ecaxis_master::mailbox::MailboxTransport;
+
+pub mod coe_info;
+pub mod esi_match;
+pub mod other_main_device;
+pub mod registers;
+#[cfg(test)]
+mod tests;
+pub mod topology;
+pub mod write;
+
+pub use coe_info::{CoeInfo, DriveInfo};
+pub use esi_match::EsiMatch;
+pub use other_main_device::MainDeviceEvidence;
+use registers::{CONTROLLER_BYTES, Controller};
+pub use topology::ParentPort;
+
+/// The time to detect another MainDevice.
+const WATCH: Duration = Duration::from_millis(50);
+/// The number of latched receive times; the delays are averages.
+const LATCHES: u32 = 8;
+
+/// The extent of a scan.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Options {
+    /// Use the mailboxes of the devices; those in Init are in PreOp meanwhile.
+    pub ask: bool,
+    /// Use the mailboxes even if another MainDevice drives the segment.
+    pub intrude: bool,
+    /// Foreign frames that the interface received before the first transmission.
+    pub heard: u64,
+}
+
+/// The progress of the scan for display.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Step {
+    pub what: &'static str,
+    pub position: u16,
+    pub of: usize,
+}
+
+/// The result of a scan.
+#[derive(Debug, Clone, Default)]
+pub struct Scan {
+    /// The devices in segment order.
+    pub devices: Vec<Device>,
+    /// Evidence of another MainDevice; empty if there is none.
+    pub others: Vec<MainDeviceEvidence>,
+    /// True if the mailboxes were used.
+    pub asked: bool,
+    /// True if the propagation delays were measured; otherwise they are those that another
+    /// MainDevice wrote.
+    pub measured: bool,
+}
+
+/// A SubDevice of the scan.
+#[derive(Debug, Clone)]
+pub struct Device {
+    pub found: EnumeratedDevice,
+    pub controller: Controller,
+    /// DL status (0x0110).
+    pub dl_status: u16,
+    /// The port that it is connected to; `None`: the MainDevice.
+    pub uplink: Option<ParentPort>,
+    /// The one-way delay from the first device in ns.
+    pub delay_ns: Option<u32>,
+    /// True if it has a running system time. Not every device with DC support in 0x0008 has it
+    /// enabled.
+    pub dc: bool,
+    /// The content of its EEPROM, or why it is unknown.
+    pub sii: Result<Sii, String>,
+    /// The explicit device identification, if supported and readable.
+    pub id: Option<u16>,
+    /// The answers over CoE, or why there are none.
+    pub answers: Option<Result<CoeInfo, String>>,
+}
+
+impl Device {
+    #[must_use]
+    pub fn position(&self) -> u16 {
+        self.found.position
+    }
+
+    #[must_use]
+    pub fn identity(&self) -> Option<Identity> {
+        self.sii.as_ref().ok().map(|sii| sii.identity)
+    }
+
+    #[must_use]
+    pub fn serial(&self) -> Option<u32> {
+        self.sii.as_ref().ok().map(|sii| sii.serial)
+    }
+
+    /// Returns the type from its EEPROM, or its longer name.
+    #[must_use]
+    pub fn own_name(&self) -> Option<String> {
+        let general = self.sii.as_ref().ok()?.general.as_ref()?;
+        let name = [&general.order, &general.name]
+            .into_iter()
+            .find(|name| !name.is_empty())?;
+        Some(name.chars().filter(|c| !c.is_control()).collect())
+    }
+
+    /// Returns the names of its mailbox protocols.
+    #[must_use]
+    pub fn protocols(&self) -> Vec<&'static str> {
+        const NAMES: [(u16, &str); 6] = [
+            (Protocols::COE, "CoE"),
+            (Protocols::FOE, "FoE"),
+            (Protocols::EOE, "EoE"),
+            (Protocols::AOE, "AoE"),
+            (Protocols::SOE, "SoE"),
+            (Protocols::VOE, "VoE"),
+        ];
+        let has = self.sii.as_ref().map(|sii| sii.protocols);
+        let has = has.unwrap_or_default();
+        let named = NAMES.iter().filter(|(bit, _)| has.has(*bit));
+        named.map(|(_, name)| *name).collect()
+    }
+
+    /// True if its device type (0x1000) or a Controlword in its EEPROM's PDOs marks it as a drive.
+    #[must_use]
+    pub fn says_drive(&self) -> bool {
+        const CIA_402: u32 = 402;
+        const CONTROLWORD: u16 = 0x6040;
+        let answered = match &self.answers {
+            Some(Ok(answers)) => answers.device_type,
+            _ => None,
+        };
+        if let Some(device_type) = answered
+            && device_type & 0xffff == CIA_402
+        {
+            return true;
+        }
+        let pdos = self.sii.as_ref().map(|sii| sii.rx_pdos.as_slice());
+        let mut entries = pdos.unwrap_or_default().iter().flat_map(|pdo| &pdo.entries);
+        // A single bit of a terminal may have the same index.
+        entries.any(|entry| entry.index == CONTROLWORD && entry.bit_len == 16)
+    }
+}
+
+/// Scans all devices on the segment.
+///
+/// # Errors
+/// [`ServiceError::NoAnswer`], or a device that leaves during the scan. Failures of one device are
+/// stored in its result.
+pub async fn scan(
+    wire: &DatagramClient,
+    options: Options,
+    report: &mut dyn FnMut(Step),
+) -> Result<Scan, ServiceError> {
+    let mut found = enumerate::enumerate(wire).await?;
+    let others = other_main_device::look(wire, &found, options.heard, WATCH).await?;
+    let quiet = others.is_empty();
+    // A MainDevice in bring-up assigns addresses and reads EEPROMs.
+    let shared = others.iter().any(MainDeviceEvidence::is_live) && !options.intrude;
+    if !shared {
+        enumerate::address(wire, &mut found).await?;
+    }
+
+    let of = found.len();
+    let stations: Vec<u16> = found.iter().map(|found| found.station).collect();
+    let mut devices = Vec::with_capacity(of);
+    for found in found {
+        let same = stations.iter().filter(|other| **other == found.station);
+        let addressed = found.station != 0 && same.count() == 1;
+        let readable = addressed && !(shared && found.state == AlState::Init);
+        let position = found.position;
+        report(Step {
+            what: "reading",
+            position,
+            of,
+        });
+        devices.push(look_at(wire, found, readable).await?);
+    }
+    place(&mut devices);
+    delays(wire, &mut devices, quiet).await?;
+
+    let mut scan = Scan {
+        devices,
+        others,
+        asked: false,
+        measured: quiet,
+    };
+    if quiet || options.intrude {
+        for device in &mut scan.devices {
+            device.id = explicit_id(wire, device).await?;
+        }
+    }
+    if options.ask && (quiet || options.intrude) {
+        scan.asked = true;
+        for device in &mut scan.devices {
+            let position = device.position();
+            report(Step {
+                what: "asking",
+                position,
+                of,
+            });
+            device.answers = ask(wire, device).await;
+        }
+    }
+    Ok(scan)
+}
+
+/// Reads registers and EEPROM without any effect on the state machine.
+async fn look_at(
+    wire: &DatagramClient,
+    found: EnumeratedDevice,
+    readable: bool,
+) -> Result<Device, ServiceError> {
+    const STEP: &str = "reading what its controller is";
+    let position = found.position;
+    let controller: [u8; CONTROLLER_BYTES] = enumerate::at(wire, position, STEP, esc::TYPE).await?;
+    let dl_status: [u8; 2] = enumerate::at(wire, position, STEP, esc::DL_STATUS).await?;
+    let controller = Controller::from_registers(controller);
+    let mut time = [0; 4];
+    let dc = controller.has_receive_times()
+        && matches!(
+            wire.read_at(position, esc::DC_SYSTEM_TIME, &mut time).await,
+            Ok(1..)
+        );
+    let at = found.named(format!("position {position}"));
+    let sii = if readable {
+        read_eeprom(wire, &at).await
+    } else {
+        Err(format!(
+            "{at}: its EEPROM was left alone: another master may be reading it"
+        ))
+    };
+    Ok(Device {
+        found,
+        controller,
+        dl_status: u16::from_le_bytes(dl_status),
+        uplink: None,
+        delay_ns: None,
+        dc,
+        sii,
+        id: None,
+        answers: None,
+    })
+}
+
+/// Reads the EEPROM if it is free.
+async fn read_eeprom(wire: &DatagramClient, at: &DeviceRef) -> Result<Sii, String> {
+    const STEP: &str = "reading the EEPROM";
+    let read = with_eeprom(wire, at, STEP, EepromAccess::IfFree, async |eeprom| {
+        eeprom.image(&mut |_, _| {}).await
+    });
+    let image: Result<Vec<u8>, ServiceError> = read.await;
+    let image = image.map_err(|error| error.to_string())?;
+    sii::parse(&image).map_err(|error| format!("EEPROM: {error}"))
+}
+
+/// Finds the parent of every device.
+fn place(devices: &mut [Device]) {
+    let open: Vec<[bool; 4]> = devices
+        .iter()
+        .map(|device| registers::open_ports(device.dl_status))
+        .collect();
+    for (device, uplink) in devices.iter_mut().zip(topology::uplinks(&open)) {
+        device.uplink = uplink;
+    }
+}
+
+/// Measures propagation delays. Latching receive times only disturbs another measurement. With
+/// another MainDevice, its written delays are used.
+async fn delays(
+    wire: &DatagramClient,
+    devices: &mut [Device],
+    quiet: bool,
+) -> Result<(), ServiceError> {
+    const STEP: &str = "measuring propagation delays";
+    if !quiet {
+        for device in devices.iter_mut().filter(|device| device.dc) {
+            let bytes =
+                enumerate::at(wire, device.position(), STEP, esc::DC_SYSTEM_TIME_DELAY).await?;
+            device.delay_ns = Some(u32::from_le_bytes(bytes));
+        }
+        return Ok(());
+    }
+    let places: Vec<_> = devices
+        .iter()
+        .map(|device| topology::TreeNode {
+            open: registers::open_ports(device.dl_status),
+            uplink: device.uplink,
+        })
+        .collect();
+    let mut sums = vec![0_i64; devices.len()];
+    let mut measured = vec![false; devices.len()];
+    for _ in 0..LATCHES {
+        wire.write_all(esc::DC_RECEIVE_TIME, &[0; 4])
+            .await
+            .map_err(|source| ServiceError::Segment { step: STEP, source })?;
+        let mut times = Vec::with_capacity(devices.len());
+        for device in devices.iter() {
+            times.push(if device.controller.has_receive_times() {
+                let bytes: [u8; 16] =
+                    enumerate::at(wire, device.position(), STEP, esc::DC_RECEIVE_TIME).await?;
+                Some(registers::receive_times(bytes))
+            } else {
+                None
+            });
+        }
+        let delays = topology::delays(&places, &times);
+        for ((sum, measured), delay) in sums.iter_mut().zip(&mut measured).zip(delays) {
+            if let Some(delay) = delay {
+                *sum += delay;
+                *measured = true;
+            }
+        }
+    }
+    for ((device, sum), measured) in devices.iter_mut().zip(sums).zip(measured) {
+        let mean = sum / i64::from(LATCHES);
+        device.delay_ns = measured.then(|| u32::try_from(mean.max(0)).unwrap_or(u32::MAX));
+    }
+    Ok(())
+}
+
+/// Reads the explicit device identification if the EEPROM declares it. It is requested by AL
+/// control in the present state.
+async fn explicit_id(wire: &DatagramClient, device: &Device) -> Result<Option<u16>, ServiceError> {
+    const STEP: &str = "reading its device identification";
+    let Ok(Sii {
+        general: Some(general),
+        ..
+    }) = &device.sii
+    else {
+        return Ok(None);
+    };
+    if general.flags & General::IDENTIFICATION_AL_STATUS != 0 && !device.found.error {
+        let id = al::read_explicit_id(wire, device.found.station).await;
+        return id.map_err(|source| ServiceError::Segment { step: STEP, source });
+    }
+    if general.flags & General::IDENTIFICATION_ADDRESS != 0 {
+        let mut bytes = [0; 2];
+        let register = general.identification_address;
+        let answer = wire.read(device.found.station, register, &mut bytes).await;
+        return Ok(matches!(answer, Ok(1..)).then(|| u16::from_le_bytes(bytes)));
+    }
+    Ok(None)
+}
+
+/// Reads all CoE objects of the scan; `None` without a CoE mailbox.
+async fn ask(wire: &DatagramClient, device: &Device) -> Option<Result<CoeInfo, String>> {
+    let sii = device.sii.as_ref().ok()?;
+    if !sii.protocols.has(Protocols::COE) {
+        return None;
+    }
+    let at = device
+        .found
+        .named(format!("position {}", device.position()));
+    let answers = with_mailbox(wire, &at, sii, "asking it who it is", async |lent| {
+        let answers = coe_info::ask(wire, &mut lent.coe, device).await;
+        answers.map_err(|source| ServiceError::Sdo {
+            device: at.clone(),
+            source,
+        })
+    });
+    Some(answers.await.map_err(|error| error.to_string()))
+}
