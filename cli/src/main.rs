@@ -1,54 +1,22 @@
-//! The command line: one file per subcommand, each with its arguments and `run`.
+//! The command line.
+//!
+//! - `args`: arguments that several subcommands share, and the files they name;
+//! - `verbs`: one file or folder per subcommand, each with its arguments and `run`;
+//! - `render`: text for people: summaries, tables, fault reports, progress;
+//! - `hints`: exit code, message and advice for each failure.
 //!
 //! Results go to stdout, progress and errors to stderr.
-//!
-//! - `hints`: exit code, message and advice for each failure;
-//! - `report`: the summary of a run; `progress`: its status during operation;
-//! - `fault_report`: the fault report of a failed run;
-//! - `files`, `record`: protect other files from being overwritten;
-//! - `style`: colours; `output`: status line and line width;
-//! - `bus`: access to a bus without a cycle.
 
-use std::io::{self, IsTerminal, Write};
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
-use tracing_subscriber::EnvFilter;
+use clap::Parser;
 
-mod analyze;
-mod bench;
-mod bus;
-mod check;
-mod compare;
-mod completions;
-mod device;
-mod doctor;
-mod eeprom;
-mod emergencies;
-mod esi;
-mod explain;
-mod fault_report;
-mod files;
-mod firmware;
+mod args;
 mod hints;
-mod jog;
-mod man;
-mod output;
-mod pdo_table;
-mod progress;
-mod record;
-mod report;
-mod run;
-mod scan;
-mod sdo;
-mod signals;
-mod sim;
-mod style;
-mod table;
-mod trace;
+mod render;
+mod verbs;
 
-pub(crate) use files::{already_exists, unwritable, write_new};
-pub(crate) use hints::Failure;
+use verbs::Verb;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -72,99 +40,14 @@ struct Cli {
     verb: Verb,
 }
 
-#[derive(Debug, Subcommand)]
-enum Verb {
-    Run(run::Args),
-    Check(check::Args),
-    Explain(explain::Args),
-    Scan(scan::Args),
-    Compare(compare::Args),
-    Sdo(sdo::Args),
-    Eeprom(eeprom::Args),
-    Esi(esi::Args),
-    Sim(sim::Args),
-    Doctor(doctor::Args),
-    Bench(bench::Args),
-    Analyze(analyze::Args),
-    Firmware(firmware::Args),
-    Jog(jog::Args),
-    Completions(completions::Args),
-    Man(man::Args),
-}
-
-#[derive(Debug, clap::Args)]
-pub(crate) struct Verbosity {
-    /// Log events to stderr; repeat for more detail; RUST_LOG overrides it
-    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
-    verbose: u8,
-}
-
-impl Verbosity {
-    /// True if log lines are mixed with the output, so that no line is rewritten.
-    pub fn plain(&self) -> bool {
-        self.verbose > 0
-    }
-
-    fn start_logging(&self) {
-        let level = match self.verbose {
-            0 => "warn,ethercrab=error",
-            1 => "info,ecaxis=debug",
-            2 => "debug,ecaxis=trace",
-            _ => "trace",
-        };
-        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
-        tracing_subscriber::fmt()
-            .with_env_filter(filter)
-            .with_writer(|| output::Log)
-            .with_ansi(style::on_stderr())
-            .with_timer(tracing_subscriber::fmt::time::uptime())
-            .init();
-    }
-}
-
 /// Runs the command line. Exit codes: 0 done, 1 the machine or the bus failed, 2 the file or the
 /// command line is wrong, 130 interrupted.
 fn main() -> ExitCode {
-    let cli = Cli::parse();
-    match &cli.verb {
-        Verb::Run(run::Args { verbosity, .. })
-        | Verb::Scan(scan::Args { verbosity, .. })
-        | Verb::Compare(compare::Args { verbosity, .. })
-        | Verb::Sdo(sdo::Args { verbosity, .. })
-        | Verb::Eeprom(eeprom::Args { verbosity, .. })
-        | Verb::Sim(sim::Args { verbosity, .. })
-        | Verb::Bench(bench::Args { verbosity, .. })
-        | Verb::Firmware(firmware::Args { verbosity, .. }) => {
-            verbosity.start_logging();
-        }
-        Verb::Check(_)
-        | Verb::Explain(_)
-        | Verb::Esi(_)
-        | Verb::Doctor(_)
-        | Verb::Jog(_)
-        | Verb::Completions(_)
-        | Verb::Man(_)
-        | Verb::Analyze(_) => {}
+    let verb = Cli::parse().verb;
+    if let Some(verbosity) = verb.verbosity() {
+        verbosity.start_logging();
     }
-    let done = match cli.verb {
-        Verb::Run(args) => run::run(&args),
-        Verb::Check(args) => check::run(&args),
-        Verb::Explain(args) => explain::run(&args),
-        Verb::Scan(args) => scan::run(&args),
-        Verb::Compare(args) => compare::run(&args),
-        Verb::Sdo(args) => sdo::run(&args),
-        Verb::Eeprom(args) => eeprom::run(&args),
-        Verb::Esi(args) => esi::run(&args),
-        Verb::Sim(args) => sim::run(&args),
-        Verb::Doctor(args) => doctor::run(&args),
-        Verb::Bench(args) => bench::run(&args),
-        Verb::Firmware(args) => firmware::run(&args),
-        Verb::Jog(args) => jog::run(&args),
-        Verb::Completions(args) => completions::run(&args),
-        Verb::Man(args) => man::run(&args),
-        Verb::Analyze(args) => analyze::run(&args),
-    };
-    match done {
+    match verb.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             failure.print();
@@ -173,56 +56,14 @@ fn main() -> ExitCode {
     }
 }
 
-/// Prints a result on stdout.
-pub(crate) fn result(text: &str) -> Result<(), Failure> {
-    let mut out = io::stdout().lock();
-    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
-}
-
-/// Prints prose on stdout. On a terminal, long lines are wrapped.
-pub(crate) fn page(text: &str) -> Result<(), Failure> {
-    result(&output::wrapped(text, output::stdout_width()))
-}
-
-/// Maps a write result. A closed pipe (`| head`) is not a failure.
-fn written(done: io::Result<()>) -> Result<(), Failure> {
-    match done {
-        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Failure::new(
-            hints::FAILED,
-            format!("cannot write the result: {e}"),
-        )),
-        _ => Ok(()),
-    }
-}
-
-/// Prints a line on stderr.
-pub(crate) fn note(text: &str) {
-    let text = output::wrapped(text, output::stderr_width());
-    let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
-}
-
 /// Returns the definition of the command line.
-fn command() -> clap::Command {
+pub(crate) fn command() -> clap::Command {
     <Cli as clap::CommandFactory>::command()
-}
-
-pub(crate) fn stderr_is_terminal() -> bool {
-    io::stderr().is_terminal()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-
-    #[test]
-    fn output_ignores_only_a_closed_pipe() {
-        assert_eq!(written(Ok(())), Ok(()));
-        let gone = io::Error::from(io::ErrorKind::BrokenPipe);
-        assert_eq!(written(Err(gone)), Ok(()));
-        let full = written(Err(io::Error::from(io::ErrorKind::StorageFull))).unwrap_err();
-        assert_eq!(full.code, hints::FAILED);
-        assert!(full.message.contains("cannot write the result"));
-    }
+    use crate::*;
 
     #[test]
     fn every_subcommand_has_valid_examples() {

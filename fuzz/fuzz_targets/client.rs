@@ -7,7 +7,7 @@ use std::pin::pin;
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use ecaxis::mailbox::{
+use ecaxis_master::mailbox::{
     CoeClient, DatagramError, FoeClient, MailboxLayout, MailboxTransport, ObjectList,
 };
 use libfuzzer_sys::fuzz_target;

@@ -1,8 +1,8 @@
 //! A recording and its analysis: the report as JSON and as a page.
 #![no_main]
 
-use ecaxis::analyze::{Context, analyze, html};
-use ecaxis::recording::Reader;
+use ecaxis_master::recording::Reader;
+use ecaxis_tools::analyze::{Context, analyze, html};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|file: &[u8]| {

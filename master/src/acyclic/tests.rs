@@ -345,17 +345,23 @@ fn with_mailbox_restores_the_device_when_stopped() {
             let sii = information(&wire, &found, &at).await?;
             let mut reached = 0;
             let step = "reading its parameters";
-            let all = with_mailbox(&wire, &at, &sii, step, async |lent| -> Result<(), ServiceError> {
-                loop {
-                    reached += 1;
-                    stop.store(reached >= 10, Ordering::Relaxed);
-                    let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
-                    read.map_err(|source| ServiceError::Sdo {
-                        device: at.clone(),
-                        source,
-                    })?;
-                }
-            });
+            let all = with_mailbox(
+                &wire,
+                &at,
+                &sii,
+                step,
+                async |lent| -> Result<(), ServiceError> {
+                    loop {
+                        reached += 1;
+                        stop.store(reached >= 10, Ordering::Relaxed);
+                        let read = lent.coe.upload(&wire, 0x1018, 1, false).await;
+                        read.map_err(|source| ServiceError::Sdo {
+                            device: at.clone(),
+                            source,
+                        })?;
+                    }
+                },
+            );
             let ended: Result<(), ServiceError> = all.await;
             assert_eq!(reached, 10, "at once");
             ended

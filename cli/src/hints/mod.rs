@@ -1,0 +1,580 @@
+//! Failures for the user: exit code, message and advice.
+
+use std::io::ErrorKind;
+use std::path::Path;
+
+use ecaxis_axis::cia402::describe;
+use ecaxis_axis::scale::UnitMismatch;
+use ecaxis_axis::{CommandError, HomingError, State, Trip, VelocityUnit};
+use ecaxis_ecat::al_status_code::al_status_hint;
+use ecaxis_esi::address;
+use ecaxis_master::bringup::{BringUpError, StateError};
+use ecaxis_master::config::{ConfigError, LimitConflict, Nic, UnitProblem};
+use ecaxis_master::mailbox::{NamedObject, SdoError};
+use ecaxis_master::session::RunError;
+use ecaxis_sim::ServeError;
+
+use crate::render::note;
+
+mod fault_report;
+mod firmware;
+mod host;
+mod service;
+
+pub(crate) use fault_report::cause;
+pub(crate) use firmware::{firmware, shared_bus};
+use host::interfaces;
+pub(crate) use host::{capabilities, concern, denied, interface, overload};
+pub(crate) use service::{image, restore, service, with_other_main_device};
+
+/// Exit code: the machine or the bus failed.
+pub(crate) const FAILED: u8 = 1;
+/// Exit code: the file or the command line is wrong.
+pub(crate) const WRONG: u8 = 2;
+/// Exit code: a signal ended the work without another failure (128 + SIGINT).
+pub(crate) const INTERRUPTED: u8 = 130;
+
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Failure {
+    pub code: u8,
+    /// The complete message. A list of problems is already formatted.
+    pub message: String,
+    pub hints: Vec<String>,
+    /// A line printed after the hints.
+    pub after: Option<String>,
+}
+
+impl Failure {
+    pub fn new(code: u8, message: impl Into<String>) -> Self {
+        Self {
+            code,
+            message: message.into(),
+            hints: Vec::new(),
+            after: None,
+        }
+    }
+
+    /// The failure of work that a signal ended.
+    pub fn interrupted() -> Self {
+        Self::new(INTERRUPTED, RunError::Interrupted.to_string())
+    }
+
+    pub fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hints.push(hint.into());
+        self
+    }
+
+    pub fn print(&self) {
+        let prefix = if self.code == INTERRUPTED || self.message.starts_with("error: ") {
+            ""
+        } else {
+            "error: "
+        };
+        note(&format!("{prefix}{}", self.message));
+        for hint in &self.hints {
+            note(&format!("  = help: {hint}"));
+        }
+        if let Some(after) = &self.after {
+            note(after);
+        }
+    }
+}
+
+/// Returns the advice for the error code of an emergency message, as for 0x603F.
+pub(crate) fn emergency(code: u16) -> &'static str {
+    describe(code).hint
+}
+
+/// Adds advice for a recording without EtherCAT frames.
+pub(crate) fn no_ethercat(failure: Failure, one_interface: bool) -> Failure {
+    failure.hint(if one_interface {
+        "omit `--interface` to use all"
+    } else {
+        "record on the interface of the bus: frames of EtherType 0x88a4, or UDP port 34980"
+    })
+}
+
+/// Maps the error of a run to a failure. Hints depend on whether the bus is real.
+pub(crate) fn run(error: &RunError, nic: &Nic) -> Failure {
+    let failure = Failure::new(FAILED, message(error));
+    let hint = match error {
+        RunError::Open(open) => return interface(failure, open),
+        RunError::BringUp(bring_up) => return self::bring_up(failure, bring_up, nic),
+        RunError::State(state) => self::state(state),
+        RunError::Record(_) => "name a file that can be written, on a disk with room".to_owned(),
+        RunError::Replay(_) => {
+            // The recording is a user input.
+            return Failure { code: WRONG, ..failure }
+                .hint("a replay needs a complete recording of a run of this machine file, made with `ecaxis run --record`");
+        }
+        RunError::NotMapped { source, .. } => format!(
+            "add \"{}\" to the device's `pdo` lists, or omit them to use the ESI's",
+            address(source.index, source.sub),
+        ),
+        RunError::NoProcessData { .. } => {
+            "`ecaxis explain` shows the expected layout; a device without an FMMU left answers no process data".to_owned()
+        }
+        RunError::PhaseNotLocked { .. } => {
+            "wake-ups are too irregular: run with real-time priority (`ecaxis run` warns if it has none), or a longer `cycle`".to_owned()
+        }
+        RunError::NotEnabled { state, code, mode_confirmed, .. } => not_enabled(*state, *code, *mode_confirmed),
+        RunError::WrongMode { .. } => {
+            "the drive refused the mode: check that its firmware supports it and that no parameter forbids it".to_owned()
+        }
+        RunError::Trip { trip: Trip::FollowingError { .. }, limits, .. } if !limits.is_empty() => {
+            allows_less(limits)
+        }
+        RunError::DriveFault { code: Some(FOLLOWING_ERROR), report, .. } if !report.limits.is_empty() => {
+            allows_less(&report.limits)
+        }
+        RunError::DriveFault { code: Some(code), .. } => describe(*code).hint.to_owned(),
+        RunError::DriveFault { code: None, .. } => "read 0x603F and the error history 0x1003 of the drive".to_owned(),
+        RunError::Trip { trip, .. } => self::trip(trip).to_owned(),
+        RunError::BusLost { answered: false, .. } => {
+            "check cables and power; `lost_frames` sets how many bad cycles are tolerated".to_owned()
+        }
+        RunError::BusLost { answered: true, wkc, .. } => fault_report::working_counter(*wkc).to_owned(),
+        RunError::LeftOp { code, .. } => al_status(*code).to_owned(),
+        RunError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
+        RunError::LeftOpBriefly { .. } => "look for loose connectors and supply dips".to_owned(),
+        RunError::NotReached { .. } => {
+            "check load and tuning, or give the axis a wider `target_window`".to_owned()
+        }
+        RunError::ProbeNotArmed { input, .. } => format!(
+            "check that the drive has a digital input configured as touch probe {input} (0x60B8 and 0x60B9 in its manual)"
+        ),
+        RunError::NotProbed { input, edge, .. } => format!(
+            "check the sensor, its wiring, and that the drive's digital input is configured as touch probe {input}; an input that is {} when the search begins shows no such edge; search farther with `to` or `by`, or for the other `edge`",
+            if *edge == "rising" { "already on" } else { "off" }
+        ),
+        RunError::StepTimeout { .. } => "check the drive's state and fault; the step waits for `bus.enable_timeout`, or for the longest stop time of an axis".to_owned(),
+        RunError::NotSwitched { .. } => "check 0x6502 (supported drive modes) and the mode's requirements in the drive's manual".to_owned(),
+        RunError::NotHomed { error, .. } => not_homed(*error).to_owned(),
+        RunError::WaitTimeout { .. } => "check the sensor and its wiring, or give the step a longer `timeout`".to_owned(),
+        RunError::TooLarge { .. } => "map fewer objects with `pdo.rx` and `pdo.tx`".to_owned(),
+        RunError::ClockNotSettled { .. } => "frames reach the clocks too irregularly, or the device has a faulty clock: run with real-time priority, or with `dc = \"off\"`".to_owned(),
+        RunError::NotDisabled { .. } => "the drive ignores its Controlword: switch its power off by hand, then check its fault".to_owned(),
+        RunError::Refused { by_axis, device, .. } => refused(by_axis.as_deref(), &device.name),
+        RunError::Axis { .. } => "check the step and the axis' limits in the machine file".to_owned(),
+        RunError::EmergencyStop { .. } => "release it, then run again; `[stop] emergency` in the machine file says what it is".to_owned(),
+        RunError::FollowLost { cause: Some(cause), .. } => {
+            return Failure { hints: run(cause, nic).hints, ..failure };
+        }
+        RunError::FollowLost { cause: None, .. } => "keep the followed axis under power and within what the follower's limits and range allow".to_owned(),
+        RunError::EnableRefused { .. } => "`reset` the axis first, or look at what stopped it".to_owned(),
+        RunError::GroupStopped { cause, .. } => {
+            let cause = run(cause, nic).hints.into_iter();
+            let back = "once the cause is known, restart the group with the steps `reset` and `enable`";
+            return cause.fold(failure, Failure::hint).hint(back);
+        }
+        RunError::Unsupervised => "the computer is overloaded: reserve a CPU for the cycle (`cpu` in [bus]) and run `ecaxis doctor`".to_owned(),
+        RunError::Controller => "its message is on stderr; the axes were stopped".to_owned(),
+        RunError::Panicked(_) => "this is a defect of ecaxis: please report it with the machine file and, if you can, `--record`".to_owned(),
+        RunError::Interrupted => return Failure { code: INTERRUPTED, ..failure },
+        RunError::Sim(_) | RunError::Thread(_) | RunError::Link(_) => return failure,
+    };
+    failure.hint(hint)
+}
+
+/// Returns the hint for a replayed run whose recording is of another bus.
+pub(crate) fn replayed(error: &RunError, devices: usize) -> Option<String> {
+    let RunError::BringUp(error) = error else {
+        return None;
+    };
+    let shown = match error.as_ref() {
+        BringUpError::Missing { found: 1, .. } => "1 SubDevice".to_owned(),
+        BringUpError::Missing { found, .. } => format!("{found} SubDevices"),
+        BringUpError::Unexpected { .. } => "more SubDevices".to_owned(),
+        BringUpError::Identity { .. }
+        | BringUpError::Serial { .. }
+        | BringUpError::NotLocated { .. } => "other SubDevices".to_owned(),
+        _ => return None,
+    };
+    Some(format!(
+        "the recording is of another machine or of an incomplete bus: it shows {shown}, the file has {devices}"
+    ))
+}
+
+/// Returns the error text with the device and object address once. The source error repeats both.
+fn message(error: &RunError) -> String {
+    let text = error.to_string();
+    let RunError::BringUp(error) = error else {
+        return text;
+    };
+    let (device, source, named) = match error.as_ref() {
+        BringUpError::StartUp {
+            device,
+            index,
+            sub,
+            source,
+            ..
+        } => {
+            let object = NamedObject {
+                index: *index,
+                sub: *sub,
+            };
+            (device, source, Some(object.to_string()))
+        }
+        BringUpError::Mailbox { device, source }
+        | BringUpError::ReadBack { device, source }
+        | BringUpError::ReadUnits { device, source }
+        | BringUpError::ReadLimits { device, source } => (device, source, None),
+        _ => return text,
+    };
+    let long = source.to_string();
+    let mut short = long.as_str();
+    let station = format!("station {:#06x}", device.station);
+    for known in [Some(station), named].into_iter().flatten() {
+        if let Some(rest) = short.strip_prefix(&known) {
+            short = rest.trim_start_matches(':').trim_start();
+        }
+    }
+    match text.strip_suffix(&long) {
+        Some(head) => head.to_owned() + short,
+        None => text,
+    }
+}
+
+/// Returns the hint for a refused command. `name`: the axis that refused it.
+fn refused(reason: Option<&CommandError>, name: &str) -> String {
+    match reason {
+        Some(CommandError::NotEnabled { .. }) => {
+            format!("enable the axis in an earlier step: `enable = [\"{name}\"]`")
+        }
+        Some(CommandError::StillMoving { .. }) => format!(
+            "stop the axis in an earlier step: `velocity = {{ {name} = 0.0 }}` or `stop = [\"{name}\"]`"
+        ),
+        Some(CommandError::Following) => {
+            format!("end following in an earlier step: `stop = [\"{name}\"]`")
+        }
+        Some(CommandError::WrongMode { needs, .. }) => format!(
+            "switch the mode in an earlier step: `mode = {{ {name} = \"{}\" }}`",
+            needs.to_string().to_lowercase()
+        ),
+        Some(CommandError::Faulted(_) | CommandError::Tripped(_) | CommandError::GroupStopped) => {
+            format!(
+                "once the cause is known, reset the axis in an earlier step: `reset = [\"{name}\"]`"
+            )
+        }
+        Some(CommandError::ModeNotOffered { .. } | CommandError::NoModeDisplay) => {
+            "map 0x6060, 0x6061 and the mode's targets with `pdo.rx` and `pdo.tx`".to_owned()
+        }
+        Some(CommandError::NoProbe) => {
+            "map 0x60B8, 0x60B9 and 0x60BA to 0x60BD with `pdo.rx` and `pdo.tx`".to_owned()
+        }
+        _ => "check the step and the axis' limits in the machine file".to_owned(),
+    }
+}
+
+fn not_homed(error: HomingError) -> &'static str {
+    match error {
+        HomingError::Timeout { .. } => {
+            "check the switch or sensor of the method, its wiring and its side (0x60FD shows the drive's inputs); a long travel needs a higher `homing.search` or a longer `homing.timeout`"
+        }
+        HomingError::Drive => {
+            "the search reached the other limit switch or found no index pulse: check switches, their wiring and the drive's digital inputs, and the direction of `homing.method`"
+        }
+        HomingError::ModeRefused => {
+            "check 0x6502 (supported drive modes): this drive may not support homing"
+        }
+        HomingError::PowerLost => "check the drive's fault (0x603F) and its supply",
+        HomingError::Aborted => "home the axis again before any absolute move",
+    }
+}
+
+fn bring_up(failure: Failure, error: &BringUpError, nic: &Nic) -> Failure {
+    let hint = match error {
+        BringUpError::NoAnswer => {
+            let failure = match nic {
+                Nic::Interface(name) => failure
+                    .hint(format!("is `{name}` the right interface? {}", interfaces()))
+                    .hint("check that the first SubDevice has power and its IN port is connected"),
+                Nic::Sim => failure.hint("check the fault script: it may silence the bus"),
+            };
+            return failure;
+        }
+        BringUpError::Missing { .. } => {
+            "check the power of the first one missing and the cable to it, or remove its [[device]] from the file; `ecaxis compare` shows all differences".to_owned()
+        }
+        BringUpError::Unexpected { position, .. } => {
+            format!("add a [[device]] with `position = {position}`, or disconnect it")
+        }
+        BringUpError::Identity { .. } => {
+            "check the order of the devices; for another model or firmware, name its ESI file with `esi`, or pick with `product` and `revision`; `identity = \">=\"` accepts newer revisions as well; `ecaxis compare` shows all differences".to_owned()
+        }
+        BringUpError::Serial { found, .. } => {
+            format!("if the device was replaced on purpose, write `serial = {found}` or omit `serial`")
+        }
+        BringUpError::NotLocated { .. } => {
+            "set the device's alias or ID switch, or find it by `position`".to_owned()
+        }
+        BringUpError::StartUp { source, origin, .. } => sdo(source, origin),
+        BringUpError::NotHeld { .. } => {
+            "the device rounds or limits the value, or another object has changed it: write the value that it holds, or omit `verify` for this object".to_owned()
+        }
+        BringUpError::Mailbox { source, .. }
+        | BringUpError::ReadBack { source, .. }
+        | BringUpError::ReadUnits { source, .. }
+        | BringUpError::ReadLimits { source, .. } => {
+            sdo(source, "bring-up")
+        }
+        BringUpError::Watchdog { .. } => {
+            "without its watchdog the drive keeps moving when the outputs fail: ask its vendor how to enable it".to_owned()
+        }
+        BringUpError::Units { problems, .. } => {
+            return problems.iter().map(units).fold(failure, Failure::hint);
+        }
+        BringUpError::Mapping { .. } => {
+            "the drive's firmware has another PDO mapping than the ESI file: use the ESI file of that firmware".to_owned()
+        }
+        BringUpError::MailboxMoved { .. } => {
+            "the device's EEPROM is not of this ESI file: use the ESI file of its firmware".to_owned()
+        }
+        BringUpError::NoStart { .. } => {
+            "frames are lost or the computer is overloaded: check cables, and stop other programs".to_owned()
+        }
+        BringUpError::NoClock { .. } => {
+            "run the device without distributed clock: `dc = \"off\"`".to_owned()
+        }
+        BringUpError::Scan { .. } | BringUpError::Wire { .. } | BringUpError::NotTaken { .. } => {
+            "frames are lost or a device restarts: check cables and supply, and record with `--record`".to_owned()
+        }
+        BringUpError::State(state) => self::state(state),
+    };
+    failure.hint(hint)
+}
+
+/// Returns what to change in the machine file or in the drive.
+fn units(problem: &UnitProblem) -> String {
+    let found = match problem {
+        UnitProblem::Contradiction(found) => found,
+        UnitProblem::NoRatedTorque { .. } => {
+            return "add `rated_torque = 0.1` (Nm), or give torques in percent".to_owned();
+        }
+        UnitProblem::NoTorqueConstant => {
+            return "add `torque_constant = 0.0385` (Nm/A), or give torques in percent".to_owned();
+        }
+        UnitProblem::Config { .. } | UnitProblem::Homing { .. } => {
+            return "write a finer or coarser unit with `sdo = [{ index = 0x60A9, value = … }]`, or change the axis' limits".to_owned();
+        }
+    };
+    match *found {
+        UnitMismatch::VelocityUnit {
+            expected,
+            found: code,
+        } => {
+            let write = format!(
+                "write `sdo = [{{ index = 0x60A9, value = 0x{:08X} }}]`",
+                expected.si_code()
+            );
+            match VelocityUnit::from_si_code(code) {
+                Some(unit) => {
+                    format!("{write}, or `velocity_unit = \"{unit}\"`, or omit `velocity_unit`")
+                }
+                None => write,
+            }
+        }
+        UnitMismatch::CountsPerTurn {
+            index: 0x608F,
+            found: counts,
+            ..
+        } => format!(
+            "write `encoder = {counts}`, or correct the drive's encoder resolution (0x608F)"
+        ),
+        UnitMismatch::RatedTorque { found: 1.., .. } => {
+            "correct `sdo`, or the drive's motor data; `rated_torque` takes precedence".to_owned()
+        }
+        ref other => other.advice().to_owned(),
+    }
+}
+
+/// Returns the hint for an SDO error. `origin` is the source of the request; `OWN_SDO` for the
+/// user's own list.
+fn sdo(error: &SdoError, origin: &str) -> String {
+    let own = origin == OWN_SDO;
+    match error {
+        SdoError::Abort { code, .. } => match code {
+            0x0602_0000 | 0x0609_0011 if own => {
+                "the drive has no such object: check `index` and `sub` in `sdo`"
+            }
+            0x0602_0000 | 0x0609_0011 => {
+                "the drive has no such object: its firmware does not match the ESI file"
+            }
+            0x0609_0030..=0x0609_0036 if origin.contains("cycle") => {
+                "the drive does not take this cycle time: try another `cycle`"
+            }
+            0x0609_0030..=0x0609_0036 if own => {
+                "the value is outside what the drive allows: check `value` in `sdo`"
+            }
+            0x0609_0030..=0x0609_0036 => {
+                "the value is outside what the drive allows: its firmware does not match the ESI file"
+            }
+            0x0601_0000..=0x0601_0003 if own => {
+                "the object cannot be written: remove it from `sdo`"
+            }
+            0x0601_0000..=0x0601_0003 => {
+                "the object is read-only in the drive: its firmware does not match the ESI file"
+            }
+            0x0607_0010..=0x0607_0013 if own => {
+                "the object has another length in the drive: set its `type` in `sdo`"
+            }
+            0x0607_0010..=0x0607_0013 => "the object has another length in the drive: its firmware does not match the ESI file",
+            0x0604_0041..=0x0604_0042 if origin.starts_with("pdo.") => {
+                "the drive cannot map this: remove it from `pdo.rx` or `pdo.tx`"
+            }
+            0x0604_0041..=0x0604_0042 => {
+                "the drive cannot map what the ESI file lists: choose other objects with `pdo.rx` and `pdo.tx`"
+            }
+            0x0800_0021 => "the drive is under local control: end its panel or commissioning tool; an object that is mapped now may not be writable either",
+            0x0504_0005 | 0x0800_0020 | 0x0606_0000 => "the drive cannot store it now: switch it off and on, then check its own error history",
+            0x0604_0043 | 0x0604_0047 if own => "the value contradicts another setting of the drive: the order of `sdo` matters, and the mode must allow it",
+            0x0800_0022 => "the drive refuses it in its present state: switch it off and on",
+            _ => "look the code up in the drive's manual; `ecaxis explain` shows where the value comes from",
+        },
+        SdoError::Timeout { .. } => "the drive does not answer its mailbox: switch it off and on",
+        SdoError::Gone { .. } | SdoError::Wire { .. } => "check the device's power and the cable to it",
+        _ => "record the exchange with `--record`",
+    }
+    .to_owned()
+}
+
+/// The origin of start-up SDOs from the machine file.
+const OWN_SDO: &str = "sdo of the machine file";
+
+fn state(error: &StateError) -> String {
+    match error {
+        StateError::Refused { code, .. } => al_status(*code).to_owned(),
+        StateError::Timeout { .. } => {
+            "switch the device off and on, then check its own display or error history".to_owned()
+        }
+        StateError::Gone { .. } => "check the device's power and the cable to it".to_owned(),
+        StateError::Wire { .. } => "check the cables".to_owned(),
+    }
+}
+
+/// Returns the advice for an AL status code (ETG.1020).
+pub(crate) fn al_status(code: u16) -> &'static str {
+    al_status_hint(code).unwrap_or("look the code up in the device's manual")
+}
+
+fn not_enabled(state: State, code: Option<u16>, mode_confirmed: bool) -> String {
+    match (state, code) {
+        (State::Fault | State::FaultReactionActive, Some(code)) if code != 0 => describe(code).hint.to_owned(),
+        (State::Fault | State::FaultReactionActive, _) => "read the drive's error history (0x1003)".to_owned(),
+        (State::OperationEnabled, _) if !mode_confirmed => {
+            "the drive does not accept the mode: check that 0x6060 is mapped or written, and supported".to_owned()
+        }
+        _ => "check the supply of the power stage, STO and enable inputs, and that no other tool controls the drive".to_owned(),
+    }
+}
+
+/// The CiA 402 error code of a following error.
+const FOLLOWING_ERROR: u16 = 0x8611;
+
+/// Returns the hint for a following error of an axis whose drive has lower limits than the file.
+fn allows_less(limits: &[LimitConflict]) -> String {
+    let each: Vec<_> = limits.iter().map(ToString::to_string).collect();
+    format!(
+        "the drive allows less than the machine file: {}",
+        each.join("; ")
+    )
+}
+
+fn trip(trip: &Trip) -> &'static str {
+    match trip {
+        Trip::FollowingError { .. } => {
+            "is the axis free to move and tuned? lower `speed` and `ramp`, or raise `limits.following_error` and the drive's 0x6065"
+        }
+        Trip::PositionLimit { .. } => {
+            "move the axis back by hand, or check `limits.position` and `offset`"
+        }
+        Trip::OverVelocity { .. } => "check `encoder`, `per_turn` and the drive's tuning",
+        Trip::PowerLost { .. } => "check STO, enable inputs and the supply of the power stage",
+        Trip::OverTorque { .. } => "check for a blocked load, or supervise a higher torque",
+        Trip::OverAcceleration { .. } => "check the load and the drive's tuning",
+        Trip::EmergencyStop => "find out why it was pressed, then reset and enable the axis again",
+        Trip::SetPointNotTaken => "the drive must be in profile position mode with 0x607A mapped",
+        Trip::NotFollowing { .. } => {
+            "look for a limit switch, a closed brake or an internal limit; for a drive that does not serve the bit set `follows_bit = false`"
+        }
+        Trip::NotStopped { .. } => {
+            "check the drive's quick stop (0x605A, 0x6085), its torque limit and the load; `stop_timeout` sets how long a stop may take"
+        }
+        Trip::ModeLost { .. } => "another tool changes the drive's mode: disconnect it",
+    }
+}
+
+/// Maps an error of the simulated bus on an interface to a failure.
+pub(crate) fn serve(error: &ServeError) -> Failure {
+    let failure = Failure::new(FAILED, error.to_string());
+    match error {
+        ServeError::NoSuchInterface(_) | ServeError::NotEthernet(_) => Failure {
+            code: WRONG,
+            ..failure
+        }
+        .hint(interfaces()),
+        ServeError::NotPermitted(_) => failure.hint(capabilities()),
+        ServeError::Gone(_) | ServeError::Io { .. } => failure,
+    }
+}
+
+/// Maps an error of a machine file to a failure.
+pub(crate) fn config(path: &Path, error: &ConfigError) -> Failure {
+    let failure = Failure::new(WRONG, error.to_string());
+    match error {
+        ConfigError::Io { source, .. } if source.kind() == ErrorKind::NotFound => {
+            failure.hint(machine_files(path))
+        }
+        ConfigError::Io { source, .. } if source.kind() == ErrorKind::IsADirectory => {
+            failure.hint("name the machine file in it")
+        }
+        ConfigError::Io { .. } => failure.hint("check the file's permissions"),
+        ConfigError::NotText { .. } => failure.hint("a machine file is TOML, in UTF-8"),
+        ConfigError::Problems(problems) if problems.len() > 1 => {
+            let message = format!(
+                "{error}\n\n{} problems in {}",
+                problems.len(),
+                path.display()
+            );
+            Failure::new(WRONG, message)
+        }
+        ConfigError::Problems(_) => failure,
+    }
+}
+
+/// Suggests machine files in the neighbourhood of a missing one.
+fn machine_files(path: &Path) -> String {
+    let nearby = [
+        path.parent().unwrap_or(Path::new("")),
+        Path::new("."),
+        Path::new("configs"),
+    ];
+    for folder in nearby {
+        let folder = if folder.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            folder
+        };
+        let Ok(entries) = std::fs::read_dir(folder) else {
+            continue;
+        };
+        let mut names: Vec<String> = entries
+            .flatten()
+            .map(|e| e.path())
+            .filter(|p| p.extension().is_some_and(|e| e == "toml"))
+            .filter(|p| {
+                ecaxis_master::file::read_text(p, 1 << 20).is_ok_and(|text| text.contains("[bus]"))
+            })
+            .map(|p| p.strip_prefix("./").unwrap_or(&p).display().to_string())
+            .collect();
+        names.sort();
+        names.truncate(3);
+        if !names.is_empty() {
+            return format!("machine files nearby: {}", names.join(", "));
+        }
+    }
+    "name a machine file, such as configs/demo.toml".to_owned()
+}
+
+#[cfg(test)]
+mod tests;

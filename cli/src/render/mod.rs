@@ -1,0 +1,61 @@
+//! Text for people.
+
+use std::io::{self, IsTerminal, Write};
+
+use crate::hints::{self, Failure};
+
+pub(crate) mod emergencies;
+pub(crate) mod fault_report;
+pub(crate) mod output;
+pub(crate) mod pdo_table;
+pub(crate) mod progress;
+pub(crate) mod report;
+pub(crate) mod style;
+pub(crate) mod table;
+
+/// Prints a result on stdout.
+pub(crate) fn result(text: &str) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    written(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
+}
+
+/// Prints prose on stdout. On a terminal, long lines are wrapped.
+pub(crate) fn page(text: &str) -> Result<(), Failure> {
+    result(&output::wrapped(text, output::stdout_width()))
+}
+
+/// Maps a write result. A closed pipe (`| head`) is not a failure.
+fn written(done: io::Result<()>) -> Result<(), Failure> {
+    match done {
+        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Failure::new(
+            hints::FAILED,
+            format!("cannot write the result: {e}"),
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Prints a line on stderr.
+pub(crate) fn note(text: &str) {
+    let text = output::wrapped(text, output::stderr_width());
+    let _ = output::print_line(|mut err| style::complaint(&mut err, &text));
+}
+
+pub(crate) fn stderr_is_terminal() -> bool {
+    io::stderr().is_terminal()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn output_ignores_only_a_closed_pipe() {
+        assert_eq!(written(Ok(())), Ok(()));
+        let gone = io::Error::from(io::ErrorKind::BrokenPipe);
+        assert_eq!(written(Err(gone)), Ok(()));
+        let full = written(Err(io::Error::from(io::ErrorKind::StorageFull))).unwrap_err();
+        assert_eq!(full.code, hints::FAILED);
+        assert!(full.message.contains("cannot write the result"));
+    }
+}

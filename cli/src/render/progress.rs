@@ -1,0 +1,187 @@
+//! Progress of a run on stderr: a rewritten line on a terminal, otherwise separate lines.
+
+use std::time::{Duration, Instant};
+
+use ecaxis_axis::Mode;
+use ecaxis_master::bringup::Step;
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::{Bus, Nic, TorqueUnit};
+use ecaxis_master::session::{AxisLine, Observer, Progress, Status};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::hints;
+use crate::render::note;
+use crate::render::output;
+use crate::render::style;
+
+/// The minimum interval between status lines. In virtual time, an hour of status passes in seconds.
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+
+pub(crate) struct ProgressPrinter {
+    /// `None` prints separate lines.
+    bar: Option<ProgressBar>,
+    clock: Clock,
+    cycle_ns: u64,
+    /// The interface; hints depend on it.
+    nic: Nic,
+    last_passing: Option<Instant>,
+    advised: Vec<String>,
+}
+
+impl ProgressPrinter {
+    /// `plain`: print separate lines, because log lines are mixed in.
+    pub fn new(clock: Clock, bus: &Bus, plain: bool) -> Self {
+        let bar = (style::rewrites() && !plain).then(|| {
+            let bar = ProgressBar::new_spinner();
+            let style = ProgressStyle::with_template("{spinner} {wide_msg}");
+            let bar = bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_spinner()));
+            output::attach_bar(&bar);
+            bar
+        });
+        Self {
+            bar,
+            clock,
+            cycle_ns: bus.cycle_ns,
+            nic: bus.nic.clone(),
+            last_passing: None,
+            advised: Vec::new(),
+        }
+    }
+
+    /// Shows a transient message.
+    fn passing(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => {
+                bar.set_message(text.to_owned());
+                bar.tick();
+            }
+            None => note(text),
+        }
+    }
+
+    /// Prints at most one message per second with separate lines or in virtual time.
+    fn rate_limited(&mut self, text: impl FnOnce() -> String) {
+        if self
+            .last_passing
+            .is_none_or(|last| last.elapsed() >= STATUS_PERIOD)
+        {
+            self.last_passing = Some(Instant::now());
+            self.passing(&text());
+        }
+    }
+}
+
+impl Observer for ProgressPrinter {
+    fn progress(&mut self, progress: &Progress) {
+        match progress {
+            // With separate lines, one line per device is enough.
+            Progress::Step(Step::StartUp { done, of, .. }) if self.bar.is_none() && done < of => {}
+            Progress::Step(step @ (Step::StartUp { .. } | Step::Scan)) => {
+                self.passing(&step.to_string());
+            }
+            Progress::Step(step) => note(&step.to_string()),
+            Progress::Denied(denied) => {
+                note(&format!("warning: {denied}"));
+                let help = hints::denied(denied);
+                if !self.advised.contains(&help) {
+                    note(&format!("  = help: {help}"));
+                    self.advised.push(help);
+                }
+            }
+            Progress::Overload(overload) => {
+                note(&format!("warning: {overload}"));
+                note(&format!("  = help: {}", hints::overload()));
+            }
+            Progress::Concern(concern) => {
+                note(&format!("warning: {concern}"));
+                if let Some(help) = hints::concern(concern) {
+                    note(&format!("  = help: {help}"));
+                }
+            }
+            Progress::Warning(text) => note(&format!("warning: {text}")),
+            Progress::Emergency(report) => note(&format!("warning: {report}")),
+            Progress::Mailboxes(_) => {}
+            Progress::GroupStopped { group, cause } => {
+                note(&format!(
+                    "warning: the group `{group}` stops, the rest goes on: {cause}"
+                ));
+                for hint in hints::run(cause, &self.nic).hints {
+                    note(&format!("  = help: {hint}"));
+                }
+            }
+            Progress::GroupReleased { group } => {
+                note(&format!(
+                    "the group `{group}` has been reset and can be enabled again"
+                ));
+            }
+            Progress::PhaseLocked => note("frames leave in phase with SYNC0"),
+            Progress::Enabled { axes: 1 } => note("1 axis in Operation enabled"),
+            Progress::Enabled { axes } => note(&format!("{axes} axes in Operation enabled")),
+            Progress::Program { run, step, what } => {
+                let text = format!("run {run}, step {}: {what}", step.number);
+                if *run == 1 && self.bar.is_none() {
+                    note(&text);
+                } else {
+                    self.rate_limited(|| text);
+                }
+            }
+            Progress::Captured { run, capture } => {
+                note(&format!("run {run}, step {}: {capture}", capture.step));
+            }
+            Progress::Status(status) if self.clock == Clock::Virtual => {
+                let cycle_ns = self.cycle_ns;
+                self.rate_limited(|| status_line(status, cycle_ns));
+            }
+            Progress::Status(status) => self.passing(&status_line(status, self.cycle_ns)),
+            Progress::Stopping => note("stopping: axes to rest, power off, bus to Init"),
+        }
+    }
+}
+
+impl Drop for ProgressPrinter {
+    fn drop(&mut self) {
+        output::detach_bar();
+    }
+}
+
+fn status_line(status: &Status, cycle_ns: u64) -> String {
+    let counters = &status.counters;
+    let turns = counters.cycles.saturating_add(counters.overruns);
+    let mut text = format!(
+        "{:7.1} s  cycle {}  lost {}  wkc {}",
+        turns as f64 * cycle_ns as f64 * 1e-9,
+        counters.cycles,
+        counters.lost_frames,
+        counters.wkc_errors,
+    );
+    if let Some(phase) = &status.phase {
+        text += &format!(
+            "  phase {:+} ns{}",
+            phase.error_ns,
+            if phase.locked { "" } else { " (not locked)" }
+        );
+    }
+    for axis in &status.axes {
+        text += "  ";
+        text += &axis_text(axis);
+    }
+    text
+}
+
+fn axis_text(axis: &AxisLine) -> String {
+    let AxisLine {
+        name,
+        unit,
+        position,
+        velocity,
+        torque,
+        torque_unit,
+        ..
+    } = axis;
+    match axis.mode {
+        Mode::Csv => format!("{name} {velocity:.2} {unit}/s"),
+        Mode::Cst if *torque_unit == TorqueUnit::Percent => format!("{name} {torque:.1} %"),
+        Mode::Cst => format!("{name} {torque:.4} {torque_unit}"),
+        _ => format!("{name} {position:.3} {unit}"),
+    }
+}

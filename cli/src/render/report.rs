@@ -1,0 +1,513 @@
+//! The summary of a run as text. In virtual time all figures describe the machine, not the
+//! computer.
+
+use std::time::Duration;
+
+use ecaxis_master::config::duration;
+use ecaxis_master::rt::stats::Percentiles;
+use ecaxis_master::session::{AxisSummary, DeviceErrors, EventLine, Summary, ThreadSummary};
+
+pub(crate) use crate::render::table::Table;
+
+/// Formats the whole summary of a run.
+pub(crate) fn summary(summary: &Summary) -> String {
+    let mut text = head(summary);
+    text += "\n";
+    text += &counters(summary).indented(2);
+    text += "\n\n";
+    text += &times(summary).indented(2);
+    text += "\n";
+    if let Some(thread) = &summary.thread {
+        text += &self::thread(thread, summary.counters.cycles);
+    }
+    if !summary.axes.is_empty() {
+        text += "\n";
+        text += &axes(&summary.axes).shown(2);
+        text += "\n";
+    }
+    for axis in &summary.axes {
+        for what in [&axis.fault, &axis.trip].into_iter().flatten() {
+            text += &format!("  {}: {what}\n", axis.name);
+        }
+    }
+    for stop in &summary.group_stops {
+        let end = if stop.released {
+            "reset since"
+        } else {
+            "not reset"
+        };
+        text += &format!("  group `{}` stopped, {end}: {}\n", stop.group, stop.cause);
+    }
+    if !summary.probes.is_empty() {
+        text += "\n";
+    }
+    for found in &summary.probes {
+        let times = match found.times {
+            1 => String::new(),
+            n => format!(" (the last of {n})"),
+        };
+        text += &format!("  step {}: {found}{times}\n", found.step);
+    }
+    if !summary.errors.is_empty() {
+        text += "\n";
+        text += &errors(&summary.errors).shown(2);
+        text += "\n";
+    }
+    if !summary.emergencies.is_empty() {
+        text += "\n";
+        text += &crate::render::emergencies::table(&summary.emergencies, summary.more_emergencies);
+    }
+    if summary.events.iter().any(|event| event.failure) {
+        text += &format!("\n{}\n", events(&summary.events));
+    }
+    if let Some(frames) = summary.recorded_frames {
+        text += &format!("\n  {frames} frames recorded");
+        match summary.recorded_frames_dropped {
+            Some(dropped @ 1..) => text += &format!(", {dropped} dropped: the disk is too slow\n"),
+            _ => text += "\n",
+        }
+    }
+    text
+}
+
+fn head(summary: &Summary) -> String {
+    let plural = |n: u64, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
+    let devices = u64::try_from(summary.devices).unwrap_or(u64::MAX);
+    format!(
+        "{}: {}, {} in {} time, {} of the program{}\n",
+        summary.machine,
+        plural(devices, "SubDevice"),
+        seconds(summary.machine_seconds),
+        summary.time,
+        plural(u64::from(summary.program_runs), "complete run"),
+        if summary.interrupted {
+            ", interrupted"
+        } else {
+            ""
+        },
+    )
+}
+
+fn seconds(s: f64) -> String {
+    format!(
+        "{:.3} s",
+        Duration::try_from_secs_f64(s)
+            .unwrap_or_default()
+            .as_secs_f64()
+    )
+}
+
+fn counters(summary: &Summary) -> Table {
+    let counters = &summary.counters;
+    let cycle = format!("of {}", duration::show(summary.cycle_ns));
+    let mut table = Table::new(&["cycles", &counters.cycles.to_string(), &cycle]);
+    for (name, count, meaning) in [
+        (
+            "lost frames",
+            counters.lost_frames,
+            "not back before the deadline",
+        ),
+        ("late frames", counters.late_frames, "back in a later cycle"),
+        (
+            "working-counter errors",
+            counters.wkc_errors,
+            "a SubDevice did not take part",
+        ),
+        (
+            "overruns",
+            counters.overruns,
+            "cycles skipped because the thread woke too late",
+        ),
+        (
+            "link errors",
+            counters.link_errors,
+            "sends and receives refused",
+        ),
+        (
+            "refused answers",
+            counters.refused_answers,
+            "mailbox frames too late or damaged",
+        ),
+        (
+            "foreign frames",
+            summary.link.foreign,
+            "of other protocols or MainDevices on this wire",
+        ),
+        (
+            "tagged frames",
+            summary.link.tagged,
+            "with a VLAN tag, which ours never have",
+        ),
+        (
+            "damaged frames",
+            summary.link.damaged,
+            "shorter than they say, or too long",
+        ),
+        (
+            "dropped frames",
+            summary.link.dropped,
+            "kernel receive buffer overflow",
+        ),
+    ] {
+        // The first three are always shown, the others only if not zero.
+        if count > 0
+            || matches!(
+                name,
+                "lost frames" | "late frames" | "working-counter errors"
+            )
+        {
+            table.row([
+                name,
+                &count.to_string(),
+                if count > 0 { meaning } else { "" },
+            ]);
+        }
+    }
+    table
+}
+
+fn times(summary: &Summary) -> Table {
+    let mut table = Table::new(&["", "p50", "p99", "p99.9", "max"]);
+    let mut row = |name: &str, times: &Percentiles| {
+        let show = |ns: u64| {
+            if times.count == 0 {
+                "-".to_owned()
+            } else {
+                duration::show(ns)
+            }
+        };
+        let [p50, p99, p99_9, max] =
+            [times.p50_ns, times.p99_ns, times.p99_9_ns, times.max_ns].map(show);
+        table.row([name, &p50, &p99, &p99_9, &max]);
+    };
+    row("wake-up lateness", &summary.wake_up_lateness);
+    row("round trip", &summary.round_trip);
+    row("work a cycle", &summary.work);
+    if let Some(phase) = &summary.dc_phase_error {
+        row("DC phase error", phase);
+    }
+    table
+}
+
+/// Formats CPU time and page faults of the real-time thread.
+fn thread(thread: &ThreadSummary, cycles: u64) -> String {
+    let used = &thread.used;
+    let a_cycle = |n: u64| n as f64 / cycles.max(1) as f64;
+    let mut text = format!(
+        "\n  real-time thread: {:.1} % of its CPU, {} a cycle; {:.2} context switches a cycle, {} against its will; {} page faults{}\n",
+        thread.load_percent,
+        duration::show(a_cycle(used.cpu_ns).round() as u64),
+        a_cycle(used.voluntary_switches + used.involuntary_switches),
+        used.involuntary_switches,
+        used.minor_faults + used.major_faults,
+        match used.major_faults {
+            0 => String::new(),
+            n => format!(", {n} of them from disk"),
+        },
+    );
+    let slept = &thread.sleep_lateness;
+    if slept.count > 0 {
+        text += &format!(
+            "  sleeping ends late by {} (p50), {} (p99), {} (p99.9); {} are spun before a release\n",
+            duration::show(slept.p50_ns),
+            duration::show(slept.p99_ns),
+            duration::show(slept.p99_9_ns),
+            duration::show(thread.spin_ns),
+        );
+    }
+    text
+}
+
+/// One row per port with errors.
+fn errors(devices: &[DeviceErrors]) -> Table {
+    let mut table = Table::new(&[
+        "SubDevice",
+        "port",
+        "invalid frames",
+        "receive errors",
+        "found bad before",
+        "lost links",
+    ]);
+    for device in devices {
+        for port in 0..4 {
+            let of_port = [
+                device.invalid_frames,
+                device.rx_errors,
+                device.forwarded,
+                device.lost_links,
+            ]
+            .map(|counters| counters[port]);
+            if of_port != [0; 4] {
+                let [invalid, rx, forwarded, lost] = of_port.map(|n| n.to_string());
+                table.row([
+                    &device.name,
+                    &port.to_string(),
+                    &invalid,
+                    &rx,
+                    &forwarded,
+                    &lost,
+                ]);
+            }
+        }
+        for (what, count) in [("unit", device.processing_unit), ("PDI", device.pdi)] {
+            if count > 0 {
+                table.row([&device.name, what, &count.to_string(), "", "", ""]);
+            }
+        }
+    }
+    table
+}
+
+/// Formats the last events before the end, with their times.
+fn events(events: &[EventLine]) -> String {
+    const SHOWN: usize = 12;
+    let mut table = Table::new(&["time", "cycle", "what the cycle noticed last"]);
+    for event in &events[events.len().saturating_sub(SHOWN)..] {
+        let cycles = if event.first_cycle == event.last_cycle {
+            event.first_cycle.to_string()
+        } else {
+            format!("{}-{}", event.first_cycle, event.last_cycle)
+        };
+        table.row([&format!("{:.3} s", event.at_s), &cycles, &event.what]);
+    }
+    table.shown(2)
+}
+
+fn axes(axes: &[AxisSummary]) -> Table {
+    let mut table = Table::new(&[
+        "axis",
+        "mode",
+        "target",
+        "final position",
+        "off by",
+        "largest following error",
+        "state",
+    ]);
+    for axis in axes {
+        let unit = &axis.unit;
+        let position = |x: f64| format!("{:.4} {unit}", positive_zero(x));
+        let cyclic_position = axis.mode == "csp" && axis.was_enabled;
+        let heard = axis.last_heard_s.is_none();
+        let only = |show: bool, text: String| if show { text } else { "-".to_owned() };
+        let off = match axis.final_error_counts {
+            Some(1) if heard => "1 count".to_owned(),
+            Some(n) if heard => format!("{n} counts"),
+            _ => "-".to_owned(),
+        };
+        table.row([
+            &axis.name,
+            &axis.mode,
+            &only(
+                cyclic_position,
+                position(axis.target_place.unwrap_or(axis.target_position)),
+            ),
+            &only(
+                axis.was_enabled && heard,
+                position(axis.final_place.unwrap_or(axis.final_position)),
+            ),
+            &off,
+            &only(cyclic_position, position(axis.largest_following_error)),
+            &match axis.last_heard_s {
+                Some(at_s) => format!("not heard since {}", seconds(at_s)),
+                None => axis.final_state.clone(),
+            },
+        ]);
+    }
+    table
+}
+
+/// Replaces negative zero, which would print as `-0.0000`.
+fn positive_zero(x: f64) -> f64 {
+    if x.abs() < 0.000_05 { 0.0 } else { x }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecaxis_master::session::EmergencyLine;
+
+    use super::*;
+
+    fn sample() -> Summary {
+        let times = Percentiles {
+            count: 9,
+            p50_ns: 120,
+            p99_ns: 1500,
+            p99_9_ns: 2000,
+            max_ns: 2_000_000,
+        };
+        Summary {
+            machine: "m.toml".into(),
+            devices: 1,
+            time: "virtual",
+            cycle_ns: 1_000_000,
+            machine_seconds: 12.5,
+            program_runs: 2,
+            interrupted: false,
+            counters: ecaxis_master::rt::stats::Counters {
+                cycles: 12_500,
+                lost_frames: 1,
+                ..Default::default()
+            },
+            link: ecaxis_master::link::LinkStats::default(),
+            wake_up_lateness: times,
+            round_trip: times,
+            dc_phase_error: Some(times),
+            work: Percentiles::default(),
+            thread: None,
+            axes: vec![AxisSummary {
+                name: "x".into(),
+                unit: "mm".into(),
+                mode: "csp".into(),
+                was_enabled: true,
+                final_position: -0.000_01,
+                target_position: 0.0,
+                final_place: None,
+                target_place: None,
+                final_error_counts: Some(0),
+                largest_following_error: 0.1234,
+                final_state: "Switch on disabled".into(),
+                last_heard_s: None,
+                fault: None,
+                trip: None,
+            }],
+            probes: vec![ecaxis_master::session::ProbeCapture {
+                step: "3".into(),
+                axis: "x".into(),
+                input: 2,
+                edge: "falling",
+                times: 3,
+                position: 725.0,
+                place: Some(5.0),
+                unit: "deg".into(),
+            }],
+            errors: vec![DeviceErrors {
+                name: "x".into(),
+                invalid_frames: [0, 3, 0, 0],
+                rx_errors: [0, 4, 0, 0],
+                forwarded: [0; 4],
+                lost_links: [0, 1, 0, 0],
+                processing_unit: 0,
+                pdi: 0,
+            }],
+            emergencies: vec![EmergencyLine {
+                device: "x".into(),
+                at_s: -0.25,
+                dc_time_ns: None,
+                code: 0x8611,
+                text: "following error".into(),
+                register: 0x20,
+                data: [1, 2, 3, 4, 0xff],
+            }],
+            more_emergencies: 2,
+            events: vec![
+                EventLine {
+                    at_s: 1.25,
+                    first_cycle: 1250,
+                    last_cycle: 1252,
+                    what: "frames were not back before the deadline".into(),
+                    failure: false,
+                },
+                EventLine {
+                    at_s: 1.252,
+                    first_cycle: 1252,
+                    last_cycle: 1252,
+                    what: "stop: 3 cycles in a row without a valid answer".into(),
+                    failure: true,
+                },
+            ],
+            group_stops: vec![ecaxis_master::session::GroupStop {
+                group: "gantry".into(),
+                cause: "`x`: drive fault".into(),
+                released: true,
+            }],
+            recorded_frames: Some(7),
+            recorded_frames_dropped: Some(0),
+        }
+    }
+
+    #[test]
+    fn summary_prints_all_figures() {
+        let expected = "\
+m.toml: 1 SubDevice, 12.500 s in virtual time, 2 complete runs of the program
+
+  cycles                  12500  of 1 ms
+  lost frames             1      not back before the deadline
+  late frames             0
+  working-counter errors  0
+
+                    p50     p99     p99.9  max
+  wake-up lateness  120 ns  1.5 µs  2 µs   2 ms
+  round trip        120 ns  1.5 µs  2 µs   2 ms
+  work a cycle      -       -       -      -
+  DC phase error    120 ns  1.5 µs  2 µs   2 ms
+
+  axis  mode  target     final position  off by    largest following error  state
+  x     csp   0.0000 mm  0.0000 mm       0 counts  0.1234 mm                Switch on disabled
+  group `gantry` stopped, reset since: `x`: drive fault
+
+  step 3: `x`: falling edge of input 2 at 5.0000 deg (the last of 3)
+
+  SubDevice  port  invalid frames  receive errors  found bad before  lost links
+  x          1     3               4               0                 1
+
+  time      device  emergency  register  data            what
+  -0.250 s  x       0x8611     0x20      01 02 03 04 ff  following error
+  2 more emergencies are not kept
+
+  time     cycle      what the cycle noticed last
+  1.250 s  1250-1252  frames were not back before the deadline
+  1.252 s  1252       stop: 3 cycles in a row without a valid answer
+
+  7 frames recorded
+";
+        assert_eq!(summary(&sample()), expected);
+    }
+
+    #[test]
+    fn summary_shows_when_an_axis_was_last_heard() {
+        let mut summary = sample();
+        summary.axes[0].last_heard_s = Some(0.908);
+        let text = self::summary(&summary);
+        let line = text.lines().find(|line| line.starts_with("  x ")).unwrap();
+        let cells: Vec<&str> = line
+            .split("  ")
+            .map(str::trim)
+            .filter(|c| !c.is_empty())
+            .collect();
+        let expected = [
+            "x",
+            "csp",
+            "0.0000 mm",
+            "-",
+            "-",
+            "0.1234 mm",
+            "not heard since 0.908 s",
+        ];
+        assert_eq!(cells, expected);
+    }
+
+    #[test]
+    fn summary_prints_thread_figures() {
+        let thread = ThreadSummary {
+            used: ecaxis_master::sys::process::ThreadUsage {
+                cpu_ns: 625_000_000,
+                minor_faults: 3,
+                major_faults: 1,
+                voluntary_switches: 12_500,
+                involuntary_switches: 125,
+            },
+            load_percent: 5.0,
+            sleep_lateness: sample().wake_up_lateness,
+            spin_ns: 34_000,
+        };
+        let summary = Summary {
+            thread: Some(thread),
+            ..sample()
+        };
+        let expected = "
+  real-time thread: 5.0 % of its CPU, 50 µs a cycle; 1.01 context switches a cycle, 125 against its will; 4 page faults, 1 of them from disk
+  sleeping ends late by 120 ns (p50), 1.5 µs (p99), 2 µs (p99.9); 34 µs are spun before a release
+";
+        assert!(self::summary(&summary).contains(expected));
+    }
+}

@@ -1,0 +1,147 @@
+//! `ecaxis analyze`: reports on a recording as text, JSON, or HTML with plots of the axes.
+
+use std::path::{Path, PathBuf};
+
+use ecaxis_master::text::pluralize;
+use ecaxis_master::{config, recording};
+use ecaxis_tools::analyze::{self as analysis, Context, DeviceReport};
+
+use crate::args::files;
+use crate::args::files::unwritable;
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::note;
+use crate::render::result;
+
+mod text;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis analyze run.pcapng                        the report on one page
+  ecaxis analyze run.pcapng --all                  every event and transfer
+  ecaxis analyze run.pcapng --machine m.toml       with its names and units
+  ecaxis analyze run.pcapng --html report.html     with pictures of each axis
+  ecaxis analyze other.pcap --esi esi/ --json      from any MainDevice, as JSON
+  ecaxis analyze night.pcapng night.0*.pcapng      parts of one recording
+
+Reads pcap and pcapng of any MainDevice: `ecaxis run --record`, Wireshark,
+tcpdump. A file that is cut or damaged is read as far as it can be.
+Exit code: 0 read, 1 there is no EtherCAT in it, 2 it cannot be opened.";
+
+/// Analyze a recording: devices, states, SDO transfers, cycle, clocks, axes
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Recording (pcap or pcapng), or all its parts
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+    /// Take names, process data and units from this machine file
+    #[arg(long, value_name = "FILE")]
+    machine: Option<PathBuf>,
+    /// Take names and default process data from this ESI file or folder
+    #[arg(long, value_name = "PATH")]
+    esi: Option<PathBuf>,
+    /// Use only this interface of the recording
+    #[arg(long, value_name = "N")]
+    interface: Option<u32>,
+    /// Print every event, transfer and SyncManager
+    #[arg(long)]
+    all: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+    /// Write an HTML report with plots of the axes to this file
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    if let Some(path) = &args.html {
+        let recordings = args.files.iter().map(|file| (file, "a recording to read"));
+        let machine = args.machine.iter().map(|file| (file, "the machine file"));
+        let esi = args.esi.iter().map(|file| (file, "the ESI file"));
+        let inputs = recordings.chain(machine).chain(esi);
+        let inputs = inputs.map(|(file, what)| (file.as_path(), what));
+        files::may_replace("--html", path, &files::PAGE, inputs)?;
+    }
+    let (known, expected) = known(args)?;
+    let mut parts = Vec::new();
+    for path in &args.files {
+        let mut reader = recording::open(path).map_err(|e| {
+            let message = format!("cannot open {}: {e}", path.display());
+            Failure::new(hints::WRONG, message)
+        })?;
+        let begins = reader.peek().and_then(|packet| packet.at);
+        parts.push((path, reader, begins));
+    }
+    // Sort by time, because the shell may have sorted by name.
+    parts.sort_by_cached_key(|(_, _, begins)| *begins);
+    let shown = parts.first().map_or(Path::new(""), |(path, ..)| path);
+    let name = shown
+        .file_name()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
+    let readers = parts.into_iter().map(|(_, reader, _)| reader).collect();
+    let report = analysis::analyze(readers, args.interface, known);
+    if let Some((file, names)) = &expected
+        && let Some(odd) = other_machine(names, &report.devices)
+    {
+        note(&format!("note: {}: {odd}", file.display()));
+    }
+    if let Some(path) = &args.html {
+        std::fs::write(path, analysis::html(&name, &report)).map_err(|e| unwritable(path, &e))?;
+        note(&format!("written: {}", path.display()));
+    }
+    let text = if args.json {
+        let json = serde_json::to_string_pretty(&report);
+        json.map_err(|e| Failure::new(hints::FAILED, format!("cannot write the result: {e}")))?
+            + "\n"
+    } else {
+        text::page(&name, &report, args.all)
+    };
+    result(&text)?;
+    if report.file.ethercat_frames == 0 {
+        let failure = Failure::new(hints::FAILED, format!("there is no EtherCAT in {name}"));
+        return Err(hints::no_ethercat(failure, args.interface.is_some()));
+    }
+    Ok(())
+}
+
+/// A machine file and the names of its devices.
+type Expected<'a> = (&'a Path, Vec<String>);
+
+/// Returns a warning if the machine file does not match the recorded machine. Devices get names
+/// only if position and product match.
+fn other_machine(names: &[String], devices: &[DeviceReport]) -> Option<String> {
+    let known = |device: &&DeviceReport| {
+        let name = device.name.as_ref();
+        name.is_some_and(|name| names.contains(name))
+    };
+    let fitting = devices.iter().filter(known).count();
+    if fitting == devices.len() && fitting == names.len() {
+        return None;
+    }
+    Some(format!(
+        "of its {}, {fitting} fit the recording, which shows {}: is it of this machine?",
+        pluralize(names.len(), "device"),
+        devices.len()
+    ))
+}
+
+fn known(args: &Args) -> Result<(Context, Option<Expected<'_>>), Failure> {
+    let mut known = Context::default();
+    let mut expected = None;
+    if let Some(file) = &args.machine {
+        let machine = config::load(file).map_err(|e| hints::config(file, &e))?;
+        known = known.with_machine(&machine);
+        let names = machine.devices.into_iter().map(|device| device.name);
+        expected = Some((file.as_path(), names.collect()));
+    }
+    if let Some(path) = &args.esi {
+        let library = analysis::library(path)
+            .map_err(|e| Failure::new(hints::WRONG, format!("--esi: {e}")))?;
+        known = known.with_library(library);
+    }
+    Ok((known, expected))
+}

@@ -1,0 +1,121 @@
+//! `ecaxis check`: checks a machine file and its ESI files, without a bus.
+
+use std::path::{Path, PathBuf};
+
+use ecaxis_master::config::{self, ConfigError, Machine, duration};
+use ecaxis_master::text::pluralize;
+use serde_json::json;
+
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::page;
+use crate::render::result;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis check machine.toml
+  ecaxis check machine.toml --json          for an editor or a script";
+
+/// Check a machine file against its ESI files, without a bus
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Machine file
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let loaded = config::load(&args.file);
+    let text = match &loaded {
+        _ if args.json => format!("{:#}\n", as_json(&args.file, &loaded)),
+        Ok(machine) => summary(machine),
+        Err(_) => String::new(),
+    };
+    let written = if args.json {
+        result(&text)
+    } else {
+        page(&text)
+    };
+    loaded.map_err(|e| hints::config(&args.file, &e))?;
+    written
+}
+
+fn as_json(path: &Path, loaded: &Result<Machine, ConfigError>) -> serde_json::Value {
+    match loaded {
+        Ok(machine) => json!({
+            "ok": true, "error": null, "devices": machine.devices.len(), "problems": [],
+        }),
+        Err(e) => json!({ "ok": false, "error": in_short(path, e), "problems": problems(e) }),
+    }
+}
+
+/// Returns the error in one line, without the list from [`problems`].
+pub(crate) fn in_short(path: &Path, error: &ConfigError) -> String {
+    match error {
+        ConfigError::Problems(problems) if problems.len() == 1 => {
+            format!("1 problem in {}", path.display())
+        }
+        ConfigError::Problems(problems) => {
+            format!("{} problems in {}", problems.len(), path.display())
+        }
+        ConfigError::Io { .. } | ConfigError::NotText { .. } => error.to_string(),
+    }
+}
+
+/// Returns the problems of a machine file as JSON.
+pub(crate) fn problems(error: &ConfigError) -> serde_json::Value {
+    let problems = match error {
+        ConfigError::Problems(problems) => problems.as_slice(),
+        ConfigError::Io { .. } | ConfigError::NotText { .. } => &[],
+    };
+    let each = problems.iter().map(|p| {
+        json!({
+            "file": p.path.display().to_string(),
+            "line": p.line,
+            "column": p.column,
+            "width": p.width,
+            "message": p.message,
+            "hint": p.hint,
+        })
+    });
+    each.collect()
+}
+
+fn summary(machine: &Machine) -> String {
+    let mut text = format!(
+        "{}: {}, cycle {}, {}\n",
+        machine.path.display(),
+        pluralize(machine.devices.len(), "device"),
+        duration::show(machine.bus.cycle_ns),
+        pluralize(machine.steps.len(), "step"),
+    );
+    for device in &machine.devices {
+        let selection = &device.selection;
+        let mode = selection.mode.map_or("I/O".to_owned(), |m| m.to_string());
+        text += &format!(
+            "  {} at {}: {}, {mode}, {} out, {} in\n",
+            device.name,
+            device.at,
+            selection.device_name,
+            pluralize(selection.layout.rx_bytes(), "byte"),
+            selection.layout.tx_bytes(),
+        );
+        for note in &selection.notes {
+            text += &format!("    note: {note}\n");
+        }
+        for warning in &device.esi.warnings {
+            text += &format!(
+                "    {}:{} {}: {}\n",
+                device.esi_path.display(),
+                warning.position,
+                warning.path,
+                warning.message,
+            );
+        }
+    }
+    text + "no problems\n"
+}

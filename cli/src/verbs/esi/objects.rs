@@ -1,0 +1,186 @@
+//! `ecaxis esi objects`: shows the object dictionary of a device.
+
+use ecaxis_esi::{
+    Bytes, Dictionary, Mode, ObjectItem, PdoMapping, SelectOptions, Writable, address, select,
+};
+use serde_json::json;
+
+use super::DeviceArgs;
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::report::Table;
+use crate::render::result;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi objects f.xml --device EPOS4
+  ecaxis esi objects f.xml --mode csp       with the objects of a module
+  ecaxis esi objects f.xml --json           for a script";
+
+/// Show the object dictionary: types, access, defaults, ranges, PDO mapping
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    which: DeviceArgs,
+    /// Include the objects of this mode's module: pp, pv, hm, csp, csv, cst
+    #[arg(long, value_parser = super::mode)]
+    mode: Option<Mode>,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let file = args.which.load()?;
+    let device = args.which.device(&file)?;
+    let choice = SelectOptions {
+        mode: args.mode,
+        cycle_ns: 1_000_000,
+        ..SelectOptions::default()
+    };
+    // If the default configuration is invalid, use the device's own objects.
+    let dictionary = match (select(&file, device, &choice), args.mode) {
+        (Ok(selection), _) => selection.dictionary,
+        (Err(error), Some(_)) => return Err(Failure::new(hints::WRONG, error.to_string())),
+        (Err(_), None) => device.dictionary.clone(),
+    };
+    if dictionary.objects.is_empty() && !args.json {
+        let message = format!("the ESI of {} has no object dictionary", device.name);
+        return Err(Failure::new(hints::WRONG, message)
+            .hint("`ecaxis esi show` has the objects in its PDOs"));
+    }
+    result(&listed(&dictionary, args.json))
+}
+
+/// Formats every subindex as a table or as JSON.
+pub(crate) fn listed(dictionary: &Dictionary, json: bool) -> String {
+    let mut table = Table::new(&[
+        "object", "type", "bits", "access", "PDO", "default", "min", "max", "name",
+    ]);
+    let mut all = Vec::new();
+    for object in &dictionary.objects {
+        for item in &object.items {
+            let name = if object.items.len() > 1 && item.sub > 0 {
+                format!("  {}", item.name)
+            } else {
+                object.name.to_string()
+            };
+            let index = address(object.index, item.sub).to_string();
+            let shown = |bytes: &[u8]| value(&item.type_name, bytes);
+            let default = if item.has_default {
+                shown(&item.default)
+            } else {
+                String::new()
+            };
+            let edge = |bytes: &Option<Bytes>| bytes.as_deref().map_or_else(String::new, shown);
+            let (min, max) = (edge(&item.min), edge(&item.max));
+            all.push(json!({
+                "index": object.index, "sub": item.sub, "name": &*item.name, "object": &*object.name,
+                "type": &*item.type_name, "bits": item.bit_len, "access": access(item),
+                "pdo": mapping(item.pdo_mapping), "default": default, "min": min, "max": max,
+            }));
+            table.row([
+                &index,
+                &item.type_name,
+                &item.bit_len.to_string(),
+                &access(item),
+                mapping(item.pdo_mapping),
+                &default,
+                &min,
+                &max,
+                &name,
+            ]);
+        }
+    }
+    if json {
+        return format!("{:#}\n", serde_json::Value::Array(all));
+    }
+    table.shown(0) + "\n"
+}
+
+fn access(item: &ObjectItem) -> String {
+    let write = match item.access.write {
+        Writable::Never => "",
+        Writable::Always => "w",
+        Writable::Only {
+            pre_op: true,
+            safe_op: false,
+            op: false,
+        } => "w in PreOp",
+        Writable::Only { op: false, .. } => "w below Op",
+        Writable::Only { .. } => "w in some states",
+    };
+    match (item.access.read, write) {
+        (true, "") => "ro".to_owned(),
+        (true, write) => format!("r{write}"),
+        (false, "") => "none".to_owned(),
+        (false, write) => format!("{write}o"),
+    }
+}
+
+fn mapping(mapping: PdoMapping) -> &'static str {
+    match (mapping.rx, mapping.tx) {
+        (true, true) => "rx tx",
+        (true, false) => "rx",
+        (false, true) => "tx",
+        (false, false) => "",
+    }
+}
+
+/// Formats numbers by type, text as text, everything else as bytes.
+fn value(type_name: &str, bytes: &[u8]) -> String {
+    if type_name.contains("STRING") && !type_name.contains("OCTET") {
+        let text = String::from_utf8_lossy(bytes);
+        return format!("{:?}", text.trim_end_matches('\0'));
+    }
+    let signed = matches!(type_name, "SINT" | "INT" | "DINT" | "LINT");
+    let float = type_name == "REAL";
+    let mut wide = [0_u8; 8];
+    match (bytes.len(), wide.get_mut(..bytes.len())) {
+        (1..=8, Some(low)) => low.copy_from_slice(bytes),
+        _ => {
+            let hex: Vec<String> = bytes.iter().take(8).map(|b| format!("{b:02x}")).collect();
+            let more = if bytes.len() > 8 { " …" } else { "" };
+            return hex.join(" ") + more;
+        }
+    }
+    let raw = u64::from_le_bytes(wide);
+    if float {
+        return f32::from_bits(raw as u32).to_string();
+    }
+    if signed {
+        let unused = 64 - 8 * bytes.len() as u32;
+        return (raw.cast_signed() << unused >> unused).to_string();
+    }
+    if raw > 0xffff {
+        format!("0x{raw:x}")
+    } else {
+        raw.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn value_formats_bytes_by_type() {
+        for (type_name, bytes, text) in [
+            ("USINT", &[200][..], "200"),
+            ("SINT", &[0xfd], "-3"),
+            ("DINT", &[0xfe, 0xff, 0xff, 0xff], "-2"),
+            ("UDINT", &[0, 0, 1, 0], "0x10000"),
+            ("REAL", &[0, 0, 0xc0, 0x3f], "1.5"),
+            ("STRING(5)", b"EPOS4", "\"EPOS4\""),
+            (
+                "ARRAY [0..9] OF BYTE",
+                &[1; 10],
+                "01 01 01 01 01 01 01 01 …",
+            ),
+            ("LREAL", &[], ""),
+        ] {
+            assert_eq!(value(type_name, bytes), text, "{type_name}");
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! `ecaxis esi show`: shows a device.
+//!
+//! `head` shows the identity, `offers` the options, `chosen` one configuration; `as_json` formats
+//! all as JSON.
+
+use std::fmt::Write;
+
+use ecaxis_esi::{EsiFile, Mode, SelectError, SelectOptions, offered_modes, select};
+use ecaxis_master::config::duration;
+use ecaxis_master::text::pluralize;
+
+use super::DeviceArgs;
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::note;
+use crate::render::page;
+use crate::render::report::Table;
+use crate::render::result;
+
+mod as_json;
+mod chosen;
+mod head;
+mod offers;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis esi show f.xml                     list the devices
+  ecaxis esi show f.xml --device EPOS4      one device
+  ecaxis esi show f.xml --device EPOS4 --mode csp --cycle 2ms
+  ecaxis esi show f.xml --device 2 --modules CSP,- --json";
+
+/// Show a device: identity, modes, PDOs, SyncManagers, clocks, start-up SDOs
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    which: DeviceArgs,
+    /// Use this mode: pp, pv, hm, csp, csv, cst [default: the device's default mode]
+    #[arg(long, value_parser = super::mode)]
+    mode: Option<Mode>,
+    /// Modules by slot, `-` for an empty slot
+    #[arg(long, value_delimiter = ',', value_name = "MODULE,…")]
+    modules: Vec<String>,
+    /// PDO assignment by name
+    #[arg(long, value_name = "NAME")]
+    assignment: Option<String>,
+    /// Clock mode by name, or `off`
+    #[arg(long, value_name = "NAME")]
+    dc: Option<String>,
+    /// Bus cycle time
+    #[arg(long, default_value = "1ms", value_parser = duration::parse)]
+    cycle: u64,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let file = args.which.load()?;
+    // Without a selection, a file with several products is shown as a list.
+    let one_product = file
+        .devices
+        .windows(2)
+        .all(|pair| pair[0].identity.product == pair[1].identity.product);
+    if !args.which.says_which() && (file.devices.is_empty() || !one_product) {
+        if args.json {
+            return result(&as_json::devices(&file));
+        }
+        let mut out = String::new();
+        // Writing into a String cannot fail.
+        let _ = devices(&file, &mut out);
+        return page(&out);
+    }
+    let device = args.which.device(&file)?;
+    let modules: Vec<&str> = args.modules.iter().map(String::as_str).collect();
+    let choice = SelectOptions {
+        mode: args.mode,
+        modules: &modules,
+        assignment: args.assignment.as_deref(),
+        dc_mode: args.dc.as_deref(),
+        cycle_ns: args.cycle,
+        ..SelectOptions::default()
+    };
+    let chosen = args.mode.is_some()
+        || !modules.is_empty()
+        || args.assignment.is_some()
+        || args.dc.is_some();
+    let selection = match select(&file, device, &choice) {
+        Err(error) if chosen => {
+            let failure = Failure::new(hints::WRONG, error.to_string());
+            return Err(
+                failure.hint("`ecaxis esi show` without the choice lists what there is to choose")
+            );
+        }
+        other => other,
+    };
+    if args.json {
+        return result(&as_json::device(&file, device, &choice, &selection));
+    }
+    let mut out = String::new();
+    let _ = head::write(&file, device, &mut out);
+    let mailbox = device.mailbox.as_ref();
+    let soe_alone = mailbox.is_some_and(|mailbox| mailbox.soe && mailbox.coe.is_none());
+    if soe_alone {
+        let _ = writeln!(
+            out,
+            "\nnot usable: it speaks SoE and not CoE; IDNs set what its process data contains, and ecaxis does not \
+             speak SoE"
+        );
+    }
+    let _ = offers::write(&file, device, &choice, &mut out);
+    match &selection {
+        Ok(selection) if !soe_alone => {
+            let _ = chosen::write(device, selection, &choice, &mut out);
+        }
+        Err(error) if !soe_alone => {
+            let _ = writeln!(out, "\nno default configuration: {error}");
+            if matches!(error, SelectError::ModuleNeeded { .. }) {
+                note("help: `--modules` takes one module for each slot, `-` for none");
+            }
+        }
+        _ => {}
+    }
+    page(&out)
+}
+
+fn devices(file: &EsiFile, out: &mut String) -> std::fmt::Result {
+    writeln!(
+        out,
+        "{} (0x{:08x}): {}, {}\n",
+        file.vendor.name,
+        file.vendor.id,
+        pluralize(file.devices.len(), "device"),
+        pluralize(file.modules.len(), "module"),
+    )?;
+    if file.devices.is_empty() {
+        return modules(file, out);
+    }
+    let head = ["type", "product", "revision", "modes", "mailbox", "name"];
+    let mut table = Table::new(&head);
+    for device in &file.devices {
+        let modes: Vec<String> = offered_modes(file, device)
+            .iter()
+            .map(Mode::to_string)
+            .collect();
+        table.row([
+            &device.type_name,
+            &format!("0x{:08x}", device.identity.product),
+            &format!("0x{:08x}", device.identity.revision),
+            &modes.join(" "),
+            &device
+                .mailbox
+                .as_ref()
+                .map_or_else(String::new, head::protocols),
+            &device.name,
+        ]);
+    }
+    writeln!(out, "{}", table.shown(0))?;
+    writeln!(out, "\n`--device TYPE` shows one of them.")
+}
+
+/// Shows a file that only contains modules for devices of another file.
+fn modules(file: &EsiFile, out: &mut String) -> std::fmt::Result {
+    let mut table = Table::new(&["module", "identity", "PDOs", "name"]);
+    for module in &file.modules {
+        let pdos = module.rx_pdos.iter().chain(&module.tx_pdos);
+        let pdos: Vec<String> = pdos.map(|pdo| format!("0x{:04x}", pdo.index)).collect();
+        table.row([
+            &module.type_name,
+            &format!("0x{:08x}", module.ident),
+            &pdos.join(" "),
+            &module.name,
+        ]);
+    }
+    writeln!(out, "{}", table.shown(0))
+}

@@ -1,0 +1,48 @@
+//! `ecaxis firmware info`: identity, running software and update methods of a device.
+
+use ecaxis_tools::firmware;
+
+use super::show;
+use super::target::DeviceArgs;
+use crate::args::bus;
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::result;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis firmware info m.toml x
+  ecaxis firmware info --nic enp3s0 --position 0 --json";
+
+const USAGE: &str = "\
+ecaxis firmware info [OPTIONS] <MACHINE> <DEVICE>
+       ecaxis firmware info [OPTIONS] --nic <IF> --position <N>";
+
+/// Show the software of a device and its update methods; changes nothing
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, override_usage = USAGE)]
+pub(crate) struct Args {
+    /// Machine file and the device's name in it, or neither
+    #[arg(value_names = ["MACHINE", "DEVICE"], num_args = 0..=2)]
+    words: Vec<String>,
+    #[command(flatten)]
+    at: DeviceArgs,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let target = args.at.target(&args.words, None)?;
+    let (which, name, nic) = (target.which, target.name.clone(), target.nic());
+    let found = target.visit(async move |wire, others| {
+        bus::warn_foreign_frames(others);
+        firmware::examine(&wire, which, &name).await
+    })?;
+    let examined = found.map_err(|error| hints::firmware(&error, &nic))?;
+    result(&if args.json {
+        format!("{:#}\n", show::as_json(&examined))
+    } else {
+        show::info(&examined)
+    })
+}

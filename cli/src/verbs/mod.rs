@@ -1,0 +1,81 @@
+//! The subcommands.
+
+use clap::Subcommand;
+
+use crate::args::Verbosity;
+use crate::hints::Failure;
+
+mod analyze;
+mod bench;
+mod check;
+mod compare;
+mod completions;
+mod doctor;
+mod eeprom;
+pub(crate) mod esi;
+mod explain;
+mod firmware;
+pub(crate) mod jog;
+mod man;
+mod run;
+mod scan;
+mod sdo;
+mod sim;
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Verb {
+    Run(run::Args),
+    Check(check::Args),
+    Explain(explain::Args),
+    Scan(scan::Args),
+    Compare(compare::Args),
+    Sdo(sdo::Args),
+    Eeprom(eeprom::Args),
+    Esi(esi::Args),
+    Sim(sim::Args),
+    Doctor(doctor::Args),
+    Bench(bench::Args),
+    Analyze(analyze::Args),
+    Firmware(firmware::Args),
+    Jog(jog::Args),
+    Completions(completions::Args),
+    Man(man::Args),
+}
+
+impl Verb {
+    /// Returns the log options of a subcommand that logs.
+    pub fn verbosity(&self) -> Option<&Verbosity> {
+        match self {
+            Self::Run(args) => Some(&args.verbosity),
+            Self::Scan(args) => Some(&args.verbosity),
+            Self::Compare(args) => Some(&args.verbosity),
+            Self::Sdo(args) => Some(&args.verbosity),
+            Self::Eeprom(args) => Some(&args.verbosity),
+            Self::Sim(args) => Some(&args.verbosity),
+            Self::Bench(args) => Some(&args.verbosity),
+            Self::Firmware(args) => Some(&args.verbosity),
+            _ => None,
+        }
+    }
+
+    pub fn run(self) -> Result<(), Failure> {
+        match self {
+            Self::Run(args) => run::run(&args),
+            Self::Check(args) => check::run(&args),
+            Self::Explain(args) => explain::run(&args),
+            Self::Scan(args) => scan::run(&args),
+            Self::Compare(args) => compare::run(&args),
+            Self::Sdo(args) => sdo::run(&args),
+            Self::Eeprom(args) => eeprom::run(&args),
+            Self::Esi(args) => esi::run(&args),
+            Self::Sim(args) => sim::run(&args),
+            Self::Doctor(args) => doctor::run(&args),
+            Self::Bench(args) => bench::run(&args),
+            Self::Firmware(args) => firmware::run(&args),
+            Self::Jog(args) => jog::run(&args),
+            Self::Completions(args) => completions::run(&args),
+            Self::Man(args) => man::run(&args),
+            Self::Analyze(args) => analyze::run(&args),
+        }
+    }
+}

@@ -1,0 +1,386 @@
+//! `ecaxis run`: brings a machine up, runs its program and prints a summary.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use ecaxis_master::clock::Clock;
+use ecaxis_master::config::{self, ConfigError, Machine, Nic, duration};
+use ecaxis_master::post_mortem::FaultReport;
+use ecaxis_master::session::{self, Options, Outcome, Summary};
+use ecaxis_sim::FaultScript;
+use serde_json::{Value, json};
+
+use crate::args::files;
+use crate::args::record;
+use crate::args::signals;
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::fault_report::{self, ReportDestination};
+use crate::render::note;
+use crate::render::page;
+use crate::render::progress::ProgressPrinter;
+use crate::render::report;
+use crate::render::result;
+use crate::verbs::check;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis run                                the demonstration, simulated
+  ecaxis run m.toml --sim --virtual         in virtual time
+  ecaxis run m.toml --nic enp3s0 --for 1h   for an hour on a real bus
+  ecaxis run m.toml --record bus.pcapng     record all frames for Wireshark
+  ecaxis run m.toml --sim --faults f.toml   with a fault script
+  ecaxis run m.toml --no-enable             to Op, axes without power
+  ecaxis run m.toml --json                  the result as JSON
+
+Ctrl-C, SIGTERM, or a terminal that closes: the axes decelerate within their
+limits, lose power, and the bus goes back to Init; the exit code is 130. Ctrl-Z
+is ignored.";
+
+/// Bring a machine up, run its program, and show what the bus and the axes did
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Machine file
+    #[arg(value_name = "FILE", default_value = "configs/demo.toml")]
+    file: PathBuf,
+    /// Use this network interface instead of the file's
+    #[arg(long, value_name = "IF", conflicts_with = "sim")]
+    nic: Option<String>,
+    /// Use the simulated bus instead of the file's interface
+    #[arg(long)]
+    sim: bool,
+    /// Run in virtual time: as fast as possible, the same every time (simulated bus only)
+    #[arg(long = "virtual")]
+    virtual_time: bool,
+    /// Repeat the program for this time, such as 10s or 1h
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse, allow_hyphen_values = true)]
+    time: Option<u64>,
+    /// Run the program this many times instead of the file's `repeat`
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), allow_hyphen_values = true)]
+    repeat: Option<u32>,
+    /// Seed of the simulated bus
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Fault script for the simulated bus
+    #[arg(long, value_name = "FILE")]
+    faults: Option<PathBuf>,
+    /// Bring the bus to Op without enabling the axes, until Ctrl-C or the end of `--for`
+    #[arg(long, conflicts_with = "enable")]
+    no_enable: bool,
+    /// Enable the axes even if the file has `enable = false`
+    #[arg(long)]
+    enable: bool,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+    /// Record all frames to this pcapng file
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Limit the recording to this size, such as 100MB; keep the beginning and the newest frames,
+    /// in parts
+    #[arg(long, value_name = "SIZE", requires = "record", value_parser = record::size)]
+    record_limit: Option<u64>,
+    /// Replay this recording of a `--virtual` run instead of a bus, and report where this run
+    /// deviates
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["nic", "seed", "faults"])]
+    replay: Option<PathBuf>,
+    /// Write the fault report of a failed run to this file, and as JSON next to it [default:
+    /// ecaxis-stop-TIME.txt in the current folder, on a real bus only]
+    #[arg(long, alias = "story", value_name = "FILE")]
+    fault_report: Option<PathBuf>,
+    /// Write no fault report
+    #[arg(long, alias = "no-story", conflicts_with = "fault_report")]
+    no_fault_report: bool,
+    #[command(flatten)]
+    pub verbosity: crate::args::Verbosity,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let sim = args.sim || args.replay.is_some();
+    let machine = match load(&args.file, args.nic.as_deref(), sim) {
+        Ok(machine) => Machine {
+            enable: args.enable || machine.enable && !args.no_enable,
+            ..machine
+        },
+        Err(error) => {
+            let short = check::in_short(&args.file, &error);
+            let failure = hints::config(&args.file, &error);
+            print_failure(args, &short, &failure.hints, check::problems(&error));
+            return Err(failure);
+        }
+    };
+    let options = options(args, &machine)
+        .inspect_err(|f| print_failure(args, &f.message, &f.hints, json!([])))?;
+    if !machine.enable && !args.no_enable {
+        note(
+            "note: the file says `enable = false`: the axes get no power; `--enable` gives it to them",
+        );
+    }
+    let (nic, devices) = (machine.bus.nic.clone(), machine.devices.len());
+    let stop = Arc::new(AtomicBool::new(false));
+    signals::stop_on_interrupt(&stop);
+    let mut teller = ProgressPrinter::new(options.clock, &machine.bus, args.verbosity.plain());
+    let Outcome {
+        summary,
+        result: ended,
+        story,
+        ..
+    } = session::run(machine, options, stop, &mut teller);
+    drop(teller);
+
+    let mut failure = ended.err().map(|error| {
+        let mut failure = hints::run(&error, &nic);
+        if args.replay.is_some()
+            && let Some(hint) = hints::replayed(&error, devices)
+        {
+            failure.hints = vec![hint];
+        }
+        failure
+    });
+    failure = failure.or_else(|| summary.as_ref().and_then(unfinished));
+    if let (Some(story), Some(failure)) = (&story, &mut failure) {
+        print_fault_report(args, story, failure, &nic);
+    }
+    let text = if args.json {
+        let report = json!({
+            "ok": failure.is_none(),
+            "error": failure.as_ref().map(|f| &f.message),
+            "hints": failure.as_ref().map_or(&[][..], |f| &f.hints),
+            "problems": [],
+            "summary": summary,
+            "story": story,
+        });
+        format!("{report:#}\n")
+    } else {
+        summary.as_ref().map(report::summary).unwrap_or_default()
+    };
+    let written = if args.json {
+        result(&text)
+    } else {
+        page(&text)
+    };
+    failure.map_or(written, Err)
+}
+
+/// Returns what a run that ended without an error did not complete. A stopped group takes
+/// precedence over an interruption.
+pub(crate) fn unfinished(summary: &Summary) -> Option<Failure> {
+    let interrupted = summary.interrupted.then(Failure::interrupted);
+    stopped_since(summary).or(interrupted)
+}
+
+/// Returns a failure if an axis group stopped and was not reset.
+fn stopped_since(summary: &Summary) -> Option<Failure> {
+    let mut stopped = summary.group_stops.iter().filter(|stop| !stop.released);
+    let stop = stopped.next()?;
+    let others = match stopped.count() {
+        0 => String::new(),
+        n => format!(" (and {n} more)"),
+    };
+    let message = format!(
+        "the group `{}` has stopped and was not reset{others}: {}",
+        stop.group, stop.cause
+    );
+    let hint =
+        "fix the cause and run again; in a program, the steps `reset` and `enable` restart a group";
+    Some(Failure::new(hints::FAILED, message).hint(hint))
+}
+
+/// Prints the fault report in short on stderr and writes it to a file. If the cause is known, its
+/// advice replaces the advice for the error.
+fn print_fault_report(args: &Args, story: &FaultReport, failure: &mut Failure, nic: &Nic) {
+    let advice = hints::cause(&story.cause);
+    // The recorded bus cannot be fixed during a replay.
+    if !advice.is_empty() && args.replay.is_none() {
+        failure.hints = advice;
+    }
+    let short = fault_report::short(story);
+    if !short.is_empty() {
+        note(short.trim_end());
+    }
+    let keep = match (&args.fault_report, nic) {
+        _ if args.no_fault_report => ReportDestination::No,
+        (Some(path), _) => ReportDestination::File(path.clone()),
+        (None, Nic::Interface(_)) => ReportDestination::Folder(PathBuf::new()),
+        // A simulated run is repeatable, so its fault report is not kept.
+        (None, Nic::Sim) => ReportDestination::No,
+    };
+    match fault_report::keep(story, &failure.hints, &keep) {
+        Ok(Some(path)) => {
+            failure.after = Some(format!(
+                "  full fault report: {}, and as JSON next to it",
+                path.display()
+            ))
+        }
+        Ok(None) => {}
+        Err(trouble) => note(&format!("  warning: {}", trouble.message)),
+    }
+}
+
+/// Prints the failure as JSON if `--json` was given.
+fn print_failure(args: &Args, error: &str, hints: &[String], problems: Value) {
+    if args.json {
+        let report = json!({
+            "ok": false, "error": error, "hints": hints, "problems": problems, "summary": null,
+        });
+        // Ignored: the caller prints the failure on stderr and sets the exit code.
+        let _ = result(&format!("{report:#}\n"));
+    }
+}
+
+/// Loads a machine file. `nic` and `sim` override the bus of the file.
+pub(crate) fn load(file: &Path, nic: Option<&str>, sim: bool) -> Result<Machine, ConfigError> {
+    let mut machine = config::load(file)?;
+    if sim || nic == Some("sim") {
+        machine.bus.nic = Nic::Sim;
+    } else if let Some(nic) = nic {
+        machine.bus.nic = Nic::Interface(nic.to_owned());
+    }
+    Ok(machine)
+}
+
+fn options(args: &Args, machine: &Machine) -> Result<Options, Failure> {
+    if let Nic::Interface(nic) = &machine.bus.nic {
+        let needs_sim = [
+            (args.virtual_time, "--virtual"),
+            (args.faults.is_some(), "--faults"),
+            (args.seed.is_some(), "--seed"),
+        ];
+        if let Some((_, option)) = needs_sim.iter().find(|(given, _)| *given) {
+            let message = format!("{option} needs the simulated bus, the machine is on `{nic}`");
+            return Err(Failure::new(hints::WRONG, message).hint("add --sim"));
+        }
+    }
+    let virtual_time = args.virtual_time || args.replay.is_some();
+    let ends = machine.enable && !machine.steps.is_empty();
+    if virtual_time && !ends && args.time.is_none() {
+        let message = "--virtual without a program would never end";
+        return Err(Failure::new(hints::WRONG, message).hint("add `--for 10s` or a [[step]]"));
+    }
+    let script = args.faults.as_deref();
+    let faults = script.map(|path| faults(path, machine)).transpose()?;
+    if let Some(path) = &args.record {
+        record::check(path, machine, script)?;
+        if args.record_limit.is_some() {
+            record::check_parts(path)?;
+        }
+    }
+    if let Some(path) = &args.fault_report {
+        let data = path.with_extension("json");
+        if data == *path {
+            let message = format!(
+                "--fault-report: {} is the file of the JSON data",
+                path.display()
+            );
+            return Err(Failure::new(hints::WRONG, message).hint(
+                "name the page, such as `report.txt`; the JSON data are written next to it",
+            ));
+        }
+        files::may_replace("--fault-report", path, &files::STORY, [])?;
+        files::may_replace("--fault-report", &data, &files::STORY_DATA, [])?;
+    }
+    let seed = args.seed.or(faults.as_ref().and_then(|f| f.seed));
+    let defaults = Options::default();
+    Ok(Options {
+        clock: if virtual_time {
+            Clock::Virtual
+        } else {
+            Clock::Real
+        },
+        limit: args.time,
+        repeat: args.repeat,
+        seed: seed.unwrap_or(defaults.seed),
+        faults,
+        record: args.record.clone(),
+        record_limit: args.record_limit,
+        replay: args.replay.clone(),
+        enable: machine.enable,
+    })
+}
+
+/// The maximum size of a fault script in bytes.
+const MAX_BYTES: u64 = 16 << 20;
+
+/// Loads a fault script and checks it against the machine's simulated bus.
+pub(crate) fn faults(path: &Path, machine: &Machine) -> Result<FaultScript, Failure> {
+    let text = ecaxis_master::file::read_text(path, MAX_BYTES)
+        .map_err(|e| Failure::new(hints::WRONG, format!("cannot read {}: {e}", path.display())))?;
+    let bus = session::topology(machine).map_err(|e| hints::run(&e, &machine.bus.nic))?;
+    let script = FaultScript::parse(&text).and_then(|script| {
+        script.check(&bus)?;
+        Ok(script)
+    });
+    script.map_err(|e| Failure::new(hints::WRONG, format!("{}: {e}", path.display())))
+}
+
+#[cfg(test)]
+mod tests {
+    use ecaxis_master::session::{Observer, Progress};
+
+    use super::*;
+
+    struct QuietObserver;
+
+    impl Observer for QuietObserver {
+        fn progress(&mut self, _: &Progress) {}
+    }
+
+    fn printed(seed: u64) -> (String, String) {
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        let machine = config::load(&configs.join("demo.toml")).unwrap();
+        let options = Options {
+            clock: Clock::Virtual,
+            repeat: Some(1),
+            seed,
+            ..Options::default()
+        };
+        let outcome = session::run(machine, options, Arc::default(), &mut QuietObserver);
+        outcome.result.unwrap();
+        let summary = outcome.summary.unwrap();
+        (
+            report::summary(&summary),
+            serde_json::to_string(&summary).unwrap(),
+        )
+    }
+
+    fn refused(options: &[&str], machine: &str) -> Failure {
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            args: Args,
+        }
+        let line = ["run", "m.toml"].iter().chain(options);
+        let args = <Line as clap::Parser>::parse_from(line).args;
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        let demo = std::fs::read_to_string(configs.join("demo.toml")).unwrap();
+        let (head, _) = demo.split_once("[[step]]").unwrap();
+        let text = if machine == "demo" { &demo } else { head };
+        let machine = config::parse(&configs.join("demo.toml"), text).unwrap();
+        super::options(&args, &machine).unwrap_err()
+    }
+
+    #[test]
+    fn virtual_time_needs_a_program_or_a_limit() {
+        let failure = refused(&["--virtual", "--repeat", "3"], "no steps");
+        assert_eq!(failure.code, hints::WRONG);
+        assert!(failure.hints[0].contains("--for 10s"));
+    }
+
+    #[test]
+    fn faults_rejects_an_unknown_device() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("f.toml");
+        std::fs::write(&script, "\n[[fault]]\nkind = \"absent\"\ndevice = 2\n").unwrap();
+        let failure = refused(&["--faults", script.to_str().unwrap()], "demo");
+        assert_eq!(failure.code, hints::WRONG);
+        assert!(failure.message.contains("line 3"), "{failure:?}");
+        assert!(failure.message.contains("device 2"), "{failure:?}");
+    }
+
+    #[test]
+    fn virtual_runs_print_the_same_bytes() {
+        assert_eq!(printed(7), printed(7));
+    }
+}

@@ -1,0 +1,218 @@
+//! `ecaxis scan`: lists the devices of a bus and writes a machine file for it.
+
+use std::path::{Path, PathBuf};
+
+use ecaxis_master::config::{self, Nic};
+use ecaxis_master::esi_library::{self, Library};
+use ecaxis_tools::scan::{self, EsiMatch, MainDeviceEvidence, Scan, esi_match};
+
+use crate::args::bus::{self, Bus};
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::note;
+use crate::render::result;
+
+mod report;
+mod text;
+mod write;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis scan enp3s0                        list the devices
+  ecaxis scan enp3s0 --tree                 draw the topology
+  ecaxis scan enp3s0 --write machine.toml   generate a machine file
+  ecaxis scan --sim configs/demo.toml       the simulated bus of a machine file";
+
+/// Show the devices of a bus: position, identity, state, ports, clocks, mailboxes, and matching ESI
+/// files
+///
+/// Only reads registers and EEPROMs: a bus that another MainDevice drives is not disturbed. `--ask`
+/// and `--write` use the mailboxes as well; devices in Init are in PreOp meanwhile. This is skipped
+/// if another MainDevice is active.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// Network interface
+    #[arg(value_name = "IF", required_unless_present = "sim")]
+    nic: Option<String>,
+    /// Scan the simulated bus of this machine file instead
+    #[arg(long, value_name = "FILE", conflicts_with = "nic")]
+    sim: Option<PathBuf>,
+    /// ESI file or folder to search [default: esi]
+    #[arg(long, value_name = "PATH")]
+    esi: Option<PathBuf>,
+    /// Ask the devices over their mailboxes: modules, modes, units, limits
+    #[arg(long)]
+    ask: bool,
+    /// Use the mailboxes even if another MainDevice is active
+    #[arg(long)]
+    intrude: bool,
+    /// Draw the topology
+    #[arg(long, conflicts_with = "json")]
+    tree: bool,
+    /// Write a machine file; implies `--ask`
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["json", "tree"])]
+    write: Option<PathBuf>,
+    /// Overwrite the file
+    #[arg(long, requires = "write")]
+    force: bool,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    pub verbosity: crate::args::Verbosity,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    if let Some(path) = &args.write {
+        write::refuse(path, args.force)?;
+    }
+    let library = library(args)?;
+    let bus = match (&args.sim, &args.nic) {
+        (Some(file), _) => {
+            let mut machine = config::load(file).map_err(|e| hints::config(file, &e))?;
+            machine.bus.nic = Nic::Sim;
+            Bus::of(&machine)
+        }
+        (None, Some(nic)) => Bus::interface(nic),
+        (None, None) => return Err(Failure::new(hints::WRONG, "which network interface?")),
+    };
+    let nic = bus.nic();
+    let scan = look(bus, args.ask || args.write.is_some(), args.intrude)?;
+    let seen = ScanResult::new(&nic, scan, library.as_ref());
+    seen.warn(args.intrude);
+    if let Some(path) = &args.write {
+        return write::machine_file(&seen, path, library.is_some());
+    }
+    result(&if args.json {
+        format!("{:#}\n", report::json(&seen))
+    } else if args.tree {
+        text::tree(&seen)
+    } else {
+        text::tables(&seen)
+    })
+}
+
+/// Scans a bus and shows the progress.
+pub(crate) fn look(bus: Bus, ask: bool, intrude: bool) -> Result<Scan, Failure> {
+    let nic = bus.nic();
+    let done = bus.visit(async move |wire, heard| {
+        let options = scan::Options {
+            ask,
+            intrude,
+            heard,
+        };
+        let mut report = |step: scan::Step| {
+            let (what, position, of) = (step.what, step.position, step.of);
+            bus::passing(&format!("{what} position {position}, {of} in all"));
+        };
+        scan::scan(&wire, options, &mut report).await
+    });
+    bus::passed();
+    bus::done(done?, &nic)
+}
+
+/// A bus and the ESI descriptions of its devices.
+pub(crate) struct ScanResult {
+    pub nic: String,
+    pub scan: Scan,
+    /// One per device.
+    pub described: Vec<Option<EsiMatch>>,
+    unreadable: Vec<String>,
+}
+
+impl ScanResult {
+    pub fn new(nic: &Nic, scan: Scan, library: Option<&Library>) -> Self {
+        let (described, unreadable) = match library {
+            Some(library) => esi_match::describe(&scan, library),
+            None => (scan.devices.iter().map(|_| None).collect(), Vec::new()),
+        };
+        Self {
+            nic: match nic {
+                Nic::Sim => "sim".to_owned(),
+                Nic::Interface(nic) => nic.clone(),
+            },
+            described,
+            unreadable: unreadable.iter().map(ToString::to_string).collect(),
+            scan,
+        }
+    }
+
+    /// Iterates over the devices with their descriptions.
+    pub fn devices(&self) -> impl Iterator<Item = (&scan::Device, Option<&EsiMatch>)> {
+        let described = self.described.iter().map(Option::as_ref);
+        self.scan.devices.iter().zip(described)
+    }
+
+    /// Prints warnings on stderr.
+    pub fn warn(&self, intrude: bool) {
+        for problem in &self.unreadable {
+            bus::warn(problem);
+        }
+        let others = &self.scan.others;
+        if !others.is_empty() {
+            let there = if others.iter().any(MainDeviceEvidence::is_live) {
+                "another master is driving this bus"
+            } else {
+                "another master has left this bus running"
+            };
+            bus::warn(format_args!("{there}: {}", in_short(others)));
+            note(if intrude {
+                "note: the devices were asked over their mailboxes all the same (--intrude)"
+            } else {
+                "note: states and mailboxes were left alone; `--intrude` asks the devices all the same"
+            });
+        }
+        for device in &self.scan.devices {
+            let position = device.position();
+            if let Err(problem) = &device.sii {
+                bus::warn(problem);
+            }
+            if let Some(Err(problem)) = &device.answers {
+                bus::warn(problem);
+            }
+            if position > 0 && device.uplink.is_none() {
+                bus::warn(format_args!(
+                    "position {position}: no device before it has a port for it; DL status is odd"
+                ));
+            }
+        }
+    }
+}
+
+/// Formats the first pieces of evidence.
+fn in_short(signs: &[MainDeviceEvidence]) -> String {
+    const SHOWN: usize = 3;
+    let shown: Vec<String> = signs.iter().take(SHOWN).map(ToString::to_string).collect();
+    let more = signs.len().saturating_sub(SHOWN);
+    let mut text = shown.join("; ");
+    if more > 0 {
+        text += &format!("; and {more} more signs");
+    }
+    text
+}
+
+/// Returns the ESI library: `--esi`, else the folder `esi` here, next to the written file, or next
+/// to the simulated machine's file.
+fn library(args: &Args) -> Result<Option<Library>, Failure> {
+    if let Some(path) = &args.esi {
+        return open(path).map(Some);
+    }
+    let during = |file: &Option<PathBuf>| Some(file.as_deref()?.parent()?.join("esi"));
+    let places = [
+        during(&args.write),
+        during(&args.sim),
+        Some(PathBuf::from("esi")),
+    ];
+    let place = places.into_iter().flatten().find(|place| place.is_dir());
+    place.map(|place| open(&place)).transpose()
+}
+
+pub(crate) fn open(path: &Path) -> Result<Library, Failure> {
+    let opened = if path.is_file() {
+        Library::of_file(path)
+    } else {
+        Library::open(path, esi_library::cache_file(path).as_deref())
+    };
+    opened.map_err(|error| Failure::new(hints::WRONG, error.to_string()))
+}

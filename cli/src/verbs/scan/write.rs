@@ -1,0 +1,67 @@
+//! Writes the result of a scan as a machine file.
+
+use std::path::Path;
+
+use ecaxis_master::config::{self, ConfigError};
+use ecaxis_tools::scan::write::{self, MARK, OutputPath};
+
+use super::ScanResult;
+use crate::args::bus;
+use crate::args::files::{BackupPolicy, replace};
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::note;
+use crate::render::result;
+
+/// Fails if the file exists, because it may contain manual changes.
+pub(super) fn refuse(path: &Path, force: bool) -> Result<(), Failure> {
+    if force || !path.exists() {
+        return Ok(());
+    }
+    let message = format!("{} is there already", path.display());
+    Err(Failure::new(hints::WRONG, message).hint(
+        "name another file, `--force` overwrites it, `ecaxis compare FILE --apply` only changes what differs",
+    ))
+}
+
+pub(super) fn machine_file(seen: &ScanResult, path: &Path, library: bool) -> Result<(), Failure> {
+    let place = OutputPath {
+        nic: &seen.nic,
+        folder: path.parent().unwrap_or(Path::new("")),
+    };
+    let text = write::machine_file(&seen.scan, &seen.described, place);
+    replace(path, &text, BackupPolicy::Lost)?;
+    let devices = seen.scan.devices.len();
+    let axes = text.matches("[device.axis]").count();
+    let plural = |n: usize| if n == 1 { "" } else { "s" };
+    let mut reported = format!(
+        "{}: {devices} device{}, {axes} of them {}\n",
+        path.display(),
+        plural(devices),
+        if axes == 1 { "an axis" } else { "axes" },
+    );
+    let checks = text.lines().filter(|line| line.contains(MARK));
+    // The first lines of the file explain the mark.
+    let checks = checks.filter(|line| !line.starts_with("# Written")).count();
+    reported += &format!("{checks} lines are marked \"{MARK}\" and need a check\n");
+    let file = path.display();
+    reported += &format!("next: `ecaxis check {file}`, then `ecaxis run {file} --no-enable`\n");
+    if !seen.scan.asked {
+        bus::warn("the devices were not asked: units, limits and modules in the file are guesses");
+    }
+    if seen.described.iter().any(Option::is_none) {
+        bus::warn("some devices have no ESI file, so the file cannot be run yet");
+        note(if library {
+            "  = help: put their vendors' files into the folder of ESI files, and scan again with --force"
+        } else {
+            "  = help: name the folder of ESI files with `--esi`"
+        });
+    } else if let Err(ConfigError::Problems(problems)) = config::load(path) {
+        bus::warn(format_args!(
+            "the file has {} problem{}: `ecaxis check {file}` shows them",
+            problems.len(),
+            plural(problems.len()),
+        ));
+    }
+    result(&reported)
+}

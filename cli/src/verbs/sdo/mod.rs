@@ -1,0 +1,195 @@
+//! `ecaxis sdo`: reads, writes, lists, saves and restores the parameters of a device. One file per
+//! subcommand.
+
+use std::path::Path;
+
+use clap::Subcommand;
+use ecaxis_esi::Dictionary;
+use ecaxis_master::mailbox::{NamedObject, abort_text};
+use ecaxis_tools::parameters::compare::Difference;
+use ecaxis_tools::parameters::dump::Dump;
+use ecaxis_tools::parameters::lookup::{FindError, ObjectQuery, find};
+use serde_json::{Value, json};
+
+use crate::args::Verbosity;
+use crate::args::device::{DeviceArgs, address};
+use crate::hints;
+use crate::hints::Failure;
+use crate::render::table::Table;
+
+mod command;
+mod compare;
+mod dump;
+mod list;
+mod read;
+mod restore;
+mod write;
+
+const EXAMPLES: &str = "\
+Examples:
+  ecaxis sdo read machine.toml x Statusword 0x1018
+  ecaxis sdo write machine.toml x 0x6065 2000
+  ecaxis sdo list --nic enp3s0 --position 0
+  ecaxis sdo dump machine.toml x x.toml       save all readable objects
+  ecaxis sdo compare machine.toml x x.toml    print the differences
+  ecaxis sdo restore machine.toml x x.toml    restore the settings
+  ecaxis sdo store machine.toml x             store them in non-volatile memory
+
+Values are decimal, hexadecimal (0x10), text, or bytes ([01 02]). An object is
+a number (0x6065, 0x1018:01) or a name (Statusword, \"Identity: Vendor ID\").";
+
+/// Read and write the parameters of a device, save and restore them
+///
+/// Select the device by machine file and name, or by --nic with --position or --alias. Its state is
+/// kept: a device in Init is in PreOp during the access, a device in Op stays in Op.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    pub verbosity: Verbosity,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Read(read::Args),
+    Write(write::Args),
+    List(list::Args),
+    Dump(dump::Args),
+    Compare(compare::Args),
+    Restore(restore::Args),
+    Store(command::StoreArgs),
+    Defaults(command::DefaultsArgs),
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.command {
+        Command::Read(args) => read::run(args),
+        Command::Write(args) => write::run(args),
+        Command::List(args) => list::run(args),
+        Command::Dump(args) => dump::run(args),
+        Command::Compare(args) => compare::run(args),
+        Command::Restore(args) => restore::run(args),
+        Command::Store(args) => command::store(args),
+        Command::Defaults(args) => command::defaults(args),
+    }
+}
+
+/// The options of every subcommand.
+#[derive(Debug, Clone, clap::Args)]
+struct Common {
+    #[command(flatten)]
+    place: DeviceArgs,
+    /// Read the object dictionary from the device (SDO Information), even if an ESI file describes
+    /// it
+    #[arg(long)]
+    ask: bool,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Parses an object given by number or name.
+fn wanted(dictionary: Option<&Dictionary>, text: &str) -> Result<ObjectQuery, Failure> {
+    find(dictionary, text).map_err(|error| {
+        let failure = Failure::new(hints::WRONG, error.to_string());
+        match error {
+            FindError::Unknown {
+                near: Some(near), ..
+            } => failure.hint(format!("did you mean `{near}`?")),
+            FindError::Unknown { .. } => failure
+                .hint("`ecaxis sdo list` shows the names; a number such as 0x6041:00 always works"),
+            FindError::Ambiguous { .. } => failure.hint(
+                "give the number, or the object's name before its own: `Identity: Vendor ID`",
+            ),
+            FindError::Number(_) => failure,
+        }
+    })
+}
+
+/// Loads a parameter file.
+fn load(path: &Path) -> Result<Dump, Failure> {
+    /// The maximum size of a dump in bytes.
+    const MAX_BYTES: u64 = 64 << 20;
+    let shown = path.display();
+    let wrong = |what: String| Failure::new(hints::WRONG, what);
+    let text = ecaxis_master::file::read_text(path, MAX_BYTES);
+    let text = text.map_err(|error| wrong(format!("cannot read {shown}: {error}")))?;
+    Dump::parse(&text).map_err(|error| {
+        wrong(format!("{shown}: {error}"))
+            .hint("`ecaxis sdo dump` writes such files; `value` may be changed by hand")
+    })
+}
+
+/// One value, printed alone or as a row of a table.
+struct Line {
+    at: NamedObject,
+    name: String,
+    data_type: String,
+    /// The value as text, and in hexadecimal if it is a number; or the abort code.
+    value: Result<(String, Option<String>), u32>,
+}
+
+fn lines(all: &[Line]) -> String {
+    if let [line] = all {
+        let Line {
+            at,
+            name,
+            data_type,
+            value,
+        } = line;
+        let name = match name.as_str() {
+            "" => String::new(),
+            name => format!(" {name}"),
+        };
+        let value = match value {
+            Ok((value, Some(hex))) => format!("{value} ({hex})"),
+            Ok((value, None)) => value.clone(),
+            Err(code) => refusal(*code),
+        };
+        return format!("{}{name} ({data_type}) = {value}\n", address(*at));
+    }
+    let mut table = Table::new(&["object", "type", "value", "hex", "name"]);
+    for line in all {
+        let (value, hex) = match &line.value {
+            Ok((value, hex)) => (value.clone(), hex.clone().unwrap_or_default()),
+            Err(code) => (refusal(*code), String::new()),
+        };
+        table.row([&address(line.at), &line.data_type, &value, &hex, &line.name]);
+    }
+    table.shown(0) + "\n"
+}
+
+fn refusal(code: u32) -> String {
+    format!("refused with {code:#010x}: {}", abort_text(code))
+}
+
+/// Formats the differences between two sides as a table.
+fn differences(sides: [&str; 2], all: &[Difference]) -> String {
+    if all.is_empty() {
+        return String::new();
+    }
+    let [left, right] = sides;
+    let mut table = Table::new(&["object", left, right, "name"]);
+    let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
+    for difference in all {
+        table.row([
+            &address(difference.at),
+            &side(&difference.left),
+            &side(&difference.right),
+            &difference.name,
+        ]);
+    }
+    table.shown(0) + "\n"
+}
+
+fn as_json(all: &[Difference]) -> Value {
+    let each = all.iter().map(|difference| {
+        json!({
+            "index": difference.at.index, "sub": difference.at.sub, "name": difference.name,
+            "left": difference.left, "right": difference.right,
+        })
+    });
+    each.collect()
+}
