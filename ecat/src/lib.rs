@@ -6,5 +6,7 @@ extern crate alloc;
 
 pub mod al_status_code;
 pub mod data_type;
+pub mod datagram;
+pub mod mailbox;
 pub mod registers;
 pub mod value;

@@ -22,13 +22,13 @@ pub struct Emergency {
 }
 
 impl Emergency {
-    pub fn parse(content: &[u8]) -> Option<Self> {
-        let ([low, high, register, data @ ..], _) = content.split_first_chunk::<8>()?;
-        Some(Self {
-            code: u16::from_le_bytes([*low, *high]),
-            register: *register,
-            data: *data,
-        })
+    #[must_use]
+    pub const fn from_bytes([low, high, register, data @ ..]: [u8; 8]) -> Self {
+        Self {
+            code: u16::from_le_bytes([low, high]),
+            register,
+            data,
+        }
     }
 
     /// Returns the meaning of the code according to CiA 301, CiA 402 and maxon.

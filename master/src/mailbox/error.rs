@@ -3,7 +3,8 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::abort::{abort_text, mailbox_error_text};
+use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
+
 use super::object_names::NamedObject;
 use super::{DatagramError, MAX_OBJECT};
 

@@ -4,32 +4,27 @@
 //! - [`MailboxTransport`]: the datagrams, the delay and the clock that this module uses.
 //! - `transport`: the mailbox SyncManagers: request and answer, lost answers, emergencies in
 //!   between.
-//! - `coe`: the bytes of mailbox, CoE and SDO headers (ETG.1000.4, ETG.1000.6).
 //! - `sdo`, `transfer`: [`CoeClient`], SDO upload and download.
 //! - `sdo_info`: the object dictionary as reported by the device (SDO Information).
 //! - [`foe`]: [`FoeClient`], file transfer.
 //! - `worker`: [`Mailboxes`], transfers from any thread while workers serve the mailboxes.
-//! - `error`, `abort`, `emergency`, `object_names`: error types and texts.
+//! - `error`, `emergency`, `object_names`: error types and texts.
 
 use std::time::Duration;
 
 use crate::cancel::CancelToken;
 
-mod abort;
-mod coe;
 mod emergency;
 mod error;
 pub mod foe;
 mod object_names;
-#[cfg(test)]
-pub(crate) mod recorded_tests;
 mod sdo;
 mod sdo_info;
 mod transfer;
 mod transport;
 pub mod worker;
 
-pub use abort::{abort_text, mailbox_error_text};
+pub use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
 pub use emergency::{EMERGENCY_QUEUE, Emergencies, Emergency, Received};
 pub use error::{Phase, SdoError, Subject};
 pub use foe::{FoeClient, FoeError};

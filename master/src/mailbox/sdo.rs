@@ -1,7 +1,8 @@
 //! The CoE client of one SubDevice: SDO upload and download, expedited, normal and segmented, with
 //! complete access.
 
-use super::coe::{Answer, Message, Request, download_room, parse, segment_room};
+use ecaxis_ecat::mailbox::coe::{Answer, Message, Request, download_room, segment_room};
+
 use super::emergency::{Emergencies, Emergency};
 use super::error::{Phase, SdoError};
 use super::transfer::{Transfer, TransferFailure, drain_error};
@@ -414,7 +415,7 @@ impl CoeClient {
                 }
                 Err(trouble) => return Err(transfer.trouble(&self.port, trouble)),
             }
-            match parse(self.port.message()) {
+            match Message::parse(self.port.message()) {
                 // Segments carry no address, and in an abort among them some devices leave it empty
                 // as well.
                 Ok(Message::Sdo(Answer::Abort { index, code, .. }))

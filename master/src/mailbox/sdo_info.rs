@@ -4,8 +4,9 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::abort::{abort_text, mailbox_error_text};
-use super::coe::{Answer, Fragment, Message, Request, parse};
+use ecaxis_ecat::mailbox::coe::{Answer, Fragment, Message, Request};
+use ecaxis_ecat::mailbox::{abort_text, mailbox_error_text};
+
 use super::error::{LostDatagram, Phase};
 use super::object_names::NamedObject;
 use super::transport::{Deadline, TransportError};
@@ -346,7 +347,7 @@ impl CoeClient {
                     _ => InfoFailure::For(error),
                 });
             }
-            let fragment = match parse(self.port.message()) {
+            let fragment = match Message::parse(self.port.message()) {
                 Ok(Message::Information(fragment))
                     if self.is_answer(asked, expected, &fragment) =>
                 {

@@ -1,7 +1,8 @@
 //! One SDO transfer: its object, the answers that belong to it, and its end.
 
 use super::MailboxLayout;
-use super::coe::Answer;
+use ecaxis_ecat::mailbox::coe::Answer;
+
 use super::error::{Phase, SdoError, Subject};
 use super::object_names::NamedObject;
 use super::transport::{Deadline, Port, TransportError};

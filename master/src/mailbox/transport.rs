@@ -4,8 +4,10 @@
 use std::mem;
 use std::time::Duration;
 
-use super::coe::{MAILBOX_MIN, Message, parse};
-use super::emergency::Emergencies;
+use ecaxis_ecat::mailbox::coe::Message;
+use ecaxis_ecat::mailbox::{Encode, MIN_LENGTH};
+
+use super::emergency::{Emergencies, Emergency};
 use super::error::Phase;
 use super::{DatagramError, MailboxLayout, MailboxTransport, Timeouts};
 use crate::link::MAX_DATA;
@@ -30,13 +32,6 @@ const REPEATS: u32 = 3;
 
 const POLL_MIN: Duration = Duration::from_micros(200);
 const POLL_MAX: Duration = Duration::from_millis(2);
-
-/// A message for a SubDevice.
-pub(super) trait Encode {
-    /// Writes the message to `out` and pads it to `mailbox` bytes. A SyncManager releases a mailbox
-    /// when its last byte is written.
-    fn emit(&self, counter: u8, mailbox: u16, out: &mut Vec<u8>);
-}
 
 #[derive(Debug)]
 pub(super) enum TransportError {
@@ -115,7 +110,7 @@ impl Port {
     }
 
     pub(super) fn check(&self) -> Result<(), TransportError> {
-        let fits = |len| (MAILBOX_MIN..=MAX_DATA).contains(&len);
+        let fits = |len| (MIN_LENGTH..=MAX_DATA).contains(&len);
         if fits(self.layout.out_len) && fits(self.layout.in_len) {
             Ok(())
         } else {
@@ -343,8 +338,11 @@ impl Port {
 
     /// Queues an emergency and drops any other message.
     pub(super) fn set_aside<W: MailboxTransport>(&mut self, w: &W) {
-        match parse(&self.incoming) {
-            Ok(Message::Emergency(emergency)) => self.emergencies.push(w.now(), emergency),
+        match Message::parse(&self.incoming) {
+            Ok(Message::Emergency(bytes)) => {
+                self.emergencies
+                    .push(w.now(), Emergency::from_bytes(*bytes));
+            }
             _ => self.forgotten += 1,
         }
     }

@@ -3,9 +3,10 @@
 
 use std::ops::Range;
 
+use ecaxis_ecat::datagram::{Command, ETHERTYPE, HEADER, Header, WORKING_COUNTER};
+
 use super::{Direction, Packet};
 
-const ETHERTYPE: u16 = 0x88a4;
 const VLAN: [u16; 3] = [0x8100, 0x88a8, 0x9100];
 const IPV4: u16 = 0x0800;
 const UDP: u8 = 17;
@@ -17,8 +18,6 @@ const LINK_ETHERNET: u16 = 1;
 const LINK_SLL: u16 = 113;
 const LINK_SLL2: u16 = 276;
 
-const DATAGRAM_HEADER: usize = 10;
-const WKC: usize = 2;
 /// The type of an EtherCAT frame with datagrams.
 const DLPDUS: u8 = 1;
 
@@ -29,79 +28,6 @@ pub enum Encapsulation {
     /// At least one tag; the VLAN ID of the innermost.
     Vlan(u16),
     Udp,
-}
-
-/// Commands of datagrams (ETG.1000.4 Table 12 and the following).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Command(pub u8);
-
-impl Command {
-    pub const APRD: Self = Self(1);
-    pub const APWR: Self = Self(2);
-    pub const APRW: Self = Self(3);
-    pub const FPRD: Self = Self(4);
-    pub const FPWR: Self = Self(5);
-    pub const FPRW: Self = Self(6);
-    pub const BRD: Self = Self(7);
-    pub const BWR: Self = Self(8);
-    pub const BRW: Self = Self(9);
-    pub const LRD: Self = Self(10);
-    pub const LWR: Self = Self(11);
-    pub const LRW: Self = Self(12);
-    pub const ARMW: Self = Self(13);
-    pub const FRMW: Self = Self(14);
-
-    /// Returns its abbreviation; empty for unknown commands.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        const NAMES: [&str; 15] = [
-            "NOP", "APRD", "APWR", "APRW", "FPRD", "FPWR", "FPRW", "BRD", "BWR", "BRW", "LRD",
-            "LWR", "LRW", "ARMW", "FRMW",
-        ];
-        if (self.0 as usize) < NAMES.len() {
-            NAMES[self.0 as usize]
-        } else {
-            "?"
-        }
-    }
-
-    /// True if it has one 32-bit address instead of two 16-bit addresses.
-    #[must_use]
-    pub const fn is_logical(self) -> bool {
-        matches!(self, Self::LRD | Self::LWR | Self::LRW)
-    }
-
-    /// True if SubDevices increment the address.
-    #[must_use]
-    pub const fn is_positional(self) -> bool {
-        matches!(
-            self,
-            Self::APRD | Self::APWR | Self::APRW | Self::ARMW | Self::BRD | Self::BWR | Self::BRW
-        )
-    }
-
-    #[must_use]
-    pub const fn reads(self) -> bool {
-        !matches!(
-            self,
-            Self(0) | Self::APWR | Self::FPWR | Self::BWR | Self::LWR
-        )
-    }
-
-    #[must_use]
-    pub const fn writes(self) -> bool {
-        matches!(
-            self,
-            Self::APWR
-                | Self::APRW
-                | Self::FPWR
-                | Self::FPRW
-                | Self::BWR
-                | Self::BRW
-                | Self::LWR
-                | Self::LRW
-        )
-    }
 }
 
 /// One datagram; its data are in the frame.
@@ -273,30 +199,24 @@ fn datagrams(bytes: &[u8], start: usize, end: usize) -> (Vec<Datagram>, bool) {
     let mut found = Vec::new();
     let mut at = start;
     loop {
-        let Some(head) = bytes
-            .get(at..end)
-            .and_then(<[u8]>::first_chunk::<DATAGRAM_HEADER>)
-        else {
+        let head = bytes.get(at..end).and_then(<[u8]>::first_chunk::<HEADER>);
+        let Some(head) = head.map(Header::parse) else {
             return (found, true);
         };
-        let [command, index, a0, a1, a2, a3, l0, l1, ..] = *head;
-        let len = u16::from_le_bytes([l0, l1]);
-        let data = at + DATAGRAM_HEADER..at + DATAGRAM_HEADER + usize::from(len & 0x07ff);
-        let wkc = bytes
-            .get(data.end..end)
-            .and_then(<[u8]>::first_chunk::<WKC>);
+        let data = at + HEADER..at + HEADER + usize::from(head.len);
+        let wkc = bytes.get(data.end..end).and_then(<[u8]>::first_chunk);
         let Some(wkc) = wkc else {
             return (found, true);
         };
-        at = data.end + WKC;
+        at = data.end + WORKING_COUNTER;
         found.push(Datagram {
-            command: Command(command),
-            index,
-            address: u32::from_le_bytes([a0, a1, a2, a3]),
+            command: head.command,
+            index: head.index,
+            address: head.address,
             data,
             wkc: u16::from_le_bytes(*wkc),
         });
-        if len & 0x8000 == 0 {
+        if !head.more {
             return (found, false);
         }
     }

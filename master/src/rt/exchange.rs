@@ -17,149 +17,35 @@
 use std::sync::Arc;
 
 use super::image::plan::frames as frames_of;
-use super::image::{Access, DatagramPlan, ImagePlan};
+use super::image::{Access, ImagePlan};
 use super::phase::ClockPlan;
 use crate::clock::Nanos;
 use crate::link::pdu_loop::ETHERCAT;
-use crate::link::{Link, LinkError, MAX_FRAME};
+use crate::link::{Link, LinkError};
 
 mod bus_status;
 mod diagnostics;
 mod frame;
 mod frame_set;
 mod poll_schedule;
+mod result;
+mod slots;
 
 pub use bus_status::BusStatus;
 pub use diagnostics::{DiagnosticRegister, ErrorCounters, SubDeviceDiagnostics, Window};
-use ecaxis_ecat::registers;
 use frame::{
-    DATAGRAM_HEADER, DatagramSlot, FIRST_DATAGRAM, Frame, MAC_TAIL, WKC, clear_wkc, frame_number,
-    frame_tag, new_frames, push, same_datagram, write_header,
+    DATAGRAM_HEADER, DatagramSlot, FIRST_DATAGRAM, MAC_TAIL, WKC, clear_wkc, frame_number,
+    frame_tag, new_frames, same_datagram, write_header,
 };
 use frame_set::FrameSet;
 pub use poll_schedule::LONGEST_LOOK;
 use poll_schedule::{PollSchedule, PollTarget};
-
-const FPRD: u8 = 4;
-const BRD: u8 = 7;
-const LRD: u8 = 10;
-const LWR: u8 = 11;
-const LRW: u8 = 12;
-const FRMW: u8 = 14;
+pub use result::{CycleResult, Evidence, ExchangeDevice, ExchangeMode, GroupResult, Received};
+use slots::DatagramSlots;
 
 /// After a wrong working counter each device has its own datagram, until this many cycles in a row
 /// were right.
 const SEPARATE_CYCLES: u16 = 100;
-
-#[derive(Debug, Clone, Copy)]
-struct ProcessDatagram {
-    place: DatagramSlot,
-    access: Access,
-    group: usize,
-    /// Offset in the image.
-    image: usize,
-    expected_wkc: u16,
-    /// The range of its devices in [`Exchange::order`]: the first, and one past the last.
-    devices: (usize, usize),
-}
-
-/// A SubDevice in the exchange.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ExchangeDevice {
-    pub station: u16,
-    /// True if it processes the system time.
-    pub clock: bool,
-    /// The SyncManager through which its mailbox is read; `None` without a mailbox.
-    pub mailbox: Option<u8>,
-}
-
-/// The result of one group's process data in a cycle.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct GroupResult {
-    /// True if every frame with a part of the group came back. For a group without process data,
-    /// this refers to the first frame.
-    pub answered: bool,
-    /// True if every working counter was also as expected: the group's inputs are from this cycle.
-    pub fresh: bool,
-    /// Sums of the working counters seen and of those expected.
-    pub wkc: (u16, u16),
-    /// The number of SubDevices that process the system time.
-    clocks: u16,
-}
-
-#[cfg(test)]
-impl GroupResult {
-    pub(super) const fn new(answered: bool, fresh: bool, wkc: (u16, u16)) -> Self {
-        Self {
-            answered,
-            fresh,
-            wkc,
-            clocks: 0,
-        }
-    }
-}
-
-/// What the answers of a cycle show about one device.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Evidence {
-    /// Its working counter, own or shared, was right: it processed its outputs, and its inputs are
-    /// from this cycle.
-    Fresh,
-    /// A working counter that it shares with other devices was wrong.
-    #[default]
-    Unknown,
-    /// Its own working counter was wrong, or its frame did not come back.
-    Missing,
-}
-
-/// The classification of a received frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Received {
-    /// A frame of this cycle.
-    Current,
-    /// A frame of this exchange, but of another cycle or received twice.
-    Late,
-    /// Not a frame of this exchange.
-    Foreign,
-}
-
-/// The result of a cycle's exchange.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct CycleResult {
-    /// True if every frame came back.
-    pub complete: bool,
-    /// True if every working counter was as expected: the whole input image is from this cycle.
-    pub inputs_fresh: bool,
-    /// Sums of the working counters seen and of those expected.
-    pub wkc: (u16, u16),
-    /// System time of the reference clock as the frame passed it.
-    pub system_time: Option<u64>,
-    /// AL status of all SubDevices, or-ed, and the number of answers.
-    pub al_status: Option<(u8, u16)>,
-    /// The delay from the planned release of these frames until they were sent.
-    pub sent_late: Nanos,
-}
-
-/// The cycle in which answers are evaluated.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum ExchangeMode {
-    /// The cycle that sent the frames; the thread waits for the answers.
-    #[default]
-    SameCycle,
-    /// The cycle after it: the answers have arrived by then, and the thread does not wait.
-    Pipelined,
-}
-
-impl ExchangeMode {
-    /// Returns how many cycles have frames in flight at once.
-    #[must_use]
-    pub const fn flights(self) -> u8 {
-        match self {
-            Self::SameCycle => 1,
-            Self::Pipelined => 2,
-        }
-    }
-}
 
 /// The exchange of process data.
 #[derive(Debug)]
@@ -660,69 +546,6 @@ impl Exchange {
         staged
             .into_iter()
             .flat_map(|flight| flight.frames().iter().map(|frame| frame.bytes.len()))
-    }
-}
-
-/// The positions of a cycle's datagrams in its frames.
-#[derive(Debug)]
-struct DatagramSlots {
-    clock: Option<DatagramSlot>,
-    process_data: Vec<ProcessDatagram>,
-    al_status: DatagramSlot,
-    probe_at: usize,
-}
-
-impl DatagramSlots {
-    /// Puts all datagrams except the diagnostic one into empty frames.
-    #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
-    fn fill(
-        frames: &mut [Frame],
-        plan: &ImagePlan,
-        datagrams: &[DatagramPlan],
-        order: &[usize],
-        clock: Option<&ClockPlan>,
-    ) -> Self {
-        let clock = clock.map(|clock| {
-            let address = u32::from(registers::DC_SYSTEM_TIME) << 16 | u32::from(clock.reference);
-            push(&mut frames[0], 0, FRMW, address, 8)
-        });
-        let offset = |device: &usize| plan.regions[*device].map_or(0, |region| region.offset);
-        let process_data = datagrams.iter().map(|datagram| {
-            let first = order.partition_point(|device| offset(device) < datagram.offset);
-            let behind = datagram.offset + datagram.len;
-            let end = order.partition_point(|device| offset(device) < behind);
-            let frame = datagram.frame;
-            let command = match datagram.access {
-                Access::Both => LRW,
-                Access::Inputs => LRD,
-                Access::Outputs => LWR,
-            };
-            let (logical, len) = (datagram.logical, datagram.len);
-            ProcessDatagram {
-                place: push(&mut frames[frame], frame, command, logical, len),
-                access: datagram.access,
-                group: datagram.group,
-                image: datagram.offset,
-                expected_wkc: datagram.expected_wkc,
-                devices: (first, end),
-            }
-        });
-        let process_data = process_data.collect();
-        let al_status = push(
-            &mut frames[0],
-            0,
-            BRD,
-            u32::from(registers::AL_STATUS) << 16,
-            2,
-        );
-        let probe_at = frames[0].bytes.len();
-        debug_assert!(probe_at + LONGEST_LOOK <= MAX_FRAME);
-        Self {
-            clock,
-            process_data,
-            al_status,
-            probe_at,
-        }
     }
 }
 

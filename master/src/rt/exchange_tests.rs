@@ -1,4 +1,6 @@
 use super::*;
+use crate::link::MAX_FRAME;
+use ecaxis_ecat::datagram::Command;
 use crate::rt::image::{ProcessData, plan};
 use proptest::prelude::*;
 
@@ -36,7 +38,7 @@ fn reflect(exchange: &mut Exchange, number: usize, input: u8) -> Vec<u8> {
             .iter()
             .find(|d| (d.place.frame, d.place.offset) == (number, at));
         let wkc = expected.map_or(1, |d| d.expected_wkc);
-        if frame[at] != LWR {
+        if frame[at] != Command::LWR.0 {
             frame[data..data + len].fill(input);
         }
         frame[data + len..data + len + 2].copy_from_slice(&wkc.to_le_bytes());
@@ -201,7 +203,14 @@ fn device_without_lrw_exchanges_data_in_two_datagrams() {
             )
         })
         .collect();
-    assert_eq!(commands, [(LRW, true), (LWR, true), (LRD, false)]);
+    assert_eq!(
+        commands,
+        [
+            (Command::LRW.0, true),
+            (Command::LWR.0, true),
+            (Command::LRD.0, false)
+        ]
+    );
     let answer = reflect(&mut exchange, 0, 0x11);
     assert_eq!(exchange.receive(&answer), Received::Current);
     let answer = exchange.evaluate();

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use hdrhistogram::Histogram;
 
 use super::match_frames::DatagramExchange;
-use ecaxis_master::recording::frame::Command;
+use ecaxis_ecat::datagram::Command;
 
 /// The maximum number of logical datagrams: one per group, and one per eight mailboxes.
 const GROUPS: usize = 64;

@@ -2,12 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use ecaxis_ecat::mailbox::coe::{Answer, Fragment, Message, Request};
+use ecaxis_ecat::mailbox::{self, TYPE_COE, TYPE_ERROR, TYPE_FOE, foe};
 use ecaxis_master::mailbox::Emergency;
-
-const HEADER: usize = 6;
-const TYPE_ERROR: u8 = 0;
-const TYPE_COE: u8 = 3;
-const TYPE_FOE: u8 = 4;
 
 /// The maximum number of stored bytes of an object; the full length is counted.
 const KEPT: usize = 1024;
@@ -126,10 +123,6 @@ fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
     Some(u16::from_le_bytes(*bytes.get(at..)?.first_chunk()?))
 }
 
-fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
-    Some(u32::from_le_bytes(*bytes.get(at..)?.first_chunk()?))
-}
-
 fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|b| *b == 0).unwrap_or(bytes.len());
     let text = String::from_utf8_lossy(bytes.get(..end).unwrap_or_default());
@@ -139,15 +132,14 @@ fn text(bytes: &[u8]) -> String {
 /// True if bytes look like a mailbox message. Used if the recording does not show the SyncManager
 /// configuration.
 pub fn plausible(bytes: &[u8]) -> bool {
-    let (Some(len), Some(kind)) = (u16_at(bytes, 0), bytes.get(5)) else {
+    let Ok(mailbox) = mailbox::Mailbox::parse(bytes) else {
         return false;
     };
-    let fits = len >= 2 && HEADER + usize::from(len) <= bytes.len();
-    let coe = || u16_at(bytes, HEADER).is_some_and(|head| matches!(head >> 12, 1..=8));
-    fits && match kind & 0x0f {
-        TYPE_COE => coe(),
-        TYPE_ERROR => len == 4 && u16_at(bytes, HEADER) == Some(1),
-        1..=5 | 15 => true,
+    let head = u16_at(mailbox.body, 0);
+    match mailbox.protocol {
+        TYPE_COE => head.is_some_and(|head| matches!(head >> 12, 1..=8)),
+        TYPE_ERROR => mailbox.body.len() == 4 && head == Some(1),
+        1..=5 | 15 => mailbox.body.len() >= 2,
         _ => false,
     }
 }
@@ -156,29 +148,29 @@ impl Mailbox {
     /// Processes a complete mailbox. Returns the completed events.
     pub fn message(&mut self, at: u64, to_device: bool, bytes: &[u8]) -> Vec<MailboxEvent> {
         let mut reported = Vec::new();
-        let (Some(len), Some(kind)) = (u16_at(bytes, 0), bytes.get(5).copied()) else {
-            return reported;
-        };
-        let Some(body) = bytes.get(HEADER..HEADER + usize::from(len)) else {
+        let Ok(mailbox) = mailbox::Mailbox::parse(bytes) else {
             return reported;
         };
         if to_device {
-            let whole = bytes.get(..HEADER + body.len()).unwrap_or_default();
+            let whole = bytes
+                .get(..mailbox::HEADER + mailbox.body.len())
+                .unwrap_or_default();
             // A repeated request after a lost answer has the same counter.
-            if kind >> 4 & 7 != 0 && self.last_request == whole {
+            if mailbox.counter != 0 && self.last_request == whole {
                 return reported;
             }
             self.last_request.clear();
             self.last_request.extend_from_slice(whole);
         }
-        if let Some(count) = self.messages.get_mut(usize::from(kind & 0x0f)) {
+        if let Some(count) = self.messages.get_mut(usize::from(mailbox.protocol)) {
             *count += 1;
         }
-        match kind & 0x0f {
-            TYPE_COE => self.coe(at, to_device, body, &mut reported),
-            TYPE_FOE => self.foe(at, to_device, body, &mut reported),
+        match mailbox.protocol {
+            TYPE_COE if to_device => self.request(at, bytes, &mut reported),
+            TYPE_COE => self.response(at, bytes, &mut reported),
+            TYPE_FOE => self.foe(at, to_device, bytes, &mut reported),
             TYPE_ERROR => {
-                let code = u16_at(body, 2).unwrap_or(0);
+                let code = mailbox.error_code().unwrap_or(0);
                 if self.transfer.is_some() {
                     self.close(at, TransferOutcome::Refused(code), &mut reported);
                 } else {
@@ -209,45 +201,54 @@ impl Mailbox {
         }
     }
 
-    fn coe(&mut self, at: u64, to_device: bool, body: &[u8], reported: &mut Vec<MailboxEvent>) {
-        let (Some(head), Some(content)) = (u16_at(body, 0), body.get(2..)) else {
-            return;
-        };
-        match head >> 12 {
-            1 => reported.extend(Emergency::parse(content).map(MailboxEvent::Emergency)),
-            2 | 3 if content.first() == Some(&0x80) => {
-                let code = u32_at(content, 4).unwrap_or(0);
-                let by_device = !to_device;
-                self.close(at, TransferOutcome::Aborted { code, by_device }, reported);
-            }
-            2 if to_device => self.request(at, content, reported),
-            3 => self.response(at, content, reported),
-            8 => self.information(to_device, content, reported),
-            _ => {}
-        }
+    fn abort(&mut self, at: u64, code: u32, by_device: bool, reported: &mut Vec<MailboxEvent>) {
+        self.close(at, TransferOutcome::Aborted { code, by_device }, reported);
     }
 
-    fn request(&mut self, at: u64, content: &[u8], reported: &mut Vec<MailboxEvent>) {
-        let Some((&command, rest)) = content.split_first() else {
+    fn request(&mut self, at: u64, bytes: &[u8], reported: &mut Vec<MailboxEvent>) {
+        let Ok(Some(request)) = Request::parse(bytes) else {
             return;
         };
-        let way = match command >> 5 {
-            0 => {
+        let (way, index, sub, complete, size, data) = match request {
+            Request::Upload {
+                index,
+                sub,
+                complete,
+            } => (TransferDirection::Read, index, sub, complete, 0, &[][..]),
+            Request::DownloadExpedited { index, sub, data } => (
+                TransferDirection::Write,
+                index,
+                sub,
+                false,
+                data.len(),
+                data,
+            ),
+            Request::Download {
+                index,
+                sub,
+                complete,
+                size,
+                data,
+            } => {
+                let size = size as usize;
+                let data = data.get(..size).unwrap_or(data);
+                (TransferDirection::Write, index, sub, complete, size, data)
+            }
+            Request::DownloadSegment { last, data, .. } => {
                 if let Some(pending) = &mut self.transfer {
-                    pending.add(segment(command, rest));
-                    pending.transfer.segments += 1;
-                    pending.last_sent = command & 1 != 0;
+                    pending.add_segment(data);
+                    pending.last_sent = last;
                 }
                 return;
             }
-            1 => TransferDirection::Write,
-            2 => TransferDirection::Read,
-            _ => return,
+            Request::Abort { code, .. } => return self.abort(at, code, false, reported),
+            Request::Information { .. } => {
+                self.listed = 0;
+                return;
+            }
+            Request::UploadSegment { .. } => return,
         };
         self.close(at, TransferOutcome::Unanswered, reported);
-        let (Some(index), Some(sub)) = (u16_at(rest, 0), rest.get(2).copied()) else {
-            return;
-        };
         let mut pending = Pending {
             transfer: Transfer {
                 began: at,
@@ -255,44 +256,53 @@ impl Mailbox {
                 way,
                 index,
                 sub,
-                complete: command & 0x10 != 0,
+                complete,
                 data: Vec::new(),
                 len: 0,
                 segments: 0,
                 ended: TransferOutcome::Unanswered,
             },
-            size: 0,
+            size,
             last_sent: false,
         };
-        if way == TransferDirection::Write {
-            let (size, data) = initiated(command, rest.get(3..).unwrap_or_default());
-            pending.size = size;
-            pending.add(data);
-        }
+        pending.add(data);
         self.transfer = Some(pending);
     }
 
-    fn response(&mut self, at: u64, content: &[u8], reported: &mut Vec<MailboxEvent>) {
-        let (Some((&command, rest)), Some(pending)) = (content.split_first(), &mut self.transfer)
-        else {
+    fn response(&mut self, at: u64, bytes: &[u8], reported: &mut Vec<MailboxEvent>) {
+        let answer = match Message::parse(bytes) {
+            Ok(Message::Sdo(answer)) => answer,
+            Ok(Message::Information(fragment)) => return self.information(&fragment, reported),
+            Ok(Message::Emergency(bytes)) => {
+                return reported.push(MailboxEvent::Emergency(Emergency::from_bytes(*bytes)));
+            }
+            _ => return,
+        };
+        let Some(pending) = &mut self.transfer else {
             return;
         };
         let transfer = &pending.transfer;
-        let same = u16_at(rest, 0) == Some(transfer.index);
-        let done = match (command >> 5, transfer.way) {
-            (2, TransferDirection::Read) if same => {
-                let (size, data) = initiated(command, rest.get(3..).unwrap_or_default());
+        let (way, expected) = (transfer.way, transfer.index);
+        let done = match (answer, way) {
+            (Answer::Abort { code, .. }, _) => return self.abort(at, code, true, reported),
+            (
+                Answer::Upload {
+                    index, size, data, ..
+                },
+                TransferDirection::Read,
+            ) if index == expected => {
                 pending.size = size;
                 pending.add(data);
                 pending.transfer.len >= size
             }
-            (0, TransferDirection::Read) => {
-                pending.add(segment(command, rest));
-                pending.transfer.segments += 1;
-                command & 1 != 0
+            (Answer::UploadSegment { last, data, .. }, TransferDirection::Read) => {
+                pending.add_segment(data);
+                last
             }
-            (3, TransferDirection::Write) if same => transfer.len >= pending.size,
-            (1, TransferDirection::Write) => pending.last_sent,
+            (Answer::Download { index, .. }, TransferDirection::Write) if index == expected => {
+                transfer.len >= pending.size
+            }
+            (Answer::DownloadSegment { .. }, TransferDirection::Write) => pending.last_sent,
             _ => false,
         };
         if done {
@@ -300,21 +310,12 @@ impl Mailbox {
         }
     }
 
-    /// Processes SDO Information: opcode, fragments left, content.
-    fn information(&mut self, to_device: bool, content: &[u8], reported: &mut Vec<MailboxEvent>) {
-        let (Some(&opcode), Some(left), Some(body)) =
-            (content.first(), u16_at(content, 2), content.get(4..))
-        else {
-            return;
-        };
-        if to_device {
-            self.listed = 0;
-            return;
-        }
-        match opcode & 0x7f {
+    fn information(&mut self, fragment: &Fragment<'_>, reported: &mut Vec<MailboxEvent>) {
+        let body = fragment.data;
+        match fragment.opcode {
             2 => {
                 self.listed += body.len() / 2;
-                if left == 0 {
+                if fragment.left == 0 {
                     // The first word is the list type.
                     reported.push(MailboxEvent::ObjectList(self.listed.saturating_sub(1)));
                 }
@@ -333,7 +334,12 @@ impl Mailbox {
                     self.name(index, u16::from(*sub), name);
                 }
             }
-            7 => reported.push(MailboxEvent::NoInformation(u32_at(body, 0).unwrap_or(0))),
+            7 => {
+                let code = body
+                    .first_chunk()
+                    .map_or(0, |code| u32::from_le_bytes(*code));
+                reported.push(MailboxEvent::NoInformation(code));
+            }
             _ => {}
         }
     }
@@ -345,44 +351,49 @@ impl Mailbox {
         }
     }
 
-    fn foe(&mut self, at: u64, to_device: bool, body: &[u8], reported: &mut Vec<MailboxEvent>) {
-        let (Some(&opcode), Some(rest)) = (body.first(), body.get(2..)) else {
-            return;
-        };
-        match opcode {
-            1 | 2 if to_device => {
-                if let Some(mut file) = self.file.take() {
-                    file.ended_at = at;
-                    reported.push(MailboxEvent::File(file));
-                }
-                self.file = Some(FileTransfer {
-                    began: at,
-                    ended_at: at,
-                    way: if opcode == 1 {
-                        TransferDirection::Read
-                    } else {
-                        TransferDirection::Write
-                    },
-                    name: text(rest.get(4..).unwrap_or_default()),
-                    len: 0,
-                    error: None,
-                });
+    fn foe(&mut self, at: u64, to_device: bool, bytes: &[u8], reported: &mut Vec<MailboxEvent>) {
+        match foe::Message::parse(bytes) {
+            Ok(foe::Message::Read { name, .. }) if to_device => {
+                self.begin_file(at, TransferDirection::Read, name, reported);
             }
-            3 => {
+            Ok(foe::Message::Write { name, .. }) if to_device => {
+                self.begin_file(at, TransferDirection::Write, name, reported);
+            }
+            Ok(foe::Message::Data { data, .. }) => {
                 if let Some(file) = &mut self.file {
                     file.ended_at = at;
-                    file.len += rest.len().saturating_sub(4);
+                    file.len += data.len();
                 }
             }
-            5 => {
+            Ok(foe::Message::Error { code, text: reason }) => {
                 if let Some(mut file) = self.file.take() {
                     file.ended_at = at;
-                    let code = u32_at(rest, 0).unwrap_or(0);
-                    file.error = Some((code, text(rest.get(4..).unwrap_or_default())));
+                    file.error = Some((code, text(reason)));
                     reported.push(MailboxEvent::File(file));
                 }
             }
             _ => {}
+        }
+    }
+
+    fn begin_file(
+        &mut self,
+        at: u64,
+        way: TransferDirection,
+        name: &[u8],
+        reported: &mut Vec<MailboxEvent>,
+    ) {
+        let started = FileTransfer {
+            began: at,
+            ended_at: at,
+            way,
+            name: text(name),
+            len: 0,
+            error: None,
+        };
+        if let Some(mut file) = self.file.replace(started) {
+            file.ended_at = at;
+            reported.push(MailboxEvent::File(file));
         }
     }
 }
@@ -394,29 +405,9 @@ impl Pending {
         let kept = data.get(..room.min(data.len())).unwrap_or_default();
         self.transfer.data.extend_from_slice(kept);
     }
-}
 
-/// Returns the announced size and the first data after command, index and subindex.
-fn initiated(command: u8, rest: &[u8]) -> (usize, &[u8]) {
-    if command & 0x02 != 0 {
-        let unused = if command & 1 != 0 {
-            usize::from(command >> 2 & 3)
-        } else {
-            0
-        };
-        let size = 4 - unused;
-        return (size, rest.get(..size).unwrap_or(rest));
+    fn add_segment(&mut self, data: &[u8]) {
+        self.add(data);
+        self.transfer.segments += 1;
     }
-    let size = u32_at(rest, 0).map_or(0, |size| size as usize);
-    let data = rest.get(4..).unwrap_or_default();
-    (size, data.get(..size).unwrap_or(data))
-}
-
-/// Returns the data of a segment. Short segments are padded to the size of a CAN frame.
-fn segment(command: u8, data: &[u8]) -> &[u8] {
-    if data.len() > 7 {
-        return data;
-    }
-    let used = 7 - usize::from(command >> 1 & 7);
-    data.get(..used).unwrap_or(data)
 }

@@ -3,8 +3,9 @@
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::hash::{DefaultHasher, Hash, Hasher};
 
+use ecaxis_ecat::datagram::Command;
 use ecaxis_master::recording::Direction;
-use ecaxis_master::recording::frame::{Command, Frame};
+use ecaxis_master::recording::frame::Frame;
 
 /// The maximum round-trip time in ns; later requests count as unanswered.
 pub const PATIENCE_NS: u64 = 250_000_000;

@@ -1,8 +1,8 @@
 //! The SubDevices of a recording, reconstructed from its datagrams.
 
+use ecaxis_ecat::datagram::Command;
 use ecaxis_ecat::registers;
 use ecaxis_master::bringup::AlState;
-use ecaxis_master::recording::frame::Command;
 
 use super::axes::Axes;
 use super::clocks::Clocks;

@@ -3,7 +3,8 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::super::abort::mailbox_error_text;
+use ecaxis_ecat::mailbox::mailbox_error_text;
+
 use super::super::error::LostDatagram;
 use super::super::{DatagramError, Phase};
 

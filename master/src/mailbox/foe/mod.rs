@@ -1,6 +1,5 @@
 //! File access over EtherCAT (ETG.1000.6 §5.8): the client of one SubDevice.
 //!
-//! - `message`: the bytes.
 //! - `error`: [`FoeError`].
 //!
 //! A file is transferred in packets, counted from 1 and acknowledged one by one. The first packet
@@ -15,11 +14,11 @@ use super::transport::{Deadline, Port, TransportError};
 use super::{MailboxLayout, MailboxTransport, Timeouts};
 
 mod error;
-mod message;
 
+use ecaxis_ecat::mailbox::DecodeError;
+use ecaxis_ecat::mailbox::foe::Message;
+pub use ecaxis_ecat::mailbox::foe::room;
 pub use error::{FoeError, foe_error_text};
-pub use message::room;
-use message::{Message, Request, parse};
 
 /// The maximum number of old messages that are read before a transfer.
 const DRAIN: usize = 64;
@@ -228,7 +227,11 @@ impl FoeClient {
     /// Sends an error code to the SubDevice. If it cannot be sent now, it is sent before the next
     /// transfer. The caller gets the first error.
     async fn give_up<W: MailboxTransport>(&mut self, w: &W, code: u32) {
-        self.under_way = self.port.send(w, &Request::Error { code }).await.is_err();
+        self.under_way = self
+            .port
+            .send(w, &Message::Error { code, text: &[] })
+            .await
+            .is_err();
     }
 
     async fn write_in<W: MailboxTransport>(
@@ -241,7 +244,8 @@ impl FoeClient {
     ) -> Result<(), FoeFailure> {
         let full = room(self.port.layout.out_len);
         let name = transfer.file;
-        let mut request = Request::Write { password, name };
+        let name = name.as_bytes();
+        let mut request = Message::Write { password, name };
         let mut done = 0;
         let mut is_last = false;
         loop {
@@ -265,7 +269,7 @@ impl FoeClient {
             let rest = data.get(done..).unwrap_or_default();
             let part = rest.get(..full).unwrap_or(rest);
             transfer.packet = packet.wrapping_add(1);
-            request = Request::Data {
+            request = Message::Data {
                 packet: transfer.packet,
                 data: part,
             };
@@ -284,7 +288,8 @@ impl FoeClient {
     ) -> Result<Vec<u8>, FoeFailure> {
         let full = room(self.port.layout.in_len);
         let name = transfer.file;
-        let mut request = Request::Read { password, name };
+        let name = name.as_bytes();
+        let mut request = Message::Read { password, name };
         let mut file = Vec::new();
         loop {
             let due = transfer.packet.wrapping_add(1);
@@ -316,7 +321,7 @@ impl FoeClient {
             }
             file.extend_from_slice(&part);
             progress(FoeProgress::Bytes(file.len()));
-            request = Request::Ack { packet: due };
+            request = Message::Ack { packet: due };
             if part.len() < full {
                 let sent = self.port.send(w, &request).await;
                 return match sent {
@@ -333,7 +338,7 @@ impl FoeClient {
         &mut self,
         w: &W,
         transfer: &Transfer<'_>,
-        request: &Request<'_>,
+        request: &Message<'_>,
         progress: &mut dyn FnMut(FoeProgress),
         pick: impl Fn(&Message<'_>) -> ReplyMatch<T>,
     ) -> Result<T, FoeFailure> {
@@ -384,7 +389,7 @@ impl FoeClient {
             if let Err(trouble) = self.port.receive(w, &mut deadline).await {
                 return Err(transfer.trouble(&self.port, trouble));
             }
-            let answer = match parse(self.port.message()) {
+            let answer = match Message::parse(self.port.message()) {
                 Ok(Message::Busy { done, entire }) => Some(Answer::Busy { done, entire }),
                 Ok(Message::Error { code, text }) => {
                     let text = words(text);
@@ -393,6 +398,8 @@ impl FoeClient {
                 }
                 Ok(Message::Refused(code)) => return Err(transfer.mailbox(code)),
                 Ok(Message::Other) => None,
+                Ok(Message::Read { .. }) => return Err(transfer.malformed(DecodeError::Opcode(1))),
+                Ok(Message::Write { .. }) => return Err(transfer.malformed(DecodeError::Opcode(2))),
                 Ok(said) => match pick(&said) {
                     ReplyMatch::Take(value) => Some(Answer::Is(value)),
                     ReplyMatch::Again => Some(Answer::Again),

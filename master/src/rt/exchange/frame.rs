@@ -1,12 +1,13 @@
 //! The bytes of the cycle's frames: Ethernet header, then the datagrams.
 
+use ecaxis_ecat::datagram::{Command, Header};
+pub(super) use ecaxis_ecat::datagram::{HEADER as DATAGRAM_HEADER, WORKING_COUNTER as WKC};
+
 use crate::link::pdu_loop::ETHERCAT;
 
 pub(super) const MAC_TAIL: u8 = 0x20;
 const ETHERNET_HEADER: usize = 14;
 pub(super) const FIRST_DATAGRAM: usize = 16;
-pub(super) const DATAGRAM_HEADER: usize = 10;
-pub(super) const WKC: usize = 2;
 
 /// The position of a datagram in its frame.
 #[derive(Debug, Clone, Copy)]
@@ -76,7 +77,7 @@ fn new_frame() -> Frame {
 pub(super) fn push(
     frame: &mut Frame,
     number: usize,
-    command: u8,
+    command: Command,
     address: u32,
     len: usize,
 ) -> DatagramSlot {
@@ -90,11 +91,22 @@ pub(super) fn push(
     place
 }
 
-pub(super) fn write_header(frame: &mut [u8], offset: usize, command: u8, address: u32, len: usize) {
-    let [a0, a1, a2, a3] = address.to_le_bytes();
-    let [l0, l1] = u16::try_from(len).unwrap_or(0).to_le_bytes();
-    if let Some(header) = frame.get_mut(offset..offset + DATAGRAM_HEADER) {
-        header.copy_from_slice(&[command, 0, a0, a1, a2, a3, l0, l1, 0, 0]);
+pub(super) fn write_header(
+    frame: &mut [u8],
+    offset: usize,
+    command: Command,
+    address: u32,
+    len: usize,
+) {
+    let header = Header {
+        command,
+        index: 0,
+        address,
+        len: u16::try_from(len).unwrap_or(0),
+        more: false,
+    };
+    if let Some(place) = frame.get_mut(offset..offset + DATAGRAM_HEADER) {
+        place.copy_from_slice(&header.emit());
     }
 }
 

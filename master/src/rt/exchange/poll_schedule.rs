@@ -1,10 +1,11 @@
 //! The schedule of the diagnostic slot. If mailboxes are polled, every other read is theirs. The
 //! cost per cycle does not depend on the number of mailboxes.
 
+use super::ExchangeDevice;
 use super::diagnostics::DiagnosticRegister;
 use super::frame::{DATAGRAM_HEADER, WKC};
-use super::{ExchangeDevice, FPRD, LRD};
 use crate::rt::image::MailboxPlan;
+use ecaxis_ecat::datagram::Command;
 use ecaxis_ecat::registers;
 
 /// Data bytes of the longest read.
@@ -29,7 +30,7 @@ pub(super) enum PollTarget {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct PollDatagram {
     pub look: PollTarget,
-    pub command: u8,
+    pub command: Command,
     pub address: u32,
     pub len: usize,
 }
@@ -60,7 +61,7 @@ impl PollSchedule {
                 .enumerate()
                 .map(move |(device, member)| PollDatagram {
                     look: PollTarget::At { device, probe },
-                    command: FPRD,
+                    command: Command::FPRD,
                     address: registers(member.station, register),
                     len,
                 })
@@ -75,7 +76,7 @@ impl PollSchedule {
             })
             .map(|(first, len)| PollDatagram {
                 look: PollTarget::Mailboxes { first },
-                command: LRD,
+                command: Command::LRD,
                 address: mapped.map_or(0, |plan| plan.address(first)),
                 len,
             })
@@ -88,7 +89,7 @@ impl PollSchedule {
                     look: PollTarget::Mailboxes {
                         first: mailbox_devices.len(),
                     },
-                    command: FPRD,
+                    command: Command::FPRD,
                     address: registers(
                         member.station,
                         registers::SYNC_MANAGER_STATUS + 8 * u16::from(sm),
@@ -196,10 +197,10 @@ mod tests {
             })
             .collect();
         let expected = [
-            (0, LRD, 0x0001_0100, 8),
-            (8, LRD, 0x0001_0108, 3),
-            (11, FPRD, 0x080d_03ed, 1),
-            (0, LRD, 0x0001_0100, 8),
+            (0, Command::LRD, 0x0001_0100, 8),
+            (8, Command::LRD, 0x0001_0108, 3),
+            (11, Command::FPRD, 0x080d_03ed, 1),
+            (0, Command::LRD, 0x0001_0100, 8),
         ];
         assert_eq!(mailboxes, expected);
         assert_eq!(schedule.mailbox_devices[11], 4);

@@ -2,6 +2,7 @@
 //! codes (ETG.1000.4).
 
 /// Returns the text of an SDO abort code; codes from 0x0F00_0000 on are maxon's.
+#[must_use]
 pub fn abort_text(code: u32) -> &'static str {
     match code {
         0x0000_0000 => "no abort",
@@ -54,6 +55,7 @@ pub fn abort_text(code: u32) -> &'static str {
 }
 
 /// Returns the text of the code in a mailbox error reply.
+#[must_use]
 pub fn mailbox_error_text(code: u16) -> &'static str {
     match code {
         0x0001 => "the mailbox header is wrong",

@@ -1,8 +1,10 @@
 //! Recorded messages of real devices and MainDevices: an EK1914 and an EL3004 with ethercrab, a
 //! LAN9252 with SOEM.
 
-use crate::mailbox::coe::{Answer, Message, Request, parse};
-use crate::mailbox::transport::Encode;
+use proptest::prelude::*;
+
+use super::coe::{Answer, Message, Request};
+use super::{Encode, foe};
 
 /// The mailbox header and CoE message, without the padding of the mailbox.
 fn emitted(request: &Request<'_>, counter: u8) -> Vec<u8> {
@@ -57,6 +59,7 @@ fn requests_match_recordings_of_other_main_devices() {
         ),
     ] {
         assert_eq!(emitted(&request, counter), bytes(recorded), "{request:?}");
+        assert_eq!(Request::parse(&bytes(recorded)), Ok(Some(request)));
     }
 }
 
@@ -102,6 +105,88 @@ fn answers_of_real_devices_are_parsed() {
     ] {
         let mut mailbox = bytes(recorded);
         mailbox.resize(128, 0xa5);
-        assert_eq!(parse(&mailbox), Ok(Message::Sdo(answer)));
+        assert_eq!(Message::parse(&mailbox), Ok(Message::Sdo(answer)));
+    }
+}
+
+fn requests(data: &[u8], flags: (bool, bool), numbers: (u16, u8, u32)) -> Vec<Request<'_>> {
+    let ((first, second), (index, sub, number)) = (flags, numbers);
+    let short = data.get(..data.len().min(4)).unwrap_or_default();
+    let mut all = vec![
+        Request::Upload {
+            index,
+            sub,
+            complete: first,
+        },
+        Request::UploadSegment { toggle: first },
+        Request::Download {
+            index,
+            sub,
+            complete: first,
+            size: number,
+            data,
+        },
+        Request::DownloadSegment {
+            toggle: first,
+            last: second,
+            data,
+        },
+        Request::Abort {
+            index,
+            sub,
+            code: number,
+        },
+        Request::Information {
+            opcode: sub & 0x7f,
+            body: data,
+        },
+    ];
+    if !short.is_empty() {
+        all.push(Request::DownloadExpedited {
+            index,
+            sub,
+            data: short,
+        });
+    }
+    all
+}
+
+proptest! {
+    #[test]
+    fn emitted_requests_are_parsed_again(
+        data in prop::collection::vec(any::<u8>(), 0..40),
+        flags: (bool, bool),
+        numbers: (u16, u8, u32),
+        counter in 0_u8..8,
+    ) {
+        let mut out = vec![0xa5; 5];
+        for request in requests(&data, flags, numbers) {
+            request.emit(counter, 64, &mut out);
+            prop_assert_eq!(out.len(), 64);
+            prop_assert_eq!(Request::parse(&out), Ok(Some(request)));
+        }
+        for message in [
+            foe::Message::Read { password: numbers.2, name: &data },
+            foe::Message::Write { password: numbers.2, name: &data },
+            foe::Message::Data { packet: numbers.2, data: &data },
+            foe::Message::Ack { packet: numbers.2 },
+            foe::Message::Error { code: numbers.2, text: &data },
+            foe::Message::Busy { done: numbers.0, entire: !numbers.0 },
+        ] {
+            message.emit(counter, 64, &mut out);
+            prop_assert_eq!(foe::Message::parse(&out), Ok(message));
+        }
+    }
+
+    #[test]
+    fn parsing_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..64), kind in 0_u8..8) {
+        let mut bytes = bytes;
+        if let Some(protocol) = bytes.get_mut(5) {
+            *protocol = kind;
+        }
+        if let [low, high, ..] = bytes.as_mut_slice() {
+            (*low, *high) = (*low % 64, 0);
+        }
+        let _ = (Request::parse(&bytes), Message::parse(&bytes), foe::Message::parse(&bytes));
     }
 }

@@ -1,0 +1,84 @@
+//! The datagrams of a cycle in its frames.
+
+use super::super::image::{Access, DatagramPlan, ImagePlan};
+use super::super::phase::ClockPlan;
+use super::frame::{DatagramSlot, Frame, push};
+use super::poll_schedule::LONGEST_LOOK;
+use crate::link::MAX_FRAME;
+use ecaxis_ecat::datagram::Command;
+use ecaxis_ecat::registers;
+
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ProcessDatagram {
+    pub(super) place: DatagramSlot,
+    pub(super) access: Access,
+    pub(super) group: usize,
+    /// Offset in the image.
+    pub(super) image: usize,
+    pub(super) expected_wkc: u16,
+    /// The range of its devices in [`Exchange`](super::Exchange)'s `order`: the first, and one past the last.
+    pub(super) devices: (usize, usize),
+}
+
+/// The positions of a cycle's datagrams in its frames.
+#[derive(Debug)]
+pub(super) struct DatagramSlots {
+    pub(super) clock: Option<DatagramSlot>,
+    pub(super) process_data: Vec<ProcessDatagram>,
+    pub(super) al_status: DatagramSlot,
+    pub(super) probe_at: usize,
+}
+
+impl DatagramSlots {
+    /// Puts all datagrams except the diagnostic one into empty frames.
+    #[allow(clippy::disallowed_methods, reason = "runs before the loop")]
+    pub(super) fn fill(
+        frames: &mut [Frame],
+        plan: &ImagePlan,
+        datagrams: &[DatagramPlan],
+        order: &[usize],
+        clock: Option<&ClockPlan>,
+    ) -> Self {
+        let clock = clock.map(|clock| {
+            let address = u32::from(registers::DC_SYSTEM_TIME) << 16 | u32::from(clock.reference);
+            push(&mut frames[0], 0, Command::FRMW, address, 8)
+        });
+        let offset = |device: &usize| plan.regions[*device].map_or(0, |region| region.offset);
+        let process_data = datagrams.iter().map(|datagram| {
+            let first = order.partition_point(|device| offset(device) < datagram.offset);
+            let behind = datagram.offset + datagram.len;
+            let end = order.partition_point(|device| offset(device) < behind);
+            let frame = datagram.frame;
+            let command = match datagram.access {
+                Access::Both => Command::LRW,
+                Access::Inputs => Command::LRD,
+                Access::Outputs => Command::LWR,
+            };
+            let (logical, len) = (datagram.logical, datagram.len);
+            ProcessDatagram {
+                place: push(&mut frames[frame], frame, command, logical, len),
+                access: datagram.access,
+                group: datagram.group,
+                image: datagram.offset,
+                expected_wkc: datagram.expected_wkc,
+                devices: (first, end),
+            }
+        });
+        let process_data = process_data.collect();
+        let al_status = push(
+            &mut frames[0],
+            0,
+            Command::BRD,
+            u32::from(registers::AL_STATUS) << 16,
+            2,
+        );
+        let probe_at = frames[0].bytes.len();
+        debug_assert!(probe_at + LONGEST_LOOK <= MAX_FRAME);
+        Self {
+            clock,
+            process_data,
+            al_status,
+            probe_at,
+        }
+    }
+}
