@@ -6,6 +6,7 @@
 //! - [`config`]: the machine file, first as written, then validated;
 //! - [`session`]: one run of a machine, from the machine file to the summary;
 //! - [`post_mortem`]: what stopped a run, and on which device;
+//! - [`report`]: errors, progress and the summary of a run, as plain data;
 //! - [`supervise`]: all work outside the cycle while the machine runs;
 //! - [`bringup`]: the way from power-up to SafeOp; may block and allocate;
 //! - [`rt`]: the cycle; must not block or allocate;
@@ -32,6 +33,7 @@ pub mod link;
 pub mod mailbox;
 pub mod post_mortem;
 pub mod recording;
+pub mod report;
 pub mod rt;
 pub mod session;
 pub mod supervise;

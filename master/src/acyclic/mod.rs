@@ -23,7 +23,7 @@ use crate::clock::Clock;
 use crate::link::Link;
 use crate::link::pdu_loop::{drive_pdu_loop, main_device};
 use crate::mailbox::{DatagramError, InfoError, MailboxTransport, SdoError};
-use crate::session::{RunError, panic_text};
+use crate::report::{RunError, panic_text};
 
 pub use crate::datagram::DatagramClient;
 

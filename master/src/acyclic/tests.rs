@@ -17,7 +17,8 @@ use crate::clock::Clock;
 use crate::config::{self, Locator};
 use crate::link::sim::SimLink;
 use crate::mailbox::{DatagramError, MailboxTransport};
-use crate::session::{RunError, simulated_bus};
+use crate::report::RunError;
+use crate::session::simulated_bus;
 
 /// Runs `work` on a segment of two drives.
 fn with_drives<T: Send + 'static>(

@@ -11,6 +11,7 @@
 //! Hints for the user come from the command line.
 
 pub mod cause;
+mod class;
 pub mod diagnose;
 pub mod evidence;
 pub mod ports;

@@ -9,10 +9,10 @@ use super::{Cause, ports};
 use crate::bringup::AlState;
 use crate::clock::Nanos;
 use crate::link::LinkStats;
+use crate::report::EventLine;
 use crate::rt::exchange::ErrorCounters;
 use crate::rt::flight_recorder::{AxisCycle, Cycle};
 use crate::rt::stats::Counters;
-use crate::session::EventLine;
 use ecaxis_ecat::al_status_code::al_status_text;
 
 /// The report of a failed run.

@@ -24,30 +24,24 @@ use crate::rt::stats::Stats;
 use crate::supervise::jog::{self, Operator};
 
 mod cycle_thread;
-mod emergencies;
-mod error;
-mod events;
 mod fault_evidence;
 mod open;
 mod prepare;
-mod progress;
 mod signals;
-mod summary;
 
-pub use crate::supervise::diagnosis_history::{DiagnosisKind, DiagnosisMessage};
+use crate::report::summary::{self, SummaryInputs};
+pub use crate::report::{
+    AxisLine, AxisSummary, DeviceErrors, DiagnosisKind, DiagnosisMessage, DriveReport,
+    EmergencyLine, EmergencyLog, EmergencyReport, EventLine, GroupStop, Observer, ProbeCapture,
+    Progress, RunError, Status, StepRef, Summary, ThreadSummary,
+};
+use crate::report::{events, panic_text};
 use cycle_thread::CycleRun;
-pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
-pub use error::{DriveReport, RunError};
-pub use events::EventLine;
-pub(crate) use events::clock_off;
 use fault_evidence::{BringUpEvidence, RunEvidence};
 pub use open::{recorded, simulated_bus, topology};
 pub use prepare::{Prepared, RunBuilder};
 use prepare::{broadcast_init, prefer_replay_end};
-pub use progress::{AxisLine, Observer, ProbeCapture, Progress, Status, StepRef};
 pub use signals::{SignalReport, stop_on_signals};
-use summary::SummaryInputs;
-pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
 
 /// The stack size in bytes of the thread that owns the link. ethercrab's futures hold its tables by
 /// value.
@@ -240,14 +234,6 @@ fn report_panics_briefly() {
     });
 }
 
-pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
-    panic
-        .downcast_ref::<String>()
-        .cloned()
-        .or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()))
-        .unwrap_or_else(|| "unknown cause".to_owned())
-}
-
 fn run_on_link_thread(
     machine: &Arc<Machine>,
     options: &Options,
@@ -349,6 +335,10 @@ fn run_on_link_thread(
         fault_evidence::of_run(machine, options, error, left)
     });
     let aside = SummaryInputs {
+        program_runs: ended.runs,
+        interrupted: ended.interrupted,
+        captures: ended.captures,
+        group_stops: ended.group_stops,
         link: seen,
         thread,
         record,
@@ -358,7 +348,7 @@ fn run_on_link_thread(
         started,
         stops,
     };
-    let summary = Summary::new(machine, options.clock, &axes, &stats, ended, aside);
+    let summary = Summary::new(machine, options.clock, &axes, &stats, aside);
     Outcome {
         summary: Some(summary),
         result,

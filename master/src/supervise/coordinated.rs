@@ -11,9 +11,9 @@ use super::Supervisor;
 use super::program::{Settling, TargetKind};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
+use crate::report::RunError;
 use crate::rt::channel::RtCommand;
 use crate::rt::setpoint_generator::{GeneratorRequest, GeneratorState, commanded};
-use crate::session::RunError;
 
 /// The timeout in ns for a follower to catch up.
 const ENGAGE_TIMEOUT: Nanos = 30_000_000_000;

@@ -14,10 +14,10 @@ use crate::clock::{self, Nanos};
 use crate::config::LimitConflict;
 use crate::post_mortem::snapshot::{self, Depth};
 use crate::post_mortem::{DeviceSnapshot, Witnessed};
+use crate::report::{DriveReport, Progress, RunError};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{RtCommand, Snapshot};
 use crate::rt::setpoint_generator::GeneratorState;
-use crate::session::{DriveReport, Progress, RunError};
 
 const ERROR_CODE: u16 = 0x603f;
 pub(super) const MODES_OF_OPERATION_DISPLAY: u16 = 0x6061;

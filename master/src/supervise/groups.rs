@@ -7,10 +7,10 @@ use super::Supervisor;
 use crate::config::{Action, Step};
 use crate::post_mortem::Witnessed;
 use crate::post_mortem::snapshot::Depth;
+use crate::report::{GroupStop, Progress, RunError};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::Snapshot;
 use crate::rt::reaction_group::GroupStatus;
-use crate::session::{GroupStop, Progress, RunError};
 
 /// A stop of a group during which the machine continued.
 #[derive(Debug, Clone)]

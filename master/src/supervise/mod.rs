@@ -21,12 +21,11 @@ use crate::datagram::{CyclicMailboxTransport, DatagramClient};
 use crate::mailbox::Mailboxes;
 use crate::mailbox::worker::{MailboxWorker, run_with_workers};
 use crate::post_mortem::{Witnessed, snapshot};
+use crate::report::events::clock_off;
+use crate::report::{EmergencyLog, GroupStop, ProbeCapture, Progress, RunError, Status};
 use crate::rt::bus_monitor::StopCause;
 use crate::rt::channel::{Event, HostEndpoint, ORDERS_A_CYCLE, RtCommand, Snapshot};
 use crate::rt::exchange::DiagnosticRegister;
-use crate::session::{
-    EmergencyLog, GroupStop, ProbeCapture, Progress, RunError, Status, clock_off,
-};
 use groups::StoppedGroup;
 
 mod coordinated;

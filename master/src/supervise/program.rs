@@ -19,8 +19,8 @@ use super::groups::needed;
 use super::{ProgramOutcome, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, AxisSetup, Step};
+use crate::report::{Progress, RunError, StepRef};
 use crate::rt::channel::{RtCommand, Snapshot};
-use crate::session::{Progress, RunError, StepRef};
 
 mod moves;
 mod probe;

@@ -7,9 +7,9 @@ use ecaxis_axis::Command;
 use super::controller::{Activity, Commands, JogContext, JogController};
 use super::{JogEvent, Operator, Presence, View};
 use crate::clock;
+use crate::report::RunError;
 use crate::rt::channel::RtCommand;
 use crate::rt::reaction_group::GroupStatus;
-use crate::session::RunError;
 use crate::supervise::Supervisor;
 use crate::supervise::explain::MODES_OF_OPERATION_DISPLAY;
 

@@ -6,8 +6,8 @@ use ecaxis_axis::{AxisStatus, Command, Mode};
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::Nanos;
 use crate::config::Step;
+use crate::report::RunError;
 use crate::rt::channel::Snapshot;
-use crate::session::RunError;
 
 impl Supervisor {
     /// Starts all moves in the same cycle; each arrives on its own. `part`: fraction of the

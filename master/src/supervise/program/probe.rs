@@ -10,8 +10,8 @@ use ecaxis_axis::{Command, Edge, Probe, ProbeStatus, Source};
 use super::{Settling, Supervisor, TargetKind};
 use crate::clock::{self, Nanos};
 use crate::config::Step;
+use crate::report::{ProbeCapture, Progress, RunError};
 use crate::rt::channel::Snapshot;
-use crate::session::{ProbeCapture, Progress, RunError};
 
 /// The timeout in ns until 0x60B9 shows that the drive watches the input.
 const ARM_TIMEOUT: Nanos = 1_000_000_000;

@@ -6,8 +6,8 @@ use ecaxis_axis::{AxisStatus, Command, Mode};
 use super::{SETTLE_TIMEOUT, STANDS, Supervisor};
 use crate::clock::{self, Nanos};
 use crate::config::{Action, Condition, Step};
+use crate::report::RunError;
 use crate::rt::channel::Snapshot;
-use crate::session::RunError;
 
 impl Supervisor {
     /// Waits until `holds` is true for every axis. Fails after the enable timeout or the longest

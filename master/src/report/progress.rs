@@ -6,6 +6,7 @@ use ecaxis_axis::units::UserUnits;
 use ecaxis_axis::{Mode, State};
 use serde::Serialize;
 
+use super::{EmergencyReport, RunError};
 use crate::bringup::Step;
 use crate::clock::Nanos;
 use crate::config::{Machine, TorqueUnit};
@@ -13,7 +14,6 @@ use crate::link::NicWarning;
 use crate::mailbox::Mailboxes;
 use crate::rt::channel::{PhaseStatus, Snapshot};
 use crate::rt::stats::Counters;
-use crate::session::{EmergencyReport, RunError};
 use crate::sys::rt_thread::{RtSetupError, RtThrottlingRisk};
 
 /// Receives the progress of a run.

@@ -53,7 +53,7 @@ pub struct EmergencyLine {
 }
 
 impl EmergencyReport {
-    pub(super) fn line(&self, started: Nanos) -> EmergencyLine {
+    pub(crate) fn line(&self, started: Nanos) -> EmergencyLine {
         let Emergency {
             code,
             register,
@@ -121,7 +121,7 @@ impl EmergencyLog {
     }
 
     /// Returns the first emergencies of all devices and the number of further ones.
-    pub(super) fn lines(&self, started: Nanos) -> (Vec<EmergencyLine>, u64) {
+    pub(crate) fn lines(&self, started: Nanos) -> (Vec<EmergencyLine>, u64) {
         let kept = self.kept();
         let lines = kept.first.iter().map(|report| report.line(started));
         let mut lost = kept.lost.iter().map(|(_, lost)| *lost);

@@ -11,7 +11,6 @@ use crate::link::capture::RecordStats;
 use crate::rt::axis::RtAxis;
 use crate::rt::exchange::{ErrorCounters, SubDeviceDiagnostics};
 use crate::rt::stats::{Counters, Percentiles, Stats};
-use crate::supervise::ProgramOutcome;
 use crate::sys::process::ThreadUsage;
 
 use super::ProbeCapture;
@@ -77,7 +76,7 @@ pub struct DeviceErrors {
 }
 
 /// Returns the devices whose counters have grown.
-pub(super) fn device_errors(
+pub(crate) fn device_errors(
     machine: &Machine,
     diagnoses: &[SubDeviceDiagnostics],
 ) -> Vec<DeviceErrors> {
@@ -112,7 +111,7 @@ pub struct ThreadSummary {
 }
 
 impl ThreadSummary {
-    pub(super) fn new(used: ThreadUsage, wall_ns: u64, spin_ns: u64, stats: &Stats) -> Self {
+    pub(crate) fn new(used: ThreadUsage, wall_ns: u64, spin_ns: u64, stats: &Stats) -> Self {
         Self {
             used,
             load_percent: used.load_percent(wall_ns),
@@ -123,7 +122,12 @@ impl ThreadSummary {
 }
 
 /// The inputs of the summary that the cycle does not provide.
-pub(super) struct SummaryInputs {
+pub(crate) struct SummaryInputs {
+    pub program_runs: u32,
+    pub interrupted: bool,
+    /// The probing results, one per step.
+    pub captures: Vec<ProbeCapture>,
+    pub group_stops: Vec<GroupStop>,
     pub link: LinkStats,
     pub thread: Option<ThreadSummary>,
     pub record: Option<RecordStats>,
@@ -193,12 +197,11 @@ fn name_of(mode: Mode) -> String {
 }
 
 impl Summary {
-    pub(super) fn new(
+    pub(crate) fn new(
         machine: &Machine,
         clock: Clock,
         axes: &[RtAxis],
         stats: &Stats,
-        ended: ProgramOutcome,
         aside: SummaryInputs,
     ) -> Self {
         let setups = machine
@@ -244,8 +247,8 @@ impl Summary {
             },
             cycle_ns,
             machine_seconds: turns as f64 * cycle_ns as f64 * 1e-9,
-            program_runs: ended.runs,
-            interrupted: ended.interrupted,
+            program_runs: aside.program_runs,
+            interrupted: aside.interrupted,
             counters: stats.counters,
             link: aside.link,
             wake_up_lateness: stats.lateness.summary(),
@@ -254,12 +257,12 @@ impl Summary {
             work: stats.work.summary(),
             thread: aside.thread,
             axes,
-            probes: ended.captures,
+            probes: aside.captures,
             errors: aside.errors,
             events: aside.events,
             emergencies: aside.emergencies.0,
             more_emergencies: aside.emergencies.1,
-            group_stops: ended.group_stops,
+            group_stops: aside.group_stops,
             recorded_frames: aside.record.map(|r| r.written),
             recorded_frames_dropped: aside.record.map(|r| r.dropped),
         }

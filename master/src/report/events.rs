@@ -22,7 +22,7 @@ pub struct EventLine {
 }
 
 /// Returns all events that the log has kept.
-pub(super) fn lines(journal: &EventLog, started: Nanos, machine: &Machine) -> Vec<EventLine> {
+pub(crate) fn lines(journal: &EventLog, started: Nanos, machine: &Machine) -> Vec<EventLine> {
     let line = |entry: &Entry| EventLine {
         at_s: entry.time.saturating_sub(started) as f64 * 1e-9,
         first_cycle: entry.first_cycle,

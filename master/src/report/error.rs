@@ -11,9 +11,9 @@ use crate::bringup::{AlState, BringUpError, DeviceRef, StateError};
 use crate::config::LimitConflict;
 use crate::link::{LinkError, OpenError};
 use crate::rt::image::{NotMapped, TooLarge};
-use crate::session::{EmergencyReport, StepRef};
-use crate::supervise::diagnosis_history::DiagnosisMessage;
 use crate::text::pluralize;
+
+use super::{DiagnosisMessage, EmergencyReport, StepRef};
 use ecaxis_ecat::al_status_code::al_status_text;
 
 /// A failure of the machine or the bus.
@@ -350,4 +350,13 @@ fn by(method: i8) -> String {
         Some(known) => format!("method {method} ({})", known.text),
         None => format!("method {method}"),
     }
+}
+
+/// Returns the message of a panic.
+pub(crate) fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
+    panic
+        .downcast_ref::<String>()
+        .cloned()
+        .or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()))
+        .unwrap_or_else(|| "unknown cause".to_owned())
 }

@@ -1,0 +1,131 @@
+//! The class of causes that an error can have.
+
+use super::diagnose::{SYNC_CODES, WATCHDOG};
+use super::evidence::{Evidence, Lateness};
+use crate::bringup::{AlState, BringUpError, StateError};
+use crate::mailbox::SdoError;
+use crate::report::RunError;
+
+/// The class of causes that an error can have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Class {
+    /// Frames, cables, missing devices, watchdogs.
+    Bus,
+    /// The arrival time of frames.
+    Timing,
+    /// One device, drive or axis, or the machine file.
+    Device,
+}
+
+impl Class {
+    pub(super) fn of(error: &RunError, evidence: &Evidence) -> Self {
+        match error {
+            RunError::BusLost { .. }
+            | RunError::Gone { .. }
+            | RunError::LeftOpBriefly { .. }
+            | RunError::NoProcessData { .. } => Self::Bus,
+            RunError::DriveFault {
+                code: Some(code), ..
+            } => match code {
+                0x7500..=0x75ff | 0x8100..=0x81ff | 0x8250 | 0x8280..=0x82ff => {
+                    Self::said_by_device(evidence)
+                }
+                0x8700..=0x87ff => Self::Timing,
+                _ => Self::Device,
+            },
+            RunError::LeftOp {
+                device,
+                state,
+                code: WATCHDOG,
+            } if *state != AlState::Op => Self::of_watchdog(&device.name, evidence),
+            RunError::LeftOp { state, code, .. } => Self::of_state(*state, *code, evidence),
+            RunError::State(error) => Self::of_change(error, evidence),
+            RunError::BringUp(error) => match error.as_ref() {
+                BringUpError::NoAnswer
+                | BringUpError::Scan { .. }
+                | BringUpError::Missing { .. }
+                | BringUpError::Wire { .. }
+                | BringUpError::NotTaken { .. } => Self::Bus,
+                BringUpError::State(error) => Self::of_change(error, evidence),
+                BringUpError::NoStart { .. } => Self::Timing,
+                BringUpError::StartUp { source, .. }
+                | BringUpError::Mailbox { source, .. }
+                | BringUpError::ReadBack { source, .. }
+                | BringUpError::ReadUnits { source, .. } => match source {
+                    SdoError::Gone { .. } | SdoError::Wire { .. } => Self::Bus,
+                    // A device that another MainDevice sets to Init loses its mailbox.
+                    SdoError::Timeout { .. } if evidence.other_frames() > 0 => Self::Bus,
+                    _ => Self::Device,
+                },
+                _ => Self::Device,
+            },
+            RunError::FollowLost { reason, .. }
+                if reason == crate::rt::setpoint_generator::HELD_UP =>
+            {
+                Self::Bus
+            }
+            RunError::PhaseNotLocked { .. } | RunError::ClockNotSettled { .. } => Self::Timing,
+            _ => Self::Device,
+        }
+    }
+
+    /// Returns the class of an error by which a device blames the bus. The cycle must have seen
+    /// trouble on the bus as well.
+    fn said_by_device(evidence: &Evidence) -> Self {
+        let Lateness { missed, longest } = evidence.lateness();
+        let late = missed > 0 || longest > evidence.cycle_ns;
+        let seen = late
+            || evidence.without_data() > evidence.cycle_ns
+            || evidence.other_frames() > 0
+            || evidence.stop.is_none();
+        if seen { Self::Bus } else { Self::Device }
+    }
+
+    /// Returns the class of a watchdog error. A watchdog expires only if process data was missing
+    /// for about its time.
+    fn of_watchdog(device: &str, evidence: &Evidence) -> Self {
+        let look = evidence.named(device).and_then(|found| found.look.watchdog);
+        let enough = look.map_or(0, |watchdog| watchdog.time_ns / 2);
+        let without = evidence.without_data().max(evidence.lateness().longest);
+        if without > 0 && without >= enough {
+            Self::Bus
+        } else {
+            Self::Device
+        }
+    }
+
+    fn of_change(error: &StateError, evidence: &Evidence) -> Self {
+        // Invalid requested state change and invalid mailbox configuration: another MainDevice may
+        // have set the device to Init during bring-up.
+        const SENT_ELSEWHERE: [u16; 2] = [0x0011, 0x0016];
+        let others = evidence.other_frames() > 0;
+        match error {
+            StateError::Gone { .. } | StateError::Wire { .. } => Self::Bus,
+            StateError::Refused { code, .. } if others && SENT_ELSEWHERE.contains(code) => {
+                Self::Bus
+            }
+            StateError::Refused { actual, code, .. } => Self::of_state(*actual, *code, evidence),
+            StateError::Timeout { wanted, actual, .. } => {
+                // The bring-up itself never leaves a device in Init.
+                let moved = *wanted == AlState::Op && *actual != AlState::SafeOp;
+                if others && (moved || *actual == AlState::Init) {
+                    Self::Bus
+                } else {
+                    Self::Device
+                }
+            }
+        }
+    }
+
+    fn of_state(state: AlState, code: u16, evidence: &Evidence) -> Self {
+        if code == 0 || code == WATCHDOG {
+            Self::Bus
+        } else if !SYNC_CODES.contains(&code) || state != AlState::SafeOp {
+            Self::Device
+        } else if evidence.stop.is_some() && evidence.without_data() > evidence.cycle_ns {
+            Self::Bus
+        } else {
+            Self::Timing
+        }
+    }
+}

@@ -1,0 +1,22 @@
+//! What a run reports: errors, progress, events and the summary, as plain data. No I/O.
+//!
+//! - [`RunError`]: the errors of a run;
+//! - [`Progress`], [`Status`]: what an [`Observer`] receives during a run;
+//! - [`EventLine`], [`EmergencyLine`], [`DiagnosisMessage`]: what the cycle and the devices
+//!   reported;
+//! - [`Summary`]: the result.
+
+mod diagnosis_message;
+mod emergencies;
+mod error;
+pub(crate) mod events;
+mod progress;
+pub(crate) mod summary;
+
+pub use diagnosis_message::{DiagnosisKind, DiagnosisMessage};
+pub use emergencies::{EmergencyLine, EmergencyLog, EmergencyReport};
+pub(crate) use error::panic_text;
+pub use error::{DriveReport, RunError};
+pub use events::EventLine;
+pub use progress::{AxisLine, Observer, ProbeCapture, Progress, Status, StepRef};
+pub use summary::{AxisSummary, DeviceErrors, GroupStop, Summary, ThreadSummary};
