@@ -1,8 +1,7 @@
 //! Switching power on and off: no step when the axis is enabled, and no power without a request.
 
-mod common;
-
-use common::{Drive, LIMITS, Rig, axis, scale};
+use crate::common;
+use crate::common::{Drive, LIMITS, Rig, axis, scale};
 use ecaxis_axis::{
     Axis, AxisConfig, Command, CommandError, ConfigError, Inputs, Limits, Mode, State, Trip,
 };

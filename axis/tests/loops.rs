@@ -1,9 +1,7 @@
 //! Position loops in the master, with moves, velocities, external set-points and jerk-limited
 //! moves.
 
-mod common;
-
-use common::{DEAD_TIME_S, DT, Drive, LIMITS, Rig, looped};
+use crate::common::{DEAD_TIME_S, DT, Drive, LIMITS, Rig, looped};
 use ecaxis_axis::{
     Axis, AxisConfig, AxisStatus, Command, CommandError, ConfigError, FeedForward, Limits, Loops,
     Mode, PositionPid, VelocityLoop,

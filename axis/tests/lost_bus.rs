@@ -1,9 +1,8 @@
 //! Lost frames: how far the set-point runs ahead of a drive that holds its last target, and how the
 //! motion continues.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, axis, scale};
+use crate::common;
+use crate::common::{DT, Drive, LIMITS, Rig, axis, scale};
 use ecaxis_axis::{Axis, AxisConfig, AxisStatus, Command, Limits, Mode, Outputs, State};
 use proptest::prelude::*;
 

@@ -1,10 +1,8 @@
 //! Lost frames during a mode switch: the axis does not know whether the drive has received it.
 
-mod common;
-
 use std::collections::VecDeque;
 
-use common::{DT, Drive, LIMITS, Rig, all, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{Axis, AxisConfig, AxisStatus, Command, Limits, Mode, Modes, Outputs, State};
 
 const COUNTS_PER_UNIT: f64 = 400.0;

@@ -4,11 +4,7 @@
 //! `cargo test` runs a bounded part; `ECAXIS_MACHINE_SECONDS` requests more, `ECAXIS_SEED` a single
 //! run.
 
-#![allow(clippy::print_stdout, reason = "how much was simulated")]
-
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, all};
+use crate::common::{DT, Drive, LIMITS, Rig, all};
 use ecaxis_axis::{
     Axis, AxisConfig, AxisStatus, Brake, Command, Edge, FaultReset, FeedForward, Inputs, Limits,
     Loops, Mode, Outputs, Probe, Source, State, StopMethod, Supervision, TorqueWatch,

@@ -1,8 +1,6 @@
 //! Mode switches, at rest and in motion.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, looped, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, looped, scale};
 use ecaxis_axis::{
     Axis, AxisConfig, Command, CommandError, Limits, Loops, Mode, Modes, State, Trip,
 };

@@ -1,8 +1,6 @@
 //! Moves, velocities, torques, and rejected commands.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, scale};
 use ecaxis_axis::{
     Axis, AxisConfig, Command, CommandError, Limits, Mode, Scale, State, VelocityUnit,
 };

@@ -1,10 +1,7 @@
 //! The cycle of an axis allocates nothing, including commands, rejections, faults and trips.
 
-mod common;
-mod counting;
-
-use common::{DT, Rig};
-use counting::allocations;
+use crate::common::{DT, Rig};
+use crate::counting::allocations;
 use ecaxis_axis::{Command, Mode};
 
 #[test]

@@ -1,9 +1,7 @@
 //! The cycle of set-points and lines allocates nothing, including planning, rejections and
 //! continuation after lost frames.
 
-mod counting;
-
-use counting::allocations;
+use crate::counting::allocations;
 use ecaxis_axis::group::{Line, LineAxis};
 use ecaxis_axis::setpoint::{
     Gear, GearConfig, GearInMode, Goal, Interpolation, JerkLimited, Knot, Motion, MotionLimits,

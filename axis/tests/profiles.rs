@@ -1,8 +1,6 @@
 //! Profiles of the drive: PP, PV, homing, and the switches into and out of these modes.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, all, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{
     Axis, AxisConfig, Command, CommandError, HomingError, HomingStatus, Limits, Mode, State, Trip,
 };

@@ -1,8 +1,6 @@
 //! Random commands, faults, Statuswords and lost frames: properties that hold in every cycle.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, axis, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, axis, scale};
 use ecaxis_axis::{Axis, AxisConfig, Command, Inputs, Limits, Mode, Outputs, State};
 use proptest::prelude::*;
 

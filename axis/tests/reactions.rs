@@ -1,9 +1,7 @@
 //! Reactions to trips, emergency stops, brakes, automatic resets, enable blockers, dwell times,
 //! touch probes.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, all, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, all, scale};
 use ecaxis_axis::{
     Axis, AxisConfig, Brake, Command, CommandError, Edge, EnableBlocker, FaultReset, Inputs,
     Limits, Mode, Probe, ProbeStatus, QuickStopOption, Source, State, StopMethod, Supervision,

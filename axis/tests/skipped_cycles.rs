@@ -1,8 +1,6 @@
 //! Skipped cycles: no frame was sent, and the drive holds its last outputs.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, all};
+use crate::common::{DT, Drive, LIMITS, Rig, all};
 use ecaxis_axis::{Axis, AxisConfig, Command, Limits, Mode, State};
 
 const COUNTS_PER_UNIT: f64 = 400.0;

@@ -1,8 +1,6 @@
 //! Stops: the sequence of outputs that the drive receives until it has no power.
 
-mod common;
-
-use common::{DT, LIMITS, axis, scale};
+use crate::common::{DT, LIMITS, axis, scale};
 use ecaxis_axis::{
     Axis, AxisConfig, Command, CommandError, EnableBlocker, Inputs, Limits, Mode, Outputs,
     StopMethod, StopPhase, Trip,

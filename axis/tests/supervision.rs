@@ -1,8 +1,6 @@
 //! Trips of an axis and their reported causes.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, axis, scale};
+use crate::common::{DT, Drive, LIMITS, Rig, axis, scale};
 use ecaxis_axis::{Axis, AxisConfig, Command, CommandError, Limits, Mode, State, Trip};
 
 const fn to(position: f64) -> Command {

@@ -1,9 +1,7 @@
 //! All 65,536 Statuswords × every command × every mode: idle, enabled, and during a move, a mode
 //! switch or a homing.
 
-mod common;
-
-use common::{DT, Drive, LIMITS, Rig, all};
+use crate::common::{DT, Drive, LIMITS, Rig, all};
 use ecaxis_axis::{Axis, Command, Edge, Inputs, Mode, Probe, Source, State};
 
 const MODES: [Mode; 5] = [Mode::Csp, Mode::Csv, Mode::Cst, Mode::Pp, Mode::Pv];

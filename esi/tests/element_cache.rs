@@ -5,10 +5,7 @@
 //! elements come from the cache. With numbered comments, all texts differ. Lines and columns are
 //! the same in both cases.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-
+use crate::common;
 use ecaxis_esi::{EsiError, EsiFile, parse};
 use proptest::prelude::*;
 

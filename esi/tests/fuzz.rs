@@ -3,13 +3,9 @@
 //! feature.
 //!
 //! `ECAXIS_FUZZ_FILES` sets the number of files, `ECAXIS_FUZZ_SEED` the first seed:
-//! `ECAXIS_FUZZ_FILES=1000000 cargo test --release -p ecaxis-esi --test fuzz -- --nocapture`
+//! `ECAXIS_FUZZ_FILES=1000000 cargo test --release -p ecaxis-esi --test main fuzz -- --nocapture`
 
-#![allow(clippy::print_stdout)]
-
-#[path = "fuzz/mutate.rs"]
 mod mutate;
-#[path = "fuzz/walk.rs"]
 mod walk;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};

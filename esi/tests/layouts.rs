@@ -1,18 +1,14 @@
 //! The process data of every device of every recorded vendor file, for each choice in its ESI. The
 //! snapshots in `snapshots/` are reviewed against the XML.
 //!
-//! `ECAXIS_UPDATE_SNAPSHOTS=1 cargo test -p ecaxis-esi --test layouts` writes the snapshots again.
+//! `ECAXIS_UPDATE_SNAPSHOTS=1 cargo test -p ecaxis-esi --test main layouts` writes the snapshots again.
 //! The difference then needs the same review. Snapshots contain only numbers: a device is its
 //! identity and line, a module its identity, an OpMode or assignment its index in the file.
 
-#![allow(clippy::print_stdout)]
-
-#[path = "layouts/choices.rs"]
 mod choices;
-mod common;
-#[path = "layouts/text.rs"]
 mod text;
 
+use crate::common;
 use std::path::{Path, PathBuf};
 
 use ecaxis_esi::{EsiFile, SelectError, SelectOptions, Severity, lint, parse, select};

@@ -1,23 +1,15 @@
 //! A drive's ESI file with one damage at a time. Each damage yields an error or a finding at its
 //! position, without a panic and with bounded memory and time.
 //!
-//! `cargo test -p ecaxis-esi --test mutations -- --nocapture` prints message, peak memory and time
-//! of each damage. This binary has one test, because the test measures its own process.
+//! `cargo test -p ecaxis-esi --test memory mutations -- --nocapture` prints message, peak memory
+//! and time of each damage.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-#[path = "mutations/memory.rs"]
-mod memory;
-#[path = "mutations/modules.rs"]
 mod modules;
-#[path = "mutations/process_data.rs"]
 mod process_data;
-#[path = "mutations/structure.rs"]
 mod structure;
-#[path = "mutations/table.rs"]
 mod table;
 
+use crate::common;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -113,9 +105,9 @@ fn check(mutation: &Mutation, original: &str) -> Result<(String, usize, Duration
     let bytes = damaged.chars().map(|c| u8::try_from(u32::from(c)).unwrap());
     let bytes: Vec<u8> = bytes.collect();
     drop(damaged);
-    memory::reset();
+    crate::reset();
     let (said, took) = examine(bytes);
-    let peak = memory::peak();
+    let peak = crate::peak();
     let matching = said.iter().find(|said| {
         (said.kind, said.line, said.column) == (*kind, line, column)
             && said.path == *path
@@ -139,6 +131,7 @@ fn each_damage_is_reported_at_its_position() {
     let Some(bytes) = common::read(common::EPOS4) else {
         return;
     };
+    let _alone = crate::measure();
     let original: String = bytes.iter().map(|&byte| char::from(byte)).collect();
     let (said, undamaged) = examine(bytes);
     assert!(said.is_empty(), "{said:#?}");

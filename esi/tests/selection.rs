@@ -1,13 +1,9 @@
 //! From a vendor file and a choice to layout and start-up list.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-#[path = "selection/eni.rs"]
 mod eni;
-#[path = "selection/modules.rs"]
 mod modules;
 
+use crate::common;
 use ecaxis_esi::{
     DeviceQuery, EntryRef, EsiFile, Mode, SelectError, SelectOptions, Selection, StartupSdo,
     UserSdo, find_device, offered_modes, parse, select,

@@ -1,9 +1,6 @@
 //! EEPROM images: recorded images parse, and emitted images parse to the same contents.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-
+use crate::common;
 use ecaxis_esi::sii::{
     self, General, MailboxAreas, Protocols, Sii, SiiDc, SiiEntry, SiiFmmuDetail, SiiOptions,
     SiiPdo, SiiSyncManager,

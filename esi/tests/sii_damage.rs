@@ -1,11 +1,6 @@
 //! Damaged EEPROM images: an error or a warning names offset and category, and nothing panics.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-#[path = "mutations/memory.rs"]
-mod memory;
-
+use crate::common;
 use ecaxis_esi::parse;
 use ecaxis_esi::sii::{self, SiiOptions};
 
@@ -329,6 +324,7 @@ fn parse_never_panics_on_cuts_and_wrong_bytes() {
 #[test]
 fn parse_needs_bounded_memory_for_any_counts() {
     const LIMIT: usize = 64 << 20;
+    let _alone = crate::measure();
     let mut long = whole();
     let end = head(&long, 0xffff);
     long.truncate(end);
@@ -342,7 +338,7 @@ fn parse_needs_bounded_memory_for_any_counts() {
         long.extend([0xff; 2 * 0xff]);
     }
     long.extend([0xff, 0xff]);
-    memory::reset();
+    crate::reset();
     let _ = said(&long);
     let mut image = whole();
     for at in (0x80..image.len() - 1).step_by(2) {
@@ -351,7 +347,7 @@ fn parse_needs_bounded_memory_for_any_counts() {
         let _ = said(&image);
         put(&mut image, at, before);
     }
-    assert!(memory::peak() < LIMIT, "{} bytes", memory::peak());
+    assert!(crate::peak() < LIMIT, "{} bytes", crate::peak());
 }
 
 #[test]

@@ -1,10 +1,7 @@
 //! Recorded EEPROM images compared with the ESI files of the same devices. Each real difference is
 //! listed here. A listed difference that no longer exists fails as well.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-
+use crate::common;
 use ecaxis_esi::sii::{self, Difference, DifferenceKind, SiiOptions};
 use ecaxis_esi::{DeviceQuery, find_device, parse};
 

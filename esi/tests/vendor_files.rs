@@ -1,9 +1,6 @@
 //! Every recorded vendor file parses; the contents of the EPOS4 file are checked in detail.
 
-#![allow(clippy::print_stdout)]
-
-mod common;
-
+use crate::common;
 use ecaxis_esi::{FmmuUse, ObjectCode, SmUse, Writable, parse};
 
 #[test]

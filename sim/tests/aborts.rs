@@ -1,9 +1,7 @@
 //! SDO aborts, ETG.1000.6 table 41 row by row.
 
-mod common;
-
+use crate::common::*;
 use Refusal::Abort;
-use common::*;
 use ecaxis_esi::model::{Device, Object, ObjectItem};
 use ecaxis_sim::{DeviceOptions, FaultScript, MailboxOptions};
 

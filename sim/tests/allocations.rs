@@ -1,44 +1,13 @@
 //! A cycle allocates nothing: frames, SYNC0, process data, drives.
 
-mod common;
-mod main_device;
+use crate::counting::allocations;
+use crate::main_device;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::FrameBuilder;
 use ecaxis_sim::gateway::{Epos, GatewayOptions, NodeOptions, PdoLink};
 use ecaxis_sim::{DeviceOptions, FrameOutcome};
-
-struct Counting;
-
-thread_local! {
-    static COUNT: Cell<Option<u64>> = const { Cell::new(None) };
-}
-
-fn count() {
-    COUNT.with(|c| c.set(c.get().map(|n| n + 1)));
-}
-
-// SAFETY: forwards every call to the system allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
-        // SAFETY: the caller upholds the contract of `GlobalAlloc`.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        count();
-        // SAFETY: the caller upholds the contract of `GlobalAlloc`.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
 
 /// Turns the device into a drive. The drive adds the objects that it needs.
 fn as_drive(mut device: Device) -> Device {
@@ -70,7 +39,7 @@ fn cycling_does_not_allocate() {
         .datagram(7, 0, 0x130, &[0; 2])
         .build();
     let mut bytes = template.clone();
-    COUNT.with(|c| c.set(Some(0)));
+    let before = allocations();
     for n in 1..2_000 {
         bytes.copy_from_slice(&template);
         let result = bus.segment.transit(&mut bytes, bus.now + n * 1_000_000);
@@ -78,8 +47,7 @@ fn cycling_does_not_allocate() {
             break;
         }
     }
-    let allocations = COUNT.with(|c| c.replace(None));
-    assert_eq!(allocations, Some(0));
+    assert_eq!(allocations() - before, 0);
     assert_eq!(bytes[bytes.len() - 2..], [2, 0], "both answered to the end");
     assert_eq!(bytes[bytes.len() - 4], 8, "both in Op");
 }
@@ -129,16 +97,15 @@ fn forwarding_between_two_networks_does_not_allocate() {
         let gateway = bus.segment.device(0).unwrap().gateway().unwrap();
         gateway.frames().last().unwrap()
     };
-    let (before, template) = (frames(&bus), command(20));
+    let (sent, template) = (frames(&bus), command(20));
     let mut bytes = template.clone();
-    COUNT.with(|c| c.set(Some(0)));
+    let before = allocations();
     for n in 1..2_000 {
         bytes.copy_from_slice(&template);
         bus.segment.transit(&mut bytes, bus.now + n * 1_000_000);
     }
-    let allocations = COUNT.with(|c| c.replace(None));
-    assert_eq!(allocations, Some(0));
+    assert_eq!(allocations() - before, 0);
     assert_eq!(bytes[bytes.len() - 2..], [3, 0]);
-    let ran = frames(&bus).0 - before.0;
+    let ran = frames(&bus).0 - sent.0;
     assert!(ran > 1_990_000_000, "the network ran all the time: {ran}");
 }

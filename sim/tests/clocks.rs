@@ -1,8 +1,6 @@
 //! Distributed clocks, SYNC0 and repeatability.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::FrameBuilder;
 use ecaxis_sim::{DeviceOptions, FrameOutcome};
 

@@ -1,9 +1,7 @@
 //! The SDO server, accessed over the wire.
 
-mod common;
-
+use crate::common::*;
 use Refusal::Abort;
-use common::*;
 use ecaxis_sim::{DeviceOptions, FaultScript};
 
 const S: u16 = 0x1001;

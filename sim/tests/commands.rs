@@ -1,9 +1,7 @@
 //! Every datagram command: addressing, data and exact working counters (ETG.1000.4, 5.4; Beckhoff
 //! ESC data sheet, section I, tables 5 to 7).
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
 
 const DEVICES: u16 = 3;

@@ -1,8 +1,6 @@
 //! Registers, working counters, FMMUs, EEPROM and states, accessed over the wire.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::FrameBuilder;
 use ecaxis_sim::{AlState, DeviceOptions, EscInfo, FaultScript};
 use proptest::prelude::*;

@@ -2,9 +2,7 @@
 //! from DL status, delays from the receive times of each port (Beckhoff ESC hardware data sheet,
 //! section I, 9.1.2).
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::network::topology::media;
 use ecaxis_sim::{DeviceOptions, PortRequest, Segment, SegmentOptions, SimDevice, Topology};

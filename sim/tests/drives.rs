@@ -1,13 +1,9 @@
 //! Two drives from a vendor's ESI file: brought to Op, enabled and moved, and the computing time of
 //! a cycle.
 
-#![allow(clippy::print_stderr, reason = "prints the computing time of a cycle")]
-
-mod common;
-
 use std::time::Instant;
 
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::{DeviceOptions, FaultScript, FrameOutcome, PlantParams, SimDevice};
 

@@ -1,8 +1,6 @@
 //! The EEPROM behind 0x0500–0x050F, and the values that the controller loads: alias, configuration.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::{DeviceOptions, FaultScript, SimDevice};
 

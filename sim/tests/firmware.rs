@@ -1,9 +1,7 @@
 //! The boot loader of simulated devices: program control (CiA 302-3) row by row, a device without
 //! its program, and persistence over a power cycle. The tests use no client.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::{DeviceOptions, FirmwareHeader, FirmwareOptions};
 use proptest::prelude::*;
 

@@ -1,14 +1,10 @@
 //! Every device of every available ESI file becomes a SubDevice. A MainDevice takes it from Init to
 //! Op without the ESI.
 
-#![allow(clippy::print_stderr, reason = "prints the number of devices")]
-
-mod common;
-mod main_device;
-
+use crate::main_device;
 use std::path::{Path, PathBuf};
 
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::{DeviceOptions, SimDevice};
 

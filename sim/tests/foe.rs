@@ -1,8 +1,6 @@
 //! File access (ETG.1000.6 §5.8), in Bootstrap and in the other states.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::{DeviceOptions, FaultScript, FoeOptions, MailboxOptions};
 use proptest::prelude::*;
 

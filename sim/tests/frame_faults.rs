@@ -1,8 +1,6 @@
 //! Effects of the fault script on frames and devices: corruption, duplication, delay, exchange.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::FrameBuilder;
 use ecaxis_sim::{DeviceOptions, FaultScript, FrameOutcome};
 

@@ -1,12 +1,9 @@
 //! Random input: the simulator neither panics nor hangs nor returns a wrong length.
 //!
 //! `ECAXIS_FUZZ_FRAMES` sets the number of random frames, e.g. 10 million:
-//! `ECAXIS_FUZZ_FRAMES=10000000 cargo test --release -p ecaxis-sim --test fuzz frames --
+//! `ECAXIS_FUZZ_FRAMES=10000000 cargo test --release -p ecaxis-sim --test main fuzz::frames --
 //! --nocapture`
 
-#![allow(clippy::print_stderr, reason = "prints the number of attacks")]
-
-mod common;
 #[path = "common/hostile/mod.rs"]
 mod hostile;
 

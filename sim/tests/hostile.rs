@@ -1,8 +1,6 @@
 //! Invariants that no mailbox message may break.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::{DeviceOptions, FoeOptions, MailboxOptions};
 use proptest::prelude::*;
 

@@ -1,11 +1,7 @@
 //! Every published EEPROM image becomes a SubDevice that a MainDevice takes from Init to Op.
 
-#![allow(clippy::print_stderr, reason = "prints a line per image")]
-
-mod common;
-mod main_device;
-
-use common::*;
+use crate::common::*;
+use crate::main_device;
 use ecaxis_sim::{DeviceOptions, SimDevice};
 
 fn climb(image: &[u8]) -> Result<String, String> {

@@ -1,9 +1,7 @@
 //! A mailbox behind a wire that loses frames. With the counters and repetitions of the mailbox's
 //! data link layer (ETG.1000.4 §5.6) every request is executed exactly once.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::{DeviceOptions, FaultScript};
 

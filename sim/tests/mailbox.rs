@@ -1,8 +1,6 @@
 //! The mailbox protocol: headers and their errors, counters, repetitions, order.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::{DeviceOptions, FaultScript, MailboxOptions};
 
 const S: u16 = 0x1001;

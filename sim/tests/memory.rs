@@ -1,8 +1,6 @@
 //! Process RAM: SyncManagers that protect it, FMMUs that map it, accessed over the wire.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use proptest::prelude::*;
 

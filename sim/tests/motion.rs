@@ -1,8 +1,6 @@
 //! A drive's behaviour over the bus, as its MainDevice sees it.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::drive::{State, input};
 use ecaxis_sim::{DeviceOptions, PlantParams, SimDevice, Track};
 

@@ -1,8 +1,6 @@
 //! Links, loops and the path of frames: line, tree and ring, whole, broken and healed.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::network::topology::media;

@@ -1,8 +1,6 @@
 //! Random networks under random operations.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::network::topology::media;

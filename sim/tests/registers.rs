@@ -1,8 +1,6 @@
 //! Registers with effects: write protection, reset, events, watchdogs, application layer.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::Device;
 use ecaxis_sim::frame::{self, FrameBuilder};
 use ecaxis_sim::{AlState, DeviceOptions, SimDevice};

@@ -1,8 +1,6 @@
 //! SDO Information (ETG.1000.6 §5.6.3): a device's own description must match its ESI.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::{ObjectCode, Writable};
 use ecaxis_sim::{DeviceOptions, MailboxOptions};
 

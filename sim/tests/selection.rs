@@ -1,10 +1,6 @@
 //! The drives of an ESI become simulated drives, in every cyclic mode.
 
-#![allow(clippy::print_stderr, reason = "prints the tested drives")]
-
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::{Device, Entry, EsiFile};
 use ecaxis_esi::{Mode, SelectOptions, offered_modes, select};
 use ecaxis_sim::{DeviceOptions, SimDevice};

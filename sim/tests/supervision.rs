@@ -1,8 +1,6 @@
 //! A device with SYNC0: late outputs, a missing SYNC0, missing frames.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_esi::model::{Object, Writable};
 use ecaxis_sim::SimDevice;
 use ecaxis_sim::drive::State;

@@ -1,8 +1,6 @@
 //! SYNC0, SYNC1, latches and the clock registers, accessed over the wire.
 
-mod common;
-
-use common::*;
+use crate::common::*;
 use ecaxis_sim::{DeviceOptions, EscInfo};
 
 const S: u16 = 0x1001;

@@ -1,12 +1,9 @@
 //! A coupler and digital terminals: no mailbox, no application, single bits.
 
-mod common;
-mod main_device;
-
-use common::*;
+use crate::common::*;
+use crate::main_device::bring_up;
 use ecaxis_esi::model::{Device, EsiFile};
 use ecaxis_sim::AlState;
-use main_device::bring_up;
 
 /// The project's own coupler and terminals.
 fn ours() -> EsiFile {

@@ -1,8 +1,6 @@
 //! Reference drive for these tests: transitions of the standard, an ideal motor, one cycle of delay
 //! in each direction.
 
-#![allow(dead_code)]
-
 use ecaxis_axis::setpoint::{Hold, Motion, Ramp, Trapezoid};
 use ecaxis_axis::{
     Axis, AxisConfig, AxisStatus, Command, FeedForward, Inputs, Limits, Loops, Mode, Modes,

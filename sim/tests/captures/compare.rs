@@ -1,6 +1,6 @@
 //! Compares recorded and simulated answers: equal, or different for one of a few reasons.
 
-use crate::recording::{Datagram, FPRD};
+use super::recording::{Datagram, FPRD};
 
 /// Real clocks drift against the recording host's, and its time stamps jitter.
 const CLOCK_TOLERANCE_NS: u64 = 100_000;

@@ -6,7 +6,7 @@ use ecaxis_esi::model::{Access, Writable};
 use ecaxis_esi::sii;
 use ecaxis_sim::SimDevice;
 
-use crate::recording::{FPRD, FPWR, Recording};
+use super::recording::{FPRD, FPWR, Recording};
 
 const EEPROM_CONTROL: u16 = 0x0502;
 const EEPROM_DATA: u16 = 0x0508;

@@ -1,22 +1,17 @@
 //! The CANopen gateway from both sides, on a whole bus under virtual time.
 
-#[path = "../common/mod.rs"]
-mod common;
-#[path = "../main_device/mod.rs"]
-mod main_device;
-
 mod commands;
 mod ethercat;
 mod nodes;
 mod supervision;
 
-use common::*;
+use crate::common::*;
+use crate::main_device::{Learned, Mailbox, bring_up, number};
 use ecaxis_esi::model::EsiFile;
 use ecaxis_sim::gateway::{
     CanFrame, Epos, Gateway, GatewayOptions, NmtState, Node, NodeOptions, PdoLink, Supervision,
 };
 use ecaxis_sim::{DeviceOptions, SimDevice};
-use main_device::{Learned, Mailbox, bring_up, number};
 use proptest::prelude::*;
 
 const S: u16 = 0x1001;

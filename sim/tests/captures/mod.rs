@@ -2,19 +2,15 @@
 //! with the same EEPROM contents at the recorded time. Its answer must equal the recorded one.
 //! docs/captures.md has the results.
 
-#![allow(clippy::print_stderr, reason = "prints the results")]
-
 mod buses;
-#[path = "../common/mod.rs"]
-mod common;
 mod compare;
 mod image;
 mod recording;
 
 use std::collections::BTreeMap;
 
+use crate::common::fixture;
 use buses::{BUSES, Bus, Device};
-use common::fixture;
 use compare::{Case, EXCUSES, excuse};
 use ecaxis_sim::frame::FrameBuilder;
 use ecaxis_sim::{DeviceOptions, FrameOutcome, MailboxOptions, Segment, SegmentOptions, SimDevice};

@@ -1,0 +1,23 @@
+//! The tests of `ecaxis-axis`.
+
+#![allow(clippy::print_stdout, reason = "tests print counts and what they skip")]
+
+mod common;
+mod counting;
+mod enabling;
+mod loops;
+mod lost_bus;
+mod lost_modes;
+mod machine;
+mod modes;
+mod motion;
+mod no_alloc;
+mod no_alloc_motion;
+mod profiles;
+mod properties;
+mod reactions;
+mod shortest_time;
+mod skipped_cycles;
+mod stops;
+mod supervision;
+mod sweep;

@@ -1,0 +1,15 @@
+//! The tests of `ecaxis-esi` that do not measure their own process; `memory.rs` holds the others.
+
+#![allow(clippy::print_stdout, reason = "tests print counts and what they skip")]
+
+mod common;
+mod damage;
+mod element_cache;
+mod fuzz;
+mod layouts;
+mod own_files;
+mod selection;
+mod sii;
+mod sii_vs_recorded;
+mod vendor_files;
+mod warnings;

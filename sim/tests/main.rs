@@ -1,0 +1,38 @@
+//! The tests of `ecaxis-sim`.
+
+#![allow(clippy::print_stderr, reason = "tests print counts and what they skip")]
+
+mod aborts;
+mod allocations;
+mod captures;
+mod clocks;
+mod coe;
+mod commands;
+mod common;
+mod controller;
+#[path = "../../axis/tests/counting/mod.rs"]
+mod counting;
+mod delays;
+mod drives;
+mod eeprom;
+mod firmware;
+mod fixtures;
+mod foe;
+mod frame_faults;
+mod fuzz;
+mod gateway;
+mod hostile;
+mod images;
+mod lossy;
+mod mailbox;
+mod main_device;
+mod memory;
+mod motion;
+mod network;
+mod network_properties;
+mod registers;
+mod sdo_info;
+mod selection;
+mod supervision;
+mod sync;
+mod terminals;
